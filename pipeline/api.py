@@ -73,7 +73,7 @@ def reconstruct(
     ...     )
     ...     again = rille.open_run(run.folder)
     ...     print(again.trajectory.sizes["frame"], again.terrain.elevation.units)
-    /...computed..., cached 0, missing 0
+    /...computed..., cached 0, missing ...
     2 m
     """
     from rille.pipeline.commands.options import cache_folder, prepare

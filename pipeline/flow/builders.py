@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from types import ModuleType
 from typing import Any, Concatenate, ParamSpec, TypeVar
@@ -88,10 +89,25 @@ class Builder:
         self.graph, self.sequence, self.config = graph, sequence, config
         self.products = Products()
         self.made: dict[Any, Any] = {}
-        # Arguments of many tasks, one object for all: each would hold some kilobytes of its own until the run's end.
-        self.given_rig = sequence.rig.to_dict()
-        self.given_vehicle = config.vehicle.model_dump(mode="json", exclude={"name"})
-        self.given_resect = config.resect.model_dump(mode="json")
+
+    # Arguments of many tasks, one object for all: each would hold some kilobytes of its own until the run's end.
+
+    @cached_property
+    def given_rig(self) -> dict[str, Any]:
+        """The sequence's rig."""
+        return self.sequence.rig.to_dict()
+
+    @cached_property
+    def given_vehicle(self) -> dict[str, Any]:
+        """The vehicle without its name, which changes no result."""
+        found: dict[str, Any] = self.config.vehicle.model_dump(mode="json", exclude={"name"})
+        return found
+
+    @cached_property
+    def given_resect(self) -> dict[str, Any]:
+        """The parameters of stage ``resect``, for stages that read them too."""
+        found: dict[str, Any] = self.config.resect.model_dump(mode="json")
+        return found
 
     def node(self, stage: ModuleType, label: str, args: Mapping[str, Any], **inputs: Handle | list[Handle]) -> Handle:
         """One task of the stage that a module declares, with the parameters that it has in the configuration."""

@@ -2,17 +2,18 @@
 
 ::
 
-    image -> undistort -> pyramid -+-> motion (N, N+1) -+-> steps -> continuity -> select: which pairs are basic
+    image -> undistort -> pyramid -+-> motion (N, N+1) -+-> step_table -> frame_screening -> keyframes: basic pairs
              (if needed)           |                    +-> track (segment) --+
                                    |                                          |
-                                   +-> hfvm (basic pair) -+-> level ----------+-> resect (segment) -> trajectory
+                                   +-> hfvm (basic pair) -+-> ground_frame ---+-> resect (segment) -> trajectory
                                                           |     |               (landmarks)  (refine)     |
         given rig --+-> orientation (basic pair) <--------+     |                                         |
                     |       +-> rig -> calibration -------+-----+-> locus (local frame)                   |
-                    |           (pooled; into level,      |           +-> risk, path (local)              |
+                    |           (pooled; into the frame,  |           +-> risk, path (local)              |
                     |            locus and resect)        +-> locus (world lattice) <- pose (pair) <------+
-                    |                                           +-> footprint (pair): which world tiles it touches
-                    |                                           +-> seam (pair, earlier ones) -> seam_audit, exposure
+                    |                                           +-> tile_index (pair): which world tiles it touches
+                    |                                           +-> overlap_qa (pair, earlier ones)
+                    |                                           |     +-> overlap_audit, radiometry
                     |                                           +-> merge (world tile) -> risk, path (mission)
                     +-> crosscheck (window; images of both cameras) -> crosscheck_join -> agreement <- trajectory
     leaves: accuracy (trajectory, crosscheck), position_accuracy, dem_accuracy (local and merged DEM), path_check

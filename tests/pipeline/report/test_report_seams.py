@@ -40,7 +40,7 @@ def scene() -> Any:
         found[pair] = overlap_qa.STAGE.run(NoParams(), {}, {"dem": dems[pair], "others": others})
     centres = {str(k): [0.245, 0.01 * (5 * k - 29.5)] for k in dems}
     audit = overlap_audit.STAGE.run(OverlapAuditParams(), {"centres": centres}, {"seams": list(found.values())})
-    products = SimpleNamespace(seam_audit=audit, seams=found)
+    products = SimpleNamespace(overlap_audit=audit, seams=found)
     return SimpleNamespace(view=SimpleNamespace(bundle=lambda handle: handle, products=products))
 
 
@@ -84,7 +84,7 @@ def test_the_model_to_blame_stands_first(scene: Any) -> None:
 def test_without_a_seam_there_is_no_page() -> None:
     empty = overlap_audit.STAGE.run(OverlapAuditParams(), {"centres": {"0": [0.0, 0.0]}}, {"seams": []})
     for audit in (None, empty):
-        products = SimpleNamespace(seam_audit=audit, seams={})
+        products = SimpleNamespace(overlap_audit=audit, seams={})
         scene = SimpleNamespace(view=SimpleNamespace(bundle=lambda handle: handle, products=products))
         assert seams.worst(scene) is None
         assert seams.models(scene) is None

@@ -128,7 +128,7 @@ def test_a_closed_row_is_named(row: int) -> None:
     found = plan(np.zeros((16, 9), dtype=np.int64), every_way(free), tolerance=2)
     assert len(found.cells) == 0
     assert found.blocking_row == row
-    assert "row" in found.reason
+    assert "the whole width" in found.reason
     assert not found.reachable.any()
 
 
