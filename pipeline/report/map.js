@@ -51,32 +51,39 @@
     all.sort((a, b) => a - b);
     range[name] = name === "models" ? [1, Math.max(2, all[all.length - 1] || 2)] : [0, all[Math.floor(0.97 * all.length)] || 1];
   }
-  const shade = (k) => {
-    const row = Math.floor(k / D.cols), col = k % D.cols;
-    const d = (a, b) => { const v = height(a) - height(b); return v === v ? v / (2 * D.cell) : 0; };
-    const gx = d(row * D.cols + Math.min(col + 1, D.cols - 1), row * D.cols + Math.max(col - 1, 0));
-    const gy = d(Math.max(row - 1, 0) * D.cols + col, Math.min(row + 1, D.rows - 1) * D.cols + col);
-    return 255 * Math.max(0, (0.54 * gx - 0.54 * gy + 0.64) / Math.sqrt(gx * gx + gy * gy + 1));
+  /* Grey of the hillshade, computed when it is first asked for. */
+  let hills = null;
+  const shaded = () => {
+    const out = new Uint8ClampedArray(N), step = (a, b) => { const v = height(a) - height(b); return v === v ? v / (2 * D.cell) : 0; };
+    for (let row = 0, k = 0; row < D.rows; row++) for (let col = 0; col < D.cols; col++, k++) {
+      const gx = step(k + (col + 1 < D.cols), k - (col > 0));
+      const gy = step(k - D.cols * (row > 0), k + D.cols * (row + 1 < D.rows));
+      out[k] = 255 * Math.max(0, (0.54 * gx - 0.54 * gy + 0.64) / Math.sqrt(gx * gx + gy * gy + 1));
+    }
+    return out;
   };
   const sheet = document.createElement("canvas");
   sheet.width = D.cols; sheet.height = D.rows;
   const state = { base: "ortho", layer: D.judged ? "risk" : "elevation", opacity: 0.45, by: "plain", ruler: [], measuring: false, three: false };
+  const ramped = Array.from({ length: 256 }, (_, i) => ramp.subarray(3 * i, 3 * i + 3));
+  const share = (v, low, high) => ramped[Math.round(255 * Math.min(1, Math.max(0, (v - low) / (high - low))))];
+  /* Colour of a cell in the layer chosen; undefined where it has none. */
+  const painter = () => {
+    const name = state.layer, bits = Object.values(D.reasons);
+    if (name === "none") return () => undefined;
+    if (name === "risk") return (k) => classes[value.risk(k)];
+    if (name === "reason") return (k) => { const all = value.reason(k); return all ? share(bits.findIndex((bit) => all & bit), 0, Math.max(1, bits.length - 1)) : undefined; };
+    const [low, high] = range[name], of = value[name];
+    return (k) => { const v = of(k); return v === v ? share(v, low, high) : undefined; };
+  };
   const paint = () => {
-    const pen = sheet.getContext("2d"), out = pen.createImageData(D.cols, D.rows), o = out.data, name = state.layer;
-    for (let k = 0; k < N; k++) {
-      const known = A[4 * k] || A[4 * k + 1];
-      let c = [0, 0, 0], mix = 0;
-      if (name === "risk") { c = classes[value.risk(k)]; mix = state.opacity; }
-      else if (name === "reason") {
-        const bits = value.reason(k), first = Object.values(D.reasons).findIndex((bit) => bits & bit);
-        if (first >= 0) { const i = 3 * Math.round(255 * first / Math.max(1, Object.keys(D.reasons).length - 1)); c = [ramp[i], ramp[i + 1], ramp[i + 2]]; mix = state.opacity; }
-      } else if (name !== "none") {
-        const v = value[name](k), [low, high] = range[name];
-        if (v === v) { const i = 3 * Math.round(255 * Math.min(1, Math.max(0, (v - low) / (high - low)))); c = [ramp[i], ramp[i + 1], ramp[i + 2]]; mix = state.opacity; }
-      }
-      const grey = known ? shade(k) : 0, ortho = state.base === "ortho";
-      for (let i = 0; i < 3; i++) o[4 * k + i] = (ortho ? photo[4 * k + i] : grey) * (1 - mix) + c[i] * mix;
-      o[4 * k + 3] = known ? 255 : 0;
+    const pen = sheet.getContext("2d"), out = pen.createImageData(D.cols, D.rows), o = out.data, ortho = state.base === "ortho", color = painter();
+    if (!ortho && !hills) hills = shaded();
+    for (let k = 0, i = 0; k < N; k++, i += 4) {
+      if (!(A[i] || A[i + 1])) continue; /* unknown ground stays transparent */
+      const c = color(k), mix = c ? state.opacity : 0;
+      for (let j = 0; j < 3; j++) o[i + j] = (ortho ? photo[i + j] : hills[k]) * (1 - mix) + (c ? c[j] * mix : 0);
+      o[i + 3] = 255;
     }
     pen.putImageData(out, 0, 0);
     legend();
