@@ -64,6 +64,7 @@ class Products:
     local_path: dict[int, Handle] = field(default_factory=dict)
     tracks: list[Handle] = field(default_factory=list)
     resections: list[Handle] = field(default_factory=list)
+    refined: list[Handle] = field(default_factory=list)
     common_tilt: Handle | None = None
     world_dem: dict[int, Handle] = field(default_factory=dict)
     seams: dict[int, Handle] = field(default_factory=dict)

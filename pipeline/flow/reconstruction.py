@@ -292,6 +292,7 @@ def refined(
         )
         if (yield tilt).meta["undone"]:
             found = [adjusted("refine/untilted", window, tilt=tilt) for window in windows]
+    p.refined = found
     return {"refined": found}
 
 

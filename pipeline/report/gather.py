@@ -229,11 +229,17 @@ def _truth(view: RunView, posed: Mapping[int, RigidTransform]) -> Floats | None:
 
 
 def frame_facts(view: RunView) -> dict[int, dict[str, Any]]:
-    """Facts of the resection of each frame; a key frame's come from the segment that posed it, the one before."""
+    """Facts of the resection of each frame; a key frame's come from the segment that posed it, the one before.
+
+    Inliers and error are those of the joint refinement, where there was one: its poses are the trajectory's.
+    """
     facts: dict[int, dict[str, Any]] = {}
     for bundle in map(view.bundle, view.products.resections):
         for item in bundle.meta.get("per_frame", ()) if bundle is not None else ():
             facts.setdefault(int(item["frame"]), dict(item))
+    for bundle in map(view.bundle, view.products.refined):
+        for item in bundle.meta["per_frame"] if bundle is not None else ():
+            facts.setdefault(int(item["frame"]), {}).update(item)
     return facts
 
 

@@ -169,7 +169,7 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
 READS = (
     "screening keyframes common_tilt crosschecks crosscheck agreement crosscheck_accuracy trajectory accuracy "
     "position_accuracy accuracy_pieces overlap_audit disparity orientations rigs level local_dem local_risk local_path "
-    "local_dem_accuracy resections world_dem tiles risk path dem_accuracy path_check drive"
+    "local_dem_accuracy resections refined world_dem tiles risk path dem_accuracy path_check drive"
 )
 KNOWS = (
     "frames config.vehicle config.crosscheck.enabled sequence.name sequence.frames sequence.frame_names sequence.rig "

@@ -20,6 +20,7 @@ from rille.pipeline.export.programs.run_artifacts import RunArtifacts, check_new
 from rille.stages.core.declare import Bundle
 from rille.stages.evaluation.crosscheck import PIXEL_CENTRE
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.odometry.resection import refine
 from rille.stages.odometry.resection.landmarks import matches_at
 from rille.stages.odometry.resection.trajectory import world_poses
 
@@ -34,11 +35,17 @@ LEFT, RIGHT = 1, 2
 
 
 class MatchedSegment(NamedTuple):
-    """Tracks from one key frame to the next, their resection, and by frame number the disparities of its pairs."""
+    """Tracks from one key frame to the next, their resection, and by frame number the disparities of its pairs.
+
+    ``landmarks`` (point, 3), m, local frame of the key, and ``inlier`` (point, frame): after the joint refinement if
+    there was one, as the poses are.
+    """
 
     track: Bundle
     resection: Bundle
     matches: Mapping[int, Bundle]
+    landmarks: Floats
+    inlier: NDArray[np.uint8]
 
 
 @dataclass
@@ -66,10 +73,7 @@ def export_run(run: Path, target: Path, store: Store) -> str:
     check_new(target)
     bundles = RunArtifacts(run, store)
     rig = Rig.from_dict(bundles.one("calibration").meta["rig"])
-    segments = [
-        MatchedSegment(track, resection, {f: b for f in _ends(track) if (b := bundles.find(f"hfvm/{f}")) is not None})
-        for track, resection in bundles.pairs("track", "resect")
-    ]
+    segments = _segments(bundles)
     images = {f: b for s in segments for f in _ends(s.track)[:1] if (b := bundles.find(f"image/left/{f}")) is not None}
     model = build(rig, bundles.one("trajectory"), _names(run), segments, images)
     target.mkdir(parents=True, exist_ok=True)
@@ -78,6 +82,25 @@ def export_run(run: Path, target: Path, store: Store) -> str:
         f"{target}: {model.num_reg_frames()} frames of 2 images, {model.num_points3D()} points, "
         f"{model.compute_mean_reprojection_error():.2f} px; open it with colmap gui --import_path"
     )
+
+
+def _segments(bundles: RunArtifacts) -> list[MatchedSegment]:
+    """The segments of a run in their order."""
+    tracked = sorted(bundles.pairs("track", "resect"), key=lambda pair: _ends(pair[0])[0])
+    keys = [_ends(track)[0] for track, _ in tracked]
+    points = [(np.asarray(resection["landmarks"]), np.asarray(resection["inlier"])) for _, resection in tracked]
+    # Where disparities were tilted, the adjustment without the tilt is the one whose poses count.
+    for label in ("refine/untilted", "refine"):
+        found = [part for k in keys if (b := bundles.find(f"{label}/{k}")) is not None for part in refine.parts(b)]
+        if found:
+            points = found
+            break
+    return [
+        MatchedSegment(
+            track, resection, {f: b for f in _ends(track) if (b := bundles.find(f"hfvm/{f}")) is not None}, *of
+        )
+        for (track, resection), of in zip(tracked, points, strict=True)
+    ]
 
 
 def build(
@@ -177,9 +200,9 @@ def _points(
     if key not in poses:
         return
     T_local_key = RigidTransform.from_matrix(np.asarray(segment.resection["poses"])[0])
-    world = (poses[key] @ T_local_key.inverse()).apply(np.asarray(segment.resection["landmarks"]))
+    world = (poses[key] @ T_local_key.inverse()).apply(segment.landmarks)
     pixels = np.asarray(segment.track["points"], dtype=np.float64)
-    agrees = (np.asarray(segment.resection["inlier"]) != 0) & np.array([f in poses for f in frames])
+    agrees = (segment.inlier != 0) & np.array([f in poses for f in frames])
     disparity = np.full(pixels.shape, np.nan)
     for j, frame in enumerate(frames):
         if (found := segment.matches.get(frame)) is not None:

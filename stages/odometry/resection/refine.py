@@ -19,12 +19,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import Bundle, Inputs, Stage
+from rille.stages.core.declare import Array, Bundle, Inputs, Stage
 from rille.stages.core.errors import ConfigError
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
@@ -43,8 +44,15 @@ from rille.stages.odometry.resection.landmarks import Landmarks
 from rille.stages.odometry.resection.pnp import HUBER, Observations, Poses, back_projection, norms
 from rille.stages.odometry.resection.resect import SOURCES, ResectParams, coordinates, root, scatter_of_blocks
 
-Segment = tuple[SegmentTracks, SegmentState, list[int]]
-"""Measurements of a segment, where its adjustment starts, and which of its frames have a pose."""
+
+class Segment(NamedTuple):
+    """Measurements of a segment, where its adjustment starts, which of its frames have a pose, and which points it has
+    of the track."""
+
+    views: SegmentTracks
+    state: SegmentState
+    frames: list[int]
+    which: NDArray[np.intp]
 
 
 def views_of(track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig) -> Segment | None:
@@ -71,7 +79,7 @@ def views_of(track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig) -
     # An exact disparity would have infinite information.
     held = np.maximum(known.sigma, 1e-3)
     views = SegmentTracks(known.position, known.per_pixel, held, pixels, seen, rig.left, tilt)
-    return views, state, frames
+    return Segment(views, state, frames, which)
 
 
 def _tilt_pattern(position: Floats, T_local_key: RigidTransform, rig: Rig) -> Floats:
@@ -105,31 +113,68 @@ def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     meta: dict[str, Any] = {}
     if "tilt" in inputs:
         tilt = float(inputs["tilt"].meta["tilt_rad"])
-        again = [None if one is None else (one[0].without_tilt(tilt), states[k], one[2]) for k, one in enumerate(found)]
+        again = [
+            None if one is None else one._replace(views=one.views.without_tilt(tilt), state=states[k])
+            for k, one in enumerate(found)
+        ]
         _adjusted(again, out, params)
         judged = [_anew(one, new.poses, tilt, resect) for one, new in zip(given, out, strict=True)]
         facts, _ = _adjusted(judged, out, params)
     elif params.tilt_sigma_deg > 0:
-        of = [(one[0], states[k]) for k, one in list(enumerate(found))[kept] if one is not None]
+        of = [(one.views, states[k]) for k, one in list(enumerate(found))[kept] if one is not None]
         told = [tilt_of(views, state, facts["bias_px"], params) for views, state in of]
         meta["tilt"] = [list(pair) for pair in told if np.isfinite(pair).all()]
-    meta |= {"frames": [len(one.poses) for one in out[kept]], "adjustment": facts}
-    names = ("poses", "covariance", "shared")
-    return Bundle({name: np.concatenate([getattr(one, name) for one in out[kept]]) for name in names}, meta)
+    per_frame = [item for one, of in zip(given[kept], out[kept], strict=True) for item in _per_frame(one, of)]
+    meta |= {"frames": [len(one.poses) for one in out[kept]], "points": [len(one.landmarks) for one in out[kept]]}
+    meta |= {"adjustment": facts, "per_frame": per_frame}
+    names = ("poses", "covariance", "shared", "landmarks")
+    arrays = {name: np.concatenate([getattr(one, name) for one in out[kept]]) for name in names}
+    most = max(meta["frames"])
+    arrays["inlier"] = np.concatenate([np.pad(o.inlier, ((0, 0), (0, most - len(o.poses)))) for o in out[kept]])
+    return Bundle(arrays, meta)
+
+
+def _per_frame(given: _Given, of: SegmentOut) -> list[dict[str, Any]]:
+    """Number, inliers and RMS back-projection error [pixels] of each posed frame behind the key."""
+    frames, rows = given.track.meta["frames"], []
+    points = np.asarray(given.track["points"], dtype=np.float64)
+    for j in range(1, len(of.poses)):
+        seen = of.inlier[:, j] != 0
+        if np.isfinite(of.poses[j]).all() and seen.any():
+            at = RigidTransform.from_matrix(of.poses[j]).inverse().apply(of.landmarks[seen])
+            off = given.rig.left.project(at) - points[seen, j]
+            rms = float(np.sqrt((off**2).sum(1).mean()))
+            rows.append({"frame": int(frames[j]), "inliers": int(seen.sum()), "rms_px": rms})
+    return rows
+
+
+def parts(refined: Bundle) -> list[tuple[Floats, NDArray[np.uint8]]]:
+    """Landmarks (point, 3), m, local frame, and inliers (point, frame) of each segment of an artifact of this stage."""
+    ends = np.cumsum(refined.meta["points"])[:-1]
+    segments = (np.split(np.asarray(refined[name]), ends) for name in ("landmarks", "inlier"))
+    return [(at, inlier[:, :n]) for at, inlier, n in zip(*segments, refined.meta["frames"], strict=True)]
 
 
 @dataclass(frozen=True)
 class SegmentOut:
-    """What a segment's frames get: ``poses`` (frame, 3, 4), ``covariance`` (frame, 6, 6), ``shared`` (frame, 6, 7)."""
+    """What a segment's frames get: ``poses`` (frame, 3, 4), ``covariance`` (frame, 6, 6), ``shared`` (frame, 6, 7).
+
+    And its points: ``landmarks`` (point, 3), ``inlier`` (point, frame) whether they agree with the pose.
+    """
 
     poses: Floats
     covariance: Floats
     shared: Floats
+    landmarks: Floats
+    inlier: NDArray[np.uint8]
 
     @staticmethod
     def of(resection: Bundle) -> SegmentOut:
         """As resected."""
-        return SegmentOut(*(np.array(resection[n], dtype=np.float64) for n in ("poses", "covariance", "shared")))
+        poses, covariance, shared, landmarks = (
+            np.array(resection[n], dtype=np.float64) for n in ("poses", "covariance", "shared", "landmarks")
+        )
+        return SegmentOut(poses, covariance, shared, landmarks, np.array(resection["inlier"]))
 
 
 @dataclass(frozen=True)
@@ -150,11 +195,10 @@ def _anew(given: _Given, poses: Floats, tilt: float, resect: ResectParams) -> Se
     one = views_of(given.track, resection, given.landmarks, given.rig)
     if one is None:
         return None
-    (views, state, rows), most = one, resect.threshold / resect.pixel_sigma
-    views = views.without_tilt(tilt)
-    for f in range(len(rows)):
-        views.seen[f] &= norms(_frame(views, f, resect.pixel_sigma), _pose(state, f, 0.0))[0] <= most
-    return views, state, rows
+    views, most = one.views.without_tilt(tilt), resect.threshold / resect.pixel_sigma
+    for f in range(len(one.frames)):
+        views.seen[f] &= norms(_frame(views, f, resect.pixel_sigma), _pose(one.state, f, 0.0))[0] <= most
+    return one._replace(views=views)
 
 
 def _frame(views: SegmentTracks, f: int, pixel_sigma: float) -> Observations:
@@ -205,20 +249,25 @@ def _adjusted(
 ) -> tuple[dict[str, float], dict[int, SegmentState]]:
     """A window adjusted, ``out`` written to; facts of the adjustment, and the state of each segment."""
     group = {k: one for k, one in enumerate(found) if one is not None}
-    starts = [(views, state) for views, state, _ in group.values()]
+    starts = [(one.views, one.state) for one in group.values()]
     states, bias, before, after = adjust(starts, params)
     claimed = claims([(views, state) for (views, _), state in zip(starts, states, strict=True)], bias, params)
-    for (k, (_, _, rows)), state, (covariance, shared) in zip(group.items(), states, claimed, strict=True):
-        for row, R, t in zip(rows, state.R, state.t, strict=True):
+    for (k, one), state, (covariance, shared) in zip(group.items(), states, claimed, strict=True):
+        for row, R, t in zip(one.frames, state.R, state.t, strict=True):
             out[k].poses[row] = RigidTransform(R, t).inverse().matrix34
-        out[k].covariance[rows], out[k].shared[rows] = covariance, shared
+        out[k].covariance[one.frames], out[k].shared[one.frames] = covariance, shared
+        views = one.views
+        out[k].landmarks[one.which] = views.position + (state.depth + bias)[:, None] * views.along
+        out[k].inlier[:] = 0
+        out[k].inlier[one.which, 0] = views.seen.any(0)
+        out[k].inlier[np.ix_(one.which, np.array(one.frames))] = views.seen.T
     facts = {"bias_px": bias, "cost_before": before, "cost_after": after}
     return facts, dict(zip(group, states, strict=True))
 
 
 STAGE = Stage(
     name="refine",
-    version=3,
+    version=4,
     summary="poses of a segment adjusted jointly with its landmarks",
     params=RefineParams,
     inputs=("tracks*", "resections*", "levels*", "disparities*", "rigs*", "tilt?"),
@@ -226,6 +275,8 @@ STAGE = Stage(
         replace(POSES, long_name="poses of a segment, of several one after the other", frame="local"),
         replace(COVARIANCE, frame="local"),
         replace(SHARED, frame="local"),
+        Array("landmarks", ("point", "xyz"), "float64", "m", "landmarks after the adjustment", "nan", "local"),
+        Array("inlier", ("point", "frame"), "uint8", "1", "landmark agrees with the pose", nodata="0"),
     ),
     run=_run,
 )

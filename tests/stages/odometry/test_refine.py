@@ -22,7 +22,7 @@ from rille.stages.odometry.resection.bundle_adjustment import (
 )
 from rille.stages.odometry.resection.common_tilt import common_tilt
 from rille.stages.odometry.resection.landmarks import landmarks_from_disparity
-from rille.stages.odometry.resection.refine import STAGE, _tilt_pattern, claims, views_of
+from rille.stages.odometry.resection.refine import STAGE, _tilt_pattern, claims, parts, views_of
 from rille.stages.odometry.resection.resect import ResectParams
 
 CAMERA = Camera(500.0, 500.0, 299.5, 199.5, 600, 400)
@@ -274,7 +274,8 @@ def bundles(tracks_of_last=True):
     poses = np.array([np.hstack([np.eye(3), [[0.0], [0.0], [0.1 * j + 0.002 * (j > 0)]]]) for j in range(3)])
     track = Bundle({"points": points}, {"frames": [0, 1, 2]})
     claimed = {"covariance": np.zeros((3, 6, 6)), "shared": np.zeros((3, 6, 7))}
-    resection = Bundle({"poses": poses, "inlier": np.ones((80, 3), np.uint8)} | claimed, {})
+    agreed = {"inlier": np.ones((80, 3), np.uint8), "landmarks": np.where(np.arange(80)[:, None] < 79, X, np.nan)}
+    resection = Bundle({"poses": poses} | agreed | claimed, {})
     level = Bundle({}, {"T_local_left": RigidTransform.identity().to_list()})
     rig = Bundle({}, {"rig": RIG.to_dict()})
     return {
@@ -296,6 +297,15 @@ def test_the_stage_gives_the_poses_of_the_last_segment_or_of_all(window):
     count = 2 if window == 0 else 1
     assert out.meta["frames"] == [3] * count
     np.testing.assert_allclose(out["poses"][:, :, 3], [[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]] * count, atol=2e-4)
+    for k, (landmarks, inlier) in enumerate(parts(out)):
+        for j in (1, 2):
+            at = RigidTransform.from_matrix(out["poses"][3 * k + j]).inverse().apply(landmarks)
+            off = CAMERA.project(at)[inlier[:, j] != 0] - one["tracks"][0]["points"][inlier[:, j] != 0, j]
+            said = out.meta["per_frame"][2 * k + j - 1]
+            assert said["frame"] == j
+            assert said["inliers"] == len(off) > 70
+            assert said["rms_px"] == pytest.approx(np.sqrt((off**2).sum(1).mean()))
+            assert said["rms_px"] < 0.01
     assert not out["covariance"][::3].any()
     assert (np.linalg.eigvalsh(np.delete(out["covariance"], slice(0, None, 3), 0))[:, 0] > 0).all()
     with raises("RIL-416"):
@@ -321,5 +331,5 @@ def test_a_lost_frame_stays_lost():
         np.full(80, 0.2),
         max_depth_ratio=0.2,
     )
-    _, _, frames = views_of(track, resection, known, RIG)
+    frames = views_of(track, resection, known, RIG).frames
     assert frames == [2]
