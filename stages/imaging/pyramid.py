@@ -1,9 +1,9 @@
 """Image pyramid: each level is the mean of 2 x 2 pixels of the one below (paper, 4.3.4).
 
 Pixel centres are at integers, so column ``x`` of level 0 lies at ``x_n = (x + 0.5) / 2**n - 0.5`` on level n. Odd sizes
-are completed by repeating the last row or column. A coarse pixel is valid if at least two of its four pixels are, so
-that a mask one pixel wide along the border does not spread from level to level; its value is the mean of the valid
-ones. A black frame, as warping an image leaves, is no part of it (:func:`frame`).
+are completed by repeating the last row or column. A coarse pixel is valid if at least three of its four pixels are
+(:data:`MOST`); its value is the mean of the valid ones. A black frame, as warping an image leaves, is no part of it
+(:func:`frame`); there two of four are enough (:data:`HALF`).
 """
 
 from __future__ import annotations
@@ -37,6 +37,10 @@ class PyramidParams(Params):
 
 FRAME_LEAST, FRAME_LENGTH, FRAME_DEPTH = 8, 0.1, 0.1
 """Pixels and share of a side that a black frame touches at least, and share of the shorter side that it reaches in."""
+
+MOST, HALF = np.float32(3.0), np.float32(2.0)
+"""Valid pixels of four that make a coarse pixel valid. With three, a frame one pixel wide doubles its width, in pixels
+of the image, from level to level. With two, pixels that are half outside of a warped image draw matches astray."""
 
 MIXED = 0.8
 """Share of the brightness beyond them that the pixels beside a frame have at most, where they are mixed with black."""
@@ -115,7 +119,8 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
     mask = np.ones(level.shape, bool) if whole else np.isfinite(level)
     if valid is not None:
         mask &= valid != 0
-    black = frame(level)
+    # What a mask leaves out is often black, too, and no frame.
+    black = frame(level, mask)
     if black is not None:
         mask &= ~black
     levels, side = 1, min(level.shape)
@@ -123,22 +128,23 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
         levels, side = levels + 1, (side + 1) // 2
     if not (whole and valid is None and black is None):
         level = np.where(mask, level, np.float32(0.0))
-    found = halved(level, mask.view(np.uint8), levels)
+    found = halved(level, mask.view(np.uint8), levels, MOST if black is None else HALF)
     return Pyramid(found.images, found.valid, noise.standard_deviation(found.images, found.valid))
 
 
-def frame(image: Floats32) -> Bools | None:
-    """Black frame (row, col) that warping left around an image; None: there is none.
+def frame(image: Floats32, valid: Bools) -> Bools | None:
+    """Black frame (row, col) that warping left around the valid pixels of an image; None: there is none.
 
     Pixels of grey 0 that hang together, make up a good part of a side, and keep near it: darkness that reaches into the
     image is a shadow or the sky. Where interpolation has mixed the pixels beside the frame with black, those belong to
     it, and the outermost pixels of the sides that it touches.
     """
+    dark = (image == 0) & valid
     sides: tuple[Any, ...] = (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1])
-    least = [max(FRAME_LENGTH * image[side].size, FRAME_LEAST) for side in sides]
-    if all(np.count_nonzero(image[side] == 0) < n for side, n in zip(sides, least, strict=True)):
+    least = [max(FRAME_LENGTH * dark[side].size, FRAME_LEAST) for side in sides]
+    if all(np.count_nonzero(dark[side]) < n for side, n in zip(sides, least, strict=True)):
         return None
-    count, label = cv2.connectedComponents((image == 0).view(np.uint8), connectivity=4)
+    count, label = cv2.connectedComponents(dark.view(np.uint8), connectivity=4)
     deep = int(np.ceil(FRAME_DEPTH * min(image.shape)))
     inside = np.unique(label[deep:-deep, deep:-deep])
     found, touched = np.zeros(image.shape, bool), np.zeros(image.shape, bool)
@@ -156,32 +162,32 @@ def frame(image: Floats32) -> Bools | None:
     return found
 
 
-def halved(image: Floats32, mask: Mask, levels: int) -> Pyramid:
-    """Pyramid of so many levels of a float32 image (0 where masked) and its mask.
+def halved(image: Floats32, mask: Mask, levels: int, least: np.float32 = MOST) -> Pyramid:
+    """Pyramid of so many levels of a float32 image (0 where masked) and its mask; ``least`` of four make one valid.
 
     Of a window that starts and ends where a pixel of the top level does, it is a part of the image's pyramid.
     """
     images, masks = [image], [mask]
     for _ in range(levels - 1):
-        image, mask = _halve(image, mask)
+        image, mask = _halve(image, mask, least)
         images.append(image)
         masks.append(mask)
     return Pyramid(tuple(images), tuple(masks))
 
 
-def _halve(image: Floats32, mask: Mask) -> tuple[Floats32, Mask]:
+def _halve(image: Floats32, mask: Mask, least: np.float32) -> tuple[Floats32, Mask]:
     rows, cols = image.shape
     coarse = np.empty(((rows + 1) // 2, (cols + 1) // 2), np.float32)
     valid = np.empty(coarse.shape, np.uint8)
-    _means(image, mask, coarse, valid)
+    _means(image, mask, least, coarse, valid)
     return coarse, valid
 
 
 @njit(cache=True, nogil=True)
-def _means(image, mask, coarse, valid):  # type: ignore[no-untyped-def]
+def _means(image, mask, least, coarse, valid):  # type: ignore[no-untyped-def]
     """Indices without sign, so that the compiler need not mind negative ones and makes vector code of the loop."""
     rows, cols = image.shape
-    nil, one, two = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+    nil, one = np.float32(0.0), np.float32(1.0)
     for y in range(coarse.shape[0]):
         a, b = image[2 * y], image[min(2 * y + 1, rows - 1)]
         p, q = mask[2 * y], mask[min(2 * y + 1, rows - 1)]
@@ -190,14 +196,14 @@ def _means(image, mask, coarse, valid):  # type: ignore[no-untyped-def]
             i, k = np.uint64(2 * x), np.uint64(2 * x + 1)
             # Counted in float32, the type of the sums: a mix of types would keep the loop from becoming vector code.
             count = (np.float32(p[i]) + np.float32(p[k])) + (np.float32(q[i]) + np.float32(q[k]))
-            found[x] = (a[i] + a[k] + b[i] + b[k]) / max(count, one) if count >= two else nil
-            usable[x] = count >= two
+            found[x] = (a[i] + a[k] + b[i] + b[k]) / max(count, one) if count >= least else nil
+            usable[x] = count >= least
         if cols % 2:
             x, i = cols // 2, cols - 1
             # The last column stands for a repeated one.
             count = np.float32(2 * (p[i] + q[i]))
-            found[x] = (a[i] + a[i] + b[i] + b[i]) / max(count, one) if count >= two else nil
-            usable[x] = count >= two
+            found[x] = (a[i] + a[i] + b[i] + b[i]) / max(count, one) if count >= least else nil
+            usable[x] = count >= least
 
 
 def filled(pyramid: Pyramid) -> tuple[Floats32, ...]:

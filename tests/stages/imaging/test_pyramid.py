@@ -40,24 +40,23 @@ def test_coarse_pixel_lies_where_the_docstring_says():
         np.testing.assert_allclose(values, x[inner] + 10, atol=1e-4)
 
 
-def test_mask_needs_two_of_four_and_masked_grey_does_not_leak():
+def test_mask_needs_three_of_four_and_masked_grey_does_not_leak():
     image = np.full((4, 4), 10, np.float32)
-    valid = np.zeros((4, 4), np.uint8)
-    valid[0, 1] = valid[0, 2] = valid[1, 3] = 1
-    valid[2:] = 1
+    valid = np.ones((4, 4), np.uint8)
+    valid[0, 0] = valid[0, 2] = valid[1, 3] = 0
     image[valid == 0] = 250
     found = pyramid.build(image, params(levels=3), valid)
-    np.testing.assert_array_equal(found.valid[1], [[0, 1], [1, 1]])
-    np.testing.assert_array_equal(found.images[1], [[0, 10], [10, 10]])
+    np.testing.assert_array_equal(found.valid[1], [[1, 0], [1, 1]])
+    np.testing.assert_array_equal(found.images[1], [[10, 0], [10, 10]])
     assert found.valid[2][0, 0] == 1
     assert found.images[2][0, 0] == 10
 
 
-def test_mask_along_the_border_stays_as_narrow_as_it_is():
-    valid = np.ones((64, 64), np.uint8)
-    valid[:3] = valid[:, :1] = 0
+def test_a_black_frame_stays_as_narrow_as_it_is():
+    image = np.full((64, 64), 9, np.float32)
+    image[:3] = image[:, :1] = 0
     narrow = []
-    for mask in pyramid.build(np.full((64, 64), 9, np.float32), params(levels=5), valid).valid:
+    for mask in pyramid.build(image, params(levels=5)).valid:
         narrow.append((mask.shape[0] - int(mask[:, -1].sum()), mask.shape[1] - int(mask[-1].sum())))
     assert narrow == [(3, 1), (1, 0), (0, 0), (0, 0), (0, 0)]
 
@@ -91,7 +90,14 @@ def test_what_is_dark_but_no_frame_is_kept():
     shadow, speck, sky = textured(), textured(), textured()
     shadow[:60, 20:70], speck[:2, 5:12], sky[:50] = 0, 0, 0
     for image in (noisy, shadow, speck, sky, np.zeros((40, 40), np.float32)):
-        assert pyramid.frame(image) is None
+        assert pyramid.frame(image, np.ones(image.shape, bool)) is None
+
+
+def test_what_a_mask_leaves_out_is_no_frame():
+    image, share = warped(textured(), 2.0, cv2.INTER_LINEAR)
+    valid = share > 0.99
+    found = pyramid.build(np.where(valid, image, 0), params(levels=1), valid)
+    np.testing.assert_array_equal(found.valid[0] != 0, valid)
 
 
 def test_filled_images_carry_no_edge_of_the_mask():
