@@ -4,8 +4,8 @@
 
 A cold run starts with an empty cache and no compiled kernels; warm runs follow, with nothing to compute.
 ``--bucket`` repeats both with the cache in a bucket of moto's S3 server on this machine (a process of its own). Printed
-are wall and processor time, the bound ``1.15 x max(seconds of stages / cores, longest chain) + 5 s`` of the cold run
-with ``rille timing``'s account, and for warm runs that no worker was started: a run that starts none writes no ledger.
+are wall and processor time, and the bound ``1.15 x max(seconds of stages / cores, longest chain) + 5 s`` of the cold
+run with ``rille timing``'s account.
 """
 
 from __future__ import annotations
@@ -75,17 +75,16 @@ def measure(sequence: str, cache: str, folder: Path, warm: int, environment: dic
     print(f"cold   {wall:7.2f} s by the clock, {used:7.2f} s of processors: {text.split('  ')[-1].strip()}")
     _, _, account = rille("timing", sequence, "--runs", str(folder / "runs"), environment=environment)
     print("       " + account.strip().replace("\n", "\n       "))
-    bound = float(next(iter(re.findall(r"and 5 s are ([\d.]+) s", account))))
+    bound = float(next(iter(re.findall(r"limit of a good run ([\d.]+) s", account))))
     print(f"       command to prompt {wall:.1f} s, bound {bound:.1f} s: {'kept' if wall <= bound else 'NOT KEPT'}")
     runs = [rille("reconstruct", sequence, *where, environment=environment) for _ in range(warm)]
-    if any("nothing new" not in text for *_, text in runs):
+    if any("computed 0," not in text for *_, text in runs):
         sys.exit("a warm run had something to do: " + runs[-1][2])
     walls, useds = [r[0] for r in runs], [r[1] for r in runs]
-    folders = [p for p in (folder / "runs" / sequence).iterdir() if p.is_dir() and not p.is_symlink()]
     print(
-        f"warm   {min(walls):.2f} {median(walls):.2f} {max(walls):.2f} s (least, median, greatest of {warm}), ", end=""
+        f"warm   {min(walls):.2f} {median(walls):.2f} {max(walls):.2f} s (least, median, greatest of {warm}), "
+        f"{median(useds):.2f} s of processors"
     )
-    print(f"{median(useds):.2f} s of processors; {len(folders)} folder of results: nothing was begun")
 
 
 def main() -> None:

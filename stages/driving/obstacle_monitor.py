@@ -24,7 +24,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.spatial import KDTree
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Inputs, Params, Stage
@@ -210,11 +209,12 @@ def obstacle(points: Points, wheel: float, p: ObstacleMonitorParams, before: Flo
     if len(up) < p.min_points:
         return None, np.zeros((0, 2))
     raised, around = (
-        KDTree(some).query_ball_point(up, 0.5 * wheel, p=np.inf, return_length=True) for some in (up, points.place)
+        scipy.spatial.KDTree(some).query_ball_point(up, 0.5 * wheel, p=np.inf, return_length=True)
+        for some in (up, points.place)
     )
     enough = raised >= p.min_points
     doubtful = enough & (raised >= p.min_share_again * around)
-    apart = KDTree(before).query(ground)[0] if len(before) else np.full(len(up), np.inf)
+    apart = scipy.spatial.KDTree(before).query(ground)[0] if len(before) else np.full(len(up), np.inf)
     counts = enough & (raised >= p.min_share * around) | doubtful & (apart <= 0.5 * wheel)
     if not counts.any():
         return None, ground[doubtful]

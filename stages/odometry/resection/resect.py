@@ -28,9 +28,9 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.special import bdtrc
 
 from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
@@ -390,7 +390,7 @@ def _not_by_chance(obs: Observations, poses: Poses, agree: int, params: ResectPa
         if share == 1.0:  # a threshold that every place passes was chosen so as to believe everything
             return
         if count >= MINIMUM:
-            least = min(least, len(PARTS) * math.comb(n, 3) * float(bdtrc(count - 4, n - 3, share)))
+            least = min(least, len(PARTS) * math.comb(n, 3) * float(scipy.special.bdtrc(count - 4, n - 3, share)))
     if least > FALSE_ALARMS:
         raise DegenerateError(
             "RIL-720",
