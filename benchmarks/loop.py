@@ -103,15 +103,15 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         mine = [r for r in rows if cover in (None, r["cover"])]
         judged = [r for r in mine if "clearance_violations" in r]
         possible = [r for r in mine if r.get("path_exists", True)]
-        reached = [r for r in possible if r["verdict"] == "goal" and "way" in r]
+        reached = [r for r in possible if r["verdict"] == "goal" and "path_length" in r]
         broken = [r for r in judged if any(r[f"{k}_violations"] for k in ("clearance", "tilt", "step"))]
         drift = sorted(100 * r["localisation_share"] for r in judged if r["verdict"] == "goal")
         cells = ["all" if cover is None else f"{100 * cover:.0f} %", str(len(mine)), str(len(possible))]
         cells += [f"{len(reached)}: {share(len(reached), len(possible))}"]
         cells += [f"{len(broken)}: {share(len(broken), len(judged))}"]
         cells += [f"{median(drift):.2f}, {drift[-1]:.2f} %" if drift else "-"]
-        cells += Ratios([(r["way"], r["shortest_way"]) for r in reached]).cells()
-        cells += Ratios([(r["way"], r[LIMITS]) for r in reached if r.get(LIMITS)]).cells()
+        cells += Ratios([(r["path_length"], r["shortest_length"]) for r in reached]).cells()
+        cells += Ratios([(r["path_length"], r[LIMITS]) for r in reached if r.get(LIMITS)]).cells()
         lines.append(f"| {' | '.join(cells)} |")
     return [*lines, *worst(rows)]
 
@@ -126,7 +126,8 @@ def worst(rows: list[dict[str, Any]]) -> list[str]:
         f"{1e3 * min(r['least_clearance'] for r in judged):.1f} mm, greatest edge under a wheel "
         f"{1e3 * max(r['greatest_step'] for r in judged):.1f} mm, greatest tilt "
         f"{max(r['greatest_tilt'] for r in judged):.1f} degrees",
-        f"{sum(r['way'] for r in judged):.1f} m driven with {sum(r['obstacle_stops'] for r in judged)} obstacle stops, "
+        f"{sum(r['path_length'] for r in judged):.1f} m driven "
+        f"with {sum(r['obstacle_stops'] for r in judged)} obstacle stops, "
         f"{sum(r['seconds'] for r in judged) / len(judged):.0f} s a drive",
     ]
 

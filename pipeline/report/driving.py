@@ -102,7 +102,7 @@ def strip(scene: Scene) -> Block | None:
         f"{outcome(drive)}. Each column is a stop. First: the left "
         "image. Second: the hazards around the vehicle (disk), as far as known from near enough to drive there, with "
         "the leg that is driven next (black) "
-        "and the way as planned beyond it (thin); the star is the goal. Third: the merged elevations of all stops so "
+        "and the planned path beyond it (thin); the star is the goal. Third: the merged elevations of all stops so "
         "far with the vehicle's track, estimated (blue) and true (orange)."
     )
     caption += _fixed(scene)

@@ -101,7 +101,7 @@
       bar(`${name}: ${show(low)} to ${show(high)}`);
     }
     if (D.path.length) { add("#111", "path"); add("#ffd34d", "vehicle at its start, to scale"); }
-    if (Object.keys(D.legs).length) add("#111", "way that was driven");
+    if (Object.keys(D.legs).length) add("#111", "path that was driven");
     if (state.by === "plain") add("#0b4f8a", "trajectory of the left camera");
     else bar(`trajectory, ${state.by}: 0 to ${metres(most())}`);
   };

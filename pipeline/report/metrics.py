@@ -87,8 +87,8 @@ KEY = frozenset(
         "drive_step_violations",
         "drive_localisation_error",
         "drive_localisation_share",
-        "drive_way",
-        "drive_shortest_way",
+        "drive_path_length",
+        "drive_shortest_length",
         "trajectory_drift",
         "trajectory_ate_rmse",
         "trajectory_position_rmse",
@@ -284,7 +284,18 @@ def _drive(view: RunView) -> dict[str, Metric]:
         return {}
     truth = "the simulator's own placements"
     found = dict(_assessed(view, view.products.drive.check, "drive_", "Drive against truth", truth))
-    return {name: {**metric, "completeness": None} for name, metric in found.items()}
+    return _labelled(found, "drive_", {"path_length": "Length driven", "shortest_length": SHORTEST})
+
+
+SHORTEST = "Shortest path on the exact map"
+
+
+def _labelled(found: Mapping[str, Metric], prefix: str, labels: Mapping[str, str]) -> dict[str, Metric]:
+    """Metrics with other labels, and without a completeness: they are of the whole run."""
+    return {
+        name: {**metric, "label": labels.get(name.removeprefix(prefix), metric["label"]), "completeness": None}
+        for name, metric in found.items()
+    }
 
 
 def _path_check(view: RunView) -> dict[str, Metric]:
@@ -292,13 +303,10 @@ def _path_check(view: RunView) -> dict[str, Metric]:
     found = dict(_assessed(view, view.products.path_check, "path_check_", "Path against truth", truth))
     labels = {
         "path_length": "Length of the path",
-        "shortest_length": "Shortest way on the exact map",
+        "shortest_length": SHORTEST,
         "length_ratio": "Length of the path over the shortest",
     }
-    for name, label in labels.items():
-        if f"path_check_{name}" in found:
-            found[f"path_check_{name}"]["label"] = label
-    return {name: {**metric, "completeness": None} for name, metric in found.items()}
+    return _labelled(found, "path_check_", labels)
 
 
 def _metric(label: str, value: Any, unit: str, how: str, completeness: str | None = None) -> Metric:

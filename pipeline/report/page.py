@@ -26,7 +26,7 @@ TILES = (
     ("trajectory_drift", "agreement_share"),
     ("dem_merged_rmse", "elevation_sigma"),
     ("mapped_area",),
-    ("path_length", "drive_way"),
+    ("path_length", "drive_path_length"),
 )
 """Metrics of the opening screen: of each row the first that has a value."""
 

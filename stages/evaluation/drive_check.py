@@ -59,7 +59,7 @@ def localisation(estimate: Floats, truth: Floats, length: float) -> tuple[Floats
     how = "of the last position, after making the first poses equal"
     return error, {
         "localisation_error": metric(last, "m", how),
-        "localisation_share": metric(last / length if length > 0 else None, "1", f"{how}, over the true way"),
+        "localisation_share": metric(last / length if length > 0 else None, "1", f"{how}, over the length driven"),
         "greatest_error": metric(float(error.max()), "m", "of any position, after making the first poses equal"),
     }
 
@@ -68,7 +68,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     parts = [judged(drive, int(row)) for drive, row in zip(inputs["drives"], args["rows"], strict=True)]
     length, error = way(parts), np.zeros(0)
     metrics = placements(parts, args["vehicle"])
-    metrics["way"] = metric(length, "m", "true way of the vehicle, seen from above")
+    metrics["path_length"] = metric(length, "m", "true path of the vehicle, seen from above")
     facts: dict[str, Any] = {"metrics": metrics, "stops": len(parts), "path_exists": None, "with_margin": None}
     if "trajectory" in inputs:
         estimate, truth = (np.asarray(inputs[port]["poses"]) for port in ("trajectory", "truth"))
@@ -79,7 +79,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         shortest, margin = best["shortest_m"], best["shortest_margin_m"]
         room = "with the vehicle's margin" if margin else "within its limits, but without its margin"
         how = f"from start to goal over the risk map of the exact elevations, {room}"
-        metrics["shortest_way"] = metric(shortest, "m", how)
+        metrics["shortest_length"] = metric(shortest, "m", how)
         facts |= {"path_exists": shortest is not None, "with_margin": bool(shortest is not None and margin > 0)}
     T = np.concatenate([p["trail"] for p in parts])
     return Bundle({"error": error, "way": T[:, :, 3].copy()}, facts)

@@ -74,7 +74,7 @@ def test_it_arrives_and_knows_where_it_is(arrived: tuple[Drive, Result], store: 
     assert [metrics[f"{name}_violations"]["value"] for name in ("clearance", "tilt", "step")] == [0, 0, 0]
     # 0.2 px at 90 px of focal length and 0.4 m are 0.9 mm an image; the legs of a drive of 0.3 m add up to a few
     assert metrics["localisation_error"]["value"] < 0.006
-    assert 0.2 < metrics["way"]["value"] < 0.45
+    assert 0.2 < metrics["path_length"]["value"] < 0.45
 
 
 @pytest.mark.slow

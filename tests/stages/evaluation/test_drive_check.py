@@ -27,7 +27,7 @@ def test_a_drive_that_failed_is_judged_by_all_that_it_drove() -> None:
     metrics = found.meta["metrics"]
     assert metrics["placements"]["value"] == 4
     assert metrics["step_violations"]["value"] == 1
-    assert metrics["way"]["value"] == 0.01
+    assert metrics["path_length"]["value"] == 0.01
     assert found.meta["path_exists"] is None
     assert "localisation_error" not in metrics
 
