@@ -172,9 +172,10 @@ class Finish:
     def final(self, window: Window, fine: Rasters, checked: Rasters, refined: Rasters, gone: Raster) -> Results:
         """Everything that :class:`~rille.stages.hfvm.Disparity` has.
 
-        Reach: that of filling along rows, of the uncertainty and of what counts as lonely.
+        Reach: that of filling along rows, of the uncertainty, of what counts as lonely and of what bears out a pixel.
         """
-        p, near = self.params, uncertainty.SURROUNDINGS // 2 + consistency.CROWD // 2
+        p = self.params
+        near = uncertainty.SURROUNDINGS // 2 + consistency.CROWD // 2 + consistency.SUPPORT // 2
         extra = guided.RADIUS if p.guided_fill else 0
         # Filling reaches along rows alone, so that columns need more than rows.
         outer = window.grow(near + extra, max(near, p.fill_reach) + extra, self.shape)
@@ -183,13 +184,19 @@ class Finish:
         left, valid = self.pair.left.view.grey(0, outer), self.pair.left.view.valid(0, outer)
         keep = validity == 0
         removed &= keep
+        blank = consistency.supported(validity == Validity.NO_TEXTURE, keep & ~removed)
+        validity[blank], keep[blank] = 0, True
         # Lonely matches are too uncertain to count as measured, but still the best guess where they are.
         lonely = consistency.lonely(keep & ~removed, p.min_support)
         mark(validity, removed | lonely, Validity.SPECKLE)
         interpolated = lonely.astype(np.uint8)
         consistency.fill_rows(u, v, keep & ~removed, p.fill_reach, self.near_sign or -1.0, interpolated)
         keep &= ~removed & ~lonely
-        std = uncertainty.standard_deviation(cut(refined["noise"], outer), u, keep, p)
+        noise = cut(refined["noise"], outer)
+        std = uncertainty.standard_deviation(noise, u, keep & ~blank, p)
+        if blank.any():
+            # Their neighbours lean on them no more than on other pixels without texture.
+            std[blank] = np.hypot(uncertainty.standard_deviation(noise, u, keep, p), uncertainty.BLANK)[blank]
         if p.greatest_std is not None:
             unsure = keep & (std > p.greatest_std)
             mark(validity, unsure, Validity.OVER_THRESHOLD)

@@ -37,6 +37,11 @@ SURROUNDINGS = 9
 """Pixels: side of the window in which unmatched pixels count; about the reach of features and windows together."""
 
 
+BLANK = 0.2
+"""Pixels: by how much a match without texture of its own, borne out by its surroundings, errs beyond what the parts
+below explain. From the five pairs of :data:`rille.stages.hfvm.level.consistency.SUPPORT`: .13 to .26."""
+
+
 class Factors(NamedTuple):
     """Factors of the parts; ``floor`` and ``border`` in pixels, the others without unit."""
 

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from matching_scenes import convergent_rig, pair, rig_displacement
 from scipy import ndimage
 
+from rille.stages.core.validity import Validity, has
 from rille.stages.geometry.geometry import Rig
 from rille.stages.hfvm.coarse_to_fine import hierarchy
 from rille.stages.hfvm.finish import refine
@@ -15,6 +16,7 @@ from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.window import whole
 from rille.stages.hfvm.level import consistency, epipolar, rowwise, subpixel_lut
 from rille.stages.hfvm.level.window_pair import WindowPair
+from rille.stages.hfvm.stage import match
 from rille.stages.imaging.pyramid import PyramidParams, build
 
 
@@ -303,3 +305,33 @@ class TestLookup:
         table = subpixel_lut.learn(offset[..., 0][state.left_ok])
         # One of six images of the lesson: a few hundredths.
         np.testing.assert_allclose(table, subpixel_lut.DEFAULT_TABLE, atol=0.03)
+
+
+def test_pixels_without_texture_are_borne_out_by_consistent_surroundings_with_some_texture():
+    keep, blank = np.ones((120, 120), bool), np.zeros((120, 120), bool)
+    hole = np.s_[40:60, 40:60]
+    keep[hole], blank[hole] = False, True
+    np.testing.assert_array_equal(consistency.supported(blank, keep), blank)
+    # Half of the pixels around have failed: what is consistent among them is chance.
+    failed = np.indices(keep.shape).sum(0) % 2 == 0
+    assert not consistency.supported(blank, keep & failed).any()
+    # Deep in a wall without texture nothing is known, however consistent it is; along its edge it is.
+    wall = np.zeros_like(keep)
+    wall[:, 30:] = True
+    found = consistency.supported(wall, ~wall)
+    assert found[60, 30:35].all()
+    assert not found[:, 45:].any()
+
+
+def test_a_patch_without_texture_on_a_textured_wall_is_matched_with_a_larger_deviation():
+    rng = np.random.default_rng(4)
+    grey = ndimage.gaussian_filter(rng.uniform(0, 255, (160, 240)), 1.2)
+    grey = np.clip((grey - grey.mean()) * 3 + 128, 0, 255)
+    grey[70:90, 110:130] = 128
+    left, right = (np.rint(grey[:, at : at + 200]).astype(np.uint8) for at in (0, 12))
+    found = match(left, right)
+    inside = np.s_[76:84, 116:124]
+    assert has(found.validity[inside], Validity.MATCHED).mean() > 0.95
+    np.testing.assert_allclose(found.column_disparity[inside], -12, atol=0.5)
+    around = found.disparity_std[20:60, 40:180]
+    assert np.nanmin(found.disparity_std[inside]) > 2 * np.nanmedian(around)
