@@ -18,7 +18,7 @@ from rille.pipeline.report.words import number, spread
 Facts = Mapping[str, Any]
 
 MOST_ROWS = 12
-"""Seams and models in a table; report.json has all of them."""
+"""Seams and models in a table; report.json has more of them."""
 
 
 def audit(scene: Scene) -> Facts | None:
@@ -28,9 +28,11 @@ def audit(scene: Scene) -> Facts | None:
 
 
 def facts(scene: Scene) -> dict[str, Any] | None:
-    """The audit for report.json: variance factor, models and seams, the worst first."""
+    """The audit for report.json: variance factor, models, how many seams there are and the worst of them."""
     found = audit(scene)
-    return None if found is None else {name: found[name] for name in ("variance_factor", "models", "seams")}
+    return (
+        None if found is None else {name: found[name] for name in ("variance_factor", "models", "seam_count", "seams")}
+    )
 
 
 def worst(scene: Scene) -> Block | None:
@@ -62,7 +64,7 @@ def worst(scene: Scene) -> Block | None:
         ),
     )
     caption = (
-        f"The worst of {len(found['seams'])} seams: elevation of {name} where both are known, and what is left of it "
+        f"The worst of {found['seam_count']} seams: elevation of {name} where both are known, and what is left of it "
         f"without its bias of {_signed(first['bias'])} and tilt of {_degrees(first['tilt'][0])} along x and "
         f"{_degrees(first['tilt'][1])} along y. A plane is an error of pose (or rig); what is left is noise of the "
         "matching, and edges that two views see apart. In the table noise is compared with what both models' own "

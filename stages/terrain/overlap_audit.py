@@ -31,6 +31,8 @@ LEAST_OTHERS = 3
 """Seams without a model that tell what is usual; with fewer, all seams have to."""
 NAMED = 3
 """Models that a warning names."""
+LISTED = 500
+"""Seams that the result tells of, the worst first: a long sequence has tens of thousands."""
 
 
 class OverlapAuditParams(Params):
@@ -192,7 +194,8 @@ def _run(params: OverlapAuditParams, args: Mapping[str, Any], inputs: Inputs) ->
         {
             "variance_factor": factor,
             "models": models,
-            "seams": [{k: s[k] for k in kept} for s in ranked],
+            "seam_count": len(ranked),
+            "seams": [{k: s[k] for k in kept} for s in ranked[:LISTED]],
             "warnings": warnings,
         },
     )
@@ -200,7 +203,7 @@ def _run(params: OverlapAuditParams, args: Mapping[str, Any], inputs: Inputs) ->
 
 STAGE = Stage(
     name="overlap_audit",
-    version=1,
+    version=2,
     summary="which elevation models contradict their neighbours, in bias and tilt, the worst first",
     params=OverlapAuditParams,
     inputs=("seams*",),

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from rille.stages.core.declare import AnyArray, Array, Bundle, Stage
 from rille.stages.core.errors import RilleError
 
 CHUNK = 1024
-"""Greatest chunk edge, cells: 4 MB of float32, so that a usual image is a few files to write and to sync."""
+"""Chunk edge, cells; an array of at most its square (4 MB of float32) is one chunk, whatever its shape."""
 
 
 class DamagedError(RilleError):
@@ -123,7 +124,7 @@ def _add(group: Any, name: str, stage: Stage, bundle: Bundle, lattice: Any) -> d
         name,
         shape=array.shape,
         dtype=array.dtype.newbyteorder("<"),
-        chunks=tuple(min(max(n, 1), CHUNK) for n in array.shape),
+        chunks=_chunks(array.shape),
         compressors=BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
         fill_value=np.nan if array.dtype.kind == "f" else 0,
         dimension_names=about["dims"],
@@ -134,6 +135,15 @@ def _add(group: Any, name: str, stage: Stage, bundle: Bundle, lattice: Any) -> d
     )
     written[...] = array
     return about
+
+
+def _chunks(shape: tuple[int, ...]) -> tuple[int, ...]:
+    if math.prod(shape) <= CHUNK**2:
+        return tuple(max(n, 1) for n in shape)
+    if sum(n > CHUNK for n in shape) == 1:  # a long list, cut along its length
+        longest = max(shape)
+        return tuple(n if n < longest else max(CHUNK**2 // (math.prod(shape) // n), 1) for n in shape)
+    return tuple(min(n, CHUNK) for n in shape)
 
 
 def _describe(name: str, array: AnyArray, spec: Array) -> dict[str, Any]:
@@ -236,7 +246,7 @@ class LazyArrays(Mapping[str, AnyArray]):
         from numcodecs import blosc
 
         found = self._manifest["arrays"][name]
-        if max(found["shape"], default=0) > CHUNK:
+        if math.prod(found["shape"]) > CHUNK**2:
             return None
         described = self._member(f"{name}/zarr.json")
         about = json.loads(described) if described is not None else {"chunk_grid": None, "codecs": []}

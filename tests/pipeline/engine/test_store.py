@@ -423,11 +423,23 @@ def chunks(cache):
     return [name for name in zipfile.ZipFile(file_of(cache)).namelist() if "/c." in name]
 
 
-def test_large_arrays_are_chunked(cache):
-    rng = np.random.default_rng(0)
-    big = rng.normal(size=(artifact.CHUNK + 10, 30)).astype(np.float32)
+@pytest.mark.parametrize(
+    ("shape", "count"),
+    [
+        ((1024, 1024), 1),
+        ((2000, 500), 1),
+        ((1034, 1025), 4),
+        ((1034, 1024), 2),
+        ((400_000, 3), 2),
+        ((3_000, 500), 2),
+        ((0, 3), 0),
+    ],
+)
+def test_large_arrays_are_chunked(cache, shape, count):
+    assert artifact.CHUNK == 1024
+    big = np.random.default_rng(0).normal(size=shape).astype(np.float32)
     ref = Store(cache).commit(STAGE, KEY, Bundle({"elevation": big}, {}))
-    assert len(chunks(cache)) == 2
+    assert len(chunks(cache)) == count
     np.testing.assert_array_equal(Store(cache).open(ref)["elevation"], big)
 
 
