@@ -42,7 +42,12 @@ def is_complete(missing: Items) -> bool:
 def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
     """List ``delivered``, ``absent`` and ``missing`` results as far as the artifacts tell."""
     view = scene.view
-    missing = _poses(frames) + _local_paths(pairs) + _path(view) + _crosscheck_lost(scene)
+    missing = (
+        _poses(frames)
+        + _local_paths(pairs, merged=start_of_path(view) is not None)
+        + _path(view)
+        + _crosscheck_lost(scene)
+    )
     found = {"delivered": _delivered(view, frames, pairs), "missing": missing}
     return found | {"absent": _truth(view) + _crosscheck_off(view)}
 
@@ -125,14 +130,15 @@ def _poses(frames: Rows) -> Items:
     return found
 
 
-def _local_paths(pairs: Rows) -> Items:
-    """Stops without a local path, each reason with its frames."""
+def _local_paths(pairs: Rows, *, merged: bool) -> Items:
+    """Stops without a local path, each reason with its frames; ``merged``: there is a path over all models."""
     found, asked = local_paths(pairs)
     if found == asked:
         return []
     without = [r for r in pairs if r["path"] not in (None, "found")]
     reasons = dict.fromkeys(r["path"] for r in without)
     why = "; ".join(f"{reason} ({which([r['frame'] for r in without if r['path'] == reason])})" for reason in reasons)
+    why += "; the path over the merged terrain is whole: there one stop sees what another does not" if merged else ""
     return [_item("no path", f"{asked - found} of {asked} stops have no local path", why)]
 
 

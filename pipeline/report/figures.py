@@ -246,7 +246,7 @@ def _not_narrower(ax: Any, span: float) -> None:
 # -- a quantity over frames or pairs, and residuals over the image
 
 
-def stack(heights: Sequence[float], *, foot: float = 0.42, left: float = 0.62) -> tuple[Any, list[Any]]:
+def stack(heights: Sequence[float], *, foot: float = 0.42, left: float = 0.7) -> tuple[Any, list[Any]]:
     """Figure with axes of the given heights (inches) below each other, one x axis for all."""
     top, gap = 0.1, 0.14
     total = top + sum(heights) + gap * (len(heights) - 1) + foot
@@ -259,7 +259,7 @@ def stack(heights: Sequence[float], *, foot: float = 0.42, left: float = 0.62) -
         ax.tick_params(labelbottom=i == len(heights) - 1)
         ax.xaxis.get_major_locator().set_params(integer=True)
         ax.yaxis.get_major_locator().set_params(nbins=5)
-        ax.yaxis.set_label_coords(-0.5 / (canvas.WIDTH - left - 0.12), 0.5)
+        ax.yaxis.set_label_coords(-0.52 / (canvas.WIDTH - left - 0.12), 0.5)
         axes.append(ax)
         y -= gap
     return fig, axes

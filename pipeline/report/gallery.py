@@ -16,7 +16,7 @@ from rille.pipeline.report import canvas, checks, driving, figures, gather, seam
 from rille.pipeline.report.canvas import Block, Figure
 from rille.pipeline.report.delivery import start_words
 from rille.pipeline.report.gather import Scene
-from rille.pipeline.report.words import length, spread
+from rille.pipeline.report.words import length, number, spread
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import RilleError
 
@@ -111,6 +111,9 @@ def _terrain(scene: Scene) -> Block | None:
     )
 
 
+CLASSES = ("safe", "caution", "hazard", "unknown")
+
+
 def _map(scene: Scene) -> Block | None:
     """The layered map; its still picture is the risk map, or the elevations where nothing was judged."""
     found, world, risk = terrain_map.data(scene), scene.world, scene.risk
@@ -120,13 +123,13 @@ def _map(scene: Scene) -> Block | None:
     if risk is not None:
         classes, vehicle = risk.arrays["risk"], scene.view.config.vehicle
         shares = [float((classes == k).mean()) for k in range(4)]
-        words = f"{shares[0]:.0%} safe, {shares[1]:.0%} caution, {shares[2]:.0%} hazard, {shares[3]:.0%} unknown"
+        words = ", ".join(f"{number(100 * part, 2)}% {name}" for part, name in zip(shares, CLASSES, strict=True))
         panel = figures.risk_map(classes, scene.path, risk.extent, f"Risk map seen from above: {words}")
         caption = (
-            f"Of all cells {words}. Limits of {vehicle.name}: slope and tilt {vehicle.max_slope_deg:g}°, "
-            f"step {length(vehicle.max_step)}, roughness {length(vehicle.max_roughness)}, clearance "
-            f"{length(vehicle.clearance)}; a hazard is what exceeds one within {scene.view.config.risk.sigmas:g} "
-            f"standard deviations, caution what comes near it. {_path_words(scene)} "
+            f"Of all cells {words}; unknown ones may lie out of view. Limits of {vehicle.name}: slope and tilt "
+            f"{vehicle.max_slope_deg:g}°, step {length(vehicle.max_step)}, roughness {length(vehicle.max_roughness)}, "
+            f"clearance {length(vehicle.clearance)}; a hazard is what exceeds one within "
+            f"{scene.view.config.risk.sigmas:g} standard deviations, caution what comes near it. {_path_words(scene)} "
         )
     else:
         assert world is not None
@@ -175,8 +178,7 @@ def _path_words(scene: Scene) -> str:
 
 def _legend(shares: list[float]) -> tuple[tuple[str, str], ...]:
     colors = (canvas.SAFE, canvas.CAUTION, canvas.HAZARDOUS, canvas.UNKNOWN)
-    names = ("safe", "caution", "hazard", "unknown")
-    return tuple((c, f"{name} {share:.0%}") for c, name, share in zip(colors, names, shares, strict=True))
+    return tuple((c, f"{name} {share:.0%}") for c, name, share in zip(colors, CLASSES, shares, strict=True))
 
 
 def _local(scene: Scene) -> Block | None:

@@ -129,7 +129,7 @@ class Scene:
     @cached_property
     def risk(self) -> Terrain | None:
         """Risk map of the merged terrain."""
-        return terrain(self.view.bundle(self.view.products.risk), "risk", "reason", "p_hazard")
+        return terrain(self.view.bundle(self.view.products.risk), "risk", "reason", "p_hazard", "inclination")
 
     @cached_property
     def path(self) -> Floats | None:

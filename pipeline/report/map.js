@@ -66,13 +66,20 @@
   sheet.width = D.cols; sheet.height = D.rows;
   const state = { base: "ortho", layer: D.judged ? "risk" : "elevation", opacity: 0.45, by: "plain", ruler: [], measuring: false, three: false };
   const ramped = Array.from({ length: 256 }, (_, i) => ramp.subarray(3 * i, 3 * i + 3));
+  /* Okabe and Ito's colours, which also the colour-blind tell apart, and darker ones of them. */
+  const KINDS = ["#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7", "#7f5700", "#2b6f99", "#005c43", "#7d3600", "#6e2f57"].map(rgb);
+  let first = null;
+  const there = () => { /* which reasons are the first one somewhere */
+    if (!first) { first = new Set(); const bits = Object.values(D.reasons); for (let k = 0; k < N; k++) { const all = value.reason(k); if (all) first.add(bits.findIndex((bit) => all & bit)); } }
+    return first;
+  };
   const share = (v, low, high) => ramped[Math.round(255 * Math.min(1, Math.max(0, (v - low) / (high - low))))];
   /* Colour of a cell in the layer chosen; undefined where it has none. */
   const painter = () => {
     const name = state.layer, bits = Object.values(D.reasons);
     if (name === "none") return () => undefined;
     if (name === "risk") return (k) => classes[value.risk(k)];
-    if (name === "reason") return (k) => { const all = value.reason(k); return all ? share(bits.findIndex((bit) => all & bit), 0, Math.max(1, bits.length - 1)) : undefined; };
+    if (name === "reason") return (k) => { const all = value.reason(k); return all ? KINDS[bits.findIndex((bit) => all & bit) % KINDS.length] : undefined; };
     const [low, high] = range[name], of = value[name];
     return (k) => { const v = of(k); return v === v ? share(v, low, high) : undefined; };
   };
@@ -95,7 +102,7 @@
     const add = (color, words) => { const li = document.createElement("li"), i = document.createElement("i"); i.style.background = color; li.append(i, words); spot.append(li); };
     const bar = (words) => { add(gradient(), words); spot.lastChild.firstChild.style.width = "6em"; };
     if (name === "risk") D.colors.forEach((c, i) => add(c, CLASSES[i]));
-    else if (name === "reason") Object.keys(D.reasons).forEach((words, n, all) => { const i = 3 * Math.round(255 * n / Math.max(1, all.length - 1)); add(`rgb(${ramp[i]},${ramp[i + 1]},${ramp[i + 2]})`, words); });
+    else if (name === "reason") Object.keys(D.reasons).forEach((words, n) => { if (there().has(n)) add(`rgb(${KINDS[n % KINDS.length]})`, words); });
     else if (name !== "none") {
       const [low, high] = range[name], show = { slope: (v) => v + "°", p_hazard: String, models: String }[name] || metres;
       bar(`${name}: ${show(low)} to ${show(high)}`);
@@ -241,15 +248,16 @@
     const s = [0];
     for (let i = 1; i < D.path.length; i++) s.push(s[i - 1] + Math.hypot(D.path[i][0] - D.path[i - 1][0], D.path[i][1] - D.path[i - 1][1]));
     const zs = D.path.map((q) => q[2]), low = Math.min(...zs), high = Math.max(...zs), top = Math.max(high - low, 1e-6);
-    const slopes = D.path.map((q) => { const k = at(q[0], q[1]); return k < 0 ? NaN : value.slope(k); });
+    const slopes = D.path.map((q) => q[3] ?? NaN); /* as the planner judged them: over the vehicle's reach, not a cell */
     const X = (i) => 44 + (w - 88) * s[i] / s[s.length - 1], ink = getComputedStyle(box).color;
     const curve = (y, color) => { p.beginPath(); let pen_ = false; zs.forEach((_, i) => { const v = y(i); if (v !== v) { pen_ = false; return; } if (pen_) p.lineTo(X(i), v); else p.moveTo(X(i), v); pen_ = true; }); p.strokeStyle = color; p.lineWidth = 1.8; p.stroke(); };
-    const steep = Math.max(10, ...slopes.filter((v) => v === v));
-    curve((i) => h - 20 - (h - 34) * slopes[i] / steep, "#d1731a");
+    const steep = Math.max(D.limit, ...slopes.filter((v) => v === v)) * 1.1, Y = (v) => h - 20 - (h - 34) * v / steep;
+    p.setLineDash([4, 4]); p.beginPath(); p.moveTo(44, Y(D.limit)); p.lineTo(w - 44, Y(D.limit)); p.strokeStyle = "#c0392b"; p.stroke(); p.setLineDash([]);
+    curve((i) => Y(slopes[i]), "#d1731a");
     curve((i) => h - 20 - (h - 34) * (zs[i] - low) / top, "#4a90c8");
     p.font = "11px system-ui, sans-serif"; p.fillStyle = ink;
-    p.fillText(metres(high), 0, 16); p.fillText(metres(low), 0, h - 20); p.fillText(steep.toFixed(0) + "°", w - 40, 16); p.fillText("0°", w - 40, h - 20);
-    p.fillText("height (blue), slope (orange) along the path of " + metres(s[s.length - 1]), 44, h - 4);
+    p.fillText(metres(high), 0, 16); p.fillText(metres(low), 0, h - 20); p.fillText(D.limit + "°", w - 40, Y(D.limit) + 4); p.fillText("0°", w - 40, h - 20);
+    p.fillText("height (blue) and inclination (orange; dashed: limit) along the path of " + metres(s[s.length - 1]), 44, h - 4);
   };
 
   /* -- the view in space ------------------------------------------------------------------------------------ */
@@ -293,8 +301,8 @@
     const V = buffer(gl.ARRAY_BUFFER, new Float32Array(vertices)), F = buffer(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(faces)), T = gl.createTexture();
     const strip = (points, color, kind) => ({ b: buffer(gl.ARRAY_BUFFER, new Float32Array(points.flatMap(local))), n: points.length, color, kind });
     const lift = (q) => [q[0], q[1], q[2] + 0.002 * size];
-    const lines = [strip(D.path.map(lift), [1, 0.83, 0.2], gl.LINE_STRIP), strip(D.track.map((t) => t.slice(1, 4)), [0.2, 0.6, 1], gl.LINE_STRIP)];
-    for (const f of D.frusta) lines.push(strip([0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1].map((i) => f[i]), [1, 0.4, 0.2], gl.LINES));
+    const lines = [strip(D.path.map(lift), [0.07, 0.07, 0.07], gl.LINE_STRIP), strip(D.track.map((t) => t.slice(1, 4)), [0.04, 0.31, 0.54], gl.LINE_STRIP)];
+    for (const f of D.frusta) lines.push(strip([0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1].map((i) => f[i]), [0.55, 0.56, 0.6], gl.LINES));
     const texture = () => { gl.bindTexture(gl.TEXTURE_2D, T); gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, sheet); gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR); gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE); gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE); };
     const render = () => {
       const ratio = window.devicePixelRatio || 1;
@@ -351,7 +359,7 @@
   $("out").addEventListener("click", () => zoom(1 / 1.4));
   $("fit").addEventListener("click", () => { fit(); draw(); });
   $("ruler").addEventListener("click", (e) => { state.measuring = !state.measuring; if (!state.measuring) state.ruler = []; e.target.setAttribute("aria-pressed", state.measuring); draw(); });
-  $("tall").addEventListener("input", (e) => { eye.tall = +e.target.value; if (space) space.render(); });
+  $("tall").addEventListener("input", (e) => { eye.tall = +e.target.value; $("times").textContent = eye.tall.toFixed(1); if (space) space.render(); });
   $("three").addEventListener("click", (e) => {
     state.three = !state.three;
     flat.hidden = state.three; $("space").hidden = !state.three;

@@ -47,6 +47,7 @@ LABELS: Mapping[str, str] = {
     "rotation_bias": "Rotation, the same in every frame",
     "scatter": "Motion of a frame, what remains",
     "nees": "Squared error over the claimed one (NEES)",
+    "least_clearance": "Room under the belly, least",
     "frames": "Frames to be posed",
     "frames_missing": "Frames without a pose in the world",
     "frames_without_truth": "Frames without truth",
@@ -366,7 +367,7 @@ def _terrain(scene: Scene) -> dict[str, Metric]:
             "covariances: median over cells"
         )
         value = float(np.nanmedian(sigma))
-        found["elevation_sigma"] = _metric("Standard deviation of elevation", value, "m", how, of_map)
+        found["elevation_sigma"] = _metric("Predicted σ of elevation, median", value, "m", how, of_map)
     return found
 
 
@@ -404,8 +405,8 @@ def _path(view: RunView) -> dict[str, Metric]:
         value = float(np.degrees(meta["max_tilt"]))
         found["path_tilt"] = _metric("Greatest tilt on the path", value, "deg", "of the vehicle, at the worst heading")
     if meta.get("least_clearance") is not None:
-        how = "left under the belly, at the worst heading"
-        found["path_clearance"] = _metric("Least clearance on the path", meta["least_clearance"], "m", how)
+        how = "left under the belly of a vehicle whose ground clearance is stated, at the worst heading"
+        found["path_clearance"] = _metric("Room under the belly on the path, least", meta["least_clearance"], "m", how)
     if meta.get("max_p_hazard") is not None:
         how = "probability that a measure exceeds its limit, largest of the path's cells"
         found["path_p_hazard"] = _metric("Greatest hazard probability on the path", meta["max_p_hazard"], "1", how)

@@ -23,12 +23,29 @@ from rille.pipeline.report.words import coordinate, metres, number, quantity, se
 
 TILES = (
     ("frames_posed",),
-    ("trajectory_drift", "agreement_share"),
+    ("trajectory_drift", "agreement_rmse"),
     ("dem_merged_rmse", "elevation_sigma"),
     ("mapped_area",),
     ("path_length", "drive_path_length"),
 )
 """Metrics of the opening screen: of each row the first that has a value."""
+
+BESIDE: Mapping[str, tuple[tuple[str, str], ...]] = {
+    "trajectory_drift": (("{} at the end", "trajectory_final_error"), ("of {} driven", "trajectory_path_length")),
+    "agreement_rmse": (("over {}", "agreement_length"), ("{} if scale is free", "agreement_rmse_scaled")),
+    "dem_merged_rmse": (("after a tilt of {} is taken out", "dem_merged_tilt"),),
+    "path_length": (
+        ("inclination up to {} of {limit}°", "path_inclination"),
+        ("tilt up to {} of {limit}°", "path_tilt"),
+        ("probability of a hazard up to {}", "path_p_hazard"),
+    ),
+    "drive_path_length": (
+        ("belly struck at {}", "drive_clearance_violations"),
+        ("tilted beyond the limit at {}", "drive_tilt_violations"),
+        ("a wheel on too high an edge at {}", "drive_step_violations"),
+    ),
+}
+"""What a tile says below its figure: words and another metric, before truth and completeness."""
 
 CHAPTERS = (
     ("Trajectory", "trajectory", ("Crosscheck",)),
@@ -100,7 +117,9 @@ def render(
         theme=canvas.theme(),
         map=blocks.get("Map"),
         chapters=[c for c in chapters if c[2] or c[1] in ALWAYS],
-        tiles=_tiles(facts["metrics"]),
+        tiles=_tiles(facts["metrics"], view.config.vehicle.max_slope_deg),
+        tasks=len(view.tasks),
+        cached=sum(t.status == "cached" for t in view.tasks),
         script=resources.files("rille.pipeline.report").joinpath("map.js").read_text(encoding="utf-8"),
         files=files,
         table_2=rows,
@@ -113,6 +132,22 @@ def render(
     )
 
 
-def _tiles(metrics: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+def _tiles(metrics: Mapping[str, Any], limit: float) -> list[tuple[str, str, str]]:
+    """Label, figure and words of each tile; ``limit`` of slope and tilt, degrees."""
     known = {name: metric for name, metric in metrics.items() if metric["value"] is not None}
-    return [known[found] for names in TILES if (found := next((n for n in names if n in known), None))]
+    return [_tile(found, known, limit) for names in TILES if (found := next((n for n in names if n in known), None))]
+
+
+def _tile(name: str, known: Mapping[str, Any], limit: float) -> tuple[str, str, str]:
+    metric = known[name]
+    if name == "frames_posed":
+        return metric["label"], metric["completeness"], ""
+    words = [
+        text.format(quantity(known[other]["value"], known[other]["unit"]), limit=number(limit))
+        for text, other in BESIDE.get(name, ())
+        if other in known
+    ]
+    words += ["against truth"] if metric["truth"] else []
+    words += [metric["completeness"]] if metric["completeness"] else []
+    label = "Disagreement with COLMAP, RMS" if name == "agreement_rmse" else metric["label"]
+    return label, quantity(metric["value"], metric["unit"]), "; ".join(words)

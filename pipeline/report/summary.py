@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -100,6 +101,7 @@ def find_warnings(scene: Scene) -> list[str]:
     ):
         bundle = view.bundle(handle)
         lines += (bundle.meta.get("warnings") or []) if bundle is not None else []
+    lines += _sigma_warning(view)
     compared = scene.comparison
     if compared is not None and compared.flagged.any():
         bad = [frame for frame, flagged in zip(view.frames, compared.flagged, strict=True) if flagged]
@@ -107,6 +109,22 @@ def find_warnings(scene: Scene) -> list[str]:
         lines.append(f"trajectory and COLMAP disagree more than elsewhere at {share}: {delivery.which(bad)}")
     # A name in the data may hold line feeds, and a warning is one line.
     return list(dict.fromkeys(" ".join(str(line).split()) for line in lines))
+
+
+SIGMA_OFF = 3.0
+"""Factor by which errors exceed their standard deviations from which on it is said."""
+
+
+def _sigma_warning(view: RunView) -> list[str]:
+    """The standard deviations of the positions are not to be weighed by, where truth says so."""
+    accuracy = view.bundle(view.products.accuracy)
+    nees = None if accuracy is None else accuracy.meta["metrics"].get("nees", {}).get("value")
+    if nees is None or nees <= SIGMA_OFF**2:
+        return []
+    return [
+        f"the standard deviations of the poses are about {math.sqrt(nees):.2g} times too small against the truth: do "
+        "not weigh by them"
+    ]
 
 
 def _verdict(view: RunView, frames: list[dict[str, Any]], pairs: list[dict[str, Any]]) -> str:

@@ -76,7 +76,8 @@ def data(scene: Scene) -> dict[str, Any] | None:
         "ramp": base64.b64encode(canvas.ramp("viridis").tobytes()).decode("ascii"),
         "track": _track(scene),
         "frusta": _frusta(scene),
-        "path": [] if scene.path is None else np.round(scene.path, 4).tolist(),
+        "path": _path(scene),
+        "limit": scene.view.config.vehicle.max_slope_deg,
         "vehicle": _vehicle(scene),
         "legs": _legs(scene),
     }
@@ -176,6 +177,22 @@ def _frusta(scene: Scene) -> list[Any]:
         if frame in view.products.disparity and np.isfinite(pose).all():
             found.append(np.round(RigidTransform.from_matrix(pose).apply(points), 4).tolist())
     return found
+
+
+def _path(scene: Scene) -> list[list[float | None]]:
+    """Vertices of the path: x, y, z, m, and the inclination that the planner judged there, degrees, or None."""
+    if scene.path is None:
+        return []
+    inclination = np.full(len(scene.path), np.nan)
+    judged = None if scene.risk is None else scene.risk.get("inclination")
+    if judged is not None and scene.risk is not None:
+        row, col = np.rint(scene.risk.lattice.index(scene.path[:, :2])).astype(int).T
+        inside = (row >= 0) & (col >= 0) & (row < judged.shape[0]) & (col < judged.shape[1])
+        inclination[inside] = np.degrees(np.asarray(judged, np.float64)[row[inside], col[inside]])
+    return [
+        [*(round(v, 4) for v in place), round(value, 2) if math.isfinite(value) else None]
+        for place, value in zip(scene.path.tolist(), inclination.tolist(), strict=True)
+    ]
 
 
 def _legs(scene: Scene) -> dict[str, Any]:
