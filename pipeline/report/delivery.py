@@ -77,6 +77,12 @@ def which(frames: list[int]) -> str:
     return f"frame{'s' if len(frames) > 1 else ''} {spans(frames)}"
 
 
+def _among(frames: list[int], stops: list[int]) -> str:
+    """The shorter of both lists: those that are meant, or all others."""
+    others = [stop for stop in stops if stop not in frames]
+    return which(frames) if len(frames) <= len(others) or not others else f"all stops but {which(others)}"
+
+
 def local_paths(pairs: Rows) -> tuple[int, int]:
     """How many stops have a local path, of how many at which one was looked for."""
     asked = [r for r in pairs if r["path"] is not None]
@@ -136,8 +142,10 @@ def _local_paths(pairs: Rows, *, merged: bool) -> Items:
     if found == asked:
         return []
     without = [r for r in pairs if r["path"] not in (None, "found")]
+    stops = [r["frame"] for r in pairs if r["path"] is not None]
     reasons = dict.fromkeys(r["path"] for r in without)
-    why = "; ".join(f"{reason} ({which([r['frame'] for r in without if r['path'] == reason])})" for reason in reasons)
+    at = {reason: [r["frame"] for r in without if r["path"] == reason] for reason in reasons}
+    why = "; ".join(f"{reason} ({_among(frames, stops)})" for reason, frames in at.items())
     why += "; the path over the merged terrain is whole: there one stop sees what another does not" if merged else ""
     return [_item("no path", f"{asked - found} of {asked} stops have no local path", why)]
 

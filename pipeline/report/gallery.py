@@ -148,7 +148,8 @@ def _path_words(scene: Scene) -> str:
     drive = scene.view.products.drive
     if drive is not None:
         return (
-            f"{driving.outcome(drive)}; no path is planned over the whole map, what was driven is shown stop by stop."
+            f"{driving.outcome(drive)}; no path is planned over the whole map, what was driven is shown stop by stop. "
+            "A disk around the start, which no camera saw, may be taken for flat ground (stage start_area)."
         )
     if scene.path is None:
         found = scene.view.bundle(scene.view.products.path)

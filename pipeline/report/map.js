@@ -108,7 +108,8 @@
       bar(`${name}: ${show(low)} to ${show(high)}`);
     }
     if (D.path.length) { add("#111", "path"); add("#ffd34d", "vehicle at its start, to scale"); }
-    if (Object.keys(D.legs).length) add("#111", "path that was driven");
+    if (Object.keys(D.legs).length) add("#111", "path that was driven by the vehicle's middle (ring: start)");
+    if (D.goal) add("#ffd34d", "goal (star)");
     if (state.by === "plain") add("#0b4f8a", "trajectory of the left camera");
     else bar(`trajectory, ${state.by}: 0 to ${metres(most())}`);
   };
@@ -178,6 +179,14 @@
       for (const t of D.track) { const [u, v] = screen(t[1], t[2]); pen.beginPath(); pen.arc(u, v, 3, 0, 7); pen.fillStyle = trackColor(t); pen.fill(); pen.strokeStyle = "#fff"; pen.lineWidth = 0.8; pen.stroke(); }
     }
     if ($("path").checked && D.path.length) { line(D.path, "#fff", 5); line(D.path, "#111", 2.5); }
+    const legs = Object.values(D.legs);
+    if (legs.length) { const [u, v] = screen(...legs[0][0]); pen.beginPath(); pen.arc(u, v, 6, 0, 7); pen.strokeStyle = "#111"; pen.lineWidth = 2.5; pen.stroke(); }
+    if (D.goal) {
+      const [u, v] = screen(...D.goal);
+      pen.beginPath();
+      for (let i = 0; i < 10; i++) { const r = i % 2 ? 4 : 10, t = Math.PI * (i / 5 - 0.5); pen.lineTo(u + r * Math.cos(t), v + r * Math.sin(t)); }
+      pen.closePath(); pen.fillStyle = "#ffd34d"; pen.strokeStyle = "#111"; pen.lineWidth = 1.5; pen.fill(); pen.stroke();
+    }
     const stop = stops[state.stop];
     for (const [frame, leg] of Object.entries(D.legs)) if (!stop || +frame <= stop.frame) { const here = stop && +frame === stop.frame; line(leg, "#fff", here ? 6 : 3); line(leg, here ? "#c0167a" : "#111", here ? 3.5 : 1.5); }
     if (stop && stop.at) {

@@ -80,6 +80,7 @@ def data(scene: Scene) -> dict[str, Any] | None:
         "limit": scene.view.config.vehicle.max_slope_deg,
         "vehicle": _vehicle(scene),
         "legs": _legs(scene),
+        "goal": _goal(scene),
     }
 
 
@@ -203,6 +204,13 @@ def _legs(scene: Scene) -> dict[str, Any]:
         if leg is not None and len(leg["path"]):
             found[str(stop.frame)] = np.round(np.asarray(leg["path"])[:, :2], 4).tolist()
     return found
+
+
+def _goal(scene: Scene) -> list[float] | None:
+    """x, y, m, of a drive's goal."""
+    drive = scene.view.products.drive
+    leg = scene.view.bundle(drive.stops[-1].leg) if drive is not None and drive.stops else None
+    return None if leg is None else [round(float(v), 4) for v in leg.meta["goal"][:2]]
 
 
 def _vehicle(scene: Scene) -> list[float]:

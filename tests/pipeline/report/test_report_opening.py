@@ -1,0 +1,68 @@
+"""The opening screen in words: tiles, missing local paths, standard deviations that the truth contradicts."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rille.pipeline.report import delivery, page, summary, terrain_map
+from rille.stages.geometry.lattice import Lattice
+
+
+def metric(value, unit, label="", truth=None, completeness=None):
+    return {"value": value, "unit": unit, "label": label, "truth": truth, "completeness": completeness}
+
+
+def test_tiles_say_what_stands_beside_their_figure():
+    metrics = {
+        "frames_posed": metric(9, "frames", "Frames with a pose", completeness="9 of 10 frames"),
+        "trajectory_drift": metric(0.84, "%", "Drift at the end", truth="GPS", completeness="9 of 10 frames"),
+        "trajectory_final_error": metric(0.5, "m"),
+        "trajectory_path_length": metric(59.9, "m"),
+        "path_length": metric(66.6, "m", "Path length"),
+        "path_inclination": metric(6.2, "deg"),
+        "path_tilt": metric(None, "deg"),
+        "mapped_area": metric(None, "m²", "Mapped area"),
+    }
+    assert page._tiles(metrics, 20.0) == [
+        ("Frames with a pose", "9 of 10 frames", ""),
+        ("Drift at the end", "0.840 %", "0.500 m at the end; of 59.9 m driven; against truth; 9 of 10 frames"),
+        ("Path length", "66.6 m", "inclination up to 6.20° of 20°"),
+    ]
+
+
+def rows(*paths):
+    return [{"frame": 2 * k, "path": path} for k, path in enumerate(paths)]
+
+
+def test_a_missing_local_path_names_the_shorter_list_of_stops_and_whether_the_merged_path_is_whole():
+    (few,) = delivery._local_paths(rows("found", "closed", "found", None, "found"), merged=False)
+    assert few["what"] == "1 of 4 stops have no local path"
+    assert few["why"] == "closed (frame 2)"
+    (most,) = delivery._local_paths(rows("closed", "closed", "found", "closed"), merged=True)
+    assert most["why"].startswith("closed (all stops but frame 4); the path over the merged terrain is whole")
+    (all_of_them,) = delivery._local_paths(rows("closed", "closed"), merged=False)
+    assert all_of_them["why"] == "closed (frames 0, 2)"
+    assert delivery._local_paths(rows("found", None), merged=True) == []
+
+
+@pytest.mark.parametrize(("nees", "words"), [(None, []), (8.9, []), (850.0, ["about 29 times too small"])])
+def test_standard_deviations_that_truth_contradicts_are_warned_of(nees, words):
+    accuracy = SimpleNamespace(meta={"metrics": {"nees": {"value": nees}}})
+    view = SimpleNamespace(products=SimpleNamespace(accuracy=accuracy), bundle=lambda handle: handle)
+    found = summary._sigma_warning(view)
+    assert len(found) == len(words)
+    assert all(word in line for word, line in zip(words, found, strict=True))
+
+
+def test_the_profile_shows_the_inclination_that_was_judged():
+    lattice = Lattice.snap((0.0, 4.0, 0.0, 3.0), 1.0)
+    inclination = np.arange(lattice.rows * lattice.cols, dtype=np.float64).reshape(lattice.shape) / 100
+    inclination[1, 1] = np.nan
+    centres = lattice.xy()
+    path = np.array([[*centres[2, 3], 0.5], [*centres[1, 1], 0.6], [centres[0, 0][0] - 5.0, 0.0, 0.7]])
+    risk = SimpleNamespace(lattice=lattice, get={"inclination": inclination}.get)
+    found = terrain_map._path(SimpleNamespace(path=path, risk=risk))
+    assert found[0] == [*path[0], round(float(np.degrees(inclination[2, 3])), 2)]
+    assert [row[3] for row in found[1:]] == [None, None]
+    assert terrain_map._path(SimpleNamespace(path=None, risk=None)) == []
