@@ -45,7 +45,7 @@ from rille.stages.odometry.resection.pnp import HUBER, Observations, Poses, back
 from rille.stages.odometry.resection.resect import SOURCES, ResectParams, coordinates, root, scatter_of_blocks
 
 
-class Segment(NamedTuple):
+class SegmentStart(NamedTuple):
     """Measurements of a segment, where its adjustment starts, which of its frames have a pose, and which points it has
     of the track."""
 
@@ -55,7 +55,7 @@ class Segment(NamedTuple):
     which: NDArray[np.intp]
 
 
-def views_of(track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig) -> Segment | None:
+def views_of(track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig) -> SegmentStart | None:
     """Measurements and start of a segment, and which of its frames are posed; None: fewer than one behind the key.
 
     ``landmarks`` are those of all points of the track, in the local frame.
@@ -79,7 +79,7 @@ def views_of(track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig) -
     # An exact disparity would have infinite information.
     held = np.maximum(known.sigma, 1e-3)
     views = SegmentTracks(known.position, known.per_pixel, held, pixels, seen, rig.left, tilt)
-    return Segment(views, state, frames, which)
+    return SegmentStart(views, state, frames, which)
 
 
 def _tilt_pattern(position: Floats, T_local_key: RigidTransform, rig: Rig) -> Floats:
@@ -187,7 +187,7 @@ class _Given:
     rig: Rig
 
 
-def _anew(given: _Given, poses: Floats, tilt: float, resect: ResectParams) -> Segment | None:
+def _anew(given: _Given, poses: Floats, tilt: float, resect: ResectParams) -> SegmentStart | None:
     """A segment without the tilt, its landmarks judged once more by poses: the tilt had made good ones inconsistent."""
     tracked = np.isfinite(np.asarray(given.track["points"])).all(-1)
     # All tracks stand trial again, not only those that agreed under the tilt.
@@ -245,7 +245,7 @@ def claims(
 
 
 def _adjusted(
-    found: Sequence[Segment | None], out: Sequence[SegmentOut], params: RefineParams
+    found: Sequence[SegmentStart | None], out: Sequence[SegmentOut], params: RefineParams
 ) -> tuple[dict[str, float], dict[int, SegmentState]]:
     """A window adjusted, ``out`` written to; facts of the adjustment, and the state of each segment."""
     group = {k: one for k, one in enumerate(found) if one is not None}
