@@ -196,9 +196,23 @@ def supported(blank: AnyArray, keep: AnyArray) -> NDArray[np.bool_]:
     ``blank``: consistent, but without texture. Nearly all pixels around are consistent, too, and enough of them are
     matches (``keep``). Among failures, as on a wall without any texture, consistent pixels are chance.
     """
-    room = window_sum(np.ones(keep.shape, np.float32), SUPPORT)
-    consistent, textured = (window_sum(a.astype(np.float32), SUPPORT) for a in (keep | blank, keep))
-    return np.asarray(blank & (consistent >= SUPPORT_CONSISTENT * room) & (textured >= SUPPORT_TEXTURED * room))
+    y, x = np.nonzero(blank)
+    found = np.zeros(blank.shape, bool)
+    if y.size:
+        # Counts of whole numbers, at the few pixels that are asked for: a third of the time of sums everywhere.
+        consistent, textured = (
+            cv2.boxFilter(
+                a.view(np.uint8), cv2.CV_32S, (SUPPORT, SUPPORT), normalize=False, borderType=cv2.BORDER_CONSTANT
+            )[y, x]
+            for a in (keep | blank, keep)
+        )
+        tall, wide = (
+            np.minimum(at + SUPPORT // 2 + 1, n) - np.maximum(at - SUPPORT // 2, 0)
+            for at, n in zip((y, x), blank.shape, strict=True)
+        )
+        room = tall * wide
+        found[y, x] = (consistent >= SUPPORT_CONSISTENT * room) & (textured >= SUPPORT_TEXTURED * room)
+    return found
 
 
 def unsupported(u: AnyArray, v: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
