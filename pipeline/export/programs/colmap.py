@@ -92,7 +92,7 @@ def _segments(bundles: RunArtifacts) -> list[MatchedSegment]:
     # Where disparities were tilted, the adjustment without the tilt is the one whose poses count.
     for label in ("refine/untilted", "refine"):
         found = [part for k in keys if (b := bundles.find(f"{label}/{k}")) is not None for part in refine.parts(b)]
-        if found:
+        if len(found) == len(points):
             points = found
             break
     return [
