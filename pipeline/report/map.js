@@ -271,7 +271,7 @@
 
   /* -- the view in space ------------------------------------------------------------------------------------ */
   let space = null;
-  const eye = { turn: -0.6, tilt: 0.75, far: 0.8, tall: 1 };
+  const eye = { turn: -0.6, tilt: 0.75, far: 0.6, tall: 1 };
   const open = () => {
     const c = $("space"), gl = c.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
     if (!gl) { $("hover").textContent = "This browser has no WebGL2: the map stays flat."; return null; }
@@ -311,6 +311,8 @@
     const strip = (points, color, kind) => ({ b: buffer(gl.ARRAY_BUFFER, new Float32Array(points.flatMap(local))), n: points.length, color, kind });
     const lift = (q) => [q[0], q[1], q[2] + 0.002 * size];
     const lines = [strip(D.path.map(lift), [0.07, 0.07, 0.07], gl.LINE_STRIP), strip(D.track.map((t) => t.slice(1, 4)), [0.04, 0.31, 0.54], gl.LINE_STRIP)];
+    const onGround = (q) => { const k = at(q[0], q[1]), z = k < 0 ? NaN : height(k); return [q[0], q[1], z === z ? z : cz]; };
+    for (const leg of Object.values(D.legs)) lines.push(strip(leg.map(onGround).map(lift), [0.07, 0.07, 0.07], gl.LINE_STRIP));
     for (const f of D.frusta) lines.push(strip([0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1].map((i) => f[i]), [0.55, 0.56, 0.6], gl.LINES));
     const texture = () => { gl.bindTexture(gl.TEXTURE_2D, T); gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, sheet); gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR); gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE); gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE); };
     const render = () => {
