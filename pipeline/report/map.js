@@ -271,7 +271,7 @@
 
   /* -- the view in space ------------------------------------------------------------------------------------ */
   let space = null;
-  const eye = { turn: -0.6, tilt: 0.75, far: 0.6, tall: 1 };
+  const eye = { turn: -0.6, tilt: 0.75, far: 0.7, tall: 1 };
   const open = () => {
     const c = $("space"), gl = c.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
     if (!gl) { $("hover").textContent = "This browser has no WebGL2: the map stays flat."; return null; }
@@ -321,7 +321,7 @@
       gl.viewport(0, 0, c.width, c.height);
       gl.clearColor(0, 0, 0, 0); gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT); gl.enable(gl.DEPTH_TEST);
       /* rows of world turned about z, tilted, moved away, then perspective */
-      const [ct, st, cp, sp] = [Math.cos(eye.turn), Math.sin(eye.turn), Math.cos(eye.tilt), Math.sin(eye.tilt)], g = 1.8 / Math.min(1, c.width / c.height), aspect = c.width / c.height, d = 2.6 * eye.far;
+      const [ct, st, cp, sp] = [Math.cos(eye.turn), Math.sin(eye.turn), Math.cos(eye.tilt), Math.sin(eye.tilt)], g = 1.8 * Math.min(1, c.width / c.height), aspect = c.width / c.height, d = 2.6 * eye.far;
       const right = [ct, st, 0], up = [-st * sp, ct * sp, cp], back = [st * cp, -ct * cp, sp], near = 0.02, distant = 20;
       const k = -(distant + near) / (distant - near), q = -2 * distant * near / (distant - near), m = [];
       for (let i = 0; i < 3; i++) m.push(g / aspect * right[i], g * up[i], k * back[i], -back[i]);
