@@ -81,6 +81,8 @@ AGREEMENT: Mapping[str, str] = {
 }
 """Words for the figures of the comparison with the other program."""
 
+SHORTEST = "Shortest path on the exact map"
+
 KEY = frozenset(
     {
         "drive_clearance_violations",
@@ -286,9 +288,6 @@ def _drive(view: RunView) -> dict[str, Metric]:
     truth = "the simulator's own placements"
     found = dict(_assessed(view, view.products.drive.check, "drive_", "Drive against truth", truth))
     return _labelled(found, "drive_", {"path_length": "Length driven", "shortest_length": SHORTEST})
-
-
-SHORTEST = "Shortest path on the exact map"
 
 
 def _labelled(found: Mapping[str, Metric], prefix: str, labels: Mapping[str, str]) -> dict[str, Metric]:

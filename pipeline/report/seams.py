@@ -30,9 +30,8 @@ def audit(scene: Scene) -> Facts | None:
 def facts(scene: Scene) -> dict[str, Any] | None:
     """The audit for report.json: variance factor, models, how many seams there are and the worst of them."""
     found = audit(scene)
-    return (
-        None if found is None else {name: found[name] for name in ("variance_factor", "models", "seam_count", "seams")}
-    )
+    names = "variance_factor", "models", "seam_count", "seams"
+    return None if found is None else {name: found[name] for name in names}
 
 
 def worst(scene: Scene) -> Block | None:
