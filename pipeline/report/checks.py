@@ -13,10 +13,13 @@ from rille.pipeline.export.comparison import Comparison
 from rille.pipeline.report import canvas, figures
 from rille.pipeline.report.canvas import Block, Table
 from rille.pipeline.report.gather import Calibration, Scene
-from rille.pipeline.report.words import length, quantity, spans, spread
+from rille.pipeline.report.words import length, number, quantity, spans, spread
 
 MOST_CURVES = 3
 """Parameters of the rig whose change over the pairs is drawn."""
+
+ASKED = 4.0
+"""Standard deviations from which on a correction that the images ask for is told of."""
 
 MOST_FLAGS = 8
 """Flagged frames that a caption names with their reasons; agreement.csv has all."""
@@ -39,6 +42,7 @@ def rig(scene: Scene) -> Block | None:
             f"The matches lie {before:.2f} px RMS off their epipolar lines under the given rig"
             + (f", {after:.2f} px under the one that was used." if found.changed and after is not None else ".")
         )
+    words += _untold(scene, found)
     if panels:
         words.append(
             "In the maps the left image is divided into cells; a colour is the median distance of the right points "
@@ -52,6 +56,29 @@ def rig(scene: Scene) -> Block | None:
         )
     title = "Relative orientation of the rig, " + ("before and after its repair" if found.changed else "checked")
     return Block("Rig", title, " ".join(words), tuple(panels), table=_parameters(found))
+
+
+def _untold(scene: Scene, found: Calibration) -> list[str]:
+    """What the images ask for but cannot tell from a principal point that is off, and what the truth says of it."""
+    unsure = [
+        p
+        for p in found.collected("parameters")
+        if not p.get("freed") and not p.get("observed") and p.get("sigma") and abs(p["asked"]) > ASKED * p["sigma"]
+    ]
+    if not unsure:
+        return []
+    asked = ", ".join(f"{str(p['name']).replace('_', ' ')} {_signed(p['asked'], '°')}" for p in unsure)
+    words = [
+        f"Taken alone the images would turn the right camera ({asked}), but a principal point a few pixels off looks "
+        "the same: they cannot tell, and the calibration is kept."
+    ]
+    accuracy = scene.view.bundle(scene.view.products.accuracy)
+    scale = None if accuracy is None else accuracy.meta["metrics"].get("scale_error", {}).get("value")
+    if scale is None:
+        words.append("If depth matters, compare a known length.")
+    else:
+        words.append(f"The scale of the motions is off by {number(abs(scale), 2)} % against the truth: depth, too.")
+    return words
 
 
 def _residuals(scene: Scene, found: Calibration) -> list[canvas.Panel]:
@@ -172,13 +199,17 @@ def crosscheck(scene: Scene) -> Block | None:
     flagged = [f for f, bad in zip(view.frames, found.flagged, strict=True) if bad]
     lost = [f for f, there in zip(view.frames, found.registered, strict=True) if not there]
     shown = "#333333"
-    factor, unit = canvas.metres_or_mm(np.concatenate([found.distance, found.error, found.error_crosscheck]))
+    factor, unit = canvas.metres_or_mm(found.distance)
     position = [("disagreement", shown, found.distance * factor)]
-    for name, color, error in (
-        ("error against truth", canvas.ESTIMATE, found.error),
-        ("error of COLMAP", canvas.OTHER, found.error_crosscheck),
-    ):
-        position += [(name, color, error * factor)] if np.isfinite(error).any() else []
+    off, off_unit = canvas.metres_or_mm(np.concatenate([found.error, found.error_crosscheck]))
+    errors = [
+        (name, color, error * off)
+        for name, color, error in (
+            ("ours", canvas.ESTIMATE, found.error),
+            ("COLMAP's", canvas.OTHER, found.error_crosscheck),
+        )
+        if np.isfinite(error).any()
+    ]
     per_step, step_unit = canvas.metres_or_mm(found.step_distance)
     turn, step_turn = ([("disagreement", shown, np.degrees(a))] for a in (found.angle, found.step_angle))
     step = [("disagreement", shown, found.step_distance * per_step)]
@@ -190,6 +221,8 @@ def crosscheck(scene: Scene) -> Block | None:
         (f"motion, {step_unit}", step, _limit(found, "step_distance", per_step)),
         ("rotation, °", step_turn, _limit(found, "step_angle")),
     ]
+    # An axis of its own: both are aligned by the first pose here, by all of them above.
+    poses += [(f"error, {off_unit}", errors, None)] if errors else []
     degrees = f"{spread(np.degrees(found.angle))} degrees"
     panels = (
         figures.disagreement(
@@ -222,6 +255,11 @@ def _crosscheck_words(found: Comparison, lost: list[int], *, repaired: bool) -> 
         f"{several} on ours by one rotation and translation, without a change of scale. First: disagreement of "
         "position and rotation; second: of the motion since the frame before."
     ]
+    if np.isfinite(found.error).any():
+        words.append(
+            "The error of either against the truth is drawn below the first, aligned by the first pose alone: these "
+            "curves begin at 0 and grow, while the disagreement is spread over all frames."
+        )
     if repaired:
         words.append("COLMAP has used the rig as it was given, ours was repaired: that alone makes them differ.")
     rule = found.meta.get("rule")

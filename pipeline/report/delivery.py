@@ -17,6 +17,7 @@ from rille.pipeline.export.view import RunView
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.words import metres, spans
+from rille.stages.hazard.vehicle import DEFAULT_VEHICLE
 
 Rows = list[dict[str, Any]]
 Items = list[dict[str, str]]
@@ -49,7 +50,7 @@ def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
         + _crosscheck_lost(scene)
     )
     found = {"delivered": _delivered(view, frames, pairs), "missing": missing}
-    return found | {"absent": _truth(view) + _crosscheck_off(view)}
+    return found | {"absent": _truth(view) + _crosscheck_off(view) + _vehicle(view)}
 
 
 def complete(found: Mapping[str, Any], view: RunView, figures: Sequence[Figure]) -> Delivery:
@@ -146,7 +147,9 @@ def _local_paths(pairs: Rows, *, merged: bool) -> Items:
     reasons = dict.fromkeys(r["path"] for r in without)
     at = {reason: [r["frame"] for r in without if r["path"] == reason] for reason in reasons}
     why = "; ".join(f"{reason} ({_among(frames, stops)})" for reason, frames in at.items())
-    why += "; the path over the merged terrain is whole: there one stop sees what another does not" if merged else ""
+    why += (
+        "; a path over the merged terrain was found all the same: one stop sees what another does not" if merged else ""
+    )
     return [_item("no path", f"{asked - found} of {asked} stops have no local path", why)]
 
 
@@ -174,6 +177,15 @@ def _truth(view: RunView) -> Items:
     none = view.sequence.truth is None and view.sequence.truth_positions is None
     owner = "the sequence has none" if none else "it has none for the chosen frames"
     return [_item("no truth", "No truth", f"{owner}, so accuracy is not assessed")]
+
+
+def _vehicle(view: RunView) -> Items:
+    v = view.config.vehicle
+    if v != DEFAULT_VEHICLE or view.bundle(view.products.risk) is None:
+        return []
+    size = f"{metres(v.wheel_base)} between its axles, {metres(v.track)} between its wheels"
+    why = f"hazards and path are those of the {v.name}, {size}, up to {v.max_slope_deg:g}°; give yours by vehicle.*"
+    return [_item("vehicle", "No vehicle was stated", why)]
 
 
 def _crosscheck_off(view: RunView) -> Items:

@@ -128,8 +128,9 @@ def _map(scene: Scene) -> Block | None:
         caption = (
             f"Of all cells {words}; unknown ones may lie out of view. Limits of {vehicle.name}: slope and tilt "
             f"{vehicle.max_slope_deg:g}°, step {length(vehicle.max_step)}, roughness {length(vehicle.max_roughness)}, "
-            f"clearance {length(vehicle.clearance)}; a hazard is what exceeds one within "
-            f"{scene.view.config.risk.sigmas:g} standard deviations, caution what comes near it. {_path_words(scene)} "
+            f"clearance {length(vehicle.clearance)}. Hazard: a limit is exceeded once "
+            f"{scene.view.config.risk.sigmas:g} standard deviations of the measure are added to it; caution: it comes "
+            f"near one. {_path_words(scene)} "
         )
     else:
         assert world is not None
@@ -149,7 +150,7 @@ def _path_words(scene: Scene) -> str:
     if drive is not None:
         return (
             f"{driving.outcome(drive)}; no path is planned over the whole map, what was driven is shown stop by stop. "
-            "A disk around the start, which no camera saw, may be taken for flat ground (stage start_area)."
+            "A disk around the start, which no camera saw, may be taken for flat ground."
         )
     if scene.path is None:
         found = scene.view.bundle(scene.view.products.path)
@@ -332,7 +333,7 @@ _FIGURES: tuple[tuple[str, Maker, Condition, str, str], ...] = (
     ),
     ("Figure 6. Disparities", _disparities, _always, "disparity images undistorted", ""),
     ("Stops", stops.strip, _planned, "disparity images undistorted local_dem local_risk local_path drive", ""),
-    ("Rig", checks.rig, lambda scene: bool(scene.view.products.rigs), "rigs orientations", "sequence.rig"),
+    ("Rig", checks.rig, lambda scene: bool(scene.view.products.rigs), "rigs orientations accuracy", "sequence.rig"),
     ("Figure 7. Ortho image and path", _terrain, _always, "tiles world_dem risk path", "config.vehicle"),
     ("Figure 3. Local risk map", _local, _planned, "local_path local_risk drive", ""),
     ("Figure 8. Tracks", _tracks, _several, "images undistorted tracks resections", ""),

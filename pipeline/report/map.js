@@ -85,9 +85,10 @@
   };
   const paint = () => {
     const pen = sheet.getContext("2d"), out = pen.createImageData(D.cols, D.rows), o = out.data, ortho = state.base === "ortho", color = painter();
+    const empty = state.layer === "risk" ? [...classes[3], 255 * state.opacity] : [0, 0, 0, 0]; /* nothing is known of it */
     if (!ortho && !hills) hills = shaded();
     for (let k = 0, i = 0; k < N; k++, i += 4) {
-      if (!(A[i] || A[i + 1])) continue; /* unknown ground stays transparent */
+      if (!(A[i] || A[i + 1])) { for (let j = 0; j < 4; j++) o[i + j] = empty[j]; continue; }
       const c = color(k), mix = c ? state.opacity : 0;
       for (let j = 0; j < 3; j++) o[i + j] = (ortho ? photo[i + j] : hills[k]) * (1 - mix) + (c ? c[j] * mix : 0);
       o[i + 3] = 255;
@@ -99,14 +100,17 @@
   const legend = () => {
     const spot = $("legend"), name = state.layer;
     spot.replaceChildren();
+    /* As they look over ground of a middle grey. */
+    const seen = (color) => `rgb(${color.map((v) => Math.round(128 + state.opacity * (v - 128)))})`;
     const add = (color, words) => { const li = document.createElement("li"), i = document.createElement("i"); i.style.background = color; li.append(i, words); spot.append(li); };
     const bar = (words) => { add(gradient(), words); spot.lastChild.firstChild.style.width = "6em"; };
-    if (name === "risk") D.colors.forEach((c, i) => add(c, CLASSES[i]));
-    else if (name === "reason") Object.keys(D.reasons).forEach((words, n) => { if (there().has(n)) add(`rgb(${KINDS[n % KINDS.length]})`, words); });
+    if (name === "risk") classes.forEach((c, i) => add(seen(c), CLASSES[i]));
+    else if (name === "reason") Object.keys(D.reasons).forEach((words, n) => { if (there().has(n)) add(seen(KINDS[n % KINDS.length]), words); });
     else if (name !== "none") {
       const [low, high] = range[name], show = { slope: (v) => v + "°", p_hazard: String, models: String }[name] || metres;
       bar(`${name}: ${show(low)} to ${show(high)}`);
     }
+    if (name !== "risk") add("#8d8f9833", "no elevation");
     if (D.path.length) { add("#111", "path"); add("#ffd34d", "vehicle at its start, to scale"); }
     if (Object.keys(D.legs).length) add("#111", "path that was driven by the vehicle's middle (ring: start)");
     if (D.goal) add("#ffd34d", "goal (star)");

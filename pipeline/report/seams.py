@@ -21,6 +21,13 @@ MOST_ROWS = 12
 """Seams and models in a table; report.json has more of them."""
 
 
+VERDICTS = (("found", "stands out"), ("contradicts", "beyond its σ"))
+"""Facts of a model in the audit, and their words."""
+
+CLOSE = 2.0
+"""Times what noise lets expect up to which seams are said to agree."""
+
+
 def audit(scene: Scene) -> Facts | None:
     """Facts of the audit; None without one, or without a seam."""
     bundle = scene.view.bundle(scene.view.products.overlap_audit)
@@ -67,9 +74,8 @@ def worst(scene: Scene) -> Block | None:
         f"without its bias of {_signed(first['bias'])} and tilt of {_degrees(first['tilt'][0])} along x and "
         f"{_degrees(first['tilt'][1])} along y. A plane is an error of pose (or rig); what is left is noise of the "
         "matching, and edges that two views see apart. In the table noise is compared with what both models' own "
-        f"standard deviations let expect. ± is one standard deviation, from the scatter of blocks of cells. Seams are "
-        f"off by {math.sqrt(found['variance_factor']):.2g} times what noise alone lets expect (median): where that is "
-        "far above 1, poses are less exact than elevations."
+        f"standard deviations let expect. ± is one standard deviation, from the scatter of blocks of cells. "
+        f"{_judged(math.sqrt(found['variance_factor']))}"
     )
     return Block("Seams", "Seams between elevation models, the worst first", caption, panels, table=_seam_table(found))
 
@@ -82,14 +88,14 @@ def models(scene: Scene) -> Block | None:
     listed = found["models"]
     named = [m for m in listed if m["found"] or m["contradicts"]]
     words = [
-        "Bias (at the middle of a model) and tilt that explain the seams of a model best, its neighbours held; the "
-        "worst model was taken out of the seams before the next one was judged. A model is found when chance, and the "
-        "poses of the others, lead to as much once in ten thousand; it contradicts when the error is more than its "
-        "sigma allows."
+        f"Look first at {', '.join('pair ' + str(m['pair']) for m in named[:MOST_ROWS])}."
+        if named
+        else "No model stands out.",
+        "Bias (at the middle of a model) and tilt explain a model's seams best, its neighbours held; the worst model "
+        " was taken out before the next one was judged. A model stands out where chance and the other "
+        "models' poses give as much only once in ten thousand; it is beyond its σ where the error is larger than its "
+        "own standard deviations allow.",
     ]
-    words.append(
-        f"Named: {', '.join('pair ' + str(m['pair']) for m in named[:MOST_ROWS])}." if named else "No model stands out."
-    )
     rows = tuple(
         (
             str(m["pair"]),
@@ -97,13 +103,19 @@ def models(scene: Scene) -> Block | None:
             *(f"{_degrees(t)} ± {number(math.degrees(s), 2)}°" for t, s in zip(m["tilt"], m["sigma"][1:], strict=True)),
             _size(m["systematic"]),
             _size(m["expected"]),
-            ", ".join(word for word in ("found", "contradicts") if m[word]) or "–",
+            ", ".join(word for key, word in VERDICTS if m[key]) or "as expected",
         )
         for m in listed[:MOST_ROWS]
     )
-    head = ("Pair", "bias", "tilt along x", "tilt along y", "RMS of both", "sigma of a cell's difference", "verdict")
+    head = ("Pair", "bias", "tilt along x", "tilt along y", "RMS of both", "σ of a cell's difference", "verdict")
     table = Table(head, rows, frozenset(range(1, 6)))
     return Block("Seam audit", "Elevation models by their own error", " ".join(words), (), table=table)
+
+
+def _judged(factor: float) -> str:
+    """What the errors of the seams say, over those that noise alone would make."""
+    off = f"Seams are off by {factor:.2g} times what noise alone lets expect (median)"
+    return f"{off}: {'they agree' if factor <= CLOSE else 'poses (or the rig) are less exact than elevations'}."
 
 
 def _plane(at: Facts, extent: canvas.Extent, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -296,8 +296,9 @@ class _Chooser:
         value = float(fit.x[i])
         asked, certain = self._estimate(i, others)
         why = (
-            f"contradicted by {abs(asked) / certain:.0f} sigmas: it moves rows by {abs(value) * self.rows[i]:.2f} px, "
-            f"depth by {abs(value) * math.sqrt(float(self.depth[i, i])):.2%}"
+            f"contradicted: {abs(asked) / certain:.0f} times the images' own error, without that of what is held; it "
+            f"moves rows by {abs(value) * self.rows[i]:.2f} px, depth by "
+            f"{abs(value) * math.sqrt(float(self.depth[i, i])):.2%}"
         )
         return Parameter(NAMES[i], value, value, sigma, observed, True, why)
 

@@ -238,7 +238,7 @@ def test_one_stop_without_a_local_path_is_not_nothing_missing(tmp_path: Path) ->
     facts, page_, _, _ = written(tmp_path, view(made))
     (missing,) = facts["missing"]
     assert missing["what"] == "1 of 2 stops have no local path"
-    assert missing["why"].startswith("no free cell (frame 4); the path over the merged terrain is whole")
+    assert missing["why"].startswith("no free cell (frame 4); a path over the merged terrain was found all the same")
     assert "Nothing is missing" not in page_.text
     assert "every stop has a local path" not in facts["delivered"]
     assert facts["complete"] is True  # it was looked for: that is an answer

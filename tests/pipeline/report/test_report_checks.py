@@ -123,7 +123,8 @@ def test_a_broken_comparison_says_why(tmp_path: Path) -> None:
 
 
 def test_no_comparison_is_told_only_where_it_was_switched_off(tmp_path: Path) -> None:
-    config = SimpleNamespace(vehicle=Vehicle(), risk=RiskParams(), crosscheck=SimpleNamespace(enabled=False))
+    vehicle = Vehicle(name="rover")
+    config = SimpleNamespace(vehicle=vehicle, risk=RiskParams(), crosscheck=SimpleNamespace(enabled=False))
     facts, _, html, _ = written(tmp_path, view(config=config))
     assert facts["missing"] == []
     assert [m["kind"] for m in facts["absent"]] == ["crosscheck"]

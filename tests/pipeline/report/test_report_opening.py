@@ -4,9 +4,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from toys.finished import view, written
 
-from rille.pipeline.report import delivery, page, summary, terrain_map
+from rille.pipeline.report import checks, delivery, page, summary, terrain_map
 from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.risk import RiskParams
+from rille.stages.hazard.vehicle import Vehicle
 
 
 def metric(value, unit, label="", truth=None, completeness=None):
@@ -35,12 +38,14 @@ def rows(*paths):
     return [{"frame": 2 * k, "path": path} for k, path in enumerate(paths)]
 
 
-def test_a_missing_local_path_names_the_shorter_list_of_stops_and_whether_the_merged_path_is_whole():
+def test_a_missing_local_path_names_the_shorter_list_of_stops_and_whether_there_is_a_merged_path():
     (few,) = delivery._local_paths(rows("found", "closed", "found", None, "found"), merged=False)
     assert few["what"] == "1 of 4 stops have no local path"
     assert few["why"] == "closed (frame 2)"
     (most,) = delivery._local_paths(rows("closed", "closed", "found", "closed"), merged=True)
-    assert most["why"].startswith("closed (all stops but frame 4); the path over the merged terrain is whole")
+    assert most["why"].startswith(
+        "closed (all stops but frame 4); a path over the merged terrain was found all the same"
+    )
     (all_of_them,) = delivery._local_paths(rows("closed", "closed"), merged=False)
     assert all_of_them["why"] == "closed (frames 0, 2)"
     assert delivery._local_paths(rows("found", None), merged=True) == []
@@ -53,6 +58,32 @@ def test_standard_deviations_that_truth_contradicts_are_warned_of(nees, words):
     found = summary._sigma_warning(view)
     assert len(found) == len(words)
     assert all(word in line for word, line in zip(words, found, strict=True))
+
+
+@pytest.mark.parametrize(("vehicle", "told"), [(Vehicle(), True), (Vehicle(track=0.5), False)])
+def test_limits_that_nobody_stated_are_told(tmp_path, vehicle, told):
+    facts, read, _, _ = written(tmp_path, view(config=SimpleNamespace(vehicle=vehicle, risk=RiskParams())))
+    assert [m["kind"] for m in facts["absent"]] == ["vehicle"] * told
+    assert ("0.700 m between its axles, 0.600 m between its wheels, up to 20°" in read.text) == told
+
+
+@pytest.mark.parametrize(
+    ("change", "scale", "words"),
+    [
+        ({}, None, "compare a known length"),
+        ({}, -0.31, "off by 0.31 % against the truth"),
+        ({"asked": 0.1}, None, None),
+        ({"observed": True}, None, None),
+        ({"freed": True}, None, None),
+    ],
+)
+def test_a_turn_that_the_images_ask_for_but_cannot_tell_is_judged_by_the_truth(change, scale, words):
+    yaw = {"name": "yaw", "freed": False, "observed": False, "asked": 0.4, "sigma": 0.05} | change
+    accuracy = None if scale is None else SimpleNamespace(meta={"metrics": {"scale_error": {"value": scale}}})
+    scene = SimpleNamespace(view=SimpleNamespace(products=SimpleNamespace(accuracy=accuracy), bundle=lambda h: h))
+    found = " ".join(checks._untold(scene, SimpleNamespace(collected=lambda name: [yaw])))
+    assert words in found if words else found == ""
+    assert "yaw +0.4000°" in found or not words
 
 
 def test_the_profile_shows_the_inclination_that_was_judged():

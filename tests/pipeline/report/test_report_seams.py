@@ -69,12 +69,12 @@ def test_the_model_to_blame_stands_first(scene: Any) -> None:
     block = seams.models(scene)
     assert block is not None
     assert block.table is not None
-    assert "Named: pair 8." in block.caption
+    assert "Look first at pair 8." in block.caption
     first, *rest = block.table.rows
-    assert (first[0], first[-1]) == ("8", "found, contradicts")
+    assert (first[0], first[-1]) == ("8", "stands out, beyond its σ")
     assert first[1].startswith("+20 mm ±")
     assert first[2].startswith("+0.2")
-    assert all(row[-1] == "–" for row in rest)
+    assert all(row[-1] == "as expected" for row in rest)
     facts = seams.facts(scene)
     assert facts is not None
     assert facts["models"][0]["pair"] == 8

@@ -271,7 +271,7 @@ def view(made: dict[str, Bundle] | None = None, *, truth: bool = True, **changes
         products=products(),
         bundle=lambda handle: store.get(handle) if isinstance(handle, str) else None,
         tasks=TASKS,
-        config=SimpleNamespace(vehicle=Vehicle(), risk=RiskParams()),
+        config=SimpleNamespace(vehicle=Vehicle(name="rover of the toy"), risk=RiskParams()),
         config_toml="[locus]\ncell_size = 0.01  # <m>\n",
         seconds=12.3,
         versions={"rille": "0.1.0", "numpy": "2.4"},
