@@ -13,12 +13,10 @@ import json
 import sys
 import time
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
-from functools import cached_property
-from typing import Any
+from collections.abc import Iterable, Mapping
 from urllib.parse import quote
 
-from rille.pipeline.engine.store.manifest import Ref, parsed
+from rille.pipeline.engine.store.manifest import Facts, Ref, parsed
 from rille.pipeline.engine.store.place import Item, Place
 from rille.stages.core.errors import RilleError
 
@@ -36,27 +34,6 @@ KEY = 64
 
 FRESH = 3600.0
 """Seconds after which a run writes again that it used the same artifacts."""
-
-
-class Facts(Mapping[str, Any]):
-    """Facts that are read once somebody asks: of most artifacts of a long sequence nobody does."""
-
-    def __init__(self, line: str, start: int) -> None:
-        self._line, self._start = line, start
-
-    @cached_property
-    def _read(self) -> Mapping[str, Any]:
-        found: Mapping[str, Any] = parsed(self._line[self._start : -1])
-        return found
-
-    def __getitem__(self, name: str) -> Any:
-        return self._read[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._read)
-
-    def __len__(self) -> int:
-        return len(self._read)
 
 
 class Index:
@@ -87,7 +64,7 @@ class Index:
             _, digest, nbytes, stored = parsed(f"{line[:end]}]")
         except (ValueError, TypeError):
             return None
-        return Ref(key, stage, digest, Facts(line, end + 1), nbytes, stored)
+        return Ref(key, stage, digest, Facts(line, end + 1, -1), nbytes, stored)
 
     def forget(self, key: str) -> None:
         """Drop a line whose mark has changed though the file has not: it is written anew at the end."""
@@ -115,7 +92,8 @@ class Index:
 
 
 def _line(mark: str, ref: Ref) -> str:
-    return json.dumps([mark, ref.digest, ref.nbytes, ref.stored, dict(ref.meta)], separators=(",", ":"))
+    facts = ref.meta.text if isinstance(ref.meta, Facts) else json.dumps(dict(ref.meta), separators=(",", ":"))
+    return f"{json.dumps([mark, ref.digest, ref.nbytes, ref.stored], separators=(',', ':'))[:-1]},{facts}]"
 
 
 def pack(lines: Iterable[str]) -> bytes:
