@@ -184,7 +184,10 @@ def _vehicle(view: RunView) -> Items:
     if v != DEFAULT_VEHICLE or view.bundle(view.products.risk) is None:
         return []
     size = f"{metres(v.wheel_base)} between its axles, {metres(v.track)} between its wheels"
-    why = f"hazards and path are those of the {v.name}, {size}, up to {v.max_slope_deg:g}°; give yours by vehicle.*"
+    why = (
+        f"hazards and path are those of the {v.name}, {size}, up to {v.max_slope_deg:g}°; state yours in the manifest, "
+        "or by --set vehicle.track=1.2 and the like"
+    )
     return [_item("vehicle", "No vehicle was stated", why)]
 
 
