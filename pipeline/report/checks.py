@@ -77,7 +77,8 @@ def _untold(scene: Scene, found: Calibration) -> list[str]:
     if scale is None:
         words.append("If depth matters, compare a known length.")
     else:
-        words.append(f"The scale of the motions is off by {number(abs(scale), 2)} % against the truth: depth, too.")
+        off = number(abs(scale), 2)
+        words.append(f"Against the truth the scale of the motions, and with it that of depth, is off by {off} %.")
     return words
 
 

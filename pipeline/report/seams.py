@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,9 @@ from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.words import number, spread
 
 Facts = Mapping[str, Any]
+
+MOST_NAMED = 5
+"""Models that a caption names."""
 
 MOST_ROWS = 12
 """Seams and models in a table; report.json has more of them."""
@@ -88,7 +91,7 @@ def models(scene: Scene) -> Block | None:
     listed = found["models"]
     named = [m for m in listed if m["found"] or m["contradicts"]]
     words = [
-        f"Look first at {', '.join('pair ' + str(m['pair']) for m in named[:MOST_ROWS])}."
+        f"{len(named)} of {len(listed)} models stand out; look first at {_listed(named[:MOST_NAMED])}."
         if named
         else "No model stands out.",
         "Bias (at the middle of a model) and tilt explain a model's seams best, its neighbours held; the worst model "
@@ -110,6 +113,10 @@ def models(scene: Scene) -> Block | None:
     head = ("Pair", "bias", "tilt along x", "tilt along y", "RMS of both", "σ of a cell's difference", "verdict")
     table = Table(head, rows, frozenset(range(1, 6)))
     return Block("Seam audit", "Elevation models by their own error", " ".join(words), (), table=table)
+
+
+def _listed(models: Sequence[Facts]) -> str:
+    return f"pair{'s' if len(models) > 1 else ''} {', '.join(str(m['pair']) for m in models)}"
 
 
 def _judged(factor: float) -> str:

@@ -127,7 +127,7 @@ def settings(options: Options) -> Settled:
     # A manifest warns of its baseline itself, with the key to change.
     if doubts and not any("baseline" in line for line in sequence.warnings):
         sequence = replace(sequence, warnings=(*sequence.warnings, *doubts))
-    vehicle, source = {}, "default rover of the program (neither the sequence nor the user states one)"
+    vehicle, source = {}, "nobody, so they are the defaults"
     if sequence.vehicle is not None:
         vehicle, source = {"vehicle": sequence.vehicle.model_dump()}, f"sequence {sequence.name}"
     if "vehicle" in for_stages:

@@ -71,7 +71,7 @@ def test_limits_that_nobody_stated_are_told(tmp_path, vehicle, told):
     ("change", "scale", "words"),
     [
         ({}, None, "compare a known length"),
-        ({}, -0.31, "off by 0.31 % against the truth"),
+        ({}, -0.31, "with it that of depth, is off by 0.31 %"),
         ({"asked": 0.1}, None, None),
         ({"observed": True}, None, None),
         ({"freed": True}, None, None),
