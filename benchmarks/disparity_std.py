@@ -100,7 +100,7 @@ def judged(
     uncertainty.standard_deviation = recording
     try:
         params = HfvmParams.model_validate({"preset": preset})
-        found = hfvm.match(left, right, params, left_valid=left_valid, right_valid=right_valid)
+        found = hfvm.match(left, right, params, valid=(left_valid, right_valid))
     finally:
         uncertainty.standard_deviation = original
     ok = np.isfinite(found.disparity_std) & np.isfinite(truth)

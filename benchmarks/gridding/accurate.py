@@ -27,7 +27,7 @@ def jobs(scene: Scene) -> dict[str, Callable[[], Any]]:
     def matching() -> None:
         found.clear()
         for (image, valid), (other, also) in (sides, sides[::-1]):
-            d = match(image, other, chosen.hfvm, left_valid=valid, right_valid=also)
+            d = match(image, other, chosen.hfvm, valid=(valid, also))
             good = usable(d.validity, d.backmatch_error, chosen.locus)
             found.append(Matches(d.column_disparity, d.row_disparity, good, d.disparity_std))
 

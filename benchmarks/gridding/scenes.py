@@ -79,7 +79,7 @@ def match(scene: Scene, preset: str = "default") -> Disparities:
     from rille.stages.hfvm.stage import match as hfvm
 
     params = config.build({"hfvm": {"preset": preset}}).hfvm
-    found = hfvm(scene.left, scene.right, params, left_valid=scene.valid[0], right_valid=scene.valid[1])
+    found = hfvm(scene.left, scene.right, params, valid=(scene.valid[0], scene.valid[1]))
     maps = found.column_disparity, found.row_disparity, matched(found.validity)
     return Disparities(*maps, found.backmatch_error, found.disparity_std)
 

@@ -121,7 +121,7 @@ def build(seed: int, cover: float, slope_deg: float, preset: str = "default") ->
     assert isinstance(sequence.rig, Rig)
     images = np.asarray(left["image"]), np.asarray(right["image"])
     forth, back = (
-        match(a["image"], b["image"], chosen.hfvm, left_valid=a["valid"], right_valid=b["valid"]) if wanted else None
+        match(a["image"], b["image"], chosen.hfvm, valid=(a["valid"], b["valid"])) if wanted else None
         for a, b, wanted in ((left, right, True), (right, left, chosen.locus.both))
     )
     pair = Pair(images, sequence.rig, chosen.locus, forth, back)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export import colour, ranges
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.writers import write_raster
+from rille.pipeline.export.writers import Meaning, write_raster
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.lattice import Lattice, mosaic, union
 from rille.stages.hazard.risk import REASONS
@@ -54,7 +54,7 @@ def _raster(file: str, band: str, unit: str, values: Values) -> Callable[..., No
     def write(folder: Path, view: Any) -> None:
         lattice, found = values(view)
         bands = {band: np.asarray(found, np.float32)}
-        write_raster(folder / file, bands, lattice, unit=unit, nodata=NAN, place=view.sequence.georeference)
+        write_raster(folder / file, bands, lattice, Meaning(unit), view.sequence.georeference)
 
     return write
 
@@ -71,7 +71,7 @@ def _slope(view: Any) -> tuple[Lattice, NDArray[Any]]:
 def _write_hillshade(folder: Path, view: Any) -> None:
     lattice, elevation = _merged("elevation")(view)
     bands, place = {"hillshade": hillshade(elevation, lattice.cell)}, view.sequence.georeference
-    write_raster(folder / "hillshade.tif", bands, lattice, unit="", nodata=0, tags=LIGHT, place=place)
+    write_raster(folder / "hillshade.tif", bands, lattice, Meaning(nodata=0, tags=LIGHT), place)
 
 
 def _write_ortho(folder: Path, view: Any) -> None:
@@ -79,13 +79,13 @@ def _write_ortho(folder: Path, view: Any) -> None:
     lattice, grey = _merged("ortho")(view)
     place, path = view.sequence.georeference, folder / "ortho.tif"
     if not colour.coloured(view):
-        write_raster(path, {"ortho": np.asarray(grey, np.float32)}, lattice, unit="", nodata=NAN, place=place)
+        write_raster(path, {"ortho": np.asarray(grey, np.float32)}, lattice, Meaning(), place)
         return
     # 0 is the number of a frame, so no frame is -1.
     source = whole(list(map(view.bundle, view.products.tiles)), "source", -1)[1]
     merged = {"ortho": grey, "elevation": _merged("elevation")(view)[1], "source": source}
     bands = dict(zip(("red", "green", "blue"), np.moveaxis(colour.ortho(view, lattice, merged), 2, 0), strict=True))
-    write_raster(path, bands, lattice, unit="", nodata=0, place=place)
+    write_raster(path, bands, lattice, Meaning(nodata=0), place)
 
 
 def _write_dem_style(folder: Path, view: Any) -> None:
@@ -109,8 +109,8 @@ def _write_risk(folder: Path, view: Any) -> None:
     tags = {"classes": ", ".join(f"{k} {name}" for k, name in enumerate(CLASSES))} | _vehicle(risk)
     lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
     # No nodata: class 3, unknown, is to be seen and counted like the others.
-    bands, colours = {"class": np.asarray(risk["risk"], np.uint8)}, list(CLASSES.values())
-    write_raster(folder / "risk.tif", bands, lattice, unit="", nodata=None, tags=tags, place=place, colours=colours)
+    meaning = Meaning(nodata=None, tags=tags, colours=list(CLASSES.values()))
+    write_raster(folder / "risk.tif", {"class": np.asarray(risk["risk"], np.uint8)}, lattice, meaning, place)
 
 
 def _write_class_names(folder: Path, view: Any) -> None:
@@ -125,7 +125,7 @@ def _write_reasons(folder: Path, view: Any) -> None:
     bands = {"reason": np.asarray(risk["reason"], np.uint16), "filled": np.asarray(risk["filled"], np.uint16)}
     tags = {"reason_bits": ", ".join(f"{bit} {name}" for name, bit in REASONS.items())}
     lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
-    write_raster(folder / "reason.tif", bands, lattice, unit="", nodata=None, tags=tags, place=place)
+    write_raster(folder / "reason.tif", bands, lattice, Meaning(nodata=None, tags=tags), place)
 
 
 def _write_hazard(folder: Path, view: Any) -> None:
@@ -137,7 +137,7 @@ def _write_hazard(folder: Path, view: Any) -> None:
     unit = {name: {"rad": "degree"}.get(units.get(name, ""), units.get(name, "")) for name in bands}
     given = {name: rounded(np.asarray(values, dtype=np.float32), BITS) for name, values in bands.items()}
     lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
-    write_raster(folder / "hazard.tif", given, lattice, unit=unit, nodata=NAN, tags=_vehicle(risk), place=place)
+    write_raster(folder / "hazard.tif", given, lattice, Meaning(unit, tags=_vehicle(risk)), place)
 
 
 def _vehicle(risk: Bundle) -> dict[str, str]:

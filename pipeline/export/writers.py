@@ -8,8 +8,10 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -50,16 +52,31 @@ GPKG_DATE = "2000-01-01T00:00:00.000Z"
 """Written as time of change into every GeoPackage, so that equal paths make equal files."""
 
 
+@dataclass(frozen=True)
+class Meaning:
+    """What the values of a raster mean.
+
+    Parameters
+    ----------
+    unit : unit of the values, or of each band by name; ``"m"`` is written as GDAL's ``metre``.
+    nodata : value of unknown cells (NaN for floats). None where every value means something; the overviews then take
+        the most frequent value, since classes have no mean.
+    tags : more metadata; the frame, the unit and the cell size are always there.
+    colours : of the values 0, 1, ... of the one band, ``#rrggbb``.
+    """
+
+    unit: str | Mapping[str, str] = ""
+    nodata: float | None = math.nan
+    tags: Mapping[str, str] = field(default_factory=dict)
+    colours: Sequence[str] = ()
+
+
 def write_raster(
     path: Path,
     bands: Mapping[str, NDArray[Any]],
     lattice: Lattice,
-    *,
-    unit: str | Mapping[str, str],
-    nodata: float | None,
-    tags: Mapping[str, str] | None = None,
+    meaning: Meaning,
     place: Georeference | None = None,
-    colours: Sequence[str] | None = None,
 ) -> None:
     """Write a cloud-optimised GeoTIFF in the engineering CRS, or in that of ``place``.
 
@@ -67,13 +84,8 @@ def write_raster(
     ----------
     path : file to write or replace.
     bands : arrays (row, col) of one dtype on ``lattice``, by the band's name.
-    unit : unit of the values, or of each band by name; ``"m"`` is written as GDAL's ``metre``.
-    nodata : value of unknown cells (NaN for floats). None where every value means something; the overviews then take
-        the most frequent value, since classes have no mean.
-    tags : more metadata; the frame, the unit and the cell size are always there.
     place : of the world frame. The raster is not resampled: its geotransform is turned by the azimuth. Elevations have
         to be heights in its system already.
-    colours : of the values 0, 1, ... of the one band, ``#rrggbb``.
 
     Raises
     ------
@@ -93,15 +105,16 @@ def write_raster(
         "dtype": next(iter(bands.values())).dtype.name,
         "crs": rasterio.crs.CRS.from_user_input(ENGINEERING_CRS if place is None else place.crs),
         "transform": raster_transform(lattice, place),
-        "nodata": nodata,
+        "nodata": meaning.nodata,
         "compress": "deflate",
         "level": 1,
         "num_threads": "all_cpus",
         # COG chooses by the dtype: differences of whole numbers (2) or of floats (3).
         "predictor": "yes",
         "blocksize": 256,
-        "overview_resampling": "mode" if nodata is None else "average",
+        "overview_resampling": "mode" if meaning.nodata is None else "average",
     }
+    unit = meaning.unit
     units = [unit if isinstance(unit, str) else unit[name] for name in bands]
     facts = {
         "FRAME": FRAME,
@@ -116,10 +129,10 @@ def write_raster(
             file.set_band_description(number, name)
         if list(bands) == ["red", "green", "blue"]:
             file.colorinterp = [rasterio.enums.ColorInterp[name] for name in bands]
-        if colours is not None:
-            file.write_colormap(1, {k: tuple(bytes.fromhex(c[1:])) for k, c in enumerate(colours)})
+        if meaning.colours:
+            file.write_colormap(1, {k: tuple(bytes.fromhex(c[1:])) for k, c in enumerate(meaning.colours)})
         file.units = tuple("metre" if u == "m" else u for u in units)
-        file.update_tags(**facts, **{key.upper(): value for key, value in dict(tags or {}).items()})
+        file.update_tags(**facts, **{key.upper(): value for key, value in meaning.tags.items()})
 
 
 def raster_transform(lattice: Lattice, place: Georeference | None) -> Any:

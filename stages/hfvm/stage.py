@@ -61,8 +61,7 @@ def match(
     right: AnyArray,
     params: HfvmParams | None = None,
     *,
-    left_valid: AnyArray | None = None,
-    right_valid: AnyArray | None = None,
+    valid: tuple[AnyArray | None, AnyArray | None] = (None, None),
     prior: tuple[AnyArray, AnyArray] | None = None,
     tell: Tell | None = None,
     side: int | None = None,
@@ -73,7 +72,7 @@ def match(
     ----------
     left, right : (row, col) grey images, uint8, uint16 or floating point 0..255; sizes may differ.
     params : matcher's parameters; None: preset ``default``.
-    left_valid, right_valid : (row, col), not zero where usable; None: everywhere.
+    valid : of the left and the right image (row, col), not zero where usable; None: everywhere.
     prior : column and row disparities of the left image, pixels, NaN undefined, to start from (see
         :mod:`rille.stages.hfvm.coarse_to_fine.start`); None: nothing is known.
     tell : told of the progress.
@@ -91,7 +90,7 @@ def match(
     ``MATCHED``, and the other bits say why.
     """
     levels = PyramidParams()
-    a, b = pyramid.build(left, levels, left_valid), pyramid.build(right, levels, right_valid)
+    a, b = (pyramid.build(image, levels, usable) for image, usable in zip((left, right), valid, strict=True))
     return match_pyramids(a, b, params or HfvmParams(), start.check(prior, left.shape), tell, side)
 
 

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import AnyArray
 from rille.stages.core.validity import matched
 from rille.stages.hfvm.coarse_to_fine import accurate, hierarchy, start
 from rille.stages.hfvm.coarse_to_fine.hierarchy import Prepared, State
@@ -252,9 +251,9 @@ def enlarged(found: Results, mask: Raster, window: Window, right_shape: Shape) -
     2 x 2 pixels each. ``mask``: of the left image, at full resolution."""
     names = "column_disparity", "row_disparity", "validity", "backmatch_error", "distance"
     out: Results = {name: np.empty(window.shape, np.uint8 if name == "validity" else np.float32) for name in names}
-    maps: list[AnyArray] = [found[name] for name in names]
+    maps, larger = (tuple(given[name] for name in names) for given in (found, out))
     size = right_shape[0], right_shape[1]
-    resample.enlarge(*maps, cut(mask, window), size, *(out[name] for name in names), window.x0, window.y0)
+    resample.enlarge(maps, cut(mask, window), size, larger, window.x0, window.y0)
     std = (2.0 * found["disparity_std"]).repeat(2, axis=0)[: window.shape[0]].repeat(2, axis=1)[:, : window.shape[1]]
     std = np.where(matched(out["validity"]), std, np.float32(np.nan)).astype(np.float32)
     return {**out, "disparity_std": std}

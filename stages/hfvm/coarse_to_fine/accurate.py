@@ -35,8 +35,7 @@ class AccurateSolver:
             _view(b),
             (np.asarray(found.u), np.asarray(found.v)),
             None if up is None else (np.asarray(up.u), np.asarray(up.v)),
-            band.lines(a.window),
-            band.mu,
+            (band.lines(a.window), band.mu),
             paths.Weights(p.path_compact, p.path_small, p.path_large, p.path_grey),
             p.path_rounds,
         )

@@ -145,19 +145,18 @@ class FastSolver:
         at = (*offset(a, b), a.window.x0, a.window.y0)
         u, v = np.empty(shape, np.int16), np.empty(shape, np.int16)
         packed, data, dirty = (self._room(name, shape, kind) for name, kind in ROOM)
-        f, mu = band.f, np.float32(band.mu)
+        words, soft = (a.words, b.words), (band.f, np.float32(band.mu))
         if up is None:
-            reach_x, reach_y = top_reach(p, *shapes)
-            search.exhaustive(a.words, b.words, reach_x, reach_y, 1, u, v, data)
+            search.exhaustive(words, top_reach(p, *shapes), 1, (u, v, data))
             propagation.pack_map(u, v, packed)
         else:
             reach = p.search_columns, p.search_rows
-            propagation.descend(a.words, b.words, up.u, up.v, *reach, p.centres, f, mu, packed, data, *at)
+            propagation.descend(words, (up.u, up.v), reach, p.centres, soft, (packed, data), at)
         rounds = self.rounds(level)
         # Rows are settled on the coarser levels, where trying them costs little; of a single round on the finest one,
         # which costs most, jumps are wanted alone: the search has just tried the columns beside.
         beside = 2 if level > 0 else 1 if rounds > 1 else 0
-        propagation.checkerboard(a.words, b.words, packed, data, dirty, f, mu, p.smoothness, rounds, beside, *at)
+        propagation.checkerboard(words, (packed, data, dirty), soft, p.smoothness, rounds, beside, at)
         propagation.unpack(packed, u, v)
         return Map(u, v, np.zeros(shape, bool))
 
@@ -173,7 +172,7 @@ class FastSolver:
         """Sub-pixel map from distances summed over :data:`SUM_RADIUS`."""
         u, v, d = (np.empty(a.window.shape, np.float32) for _ in range(3))
         at = offset(a, b)
-        subpixel.summed(a.words, b.words, m.u, m.v, wanted.astype(np.uint8), u, v, d, *at)
+        subpixel.summed((a.words, b.words), (m.u, m.v), wanted.astype(np.uint8), (u, v, d), at)
         return Fine(u, v, d)
 
 
@@ -219,7 +218,8 @@ class PaperSolver:
         shape = a.window.shape
         u, v = np.empty(shape, np.int16), np.empty(shape, np.int16)
         distance, found = np.empty(shape, np.float32), np.empty((*shape, 2), np.float32)
-        paper.search(a.words, b.words, cu, cv, reach_x, reach_y, u, v, distance, found, *offset(a, b))
+        reach = reach_x, reach_y
+        paper.search((a.words, b.words), (cu, cv), reach, (u, v, distance, found), offset(a, b))
         return u, v, distance, found
 
 

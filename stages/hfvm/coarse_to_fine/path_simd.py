@@ -11,6 +11,7 @@ from typing import Any
 
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from rille.stages.hfvm.level import simd
@@ -34,21 +35,25 @@ def _at(context: Any, builder: Any, kind: Any, array: Any, index: Any, as_kind: 
 
 
 @intrinsic
-def step(typingctx, cu, cv, cost, path, there, out, here, total, at, small, far):  # type: ignore[no-untyped-def]
+def step(typingctx, candidates, places, path, out, total, penalty):  # type: ignore[no-untyped-def]
     """One step of one direction: costs of getting to the candidates of a pixel from those of the pixel before.
 
-    ``cu, cv, cost`` hold the candidates of all pixels; ``at`` and ``there`` are where those of the pixel and of the
-    pixel before begin. ``path``, at ``path[0]``: costs of the latter, none below 0. Candidate k costs
+    ``candidates``: column and row displacements and costs of those of all pixels; ``places``: where those of the pixel
+    (``at``) and of the pixel before begin. ``path``: costs of the latter, none below 0. ``penalty``: (small, far).
+    Candidate k costs
 
         cost[k] + min over m (path[m] + min(small * |difference of k and m|, far)) - min over m path[m]
 
-    which is written to ``out[here:]`` and added to ``total[at:]``.
+    which is written to ``out`` and added to ``total[at:]``.
     """
     i64 = types.int64
-    signature = types.void(SHORTS, SHORTS, SHORTS, SHORTS, i64, SHORTS, i64, TOTALS, i64, i64, i64)
+    three, two = types.UniTuple(SHORTS, 3), types.UniTuple(i64, 2)
+    signature = types.void(three, two, SHORTS, SHORTS, TOTALS, two)
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        cu, cv, cost, path, there, out, here, total, at, small, far = args
+        candidates, places, path, out, total, penalty = args
+        cu, cv, cost = cgutils.unpack_tuple(builder, candidates)
+        (at, there), (small, far) = (cgutils.unpack_tuple(builder, given) for given in (places, penalty))
 
         def load(kind: Any, array: Any, index: Any, vector: Any) -> Any:
             return builder.load(_at(context, builder, kind, array, index, vector), align=2)
@@ -57,8 +62,8 @@ def step(typingctx, cu, cv, cost, path, there, out, here, total, at, small, far)
             return simd._call(builder, f"llvm.{name}.v{MOST}i16", _SHORTS, *operands)
 
         zero = ir.Constant(_I64, 0)
-        u, v, own = (load(kind, array, at, _SHORTS) for kind, array in zip(sig.args[:3], (cu, cv, cost), strict=True))
-        before = load(sig.args[3], path, zero, _SHORTS)
+        u, v, own = (load(SHORTS, array, at, _SHORTS) for array in (cu, cv, cost))
+        before = load(SHORTS, path, zero, _SHORTS)
         least = simd._call(builder, f"llvm.vector.reduce.smin.v{MOST}i16", _I16, before)
         far16, small16 = builder.trunc(far, _I16), builder.trunc(small, _I16)
         most = simd._splat(builder, far16, MOST)
@@ -71,20 +76,20 @@ def step(typingctx, cu, cv, cost, path, there, out, here, total, at, small, far)
         for m in range(MOST):
             k = ir.Constant(_I64, m)
             gap = None
-            for kind, array, mine in ((sig.args[0], cu, u), (sig.args[1], cv, v)):
-                one = builder.load(_at(context, builder, kind, array, builder.add(there, k), _I16))
+            for array, mine in ((cu, u), (cv, v)):
+                one = builder.load(_at(context, builder, SHORTS, array, builder.add(there, k), _I16))
                 # Saturating: two displacements of opposite sign may differ by more than 16 bits hold.
                 part = call("ssub.sat", simd._splat(builder, one, MOST), mine)
                 part = simd._call(builder, f"llvm.abs.v{MOST}i16", _SHORTS, part, no_poison)
                 gap = part if gap is None else call("umin", call("uadd.sat", gap, part), reach)
             way = call("smin", builder.mul(gap, cost_of_one), most)
-            so_far = builder.load(_at(context, builder, sig.args[3], path, k, _I16))
+            so_far = builder.load(_at(context, builder, SHORTS, path, k, _I16))
             best = call("smin", best, call("sadd.sat", simd._splat(builder, so_far, MOST), way))
         # Less the least, so that costs do not grow along the path and 16 bits go on holding them.
         best = builder.sub(best, simd._splat(builder, least, MOST))
         result = call("sadd.sat", own, best)
-        builder.store(result, _at(context, builder, sig.args[5], out, here, _SHORTS), align=2)
-        pointer = _at(context, builder, sig.args[7], total, at, _INTS)
+        builder.store(result, _at(context, builder, SHORTS, out, zero, _SHORTS), align=2)
+        pointer = _at(context, builder, TOTALS, total, at, _INTS)
         # In 32 bits: the sum of six directions does not fit into 16.
         builder.store(builder.add(builder.load(pointer, align=4), builder.sext(result, _INTS)), pointer, align=4)
         return context.get_dummy_value()

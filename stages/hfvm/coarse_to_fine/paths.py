@@ -74,8 +74,7 @@ def propagate(
     right: LevelView,
     start: tuple[AnyArray, AnyArray],
     up: tuple[AnyArray, AnyArray] | None,
-    lines: AnyArray,
-    mu: float,
+    band: tuple[AnyArray, float],
     weights: Weights,
     rounds: int,
 ) -> tuple[AnyArray, AnyArray]:
@@ -86,8 +85,8 @@ def propagate(
     left, right : images of one level.
     start : columns and rows of displacement (row, col) int16 to start from.
     up : the same of the level above, whose doubled values are candidates too, or None.
-    lines : (row, col, 3) epipolar line of each pixel, not read where ``mu`` is 0.
-    mu : byte steps per pixel off the line.
+    band : epipolar line of each pixel (row, col, 3), and byte steps per pixel off it; lines are not read where they
+        are 0.
     """
     shape = start[0].shape
     maps = np.empty(shape, np.int32)
@@ -96,7 +95,7 @@ def propagate(
     found = Candidates(*(np.empty((*shape, MOST), np.int16) for _ in range(3)))
     total = np.empty((*shape, MOST), np.int32)
     for _ in range(rounds):
-        _gather(left, right, weights.compact, maps, above, (lines, mu), found)
+        _gather(left, right, weights.compact, maps, above, band, found)
         total[:] = 0
         # Three directions each; the two within a row are left out to save time.
         for backward in (False, True):
@@ -190,7 +189,8 @@ def _sweep(found, grey, weights, backward, total):  # type: ignore[no-untyped-de
     rows, cols = grey.shape
     before = np.zeros((3, cols, MOST), np.int16)
     after = np.zeros((3, cols, MOST), np.int16)
-    us, vs, costs, totals = found.u.reshape(-1), found.v.reshape(-1), found.cost.reshape(-1), total.reshape(-1)
+    costs, totals = found.cost.reshape(-1), total.reshape(-1)
+    candidates = found.u.reshape(-1), found.v.reshape(-1), costs
     large, half, small = np.float32(weights.large), np.float32(weights.grey), weights.small
     s = -1 if backward else 1
     for row in range(rows):
@@ -209,7 +209,7 @@ def _sweep(found, grey, weights, backward, total):  # type: ignore[no-untyped-de
                 # Small differences cost less than jumps even where the grey step is greatest.
                 far = np.int64(max(large / (np.float32(1.0) + change / half), 2 * small))
                 there = (j * cols + i) * MOST
-                path_simd.step(us, vs, costs, before[d, i], there, after[d, x], 0, totals, at, small, far)
+                path_simd.step(candidates, (at, there), before[d, i], after[d, x], totals, (small, far))
         before, after = after, before
 
 

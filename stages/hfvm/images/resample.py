@@ -55,15 +55,16 @@ def sample_cubic(a, x, y, x0=0, y0=0):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def enlarge(  # type: ignore[no-untyped-def]
-    u, v, bits, error, distance, valid, right_shape, out_u, out_v, out_bits, out_error, out_distance, x0=0, y0=0
-):
+def enlarge(maps, valid, right_shape, out, x0=0, y0=0):  # type: ignore[no-untyped-def]
     """Displacements of the next finer level: each doubled, for 2 x 2 pixels.
 
+    ``maps`` and ``out``: column and row displacements, validity, error of matching back, distance; each (row, col).
     Both images' pixel centres shift alike, so nothing is to be added. A masked pixel (``valid`` 0) is undefined, and
     so is one whose displacement then leaves the right image; both are marked. ``x0, y0``: first column and row of a
     window (even).
     """
+    u, v, bits, error, distance = maps
+    out_u, out_v, out_bits, out_error, out_distance = out
     two, nan = np.float32(2.0), np.float32(np.nan)
     for y in range(out_u.shape[0]):
         for x in range(out_u.shape[1]):

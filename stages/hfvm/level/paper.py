@@ -27,15 +27,17 @@ def _eq1(f, g):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def search(  # type: ignore[no-untyped-def]
-    left, right, centre_u, centre_v, reach_x, reach_y, out_u, out_v, out_distance, out_offset, ox=0, oy=0
-):
+def search(images, centre, reach, out, at=(0, 0)):  # type: ignore[no-untyped-def]
     """Best match of every pixel in the search area around its centre (Eq. 2, Eq. 3).
 
-    Of equal distances the first in row, column order wins. ``out_distance``: Eq. 1 of the best, -1 where nothing lies
-    inside. ``out_offset`` (row, col, 2): linear sub-pixel offsets (column, row), 4.3.2; 0 at the border of the image.
-    ``ox, oy``: where the left window's first pixel lies in the right window.
+    ``images``: vectors (row, col, 8) of the left and the right one. ``centre``: column and row displacement of each
+    pixel; ``reach``: how far to either side. ``out``: column and row displacement found; distance by Eq. 1, -1 where
+    nothing lies inside; linear sub-pixel offsets (row, col, 2) by 4.3.2, column and row, 0 at the border of the image.
+    Of equal distances the first in row, column order wins. ``at``: column and row of the left window's first pixel in
+    the right window.
     """
+    (left, right), (centre_u, centre_v), (reach_x, reach_y), (ox, oy) = images, centre, reach, at
+    out_u, out_v, out_distance, out_offset = out
     rows, cols = left.shape[:2]
     rrows, rcols = right.shape[:2]
     for y in range(rows):

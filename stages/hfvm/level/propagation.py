@@ -2,7 +2,7 @@
 
 A map is one array of packed displacements, v << 16 | u (int32), beside the cost of each without smoothness. All costs
 are integers, candidates come in a fixed order and only a strictly lower cost wins, so that results do not depend on
-the machine. Eight candidates are looked at together (``strip_lanes`` one pixel's, ``lanes`` eight pixels').
+the machine. Eight candidates are looked at together (``strip_simd`` one pixel's, ``simd`` eight pixels').
 """
 
 from __future__ import annotations
@@ -14,6 +14,10 @@ from rille.stages.hfvm.level import epipolar, simd, strip_simd
 from rille.stages.hfvm.level.features import distance
 from rille.stages.hfvm.level.simd import LANES, SHARP
 from rille.stages.numeric.line import copy_line
+
+HERE = 0, 0, 0, 0
+"""Place of a left window: column and row of its first pixel in the right window, and in the whole left image (the
+latter even)."""
 
 MOST_STRIPS = 512
 """Room for the strips that a pixel searches: 9 centres, 17 rows each, 17 columns in three pieces."""
@@ -40,31 +44,28 @@ def rows_of(packed):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def descend(left, right, up_u, up_v, reach_x, reach_y, count, f, mu, packed, data, ox=0, oy=0, x0=0, y0=0):  # type: ignore[no-untyped-def]
+def descend(images, up, reach, count, band, out, at=HERE):  # type: ignore[no-untyped-def]
     """Search around the doubled displacements of the coarse parent and of its nearest neighbours.
 
-    The four pixels of a parent try the same. ``count``: centres, of the parent, its neighbours along the row, along the
-    column and on the diagonals. ``reach_x, reach_y``: search to either side, along the row, and about the parent also
+    ``images``: words of the left and the right one, (row, col); ``up``: column and row displacements of the coarse
+    level. The four pixels of a parent try the same. ``count``: centres, of the parent, its neighbours along the row,
+    along the column and on the diagonals. ``reach``: how far to either side, along the row, and about the parent also
     along its column; where the band is not sharp, over the whole rectangle about each. Of equal ones the parent's own
-    wins. ``f``: fundamental matrix of the band, zeros without one; the four pixels share the line of their middle.
-    ``mu``: cost per pixel off it, float32. Where the band is sharp each centre is first moved towards its line, by a
-    pixel at most: a coarse fit may be wrong by more than that. ``packed, data`` (row, col) int32 get the displacements
-    and their costs. With nothing inside the other image the prediction stays: it leads out of it. ``ox, oy``: where the
-    left window's first pixel lies in the right window; ``x0, y0``: its column and row, even, in the whole left image.
-    Reach: a coarse pixel.
+    wins. ``band``: fundamental matrix, zeros without one, and the cost per pixel off the line, float32; the four pixels
+    share the line of their middle. Where the band is sharp each centre is first moved towards its line, by a pixel at
+    most: a coarse fit may be wrong by more than that. ``out`` (row, col) int32: packed displacements and their costs.
+    With nothing inside the other image the prediction stays: it leads out of it. ``at``: see :data:`HERE`. Reads a
+    coarse pixel around each.
     """
+    (left, right), (up_u, up_v), (reach_x, reach_y), (f, mu), (packed, data) = images, up, reach, band, out
+    ox, oy, x0, y0 = at
     rows, cols = left.shape
     crows, ccols = up_u.shape
     centres = np.empty((crows + 2, ccols + 2), np.int32)
     _centres(up_u, up_v, f, mu, x0, y0, centres)
     wide = ccols + 2
     plan, best, least = np.empty((MOST_STRIPS, 5), np.int64), np.empty(4, np.int32), np.empty(4, np.int32)
-    here, there, near, lines = (
-        left.reshape(-1),
-        right.reshape(-1),
-        centres.reshape(-1),
-        np.empty((3, ccols), np.float32),
-    )
+    flat, near, lines = (left.reshape(-1), right.reshape(-1)), centres.reshape(-1), np.empty((3, ccols), np.float32)
     rrows, rcols = right.shape
     sizes = cols, rcols
     # A row about a centre fits into eight lanes up to a reach of 3, and ``cross`` holds one row to either side.
@@ -72,26 +73,26 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, count, f, mu, packed, dat
     for j in range(crows):
         _lines(f, x0, y0 + 2 * j, mu, lines)
         for i in range(ccols):
-            at = (j + 1) * wide + i + 1
+            parent = (j + 1) * wide + i + 1
             if in_rows:
-                planned = _rows(near, at, wide, count, reach_x, reach_y, plan)
+                planned = _rows(near, parent, wide, count, reach_x, reach_y, plan)
             else:
-                planned = _rectangles(near, at, wide, count, reach_x, reach_y, mu < SHARP, plan)
+                planned = _rectangles(near, parent, wide, count, reach_x, reach_y, mu < SHARP, plan)
             x, y = 2 * i, 2 * j
             whole = x + 1 < cols and y + 1 < rows
             # Above every cost: the first candidate inside wins, and without any the prediction stays.
-            best[0] = best[1] = best[2] = best[3] = near[at]
+            best[0] = best[1] = best[2] = best[3] = near[parent]
             least[0] = least[1] = least[2] = least[3] = simd.FAR
             line = lines[0, i], lines[1, i], lines[2, i]
             for k in range(planned):
-                u, size, centre, v, cross = plan[k, 0], plan[k, 1], plan[k, 2], plan[k, 3], plan[k, 4]
+                strip = plan[k, 0], plan[k, 1], plan[k, 2], plan[k, 3], plan[k, 4]
+                u, _, _, v, cross = strip
                 xr, yr = x + ox + u, y + oy + v
                 # Eight words are read for either column, whatever the strip's size: all must lie in the image.
                 if whole and xr >= 0 and xr + LANES < rcols and yr >= cross and yr + 1 + cross < rrows:
-                    start, target, place = y * cols + x, yr * rcols + xr, (u, centre, v)
-                    strip_simd.four(here, there, line, start, target, sizes, place, (size, cross), best, least)
+                    strip_simd.four(flat, line, (y * cols + x, yr * rcols + xr), sizes, strip, (best, least))
                 else:
-                    _singly(here, there, line, x, y, (rows, cols), (rrows, rcols), ox, oy, plan, k, best, least)
+                    _singly(flat, line, (x, y), (rows, cols, rrows, rcols), (ox, oy), strip, (best, least))
             packed[y, x], data[y, x] = best[0], least[0]
             if whole:
                 packed[y, x + 1], data[y, x + 1] = best[1], least[1]
@@ -104,11 +105,11 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, count, f, mu, packed, dat
 
 
 @njit(cache=True, nogil=True)
-def _singly(here, there, line, x0, y0, shape, other, ox, oy, plan, at, best, least):  # type: ignore[no-untyped-def]
-    """What ``strip_lanes.four`` does, candidate by candidate: near the borders."""
-    u, count, centre, v, cross = plan[at, 0], plan[at, 1], plan[at, 2], plan[at, 3], plan[at, 4]
-    rows, cols = shape
-    rrows, rcols = other
+def _singly(flat, line, first_pixel, shapes, offset, strip, out):  # type: ignore[no-untyped-def]
+    """What ``strip_simd.four`` does, candidate by candidate: near the borders."""
+    (here, there), (x0, y0), (ox, oy), (best, least) = flat, first_pixel, offset, out
+    u, count, centre, v, cross = strip
+    rows, cols, rrows, rcols = shapes
     most = np.float32(simd.FARTHEST_OFF)
     for n in range(4):
         x, y = x0 + (n & 1), y0 + (n >> 1)
@@ -236,22 +237,24 @@ def _centres(up_u, up_v, f, mu, x0, y0, centres):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True)
-def checkerboard(left, right, packed, data, dirty, f, mu, smoothness, rounds, beside, ox=0, oy=0, x0=0, y0=0):  # type: ignore[no-untyped-def]
+def checkerboard(images, maps, band, smoothness, rounds, beside, at=HERE):  # type: ignore[no-untyped-def]
     """Rounds of propagation in place: each pixel tries its neighbours' displacements, and what lies beside its own.
 
+    ``maps`` (row, col): packed displacements and their costs, int32, and room for marks, uint8: from the second round
+    on only the neighbourhoods of what changed are looked at. ``images``, ``band``, ``at``: as in :func:`descend`.
     ``beside``: nothing (0), a column to either side (1), also a row (2); the latter always where the band is not sharp
     and hardly says in which row to search. A neighbour's that is just a column beside is for ``beside`` to try.
 
     Cost: that of the displacement + ``smoothness`` times the sum over the four neighbours of min(|du| + |dv|, 2);
     beyond the border the neighbour on the other side stands in. The two colours of a checkerboard take turns, which
     settles in half the rounds of all at once. Each turn follows the one before at a row's distance, so that all of them
-    pass over the image while it is at hand. ``dirty`` (row, col) uint8: room; from the second round on only the
-    neighbourhoods of what changed are looked at. ``f``, ``ox, oy``, ``x0, y0``: as in :func:`descend`. A round reaches
-    two pixels.
+    pass over the image while it is at hand. A round reaches two pixels.
     """
+    (left, right), (packed, data, dirty), (f, mu), (ox, oy, x0, y0) = images, maps, band, at
     rows, cols = left.shape
     flat = left.reshape(-1), right.reshape(-1), packed.reshape(-1), data.reshape(-1)
-    shape = (right.shape[0], right.shape[1], cols, ox, x0, 2 if mu < SHARP else np.int64(beside))
+    beside = 2 if mu < SHARP else np.int64(beside)
+    level = (right.shape[0], right.shape[1], cols, ox, x0, beside, np.int64(smoothness))
     room = np.empty((4, cols + LANES), np.int32)
     dirty[:] = 0
     turns = 2 * rounds
@@ -260,14 +263,15 @@ def checkerboard(left, right, packed, data, dirty, f, mu, smoothness, rounds, be
             y = step - turn
             # The absolute row: lines must not depend on where the window begins.
             line = (*epipolar.row_terms(f, np.float64(y + y0)), mu)
-            _turn(flat, dirty, y, turn, line, shape, y + oy, smoothness, turns == 2, room)
+            _turn(flat, dirty, (y, turn, y + oy, turns == 2), line, level, room)
 
 
 @njit(cache=True, nogil=True)
-def _turn(flat, dirty, y, turn, line, shape, yr, smoothness, once, room):  # type: ignore[no-untyped-def]
-    """One colour of row ``y``; ``yr``: the row in the right window; ``once``: no turn will look again."""
+def _turn(flat, dirty, which, line, level, room):  # type: ignore[no-untyped-def]
+    """One colour of a row; ``which``: row, turn, the row in the right window, and whether no turn will look again."""
+    y, turn, yr, once = which
     rows, cols = dirty.shape
-    here, there, packed, cost = flat
+    packed, cost = flat[2], flat[3]
     todo, new, found, moved = room[0], room[1], room[2], room[3]
     above, below = (y - 1 if y > 0 else min(1, rows - 1)), (y + 1 if y < rows - 1 else max(rows - 2, 0))
     flags, before, after = dirty[y], dirty[above], dirty[below]
@@ -291,18 +295,12 @@ def _turn(flat, dirty, y, turn, line, shape, yr, smoothness, once, room):  # typ
     start = y * cols
     for k in range(0, n, LANES):
         a, b = np.int64(todo[k]), np.int64(todo[k + LANES - 1])
-        args = start, above * cols, below * cols, yr
+        place = k, start, above * cols, below * cols, yr
         # Without a gap between the eight columns two plain loads stand for eight gathered ones.
         if k + LANES <= n and b - a == 2 * LANES - 2 and a > 0 and b + 2 < cols:
-            simd.settle_dense(
-                here, there, packed, cost, line, todo, k, args[0], args[1], args[2], args[3], shape, smoothness, new,
-                found,
-            )  # fmt: skip
+            simd.settle_dense(flat, line, todo, place, level, (new, found))
         else:
-            simd.settle(
-                here, there, packed, cost, line, todo, k, args[0], args[1], args[2], args[3], shape, smoothness, new,
-                found,
-            )  # fmt: skip
+            simd.settle(flat, line, todo, place, level, (new, found))
     if once:
         for k in range(n):
             packed[start + todo[k]], cost[start + todo[k]] = new[k], found[k]

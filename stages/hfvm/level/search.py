@@ -13,8 +13,9 @@ NONE = np.iinfo(np.int32).max
 
 
 @njit(cache=True, nogil=True)
-def _keep_least(total, tall, first, last, radius, u, v, best, out_u, out_v):  # type: ignore[no-untyped-def]
-    """Take a displacement where the mean of ``total``, in sixteenths, then its own length, is less than ``best``."""
+def _keep_least(total, tall, columns, radius, tried, best, out):  # type: ignore[no-untyped-def]
+    """Take what is ``tried`` where the mean of ``total``, in sixteenths, then its length, is less than ``best``."""
+    (first, last), (u, v), (out_u, out_v) = columns, tried, out
     length = np.int32(abs(u) + abs(v))
     for x in range(first, last):
         inner = first + radius <= x < last - radius
@@ -27,12 +28,14 @@ def _keep_least(total, tall, first, last, radius, u, v, best, out_u, out_v):  # 
 
 
 @njit(cache=True, nogil=True)
-def exhaustive(left, right, reach_x, reach_y, radius, out_u, out_v, out_cost):  # type: ignore[no-untyped-def]
+def exhaustive(images, reach, radius, out):  # type: ignore[no-untyped-def]
     """Null prediction and large search area (4.3.4), for the top level: least distance summed over a window.
 
-    Mean over the window's pixels that both images show; of equal ones the shorter displacement wins. ``out_cost``:
-    the distance of each pixel alone, which is what ``propagation`` counts with.
+    ``images``: words of the left and the right one, (row, col); ``reach``: columns and rows to either side. Mean over
+    the window's pixels that both images show; of equal ones the shorter displacement wins. ``out``: column and row
+    displacement, and the distance of each pixel alone, which is what ``propagation`` counts with.
     """
+    (left, right), (reach_x, reach_y), (out_u, out_v, out_cost) = images, reach, out
     rows, cols = left.shape
     rrows, rcols = right.shape
     side = 2 * radius + 1
@@ -62,7 +65,7 @@ def exhaustive(left, right, reach_x, reach_y, radius, out_u, out_v, out_cost):  
                         for x in range(cols):
                             total[x] += part[x]
                 tall = min(bottom, y + radius + 1) - max(top, y - radius)
-                _keep_least(total, tall, first, last, radius, u, v, best[y], out_u[y], out_v[y])
+                _keep_least(total, tall, (first, last), radius, (u, v), best[y], (out_u[y], out_v[y]))
     for y in range(rows):
         for x in range(cols):
             out_cost[y, x] = distance(left[y, x], right[y + out_v[y, x], x + out_u[y, x]]) if best[y, x] < NONE else FAR

@@ -100,6 +100,7 @@ def _as(builder: Any, pointer: Any, kind: Any) -> Any:
 WORDS = types.Array(types.uint64, 1, "C")
 PAIRS = types.Array(types.int32, 1, "C")
 TERMS = types.UniTuple(types.float32, 8)
+MAPS = types.Tuple((WORDS, WORDS, PAIRS, PAIRS))
 
 
 def _load(builder: Any, pointer: Any, inside: Any) -> Any:
@@ -224,25 +225,22 @@ def make_settle(width: int, dense: bool = False) -> Any:
     """Intrinsic ``settle``, see :data:`settle`; ``dense``: of every other pixel of a row, see :data:`settle_dense`."""
 
     @intrinsic
-    def settle(  # type: ignore[no-untyped-def]
-        typingctx, left, right, packed, data, line, todo, at, here, above, below, y, shape, smooth, new, cost
-    ):
+    def settle(typingctx, maps, line, todo, place, level, out):  # type: ignore[no-untyped-def]
         i64 = types.int64
-        sizes = types.UniTuple(i64, 6)
-        signature = types.void(
-            WORDS, WORDS, PAIRS, PAIRS, TERMS, PAIRS, i64, i64, i64, i64, i64, sizes, i64, PAIRS, PAIRS
-        )
+        places, whole = types.UniTuple(i64, 5), types.UniTuple(i64, 7)
+        signature = types.void(MAPS, TERMS, PAIRS, places, whole, types.UniTuple(PAIRS, 2))
 
         def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+            maps, line, todo, place, level, out = args
             left, right, packed, data = (
                 context.make_array(kind)(context, builder, a).data
-                for kind, a in zip(sig.args[:4], args[:4], strict=True)
+                for kind, a in zip(MAPS, cgutils.unpack_tuple(builder, maps), strict=True)
             )
-            at, here, above, below, y = args[6:11]
-            rows, cols, left_cols, ahead, begin, beside = (
-                builder.trunc(n, _I32) for n in cgutils.unpack_tuple(builder, args[11])
+            at, here, above, below, y = cgutils.unpack_tuple(builder, place)
+            rows, cols, left_cols, ahead, begin, beside, smooth = (
+                builder.trunc(n, _I32) for n in cgutils.unpack_tuple(builder, level)
             )
-            columns = _pointer(context, builder, sig.args[5], args[5], at)
+            columns = _pointer(context, builder, PAIRS, todo, at)
             if dense:
                 start = builder.load(columns)
                 x = builder.add(_splat(builder, start), _vector(_INTS, range(0, 2 * LANES, 2)))
@@ -268,10 +266,10 @@ def make_settle(width: int, dense: bool = False) -> Any:
             absolute = builder.sitofp(builder.add(x, _splat(builder, begin)), _FLOATS8)
             pixels = _Pixels(
                 builder, width, builder.add(x, _splat(builder, ahead)), _splat(builder, builder.trunc(y, _I32)),
-                read(left, here, x, _WORDS), _lines(builder, args[4], absolute), right, _splat(builder, rows),
+                read(left, here, x, _WORDS), _lines(builder, line, absolute), right, _splat(builder, rows),
                 _splat(builder, cols),
             )  # fmt: skip
-            smooth = _splat(builder, builder.trunc(args[12], _I32))
+            smooth = _splat(builder, smooth)
             total = builder.add(stay, builder.mul(smooth, _rough(builder, own, near)))
             best, found, least = (cgutils.alloca_once_value(builder, a) for a in (own, stay, total))
 
@@ -307,8 +305,8 @@ def make_settle(width: int, dense: bool = False) -> Any:
                     fresh = builder.and_(fresh, builder.icmp_signed("!=", tried, other))
                 with builder.if_then(_any(builder, fresh)):
                     attempt(tried, fresh)
-            for kind, array, slot in ((sig.args[13], args[13], best), (sig.args[14], args[14], found)):
-                pointer = _as(builder, _pointer(context, builder, kind, array, at), _INTS)
+            for array, slot in zip(cgutils.unpack_tuple(builder, out), (best, found), strict=True):
+                pointer = _as(builder, _pointer(context, builder, PAIRS, array, at), _INTS)
                 builder.store(builder.load(slot), pointer, align=4)
             return context.get_dummy_value()
 
@@ -318,19 +316,19 @@ def make_settle(width: int, dense: bool = False) -> Any:
 
 
 settle = make_settle(widest())
-"""``settle(left, right, packed, data, line, todo, at, here, above, below, y, shape, smooth, new, cost)``: the best
+"""``settle((left, right, packed, data), line, todo, (at, here, above, below, y), level, (new, cost))``: the best
 displacement of eight pixels of row ``y`` among each one's own, those a pixel beside it, and those of its four
 neighbours.
 
 ``todo[at : at + 8]``: columns of the pixels, no two of them neighbours. All arrays are flat: words of both images;
 ``packed`` displacements, v << 16 | u, and their costs without smoothness. ``line``: the row's terms of
 :func:`rille.stages.hfvm.level.epipolar.line`, and the length of a normal. ``here, above, below``: index at which the
-row and its neighbours begin. ``shape``: rows and columns of the right image, columns of the left one, the column of the
+row and its neighbours begin. ``level``: rows and columns of the right image, columns of the left one, the column of the
 left one's first pixel in the right one, as ``y`` is the row there (both may be windows), its column in the whole left
-image, and what beside the own one is tried: nothing, columns (1), rows too (2). In this order: own, own a column less,
-more, a row less, more, then up, west, east, down, but for those that lie a column beside the own one; the first of
-equal ones wins. Costs have ``smooth`` times the roughness added. ``new[at : at + 8]`` gets the best ones and ``cost``
-their costs without smoothness.
+image, what beside the own one is tried: nothing, columns (1), rows too (2); and ``smooth``. In this order: own, own a
+column less, more, a row less, more, then up, west, east, down, but for those that lie a column beside the own one; the
+first of equal ones wins. Costs have ``smooth`` times the roughness added. ``new[at : at + 8]`` gets the best ones and
+``cost`` their costs without smoothness.
 """
 
 settle_dense = make_settle(widest(), dense=True)
@@ -352,24 +350,27 @@ def make_sums(width: int) -> Any:
     """Intrinsic ``sums``, see :data:`sums`."""
 
     @intrinsic
-    def sums(typingctx, left, right, at_left, at_right, left_cols, right_cols, count, four, last, at):  # type: ignore[no-untyped-def]
+    def sums(typingctx, images, at, sizes, count, out, index):  # type: ignore[no-untyped-def]
         i64 = types.int64
-        signature = types.void(WORDS, WORDS, i64, i64, i64, i64, i64, WORDS, WORDS, i64)
+        two = types.UniTuple(i64, 2)
+        words = types.UniTuple(WORDS, 2)
+        signature = types.void(words, two, two, i64, words, i64)
 
         def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            left, right, at_left, at_right, left_cols, right_cols, count = args[:7]
+            images, at, sizes, out = (cgutils.unpack_tuple(builder, args[k]) for k in (0, 1, 2, 4))
+            (left, right), (at_left, at_right), (left_cols, right_cols) = images, at, sizes
+            count, index = args[3], args[5]
             reach = builder.add(count, ir.Constant(_I64, 2 * SUM_RADIUS))
             inside = builder.icmp_signed("<", _vector(_WORDS, range(LANES)), _splat(builder, reach))
 
-            def row(kind: Any, array: Any, at: Any, cols: Any, j: int, i: int) -> Any:
+            def row(array: Any, at: Any, cols: Any, j: int, i: int = 0) -> Any:
                 shift = builder.add(builder.mul(cols, ir.Constant(_I64, j)), ir.Constant(_I64, i - SUM_RADIUS))
-                pointer = _pointer(context, builder, kind, array, builder.add(at, shift))
+                pointer = _pointer(context, builder, WORDS, array, builder.add(at, shift))
                 return _load(builder, _as(builder, pointer, _WORDS), inside)
 
-            lefts = [row(sig.args[0], left, at_left, left_cols, j, 0) for j in range(-2, 3)]
-            rights = [row(sig.args[1], right, at_right, right_cols, j, 0) for j in range(-3, 4)]
-            wests = [row(sig.args[1], right, at_right, right_cols, j, -1) for j in range(-2, 3)]
-            easts = [row(sig.args[1], right, at_right, right_cols, j, 1) for j in range(-2, 3)]
+            lefts = [row(left, at_left, left_cols, j) for j in range(-2, 3)]
+            rights = [row(right, at_right, right_cols, j) for j in range(-3, 4)]
+            wests, easts = ([row(right, at_right, right_cols, j, i) for j in range(-2, 3)] for i in (-1, 1))
             totals = []
             for others in (rights[1:6], wests, easts, rights[:5], rights[2:]):
                 total = _vector(_WORDS, [0] * LANES)
@@ -386,14 +387,14 @@ def make_sums(width: int) -> Any:
                 pick = ir.Constant(_INTS, list(range(n, n + LANES)))
                 return builder.shuffle_vector(value, nothing, pick)
 
-            for total, k in ((packed, 7), (totals[4], 8)):
+            for total, array in zip((packed, totals[4]), out, strict=True):
                 # Five columns by three additions: two pairs and one; integers allow any order.
                 pairs = builder.add(total, moved(total, 1))
                 found = builder.add(builder.add(pairs, moved(pairs, 2)), moved(total, 4))
                 first = ir.Constant(ir.VectorType(_I32, SIDE_BY_SIDE), list(range(SIDE_BY_SIDE)))
                 pointer = _as(
                     builder,
-                    _pointer(context, builder, sig.args[k], args[k], args[9]),
+                    _pointer(context, builder, WORDS, array, index),
                     ir.VectorType(_I64, SIDE_BY_SIDE),
                 )
                 builder.store(builder.shuffle_vector(found, nothing, first), pointer, align=8)
@@ -405,10 +406,10 @@ def make_sums(width: int) -> Any:
 
 
 sums = make_sums(widest())
-"""``sums(left, right, at_left, at_right, left_cols, right_cols, count, four, last, at)``: five distances summed over
-5 x 5 pixels, of ``count`` pixels side by side, at most four.
+"""``sums((left, right), (at_left, at_right), (left cols, right cols), count, (four, last), index)``: five distances
+summed over 5 x 5 pixels, of ``count`` pixels side by side, at most four.
 
 Around word ``at_left`` of the left image, and those after it, and ``at_right`` of the right one, displaced by nothing,
-one to the west, east, north, south. The windows must lie inside. ``four[at + k]``: the first four sums, 16 bits each,
-the first one lowest; ``last[at + k]``: the fifth one; four elements are written whatever ``count``.
+one to the west, east, north, south. The windows must lie inside. ``four[index + k]``: the first four sums, 16 bits
+each, the first one lowest; ``last[index + k]``: the fifth one; four elements are written whatever ``count``.
 """

@@ -41,23 +41,20 @@ def make_four(width: int) -> Any:
     """Intrinsic ``four``, see :data:`four`."""
 
     @intrinsic
-    def four(typingctx, left, right, line, here, there, sizes, place, counts, best, least):  # type: ignore[no-untyped-def]
-        i64 = types.int64
-        signature = types.void(
-            simd.WORDS, simd.WORDS, types.UniTuple(types.float32, 3), i64, i64, types.UniTuple(i64, 2),
-            types.UniTuple(i64, 3), types.UniTuple(i64, 2), simd.PAIRS, simd.PAIRS,
-        )  # fmt: skip
+    def four(typingctx, images, line, at, sizes, strip, out):  # type: ignore[no-untyped-def]
+        two, five = types.UniTuple(types.int64, 2), types.UniTuple(types.int64, 5)
+        words, maps = types.UniTuple(simd.WORDS, 2), types.UniTuple(simd.PAIRS, 2)
+        signature = types.void(words, types.UniTuple(types.float32, 3), two, two, five, maps)
 
         def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
             splat, vector = simd._splat, simd._vector
-            left, right, line, here, there = args[:5]
-            cols, rcols = cgutils.unpack_tuple(builder, args[5])
-            u, centre, v = (builder.trunc(n, _I32) for n in cgutils.unpack_tuple(builder, args[6]))
-            count, cross = cgutils.unpack_tuple(builder, args[7])
-            a, b, c = (splat(builder, n) for n in cgutils.unpack_tuple(builder, line))
+            images, line, at, sizes, strip, out = (cgutils.unpack_tuple(builder, given) for given in args)
+            (left, right), (here, there), (cols, rcols), (u, count, centre, v, cross) = images, at, sizes, strip
+            u, centre, v = (builder.trunc(n, _I32) for n in (u, centre, v))
+            a, b, c = (splat(builder, n) for n in line)
 
-            def load(k: int, array: Any, index: Any, kind: Any) -> Any:
-                pointer = simd._pointer(context, builder, sig.args[k], array, index)
+            def load(array: Any, index: Any, kind: Any) -> Any:
+                pointer = simd._pointer(context, builder, simd.WORDS, array, index)
                 # Strips begin at any word: no more than a word's alignment may be promised.
                 return builder.load(simd._as(builder, pointer, kind), align=8)
 
@@ -89,10 +86,10 @@ def make_four(width: int) -> Any:
             taking = builder.icmp_signed("<", lane, splat(builder, builder.trunc(count, _I32)))
             other = band(builder.add(splat(builder, u), lane), splat(builder, v), rank)
             other = builder.select(taking, other, vector(_SHORTS, [-1] * LANES))
-            words = [load(0, left, moved(here, j, i, cols), _I64) for j, i in _CHILDREN]
+            words = [load(left, moved(here, j, i, cols), _I64) for j, i in _CHILDREN]
             key = ir.Constant(_FOUR, ir.Undefined)
             for k, word in enumerate(words):
-                found = load(1, right, moved(there, *_CHILDREN[k], rcols), simd._WORDS)
+                found = load(right, moved(there, *_CHILDREN[k], rcols), simd._WORDS)
                 one = cost(simd._distances(builder, splat(builder, word), found, width), other)
                 one = simd._call(builder, "llvm.vector.reduce.umin.v8i16", _I16, one)
                 key = builder.insert_element(key, builder.zext(one, _I32), ir.Constant(_I32, k))
@@ -100,7 +97,7 @@ def make_four(width: int) -> Any:
             with builder.if_then(builder.icmp_signed("!=", cross, ir.Constant(_I64, 0))):
                 # Lanes: four pixels, each with the row less, then the same with the row more.
                 at = builder.add(there, builder.sext(builder.sub(centre, u), _I64))
-                rows = [load(1, right, moved(at, j, 0, rcols), _PAIR) for j in (-1, 0, 1, 2)]
+                rows = [load(right, moved(at, j, 0, rcols), _PAIR) for j in (-1, 0, 1, 2)]
                 less, more = (_pairs(builder, rows[k], rows[k + 1], (0, 1, 2, 3)) for k in (0, 2))
                 found = _pairs(builder, less, more, tuple(range(8)))
 
@@ -132,8 +129,8 @@ def make_four(width: int) -> Any:
             tried = builder.or_(rows, builder.and_(columns, vector(_FOUR, [0xFFFF] * 4)))
             total = builder.lshr(key, vector(_FOUR, [4] * 4))
             pointers = [
-                simd._as(builder, simd._pointer(context, builder, sig.args[k], args[k], ir.Constant(_I64, 0)), _FOUR)
-                for k in (8, 9)
+                simd._as(builder, simd._pointer(context, builder, simd.PAIRS, array, ir.Constant(_I64, 0)), _FOUR)
+                for array in out
             ]
             before = builder.load(pointers[1], align=4)
             # Strictly less: of equal costs the strip that came earlier wins.
@@ -148,7 +145,7 @@ def make_four(width: int) -> Any:
 
 
 four = make_four(simd.widest())
-"""``four(left, right, line, here, there, (cols, right cols), (u, centre, v), (count, cross), best, least)``:
+"""``four((left, right), line, (here, there), (cols, right cols), (u, count, centre, v, cross), (best, least))``:
 the best candidate, cost << 4 | rank, of each pixel of a square of two by two.
 
 ``left[here]``: word of the first pixel; ``right[there]``: the one it meets at column displacement ``u``, row

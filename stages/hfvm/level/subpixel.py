@@ -30,43 +30,51 @@ def linear(before, at, after):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def summed(left, right, u_map, v_map, wanted, out_u, out_v, out_distance, ox=0, oy=0):  # type: ignore[no-untyped-def]
+def summed(images, maps, wanted, out, at=(0, 0)):  # type: ignore[no-untyped-def]
     """Sub-pixel displacements of an integer map from distances summed over 5 x 5 pixels.
 
-    Only where ``wanted`` is not zero and the window, shifted by a pixel, lies inside both images; elsewhere the integer
-    map is copied. ``out_distance``: mean distance per pixel at the integer displacement, or the pixel's own where the
-    window is not inside; -1 outside the other image and where not wanted. ``ox, oy``: where the left window's first
-    pixel lies in the right window; both windows must reach SUM_RADIUS (right: and one) pixels farther than what counts.
+    ``images``: words of the left and the right one, (row, col). ``maps``: column and row displacements of the left
+    one's pixels; ``out``: where the refined ones, and the distance, are written. Only where ``wanted`` is not zero and
+    the window, shifted by a pixel, lies inside both images; elsewhere the integer map is copied. The distance is the
+    mean of a pixel's at the integer displacement, or the pixel's own where the window is not inside; -1 outside the
+    other image and where not wanted. ``at``: column and row of the left window's first pixel in the right window; both
+    windows must reach SUM_RADIUS (right: and one) pixels farther than what counts.
     """
+    (left, right), (u_map, v_map), (out_u, out_v, out_distance) = images, maps, out
     rows, cols = left.shape
     shapes = rows, cols, right.shape[0], right.shape[1]
-    here, there = left.reshape(-1), right.reshape(-1)
+    flat = left.reshape(-1), right.reshape(-1)
     # Four sums are written however short a run is, so the last column needs room beyond it.
     four, last, state = np.zeros(cols + 4, np.uint64), np.zeros(cols + 4, np.uint64), np.zeros(cols, np.int8)
     count = np.float32((2 * SUM_RADIUS + 1) * (2 * SUM_RADIUS + 1))
     for y in range(rows):
-        _windows(here, there, y, u_map[y], v_map[y], wanted[y], shapes, ox, oy, four, last, state)
+        _windows(flat, y, (u_map[y], v_map[y]), wanted[y], shapes, at, (four, last, state))
         us, vs, first, second, third = u_map[y], v_map[y], out_u[y], out_v[y], out_distance[y]
         # Sixteen bits hold a sum: 25 distances of at most 8 x 255.
         low = np.uint64(0xFFFF)
         for x in range(cols):
-            at = np.int64(four[x] & low)
+            middle = np.int64(four[x] & low)
             west, east = np.int64((four[x] >> np.uint64(16)) & low), np.int64((four[x] >> np.uint64(32)) & low)
             north, south = np.int64(four[x] >> np.uint64(48)), np.int64(last[x])
             summed_up = state[x] == SUMMED
-            first[x] = np.float32(us[x]) + (linear(west, at, east) if summed_up else np.float32(0.0))
-            second[x] = np.float32(vs[x]) + (linear(north, at, south) if summed_up else np.float32(0.0))
+            first[x] = np.float32(us[x]) + (linear(west, middle, east) if summed_up else np.float32(0.0))
+            second[x] = np.float32(vs[x]) + (linear(north, middle, south) if summed_up else np.float32(0.0))
             third[x] = (
-                np.float32(at) / count if summed_up else np.float32(at) if state[x] == ALONE else np.float32(-1.0)
+                np.float32(middle) / count
+                if summed_up
+                else np.float32(middle)
+                if state[x] == ALONE
+                else np.float32(-1.0)
             )
 
 
 @njit(cache=True, nogil=True)
-def _windows(here, there, y, us, vs, wanted, shapes, ox, oy, four, last, state):  # type: ignore[no-untyped-def]
-    """Sums of the windows of a row: ``four, last`` as in ``lanes.sums``, and what they are worth, ``state``.
+def _windows(flat, y, row, wanted, shapes, at, out):  # type: ignore[no-untyped-def]
+    """Sums of the windows of a row: ``out`` are ``four, last`` of ``simd.sums``, and what they are worth, ``state``.
 
     Neighbours of equal displacement are summed together. A pixel's own distance stands where its window is not inside.
     """
+    (here, there), (us, vs), (four, last, state), (ox, oy) = flat, row, out, at
     rows, cols, rrows, rcols = shapes
     far = SUM_RADIUS + 1
     x = 0
@@ -86,6 +94,6 @@ def _windows(here, there, y, us, vs, wanted, shapes, ox, oy, four, last, state):
         n = 1
         while n < most and us[x + n] == u and vs[x + n] == v and wanted[x + n]:
             n += 1
-        simd.sums(here, there, y * cols + x, yr * rcols + xr, cols, rcols, n, four, last, x)
+        simd.sums(flat, (y * cols + x, yr * rcols + xr), (cols, rcols), n, (four, last), x)
         state[x : x + n] = SUMMED
         x += n

@@ -20,6 +20,7 @@ from rille.datasets.georeference import Georeference
 from rille.pipeline.export.frames_json import describe
 from rille.pipeline.export.rasters import dem_style, risk_style, rounded
 from rille.pipeline.export.writers import (
+    Meaning,
     write_path_geojson,
     write_path_gpkg,
     write_raster,
@@ -41,7 +42,7 @@ def poses(n: int) -> np.ndarray:
 def test_an_elevation_raster_keeps_values_place_and_crs(tmp_path: Path) -> None:
     z = np.random.default_rng(0).normal(size=LATTICE.shape).astype(np.float32)
     z[100:200, 50:90] = np.nan
-    write_raster(tmp_path / "run" / "dem.tif", {"elevation": z}, LATTICE, unit="m", nodata=float("nan"))
+    write_raster(tmp_path / "run" / "dem.tif", {"elevation": z}, LATTICE, Meaning("m"))
     with rasterio.open(tmp_path / "run" / "dem.tif") as file:
         np.testing.assert_array_equal(file.read(1), z)
         np.testing.assert_array_equal(file.read_masks(1) == 0, np.isnan(z))
@@ -60,7 +61,7 @@ def test_an_elevation_raster_keeps_values_place_and_crs(tmp_path: Path) -> None:
 
 
 def test_the_engineering_crs_is_in_metres_and_says_how_axes_lie(tmp_path: Path) -> None:
-    write_raster(tmp_path / "a.tif", {"a": np.zeros(LATTICE.shape, np.uint8)}, LATTICE, unit="1", nodata=None)
+    write_raster(tmp_path / "a.tif", {"a": np.zeros(LATTICE.shape, np.uint8)}, LATTICE, Meaning("1", nodata=None))
     with rasterio.open(tmp_path / "a.tif") as file:
         crs = pyproj.CRS.from_wkt(file.crs.to_wkt(version="WKT2_2019"))
         assert "x and y are the world frame's" in file.tags()["AXES"]
@@ -76,7 +77,7 @@ def test_the_engineering_crs_is_in_metres_and_says_how_axes_lie(tmp_path: Path) 
 def test_a_raster_with_a_place_is_turned_and_not_resampled(tmp_path: Path) -> None:
     place = Georeference("EPSG:32633", (500100.0, 5200200.0, 1800.0), 0.7)
     z = np.random.default_rng(0).normal(size=LATTICE.shape).astype(np.float32)
-    write_raster(tmp_path / "dem.tif", {"elevation": z}, LATTICE, unit="m", nodata=float("nan"), place=place)
+    write_raster(tmp_path / "dem.tif", {"elevation": z}, LATTICE, Meaning("m"), place)
     with rasterio.open(tmp_path / "dem.tif") as file:
         assert file.crs.to_epsg() == 32633
         np.testing.assert_array_equal(file.read(1), z)
@@ -93,7 +94,7 @@ def test_classes_are_not_averaged_in_overviews(tmp_path: Path) -> None:
     risk = np.zeros(LATTICE.shape, dtype=np.uint8)
     risk[:, 351:] = 2  # not on the border of an overview's cells
     bands = {"class": risk, "reason": risk * 4, "filled": np.zeros_like(risk)}
-    write_raster(tmp_path / "risk.tif", bands, LATTICE, unit="1", nodata=None, tags={"classes": "0 safe"})
+    write_raster(tmp_path / "risk.tif", bands, LATTICE, Meaning("1", nodata=None, tags={"classes": "0 safe"}))
     with rasterio.open(tmp_path / "risk.tif") as file:
         assert file.descriptions == ("class", "reason", "filled")
         np.testing.assert_array_equal(file.read(2), risk * 4)
@@ -105,7 +106,7 @@ def test_classes_are_not_averaged_in_overviews(tmp_path: Path) -> None:
 
 def test_classes_have_colours(tmp_path: Path) -> None:
     risk = np.zeros(LATTICE.shape, dtype=np.uint8)
-    write_raster(tmp_path / "a.tif", {"class": risk}, LATTICE, unit="", nodata=None, colours=["#a6d7c3", "#0001ff"])
+    write_raster(tmp_path / "a.tif", {"class": risk}, LATTICE, Meaning(nodata=None, colours=["#a6d7c3", "#0001ff"]))
     with rasterio.open(tmp_path / "a.tif") as file:
         assert file.colorinterp == (rasterio.enums.ColorInterp.palette,)
         assert [file.colormap(1)[k] for k in (0, 1)] == [(0xA6, 0xD7, 0xC3, 255), (0, 1, 255, 255)]
@@ -122,7 +123,7 @@ def test_measures_are_rounded_to_significant_bits() -> None:
 
 def test_a_raster_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     with raises("RIL-621"):
-        write_raster(tmp_path / "a.tif", {"a": np.zeros((2, 2), np.uint8)}, LATTICE, unit="1", nodata=None)
+        write_raster(tmp_path / "a.tif", {"a": np.zeros((2, 2), np.uint8)}, LATTICE, Meaning("1", nodata=None))
 
 
 def test_the_path_says_that_it_is_not_wgs84(tmp_path: Path) -> None:

@@ -235,7 +235,7 @@ def test_street_of_kitti_is_left_alone_and_repaired_when_knocked(data_dir):
     knock = MisalignParams(rows=3.0, roll_deg=0.3)
     bent, valid = warp(right, np.ones_like(right), Lens(sequence.rig.right), knock)
     for image, mask, repaired in ((right, None, []), (bent, valid, ["pitch", "roll"])):
-        d = match(left, image, right_valid=mask)
+        d = match(left, image, valid=(None, mask))
         points = thin(d.column_disparity, d.row_disparity, matched(d.validity), d.backmatch_error, 1500)
         found = facts(sequence.rig, [PointPairs(20, *points)])
         assert [p["name"] for p in found["parameters"] if p["freed"]] == repaired

@@ -174,7 +174,7 @@ def test_masked_pixels_are_never_matched_nor_matched_to():
     left_valid, right_valid = np.ones(left.shape, np.uint8), np.ones(right.shape, np.uint8)
     left_valid[30:60, 40:80] = 0
     right_valid[80:110, 100:140] = 0
-    found = match(left, right, left_valid=left_valid, right_valid=right_valid)
+    found = match(left, right, valid=(left_valid, right_valid))
     assert not defined(found.validity)[left_valid == 0].any()
     y, x = np.nonzero(matched(found.validity))
     xr = np.rint(x + found.column_disparity[y, x]).astype(int)
@@ -228,7 +228,7 @@ def test_preset_fast_matches_at_half_the_resolution():
     left, right, u, v = pair(lambda x, y: (-6.4, 1.3), shape=shape, right_shape=shape, noise=1.0)
     valid = np.ones(left.shape, np.uint8)
     valid[40:50, 60:81] = 0
-    found = match(left, right, HfvmParams(preset="fast"), left_valid=valid)
+    found = match(left, right, HfvmParams(preset="fast"), valid=(valid, None))
     median, good, complete = score(found, u, v, right.shape)
     assert found.column_disparity.shape == shape
     # The shortest wavelengths, 5 pixels, are 2.5 at half the resolution: a tenth of a pixel there, two tenths here.
@@ -315,7 +315,7 @@ def test_motorcycle_with_a_roll_of_two_degrees(motorcycle):
     size = (cols, rows)
     rolled = cv2.warpAffine(right, turn, size, flags=cv2.INTER_CUBIC)
     valid = cv2.warpAffine(np.ones_like(right), turn, size, flags=cv2.INTER_NEAREST)
-    found = match(left, rolled, right_valid=valid)
+    found = match(left, rolled, valid=(None, valid))
     y, x = np.indices(truth.shape, dtype=np.float32)
     u = turn[0, 0] * (x + truth) + turn[0, 1] * y + turn[0, 2] - x
     ok = matched(found.validity) & np.isfinite(truth)

@@ -181,7 +181,7 @@ def test_paths_find_both_sides_of_a_step_from_a_poor_start():
     rng = np.random.default_rng(0)
     start = np.where(rng.random(u.shape) < 0.3, u, rng.integers(-15, 3, u.shape)).astype(np.int16)
     found, rows = paths.propagate(
-        view(left), view(right), (start, np.zeros_like(start)), None, NO_LINES, 0.0, WEIGHTS, 3
+        view(left), view(right), (start, np.zeros_like(start)), None, (NO_LINES, 0.0), WEIGHTS, 3
     )
     visible = ~occluded & seen(u, 0 * u, left.shape, 3)
     assert np.mean((found == u)[visible]) > 0.97
@@ -194,7 +194,7 @@ def test_paths_find_both_sides_of_a_step_from_a_poor_start():
 def test_the_true_map_of_equal_images_stays():
     image = Texture(5)(*np.indices((40, 50))[::-1].astype(float))
     nothing = np.zeros(image.shape, np.int16)
-    u, v = paths.propagate(view(image), view(image), (nothing, nothing), None, NO_LINES, 0.0, WEIGHTS, 2)
+    u, v = paths.propagate(view(image), view(image), (nothing, nothing), None, (NO_LINES, 0.0), WEIGHTS, 2)
     assert not u.any()
     assert not v.any()
 
@@ -203,7 +203,7 @@ def test_the_true_map_of_equal_images_stays():
 def test_paths_on_tiny_images(shape):
     image = np.random.default_rng(0).uniform(0, 255, shape).astype(np.float32)
     start = np.full(shape, 5, np.int16)  # leads out
-    u, v = paths.propagate(view(image), view(image), (start, start), (start, start), NO_LINES, 0.0, WEIGHTS, 2)
+    u, v = paths.propagate(view(image), view(image), (start, start), (start, start), (NO_LINES, 0.0), WEIGHTS, 2)
     assert u.shape == v.shape == shape
 
 
@@ -409,12 +409,12 @@ def test_bits_of_the_mask_agree_with_the_values():
     left, right, *_ = pair(lambda x, y: (-8.0, 1.0), noise=3.0)
     valid = np.ones(left.shape, np.uint8)
     valid[20:40, 30:60] = 0
-    found = match(left, right, ACC, left_valid=valid)
+    found = match(left, right, ACC, valid=(valid, None))
     known = has(found.validity, Validity.MATCHED | Validity.INTERPOLATED)
     np.testing.assert_array_equal(np.isfinite(found.column_disparity), known)
     assert not (matched(found.validity) & has(found.validity, Validity.INTERPOLATED | Validity.SPECKLE)).any()
     assert not known[valid == 0].any()
-    again = match(build_back(left), build_back(right), ACC, left_valid=valid)
+    again = match(build_back(left), build_back(right), ACC, valid=(valid, None))
     np.testing.assert_array_equal(found.column_disparity, again.column_disparity)
 
 

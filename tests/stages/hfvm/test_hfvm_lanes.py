@@ -24,7 +24,7 @@ def test_sums_over_windows(width):
 
     @njit
     def call(left, right, at_left, at_right, count, four, last):
-        sums(left, right, at_left, at_right, np.int64(13), np.int64(15), count, four, last, np.int64(1))
+        sums((left, right), (at_left, at_right), (np.int64(13), np.int64(15)), count, (four, last), np.int64(1))
 
     left, right = words(117, 2).reshape(9, 13), words(165, 3).reshape(11, 15)
     for count in (1, 4):
@@ -55,17 +55,14 @@ def test_all_widths_search_alike():
         @njit
         def call(packed, data, new, cost, best, least):
             for k in range(6):
-                place, counts = (np.int64(-2), np.int64(k - 2), np.int64(-1)), (np.int64(8 - k), np.int64(k % 2))
+                strip = np.int64(-2), np.int64(8 - k), np.int64(k - 2), np.int64(-1), np.int64(k % 2)
                 at = np.int64(4 * 21 + 2 * k), np.int64(5 * 30 + 2 * k)
                 sizes = np.int64(21), np.int64(30)
-                four(left, right, line, at[0], at[1], sizes, place, counts, best[4 * k :], least[4 * k :])  # noqa: B023 (called before the next turn)
-            shape = (20, 30, 21, 3, 40, 2)
-            settle(  # noqa: B023
-                left, right, packed, data, terms, todo, 0, 4 * 21, 3 * 21, 5 * 21, 4, shape, 5, new, cost
-            )
-            dense(  # noqa: B023
-                left, right, packed, data, terms, todo, 0, 4 * 21, 3 * 21, 5 * 21, 4, shape, 5, new[8:], cost[8:]
-            )
+                out = best[4 * k :], least[4 * k :]
+                four((left, right), line, at, sizes, strip, out)  # noqa: B023 (called before the next turn)
+            maps, level, place = (left, right, packed, data), (20, 30, 21, 3, 40, 2, 5), (0, 4 * 21, 3 * 21, 5 * 21, 4)
+            settle(maps, terms, todo, place, level, (new, cost))  # noqa: B023
+            dense(maps, terms, todo, place, level, (new[8:], cost[8:]))  # noqa: B023
 
         results = [np.zeros(16, np.int32), np.zeros(16, np.int32), np.zeros(24, np.int32), np.full(24, 9999, np.int32)]
         call(start, np.full(12 * 21, 900, np.int32), *results)

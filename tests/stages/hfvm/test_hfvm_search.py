@@ -107,7 +107,8 @@ def test_descend_finds_the_first_of_the_best_around_its_centres(mu, reach_x, rea
     up_u[2:], up_v[2:] = up_u[2:] // 2 + 1, 0
     f, length = some_band(4), np.float32(mu)
     packed, data = np.zeros((2, ROWS, COLS), np.int32)
-    propagation.descend(left, right, up_u, up_v, reach_x, reach_y, count, f, length, packed, data, 0, 0, X0, Y0)
+    out, at = (packed, data), (0, 0, X0, Y0)
+    propagation.descend((left, right), (up_u, up_v), (reach_x, reach_y), count, (f, length), out, at)
     for y, x in np.ndindex(ROWS, COLS):
         j, i = y // 2, x // 2
         near = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1)][:count]
@@ -165,7 +166,8 @@ def test_propagation_equals_slow_numpy_over_several_rounds(mu, beside, monkeypat
         propagation.pack_map(u, v, packed)
         data[:] = costs(left, right, u, v, f, mu)
         dirty = np.empty((ROWS, COLS), np.uint8)
-        propagation.checkerboard(left, right, packed, data, dirty, f, np.float32(mu), 2, rounds, beside, 0, 0, X0, Y0)
+        maps, band = (packed, data, dirty), (f, np.float32(mu))
+        propagation.checkerboard((left, right), maps, band, 2, rounds, beside, (0, 0, X0, Y0))
         found = np.empty((2, ROWS, COLS), np.int16)
         propagation.unpack(packed, *found)
         np.testing.assert_array_equal(found, expected)
@@ -188,14 +190,14 @@ def test_exhaustive_search_finds_a_two_dimensional_shift_and_prefers_the_short_o
     left, right = big[4:16, 6:18], big[2:14, 3:15]
     u, v = np.full((2, 12, 12), 99, np.int16)
     cost = np.zeros((12, 12), np.int32)
-    search.exhaustive(left, right, 6, 6, 1, u, v, cost)
+    search.exhaustive((left, right), (6, 6), 1, (u, v, cost))
     assert (u[:9, :8] == 3).all()
     assert (v[:9, :8] == 2).all()
     for y, x in np.ndindex(12, 12):
         assert cost[y, x] == sad(left[y, x], right[y + v[y, x], x + u[y, x]])
     flat = np.zeros((5, 5), np.uint64)
     u, v = np.full((2, 5, 5), 99, np.int16)
-    search.exhaustive(flat, flat, 3, 3, 1, u, v, np.zeros((5, 5), np.int32))
+    search.exhaustive((flat, flat), (3, 3), 1, (u, v, np.zeros((5, 5), np.int32)))
     assert (u == 0).all()
     assert (v == 0).all()
 
@@ -208,7 +210,7 @@ def test_summed_distances_against_numpy():
     fine_u, fine_v, d = np.empty((3, 12, 14), np.float32)
     wanted = np.ones((12, 14), np.uint8)
     wanted[5, 5] = 0
-    subpixel.summed(left, right, u, v, wanted, fine_u, fine_v, d)
+    subpixel.summed((left, right), (u, v), wanted, (fine_u, fine_v, d))
 
     def total(y, x, du, dv):
         return sum(sad(left[y + j, x + i], right[y + j + dv, x + i + du]) for j in range(-2, 3) for i in range(-2, 3))
@@ -245,7 +247,7 @@ def test_papers_search_is_equation_1_to_3():
     centre_u, centre_v = rng.integers(-2, 3, (2, 10, 12)).astype(np.int16)
     u, v = np.empty((2, 10, 12), np.int16)
     d, offset = np.empty((10, 12), np.float32), np.empty((10, 12, 2), np.float32)
-    paper.search(a, b, centre_u, centre_v, 2, 1, u, v, d, offset)
+    paper.search((a, b), (centre_u, centre_v), (2, 1), (u, v, d, offset))
     w = np.array(weights)
     for y in range(10):
         for x in range(12):
