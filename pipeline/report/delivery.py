@@ -146,11 +146,20 @@ def _local_paths(pairs: Rows, *, merged: bool) -> Items:
     stops = [r["frame"] for r in pairs if r["path"] is not None]
     reasons = dict.fromkeys(r["path"] for r in without)
     at = {reason: [r["frame"] for r in without if r["path"] == reason] for reason in reasons}
-    why = "; ".join(f"{reason} ({_among(frames, stops)})" for reason, frames in at.items())
+    why = "; ".join(f"{reason} ({_among(frames, stops)}{_ahead(without, reason)})" for reason, frames in at.items())
     why += (
         "; a path over the merged terrain was found all the same: one stop sees what another does not" if merged else ""
     )
     return [_item("no path", f"{asked - found} of {asked} stops have no local path", why)]
+
+
+def _ahead(rows: Rows, reason: str) -> str:
+    """Where the ground is closed, of the stops with this reason."""
+    where = [r["blocked_m"] for r in rows if r["path"] == reason and r.get("blocked_m") is not None]
+    if not where:
+        return ""
+    low, high = min(where), max(where)
+    return f"; closed {metres(low)} ahead" if low == high else f"; closed {low:.3g} to {high:.3g} m ahead"
 
 
 def _path(view: RunView) -> Items:

@@ -150,7 +150,8 @@ def _path_words(scene: Scene) -> str:
     if drive is not None:
         return (
             f"{driving.outcome(drive)}; no path is planned over the whole map, what was driven is shown stop by stop. "
-            "A disk around the start, which no camera saw, may be taken for flat ground."
+            "Of a round patch at the start no camera saw anything: where the map has one, it is taken for flat ground, "
+            "since the rover stands on it."
         )
     if scene.path is None:
         found = scene.view.bundle(scene.view.products.path)
@@ -162,6 +163,13 @@ def _path_words(scene: Scene) -> str:
     vehicle = scene.view.config.vehicle
     start = start_words(scene.view, " It ")
     rest = f"{start}." if start else ""
+    x, y = scene.path[-1, :2]
+    aim = scene.view.config.path.target
+    chosen = "the target" if aim else "no path.target is set, so that is the free place nearest to the far row's middle"
+    rest += (
+        f" It ends at x {x:.2f} m, y {y:.2f} m: {chosen}. Of all paths there it is the one that climbs and falls "
+        "least, caution ground charged, not the shortest."
+    )
     if max(before, beyond) > vehicle.wheel_base + vehicle.wheel_diameter:
         rest += (
             f" It crosses the connected ground over most rows: {length(before)} of nearer and {length(beyond)} of "
@@ -173,8 +181,8 @@ def _path_words(scene: Scene) -> str:
         "middle": "its middle stays on known ground, its wheels do not everywhere",
     }.get(ground, "unknown ground is not entered")
     return (
-        "The path (black line; the vehicle stands at its start) is that of the vehicle's middle; its wheels keep "
-        f"{margin} from hazards; {known}.{rest}"
+        "The path (black line; the vehicle stands at its start, a disk at its end) is that of the vehicle's middle; "
+        f"its wheels keep {margin} from hazards; {known}.{rest}"
     )
 
 
@@ -322,7 +330,7 @@ _FIGURES: tuple[tuple[str, Maker, Condition, str, str], ...] = (
         _map,
         _always,
         "tiles risk path drive trajectory disparity rigs images undistorted screening",
-        "config.vehicle config.risk.sigmas sequence.rig sequence.truth",
+        "config.vehicle config.risk.sigmas config.path.target sequence.rig sequence.truth",
     ),
     (
         "Drive",

@@ -110,6 +110,11 @@ class Calibration:
         """Whether any rig that was used differs from the given one."""
         return any(bool(facts.get("changed")) for facts in self.facts)
 
+    def residual(self, when: str) -> float:
+        """RMS distance from the epipolar lines, px, ``before`` or ``after``; of one rig as it was weighed there."""
+        told = self.facts[0].get(f"residual_{when}_px") if len(self.facts) == 1 else None
+        return float(np.sqrt(np.mean(np.square(getattr(self, when))))) if told is None else float(told)
+
     def collected(self, key: str) -> list[Any]:
         """The entries of a list that each rig's facts have."""
         return [entry for facts in self.facts for entry in facts.get(key) or ()]

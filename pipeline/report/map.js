@@ -64,7 +64,7 @@
   };
   const sheet = document.createElement("canvas");
   sheet.width = D.cols; sheet.height = D.rows;
-  const state = { base: "ortho", layer: D.judged ? "risk" : "elevation", opacity: 0.45, by: "plain", ruler: [], measuring: false, three: false };
+  const state = { base: "ortho", layer: D.judged ? "risk" : "elevation", opacity: 0.6, by: "plain", ruler: [], measuring: false, three: false };
   const ramped = Array.from({ length: 256 }, (_, i) => ramp.subarray(3 * i, 3 * i + 3));
   /* Okabe and Ito's colours, which also the colour-blind tell apart, and darker ones of them. */
   const KINDS = ["#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7", "#7f5700", "#2b6f99", "#005c43", "#7d3600", "#6e2f57"].map(rgb);
@@ -111,7 +111,7 @@
       bar(`${name}: ${show(low)} to ${show(high)}`);
     }
     if (name !== "risk") add("#8d8f9833", "no elevation");
-    if (D.path.length) { add("#111", "path"); add("#ffd34d", "vehicle at its start, to scale"); }
+    if (D.path.length) { add("#111", "path (disk: its end)"); add("#ffd34d", "vehicle at its start, to scale"); }
     if (Object.keys(D.legs).length) add("#111", "path that was driven by the vehicle's middle (ring: start)");
     if (D.goal) add("#ffd34d", "goal (star)");
     if (state.by === "plain") add("#0b4f8a", "trajectory of the left camera");
@@ -182,7 +182,11 @@
       D.track.forEach((t, i) => { if (i) line([D.track[i - 1].slice(1), t.slice(1)], trackColor(t), 2.4); });
       for (const t of D.track) { const [u, v] = screen(t[1], t[2]); pen.beginPath(); pen.arc(u, v, 3, 0, 7); pen.fillStyle = trackColor(t); pen.fill(); pen.strokeStyle = "#fff"; pen.lineWidth = 0.8; pen.stroke(); }
     }
-    if ($("path").checked && D.path.length) { line(D.path, "#fff", 5); line(D.path, "#111", 2.5); }
+    if ($("path").checked && D.path.length) {
+      line(D.path, "#fff", 5); line(D.path, "#111", 2.5);
+      const [u, v] = screen(...D.path[D.path.length - 1]);
+      pen.beginPath(); pen.arc(u, v, 6, 0, 7); pen.fillStyle = "#111"; pen.fill(); pen.strokeStyle = "#fff"; pen.lineWidth = 2; pen.stroke();
+    }
     const legs = Object.values(D.legs);
     if (legs.length) { const [u, v] = screen(...legs[0][0]); pen.beginPath(); pen.arc(u, v, 6, 0, 7); pen.strokeStyle = "#111"; pen.lineWidth = 2.5; pen.stroke(); }
     if (D.goal) {
@@ -263,14 +267,19 @@
     const zs = D.path.map((q) => q[2]), low = Math.min(...zs), high = Math.max(...zs), top = Math.max(high - low, 1e-6);
     const slopes = D.path.map((q) => q[3] ?? NaN); /* as the planner judged them: over the vehicle's reach, not a cell */
     const X = (i) => 44 + (w - 88) * s[i] / s[s.length - 1], ink = getComputedStyle(box).color;
+    /* Height above, inclination below: in one frame the height would seem to cross the limit. */
+    const half = (h - 34) / 2, low_ = 14 + half, foot = h - 20;
     const curve = (y, color) => { p.beginPath(); let pen_ = false; zs.forEach((_, i) => { const v = y(i); if (v !== v) { pen_ = false; return; } if (pen_) p.lineTo(X(i), v); else p.moveTo(X(i), v); pen_ = true; }); p.strokeStyle = color; p.lineWidth = 1.8; p.stroke(); };
-    const steep = Math.max(D.limit, ...slopes.filter((v) => v === v)) * 1.1, Y = (v) => h - 20 - (h - 34) * v / steep;
+    const steep = Math.max(D.limit, ...slopes.filter((v) => v === v)) * 1.1, Y = (v) => foot - (half - 6) * v / steep;
     p.setLineDash([4, 4]); p.beginPath(); p.moveTo(44, Y(D.limit)); p.lineTo(w - 44, Y(D.limit)); p.strokeStyle = "#c0392b"; p.stroke(); p.setLineDash([]);
     curve((i) => Y(slopes[i]), "#d1731a");
-    curve((i) => h - 20 - (h - 34) * (zs[i] - low) / top, "#4a90c8");
+    curve((i) => low_ - 4 - (half - 8) * (zs[i] - low) / top, "#4a90c8");
+    p.strokeStyle = "#8888"; p.lineWidth = 1;
+    const far = s[s.length - 1], tick = round(far / 5);
+    for (let d = 0; d <= far; d += tick) { const x = 44 + (w - 88) * d / far; p.beginPath(); p.moveTo(x, 10); p.lineTo(x, foot); p.stroke(); }
     p.font = "11px system-ui, sans-serif"; p.fillStyle = ink;
-    p.fillText(metres(high), 0, 16); p.fillText(metres(low), 0, h - 20); p.fillText(D.limit + "°", w - 40, Y(D.limit) + 4); p.fillText("0°", w - 40, h - 20);
-    p.fillText("height (blue) and inclination (orange; dashed: limit) along the path of " + metres(s[s.length - 1]), 44, h - 4);
+    p.fillText(metres(high), 0, 20); p.fillText(metres(low), 0, low_); p.fillText(D.limit + "°", w - 40, Y(D.limit) + 4); p.fillText("0°", w - 40, foot);
+    p.fillText(`height (blue) and inclination (orange; dashed: limit) along the path of ${metres(far)}, lines every ${tick < 1 ? 100 * tick + " cm" : tick + " m"}`, 44, h - 4);
   };
 
   /* -- the view in space ------------------------------------------------------------------------------------ */

@@ -146,7 +146,7 @@ def metrics(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Metric]:
         ("Agreement with COLMAP", _agreement(scene)),
         ("Rig", _rig(scene)),
         ("Matching and terrain", _matching(pairs) | _terrain(scene) | _overlap(scene)),
-        ("Hazards and path", _hazards(scene) | _local_paths(pairs) | _path(scene.view)),
+        ("Hazards and path", _hazards(scene) | _local_paths(pairs) | _path(scene.view) | _path_sigma(scene)),
         ("Run", _run(scene.view)),
     ):
         found |= {name: {"group": group, "truth": None, **metric} for name, metric in more.items()}
@@ -219,7 +219,7 @@ def _rig(scene: Scene) -> dict[str, Metric]:
     if found is None or not len(found.before):
         return {}
     every = f"{len(scene.view.products.orientations)} basic pairs, {len(found.before)} matches"
-    rms = [float(np.sqrt(np.mean(d**2))) for d in (found.before, found.after)]
+    rms = [found.residual(name) for name in ("before", "after")]
     how = "RMS distance of matched points from their epipolar lines, outliers left out, under the "
     metrics = {"rig_residual_given": _metric("Epipolar residual, given rig", rms[0], "px", how + "given rig", every)}
     metrics["rig_residual"] = _metric("Epipolar residual, used rig", rms[1], "px", how + "rig that was used", every)
@@ -410,6 +410,23 @@ def _path(view: RunView) -> dict[str, Metric]:
         how = "probability that a measure exceeds its limit, largest of the path's cells"
         found["path_p_hazard"] = _metric("Greatest hazard probability on the path", meta["max_p_hazard"], "1", how)
     return found
+
+
+def _path_sigma(scene: Scene) -> dict[str, Metric]:
+    """Of the merged terrain, at the path's vertices."""
+    sigma = None if scene.world is None else scene.world.get("elevation_std")
+    if scene.world is None or sigma is None or scene.path is None or not len(scene.path):
+        return {}
+    row, col = np.rint(scene.world.lattice.index(scene.path[:, :2])).astype(int).T
+    rows, cols = sigma.shape
+    inside = (row >= 0) & (col >= 0) & (row < rows) & (col < cols)
+    found = sigma[row[inside], col[inside]]
+    known = found[np.isfinite(found)]
+    if not known.size:
+        return {}
+    how = "as that of the terrain; median over the path's vertices"
+    every = f"{known.size} of {len(scene.path)} vertices"
+    return {"path_sigma": _metric("Predicted σ of elevation along the path", float(np.median(known)), "m", how, every)}
 
 
 def _run(view: RunView) -> dict[str, Metric]:

@@ -20,6 +20,7 @@ from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.delivery import Items
 from rille.pipeline.report.summary import summarise
 from rille.pipeline.report.words import coordinate, metres, number, quantity, seconds, share
+from rille.stages.hazard.measures import MEASURES
 
 TILES = (
     ("frames_posed",),
@@ -38,11 +39,16 @@ BESIDE: Mapping[str, tuple[tuple[str, str], ...]] = {
         ("inclination up to {} of {limit}°", "path_inclination"),
         ("tilt up to {} of {limit}°", "path_tilt"),
         ("probability of a hazard up to {}", "path_p_hazard"),
+        ("σ of elevation {} along it", "path_sigma"),
     ),
     "drive_path_length": (
+        ("judged at {}", "drive_placements"),
         ("belly struck at {}", "drive_clearance_violations"),
         ("tilted beyond the limit at {}", "drive_tilt_violations"),
         ("a wheel on too high an edge at {}", "drive_step_violations"),
+        ("at least {} of room under the belly", "drive_least_clearance"),
+        ("tilt up to {} of {limit}°", "drive_greatest_tilt"),
+        ("edges up to {}", "drive_greatest_step"),
     ),
 }
 """What a tile says below its figure: words and another metric, before truth and completeness."""
@@ -123,6 +129,8 @@ def render(
         script=resources.files("rille.pipeline.report").joinpath("map.js").read_text(encoding="utf-8"),
         files=files,
         table_2=rows,
+        pair_table=tables.pair_columns(facts["pairs"]),
+        reasons=reasons(),
         together=together,
         others=tables.other_stages(view),
         config_toml=view.config_toml,
@@ -130,6 +138,18 @@ def render(
         compared=compared,
         place=view.sequence.georeference,
     )
+
+
+def reasons() -> list[tuple[str, str]]:
+    """What may be a cell's reason on the map, in words."""
+    measures = [(m.name, f"{m.description} (limit: {m.limit})") for m in MEASURES]
+    return [
+        *measures,
+        ("unknown", "too little of the wheel's window has an elevation"),
+        ("unseen", "some of the ground below the vehicle has none"),
+        ("filled", "the elevation was interpolated"),
+        ("uncertain", "over a limit only with the standard deviations added"),
+    ]
 
 
 def _tiles(metrics: Mapping[str, Any], limit: float) -> list[tuple[str, str, str]]:
@@ -145,7 +165,7 @@ def _tile(name: str, known: Mapping[str, Any], limit: float) -> tuple[str, str, 
     words = [
         text.format(quantity(known[other]["value"], known[other]["unit"]), limit=number(limit))
         for text, other in BESIDE.get(name, ())
-        if other in known
+        if other in known and not (other.endswith("_violations") and known[other]["value"] == 0)
     ]
     words += ["against truth"] if metric["truth"] else []
     words += [metric["completeness"]] if metric["completeness"] else []

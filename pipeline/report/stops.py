@@ -43,14 +43,15 @@ def strip(scene: Scene) -> Block | None:
     shown = pairs[::step]
     width = min(WIDEST, int(math.sqrt(RESERVE * BUDGET / (len(shown) * cost))))
     panels = within([column(scene, pair, width) for pair in shown])
+    judged = any(scene.view.bundle(handle) is not None for handle in scene.view.products.local_risk.values())
     some = "" if len(panels) == len(pairs) else f" {len(panels)} of {len(pairs)} pairs are shown."
     caption = (
         "Each column is a basic pair, from the top: left image; its matches, coloured by column disparity (blue: far); "
-        "elevations of its own model; its hazards with the local path (black). Pictures are "
+        f"elevations of its own model{'; its hazards with the local path (black)' if judged else ''}. Pictures are "
         f"{width} pixels wide, so that the page stays below 5 MB.{some}"
     )
     names = ("safe", "caution", "hazard", "unknown")
-    legend = tuple(zip(_CLASSES, names, strict=True))
+    legend = tuple(zip(_CLASSES, names, strict=True)) if judged else ()
     return Block("Stops", "Every pair", caption, tuple(panels), legend, strip=True)
 
 

@@ -123,7 +123,8 @@ def _sigma_warning(view: RunView) -> list[str]:
         return []
     return [
         f"the standard deviations of the poses are about {math.sqrt(nees):.2g} times too small against the truth: do "
-        "not weigh by them"
+        "not weigh by them; what the merged map says of σ and of the probability of a hazard holds for the shape of "
+        "the ground, not for where it lies"
     ]
 
 

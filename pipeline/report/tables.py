@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from rille.pipeline.export.artifacts import chain
 from rille.pipeline.export.view import RunView, TaskRow
 from rille.pipeline.report import gather
+from rille.pipeline.report.words import metres, number, quantity, share
 
 TABLE_2: tuple[tuple[str, str, float, tuple[str, ...]], ...] = (
     ("Stereo matching (HFVM)", "one stereo pair, every pixel", 40.0, ("hfvm",)),
@@ -171,6 +172,36 @@ def pairs(scene: gather.Scene) -> list[dict[str, Any]]:
     return rows
 
 
+def pair_columns(rows: list[dict[str, Any]]) -> list[tuple[str, list[str], bool]]:
+    """Columns of the table of pairs that hold anything: head, words of each pair, and whether they are numbers."""
+    found = [(head, [r[name] for r in rows], shown) for head, name, shown in _PAIR_COLUMNS]
+    return [
+        (head, ["–" if v is None else shown(v) for v in values], shown is not str)
+        for head, values, shown in found
+        if any(v is not None for v in values)
+    ]
+
+
+_PAIR_COLUMNS: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
+    ("Frame", "frame", number),
+    ("Chosen by", "why_basic", str),
+    ("Overlap", "overlap", share),
+    ("Matched", "matched", share),
+    ("Off epipolar line", "epipolar_px", lambda v: quantity(v, "px")),
+    ("Vertical from", "vertical", str),
+    ("Cells defined", "defined", share),
+    ("Median σ", "sigma_m", metres),
+    ("Above the one before", "difference_m", metres),
+    ("Hazardous", "hazardous", share),
+    ("Unknown", "unknown", share),
+    ("Path", "path", str),
+    ("Length of the path", "path_m", metres),
+    ("Blocked ahead at", "blocked_m", metres),
+    ("RMSE", "rmse_m", metres),
+    ("Completeness", "completeness", share),
+)
+
+
 def _pair(view: RunView, pair: int) -> dict[str, Any]:
     p = view.products
     disparity, level = view.bundle(p.disparity[pair]), view.bundle(p.level.get(pair))
@@ -189,6 +220,7 @@ def _pair(view: RunView, pair: int) -> dict[str, Any]:
         "unknown": shares.get("unknown"),
         "path": None if path is None else ("found" if path.meta["found"] else path.meta.get("reason") or "none"),
         "path_m": None if path is None else path.meta.get("length_m"),
+        "blocked_m": None if path is None else path.meta.get("blocking_y"),
         "rmse_m": assessed.get("rmse", {}).get("value"),
         "completeness": assessed.get("completeness", {}).get("value"),
         "tilt_deg": assessed.get("tilt", {}).get("value"),

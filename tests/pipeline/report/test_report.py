@@ -24,6 +24,7 @@ from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import RilleError
 from rille.stages.hazard.risk import RiskParams
 from rille.stages.odometry.resection.trajectory import _account
+from rille.stages.planning.path import PathParams
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +220,11 @@ def test_no_path_names_the_row_that_blocks(tmp_path: Path) -> None:
     assert facts["complete"] is True  # an answer, not a hole
     reason = "no way through"
     assert facts["missing"] == [
-        {"kind": "no path", "what": "2 of 2 stops have no local path", "why": f"{reason} (frames 0, 4)"},
+        {
+            "kind": "no path",
+            "what": "2 of 2 stops have no local path",
+            "why": f"{reason} (frames 0, 4; closed 0.630 m ahead)",
+        },
         {"kind": "no path", "what": "No path", "why": f"{reason}; blocked at row 17, 0.63 m ahead"},
     ]
     assert facts["metrics"]["local_paths"]["value"] == 0
@@ -246,7 +251,7 @@ def test_one_stop_without_a_local_path_is_not_nothing_missing(tmp_path: Path) ->
 
 def test_a_path_says_where_it_starts_when_that_is_not_at_the_vehicle(tmp_path: Path) -> None:
     """It starts 0.21 m ahead of the camera: within the length of the default rover, but two of a rover at 1:10."""
-    config = SimpleNamespace(vehicle=vehicle_at_scale(), risk=RiskParams())
+    config = SimpleNamespace(vehicle=vehicle_at_scale(), risk=RiskParams(), path=PathParams())
     facts, page_, _, _ = written(tmp_path, view(config=config))
     assert facts["metrics"]["path_start"]["value"] == pytest.approx(0.21)
     assert facts["verdict"].endswith("a path of 0.49 m, which starts 0.210 m from the first camera.")

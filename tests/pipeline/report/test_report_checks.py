@@ -32,6 +32,7 @@ from rille.pipeline.report import canvas, figures, gather
 from rille.stages.core.declare import Bundle
 from rille.stages.hazard.risk import RiskParams
 from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.path import PathParams
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +125,9 @@ def test_a_broken_comparison_says_why(tmp_path: Path) -> None:
 
 def test_no_comparison_is_told_only_where_it_was_switched_off(tmp_path: Path) -> None:
     vehicle = Vehicle(name="rover")
-    config = SimpleNamespace(vehicle=vehicle, risk=RiskParams(), crosscheck=SimpleNamespace(enabled=False))
+    config = SimpleNamespace(
+        vehicle=vehicle, risk=RiskParams(), path=PathParams(), crosscheck=SimpleNamespace(enabled=False)
+    )
     facts, _, html, _ = written(tmp_path, view(config=config))
     assert facts["missing"] == []
     assert [m["kind"] for m in facts["absent"]] == ["crosscheck"]

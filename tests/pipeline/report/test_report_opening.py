@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from toys.finished import view, written
 
-from rille.pipeline.report import checks, delivery, page, summary, terrain_map
+from rille.pipeline.report import checks, delivery, page, summary, tables, terrain_map
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.hazard.risk import RiskParams
+from rille.stages.hazard.risk import REASONS, RiskParams
 from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.path import PathParams
 
 
 def metric(value, unit, label="", truth=None, completeness=None):
@@ -32,6 +33,41 @@ def test_tiles_say_what_stands_beside_their_figure():
         ("Drift at the end", "0.840 %", "0.500 m at the end; of 59.9 m driven; against truth; 9 of 10 frames"),
         ("Path length", "66.6 m", "inclination up to 6.20° of 20°"),
     ]
+
+
+def test_a_drive_names_the_limits_that_were_broken_and_how_near_the_others_came():
+    metrics = {
+        "drive_path_length": metric(1.08, "m", "Length driven", truth="simulator"),
+        "drive_placements": metric(273, "placements"),
+        "drive_clearance_violations": metric(0, "placements"),
+        "drive_tilt_violations": metric(2, "placements"),
+        "drive_least_clearance": metric(0.0164, "m"),
+        "drive_greatest_tilt": metric(21.0, "deg"),
+    }
+    words = (
+        "judged at 273 placements; tilted beyond the limit at 2 placements; at least 16.4 mm of room under the belly"
+    )
+    assert page._tiles(metrics, 20.0) == [("Length driven", "1.08 m", f"{words}; tilt up to 21° of 20°; against truth")]
+
+
+def test_every_reason_on_the_map_has_words():
+    assert dict(page.reasons()).keys() == REASONS.keys()
+
+
+def test_columns_of_pairs_without_anything_are_left_out():
+    given = {name: None for _, name, _ in tables._PAIR_COLUMNS}
+    two = [given | {"frame": 0, "matched": 0.5}, given | {"frame": 4, "path": "found"}]
+    assert tables.pair_columns(two) == [
+        ("Frame", ["0", "4"], True),
+        ("Matched", ["50 %", "–"], True),
+        ("Path", ["–", "found"], False),
+    ]
+
+
+def test_where_stops_are_closed():
+    two = [{"frame": k, "path": "closed", "blocked_m": m} for k, m in ((0, 4.0), (2, 12.345))]
+    (item,) = delivery._local_paths(two, merged=False)
+    assert item["why"] == "closed (frames 0, 2; closed 4 to 12.3 m ahead)"
 
 
 def rows(*paths):
@@ -62,7 +98,8 @@ def test_standard_deviations_that_truth_contradicts_are_warned_of(nees, words):
 
 @pytest.mark.parametrize(("vehicle", "told"), [(Vehicle(), True), (Vehicle(track=0.5), False)])
 def test_limits_that_nobody_stated_are_told(tmp_path, vehicle, told):
-    facts, read, _, _ = written(tmp_path, view(config=SimpleNamespace(vehicle=vehicle, risk=RiskParams())))
+    config = SimpleNamespace(vehicle=vehicle, risk=RiskParams(), path=PathParams())
+    facts, read, _, _ = written(tmp_path, view(config=config))
     assert [m["kind"] for m in facts["absent"]] == ["vehicle"] * told
     assert ("0.700 m between its axles, 0.600 m between its wheels, up to 20°" in read.text) == told
 

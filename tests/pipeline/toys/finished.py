@@ -28,6 +28,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.measures import MEASURES
 from rille.stages.hazard.risk import RiskParams
 from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.path import PathParams
 
 CELL, ROWS, COLS = 0.01, 60, 80
 LATTICE = {"x0": -0.4, "y0": 0.8, "cell": CELL, "rows": ROWS, "cols": COLS}
@@ -271,7 +272,7 @@ def view(made: dict[str, Bundle] | None = None, *, truth: bool = True, **changes
         products=products(),
         bundle=lambda handle: store.get(handle) if isinstance(handle, str) else None,
         tasks=TASKS,
-        config=SimpleNamespace(vehicle=Vehicle(name="rover of the toy"), risk=RiskParams()),
+        config=SimpleNamespace(vehicle=Vehicle(name="rover of the toy"), risk=RiskParams(), path=PathParams()),
         config_toml="[locus]\ncell_size = 0.01  # <m>\n",
         seconds=12.3,
         versions={"rille": "0.1.0", "numpy": "2.4"},
