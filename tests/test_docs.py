@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import textwrap
 from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +19,10 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 PAGES += sorted(p for p in DOCS.rglob("*.md") if not {"_build", "examples"} & set(p.relative_to(DOCS).parts))
 LIST = DOCS / "reference/commands-not-run.md"
 BLOCK = re.compile(r"(?:^<!-- (not run|needs data): (.*?) -->\n)?^```(sh|python)\n(.*?)^```", re.M | re.S)
+FENCE = re.compile(r"^```.*?^```", re.M | re.S)
+INLINE = re.compile(r"(`)([\w/]+\.py)`")
+EXAMPLES = frozenset[str]()
+"""Modules that a page names though they do not exist: those that its reader is to write."""
 needs_sphinx = pytest.mark.skipif(find_spec("sphinx_gallery") is None, reason="needs pip install -e '.[docs]'")
 
 
@@ -58,6 +63,23 @@ def not_run() -> str:
         "Tests run all other blocks of commands and of Python in the README and in these pages as they stand.\n\n"
         "| page | block that begins with | why it is not run |\n|---|---|---|\n" + "\n".join(rows) + "\n"
     )
+
+
+def test_the_dataflow_is_drawn_once() -> None:
+    from rille.pipeline.flow import reconstruction
+
+    drawn = re.search(r"^```\n(image ->.*?)^```", (DOCS / "dataflow.md").read_text(encoding="utf-8"), re.M | re.S)
+    assert drawn is not None
+    assert textwrap.indent(drawn[1], "    ") in str(reconstruction.__doc__)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_modules_that_a_page_names_are_there(page: Path) -> None:
+    folders = ("pipeline", "stages", "datasets", "tests", "benchmarks", "docs", "rille")
+    there = [path.relative_to(ROOT).as_posix() for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    named = {name for _, name in INLINE.findall(FENCE.sub("", page.read_text(encoding="utf-8")))}
+    lost = sorted(name for name in named if not any(("/" + path).endswith("/" + name) for path in there))
+    assert not [name for name in lost if name not in EXAMPLES]
 
 
 def test_the_list_of_what_is_not_run_is_complete() -> None:

@@ -8,31 +8,30 @@
                                    +-> hfvm (basic pair) -+-> ground_frame ---+-> resect (segment) -> trajectory
                                                           |     |               (landmarks)  (refine)     |
         given rig --+-> orientation (basic pair) <--------+     |                                         |
-                    |       +-> rig -> calibration -------+-----+-> locus (local frame)                   |
+                    |       +-> rig -> calibration -------+-----+-> locus (local frame; pyramids)         |
                     |           (pooled; into the frame,  |           +-> risk, path (local)              |
                     |            locus and resect)        +-> locus (world lattice) <- pose (pair) <------+
                     |                                           +-> tile_index (pair): which world tiles it touches
                     |                                           +-> overlap_qa (pair, earlier ones)
-                    |                                           |     +-> overlap_audit, radiometry
-                    |                                           +-> merge (world tile) -> risk, path (mission)
+                    |                                           |     +-> overlap_audit; radiometry -+
+                    |                                           +-> merge (world tile) <-------------+
+                    |                                                 +-> risk, path (mission)
                     +-> crosscheck (window; images of both cameras) -> crosscheck_join -> agreement <- trajectory
-    leaves: accuracy (trajectory, crosscheck), position_accuracy, dem_accuracy (local and merged DEM), path_check
+    leaves:  accuracy (trajectory, crosscheck), position_accuracy, dem_accuracy (local and merged DEM), path_check
+    outputs: rasters, tracks, tables, figures: a task each; then report.html and report.json around them
 
-Frames that show no motion (black, foreign, sides exchanged) are lost: ``frame_screening`` finds them by
-``image_quality`` (what each pair looks like), the motions, and where it asks for them bridges (motions over a lost
-frame) and ``swap_check`` (left against right).
+Frames that show no motion (black, foreign, sides exchanged) are lost: ``frame_screening`` finds them by their looks
+(``image_quality``), motions, bridges over a lost frame, and ``swap_check`` (left against right).
 
-A segment needs landmarks only relative to its own basic pair, so all segments are resected and refined at once (and
-refined again, where ``common_tilt`` finds a tilt of all disparities); absolute poses are one cheap scan
-(``trajectory``), and Locus then runs a second time, straight on the shared world lattice: nothing is resampled. Locus
-reads both pyramids' finest images, and with ``locus.both`` the disparities of both (``hfvm/back``). What depends on
-data (which pairs are basic, how far the world reaches) follows as results arrive: ``reconstruction`` is a generator
-that yields tasks and goes on with their results. The ports of ``hfvm`` to ``locus``, ``track`` and ``resect`` are in
-:mod:`rille.pipeline.flow.builders`, the leaves in :mod:`rille.pipeline.flow.assessment`.
+A segment needs landmarks only relative to its own basic pair, so all are resected and refined at once (and refined
+again, where ``common_tilt`` finds a tilt of all disparities); ``trajectory`` chains them, and Locus then runs a second
+time, straight on the shared world lattice: nothing is resampled. With ``locus.both`` it reads the disparities of both
+images (``hfvm/back``). What depends on data (which pairs are basic, how far the world reaches) follows as results
+arrive: ``reconstruction`` is a generator that yields tasks and goes on with their results. Ports of single stages are
+in ``builders``, the leaves in ``assessment``; outputs are added last, by :mod:`rille.pipeline.runs.run_files`.
 
 The world is cut into tiles once and for all; a tile's task has those models alone as inputs that have a cell in it. A
-pair that is added, or moved by another pose, is thus merged anew in the tiles that it touches and touched, no others:
-world models depend on their own pose only, and what comes out as before is not followed any further.
+pair that is added, or moved by another pose, is merged anew in the tiles that it touches and touched, no others.
 """
 
 from __future__ import annotations
@@ -94,7 +93,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         make.motion(a, b)
     make.orientation(whole[0])
     if make.config.crosscheck.enabled and len(whole) > 1:
-        # Order is priority: its windows take longest of all tasks, so they begin before the rest is known.
+        # What is laid out first runs first: its windows take longest of all tasks.
         p.crosscheck = another_program(make, whole)
 
     # Frames that the trajectory goes through, and which of them are basic pairs.
@@ -112,7 +111,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     chosen = yield p.keyframes
     basic = [chain[i] for i in chosen.meta["basic"]]
 
-    # Stop and think: stereo pair to local elevation model, hazards and path.
+    # At each basic pair, the rover's stop: local elevation model, hazards and path.
     pairs = basic_pairs(make, basic, frames[0])
 
     # In between: tracks, poses in the frame of the segment's basic pair, and their product.

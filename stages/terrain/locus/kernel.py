@@ -9,9 +9,21 @@ s > 0: the surface that the left camera sees behind P is farther than P, so P is
 surface. A terrain surface is a change from free (above) to behind (below) along the normal. Where the change happens
 across a depth jump between two pixels nothing was seen: the cell is occluded there.
 
-A few dozen cells are followed side by side, each in its own *lane*: their lines are divided into steps (:func:`spans`),
-steps are looked at several at once (:func:`meet`) until s changes its sign, and the roots of all the changes found are
-solved together (:func:`roots`). A lane whose root does not stand goes on from there.
+**Which change, where there are several.** The search begins at the top of the cell's interval. If the point there is
+free, it goes down to the first change; if it is behind the surface, it first goes up to the nearest change above the
+start. A change *stands* if its residual, its slope and the jump of the disparities around it are within the limits
+(:func:`accept`); after one that does not, the search goes on, downwards from the start in the end. So the result is the
+highest change that stands at or below the start, or the nearest one above it. A cell whose interval, handed down from
+its coarse neighbours, lies wholly on another surface may so miss one that a search of the whole range would find.
+
+A few dozen cells are followed side by side, each in its own *lane*::
+
+    search               blocks of LANES cells: lines, clip, spans (steps of a pixel at most)
+      _solve             until every lane has ended
+        _look, meet      s at the next STEPS steps of each active lane
+        _scan            follows s: _begin, _upwards, _downwards; a change becomes a bracket
+        gather, roots    regula falsi of all brackets together
+        slopes, accept   what stands is written; other lanes go on from there
 
 Values lie in *planes* of a buffer, one behind the other, whose sizes are constants: so the compiler knows that they do
 not overlap, and computes several lanes or points side by side.
@@ -33,13 +45,13 @@ NEAR = 1e-9  # least projective depth (metres): excludes the camera's own plane
 LANES = 32
 """Cells that are solved together."""
 STEPS = 8
-"""LineSteps of one cell's search that are looked at together."""
+"""Steps of one cell's line that are looked at together."""
 POINTS = LANES * STEPS
 
 X, Y, X_RIGHT, Y_RIGHT, FX, FY, PIXEL, U, V, S, ACROSS, POWER = (k * POINTS for k in range(12))
-"""Planes of a buffer of points: p_l and p_r, the place of p_l in its bilinear cell, the pixel at that cell's start, the
-disparity there, and as :func:`meet` gives them s and its part across the epipolar line, both times a norm whose square
-is ``POWER``."""
+"""Planes of a buffer of points: p_l and p_r; fractions of p_l in its bilinear cell, and the pixel at that cell's start;
+the disparity there; and as :func:`meet` gives them s and its part across the epipolar line, both times a norm whose
+square is ``POWER``."""
 POINT_PLANES = 12
 
 LEFT_A, RIGHT_A, LEFT_B, RIGHT_B = (3 * k * LANES for k in range(4))
@@ -59,16 +71,20 @@ BOTTOM, TOP, DZ, COUNT, START, LAST = (k * LANES for k in range(21, 27))
 starts in; the part of the line that both images see, a step, how many there are, first and last one searched."""
 LINE_PLANES = 27
 
-WAY, PLACE, LEVEL, FIRST = (k * LANES for k in range(LINE_PLANES, LINE_PLANES + 4))
-"""Planes of the search: -1 downwards, 1 upwards, 0 not begun; the step looked at last, and s there; s at the start."""
+DIRECTION, REACHED, S_REACHED, S_START = (k * LANES for k in range(LINE_PLANES, LINE_PLANES + 4))
+"""Planes of the search: its direction (-1 downwards, 1 upwards, 0 not begun); the step that was looked at last, or
+:data:`ENDED`; s at that step; s at the start."""
+ENDED = 0.0
+"""Step reached by a lane that goes no farther if its root is refused: the lowest one."""
 UPPER_Z, UPPER_S, LOWER_Z, LOWER_S = (k * LANES for k in range(LINE_PLANES + 4, LINE_PLANES + 8))
 """Planes of the bracket that was found: elevation and s of both ends, as :func:`gather` copies them."""
 SEARCH_PLANES = LINE_PLANES + 8
 DONE, MORE, FOUND = 0, 1, 2
 
-SOLVED_PX = 1e-3  # |s| of a solution: a hundredth of the disparity's own noise
+SOLVED_PX = 1e-3  # |s| of a solution: a two-hundredth of the disparity's usual noise
 TURNS = 16
 
+# Another buffer, of the lanes whose root is solved: its planes behind the lines have other meanings.
 STEP, Z0, S0, Z1, S1 = (k * LANES for k in range(13, 18))
 """Planes beside the lines: the search's step, and the bracket: s0 >= 0 at z0, s1 < 0 at z1."""
 SIDE, OPEN, ROOT, UPWARDS, DOWNWARDS = (k * LANES for k in range(18, 23))
@@ -128,8 +144,8 @@ def project(line, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _place(left, right, z, shape, room, k):  # type: ignore[no-untyped-def]
-    """Point ``k``: p_l and p_r of the lines' point at elevation z, and the bilinear cell of p_l."""
+def _put_point(left, right, z, shape, points, k):  # type: ignore[no-untyped-def]
+    """Point ``k`` of a buffer: p_l and p_r of the lines' point at elevation z, and the bilinear cell of p_l."""
     x, y, w_left = project(left, z)
     xr, yr, w_right = project(right, z)
     rows, cols = shape
@@ -137,56 +153,59 @@ def _place(left, right, z, shape, room, k):  # type: ignore[no-untyped-def]
     # A point outside reads pixel 0, so that the loop over the disparity needs no branch; its NaN makes s one.
     x, y, xr = x if inside else 0.0, y if inside else 0.0, xr if inside else np.nan
     c, r = np.floor(x), np.floor(y)
-    room[X + k], room[Y + k], room[X_RIGHT + k], room[Y_RIGHT + k] = x, y, xr, yr
-    room[FX + k], room[FY + k], room[PIXEL + k] = x - c, y - r, r * float(cols) + c
+    points[X + k], points[Y + k], points[X_RIGHT + k], points[Y_RIGHT + k] = x, y, xr, yr
+    points[FX + k], points[FY + k], points[PIXEL + k] = x - c, y - r, r * float(cols) + c
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def climb(lanes, m, steps, shape, room):  # type: ignore[no-untyped-def]
+def climb(lanes, m, steps, shape, points):  # type: ignore[no-untyped-def]
     """Project the next steps of lane ``m`` into both images; ``shape`` (rows, cols) of the left one."""
     left, right = line_of(lanes, LEFT_A, LEFT_B, m), line_of(lanes, RIGHT_A, RIGHT_B, m)
     for k in range(STEPS):
-        _place(left, right, steps.bottom + (steps.first + steps.way * k) * steps.dz, shape, room, k)
+        _put_point(left, right, steps.bottom + (steps.first + steps.way * k) * steps.dz, shape, points, k)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def raise_to(lanes, n, shape, room):  # type: ignore[no-untyped-def]
+def raise_to(lanes, n, shape, points):  # type: ignore[no-untyped-def]
     """Project the point at elevation :data:`Z` of each of ``n`` lanes."""
     for m in range(n):
         left, right = line_of(lanes, LEFT_A, LEFT_B, m), line_of(lanes, RIGHT_A, RIGHT_B, m)
-        _place(left, right, lanes[Z + m], shape, room, m)
+        _put_point(left, right, lanes[Z + m], shape, points, m)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def meet(n, epipole, seen, room):  # type: ignore[no-untyped-def]
+def meet(n, epipole, seen, points):  # type: ignore[no-untyped-def]
     """s of ``n`` projected points; NaN where a point is outside an image or disparity is undefined."""
     # To read the disparity at scattered pixels is what vectors cannot do, so it is a loop of its own.
     disparity, width = seen.disparity, seen.image.shape[1]
     for k in range(n):
-        i = 2 * int(room[PIXEL + k])
+        i = 2 * int(points[PIXEL + k])
         j = i + 2 * width
-        fx, fy = room[FX + k], room[FY + k]
+        fx, fy = points[FX + k], points[FY + k]
         w00, w01, w10, w11 = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
-        room[U + k] = w00 * disparity[i] + w01 * disparity[i + 2] + w10 * disparity[j] + w11 * disparity[j + 2]
-        room[V + k] = w00 * disparity[i + 1] + w01 * disparity[i + 3] + w10 * disparity[j + 1] + w11 * disparity[j + 3]
+        points[U + k] = w00 * disparity[i] + w01 * disparity[i + 2] + w10 * disparity[j] + w11 * disparity[j + 2]
+        points[V + k] = (
+            w00 * disparity[i + 1] + w01 * disparity[i + 3] + w10 * disparity[j + 1] + w11 * disparity[j + 3]
+        )
     e0, e1, e2 = epipole[0], epipole[1], epipole[2]
     for k in range(n):
         # g = p_l + d(p_l) - p_r
-        xr, yr = room[X_RIGHT + k], room[Y_RIGHT + k]
-        gx, gy = room[X + k] + room[U + k] - xr, room[Y + k] + room[V + k] - yr
-        # With p_r(t) = (epipole + t m) / w on the ray of p_l, d p_r / d t is parallel to p_r * epipole_2 - epipole_01.
+        xr, yr = points[X_RIGHT + k], points[Y_RIGHT + k]
+        gx, gy = points[X + k] + points[U + k] - xr, points[Y + k] + points[V + k] - yr
+        # On the ray of p_l, p_r(t) = (epipole + t q) / w for a fixed q: d p_r / d t is parallel to
+        # p_r * epipole_2 - epipole_01.
         ex, ey = xr * e2 - e0, yr * e2 - e1
         # s = g . e / |e|: the search asks for its sign alone, so the root and the division are left to ``pixels``.
         power = ex * ex + ey * ey
         s = gx * ex + gy * ey
-        room[S + k] = s if power > 0.0 else np.nan
-        room[ACROSS + k], room[POWER + k] = gy * ex - gx * ey, power
+        points[S + k] = s if power > 0.0 else np.nan
+        points[ACROSS + k], points[POWER + k] = gy * ex - gx * ey, power
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def pixels(room, plane, k):  # type: ignore[no-untyped-def]
+def pixels(points, plane, k):  # type: ignore[no-untyped-def]
     """:data:`S` or :data:`ACROSS` of point ``k`` in pixels."""
-    return room[plane + k] / math.sqrt(room[POWER + k])
+    return points[plane + k] / math.sqrt(points[POWER + k])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -241,10 +260,10 @@ def spans(n, lanes):  # type: ignore[no-untyped-def]
         left, right = line_of(lanes, LEFT_A, LEFT_B, m), line_of(lanes, RIGHT_A, RIGHT_B, m)
         fastest = max(_speed(left, bottom), _speed(left, top))
         fastest = max(fastest, _speed(right, bottom), _speed(right, top))
-        count = max(1.0, min(np.ceil(fastest * (top - bottom) / STEP_PX), MAX_STEPS))
-        dz = (top - bottom) / count
-        lanes[DZ + m], lanes[COUNT + m] = dz, count
-        lanes[START + m] = max(0.0, min(count, np.ceil((lanes[HIGH + m] - bottom) / dz) + MARGIN))
+        steps = max(1.0, min(np.ceil(fastest * (top - bottom) / STEP_PX), MAX_STEPS))
+        dz = (top - bottom) / steps
+        lanes[DZ + m], lanes[COUNT + m] = dz, steps
+        lanes[START + m] = max(0.0, min(steps, np.ceil((lanes[HIGH + m] - bottom) / dz) + MARGIN))
         lanes[LAST + m] = np.floor((lanes[LOW + m] - bottom) / dz) - MARGIN
 
 
@@ -282,9 +301,9 @@ class PairCameras(NamedTuple):
     sizes: Floats
 
 
-class _Room(NamedTuple):
-    """Room to work in: planes of the lanes that search, of those whose root is solved, and of points; numbers of the
-    lanes that go on and of those with a bracket; the cell of each lane."""
+class _Buffers(NamedTuple):
+    """What the search works in: planes of the lanes that search, of those whose root is solved, and of points; numbers
+    of the lanes that go on, and of those with a bracket; the cell of each lane."""
 
     lanes: Floats
     solved: Floats
@@ -301,8 +320,8 @@ def search(cells: BlockCells, z_range: tuple[float, float], cameras: PairCameras
     Parameters
     ----------
     z_range : limits of Z, metres.
-    out : (r, c, 4) elevation (m), its standard deviation (m), residual (px) and grey value of the highest change from
-        free to behind that stands; to be filled with NaN before.
+    out : (r, c, 4) elevation (m), its standard deviation (m), residual (px) and grey value of the change from free to
+        behind that was chosen (see the module); to be filled with NaN before.
     """
     lanes, solved, points = (
         np.zeros(SEARCH_PLANES * LANES),
@@ -310,7 +329,7 @@ def search(cells: BlockCells, z_range: tuple[float, float], cameras: PairCameras
         np.zeros(POINT_PLANES * POINTS),
     )
     active, found, chosen = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
-    room = _Room(lanes, solved, points, active, found, chosen)
+    buffers = _Buffers(lanes, solved, points, active, found, chosen)
     foot, normal, rows = cells.feet.reshape(-1, 3), cells.normals.reshape(-1, 3), out.reshape(-1, 4)
     low, high = cells.low.ravel(), cells.high.ravel()
     n, last = 0, low.size - 1
@@ -324,17 +343,17 @@ def search(cells: BlockCells, z_range: tuple[float, float], cameras: PairCameras
             lines(n, cameras.left, cameras.right, lanes)
             clip(n, cameras.sizes, z_range[0], z_range[1], lanes)
             spans(n, lanes)
-            _solve(n, room, cameras.epipole, seen, rows)
+            _solve(n, buffers, cameras.epipole, seen, rows)
             n = 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _solve(n, room, epipole, seen, out):  # type: ignore[no-untyped-def]
+def _solve(n, buffers, epipole, seen, out):  # type: ignore[no-untyped-def]
     """Follow ``n`` lanes to the end."""
-    lanes, solved, points, active, found, cells = room
+    lanes, solved, points, active, found, cells = buffers
     count = 0
     for m in range(n):
-        lanes[WAY + m], lanes[PLACE + m] = 0.0, lanes[START + m] + 1.0
+        lanes[DIRECTION + m], lanes[REACHED + m] = 0.0, lanes[START + m] + 1.0
         if lanes[TOP + m] > lanes[BOTTOM + m]:
             active[count] = m
             count += 1
@@ -349,36 +368,40 @@ def _solve(n, room, epipole, seen, out):  # type: ignore[no-untyped-def]
         slopes(hits, solved, epipole, seen, points)
         refused = accept(hits, found, cells, solved, seen, points, out)
         for t in range(refused):
-            if lanes[PLACE + found[t]] > 0.0:
+            if lanes[REACHED + found[t]] > ENDED:
                 active[count] = found[t]
                 count += 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _look(active, count, lanes, shape, room):  # type: ignore[no-untyped-def]
+def _look(active, count, lanes, shape, points):  # type: ignore[no-untyped-def]
     """Project the next steps of the active lanes."""
     for t in range(count):
         m = active[t]
         # A lane that has not begun looks downwards: its first point is the start, which tells the way.
-        way = 1.0 if lanes[WAY + m] > 0.0 else -1.0
+        way = 1.0 if lanes[DIRECTION + m] > 0.0 else -1.0
         climb(
-            lanes, m, LineSteps(lanes[BOTTOM + m], lanes[PLACE + m] + way, way, lanes[DZ + m]), shape, room[STEPS * t :]
+            lanes,
+            m,
+            LineSteps(lanes[BOTTOM + m], lanes[REACHED + m] + way, way, lanes[DZ + m]),
+            shape,
+            points[STEPS * t :],
         )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _scan(active, count, found, hits, lanes, room):  # type: ignore[no-untyped-def]
+def _scan(active, count, found, hits, lanes, points):  # type: ignore[no-untyped-def]
     """Follow s over the steps looked at: lanes that go on stay active, those with a bracket are added to ``found``."""
     keep = 0
     for t in range(count):
         m, first = active[t], STEPS * t
-        fresh = lanes[WAY + m] == 0.0
-        if lanes[WAY + m] > 0.0:
-            outcome = _upwards(lanes, m, room, first)
-        elif fresh and _begin(lanes, m, room, first):
+        fresh = lanes[DIRECTION + m] == 0.0
+        if lanes[DIRECTION + m] > 0.0:
+            outcome = _upwards(lanes, m, points, first)
+        elif fresh and _begin(lanes, m, points, first):
             outcome = MORE
         else:
-            outcome = _downwards(lanes, m, room, first, 1 if fresh else 0)
+            outcome = _downwards(lanes, m, points, first, 1 if fresh else 0)
         if outcome == MORE:
             active[keep] = m
             keep += 1
@@ -389,31 +412,31 @@ def _scan(active, count, found, hits, lanes, room):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _begin(lanes, m, room, k):  # type: ignore[no-untyped-def]
+def _begin(lanes, m, points, k):  # type: ignore[no-untyped-def]
     """Take s at the start from point ``k``; whether the search begins upwards, because the point is behind."""
-    lanes[FIRST + m] = lanes[LEVEL + m] = pixels(room, S, k)
-    lanes[PLACE + m] = lanes[START + m]
-    upwards = (lanes[LEVEL + m] < 0.0) & (lanes[START + m] < lanes[COUNT + m])
-    lanes[WAY + m] = 1.0 if upwards else -1.0
+    lanes[S_START + m] = lanes[S_REACHED + m] = pixels(points, S, k)
+    lanes[REACHED + m] = lanes[START + m]
+    upwards = (lanes[S_REACHED + m] < 0.0) & (lanes[START + m] < lanes[COUNT + m])
+    lanes[DIRECTION + m] = 1.0 if upwards else -1.0
     return upwards
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _downwards(lanes, m, room, first, begin):  # type: ignore[no-untyped-def]
+def _downwards(lanes, m, points, first, begin):  # type: ignore[no-untyped-def]
     """Go down from free to behind, beyond the last step only while free."""
-    place, last, above, outcome = lanes[PLACE + m], lanes[LAST + m], lanes[LEVEL + m], MORE
+    place, last, above, outcome = lanes[REACHED + m], lanes[LAST + m], lanes[S_REACHED + m], MORE
     for i in range(begin, STEPS):
         place -= 1.0
-        s = room[S + first + i]
+        s = points[S + first + i]
         if place < 0.0:
             outcome = DONE
             break
         if above >= 0.0 and s < 0.0:
-            upper = pixels(room, S, first + i - 1) if i else lanes[LEVEL + m]
-            lanes[LEVEL + m] = pixels(room, S, first + i)
-            _bracket(lanes, m, place + 1.0, upper, lanes[LEVEL + m])
-            # 0 ends a lane whose root is refused: below the last step only free ground is searched on.
-            lanes[PLACE + m] = place if place > last else 0.0
+            upper = pixels(points, S, first + i - 1) if i else lanes[S_REACHED + m]
+            lanes[S_REACHED + m] = pixels(points, S, first + i)
+            _bracket(lanes, m, place + 1.0, upper, lanes[S_REACHED + m])
+            # Below the last step the search goes on through free ground only.
+            lanes[REACHED + m] = place if place > last else ENDED
             outcome = FOUND
             break
         if place <= last and not s >= 0.0:
@@ -421,28 +444,29 @@ def _downwards(lanes, m, room, first, begin):  # type: ignore[no-untyped-def]
             break
         above = s
     if outcome == MORE:
-        lanes[PLACE + m], lanes[LEVEL + m] = place, pixels(room, S, first + STEPS - 1)
+        lanes[REACHED + m], lanes[S_REACHED + m] = place, pixels(points, S, first + STEPS - 1)
     return outcome
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _upwards(lanes, m, room, first):  # type: ignore[no-untyped-def]
-    """Go up while behind; what comes after that, or after a bracket, is the way down from the start."""
-    place, outcome, turned = lanes[PLACE + m], MORE, False
+def _upwards(lanes, m, points, first):  # type: ignore[no-untyped-def]
+    """Go up while behind, to a bracket or to the end of what is known; after either the lane is sent back to its start,
+    to go down from there (``turned``)."""
+    place, outcome, turned = lanes[REACHED + m], MORE, False
     for i in range(STEPS):
         place += 1.0
-        s = room[S + first + i]
+        s = points[S + first + i]
         turned = place > lanes[COUNT + m] or not s < 0.0
         if turned:
             if place <= lanes[COUNT + m] and s >= 0.0:
-                below = pixels(room, S, first + i - 1) if i else lanes[LEVEL + m]
-                _bracket(lanes, m, place, pixels(room, S, first + i), below)
+                below = pixels(points, S, first + i - 1) if i else lanes[S_REACHED + m]
+                _bracket(lanes, m, place, pixels(points, S, first + i), below)
                 outcome = FOUND
             break
     if turned:
-        lanes[WAY + m], lanes[PLACE + m], lanes[LEVEL + m] = -1.0, lanes[START + m], lanes[FIRST + m]
+        lanes[DIRECTION + m], lanes[REACHED + m], lanes[S_REACHED + m] = -1.0, lanes[START + m], lanes[S_START + m]
     else:
-        lanes[PLACE + m], lanes[LEVEL + m] = place, pixels(room, S, first + STEPS - 1)
+        lanes[REACHED + m], lanes[S_REACHED + m] = place, pixels(points, S, first + STEPS - 1)
     return outcome
 
 
@@ -454,7 +478,7 @@ def _bracket(lanes, m, step, upper, lower):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def roots(n, lanes, epipole, seen, room):  # type: ignore[no-untyped-def]
+def roots(n, lanes, epipole, seen, points):  # type: ignore[no-untyped-def]
     """Regula falsi (Illinois); NaN at undefined disparity."""
     for m in range(n):
         lanes[SIDE + m], lanes[OPEN + m] = 0.0, 1.0
@@ -463,79 +487,81 @@ def roots(n, lanes, epipole, seen, room):  # type: ignore[no-untyped-def]
             z0, s0, z1, s1 = lanes[Z0 + m], lanes[S0 + m], lanes[Z1 + m], lanes[S1 + m]
             z = (z0 * s1 - z1 * s0) / (s1 - s0)
             lanes[Z + m] = z if lanes[OPEN + m] > 0.0 else lanes[Z + m]
-        raise_to(lanes, n, seen.image.shape, room)
-        meet(n, epipole, seen, room)
-        if not _halve(n, lanes, room):
+        raise_to(lanes, n, seen.image.shape, points)
+        meet(n, epipole, seen, points)
+        if not _halve(n, lanes, points):
             break
     for m in range(n):
         lanes[ROOT + m] = lanes[Z + m]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _halve(n, lanes, room):  # type: ignore[no-untyped-def]
+def _halve(n, lanes, points):  # type: ignore[no-untyped-def]
     """Narrow each bracket by the point looked at; how many are not solved yet."""
-    left = 0
+    unsolved = 0
     for m in range(n):
-        s, z = pixels(room, S, m), lanes[Z + m]
+        s, z = pixels(points, S, m), lanes[Z + m]
         z0, s0, z1, s1, side = lanes[Z0 + m], lanes[S0 + m], lanes[Z1 + m], lanes[S1 + m], lanes[SIDE + m]
         still = (lanes[OPEN + m] > 0.0) & (abs(s) >= SOLVED_PX)
         lanes[OPEN + m] = 1.0 if still else 0.0
-        left += 1 if still else 0
+        unsolved += 1 if still else 0
         free = s > 0.0
         # Illinois: an end that stays twice counts half, else the chord would creep towards the root from one side.
         lanes[Z0 + m], lanes[S0 + m] = (z if free else z0), (s if free else (s0 * 0.5 if side < 0.0 else s0))
         lanes[Z1 + m], lanes[S1 + m] = (z1 if free else z), ((s1 * 0.5 if side > 0.0 else s1) if free else s)
         lanes[SIDE + m] = 1.0 if free else -1.0
         lanes[Z + m] = z if s == s else np.nan
-    return left
+    return unsolved
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def slopes(n, lanes, epipole, seen, room):  # type: ignore[no-untyped-def]
-    """One-sided ds/dZ at the roots, pixels per metre; leaves the roots' own points in ``room``."""
+def slopes(n, lanes, epipole, seen, points):  # type: ignore[no-untyped-def]
+    """One-sided ds/dZ at the roots, pixels per metre; leaves those of the roots in ``points``."""
     for m in range(n):
         lanes[Z + m] = lanes[ROOT + m] + lanes[STEP + m]
-    raise_to(lanes, n, seen.image.shape, room)
-    meet(n, epipole, seen, room)
+    raise_to(lanes, n, seen.image.shape, points)
+    meet(n, epipole, seen, points)
     for m in range(n):
-        lanes[UPWARDS + m] = pixels(room, S, m) / lanes[STEP + m]
+        lanes[UPWARDS + m] = pixels(points, S, m) / lanes[STEP + m]
         lanes[Z + m] = lanes[ROOT + m] - lanes[STEP + m]
-    raise_to(lanes, n, seen.image.shape, room)
-    meet(n, epipole, seen, room)
+    raise_to(lanes, n, seen.image.shape, points)
+    meet(n, epipole, seen, points)
     for m in range(n):
-        lanes[DOWNWARDS + m] = -pixels(room, S, m) / lanes[STEP + m]
-        # The roots themselves once more: their residual and grey value are read from the room of points.
+        lanes[DOWNWARDS + m] = -pixels(points, S, m) / lanes[STEP + m]
+        # The roots themselves once more: their residual and grey value are read from the buffer of points.
         lanes[Z + m] = lanes[ROOT + m]
-    raise_to(lanes, n, seen.image.shape, room)
-    meet(n, epipole, seen, room)
+    raise_to(lanes, n, seen.image.shape, points)
+    meet(n, epipole, seen, points)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def accept(n, found, cells, lanes, seen, room, out):  # type: ignore[no-untyped-def]
-    """Write ``out`` of the roots that stand; leave the other lanes in front of ``found``, and return their number.
+def accept(n, found, cells, lanes, seen, points, out):  # type: ignore[no-untyped-def]
+    """Write ``out`` of the roots that stand; give how many do not.
 
-    ``found``: the search's lane of each; ``cells``: the row of ``out`` of each of those."""
+    ``found``: number of each root's lane in the search; afterwards it begins with those of the roots that do not stand.
+    ``cells``: the row of ``out`` of each lane of the search.
+    """
     disparity, std, image, limits = seen
-    width, count = image.shape[1], 0
+    width, refused = image.shape[1], 0
     for m in range(n):
-        s, across = pixels(room, S, m), pixels(room, ACROSS, m)
+        s, across = pixels(points, S, m), pixels(points, ACROSS, m)
         residual = math.sqrt(s * s + across * across)
         # The lesser slope: beside a jump the other side is steep, and would make the elevation look certain.
         up, down = lanes[UPWARDS + m], lanes[DOWNWARDS + m]
         slope = up if down != down else (down if up != up else min(up, down))
-        at = 2 * int(room[PIXEL + m])
+        at = 2 * int(points[PIXEL + m])
         if residual <= limits[0] and slope > 0.0 and not _is_jump(at, at + 2 * width, disparity, limits[1]):
-            c, r, fx, fy = int(room[X + m]), int(room[Y + m]), room[FX + m], room[FY + m]
+            c, r, fx, fy = int(points[X + m]), int(points[Y + m]), points[FX + m], points[FY + m]
             top = image[r, c] * (1.0 - fx) + image[r, c + 1] * fx
             bottom = image[r + 1, c] * (1.0 - fx) + image[r + 1, c + 1] * fx
-            i, own = cells[found[m]], std[int(np.rint(room[Y + m])), int(np.rint(room[X + m]))]
+            i, own = cells[found[m]], std[int(np.rint(points[Y + m])), int(np.rint(points[X + m]))]
             # sigma_Z = sigma_d / |ds/dZ|
             out[i, 0], out[i, 1], out[i, 2] = lanes[ROOT + m], own / slope, residual
             out[i, 3] = top * (1.0 - fy) + bottom * fy
         else:
-            found[count] = found[m]  # count <= m: none is lost
-            count += 1
-    return count
+            found[refused] = found[m]  # refused <= m: none is lost
+            refused += 1
+    return refused
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
