@@ -2,12 +2,12 @@
 their check.
 
 ``python benchmarks/disparity_std.py`` renders pairs of the built-in mockup (kept in ``--cache``), matches them and
-prints how many of the matched pixels err by less than one and two standard deviations. ``motorcycle`` and ``cones`` of
-RILLE_DATA are judged where they are. ``--fit`` also fits the factors anew on the pairs marked with a star and prints
-them: to be done after every change of the matcher. Factors are those that make 68.3 % of the errors lie below std and
-95.4 % below twice that, whatever the parts N, R, M of a pixel are: the minimum of the two quantiles' pinball losses of
-log(error / std). The floor is not fitted, since the mockup has no lens and no gaps between pixels: 0.1 px is what
-well-textured smooth surfaces of real pairs show.
+prints how many of the matched pixels err by less than one and two standard deviations, also on the photographed pairs
+of ``robustness.py`` (RILLE_DATA). ``--fit`` fits the factors anew to the pairs marked with a star for each ``--floor``,
+prints them, and says what they make of all pairs: to be done after every change of the matcher. Factors are those that
+make 68.3 % of the errors lie below std and 95.4 % below twice that, whatever the parts N, R, M of a pixel are: the
+minimum of the two quantiles' pinball losses of log(error / std). The floor cannot be fitted so, since the mockup has no
+lens and no gaps between pixels: it is chosen by the photographed pairs marked ``+``.
 """
 
 from __future__ import annotations
@@ -36,7 +36,6 @@ PAIRS: dict[str, tuple[dict[str, Any], int, bool]] = {
 }
 """Name to mockup parameters, frame, and whether factors are fitted to it."""
 
-FLOOR = 0.1
 WEIGHT = 0.5
 """Of the loss at two standard deviations against that at one."""
 SAMPLES = 20000
@@ -65,27 +64,23 @@ def rendered(cache: Path, parameters: dict[str, Any], frame: int) -> tuple[Any, 
 
 
 def photographs() -> dict[str, tuple[Any, ...]]:
-    """Pairs with measured disparity: their truth has an error of its own, of about .1 px."""
-    import cv2
+    """Photographed pairs whose disparity was measured; ``+``: for choosing, ``-``: for judging."""
+    import robustness
 
-    found: dict[str, tuple[Any, ...]] = {}
-    folder = Path(os.environ.get("RILLE_DATA") or "-")
-    if (folder / "motorcycle").is_dir():
-        with np.load(folder / "motorcycle" / "motorcycle_disp.npz") as z:
-            truth = z[z.files[0]].astype(np.float32)
-        sides = [cv2.imread(str(folder / "motorcycle" / f"motorcycle_{s}.png"), 0) for s in ("left", "right")]
-        found["motorcycle"] = (*sides, np.where(np.isfinite(truth) & (truth > 0), -truth, np.nan))
-    if (folder / "cones").is_dir():
-        truth = cv2.imread(str(folder / "cones" / "cones_disp_02.png"), 0).astype(np.float32) / 4
-        sides = [cv2.imread(str(folder / "cones" / f"cones_image_{n}.png"), 0) for n in ("02", "06")]
-        found["cones"] = (*sides, np.where(truth > 0, -truth, np.nan))
-    return found
+    return {
+        f"{'+' if name in robustness.CHOSEN else '-'} {name}": (pair.left, pair.right, pair.truth.u)
+        for name, pair in robustness.pairs().items()
+        if name in (*robustness.CHOSEN, *robustness.JUDGED)
+    }
 
 
 def judged(
     preset: str, left: Any, right: Any, truth: Any, left_valid: Any = None, right_valid: Any = None
 ) -> tuple[Floats, Floats, Floats]:
-    """Parts (1, N, R, M) x n, absolute errors (n,) and standard deviations (n,) of the matched pixels with truth."""
+    """Parts (1, N, R, M) x n, absolute errors (n,) and standard deviations (n,) of the matched pixels with truth.
+
+    Parts are NaN at pixels without texture, which the factors do not describe alone.
+    """
     from rille.stages.hfvm import stage as hfvm
     from rille.stages.hfvm.finish import uncertainty
     from rille.stages.hfvm.images.params import HfvmParams
@@ -94,7 +89,10 @@ def judged(
     original = uncertainty.standard_deviation
 
     def recording(noise: Any, column: Any, keep: Any, params: Any) -> Any:
-        parts.extend([noise.copy(), *uncertainty.neighbours(column, keep)])
+        # A second call is for pixels without texture.
+        parts.extend(
+            [] if parts else [np.where(keep, p, np.nan) for p in (noise, *uncertainty.neighbours(column, keep))]
+        )
         return original(noise, column, keep, params)
 
     uncertainty.standard_deviation = recording
@@ -109,24 +107,25 @@ def judged(
     return x, error, found.disparity_std[ok].astype(np.float64)
 
 
-def fit(data: list[tuple[Floats, Floats, Floats]]) -> Floats:
+def fit(data: list[tuple[Floats, Floats, Floats]], floor: float) -> Floats:
     """Factors floor, noise, relief, border."""
     from scipy.optimize import minimize
 
     rng = np.random.default_rng(0)
     chosen = [(x, e, rng.choice(len(e), min(SAMPLES, len(e)), replace=False)) for x, e, _ in data]
     x = np.concatenate([x[:, i] for x, _, i in chosen], axis=1)
-    log_error = np.log(np.concatenate([e[i] for _, e, i in chosen]) + 1e-4)
+    described = np.isfinite(x).all(axis=0)
+    x, log_error = x[:, described], np.log(np.concatenate([e[i] for _, e, i in chosen])[described] + 1e-4)
 
     def loss(p: Floats) -> float:
-        over = log_error - 0.5 * np.log(np.exp(np.append(2 * np.log(FLOOR), p)) @ x)
+        over = log_error - 0.5 * np.log(np.exp(np.append(2 * np.log(floor), p)) @ x)
         total = 0.0
         for share, level, weight in ((0.683, 0.0, 1.0), (0.954, np.log(2.0), WEIGHT)):
             total += weight * float(np.mean(np.maximum(share * (over - level), (share - 1) * (over - level))))
         return total
 
     found = minimize(loss, np.full(3, -1.0), method="Powell", options={"xtol": 1e-3, "ftol": 1e-6})
-    return np.append(FLOOR, np.exp(0.5 * found.x))
+    return np.append(floor, np.exp(0.5 * found.x))
 
 
 def main() -> None:
@@ -134,20 +133,29 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path(".rille/cache"))
     parser.add_argument("--preset", default="default")
     parser.add_argument("--fit", action="store_true")
+    parser.add_argument("--floor", type=float, nargs="*", default=[0.1, 0.13, 0.16], help="pixels, to fit with")
     options = parser.parse_args()
     from rille.pipeline.engine.runtime.environment import prepare_environment
 
     prepare_environment()
-    pairs = {name: rendered(options.cache, p, frame) for name, (p, frame, _) in PAIRS.items()} | photographs()
-    fitted = []
-    for name, pair in pairs.items():
-        x, error, std = judged(options.preset, *pair)
-        star = name in PAIRS and PAIRS[name][2]
-        fitted += [(x, error, std)] if star else []
-        inside = " ".join(f"{100 * np.mean(error <= k * std):5.1f} %" for k in (1, 2, 3))
-        print(f"{'*' if star else ' '} {name:18s} within 1, 2, 3 std: {inside}   median std {np.median(std):.3f} px")
-    if options.fit:
-        print("floor, noise, relief, border:", np.round(fit(fitted), 3))
+    pairs = {name: rendered(options.cache, p, frame) for name, (p, frame, _) in PAIRS.items()}
+    pairs |= photographs() if os.environ.get("RILLE_DATA") else {}
+    stars = {name for name, (_, _, star) in PAIRS.items() if star}
+    data = {name: judged(options.preset, *pair) for name, pair in pairs.items()}
+    for name, (_, error, std) in data.items():
+        mark = "* " if name in stars else "  " * (name in PAIRS)
+        print(f"{mark + name:20s} within 1, 2, 3 std: {inside(error, std)}   median std {np.median(std):.3f} px")
+    for floor in options.floor if options.fit else ():
+        factors = fit([data[name] for name in stars], floor)
+        print("floor, noise, relief, border:", np.round(factors, 3))
+        for name, (x, error, std) in data.items():
+            by_parts = np.sqrt(np.square(factors) @ np.nan_to_num(x))
+            print(f"    {name:18s} {inside(error, np.where(np.isfinite(x).all(axis=0), by_parts, std))}")
+
+
+def inside(error: Floats, std: Floats) -> str:
+    """Shares within one, two and three standard deviations."""
+    return " ".join(f"{100 * np.mean(error <= k * std):5.1f} %" for k in (1, 2, 3))
 
 
 if __name__ == "__main__":
