@@ -168,7 +168,7 @@ def _path_words(scene: Scene) -> str:
     chosen = "the target" if aim else "no path.target is set, so that is the free place nearest to the far row's middle"
     rest += (
         f" It ends at x {x:.2f} m, y {y:.2f} m: {chosen}. Of all paths there it is the one that climbs and falls "
-        "least, caution ground charged, not the shortest."
+        "least, with caution ground and detours charged; not the shortest."
     )
     if max(before, beyond) > vehicle.wheel_base + vehicle.wheel_diameter:
         rest += (

@@ -7,7 +7,8 @@ the second where the first reaches no target that was asked for.
 
 The weight of an edge is the absolute height difference between the places where a wheel would stand: means over the
 wheel's window, rounded to a step that means nothing to the vehicle. ``grid8`` adds the length, since without rows to
-cross a path of no climb could be of any length. Caution ground costs a toll.
+cross a path of no climb could be of any length; ``rows`` a part of what a diagonal is longer (``detour_cost``), else a
+path over level ground would follow the noise of its elevations. Caution ground costs a toll.
 
 Footprint. The middle of the vehicle never enters a hazardous or unknown cell; and in the direction of each edge its
 wheels keep the margin from ground that is hazardous to a wheel, and its middle keeps it from places where the vehicle
@@ -45,7 +46,7 @@ from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning import grid8
 from rille.stages.planning.path_ground import GROUNDS, Maps, PathMaps, PathPrices, Point, RowGrid
 from rille.stages.planning.path_words import Route, describe, hazard_words
-from rille.stages.planning.row_graph import UNREACHED, Cell, Plan, nearest_middle, plan, row_span
+from rille.stages.planning.row_graph import UNREACHED, Cell, Charges, Plan, nearest_middle, plan, row_span
 
 __all__ = ["STAGE", "PathParams", "Route", "describe", "find_path"]
 
@@ -71,6 +72,14 @@ class PathParams(Params):
     )
     height_step: float = Field(
         default=0.02, gt=0, le=1, description="smallest height difference that costs [share of max_step]"
+    )
+    detour_cost: float = Field(
+        default=0.2,
+        ge=0,
+        le=10,
+        description="cost of a metre by which planner rows departs from straight ahead [m of climb]; 0: heights alone "
+        "count, as in the paper; 0.2: about the rolling resistance of loose ground; grid8 counts its whole length as "
+        "climb",
     )
     caution_cost: float = Field(
         default=0.2,
@@ -187,11 +196,13 @@ def _by_rows(
     # One vehicle length, from the front of the front wheels to the back of the rear ones.
     tolerance = math.ceil((vehicle.wheel_base + vehicle.wheel_diameter) / lattice.cell)
     span = row_span(~ground.closed)
+    # A diagonal is longer than a row is wide; the rows themselves every path crosses.
+    charges = Charges(ground.toll, round(p.detour_cost * (math.sqrt(2) - 1) * grid.cell / ground.unit))
     for name in GROUNDS:
         # How far one can go takes a sweep of its own, which only the last and most lenient try needs.
         explain = name == GROUNDS[-1]
         ways = ground.ways(name)
-        found = plan(ground.height, ways, tolerance, (first, last), span=span, toll=ground.toll, explain=explain)
+        found = plan(ground.height, ways, tolerance, (first, last), span, charges, explain)
         if len(found.cells):
             break
     cost = ground.metres(found.cost, UNREACHED, grid.rows)

@@ -12,7 +12,7 @@ in the direction of the edge.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -47,8 +47,19 @@ class Plan:
     reason: str = ""
 
 
+class Charges(NamedTuple):
+    """What a path pays beside the height differences, in their unit: ``toll`` (row, col) on entering a cell, None is
+    nothing; ``sideways`` for the greater length of each move to a neighbouring column."""
+
+    toll: Ints | None = None
+    sideways: int = 0
+
+
+FREE = Charges()
+
+
 def sweep(
-    height: Ints, ways: Ways, sources: Bools, toll: Ints | None = None
+    height: Ints, ways: Ways, sources: Bools, charges: Charges = FREE
 ) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
     """Least cost from any source to every cell of the row graph, towards row 0.
 
@@ -58,23 +69,27 @@ def sweep(
     ways : (row, col) directions as bits in which the vehicle may stand (see
         :mod:`rille.stages.planning.configuration_space`).
     sources : (row, col) cells where a path may start.
-    toll : (row, col) whole numbers, added on entering a cell, in the unit of the heights.
+    charges : whole numbers.
 
     Returns
     -------
-    Cost (row, col) int64: sum of absolute height differences and tolls, times the number of rows, plus the sideways
+    Cost (row, col) int64: sum of absolute height differences and charges, times the number of rows, plus the sideways
     moves; and the index into :data:`MOVES` of the last move (-1 at sources and where not reached).
     """
     cost, move = np.empty(height.shape, dtype=np.int64), np.empty(height.shape, dtype=np.int8)
-    _sweep(np.ascontiguousarray(height), ways, np.zeros_like(height) if toll is None else toll, sources, cost, move)
+    toll = np.zeros_like(height) if charges.toll is None else charges.toll
+    _sweep(np.ascontiguousarray(height), ways, (toll, charges.sideways), sources, cost, move)
     return cost, move
 
 
 @njit(cache=True, nogil=True)
-def _sweep(height, ways, toll, sources, cost, move):  # type: ignore[no-untyped-def]
+def _sweep(height, ways, charges, sources, cost, move):  # type: ignore[no-untyped-def]
     """Rows are worked on as lines, each from the first to the last cell that can be reached; the last one is kept with
     an unreachable cell at either end. Costs there are four times as large, plus the index of the move."""
     rows, cols = height.shape
+    toll = charges[0]
+    # Times four, as all costs here, and one more step: of equal costs the fewest moves sideways win.
+    sideways = 4 * (rows * charges[1] + 1)
     last, around = np.full(cols + 2, 4 * UNREACHED, dtype=np.int64), np.zeros(cols + 2, dtype=np.uint8)
     lines = np.zeros((2, cols + 2), dtype=np.int64)
     best, step, can = np.empty(cols, dtype=np.int64), np.empty(cols, dtype=np.int64), np.empty(cols, dtype=np.uint8)
@@ -91,12 +106,12 @@ def _sweep(height, ways, toll, sources, cost, move):  # type: ignore[no-untyped-
         if r + 1 < rows:
             _copy_ways(ways[r + 1], around)
         inner = slice(left, right)
-        # Times the number of rows: all moves sideways of a path together weigh less than one unit of height.
+        # Times the number of rows: the steps beside the charge of all moves sideways of a path weigh less than a unit.
         _scale(height[r, inner], 4 * rows, here[left + 1 : right + 1])
         _scale(toll[r, inner], 4 * rows, step[inner])
         _allow(ways[r, inner], around[left : right + 2], can[inner])
-        _enter(here[left + 1 : right + 1], step[inner], can[inner], last[left : right + 2], before[left : right + 2],
-               best[inner])  # fmt: skip
+        reached = last[left : right + 2], before[left : right + 2]
+        _enter(here[left + 1 : right + 1], step[inner], can[inner], reached, sideways, best[inner])
         _unpack(best[inner], cost[r, inner], move[r, inner])
         for c in range(first, end):
             if sources[r, c] and ways[r, c]:
@@ -148,18 +163,20 @@ def _allow(here, around, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _enter(height, toll, can, last, before, out):  # type: ignore[no-untyped-def]
+def _enter(height, toll, can, reached, sideways, out):  # type: ignore[no-untyped-def]
     """Least cost of one row from the last one, with the index of the move in the last two bits: of equal costs the
-    first move is the least. Without branches, so that cells go side by side."""
+    first move is the least. ``reached``: cost and height of the last row. Without branches, so that cells go side by
+    side."""
+    last, before = reached
     far = np.int64(4 * UNREACHED)
     for c in range(height.shape[0]):
         way, h, step = can[c], height[c], toll[c]
         a = last[c + 1] + (abs(h - before[c + 1]) + step)
         a = a if (way & STRAIGHT != 0) & (last[c + 1] < far) else far
-        # 4 for a move sideways (costs are four times as large), and 1 or 2, the index of the move, which decides ties.
-        b = last[c + 2] + (abs(h - before[c + 2]) + step) + 5
+        # 1 or 2 is the index of the move, which decides ties.
+        b = last[c + 2] + (abs(h - before[c + 2]) + step) + (sideways + 1)
         b = b if (way & LEFT != 0) & (last[c + 2] < far) else far
-        d = last[c] + (abs(h - before[c]) + step) + 6
+        d = last[c] + (abs(h - before[c]) + step) + (sideways + 2)
         d = d if (way & RIGHT != 0) & (last[c] < far) else far
         best = a if a < b else b
         out[c] = best if best < d else d
@@ -200,7 +217,7 @@ def plan(
     tolerance: int = 0,
     ends: tuple[Cell | None, Cell | None] = (None, None),
     span: tuple[int, int] | None = None,
-    toll: Ints | None = None,
+    charges: Charges = FREE,
     explain: bool = True,
 ) -> Plan:
     """Path from the nearest to the farthest row, or between given cells.
@@ -213,7 +230,7 @@ def plan(
         at most a quarter of the rows between them.
     ends : start and target, row and column inside the grid, or None.
     span : the farthest and the nearest row that count; None: those with a free cell.
-    toll : see :func:`sweep`.
+    charges : see :func:`sweep`.
     explain : where there is no path, find out how far one can go.
     """
     rows, cols = ways.shape
@@ -249,7 +266,7 @@ def plan(
     if not good.any():
         if not explain:
             return nothing
-        cost, _ = sweep(height, allowed, candidates, toll)
+        cost, _ = sweep(height, allowed, candidates, charges)
         reached = np.flatnonzero((cost < UNREACHED).any(axis=1))
         stop = int(reached[0]) - 1 if len(reached) else nearest
         why = "hazardous or unknown ground closes the whole width"
@@ -257,7 +274,7 @@ def plan(
     source = np.zeros(ways.shape, dtype=bool)
     # One source, not all candidates: costs are then those of the path's own start, as the report draws them.
     source[nearest_middle(good, nearest)] = True
-    cost, move = sweep(height, allowed, source, toll)
+    cost, move = sweep(height, allowed, source, charges)
     row, col = nearest_middle(cost[: limit + 1] < UNREACHED, farthest)
     return Plan(_trace(move, row, col), cost, cost[row] < UNREACHED, row)
 

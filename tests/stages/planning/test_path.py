@@ -101,6 +101,17 @@ def test_what_stays_on_known_ground_is_told(gap: int, ground: str) -> None:
     assert len(route.xyz) > 30
 
 
+def test_a_path_over_level_ground_does_not_follow_the_noise_of_its_elevations() -> None:
+    lattice = Lattice.at(-20, 60, CELL, 60, 41)
+    risk, z = level(lattice)
+    z = z + np.random.default_rng(3).normal(0.0, 0.005, z.shape).astype(np.float32)
+    winding, straight = (
+        find_path(maps(risk, z), lattice, SHORT, params=PathParams(detour_cost=cost)) for cost in (0.0, 0.2)
+    )
+    aside = [int(np.abs(np.diff(route.cells[:, 1])).sum()) for route in (winding, straight)]
+    assert aside[1] < 0.5 * aside[0]
+
+
 def test_caution_ground_is_avoided_where_the_detour_is_short() -> None:
     lattice = Lattice.at(-20, 60, CELL, 60, 41)
     risk, z = level(lattice)

@@ -11,14 +11,16 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from rille.stages.planning.configuration_space import ALL, LEFT, RIGHT, STRAIGHT
-from rille.stages.planning.row_graph import UNREACHED, leading, plan, sweep
+from rille.stages.planning.row_graph import UNREACHED, Charges, leading, plan, sweep
 
 
-def edges(height: np.ndarray, free: np.ndarray) -> list[tuple[tuple[int, int], tuple[int, int], int]]:
+def edges(
+    height: np.ndarray, free: np.ndarray, sideways: int = 0
+) -> list[tuple[tuple[int, int], tuple[int, int], int]]:
     """The row graph as a list, from each cell to the next row (one less), weighted as `sweep` says."""
     rows, cols = height.shape
     return [
-        ((r, c), (r - 1, d), int(abs(height[r, c] - height[r - 1, d])) * rows + (c != d))
+        ((r, c), (r - 1, d), int(abs(height[r, c] - height[r - 1, d])) * rows + (c != d) * (1 + rows * sideways))
         for r in range(rows - 1, 0, -1)
         for c in range(cols)
         for d in (c - 1, c, c + 1)
@@ -64,23 +66,29 @@ def test_among_equals_straight_then_left_then_right() -> None:
 
 
 @settings(max_examples=40, deadline=None)
-@given(seed=st.integers(0, 9999), rows=st.integers(2, 12), cols=st.integers(1, 12), blocked=st.floats(0.0, 0.6))
-def test_costs_equal_networkx_and_scipy(seed: int, rows: int, cols: int, blocked: float) -> None:
+@given(
+    seed=st.integers(0, 9999),
+    rows=st.integers(2, 12),
+    cols=st.integers(1, 12),
+    blocked=st.floats(0.0, 0.6),
+    sideways=st.integers(0, 3),
+)
+def test_costs_equal_networkx_and_scipy(seed: int, rows: int, cols: int, blocked: float, sideways: int) -> None:
     height, free = grid(seed, rows, cols, blocked)
     free[-1, cols // 2] = True
     source = np.zeros_like(free)
     source[-1, cols // 2] = True
-    cost, move = sweep(height, every_way(free), source)
+    cost, move = sweep(height, every_way(free), source, Charges(sideways=sideways))
     graph = nx.DiGraph()
     graph.add_node((rows - 1, cols // 2))
-    graph.add_weighted_edges_from(edges(height, free))
+    graph.add_weighted_edges_from(edges(height, free, sideways))
     expected = nx.single_source_dijkstra_path_length(graph, (rows - 1, cols // 2))
     reached = {(int(r), int(c)): int(cost[r, c]) for r, c in np.argwhere(cost < UNREACHED)}
     assert reached == expected
     assert ((move >= 0) == ((cost < UNREACHED) & ~source)).all()
 
     # scipy drops edges of weight 0: shift all by 1, since all paths to a row have equally many edges
-    triples = [(a[0] * cols + a[1], b[0] * cols + b[1], w + 1) for a, b, w in edges(height, free)]
+    triples = [(a[0] * cols + a[1], b[0] * cols + b[1], w + 1) for a, b, w in edges(height, free, sideways)]
     if triples:
         i, j, w = zip(*triples, strict=True)
         sparse = csr_matrix((w, (i, j)), shape=(rows * cols, rows * cols))
@@ -180,4 +188,4 @@ def test_an_edge_is_used_where_both_ends_allow_its_direction() -> None:
 def test_a_toll_is_paid_on_entering() -> None:
     flat, free, toll = np.zeros((5, 7), dtype=np.int64), np.ones((5, 7), dtype=bool), np.zeros((5, 7), dtype=np.int64)
     toll[2, 3] = 2  # two moves aside cost two parts of a step of height
-    assert plan(flat, every_way(free), toll=toll).cells[2, 1] != 3
+    assert plan(flat, every_way(free), charges=Charges(toll)).cells[2, 1] != 3
