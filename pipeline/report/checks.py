@@ -14,11 +14,12 @@ from rille.pipeline.report import canvas, figures
 from rille.pipeline.report.canvas import Block, Table
 from rille.pipeline.report.gather import Calibration, Scene
 from rille.pipeline.report.words import length, number, quantity, spans, spread
+from rille.stages.calibration.parameter_selection import RelativeParams
 
 MOST_CURVES = 3
 """Parameters of the rig whose change over the pairs is drawn."""
 
-ASKED = 4.0
+ASKED: float = RelativeParams.model_fields["significance"].default
 """Standard deviations from which on a correction that the images ask for is told of."""
 
 MOST_FLAGS = 8

@@ -43,6 +43,15 @@ class Terrain:
         """An array, None where there is none."""
         return self.arrays.get(name)
 
+    def at(self, name: str, xy: Floats) -> Floats:
+        """Values (n,) of an array in the cells of points (n, 2), m; NaN outside, and where there is no such array."""
+        values, found = self.get(name), np.full(len(xy), np.nan)
+        if values is not None:
+            row, col = np.rint(self.lattice.index(xy)).astype(int).T
+            inside = (row >= 0) & (col >= 0) & (row < values.shape[0]) & (col < values.shape[1])
+            found[inside] = values[row[inside], col[inside]]
+        return found
+
 
 @dataclass(frozen=True)
 class Track:

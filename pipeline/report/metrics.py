@@ -414,14 +414,10 @@ def _path(view: RunView) -> dict[str, Metric]:
 
 def _path_sigma(scene: Scene) -> dict[str, Metric]:
     """Of the merged terrain, at the path's vertices."""
-    sigma = None if scene.world is None else scene.world.get("elevation_std")
-    if scene.world is None or sigma is None or scene.path is None or not len(scene.path):
+    if scene.world is None or scene.path is None:
         return {}
-    row, col = np.rint(scene.world.lattice.index(scene.path[:, :2])).astype(int).T
-    rows, cols = sigma.shape
-    inside = (row >= 0) & (col >= 0) & (row < rows) & (col < cols)
-    found = sigma[row[inside], col[inside]]
-    known = found[np.isfinite(found)]
+    sigma = scene.world.at("elevation_std", scene.path[:, :2])
+    known = sigma[np.isfinite(sigma)]
     if not known.size:
         return {}
     how = "as that of the terrain; median over the path's vertices"

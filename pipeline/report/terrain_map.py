@@ -184,11 +184,9 @@ def _path(scene: Scene) -> list[list[float | None]]:
     """Vertices of the path: x, y, z, m, and the inclination that the planner judged there, degrees, or None."""
     if scene.path is None:
         return []
-    risk, inclination = scene.risk, np.full(len(scene.path), np.nan)
-    if risk is not None and (judged := risk.get("inclination")) is not None:
-        row, col = np.rint(risk.lattice.index(scene.path[:, :2])).astype(int).T
-        inside = (row >= 0) & (col >= 0) & (row < judged.shape[0]) & (col < judged.shape[1])
-        inclination[inside] = np.degrees(np.asarray(judged, np.float64)[row[inside], col[inside]])
+    inclination = np.full(len(scene.path), np.nan)
+    if scene.risk is not None:
+        inclination = np.degrees(scene.risk.at("inclination", scene.path[:, :2]))
     return [
         [*(round(v, 4) for v in place), round(value, 2) if math.isfinite(value) else None]
         for place, value in zip(scene.path.tolist(), inclination.tolist(), strict=True)

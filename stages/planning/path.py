@@ -197,7 +197,7 @@ def _by_rows(
     tolerance = math.ceil((vehicle.wheel_base + vehicle.wheel_diameter) / lattice.cell)
     span = row_span(~ground.closed)
     # A diagonal is longer than a row is wide; the rows themselves every path crosses.
-    charges = Charges(ground.toll, round(p.detour_cost * (math.sqrt(2) - 1) * grid.cell / ground.unit))
+    charges = Charges(ground.toll, round(p.detour_cost * (grid8.DIAGONAL - 1) * grid.cell / ground.unit))
     for name in GROUNDS:
         # How far one can go takes a sweep of its own, which only the last and most lenient try needs.
         explain = name == GROUNDS[-1]
