@@ -5,7 +5,7 @@ Rates are integrated exactly for a rate that is constant between two samples (th
 of a second. The gyroscope's bias is what it reads where the sensor rests. An accelerometer measures specific force, in
 rest the reaction to gravity: it points **up**. Single samples of a sensor on a running engine are worthless (1 m/s^2 of
 vibration), so that the force is averaged over two seconds around each frame, turned by the gyroscope into the
-frame's moment, and believed only where it is steady, as large as gravity, and the sensor hardly turns.
+frame's moment, and used only where it is steady, as large as gravity, and the sensor hardly turns.
 """
 
 from __future__ import annotations
@@ -107,8 +107,8 @@ class Inertial:
 def read_imu(path: Path, *, unit: str = "auto") -> ImuRecord:
     """Table of time, rates about x y z and specific forces along them.
 
-    Columns are told by their names (``w_RS_S_x [rad s^-1]``, ``gyro_x``, ``acc_x`` ...), else they stand in this
-    order. Names that say ``deg`` are converted.
+    Columns are recognised by their names (``w_RS_S_x [rad s^-1]``, ``gyro_x``, ``acc_x`` ...); without names they must
+    be in this order. Names that say ``deg`` are converted.
 
     Parameters
     ----------

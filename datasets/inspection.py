@@ -1,7 +1,7 @@
-"""What a folder of stereo images holds: pairs, calibration, times, poses, told from names and content alone.
+"""Inspect a folder of stereo images: find pairs, calibration, times and poses by file names and content.
 
-Nothing is decided silently: what is found is written into a manifest with the reason beside it, what is missing is
-written as a comment that says what to fill in. Opening the manifest before that fails with the line that is missing.
+The manifest shows all findings: each entry has its reason beside it, and each missing entry is a comment that says what
+to fill in. A manifest with missing entries cannot be opened; the error names the first of them.
 """
 
 from __future__ import annotations
@@ -38,10 +38,17 @@ NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 @dataclass(frozen=True)
 class FoundImages:
-    """The images: patterns relative to the folder, number of pairs, size of all images if they have one, and why
-    they are taken so.
+    """The left and right images that were found.
 
-    ``trouble`` says what does not fit; ``stamped`` whether the names are times since an epoch.
+    Attributes
+    ----------
+    left, right : patterns relative to the folder.
+    pairs : number of pairs.
+    size : width and height if all images have the same.
+    why : how left and right were recognised.
+    trouble : why the images cannot be paired; empty if they can.
+    stamped : whether the file names are times since an epoch.
+    sides : the words or letters in the names that mark left and right.
     """
 
     left: str
@@ -81,12 +88,14 @@ class Findings:
 
 
 def inspect(folder: Path) -> Findings:
-    """Look at a folder.
+    """Find image pairs, calibration files and tables (times, poses, IMU ...) in a folder and its subfolders.
+
+    Subfolders are searched :data:`DEPTH` levels deep, and at most :data:`MOST_TEXTS` text files are read.
 
     Raises
     ------
     InputError
-        It is no folder, or no two sets of images in it belong to a left and a right camera.
+        ``folder`` is not a folder, or its images cannot be divided into those of a left and a right camera.
     """
     if not folder.is_dir():
         raise InputError("RIL-193", f"{folder} is no folder", remedy="name a folder that holds images of two cameras")

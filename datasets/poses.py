@@ -8,7 +8,8 @@ Forms of a file, one pose T_reference_body a row:
 * ``csv``: columns by name in any order: a time (``t``, ``time``, ``timestamp``), quaternion ``qw qx qy qz`` or angles
   ``roll pitch yaw`` with their unit (``roll_deg``, ``yaw [rad]``), and perhaps a position ``x y z`` (``px``, ``tx``).
 
-Truth may be positions alone (:func:`read_positions`): columns x, y and perhaps time and z, by name or as told.
+Truth may be positions alone (:func:`read_positions`): columns x, y and perhaps time and z, by
+name or as the manifest states.
 
 Angles are those of vehicles: R_reference_body = Rz(yaw) Ry(pitch) Rx(roll). Rows without position stand at 0.
 """
@@ -147,13 +148,13 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
     Raises
     ------
     InputError
-        A column that is told is not there, x or y is not known, or a cell is no number.
+        A column in ``columns`` does not exist, x or y is missing, or a cell is no number.
     """
     if format not in ("auto", "csv"):
         return None
     table = read_table(path, "file of true positions" if columns else "pose file")
     told = {meaning: _column(table, column) for meaning, column in columns.items()}
-    # A column that is told to be one axis is not another one by its name: { x = "x", y = "z" } leaves no height.
+    # A column that the user assigns to one axis is not another axis by its name: { x = "x", y = "z" } leaves no height.
     meant = {meaning: k for meaning, k in _meanings(table).items() if k not in told.values()} | told
     known = {meaning for meaning in ("x", "y") if meaning in meant}
     if not columns and (_complete(meant) or (len(known) < 2 and table.columns >= len(ORDERED["tum"]))):

@@ -1,4 +1,4 @@
-"""Calibration files of other programs: cameras with their lenses and where they stand, recognised by content."""
+"""Read calibration files of other programs: intrinsics, lens and pose of each camera. The content tells the format."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Calibration files as nested entries: YAML with OpenCV's header and matrices, OpenCV's XML, and JSON."""
+"""Parse the text of calibration files into nested entries: YAML (also OpenCV's), JSON, OpenCV's XML, ``key = value``.
+
+Values stay text, or None where the file gives none; :mod:`rille.datasets.cameras.fields` converts them.
+"""
 
 from __future__ import annotations
 

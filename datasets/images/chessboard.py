@@ -2,8 +2,8 @@
 
 Detection is OpenCV's: by squares, then by sectors (Duda, Frese 2018) for what that misses. Both are refined alike: on
 rendered boards the second alone errs by 0.13 - 0.28 px RMS, refined by 0.02 - 0.05, and on real ones all parameters are
-then the same whichever found the corners. A board turned by half a turn may look the same; so the order of the corners
-is settled between the two images of a pair, which is all that a calibration needs.
+then the same whichever found the corners. A board turned by half a turn may look the same. So the order of the corners
+is only made equal in the two images of a pair, which is all that a calibration needs.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
 LEAST_SIDE = 3
-"""Inner corners along a side, below which a pattern cannot be told from clutter."""
+"""Inner corners along a side, below which a pattern cannot be distinguished from clutter."""
 
 ABSURD_SQUARE = 1.0
 """m; no printed board has squares as large: a length in millimetres or centimetres."""

@@ -149,4 +149,4 @@ RECORDED_ONLY = (
     *("frames", "forward", "sideways", "turn_deg", "roll_deg", "roll_swing_deg", "jitter_deg"),
     "attitude_noise_deg",
 )
-"""What says how the body moves and what is told of it; a rover that is driven has its own (``RoverParams``)."""
+"""Parameters of a recorded motion and of the attitude given with it; a driven rover has ``RoverParams`` instead."""

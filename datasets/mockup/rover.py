@@ -1,9 +1,9 @@
 """Stage ``mockup.drive``: a rover that drives one leg over the simulated bed, with slip and errors of its heading.
 
-It is told a path in the frame of its own estimate and where it believes to stand; it turns towards each vertex and
-drives there by its wheels. What its wheels do and what it does are not the same: it slips and drifts off its heading.
-The body follows the wheels over the ground (:mod:`rille.stages.planning.wheels`). Nothing of what this stage gives is
-known to the rover; what its sensors tell of it is stage ``mockup.sense``.
+The stage gets a path and the rover's estimated pose, both in the frame of the estimate. The rover turns towards each
+vertex and drives there by its wheels. Its true motion differs from that of the wheels: it slips and drifts off its
+heading. The body follows the wheels over the ground (:mod:`rille.stages.planning.wheels`). The rover does not know the
+results of this stage; stage ``mockup.sense`` simulates the readings of its sensors.
 """
 
 from __future__ import annotations
@@ -122,8 +122,8 @@ def heading_of(T: RigidTransform) -> float:
 
 
 class SentLeg(NamedTuple):
-    """``path`` (vertex, 2) m, the first vertex where the rover believes to stand; ``gear`` of each piece, 1 ahead or -1
-    back; ``turn`` on the spot at the end, rad."""
+    """``path`` (vertex, 2) m, from the rover's estimated position on; ``gear`` of each piece, 1 ahead or -1 back;
+    ``turn`` on the spot at the end, rad."""
 
     path: Floats
     gear: Sequence[int]
@@ -143,7 +143,8 @@ def drive_leg(
 
     Parameters
     ----------
-    before, believed : x, y (m), heading (rad) on the bed, and where the rover believes to be in the path's frame.
+    before : true x, y (m) and heading (rad) on the bed.
+    believed : estimated x, y (m) and heading (rad) in the frame of the path.
     """
     path, gear, turn = sent
     slip = p.slip + p.slip_sigma * float(rng.standard_normal())

@@ -28,7 +28,12 @@ def _distance(scene: Bundle, x: float, y: float, shape: tuple[int, ...], spacing
 def prepare(
     scene: Bundle, pad: tuple[float, float, float] | None, blank: tuple[float, float, float] | None
 ) -> dict[str, Any]:
-    """Arrays of the scene with a pad and a blank patch, each x, y, radius on the bed, m.
+    """Return the arrays of the scene with a smooth start area and a patch without texture.
+
+    Parameters
+    ----------
+    pad : start area: x, y and radius on the bed, m; None: none.
+    blank : patch without texture, likewise.
 
     Both are planes as steep as the bed is (``slope_deg``), at the median height of the ground that they replace: on a
     slope a level pad would be a pit with a wall before it.

@@ -21,7 +21,7 @@ UPPER = {"s": 1e11, "ms": 1e14, "us": 1e17}
 """Above it a value can no longer be in that unit: 1e11 s after 1970 is the year 5138."""
 
 GAP = 2.5
-"""Of the median spacing: one missing frame (2) is common, more is worth a line."""
+"""Gap, in median spacings, from which a warning is given: one missing frame (2) is common, more is not."""
 
 SLOW = 3600.0
 """s; pairs an hour apart are possible, but a wrong unit is likelier."""

@@ -1,10 +1,12 @@
-"""Warnings about the input: one line each, which begins with the code of its message."""
+"""Warnings about the input: one line each, beginning with the code of the message."""
 
 from __future__ import annotations
 
 
 def warning(code: str, text: str) -> str:
-    """Line of a warning; ``text`` says what is suspicious, with the figure and the place.
+    """Format a warning as one line: the code of the message, then ``text``.
+
+    ``text`` states the problem, with its value and where it is (file, camera or frame).
 
     >>> warning("RIL-680", "cam0: 2 images are not there")
     'RIL-680: cam0: 2 images are not there'

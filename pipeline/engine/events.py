@@ -1,4 +1,7 @@
-"""Ledger of a run: JSON lines, one for each node as soon as its fate is known, so that it survives a crash."""
+"""Ledger of a run: a file of JSON lines, one line a node with its outcome (computed, cached, failed, skipped).
+
+Each line is written as soon as the outcome is known, so a killed run leaves the lines written until then.
+"""
 
 from __future__ import annotations
 

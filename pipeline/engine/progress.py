@@ -23,7 +23,7 @@ INTERVAL = 5.0
 
 
 SLOW_COMPILE = 1.0
-"""Seconds of compilation that a user notices, and is told of."""
+"""Seconds of compilation from which on it is reported to the user."""
 
 
 class Progress(Protocol):
@@ -38,7 +38,7 @@ class Progress(Protocol):
         """A task was given to a worker."""
 
     def resolved(self, handle: Handle) -> None:
-        """The fate of a node is known."""
+        """The outcome of a node is known: computed, cached, failed or skipped."""
 
     def failed(self, label: str, error: BaseException) -> None:
         """A task or an expansion failed."""

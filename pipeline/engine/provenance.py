@@ -24,7 +24,7 @@ KEPT = 4
 """Earlier keys remembered per label: enough for a user who goes back and forth between a few settings."""
 
 SHOWN = 3
-"""Differences told per node."""
+"""Largest number of differences stated for a node."""
 
 Keys = dict[str, list[str]]
 """Stage and label to keys, the latest first."""
@@ -65,7 +65,7 @@ class Known:
         now = {**recipe, "params": recipe["params"].model_dump(mode="json")}
         # Through JSON, as the stored recipe went: tuples become lists, which would differ otherwise.
         now = json.loads(json.dumps(now))
-        # The nearest of the earlier ones: a user who goes back to former settings is told what is new, not what was
+        # The nearest of the earlier ones: a user who goes back to former settings sees what is new, not what was
         # undone.
         found = min((differences(then, now) for then in earlier), key=len)
         told = found[:SHOWN] + ([f"and {len(found) - SHOWN} more"] if len(found) > SHOWN else [])

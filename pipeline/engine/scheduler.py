@@ -139,7 +139,7 @@ class RunOptions:
     force : names of stages to compute again though they are there; the digests must agree.
     dry : look up only.
     ledger : file of JSON lines, one a node, written as they resolve.
-    progress : told of every step.
+    progress : receives every step of the run.
     memory_limit : bytes that this process and its workers may take together; None is what is free here.
     survey : lays the same graph out anew, to look ahead: what cannot fit into memory is refused before anything runs.
     """

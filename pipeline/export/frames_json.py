@@ -45,7 +45,7 @@ def describe(
     place: Georeference | None = None,
     vertical: str = "",
 ) -> dict[str, Any]:
-    """What ``frames.json`` holds.
+    """Return the content of ``frames.json``.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def describe(
     frames, names, stamps : number, name and time stamp (as in the trajectory files) of each frame.
     clock : the stamps are seconds; otherwise they are the frames' numbers.
     place : of the world frame, where it is known; rasters and ``path.gpkg`` are then in its CRS.
-    vertical : what told of the world's vertical, "none" where nothing did; empty without a trajectory.
+    vertical : source of the world's vertical, "none" if there is none; empty without a trajectory.
     """
     world = FRAMES["world"] | ({"vertical": vertical} if vertical else {})
     if vertical == NO_VERTICAL:

@@ -23,7 +23,7 @@ Pair, world model, segment and hazards are those of a reconstruction (:mod:`rill
                v
              stop k+1 at the last image, or at the one where a monitor stopped
 
-``drive``, ``sense``, the images and nothing else know the true poses. What the vehicle believes is the trajectory:
+Only ``drive``, ``sense`` and the images know the true poses. The vehicle's own estimate is the trajectory:
 the product of the segments that were tracked and resected. Every node is keyed by what it reads, so a drive that is
 killed goes on where it was, and one that is repeated computes nothing.
 """

@@ -20,8 +20,8 @@
     leaves:  accuracy (trajectory, crosscheck), position_accuracy, dem_accuracy (local and merged DEM), path_check
     outputs: rasters, tracks, tables, figures: a task each; then report.html and report.json around them
 
-Frames that show no motion (black, foreign, sides exchanged) are lost: ``frame_screening`` finds them by their looks
-(``image_quality``), motions, bridges over a lost frame, and ``swap_check`` (left against right).
+Frames that show no motion (black, of another scene, left and right exchanged) are lost: ``frame_screening`` finds them
+by their ``image_quality``, by motions and bridges over a lost frame, and by ``swap_check`` (left against right).
 
 A segment needs landmarks only relative to its own basic pair, so all are resected and refined at once (and refined
 again, where ``common_tilt`` finds a tilt of all disparities); ``trajectory`` chains them, and Locus then runs a second

@@ -67,11 +67,16 @@ GONE: Mapping[str, str] = {"refine.stereo": "it gained little and is gone: leave
 
 
 def present(key: str, given: Any) -> str | None:
-    """Say what to write instead of a former key or section; None: it is neither.
+    """Return the message for a key or section of an earlier version: the present name, or that it is gone.
 
     Parameters
     ----------
-    given : value of the key; of a section, a mapping of its keys.
+    key : ``section`` or ``section.name``.
+    given : value of the key; for a section, a mapping of its keys.
+
+    Returns
+    -------
+    None if ``key`` is not of an earlier version.
     """
     if key in GONE:
         return f"{key} is a key of an earlier version: {GONE[key]}"

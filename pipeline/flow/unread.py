@@ -60,12 +60,17 @@ def set_by_user(given: Mapping[str, Any], config: Params, without: Params) -> tu
 
 
 def refuse_unreadable(keys: Iterable[str], config: Params, sequence: Sequence) -> None:
-    """Refuse what no task of any run of this kind reads.
+    """Refuse parameters that the user has set and that no task of such a run (reconstruction or drive) can read.
+
+    Parameters
+    ----------
+    keys : dotted keys of the parameters set, see :func:`set_by_user`.
 
     Raises
     ------
     ConfigError
-        There is such a parameter.
+        A key belongs to a section that only the other kind of run has, or to ``undistort`` though the images are
+        undistorted.
     """
     simulated = sequence.simulation is not None
     foreign = recorded() if simulated else driven()
@@ -78,12 +83,16 @@ def refuse_unreadable(keys: Iterable[str], config: Params, sequence: Sequence) -
 
 
 def refuse_unchecked(keys: Iterable[str], config: Params) -> None:
-    """Refuse what ``rille check`` does not read.
+    """Refuse parameters that the user has set and that ``rille check`` does not read.
+
+    Parameters
+    ----------
+    keys : dotted keys of the parameters set, see :func:`set_by_user`.
 
     Raises
     ------
     ConfigError
-        There is such a parameter.
+        The section of a key is not in :data:`CHECKED`.
     """
     lost = [key for key in keys if key.partition(".")[0] not in CHECKED]
     if lost:

@@ -20,7 +20,7 @@ MOST_CURVES = 3
 """Parameters of the rig whose change over the pairs is drawn."""
 
 ASKED: float = RelativeParams.model_fields["significance"].default
-"""Standard deviations from which on a correction that the images ask for is told of."""
+"""Standard deviations from which on a correction that the images ask for is reported."""
 
 MOST_FLAGS = 8
 """Flagged frames that a caption names with their reasons; agreement.csv has all."""

@@ -212,7 +212,7 @@ def _crosscheck_lost(scene: Scene) -> Items:
     """Frames that the other program was asked for and could not pose."""
     view, compared = scene.view, scene.comparison
     if len(view.frames) < 2 or compared is None:
-        return []  # a task that failed or was skipped is told of by itself
+        return []  # a task that failed or was skipped has its own line
     lost = [frame for frame, there in zip(view.frames, compared.registered, strict=True) if not there]
     if not lost:
         return []

@@ -52,7 +52,7 @@ AGAIN = "<script>setTimeout(() => location.reload(), 2000);</script>\n"
 
 @contextmanager
 def page(shown: Progress, path: Path | None) -> Iterator[Progress]:
-    """Give who is told of a run's steps: ``shown`` alone, or with ``path`` one that keeps the page there too."""
+    """Yield the receiver of a run's progress: ``shown``, or with ``path`` one that also updates the page there."""
     if path is None:
         yield shown
         return

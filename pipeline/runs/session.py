@@ -107,7 +107,7 @@ class Settled:
 
 
 def settings(options: Options) -> Settled:
-    """Open a sequence and settle its configuration."""
+    """Open a sequence and determine its configuration: defaults, presets, file and options of the user."""
     from rille.datasets.registry import open_sequence
     from rille.pipeline.flow import unread
     from rille.pipeline.runs.input_checks import judge_rig

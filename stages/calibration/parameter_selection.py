@@ -1,16 +1,18 @@
-"""What of a rig the images may change: only what they observe, what they contradict, and what is worth it.
+"""Select the parameters of a rig that the images may change.
 
-A low epipolar residual does not show a right rig: toe-in of a parallel rig moves rows like a principal point that is a
-few pixels off, and a fit that frees it trades an honest residual for wrong depth. So a parameter is freed only if
+A low epipolar residual does not prove that the rig is right: toe-in of a parallel rig moves rows like a principal point
+that is a few pixels off, and a fit that frees the toe-in lowers the residual at the price of wrong depth. So a
+parameter is freed only if
 
-1. it is *observed*: with every other explanation allowed for (:mod:`rille.stages.calibration.relative_orientation`),
-what remains unknown of it
-   costs little depth, or matches beyond infinity show that depth is wrong, and it explains them;
-2. it is *contradicted*: it differs from the calibration by several of its sigmas, and a principal point that is off is
-   not the likelier reason: that it is where a single angle departs and the others are as they were;
-3. it is *worth it*: the change moves rows, or depth, by more than a good calibration is out anyway.
+1. it is *observed*: with every other error estimated, too (:mod:`rille.stages.calibration.relative_orientation`), its
+   remaining uncertainty changes depth little; or matches beyond infinity show that depth is wrong, and the parameter
+   explains them;
+2. it is *contradicted*: it differs from the calibration by several of its standard deviations, and a wrong principal
+   point is not the likelier cause. The principal point is the likelier cause if a single angle departs alone;
+3. it is *worth it*: the change moves rows, or depth, by more than the usual error of a good calibration.
 
-All others stay exactly as given. Angles are asked for before the baseline's direction: mounts turn, they do not shift.
+All other parameters stay exactly as given. Angles are tested before the direction of the baseline, because mounts turn
+rather than shift.
 """
 
 from __future__ import annotations
@@ -206,10 +208,10 @@ class _Chooser:
         return fit, np.where(free, fit.x[:RIG], 0.0)
 
     def _worth(self, correction: Floats) -> bool:
-        """Whether a correction (5,) moves rows or depth by more than a good calibration is out anyway."""
+        """Whether a correction (5,) moves rows or depth by more than the usual error of a good calibration."""
         rows = float(np.max(np.abs(correction) * self.rows))
         depth = math.sqrt(float(correction @ self.depth @ correction))
-        # Depth beyond infinity is wrong for sure, so any repair is worth it.
+        # Points beyond infinity prove that depth is wrong, so a correction of any size counts.
         return self.impossible or rows >= self.params.least_rows or depth >= self.params.least_depth
 
     def _add(self, chosen: list[int], group: Sequence[int]) -> None:
@@ -279,7 +281,7 @@ class _Chooser:
         return None
 
     def _held(self, chosen: list[int]) -> Floats:
-        """How far (5,) the held parameters may be out, radians: as believed, or less where the images show it."""
+        """Standard deviations (5,) of the held parameters, radians: their prior, or less if the images show less."""
         # Root of value squared and sigma squared: the images show how far it may be out, their own error included.
         shown = [math.hypot(*self._estimate(i, chosen)) for i in range(RIG)]
         return np.minimum(self.beliefs.held(), shown)

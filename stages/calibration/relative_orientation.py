@@ -76,10 +76,14 @@ class PointPairs:
 
 @dataclass(frozen=True)
 class Beliefs:
-    """Deviations that the calibration is believed to have.
+    """Prior standard deviations of the errors of an intact calibration.
 
-    ``rotation``, ``baseline`` (radians): of an intact calibration's three angles and of its baseline's direction.
-    ``principal``: pixels, of the principal point. ``systematic``: pixels, RMS of the smooth error, at least.
+    Attributes
+    ----------
+    rotation : of each of the three angles between the cameras, radians.
+    baseline : of the direction of the baseline, radians.
+    principal : of the principal point, pixels.
+    systematic : least RMS of the smooth error, pixels.
     """
 
     rotation: float
@@ -138,12 +142,16 @@ def adjust(
     rival: bool,
     start: list[Linear] | None = None,
 ) -> OrientationFit:
-    """Adjust a rig to pairs, everything that no rig explains allowed for.
+    """Adjust a rig to point pairs, together with the errors of the images that no rig explains.
 
-    ``free`` says which of the five parameters the images alone decide. The others are held by what the calibration is
-    believed to be good for: they take up their share of the error, so that the free ones do not have to. ``rival``: see
-    :func:`precision`. The smooth error's size is estimated, too (expectation maximisation, starting from the belief).
-    ``start``: what :func:`linearised` gives for them, where it is at hand.
+    Parameters
+    ----------
+    free : which of the five parameters of the rig have no prior. The others have the prior of an intact calibration
+        (``beliefs``), so that they take up their part of the residuals and the free ones do not.
+    rival : see :func:`precision`.
+    start : the result of :func:`linearised` for these pairs, if it is known already.
+
+    The size of the smooth error is estimated, too: by expectation maximisation, starting from its prior.
     """
     prior = precision(free, beliefs, beliefs.term, rival=rival)
     return _adjust(rig, pairs, prior, beliefs.term, start, estimate=True)
@@ -152,9 +160,10 @@ def adjust(
 def settle(
     rig: Rig, pairs: Sequence[PointPairs], free: Sequence[bool], beliefs: Beliefs, start: list[Linear] | None = None
 ) -> OrientationFit:
-    """Adjust the free parameters to the smallest residuals of the rig that results.
+    """Fit the free parameters so that the residuals of the resulting rig are smallest.
 
-    In that rig the others are exactly as given and smooth errors stay in the images, so neither takes a share here.
+    The other parameters are fixed at their given values, and the smooth error is not estimated. Neither may take up a
+    part of the residuals here, because in the resulting rig the others are as given and the smooth error remains.
     """
     nil = replace(beliefs, rotation=EXACT, baseline=EXACT)
     prior = precision(free, nil, LEAST_SMOOTH, rival=False)
@@ -162,14 +171,15 @@ def settle(
 
 
 def considered(fit: OrientationFit, free: Sequence[bool], beliefs: Beliefs, smooth: float, held: Floats) -> Floats:
-    """Covariance (5, 5) of a settled fit's free parameters; zero for the others.
+    """Return the covariance (5, 5), radians^2, of the free parameters of a fit by :func:`settle`; zero for the others.
 
-    What took no share is an error of the result (a consider covariance: Bierman 1977, chapter 8): held parameters with
-    deviations ``held`` (5,), radians; the smooth error with ``smooth`` pixels a term, but no less than is believed.
+    It is a consider covariance (Bierman 1977, chapter 8): parameters that the fit did not estimate contribute their
+    uncertainty. These are the held parameters, with standard deviations ``held`` (5,), radians, and the smooth error,
+    with ``smooth`` pixels a term, but at least the prior's (:class:`Beliefs`).
     """
     prior = precision(free, beliefs, max(beliefs.term, smooth), rival=False)
     for i in np.flatnonzero(~np.asarray(free)):
-        # By the deviations that they are believed to have now, not those that the fit held them with.
+        # By the standard deviations that they are known to have now, not by the priors of the fit.
         prior[i, i] = held[i] ** -2.0
     solved = np.array([*free, *[True] * PRINCIPAL, *[False] * len(TERMS)])
     inverse = np.linalg.inv(fit.normal[np.ix_(solved, solved)] + prior[np.ix_(solved, solved)])

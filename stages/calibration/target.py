@@ -37,10 +37,10 @@ CORNER_SCALE = 0.5
 """Pixels; residuals beyond it lose weight in the first adjustment. Corners are found to 0.1 - 0.3 px."""
 
 BAD_RATIO, BAD_PX = 4.0, 0.5
-"""A view is bad whose RMS exceeds four times the views' median, and half a pixel."""
+"""A view is bad if its RMS residual exceeds both four times the median of all views and half a pixel."""
 
 MOST_STEPS, SETTLED = 100, 1e-10
-"""Steps of an adjustment, and the relative gain at which it is settled."""
+"""Largest number of steps of an adjustment, and the relative decrease of its cost at which it has converged."""
 
 UNDETERMINED = "the views do not determine the cameras"
 MORE_VIEWS = (

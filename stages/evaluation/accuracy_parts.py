@@ -13,7 +13,10 @@ Metric = dict[str, Any]
 
 
 def metric(value: float | int | None, unit: str, how: str) -> Metric:
-    """One figure as the report prints it; ``None`` means not applicable, and ``how`` says why."""
+    """Return one figure of the report: ``value``, its ``unit``, and ``how`` it was measured.
+
+    A value of None, NaN or infinity becomes None: the figure does not apply, and ``how`` says why.
+    """
     sound = value is not None and math.isfinite(value)
     return {"value": value if sound else None, "unit": unit, "how": how}
 

@@ -198,7 +198,7 @@ def _gauss_newton(
             remedy="leave --align out, or choose overlapping models",
         )
     r, n = difference[good], normal[good]
-    # Rotations turn about the moved centre: shifts and turns then hang together least.
+    # Rotations turn about the moved centre: their correlation with the shifts is then least.
     q = moved[good] - state.centre - state.translation
     J = np.column_stack([n, np.cross(q, n)])[:, free] * unit
     scale = max(mad_sigma(r), 1e-9)
@@ -225,7 +225,14 @@ def _with_rms(b: Grid, slopes: Floats, points: Floats, state: Alignment, before:
 
 
 def errors(a: Grid, b: Grid, alignment: Alignment | None = None) -> Floats:
-    """A minus B (rows, cols) on the common cells; of an aligned A, at its moved points over B, by A's cell."""
+    """Return the elevation differences A minus B (rows, cols), metres; NaN where one of them is unknown.
+
+    Parameters
+    ----------
+    a, b : models on the same cells, see :func:`common`.
+    alignment : motion from :func:`align`. Each cell of A is moved by it and compared with B interpolated at the moved
+        point; the difference stands at the cell of A. None: A is compared cell by cell.
+    """
     if alignment is None:
         return a.values - b.values
     moved = alignment.apply(np.concatenate([a.centres(), a.values[..., None]], axis=-1))

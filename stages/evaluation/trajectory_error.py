@@ -22,7 +22,7 @@ SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
 LEAST_MOVED = 1e-6
 """Length [m] of the true path below which a camera counts as at rest, and has no scale error."""
 MEANINGFUL = 3.0
-"""Size of a systematic error, in its standard errors, from which on it is told from chance."""
+"""Size of a systematic error, in its standard errors, from which on it counts as more than chance."""
 
 
 def by_steps(P: Floats, Q: Floats) -> dict[str, Metric]:

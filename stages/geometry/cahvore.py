@@ -1,14 +1,16 @@
 """Camera models CAHV, CAHVOR and CAHVORE of NASA's rovers: point to pixel, and pixel to ray.
 
-A point P of the reference frame, p = P - C, is imaged at column p''.H / p''.A and row p''.V / p''.A, pixel centres at
-integers (CAHV: p'' = p). With w = p.O along the optical axis and l = p - w O across it:
+Vectors are given in the reference frame: the camera's centre C (m), the unit normal A of the image plane, H and V that
+give column and row (pixels), and the unit optical axis O. A point P, with p = P - C, is imaged at column p''.H / p''.A
+and row p''.V / p''.A, pixel centres at integers (CAHV: p'' = p). With w = p.O along the optical axis and l = p - w O
+across it:
 
 * CAHVOR bends the ray: p'' = p + mu l, mu = R0 + R1 x^2 + R2 x^4, x = |l| / w.
 * CAHVORE also moves the entrance pupil along O by (t / sin t - 1) e(t), e = E0 + E1 t^2 + E2 t^4, for a ray at the
   angle t to O, so that w sin t - |l| cos t = (t - sin t) e(t). Then p'' = |l| / x O + (1 + mu) l with
   x = tan(L t) / L, sin(L t) / L or t for a linearity L above, below or equal to 0 (perspective lens 1, fisheye 0).
 
-CAHVOR is CAHVORE with E = 0 and L = 1. Rays of far points meet in C whatever E is.
+CAHVOR is CAHVORE with E = 0 and L = 1. The pixel of a point much farther than E depends only on its direction from C.
 
 Sources: Yakimovsky, Cunningham (1978), doi:10.1016/0146-664X(78)90112-0; Gennery (2001), Least-squares camera
 calibration including lens distortion and automatic editing of calibration points; Gennery (2006), Generalized camera

@@ -1,11 +1,11 @@
-"""How poses are stored, wherever a stage gives them: the frame of reference is the stage's to say."""
+"""Declarations of stored poses and covariances. Each stage states the frame of reference of its poses."""
 
 from __future__ import annotations
 
 from rille.stages.core.declare import Array
 
 NO_VERTICAL = "none"
-"""Source of the vertical of a frame that nothing tells of: the camera's own up stands for it."""
+"""Source of the vertical if nothing gives it: z is then the camera's own up."""
 
 POSES = Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan")
 

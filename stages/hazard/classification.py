@@ -103,7 +103,7 @@ class ClassifiedBlocks(NamedTuple):
 
 class Cells(NamedTuple):
     """Arrays (row, col) of cells: elevation with holes ``closed`` and 1 where it was ``filled``; then what is written:
-    classes, reasons, probability, rasters of the measures on blocks, and those on cells (blanked where unknown)."""
+    classes, reasons, probability, rasters of the measures on blocks, and those on cells (NaN where unknown)."""
 
     closed: Floats32
     filled: Bytes

@@ -75,9 +75,9 @@ def match(
     valid : of the left and the right image (row, col), not zero where usable; None: everywhere.
     prior : column and row disparities of the left image, pixels, NaN undefined, to start from (see
         :mod:`rille.stages.hfvm.coarse_to_fine.start`); None: nothing is known.
-    tell : told of the progress.
-    side : pixels of a tile; None: whole. The result does not depend on it, the room for it does. Presets ``accurate``
-        and those with a relief are matched whole.
+    tell : called with the progress.
+    side : pixels of a tile; None: the whole image. The result does not depend on it, the memory needed does. Presets
+        ``accurate`` and those with a relief are matched whole.
 
     Raises
     ------

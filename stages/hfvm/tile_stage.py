@@ -119,7 +119,12 @@ class TileInputs:
         return Map(*(self.mosaic(port, f"map_{name}", shape) for name in MAP))
 
     def state(self, pair: Prepared, level: int) -> State:
-        """What is known of a level: from the coarse levels' task, or from those of tiles and of the band."""
+        """Return both displacement maps of a level, their consistent pixels, the epipolar band and the sign of depth.
+
+        All of the finest level that step ``coarse`` matched is read from its result. Of a finer level the maps are read
+        from the tiles, band and sign from step ``band``; without that input there is no band, and the sign is that of
+        step ``coarse``.
+        """
         coarse: Bundle = self.inputs["coarse"]
         if level == coarse.meta["level"]:
             maps = [Map(*(coarse.raster(f"{way}_{name}") for name in MAP)) for way in ("left", "right")]
@@ -161,7 +166,7 @@ def mosaic(parts: Sequence[Bundle], name: str, shape: Shape, side: int) -> Mosai
 
 
 def band(meta: Mapping[str, Any]) -> Band:
-    """The soft band that metadata tell of."""
+    """Return the soft epipolar band that metadata describe."""
     return hierarchy.FREE if meta["f"] is None else Band(np.array(meta["f"]), meta["mu"])
 
 

@@ -29,7 +29,7 @@ LEAST = 20
 
 
 def standard_deviation(images: Sequence[AnyArray], masks: Sequence[AnyArray]) -> float:
-    """Standard deviation of an image's noise, grey levels; 0 where it cannot be told from texture.
+    """Standard deviation of an image's noise, grey levels; 0 where it cannot be separated from texture.
 
     Parameters
     ----------

@@ -135,9 +135,9 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
 def frame(image: Floats32, valid: Bools) -> Bools | None:
     """Black frame (row, col) that warping left around the valid pixels of an image; None: there is none.
 
-    Pixels of grey 0 that hang together, make up a good part of a side, and keep near it: darkness that reaches into the
-    image is a shadow or the sky. Where interpolation has mixed the pixels beside the frame with black, those belong to
-    it, and the outermost pixels of the sides that it touches.
+    It consists of connected pixels of grey 0 that cover a good part of a side and stay near it; darkness that reaches
+    into the image is a shadow or the sky. Where interpolation has mixed the pixels beside the frame with black, they
+    belong to it, and so do the outermost pixels of the sides that it touches.
     """
     dark = (image == 0) & valid
     sides: tuple[Any, ...] = (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1])

@@ -128,7 +128,7 @@ def _resample(image, usable, whole, maps, table, out, out_valid):  # type: ignor
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             x, y = column[i, j], row[i, j]
-            # also refuses NaN; a position on the last pixel needs no tap beyond it, but is not worth a case
+            # also refuses NaN; a position on the last pixel needs no tap beyond it, but gets no branch of its own
             if not (x >= before and x < cols - before - 1 and y >= before and y < rows - before - 1):
                 continue
             left, top = int(x), int(y)

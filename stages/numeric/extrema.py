@@ -1,12 +1,12 @@
-"""Running extrema over octagons, and medians: what of a window is order, not mean.
+"""Running maxima, ranges and medians in windows: statistics by the order of the heights, not by their mean.
 
-The window is a regular octagon rather than a square, since the highest minus the lowest height of a plane over a square
-is larger by a factor of 1.41 on the diagonal; over the octagon it is by at most 1.10 (:func:`octagon`), nowhere smaller
-than along an axis. An octagon is a square widened along both diagonals, so its running maximum is that of a square,
-then of two diagonal lines (``cv2.dilate``).
+The window is an octagon rather than a square. Over a square the highest minus the lowest height of a plane is larger by
+a factor of 1.41 if the plane falls along the diagonal. Over a regular octagon this factor is at most 1.08 (for small
+windows see :func:`octagon`), and in no direction is the range smaller than along an axis. An octagon is a square
+widened along both diagonals, so its running maximum is that of a square, then of two diagonal lines (``cv2.dilate``).
 
-Everything here commutes with any rising function of the heights: where relief is made greater, every difference of two
-of these results is (the argument is in :mod:`rille.stages.hazard.measures`).
+Everything here commutes with any rising function of the heights: if the relief grows, so does every difference of two
+of these results (the argument is in :mod:`rille.stages.hazard.measures`).
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ NOTHING = np.float32(-np.inf)
 
 
 def octagon(reach: int) -> tuple[int, int]:
-    """Half side of the square and steps along either diagonal that make an octagon of ``reach`` cells from its middle.
+    """Return the half side of a square and the steps along each diagonal that widen it to an octagon, in cells.
 
-    It extends by exactly ``reach`` along the axes, and by one to 1.10 ``reach`` in every other direction: vertices
-    lie at (reach, side).
+    The octagon extends by exactly ``reach`` cells from its centre along the axes. Its vertices lie at (reach, side),
+    where side is the first number returned: at 1.08 ``reach`` for a regular octagon. Whole cells make this at most
+    1.12 ``reach`` from 20 cells on, 1.17 from 7 and 1.21 from 4; for 1 to 3 cells the octagon is a square (1.42).
     """
     diagonal = int(reach / (2.0 + np.sqrt(2.0)))
     return reach - 2 * diagonal, diagonal
 
 
 def running_max(surface: Floats32, reach: int) -> Floats32:
-    """Highest value (row, col) within the octagon; unknown (NaN) is left out, -inf where all is."""
+    """Return the highest known value (row, col) in the octagon of ``reach`` cells; -inf where all are NaN."""
     return _inside(_widened(_padded(surface, reach), *octagon(reach)), reach)
 
 

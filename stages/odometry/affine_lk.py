@@ -1,6 +1,6 @@
 """Sub-pixel alignment of templates under a local affinity (refinement of tracked positions, section 5.2.1).
 
-Feature vectors find *which* pixel corresponds; where in the pixel is better told by the grey values themselves, once
+Feature vectors find *which* pixel corresponds. The grey values give the position within the pixel more exactly, once
 the template is drawn in the perspective of the searched frame. Affine Lucas-Kanade with gain and offset, inverse
 compositional: Baker and Matthews (2004), doi:10.1023/B:VISI.0000011205.11775.fd. The affinity that the neighbouring
 tracks suggest is a prior, so that weak texture keeps to it.
@@ -50,7 +50,7 @@ def align(
 
     Returns
     -------
-    position : (n, 2) column, row in b; NaN where it leaves the image, does not settle or is refused.
+    position : (n, 2) column, row in b; NaN where it leaves the image, does not converge or is refused.
     error : (n,) rms grey difference over the template before the last step; NaN likewise.
     """
     points = templates.points

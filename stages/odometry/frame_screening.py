@@ -1,15 +1,16 @@
-"""Which frames the trajectory can go through: frames whose images show no motion are lost, and are bridged.
+"""Find the frames whose images do not show the motion: these are *lost*, and the trajectory bridges them.
 
-A frame is *lost* where its left image shows nothing, where left and right are exchanged, or where neither the frame
-before nor the one behind is found in it while those two are found in each other. What is lost has no pose; tracking
-goes from the last good frame to the next. Where that bridge is no better, nothing speaks against the frame itself (the
-camera may have jumped): it stays, and resection decides.
+A frame is lost if its left image is uniform, if left and right are exchanged, or if it matches neither the frame before
+nor the frame after it while those two match each other. A lost frame has no pose; tracking goes from the last good
+frame to the next one (a *bridge*). If those two do not match each other either, the frame is not to blame (the camera
+may have jumped): it is kept, and resection decides.
 
-A pair of which one image is black, blurred, a copy of the other or of the one before is *unfit* as basic pair: it may
-be posed, but nothing is reconstructed from it.
+A pair is *unfit* as basic pair if one of its images is uniform, blurred, or a copy of the other image or of the one
+before. It may get a pose, but no elevation model is made of it.
 
-The stage is asked again with what it asks for: ``asks`` names bridges (motions between frames that are not
-neighbours) and frames whose sides are to be looked at; where both are empty the answer stands.
+The stage is run repeatedly. ``asks`` names the facts that it needs in addition: bridges (motions between frames that
+are not neighbours), and frames in which the order of left and right is to be tested. If both lists are empty, the
+result is final.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ Asks = dict[str, list[Any]]
 
 SIDES = ("left", "right")
 QUIET = 0.25
-"""Quantile of the changes that is usual: one exchanged frame changes three steps, of a short sequence the half."""
+"""Quantile of the changes that counts as usual: one exchanged frame changes three steps, half of a short sequence."""
 
 
 class FrameScreeningParams(Params):
@@ -71,7 +72,8 @@ class FrameScreeningParams(Params):
 
 @dataclass
 class Judgement:
-    """``lost`` cause by frame; ``unfit`` why by frame; ``repeated`` frames like the one before; ``asks``."""
+    """``lost``, ``unfit``: cause by frame. ``repeated``: pairs of successive frames with equal images. ``asks``: see
+    the module."""
 
     lost: dict[int, str] = field(default_factory=dict)
     unfit: dict[int, str] = field(default_factory=dict)
@@ -87,15 +89,15 @@ def judge(
     sides: Mapping[int, Mapping[str, Any]],
     params: FrameScreeningParams,
 ) -> Judgement:
-    """What is known of the frames' continuity so far.
+    """Decide which frames are lost or unfit by the facts known so far, and which facts are needed in addition.
 
     Parameters
     ----------
     frames : frame numbers in order.
-    sights : facts of stage ``image_quality`` by frame.
-    steps : share of matches by (frame, later frame); 0 where they tell nothing.
+    sights : image quality by frame: facts of stage ``image_quality``.
+    steps : share of matching pixels by (frame, later frame); 0 if the match shows no motion.
     jumps : frames at which the displacements change abruptly.
-    sides : facts of stage ``swap_check`` by frame, as far as they were asked for.
+    sides : by frame, whether left and right are exchanged: facts of stage ``swap_check``, of the frames tested so far.
     """
     out = Judgement()
     _see(out, frames, sights, params)
@@ -124,7 +126,7 @@ def judge(
 def _see(
     out: Judgement, frames: Sequence[int], sights: Mapping[int, Mapping[str, Any]], params: FrameScreeningParams
 ) -> None:
-    """What the images alone say."""
+    """Judge frames by their images alone: uniform, blurred, copied."""
     usual = {(s, what): _usual([sights[f][s][what] for f in frames]) for s in SIDES for what in ("sharpness", "detail")}
     for f in frames:
         for side in SIDES:

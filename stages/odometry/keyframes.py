@@ -25,7 +25,7 @@ from rille.stages.odometry.covisibility import Covisibility, Step
 from rille.stages.odometry.step_table import steps_of
 
 LEAST_BLOCKS = 12
-"""Blocks of the image with a displacement, below which the whole is not told by them."""
+"""Least number of blocks with a displacement from which the overlap of two images is estimated."""
 
 LITTLE = 0.4
 """Overlap below which a stride, which asks for none, is warned of: most landmarks of a segment leave the image."""
@@ -93,10 +93,13 @@ class KeyframesParams(Params):
 
 @dataclass(frozen=True)
 class Choice:
-    """``basic`` positions; ``why`` each is basic (first frame, stride, overlap, max_gap, few matches, behind a gap);
-    ``overlap``.
+    """The basic pairs.
 
-    ``overlap`` is that with the basic pair before, None for the first and where too few coarse matches tell of it.
+    Attributes
+    ----------
+    basic : their positions in the sequence.
+    why : reason for each: first frame, stride, overlap, max_gap, few matches, behind a gap.
+    overlap : share of each that overlaps the basic pair before; None for the first, and with too few coarse matches.
     """
 
     basic: list[int]
@@ -129,7 +132,8 @@ UNMARKED = Marked()
 def by_stride(steps: Sequence[Step], params: KeyframesParams, marked: Marked = UNMARKED) -> Choice:
     """Positions 0, stride, 2 stride ... of one more frame than there are steps; for an unfit one the next that is.
 
-    Behind a step that is not to be believed there is one, too: what follows can then be posed, though by itself.
+    A frame after a step with too few matches is basic, too: the frames that follow then get poses, in a piece of their
+    own.
     """
     count = len(steps) + 1
     broken = [k + 1 for k, step in enumerate(steps) if doubtful(step, params)]
@@ -181,7 +185,7 @@ def _why(steps: Sequence[Step], k: int, key: int, ahead: Covisibility, params: K
 
 
 def doubtful(step: Step, params: KeyframesParams) -> bool:
-    """Whether a step has too few matches to be believed."""
+    """Whether a step has too few matches to be used."""
     return step.match_rate < params.min_matches or int(step.known.sum()) < LEAST_BLOCKS
 
 

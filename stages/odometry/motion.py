@@ -146,7 +146,7 @@ def _rolled(
     shape = (a.images[0].shape[0], a.images[0].shape[1])
 
     def attempt(homography: Floats, which: MotionParams) -> tuple[Motion, Derotation]:
-        # The rotation looked for comes on top of the one that a sensor told.
+        # The rotation that is searched is added to the one that a sensor measured.
         upright = Derotation(homography if turn is None else turn.homography @ homography, shape)
         return coarse_motion(a, b, which, upright), upright
 

@@ -1,4 +1,4 @@
-"""Rotation between two frames, found from the images where no sensor tells of it.
+"""Rotation between two frames, found from the images if no sensor measured it.
 
 Feature vectors compare upright windows and stand a turn of some ten degrees. Up to twice that enough of them still
 match to show the rotation, which is then undone. Beyond, the later frame is turned by a few angles about the image

@@ -1,4 +1,4 @@
-"""Steps between successive frames in short: what a hundred motions tell of overlap and of abrupt changes.
+"""Table of the steps between successive frames: overlap and abrupt changes, of about a hundred motions a table.
 
 The choice of basic pairs and the screening of frames go through the whole sequence. They need blocks of each motion's
 displacements, not the maps: read from tables, a sequence of thousands of frames is some tens of artifacts.

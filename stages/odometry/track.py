@@ -177,7 +177,7 @@ def _reseed(state: _State, frames: Sequence[Pyramid], j: int, params: TrackParam
     seeds = interest_points(
         frames[j].images[0], frames[j].valid[0], params.points, noise=params.noise, border=BORDER, occupied=here
     ).astype(np.float64)
-    # With fewer tracks no affinity back to the key frame can be told.
+    # Fewer tracks do not determine the affinity back to the key frame.
     if len(seeds) == 0 or len(here) < NEIGHBOURS:
         return state
     affinity, shift = fit_affinity(here, there, np.ones(len(here), bool), seeds)

@@ -1,7 +1,7 @@
 """Path in any direction over the eight-connected grid, for targets that the row graph cannot reach.
 
-Dijkstra's algorithm with a binary heap, from the target to the start: so the cost of every cell that was settled is its
-cost to go. The cost of an edge is its length and, weighted, its climb or descent and the toll of the cell entered; in
+Dijkstra's algorithm with a binary heap, from the target to the start: the final cost of a cell is its cost to go. The
+cost of an edge is the weighted sum of its length, its climb or descent, and the cost of the cell entered (``toll``), in
 whole numbers, so that sums are exact. Ties go to the lower cell index. scipy's Dijkstra wants the graph as a matrix, of
 15 million entries for a map of 1300 x 1500, which takes longer to build than this takes to search.
 """
@@ -40,9 +40,10 @@ def cost_to_go(
     Parameters
     ----------
     height : (row, col) whole numbers, of which a difference of one costs one.
-    ways : (row, col) directions as bits in which the vehicle may stand
-    (:mod:`rille.stages.planning.configuration_space`). target, start : row and column; the search ends where
-    it meets ``start``, None: when all is settled. unit : cost of a straight step's length, at least 1.
+    ways : (row, col) bits of the directions in which the vehicle may stand
+        (:mod:`rille.stages.planning.configuration_space`).
+    target, start : row and column. The search ends at ``start``; None: when the cost of every cell is final.
+    unit : cost of the length of a straight step, at least 1.
     toll : (row, col) whole numbers, cost of entering a cell.
 
     Returns

@@ -23,8 +23,8 @@ An elevation model is fan-shaped and ragged: the first and last rows with a free
 nowhere. So a start that is not given is, of the free cells within one vehicle length of the first row that lead on,
 the one nearest to that row's middle; the target likewise at the last row. A path counts as found when it comes within
 one vehicle length of the last row. A mission's map, on which the vehicle stands nowhere in particular, may be cut by
-ground that it cannot cross: then the connected ground over most rows is crossed, in any direction, and what is left out
-is told (``left_out_m``).
+ground that it cannot cross: then the connected ground over most rows is crossed, in any direction, and the length left
+out is reported (``left_out_m``).
 """
 
 from __future__ import annotations

@@ -29,13 +29,13 @@ Maps = Mapping[str, NDArray[Any]]
 Point = tuple[float, float]
 
 GROUNDS = ("outline", "wheels", "middle")
-"""What of the vehicle stays on known ground, as tried in turn."""
+"""Part of the vehicle that stays on known ground: tried in this order."""
 
 WORTH = {"outline": 1.0, "wheels": 0.75, "middle": 0.5}
-"""Worth of a row that a path crosses while this part of the vehicle stays on known ground.
+"""Weight of a row that a path crosses while this part of the vehicle stays on known ground.
 
-Unknown ground under the belly may touch it, so a quarter is taken off; unknown ground under a wheel may tip the
-vehicle, so half is.
+Unknown ground under the belly may touch it, so the weight is lower by a quarter; unknown ground under a wheel may tip
+the vehicle, so it is lower by half.
 """
 
 LARGE = 1 << 30
@@ -208,7 +208,7 @@ class PathMaps:
         return self._parts[below]
 
     def by_worth(self) -> list[str]:
-        """:data:`GROUNDS`, first the one whose connected ground covers the rows that are worth most."""
+        """Sort :data:`GROUNDS` by rows covered by connected ground, weighted by :data:`WORTH`; most first."""
 
         def worth(name: str) -> float:
             spans = self.parts(name)[1]

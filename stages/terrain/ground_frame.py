@@ -6,7 +6,7 @@ best source at hand: a measured attitude, the given initial pose, the rig's stat
 disparity shows. The ground plane is fitted in any case: it gives the range of elevations that Locus searches.
 
 A trajectory needs neither. Where no ground is seen, no elevation model can be made (unless ``reference_height`` states
-a surface); where nothing tells of the vertical either, the local frame is that of the camera: its own up is z.
+a surface); if nothing gives the vertical either, the local frame is that of the camera: its own up is z.
 """
 
 from __future__ import annotations
@@ -126,8 +126,8 @@ def level(
         ``ground_height`` z of the ground below the camera (m, negative); ``plane`` (a, b, c) of z = c + a x + b y;
         ``tilt`` of the ground (rad); ``relief`` lowest and highest terrain against the plane (m); ``z_range`` (m);
         ``cell_size`` (m) that suits the rig; ``footprint`` x_min, x_max, y_min, y_max (m) for it; ``ground_share`` of
-        the sampled pixels. All in the local frame. Where no ground is seen, ``no_ground`` says why, and what would
-        tell of it is None, but for ``cell_size``.
+        the sampled pixels. All in the local frame. Where no ground is seen, ``no_ground`` says why, and the
+        values that describe it are None, except ``cell_size``.
 
     Raises
     ------

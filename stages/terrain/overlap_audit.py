@@ -32,7 +32,7 @@ LEAST_OTHERS = 3
 NAMED = 3
 """Models that a warning names."""
 LISTED = 500
-"""Seams that the result tells of, the worst first: a long sequence has tens of thousands."""
+"""Largest number of seams in the result, the worst first: a long sequence has tens of thousands."""
 
 
 class OverlapAuditParams(Params):

@@ -60,7 +60,7 @@ def _extent(where: NDArray[np.intp], tile: int, side: int) -> tuple[int, int]:
 
 
 def tile_lattice(boxes: Iterable[Box], cell: float) -> Lattice:
-    """Smallest lattice that holds the boxes: what of a tile is worth computing."""
+    """Return the smallest lattice that holds the boxes: the part of a tile that has to be computed."""
     every = list(boxes)
     left, top = min(b[0] for b in every), min(b[1] for b in every)
     right, foot = max(b[0] + b[2] for b in every), max(b[1] + b[3] for b in every)

@@ -111,7 +111,7 @@ def _byte(key: str) -> int:
 def _lock(key: str) -> None:
     """Wait until no other process compiles the kernel; the system frees the byte when that process ends.
 
-    Waiting is no more than thrift: where files cannot be locked, or the other stands still, both compile. A kernel is
+    Waiting only saves time: if files cannot be locked, or the other process hangs, both compile. A kernel is
     locked before those that it calls, so that no two processes wait for each other.
     """
     until = time.monotonic() + PATIENCE
@@ -213,7 +213,10 @@ def _content(code: CodeType) -> tuple[object, ...]:
 
 
 class Calls(threading.local):
-    """How deep numba is in what a kernel calls, in this thread: 0 while it compiles or loads for a call by Python."""
+    """Nesting depth, in this thread, of calls between kernels that numba compiles or loads; 0: Python calls the kernel.
+
+    Only a kernel that Python calls needs a wrapper for callers in Python.
+    """
 
     depth = 0
 

@@ -1,7 +1,8 @@
 """Location of a cache: a folder, or ``s3://bucket/prefix``; and the local folder of its hints.
 
-Keys for explanations and mean times are hints of one machine. With a cache in a bucket they are kept in a folder
-beside it on this machine (``RILLE_LOCAL``, else ``.rille/local``).
+Hints speed up or explain a run and never change a result: the keys of earlier tasks, digests of image files, costs of
+tasks. They belong to one machine. If the cache is in a bucket, they are kept in a local folder (``RILLE_LOCAL``, else
+``.rille/local``).
 """
 
 from __future__ import annotations
@@ -51,7 +52,11 @@ def locate(given: Path | str) -> Location:
 
 
 def hints_folder(cache: Location) -> Path:
-    """Folder of a cache's hints on this machine: the cache itself where it is a folder."""
+    """Return the local folder for the hints of a cache.
+
+    It is the cache's own folder, or for ``s3://bucket/prefix`` the folder ``bucket+prefix`` below ``RILLE_LOCAL``
+    (default ``.rille/local``).
+    """
     if isinstance(cache, Path):
         return cache
     base = Path(os.environ.get("RILLE_LOCAL") or ".rille/local")

@@ -95,9 +95,10 @@ def _decoded(manifest: Manifest, data: bytes) -> str:
 def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bool = False) -> Cleared:
     """Remove artifacts whose key is not in ``keep``, leftovers, quarantine, and this user's kernels that nothing uses.
 
-    Only what was neither made nor used within ``grace`` seconds goes (a run may be under way); what a run used is told
-    by its index. ``keep`` are the keys of the kept runs (:func:`rille.pipeline.engine.events.keys`). The ages of a
-    bucket are by the server's clock against this machine's: keep the grace well above their difference.
+    Only files that were neither made nor used within ``grace`` seconds are removed, since a run may be under way; the
+    index of a run states what it used. ``keep`` are the keys of the kept runs
+    (:func:`rille.pipeline.engine.events.keys`). The age of an object in a bucket is this machine's clock minus the
+    server's: keep ``grace`` well above the difference of the clocks.
     """
     limit, cleared, doomed = time.time() - grace, Cleared(), []
     # Of a run whose folder is gone, or of another machine, the index alone tells what it used.

@@ -46,7 +46,10 @@ class Place(Protocol):
         """Note that a file is in use, if the place can: from then on :meth:`clear` spares it. None if it has gone."""
 
     def read(self, path: str, start: int = 0, stop: int | None = None) -> bytes | None:
-        """Bytes of a file from ``start`` to ``stop``, fewer where it ends before; None if it is not there."""
+        """Return bytes ``start`` to ``stop`` (exclusive) of a file; None if there is no such file.
+
+        If the file ends before ``stop``, fewer bytes are returned. Without ``stop`` the whole file is returned.
+        """
 
     def write(self, path: str, data: bytes) -> None:
         """Replace a file, whole or not at all."""

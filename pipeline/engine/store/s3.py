@@ -1,8 +1,8 @@
 """A prefix of a bucket of an S3-compatible server as a place for a store, and what to say when it fails.
 
 Credentials, region and endpoint come from the environment alone (``AWS_ACCESS_KEY_ID``, ``AWS_SECRET_ACCESS_KEY``,
-``AWS_SESSION_TOKEN``, ``AWS_REGION``, ``AWS_ENDPOINT_URL`` ...) and are never written anywhere; of what a server
-answers only its error code is told. Server errors and lost connections are tried again for half a minute, at the first
+``AWS_SESSION_TOKEN``, ``AWS_REGION``, ``AWS_ENDPOINT_URL`` ...) and are never written anywhere; of a server's
+answers only the error code is shown. Server errors and lost connections are tried again for half a minute, at the first
 contact for a few seconds.
 
 A commit relies on ``If-None-Match: *``: of two that write a manifest one must be refused. A server that ignores it

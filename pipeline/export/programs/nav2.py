@@ -46,13 +46,17 @@ FREE_THRESHOLD, OCCUPIED_THRESHOLD = 0.0, 1.0
 
 
 def export_run(run: Path, target: Path, store: Store) -> str:
-    """Write maps, masks and path of a run folder; the line to print.
+    """Write the maps, masks and path of a run as files for Nav2 into a new or empty folder.
+
+    Returns
+    -------
+    The line to print: number of cells, and of poses of the path.
 
     Raises
     ------
     InputError
-        The folder holds no finished run with a risk map, its artifacts are gone from the cache, or the target is not
-        empty.
+        ``run`` is not the folder of a finished run with a risk map, its artifacts are not in the cache, or ``target``
+        is not empty.
     """
     check_new(target)
     artifacts = RunArtifacts(run, store)

@@ -92,7 +92,7 @@ class Solver(Protocol):
 
     @property
     def uses_band(self) -> bool:
-        """Whether ``match`` heeds the band."""
+        """Whether ``match`` uses the band."""
 
     @property
     def whole(self) -> bool:
@@ -153,8 +153,8 @@ class FastSolver:
             reach = p.search_columns, p.search_rows
             propagation.descend(words, (up.u, up.v), reach, p.centres, soft, (packed, data), at)
         rounds = self.rounds(level)
-        # Rows are settled on the coarser levels, where trying them costs little; of a single round on the finest one,
-        # which costs most, jumps are wanted alone: the search has just tried the columns beside.
+        # Row displacements are found on the coarser levels, where trying them costs little. On the finest level, which
+        # costs most, a single round only tries jumps: the search has just tried the neighbouring columns.
         beside = 2 if level > 0 else 1 if rounds > 1 else 0
         propagation.checkerboard(words, (packed, data, dirty), soft, p.smoothness, rounds, beside, at)
         propagation.unpack(packed, u, v)

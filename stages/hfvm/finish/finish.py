@@ -172,7 +172,8 @@ class Finish:
     def final(self, window: Window, fine: Rasters, checked: Rasters, refined: Rasters, gone: Raster) -> Results:
         """Everything that :class:`~rille.stages.hfvm.Disparity` has.
 
-        Reach: that of filling along rows, of the uncertainty, of what counts as lonely and of what bears out a pixel.
+        The result of a window depends on pixels around it: those within reach of the filling along rows, of the
+        standard deviation, and of the neighbours that must agree with a match (``lonely``, ``supported``).
         """
         p = self.params
         near = uncertainty.SURROUNDINGS // 2 + consistency.CROWD // 2 + consistency.SUPPORT // 2
@@ -186,7 +187,7 @@ class Finish:
         removed &= keep
         blank = consistency.supported(validity == Validity.NO_TEXTURE, keep & ~removed)
         validity[blank], keep[blank] = 0, True
-        # Lonely matches are too uncertain to count as measured, but still the best guess where they are.
+        # Matches with too few agreeing neighbours are too uncertain to count as measured, but remain the best guess.
         lonely = consistency.lonely(keep & ~removed, p.min_support)
         mark(validity, removed | lonely, Validity.SPECKLE)
         interpolated = lonely.astype(np.uint8)
@@ -195,14 +196,14 @@ class Finish:
         noise = cut(refined["noise"], outer)
         std = uncertainty.standard_deviation(noise, u, keep & ~blank, p)
         if blank.any():
-            # Their neighbours lean on them no more than on other pixels without texture.
+            # For the deviation of their neighbours they count as unmatched, like other pixels without texture.
             std[blank] = np.hypot(uncertainty.standard_deviation(noise, u, keep, p), uncertainty.BLANK)[blank]
         if p.greatest_std is not None:
             unsure = keep & (std > p.greatest_std)
             mark(validity, unsure, Validity.OVER_THRESHOLD)
             interpolated[unsure], std[unsure] = 1, np.nan
             keep &= ~unsure
-        # A masked pixel is no part of the image, whatever the row tells of it.
+        # A masked pixel is no part of the image, so it is not filled either.
         interpolated[valid == 0] = 0
         if p.guided_fill:
             u, v = guided.median(u, v, keep, interpolated, left)

@@ -8,14 +8,14 @@ N: variance of the least-squares displacement of the 5 x 5 window (the Cramer-Ra
 refinement, times the column element of the inverse structure tensor). A window along a column edge has a small one,
 a window along a row edge a large one. R: mean square, in the 5 x 5 window, of how far a disparity
 lies from the mean of the four two pixels away (0 on a plane); errors of neighbours differ, and a window on relief or a
-depth edge answers for a part of each surface. M: share of
-unmatched pixels in 9 x 9; beside occlusions and failed matches a match leans on the wrong surface. The floor is what
-no pixel shows: sampling, lenses, the matcher's own sub-pixel bias.
+depth edge mixes the surfaces in it. M: share of unmatched pixels in 9 x 9; beside occlusions and failed matches a match
+is often drawn to the wrong surface. The floor stands for errors that no pixel shows: sampling, lenses, the matcher's
+own sub-pixel bias.
 
-What the number means: of the pixels with like features 68 % err by less than one and 95 % by less than two of it. So
-it is no root mean square: a few mismatches (a repeated pattern, a hidden pixel that found a likeness) err by ten and
-more, look sound to every feature, and no finite variance covers them. Back-matching error and feature distance tell
-nothing more once N, R and M are known; their fitted factors were zero.
+Of the pixels with similar N, R and M, 68 % err by less than one standard deviation and 95 % by less than two. So the
+standard deviation is no root mean square: a few mismatches (a repeated pattern, a hidden pixel that resembles another)
+err by ten and more, no feature reveals them, and no finite variance covers them. Back-matching error and feature
+distance add nothing once N, R and M are known; their fitted factors were zero.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ SURROUNDINGS = 9
 
 
 BLANK = 0.2
-"""Pixels: by how much a match without texture of its own, borne out by its surroundings, errs beyond what the parts
-below explain. From the five pairs of :data:`rille.stages.hfvm.level.consistency.SUPPORT`: .13 to .26."""
+"""Standard deviation (pixels) that is added to a match without texture that its surroundings confirm; the parts below
+do not explain it. From the five pairs of :data:`rille.stages.hfvm.level.consistency.SUPPORT`: .13 to .26."""
 
 
 class Factors(NamedTuple):

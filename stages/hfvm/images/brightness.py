@@ -1,9 +1,9 @@
-"""Smooth ratio of the brightness of two images (vignetting, exposure), found coarsely and undone in the right one.
+"""Smooth brightness ratio of two images (vignetting, exposure), estimated coarsely and corrected in the right image.
 
-Matches follow the gradient of brightness where texture is weak; where one image has another such gradient, they follow
-it astray. The logarithm of the ratio, left over right, is a polynomial of the place in the right image. It is fitted to
-the grey values of matches of a coarse level, and before there are any to those of either image as a whole, which show
-nearly the same scene: a guess that only counts where more matches are found with it than without.
+Where texture is weak, matches follow the gradient of brightness, and if this gradient differs between the images, they
+are wrong. The logarithm of the ratio, left over right, is a polynomial in the coordinates of the right image. It is
+fitted to the grey values of matches of a coarse level. Before there are matches, it is guessed from the grey values of
+each image as a whole, since both show nearly the same scene; the guess is used only if it gives more matches.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ SAMPLES, LEAST = 4000, 100
 """Pixels that a polynomial is fitted to at most, and that it needs at least."""
 
 DARK, SATURATED = 4.0, 250.0
-"""Grey levels between which pixels tell of brightness."""
+"""Grey levels between which pixels are used for the ratio."""
 
 SCATTER, ITERATIONS = 0.05, 8
 """Least scatter of the logarithms of matched grey values, and steps of the robust fit."""
 
 NOTABLE = 0.1
-"""Logarithm of a ratio that is worth undoing somewhere in the image."""
+"""Logarithm of the ratio that must be reached somewhere in the image for it to be corrected."""
 
 
 def terms(x: AnyArray, y: AnyArray, level: int, shape: Shape) -> Floats:

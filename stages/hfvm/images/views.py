@@ -49,7 +49,7 @@ class View(Protocol):
 
 @dataclass(frozen=True)
 class Plain:
-    """A pyramid of rasters. ``noise``: standard deviation of level 0, grey levels."""
+    """A pyramid of rasters. ``noise``: standard deviation of level 0, grey levels; ``blank``: see :class:`Aligned`."""
 
     images: Sequence[Raster]
     masks: Sequence[Raster]
@@ -169,8 +169,8 @@ def fill(view: View, level: int, window: Window) -> AnyArray:
 class Aligned:
     """The right image resampled to the left one's geometry by a plane, a window at a time.
 
-    ``h``: homography from aligned to right pixels (level 0). Levels from ``kept`` on are held in memory, the finer
-    ones resampled whenever they are asked for.
+    ``h``: homography from aligned to right pixels (level 0). Levels from ``kept`` on are held in memory, finer ones are
+    resampled at each access. ``blank``: grey level of masked pixels that no level covers: the mean of the coarsest.
     """
 
     right: View
@@ -204,7 +204,7 @@ class Aligned:
 
     @staticmethod
     def again(right: View, h: plane.Matrix, left: View, blank: float) -> Aligned:
-        """View that holds nothing, of an image whose ``blank`` is known."""
+        """Return a view that holds no level in memory; ``blank``: see the class."""
         m = plane.margin(left.shapes[0])
         shapes = pyramid_shapes((left.shapes[0][0] + 2 * m, left.shapes[0][1] + 2 * m), len(left.shapes))
         return Aligned(right, h, left.shapes[0], shapes, (), (), len(shapes), blank)

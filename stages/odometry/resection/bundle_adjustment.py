@@ -5,8 +5,8 @@ complement) is a division, and the system has the size of the poses (Triggs, McL
 doi:10.1007/3-540-44480-7_21). The result is never worse than its start by the same cost: where no step lowers it, the
 start is returned. The inverse of the same reduced system is the covariance of the poses (:func:`posterior`).
 
-Another error that disparities share, a tilt, shows over the whole sequence only: :func:`tilt_of` is what one segment
-tells of it (:mod:`rille.stages.odometry.resection.common_tilt`).
+Another error that disparities share, a tilt, shows over the whole sequence only: :func:`tilt_of` is the
+contribution of one segment (:mod:`rille.stages.odometry.resection.common_tilt`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tilt that all disparities share, by what each adjusted segment tells of it.
+"""Tilt that all disparities share, estimated from the contributions of all adjusted segments.
 
 A right image whose rows lie too low may have been turned (pitch), or have its principal point there; epipolar lines
 hardly tell the two apart, and a rig that is repaired takes the turn. The wrong choice tilts disparities: by ``f x y`` a

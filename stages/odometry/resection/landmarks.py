@@ -29,11 +29,14 @@ TEMPLATE = 5
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Coordinates and what they hang on.
+    """Landmarks of a basic pair, with the derivative and the standard deviation of their coordinates.
 
-    ``position`` (n, 3) in the local frame, m, NaN none; ``per_pixel`` (n, 3) how it moves along its ray as the depth
-    grows by what one pixel of disparity is worth, m/pixel; ``sigma`` (n,) standard deviation of the disparity, pixels.
-    ``lost`` says why the others have no coordinates: reason and count.
+    Attributes
+    ----------
+    position : (n, 3) in the local frame, m; NaN if a landmark has no coordinates.
+    per_pixel : (n, 3) motion along the ray, away from the camera, for a change of the disparity by a pixel, m/pixel.
+    sigma : (n,) standard deviation of the disparity, pixels.
+    lost : number of landmarks without coordinates, by reason.
     """
 
     position: Floats

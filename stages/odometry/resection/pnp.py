@@ -94,11 +94,16 @@ class Poses:
 
 @dataclass(frozen=True)
 class Errors:
-    """Back-projection errors at poses.
+    """Back-projection errors of n landmarks at b poses, and the parts of their derivatives.
 
-    ``pixels`` (b, n, 2) raw, ``white`` (b, n, 2) whitened, ``norm`` (b, n) their Mahalanobis length (infinite behind
-    the camera), and what the derivatives need: camera coordinates ``x`` (b, n, 3), ``projection`` (b, n, 2, 3)
-    derivative of the image by them, ``per_pixel`` (b, n, 2) that by the landmark's disparity.
+    Attributes
+    ----------
+    pixels : (b, n, 2) column and row error, computed minus observed, pixels.
+    white : (b, n, 2) the same whitened by the covariance S (see the module), dimensionless.
+    norm : (b, n) length of ``white``, a Mahalanobis distance; infinite behind the camera.
+    x : (b, n, 3) landmarks in the camera frame, m.
+    projection : (b, n, 2, 3) derivative of the projected pixel by ``x``, pixels / m.
+    per_pixel : (b, n, 2) derivative of the projected pixel by the landmark's disparity, pixels / pixel.
     """
 
     pixels: Floats
@@ -312,7 +317,7 @@ def _step(normal, gradient, damping, lower, step):  # type: ignore[no-untyped-de
     most = 0.0
     for i in range(UNKNOWNS):
         most = max(most, normal[i, i])
-    # Damping scales with the diagonal, which is 0 for an unknown that no landmark tells of.
+    # Damping scales with the diagonal, which is 0 for an unknown that no landmark determines.
     floor = 1e-12 * most + 1e-300
     for i in range(UNKNOWNS):
         for k in range(i + 1):

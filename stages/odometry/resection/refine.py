@@ -10,9 +10,9 @@ The poses' covariances are those of this adjustment, by the same rules as the re
 (:mod:`rille.stages.odometry.resection.resect`): the errors that are found set the scale, what the stated ones leave
 beyond them is shared by all segments.
 
-Another error that they share, a tilt, shows over the whole sequence only: each task says what its segment tells of it
-(:mod:`rille.stages.odometry.resection.common_tilt`). Where it is beyond doubt, landmarks are judged and all segments
-adjusted once more without it.
+Another error that they share, a tilt, shows over the whole sequence only: each task gives the contribution of its
+segment (:mod:`rille.stages.odometry.resection.common_tilt`). If the tilt is significant, landmarks are judged and all
+segments adjusted once more without it.
 """
 
 from __future__ import annotations

@@ -9,8 +9,9 @@ weighted by how exactly the landmark itself is known (see :mod:`rille.stages.odo
 the rule above is that weighted one in units of ``pixel_sigma``; for exact landmarks it is the paper's.
 
 Covariances here are 6 x 6 of ``(dt, dtheta)`` in the destination frame: position error in metres, then the rotation
-vector ``R_true = exp(dtheta) R`` in radians. They tell of the measurements and of a shared error of the disparities;
-errors of the calibration (focal length, direction of the camera in the vehicle) are not in them. They have two parts:
+vector ``R_true = exp(dtheta) R`` in radians. They contain the errors of the measurements and a shared error of the
+disparities, but not errors of the calibration (focal length, direction of the camera in the vehicle). They have two
+parts:
 
 * what the residuals show: the errors found, times what they go together by (:func:`scatter_of_blocks`). It begins anew
   with the landmarks of every segment;

@@ -10,8 +10,9 @@ so that ``T_world_local(k) = T_world_left(k) T_local_left(k)^-1`` whatever the l
 segment's key frame is the last frame of this one. Where that frame is lost the trajectory breaks: what follows is a
 piece of its own, in the local frame of its first basic pair.
 
-Where nothing tells of the vertical at a piece's first pair, that of its first pair that has one is carried back along
-the piece; where none has, the frame of the piece is that of its first camera, whose own up is z, and that is said.
+If the first pair of a piece has no source of the vertical, the vertical of the first pair that has one is carried back
+along the piece. If no pair has one, the frame of the piece is that of its first camera, whose own up is z; the result
+says so.
 
 Of the covariances, what each segment has for itself adds up; of what all segments share, the errors add up, which grows
 with the length of the way and not with its root (:mod:`rille.stages.odometry.resection.resect`).

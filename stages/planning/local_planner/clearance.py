@@ -92,7 +92,7 @@ class Footing:
 
     ``fields`` (6, row, col): distances to hazards to a wheel that are none by sigma alone, to those that are, and to
     proven ones; then the same three of hazards to the vehicle. ``unknown``: distance to unknown ground; ``frontier``:
-    to that of it where a wheel has room, for the rest is mostly the shadows of stones. ``dear``: 0,
+    to that of it where a wheel has room, for the rest is mostly the shadows of stones. ``dear``: class by cost, 0,
     :data:`CAUTION_GROUND` or :data:`DOUBTED_GROUND`. ``straddle``: what of unknown ground the belly may pass over.
     ``glanced``: where unknown ground was seen from afar; None: nowhere.
     """

@@ -27,7 +27,7 @@ ASIDE = tuple(math.radians(d) for d in (3.0, -3.0, 6.0, -6.0, 9.0, -9.0))
 lattice are some 20 degrees apart, and out of a narrow place a path may lead only between two of them."""
 
 DOUBT_WEIGHT = 60
-"""Price of doubted ground over that of caution ground: one wheel there makes a way more than three times as dear."""
+"""Ratio of the cost of doubted ground to that of caution ground: one wheel on it more than triples the cost."""
 PARTS = 5
 """Parts of a vehicle that stand on ground: its wheels and its middle."""
 HERE = 0.3
@@ -84,7 +84,7 @@ class Ground:
         # Hazards that are likely but not proven may be planned over, at a price: seen from nearer most of them go.
         opened = gaps.proven > np.where(near, self.here[2], margin) - slack
         for cx, cy in self.closed:
-            # What was looked at in vain is closed as far as it is not known: the rest of the circle may be driven.
+            # Where looking did not help, unknown ground is closed; known ground in the circle may be driven.
             opened &= known | (np.hypot(x - cx, y - cy) > self.p.failed_view_radius * self.vehicle.wheel_base)
         return known, opened | known
 
@@ -113,7 +113,7 @@ class Ground:
         stays = (gaps.gap <= self.vehicle.margin) | ((gaps.unknown <= 0) & (gaps.frontier > 0))
         unknown = np.where(stays, np.maximum(self.p.uncertainty_cost, unknown), unknown)
         caution = self.p.caution_cost * ((gaps.caution + DOUBT_WEIGHT * gaps.doubted) / PARTS)
-        # not dearer than if nothing were known of it
+        # No higher than the cost of unknown ground.
         fades = (away > NEARER * self.p.occluded_radius) & ~stays
         caution = np.where(fades, np.minimum(caution, self.p.unknown_cost - 1.0), caution)
         price = np.where(known, 1.0, unknown) + caution
@@ -157,7 +157,10 @@ class Ground:
         return goals, *self.graph.search(goals, turn, self.p.reverse_cost, whole=whole)
 
     def beside(self) -> Iterator[Ground]:
-        """The same from headings a little aside, as far as the wheels have room to turn there."""
+        """Yield this map with other lattices: their first heading is offset by each of :data:`ASIDE`.
+
+        An offset is left out if the wheels have no room for the turn.
+        """
         for aside in ASIDE:
             if turnable(self.start, self.heading, self.heading + aside, self.clear):
                 yield Ground(self.footing, self.start, self.heading, self.p, self.closed, aside)
@@ -186,7 +189,7 @@ class Ground:
             metres = piece.length * (self.p.reverse_cost if piece.gear < 0 else 1.0)
             if not np.isfinite(price).all():
                 return [], math.inf
-            # As the lattice prices a turn: by the dearest pose on it; a piece by the mean of its poses.
+            # A turn costs as in the lattice, by its costliest pose; a piece costs by the mean of its poses.
             cost += abs(piece.heading - heading) * self.p.turn_cost * self.vehicle.wheel_base * float(price[:n].max())
             cost += metres * float(price[n:].mean())
             # The known part is driven now: cut there, or a whole long piece would count as unknown.

@@ -99,9 +99,15 @@ def bearing(points: Floats, stand: Stand) -> tuple[float, float]:
 
 @dataclass
 class PlannerMemory:
-    """``looks`` around since the last leg that was driven; ``closed`` places (m) about which unknown ground was looked
-    at in vain; ``stands`` from which it has looked; ``reopened``: the closed places were tried once more, as the last
-    way that is left."""
+    """Earlier looks of a vehicle.
+
+    Attributes
+    ----------
+    looks : number of looks since the last leg that was driven.
+    closed : places (m); the ground around them was still unknown after it had been looked at.
+    stands : poses from which the vehicle has looked.
+    reopened : whether the closed places were tried once more, because no other path was left.
+    """
 
     looks: int = 0
     closed: list[Point] = field(default_factory=list)
@@ -134,8 +140,15 @@ class PlannerMemory:
 
 @dataclass(frozen=True)
 class Target:
-    """Ground that has to be seen, ``points`` (n, 2) m, by what is in ``view``; ``before``: direction (rad) and distance
-    (m) from which it was looked at already; ``unseen``: never from near, else it is doubtful though it was."""
+    """Ground that has to be seen before the vehicle can go on.
+
+    Attributes
+    ----------
+    view : field of view of the cameras.
+    points : (n, 2) m, the ground.
+    unseen : it was never seen from near; otherwise it was, and is a doubtful hazard nevertheless.
+    before : direction (rad) and distance (m) of each place from which it was in view already.
+    """
 
     ground: Ground
     view: FieldOfView
@@ -150,7 +163,7 @@ class Target:
         return Target(ground, view, points, unseen, looked(view, [*stands, (*ground.start, ground.heading)], points))
 
     def shows(self, stand: Stand, looks: int = 1) -> bool:
-        """Whether it is in view from a place, and was looked at fewer times from there or nearer."""
+        """Whether it is in view from a pose, and was in view fewer than ``looks`` times from there or nearer."""
         if not self.view.holds(self.points, stand):
             return False
         side, far = bearing(self.points, stand)
@@ -170,8 +183,17 @@ class Target:
         return next((t for t in sorted(found, key=abs) if self.shows((*at, heading + t), looks)), None)
 
     def last_view(self, leg: Sequence[Piece], bound: float) -> tuple[float, float] | None:
-        """Metres of a leg after which it is last in view, and the turn (rad) for that, with all headings of the leg
-        within a bound (rad) of each other; None: nowhere on it."""
+        """Return the last position on a leg from which the target is in view, and the turn on the spot that shows it.
+
+        Parameters
+        ----------
+        leg : pieces of the leg, from the start pose.
+        bound : largest difference [rad] between any two headings of the leg, the turn included.
+
+        Returns
+        -------
+        Distance [m] from the beginning of the leg and turn [rad, to the left]; None if no position shows the target.
+        """
         headings = np.array([self.ground.heading, *(piece.heading for piece in leg)])
         low, high = np.minimum.accumulate(headings), np.maximum.accumulate(headings)
         # From the end: the later a leg stops, the fewer stops there are.

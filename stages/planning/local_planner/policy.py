@@ -1,15 +1,18 @@
-"""The next leg of a drive to a goal: where to, how far of it is safe to drive now, or why no way leads there.
+"""Plan the next leg of a drive to a goal: its path, how much of it is safe to drive now, or why no path exists.
 
-The way is planned to the goal over all of the map. Ground that is known and free costs its length; unknown ground may
-be planned over, at a higher price, since the next stop will see it, but is never driven on: the leg ends before it. So
-may ground that is hazardous only by the standard deviation of its elevations, and, dearer, what is likely hazardous but
-not certainly so, and the shadows of stones: both mostly stay as they are when looked at from nearer. Ground that is
-known to be hazardous, or nearer to it than the vehicle and its margin need, is closed. What was seen from afar alone
-counts as unknown but for its hazards and for what is clearly free, at a price of its own: the windows of a matcher
-smooth away what is smaller than they are on the ground.
+The path is planned to the goal over the whole map. Known free ground costs its length. These kinds of ground may be
+planned over, at a higher cost, but are never driven on (the leg ends before them):
 
-So the way bends round dead ends as soon as they are seen, and where no way is left even over unknown ground there is
-none. This is the usual free-space assumption (Koenig, Tovey, Smirnov 2003, doi:10.1016/S0004-3702(03)00062-6), planned
+- unknown ground, since the next stop will see it;
+- ground that is hazardous only by the standard deviation of its elevations;
+- at a still higher cost, likely but not certain hazards and the shadows of stones: both mostly remain so from nearer.
+
+Ground that is certainly hazardous is closed, with the vehicle's margin around it. Ground that was seen only from afar
+counts as unknown, except for its hazards and for ground that is clearly free; it has a cost of its own, because the
+matcher's windows smooth away relief that is smaller than they are on the ground.
+
+So the path avoids dead ends as soon as they are seen, and if no path is left even over unknown ground, there is none.
+This is the usual free-space assumption (Koenig, Tovey, Smirnov 2003, doi:10.1016/S0004-3702(03)00062-6), planned
 anew at each stop.
 
 The vehicle drives ahead, or back at a higher price, and turns on the spot where its wheels have room to
@@ -94,10 +97,10 @@ def plan_leg(
     footing : of the map known so far.
     stand : where the vehicle is.
     goal : m.
-    memory : what it has looked at before; None: nothing.
-    before : what was left, after the last leg, of the way planned then: (vertex, 2) m, (piece,) gear. It is kept unless
-        another one is better by ``replan_hysteresis``; None: there is none.
-    view : the ground that its cameras see.
+    memory : earlier looks of the vehicle; None: none.
+    before : rest of the path planned at the last stop: (vertex, 2) m, (piece,) gear. It is kept unless another one is
+        cheaper by ``replan_hysteresis``; None: there is none.
+    view : the ground that the cameras of the vehicle see.
 
     Raises
     ------
@@ -120,7 +123,7 @@ def plan_leg(
     kept, price = list[Piece](), math.inf
     if before is not None:
         kept, price = ground.again(_onward(before, start, heading, ground.grid.spacing))
-    # Only as the last resort: each of them is a graph of its own, as dear as the first.
+    # Only as the last resort: each of them builds a graph of its own, which takes as long as the first.
     for other in ground.beside() if not np.isfinite(min(least, price)) and ground.opens(goals) else ():
         _, found, move = other.search(goal, 0.5 * params.tolerance * base)
         least = other.from_start(found)
@@ -161,12 +164,14 @@ def _onwards(
     target: Target | None,
     looks: int,
 ) -> Leg | None:
-    """The leg along a way: as far as it is known, and no farther than where it is not can be seen from. None: that is
-    not worth a stop."""
+    """Return the leg along a path: to the end of known ground, or to the last place that sees the unknown ground.
+
+    None: this leg would be shorter than ``min_length``.
+    """
     p, base, start, heading = ground.p, ground.vehicle.wheel_base, ground.start, ground.heading
     bound = math.radians(p.max_turn_deg)
     leg = first_metres(plan[: _sure(plan)], p.max_length * base)
-    # A short last piece to the goal is worth its stop.
+    # A last piece to the goal may be shorter.
     if length_of(leg) < min(p.min_length * base, length_of(way) - 1e-9):
         return None
     seen = None if target is None else target.last_view(leg, bound)

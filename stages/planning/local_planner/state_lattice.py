@@ -71,8 +71,9 @@ class PoseGrid:
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """Prices (heading over half a turn, row, col): of poses, of the middles of steps ahead from them and of turns to
-    the left; and which of the three may be driven on what is known, masks of the same shape."""
+    """Cost of a metre (heading over half a turn, row, col) at each pose (``pose``), half a step ahead of it (``step``)
+    and half a turn to the left of it (``turn``); infinite where closed. ``known``: masks of the same shape of these
+    three that may be driven by what is known."""
 
     grid: PoseGrid
     pose: Floats
@@ -105,8 +106,9 @@ class PoseGraph:
         Parameters
         ----------
         goals : (row, col) places, at any heading.
-        turn_price : metres that a radian is worth. ``back``: price of driving back, ahead is 1.
-        whole : to all poses; else only as far as the start.
+        turn_price : cost of a turn, metres of driving ahead per radian.
+        back : cost of a metre driven back; a metre ahead costs 1.
+        whole : search all poses; else end at the start.
         """
         size = (2 * HALF, *self.grid.shape)
         cost, move = np.full(size, np.inf), np.full(size, -1, np.int8)
@@ -188,7 +190,7 @@ def _search(prices, goals, moves, end, cost, move):  # type: ignore[no-untyped-d
                 before = (k + 15) % 16 if m == 2 else (k + 1) % 16
                 lower = before if m == 2 else k
                 between, scale = turn[lower % 8, r, c], turns[lower]
-            # The dearest of both ends and the middle: what is dear must not be stepped over.
+            # The highest cost of both ends and the middle, so that a step does not jump over costly ground.
             price = max(here, pose[before % 8, i, j], between)
             total = key + scale * price
             if total < cost[before, i, j]:

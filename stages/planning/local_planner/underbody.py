@@ -68,8 +68,14 @@ class Straddle(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def stands(straddle, at, heights):  # type: ignore[no-untyped-def]
-    """Whether four wheels, front left, front right, rear left, rear right, at cells ``at`` (4, 2) stand on what was
-    seen, no steeper than allowed; ``heights`` (4,), m, at which they do at least."""
+    """Return whether all wheels stand on ground that was seen, and the slope between them is surely within the limit.
+
+    Parameters
+    ----------
+    straddle : :class:`Straddle`; without bounds the answer is False.
+    at : (4, 2) row and column of the cells under the wheels: front left, front right, rear left, rear right.
+    heights : (4,), m; filled with the least height at which each wheel stands.
+    """
     stand = straddle.stand
     if stand.shape[1] == 0:
         return False
