@@ -82,7 +82,7 @@ class ImuRecord:
 
 @dataclass(frozen=True)
 class Inertial:
-    """What an IMU says of each frame; nothing of any, where there is no IMU.
+    """Attitude and rotation of each frame by an IMU; empty without an IMU.
 
     Attributes
     ----------

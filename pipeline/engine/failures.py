@@ -11,7 +11,7 @@ CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
 def told(error: BaseException) -> RilleError | None:
-    """The same failure as an error of Rille; None where nothing better than its own words can be said."""
+    """Translate a failure into an error of Rille with a remedy; None if Rille knows no better message."""
     if isinstance(error, RilleError):
         return error
     if isinstance(error, MemoryError):

@@ -96,7 +96,7 @@ class MissingError(Exception):
 
 @dataclass(frozen=True)
 class Maybe:
-    """To wait until it is known what became of all handles; what will never have an artifact is given as None."""
+    """Wait until every handle has succeeded or failed; a handle without an artifact gives None."""
 
     handles: Sequence[Handle]
 

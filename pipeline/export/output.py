@@ -74,7 +74,7 @@ class Output:
 
     @cached_property
     def about(self) -> dict[str, str]:
-        """What ``frames.json`` says of it; empty for files without coordinates."""
+        """Entry of the file in ``frames.json``; empty for files without coordinates."""
         return {"frame": self.frame, **self.facts} if self.frame else {}
 
 

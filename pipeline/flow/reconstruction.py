@@ -242,8 +242,8 @@ def vertical(make: Builder, pair: int, first: bool) -> dict[str, Any]:
 
 
 def steps_of(make: Builder, chosen: Ref) -> list[list[float | None]]:
-    """How far the view moves from each frame to the next (radians, as of a camera that only turns), and the share of it
-    that is found again."""
+    """Return, for each step to the next frame, the displacement as an angle (radians; None: not known) and the share of
+    matching pixels."""
     lengths, focal = chosen.meta["displacement"], make.sequence.rig.left.fx
     turns = [None if length is None else round(math.atan(length / focal), 4) for length in lengths]
     return [[turn, share] for turn, share in zip(turns, chosen.meta["match_rate"], strict=True)]
@@ -336,7 +336,7 @@ def cells_in_both(a: Series[int], b: Series[int]) -> int:
 
 
 def spread(pairs: list[int], most: int) -> list[int]:
-    """At most so many of the pairs, evenly apart, the first among them."""
+    """Choose at most ``most`` of the pairs, evenly spaced, beginning with the first."""
     # Minus twice: rounds the stride up, so that no more than `most` remain.
     return pairs[:: -(-len(pairs) // most)]
 

@@ -141,7 +141,7 @@ def render(
 
 
 def reasons() -> list[tuple[str, str]]:
-    """What may be a cell's reason on the map, in words."""
+    """Return the possible reasons of a cell's class on the map: name and description."""
     measures = [(m.name, f"{m.description} (limit: {m.limit})") for m in MEASURES]
     return [
         *measures,

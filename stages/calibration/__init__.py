@@ -1,1 +1,1 @@
-"""How the two cameras stand and what they are: orientation, rig, lens targets, swapped sides."""
+"""Calibration of the two cameras: orientation, rig, lenses from targets, test for swapped images."""

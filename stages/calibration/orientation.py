@@ -115,7 +115,7 @@ def orient(rig: Rig, matches: PointPairs, params: RelativeParams) -> tuple[dict[
 
 
 def misalignment(offset: float, decision: Decision) -> str:
-    """How the right image lies against the given rig: row offset (pixels), and what was freed, in words."""
+    """Describe in words how the right image departs from the given rig: row offset (pixels) and freed parameters."""
     parts = [f"rows of the right image lie {abs(offset):.2f} px too {'low' if offset > 0 else 'high'}"]
     for p in decision.parameters:
         degrees = math.degrees(p.value)

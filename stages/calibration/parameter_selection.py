@@ -102,7 +102,7 @@ class RelativeParams(Params):
     )
 
     def beliefs(self, rig: Rig) -> Beliefs:
-        """The same in radians and pixels."""
+        """Prior standard deviations of a rig, in radians and pixels."""
         return Beliefs(
             math.radians(self.prior_rotation_deg),
             math.radians(self.prior_baseline_deg),
@@ -143,9 +143,14 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Decision:
-    """What the images change: ``correction`` (5,) radians, the parameters in order, and the fit behind it.
+    """Decision about each parameter of a rig.
 
-    ``start``: of each pair, what fits to it begin with.
+    Attributes
+    ----------
+    correction : (5,) radians; 0 for held parameters.
+    parameters : the parameters, in order of :data:`rille.stages.geometry.epipolar.NAMES`.
+    fit : the fit behind the correction.
+    start : linearised residuals of each pair, from which other fits may start.
     """
 
     correction: Floats

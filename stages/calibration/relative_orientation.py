@@ -129,7 +129,7 @@ class Linear:
 
 
 def linearised(rig: Rig, pairs: Sequence[PointPairs]) -> list[Linear]:
-    """What every fit of a rig to some pairs begins with."""
+    """Linearise the epipolar distances of each pair at the given rig; every fit starts from these."""
     return [_linear(rig, m) for m in pairs]
 
 

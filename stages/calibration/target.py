@@ -62,7 +62,7 @@ class BoardView:
 
 @dataclass(frozen=True)
 class ViewResidual:
-    """How one view fits: RMS in pixels of the corners in each image, and of their distances from epipolar lines."""
+    """RMS residuals of one view, pixels: of the corners in each image, and of their distances from epipolar lines."""
 
     name: str
     left: float
@@ -78,12 +78,12 @@ class ViewResidual:
 
 @dataclass(frozen=True)
 class RigCalibration:
-    """What the views determine.
+    """Result of a calibration: both lenses, the relative pose, and their errors.
 
     ``sigma``: standard deviation by name (``left fx`` in pixels, ``right k1``, ``rotation x`` in radians,
-    ``translation x`` and ``baseline`` in metres), from the residuals and the geometry of the views. ``rms``: pixels, of
-    all corners that were used. ``residuals``: one a view; those of views that were left out are the ones for which they
-    were.
+    ``translation x`` and ``baseline`` in metres), from the residuals and the geometry of the views. ``rms``: of all
+    corners that were used, pixels. ``residuals``: one a view; of a view that was left out those of the first
+    adjustment.
     """
 
     left: Lens
@@ -97,7 +97,7 @@ class RigCalibration:
 def calibrate_rig(
     board: Floats, views: Sequence[BoardView], size: tuple[int, int], model: str = "radtan", *, keep_bad: bool = False
 ) -> RigCalibration:
-    """Both cameras and their relative pose.
+    """Calibrate both cameras and their relative pose from views of a board.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ class Adjustment:
         return 2 * self.lens + 6
 
     def pose(self, k: int) -> slice:
-        """Where the board's pose in view ``k`` stands."""
+        """Slice of the unknowns that holds the board's pose in view ``k``."""
         return slice(self.shared + 6 * k, self.shared + 6 * k + 6)
 
     def start(self) -> Floats:

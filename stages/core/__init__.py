@@ -1,1 +1,1 @@
-"""What every stage is made of: declarations, errors, validity masks."""
+"""Base of every stage: declarations, errors, validity masks."""

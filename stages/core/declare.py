@@ -51,7 +51,7 @@ def raster(name: str, unit: str, long_name: str, dtype: str = "float32", nodata:
 
 @dataclass(frozen=True)
 class Bundle:
-    """What a stage takes and gives: named arrays and JSON-able facts about them."""
+    """Input or result of a stage: named arrays, and facts about them that can be written as JSON."""
 
     arrays: Mapping[str, AnyArray]
     meta: Mapping[str, Any]
@@ -82,11 +82,11 @@ Size = Callable[[Any, Mapping[str, Any], Mapping[str, Any]], float]
 
 @dataclass(frozen=True)
 class Memory:
-    """What a task is guessed to need while none was measured, what it grows with, and what makes it smaller.
+    """Guess of the memory of a task, used until tasks of the stage have been measured.
 
     The guess is ``fixed`` bytes, and ``factor`` more for each byte of input (decoded arrays of all inputs, and what
     ``size`` adds); ``result`` is the guess of decoded bytes of result a byte of input. ``lower`` names the parameters
-    to change where a task is too large, as the user writes them (``hfvm.preset``).
+    that reduce the memory, as the user writes them (``hfvm.preset``).
     """
 
     fixed: float = 50e6

@@ -1,1 +1,1 @@
-"""What watches a vehicle that drives: faults of its motion and obstacles laid in its way."""
+"""Monitors of a driving vehicle: faults of its motion, and obstacles."""

@@ -65,7 +65,7 @@ class Verdict:
 
 
 class Readings(NamedTuple):
-    """What the sensors tell at each frame.
+    """Readings of the sensors at each frame.
 
     ``up`` (frame, 3) direction of up in the left camera; ``acceleration`` (frame,) m/s2; ``odometry`` (frame, 3) x, y
     (m), heading (rad) by the wheels since the first frame.

@@ -85,7 +85,7 @@ class LastModel:
 
     @staticmethod
     def of(elevation: NDArray[np.floating], lattice: Lattice, blur: float) -> LastModel:
-        """From elevations, comparing within ``blur`` metres."""
+        """Build from elevations (row, col), m, NaN unknown; ``top`` is the highest within ``blur`` metres."""
         z = np.asarray(elevation, np.float64)
         side = 2 * round(blur / lattice.cell) + 1
         # The highest nearby: an error of the pose by that much must not make a known stone rise.
@@ -141,7 +141,7 @@ def look(
     vehicle: Vehicle,
     p: ObstacleMonitorParams,
 ) -> Points:
-    """What the two images say of the ground ahead of the vehicle."""
+    """Compute the points that two images show ahead of the vehicle, and which of them rise above the model."""
     wheel = vehicle.wheel_diameter
     T_vehicle_local = T_vehicle_left @ view.now.inverse()
     ahead = T_vehicle_local.apply(surface.points)

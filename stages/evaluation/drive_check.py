@@ -22,7 +22,7 @@ from rille.stages.evaluation.accuracy_parts import Metric, inverse, metric, squa
 
 
 def judged(drive: Mapping[str, Any], row: int) -> dict[str, Floats]:
-    """What a drive to the image of this row (-1: the last one) has of placements."""
+    """Select the placements of a drive up to the image of this row (-1: the last one)."""
     # What lies behind the last image that was taken was driven, but nothing was known of it.
     end = int(np.asarray(drive["frame_at"])[row]) + 1
     return {name: np.asarray(drive[name])[:end] for name in ("trail", "tilt", "clearance", "step")}

@@ -1,4 +1,4 @@
-"""What the errors of a trajectory are made of: by length of the way, by cause, and against the errors it claims.
+"""Errors of a trajectory: by length of the path, by cause, and against its stated covariances.
 
 Source of the relative errors: Sturm et al. 2012 (doi:10.1109/IROS.2012.6385773), over several numbers of frames;
 Geiger et al. 2012 (doi:10.1109/CVPR.2012.6248074) and Zhang and Scaramuzza 2018 (doi:10.1109/IROS.2018.8593941), over

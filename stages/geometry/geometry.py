@@ -135,7 +135,7 @@ class RigidTransform:
 
     @staticmethod
     def from_matrix(m: ArrayLike) -> RigidTransform:
-        """From 12 numbers, a 3 x 4 or a 4 x 4 matrix."""
+        """Build from 12 numbers [R | t] row by row, or a 3 x 4 or 4 x 4 matrix."""
         a = np.asarray(m, dtype=np.float64)
         a = a.reshape(3, 4) if a.size == 12 else a.reshape(4, 4)[:3]
         return RigidTransform(a[:, :3], a[:, 3])

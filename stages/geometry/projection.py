@@ -29,7 +29,7 @@ class Pinhole(NamedTuple):
 
     @staticmethod
     def of(camera: Camera) -> Pinhole:
-        """The same numbers of a camera."""
+        """Take the intrinsics of a camera."""
         return Pinhole(float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
 
 

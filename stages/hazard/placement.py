@@ -70,7 +70,7 @@ class Stance:
 
     @staticmethod
     def of(vehicle: Vehicle, cell: float) -> Stance:
-        """Of a vehicle on a grid of ``cell`` metres."""
+        """Compute the offsets for a vehicle on a grid with cells of ``cell`` metres."""
         # Order of the wheels in all arrays: front left, front right, rear left, rear right.
         half = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [-1.0, 1.0]]) / 2.0  # ahead, right
         wheels = half * [vehicle.wheel_base, vehicle.track]

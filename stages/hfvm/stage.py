@@ -102,7 +102,7 @@ def match_pyramids(
     tell: Tell | None = None,
     side: int | None = None,
 ) -> Disparity:
-    """As :func:`match`, of two image pyramids. ``side``: pixels of a tile; None: the images are matched whole."""
+    """Match two image pyramids as :func:`match` does. ``side``: pixels of a tile; None: whole images."""
     found = tiled.match(Plain.of(left), Plain.of(right), params, prior, tell or (lambda share, step: None), side)
     arrays: dict[str, Any] = found.arrays
     return Disparity(**arrays, aligned=found.aligned)

@@ -88,7 +88,7 @@ class TileInputs:
 
     @property
     def facts(self) -> Mapping[str, Any]:
-        """What the coarse levels decided."""
+        """Facts of step ``coarse``: alignment, contrast, brightness ratio, band."""
         meta: Mapping[str, Any] = self.inputs["coarse"].meta
         return meta
 
@@ -111,7 +111,7 @@ class TileInputs:
         return mosaic(self.inputs[port], name, shape, self.args["side"])
 
     def rasters(self, port: str, names: Sequence[str], shape: Shape) -> dict[str, Mosaic]:
-        """Several of them."""
+        """Several arrays of tiles, by name."""
         return {name: self.mosaic(port, name, shape) for name in names}
 
     def map(self, port: str, shape: Shape) -> Map:

@@ -57,8 +57,8 @@ class Found:
 
 @dataclass(frozen=True)
 class Coarse:
-    """What the coarse levels decide: their maps, the plane that the right image is aligned by, if it is, and the ratio
-    of brightness that is undone in it, if one is."""
+    """Result of the coarse levels: their maps; homography of a plane and aligned right image, or None; contrast; and
+    coefficients of the brightness ratio that is corrected in the right image, or None."""
 
     state: State
     alignment: plane.Matrix | None

@@ -1,7 +1,7 @@
-"""What one stereo pair looks like, before anything is matched: grey values, sharpness, and whether it repeats another.
+"""Quality of one stereo pair before matching: grey values, sharpness, and digests that show repeated images.
 
-Plain figures that tell a black, blurred or repeated image from a good one; what follows from them is decided over the
-whole sequence (:mod:`rille.stages.odometry.frame_screening`).
+These figures distinguish a black, blurred or repeated image from a good one. The decision is made over the whole
+sequence (:mod:`rille.stages.odometry.frame_screening`).
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def close_into(
     judged: bool = False,
     rim: float = 0.5,
 ) -> Flags:
-    """The same in ``closed``, copies of the elevation and of its standard deviation; returns the flags."""
+    """Interpolate in place: in ``closed``, copies of the elevation and its standard deviation; return the flags."""
     z, s = closed
     filled = np.zeros(elevation.shape, dtype=np.uint8)
     cells = candidates(elevation, n, min_known)

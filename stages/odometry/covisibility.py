@@ -1,10 +1,10 @@
-"""How much of what one frame shows is still seen some frames later, from coarse displacements alone.
+"""Overlap of two frames that are some frames apart, estimated from coarse displacements alone.
 
 Blocks of the first frame are carried along the chain of displacements (stage ``motion``). The displacement of a block
-is the median of its matches; where too few of its pixels match, that of the surroundings is continued as an affinity.
-That matters most for a camera that drives ahead: what leaves the image below, the near ground, finds no match, and what
-was interpolated there is too short. Left out of the count, or counted by interpolated displacements, an overlap of 66 %
-looks like 85 %.
+is the median of its matches; where too few of its pixels match, the affinity of the surroundings is extrapolated. That
+matters most for a camera that drives ahead: the near ground leaves the image at its lower edge and finds no match, and
+displacements interpolated there are too short. If such blocks are left out, or counted with interpolated displacements,
+an overlap of 66 % looks like 85 %.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Step:
 
     @staticmethod
     def from_bundle(bundle: Bundle) -> Step:
-        """From the result of stage ``motion``."""
+        """Build from the result of stage ``motion``."""
         validity = np.asarray(bundle["validity"])
         known, scale = matched(validity), 2.0 ** int(bundle.meta["level"])
         # By the area, so that images of all shapes have about as many blocks.
@@ -70,7 +70,7 @@ class Step:
         return np.asarray(np.isfinite(self.shift).all(1))
 
     def move(self, points: Floats) -> Floats:
-        """Where points (n, 2) of this frame lie in the next."""
+        """Predict points (n, 2) of this frame in the next one, by affinities of the displacements around them."""
         ok = self.known
         return (
             points + fit_affinity(self.blocks[ok], (self.blocks + self.shift)[ok], np.ones(ok.sum(), bool), points)[1]
@@ -92,7 +92,7 @@ def _blocks(values: AnyArray, side: int) -> AnyArray:
 
 @dataclass(frozen=True)
 class Covisibility:
-    """What a first frame and a later one have in common.
+    """Overlap of a first frame and a later one.
 
     ``origin`` (n, 2) those blocks of the first frame that are still in the image, ``points`` (n, 2) where they are now,
     ``part`` (n,) of each that is still seen; ``kept`` share of the first frame that is still seen; ``covered`` share of
@@ -103,15 +103,15 @@ class Covisibility:
     points: Floats
     part: Floats
     later: Step
-    """A step that tells the blocks of the later frame."""
+    """A step from or to the later frame: its blocks."""
 
     @staticmethod
     def all_of(step: Step) -> Covisibility:
-        """Everything that the frame before a step shows."""
+        """Overlap of the frame before a step with itself: all of its blocks."""
         return Covisibility(step.blocks, step.blocks, np.ones(len(step.blocks)), step)
 
     def after(self, step: Step) -> Covisibility:
-        """The same for the frame behind a step; what has left does not return."""
+        """Overlap with the frame after a step; a part that has left the image does not return."""
         moved = step.move(self.points)
         # The least so far: what has left the image and comes back is not found again by tracking either.
         part = np.minimum(self.part, _part_inside(moved, step))

@@ -36,7 +36,7 @@ class Derotation:
 
     @staticmethod
     def of(rotation: ArrayLike, camera: Camera) -> Derotation:
-        """From the rotation R_b_a (3, 3) between two frames of a camera.
+        """Build from the rotation R_b_a (3, 3) between two frames of a camera.
 
         Raises
         ------

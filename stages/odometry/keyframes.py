@@ -120,7 +120,7 @@ class Marked:
 
     @classmethod
     def of(cls, args: Mapping[str, Any], frames: int) -> Marked:
-        """From the arguments of the stage; behind a gap the first position that may be basic counts."""
+        """Build from the arguments of the stage; after a gap the first position that is not unfit is basic."""
         unfit = frozenset(args.get("unfit", ()))
         fit = [k for k in range(frames) if k not in unfit]
         return cls(unfit, frozenset(n for k in args.get("behind", ()) for n in [n for n in fit if n >= k][:1]))

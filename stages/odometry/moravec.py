@@ -76,7 +76,7 @@ def interest_points(
     border: int,
     occupied: NDArray[np.floating] | None = None,
 ) -> Floats32:
-    """At most ``count`` interest points, the strongest of each bucket first.
+    """Find at most ``count`` interest points, the strongest of each bucket first.
 
     Parameters
     ----------

@@ -80,7 +80,7 @@ def fit(column: Floats32, row: Floats32, matched: Bools, level: int) -> tuple[fl
 
 
 def relative(found: tuple[float, float], known: Floats, shape: tuple[int, int]) -> tuple[float, float]:
-    """What of a rotation (degrees) and scale a known homography (3, 3) leaves, by its derivative at the centre."""
+    """Return the rotation (degrees) and scale beyond a known homography (3, 3), by its derivative at the centre."""
     centre = np.array([(shape[1] - 1) / 2.0, (shape[0] - 1) / 2.0, 1.0])
     moved = known @ centre
     # Quotient rule of (H p)_xy / (H p)_z at the centre: what a homography does to lengths and angles there.

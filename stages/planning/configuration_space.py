@@ -1,8 +1,8 @@
-"""Where a vehicle may stand in each of four directions: its wheels and its outline laid over what they must not touch.
+"""Configuration space of a vehicle on a raster: the places where it may stand in each of four directions.
 
 A raster path moves along rows, columns and diagonals, and a vehicle covers the same ground forwards and backwards, so
-four directions are all there are. What is hazardous to a wheel was found in a window as large as the wheel, so it
-counts where the middle of a wheel is. The ground between is the belly's, which is judged by clearance.
+there are four directions. Hazards to a wheel were found in a window as large as the wheel, so only the centre of the
+wheel must avoid them. The ground between the wheels is judged by the clearance of the belly.
 """
 
 from __future__ import annotations

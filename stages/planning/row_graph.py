@@ -32,7 +32,7 @@ MOVES = (0, 1, -1)
 
 @dataclass(frozen=True)
 class Plan:
-    """What the sweep found, in cells of its grid.
+    """Result of a sweep, in cells of its grid.
 
     ``cells`` (vertex, 2) row, column from start to target, empty where there is no path; ``cost`` (row, col) int64 of
     :func:`sweep`; ``reachable`` (col,) of ``target_row``; ``blocking_row`` the first row that cannot be entered and
@@ -48,8 +48,8 @@ class Plan:
 
 
 class Charges(NamedTuple):
-    """What a path pays beside the height differences, in their unit: ``toll`` (row, col) on entering a cell, None is
-    nothing; ``sideways`` for the greater length of each move to a neighbouring column."""
+    """Costs of a path in addition to the height differences, in their unit: ``toll`` (row, col) for entering a cell,
+    None: no cost; ``sideways`` for the greater length of a move to a neighbouring column."""
 
     toll: Ints | None = None
     sideways: int = 0

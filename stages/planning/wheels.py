@@ -1,4 +1,4 @@
-"""How a vehicle stands on a surface: where its four wheels touch, how it tilts, and what is left under its belly.
+"""Placement of a vehicle on a surface: contacts of its four wheels, tilt, and clearance under its belly.
 
 A wheel is a sphere of its diameter that rests on the surface (the highest position that the heights under it enforce).
 The body is the plane of least squares through the four contacts: averaging suspensions (rocker-bogie) keep to it.
@@ -109,9 +109,9 @@ def _along(z: Floats, reach: float, axis: int) -> list[Floats]:
 
 @dataclass(frozen=True)
 class Stand:
-    """How a vehicle stands: pose of its frame (origin between the wheels on the ground, y ahead, z up), and measures.
+    """Placement of a vehicle: pose of its frame (origin between the wheels on the ground, y ahead, z up), and measures.
 
-    ``tilt`` rad, ``clearance`` m (negative: the belly strikes), ``step`` m; NaN where a wheel stands on nothing known.
+    ``tilt`` rad, ``clearance`` m (negative: the belly strikes), ``step`` m; NaN if a wheel is on unknown ground.
     """
 
     T_ground_vehicle: RigidTransform
@@ -128,8 +128,8 @@ def wheel_positions(vehicle: Vehicle) -> Floats:
 
 @dataclass(frozen=True)
 class Measures:
-    """How a vehicle stands at poses (n,): ``middle`` m, ``rise`` and ``lean`` (gradients ahead and to the right) of the
-    plane between its wheels, and ``tilt`` rad, ``clearance`` m, ``step`` m as of :class:`Stand`; NaN off the ground."""
+    """Placements of a vehicle at poses (n,): height ``middle`` (m) and gradients ``rise`` (ahead) and ``lean`` (to the
+    right) of the plane between its wheels; ``tilt``, ``clearance``, ``step`` as of :class:`Stand`; NaN off the map."""
 
     middle: Floats
     rise: Floats
@@ -140,7 +140,7 @@ class Measures:
 
 
 def measured(ground: HeightGrid, x: Floats, y: Floats, heading: Floats, vehicle: Vehicle) -> Measures:
-    """The vehicle with its centre above points (n,), m, turned by ``heading`` (n,), rad to the left of y."""
+    """Place the vehicle with its centre above points (n,), m, turned by ``heading`` (n,), rad to the left of y."""
     c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
 
     def at(what: Floats, points: Floats) -> Floats:

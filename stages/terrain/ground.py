@@ -140,7 +140,7 @@ def _totals(theta, rays, rho, horizon, information, out):  # type: ignore[no-unt
 
 @dataclass(frozen=True)
 class GroundView:
-    """How the pair sees a plane: sampled pixels that hit it where both cameras see it.
+    """View of a plane by a pair: sampled pixels that hit the plane where both cameras see it.
 
     ``xy`` (n, 2) metres, local frame; ``slant`` (n,) distance from the left camera, m; ``along``, ``across`` (n,)
     size on the ground of one pixel, m per pixel; ``slope`` (n,) ds/dZ, pixels of disparity per metre of elevation.
@@ -185,7 +185,7 @@ _125 = (1.0, 2.0, 5.0)
 
 
 def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> GroundView:
-    """How the pair sees the plane z = c + a x + b y (``plane`` = a, b, c) of the local frame.
+    """Compute the view of the plane z = c + a x + b y (``plane`` = a, b, c) of the local frame.
 
     Raises
     ------

@@ -92,7 +92,7 @@ class GroundFrameParams(Params):
 
 
 class VerticalHint(NamedTuple):
-    """What is known of the vertical; the first given of the three is used.
+    """Given sources of the vertical; the first of the three that is not None is used.
 
     ``up``, ``initial_up`` (3,) direction of up in the left camera frame, from an attitude and from an initial pose;
     ``pitch`` downward pitch of the optical axis, radians, roll 0.

@@ -108,7 +108,7 @@ class Placed:
 
     @staticmethod
     def of(meta: Mapping[str, Any]) -> Placed:
-        """As the model's facts say; exact where they do not."""
+        """Read the covariance from the facts of a model; without one the pose counts as exact."""
         if meta.get("pose_covariance") is None:
             return EXACT
         full = np.array(meta["pose_covariance"], dtype=np.float64).reshape(6, 6)

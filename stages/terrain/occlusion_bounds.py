@@ -1,13 +1,13 @@
-"""How high ground may be that was not seen: no higher than the lines of sight that pass over it.
+"""Upper bounds of hidden ground: it is no higher than the lines of sight that pass over it.
 
-Behind a stone lies ground that no camera saw, but the ground beyond it was seen, so what lies between stays below the
+No camera sees the ground behind a stone, but the ground beyond it was seen. So the hidden ground between lies below the
 line from the camera to the first ground seen beyond:
 
     z(u) <= z_C + (z(k) - z_C) |u - C| / |k - C|
 
 with C the camera's centre, k the cell seen beyond and u any cell between, distances along the ground. Of several models
-the least such height holds. How low the ground there is nobody knows: no wheel may stand on it, but the belly may pass
-over it.
+the least such height holds. There is no lower bound: no wheel may stand on hidden ground, but the belly may pass over
+it.
 """
 
 from __future__ import annotations
@@ -50,26 +50,26 @@ class OcclusionBoundsParams(Params):
 
 @dataclass(frozen=True)
 class Bounds:
-    """Between which heights (row, col) float32, m, the ground lies: ``lower``, NaN where it was not seen, and
-    ``upper``, NaN where nothing bounds it either."""
+    """Bounds (row, col) float32, m, of the height of the ground: ``lower``, NaN where it was not seen, and ``upper``,
+    NaN where no line of sight bounds it either."""
 
     upper: Floats32
     lower: Floats32
 
     @staticmethod
     def of(elevation: Floats32, doubt: Floats32, hidden: Floats32) -> Bounds:
-        """Of what was seen, give or take ``doubt``, m, NaN unknown; where it was not, at most ``hidden`` high."""
+        """From ``elevation`` (NaN: not seen) plus and minus ``doubt``, and ``hidden`` as upper bound elsewhere."""
         return Bounds(np.where(np.isnan(elevation), hidden, elevation + doubt), elevation - doubt)
 
 
 def ceiling(elevation: Floats32, lattice: Lattice, centre: Floats) -> Floats32:
-    """Height, m, above which nothing stands on the unknown cells of a model (row, col), NaN where no line of sight
-    passes.
+    """Return the upper bound (row, col), m, of the ground on the unknown cells; NaN where no line of sight passes.
 
     Parameters
     ----------
-    elevation : (row, col) float32, m, at most so high is what was seen; NaN unknown.
-    centre : (3,) m, of the camera.
+    elevation : (row, col) float32, m, upper bound of the ground that was seen; NaN unknown.
+    lattice : of the elevation.
+    centre : (3,) m, the camera's centre in the frame of the lattice.
     """
     out = np.full(elevation.shape, np.inf, dtype=np.float32)
     row, col = lattice.index((centre[0], centre[1]))

@@ -34,7 +34,7 @@ Given = Ref | int
 
 
 def light(ref: Ref) -> Ref:
-    """Without its facts, which a task reads from the store: those of a long trajectory would travel to every pair."""
+    """Return a reference without its facts: a task reads them from the store, and those of a trajectory are large."""
     return replace(ref, meta={})
 
 

@@ -39,7 +39,7 @@ class MemoryRefusedError(ConfigError):
 
 @dataclass(frozen=True)
 class Account:
-    """How a limit is shared out, bytes: ``own`` is this process's, ``rest`` each of the ``workers``'."""
+    """Division of the memory limit, bytes: ``own`` is held by this process, ``rest`` by each of the ``workers``."""
 
     limit: float
     own: float
@@ -48,12 +48,12 @@ class Account:
 
     @property
     def budget(self) -> float:
-        """For all running tasks."""
+        """Memory for all running tasks together, bytes."""
         return max(0.0, self.limit - self.own - self.workers * self.rest)
 
     @property
     def alone(self) -> float:
-        """For a task that has everything to itself, on one worker."""
+        """Memory for a task that runs alone, on the only worker, bytes."""
         return max(0.0, self.limit - self.own - self.rest)
 
 
@@ -116,7 +116,7 @@ class Admission:
             self._foreseen.pop((handle.index, known), None)
 
     def end(self, handle: Handle) -> None:
-        """It has ended."""
+        """A task has ended."""
         self._running.pop(handle.index, None)
 
     def refusal(self, handle: Handle, foreseen: Foreseen | None = None) -> MemoryRefusedError | None:

@@ -203,7 +203,7 @@ class LazyArrays(Mapping[str, AnyArray]):
         return self._loaded[name]
 
     def anew(self) -> LazyArrays:
-        """The same arrays, of which nothing is read yet and held."""
+        """Return a copy that has read none of its arrays yet."""
         other = copy(self)
         other._loaded = {}
         return other

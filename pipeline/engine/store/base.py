@@ -100,7 +100,7 @@ class Store:
         self._index = Index(self.place, sequence)
 
     def note(self, refs: Iterable[Ref]) -> None:
-        """At the end of a run: what it used, for later surveys and for clearing up. Best effort."""
+        """Record, at the end of a run, which artifacts it used: for later surveys and for ``gc``. Best effort."""
         if self._index is not None:
             with suppress(OSError, RilleError):  # it may permit reading alone
                 self._index.note({ref.key: ref for ref in refs})

@@ -55,7 +55,7 @@ class Folder:
         """A question takes microseconds."""
 
     def status(self, path: str, *, fresh: bool = False) -> Item | None:
-        """By inode, size and times: any writing changes the time of change, which nobody can set."""
+        """Return the status of a file. The mark has inode, size and times; no call can set the time of change."""
         with self._clear_errors():
             try:
                 return _item(path, os.stat(f"{self.root}/{path}"))  # no Path: a plan asks tens of thousands of times

@@ -128,7 +128,7 @@ def frame(manifest: Manifest) -> bytes:
 
 
 def length(data: bytes) -> int:
-    """Of the line, as the first bytes of a file say. Raises ValueError where they are not those of an artifact."""
+    """Return the length of the manifest line, bytes, by the first bytes of a file; ValueError if it is damaged."""
     found = re.match(rb'\{"crc32c": "[0-9a-f]{8}", "bytes": ([ \d]{9}\d), "manifest": ', data)
     if found is None:
         raise ValueError("the manifest is damaged")
@@ -136,7 +136,7 @@ def length(data: bytes) -> int:
 
 
 def unframe(line: bytes) -> Manifest:
-    """Raises ValueError where it is not what was written."""
+    """Parse the manifest line of an artifact; ValueError if it is not as it was written."""
     body = line[_HEAD_SIZE : -len(_END)]
     # The whole line is made anew and compared, so that there is no byte of it that nothing checks.
     if line != _HEAD % (google_crc32c.value(body), len(body)) + body + _END:

@@ -66,7 +66,7 @@ class Bucket:
         """The server says so at the first commit."""
 
     def earlier(self) -> bool:
-        """As the mark said."""
+        """Whether artifacts of an earlier format were in the bucket, by its format mark."""
         return self._earlier
 
     def survey(self) -> None:
@@ -75,7 +75,7 @@ class Bucket:
             self._listed = {item.path: item for item in self.list("artifacts")}
 
     def status(self, path: str, *, fresh: bool = False) -> Item | None:
-        """As of the survey, else by a request."""
+        """Return the status of an object: from the survey if there is one, else by a request."""
         import obstore
 
         # A bucket takes milliseconds for each question, so tens of thousands of look-ups use the listing.

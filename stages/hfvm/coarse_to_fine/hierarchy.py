@@ -189,7 +189,7 @@ class PaperSolver:
         return 0
 
     def reverse(self) -> PaperSolver:
-        """The same: both ways are alike."""
+        """The same matcher: both directions are matched alike."""
         return self
 
     def match(self, level: int, a: Patch, b: Patch, shapes: tuple[Shape, Shape], up: Map | None, band: Band) -> Map:
@@ -278,7 +278,7 @@ def solver(params: HfvmParams) -> Solver:
 
 @dataclass(frozen=True)
 class State:
-    """What one level knows: both maps, which left and right pixels are consistent, and what to hand down."""
+    """Result of one level: both maps, which left and right pixels are consistent, band and sign of depth."""
 
     level: int
     left: Map
@@ -289,7 +289,7 @@ class State:
     near_sign: float
 
     def reverse(self) -> State:
-        """The same from right to left."""
+        """The state of the reversed pair: left and right exchanged."""
         return State(
             self.level, self.right, self.left, self.right_ok, self.left_ok, self.band.reverse(), -self.near_sign
         )

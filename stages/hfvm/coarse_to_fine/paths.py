@@ -41,7 +41,7 @@ ABOVE = tuple((j, i) for j in (-1, 0, 1) for i in (-1, 0, 1))
 
 
 class LevelView(NamedTuple):
-    """What is known of one image at one level (row, col): both feature sets (uint64), grey values (float32)."""
+    """One image at one level (row, col): both feature sets (uint64) and grey values (float32)."""
 
     words: Words
     compact: Words
@@ -49,7 +49,7 @@ class LevelView(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """Of each pixel (row, col, :data:`MOST`) int16: columns and rows of displacement, and what each costs by itself."""
+    """Candidates of each pixel (row, col, :data:`MOST`) int16: columns and rows of displacement, and matching cost."""
 
     u: AnyArray
     v: AnyArray

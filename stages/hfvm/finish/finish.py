@@ -30,7 +30,7 @@ Rasters = Mapping[str, Raster]
 
 @dataclass(frozen=True)
 class Finish:
-    """What all steps know: the pair that was matched (its right image aligned or not), and the original right image."""
+    """Inputs of all steps: the matched pair (its right image aligned or not), the original right image, parameters."""
 
     pair: Prepared
     right: View
@@ -62,7 +62,7 @@ class Finish:
         return {name: np.ascontiguousarray(p[inner]) for name, p in (("u", u), ("v", v), ("distance", found.distance))}
 
     def back(self, window: Window, b: Map) -> Results:
-        """The same of the right image, for the check alone, which whole displacements, averaged, do well enough."""
+        """Map of a window of the right image, for the back-matching check alone: whole displacements suffice."""
         if self.params.preset == "paper":
             found = hierarchy.fine_tile(self.pair.reverse(), 0, b, window, None)
             return {"u": found.u, "v": found.v}

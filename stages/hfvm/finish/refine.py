@@ -106,7 +106,7 @@ def _take_back(u, v, first, farthest, new_u, new_v, last):  # type: ignore[no-un
 
 
 def contrast(left: AnyArray, right: AnyArray, u: AnyArray, v: AnyArray, keep: AnyArray) -> float:
-    """What makes the right image's contrast that of the left one: a factor where they differ grossly, else 1.
+    """Return the factor that gives the right image the contrast of the left one if they differ much, else 1.
 
     Steps and residuals are mean-free, not free of gain: an exposure ratio of two would pass for noise. The ratio is
     that of the median differences over three columns, at matches that are not saturated (:data:`SAME_CONTRAST`).

@@ -63,7 +63,7 @@ class Levelled:
 
     @property
     def kept_noise(self) -> float:
-        """That of the view: noise grows as the signal does."""
+        """Noise of the view: it is scaled with the signal."""
         return self.view.kept_noise
 
     def grey(self, level: int, window: Window) -> AnyArray:
@@ -90,7 +90,7 @@ class Levelled:
 
 
 def levelled(view: View, ratio: Floats | None) -> View:
-    """The view with the ratio undone, if there is one."""
+    """Return the view with the ratio corrected; None: the view as it is."""
     return view if ratio is None else Levelled(view, ratio)
 
 

@@ -151,7 +151,7 @@ def fit_plane(u: AnyArray, v: AnyArray, consistent: AnyArray, tolerance: float) 
 def fit_points(
     x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray, shape: Shape, tolerance: float
 ) -> tuple[Matrix, float] | None:
-    """As :func:`fit_plane`, of matches (n,) of an image of ``shape``."""
+    """Fit a plane as :func:`fit_plane` does, to matches (n,) of an image of ``shape``."""
     if len(y) < LEAST_MATCHES:
         return None
     # In half image sides all eight terms are of like size, so that one weak hold suits them all.

@@ -211,7 +211,7 @@ class Aligned:
 
     @property
     def kept_noise(self) -> float:
-        """That of the right image."""
+        """Noise of the right image."""
         return self.right.kept_noise
 
     def grey(self, level: int, window: Window) -> AnyArray:

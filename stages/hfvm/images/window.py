@@ -22,7 +22,7 @@ Shape = tuple[int, ...]
 
 
 class Raster(Protocol):
-    """What is read by window, ``raster[rows, columns]``: an array, or something that reads one."""
+    """Array that is read by window, ``raster[rows, columns]``: in memory or on disk."""
 
     @property
     def shape(self) -> Shape:
@@ -48,7 +48,7 @@ class Window:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """As an index."""
+        """Index of the window in an array of the image."""
         return slice(self.y0, self.y1), slice(self.x0, self.x1)
 
     def grow(self, rows: int, columns: int, shape: Shape) -> Window:
@@ -84,7 +84,7 @@ class Window:
 
 
 def whole(shape: Shape) -> Window:
-    """All of an image."""
+    """Window that covers an image of ``shape``."""
     return Window(0, shape[0], 0, shape[1])
 
 

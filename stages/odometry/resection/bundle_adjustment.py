@@ -83,7 +83,7 @@ class SegmentTracks:
     tilt: Floats
 
     def without_tilt(self, tilt: float) -> SegmentTracks:
-        """With landmarks where they are if the disparities are tilted by so many radians."""
+        """Correct the landmarks for disparities that are tilted by ``tilt`` radians."""
         return replace(self, position=self.position + (tilt * self.tilt)[:, None] * self.along)
 
 
@@ -96,7 +96,7 @@ class SegmentState:
     depth: Floats
 
     def moved(self, pose: Floats, depth: Floats) -> SegmentState:
-        """After steps (frame, 6) ``v, w`` as in :mod:`rille.stages.odometry.resection.pnp`, and (n,)."""
+        """Apply steps (frame, 6) of the poses, ``v, w`` as in :mod:`rille.stages.odometry.resection.pnp`, and (n,)."""
         return SegmentState(*perturbed(self.R, self.t, pose), self.depth + depth)
 
 

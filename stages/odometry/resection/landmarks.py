@@ -109,7 +109,7 @@ def matches_at(points: Floats, column: Floats32, row: Floats32, validity: Bytes)
 
 
 def relief(points: Floats, column: Floats32, row: Floats32, validity: Bytes) -> Floats:
-    """How far the surface under a template departs from a plane: rms (n,) of the disparities about theirs, pixels.
+    """Compute the relief under each template: RMS (n,) of the disparities about their plane, pixels.
 
     A template on a rock's edge follows the rock or the ground, not the pixel at its centre; both the stereo match and
     the track are then uncertain by the relief inside the template. NaN where that is beyond :data:`CONSISTENT`, since
@@ -248,7 +248,7 @@ def landmarks_from_dem(
 
 
 def intersect(elevation: Floats32, lattice: Lattice, origin: Floats, directions: Floats) -> Floats:
-    """Where rays first come down on a surface of bilinear cells, in units of their directions; NaN where they do not.
+    """Intersect rays with a surface of bilinear cells: distance (n,) in units of ``directions``; NaN without a hit.
 
     Starts above the highest cell, goes half a cell at a time and refines by bisection. A hole forgets what was
     before it: a ray that comes out of one below the surface has passed under it and is rejected.

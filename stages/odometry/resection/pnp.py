@@ -38,11 +38,17 @@ HUBER = 2.5
 
 @dataclass(frozen=True)
 class Observations:
-    """Where landmarks were seen, in a batch of problems.
+    """Observed landmarks of a batch of b problems with n landmarks each.
 
-    ``landmarks`` (b, n, 3) m; ``per_pixel`` (b, n, 3) m/pixel, how they move with their disparity; ``sigma`` (b, n)
-    pixels, of the disparity; ``pixels`` (b, n, 2) column, row; ``pixel_sigma`` of those; ``bias_sigma`` pixels, prior
-    of the error that all disparities share.
+    Attributes
+    ----------
+    landmarks : (b, n, 3) in the local frame, m.
+    per_pixel : (b, n, 3) motion of a landmark for a change of its disparity by a pixel, m/pixel.
+    sigma : (b, n) standard deviation of the disparity, pixels.
+    pixels : (b, n, 2) observed column and row.
+    camera : intrinsics.
+    pixel_sigma : standard deviation of ``pixels``, pixels.
+    bias_sigma : prior standard deviation of the error that all disparities share, pixels.
     """
 
     landmarks: Floats
@@ -88,7 +94,7 @@ class Poses:
         return Poses(self.R[i : i + 1], self.t[i : i + 1], self.bias[i : i + 1])
 
     def moved(self, step: Floats) -> Poses:
-        """After steps (b, 7): ``v``, ``w``, and that of the bias."""
+        """Apply steps (b, 7): ``v``, ``w`` and the step of the bias."""
         return Poses(*perturbed(self.R, self.t, step[:, :6]), self.bias + step[:, 6])
 
 

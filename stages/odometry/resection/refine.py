@@ -157,9 +157,10 @@ def parts(refined: Bundle) -> list[tuple[Floats, NDArray[np.uint8]]]:
 
 @dataclass(frozen=True)
 class SegmentOut:
-    """What a segment's frames get: ``poses`` (frame, 3, 4), ``covariance`` (frame, 6, 6), ``shared`` (frame, 6, 7).
+    """Result for one segment.
 
-    And its points: ``landmarks`` (point, 3), ``inlier`` (point, frame) whether they agree with the pose.
+    Of its frames: ``poses`` (frame, 3, 4), ``covariance`` (frame, 6, 6), ``shared`` (frame, 6, 7). Of its points:
+    ``landmarks`` (point, 3) m, and ``inlier`` (point, frame), whether they agree with the pose.
     """
 
     poses: Floats
@@ -170,7 +171,7 @@ class SegmentOut:
 
     @staticmethod
     def of(resection: Bundle) -> SegmentOut:
-        """As resected."""
+        """Take the result of the resection."""
         poses, covariance, shared, landmarks = (
             np.array(resection[n], dtype=np.float64) for n in ("poses", "covariance", "shared", "landmarks")
         )

@@ -314,11 +314,11 @@ def _result(obs: Observations, poses: Poses, active: Bools, steps: int, params: 
 
 
 def scatter_of_blocks(pixels: Floats, white: Floats, weight: Floats, camera: Camera) -> float:
-    """How many times as far (variance) block means of errors scatter as means of independent errors would; 1: as far.
+    """Return the ratio of the variance of block means of errors to that of independent errors; 1: independent.
 
-    Neighbouring landmarks share matches, texture and relief, so their errors go together, and many of them do not tell
-    as much as their number says. ``white`` (n, 2) whitened errors after adjustment at ``pixels`` (n, 2), ``weight``
-    (n,). The six unknowns of the pose take up as many degrees of freedom of the means.
+    Neighbouring landmarks share matches, texture and relief, so their errors are correlated, and they determine the
+    pose less well than as many independent ones. ``white`` (n, 2): whitened errors after adjustment, at ``pixels``
+    (n, 2), with ``weight`` (n,). The six unknowns of the pose take up as many degrees of freedom of the means.
     """
     side = min(MOST_BLOCKS, int(math.sqrt(len(pixels) / PER_BLOCK)))
     if side < 3:
@@ -549,10 +549,10 @@ def _run(params: ResectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
 
 
 def moving_tracks(points: Floats32, landmarks: Landmarks, found: SegmentPoses) -> tuple[int, int]:
-    """How many landmarks were found in two posed frames or more, and how many of them agree with no pose.
+    """Count the landmarks that were found in two or more frames with a pose, and those of them that fit no pose.
 
-    What is followed well from frame to frame and never agrees does not stand on the ground: the vehicle's own shadow,
-    its wheels, other things that move; or its coordinates are wrong (a match on the edge of a rock).
+    A point that is tracked well and never fits is not fixed to the ground (the vehicle's own shadow, its wheels, other
+    moving things), or its coordinates are wrong (a match on the edge of a rock).
     """
     posed = np.asarray(np.isfinite(found.poses).all(axis=(1, 2)))
     posed[0] = False

@@ -117,7 +117,7 @@ def _without_single_frames(found: Chained) -> Chained:
 
 
 def propagation(key: RigidTransform, T_world_local: RigidTransform, world: RigidTransform) -> tuple[Floats, Floats]:
-    """How errors (6,) of the key frame in the world, and of a pose against it in the local frame, enter that pose.
+    """Return the Jacobians (6, 6) of a world pose by the error of its key frame, and by its error in the local frame.
 
     The key's rotation error swings the frame about the key's position (first order): with the lever
     ``r = C_frame - C_key``, ``dC = dC_key + dtheta_key x r + R dC_local`` and ``dtheta = dtheta_key + R dtheta_local``.
@@ -153,7 +153,7 @@ def world_poses(trajectory: Bundle, piece: int | None = None) -> Floats:
 
 
 def levelled(found: Chained, first: int, up: Floats) -> Chained:
-    """The same with the piece that begins in row ``first`` turned so that ``up`` (3,) of its frame becomes z."""
+    """Turn the piece that begins in row ``first`` so that ``up`` (3,) of its frame becomes z."""
     rows = np.flatnonzero(found.piece == found.piece[first])
     R = found.poses[first, :, :3]
     turn = level_rotation(R.T @ up) @ R.T

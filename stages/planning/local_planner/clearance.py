@@ -1,10 +1,10 @@
-"""Where a vehicle may stand on a risk map, at any place and heading: its wheels and its belly laid over the map.
+"""Clearance of a vehicle from hazards and unknown ground on a risk map, at any place and heading.
 
-What is hazardous to a wheel was found in a window as large as the wheel, so it counts where the middle of a wheel is:
-the vehicle may pass a stone between its wheels, since what the belly cannot pass over (tilt, slope, rise, for the worst
-heading) is hazardous to its middle. Unknown ground may not be under the belly unless it is known to be low enough
-(:mod:`rille.stages.planning.local_planner.underbody`), and the middles of the wheels keep the margin from it as from a
-hazard: what is unknown is mostly what is hidden by a stone, or the stone itself.
+Hazards to a wheel were found in a window as large as the wheel, so only the centre of a wheel must avoid them. The
+vehicle may pass a stone between its wheels, since ground that the belly cannot pass over (tilt, slope, rise, for the
+worst heading) is a hazard to its middle. Unknown ground may not be under the belly unless it is known to be low enough
+(:mod:`rille.stages.planning.local_planner.underbody`). The centres of the wheels keep the margin from it as from a
+hazard, because unknown ground is mostly hidden by a stone, or is the stone itself.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ CAUTION_GROUND, DOUBTED_GROUND = 1, 2
 
 @dataclass(frozen=True)
 class Gaps:
-    """How near poses are to what they must not touch, float32; with its middle off the map a vehicle is in a hazard.
+    """Distances of poses from hazards and unknown ground, float32; off the map a vehicle's middle is in a hazard.
 
     ``gap``: metres to the nearest hazard that is none by sigma alone, from the wheels to what is hazardous to wheels
     and from the middle to what is to the vehicle; ``doubtful``: to hazards by sigma alone; ``proven``: to proven ones.
@@ -117,7 +117,7 @@ class Footing:
         p_traversable: float = 0.0,
         bounds: Bounds | None = None,
     ) -> Footing:
-        """On ground of which ``bounds`` are known the belly may pass over what is not.
+        """Build the distance maps; with ``bounds`` the belly may pass over unknown ground that is low enough.
 
         A hazard is proven where it is not one by its standard deviation alone, and at least as probable as
         ``p_certain``. Where it is one by its standard deviation alone and less probable than ``p_traversable``, the
@@ -150,7 +150,7 @@ class Footing:
         return Footing(lattice, vehicle, fields, unseen, frontier, dear, straddle, glanced)
 
     def gaps(self, x: Floats, y: Floats, heading: Floats) -> Gaps:
-        """At poses: x, y of the middle (m) and heading (rad to the left of y), arrays of one shape."""
+        """Compute the distances at poses: x, y (m) and heading (rad to the left of y), arrays of one shape."""
         at = self.lattice.index(np.stack([x, y], axis=-1)).reshape(-1, 2)
         turn = np.broadcast_to(heading, np.shape(x)).reshape(-1)
         out = np.empty((7, len(at)), np.float32)

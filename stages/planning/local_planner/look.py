@@ -1,11 +1,11 @@
-"""Where a vehicle looks: the ground in view of its cameras, what it remembers of its looks, and where it looks next.
+"""Views of a vehicle: the ground in view of its cameras, its memory of earlier views, and the choice of the next one.
 
-The view is that of the cameras' geometry alone: what hides behind stones is left out. The next look is at the ground
-for which the way is not known to be free, from where that comes into view.
+The field of view follows from the geometry of the cameras alone; occlusion by stones is not modelled. The next view is
+of the ground at the first pose of the path that is not known to be free.
 
-What lies nearer than the images show, or to the side, is looked at before the vehicle comes too near to it, or from
-farther back; by the geometry of the cameras. What was in view already, from the same side and no farther, and is not
-known nevertheless, hides behind a stone or is the stone: looking again shows no more.
+Ground nearer than the images show, or to the side, must be seen before the vehicle comes too near to it, or from
+farther back. Ground that was in view already, from the same side and no farther away, and is still unknown, lies behind
+a stone or is the stone: looking again shows no more.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ class FieldOfView:
 
     @staticmethod
     def of(rig: Rig, T_vehicle_left: RigidTransform) -> FieldOfView:
-        """Of two cameras: a border of an image and the camera's centre span a plane; its line on the ground is an edge.
+        """Build from a rig. A border of an image and the camera's centre span a plane; it meets the ground in an edge.
 
-        ``T_vehicle_left``: of the left camera in the vehicle's frame, x right, y ahead, z up from the ground.
+        ``T_vehicle_left``: pose of the left camera in the vehicle's frame, x right, y ahead, z up from the ground.
         """
         right = T_vehicle_left @ rig.T_right_left.inverse()
         return FieldOfView(np.concatenate([_edges(rig.left, T_vehicle_left), _edges(rig.right, right)]))
@@ -87,7 +87,7 @@ AHEAD = FieldOfView(np.array([[0.0, 1.0, 0.0]]))
 
 
 def looked(view: FieldOfView, stands: Iterable[Stand], points: Floats) -> list[tuple[float, float]]:
-    """From where points (n, 2), m, were in view: direction (rad) and distance (m) from their middle to those places."""
+    """Direction (rad) and distance (m), from the mean of points (n, 2), m, to each pose that had them in view."""
     return [bearing(points, stand) for stand in stands if view.holds(points, stand)]
 
 
@@ -115,8 +115,8 @@ class PlannerMemory:
     reopened: bool = False
 
     def after(self, verdict: str, stand: Stand, where: Point | None = None) -> Literal["end", "again", "drive"]:
-        """What follows a leg (:class:`rille.stages.planning.local_planner.stage.Leg`): the end, another plan from where
-        it stands, or the drive.
+        """Update the memory after a planned leg (:class:`rille.stages.planning.local_planner.stage.Leg`); return what
+        follows: the end, another plan from the same place, or the drive.
 
         Parameters
         ----------
@@ -158,7 +158,7 @@ class Target:
 
     @staticmethod
     def of(ground: Ground, way: Sequence[Piece], first: int, view: FieldOfView, stands: Sequence[Stand]) -> Target:
-        """What the first piece of a way that is not known needs; ``stands``: from where it looked so far."""
+        """Build for the first piece of a path that is not known to be free; ``stands``: poses of earlier looks."""
         points, unseen = ground.lacking(way, first)
         return Target(ground, view, points, unseen, looked(view, [*stands, (*ground.start, ground.heading)], points))
 

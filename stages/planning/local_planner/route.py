@@ -120,7 +120,7 @@ def first_metres(way: Sequence[Piece], length: float) -> list[Piece]:
 
 
 def last_metres(way: Sequence[Piece], length: float) -> list[Piece]:
-    """What is left of a way after its first ``length`` metres."""
+    """Return the rest of a path after its first ``length`` metres."""
     out: list[Piece] = []
     for piece in way:
         if length >= piece.length - NOTHING:
@@ -145,8 +145,8 @@ def within_turn(way: Sequence[Piece], heading: float, bound: float) -> tuple[lis
 
 
 def room_to_turn(low: float, high: float, now: float, bound: float) -> tuple[float, float]:
-    """How far (rad) one may turn to the right and to the left so that all headings, from low to high so far, lie within
-    a bound of each other."""
+    """Return the largest turns (rad) to the right and to the left after which all headings, so far from ``low`` to
+    ``high``, differ by at most ``bound``."""
     return max(0.0, now - high + bound), max(0.0, low - now + bound)
 
 

@@ -47,7 +47,7 @@ class PoseGrid:
 
     @staticmethod
     def over(lattice: Lattice, middle: tuple[float, float], heading: float, spacing: float) -> PoseGrid:
-        """All of a map."""
+        """Lattice through ``middle`` that covers a whole map."""
         x0, x1, y0, y1 = lattice.bounds
         corners = np.array([(x, y) for x in (x0, x1) for y in (y0, y1)]) - middle
         c, s = math.cos(heading), math.sin(heading)
@@ -83,7 +83,7 @@ class PoseGraph:
 
     @staticmethod
     def of(footing: Footing, grid: PoseGrid, prices: Prices) -> PoseGraph:
-        """On a map; a vehicle needs the same ground backwards, so that half a turn of headings is enough."""
+        """Compute the costs on a map; as a vehicle covers the same ground backwards, half a turn suffices."""
         row, col = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in grid.shape), indexing="ij")
         price, known = (np.empty((3, HALF, *grid.shape), kind) for kind in (np.float64, np.bool_))
         for k in range(HALF):
