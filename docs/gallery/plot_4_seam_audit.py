@@ -19,7 +19,7 @@ run = rille.reconstruct(
     rille.open("mockup-short", mockup=small),
     executor="inline",
     locus={"cell_size": 0.004},
-    select={"stride": 2},
+    keyframes={"stride": 2},
     crosscheck={"enabled": False},
 )
 seams = run.report["seams"]["seams"]

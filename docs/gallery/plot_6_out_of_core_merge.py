@@ -20,7 +20,7 @@ run = rille.reconstruct(
     rille.open("mockup-short", mockup=small),
     executor="inline",
     locus={"cell_size": 0.001},
-    select={"stride": 2},
+    keyframes={"stride": 2},
     crosscheck={"enabled": False},
 )
 

@@ -200,7 +200,7 @@ def _leading(out: Judgement, chain: list[int]) -> None:
         raise DegenerateError(
             "RIL-316",
             f"no pair can be reconstructed from: frame {first[0]}: {first[1]}",
-            remedy="look at the images; the limits are those of [continuity]",
+            remedy="look at the images; the limits are those of [frame_screening]",
         )
     for f in chain[: chain.index(fit)]:
         out.lost[f] = f"{out.unfit[f]}, and no good pair before it"
