@@ -8,8 +8,8 @@ Forms of a file, one pose T_reference_body a row:
 * ``csv``: columns by name in any order: a time (``t``, ``time``, ``timestamp``), quaternion ``qw qx qy qz`` or angles
   ``roll pitch yaw`` with their unit (``roll_deg``, ``yaw [rad]``), and perhaps a position ``x y z`` (``px``, ``tx``).
 
-Truth may be positions alone (:func:`read_positions`): columns x, y and perhaps time and z, by
-name or as the manifest states.
+Truth may be positions alone (:func:`read_positions`): columns x, y and perhaps time and z, by name or as the manifest
+states.
 
 Angles are those of vehicles: R_reference_body = Rz(yaw) Ry(pitch) Rx(roll). Rows without position stand at 0.
 """

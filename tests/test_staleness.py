@@ -457,8 +457,8 @@ EDITS: dict[str, tuple[str, str, str, set[str]]] = {
     "a comment, in what all reach": ("stages/geometry/geometry.py", "", WORDS, set()),
     "a docstring, in what all reach": (
         "stages/core/declare.py",
-        '"""What a stage takes',
-        '"""What any stage takes',
+        '"""Input or result of a stage',
+        '"""Input or result of any stage',
         set(),
     ),
     "a docstring of a kernel": ("stages/hfvm/level/search.py", '"""', '"""Said otherwise. ', set()),

@@ -4,11 +4,6 @@ A :class:`Spec` says what to compute: a stage module (its ``STAGE`` is taken), v
 identify the task, and hints (paths) that cannot change the result. The key is the digest of all of it but the hints
 and the label, of the code and packages behind the stage, and of the *output digests* of the inputs. Between
 tasks only :class:`~rille.pipeline.engine.store.manifest.Ref` travel.
-
->>> spec = Spec("rille.stages.odometry.keyframes", "keyframes", KeyframesParams(), {"frames": 9})
->>> outcome = ensure(Path("cache"), spec, {})
->>> Store("cache").open(outcome.ref).meta["basic"]
-[0, 4, 8]
 """
 
 from __future__ import annotations

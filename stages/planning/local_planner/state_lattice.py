@@ -71,9 +71,9 @@ class PoseGrid:
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """Cost of a metre (heading over half a turn, row, col) at each pose (``pose``), half a step ahead of it (``step``)
-    and half a turn to the left of it (``turn``); infinite where closed. ``known``: masks of the same shape of these
-    three that may be driven by what is known."""
+    """Cost of a metre (heading within 180 degrees, row, col) at each pose (``pose``), half a step ahead of it
+    (``step``) and half way to the next heading on the left (``turn``); infinite where closed. ``known``: three masks of
+    the same shape, of the poses, steps and turns that lie on known ground."""
 
     grid: PoseGrid
     pose: Floats
@@ -83,7 +83,7 @@ class PoseGraph:
 
     @staticmethod
     def of(footing: Footing, grid: PoseGrid, prices: Prices) -> PoseGraph:
-        """Compute the costs on a map; as a vehicle covers the same ground backwards, half a turn suffices."""
+        """Compute the costs on a map; a vehicle covers the same ground backwards, so headings within 180 degrees do."""
         row, col = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in grid.shape), indexing="ij")
         price, known = (np.empty((3, HALF, *grid.shape), kind) for kind in (np.float64, np.bool_))
         for k in range(HALF):
