@@ -21,7 +21,7 @@ BENCHMARKS := $(filter-out record,$(sort $(basename $(notdir $(wildcard benchmar
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
 
-install: $(STAMP) ## make .venv with rille and everything it needs, pinned
+install: $(VENV)/.compiled ## make .venv with rille and everything it needs, pinned, and compile the kernels
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
@@ -30,6 +30,10 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@$(BIN)/python -m compileall -q rille pipeline stages datasets
 	@touch $@
+
+# Without it, the first run compiles them.
+$(VENV)/.compiled: $(STAMP)
+	@$(BIN)/rille compile && touch $@ || echo "the first run will compile the kernels" >&2
 
 reconstruct: $(STAMP) ## a sequence to terrain, trajectory, risk map, path and report: SEQ= FRAMES= JOBS= SET="key=value ..."
 	@$(BIN)/rille reconstruct "$(SEQ)" $(if $(FRAMES),--frames $(FRAMES)) $(if $(JOBS),--jobs $(JOBS)) \

@@ -1,4 +1,4 @@
-"""The command line: ``rille reconstruct | drive | plan | runs | why | timing | check | init | match | ...``.
+"""The command line: ``rille reconstruct | drive | plan | runs | why | timing | compile | check | init | match | ...``.
 
 Exit codes: 0 complete; 1 failed; 2 usage, configuration or input; 3 finished, but not all of it: what the data do not
 determine, failures under ``--keep-going``, frames without a pose, images that do not match, a drive that did not reach
@@ -273,6 +273,18 @@ def params(
     from rille.pipeline.commands import params as command
 
     return command.show(section, markdown=markdown)
+
+
+@app.command(name="compile")
+def compile_kernels(*, debug: Debug = False) -> int:
+    """Compile the numerical kernels for this user and machine, so that the first run need not.
+
+    Runs two small simulated sequences in a temporary folder. What is compiled stays: again, nothing is left to compile.
+    """
+    prepare()
+    from rille.pipeline.runs import compilation as command
+
+    return command.compile_kernels()
 
 
 @app.command

@@ -62,6 +62,7 @@ WRONG = {
     "params": [("no-such-section", "RIL-920"), ("--no-such-flag", "RIL-001")],
     "runs": [("no-such-sequence", "RIL-880"), ("--runs no-such-folder", "RIL-880"), ("other other", "RIL-001")],
     "timing": [("no-such-run", "RIL-067"), ("--runs no-such-folder", "RIL-067"), ("other other", "RIL-001")],
+    "compile": [("other", "RIL-001"), ("--no-such-option", "RIL-001")],
     "view": [("no-such-run", "RIL-067"), ("other other", "RIL-001")],
     "compare": [
         ("other", "RIL-001"),
