@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sysconfig
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
+
+import pytest
+
+from rille.pipeline.cli import main
 
 RILLE = Path(sysconfig.get_path("scripts")) / "rille"
 
@@ -126,6 +132,17 @@ class Place:
             check=False,
         )
         return Done(done.returncode, done.stdout, done.stderr)
+
+    def here(self, *words: str) -> Done:
+        """Call ``rille`` in this process, which spares the start of another one: for what ends before it computes."""
+        out, err = io.StringIO(), io.StringIO()
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("RILLE_")}
+        with pytest.MonkeyPatch.context() as patched, redirect_stdout(out), redirect_stderr(err):
+            patched.chdir(self.folder)
+            patched.setattr(os, "environ", environment)
+            with pytest.raises(SystemExit) as ended:
+                main(list(words))
+        return Done(int(ended.value.code or 0), out.getvalue(), err.getvalue())
 
     def made(self) -> set[Path]:
         """Files and folders here, and the folders of all runs."""

@@ -142,7 +142,7 @@ def test_every_command_is_here() -> None:
 )
 def test_wrong_usage_is_one_line_with_a_code(place: Place, command: str, words: str, code: str) -> None:
     before = place.made()
-    done = place.rille(*command.split(), *words.split())
+    done = place.here(*command.split(), *words.split())
     assert (done.status, done.out) == (2, "")
     assert place.made() == before
     *warnings, line = done.err.splitlines()
@@ -152,6 +152,6 @@ def test_wrong_usage_is_one_line_with_a_code(place: Place, command: str, words: 
 
 @pytest.mark.parametrize("command", sorted(commands(app)))
 def test_help(place: Place, command: str) -> None:
-    done = place.rille(*command.split(), "--help")
+    done = place.here(*command.split(), "--help")
     assert (done.status, done.err) == (0, "")
     assert done.lines[0].startswith(f"Usage: rille {command}".strip())
