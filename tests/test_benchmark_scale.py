@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -12,8 +13,11 @@ from benchmarks import scale
 @pytest.mark.slow
 def test_the_idle_sequence_is_computed_and_found_again(tmp_path: Path) -> None:
     how = ["--executor", "inline", "--jobs", "1"]
-    _, row = scale.table([12], how, tmp_path, flush=False)
-    assert row.split()[0] == "12"
-    nodes = int(row.split()[1])
+    lines = list(scale.figures(12, how, tmp_path, {scale.UNFLUSHED: "1"}))
+    found = re.fullmatch(r"12 pairs, (\d+) nodes", lines[0])
+    assert found, lines
+    nodes = int(found[1])
     assert nodes > 12 * 12
-    assert scale.entries(tmp_path / "12" / "cache")[0] < nodes / 4
+    for what in ("overhead", "plan when all is cached", "run that computes nothing"):
+        assert any(what in line for line in lines), lines
+    assert scale.entries(tmp_path / "cache")[0] < nodes / 4

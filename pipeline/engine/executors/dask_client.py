@@ -152,7 +152,10 @@ class Dask:
         """Sentence with the address of dask's dashboard, which exists if the scheduler's machine has bokeh."""
         if self._cluster is not None and find_spec("bokeh") is None:
             return "dask has pages to watch once bokeh is installed: pip install bokeh"
-        return f"dask at work: {self._client.dashboard_link}"
+        try:
+            return f"dask at work: {self._client.dashboard_link}"  # the address is asked of the scheduler
+        except OSError:
+            return ""  # it has gone; the first wait for a task says so
 
     def free(self) -> bool:
         """Not beside a suspect."""

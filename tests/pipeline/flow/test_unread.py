@@ -40,8 +40,8 @@ def test_the_configuration_of_a_run_can_be_given_back(tmp_path, name):
 
 
 def test_what_a_user_has_switched_off_himself_may_stay(tmp_path):
-    assert settled(tmp_path, "mockup", "crosscheck.enabled=false", "crosscheck.window=20").given == ()
-    off = settled(tmp_path, "mockup-loop", "crosscheck.window=20")
+    assert settled(tmp_path, "mockup", "crosscheck.enabled=false", "crosscheck.window=25").given == ()
+    off = settled(tmp_path, "mockup-loop", "crosscheck.window=25")
     assert off.given == ("crosscheck.window",), "it is off in a drive anyway"
 
 

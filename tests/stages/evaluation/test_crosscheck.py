@@ -150,7 +150,7 @@ def test_features_keep_away_from_what_is_masked(scene: Any) -> None:
     everywhere, masked = extract(dark, np.ones_like(valid), PARAMS), extract(dark, valid, PARAMS)
     assert 20 < len(masked.points) < len(everywhere.points)
     assert everywhere.points[:, 0].max() > 100  # the edge itself has features, were it not for the mask
-    assert masked.points[:, 0].max() < 100 - 3 * 1.6  # SIFT's smallest scale
+    assert masked.points[:, 0].max() < 100 - 3 * 0.8  # SIFT's smallest scale in a doubled image
     assert len(extract(dark, np.zeros_like(valid), PARAMS).points) == 0
 
 
@@ -177,9 +177,20 @@ def test_a_reduced_image_gives_positions_of_the_full_one(scene: Any) -> None:
     assert np.abs(np.median(error, axis=0)).max() < 0.1
 
 
+def test_only_a_small_image_is_doubled(scene: Any) -> None:
+    small = scene[1]["left"][0]["image"]
+    for image, octave in ((small, -1), (cv2.resize(small, (640, 480)), 0)):
+        points, same, other = (
+            extract(image, np.ones_like(image), CrosscheckParams(first_octave=o)).points
+            for o in (None, octave, -1 - octave)
+        )
+        np.testing.assert_array_equal(points, same)
+        assert len(other) != len(same)
+
+
 def test_matching_equals_colmap_s_own_matcher(scene: Any) -> None:
     images = [scene[1]["left"][k]["image"] for k in (0, 1)]
-    native = [_extractor(PARAMS).extract_from_uint8_array(image) for image in images]
+    native = [_extractor(PARAMS, image.size).extract_from_uint8_array(image) for image in images]
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu, options.num_threads = False, 1
     matcher = pycolmap.FeatureMatcher.create(options, pycolmap.Device.cpu)
