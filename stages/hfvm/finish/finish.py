@@ -17,7 +17,7 @@ from rille.stages.core.validity import Validity, mark
 from rille.stages.hfvm.coarse_to_fine import hierarchy
 from rille.stages.hfvm.coarse_to_fine.hierarchy import Band, Map, Prepared
 from rille.stages.hfvm.finish import guided, refine, uncertainty, variational_refinement
-from rille.stages.hfvm.images import plane
+from rille.stages.hfvm.images import denoise, plane
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import View
 from rille.stages.hfvm.images.window import Raster, Results, Window, around, blocks, cut, strips, whole
@@ -134,11 +134,12 @@ class Finish:
             image = image * np.float32(self.contrast)
         to_right = partial(self._to_right, window=outer)
         u, v, rest, noise = refine.refine(left, refine.RightWindow(image, valid, place, to_right), u, v, keep, p)
-        alike, variance = refine.surroundings(rest, self.pair.deviation(0, outer), keep)
+        removed = self.pair.left.view.removed_noise**2, (self.contrast * self.pair.right.view.removed_noise) ** 2
+        alike, variance = refine.surroundings(rest, self.pair.deviation(0, outer), keep, removed)
         if p.refine:
             mark(bits, keep & (alike < p.correlation), Validity.OVER_THRESHOLD)
-        # Smoothing divides the residuals' variance, not what a match knows of its place.
-        noise *= variance / min(side.view.kept_noise for side in (self.pair.left, self.pair.right))
+        # Denoising lessens the residuals' variance, but what a match knows of its place does not become more.
+        noise *= variance * np.float32(denoise.AVERAGED) if any(removed) else variance
         there = to_right(u, v)
         if p.variational_steps:
             there = variational_refinement.fit(left, image, valid, *there, bits == 0, p)

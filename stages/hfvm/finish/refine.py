@@ -44,6 +44,10 @@ CORRELATION_SIDE = 9
 FARTHEST = 1.5
 """Pixels: a correction beyond this is a jump to something else."""
 
+NOISE_TEXTURE = 0.4
+"""Local deviation for each grey level of noise that was removed from the left image, up to which it may be noise alone,
+of which denoising leaves about .3."""
+
 SAME_CONTRAST = 1.3
 """Ratio of contrasts up to which residuals hardly tell it from noise: less than a tenth of the signal's variance."""
 STRIDE, SAMPLES, LEAST = 3, 8000, 100
@@ -138,17 +142,21 @@ def drift(params: HfvmParams) -> int:
     return 2 * params.refine_steps + 3
 
 
-def surroundings(rest: AnyArray, deviation: AnyArray, keep: AnyArray) -> tuple[AnyArray, AnyArray]:
+def surroundings(
+    rest: AnyArray, deviation: AnyArray, keep: AnyArray, noise: tuple[float, float] = (0.0, 0.0)
+) -> tuple[AnyArray, AnyArray]:
     """Correlation of the left image with the warped right one over a wider window, and the residual variance there.
 
     Both (row, col) float32; correlation 1 and residual 0 where not known. From the residual variance ``rest`` and the
     left image's local ``deviation``: two signals of equal variance s^2 and correlation r differ by 2 s^2 (1 - r).
-    Noise that found noise to match, in a shadow or the sky, gives itself away.
+    Noise that found noise to match, in a shadow or the sky, gives itself away. ``noise``: variances that the left and
+    the right image's noise had before they were denoised. What the noise explains of s^2 and of the difference is then
+    left out, if that makes them more alike and the left image shows more than noise.
     """
     planes, sums = (np.empty((3, *rest.shape), np.float32) for _ in range(2))
     _known(rest, deviation, keep, planes)
     rowwise.box(planes, CORRELATION_SIDE // 2, sums)
-    _correlation(sums, planes[0], planes[1])
+    _correlation(sums, (np.float32(noise[0]), np.float32(noise[0] + noise[1])), planes[0], planes[1])
     return planes[0], planes[1]
 
 
@@ -165,10 +173,15 @@ def _known(rest, deviation, keep, planes):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _correlation(sums, found, around):  # type: ignore[no-untyped-def]
-    one, two, least = np.float32(1.0), np.float32(2.0), np.float32(1e-6)
+def _correlation(sums, noise, found, around):  # type: ignore[no-untyped-def]
+    one, two, least, nil = np.float32(1.0), np.float32(2.0), np.float32(1e-6), np.float32(0.0)
+    own, both = noise
+    texture = np.float32(NOISE_TEXTURE * NOISE_TEXTURE)
     for y in range(found.shape[0]):
         differ, power, count = sums[0, y], sums[1, y], sums[2, y]
         for x in range(found.shape[1]):
-            found[y, x] = one - differ[x] / max(two * power[x], least) if power[x] > 0 else one
+            as_it_is = one - differ[x] / max(two * power[x], least)
+            unlike, signal = max(differ[x] - both * count[x], nil), power[x] - own * count[x]
+            told = one - unlike / max(two * signal, least) if power[x] > texture * own * count[x] else as_it_is
+            found[y, x] = max(as_it_is, told) if power[x] > 0 else one
             around[y, x] = differ[x] / max(count[x], one)

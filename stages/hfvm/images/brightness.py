@@ -62,9 +62,9 @@ class Levelled:
         return self.view.blank
 
     @property
-    def kept_noise(self) -> float:
-        """Noise of the view: it is scaled with the signal."""
-        return self.view.kept_noise
+    def removed_noise(self) -> float:
+        """Noise of the view, multiplied as the middle of the image is."""
+        return self.view.removed_noise * float(np.exp(self.ratio[0]))
 
     def grey(self, level: int, window: Window) -> AnyArray:
         """Grey values, 0 where masked."""

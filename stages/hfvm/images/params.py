@@ -17,7 +17,7 @@ PAPER: Mapping[str, Any] = {
     # Grey levels: distances are Eq. 1's there, no sums of bytes.
     "threshold": 15.0,
     "texture": 0.0,
-    # Beyond the noise of any image, which so is never smoothed.
+    # Beyond the noise of any image, which so is never denoised.
     "smooth_noise": 1e6,
     "speckle": 1,
     "fill_reach": 100000,
@@ -162,8 +162,8 @@ class HfvmParams(Params):
     smooth_noise: float = Field(
         default=1.0,
         gt=0,
-        description="noise [grey levels] of an image, as estimated from itself, from which on it is smoothed before it "
-        "is matched; larger: fewer images are smoothed; images without noise added reach 0.2",
+        description="noise [grey levels] of an image, as estimated from itself, from which on it is denoised before it "
+        "is matched; larger: fewer images are denoised; images without noise added reach 0.2",
     )
     texture: float = Field(
         default=0.5,

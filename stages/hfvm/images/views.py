@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from rille.stages.core.declare import AnyArray
-from rille.stages.hfvm.images import plane
+from rille.stages.hfvm.images import denoise, plane
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.window import Raster, Shape, Window, cut, tiles, whole
 from rille.stages.hfvm.level import features, paper
@@ -33,8 +33,8 @@ class View(Protocol):
         """Grey level where no level is valid."""
 
     @property
-    def kept_noise(self) -> float:
-        """Share of the variance of the finest level's noise that is left: 1, or less where it has been smoothed."""
+    def removed_noise(self) -> float:
+        """Noise of level 0 before it was denoised, standard deviation in grey levels; 0 where it was not denoised."""
 
     def grey(self, level: int, window: Window) -> AnyArray:
         """Grey values, float32, 0 where masked."""
@@ -73,8 +73,8 @@ class Plain:
         return Plain(self.images[1:], self.masks[1:], self.blank, 0.5 * self.noise)
 
     def quiet(self, params: HfvmParams) -> View:
-        """The view with its finest level smoothed where that is noisy, else itself."""
-        return Smoothed(self) if self.noise >= params.smooth_noise else self
+        """The view denoised where it is noisy, else itself."""
+        return Denoised(self) if self.noise >= params.smooth_noise else self
 
     @property
     def shapes(self) -> Sequence[Shape]:
@@ -82,9 +82,9 @@ class Plain:
         return tuple(image.shape for image in self.images)
 
     @property
-    def kept_noise(self) -> float:
-        """All of it."""
-        return 1.0
+    def removed_noise(self) -> float:
+        """None."""
+        return 0.0
 
     def grey(self, level: int, window: Window) -> AnyArray:
         """Grey values, 0 where masked."""
@@ -100,19 +100,18 @@ class Plain:
 
 
 @dataclass(frozen=True)
-class Smoothed:
-    """A view whose finest level is smoothed by the binomial kernel (1 2 1) x (1 2 1) / 16.
+class Denoised:
+    """A noisy view, each level denoised by the noise that halving has left (:mod:`rille.stages.hfvm.images.denoise`).
 
-    At five grey levels of noise a match finds a fifth more pixels by it; without noise it would lose detail. Coarser
-    levels have been smoothed by the halving: once more made them worse.
+    With a binomial kernel on the finest level alone bad-2 of five noisy pairs was 2 % and the median error 5 % larger.
     """
 
     view: Plain
 
     @property
-    def kept_noise(self) -> float:
-        """Sum of the squares of the kernel: (1 + 4 + 1) / 16 in either direction."""
-        return (6 / 16) ** 2
+    def removed_noise(self) -> float:
+        """Noise of the view before."""
+        return self.view.noise
 
     @property
     def shapes(self) -> Sequence[Shape]:
@@ -134,15 +133,12 @@ class Smoothed:
 
     def filled(self, level: int, window: Window) -> AnyArray:
         """Grey values, those of masked pixels from above."""
-        if level > 0:
-            return self.view.filled(level, window)
         outer = window.grow(1, 1, self.shapes[level])
         rows, cols = window.inside(outer)
         # The image's edge is repeated; other sides of the window have their neighbours.
         spare = [(1 - s.start, 1 - (n - s.stop)) for s, n in zip((rows, cols), outer.shape, strict=True)]
-        a = np.pad(self.view.filled(level, outer), spare, mode="edge")
-        a = np.float32(0.25) * ((a[:-2] + a[2:]) + np.float32(2.0) * a[1:-1])
-        return np.ascontiguousarray(np.float32(0.25) * ((a[:, :-2] + a[:, 2:]) + np.float32(2.0) * a[:, 1:-1]))
+        padded = np.pad(self.view.filled(level, outer), spare, mode="edge")
+        return denoise.lee(padded, self.view.noise * 0.5**level)
 
 
 def mean_grey(image: AnyArray, mask: AnyArray) -> float:
@@ -210,9 +206,9 @@ class Aligned:
         return Aligned(right, h, left.shapes[0], shapes, (), (), len(shapes), blank)
 
     @property
-    def kept_noise(self) -> float:
+    def removed_noise(self) -> float:
         """Noise of the right image."""
-        return self.right.kept_noise
+        return self.right.removed_noise
 
     def grey(self, level: int, window: Window) -> AnyArray:
         """Grey values, 0 where masked."""

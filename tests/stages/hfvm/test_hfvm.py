@@ -169,6 +169,25 @@ def test_noise_is_not_matched_where_a_shadow_hides_the_texture():
     assert matched(found.validity[10:30, 20:180]).mean() > 0.95
 
 
+def test_texture_half_as_strong_as_the_right_images_noise_is_matched():
+    left, right, u, v = pair(lambda x, y: (-9 + 4 * np.sin(x / 30) * np.cos(y / 25), 0.0), (150, 211))
+    # Contrast 2.5 grey levels; only the right image has noise, so that the windows of no match look alike.
+    left, right = (128 + 0.07 * (a - 128) for a in (left, right))
+    found = match(left, right + np.random.default_rng(5).normal(0, 5, right.shape).astype(np.float32))
+    inside = seen(u, v, right.shape, BORDER)
+    near = np.hypot(found.column_disparity - u, found.row_disparity - v) < 1
+    assert np.mean((matched(found.validity) & near)[inside]) > 0.6
+    assert np.mean(near[inside & matched(found.validity)]) > 0.85
+
+
+def test_random_dots_match_at_fractions_of_a_pixel_though_they_look_like_noise():
+    left = np.random.default_rng(0).integers(0, 256, (120, 160)).astype(np.uint8)
+    moved = cv2.warpAffine(left, np.array([[1.0, 0.0, 0.4], [0.0, 1.0, 0.0]]), (160, 120), flags=cv2.INTER_CUBIC)
+    found = match(left, np.roll(moved, (2, -7), (0, 1)))
+    assert matched(found.validity).mean() > 0.8
+    assert np.median(found.column_disparity[matched(found.validity)]) == pytest.approx(-6.6, abs=0.05)
+
+
 def test_masked_pixels_are_never_matched_nor_matched_to():
     left, right, u, v = pair(lambda x, y: (-8.0, 1.0))
     left_valid, right_valid = np.ones(left.shape, np.uint8), np.ones(right.shape, np.uint8)

@@ -239,6 +239,26 @@ class TestRefine:
         assert np.abs(none[8:-8, 8:-8]).max() < 0.5
         assert around[30, 30] == pytest.approx(variance(a - b)[26:35, 26:35].mean(), rel=1e-5)
 
+    def test_correlation_leaves_out_the_noise_that_it_is_told(self):
+        rng = np.random.default_rng(1)
+        signal, other, noise = rng.normal(0, 1, (3, 60, 60))
+        keep = np.ones((60, 60), bool)
+        mean = lambda z: ndimage.uniform_filter(z, 5)  # noqa: E731
+        variance = lambda z: (mean(z * z) - mean(z) ** 2).astype(np.float32)  # noqa: E731
+        inner = np.s_[8:-8, 8:-8]
+        # The right image's noise is as strong as what both show, or stronger by half.
+        for difference, told, low, high in (
+            (noise, 0.0, 0.3, 0.7),
+            (noise, 1.0, 0.8, 1.0),
+            (signal - other, 0.0, -0.3, 0.3),
+            (signal - other + 1.5 * noise, 1.5**2, -0.5, 0.5),
+        ):
+            found, _ = refine.surroundings(variance(difference), np.sqrt(variance(signal)), keep, (0.0, told))
+            assert low < found[inner].mean() < high
+        # Noise of the left image is in its deviation, too: what is left of it is the texture's.
+        found, _ = refine.surroundings(variance(signal - other), np.sqrt(variance(signal + noise)), keep, (1.0, 0.0))
+        assert abs(found[inner].mean() - 0.5) < 0.2
+
 
 def test_local_mean_takes_only_like_neighbours():
     u, v = zeros(5, 5), zeros(5, 5)

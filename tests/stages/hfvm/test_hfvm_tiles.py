@@ -1,6 +1,7 @@
 """Tiles of any size, in any order, give what the whole image gives, bit for bit; windows and rasters by themselves."""
 
 import random
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -52,6 +53,13 @@ def noisy():
     return left, right
 
 
+def noisy_ground():
+    """The same for ground that pre-alignment by a plane is made for."""
+    rng = np.random.default_rng(6)
+    left, right = sheared()
+    return tuple(128 + 0.3 * (a - 128) + rng.normal(0, 6, a.shape) for a in (left, right))
+
+
 def vignetted():
     """Weak texture, and a right image that is dark in its corners, which is undone."""
     left, right, *_ = pair(lambda x, y: (-9 + 4 * np.sin(x / 30) * np.cos(y / 25), 0 * x), (150, 211))
@@ -71,13 +79,14 @@ def in_tiles(views, params, side, seed):
 
 @pytest.mark.parametrize(
     ("scene", "aligned"),
-    [(misaligned, False), (sheared, True), (turned, True), (noisy, False), (vignetted, False)],
+    [(misaligned, False), (sheared, True), (turned, True), (noisy, False), (noisy_ground, True), (vignetted, False)],
 )
 @pytest.mark.parametrize("preset", ["default", "fast", "paper"])
 def test_tiles_of_any_size_and_order_give_the_bits_of_the_whole(scene, aligned, preset):
     views, params = both(scene), HfvmParams(preset=preset)
     once = tiled.match(*views, params, None, quiet, None)
     assert once.aligned == (aligned and preset != "paper")
+    assert scene not in (noisy, noisy_ground) or min(view.noise for view in views) > 2
     # the paper compares grey levels as they are: of half the contrast little matches
     if scene in (misaligned, sheared) or preset != "paper":
         assert np.mean(once.arrays["validity"] & 1) > (0.005 if preset == "paper" else 0.5)
@@ -96,6 +105,30 @@ def test_noisy_images_are_smoothed_unless_told_otherwise():
         for limit in (1.0, 10.0)
     ]
     assert share[0] > 1.1 * share[1] > 0.1
+
+
+def test_denoising_averages_noise_and_keeps_texture_on_every_level():
+    rng = np.random.default_rng(0)
+    y, x = np.indices((160, 208))
+    scene = np.where(x < 120, 90.0, 90.0 + 80 * ((x // 8 + y // 8) % 2))
+    noisy = replace(Plain.of(build(scene + rng.normal(0, 4, scene.shape), PyramidParams())), noise=4.0)
+    quiet = noisy.quiet(HfvmParams())
+    assert quiet.removed_noise == 4
+    for level in range(3):
+        window = whole(noisy.shapes[level])
+        before, after = noisy.grey(level, window), quiet.grey(level, window)
+        flat = (slice(None), slice(0, 112 >> level))
+        # A mean of nine pixels leaves a third.
+        assert after[flat].std() < 0.4 * before[flat].std()
+        assert after[flat].mean() == pytest.approx(90, abs=0.2)
+    checks = (slice(None), slice(128, None))
+    assert quiet.grey(0, whole(noisy.shapes[0]))[checks].std() == pytest.approx(40, rel=0.02)
+
+
+def test_views_without_noise_are_left_as_they_are():
+    for view in both(misaligned):
+        assert view.quiet(HfvmParams()) is view
+        assert view.removed_noise == 0
 
 
 def test_parameters_that_widen_the_reach_widen_the_surroundings():
