@@ -300,7 +300,7 @@ def candidates(kind: Any, value: Any) -> Iterator[Any]:
         yield tuple(v * 1.01 for v in value)
         yield tuple(v + 0.1 for v in value)
     elif value is None:
-        yield from (0.0123, (0.1, 0.2), (-1.0, 0.5, 1.0, 2.0), (0.1, 0.2, 0.3), 320)
+        yield from (0.0123, (0.1, 0.2), (-1.0, 0.5, 1.0, 2.0), (0.1, 0.2, 0.3), 320, 1)
 
 
 def changes(parameter: str, defaults: Any) -> dict[str, Any]:
