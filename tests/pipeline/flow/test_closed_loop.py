@@ -120,7 +120,7 @@ def test_killed_in_the_middle_it_goes_on_to_the_same_bits(arrived: tuple[Drive, 
     paths = os.pathsep.join(map(str, (here, *here.parents[:3])))
     driving = subprocess.Popen([sys.executable, "-c", program, str(cache)], env=os.environ | {"PYTHONPATH": paths})
     try:
-        while len(list(cache.glob("artifacts/leg/*/*.zip"))) < 2:
+        while len(list(cache.glob("artifacts/local_planner/*/*.zip"))) < 2:
             assert driving.poll() is None, "it had ended before it was killed"
             time.sleep(0.05)
     finally:
