@@ -76,7 +76,7 @@ BUCKET_PAIRS = 100
 
 
 def _spent() -> float:
-    """Processor time of this thread, and of those in which zarr reads and writes for it."""
+    """Processor time of this thread, and of those in which zarr reads for it."""
     helpers = [t.ident for t in threading.enumerate() if t.name.startswith(("zarr_io", "asyncio_"))]
     return time.thread_time() + sum(time.clock_gettime(time.pthread_getcpuclockid(i)) for i in helpers if i)
 

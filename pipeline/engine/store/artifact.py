@@ -16,6 +16,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -81,60 +82,78 @@ def _refuse_non_finite(value: Any, where: str) -> None:
 
 def encode(stage: Stage, bundle: Bundle) -> tuple[dict[str, bytes], dict[str, Any]]:
     """A bundle as a zarr group: contents by relative path, and the description of its arrays (for the manifest)."""
-    import zarr
-    from zarr.storage import MemoryStore
-
-    chunks: dict[str, Any] = {}
-    attributes = {"stage": stage.name, "source": cf_coordinates.source(stage), "meta": dict(bundle.meta)}
-    # in memory first: zarr hands each small file over to a thread of its own, which takes longer than to write it
-    group = zarr.create_group(store=MemoryStore(chunks), zarr_format=3, attributes=attributes)
     lattice = cf_coordinates.lattice_of(bundle.meta)
-    described = {name: _add(group, name, stage, bundle, lattice) for name in sorted(bundle.arrays)}
+    described, nodes = {}, {}
+    files: dict[str, bytes] = {}
+    for name in sorted(bundle.arrays):
+        array = np.asarray(bundle.arrays[name])
+        about = described[name] = _describe(name, array, next(a for a in stage.outputs if a.matches(name)))
+        attributes = {k: about[k] for k in ("units", "long_name", "nodata", "frame") if about[k]}
+        attributes |= cf_coordinates.attributes(name, about, bundle.arrays, lattice)
+        nodes[name] = _add(files, name, array, about["dims"], attributes)
     if lattice is not None and bundle.arrays:
-        for name, (values, dims, attrs) in cf_coordinates.coordinates(
-            lattice, str(bundle.meta.get("frame", ""))
-        ).items():
-            at = group.create_array(
-                name, shape=values.shape, dtype="<f8", dimension_names=dims, attributes={**attrs},
-                chunk_key_encoding={"name": "default", "separator": "."},
-            )  # fmt: skip
-            at[...] = values
-    files = {name: chunk.to_bytes() for name, chunk in chunks.items()}
-    _consolidate(files)
-    return files, described
-
-
-def _consolidate(files: dict[str, bytes]) -> None:
-    """Describe all arrays in the group's own file too, so that opening it reads nothing else."""
-    about = {
-        name.removesuffix("/zarr.json"): json.loads(data) for name, data in files.items() if name.endswith("/zarr.json")
+        frame = str(bundle.meta.get("frame", ""))
+        for name, (values, dims, attributes) in cf_coordinates.coordinates(lattice, frame).items():
+            nodes[name] = _add(files, name, values, dims, attributes)
+    group = {
+        "attributes": {"stage": stage.name, "source": cf_coordinates.source(stage), "meta": dict(bundle.meta)},
+        "zarr_format": 3,
+        "node_type": "group",
+        # All arrays are described here too, so that opening the group reads nothing else.
+        "consolidated_metadata": {"kind": "inline", "must_understand": False, "metadata": nodes},
     }
-    group = json.loads(files["zarr.json"])
-    group["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": about}
-    files["zarr.json"] = json.dumps(group).encode()
+    return {"zarr.json": json.dumps(group).encode(), **files}, described
 
 
-def _add(group: Any, name: str, stage: Stage, bundle: Bundle, lattice: Any) -> dict[str, Any]:
-    """Write one array into a group; its description."""
-    from zarr.codecs import BloscCodec
+def _add(
+    files: dict[str, bytes], name: str, array: AnyArray, dims: list[str], attributes: Mapping[str, str]
+) -> dict[str, Any]:
+    """Add the members of one array, and give its description as zarr 3 wants it.
 
-    array = np.asarray(bundle.arrays[name])
-    about = _describe(name, array, next(a for a in stage.outputs if a.matches(name)))
-    written = group.create_array(
-        name,
-        shape=array.shape,
-        dtype=array.dtype.newbyteorder("<"),
-        chunks=_chunks(array.shape),
-        compressors=BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
-        fill_value=np.nan if array.dtype.kind == "f" else 0,
-        dimension_names=about["dims"],
-        chunk_key_encoding={"name": "default", "separator": "."},  # no folders within, which would need flushing
-        attributes={k: about[k] for k in ("units", "long_name", "nodata", "frame") if about[k]}
-        | cf_coordinates.attributes(name, about, bundle.arrays, lattice),
-        config={"write_empty_chunks": True},  # so that a missing chunk is always damage
-    )
-    written[...] = array
-    return about
+    zarr hands each array over to threads of its own several times, which takes longer than all the rest.
+    """
+    little = np.asarray(array, dtype=array.dtype.newbyteorder("<"))
+    edges, floating = _chunks(little.shape), little.dtype.kind == "f"
+    fill = little.dtype.type(np.nan if floating else 0)
+    blosc = {"typesize": little.itemsize, "cname": "lz4", "clevel": 5, "shuffle": "shuffle", "blocksize": 0}
+    node = {
+        "shape": little.shape,
+        "data_type": little.dtype.name,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": edges}},
+        # No folders within the archive: its members are flat.
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "."}},
+        "fill_value": "NaN" if floating else fill.item(),
+        "codecs": [
+            {"name": "bytes", "configuration": {"endian": "little"}},
+            {"name": "blosc", "configuration": blosc},
+        ],
+        "attributes": attributes,
+        "dimension_names": dims,
+        "zarr_format": 3,
+        "node_type": "array",
+        "storage_transformers": [],
+    }
+    files[f"{name}/zarr.json"] = json.dumps(node).encode()
+    codec = _codec()
+    for at in np.ndindex(*(math.ceil(n / edge) for n, edge in zip(little.shape, edges, strict=True))):
+        chunk = little[tuple(slice(i * edge, (i + 1) * edge) for i, edge in zip(at, edges, strict=True))]
+        if chunk.shape != edges:  # all chunks of an array have one size: of the last ones a part is nothing
+            part, chunk = chunk, np.full(edges, fill)
+            chunk[tuple(map(slice, part.shape))] = part
+        files[_chunk_name(name, at)] = codec.encode(np.ascontiguousarray(chunk))
+    return node
+
+
+def _chunk_name(name: str, at: tuple[int, ...]) -> str:
+    return ".".join([f"{name}/c", *map(str, at)])
+
+
+@cache
+def _codec() -> Any:
+    from numcodecs import blosc
+
+    blosc.use_threads = False  # workers have a core each
+    return blosc.Blosc(cname="lz4", clevel=5, shuffle=blosc.SHUFFLE)
 
 
 def _chunks(shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -243,8 +262,6 @@ class LazyArrays(Mapping[str, AnyArray]):
 
         zarr hands every reading over to a thread of its own, twice, which takes ten times as long.
         """
-        from numcodecs import blosc
-
         found = self._manifest["arrays"][name]
         if math.prod(found["shape"]) > CHUNK**2:
             return None
@@ -253,14 +270,13 @@ class LazyArrays(Mapping[str, AnyArray]):
         grid = {"name": "regular", "configuration": {"chunk_shape": found["shape"]}}
         if about["chunk_grid"] != grid or [codec["name"] for codec in about["codecs"]] != ["bytes", "blosc"]:
             return None
-        data = self._member(".".join([f"{name}/c", *("0" for _ in found["shape"])]))
+        data = self._member(_chunk_name(name, (0,) * len(found["shape"])))
         if data is None:
             return None
         array = np.empty(found["shape"], np.dtype(found["dtype"]))
         if int.from_bytes(data[4:8], "little") != array.nbytes:  # header of blosc
             raise _WrongError(f"{name} has another size")
-        blosc.use_threads = False  # as in zarr's threads; workers have a core each
-        blosc.Blosc().decode(data, array)
+        _codec().decode(data, array)
         return array
 
     def _member(self, name: str) -> bytes | None:

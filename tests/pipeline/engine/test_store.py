@@ -440,7 +440,37 @@ def test_large_arrays_are_chunked(cache, shape, count):
     big = np.random.default_rng(0).normal(size=shape).astype(np.float32)
     ref = Store(cache).commit(STAGE, KEY, Bundle({"elevation": big}, {}))
     assert len(chunks(cache)) == count
+    assert chunks(cache) == sorted(chunks(cache)), "in one order, that equal arrays make equal archives"
     np.testing.assert_array_equal(Store(cache).open(ref)["elevation"], big)
+
+
+@pytest.mark.parametrize("shape", [(5,), (1500, 1200), (0, 3)])
+@pytest.mark.parametrize("dtype", ["float32", "float64", "int16", "bool"])
+def test_an_array_is_stored_as_zarr_stores_it(shape, dtype):
+    values = (np.random.default_rng(0).normal(size=shape) * 9).astype(dtype)
+    stage = replace(STAGE, outputs=(Array("values", tuple("ab"[: len(shape)]), dtype, "1", "values"),))
+    files, _ = artifact.encode(stage, Bundle({"values": values}, {}))
+    stored = {}
+    zarr.create_array(
+        zarr.storage.MemoryStore(stored),
+        name="values",
+        shape=shape,
+        dtype=dtype,
+        chunks=tuple(max(min(n, artifact.CHUNK), 1) for n in shape),
+        compressors=zarr.codecs.BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
+        fill_value=np.nan if values.dtype.kind == "f" else 0,
+        dimension_names=tuple("ab"[: len(shape)]),
+        chunk_key_encoding={"name": "default", "separator": "."},
+        attributes={"units": "1", "long_name": "values"},
+        config={"write_empty_chunks": True},
+    )[...] = values
+    expected = {name: content.to_bytes() for name, content in stored.items() if name.startswith("values/")}
+    assert files.keys() - {"zarr.json"} == expected.keys()
+    described = [json.loads(found.pop("values/zarr.json")) for found in (files, expected)]
+    for found in described:
+        found["codecs"][0].pop("configuration", None)  # one byte has no order
+    assert described[0] == described[1]
+    assert {name: files[name] for name in expected} == expected
 
 
 @pytest.mark.parametrize("shape", [(7, 5), (3,), (artifact.CHUNK, 2), (2, 3, 4)])
