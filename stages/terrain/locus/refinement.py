@@ -86,7 +86,7 @@ def refine(views: Views, surface: Surface, elevation: Floats32, steps: int) -> t
         weight, rest = _misfit(seen, keep)
         slope = np.where(keep, seen.right_slope - seen.left_slope, 0.0)
         scale = np.where(keep, seen.scale, 0.0)
-        across, down = np.zeros_like(z), np.zeros_like(z)
+        across, down = np.zeros((2, *z.shape), np.float32)
         _stiffness(z, scale, across, down)
         moved = z.copy()
         terms = Terms(weight * slope * slope, weight * slope * rest, z, keep, across, down)
@@ -133,12 +133,13 @@ def _level(seen: OrthoPair, gain: float) -> None:
         values *= np.float32(gain)
 
 
-def _misfit(seen: OrthoPair, keep: Bools) -> tuple[Floats, Floats]:
+def _misfit(seen: OrthoPair, keep: Bools) -> tuple[Floats32, Floats32]:
     """Weight of each cell's equation, and difference of both images without its local mean; zero where not kept."""
     rest = np.where(keep, seen.left - seen.right, 0.0)
-    weight = keep.astype(np.float64)
+    weight = keep.astype(np.float32)
     for _ in range(MEAN_ROUNDS + 1):
-        mean = window_sum(weight * rest, MEAN_SIDE) / np.maximum(window_sum(weight, MEAN_SIDE), LEAST_WEIGHT)
+        total, count = window_sum(weight * rest, MEAN_SIDE), window_sum(weight, MEAN_SIDE)
+        mean = (total / np.maximum(count, LEAST_WEIGHT)).astype(np.float32)
         # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once.
         weight = np.where(keep, 1.0 / (1.0 + np.square((rest - mean) / RESIDUAL)), 0.0)
     # A cell smaller than a pixel brings no more than its share of what the pixel tells.

@@ -4,6 +4,8 @@ A cell takes part in second differences of its own row and column only, so it de
 as they are after this sweep, and on those to its right and below as they were before. All cells of one diagonal
 (row + column) are therefore independent of each other. The arrays are sheared so that a diagonal is a line in memory:
 its cells are then computed side by side, and the next sweep follows three diagonals behind, while they are still near.
+They have the type of the terms; single precision is enough, since elevations are taken about their mean: it changes the
+result by less than a hundredth of what a cell moves.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from rille.stages.core.arrays import Bools, Floats
+from rille.stages.core.arrays import Bools, Floats, Floats32
 
 BORDER = 2
 """Diagonals and rows of nothing around: a second difference reaches two cells far."""
@@ -28,23 +30,23 @@ class Terms(NamedTuple):
     ``down`` weights of the second differences at a cell, 0 at borders and beside unknown cells.
     """
 
-    power: Floats
-    pull: Floats
+    power: Floats32
+    pull: Floats32
     start: Floats
     keep: Bools
-    across: Floats
-    down: Floats
+    across: Floats32
+    down: Floats32
 
 
 class _Sheared(NamedTuple):
     """Arrays (diagonal, row) with a border: elevations; weights of the second differences along a row and a column;
     what the images want; and the sum of all weights, 0 where a cell does not move."""
 
-    at: Floats
-    by_row: Floats
-    by_column: Floats
-    wanted: Floats
-    total: Floats
+    at: Floats32
+    by_row: Floats32
+    by_column: Floats32
+    wanted: Floats32
+    total: Floats32
 
 
 @njit(cache=True, nogil=True)
@@ -53,38 +55,41 @@ def sweep(terms, z, sweeps, overshoot):  # type: ignore[no-untyped-def]
     power, pull, start, keep, across, down = terms
     rows, cols = z.shape
     shape = rows + cols - 1 + 2 * BORDER, rows + 2 * BORDER
-    at, by_row, by_column = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-    wanted, total = np.zeros(shape), np.full(shape, np.nan)
+    at, by_row, by_column = np.zeros(shape, power.dtype), np.zeros(shape, power.dtype), np.zeros(shape, power.dtype)
+    wanted, total = np.zeros(shape, power.dtype), np.full(shape, power.dtype.type(np.nan))
+    middle = np.nanmean(z)
     for r in range(rows):
         for c in range(cols):
             if z[r, c] == z[r, c]:
                 t, i = r + c + BORDER, r + BORDER
-                by_row[t, i], by_column[t, i], at[t, i] = across[r, c], down[r, c], z[r, c]
+                by_row[t, i], by_column[t, i], at[t, i] = across[r, c], down[r, c], z[r, c] - middle
                 if keep[r, c]:
-                    wanted[t, i], total[t, i] = power[r, c] * start[r, c] + pull[r, c], power[r, c]
+                    wanted[t, i] = power[r, c] * (start[r, c] - middle) + pull[r, c]
+                    total[t, i] = power[r, c]
     low, high = _totals(by_row, by_column, total)
-    sheared, sums = _Sheared(at, by_row, by_column, wanted, total), np.empty(rows)
+    sheared, sums = _Sheared(at, by_row, by_column, wanted, total), np.empty(rows, power.dtype)
     # All sweeps run in one pass over the diagonals, each a few behind the one before it, while these are in the cache.
     for turn in range(rows + cols - 1 + BEHIND * (sweeps - 1)):
         for k in range(sweeps):
             t = turn - BEHIND * k + BORDER
             if t >= BORDER and t < shape[0] - BORDER and low[t] < high[t]:
-                _diagonal(sheared, t, low[t], high[t] - low[t], overshoot, sums)
+                _diagonal(sheared, t, low[t], high[t] - low[t], power.dtype.type(overshoot), sums)
     for r in range(rows):
         for c in range(cols):
             if keep[r, c]:
-                z[r, c] = at[r + c + BORDER, r + BORDER]
+                z[r, c] = at[r + c + BORDER, r + BORDER] + middle
 
 
 @njit(cache=True, nogil=True)
 def _totals(by_row, by_column, total):  # type: ignore[no-untyped-def]
     """Add what the second differences weigh to ``total``, 0 where it is NaN; from where to where a diagonal has any."""
     diagonals, rows = total.shape
+    four = total.dtype.type(4.0)
     low, high = np.zeros(diagonals, np.int64), np.zeros(diagonals, np.int64)
     for t in range(BORDER, diagonals - BORDER):
         low[t] = BORDER
         for i in range(BORDER, rows - BORDER):
-            s = 4.0 * by_row[t, i] + 4.0 * by_column[t, i]
+            s = four * by_row[t, i] + four * by_column[t, i]
             s = (s + by_row[t - 1, i]) + by_column[t - 1, i - 1]
             s = (s + by_row[t + 1, i]) + by_column[t + 1, i + 1]
             own = total[t, i] + s
@@ -101,19 +106,19 @@ def _totals(by_row, by_column, total):  # type: ignore[no-untyped-def]
 def _diagonal(sheared, t, i, n, overshoot, sums):  # type: ignore[no-untyped-def]
     """Cells ``i`` to ``i + n`` of diagonal ``t``; ``sums`` is room for what the second differences want of each."""
     at, by_row, by_column, wanted, total = sheared
-    j = i + n
+    j, two = i + n, at.dtype.type(2.0)
     left, right, above, below = at[t - 1, i:j], at[t + 1, i:j], at[t - 1, i - 1 : j - 1], at[t + 1, i + 1 : j + 1]
     a, b = by_row[t, i:j], by_column[t, i:j]
     for m in range(n):
-        sums[m] = 2.0 * a[m] * (left[m] + right[m]) + 2.0 * b[m] * (above[m] + below[m])
+        sums[m] = two * a[m] * (left[m] + right[m]) + two * b[m] * (above[m] + below[m])
     a, b = by_row[t - 1, i:j], by_column[t - 1, i - 1 : j - 1]
     before, over = at[t - 2, i:j], at[t - 2, i - 2 : j - 2]
     for m in range(n):
-        sums[m] = (sums[m] + a[m] * (2.0 * left[m] - before[m])) + b[m] * (2.0 * above[m] - over[m])
+        sums[m] = (sums[m] + a[m] * (two * left[m] - before[m])) + b[m] * (two * above[m] - over[m])
     a, b = by_row[t + 1, i:j], by_column[t + 1, i + 1 : j + 1]
     behind, under = at[t + 2, i:j], at[t + 2, i + 2 : j + 2]
     for m in range(n):
-        sums[m] = (sums[m] + a[m] * (2.0 * right[m] - behind[m])) + b[m] * (2.0 * below[m] - under[m])
+        sums[m] = (sums[m] + a[m] * (two * right[m] - behind[m])) + b[m] * (two * below[m] - under[m])
     own, goal, all_ = at[t, i:j], wanted[t, i:j], total[t, i:j]
     for m in range(n):
         moved = own[m] + overshoot * ((goal[m] + sums[m]) / all_[m] - own[m])
