@@ -215,12 +215,13 @@ def filled(pyramid: Pyramid) -> tuple[Floats32, ...]:
         if mask.all():
             continue
         if n + 1 < pyramid.levels:
-            rows, cols = images[n].shape
-            above = images[n + 1].repeat(2, axis=0)[:rows].repeat(2, axis=1)[:, :cols]
+            images[n] = images[n].copy()
+            for i, j in np.ndindex(2, 2):  # one of the four pixels below each pixel of the level above
+                part = images[n][i::2, j::2]
+                np.copyto(part, images[n + 1][: part.shape[0], : part.shape[1]], where=~mask[i::2, j::2])
         else:
             # At the top there is no level above: the mean of what is seen.
-            above = np.full_like(images[n], images[n][mask].mean() if mask.any() else 0.0)
-        images[n] = np.where(mask, images[n], above)
+            images[n] = np.where(mask, images[n], images[n][mask].mean() if mask.any() else np.float32(0.0))
     return tuple(images)
 
 
