@@ -27,9 +27,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rille.stages.core.arrays import Bools, Floats, Floats32
+from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.geometry.surface import Surface
-from rille.stages.numeric.windows import window_sum
+from rille.stages.numeric.windows import window_sum32
 from rille.stages.terrain.locus.sweep import Terms, sweep
 from rille.stages.terrain.locus.views import OrthoPair, Views, look
 
@@ -99,19 +99,18 @@ def refine(views: Views, surface: Surface, elevation: Floats32, steps: int) -> t
     return z.astype(np.float32), seen
 
 
-def standard_deviation(elevation: Floats32, seen: OrthoPair, from_disparity: Floats) -> Floats:
+def standard_deviation(elevation: Floats32, seen: OrthoPair, from_disparity: Floats32) -> Floats32:
     """Standard deviation of refined elevations, metres, see the module; the disparity's part where a cell is not seen.
 
     ``seen``: as :func:`refine` gives it. ``from_disparity``: (rows, cols) the disparity's part, metres.
     """
     known = np.isfinite(elevation) & np.isfinite(seen.scale)
-    bend, step = np.zeros(elevation.shape), np.zeros(elevation.shape)
-    texture = np.zeros((3, *elevation.shape))
-    _neighbours(elevation.astype(np.float64), known, seen, bend, step, texture)
-    cells = window_sum(np.ones(elevation.shape), RELIEF_SIDE)
-    both, of_left, of_right = (np.maximum(window_sum(t, TEXTURE_SIDE), 0.0) for t in texture)
-    count = np.maximum(window_sum(known, RELIEF_SIDE), 1.0)
-    relief = window_sum(bend, RELIEF_SIDE) / cells + window_sum(step, RELIEF_SIDE) / count
+    bend, step = np.zeros((2, *elevation.shape), np.float32)
+    texture = np.zeros((3, *elevation.shape), np.float32)
+    _neighbours(elevation, known, seen, bend, step, texture)
+    cells, bends, steps, count = (window_sum32(v, RELIEF_SIDE) for v in (np.ones(elevation.shape), bend, step, known))
+    both, of_left, of_right = (np.maximum(window_sum32(t, TEXTURE_SIDE), 0.0) for t in texture)
+    relief = bends / cells + steps / np.maximum(count, 1.0)
     alike = np.clip(both / np.maximum(np.sqrt(of_left * of_right), 1e-6), LEAST_CORRELATION, 1.0)
     variance = FACTOR**2 * (from_disparity**2 + np.maximum(relief, 0.0)) / alike**2
     std = np.sqrt(variance + np.square(FLOOR / np.where(known, seen.scale, 1.0)))
@@ -138,8 +137,8 @@ def _misfit(seen: OrthoPair, keep: Bools) -> tuple[Floats32, Floats32]:
     rest = np.where(keep, seen.left - seen.right, 0.0)
     weight = keep.astype(np.float32)
     for _ in range(MEAN_ROUNDS + 1):
-        total, count = window_sum(weight * rest, MEAN_SIDE), window_sum(weight, MEAN_SIDE)
-        mean = (total / np.maximum(count, LEAST_WEIGHT)).astype(np.float32)
+        total, count = (window_sum32(v, MEAN_SIDE) for v in (weight * rest, weight))
+        mean = total / np.maximum(count, LEAST_WEIGHT)
         # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once.
         weight = np.where(keep, 1.0 / (1.0 + np.square((rest - mean) / RESIDUAL)), 0.0)
     # A cell smaller than a pixel brings no more than its share of what the pixel tells.

@@ -202,12 +202,11 @@ def _refine(dem: Dem, views: Views, surface: Surface, params: LocusParams, apart
     ``apart``: (rows, cols) difference of both directions of matching, metres; None: there was one.
     """
     elevation, seen = refine(views, surface, dem.elevation, params.refine_steps)
-    before = dem.elevation_std.astype(np.float64)
     if apart is None:
-        dem.elevation_std[...] = standard_deviation(elevation, seen, before)
+        dem.elevation_std[...] = standard_deviation(elevation, seen, dem.elevation_std)
     else:
         moved = elevation.astype(np.float64) - dem.elevation
-        dem.elevation_std[...] = from_both(elevation, seen, moved, apart, before)
+        dem.elevation_std[...] = from_both(elevation, seen, moved, apart, dem.elevation_std.astype(np.float64))
     share = np.float32(params.refined_share)
     dem.elevation[...] = share * elevation + (np.float32(1.0) - share) * dem.elevation
     dem.ortho[...] = np.clip(seen.left, 0.0, 255.0)

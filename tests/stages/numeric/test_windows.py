@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rille.stages.numeric.windows import window_mean, window_sum
+from rille.stages.numeric.windows import window_mean, window_sum, window_sum32
 
 
 @pytest.mark.parametrize("n", [1, 3, 7, 25])
@@ -34,6 +34,15 @@ def test_sums_of_whole_numbers_are_exact(n: int) -> None:
         [a[max(r - half, 0) : r + half + 1, max(c - half, 0) : c + half + 1].sum() for c in range(12)] for r in range(7)
     ]
     np.testing.assert_array_equal(window_sum(a, n), expected)
+    np.testing.assert_array_equal(window_sum32(a, n), expected)
+    assert window_sum32(a, n).dtype == np.float32
+
+
+def test_sums_in_single_precision_add_up_in_double() -> None:
+    a = np.full((60, 70), 1e-4, np.float32)
+    a[:, :9] = 1e4  # running sums of float32 would lose what follows
+    expected = window_sum(a, 5)
+    np.testing.assert_allclose(window_sum32(a, 5), expected, rtol=1e-6)
 
 
 def test_a_mean_far_from_zero_keeps_its_digits() -> None:
