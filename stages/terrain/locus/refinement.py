@@ -76,8 +76,7 @@ def refine(views: Views, surface: Surface, elevation: Floats32, steps: int) -> t
     elevation (rows, cols), and what :func:`rille.stages.terrain.locus.views.look` gives for it, the right image with
     the left one's contrast.
     """
-    start = elevation.astype(np.float64)
-    z, seen = start, look(views, surface, start)
+    z, seen = elevation, look(views, surface, elevation)
     # From the first look, for all steps: an exposure does not change with the elevations.
     gain = _gain(seen)
     _level(seen, gain)
@@ -93,10 +92,10 @@ def refine(views: Views, surface: Surface, elevation: Floats32, steps: int) -> t
         sweep(terms, moved, SWEEPS, OVERSHOOT)
         # About the start, not the last step: many small steps could otherwise wander to another likeness.
         reach = FARTHEST / np.where(keep, seen.scale, np.inf)
-        z = np.where(keep, np.clip(moved, start - reach, start + reach), start)
+        z = np.where(keep, np.clip(moved, elevation - reach, elevation + reach), elevation)
         seen = look(views, surface, z)
         _level(seen, gain)
-    return z.astype(np.float32), seen
+    return z, seen
 
 
 def standard_deviation(elevation: Floats32, seen: OrthoPair, from_disparity: Floats32) -> Floats32:

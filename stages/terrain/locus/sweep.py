@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from rille.stages.core.arrays import Bools, Floats, Floats32
+from rille.stages.core.arrays import Bools, Floats32
 
 BORDER = 2
 """Diagonals and rows of nothing around: a second difference reaches two cells far."""
@@ -32,7 +32,7 @@ class Terms(NamedTuple):
 
     power: Floats32
     pull: Floats32
-    start: Floats
+    start: Floats32
     keep: Bools
     across: Floats32
     down: Floats32
