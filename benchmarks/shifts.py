@@ -148,12 +148,12 @@ def main() -> None:
             figures[program].append(found)
             print(f"| {name} | {cols}, {rows} | {program} | {_row(found)} |", flush=True)
     for program, rounds in figures.items():
-        print(f"| median of all | | {program} | {_row(np.median(np.abs(rounds), axis=0))} |")
+        print(f"| medians of magnitudes | | {program} | {_row(np.median(np.abs(rounds), axis=0), '')} |")
 
 
-def _row(found: Any) -> str:
+def _row(found: Any, sign: str = "+") -> str:
     share, rms_u, mean_u, rms_v, mean_v = found
-    return f"{share:.2f} | {rms_u:.3f}, {mean_u:+.3f} | {rms_v:.3f}, {mean_v:+.3f}"
+    return f"{share:.2f} | {rms_u:.3f}, {mean_u:{sign}.3f} | {rms_v:.3f}, {mean_v:{sign}.3f}"
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ FIELDS: Mapping[str, str] = {
     "hfvm.relief_bend": "variational_bend",
     "hfvm.relief_steps": "variational_steps",
     "hfvm.relief_stiffness": "variational_stiffness",
+    "hfvm.smooth_noise": "denoise_from",
     "leg.avoid": "p_costly",
     "leg.back_price": "reverse_cost",
     "leg.blind": "occluded_radius",

@@ -138,8 +138,8 @@ class Finish:
         alike, variance = refine.surroundings(rest, self.pair.deviation(0, outer), keep, removed)
         if p.refine:
             mark(bits, keep & (alike < p.correlation), Validity.OVER_THRESHOLD)
-        # Denoising lessens the residuals' variance, but what a match knows of its place does not become more.
-        noise *= variance * np.float32(denoise.AVERAGED) if any(removed) else variance
+        # Denoising divides the residuals' variance by as many pixels, but a match is placed no better for it.
+        noise *= variance * np.float32(denoise.PIXELS) if any(removed) else variance
         there = to_right(u, v)
         if p.variational_steps:
             there = variational_refinement.fit(left, image, valid, *there, bits == 0, p)

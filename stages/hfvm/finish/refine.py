@@ -143,7 +143,7 @@ def drift(params: HfvmParams) -> int:
 
 
 def surroundings(
-    rest: AnyArray, deviation: AnyArray, keep: AnyArray, noise: tuple[float, float] = (0.0, 0.0)
+    rest: AnyArray, deviation: AnyArray, keep: AnyArray, noise: tuple[float, float]
 ) -> tuple[AnyArray, AnyArray]:
     """Correlation of the left image with the warped right one over a wider window, and the residual variance there.
 
@@ -180,8 +180,9 @@ def _correlation(sums, noise, found, around):  # type: ignore[no-untyped-def]
     for y in range(found.shape[0]):
         differ, power, count = sums[0, y], sums[1, y], sums[2, y]
         for x in range(found.shape[1]):
-            as_it_is = one - differ[x] / max(two * power[x], least)
-            unlike, signal = max(differ[x] - both * count[x], nil), power[x] - own * count[x]
-            told = one - unlike / max(two * signal, least) if power[x] > texture * own * count[x] else as_it_is
-            found[y, x] = max(as_it_is, told) if power[x] > 0 else one
+            with_noise = one - differ[x] / max(two * power[x], least)
+            difference, signal = max(differ[x] - both * count[x], nil), power[x] - own * count[x]
+            textured = power[x] > texture * own * count[x]
+            without = one - difference / max(two * signal, least) if textured else with_noise
+            found[y, x] = max(with_noise, without) if power[x] > 0 else one
             around[y, x] = differ[x] / max(count[x], one)

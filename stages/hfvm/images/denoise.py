@@ -21,8 +21,9 @@ EXCESS = 2.5
 are averaged alike. A texture of random dots, which looks like noise, then still matches where it is shifted by a
 fraction of a pixel: .87 and more of it, with 1 as little as .07. Bad-2 of noisy pairs is alike from 1 to 2.5."""
 
-AVERAGED = 9
-"""Pixels whose mean takes the place of a pixel without texture: of the variance of noise a ninth is left."""
+PIXELS = 9
+"""Pixels of the window: where it shows no texture its mean stands for the pixel, and a ninth of the noise's variance is
+left."""
 
 LEAST_VARIANCE = 1e-3
 """Squared grey levels: what rounding may leave of the variance of a flat window, or take from it."""

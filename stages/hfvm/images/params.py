@@ -18,7 +18,7 @@ PAPER: Mapping[str, Any] = {
     "threshold": 15.0,
     "texture": 0.0,
     # Beyond the noise of any image, which so is never denoised.
-    "smooth_noise": 1e6,
+    "denoise_from": 1e6,
     "speckle": 1,
     "fill_reach": 100000,
     "refine": False,
@@ -159,7 +159,7 @@ class HfvmParams(Params):
         description="feature distance [byte steps; preset paper: grey levels] above which a pixel counts as not "
         "matchable; larger: more matches, more errors",
     )
-    smooth_noise: float = Field(
+    denoise_from: float = Field(
         default=1.0,
         gt=0,
         description="noise [grey levels] of an image, as estimated from itself, from which on it is denoised before it "

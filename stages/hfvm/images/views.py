@@ -74,7 +74,7 @@ class Plain:
 
     def quiet(self, params: HfvmParams) -> View:
         """The view denoised where it is noisy, else itself."""
-        return Denoised(self) if self.noise >= params.smooth_noise else self
+        return Denoised(self) if self.noise >= params.denoise_from else self
 
     @property
     def shapes(self) -> Sequence[Shape]:

@@ -101,7 +101,7 @@ def test_noisy_images_are_smoothed_unless_told_otherwise():
     views = both(noisy)
     assert all(4 < view.noise < 6 for view in views)
     share = [
-        np.mean(tiled.match(*views, HfvmParams(smooth_noise=limit), None, quiet, None).arrays["validity"] & 1)
+        np.mean(tiled.match(*views, HfvmParams(denoise_from=limit), None, quiet, None).arrays["validity"] & 1)
         for limit in (1.0, 10.0)
     ]
     assert share[0] > 1.1 * share[1] > 0.1
