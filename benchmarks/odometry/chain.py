@@ -125,7 +125,7 @@ class Chain:
 
     def _continuity(self, frames: list[int]) -> tuple[list[int], list[Any], list[int]]:
         """Frames to go through, lost ones with their causes, and those that may not be basic."""
-        sights = [
+        qualities = [
             self._stage("image_quality", {"frame": f}, **{c: self._image(f, c) for c in ("left", "right")})
             for f in frames
         ]
@@ -134,7 +134,7 @@ class Chain:
         bridges: list[tuple[int, int]] = []
         while True:
             given = {"steps": steps, "bridges": [self.motion[s] for s in bridges], "sides": list(sides.values())}
-            found = self._stage("frame_screening", {"frames": frames, "bridges": bridges}, sights=sights, **given)
+            found = self._stage("frame_screening", {"frames": frames, "bridges": bridges}, qualities=qualities, **given)
             asks = found.meta["asks"]
             if not any(asks.values()):
                 missing = [{"frame": f, "cause": why} for f, why in self.sequence.lost.items()]

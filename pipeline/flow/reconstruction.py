@@ -176,7 +176,7 @@ def steps(make: Builder, frames: list[int]) -> list[Handle]:
 
 def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref]:
     """Ask which frames are lost; while more is to be known for the answer, find that and ask again."""
-    sights = [
+    qualities = [
         make.node(
             image_quality,
             f"image_quality/{frame}",
@@ -194,7 +194,7 @@ def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref]:
             frame_screening,
             f"frame_screening/{turn}" if turn else "frame_screening",
             {"frames": whole} | ({"bridges": list(bridges)} if bridges else {}),
-            sights=sights,
+            qualities=qualities,
             steps=along,
             bridges=list(bridges.values()),
             sides=list(sides.values()),

@@ -27,12 +27,12 @@ from pydantic import Field
 
 from rille.stages.calibration.relative_orientation import (
     RIG,
-    Beliefs,
     Linear,
     OrientationFit,
     PointPairs,
+    Priors,
     adjust,
-    considered,
+    consider_covariance,
     linearised,
     settle,
     solution,
@@ -101,9 +101,9 @@ class RelativeParams(Params):
         "reduce: remains of lens model and rectification",
     )
 
-    def beliefs(self, rig: Rig) -> Beliefs:
+    def priors(self, rig: Rig) -> Priors:
         """Prior standard deviations of a rig, in radians and pixels."""
-        return Beliefs(
+        return Priors(
             math.radians(self.prior_rotation_deg),
             math.radians(self.prior_baseline_deg),
             self.prior_principal * rig.right.fx,
@@ -177,9 +177,9 @@ class _Chooser:
     """Chooses on the quadratic that a fit with everything free leaves, then fits once more with the chosen."""
 
     def __init__(self, rig: Rig, pairs: Sequence[PointPairs], params: RelativeParams) -> None:
-        self.rig, self.pairs, self.params, self.beliefs = rig, pairs, params, params.beliefs(rig)
+        self.rig, self.pairs, self.params, self.priors = rig, pairs, params, params.priors(rig)
         self.start = linearised(rig, pairs)
-        self.all = adjust(rig, pairs, [True] * RIG, self.beliefs, rival=True, start=self.start)
+        self.all = adjust(rig, pairs, [True] * RIG, self.priors, rival=True, start=self.start)
         self.solved: dict[tuple[frozenset[int], bool], tuple[Floats, Floats, float]] = {}
         # Sensitivities at the rig that the images ask for: a wrong toe-in would state them for wrong depths.
         near = corrected(rig, self.all.x[:RIG])
@@ -209,7 +209,7 @@ class _Chooser:
     def _settled(self, chosen: Sequence[int]) -> tuple[OrientationFit, Floats]:
         """The fit with the chosen parameters free, and their correction (5,)."""
         free = [i in chosen for i in range(RIG)]
-        fit = settle(self.rig, self.pairs, free, self.beliefs, self.start)
+        fit = settle(self.rig, self.pairs, free, self.priors, self.start)
         return fit, np.where(free, fit.x[:RIG], 0.0)
 
     def _worth(self, correction: Floats) -> bool:
@@ -230,7 +230,7 @@ class _Chooser:
     def _solve(self, chosen: Sequence[int], *, rival: bool) -> tuple[Floats, Floats, float]:
         key = frozenset(chosen), rival
         if key not in self.solved:
-            self.solved[key] = solution(self.all, [i in chosen for i in range(RIG)], self.beliefs, rival=rival)
+            self.solved[key] = solution(self.all, [i in chosen for i in range(RIG)], self.priors, rival=rival)
         return self.solved[key]
 
     def _gain(self, i: int, chosen: list[int]) -> float:
@@ -270,7 +270,7 @@ class _Chooser:
         error = self._depth_error(i, chosen)
         if error > p.max_depth_error and not self._infinity(i, chosen):
             return (
-                f"not observed: a principal point that is {self.beliefs.principal:.1f} px off looks like it, so that "
+                f"not observed: a principal point that is {self.priors.principal:.1f} px off looks like it, so that "
                 f"{100 * error:.1f} % of depth would stay unknown; taken alone the images ask for {found}, "
                 f"which is {100 * depth:.1f} % of depth"
             )
@@ -289,7 +289,7 @@ class _Chooser:
         """Standard deviations (5,) of the held parameters, radians: their prior, or less if the images show less."""
         # Root of value squared and sigma squared: the images show how far it may be out, their own error included.
         shown = [math.hypot(*self._estimate(i, chosen)) for i in range(RIG)]
-        return np.minimum(self.beliefs.held(), shown)
+        return np.minimum(self.priors.held(), shown)
 
     def _parameter(self, i: int, chosen: list[int], fit: OrientationFit) -> Parameter:
         others = [k for k in chosen if k != i]
@@ -299,7 +299,7 @@ class _Chooser:
             why = self._refusal(i, chosen) or "not worth it: with the others it moves rows and depth by too little"
             return Parameter(NAMES[i], 0.0, value, sigma, observed, False, why)
         free = [k in chosen for k in range(RIG)]
-        sigma = math.sqrt(float(considered(fit, free, self.beliefs, self.all.smooth, self._held(chosen))[i, i]))
+        sigma = math.sqrt(float(consider_covariance(fit, free, self.priors, self.all.smooth, self._held(chosen))[i, i]))
         value = float(fit.x[i])
         asked, certain = self._estimate(i, others)
         why = (

@@ -75,7 +75,7 @@ class PointPairs:
 
 
 @dataclass(frozen=True)
-class Beliefs:
+class Priors:
     """Prior standard deviations of the errors of an intact calibration.
 
     Attributes
@@ -137,7 +137,7 @@ def adjust(
     rig: Rig,
     pairs: Sequence[PointPairs],
     free: Sequence[bool],
-    beliefs: Beliefs,
+    priors: Priors,
     *,
     rival: bool,
     start: list[Linear] | None = None,
@@ -147,37 +147,39 @@ def adjust(
     Parameters
     ----------
     free : which of the five parameters of the rig have no prior. The others have the prior of an intact calibration
-        (``beliefs``), so that they take up their part of the residuals and the free ones do not.
+        (``priors``), so that they take up their part of the residuals and the free ones do not.
     rival : see :func:`precision`.
     start : the result of :func:`linearised` for these pairs, if it is known already.
 
     The size of the smooth error is estimated, too: by expectation maximisation, starting from its prior.
     """
-    prior = precision(free, beliefs, beliefs.term, rival=rival)
-    return _adjust(rig, pairs, prior, beliefs.term, start, estimate=True)
+    prior = precision(free, priors, priors.term, rival=rival)
+    return _adjust(rig, pairs, prior, priors.term, start, estimate=True)
 
 
 def settle(
-    rig: Rig, pairs: Sequence[PointPairs], free: Sequence[bool], beliefs: Beliefs, start: list[Linear] | None = None
+    rig: Rig, pairs: Sequence[PointPairs], free: Sequence[bool], priors: Priors, start: list[Linear] | None = None
 ) -> OrientationFit:
     """Fit the free parameters so that the residuals of the resulting rig are smallest.
 
     The other parameters are fixed at their given values, and the smooth error is not estimated. Neither may take up a
     part of the residuals here, because in the resulting rig the others are as given and the smooth error remains.
     """
-    nil = replace(beliefs, rotation=EXACT, baseline=EXACT)
+    nil = replace(priors, rotation=EXACT, baseline=EXACT)
     prior = precision(free, nil, LEAST_SMOOTH, rival=False)
     return _adjust(rig, pairs, prior, LEAST_SMOOTH, start, estimate=False)
 
 
-def considered(fit: OrientationFit, free: Sequence[bool], beliefs: Beliefs, smooth: float, held: Floats) -> Floats:
+def consider_covariance(
+    fit: OrientationFit, free: Sequence[bool], priors: Priors, smooth: float, held: Floats
+) -> Floats:
     """Return the covariance (5, 5), radians^2, of the free parameters of a fit by :func:`settle`; zero for the others.
 
     It is a consider covariance (Bierman 1977, chapter 8): parameters that the fit did not estimate contribute their
     uncertainty. These are the held parameters, with standard deviations ``held`` (5,), radians, and the smooth error,
-    with ``smooth`` pixels a term, but at least the prior's (:class:`Beliefs`).
+    with ``smooth`` pixels a term, but at least the prior's (:class:`Priors`).
     """
-    prior = precision(free, beliefs, max(beliefs.term, smooth), rival=False)
+    prior = precision(free, priors, max(priors.term, smooth), rival=False)
     for i in np.flatnonzero(~np.asarray(free)):
         # By the standard deviations that they are known to have now, not by the priors of the fit.
         prior[i, i] = held[i] ** -2.0
@@ -229,14 +231,14 @@ def _maximised(normal: Floats, pull: Floats, prior: Floats, smooth: float, round
     return x, variance, smooth
 
 
-def precision(free: Sequence[bool], beliefs: Beliefs, smooth: float, *, rival: bool) -> Floats:
+def precision(free: Sequence[bool], priors: Priors, smooth: float, *, rival: bool) -> Floats:
     """The priors' part (SIZE, SIZE) of the normal matrix.
 
     ``rival``: a principal point that is off may stand in for a free angle, as it always may for a held one. With it,
     what is knowable shows; without it, the angle takes all (lenses stay on their cameras when a mount turns).
     """
     sigma = np.concatenate(
-        [beliefs.held(), np.full(PRINCIPAL, beliefs.principal), np.full(len(TERMS), smooth)], dtype=np.float64
+        [priors.held(), np.full(PRINCIPAL, priors.principal), np.full(len(TERMS), smooth)], dtype=np.float64
     )
     # Free means: anywhere within a radian, which keeps the matrix regular where a scene says nothing at all.
     sigma[:RIG] = np.where(np.asarray(free), 1.0, sigma[:RIG])
@@ -246,14 +248,12 @@ def precision(free: Sequence[bool], beliefs: Beliefs, smooth: float, *, rival: b
     return np.diag(sigma**-2.0)
 
 
-def solution(
-    fit: OrientationFit, free: Sequence[bool], beliefs: Beliefs, *, rival: bool
-) -> tuple[Floats, Floats, float]:
+def solution(fit: OrientationFit, free: Sequence[bool], priors: Priors, *, rival: bool) -> tuple[Floats, Floats, float]:
     """Values (SIZE,), covariance and gain (half the drop of chi-square) of a fit's quadratic for another choice.
 
     The smooth error counts with no less than is believed of it.
     """
-    total = fit.normal + precision(free, beliefs, max(beliefs.term, fit.smooth), rival=rival)
+    total = fit.normal + precision(free, priors, max(priors.term, fit.smooth), rival=rival)
     covariance = np.asarray(np.linalg.inv(total), dtype=np.float64)
     x = covariance @ fit.pull
     return x, covariance, 0.5 * float(np.sum(fit.pull * x))

@@ -150,9 +150,9 @@ def _alone(given: Rig, matches: PointPairs, start: Linear, decision: Decision, p
     """One pair's own values and sigmas, degrees, of all that the sequence observes."""
     names = [p.name for p in decision.parameters if p.observed]
     free = [p.observed for p in decision.parameters]
-    beliefs = params.beliefs(given)
-    fit = adjust(given, [matches], free, beliefs, rival=False, start=[start])
-    sigma = np.sqrt(np.diag(solution(fit, free, beliefs, rival=False)[1]))
+    priors = params.priors(given)
+    fit = adjust(given, [matches], free, priors, rival=False, start=[start])
+    sigma = np.sqrt(np.diag(solution(fit, free, priors, rival=False)[1]))
     return {
         "pair": matches.pair,
         "values": {n: math.degrees(fit.x[NAMES.index(n)]) for n in names},

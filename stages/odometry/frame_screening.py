@@ -83,7 +83,7 @@ class Judgement:
 
 def judge(
     frames: Sequence[int],
-    sights: Mapping[int, Mapping[str, Any]],
+    qualities: Mapping[int, Mapping[str, Any]],
     steps: Steps,
     jumps: Sequence[int],
     sides: Mapping[int, Mapping[str, Any]],
@@ -94,13 +94,13 @@ def judge(
     Parameters
     ----------
     frames : frame numbers in order.
-    sights : image quality by frame: facts of stage ``image_quality``.
+    qualities : image quality by frame: facts of stage ``image_quality``.
     steps : share of matching pixels by (frame, later frame); 0 if the match shows no motion.
     jumps : frames at which the displacements change abruptly.
     sides : by frame, whether left and right are exchanged: facts of stage ``swap_check``, of the frames tested so far.
     """
     out = Judgement()
-    _see(out, frames, sights, params)
+    _see(out, frames, qualities, params)
     for f in frames:
         if f in sides and sides[f]["swapped"]:
             out.lost.setdefault(f, _swapped(sides[f]))
@@ -124,13 +124,15 @@ def judge(
 
 
 def _see(
-    out: Judgement, frames: Sequence[int], sights: Mapping[int, Mapping[str, Any]], params: FrameScreeningParams
+    out: Judgement, frames: Sequence[int], qualities: Mapping[int, Mapping[str, Any]], params: FrameScreeningParams
 ) -> None:
     """Judge frames by their images alone: uniform, blurred, copied."""
-    usual = {(s, what): _usual([sights[f][s][what] for f in frames]) for s in SIDES for what in ("sharpness", "detail")}
+    usual = {
+        (s, what): _usual([qualities[f][s][what] for f in frames]) for s in SIDES for what in ("sharpness", "detail")
+    }
     for f in frames:
         for side in SIDES:
-            seen = sights[f][side]
+            seen = qualities[f][side]
             if seen["deviation"] < params.uniform:
                 words = _uniform(seen, side)
                 (out.lost if side == "left" else out.unfit).setdefault(f, words)
@@ -139,10 +141,10 @@ def _see(
                 share = seen[what] / usual[side, what] if seen[what] is not None and usual[side, what] > 0 else 1.0
                 if share < limit:
                     out.unfit.setdefault(f, f"blurred {side} image ({share:.0%} of the usual {what})")
-        if sights[f]["left"]["digest"] == sights[f]["right"]["digest"] and f not in out.lost:
+        if qualities[f]["left"]["digest"] == qualities[f]["right"]["digest"] and f not in out.lost:
             out.unfit[f] = "left and right are one image"
     for a, b in pairwise(frames):
-        same = {side: sights[a][side]["digest"] == sights[b][side]["digest"] for side in SIDES}
+        same = {side: qualities[a][side]["digest"] == qualities[b][side]["digest"] for side in SIDES}
         if a in out.lost or b in out.lost:
             continue
         if same["left"]:
@@ -223,15 +225,15 @@ def _jumps(frames: Sequence[int], changes: Sequence[float], params: FrameScreeni
 def _run(params: FrameScreeningParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     frames = [int(f) for f in args["frames"]]
     along, bridges = steps_of(inputs["steps"]), list(inputs.get("bridges") or [])
-    if len(along) != len(frames) - 1 or len(inputs["sights"]) != len(frames):
-        raise InputError("RIL-317", f"{len(frames)} frames need as many sights and {len(frames) - 1} steps")
-    sights = {f: s.meta for f, s in zip(frames, inputs["sights"], strict=True)}
+    if len(along) != len(frames) - 1 or len(inputs["qualities"]) != len(frames):
+        raise InputError("RIL-317", f"{len(frames)} frames need as many image qualities and {len(frames) - 1} steps")
+    qualities = {f: s.meta for f, s in zip(frames, inputs["qualities"], strict=True)}
     steps = {s: share(step) for s, step in zip(pairwise(frames), along, strict=True)}
     changes = changes_of(inputs["steps"])
     spanned = [(int(a), int(b)) for a, b in args.get("bridges", ())]
     steps |= {s: share(Step.from_bundle(m)) for s, m in zip(spanned, bridges, strict=True)}
     sides = {int(s.meta["frame"]): s.meta for s in inputs.get("sides") or []}
-    found = judge(frames, sights, steps, _jumps(frames, changes, params), sides, params)
+    found = judge(frames, qualities, steps, _jumps(frames, changes, params), sides, params)
     chain = [f for f in frames if f not in found.lost]
     unfit = {f: why for f, why in found.unfit.items() if f in chain}
     meta: dict[str, Any] = {
@@ -254,7 +256,7 @@ STAGE = Stage(
     version=1,
     summary="which frames are lost, and which may not be basic",
     params=FrameScreeningParams,
-    inputs=("sights*", "steps*", "bridges*", "sides*"),
+    inputs=("qualities*", "steps*", "bridges*", "sides*"),
     outputs=(),
     run=_run,
 )

@@ -82,7 +82,7 @@ class _Ground(NamedTuple):
     fields: Floats32
     unknown: Floats32
     frontier: Floats32
-    dear: Bytes
+    cost_class: Bytes
     straddle: Straddle
 
 
@@ -92,7 +92,7 @@ class Footing:
 
     ``fields`` (6, row, col): distances to hazards to a wheel that are none by sigma alone, to those that are, and to
     proven ones; then the same three of hazards to the vehicle. ``unknown``: distance to unknown ground; ``frontier``:
-    to that of it where a wheel has room, for the rest is mostly the shadows of stones. ``dear``: class by cost, 0,
+    to that of it where a wheel has room, for the rest is mostly the shadows of stones. ``cost_class``: 0 (clear),
     :data:`CAUTION_GROUND` or :data:`DOUBTED_GROUND`. ``straddle``: what of unknown ground the belly may pass over.
     ``glanced``: where unknown ground was seen from afar; None: nowhere.
     """
@@ -102,7 +102,7 @@ class Footing:
     fields: Floats32
     unknown: Floats32
     frontier: Floats32
-    dear: Bytes
+    cost_class: Bytes
     straddle: Straddle
     glanced: Bools | None = None
 
@@ -132,14 +132,14 @@ class Footing:
         doubtful = hazardous & ((bits & DOUBT_BIT) > 0)
         # Without probabilities every hazard that is none by sigma alone is proven.
         likely = proven = hazardous & ~doubtful
-        dear = np.where(risk == CAUTION, np.uint8(CAUTION_GROUND), np.uint8(0))
+        cost_class = np.where(risk == CAUTION, np.uint8(CAUTION_GROUND), np.uint8(0))
         if p_hazard is not None:
             proven = likely & (p_hazard >= p_certain)
             dared = doubtful & (p_hazard < p_traversable)
             doubtful &= ~dared
-            dear[dared & ~unknown] = DOUBTED_GROUND
+            cost_class[dared & ~unknown] = DOUBTED_GROUND
         if doubted is not None:
-            dear[(_distance(doubted, cell) <= 0.25 * vehicle.wheel_diameter) & ~unknown] = DOUBTED_GROUND
+            cost_class[(_distance(doubted, cell) <= 0.25 * vehicle.wheel_diameter) & ~unknown] = DOUBTED_GROUND
         kinds = [(bits & which) > 0 for which in (WHEEL_BITS, BODY_BITS)]
         fields = np.stack([_distance(mask & kind, cell) for kind in kinds for mask in (likely, doubtful, proven)])
         wide = _opened(unknown, 0.5 * vehicle.wheel_diameter, cell)
@@ -147,7 +147,7 @@ class Footing:
         void = _distance(unknown if bounds is None else unknown & np.isnan(bounds.upper), cell)
         straddle = Straddle.of(void, bounds, vehicle, _belly(vehicle), cell)
         unseen, frontier = _distance(unknown, cell), _distance(wide, cell)
-        return Footing(lattice, vehicle, fields, unseen, frontier, dear, straddle, glanced)
+        return Footing(lattice, vehicle, fields, unseen, frontier, cost_class, straddle, glanced)
 
     def gaps(self, x: Floats, y: Floats, heading: Floats) -> Gaps:
         """Compute the distances at poses: x, y (m) and heading (rad to the left of y), arrays of one shape."""
@@ -159,7 +159,7 @@ class Footing:
         around = 0.5 * math.hypot(self.vehicle.track, self.vehicle.wheel_base) + 1.5 * cell
         reach = np.array([around + self.vehicle.margin, cell, self.vehicle.margin], np.float32)
         parts = wheel_positions(self.vehicle) / cell, _belly(self.vehicle) / cell
-        ground = _Ground(self.fields, self.unknown, self.frontier, self.dear, self.straddle)
+        ground = _Ground(self.fields, self.unknown, self.frontier, self.cost_class, self.straddle)
         _gaps((at, np.cos(turn), np.sin(turn)), parts, ground, reach, out)
         out[3:5] -= NEAR_UNKNOWN * cell
         return Gaps(*(a.reshape(np.shape(x)) for a in out))
@@ -213,7 +213,7 @@ def _gaps(poses, parts, ground, reach, out):  # type: ignore[no-untyped-def]
     """
     at, cosine, sine = poses
     wheels, belly = parts
-    fields, unknown, frontier, dear, straddle = ground
+    fields, unknown, frontier, cost_class, straddle = ground
     rows, cols = unknown.shape
     stand, heights = np.empty((4, 2), dtype=np.int64), np.empty(4)
     for n in range(at.shape[0]):
@@ -227,7 +227,7 @@ def _gaps(poses, parts, ground, reach, out):  # type: ignore[no-untyped-def]
             continue
         # The middle is judged by what is hazardous to the vehicle, the wheels below by what is to wheels.
         gap, doubtful, proven = fields[3, i, j], fields[4, i, j], fields[5, i, j]
-        cautious, doubted = int(dear[i, j] == CAUTION_GROUND), int(dear[i, j] == DOUBTED_GROUND)
+        cautious, doubted = int(cost_class[i, j] == CAUTION_GROUND), int(cost_class[i, j] == DOUBTED_GROUND)
         spare = unknown[i, j] - reach[0]
         outside, least, wide = False, np.float32(np.inf), np.float32(np.inf)
         for k in range(4):
@@ -239,8 +239,8 @@ def _gaps(poses, parts, ground, reach, out):  # type: ignore[no-untyped-def]
             stand[k, 0], stand[k, 1] = i, j
             gap, doubtful = min(gap, fields[0, i, j]), min(doubtful, fields[1, i, j])
             proven = min(proven, fields[2, i, j])
-            cautious += dear[i, j] == CAUTION_GROUND
-            doubted += dear[i, j] == DOUBTED_GROUND
+            cautious += cost_class[i, j] == CAUTION_GROUND
+            doubted += cost_class[i, j] == DOUBTED_GROUND
             least, wide = min(least, unknown[i, j] - reach[2]), min(wide, frontier[i, j] - reach[2])
         out[0, n], out[1, n], out[2, n], out[5, n], out[6, n] = gap, doubtful, proven, cautious, doubted
         if outside:

@@ -8,23 +8,23 @@ from rig_scenes import knocked, matches, street_depth, street_rig
 
 from rille.stages.calibration.relative_orientation import (
     BLOCKS,
-    Beliefs,
     PointPairs,
+    Priors,
     _weigh,
     adjust,
-    considered,
+    consider_covariance,
     settle,
     solution,
 )
 from rille.stages.geometry.epipolar import distances
 
-BELIEFS = Beliefs(rotation=np.radians(0.05), baseline=np.radians(0.2), principal=3.5, systematic=0.1)
+PRIORS = Priors(rotation=np.radians(0.05), baseline=np.radians(0.2), principal=3.5, systematic=0.1)
 ANGLES = [True, True, True, False, False]
 
 
 def test_noise_is_measured_past_outliers():
     m = matches(street_rig(), street_depth, noise=0.3, outliers=0.1)
-    fit = adjust(street_rig(), [m], ANGLES, BELIEFS, rival=True)
+    fit = adjust(street_rig(), [m], ANGLES, PRIORS, rival=True)
     # the median of all is the 0.5 / 0.9 quantile of the good ones: 0.765 instead of 0.674 deviations
     assert fit.noise[0] == pytest.approx(0.3 * 0.765 / 0.674, rel=0.1)
     assert 0.07 < np.mean(fit.weights[0] == 0) < 0.13
@@ -35,7 +35,7 @@ def test_matches_that_err_together_do_not_count_again():
     rig = street_rig()
     once = matches(rig, street_depth)
     often = PointPairs(0, np.repeat(once.left, 4, axis=0), np.repeat(once.right, 4, axis=0))
-    one, four = (adjust(rig, [m], ANGLES, BELIEFS, rival=True).normal for m in (once, often))
+    one, four = (adjust(rig, [m], ANGLES, PRIORS, rival=True).normal for m in (once, often))
     ratio = np.diag(four)[:5] / np.diag(one)[:5]
     assert np.all((ratio > 0.7) & (ratio < 1.5))
 
@@ -45,23 +45,23 @@ def test_smooth_error_is_told_from_the_rig():
         return u**2 * v
 
     m = matches(knocked(street_rig(), pitch_deg=0.3), street_depth, field=field)
-    fit = adjust(street_rig(), [m], ANGLES, BELIEFS, rival=True)
+    fit = adjust(street_rig(), [m], ANGLES, PRIORS, rival=True)
     assert np.degrees(fit.x[0]) == pytest.approx(0.3, abs=0.01)
-    assert fit.smooth > BELIEFS.term / 2
+    assert fit.smooth > PRIORS.term / 2
 
 
 def test_images_without_smooth_error_are_used_to_the_full():
     pairs = [matches(knocked(street_rig(), pitch_deg=0.3), street_depth, pair=k) for k in range(2)]
-    fit = adjust(street_rig(), pairs, [True, False, True, False, False], BELIEFS, rival=False)
-    assert fit.smooth < 0.5 * BELIEFS.term
-    sigma = np.sqrt(np.diag(solution(fit, ANGLES, BELIEFS, rival=False)[1]))
+    fit = adjust(street_rig(), pairs, [True, False, True, False, False], PRIORS, rival=False)
+    assert fit.smooth < 0.5 * PRIORS.term
+    sigma = np.sqrt(np.diag(solution(fit, ANGLES, PRIORS, rival=False)[1]))
     # but no sigma is smaller than what is believed of rows: 0.03 px of 707 px
-    assert sigma[0] > 0.5 * BELIEFS.term / 707.0
+    assert sigma[0] > 0.5 * PRIORS.term / 707.0
 
 
 def test_held_parameters_take_their_share_only():
     m = matches(knocked(street_rig(), roll_deg=0.5), street_depth)
-    fit = adjust(street_rig(), [m], [True, False, True, False, False], BELIEFS, rival=False)
+    fit = adjust(street_rig(), [m], [True, False, True, False, False], PRIORS, rival=False)
     assert np.degrees(fit.x[2]) == pytest.approx(0.5, abs=0.01)
     assert abs(np.degrees(fit.x[1])) < 0.05
 
@@ -73,7 +73,7 @@ def test_settled_rig_has_the_least_residuals_beside_what_is_held():
     m = matches(
         knocked(rig, pitch_deg=0.3, roll_deg=0.3, across_deg=-0.3), street_depth, field=lambda u, v: 0.3 * u * u
     )
-    x = settle(rig, [m], free, BELIEFS).x[:5]
+    x = settle(rig, [m], free, PRIORS).x[:5]
     assert x[[1, 3, 4]] == pytest.approx(0.0, abs=1e-6)
 
     def spread(c):
@@ -88,19 +88,19 @@ def test_what_took_no_share_is_an_error_of_the_result():
     rig = street_rig()
     free = [True, False, False, False, False]
     m = matches(knocked(rig, pitch_deg=0.3), street_depth)
-    fit = settle(rig, [m], free, BELIEFS)
+    fit = settle(rig, [m], free, PRIORS)
     sure = np.full(5, 1e-7)
-    covariance = considered(fit, free, BELIEFS, 0.0, sure)
+    covariance = consider_covariance(fit, free, PRIORS, 0.0, sure)
     # the constant term alone, 0.032 px of rows; pitch moves them by 707 px a radian and more
-    assert covariance[0, 0] > (0.5 * BELIEFS.term / 707.0) ** 2
+    assert covariance[0, 0] > (0.5 * PRIORS.term / 707.0) ** 2
     assert not covariance[1:].any()
-    assert considered(fit, free, BELIEFS, 10 * BELIEFS.term, sure)[0, 0] > 20 * covariance[0, 0]
-    assert considered(fit, free, BELIEFS, 0.0, BELIEFS.held())[0, 0] > 1.1 * covariance[0, 0]
+    assert consider_covariance(fit, free, PRIORS, 10 * PRIORS.term, sure)[0, 0] > 20 * covariance[0, 0]
+    assert consider_covariance(fit, free, PRIORS, 0.0, PRIORS.held())[0, 0] > 1.1 * covariance[0, 0]
 
 
 def test_the_pair_order_does_not_matter_to_rounding():
     pairs = [matches(knocked(street_rig(), pitch_deg=0.3), street_depth, pair=k) for k in range(3)]
-    here, there = (adjust(street_rig(), p, ANGLES, BELIEFS, rival=True).x for p in (pairs, pairs[::-1]))
+    here, there = (adjust(street_rig(), p, ANGLES, PRIORS, rival=True).x for p in (pairs, pairs[::-1]))
     np.testing.assert_allclose(here, there, rtol=0, atol=1e-6)
 
 
@@ -127,6 +127,6 @@ def test_normal_equations_and_weights_by_plain_numpy():
 def test_a_large_correction_is_found_though_derivatives_are_shared():
     """Half a degree is far beyond what one linearisation serves: the distances of the corrected rig vanish."""
     given, m = street_rig(), matches(knocked(street_rig(), pitch_deg=0.5, roll_deg=-0.5), street_depth, noise=0.0)
-    fit = settle(given, [m], [True, False, True, False, False], BELIEFS)
+    fit = settle(given, [m], [True, False, True, False, False], PRIORS)
     off, _ = distances(given, fit.x[:5], m.left, m.right)
     assert np.abs(off).max() < 0.01

@@ -20,10 +20,10 @@ def sight(k, **left):
     return {"left": good | {"digest": f"L{k}"} | left, "right": good | {"digest": f"R{k}"}}
 
 
-def found(steps, sights=None, jumps=(), sides=None, n=7):
+def found(steps, qualities=None, jumps=(), sides=None, n=7):
     """Judgement of ``n`` frames; steps not given match well."""
     rates = dict.fromkeys(itertools.pairwise(range(n)), 0.7) | steps
-    return judge(range(n), sights or {k: sight(k) for k in range(n)}, rates, jumps, sides or {}, PARAMS)
+    return judge(range(n), qualities or {k: sight(k) for k in range(n)}, rates, jumps, sides or {}, PARAMS)
 
 
 def test_good_frames_are_kept_and_nothing_is_asked():
@@ -55,49 +55,49 @@ def test_one_doubtful_step_is_a_jump_and_loses_no_frame():
 
 
 def test_a_black_frame_is_lost_whatever_matches_and_is_bridged():
-    sights = {k: sight(k) for k in range(7)} | {3: sight(3, mean=0.0, deviation=0.2)}
-    assert found({}, sights).asks["bridges"] == [(2, 4)]
-    out = found({(2, 4): 0.6}, sights)
+    qualities = {k: sight(k) for k in range(7)} | {3: sight(3, mean=0.0, deviation=0.2)}
+    assert found({}, qualities).asks["bridges"] == [(2, 4)]
+    out = found({(2, 4): 0.6}, qualities)
     assert out.lost == {3: "black left image (grey values deviate by 0.2 levels)"}
 
 
 def test_a_blurred_frame_is_posed_but_not_basic_unless_nothing_matches_it():
-    sights = {k: sight(k) for k in range(7)} | {3: sight(3, sharpness=0.2)}
-    out = found({}, sights)
+    qualities = {k: sight(k) for k in range(7)} | {3: sight(3, sharpness=0.2)}
+    out = found({}, qualities)
     assert out.unfit == {3: "blurred left image (40% of the usual sharpness)"}
     assert not out.lost
     alone = {(2, 3): 0.05, (3, 4): 0.05, (2, 4): 0.1}
-    assert "blurred left image" in found(alone, sights).lost[3]
+    assert "blurred left image" in found(alone, qualities).lost[3]
 
 
 def test_a_blur_beyond_all_detail_is_told_though_noise_looks_sharp():
-    sights = {k: sight(k) for k in range(7)} | {3: sight(3, detail=0.02, sharpness=0.9)}
-    assert found({}, sights).unfit == {3: "blurred left image (20% of the usual detail)"}
+    qualities = {k: sight(k) for k in range(7)} | {3: sight(3, detail=0.02, sharpness=0.9)}
+    assert found({}, qualities).unfit == {3: "blurred left image (20% of the usual detail)"}
 
 
 def test_blurred_frames_before_the_first_good_pair_are_lost():
-    sights = {k: sight(k, **({"sharpness": 0.2} if k < 2 else {})) for k in range(7)}
-    out = found({}, sights)
+    qualities = {k: sight(k, **({"sharpness": 0.2} if k < 2 else {})) for k in range(7)}
+    out = found({}, qualities)
     assert list(out.lost) == [0, 1]
     assert "no good pair before it" in out.lost[0]
 
 
 def test_a_sequence_without_a_good_pair_is_refused():
-    sights = {k: sight(k) for k in range(7)}
+    qualities = {k: sight(k) for k in range(7)}
     for k in range(7):
-        sights[k]["right"] = sights[k]["right"] | {"deviation": 0.0, "mean": 0.0}
+        qualities[k]["right"] = qualities[k]["right"] | {"deviation": 0.0, "mean": 0.0}
     with raises("RIL-316", "frame 0"):
-        found({}, sights)
+        found({}, qualities)
 
 
 def test_a_repeated_frame_is_told_and_a_stuck_camera_makes_no_basic_pair():
-    sights = {k: sight(k) for k in range(7)}
-    sights[3] = {side: sights[3][side] | {"digest": sights[2][side]["digest"]} for side in ("left", "right")}
-    out = found({}, sights)
+    qualities = {k: sight(k) for k in range(7)}
+    qualities[3] = {side: qualities[3][side] | {"digest": qualities[2][side]["digest"]} for side in ("left", "right")}
+    out = found({}, qualities)
     assert out.repeated == [(2, 3)]
     assert not out.unfit
-    sights[5]["right"] = sights[5]["right"] | {"digest": sights[4]["right"]["digest"]}
-    assert found({}, sights).unfit == {5: "its right image is that of frame 4"}
+    qualities[5]["right"] = qualities[5]["right"] | {"digest": qualities[4]["right"]["digest"]}
+    assert found({}, qualities).unfit == {5: "its right image is that of frame 4"}
 
 
 def test_exchanged_sides_are_looked_for_at_jumps_and_beside_each_other():
@@ -116,8 +116,8 @@ def test_the_stage_asks_then_answers():
     frames = list(range(5))
     blind = motion(shift(0.0), unmatched=lambda x, y: x > 20)
     motions = [motion(shift(9.0)), blind, blind, motion(shift(9.0))]
-    sights = [Bundle({}, {"frame": k} | sight(k)) for k in frames]
-    inputs = {"sights": sights, "steps": tables(motions), "bridges": [], "sides": []}
+    qualities = [Bundle({}, {"frame": k} | sight(k)) for k in frames]
+    inputs = {"qualities": qualities, "steps": tables(motions), "bridges": [], "sides": []}
     first = STAGE.run(PARAMS, {"frames": frames}, inputs)
     check_outputs(STAGE, first)
     assert first.meta["asks"]["bridges"] == [[1, 3]]
@@ -130,8 +130,8 @@ def test_the_stage_asks_then_answers():
 
 def test_the_stage_looks_at_the_sides_where_displacements_jump():
     steps = [motion(shift(u)) for u in (9.0, 9.5, 9.0, 60.0, -42.0, 9.0)]
-    sights = [Bundle({}, {"frame": k} | sight(k)) for k in range(7)]
-    inputs = {"sights": sights, "steps": tables(steps), "bridges": [], "sides": []}
+    qualities = [Bundle({}, {"frame": k} | sight(k)) for k in range(7)]
+    inputs = {"qualities": qualities, "steps": tables(steps), "bridges": [], "sides": []}
     asks = STAGE.run(PARAMS, {"frames": list(range(7))}, inputs).meta["asks"]
     assert 4 in asks["sides"]
     assert 0 not in asks["sides"]
