@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -49,14 +50,17 @@ def _timing(
     name: str, what: str, in_1999: float | None, rows: Sequence[TaskRow], preparation: Sequence[TaskRow] = ()
 ) -> Timing:
     seconds = [r.seconds for r in rows if r.seconds is not None]
-    before = [r.seconds for r in preparation if r.seconds is not None]
-    share = statistics.median(before) * len(before) if before else 0.0
+    by_stage: dict[str, list[float]] = defaultdict(list)
+    for r in preparation:
+        by_stage[r.stage] += [] if r.seconds is None else [r.seconds]
+    # A median a stage: one over all tasks would fall between the short ones and the long ones.
+    before = sum(statistics.median(times) * len(times) for times in by_stage.values() if times)
     return Timing(
         name,
         what,
         in_1999,
-        statistics.median(seconds) + share / len(seconds) if seconds else None,
-        sum(seconds) + sum(before) if seconds else None,
+        statistics.median(seconds) + before / len(seconds) if seconds else None,
+        sum(seconds) + sum(map(sum, by_stage.values())) if seconds else None,
         len(rows),
         sum(r.status == "computed" for r in rows),
         sum(r.status == "cached" for r in rows),

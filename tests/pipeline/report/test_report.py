@@ -306,6 +306,15 @@ def test_table_2_sums_the_units_of_a_cycle() -> None:
     assert [t.name for t in tables.other_stages(view())] == ["locus/world", "pyramid"]
 
 
+def test_preparation_in_table_2_is_a_median_of_each_stage() -> None:
+    motions = [TaskRow(f"motion/{i}", "motion", "computed", seconds) for i, seconds in enumerate((4.0, 4.0, 40.0))]
+    qualities = [TaskRow(f"image_quality/{i}", "image_quality", "computed", 1.0) for i in range(4)]
+    tracks = [TaskRow(f"track/{i}", "track", "computed", 10.0) for i in range(2)]
+    rows, _ = tables.table_2(view(tasks=(*motions, *qualities, *tracks)))
+    assert rows[4].unit == pytest.approx(10.0 + (3 * 4.0 + 4 * 1.0) / 2)
+    assert rows[4].total == pytest.approx(20.0 + 48.0 + 4.0)
+
+
 def test_a_failed_write_leaves_the_old_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "report.html").write_text("old")
 
