@@ -23,10 +23,11 @@ from __future__ import annotations
 import gc
 import heapq
 import math
+import sys
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -181,8 +182,8 @@ class _Run:
         self.result = Result()
         self.stopped = ""
         self.admitted = self.expanded = 0
-        self.waits: dict[int, int] = {}
-        """How many distinct inputs of a node are not resolved yet."""
+        self.waits: Counter[int] = Counter()
+        """How many distinct inputs of a node are not resolved yet; nodes without any are left out."""
         self.out: dict[int, Handle] = {}
         """With the executor."""
         self.dependants: dict[int, list[Handle]] = defaultdict(list)
@@ -199,7 +200,8 @@ class _Run:
         self.patients: dict[str, set[str]] = {}
         """Keys that must be computed again before the task of a key can be."""
         self.put_back: dict[str, int] = defaultdict(int)
-        self.fates: dict[int, str] = {}
+        self.healing: dict[int, str] = {}
+        """Nodes that are resolved and computed again, with their status."""
         self.expansions: list[tuple[list[Handle], Expansion, bool]] = []
         self.hints = store.hints(graph.sequence)
         self.known = provenance.Known(self.hints, graph.choice)
@@ -224,6 +226,7 @@ class _Run:
             gc.unfreeze()
             if not self.dry:
                 self.known.save(self.graph.nodes)
+            self.result.keys = {h.key for h in self.graph.nodes if h.ref is not None}
             self.result.seconds = time.perf_counter() - begin
             self.ledger.run(seconds=round(self.result.seconds, 3), ok=self.result.ok)
             self.progress.close(self.result)
@@ -264,7 +267,6 @@ class _Run:
             self.admitted += 1
             upstream = {h.index: h for h in handle.upstream()}
             broken = next((h for h in upstream.values() if h.status in ("failed", "skipped", "planned")), None)
-            self.waits[handle.index] = 0
             for up in upstream.values():
                 if up.status in ("pending", "running"):
                     self.waits[handle.index] += 1
@@ -484,9 +486,10 @@ class _Run:
         else:
             first.seconds, first.peak_rss, first.kernel = outcome.seconds, outcome.peak_rss, outcome.kernel
             first.started, first.memory, first.rest = outcome.started, outcome.memory, outcome.rest
-            first.first, first.compiling, first.worker = outcome.first, outcome.compiling, outcome.worker
+            first.first, first.compiling, first.worker = outcome.first, outcome.compiling, sys.intern(outcome.worker)
+            ref = replace(outcome.ref, stage=first.stage)  # each unpickled reference brings a name of its own
             for handle in (first, *others):
-                handle.ref = outcome.ref
+                handle.ref = ref
                 self._resolve(handle, "computed" if handle is first and not outcome.cached else "cached")
         self._discharge(key, first)
 
@@ -502,7 +505,7 @@ class _Run:
             source.reason = "its artifact was found damaged, or gone, when it was read"
             if key not in self.flying:
                 self.flying[key] = [source]
-                source.status = "pending"
+                self.healing[source.index], source.status = source.status, "pending"
                 self.missing.push(source)
         if absent:
             self.patients[handle.key] = set(absent)
@@ -543,17 +546,16 @@ class _Run:
         counts = self.result.counts.setdefault(handle.stage, Counts())
         setattr(counts, status, getattr(counts, status) + 1)
         counts.seconds += handle.seconds
-        if handle.ref is not None:
-            self.result.keys.add(handle.key)
         self.ledger.write(handle)
-        before = self.fates.get(handle.index)
-        self.fates[handle.index] = status
+        before = self.healing.pop(handle.index, None)
         if before is None:
             self.progress.resolved(handle)
         else:  # healed: it counts once, as what became of it last
             setattr(counts, before, getattr(counts, before) - 1)
         for dependant in self.dependants.pop(handle.index, []):
             self.waits[dependant.index] -= 1
+            if not self.waits[dependant.index]:
+                del self.waits[dependant.index]
             if not handle.done:
                 self._break(dependant, handle)
             elif not self.waits[dependant.index] and dependant.status == "pending":
@@ -572,8 +574,8 @@ class _Run:
         """Account for everything that was not even begun."""
         self._admit()
         for handle in self.graph.nodes:
-            if handle.status == "pending" and handle.index in self.fates:  # it was to be healed
-                handle.status = self.fates[handle.index]
+            if handle.status == "pending" and handle.index in self.healing:
+                handle.status = self.healing[handle.index]
             elif handle.status == "pending":
                 handle.reason = self.stopped
                 self._resolve(handle, "skipped")

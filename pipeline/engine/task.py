@@ -12,13 +12,14 @@ import hashlib
 import importlib
 import json
 import os
+import pickle
 import platform
 import resource
 import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,9 @@ class Spec:
         """The declaration behind the module."""
         return resolve(self.module)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _unpickled, (self.module, self.label, _forms(self)[2], self.args, self.hints)
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -91,10 +95,10 @@ class Outcome:
 
 
 MANY = 4096
-"""Parameter models whose canonical form is kept."""
+"""Parameter models of which a process keeps the forms."""
 
-_kept: dict[int, tuple[Params, str]] = {}
-"""By the id of the model, which is held so that the id stays its own."""
+_kept: dict[int, tuple[Params, str, bytes]] = {}
+"""Canonical form and pickle, by the id of the model, which is held so that the id stays its own."""
 
 _run: set[str] = set()
 """Modules of the stages that this process has run."""
@@ -116,37 +120,45 @@ def resolve(module: str) -> Stage:
 
 def recipe(spec: Spec, refs: Refs) -> dict[str, Any]:
     """All that determines a result; its digest is the key."""
-    return {**_fixed(spec.module), "params": spec.params, "args": dict(spec.args), "inputs": _digests(refs)}
+    return {**_shared(spec.module)[0], "params": spec.params, "args": dict(spec.args), "inputs": _digests(refs)}
 
 
 def key_of(spec: Spec, refs: Refs) -> str:
     """Key of a task, ``digest(recipe(spec, refs))``; what many tasks share is put into its canonical form only once."""
+    _, before, after = _shared(spec.module)
+    args, inputs = text(dict(spec.args), f"{spec.label}.args"), text(_digests(refs))
+    parts = f'{{"args":{args},{before},"inputs":{inputs},"params":{_forms(spec)[1]},{after}}}'
+    return hashlib.sha256(parts.encode()).hexdigest()
+
+
+def _forms(spec: Spec) -> tuple[Params, str, bytes]:
+    """Parameters of a task, which many share, with their canonical form and their pickle."""
     kept = _kept.get(id(spec.params))
     if kept is None or kept[0] is not spec.params:
         if len(_kept) > MANY:
             _kept.clear()
-        kept = _kept[id(spec.params)] = (spec.params, text(spec.params, f"{spec.label}.params"))
-    before, after = _shared(spec.module)
-    args, inputs = text(dict(spec.args), f"{spec.label}.args"), text(_digests(refs))
-    parts = f'{{"args":{args},{before},"inputs":{inputs},"params":{kept[1]},{after}}}'
-    return hashlib.sha256(parts.encode()).hexdigest()
+        made = text(spec.params, f"{spec.label}.params"), pickle.dumps(spec.params)
+        kept = _kept[id(spec.params)] = (spec.params, *made)
+    return kept
+
+
+def _unpickled(module: str, label: str, params: bytes, *more: Any) -> Spec:
+    return Spec(module, label, _model(params), *more)
+
+
+_model = lru_cache(MANY)(pickle.loads)
+"""Tasks that shared a model share one again in the process that they are sent to, where its forms are kept as well."""
 
 
 @cache
-def _shared(module: str) -> tuple[str, str]:
-    """What all tasks of a stage have in common, in the order of the names: before the inputs, and after parameters."""
-    fixed = {name: text(value) for name, value in _fixed(module).items()}
-    before, after = ([f'"{name}":{fixed[name]}' for name in names] for names in (_FIXED[:3], _FIXED[3:]))
-    return ",".join(before), ",".join(after)
-
-
-_FIXED = ("code", "env", "format", "stage", "version")
-
-
-def _fixed(module: str) -> dict[str, Any]:
+def _shared(module: str) -> tuple[dict[str, Any], str, str]:
+    """What all tasks of a stage have in common; its text, in the order of the names: before the inputs, and after
+    parameters."""
     stage = resolve(module)
     found = (module_digests(module), versions(module), FORMAT, stage.name, stage.version)
-    return dict(zip(_FIXED, found, strict=True))
+    fixed = dict(zip(("code", "env", "format", "stage", "version"), found, strict=True))
+    texts = [f'"{name}":{text(value)}' for name, value in fixed.items()]
+    return fixed, ",".join(texts[:3]), ",".join(texts[3:])
 
 
 def _digests(refs: Refs) -> dict[str, Any]:

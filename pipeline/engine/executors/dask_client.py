@@ -9,7 +9,8 @@ A worker that dies takes along what it was given, of which it ran one at most: a
 them is then submitted alone. Who is alone for the third time when its worker dies is the culprit, unless idle workers
 died with it: then somebody killed them all. On this machine the
 workers are spawned, never forked; they never see Ctrl-C, end with this process, and speak TLS on the loopback with keys
-of this run alone, because whoever reaches a scheduler of dask can run code as its user.
+of this run alone, because whoever reaches a scheduler of dask can run code as its user. This process hosts that
+scheduler, and hands over to it what it has to say without any socket.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import pickle
 import queue
 import time
 import uuid
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
@@ -33,6 +35,7 @@ import psutil
 from dask._expr import LLGExpr
 from dask._task_spec import Task as Node
 from dask._task_spec import TaskRef
+from dask.utils import key_split
 from distributed import Client, KilledWorker, LocalCluster, WorkerPlugin, get_worker
 
 from rille.pipeline.engine.executors import dask_cluster
@@ -75,13 +78,17 @@ def here(jobs: int, cache: Location, memory: float) -> Dask:
     """Workers of this machine; they start while this process goes on."""
     _configure()
     resource_tracker.ensure_running()  # it unblocks the signal in the thread that happens to start it
-    with held():
+    with held(), warnings.catch_warnings():
+        # A queue within this process is named by the machine's address, which it may not have.
+        warnings.filterwarnings("ignore", "Couldn't detect a suitable IP address", RuntimeWarning)
         cluster = LocalCluster(
             # With workers LocalCluster would block until they run; scale() returns at once.
             n_workers=0,
             threads_per_worker=1,
             security=True,
             host="127.0.0.1",
+            # For the workers, and for the client.
+            scheduler_kwargs={"host": ["127.0.0.1", None], "protocol": ["tls://", "inproc://"]},
             # Port 0 is any free one: dask's own, 8787, may belong to another run.
             dashboard_address="127.0.0.1:0",
             worker_dashboard_address=None,
@@ -89,8 +96,9 @@ def here(jobs: int, cache: Location, memory: float) -> Dask:
             memory_limit=int(memory) if math.isfinite(memory) else 0,
             silence_logs=logging.CRITICAL,
         )
+        _, within = cluster.scheduler.listeners
         # As the default client it would take over whatever else the calling program computes with dask.
-        client = Client(cluster, set_as_default=False)
+        client = Client(within.contact_address, loop=cluster.loop, set_as_default=False)
         made = Dask(client, cache, jobs, cluster)
         cluster.scale(jobs)
     return made
@@ -223,6 +231,7 @@ class Dask:
                 self.slots = threads or self.slots
             else:
                 self._revive()
+            key_split.cache_clear()  # it holds the names of the last hundred thousand tasks
             self._looked = time.monotonic()
         # A finished future is no loss: the event with its outcome is on its way.
         lost = [n for n, future in self._futures.items() if future.status not in ("pending", "finished")]
@@ -371,6 +380,9 @@ def _configure() -> None:
             "distributed.scheduler.allowed-failures": 0,
             # A share of the limit: the bytes given are meant whole, by default dask ends a worker at 95 % of them.
             "distributed.worker.memory.terminate": 1.0,
+            # Entries of each of dask's logs, which nobody reads; some keep whole messages, with all tasks in them.
+            "distributed.admin.low-level-log-length": 10,
+            "distributed.scheduler.active-memory-manager.start": False,
             "distributed.worker.profile.enabled": False,
             "distributed.worker.memory.monitor-interval": "500ms",
             "distributed.scheduler.work-stealing-interval": "1s",
