@@ -487,7 +487,8 @@ class _Run:
             first.seconds, first.peak_rss, first.kernel = outcome.seconds, outcome.peak_rss, outcome.kernel
             first.started, first.memory, first.rest = outcome.started, outcome.memory, outcome.rest
             first.first, first.compiling, first.worker = outcome.first, outcome.compiling, sys.intern(outcome.worker)
-            ref = replace(outcome.ref, stage=first.stage)  # each unpickled reference brings a name of its own
+            # Each unpickled reference brings names of its own.
+            ref = replace(outcome.ref, stage=first.stage, key=first.key)
             for handle in (first, *others):
                 handle.ref = ref
                 self._resolve(handle, "computed" if handle is first and not outcome.cached else "cached")
