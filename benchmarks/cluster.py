@@ -19,14 +19,14 @@ class Measured:
 
     tasks: float = 10.1
     """Tasks a frame; every third frame is a basic pair."""
-    client: float = 7.8e3
-    """Bytes a node of a cold run, between 3 920 and 29 321 nodes of benchmarks/scale.py."""
-    start: float = 170e6
+    client: float = 4.7e3
+    """Bytes a node at the end of a cold run: 284 MB of 20 360 nodes; idle stages (benchmarks/scale.py) take 2.0e3."""
+    start: float = 190e6
     """Bytes of a client that has done nothing."""
     plan: float = 0.2e-3
     """Seconds a node that is found in the cache."""
-    scheduler: float = 2.6e-3
-    """Seconds of processor a task, of dask's scheduler and the client (97 712 nodes of benchmarks/scale.py)."""
+    scheduler: float = 1.5e-3
+    """Seconds of processor a task, of dask's scheduler and the client (97 860 nodes of benchmarks/scale.py)."""
     index: float = 1.36e3
     """Bytes a node of the index, unpacked."""
     index_limit: float = 256e6
