@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rille.pipeline.engine.code_digest import module_digests
 from rille.pipeline.engine.keys import text
@@ -68,7 +68,7 @@ class Spec:
         return resolve(self.module)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _unpickled, (self.module, self.label, _forms(self)[2], self.args, self.hints)
+        return _unpickled, (self.module, self.label, _forms(self).pickled, self.args, self.hints)
 
 
 @dataclass(frozen=True)
@@ -97,8 +97,25 @@ class Outcome:
 MANY = 4096
 """Parameter models of which a process keeps the forms."""
 
-_kept: dict[int, tuple[Params, str, bytes]] = {}
-"""Canonical form and pickle, by the id of the model, which is held so that the id stays its own."""
+
+class _Forms(NamedTuple):
+    """A parameter model, held so that its id stays its own, with its canonical text and its pickle."""
+
+    params: Params
+    canonical: str
+    pickled: bytes
+
+
+class _Common(NamedTuple):
+    """What all tasks of a stage have in common, and its canonical text in the order of the names: what stands before
+    ``inputs``, and what after ``params``."""
+
+    parts: dict[str, Any]
+    before: str
+    after: str
+
+
+_forms_by_id: dict[int, _Forms] = {}
 
 _run: set[str] = set()
 """Modules of the stages that this process has run."""
@@ -120,26 +137,26 @@ def resolve(module: str) -> Stage:
 
 def recipe(spec: Spec, refs: Refs) -> dict[str, Any]:
     """All that determines a result; its digest is the key."""
-    return {**_shared(spec.module)[0], "params": spec.params, "args": dict(spec.args), "inputs": _digests(refs)}
+    return {**_shared(spec.module).parts, "params": spec.params, "args": dict(spec.args), "inputs": _digests(refs)}
 
 
 def key_of(spec: Spec, refs: Refs) -> str:
     """Key of a task, ``digest(recipe(spec, refs))``; what many tasks share is put into its canonical form only once."""
-    _, before, after = _shared(spec.module)
+    common = _shared(spec.module)
     args, inputs = text(dict(spec.args), f"{spec.label}.args"), text(_digests(refs))
-    parts = f'{{"args":{args},{before},"inputs":{inputs},"params":{_forms(spec)[1]},{after}}}'
+    parts = f'{{"args":{args},{common.before},"inputs":{inputs},"params":{_forms(spec).canonical},{common.after}}}'
     return hashlib.sha256(parts.encode()).hexdigest()
 
 
-def _forms(spec: Spec) -> tuple[Params, str, bytes]:
-    """Parameters of a task, which many share, with their canonical form and their pickle."""
-    kept = _kept.get(id(spec.params))
-    if kept is None or kept[0] is not spec.params:
-        if len(_kept) > MANY:
-            _kept.clear()
-        made = text(spec.params, f"{spec.label}.params"), pickle.dumps(spec.params)
-        kept = _kept[id(spec.params)] = (spec.params, *made)
-    return kept
+def _forms(spec: Spec) -> _Forms:
+    """Forms of a task's parameters, which many tasks share."""
+    known = _forms_by_id.get(id(spec.params))
+    if known is None or known.params is not spec.params:
+        if len(_forms_by_id) > MANY:
+            _forms_by_id.clear()
+        known = _Forms(spec.params, text(spec.params, f"{spec.label}.params"), pickle.dumps(spec.params))
+        _forms_by_id[id(spec.params)] = known
+    return known
 
 
 def _unpickled(module: str, label: str, params: bytes, *more: Any) -> Spec:
@@ -151,14 +168,12 @@ _model = lru_cache(MANY)(pickle.loads)
 
 
 @cache
-def _shared(module: str) -> tuple[dict[str, Any], str, str]:
-    """What all tasks of a stage have in common; its text, in the order of the names: before the inputs, and after
-    parameters."""
+def _shared(module: str) -> _Common:
     stage = resolve(module)
     found = (module_digests(module), versions(module), FORMAT, stage.name, stage.version)
     fixed = dict(zip(("code", "env", "format", "stage", "version"), found, strict=True))
     texts = [f'"{name}":{text(value)}' for name, value in fixed.items()]
-    return fixed, ",".join(texts[:3]), ",".join(texts[3:])
+    return _Common(fixed, ",".join(texts[:3]), ",".join(texts[3:]))
 
 
 def _digests(refs: Refs) -> dict[str, Any]:

@@ -135,6 +135,7 @@ def _add(
     }
     files[f"{name}/zarr.json"] = json.dumps(node).encode()
     codec = _codec()
+    # All chunks are written, those of the fill value too: a missing one is always damage.
     for at in np.ndindex(*(math.ceil(n / edge) for n, edge in zip(little.shape, edges, strict=True))):
         chunk = little[tuple(slice(i * edge, (i + 1) * edge) for i, edge in zip(at, edges, strict=True))]
         if chunk.shape != edges:  # all chunks of an array have one size: of the last ones a part is nothing

@@ -136,8 +136,8 @@ def _misfit(seen: OrthoPair, keep: Bools) -> tuple[Floats32, Floats32]:
     rest = np.where(keep, seen.left - seen.right, 0.0)
     weight = keep.astype(np.float32)
     for _ in range(MEAN_ROUNDS + 1):
-        total, count = (window_sum32(v, MEAN_SIDE) for v in (weight * rest, weight))
-        mean = total / np.maximum(count, LEAST_WEIGHT)
+        weighted, weights = (window_sum32(v, MEAN_SIDE) for v in (weight * rest, weight))
+        mean = weighted / np.maximum(weights, LEAST_WEIGHT)
         # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once.
         weight = np.where(keep, 1.0 / (1.0 + np.square((rest - mean) / RESIDUAL)), 0.0)
     # A cell smaller than a pixel brings no more than its share of what the pixel tells.
