@@ -17,7 +17,7 @@ from rille.stages.geometry.surface import Surface
 from rille.stages.terrain.locus.kernel import BlockCells, Observed, PairCameras, search
 
 COARSE = 8  # cells a coarse cell is wide: a 64th of the cells search the whole range
-BLOCK_ROWS = 64  # rows of cells in one kernel call, so that a large surface stays small in memory
+BLOCK_ROWS = 32  # rows of cells in one kernel call, so that a large surface stays small in memory
 ONE_SIDED = 2.0  # matched one way alone: errors of such cells are two to three times as large
 
 

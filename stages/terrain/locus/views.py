@@ -19,16 +19,14 @@ from numba import njit
 from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.geometry.surface import Surface
 
-BLOCK_ROWS = 64  # rows of cells in one call, so that a large surface's feet stay small in memory
+BLOCK_ROWS = 32  # rows of cells in one call, so that a large surface's feet stay small in memory
 
 LANES = 32
 """Cells that are looked at together."""
-SPLINE = 16
-"""Coefficients that a value depends on."""
-LEFT_AT, RIGHT_AT, LEFT_VALUE, RIGHT_VALUE, WEIGHTS, SLOPES = (k * LANES for k in (0, 2, 4, 7, 10, 18))
-"""Planes: x and y in the left and in the right image, a pixel or more from the edge; value and gradient (x, y) of the
-left and of the right spline; weights of four coefficients along x, along y, and their derivatives likewise."""
-SPLINE_PLANES = 26
+TAPS = 16
+"""Coefficients that a value depends on, each of a cell in a plane of its own."""
+VALUE, ALONG_X, ALONG_Y = (k * LANES for k in range(3))
+"""Planes of what is read of a spline: value and gradient."""
 
 
 class Views(NamedTuple):
@@ -69,7 +67,7 @@ def look(views: Views, surface: Surface, elevation: Floats | Floats32) -> OrthoP
     elevation : (rows, cols) metres, NaN unknown.
     """
     out = OrthoPair(*np.full((len(OrthoPair._fields), surface.rows, surface.cols), np.nan, np.float32))
-    z, cols = np.ascontiguousarray(elevation, np.float64), np.arange(surface.cols)
+    z, cols = np.ascontiguousarray(elevation), np.arange(surface.cols)
     for start in range(0, surface.rows, BLOCK_ROWS):
         stop = min(start + BLOCK_ROWS, surface.rows)
         # A row beyond either end, so that every cell has a neighbour below or above to measure its size with.
@@ -79,21 +77,24 @@ def look(views: Views, surface: Surface, elevation: Floats | Floats32) -> OrthoP
     return out
 
 
-FOOT, NORMAL, Z, BESIDE, BELOW = (k * LANES for k in (SPLINE_PLANES, *(SPLINE_PLANES + k for k in (3, 6, 7, 10))))
-SEEN, WAYS = ((SPLINE_PLANES + k) * LANES for k in (13, 14))
-"""Planes of a buffer of lanes, a cell in each: its foot, normal and elevation, the steps to its neighbours' feet (3
-each); whether both images show it; the disparity, and for each image how a pixel moves with the elevation (2 each), and
-the pixels that the cell covers."""
+LEFT_AT, RIGHT_AT, FOOT, NORMAL, Z, BESIDE, BELOW, SEEN, WAYS = (k * LANES for k in (0, 2, 4, 7, 10, 11, 14, 17, 18))
+"""Planes of a buffer of lanes, a cell in each: x and y in the left and in the right image, a pixel or more from the
+edge; the cell's foot, normal and elevation, the steps to its neighbours' feet (3 each); whether both images show it;
+the disparity, and for each image how a pixel moves with the elevation (2 each), and the pixels that the cell covers."""
 DISPARITY, LEFT_WAY, RIGHT_WAY, AREA = WAYS, WAYS + LANES, WAYS + 3 * LANES, WAYS + 5 * LANES
-LANE_PLANES = SPLINE_PLANES + 20
+LANE_PLANES = 24
+
+NOT_NEGATIVE = 0x7FFFFFFF
+"""Mask of an index: the compiler then knows that none counts from the end, and need not ask at each use."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _look(block, z, first, span, views, out):  # type: ignore[no-untyped-def]
     """Rows of ``span``; feet and normals of the block begin at row ``first``."""
     feet, normals = block
-    left_spline, right_spline = views.splines
-    lanes, taps, cells = np.zeros(LANE_PLANES * LANES), np.zeros(SPLINE * LANES, np.float32), np.zeros(LANES, np.int64)
+    lanes, cells = np.zeros(LANE_PLANES * LANES), np.zeros(LANES, np.int64)
+    taps = np.zeros(TAPS * LANES, np.float32)
+    left, right = np.zeros(3 * LANES, np.float32), np.zeros(3 * LANES, np.float32)
     rows, cols = feet.shape[:2]
     # Flat views, so that a lane needs one number to write its cell.
     flat = OrthoPair(
@@ -115,8 +116,9 @@ def _look(block, z, first, span, views, out):  # type: ignore[no-untyped-def]
                 n += 1
             if n == LANES or (n > 0 and r == stop - 1 and c == cols - 1):
                 _project(n, views, lanes)
-                read(n, left_spline, right_spline, lanes, taps)
-                _write(n, cells, lanes, rows > 1 and cols > 1, flat)
+                read(n, views.splines[0], lanes[LEFT_AT:], taps, left)
+                read(n, views.splines[1], lanes[RIGHT_AT:], taps, right)
+                _write(n, cells, lanes, left, right, rows > 1 and cols > 1, flat)
                 n = 0
 
 
@@ -178,74 +180,56 @@ def _row(p, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _write(n, cells, lanes, wide, out):  # type: ignore[no-untyped-def]
+def _write(n, cells, lanes, left, right, wide, out):  # type: ignore[no-untyped-def]
     """What :func:`look` gives of each lane; ``wide``: cells have neighbours, so that their size is known."""
     for m in range(n):
         if lanes[SEEN + m] > 0.0:
-            i, left, right = cells[m], LEFT_VALUE + m, RIGHT_VALUE + m
-            out.left[i], out.right[i] = lanes[left], lanes[right]
-            gx, gy = lanes[left + LANES], lanes[left + 2 * LANES]
+            i = cells[m]
+            out.left[i], out.right[i] = left[VALUE + m], right[VALUE + m]
+            gx, gy = left[ALONG_X + m], left[ALONG_Y + m]
             out.left_slope[i] = gx * lanes[LEFT_WAY + m] + gy * lanes[LEFT_WAY + LANES + m]
-            gx, gy = lanes[right + LANES], lanes[right + 2 * LANES]
+            gx, gy = right[ALONG_X + m], right[ALONG_Y + m]
             out.right_slope[i] = gx * lanes[RIGHT_WAY + m] + gy * lanes[RIGHT_WAY + LANES + m]
             out.scale[i], out.area[i] = lanes[DISPARITY + m], lanes[AREA + m] if wide else 1.0
 
 
-@njit(cache=True, nogil=True)
-def read(n, left, right, lanes, taps):  # type: ignore[no-untyped-def]
-    """Value and gradient of both splines at ``n`` lanes; ``taps``: room for their coefficients."""
-    for side in range(2):
-        spline = right if side else left
-        at = RIGHT_AT if side else LEFT_AT
-        for m in range(n):
-            c, r = int(lanes[at + m]) - 1, int(lanes[at + LANES + m]) - 1
-            for k in range(4):
-                for i in range(4):
-                    taps[(4 * k + i) * LANES + m] = spline[r + k, c + i]
-        if side:
-            _weights(n, lanes, RIGHT_AT)
-            _sum(n, lanes, taps, RIGHT_VALUE)
-        else:
-            _weights(n, lanes, LEFT_AT)
-            _sum(n, lanes, taps, LEFT_VALUE)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _weights(n, lanes, at):  # type: ignore[no-untyped-def]
-    for axis in range(2):
-        w, s = WEIGHTS + 4 * axis * LANES, SLOPES + 4 * axis * LANES
-        for m in range(n):
-            t = lanes[at + axis * LANES + m]
-            t = t - int(t)
-            q = 1.0 - t
-            lanes[w + m], lanes[w + 3 * LANES + m] = q * q * q / 6.0, t * t * t / 6.0
-            lanes[w + LANES + m] = (4.0 - 3.0 * t * t * (2.0 - t)) / 6.0
-            lanes[w + 2 * LANES + m] = (4.0 - 3.0 * q * q * (2.0 - q)) / 6.0
-            lanes[s + m], lanes[s + 3 * LANES + m] = -0.5 * q * q, 0.5 * t * t
-            lanes[s + LANES + m], lanes[s + 2 * LANES + m] = 0.5 * t * (3.0 * t - 4.0), -0.5 * q * (3.0 * q - 4.0)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _sum(n, lanes, taps, value):  # type: ignore[no-untyped-def]
-    """Sums over the coefficients: along each row, then over the rows."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def read(n, spline, at, taps, values):  # type: ignore[no-untyped-def]
+    """Value and gradient of a spline at ``n`` points, whose x and y are the first two planes of ``at``; ``taps``: room
+    for its coefficients, which are read in single precision like everything that is made of them."""
+    flat, width = spline.ravel(), spline.shape[1] & NOT_NEGATIVE
+    for m in range(n & NOT_NEGATIVE):
+        first = ((int(at[LANES + m]) - 1) * width + int(at[m]) - 1) & NOT_NEGATIVE
+        for k in range(4):
+            for i in range(4):
+                taps[(4 * k + i) * LANES + m] = flat[first + k * width + i]
     for m in range(n):
-        lanes[value + m] = lanes[value + LANES + m] = lanes[value + 2 * LANES + m] = 0.0
-    for k in range(4):
-        tap = 4 * k * LANES
-        for m in range(n):
-            c0, c1, c2, c3 = (
-                taps[tap + m],
-                taps[tap + LANES + m],
-                taps[tap + 2 * LANES + m],
-                taps[tap + 3 * LANES + m],
-            )
-            w0, w1 = lanes[WEIGHTS + m], lanes[WEIGHTS + LANES + m]
-            w2, w3 = lanes[WEIGHTS + 2 * LANES + m], lanes[WEIGHTS + 3 * LANES + m]
-            across = w0 * c0 + w1 * c1 + w2 * c2 + w3 * c3
-            w0, w1 = lanes[SLOPES + m], lanes[SLOPES + LANES + m]
-            w2, w3 = lanes[SLOPES + 2 * LANES + m], lanes[SLOPES + 3 * LANES + m]
-            along = w0 * c0 + w1 * c1 + w2 * c2 + w3 * c3
-            w, s = lanes[WEIGHTS + (4 + k) * LANES + m], lanes[SLOPES + (4 + k) * LANES + m]
-            lanes[value + m] += w * across
-            lanes[value + LANES + m] += w * along
-            lanes[value + 2 * LANES + m] += s * across
+        x, y = np.float32(at[m] - int(at[m])), np.float32(at[LANES + m] - int(at[LANES + m]))
+        wx, wy, dx, dy = _weights(x), _weights(y), _slopes(x), _slopes(y)
+        a = taps[m], taps[LANES + m], taps[2 * LANES + m], taps[3 * LANES + m]
+        b = taps[4 * LANES + m], taps[5 * LANES + m], taps[6 * LANES + m], taps[7 * LANES + m]
+        c = taps[8 * LANES + m], taps[9 * LANES + m], taps[10 * LANES + m], taps[11 * LANES + m]
+        d = taps[12 * LANES + m], taps[13 * LANES + m], taps[14 * LANES + m], taps[15 * LANES + m]
+        rows = _sum(wx, a), _sum(wx, b), _sum(wx, c), _sum(wx, d)
+        values[VALUE + m], values[ALONG_Y + m] = _sum(wy, rows), _sum(dy, rows)
+        values[ALONG_X + m] = _sum(wy, (_sum(dx, a), _sum(dx, b), _sum(dx, c), _sum(dx, d)))
+
+
+@njit(cache=True, nogil=True)
+def _sum(w, c):  # type: ignore[no-untyped-def]
+    return w[0] * c[0] + w[1] * c[1] + w[2] * c[2] + w[3] * c[3]
+
+
+@njit(cache=True, nogil=True)
+def _weights(t):  # type: ignore[no-untyped-def]
+    """Weights of four coefficients at ``t`` from the second to the third one."""
+    q, four, three, two, sixth = np.float32(1) - t, np.float32(4), np.float32(3), np.float32(2), np.float32(1 / 6)
+    second, third = four - three * t * t * (two - t), four - three * q * q * (two - q)
+    return q * q * q * sixth, second * sixth, third * sixth, t * t * t * sixth
+
+
+@njit(cache=True, nogil=True)
+def _slopes(t):  # type: ignore[no-untyped-def]
+    """Derivatives of the weights."""
+    q, half, three, four = np.float32(1) - t, np.float32(0.5), np.float32(3), np.float32(4)
+    return -half * q * q, half * t * (three * t - four), -half * q * (three * q - four), half * t * t
