@@ -286,8 +286,8 @@ class BlockCells(NamedTuple):
 
     feet: Floats
     normals: Floats
-    low: Floats
-    high: Floats
+    low: Floats32
+    high: Floats32
 
 
 class PairCameras(NamedTuple):
@@ -314,14 +314,20 @@ class _Buffers(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def search(cells: BlockCells, z_range: tuple[float, float], cameras: PairCameras, seen: Observed, out: Floats) -> None:
+def search(
+    cells: BlockCells,
+    z_range: tuple[float, float],
+    cameras: PairCameras,
+    seen: Observed,
+    out: tuple[Floats32, Floats32, Floats32, Floats32],
+) -> None:
     """Solve every cell of a block.
 
     Parameters
     ----------
     z_range : limits of Z, metres.
-    out : (r, c, 4) elevation (m), its standard deviation (m), residual (px) and grey value of the change from free to
-        behind that was chosen (see the module); to be filled with NaN before.
+    out : (r, c) each: elevation (m), its standard deviation (m), residual (px) and grey value of the change from free
+        to behind that was chosen (see the module); contiguous, and to be filled with NaN before.
     """
     lanes, solved, points = (
         np.zeros(SEARCH_PLANES * LANES),
@@ -330,7 +336,8 @@ def search(cells: BlockCells, z_range: tuple[float, float], cameras: PairCameras
     )
     active, found, chosen = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
     buffers = _Buffers(lanes, solved, points, active, found, chosen)
-    foot, normal, rows = cells.feet.reshape(-1, 3), cells.normals.reshape(-1, 3), out.reshape(-1, 4)
+    foot, normal = cells.feet.reshape(-1, 3), cells.normals.reshape(-1, 3)
+    flat = out[0].ravel(), out[1].ravel(), out[2].ravel(), out[3].ravel()
     low, high = cells.low.ravel(), cells.high.ravel()
     n, last = 0, low.size - 1
     for i in range(low.size):
@@ -343,7 +350,7 @@ def search(cells: BlockCells, z_range: tuple[float, float], cameras: PairCameras
             lines(n, cameras.left, cameras.right, lanes)
             clip(n, cameras.sizes, z_range[0], z_range[1], lanes)
             spans(n, lanes)
-            _solve(n, buffers, cameras.epipole, seen, rows)
+            _solve(n, buffers, cameras.epipole, seen, flat)
             n = 0
 
 
@@ -479,7 +486,7 @@ def _bracket(lanes, m, step, upper, lower):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def roots(n, lanes, epipole, seen, points):  # type: ignore[no-untyped-def]
-    """Regula falsi (Illinois); NaN at undefined disparity."""
+    """Regula falsi (Illinois); NaN at undefined disparity. Leaves the roots in ``points``."""
     for m in range(n):
         lanes[SIDE + m], lanes[OPEN + m] = 0.0, 1.0
     for _ in range(TURNS):
@@ -516,22 +523,19 @@ def _halve(n, lanes, points):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def slopes(n, lanes, epipole, seen, points):  # type: ignore[no-untyped-def]
-    """One-sided ds/dZ at the roots, pixels per metre; leaves those of the roots in ``points``."""
+    """One-sided ds/dZ at the roots, pixels per metre; ``points`` of the roots themselves stay what they are."""
+    beside = points[LANES:]
     for m in range(n):
         lanes[Z + m] = lanes[ROOT + m] + lanes[STEP + m]
-    raise_to(lanes, n, seen.image.shape, points)
-    meet(n, epipole, seen, points)
+    raise_to(lanes, n, seen.image.shape, beside)
+    meet(n, epipole, seen, beside)
     for m in range(n):
-        lanes[UPWARDS + m] = pixels(points, S, m) / lanes[STEP + m]
+        lanes[UPWARDS + m] = pixels(beside, S, m) / lanes[STEP + m]
         lanes[Z + m] = lanes[ROOT + m] - lanes[STEP + m]
-    raise_to(lanes, n, seen.image.shape, points)
-    meet(n, epipole, seen, points)
+    raise_to(lanes, n, seen.image.shape, beside)
+    meet(n, epipole, seen, beside)
     for m in range(n):
-        lanes[DOWNWARDS + m] = -pixels(points, S, m) / lanes[STEP + m]
-        # The roots themselves once more: their residual and grey value are read from the buffer of points.
-        lanes[Z + m] = lanes[ROOT + m]
-    raise_to(lanes, n, seen.image.shape, points)
-    meet(n, epipole, seen, points)
+        lanes[DOWNWARDS + m] = -pixels(beside, S, m) / lanes[STEP + m]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -539,7 +543,7 @@ def accept(n, found, cells, lanes, seen, points, out):  # type: ignore[no-untype
     """Write ``out`` of the roots that stand; give how many do not.
 
     ``found``: number of each root's lane in the search; afterwards it begins with those of the roots that do not stand.
-    ``cells``: the row of ``out`` of each lane of the search.
+    ``cells``: the place in ``out`` of each lane of the search.
     """
     disparity, std, image, limits = seen
     width, refused = image.shape[1], 0
@@ -556,8 +560,8 @@ def accept(n, found, cells, lanes, seen, points, out):  # type: ignore[no-untype
             bottom = image[r + 1, c] * (1.0 - fx) + image[r + 1, c + 1] * fx
             i, own = cells[found[m]], std[int(np.rint(points[Y + m])), int(np.rint(points[X + m]))]
             # sigma_Z = sigma_d / |ds/dZ|
-            out[i, 0], out[i, 1], out[i, 2] = lanes[ROOT + m], own / slope, residual
-            out[i, 3] = top * (1.0 - fy) + bottom * fy
+            out[0][i], out[1][i], out[2][i] = lanes[ROOT + m], own / slope, residual
+            out[3][i] = top * (1.0 - fy) + bottom * fy
         else:
             found[refused] = found[m]  # refused <= m: none is lost
             refused += 1

@@ -87,33 +87,34 @@ class PairArrays:
         self.cameras = PairCameras(*projections(rig, T_surface_left), epipole, sizes)
         self.z_range = float(z_range[0]), float(z_range[1])
 
-    def cells(self, surface: Surface, rows: ArrayLike, cols: ArrayLike, low: ArrayLike, high: ArrayLike) -> Floats:
-        """Kernel's output (r, c, 4) for the cells rows x cols, searched from low..high (NaN: left out)."""
+    def cells(
+        self, surface: Surface, rows: ArrayLike, cols: ArrayLike, low: ArrayLike, high: ArrayLike, out: Dem
+    ) -> None:
+        """Fill ``out`` (r, c) with the cells rows x cols, searched from low..high (NaN: left out)."""
         feet, normals = surface.block(rows, cols)
-        shape = feet.shape[:2]
-        start = [np.array(np.broadcast_to(v, shape), dtype=np.float64, order="C") for v in (low, high)]
-        out = np.full((*shape, 4), np.nan)
-        search(BlockCells(feet, normals, *start), self.z_range, self.cameras, self.seen, out)
-        return out
+        start = [np.ascontiguousarray(np.broadcast_to(v, feet.shape[:2]), np.float32) for v in (low, high)]
+        found = out.elevation, out.elevation_std, out.residual, out.ortho
+        search(BlockCells(feet, normals, *start), self.z_range, self.cameras, self.seen, found)
 
 
 def solve(task: PairArrays, surface: Surface) -> Dem:
     """Every cell of a surface from one disparity map, coarse to fine: a few coarse cells search the whole range."""
     # The last row and column as well, so that every cell lies between coarse ones.
     cells = [np.unique(np.append(np.arange(0, n, COARSE), n - 1)) for n in (surface.rows, surface.cols)]
-    z_range = task.z_range
-    coarse = task.cells(surface, cells[0], cells[1], np.float64(z_range[0]), np.float64(z_range[1]))[..., 0]
-    out = Dem(*(np.full((surface.rows, surface.cols), np.nan, np.float32) for _ in range(4)))
-    low, high = _around(coarse)
+    coarse, out = _undefined(cells[0].size, cells[1].size), _undefined(surface.rows, surface.cols)
+    task.cells(surface, *cells, *task.z_range, coarse)
     cols = np.arange(surface.cols)
+    low, high = (v[:, cols // COARSE + 1] for v in _around(coarse.elevation))
     for start in range(0, surface.rows, BLOCK_ROWS):
         rows = np.arange(start, min(start + BLOCK_ROWS, surface.rows))
-        at = np.ix_(rows // COARSE + 1, cols // COARSE + 1)
-        found = task.cells(surface, rows, cols, low[at], high[at])
-        block = slice(start, start + rows.size)
-        for k, array in enumerate((out.elevation, out.elevation_std, out.residual, out.ortho)):
-            array[block] = found[..., k]
+        near = rows // COARSE + 1
+        block = Dem(*(array[start : start + rows.size] for array in vars(out).values()))
+        task.cells(surface, rows, cols, low[near], high[near], block)
     return out
+
+
+def _undefined(rows: int, cols: int) -> Dem:
+    return Dem(*np.full((4, rows, cols), np.nan, np.float32))
 
 
 def join(a: Dem, b: Dem) -> Dem:
@@ -141,11 +142,11 @@ def projections(rig: Rig, T_surface_left: RigidTransform) -> tuple[Floats, Float
     return np.ascontiguousarray(left), np.ascontiguousarray(right)
 
 
-def _around(coarse: Floats) -> tuple[Floats, Floats]:
+def _around(coarse: Floats32) -> tuple[Floats32, Floats32]:
     """Lowest and highest elevation of the 4 x 4 coarse cells around each gap between them; NaN where none has one."""
     padded = np.pad(coarse, 2, constant_values=np.nan)
     shape = padded.shape[0] - 3, padded.shape[1] - 3
-    low = np.full(shape, np.nan)
+    low = np.full(shape, np.nan, np.float32)
     high = low.copy()
     for i in range(4):
         for j in range(4):
