@@ -83,15 +83,14 @@ def refine(views: Views, surface: Surface, elevation: Floats32, steps: int) -> t
     for _ in range(steps):
         keep = np.isfinite(seen.scale)
         weight, rest = _misfit(seen, keep)
-        slope = np.where(keep, seen.right_slope - seen.left_slope, 0.0)
-        scale = np.where(keep, seen.scale, 0.0)
+        slope = seen.right_slope - seen.left_slope
         across, down = np.zeros((2, *z.shape), np.float32)
-        _stiffness(z, scale, across, down)
+        _stiffness(z, seen.scale, across, down)
         moved = z.copy()
         terms = Terms(weight * slope * slope, weight * slope * rest, z, keep, across, down)
         sweep(terms, moved, SWEEPS, OVERSHOOT)
         # About the start, not the last step: many small steps could otherwise wander to another likeness.
-        reach = FARTHEST / np.where(keep, seen.scale, np.inf)
+        reach = FARTHEST / seen.scale
         z = np.where(keep, np.clip(moved, elevation - reach, elevation + reach), elevation)
         seen = look(views, surface, z)
         _level(seen, gain)
@@ -118,11 +117,23 @@ def standard_deviation(elevation: Floats32, seen: OrthoPair, from_disparity: Flo
 
 def _gain(seen: OrthoPair) -> float:
     """Factor that gives the right image the left one's contrast, from the gradients along the surface's axes."""
-    power = [
-        sum(float(np.nansum(np.square(np.diff(image, axis=k), dtype=np.float64))) for k in (0, 1))
-        for image in (seen.left, seen.right)
-    ]
+    power = _steps(seen.left), _steps(seen.right)
     return float(np.sqrt(power[0] / power[1])) if min(power) > 0 else 1.0
+
+
+@njit(cache=True, nogil=True)
+def _steps(image):  # type: ignore[no-untyped-def]
+    """Sum of the squared differences of known neighbours."""
+    rows, cols = image.shape
+    total = 0.0
+    for r in range(rows):
+        for c in range(cols):
+            if np.isnan(image[r, c]):
+                continue
+            across = image[r, c + 1] - image[r, c] if c + 1 < cols else np.float32(0.0)
+            down = image[r + 1, c] - image[r, c] if r + 1 < rows else np.float32(0.0)
+            total += (across * across if across == across else 0.0) + (down * down if down == down else 0.0)
+    return total
 
 
 def _level(seen: OrthoPair, gain: float) -> None:
@@ -132,23 +143,24 @@ def _level(seen: OrthoPair, gain: float) -> None:
 
 
 def _misfit(seen: OrthoPair, keep: Bools) -> tuple[Floats32, Floats32]:
-    """Weight of each cell's equation, and difference of both images without its local mean; zero where not kept."""
+    """Weight of each cell's equation, zero where not kept, and difference of both images without its local mean."""
     rest = np.where(keep, seen.left - seen.right, 0.0)
-    weight = keep.astype(np.float32)
+    known = keep.astype(np.float32)
+    weight = known
     for _ in range(MEAN_ROUNDS + 1):
         weighted, weights = (window_sum32(v, MEAN_SIDE) for v in (weight * rest, weight))
-        mean = weighted / np.maximum(weights, LEAST_WEIGHT)
+        misfit = rest - weighted / np.maximum(weights, LEAST_WEIGHT)
         # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once.
-        weight = np.where(keep, 1.0 / (1.0 + np.square((rest - mean) / RESIDUAL)), 0.0)
+        weight = known / (1.0 + np.square(misfit / RESIDUAL))
     # A cell smaller than a pixel brings no more than its share of what the pixel tells.
-    return weight * np.where(keep, np.minimum(seen.area, 1.0), 0.0), np.where(keep, rest - mean, 0.0)
+    return weight * np.fmin(seen.area, 1.0), misfit
 
 
 @njit(cache=True, nogil=True)
 def _stiffness(z, scale, across, down):  # type: ignore[no-untyped-def]
     """Weight of the second difference at each cell along its row and column, 0 where a neighbour is unknown.
 
-    ``scale``: pixels of disparity a metre of elevation.
+    ``scale``: pixels of disparity a metre of elevation, NaN unknown.
     """
     rows, cols = z.shape
     for r in range(rows):
