@@ -92,7 +92,7 @@ def refine(views: Views, surface: Surface, elevation: Floats32, steps: int) -> t
         # About the start, not the last step: many small steps could otherwise wander to another likeness.
         reach = FARTHEST / seen.scale
         z = np.where(keep, np.clip(moved, elevation - reach, elevation + reach), elevation)
-        seen = look(views, surface, z)
+        seen = look(views, surface, z, seen)
         _level(seen, gain)
     return z, seen
 

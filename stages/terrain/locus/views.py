@@ -66,14 +66,19 @@ def views(left: Floats, right: Floats, left_image: Floats32, right_image: Floats
     return Views(left, right, (splines[0], splines[1]), np.asarray(centre, np.float64))
 
 
-def look(views: Views, surface: Surface, elevation: Floats | Floats32) -> OrthoPair:
+def look(
+    views: Views, surface: Surface, elevation: Floats | Floats32, room: OrthoPair | None = None
+) -> OrthoPair:
     """What both images show at the elevations of the cells.
 
     Parameters
     ----------
     elevation : (rows, cols) metres, NaN unknown.
+    room : an earlier look that is no longer needed: its arrays are used again.
     """
-    out = OrthoPair(*np.full((len(OrthoPair._fields), surface.rows, surface.cols), np.nan, np.float32))
+    out = room or OrthoPair(*np.empty((len(OrthoPair._fields), surface.rows, surface.cols), np.float32))
+    for array in out:
+        array.fill(np.nan)
     z, cols = np.ascontiguousarray(elevation), np.arange(surface.cols)
     for start in range(0, surface.rows, BLOCK_ROWS):
         stop = min(start + BLOCK_ROWS, surface.rows)
