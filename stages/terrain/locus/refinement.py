@@ -24,13 +24,15 @@ two images does not correlate.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
 from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.geometry.surface import Surface
 from rille.stages.numeric.windows import window_sum32
-from rille.stages.terrain.locus.sweep import Terms, sweep
+from rille.stages.terrain.locus.sweep import Terms, diagonals, sweep
 from rille.stages.terrain.locus.views import OrthoPair, Views, look
 
 STIFFNESS = 4000.0
@@ -80,6 +82,7 @@ def refine(views: Views, surface: Surface, elevation: Floats32, steps: int) -> t
     # From the first look, for all steps: an exposure does not change with the elevations.
     gain = _gain(seen)
     _level(seen, gain)
+    room = diagonals(elevation.shape)
     for _ in range(steps):
         keep = np.isfinite(seen.scale)
         weight, rest = _misfit(seen, keep)
@@ -88,7 +91,7 @@ def refine(views: Views, surface: Surface, elevation: Floats32, steps: int) -> t
         _stiffness(z, seen.scale, across, down)
         moved = z.copy()
         terms = Terms(weight * slope * slope, weight * slope * rest, z, keep, across, down)
-        sweep(terms, moved, SWEEPS, OVERSHOOT)
+        sweep(terms, moved, SWEEPS, OVERSHOOT, room)
         # About the start, not the last step: many small steps could otherwise wander to another likeness.
         reach = FARTHEST / seen.scale
         z = np.where(keep, np.clip(moved, elevation - reach, elevation + reach), elevation)
@@ -103,16 +106,32 @@ def standard_deviation(elevation: Floats32, seen: OrthoPair, from_disparity: Flo
     ``seen``: as :func:`refine` gives it. ``from_disparity``: (rows, cols) the disparity's part, metres.
     """
     known = np.isfinite(elevation) & np.isfinite(seen.scale)
-    bend, step = np.zeros((2, *elevation.shape), np.float32)
-    texture = np.zeros((3, *elevation.shape), np.float32)
-    _neighbours(elevation, known, seen, bend, step, texture)
-    cells, bends, steps, count = (window_sum32(v, RELIEF_SIDE) for v in (np.ones(elevation.shape), bend, step, known))
-    both, of_left, of_right = (np.maximum(window_sum32(t, TEXTURE_SIDE), 0.0) for t in texture)
-    relief = bends / cells + steps / np.maximum(count, 1.0)
-    alike = np.clip(both / np.maximum(np.sqrt(of_left * of_right), 1e-6), LEAST_CORRELATION, 1.0)
-    variance = FACTOR**2 * (from_disparity**2 + np.maximum(relief, 0.0)) / alike**2
-    std = np.sqrt(variance + np.square(FLOOR / np.where(known, seen.scale, 1.0)))
-    return np.where(known, std, from_disparity)
+    parts = np.zeros((6, *elevation.shape), np.float32)
+    _neighbours(elevation, known, seen, parts)
+    sides = (RELIEF_SIDE,) * 3 + (TEXTURE_SIDE,) * 3
+    for part, side in zip(parts, sides, strict=True):
+        part[...] = window_sum32(part, side)
+    std = from_disparity.copy()
+    _join(parts, known, seen.scale, std)
+    return std
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _join(sums, known, scale, std):  # type: ignore[no-untyped-def]
+    """Replace the disparity's part of each known cell by the whole standard deviation; ``sums`` as :func:`_neighbours`
+    gives them, over their windows."""
+    rows, cols = std.shape
+    half = RELIEF_SIDE // 2
+    for r in range(rows):
+        for c in range(cols):
+            if known[r, c]:
+                bends, steps, count = sums[0, r, c], sums[1, r, c], sums[2, r, c]
+                both, of_left, of_right = sums[3, r, c], max(sums[4, r, c], 0.0), max(sums[5, r, c], 0.0)
+                height, width = min(r + half + 1, rows) - max(r - half, 0), min(c + half + 1, cols) - max(c - half, 0)
+                relief = max(bends / (height * width) + steps / max(count, 1.0), 0.0)
+                alike = min(max(both / max(math.sqrt(of_left * of_right), 1e-6), LEAST_CORRELATION), 1.0)
+                variance = FACTOR**2 * (std[r, c] ** 2 + relief) / alike**2
+                std[r, c] = math.sqrt(variance + (FLOOR / scale[r, c]) ** 2)
 
 
 def _gain(seen: OrthoPair) -> float:
@@ -143,17 +162,27 @@ def _level(seen: OrthoPair, gain: float) -> None:
 
 
 def _misfit(seen: OrthoPair, keep: Bools) -> tuple[Floats32, Floats32]:
-    """Weight of each cell's equation, zero where not kept, and difference of both images without its local mean."""
-    rest = np.where(keep, seen.left - seen.right, 0.0)
-    known = keep.astype(np.float32)
-    weight = known
+    """Weight of each cell's equation, and difference of both images without its local mean; zero where not kept."""
+    rest, weight, misfit = (np.zeros(keep.shape, np.float32) for _ in range(3))
+    np.subtract(seen.left, seen.right, out=rest, where=keep)
+    weight[keep] = 1.0
     for _ in range(MEAN_ROUNDS + 1):
         weighted, weights = (window_sum32(v, MEAN_SIDE) for v in (weight * rest, weight))
-        misfit = rest - weighted / np.maximum(weights, LEAST_WEIGHT)
-        # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once.
-        weight = known / (1.0 + np.square(misfit / RESIDUAL))
+        _weigh(rest, keep, weighted, weights, misfit, weight)
     # A cell smaller than a pixel brings no more than its share of what the pixel tells.
     return weight * np.fmin(seen.area, 1.0), misfit
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(rest, keep, weighted, weights, misfit, weight):  # type: ignore[no-untyped-def]
+    """Difference of each kept cell from the weighted mean around it, and the weight that follows."""
+    rows, cols = rest.shape
+    for r in range(rows):
+        for c in range(cols):
+            if keep[r, c]:
+                misfit[r, c] = rest[r, c] - weighted[r, c] / max(weights[r, c], LEAST_WEIGHT)
+                # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once.
+                weight[r, c] = 1.0 / (1.0 + (misfit[r, c] / RESIDUAL) ** 2)
 
 
 @njit(cache=True, nogil=True)
@@ -179,9 +208,10 @@ def _stiffness(z, scale, across, down):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _neighbours(z, known, seen, bend, step, texture):  # type: ignore[no-untyped-def]
-    """Squared second difference and squared step of each known cell, m^2; products of the ortho gradients."""
+def _neighbours(z, known, seen, out):  # type: ignore[no-untyped-def]
+    """Squared second difference and squared step of each known cell, m^2, and 1; products of the ortho gradients."""
     left, right, scale = seen.left, seen.right, seen.scale
+    bend, step, count, texture = out[0], out[1], out[2], out[3:]
     rows, cols = z.shape
     for r in range(rows):
         for c in range(cols):
@@ -198,7 +228,7 @@ def _neighbours(z, known, seen, bend, step, texture):  # type: ignore[no-untyped
                     whole = False
                     total = UNKNOWN_BEND / scale[r, c]
                     break
-            bend[r, c] = total * total
+            bend[r, c], count[r, c] = total * total, 1.0
             if not whole:
                 continue
             for i, j in ((0, 1), (1, 0)):

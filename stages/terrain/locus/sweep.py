@@ -49,14 +49,22 @@ class _Sheared(NamedTuple):
     total: Floats32
 
 
+def diagonals(shape: tuple[int, int], dtype: type = np.float32) -> Floats32:
+    """Room for the sheared arrays of (rows, cols) cells, for any number of calls: memory that is new costs more than
+    a few sweeps."""
+    rows, cols = shape
+    return np.empty((5, rows + cols - 1 + 2 * BORDER, rows + 2 * BORDER), dtype)
+
+
 @njit(cache=True, nogil=True)
-def sweep(terms, z, sweeps, overshoot):  # type: ignore[no-untyped-def]
-    """Minimise the terms in place: ``z`` (rows, cols), NaN unknown; ``overshoot`` is the factor on each step."""
+def sweep(terms, z, sweeps, overshoot, room):  # type: ignore[no-untyped-def]
+    """Minimise the terms in place: ``z`` (rows, cols), NaN unknown; ``overshoot`` is the factor on each step, ``room``
+    what :func:`diagonals` gives."""
     power, pull, start, keep, across, down = terms
     rows, cols = z.shape
-    shape = rows + cols - 1 + 2 * BORDER, rows + 2 * BORDER
-    at, by_row, by_column = np.zeros(shape, power.dtype), np.zeros(shape, power.dtype), np.zeros(shape, power.dtype)
-    wanted, total = np.zeros(shape, power.dtype), np.full(shape, power.dtype.type(np.nan))
+    room[:4] = 0.0
+    room[4] = np.nan
+    at, by_row, by_column, wanted, total = room[0], room[1], room[2], room[3], room[4]
     middle = np.nanmean(z)
     for r in range(rows):
         for c in range(cols):
@@ -72,7 +80,7 @@ def sweep(terms, z, sweeps, overshoot):  # type: ignore[no-untyped-def]
     for turn in range(rows + cols - 1 + BEHIND * (sweeps - 1)):
         for k in range(sweeps):
             t = turn - BEHIND * k + BORDER
-            if t >= BORDER and t < shape[0] - BORDER and low[t] < high[t]:
+            if t >= BORDER and t < room.shape[1] - BORDER and low[t] < high[t]:
                 _diagonal(sheared, t, low[t], high[t] - low[t], power.dtype.type(overshoot), sums)
     for r in range(rows):
         for c in range(cols):
@@ -87,13 +95,15 @@ def _totals(by_row, by_column, total):  # type: ignore[no-untyped-def]
     four = total.dtype.type(4.0)
     low, high = np.zeros(diagonals, np.int64), np.zeros(diagonals, np.int64)
     for t in range(BORDER, diagonals - BORDER):
-        low[t] = BORDER
-        for i in range(BORDER, rows - BORDER):
-            s = four * by_row[t, i] + four * by_column[t, i]
-            s = (s + by_row[t - 1, i]) + by_column[t - 1, i - 1]
-            s = (s + by_row[t + 1, i]) + by_column[t + 1, i + 1]
-            own = total[t, i] + s
-            total[t, i] = own if own == own else 0.0
+        low[t] = i = BORDER
+        j = rows - BORDER
+        own, a, b = total[t, i:j], by_row[t, i:j], by_column[t, i:j]
+        before, above = by_row[t - 1, i:j], by_column[t - 1, i - 1 : j - 1]
+        behind, below = by_row[t + 1, i:j], by_column[t + 1, i + 1 : j + 1]
+        for m in range(j - i):
+            s = four * a[m] + four * b[m]
+            s = own[m] + (((s + before[m]) + above[m]) + behind[m] + below[m])
+            own[m] = s if s == s else own.dtype.type(0.0)
         while low[t] < rows - BORDER and not total[t, low[t]] > 0.0:
             low[t] += 1
         high[t] = rows - BORDER

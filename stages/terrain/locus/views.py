@@ -66,9 +66,7 @@ def views(left: Floats, right: Floats, left_image: Floats32, right_image: Floats
     return Views(left, right, (splines[0], splines[1]), np.asarray(centre, np.float64))
 
 
-def look(
-    views: Views, surface: Surface, elevation: Floats | Floats32, room: OrthoPair | None = None
-) -> OrthoPair:
+def look(views: Views, surface: Surface, elevation: Floats | Floats32, room: OrthoPair | None = None) -> OrthoPair:
     """What both images show at the elevations of the cells.
 
     Parameters

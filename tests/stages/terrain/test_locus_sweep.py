@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rille.stages.terrain.locus.sweep import Terms, sweep
+from rille.stages.terrain.locus.sweep import Terms, diagonals, sweep
 
 
 def reading_order(power, pull, keep, across, down, start, z, sweeps, overshoot):  # type: ignore[no-untyped-def]
@@ -47,7 +47,7 @@ def test_diagonals_give_what_reading_order_gives(shape: tuple[int, int], dtype: 
     expected, found = z.copy(), z.copy()
     reading_order(power, pull, keep, *weights, z, expected, 5, 1.7)
     terms = Terms(power.astype(dtype), pull.astype(dtype), z, keep, *(weight.astype(dtype) for weight in weights))
-    sweep(terms, found, 5, 1.7)
+    sweep(terms, found, 5, 1.7, diagonals(shape, dtype))
     np.testing.assert_allclose(found, expected, rtol=tolerance, atol=tolerance)
     assert np.array_equal(found[~keep], z[~keep], equal_nan=True)
     if min(shape) > 1:
