@@ -120,7 +120,7 @@ class Observed(NamedTuple):
     """
 
     disparity: Floats32
-    std: Floats
+    std: Floats32
     image: Floats32
     limits: Floats
 

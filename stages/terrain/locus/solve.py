@@ -80,7 +80,7 @@ class PairArrays:
         # NaN in the arrays, not a mask: the kernel's sums become NaN by themselves where a pixel must not be used.
         disparity[~given.usable] = np.nan
         std = np.full(shape, sigma) if given.std is None else given.std
-        grey, std = np.ascontiguousarray(maps[2], np.float32), np.ascontiguousarray(std, np.float64)
+        grey, std = (np.ascontiguousarray(a, np.float32) for a in (maps[2], std))
         self.seen = Observed(disparity.ravel(), std, grey, np.array(limits))
         epipole = rig.right.matrix @ rig.T_right_left.translation
         sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)

@@ -182,13 +182,13 @@ def reconstruct(
         # Negated, so that NaN is unsure as well.
         unsure = ~(out.elevation_std <= greatest)
         for array in vars(out).values():
-            array[unsure] = np.nan
+            np.copyto(array, np.nan, where=unsure)
     return out
 
 
 def _views(image: ArrayLike, right: ArrayLike, rig: Rig, T_surface_left: RigidTransform) -> Views:
     """Both images as they see the surface."""
-    images = [np.array(a, dtype=np.float32, order="C") for a in (image, right)]
+    images = [np.ascontiguousarray(a, np.float32) for a in (image, right)]
     if images[1].shape != (rig.right.height, rig.right.width):
         raise InputError(
             "RIL-382", f"the right image is {images[1].shape}, its camera's {(rig.right.height, rig.right.width)}"

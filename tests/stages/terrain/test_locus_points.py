@@ -75,8 +75,8 @@ def test_points_of_lanes_and_of_steps_equal_single_points() -> None:
     rng = np.random.default_rng(2)
     disparity = rng.normal(size=(HEIGHT, WIDTH, 2)).astype(np.float32)
     disparity[10:12, 5:9] = np.nan
-    plain = np.ones((HEIGHT, WIDTH))
-    seen = Observed(disparity.ravel(), plain, plain.astype(np.float32), np.ones(2))
+    plain = np.ones((HEIGHT, WIDTH), np.float32)
+    seen = Observed(disparity.ravel(), plain, plain, np.ones(2))
     room = np.zeros(POINT_PLANES * POINTS)
     step, dz, found = 3.0, 0.02, 0
     for way in (-1.0, 1.0):
