@@ -176,13 +176,14 @@ def _misfit(seen: OrthoPair, keep: Bools) -> tuple[Floats32, Floats32]:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _weigh(rest, keep, weighted, weights, misfit, weight):  # type: ignore[no-untyped-def]
     """Difference of each kept cell from the weighted mean around it, and the weight that follows."""
+    one, residual, least = np.float32(1.0), np.float32(RESIDUAL), np.float32(LEAST_WEIGHT)
     rows, cols = rest.shape
     for r in range(rows):
         for c in range(cols):
-            if keep[r, c]:
-                misfit[r, c] = rest[r, c] - weighted[r, c] / max(weights[r, c], LEAST_WEIGHT)
-                # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once.
-                weight[r, c] = 1.0 / (1.0 + (misfit[r, c] / RESIDUAL) ** 2)
+            off = rest[r, c] - weighted[r, c] / max(weights[r, c], least)
+            misfit[r, c] = off if keep[r, c] else 0.0
+            # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once.
+            weight[r, c] = one / (one + (off / residual) ** 2) if keep[r, c] else 0.0
 
 
 @njit(cache=True, nogil=True)
