@@ -136,8 +136,8 @@ def _join(sums, known, scale, std):  # type: ignore[no-untyped-def]
 
 def _gain(seen: OrthoPair) -> float:
     """Factor that gives the right image the left one's contrast, from the gradients along the surface's axes."""
-    power = _steps(seen.left), _steps(seen.right)
-    return float(np.sqrt(power[0] / power[1])) if min(power) > 0 else 1.0
+    left, right = float(_steps(seen.left)), float(_steps(seen.right))
+    return math.sqrt(left / right) if min(left, right) > 0 else 1.0
 
 
 @njit(cache=True, nogil=True)
@@ -151,7 +151,8 @@ def _steps(image):  # type: ignore[no-untyped-def]
                 continue
             across = image[r, c + 1] - image[r, c] if c + 1 < cols else np.float32(0.0)
             down = image[r + 1, c] - image[r, c] if r + 1 < rows else np.float32(0.0)
-            total += (across * across if across == across else 0.0) + (down * down if down == down else 0.0)
+            for step in (across, down):
+                total += float(step * step) if step == step else 0.0
     return total
 
 

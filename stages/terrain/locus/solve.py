@@ -100,16 +100,16 @@ class PairArrays:
 def solve(task: PairArrays, surface: Surface) -> Dem:
     """Every cell of a surface from one disparity map, coarse to fine: a few coarse cells search the whole range."""
     # The last row and column as well, so that every cell lies between coarse ones.
-    cells = [np.unique(np.append(np.arange(0, n, COARSE), n - 1)) for n in (surface.rows, surface.cols)]
-    coarse, out = _undefined(cells[0].size, cells[1].size), _undefined(surface.rows, surface.cols)
-    task.cells(surface, *cells, *task.z_range, coarse)
+    rows, cols = (np.unique(np.append(np.arange(0, n, COARSE), n - 1)) for n in (surface.rows, surface.cols))
+    coarse, out = _undefined(rows.size, cols.size), _undefined(surface.rows, surface.cols)
+    task.cells(surface, rows, cols, task.z_range[0], task.z_range[1], coarse)
     cols = np.arange(surface.cols)
-    low, high = (v[:, cols // COARSE + 1] for v in _around(coarse.elevation))
+    lowest, highest = (v[:, cols // COARSE + 1] for v in _around(coarse.elevation))
     for start in range(0, surface.rows, BLOCK_ROWS):
         rows = np.arange(start, min(start + BLOCK_ROWS, surface.rows))
         near = rows // COARSE + 1
         block = Dem(*(array[start : start + rows.size] for array in vars(out).values()))
-        task.cells(surface, rows, cols, low[near], high[near], block)
+        task.cells(surface, rows, cols, lowest[near], highest[near], block)
     return out
 
 
