@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 
 from rille.pipeline.engine.code_digest import module_digests
 from rille.pipeline.engine.keys import text
+from rille.pipeline.engine.memory.cost_model import tells_more
 from rille.pipeline.engine.memory.limits import Meter
 from rille.pipeline.engine.packages import versions
 from rille.pipeline.engine.runtime.numba_cache import COMPILING, guard
@@ -203,7 +204,8 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
                 return Outcome(ref, True, time.perf_counter() - begin, _peak_rss(), started)
             first = spec.module not in _run
             COMPILING.take()  # of what ran before in this process
-            with Meter() as meter:
+            size = sum(r.nbytes for ref in refs.values() for r in (ref if isinstance(ref, list) else [ref]))
+            with Meter(measure=tells_more((spec.module, _forms(spec).canonical), size)) as meter:
                 ref, kernel = _compute(store, spec, refs, own)
             seconds = time.perf_counter() - begin
             _run.add(spec.module)

@@ -8,9 +8,10 @@ are completed by repeating the last row or column. A coarse pixel is valid if at
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, overload
 
 import cv2
 import numpy as np
@@ -53,8 +54,8 @@ class Pyramid:
     ``noise``: standard deviation of level 0, grey levels (see :mod:`rille.stages.imaging.noise`).
     """
 
-    images: tuple[Floats32, ...]
-    valid: tuple[Mask, ...]
+    images: Sequence[Floats32]
+    valid: Sequence[Mask]
     noise: float = 0.0
 
     @property
@@ -62,19 +63,58 @@ class Pyramid:
         """Number of images."""
         return len(self.images)
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of level 0."""
+        rows, cols = self.images[0].shape
+        return rows, cols
+
     @staticmethod
     def from_bundle(bundle: Bundle) -> Pyramid:
-        """Pyramid out of the artifact of stage ``pyramid``."""
-        n = int(bundle.meta["levels"])
-        return Pyramid(
-            tuple(np.ascontiguousarray(bundle[f"level_{i}"]) for i in range(n)),
-            tuple(np.ascontiguousarray(bundle[f"valid_{i}"]) for i in range(n)),
-            float(bundle.meta.get("noise", 0.0)),
-        )
+        """Pyramid out of the artifact of stage ``pyramid``; a level is read at its first access."""
+        levels = range(int(bundle.meta["levels"]))
+        images, valid = (_Read(bundle, [f"{name}_{n}" for n in levels]) for name in ("level", "valid"))
+        return Pyramid(images, valid, float(bundle.meta.get("noise", 0.0)))
+
+    @cached_property
+    def filled(self) -> tuple[Floats32, ...]:
+        """Images whose masked pixels carry the grey of the next valid level above: a mask's edge is no texture."""
+        images = list(self.images)
+        # From the top down, so that the level above is filled already.
+        for n in range(self.levels - 1, -1, -1):
+            mask = self.valid[n] != 0
+            if mask.all():
+                continue
+            if n + 1 < self.levels:
+                images[n] = filled_from(images[n + 1], images[n], mask)
+            else:
+                # At the top there is no level above: the mean of what is seen.
+                images[n] = np.where(mask, images[n], images[n][mask].mean() if mask.any() else np.float32(0.0))
+        return tuple(images)
 
     def above(self, level: int) -> Pyramid:
         """The pyramid from a level on; noise halves from level to level."""
         return Pyramid(self.images[level:], self.valid[level:], self.noise * 0.5**level)
+
+
+@dataclass(frozen=True)
+class _Read(Sequence[AnyArray]):
+    """Arrays of an artifact, each read at its first access, since coarse matching needs no fine level."""
+
+    bundle: Bundle
+    names: Sequence[str]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @overload
+    def __getitem__(self, at: int) -> AnyArray: ...
+    @overload
+    def __getitem__(self, at: slice) -> Sequence[AnyArray]: ...
+    def __getitem__(self, at: int | slice) -> AnyArray | Sequence[AnyArray]:
+        if isinstance(at, slice):
+            return _Read(self.bundle, self.names[at])
+        return np.ascontiguousarray(self.bundle[self.names[at]])
 
 
 def grey(image: AnyArray) -> Floats32:
@@ -206,23 +246,17 @@ def _means(image, mask, least, coarse, valid):  # type: ignore[no-untyped-def]
             usable[x] = count >= least
 
 
-def filled(pyramid: Pyramid) -> tuple[Floats32, ...]:
-    """Images whose masked pixels carry the grey of the next valid level above, so that a mask's edge is no texture."""
-    images = list(pyramid.images)
-    # From the top down, so that the level above is filled already.
-    for n in range(pyramid.levels - 1, -1, -1):
-        mask = pyramid.valid[n] != 0
-        if mask.all():
-            continue
-        if n + 1 < pyramid.levels:
-            images[n] = images[n].copy()
-            for i, j in np.ndindex(2, 2):  # one of the four pixels below each pixel of the level above
-                part = images[n][i::2, j::2]
-                np.copyto(part, images[n + 1][: part.shape[0], : part.shape[1]], where=~mask[i::2, j::2])
-        else:
-            # At the top there is no level above: the mean of what is seen.
-            images[n] = np.where(mask, images[n], images[n][mask].mean() if mask.any() else np.float32(0.0))
-    return tuple(images)
+def filled_from(above: Floats32, image: Floats32, mask: Bools, y: int = 0, x: int = 0) -> Floats32:
+    """Image (row, col) whose masked pixels (``mask`` false) carry the grey of the level above.
+
+    ``y, x``: row and column of the image's first pixel, where pixel (0, 0) lies under the first one of ``above``.
+    """
+    image = image.copy()
+    for i, j in np.ndindex(2, 2):  # one of the four pixels below each pixel of the level above
+        part = image[i::2, j::2]
+        rows, cols = part.shape
+        np.copyto(part, above[(i + y) // 2 :, (j + x) // 2 :][:rows, :cols], where=~mask[i::2, j::2])
+    return image
 
 
 def _run(params: PyramidParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

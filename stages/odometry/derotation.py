@@ -68,7 +68,7 @@ class Derotation:
         image = np.empty((self.shape[0] + 2 * MARGIN, self.shape[1] + 2 * MARGIN), np.float32)
         valid = np.empty(image.shape, np.uint8)
         # Masked pixels are filled before the interpolation, which would spread their NaN.
-        grey, usable = pyramid.filled(b)[0], b.valid[0]
+        grey, usable = b.filled[0], b.valid[0]
         place = WindowPair(0, 0, 0, 0, *usable.shape)
         warp(grey, usable, self.homography @ translation(-MARGIN), image, valid, place)
         return pyramid.build(image, PyramidParams(levels=b.levels), valid)

@@ -143,35 +143,34 @@ def _rolled(
     share = matched_share(plain.validity)
     if params.turn_below == 0 or not matched_texture(plain):
         return None
-    shape = (a.images[0].shape[0], a.images[0].shape[1])
 
     def attempt(homography: Floats, which: MotionParams) -> tuple[Motion, Derotation]:
         # The rotation that is searched is added to the one that a sensor measured.
-        upright = Derotation(homography if turn is None else turn.homography @ homography, shape)
+        upright = Derotation(homography if turn is None else turn.homography @ homography, a.shape)
         return coarse_motion(a, b, which, upright), upright
 
     best, needed = plain, 1.0
     if share < params.turn_below:
         wide = roll_search.feature_homography(a, b)
         if wide is not None:
-            upright = Derotation(wide, shape)
+            upright = Derotation(wide, a.shape)
             found = coarse_motion(a, b, params, upright)
             if matched_share(found.validity) > roll_search.GAIN * share:
-                degrees = -roll_search.relative((0.0, 1.0), wide, shape)[0]
+                degrees = -roll_search.relative((0.0, 1.0), wide, a.shape)[0]
                 known = np.eye(3) if turn is None else turn.homography
-                return found, upright, roll_search.relative((degrees, 1.0), known, shape)[0]
+                return found, upright, roll_search.relative((degrees, 1.0), known, a.shape)[0]
         # One level coarser: a quarter of the pixels for each of the angles.
         coarse, needed = params.model_copy(update={"level": params.level + 1}), roll_search.GAIN
         for degrees in roll_search.candidates(params.turn_range_deg):
-            found, _ = attempt(roll_search.similarity(degrees, 1.0, shape), coarse)
+            found, _ = attempt(roll_search.similarity(degrees, 1.0, a.shape), coarse)
             best = max(best, found, key=lambda motion: matched_share(motion.validity))
     fitted = roll_search.fit(best.column_disparity, best.row_disparity, matched(best.validity), best.level)
     if fitted is not None and turn is not None:  # what the attitude left over
-        fitted = roll_search.relative(fitted, turn.homography, shape)
+        fitted = roll_search.relative(fitted, turn.homography, a.shape)
     # Small rotations are the matcher's, which stands them: resampling the image costs more than they do.
     if fitted is None or abs(fitted[0]) < roll_search.LEAST_DEG:
         return None
-    found, upright = attempt(roll_search.similarity(fitted[0], fitted[1], shape), params)
+    found, upright = attempt(roll_search.similarity(fitted[0], fitted[1], a.shape), params)
     return (found, upright, fitted[0]) if matched_share(found.validity) > needed * share else None
 
 

@@ -19,7 +19,7 @@ from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.level import features
 from rille.stages.hfvm.level.features import distance
 from rille.stages.hfvm.level.subpixel import linear
-from rille.stages.imaging.pyramid import Pyramid, filled
+from rille.stages.imaging.pyramid import Pyramid
 
 SUM_RADIUS = 3
 SIDE = 2 * SUM_RADIUS + 1
@@ -58,7 +58,7 @@ def match_points(
     fails.
     """
     n = len(points)
-    a_image, b_image = filled(a)[0], filled(b)[0]
+    a_image, b_image = a.filled[0], b.filled[0]
     a_valid, b_valid = a.valid[0], b.valid[0]
     usable = np.isfinite(np.concatenate([points, predicted, affinity.reshape(n, 4)], axis=1)).all(axis=1)
     # An affinity that folds the template to a tenth of its area or less draws no texture.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,6 +40,9 @@ LIKE = 1.25
 
 SPREAD = 0.1
 """Least relative uncertainty stated: allocators and the system do not repeat themselves better."""
+
+MEASURED = 3
+"""Tasks of one kind that a process measures: the first, which imports and compiles, and two that foretell others."""
 
 FEW = 0.4
 """Added to it, over the number of like tasks that were measured."""
@@ -153,6 +156,22 @@ class Costs:
             for old in list(groups)[:-GROUPS]:
                 del groups[old]
         self._foreseen.clear()
+
+
+_sizes: dict[Hashable, list[float]] = {}
+"""Of each kind the greatest inputs [bytes] that this process has measured tasks with, in ascending order."""
+
+
+def tells_more(kind: Hashable, size: float) -> bool:
+    """Whether a task with ``size`` bytes of input is worth measuring; it then counts as measured.
+
+    It is unless :data:`MEASURED` tasks of its kind, a stage with its parameters, had inputs of like size or greater.
+    """
+    known = _sizes.setdefault(kind, [])
+    if len(known) == MEASURED and size <= LIKE * known[0]:
+        return False
+    known[:] = sorted([*known, size])[-MEASURED:]
+    return True
 
 
 def _thinned(samples: list[Sample]) -> list[Sample]:

@@ -64,7 +64,7 @@ def align(right: Pyramid, h: Matrix, left_shape: tuple[int, ...], params: Pyrami
     m = margin(left_shape)
     image = np.empty((left_shape[0] + 2 * m, left_shape[1] + 2 * m), np.float32)
     valid = np.empty(image.shape, np.uint8)
-    grey, usable = pyramid.filled(right)[0], right.valid[0]
+    grey, usable = right.filled[0], right.valid[0]
     place = WindowPair(0, 0, 0, 0, *usable.shape)
     warp(grey, usable, h @ translation(-m), image, valid, place)
     return pyramid.build(image, params, valid)

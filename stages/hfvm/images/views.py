@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -44,7 +45,7 @@ class View(Protocol):
 
     def filled(self, level: int, window: Window) -> AnyArray:
         """As ``grey``; masked pixels carry the grey of the next valid level above
-        (:func:`rille.stages.imaging.pyramid.filled`)."""
+        (:attr:`rille.stages.imaging.pyramid.Pyramid.filled`)."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class Plain:
         """The view denoised where it is noisy, else itself."""
         return Denoised(self) if self.noise >= params.denoise_from else self
 
-    @property
+    @cached_property
     def shapes(self) -> Sequence[Shape]:
         """Rows and columns of each level."""
         return tuple(image.shape for image in self.images)
@@ -156,9 +157,7 @@ def fill(view: View, level: int, window: Window) -> AnyArray:
         return np.where(mask, image, np.float32(view.blank))
     outer = window.parent()
     above = view.filled(level + 1, outer)
-    rows = np.arange(window.y0, window.y1) // 2 - outer.y0
-    cols = np.arange(window.x0, window.x1) // 2 - outer.x0
-    return np.where(mask, image, above[rows[:, None], cols])
+    return pyramid.filled_from(above, image, mask, window.y0 - 2 * outer.y0, window.x0 - 2 * outer.x0)
 
 
 @dataclass(frozen=True)

@@ -100,6 +100,16 @@ def test_a_meter_sees_what_was_freed_meanwhile_and_nothing_of_tasks_side_by_side
     with limits.Meter() as meter:
         pass
     assert meter.memory < 5 * MB
+    with limits.Meter(measure=False) as meter, limits.Meter() as other:
+        pass
+    assert (meter.memory, other.memory) == (None, None), "one that is not measured runs, too"
+
+
+def test_three_tasks_of_a_kind_are_measured_and_then_only_greater_ones():
+    sizes = [50.0, 100.0, 70.0, 60.0, 200.0, 200.0, 100.0, 200.0, 200.0]
+    expected = [True, True, True, False, True, True, False, True, False]
+    assert [cost_model.tells_more("a", size) for size in sizes] == expected
+    assert cost_model.tells_more("b", 1.0)
 
 
 SPEC = Spec("toys.numbers", "n", NumbersParams())

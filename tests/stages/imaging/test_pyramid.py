@@ -104,7 +104,7 @@ def test_filled_images_carry_no_edge_of_the_mask():
     image = np.full((32, 32), 100, np.float32)
     valid = np.ones((32, 32), np.uint8)
     valid[:, 20:] = 0
-    for level in pyramid.filled(pyramid.build(image, params(levels=4), valid)):
+    for level in pyramid.build(image, params(levels=4), valid).filled:
         np.testing.assert_array_equal(level, 100)
 
 
