@@ -149,10 +149,7 @@ def _inside(valid: Bytes, border: int) -> Bools:
 def clear_of_mask(valid: Bytes, points: Floats, border: int) -> Bools:
     """Whether points (n, 2) are at least ``border`` pixels away from the image's edge and from anything unusable."""
     rows, cols = valid.shape
-    p = np.floor(np.where(np.isfinite(points), points, -1.0) + 0.5).astype(np.intp)
-    inside = ((p >= border) & (p < np.array([cols, rows]) - border)).all(1)
-    # Any place that is inside: its answer is refused below.
-    p[~inside] = border
-    dy, dx = (o.ravel() for o in np.mgrid[-border : border + 1, -border : border + 1])
-    window = valid[np.clip(p[:, 1:] + dy, 0, rows - 1), np.clip(p[:, :1] + dx, 0, cols - 1)]
-    return np.asarray(inside & (window.min(axis=1) != 0))
+    x, y = np.floor(np.where(np.isfinite(points), points, -1.0) + 0.5).astype(np.intp).T
+    seen = (x >= 0) & (y >= 0) & (x < cols) & (y < rows)
+    # Any place that is inside: its answer is refused.
+    return np.asarray(seen & _inside(valid, border)[np.where(seen, y, 0), np.where(seen, x, 0)])
