@@ -23,8 +23,8 @@ from rille.pipeline.engine.code_digest import remember
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.packages import installed
 from rille.pipeline.engine.plain import warn
-from rille.pipeline.engine.store.artifact import DamagedError
 from rille.pipeline.engine.store.base import GoneError, Store, at
+from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.store.location import Location, hints_folder, locate
 from rille.pipeline.flow import config as configuration
 from rille.stages.core.errors import ConfigError, RilleError

@@ -33,9 +33,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from rille.pipeline.engine.store.artifact import LazyArrays, array_digests, encode, output_digest
 from rille.pipeline.engine.store.folder import Folder, StoreError
 from rille.pipeline.engine.store.index import Index
+from rille.pipeline.engine.store.lazy_arrays import LazyArrays
 from rille.pipeline.engine.store.location import Location, hints_folder, locate
 from rille.pipeline.engine.store.manifest import (
     FIRST,
@@ -48,7 +48,9 @@ from rille.pipeline.engine.store.manifest import (
     reference,
     unframe,
 )
+from rille.pipeline.engine.store.output_digest import array_digests, output_digest
 from rille.pipeline.engine.store.place import Place
+from rille.pipeline.engine.store.zarr_group import encode
 from rille.stages.core.declare import Bundle, Stage
 from rille.stages.core.errors import RilleError
 

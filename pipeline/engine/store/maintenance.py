@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 
 from rille.pipeline.engine.runtime import numba_cache
 from rille.pipeline.engine.store import index
-from rille.pipeline.engine.store.artifact import DamagedError, LazyArrays, array_digests, output_digest
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.lazy_arrays import DamagedError, LazyArrays
 from rille.pipeline.engine.store.manifest import STAGE, Manifest, artifact_path, damage, length, unframe
+from rille.pipeline.engine.store.output_digest import array_digests, output_digest
 
 GRACE = 24 * 3600.0
 """Seconds before what no run is known to use goes: no single task takes a day."""

@@ -22,9 +22,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 from raising import raises
 
-from rille.pipeline.engine.store import artifact, folder, maintenance, manifest
-from rille.pipeline.engine.store.artifact import array_digests, output_digest
+from rille.pipeline.engine.store import folder, maintenance, manifest, zarr_group
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.output_digest import array_digests, output_digest
 from rille.stages.core.declare import Array, Bundle, NoParams, Stage
 
 STAGE = Stage(
@@ -436,7 +436,7 @@ def chunks(cache):
     ],
 )
 def test_large_arrays_are_chunked(cache, shape, count):
-    assert artifact.CHUNK == 1024
+    assert zarr_group.CHUNK == 1024
     big = np.random.default_rng(0).normal(size=shape).astype(np.float32)
     ref = Store(cache).commit(STAGE, KEY, Bundle({"elevation": big}, {}))
     assert len(chunks(cache)) == count
@@ -449,14 +449,14 @@ def test_large_arrays_are_chunked(cache, shape, count):
 def test_an_array_is_stored_as_zarr_stores_it(shape, dtype):
     values = (np.random.default_rng(0).normal(size=shape) * 9).astype(dtype)
     stage = replace(STAGE, outputs=(Array("values", tuple("ab"[: len(shape)]), dtype, "1", "values"),))
-    files, _ = artifact.encode(stage, Bundle({"values": values}, {}))
+    files, _ = zarr_group.encode(stage, Bundle({"values": values}, {}))
     stored = {}
     zarr.create_array(
         zarr.storage.MemoryStore(stored),
         name="values",
         shape=shape,
         dtype=dtype,
-        chunks=tuple(max(min(n, artifact.CHUNK), 1) for n in shape),
+        chunks=tuple(max(min(n, zarr_group.CHUNK), 1) for n in shape),
         compressors=zarr.codecs.BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
         fill_value=np.nan if values.dtype.kind == "f" else 0,
         dimension_names=tuple("ab"[: len(shape)]),
@@ -473,7 +473,7 @@ def test_an_array_is_stored_as_zarr_stores_it(shape, dtype):
     assert {name: files[name] for name in expected} == expected
 
 
-@pytest.mark.parametrize("shape", [(7, 5), (3,), (artifact.CHUNK, 2), (2, 3, 4)])
+@pytest.mark.parametrize("shape", [(7, 5), (3,), (zarr_group.CHUNK, 2), (2, 3, 4)])
 @pytest.mark.parametrize("dtype", ["float32", "float64", "int16", "uint8", "bool"])
 def test_an_array_of_one_chunk_is_what_zarr_reads(cache, monkeypatch, shape, dtype):
     values = (np.random.default_rng(0).normal(size=shape) * 9).astype(dtype)

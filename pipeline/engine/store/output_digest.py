@@ -1,0 +1,60 @@
+"""Digest of a result, over the *decoded* arrays (type, shape, little-endian bytes, one NaN) and the metadata.
+
+A change of codec or of chunking changes no key, and an upstream change that does not change a result stops there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rille.pipeline.engine.keys import canonical, digest
+from rille.stages.core.declare import AnyArray
+
+
+def array_digests(arrays: Mapping[str, AnyArray]) -> dict[str, str]:
+    """SHA-256 of each array: type, shape and little-endian bytes in C order, every NaN made the same."""
+    return {name: _array_digest(name, np.asarray(arrays[name])) for name in sorted(arrays)}
+
+
+def _array_digest(name: str, array: AnyArray) -> str:
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"array {name} is {array.dtype}: store integers, floats or booleans")
+    little = array.dtype.newbyteorder("<")
+    plain = np.ascontiguousarray(array, dtype=little)
+    if array.dtype.kind == "f" and np.isnan(plain).any():
+        # NaN has millions of bit patterns, and processors choose differently among them.
+        plain = np.where(np.isnan(plain), little.type(np.nan), plain)
+    total = hashlib.sha256(f"{little.str} {array.shape}\0".encode())
+    total.update(plain.data)
+    return total.hexdigest()
+
+
+def output_digest(digests: Mapping[str, str], meta: Mapping[str, Any]) -> str:
+    """Digest of a result: the digests of its arrays, and its metadata.
+
+    Raises
+    ------
+    TypeError
+        ``meta`` is not plain JSON (NaN and infinities are not either: use None).
+    """
+    _refuse_non_finite(meta, "meta")
+    return digest({"arrays": dict(digests), "meta": dict(meta)})
+
+
+def _refuse_non_finite(value: Any, where: str) -> None:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _refuse_non_finite(item, f"{where}.{key}")
+    elif isinstance(value, list | tuple):
+        for i, item in enumerate(value):
+            _refuse_non_finite(item, f"{where}[{i}]")
+    elif isinstance(value, set | frozenset):
+        raise TypeError(f"{where} is a set: give a sorted list")
+    elif isinstance(value, float) and not np.isfinite(value):
+        raise TypeError(f"{where} is {value}: metadata is JSON, use None for what is undefined")
+    else:
+        canonical(value, where)
