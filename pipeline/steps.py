@@ -366,7 +366,7 @@ def _builder(pair: StereoPair | None, settings: Settings) -> Builder:
 def _placeholder(label: str) -> Handle:
     """A task whose result is known."""
     from rille.pipeline.engine.graph import Handle
-    from rille.pipeline.engine.task import Spec
+    from rille.pipeline.engine.spec import Spec
 
     return Handle(-1, Spec("", label, NoParams()), {})
 

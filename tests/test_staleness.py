@@ -23,7 +23,7 @@ from rille.datasets.images.misalign import MisalignParams
 from rille.datasets.mockup.params import SHORT, MockupParams
 from rille.datasets.protocol import Positions, Sequence
 from rille.datasets.registry import open_sequence
-from rille.pipeline.engine import code_digest, provenance, scheduler, task
+from rille.pipeline.engine import code_digest, provenance, scheduler, spec
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.store.base import Store
@@ -491,7 +491,7 @@ def edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """``edited(file, old, new)``: the sources as a new process would find them after that edit."""
     for package in ("stages", "datasets", "pipeline"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
-    caches = (code_digest._read, code_digest._file, code_digest._reachable, task._shared)
+    caches = (code_digest._read, code_digest._file, code_digest._reachable, spec._shared)
 
     def edit(file: str, old: str, new: str) -> None:
         path = tmp_path / file

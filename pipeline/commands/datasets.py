@@ -48,8 +48,9 @@ def export_dataset(
     prepare()
     from rille.datasets.export import export
     from rille.datasets.registry import open_sequence
+    from rille.pipeline.engine.spec import Spec
     from rille.pipeline.engine.store.base import at
-    from rille.pipeline.engine.task import Spec, ensure
+    from rille.pipeline.engine.task import ensure
     from rille.pipeline.flow import config
     from rille.stages.core.errors import ConfigError
 

@@ -21,8 +21,8 @@ from functools import cache
 from types import ModuleType
 from typing import Any, Generic, TypeVar
 
+from rille.pipeline.engine.spec import Refs, Spec
 from rille.pipeline.engine.store.manifest import Ref
-from rille.pipeline.engine.task import Refs, Spec
 from rille.stages.core.declare import Params
 
 Expansion = Callable[..., None]

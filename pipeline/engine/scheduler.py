@@ -45,9 +45,10 @@ from rille.pipeline.engine.plain import some
 from rille.pipeline.engine.progress import Progress, Quiet
 from rille.pipeline.engine.runtime.environment import cores
 from rille.pipeline.engine.runtime.interrupts import Interrupts
+from rille.pipeline.engine.spec import Refs, key_of, recipe
 from rille.pipeline.engine.store.base import GoneError, NonDeterministicError, Store
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
-from rille.pipeline.engine.task import CodeChangedError, Outcome, Refs, key_of, recipe
+from rille.pipeline.engine.task import CodeChangedError, Outcome
 from rille.stages.core.errors import DegenerateError, RilleError
 
 HEALS = 3

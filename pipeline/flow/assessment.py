@@ -15,7 +15,7 @@ from typing import Any
 
 from rille.datasets.protocol import Positions
 from rille.pipeline.engine.graph import Handle, Wait
-from rille.pipeline.engine.task import Ref
+from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow.builders import Builder, Pair
 from rille.stages.evaluation import accuracy, agreement, dem_accuracy, path_check, position_accuracy, truth
 from rille.stages.geometry.geometry import RigidTransform

@@ -44,7 +44,7 @@ from itertools import groupby, pairwise
 from typing import Any
 
 from rille.pipeline.engine.graph import Handle, Maybe, Wait
-from rille.pipeline.engine.task import Ref
+from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow import assessment
 from rille.pipeline.flow.builders import Builder, Pair, Segment, centre, merge_tiles
 from rille.stages.core.errors import DegenerateError, InputError

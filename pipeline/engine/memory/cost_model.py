@@ -23,7 +23,7 @@ from rille.stages.core.declare import Params
 
 if TYPE_CHECKING:
     from rille.pipeline.engine.graph import Handle
-    from rille.pipeline.engine.task import Spec
+    from rille.pipeline.engine.spec import Spec
 
 FILE = "costs.json"
 KEPT = 64

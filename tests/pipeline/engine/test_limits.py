@@ -16,8 +16,8 @@ from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.memory import cost_model, limits
 from rille.pipeline.engine.memory.admission import Account, MemoryRefusedError, Waiting, account, forecast
 from rille.pipeline.engine.memory.cost_model import Costs, Group
+from rille.pipeline.engine.spec import Spec
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.task import Spec
 from rille.stages.core.declare import NoParams
 
 MB = 1_000_000

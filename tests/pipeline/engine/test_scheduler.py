@@ -17,9 +17,10 @@ from toys.scale import ScaleParams
 from rille.pipeline.engine import events as ledger
 from rille.pipeline.engine import packages, progress, scheduler
 from rille.pipeline.engine.graph import Graph, Maybe
+from rille.pipeline.engine.spec import Spec, recipe
 from rille.pipeline.engine.store import maintenance
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.task import Spec, ensure, recipe
+from rille.pipeline.engine.task import ensure
 from rille.stages.core.declare import NoParams
 
 NO = NoParams()

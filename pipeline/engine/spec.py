@@ -1,0 +1,138 @@
+"""What a task computes, and its key.
+
+A :class:`Spec` names a stage module (its ``STAGE`` is taken), validated parameters, the arguments that
+identify the task, and hints (paths) that cannot change the result. The key is the digest of all of it but the hints
+and the label, of the code and packages behind the stage, and of the *output digests* of the inputs. Parameters that
+many tasks share are put into canonical form, and pickled, only once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import pickle
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache, lru_cache
+from typing import Any, NamedTuple
+
+from rille.pipeline.engine.code_digest import module_digests
+from rille.pipeline.engine.keys import text
+from rille.pipeline.engine.packages import versions
+from rille.pipeline.engine.runtime.numba_cache import guard
+from rille.pipeline.engine.store.manifest import Ref
+from rille.stages.core.declare import Params, Stage
+
+FORMAT = 2
+"""Enters every key: raise it when the meaning of keys or artifacts changes."""
+
+Refs = Mapping[str, Ref | list[Ref]]
+"""Input port to the artifact given there, or to the list of them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spec:
+    """One task without its inputs. ``label`` names it to people (``locus/12``) and is not part of the key."""
+
+    module: str
+    label: str
+    params: Params
+    args: Mapping[str, Any] = field(default_factory=dict)
+    hints: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def stage(self) -> Stage:
+        """The declaration behind the module."""
+        return resolve(self.module)
+
+    @property
+    def canonical(self) -> str:
+        """The parameters as canonical text."""
+        return _forms(self).canonical
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _unpickled, (self.module, self.label, _forms(self).pickled, self.args, self.hints)
+
+
+MANY = 4096
+"""Parameter models of which a process keeps the forms."""
+
+
+class _Forms(NamedTuple):
+    """A parameter model, held so that its id stays its own, with its canonical text and its pickle."""
+
+    params: Params
+    canonical: str
+    pickled: bytes
+
+
+class _Common(NamedTuple):
+    """What all tasks of a stage have in common, and its canonical text in the order of the names: what stands before
+    ``inputs``, and what after ``params``."""
+
+    parts: dict[str, Any]
+    before: str
+    after: str
+
+
+_forms_by_id: dict[int, _Forms] = {}
+
+
+@cache
+def resolve(module: str) -> Stage:
+    """``STAGE`` of a module; its source is digested just before the import, so that both see the same files."""
+    module_digests(module)
+    guard()
+    stage = importlib.import_module(module).STAGE
+    if "cv2" in sys.modules:
+        # OpenCV takes a thread a core by default, and there is a worker for each core already.
+        sys.modules["cv2"].setNumThreads(1)
+    if not isinstance(stage, Stage):
+        raise TypeError(f"{module}.STAGE is a {type(stage).__name__}, not a Stage")
+    return stage
+
+
+def recipe(spec: Spec, refs: Refs) -> dict[str, Any]:
+    """All that determines a result; its digest is the key."""
+    return {**_shared(spec.module).parts, "params": spec.params, "args": dict(spec.args), "inputs": _digests(refs)}
+
+
+def key_of(spec: Spec, refs: Refs) -> str:
+    """Key of a task, ``digest(recipe(spec, refs))``; what many tasks share is put into its canonical form only once."""
+    common = _shared(spec.module)
+    args, inputs = text(dict(spec.args), f"{spec.label}.args"), text(_digests(refs))
+    parts = f'{{"args":{args},{common.before},"inputs":{inputs},"params":{spec.canonical},{common.after}}}'
+    return hashlib.sha256(parts.encode()).hexdigest()
+
+
+def _forms(spec: Spec) -> _Forms:
+    """Forms of a task's parameters, which many tasks share."""
+    known = _forms_by_id.get(id(spec.params))
+    if known is None or known.params is not spec.params:
+        if len(_forms_by_id) > MANY:
+            _forms_by_id.clear()
+        known = _Forms(spec.params, text(spec.params, f"{spec.label}.params"), pickle.dumps(spec.params))
+        _forms_by_id[id(spec.params)] = known
+    return known
+
+
+def _unpickled(module: str, label: str, params: bytes, *more: Any) -> Spec:
+    return Spec(module, label, _model(params), *more)
+
+
+_model = lru_cache(MANY)(pickle.loads)
+"""Tasks that shared a model share one again in the process that they are sent to, where its forms are kept as well."""
+
+
+@cache
+def _shared(module: str) -> _Common:
+    stage = resolve(module)
+    found = (module_digests(module), versions(module), FORMAT, stage.name, stage.version)
+    fixed = dict(zip(("code", "env", "format", "stage", "version"), found, strict=True))
+    texts = [f'"{name}":{text(value)}' for name, value in fixed.items()]
+    return _Common(fixed, ",".join(texts[:3]), ",".join(texts[3:]))
+
+
+def _digests(refs: Refs) -> dict[str, Any]:
+    return {p: [r.digest for r in ref] if isinstance(ref, list) else ref.digest for p, ref in refs.items()}
