@@ -25,9 +25,11 @@ def _array_digest(name: str, array: AnyArray) -> str:
         raise TypeError(f"array {name} is {array.dtype}: store integers, floats or booleans")
     little = array.dtype.newbyteorder("<")
     plain = np.ascontiguousarray(array, dtype=little)
-    if array.dtype.kind == "f" and np.isnan(plain).any():
+    if array.dtype.kind == "f":
         # NaN has millions of bit patterns, and processors choose differently among them.
-        plain = np.where(np.isnan(plain), little.type(np.nan), plain)
+        bits, usual = (a.view(f"<u{little.itemsize}") for a in (plain, little.type(np.nan)))
+        if (np.isnan(plain) & (bits != usual)).any():
+            plain = np.where(np.isnan(plain), little.type(np.nan), plain)
     total = hashlib.sha256(f"{little.str} {array.shape}\0".encode())
     total.update(plain.data)
     return total.hexdigest()
