@@ -123,7 +123,7 @@ def _search_all(a, b, templates, radius, scale, offset, cost):  # type: ignore[n
     # Features at all places of the sum need their kernels' reach around.
     side = 2 * (SUM_RADIUS + features.RADIUS) + 1
     wide = side + 2 * (radius + 1)
-    template, area = np.empty((side, side), np.float32), np.empty((wide, wide), np.float32)
+    template, area = np.zeros((side, side), np.float32), np.empty((wide, wide), np.float32)
     m = wide - 2 * features.RADIUS
     words, searched = np.empty((SIDE, SIDE), np.uint64), np.empty((m, m), np.uint64)
     deviation = np.empty((m, m), np.float32)
@@ -139,7 +139,7 @@ def _search_all(a, b, templates, radius, scale, offset, cost):  # type: ignore[n
 def _cut(image, px, py, shape, out):  # type: ignore[no-untyped-def]
     """Patch around a point, pixel offsets taken through ``shape``; False where its centre is off the image.
 
-    Positions beyond the border take the nearest inner one.
+    Positions beyond the border take the nearest inner one; corners stay what they were.
     """
     rows, cols = image.shape
     side = out.shape[0]
@@ -148,6 +148,9 @@ def _cut(image, px, py, shape, out):  # type: ignore[no-untyped-def]
     for j in range(side):
         for i in range(side):
             dx, dy = i - side // 2, j - side // 2
+            # Features look along their row, their column and at 5 x 5 pixels: none reads the patch's corners.
+            if min(abs(dx), abs(dy)) > SUM_RADIUS and max(abs(dx), abs(dy)) > SUM_RADIUS + features.VARIANCE_RADIUS:
+                continue
             x = px + shape[0, 0] * dx + shape[0, 1] * dy
             y = py + shape[1, 0] * dx + shape[1, 1] * dy
             # Cubic interpolation reads one pixel before and two behind.
