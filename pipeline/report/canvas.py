@@ -19,6 +19,7 @@ from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from rille.pipeline.export import ranges
 
@@ -83,7 +84,7 @@ class Table:
 
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    numbers: frozenset[int] = frozenset()
+    numbers: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -120,17 +121,9 @@ class Figure:
     why: str = ""
     failed: bool = False
 
-    @staticmethod
-    def from_dict(d: Mapping[str, Any]) -> Figure:
-        """Rebuild a figure from the result of ``dataclasses.asdict``."""
-        given = d["block"]
-        if given is None:
-            return Figure(d["title"], None, d["why"], d["failed"])
-        table = given["table"]
-        if table is not None:
-            table = Table(tuple(table["head"]), tuple(map(tuple, table["rows"])), frozenset(table["numbers"]))
-        parts = {"panels": tuple(Panel(**panel) for panel in given["panels"]), "table": table}
-        return Figure(d["title"], Block(**{**given, **parts, "legend": tuple(map(tuple, given["legend"]))}), d["why"])
+
+FIGURE = TypeAdapter(Figure)
+"""Reads and writes a figure as JSON."""
 
 
 @cache

@@ -146,7 +146,7 @@ def _parameters(found: Calibration) -> Table | None:
             )
         )
     head = ("Parameter of the right camera", "State", "Correction used", "Images alone ask for", "σ of that", "Why")
-    return Table(head, tuple(rows), frozenset({2, 3, 4}))
+    return Table(head, tuple(rows), (2, 3, 4))
 
 
 def _signed(value: Any, unit: str) -> str:
@@ -297,7 +297,7 @@ def _side_by_side(scene: Scene) -> Table | None:
         pair = [b.meta.get("metrics", {}).get(name) for b in (ours, theirs)]
         if all(m is not None and m["value"] is not None for m in pair):
             rows.append((label, *(quantity(m["value"], m["unit"]) for m in pair)))
-    return Table(("Against the truth", "ours", "COLMAP"), tuple(rows), frozenset({1, 2})) if rows else None
+    return Table(("Against the truth", "ours", "COLMAP"), tuple(rows), (1, 2)) if rows else None
 
 
 def overlaps(scene: Scene) -> Block | None:

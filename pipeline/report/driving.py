@@ -117,7 +117,7 @@ def strip(scene: Scene) -> Block | None:
         (canvas.ON_MAP, "estimated track"),
         (canvas.TRUE_ON_MAP, "true track"),
     )
-    table = Table(head, tuple(rows), frozenset({0, 1, 2, 4, 5}))
+    table = Table(head, tuple(rows), (0, 1, 2, 4, 5))
     return Block("Drive", "The drive, stop by stop", caption, tuple(panels), legend, table, strip=True)
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,7 @@ import numpy as np
 from rille.pipeline.export import artifacts
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.report import canvas, checks, driving, figures, gather, seams, stops, terrain_map
-from rille.pipeline.report.canvas import Block, Figure
+from rille.pipeline.report.canvas import FIGURE, Block, Figure
 from rille.pipeline.report.delivery import start_words
 from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.words import length, number, spread
@@ -45,8 +43,7 @@ def _output(title: str, maker: Maker, expected: Condition, reads: str, knows: st
 
     def write(folder: Path, view: Any) -> None:
         drawn = _drawn(title, maker, expected, Scene(view))
-        # The one thing that JSON lacks is the table's frozenset; sorted, it is the same each time.
-        (folder / "figure.json").write_text(json.dumps(asdict(drawn), default=sorted), encoding="utf-8")
+        (folder / "figure.json").write_bytes(FIGURE.dump_json(drawn))
 
     return Output(title, "", "", write, (), tuple(reads.split()), ("frames", *knows.split()))
 

@@ -111,7 +111,7 @@ def models(scene: Scene) -> Block | None:
         for m in listed[:MOST_ROWS]
     )
     head = ("Pair", "bias", "tilt along x", "tilt along y", "RMS of both", "σ of a cell's difference", "verdict")
-    table = Table(head, rows, frozenset(range(1, 6)))
+    table = Table(head, rows, tuple(range(1, 6)))
     return Block("Seam audit", "Elevation models by their own error", " ".join(words), (), table=table)
 
 
@@ -148,7 +148,7 @@ def _seam_table(found: Facts) -> Table:
             )
         )
     head = ("Seam", "cells", "bias", "tilt along x", "tilt along y", "noise", "expected noise")
-    return Table(head, tuple(rows), frozenset(range(1, 7)))
+    return Table(head, tuple(rows), tuple(range(1, 7)))
 
 
 def _size(metres: float) -> str:

@@ -17,7 +17,7 @@ from rille.pipeline.export.output import Output, handles, place, task, unpack
 from rille.pipeline.export.trajectories import stamps
 from rille.pipeline.export.view import RunView, TaskRow
 from rille.pipeline.report import gallery, summary
-from rille.pipeline.report.canvas import Figure
+from rille.pipeline.report.canvas import FIGURE
 from rille.pipeline.report.delivery import Items
 from rille.pipeline.report.page import write_report
 from rille.stages.core.declare import NoParams
@@ -81,8 +81,10 @@ def write(folder: Path, view: RunView, made: Made, store: Store) -> Items:
     trajectory = view.products.trajectory
     meta = {} if trajectory is None or trajectory.ref is None else trajectory.ref.meta
     atomic.write(folder / "frames.json", json.dumps(_frames(folder, view, meta), indent=1) + "\n")
-    facts = _content(made["facts"], store)
-    figures = [Figure.from_dict(_content(made[o.name], store)) for o in gallery.OUTPUTS if made[o.name].ref is not None]
+    facts = json.loads(_content(made["facts"], store))
+    figures = [
+        FIGURE.validate_json(_content(made[o.name], store)) for o in gallery.OUTPUTS if made[o.name].ref is not None
+    ]
     return write_report(folder, view, facts, figures)
 
 
@@ -100,8 +102,8 @@ def _frames(folder: Path, view: RunView, trajectory: Any) -> dict[str, Any]:
     )
 
 
-def _content(handle: Handle, store: Store) -> Any:
-    """The one JSON document that an output holds."""
+def _content(handle: Handle, store: Store) -> bytes:
+    """The one file that an output holds."""
     assert handle.ref is not None, handle.label
     (content,) = unpack(store.open(handle.ref)).values()
-    return json.loads(content)
+    return content

@@ -8,8 +8,9 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,8 +24,8 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.maintenance import artifacts
 from rille.pipeline.engine.store.manifest import length, reference, unframe
 from rille.pipeline.report import gallery
-from rille.pipeline.report.canvas import Figure
-from rille.pipeline.runs import session
+from rille.pipeline.report.canvas import FIGURE, Figure
+from rille.pipeline.runs import run_files, session
 
 SMALL = (
     "mockup.frames=5",
@@ -154,8 +155,13 @@ def test_a_damaged_output_is_drawn_again(cold: Path, capsys: pytest.CaptureFixtu
 def test_a_figure_that_cannot_be_drawn_is_missing(
     cold: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = Figure.from_dict(asdict(gallery._drawn("Seams", lambda _: 1 / 0, lambda _: True, None)))  # type: ignore
-    monkeypatch.setattr(Figure, "from_dict", lambda d: made if d["title"] == "Seams" else Figure(d["title"]))
+    failed = FIGURE.dump_json(gallery._drawn("Seams", lambda _: 1 / 0, lambda _: True, None))  # type: ignore
+
+    def read(data: bytes) -> Figure:
+        title = FIGURE.validate_json(data).title
+        return FIGURE.validate_json(failed) if title == "Seams" else Figure(title)
+
+    monkeypatch.setattr(run_files, "FIGURE", SimpleNamespace(validate_json=read))
     assert session.reconstruct(options(cold)) == 3
     told = capsys.readouterr()
     assert "rille: missing: Seams: drawing failed, ZeroDivisionError" in told.err

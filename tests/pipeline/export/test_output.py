@@ -28,7 +28,7 @@ from rille.pipeline.export.frames_json import describe
 from rille.pipeline.export.output import Output, handles, pack, place, task, unpack
 from rille.pipeline.export.programs import point_cloud
 from rille.pipeline.report import canvas, gallery
-from rille.pipeline.report.canvas import Figure
+from rille.pipeline.report.canvas import FIGURE
 from rille.pipeline.runs import run_files
 from rille.stages.core.declare import Bundle
 
@@ -97,7 +97,7 @@ def test_a_task_makes_of_what_its_record_names_what_the_whole_run_would(
     found = module.STAGE.run(module.STAGE.params(), given, {"read": [made[handle.ref] for handle in inputs]})
     assert unpack(found) == unpack(pack(tmp_path))
     if module is gallery:
-        figure = Figure.from_dict(json.loads(unpack(found)["figure.json"]))
+        figure = FIGURE.validate_json(unpack(found)["figure.json"])
         assert "failed" not in figure.why
         assert figure in gallery.draw(whole)
 
