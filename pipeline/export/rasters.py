@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,9 @@ from rille.stages.core.declare import Bundle
 from rille.stages.geometry.lattice import Lattice, mosaic, union
 from rille.stages.hazard.risk import REASONS
 from rille.stages.hazard.risk import STAGE as RISK
+from rille.stages.terrain import merge
 from rille.stages.terrain.shading import hillshade, slope_deg
 
-NAN = float("nan")
 LIGHT = {"light": "from the upper left (315 degrees), 45 degrees high"}
 CRS = {
     "crs": "engineering CRS, metres",
@@ -29,12 +29,16 @@ CRS = {
 GIS = "QGIS, GDAL"
 
 
-def whole(tiles: list[Bundle], name: str, nodata: float = NAN) -> tuple[Lattice, NDArray[Any]]:
-    """One array of all world tiles put together, and the lattice it is on."""
+NODATA = {array.name: float(array.nodata or 0) for array in merge.STAGE.outputs}
+"""Of the arrays of merged terrain."""
+
+
+def whole(tiles: Sequence[Bundle], name: str, lattice: Lattice | None = None) -> tuple[Lattice, NDArray[Any]]:
+    """One array of all world tiles put together, and the lattice it is on: by default the union of theirs."""
     lattices = [Lattice.from_dict(tile.meta["lattice"]) for tile in tiles]
-    lattice = union(lattices)
+    target = lattice or union(lattices)
     parts = [(part, np.asarray(tile[name])) for part, tile in zip(lattices, tiles, strict=True)]
-    return lattice, mosaic(parts, nodata, lattice)
+    return target, mosaic(parts, NODATA[name], target)
 
 
 def _height(view: Any) -> tuple[Lattice, NDArray[Any]]:
@@ -81,9 +85,7 @@ def _write_ortho(folder: Path, view: Any) -> None:
     if not colour.coloured(view):
         write_raster(path, {"ortho": np.asarray(grey, np.float32)}, lattice, Meaning(), place)
         return
-    # 0 is the number of a frame, so no frame is -1.
-    source = whole(list(map(view.bundle, view.products.tiles)), "source", -1)[1]
-    merged = {"ortho": grey, "elevation": _merged("elevation")(view)[1], "source": source}
+    merged = {"ortho": grey} | {name: _merged(name)(view)[1] for name in ("elevation", "source")}
     bands = dict(zip(("red", "green", "blue"), np.moveaxis(colour.ortho(view, lattice, merged), 2, 0), strict=True))
     write_raster(path, bands, lattice, Meaning(nodata=0), place)
 
@@ -94,7 +96,8 @@ def _write_dem_style(folder: Path, view: Any) -> None:
 
 
 CLASSES = {"safe": "#a6d7c3", "caution": "#f0d68a", "hazard": "#c8501e", "unknown (never entered)": "#8d8f98"}
-"""Names and colours of the classes 0, 1, 2 and 3."""
+"""Names and colours of the classes 0, 1, 2 and 3, distinct for colour-blind eyes; in grey, what may be driven on is
+light, hazards dark, unknown medium."""
 
 ELEVATIONS = ("#00224e", "#1a386f", "#434e6c", "#61656f", "#7d7c78", "#9b9476", "#bcae6c", "#dec958", "#fee838")
 """Colours from the lowest elevation to the highest (matplotlib's cividis)."""

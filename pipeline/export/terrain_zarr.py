@@ -146,8 +146,7 @@ def _write_output(folder: Path, view: Any) -> None:
     tiles, arrays = list(map(view.bundle, view.products.tiles)), {}
     for spec in merge.STAGE.outputs:
         if spec.dims == ("row", "col") and all(spec.name in tile.arrays for tile in tiles):
-            nodata = np.nan if spec.nodata == "nan" else float(spec.nodata or 0)
-            lattice, values = whole(tiles, spec.name, nodata)
+            lattice, values = whole(tiles, spec.name)
             arrays[spec.name] = (spec, values)
     arrays["slope"] = (SLOPE, slope_deg(arrays["elevation"][1], lattice.cell))
     about = {

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from rille.pipeline.export import ranges
+from rille.pipeline.export.rasters import CLASSES
 
 Image = NDArray[Any]
 Extent = tuple[float, float, float, float]
@@ -35,8 +36,8 @@ MOST_MARKERS = 400
 MAX_PIXELS = 700
 """Longest side of an array that is drawn; larger ones are averaged first."""
 UNDEFINED = "#e9e9ec"
-SAFE, CAUTION, HAZARDOUS, UNKNOWN = "#a6d7c3", "#f0d68a", "#c8501e", "#8d8f98"
-"""Distinct for colour-blind eyes; in grey, what may be driven on is light, hazards dark, unknown medium."""
+RISK = SAFE, CAUTION, HAZARDOUS, UNKNOWN = tuple(CLASSES.values())
+"""Colours of the classes 0, 1, 2 and 3."""
 MEASURED, INTERPOLATED = "#2f6f9f", "#f0b84a"
 ESTIMATE, REFERENCE, MARK = "#0b4f8a", "#d1731a", "#111111"
 OTHER, RIGHT = "#2c8a5b", "#333333"
@@ -338,15 +339,20 @@ def _without_crowds(fig: Any) -> None:
 def _smaller(png: str, photo: bool) -> str:
     from PIL import Image as Pillow
 
-    return address(Pillow.open(io.BytesIO(base64.b64decode(png))), photo)
+    return webp(Pillow.open(io.BytesIO(base64.b64decode(png))), photo)
 
 
-def address(picture: Any, photo: bool, quality: int = 82) -> str:
+def webp(picture: Any, photo: bool, quality: int = 82) -> str:
     """Picture as the ``data:`` address of a WebP, with loss where ``photo``."""
-    out = io.BytesIO()
     # Without loss, WebP's quality is how hard it tries.
-    picture.save(out, "WEBP", lossless=not photo, quality=quality if photo else 60, method=2)
-    return "data:image/webp;base64," + base64.b64encode(out.getvalue()).decode("ascii")
+    return address(picture, "webp", lossless=not photo, quality=quality if photo else 60, method=2)
+
+
+def address(picture: Any, kind: str, **options: Any) -> str:
+    """Picture as a ``data:`` address; ``options`` of Pillow's writer of that kind."""
+    out = io.BytesIO()
+    picture.save(out, kind, **options)
+    return f"data:image/{kind};base64," + base64.b64encode(out.getvalue()).decode("ascii")
 
 
 def themed(text: str) -> str:
@@ -375,7 +381,7 @@ def panel(rgb: Image, alt: str, *, photo: bool = False) -> Panel:
     from PIL import Image as Pillow
 
     height, width = rgb.shape[:2]
-    return Panel(address(Pillow.fromarray(rgb), photo), alt, round(width * 96 / DPI), round(height * 96 / DPI))
+    return Panel(webp(Pillow.fromarray(rgb), photo), alt, round(width * 96 / DPI), round(height * 96 / DPI))
 
 
 def fitted(pixels: Image, *, scale: int = 1) -> Image:

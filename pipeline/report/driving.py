@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rille.pipeline.export import ranges
-from rille.pipeline.report import canvas, stops
+from rille.pipeline.report import canvas, figures, gather, stops
 from rille.pipeline.report.canvas import Block, Extent, Panel, Table
 from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.words import metres
+from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 
 if TYPE_CHECKING:
-    from rille.pipeline.flow.products import Driven
+    from rille.pipeline.flow.products import Driven, Stop
 
 Floats = NDArray[Any]
 
@@ -31,24 +33,6 @@ VERDICTS = {
     "safety stop": "Safety stop",
     "stops": "Given up after too many stops",
 }
-
-
-@dataclass(frozen=True)
-class Shown:
-    """One stop: its picture, risk map, leg and merged elevations, with the vehicle's tracks up to it (n, 2) m."""
-
-    title: str
-    image: Floats
-    lattice: Lattice
-    risk: Floats
-    elevation: Floats
-    path: Floats
-    way: Floats
-    goal: tuple[float, float]
-    at: tuple[float, float]
-    estimate: Floats
-    truth: Floats | None
-    event: bool
 
 
 def strip(scene: Scene) -> Block | None:
@@ -67,22 +51,8 @@ def strip(scene: Scene) -> Block | None:
             continue
         upto = view.frames.index(stop.frame) + 1
         meta = leg.meta
-        shown = Shown(
-            f"stop {stop.index}: {meta['verdict']}",
-            np.asarray(image["image"]),
-            Lattice.from_dict(risk.meta["lattice"]),
-            np.asarray(risk["risk"]),
-            np.asarray(whole["elevation"]),
-            np.asarray(leg["path"]),
-            np.asarray(leg["way"]),
-            (meta["goal"][0], meta["goal"][1]),
-            (meta["start"][0], meta["start"][1]),
-            estimate[:upto],
-            None if truth is None else truth[:upto],
-            stop.event != "" and meta["verdict"] != "goal",
-        )
-        alt = f"Stop {stop.index} at frame {stop.frame}, {metres(meta['left_m'])} from the goal: {meta['verdict']}"
-        panels.append(replace(column(shown, alt), frame=stop.frame))
+        so_far = (estimate[:upto], None if truth is None else truth[:upto])
+        panels.append(column(stop, np.asarray(image["image"]), leg, risk, np.asarray(whole["elevation"]), so_far))
         off = None if truth is None else float(np.hypot(*(estimate[upto - 1] - truth[upto - 1])))
         rows.append(
             (
@@ -110,10 +80,7 @@ def strip(scene: Scene) -> Block | None:
     if len(panels) < every:
         caption += f" {len(panels)} of {every} stops are shown, so that the page stays below 5 MB."
     legend = (
-        (canvas.SAFE, "safe"),
-        (canvas.CAUTION, "caution"),
-        (canvas.HAZARDOUS, "hazardous"),
-        (canvas.UNKNOWN, "unknown"),
+        *zip(canvas.RISK, ("safe", "caution", "hazardous", "unknown"), strict=True),
         (canvas.ON_MAP, "estimated track"),
         (canvas.TRUE_ON_MAP, "true track"),
     )
@@ -153,31 +120,35 @@ def tracks(scene: Scene) -> tuple[Floats, Floats | None]:
     simulation, trajectory = view.sequence.simulation, view.bundle(view.products.trajectory)
     assert simulation is not None
     T_left_vehicle = simulation.T_vehicle_left.inverse()
-    n = len(view.frames)
-    found = np.full((n, 2), np.nan)
+    found = np.full((len(view.frames), 2), np.nan)
     if trajectory is None:
         return found, None
-    at_wheels = np.append(T_left_vehicle.translation, 1.0)
     poses = np.asarray(trajectory["poses"])
-    found[: len(poses)] = (poses @ at_wheels)[:, :2]  # NaN of a lost frame
-    true = [None if view.sequence.truth is None else view.sequence.truth[f] for f in view.frames]
-    both = ((pose, t) for pose, t in zip(poses, true, strict=False) if t is not None and np.isfinite(pose).all())
-    pose, first = next(both, (None, None))
-    if pose is None or first is None:
+    found[: len(poses)] = (poses @ np.append(T_left_vehicle.translation, 1.0))[:, :2]  # NaN of a lost frame
+    posed = {
+        frame: RigidTransform.from_matrix(pose)
+        for frame, pose in zip(view.frames, poses, strict=False)
+        if np.isfinite(pose).all()
+    }
+    true = gather.truth_in_world(view, posed)
+    if true is None:
         return found, None
-    T_world_truth = RigidTransform.from_matrix(pose) @ first.inverse()
-    truth = np.full((n, 2), np.nan)
-    for k, pose_ in enumerate(true):
-        if pose_ is not None:
-            truth[k] = (T_world_truth @ pose_ @ T_left_vehicle).translation[:2]
-    return found, truth
+    gap = np.full(2, np.nan)
+    return found, np.array([gap if T is None else (T @ T_left_vehicle).translation[:2] for T in true])
 
 
-def column(s: Shown, alt: str) -> Panel:
-    """One stop as a column of three pictures."""
-    rows, cols = s.image.shape[:2]
-    whole = s.lattice.bounds
-    near = _near(s.at, AROUND * max(whole[1] - whole[0], whole[3] - whole[2]) / 1.5)
+def column(
+    stop: Stop, image: Floats, leg: Bundle, risk: Bundle, elevation: Floats, so_far: tuple[Floats, Floats | None]
+) -> Panel:
+    """One stop as a column of three pictures: ``image``, hazards with the leg, and all elevations so far.
+
+    ``so_far``: the vehicle's tracks up to the stop (n, 2), m, estimated and true.
+    """
+    meta, path, way = leg.meta, np.asarray(leg["path"]), np.asarray(leg["way"])
+    at, goal = meta["start"][:2], meta["goal"][:2]
+    rows, cols = image.shape[:2]
+    whole = Lattice.from_dict(risk.meta["lattice"]).bounds
+    near = _near(at, AROUND * max(whole[1] - whole[0], whole[3] - whole[2]) / 1.5)
     heights = [WIDTH * rows / cols, WIDTH, WIDTH * (whole[3] - whole[2]) / (whole[1] - whole[0])]
     gap, top = 0.06, 0.24
     total = top + sum(heights) + 2 * gap
@@ -189,28 +160,30 @@ def column(s: Shown, alt: str) -> Panel:
         ax.set_axis_off()
         axes.append(ax)
         edge -= gap
-    color = canvas.HAZARDOUS if s.event else canvas.INK
-    fig.text(0.5, 1 - 0.6 * top / total, s.title, ha="center", va="center", fontsize=9, color=color)
-    axes[0].imshow(s.image, cmap="gray", vmin=0, vmax=255, aspect="auto")
-    colors = np.array([_rgb(c) for c in (canvas.SAFE, canvas.CAUTION, canvas.HAZARDOUS, canvas.UNKNOWN)])
-    _map(axes[1], colors[s.risk], whole, near)
-    axes[1].plot(s.way[:, 0], s.way[:, 1], color=canvas.MARK, linewidth=0.7)
-    if len(s.path) > 1:
-        axes[1].plot(s.path[:, 0], s.path[:, 1], color="white", linewidth=4)
-        axes[1].plot(s.path[:, 0], s.path[:, 1], color=canvas.MARK, linewidth=2)
-    low, high = ranges.ground_limits(s.elevation)
-    _map(axes[2], s.elevation, whole, whole, cmap=canvas.color_map("gray"), vmin=low, vmax=high)
+    color = canvas.HAZARDOUS if stop.event and meta["verdict"] != "goal" else canvas.INK
+    title = f"stop {stop.index}: {meta['verdict']}"
+    fig.text(0.5, 1 - 0.6 * top / total, title, ha="center", va="center", fontsize=9, color=color)
+    axes[0].imshow(image, cmap="gray", vmin=0, vmax=255, aspect="auto")
+    _map(axes[1], figures.paint(np.asarray(risk["risk"]), *canvas.RISK), whole, near)
+    axes[1].plot(way[:, 0], way[:, 1], color=canvas.MARK, linewidth=0.7)
+    if len(path) > 1:
+        axes[1].plot(path[:, 0], path[:, 1], color="white", linewidth=4)
+        axes[1].plot(path[:, 0], path[:, 1], color=canvas.MARK, linewidth=2)
+    low, high = ranges.ground_limits(elevation)
+    _map(axes[2], elevation, whole, whole, cmap=canvas.color_map("gray"), vmin=low, vmax=high)
+    estimate, truth = so_far
     # Truth first and wider: where both agree it shows as a rim.
-    for track, shade, width in ((s.truth, canvas.TRUE_ON_MAP, 4.0), (s.estimate, canvas.ON_MAP, 1.6)):
+    for track, shade, width in ((truth, canvas.TRUE_ON_MAP, 4.0), (estimate, canvas.ON_MAP, 1.6)):
         if track is not None:
             axes[2].plot(track[:, 0], track[:, 1], color=shade, linewidth=width)
     for ax in axes[1:]:
-        ax.plot(*s.at, "o", markersize=5, markerfacecolor=canvas.MARK, markeredgecolor="white")
-        ax.plot(*s.goal, "*", markersize=9, markerfacecolor="#ffd34d", markeredgecolor=canvas.MARK)
-    return canvas.encode(fig, alt, photo=True)
+        ax.plot(*at, "o", markersize=5, markerfacecolor=canvas.MARK, markeredgecolor="white")
+        ax.plot(*goal, "*", markersize=9, markerfacecolor="#ffd34d", markeredgecolor=canvas.MARK)
+    alt = f"Stop {stop.index} at frame {stop.frame}, {metres(meta['left_m'])} from the goal: {meta['verdict']}"
+    return replace(canvas.encode(fig, alt, photo=True), frame=stop.frame)
 
 
-def _near(at: tuple[float, float], reach: float) -> Extent:
+def _near(at: Sequence[float], reach: float) -> Extent:
     return at[0] - reach, at[0] + reach, at[1] - 0.4 * reach, at[1] + 1.6 * reach
 
 
@@ -218,7 +191,3 @@ def _map(ax: Any, values: Floats, extent: Extent, shown: Extent, **style: Any) -
     ax.imshow(values, extent=extent, aspect="auto", interpolation="none", **style)
     ax.set_xlim(shown[0], shown[1])
     ax.set_ylim(shown[2], shown[3])
-
-
-def _rgb(color: str) -> tuple[float, float, float]:
-    return tuple(int(color[k : k + 2], 16) / 255 for k in (1, 3, 5))  # type: ignore[return-value]

@@ -82,7 +82,7 @@ def risk_map(risk: Bytes, path: Floats | None, extent: Extent, alt: str, *, far:
     ``far`` (n, 3): x, y of a cell of the far row, m, and 1 where a path leads there.
     """
     fig, ax, _ = canvas.map_axes(extent)
-    _show(ax, paint(risk, canvas.SAFE, canvas.CAUTION, canvas.HAZARDOUS, canvas.UNKNOWN), extent)
+    _show(ax, paint(risk, *canvas.RISK), extent)
     if path is not None and len(path):
         canvas.polyline(ax, path)
     if far is not None and len(far):

@@ -184,8 +184,7 @@ def _path_words(scene: Scene) -> str:
 
 
 def _legend(shares: list[float]) -> tuple[tuple[str, str], ...]:
-    colors = (canvas.SAFE, canvas.CAUTION, canvas.HAZARDOUS, canvas.UNKNOWN)
-    return tuple((c, f"{name} {share:.0%}") for c, name, share in zip(colors, CLASSES, shares, strict=True))
+    return tuple((c, f"{name} {share:.0%}") for c, name, share in zip(canvas.RISK, CLASSES, shares, strict=True))
 
 
 def _local(scene: Scene) -> Block | None:

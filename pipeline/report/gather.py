@@ -14,17 +14,18 @@ from numpy.typing import NDArray
 from rille.pipeline.export import ranges
 from rille.pipeline.export.artifacts import Floats, image, used_rig
 from rille.pipeline.export.comparison import Comparison, compare
+from rille.pipeline.export.rasters import whole
 from rille.pipeline.export.view import RunView
 from rille.pipeline.report.canvas import Extent
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import RigidTransform
-from rille.stages.geometry.lattice import Lattice, mosaic, union
+from rille.stages.geometry.lattice import Lattice, union
 from rille.stages.numeric.robust import mad_sigma
 from rille.stages.odometry.resection.trajectory import world_poses
 
-NODATA: Mapping[str, float] = {"count": 0, "source": -1}
-"""Of the arrays of merged terrain that are not floats."""
+WORLD = ("elevation", "elevation_std", "spread", "count", "source", "ortho")
+"""Arrays of the merged terrain that figures and tables show."""
 
 
 @dataclass(frozen=True)
@@ -137,8 +138,13 @@ class Scene:
 
     @cached_property
     def world(self) -> Terrain | None:
-        """Merged terrain."""
-        return merged(self.view)
+        """Merged terrain, put together of its tiles."""
+        tiles = [b for b in map(self.view.bundle, self.view.products.tiles) if b is not None]
+        if not tiles:
+            return None
+        names = [name for name in WORLD if all(name in tile.arrays for tile in tiles)]
+        lattice = union(Lattice.from_dict(tile.meta["lattice"]) for tile in tiles)
+        return Terrain(lattice, {name: whole(tiles, name)[1] for name in names})
 
     @cached_property
     def risk(self) -> Terrain | None:
@@ -162,13 +168,24 @@ class Scene:
 
     @cached_property
     def differences(self) -> list[Difference]:
-        """Differences of successive elevation models on common ground."""
-        return differences(self.view)
+        """Differences of successive elevation models that overlap, in the order of the pairs."""
+        view = self.view
+        present = [pair for pair, handle in view.products.world_dem.items() if view.bundle(handle) is not None]
+        found = (_difference(view, before, pair) for before, pair in itertools.pairwise(present))
+        return [one for one in found if one is not None]
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """The rig, as it was given and as it was used."""
-        return calibration(self.view)
+        """The rig, as it was given and as it was used; None if no task examined it."""
+        p = self.view.products
+        # A pooled rig is one handle under many pairs: its facts count once.
+        handles = list({id(handle): handle for handle in p.rigs.values()}.values())
+        facts = tuple(bundle.meta for bundle in map(self.view.bundle, handles) if bundle is not None)
+        if not facts:
+            return None
+        parts = [_residuals(self.view, pair) for pair in p.orientations]
+        points, before, after = (np.concatenate([part[k] for part in parts if part] or [_NONE[k]]) for k in range(3))
+        return Calibration(facts, points, before, after)
 
 
 def vertices(path: Bundle | None) -> Floats | None:
@@ -177,28 +194,12 @@ def vertices(path: Bundle | None) -> Floats | None:
     return points if points is not None and len(points) else None
 
 
-def merged(view: RunView) -> Terrain | None:
-    """World terrain assembled of its tiles."""
-    tiles = [b for b in map(view.bundle, view.products.tiles) if b is not None]
-    names = ("elevation", "elevation_std", "spread", "count", "source", "ortho")
-    return assemble(tiles, names) if tiles else None
-
-
 def terrain(bundle: Bundle | None, *names: str) -> Terrain | None:
     """Arrays of one artifact with a lattice."""
-    return None if bundle is None or "lattice" not in bundle.meta else assemble([bundle], names)
-
-
-def assemble(parts: list[Bundle], names: tuple[str, ...]) -> Terrain:
-    """Arrays of several artifacts put together on the union of their lattices."""
-    lattices = [Lattice.from_dict(b.meta["lattice"]) for b in parts]
-    whole = union(lattices)
-    arrays = {}
-    for name in names:
-        if all(name in b.arrays for b in parts):
-            pieces = [(at, np.asarray(b[name])) for at, b in zip(lattices, parts, strict=True)]
-            arrays[name] = pieces[0][1] if len(pieces) == 1 else mosaic(pieces, NODATA.get(name, np.nan), whole)
-    return Terrain(whole, arrays)
+    if bundle is None or "lattice" not in bundle.meta:
+        return None
+    arrays = {name: np.asarray(bundle[name]) for name in names if name in bundle.arrays}
+    return Terrain(Lattice.from_dict(bundle.meta["lattice"]), arrays)
 
 
 def trajectory(view: RunView) -> Track:
@@ -226,20 +227,26 @@ def trajectory(view: RunView) -> Track:
                 sigma[row[frame]] = np.sqrt(max(float(np.trace(bundle["covariance"][i][:3, :3])), 0.0))
             if frame in view.products.disparity:
                 right.append((pose @ used_rig(view, frame).T_right_left.inverse()).translation)
-    return Track(left, np.array(right).reshape(-1, 3), _truth(view, posed), sigma, segment, piece)
+    true = truth_in_world(view, posed)
+    at = None if true is None else np.array([[np.nan] * 3 if pose is None else pose.translation for pose in true])
+    return Track(left, np.array(right).reshape(-1, 3), at, sigma, segment, piece)
 
 
-def _truth(view: RunView, posed: Mapping[int, RigidTransform]) -> Floats | None:
-    """True positions brought to the world by the pose of the first frame that has both alone; NaN in gaps."""
+def truth_in_world(view: RunView, posed: Mapping[int, RigidTransform]) -> list[RigidTransform | None] | None:
+    """True poses of the left camera, one a chosen frame, brought to the world by the first frame that has both alone.
+
+    None in gaps, and instead of all where no frame has both.
+    """
     truth = view.sequence.truth
     if truth is None:
         return None
-    true = {frame: pose for frame in view.frames if (pose := truth[frame]) is not None}
-    first = next((frame for frame in view.frames if frame in true and frame in posed), None)
-    if first is None:
+    true = [truth[frame] for frame in view.frames]
+    both = ((posed[f], pose) for f, pose in zip(view.frames, true, strict=True) if pose is not None and f in posed)
+    estimate, first = next(both, (None, None))
+    if estimate is None or first is None:
         return None
-    T_world_truth = posed[first] @ true[first].inverse()
-    return np.array([(T_world_truth @ true[f]).translation if f in true else [np.nan] * 3 for f in view.frames])
+    T_world_truth = estimate @ first.inverse()
+    return [None if pose is None else T_world_truth @ pose for pose in true]
 
 
 def frame_facts(view: RunView) -> dict[int, dict[str, Any]]:
@@ -288,19 +295,6 @@ def consecutive(view: RunView, count: int = 4) -> tuple[int, ...]:
     return tuple(have[:count])
 
 
-def calibration(view: RunView) -> Calibration | None:
-    """Collect the results of the rig's adjustment; None if no task examined the rig."""
-    p = view.products
-    # A pooled rig is one handle under many pairs: its facts count once.
-    handles = list({id(handle): handle for handle in p.rigs.values()}.values())
-    facts = tuple(bundle.meta for bundle in map(view.bundle, handles) if bundle is not None)
-    if not facts:
-        return None
-    parts = [_residuals(view, pair) for pair in p.orientations]
-    points, before, after = (np.concatenate([part[k] for part in parts if part] or [_NONE[k]]) for k in range(3))
-    return Calibration(facts, points, before, after)
-
-
 _NONE = (np.empty((0, 2)), np.empty(0), np.empty(0))
 
 
@@ -315,17 +309,6 @@ def _residuals(view: RunView, pair: int) -> tuple[Floats, Floats, Floats] | None
     before = distances(given, np.zeros(5), left, right)[0]
     after = before if used.to_dict() == given.to_dict() else distances(used, np.zeros(5), left, right)[0]
     return left, before, after
-
-
-def differences(view: RunView) -> list[Difference]:
-    """Return the differences of successive models that overlap, in the order of the pairs."""
-    found = []
-    present = [pair for pair, handle in view.products.world_dem.items() if view.bundle(handle) is not None]
-    for before, pair in itertools.pairwise(present):
-        one = _difference(view, before, pair)
-        if one is not None:
-            found.append(one)
-    return found
 
 
 def _difference(view: RunView, before: int, pair: int) -> Difference | None:

@@ -51,7 +51,7 @@ def strip(scene: Scene) -> Block | None:
         f"{width} pixels wide, so that the page stays below 5 MB.{some}"
     )
     names = ("safe", "caution", "hazard", "unknown")
-    legend = tuple(zip(_CLASSES, names, strict=True)) if judged else ()
+    legend = tuple(zip(canvas.RISK, names, strict=True)) if judged else ()
     return Block("Stops", "Every pair", caption, tuple(panels), legend, strip=True)
 
 
@@ -61,9 +61,6 @@ def within(panels: Sequence[Panel], budget: int = BUDGET) -> list[Panel]:
     while len(panels[::step]) > 1 and sum(p.size for p in panels[::step]) > budget:
         step += 1
     return list(panels[::step])
-
-
-_CLASSES = (canvas.SAFE, canvas.CAUTION, canvas.HAZARDOUS, canvas.UNKNOWN)
 
 
 def column(scene: Scene, pair: int, width: int) -> Panel:
@@ -93,7 +90,7 @@ def column(scene: Scene, pair: int, width: int) -> Panel:
         sheet.paste(picture, ((width - picture.width) // 2, top))
         top += picture.height + 4
     alt = f"Pair of frame {pair}: {', '.join(words)}"
-    return Panel(canvas.address(sheet, photo=True, quality=72), alt, sheet.width // 2, sheet.height // 2, pair)
+    return Panel(canvas.webp(sheet, photo=True, quality=72), alt, sheet.width // 2, sheet.height // 2, pair)
 
 
 def _scaled(picture: Any, width: int) -> Any:
@@ -135,7 +132,7 @@ def _ramp(share: NDArray[Any]) -> Bytes:
 def _hazards(risk: Terrain, path: NDArray[Any] | None, width: int) -> Any:
     from PIL import Image, ImageDraw
 
-    colors = np.rint(255 * paint(risk.arrays["risk"], *_CLASSES)).astype(np.uint8)
+    colors = np.rint(255 * paint(risk.arrays["risk"], *canvas.RISK)).astype(np.uint8)
     picture = _scaled(Image.fromarray(colors).convert("RGBA"), width)
     if path is not None and len(path) > 1:
         lattice, factor = risk.lattice, picture.width / colors.shape[1]

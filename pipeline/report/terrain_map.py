@@ -9,7 +9,6 @@ the GeoTIFF never disagree.
 from __future__ import annotations
 
 import base64
-import io
 import math
 from typing import Any
 
@@ -72,7 +71,7 @@ def data(scene: Scene) -> dict[str, Any] | None:
         "sigma": sigmas,
         "judged": scene.risk is not None,
         "reasons": {name: int(bit) for name, bit in REASONS.items()},
-        "colors": [canvas.SAFE, canvas.CAUTION, canvas.HAZARDOUS, canvas.UNKNOWN],
+        "colors": list(canvas.RISK),
         "ramp": base64.b64encode(canvas.ramp("viridis").tobytes()).decode("ascii"),
         "track": _track(scene),
         "frusta": _frusta(scene),
@@ -126,10 +125,9 @@ def _picture(*planes: NDArray[Any]) -> str:
     """Three planes (row, col) of bytes as a picture without loss."""
     from PIL import Image
 
-    out = io.BytesIO()
     # No alpha: a canvas multiplies colours by it, and the bytes read back would be others.
-    Image.fromarray(np.stack([np.asarray(p, np.uint8) for p in planes], axis=-1)).save(out, "PNG", compress_level=9)
-    return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode("ascii")
+    picture = Image.fromarray(np.stack([np.asarray(p, np.uint8) for p in planes], axis=-1))
+    return canvas.address(picture, "png", compress_level=9)
 
 
 def _look(scene: Scene, world: Terrain, step: int) -> Floats:
@@ -144,9 +142,8 @@ def _photo(look: Floats) -> str:
     from PIL import Image
 
     low, high = ranges.limits(look, 0.5, 99.5)
-    out, bytes_ = io.BytesIO(), np.clip((np.nan_to_num(look, nan=low) - low) / (high - low) * 255, 0, 255)
-    Image.fromarray(bytes_.astype(np.uint8)).save(out, "JPEG", quality=82)
-    return "data:image/jpeg;base64," + base64.b64encode(out.getvalue()).decode("ascii")
+    stretched = np.clip((np.nan_to_num(look, nan=low) - low) / (high - low) * 255, 0, 255)
+    return canvas.address(Image.fromarray(stretched.astype(np.uint8)), "jpeg", quality=82)
 
 
 def _track(scene: Scene) -> list[list[Any]]:

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts, check_new
+from rille.pipeline.export.rasters import whole
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
-from rille.stages.geometry.lattice import Lattice, mosaic
+from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.classification import UNKNOWN
 
 FRAME, TOPIC = "map", "/grid_map"
@@ -58,11 +59,7 @@ def export_run(run: Path, target: Path, store: Store) -> str:
 def layers(risk: Bundle, tiles: Sequence[Bundle]) -> dict[str, NDArray[np.float32]]:
     """Layers (row, col) on the lattice of the risk map: m, m, class 0 safe to 2 hazard, probability; NaN unknown."""
     lattice = Lattice.from_dict(risk.meta["lattice"])
-    places = [Lattice.from_dict(tile.meta["lattice"]) for tile in tiles]
-    found = {
-        name: mosaic([(p, np.asarray(t[array])) for p, t in zip(places, tiles, strict=True)], np.nan, lattice)
-        for name, array in (("elevation", "elevation"), ("sigma", "elevation_std"))
-    }
+    found = {"elevation": whole(tiles, "elevation", lattice)[1], "sigma": whole(tiles, "elevation_std", lattice)[1]}
     classes = np.asarray(risk["risk"], np.float32)
     found |= {"risk": np.where(classes == UNKNOWN, np.nan, classes), "p_hazard": np.asarray(risk["p_hazard"])}
     return {name: np.asarray(values, np.float32) for name, values in found.items()}
