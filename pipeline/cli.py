@@ -354,12 +354,12 @@ def _run(argv: list[str] | None) -> int:
 
 def _complain(error: Exception, debug: bool) -> int:
     """One line that says what to change; the traceback on request."""
-    from rille.pipeline.engine.failures import told
+    from rille.pipeline.engine.failures import translated
     from rille.stages.core.errors import ConfigError, InputError
 
     if debug:
         traceback.print_exception(error)
-    if (known := told(error)) is not None:
+    if (known := translated(error)) is not None:
         _print_error(known.code, str(known))
     else:
         hint = "" if debug else " (run again with --debug for the traceback)"

@@ -432,6 +432,6 @@ def _dataset(stage: Stage, found: Bundle, settings: Settings) -> xarray.Dataset:
         variables[name] = (about.dims, np.asarray(values), attrs)
     places = {} if lattice is None else coordinates(lattice, str(found.meta.get("frame", "local")))
     coords = {name: (dims, values, attrs) for name, (values, dims, attrs) in places.items()}
-    told = {k: v for k, v in found.meta.items() if isinstance(v, str | int | float) and not isinstance(v, bool)}
+    plain = {k: v for k, v in found.meta.items() if isinstance(v, str | int | float) and not isinstance(v, bool)}
     kept = coords if lattice is not None and any(list(v[0]) == DIMS for v in variables.values()) else {}
-    return xarray.Dataset(variables, kept, {**told, **_carried(found.meta, settings)})
+    return xarray.Dataset(variables, kept, {**plain, **_carried(found.meta, settings)})

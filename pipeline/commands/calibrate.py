@@ -21,9 +21,10 @@ from rille.datasets.images import chessboard, pairing
 from rille.datasets.images.files import read_grey
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE
+from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.stages.calibration.target import MODELS, BoardView, RigCalibration, calibrate_rig
-from rille.stages.core.errors import InputError, RilleError
+from rille.stages.core.errors import InputError
 
 LEAST_COVER = 0.5
 """Share of an image that all corners together should span: beyond them, distortion is extrapolated."""
@@ -85,7 +86,8 @@ def calibrate(
     points = chessboard.board_points(boards.corners, square)
     found = calibrate_rig(points, boards.views, boards.size, model, keep_bad=keep_bad)
     _refuse_clutter(found, boards)
-    _write(output, _yaml(found, boards, square, model))
+    with reported("RIL-012", f"cannot write {output}", remedy="choose another --output"):
+        output.write_text(_yaml(found, boards, square, model), encoding="utf-8")
     origin = "given" if given else "found"
     print(f"board        {boards.corners[0]} x {boards.corners[1]} inner corners ({origin}), squares of {square:g} m")
     print("\n".join([*_views(found, boards), "", *_parameters(found, model), ""]))
@@ -98,14 +100,14 @@ def calibrate(
 def _files(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
     sides = [_images(left), _images(right)]
     if left == right:
-        told = [[p for p in paths if (pairing.side_of(p.stem) or (0, -1))[1] == k] for k, paths in enumerate(sides)]
-        if not all(told):
+        by_side = [[p for p in paths if (pairing.side_of(p.stem) or (0, -1))[1] == k] for k, paths in enumerate(sides)]
+        if not all(by_side):
             raise InputError(
                 "RIL-010",
                 f"the names in {left} do not tell left from right",
                 remedy="give two folders, or two globs in quotes",
             )
-        return told[0], told[1]
+        return by_side[0], by_side[1]
     return sides[0], sides[1]
 
 
@@ -269,12 +271,3 @@ def _yaml(found: RigCalibration, boards: Boards, square: float, model: str) -> s
         file.write(key.replace(" ", "_"), value)
     file.endWriteStruct()
     return str(file.releaseAndGetString())
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise RilleError(
-            "RIL-012", f"cannot write {path}: {error.strerror}", remedy="choose another --output"
-        ) from error

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rille.datasets.protocol import CAMERAS, Sequence
 from rille.pipeline.commands.options import COMPLETE, FAILED
 from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.scheduler import Result
 from rille.pipeline.engine.store.base import Store, at
@@ -314,9 +315,5 @@ def draw(path: Path, name: str, frame: str, match: Match) -> None:
         ax.set(xlabel=label, ylabel="residual, px", ylim=(-1.5 * limit, 1.5 * limit))
     plots[2].hist(match.residual[used], bins=60, range=(-1.5 * limit, 1.5 * limit), color="0.5")
     plots[2].set(xlabel="residual, px", ylabel="matches")
-    try:
+    with reported("RIL-016", f"cannot write {path}", remedy="choose another --output"):
         fig.savefig(path, dpi=110)
-    except OSError as error:
-        raise RilleError(
-            "RIL-016", f"cannot write {path}: {error.strerror}", remedy="choose another --output"
-        ) from error

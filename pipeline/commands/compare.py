@@ -13,6 +13,7 @@ import numpy as np
 
 from rille.pipeline.commands import compare_dem
 from rille.pipeline.engine import events
+from rille.pipeline.engine.failures import reported
 from rille.pipeline.export.read_dem import read_elevation
 from rille.pipeline.report.words import metres, quantity
 from rille.pipeline.runs import lookup
@@ -111,12 +112,8 @@ def _elevations(a: Path, b: Path, output: Path) -> str:
         found, error, slope, distance = compare_dem.measure(models[0], models[1])
     except InputError as problem:
         return f"elevations    not compared: {problem}"
-    try:
+    with reported("RIL-892", f"{output} cannot be written", remedy="name another with -o", kind=ConfigError):
         compare_dem.draw(output, found, error, slope, distance)
-    except OSError as problem:
-        raise ConfigError(
-            "RIL-892", f"{output} cannot be written: {problem.strerror}", remedy="name another with -o"
-        ) from problem
     known = np.isfinite(error)
     moved, most = int(np.count_nonzero(error[known])), float(np.abs(error[known]).max(initial=0.0))
     rms = float(np.sqrt(np.mean(np.square(error[known]))))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rille.datasets.text.warning import warning
+from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import DemFile, read_elevation
@@ -45,13 +46,9 @@ def compare(path_a: Path, path_b: Path, *, align: str = "none", output: Path = P
     _print(found)
     # Either ending is understood as the name of both files.
     target = output.with_name(output.name.removesuffix(".png").removesuffix(".json"))
-    try:
+    with reported("RIL-614", f"{target} cannot be written", remedy="name others with -o", kind=InputError):
         atomic.write(target.with_name(target.name + ".json"), json.dumps(found, indent=1, allow_nan=False) + "\n")
         draw(target.with_name(target.name + ".png"), found, error, slope, distance)
-    except OSError as problem:
-        raise InputError(
-            "RIL-614", f"{target} cannot be written: {problem.strerror}", remedy="name others with -o"
-        ) from problem
     print(f"{target}.png  {target}.json")
     return 0
 
@@ -111,7 +108,7 @@ def measure(a: DemFile, b: DemFile, kind: str = "none") -> tuple[dict[str, Any],
     if kind != "none":
         found["before_alignment"] = figures(errors(on_a, on_b))
         alignment = align(on_a, on_b, kind)  # type: ignore[arg-type]
-        found["alignment"] = _told(alignment, kind)
+        found["alignment"] = _alignment(alignment, kind)
     error = errors(on_a, on_b, alignment)
     known, inside = np.isfinite(on_b.values), _within(on_b, a)
     found["figures"] = figures(error)
@@ -149,7 +146,7 @@ def _missing_crs(a: DemFile, b: DemFile) -> list[str]:
     return [*lines, *a.warnings, *b.warnings]
 
 
-def _told(found: Alignment, kind: str) -> dict[str, Any]:
+def _alignment(found: Alignment, kind: str) -> dict[str, Any]:
     from scipy.spatial.transform import Rotation
 
     angles = np.degrees(Rotation.from_matrix(found.rotation).as_rotvec())
@@ -177,13 +174,13 @@ def _within(target: Grid, a: DemFile) -> NDArray[np.bool_]:
 def _range(target: Grid, a: DemFile, b: DemFile, found: dict[str, Any]) -> Floats | None:
     """Horizontal distance (rows, cols) from the nearest camera; None (and why) where no camera is known."""
     cameras = a.viewpoints if a.viewpoints is not None else b.viewpoints
-    told = "m, from the nearest position of the left camera"
+    unit = "m, from the nearest position of the left camera"
     if cameras is None and ENGINEERING_CRS.split('"')[1] in (_crs_name(a.crs), _crs_name(b.crs)):
-        cameras, told = np.zeros((1, 2)), "m, from the frame's origin (the first left camera)"
+        cameras, unit = np.zeros((1, 2)), "m, from the frame's origin (the first left camera)"
     if cameras is None or not len(cameras):
         found["by_range"] = {"unit": "no camera is known: give the folder of a run for A or B", "bins": []}
         return None
-    found["by_range"] = {"unit": told}
+    found["by_range"] = {"unit": unit}
     centres = target.centres()
     return np.asarray(cKDTree(cameras).query(centres.reshape(-1, 2))[0], np.float64).reshape(centres.shape[:2])
 
@@ -193,9 +190,9 @@ def _print(found: dict[str, Any]) -> None:
     print(f"B  {found['b']['path']}  {found['b']['cell_m']:g} m cells, the reference")
     print(f"cells: {found['resampling']}; errors are A minus B")
     if "alignment" in found:
-        told = found["alignment"]
-        moved = ", ".join(f"{k} {v:.6g} (sigma {told['sigma'][k]:.2g})" for k, v in told["motion_of_a"].items())
-        print(f"aligned ({told['kind']}): A was moved by {moved}")
+        aligned = found["alignment"]
+        moved = ", ".join(f"{k} {v:.6g} (sigma {aligned['sigma'][k]:.2g})" for k, v in aligned["motion_of_a"].items())
+        print(f"aligned ({aligned['kind']}): A was moved by {moved}")
         print("before  " + _line(found["before_alignment"]))
     print(("after   " if "alignment" in found else "") + _line(found["figures"]))
     share = found["completeness"]

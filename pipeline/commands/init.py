@@ -11,6 +11,7 @@ from rille.datasets.manifest.text import counted, manifest_text, needs
 from rille.datasets.registry import hindrance
 from rille.datasets.text.names import derived_name
 from rille.pipeline.commands.options import COMPLETE
+from rille.pipeline.engine.failures import reported
 from rille.stages.core.errors import ConfigError, InputError
 
 
@@ -53,14 +54,9 @@ def init(directory: Path, output: Path | None = None, force: bool = False) -> in
         )
     # Written whether complete or not: what is missing stands in it as comments, at its place.
     text = manifest_text(found, _root(directory, path))
-    try:
+    remedy = f"name another file, e.g. --output {name}"
+    with reported("RIL-039", f"{path} cannot be written", remedy=remedy, kind=InputError):
         path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(
-            "RIL-039",
-            f"{path} cannot be written: {error.strerror}",
-            remedy=f"name another file, e.g. --output {name}",
-        ) from error
     needed = needs(text)
     left = hindrance(path) if not needed else None
     if left is not None:

@@ -118,8 +118,8 @@ def warnings(found: Disparity, left: NDArray[Any], right: NDArray[Any]) -> list[
         )
         # The two most frequent reasons: they tell a user whether the light, the order or the scene is at fault.
         shares = sorted(((float(has(found.validity, bit).mean()), words) for bit, words in reasons), reverse=True)
-        told = ", ".join(f"{100 * s:.0f} % {words}" for s, words in shares[:2] if s >= 0.005)
-        text = f"only {100 * share:.1f} % of the pixels match ({told}): do both images show one scene in one light?"
+        frequent = ", ".join(f"{100 * s:.0f} % {words}" for s, words in shares[:2] if s >= 0.005)
+        text = f"only {100 * share:.1f} % of the pixels match ({frequent}): do both images show one scene in one light?"
         return [warning("RIL-700", text)]
     blank = float(has(found.validity, Validity.NO_TEXTURE).mean())
     if blank > BLANK:

@@ -61,8 +61,8 @@ def plan(options: Options, *, verbose: bool = False) -> int:
     # A parameter may be read by tasks that are not known yet.
     lost = [] if result.unknown else unread.unread(settled.given, config, graph)
     if lost:
-        told = f"{unread.values(lost, config)}: no task of this run reads it"
-        raise ConfigError("RIL-733", told, remedy=unread.remedy(lost, config))
+        text = f"{unread.values(lost, config)}: no task of this run reads it"
+        raise ConfigError("RIL-733", text, remedy=unread.remedy(lost, config))
     jobs = options.jobs or cores()
     hints = store.hints(graph.sequence)
     for line in describe(graph, result, recall(hints) or {}, jobs, verbose=verbose):
@@ -111,8 +111,8 @@ def describe(graph: Graph, result: Result, earlier: Kinds, jobs: int, *, verbose
     yield f"{'stage':19s} {'cached':>7s} {'to do':>7s}  why"
     for stage, handles in by_stage.items():
         planned = [h for h in handles if h.status == "planned"]
-        told = [] if verbose else _reasons(planned)
-        yield f"{stage:19s} {len(handles) - len(planned):7d} {len(planned):7d}  {'; '.join(told)}".rstrip()
+        reasons = [] if verbose else _reasons(planned)
+        yield f"{stage:19s} {len(handles) - len(planned):7d} {len(planned):7d}  {'; '.join(reasons)}".rstrip()
         if verbose:
             yield from (f"    {h.label}: {h.reason}" for h in planned)
     yield from _totals(graph, result, earlier, jobs)
@@ -121,11 +121,11 @@ def describe(graph: Graph, result: Result, earlier: Kinds, jobs: int, *, verbose
 def _reasons(planned: list[Handle]) -> list[str]:
     """The reasons of a stage's tasks, own ones first, the most frequent first, with their number."""
     own = Counter(h.reason for h in planned if not h.reason.startswith(BEHIND))
-    told = [f"{_short(reason)} ({n})" for reason, n in own.most_common(REASONS)]
+    listed = [f"{_short(reason)} ({n})" for reason, n in own.most_common(REASONS)]
     if len(own) > REASONS:
-        told.append(f"{len(own) - REASONS} other reasons")
+        listed.append(f"{len(own) - REASONS} other reasons")
     follow = len(planned) - own.total()
-    return told + ([f"an input is to be computed ({follow})"] if follow else [])
+    return listed + ([f"an input is to be computed ({follow})"] if follow else [])
 
 
 def _short(reason: str) -> str:

@@ -137,8 +137,8 @@ def _since(run: Path, row: Mapping[str, Any], made: Mapping[str, Any], store: St
             yield f"since         {lookup.name(before)}: {known}"
             return
         same = ", and yet the result is the same to the bit" if other.get("digest") == row.get("digest") else ""
-        for told in provenance.differences(then["provenance"], made["provenance"]) or ["the key has another format"]:
-            yield f"since         {lookup.name(before)}: {told}"
+        found = provenance.differences(then["provenance"], made["provenance"]) or ["the key has another format"]
+        yield from (f"since         {lookup.name(before)}: {difference}" for difference in found)
         if same:
             yield f"since         {lookup.name(before)}: another key{same}"
         return

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from rille.stages.core.errors import RilleError
 
@@ -10,7 +12,16 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
-def told(error: BaseException) -> RilleError | None:
+@contextmanager
+def reported(code: str, words: str, *, remedy: str, kind: type[RilleError] = RilleError) -> Iterator[None]:
+    """Raise an error of the system as one of Rille: ``words``, the system's reason and the remedy."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(code, f"{words}: {error.strerror}", remedy=remedy) from error
+
+
+def translated(error: BaseException) -> RilleError | None:
     """Translate a failure into an error of Rille with a remedy; None if Rille knows no better message."""
     if isinstance(error, RilleError):
         return error

@@ -68,8 +68,8 @@ class Known:
         # The nearest of the earlier ones: a user who goes back to former settings sees what is new, not what was
         # undone.
         found = min((differences(then, now) for then in earlier), key=len)
-        told = found[:SHOWN] + ([f"and {len(found) - SHOWN} more"] if len(found) > SHOWN else [])
-        return "; ".join(told) or "the key has another format"
+        shown = found[:SHOWN] + ([f"and {len(found) - SHOWN} more"] if len(found) > SHOWN else [])
+        return "; ".join(shown) or "the key has another format"
 
     def latest(self, store: Store, stage: str, label: str) -> Ref | None:
         """The latest artifact of a stage and label that is still there, whatever it was made from."""
@@ -88,17 +88,17 @@ class Known:
 
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     """List the differences of two recipes, one phrase each: parameters first, then inputs, code and packages."""
-    told = _values("params", then.get("params"), now["params"]) + _values("args", then.get("args"), now["args"])
-    told += _inputs(then.get("inputs", {}), now["inputs"])
+    found = _values("params", then.get("params"), now["params"]) + _values("args", then.get("args"), now["args"])
+    found += _inputs(then.get("inputs", {}), now["inputs"])
     old, new = then.get("code", {}), now["code"]
-    told += [f"code: {_file(m)} {_change(m, old, new)}" for m in sorted({*old, *new}) if old.get(m) != new.get(m)]
+    found += [f"code: {_file(m)} {_change(m, old, new)}" for m in sorted({*old, *new}) if old.get(m) != new.get(m)]
     old, new = then.get("env", {}), now["env"]
-    told += [
+    found += [
         f"{d} {old.get(d, 'none')} -> {new.get(d, 'none')}" for d in sorted({*old, *new}) if old.get(d) != new.get(d)
     ]
     for what in ("version", "format"):
-        told += _values(what, then.get(what), now[what])
-    return told
+        found += _values(what, then.get(what), now[what])
+    return found
 
 
 def _values(where: str, old: Any, new: Any) -> list[str]:
@@ -116,19 +116,19 @@ def _short(value: Any) -> str:
 
 
 def _inputs(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    told = []
+    found = []
     for port in sorted({*old, *new}):
         was, now = old.get(port), new.get(port)
         if was == now:
             continue
         if isinstance(was, list) and isinstance(now, list) and len(was) == len(now):
             changed = sum(a != b for a, b in zip(was, now, strict=True))
-            told.append(f"input {port} changed ({changed} of {len(now)})")
+            found.append(f"input {port} changed ({changed} of {len(now)})")
         elif isinstance(was, list) and isinstance(now, list):
-            told.append(f"input {port} has {len(now)} instead of {len(was)}")
+            found.append(f"input {port} has {len(now)} instead of {len(was)}")
         else:
-            told.append(f"input {port} {'added' if was is None else 'dropped' if now is None else 'changed'}")
-    return told
+            found.append(f"input {port} {'added' if was is None else 'dropped' if now is None else 'changed'}")
+    return found
 
 
 def _file(module: str) -> str:

@@ -35,7 +35,7 @@ from rille.pipeline.engine import forecast, provenance
 from rille.pipeline.engine.events import Ledger
 from rille.pipeline.engine.executors.base import Executor, Failed, Given, NotBegun, Task, light, make
 from rille.pipeline.engine.executors.base import known as check
-from rille.pipeline.engine.failures import told
+from rille.pipeline.engine.failures import translated
 from rille.pipeline.engine.graph import Expansion, Graph, Handle
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.memory import cost_model
@@ -51,7 +51,7 @@ from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.task import CodeChangedError, Outcome
 from rille.stages.core.errors import DegenerateError, RilleError
 
-HEALS = 3
+MOST_PUT_BACKS = 3
 """Times that a task is put back because its input has gone."""
 
 
@@ -116,7 +116,7 @@ class Result:
         if failures:
             first = failures[0]
             error = first.error
-            if (known := told(error)) is not None:
+            if (known := translated(error)) is not None:
                 raise known.at(first.label) from error
             raise TaskError(
                 "RIL-534", f"{first.label} (stage {first.stage}): {type(error).__name__}: {error}"
@@ -196,12 +196,12 @@ class _Run:
         """Looked up, not found, not submitted."""
         self.chainable = Waiting()
         """Nodes that wait only for what is with the executor."""
-        self.flying: dict[str, list[Handle]] = {}
+        self.to_compute: dict[str, list[Handle]] = {}
         """To be computed, by key; further nodes of the same key wait for the first."""
-        self.patients: dict[str, set[str]] = {}
+        self.blocked: dict[str, set[str]] = {}
         """Keys that must be computed again before the task of a key can be."""
-        self.put_back: dict[str, int] = defaultdict(int)
-        self.healing: dict[int, str] = {}
+        self.put_backs: dict[str, int] = defaultdict(int)
+        self.recomputed: dict[int, str] = {}
         """Nodes that are resolved and computed again, with their status."""
         self.expansions: list[tuple[list[Handle], Expansion, bool]] = []
         self.hints = store.hints(graph.sequence)
@@ -294,16 +294,18 @@ class _Run:
         self._explain(handle, refs)
         if self.dry:
             self._resolve(handle, "planned")
-        elif key in self.flying:
-            self.flying[key].append(handle)
+        elif key in self.to_compute:
+            self.to_compute[key].append(handle)
         else:
-            self.flying[key] = [handle]
+            self.to_compute[key] = [handle]
             self.missing.push(handle)
 
     def _explain(self, handle: Handle, refs: Refs) -> None:
-        made, forced = recipe(handle.spec, refs), handle.stage in self.force
-        told = "forced" if forced else self.known.reason(self.store, handle.stage, handle.label, handle.key, made)
-        handle.reason = told
+        if handle.stage in self.force:
+            handle.reason = "forced"
+        else:
+            made = recipe(handle.spec, refs)
+            handle.reason = self.known.reason(self.store, handle.stage, handle.label, handle.key, made)
 
     def _expand(self) -> bool:
         """Call the first expansion whose handles are done; whether there was one."""
@@ -327,7 +329,7 @@ class _Run:
     def _end_plan(self) -> bool:
         """Lay out what comes last, once everything else is laid out or will never be; whether there was such."""
         last = self.graph.last
-        if last is None or (self.expansions and (self.flying or self.out)):
+        if last is None or (self.expansions and (self.to_compute or self.out)):
             return False
         self.graph.last = None
         last()
@@ -342,7 +344,7 @@ class _Run:
         if self.stopped:
             self.missing.clear()
             self.chainable.clear()
-            self.patients.clear()
+            self.blocked.clear()
         if self.executor is not None and not self.stopped and self.executor.free():
             batch = [self._send(handle) for handle in self._choose(self.executor)]
             if batch:
@@ -420,7 +422,7 @@ class _Run:
 
     def _take_back(self, handle: Handle) -> None:
         """Treat a task that was not begun, or whose input is not known here yet, as if it had never been sent."""
-        again = [handle, *(h for h in self.flying.pop(handle.key, ()) if h is not handle)]
+        again = [handle, *(h for h in self.to_compute.pop(handle.key, ()) if h is not handle)]
         handle.key = ""
         broken = self._broken(handle)
         if broken is not None:
@@ -469,10 +471,10 @@ class _Run:
     def _land(self, first: Handle, outcome: Outcome | Failed) -> None:
         key = first.key
         self.warm.add(first.stage)
-        if isinstance(outcome, Failed) and self._heal(first, outcome.error):
+        if isinstance(outcome, Failed) and self._put_back(first, outcome.error):
             return
         # Two labels may have one key (equal parameters and inputs): it is computed once, and both get it.
-        others = [h for h in self.flying.pop(key, ()) if h is not first and h.index not in self.out]
+        others = [h for h in self.to_compute.pop(key, ()) if h is not first and h.index not in self.out]
         if not isinstance(outcome, Failed) and first.ref is not None and first.ref.digest != outcome.ref.digest:
             error = NonDeterministicError(
                 "RIL-535", f"stage {first.stage} is not deterministic: another digest when healed"
@@ -493,41 +495,45 @@ class _Run:
             for handle in (first, *others):
                 handle.ref = ref
                 self._resolve(handle, "computed" if handle is first and not outcome.cached else "cached")
-        self._discharge(key, first)
+        self._unblock(key, first)
 
-    def _heal(self, handle: Handle, error: BaseException) -> bool:
+    def _put_back(self, handle: Handle, error: BaseException) -> bool:
         """Put a task back whose input was damaged or gone when it was read, behind what must be computed again."""
-        if not isinstance(error, DamagedError | GoneError) or self.put_back[handle.key] >= HEALS or self.stopped:
+        if (
+            not isinstance(error, DamagedError | GoneError)
+            or self.put_backs[handle.key] >= MOST_PUT_BACKS
+            or self.stopped
+        ):
             return False
-        self.put_back[handle.key] += 1
-        self.flying.setdefault(handle.key, [handle])
+        self.put_backs[handle.key] += 1
+        self.to_compute.setdefault(handle.key, [handle])
         # fresh: the survey from the start of the run still lists the artifact that has gone.
         absent = {h.key: h for h in handle.upstream() if self.store.lookup(h.stage, h.key, fresh=True) is None}
         for key, source in absent.items():
             source.reason = "its artifact was found damaged, or gone, when it was read"
-            if key not in self.flying:
-                self.flying[key] = [source]
-                self.healing[source.index], source.status = source.status, "pending"
+            if key not in self.to_compute:
+                self.to_compute[key] = [source]
+                self.recomputed[source.index], source.status = source.status, "pending"
                 self.missing.push(source)
         if absent:
-            self.patients[handle.key] = set(absent)
+            self.blocked[handle.key] = set(absent)
         else:
             self.missing.push(handle)
         return True
 
-    def _discharge(self, key: str, source: Handle) -> None:
+    def _unblock(self, key: str, source: Handle) -> None:
         """Send on what waited for a key to be computed again."""
-        for patient in [p for p, keys in self.patients.items() if key in keys]:
-            first = self.flying[patient][0]
+        for waiting in [w for w, keys in self.blocked.items() if key in keys]:
+            first = self.to_compute[waiting][0]
             if not source.done:
-                del self.patients[patient]
-                for handle in self.flying.pop(patient):
+                del self.blocked[waiting]
+                for handle in self.to_compute.pop(waiting):
                     handle.status = "pending"
                     self._break(handle, source)
                 continue
-            self.patients[patient].discard(key)
-            if not self.patients[patient]:
-                del self.patients[patient]
+            self.blocked[waiting].discard(key)
+            if not self.blocked[waiting]:
+                del self.blocked[waiting]
                 self.missing.push(first)
 
     def _failed(self, failure: Failure) -> None:
@@ -549,7 +555,7 @@ class _Run:
         setattr(counts, status, getattr(counts, status) + 1)
         counts.seconds += handle.seconds
         self.ledger.write(handle)
-        before = self.healing.pop(handle.index, None)
+        before = self.recomputed.pop(handle.index, None)
         if before is None:
             self.progress.resolved(handle)
         else:  # healed: it counts once, as what became of it last
@@ -576,8 +582,8 @@ class _Run:
         """Account for everything that was not even begun."""
         self._admit()
         for handle in self.graph.nodes:
-            if handle.status == "pending" and handle.index in self.healing:
-                handle.status = self.healing[handle.index]
+            if handle.status == "pending" and handle.index in self.recomputed:
+                handle.status = self.recomputed[handle.index]
             elif handle.status == "pending":
                 handle.reason = self.stopped
                 self._resolve(handle, "skipped")

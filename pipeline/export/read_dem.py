@@ -107,7 +107,7 @@ def read_tiff(path: Path, *, length: bool = True) -> DemFile:
             f"{path} has cells of {np.hypot(transform.a, transform.d):g} x {np.hypot(transform.b, transform.e):g}",
             remedy="resample it to square cells, e.g. with gdalwarp -tr",
         )
-    told = []
+    doubts = []
     if crs is not None and length:
         _metric_crs(path, crs)
     if length and unit and unit.lower() not in METRE:
@@ -115,9 +115,9 @@ def read_tiff(path: Path, *, length: bool = True) -> DemFile:
             "RIL-632", f"{path} has elevations in {unit!r}, not in metres", remedy="convert it, e.g. with gdal_calc"
         )
     if length and not unit:
-        told.append(f"{path} states no unit of its elevations: taken as metres")
+        doubts.append(f"{path} states no unit of its elevations: taken as metres")
     return DemFile(
-        str(path), values, transform, "" if crs is None else crs.to_wkt(version="WKT2_2019"), None, tuple(told)
+        str(path), values, transform, "" if crs is None else crs.to_wkt(version="WKT2_2019"), None, tuple(doubts)
     )
 
 

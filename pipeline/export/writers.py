@@ -357,8 +357,8 @@ def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.
             with rasterio.open(path, driver="GTiff") as file:  # other drivers open other files, by name
                 names = tuple(name for name in file.descriptions if name)
                 if file.count != 2 or names not in ((), ("column_disparity", "row_disparity")):
-                    told = ", ".join(names) or "without names"
-                    raise InputError("RIL-622", f"{path} has {file.count} bands ({told}), no disparity", remedy=remedy)
+                    found = ", ".join(names) or "without names"
+                    raise InputError("RIL-622", f"{path} has {file.count} bands ({found}), no disparity", remedy=remedy)
                 if shape and file.shape != shape:
                     raise InputError(
                         "RIL-044",

@@ -346,11 +346,11 @@ class Drive:
         """The true motion, what the sensors say of it, and the images on the way that are not lost."""
         k, s, make = stop.index, self.simulation, self.make
         assert stop.leg is not None
-        told = {"scene": self.scene, "before": at.before, "pose": self.poses[-1], "leg": stop.leg}
+        given = {"scene": self.scene, "before": at.before, "pose": self.poses[-1], "leg": stop.leg}
         change = s.change(k, at.row)
         if change is not None:
-            told["scene"] = self.scene = make.source(change, f"obstacle/{k}", told)
-        stop.drive = make.source(s.drive(self.config.vehicle, k, at.row), f"drive/{k}", told)
+            given["scene"] = self.scene = make.source(change, f"obstacle/{k}", given)
+        stop.drive = make.source(s.drive(self.config.vehicle, k, at.row), f"drive/{k}", given)
         stop.sense = make.source(s.sense(k), f"sense/{k}", {"drive": stop.drive})
         there, said = yield [stop.drive, stop.sense]
         first = max(self.true) + 1

@@ -122,8 +122,8 @@ class Calibration:
 
     def residual(self, when: str) -> float:
         """RMS distance from the epipolar lines, px, ``before`` or ``after``; of one rig as it was weighed there."""
-        told = self.facts[0].get(f"residual_{when}_px") if len(self.facts) == 1 else None
-        return float(np.sqrt(np.mean(np.square(getattr(self, when))))) if told is None else float(told)
+        stated = self.facts[0].get(f"residual_{when}_px") if len(self.facts) == 1 else None
+        return float(np.sqrt(np.mean(np.square(getattr(self, when))))) if stated is None else float(stated)
 
     def collected(self, key: str) -> list[Any]:
         """The entries of a list that each rig's facts have."""

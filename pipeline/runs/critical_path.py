@@ -134,9 +134,9 @@ def describe(run: Path) -> Iterable[str]:
 
 def _chain(chain: tuple[tuple[str, float], ...]) -> str:
     """The chain's tasks, short ones only counted."""
-    told = [f"{label} {seconds:.1f}" for label, seconds in chain if seconds >= 0.05]
-    short = len(chain) - len(told)
-    return ", ".join(told) + (f" and {short} of less than 0.05 s" if short else "")
+    shown = [f"{label} {seconds:.1f}" for label, seconds in chain if seconds >= 0.05]
+    short = len(chain) - len(shown)
+    return ", ".join(shown) + (f" and {short} of less than 0.05 s" if short else "")
 
 
 def show(text: str, folder: Path) -> int:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine import events
+from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.folder import StoreError
@@ -22,10 +23,8 @@ def pin(store: Store, run: Path) -> int:
     keys = sorted(events.keys(run / lookup.LEDGER))
     path = _path(store, lookup.name(run))
     body = json.dumps({"run": lookup.name(run), "pinned": round(time.time()), "keys": keys})
-    try:
+    with reported("RIL-562", f"cannot pin in {store.root}", remedy="check --cache", kind=StoreError):
         atomic.write(path, body)
-    except OSError as error:
-        raise StoreError("RIL-562", f"cannot pin in {store.root}: {error.strerror}", remedy="check --cache") from error
     return len(keys)
 
 

@@ -8,6 +8,7 @@ import platform
 from collections.abc import Iterator
 from pathlib import Path
 
+from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.folder import StoreError
@@ -23,12 +24,8 @@ def note(store: Store, runs: Path) -> None:
     path = store.root / FOLDER / f"{named}.json"
     if path.exists():
         return
-    try:
+    with reported("RIL-741", f"cannot write in {store.root}", remedy="check --cache", kind=StoreError):
         atomic.write(path, json.dumps({"folder": folder, "host": platform.node()}))
-    except OSError as error:
-        raise StoreError(
-            "RIL-741", f"cannot write in {store.root}: {error.strerror}", remedy="check --cache"
-        ) from error
 
 
 def folders(store: Store, runs: Path) -> list[Path]:

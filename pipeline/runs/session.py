@@ -12,7 +12,7 @@ import os
 import shutil
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from rille.datasets.protocol import Sequence
 from rille.pipeline.engine.code_digest import remember
+from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.packages import installed
 from rille.pipeline.engine.plain import warn
@@ -119,8 +120,8 @@ def settings(options: Options) -> Settled:
     if options.opened is None:
         sequence = open_sequence(options.sequence, for_dataset, hints_folder(locate(options.cache)) / "files.json")
     elif for_dataset:
-        told = f"{next(iter(for_dataset))}: the sequence is open already"
-        raise ConfigError("RIL-860", told, remedy="give its parameters to open_sequence")
+        text = f"{next(iter(for_dataset))}: the sequence is open already"
+        raise ConfigError("RIL-860", text, remedy="give its parameters to open_sequence")
     else:
         sequence = options.opened
     doubts = [f"{v.code}: {v.text}: {v.remedy}" for v in judge_rig(sequence.rig) if v.level != "OK"]
@@ -265,8 +266,8 @@ def _progress(opened: _Opened) -> Iterator[Progress]:
     shown = progress.make(options.progress, verbose=options.verbose)
     if options.live:
         print(f"rille: progress is in {page}", file=sys.stderr)
-    with live.page(shown, page if options.live else None) as told:
-        yield told
+    with live.page(shown, page if options.live else None) as receiver:
+        yield receiver
 
 
 def _compute(opened: _Opened, shown: Progress) -> Result:
@@ -348,12 +349,12 @@ def _all_read(opened: _Opened, arrived: int) -> int:
         return COMPLETE
     lost = unread.unread(opened.settled.given, opened.view.config, opened.graph)
     if lost:
-        told = f"{unread.values(lost, opened.view.config)}: no task of this run read it"
-        print(f"rille: error RIL-732: {told}: {unread.remedy(lost, opened.view.config)}", file=sys.stderr)
+        text = f"{unread.values(lost, opened.view.config)}: no task of this run read it"
+        print(f"rille: error RIL-732: {text}: {unread.remedy(lost, opened.view.config)}", file=sys.stderr)
     idle = sorted(opened.options.force - {h.stage for h in opened.graph.nodes})
     if idle:
-        told = f"--force {', '.join(idle)}: this run has no such task: leave it out"
-        print(f"rille: error RIL-735: {told}", file=sys.stderr)
+        text = f"--force {', '.join(idle)}: this run has no such task: leave it out"
+        print(f"rille: error RIL-735: {text}", file=sys.stderr)
     return HOLES if lost or idle else COMPLETE
 
 
@@ -392,15 +393,10 @@ def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
     # Two runs of one plan within a second: mkdir decides which of them has the name.
     for suffix in ["", *(f"-{i}" for i in range(2, 100))]:
         folder = parent / (name + suffix)
-        try:
+        reported_as = reported("RIL-061", f"cannot make {folder}", remedy="choose another --runs folder")
+        with reported_as, suppress(FileExistsError):
             folder.mkdir(parents=True)
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise RilleError(
-                "RIL-061", f"cannot make {folder}: {error.strerror}", remedy="choose another --runs folder"
-            ) from error
-        return folder
+            return folder
     raise RilleError("RIL-062", f"too many runs named {name}", remedy="remove some, or wait a second")
 
 

@@ -102,36 +102,36 @@ def examine(client: Any, cache: Location) -> None:
         write_probe(store, token)
         # One at a time, so that a refusal names the worker.
         for address, short in workers.items():
-            told = client.run(introduce, cache, token, short, workers=[address], on_error="return").get(address)
-            if told is not None:  # None is one that has left meanwhile
-                _judge(client, address, told, ours, cache)
-            if told is not None and read_probe(store, f"{token}-{short}") is None:
+            answer = client.run(introduce, cache, token, short, workers=[address], on_error="return").get(address)
+            if answer is not None:  # None is one that has left meanwhile
+                _judge(client, address, answer, ours, cache)
+            if answer is not None and read_probe(store, f"{token}-{short}") is None:
                 raise _no_cache(_name(client, address), cache, "its probe is not seen here")
     finally:
         with suppress(OSError, RilleError):
             store.place.delete(f"probe/{name}" for name in names)
 
 
-def _judge(client: Any, address: str, told: Any, ours: Identity, cache: Location) -> None:
+def _judge(client: Any, address: str, answer: Any, ours: Identity, cache: Location) -> None:
     name = _name(client, address)
-    if isinstance(told, BaseException):
+    if isinstance(answer, BaseException):
         raise ConfigError(
             "RIL-520",
-            f"{name} cannot run Rille: {type(told).__name__}: {' '.join(str(told).split())[:200]}",
+            f"{name} cannot run Rille: {type(answer).__name__}: {' '.join(str(answer).split())[:200]}",
             remedy="install the same version there, and start the workers with it",
         )
-    if difference := unlike(told["identity"], ours):
+    if difference := unlike(answer["identity"], ours):
         raise ConfigError(
             "RIL-521", f"{name} differs: {difference}", remedy="install the same there, and start it again"
         )
-    if told["threads"]:
+    if answer["threads"]:
         raise ConfigError(
             "RIL-522",
-            f"{name} may use several threads a library ({told['threads'][0]} is not 1)",
+            f"{name} may use several threads a library ({answer['threads'][0]} is not 1)",
             remedy="start it with OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1",
         )
-    if told["cache"]:
-        raise _no_cache(name, cache, told["cache"])
+    if answer["cache"]:
+        raise _no_cache(name, cache, answer["cache"])
 
 
 def _name(client: Any, address: str) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 import rasterio
 from numpy.typing import NDArray
 
+from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.colour import LUMA
 from rille.pipeline.export.read_dem import DemFile, read_elevation, read_tiff
@@ -50,12 +51,8 @@ def export(run: Path, kind: str, output: Path | None) -> tuple[Path, str]:
     target = output or run / default
     terrain = read_elevation(run)
     ortho, sigma = _beside(run, "ortho", terrain), _beside(run, "dem_sigma", terrain)
-    try:
+    with reported("RIL-601", f"{target} cannot be written", remedy="name another file with -o", kind=InputError):
         return target, write(target, terrain, ortho, sigma)
-    except OSError as error:
-        raise InputError(
-            "RIL-601", f"{target} cannot be written: {error.strerror}", remedy="name another file with -o"
-        ) from error
 
 
 def _beside(run: Path, name: str, terrain: DemFile) -> NDArray[np.float64] | None:

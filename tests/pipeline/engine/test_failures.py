@@ -15,7 +15,7 @@ from raising import raises
 
 from rille.pipeline.cli import main
 from rille.pipeline.engine import scheduler
-from rille.pipeline.engine.failures import told
+from rille.pipeline.engine.failures import translated
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
 
@@ -36,7 +36,7 @@ def opencv_error() -> cv2.error:
     ],
 )
 def test_what_a_machine_or_a_library_refuses_is_told_in_one_line(monkeypatch, capsys, error, code, words):
-    assert words in str(told(error))
+    assert words in str(translated(error))
     monkeypatch.setattr("rille.pipeline.commands.init.init", lambda *_: (_ for _ in ()).throw(error))
     with pytest.raises(SystemExit) as end:
         main(["init", "."])
@@ -47,7 +47,7 @@ def test_what_a_machine_or_a_library_refuses_is_told_in_one_line(monkeypatch, ca
 
 
 def test_other_errors_are_left_as_they_are():
-    assert told(ZeroDivisionError()) is None
+    assert translated(ZeroDivisionError()) is None
 
 
 def test_a_cache_that_cannot_be_written_is_refused_before_anything_is_computed(tmp_path, monkeypatch):
