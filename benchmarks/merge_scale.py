@@ -115,7 +115,7 @@ def main() -> int:
     os.environ["PYTHONPATH"] = str(HERE.parent)
     with tempfile.TemporaryDirectory() as temporary:
         from rille.pipeline.engine import events as ledger
-        from rille.pipeline.engine.executors.base import prepare_environment
+        from rille.pipeline.engine.runtime.environment import prepare_environment
 
         cache = args.cache or Path(temporary) / "cache"
         prepare_environment()

@@ -18,15 +18,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-from rille.pipeline.engine.runtime.environment import prepare_environment
 from rille.pipeline.engine.runtime.interrupts import held
 from rille.pipeline.engine.spec import Spec
 from rille.pipeline.engine.store.location import Location
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import Outcome, ensure
 from rille.stages.core.errors import ConfigError
-
-__all__ = ["Executor", "Failed", "NotBegun", "Task", "light", "make", "prepare_environment"]
 
 KINDS = ("dask", "inline")
 

@@ -6,23 +6,11 @@ import shutil
 
 import pytest
 from raising import raises
-from toys.chain import build
+from toys.chain import run
 
 from rille.pipeline.commands import why
-from rille.pipeline.engine import scheduler
-from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.runs import lookup
-
-
-def run(folder, name, sequence="toy", **kw):
-    graph = Graph(sequence)
-    build(graph, **kw)
-    at = folder / "runs" / sequence / name
-    scheduler.run(
-        graph, Store(folder / "cache"), scheduler.RunOptions(executor="inline", ledger=at / "ledger.jsonl")
-    ).check()
-    return at
 
 
 def told(folder, at, label):

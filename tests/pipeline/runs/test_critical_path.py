@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from test_why import run
+from toys.chain import run
 
 from rille.pipeline.runs import critical_path
 

@@ -8,7 +8,7 @@ import shutil
 
 import pytest
 from raising import raises
-from test_why import run
+from toys.chain import run
 
 from rille.pipeline.commands import cache as commands
 from rille.pipeline.engine.store import maintenance

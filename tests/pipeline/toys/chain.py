@@ -28,9 +28,23 @@ def build(graph, frames=4, seed=0, size=40, offset=0.0):
     graph.flow(rest())
 
 
+def run(folder, name, sequence="toy", **kw):
+    """Run it in this process, with the ledger of a run of that name below ``folder / "runs"``; the run's folder."""
+    from rille.pipeline.engine import scheduler
+    from rille.pipeline.engine.graph import Graph
+    from rille.pipeline.engine.store.base import Store
+
+    graph = Graph(sequence)
+    build(graph, **kw)
+    at = folder / "runs" / sequence / name
+    options = scheduler.RunOptions(executor="inline", ledger=at / "ledger.jsonl")
+    scheduler.run(graph, Store(folder / "cache"), options).check()
+    return at
+
+
 def main(cache, executor="inline", what="", ledger=""):
     """Run it, and say what became of it."""
-    from rille.pipeline.engine.executors.base import prepare_environment
+    from rille.pipeline.engine.runtime.environment import prepare_environment
 
     prepare_environment()
     from rille.pipeline.engine import scheduler
