@@ -7,7 +7,7 @@ is computed here is cached for it.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -129,20 +129,20 @@ class Inspection:
         self.lost = {f: why for f, why in self.sequence.lost.items() if f in self.frames}
         self.frames = tuple(f for f in self.frames if f not in self.lost)
 
-    def say(self, findings: Iterable[Finding]) -> None:
+    def say(self, *findings: Finding | None) -> None:
         """Print what was found."""
-        for finding in findings:
+        for finding in filter(None, findings):
             print(finding, flush=True)
             self.found.append(finding)
 
     def steps(self) -> Steps:
         """Look at everything, the cheap things first."""
         s = self.sequence
-        self.say([fine("sequence", f"{s.name}, {len(self.frames)} of {s.frames} pairs")])
+        self.say(fine("sequence", f"{s.name}, {len(self.frames)} of {s.frames} pairs"))
         for frame, why in self.lost.items():
             text = f"frame {s.frame_names[frame]}: {why}"
-            self.say([doubt("RIL-668", text, "images", remedy="it gets no pose; its neighbours are joined across it")])
-        self.say(Finding("", line, "input", "WARN") for line in s.warnings)  # it begins with its code
+            self.say(doubt("RIL-668", text, "images", remedy="it gets no pose; its neighbours are joined across it"))
+        self.say(*(Finding("", line, "input", "WARN") for line in s.warnings))  # it begins with its code
         self.say(judge.judge_rig(s.rig))
         self.say(judge.judge_times(None if s.times is None else [s.times[k] for k in self.frames]))
         self.say(judge.judge_truth(s.truth, self.frames, s.truth_positions))
@@ -151,7 +151,7 @@ class Inspection:
         yield from self._images()
         whole = [k for k in self.frames if not any((k, camera) in self.broken for camera in CAMERAS)]
         if not whole:
-            self.say([fault("RIL-669", "no pair of images is whole", "matching")])
+            self.say(fault("RIL-669", "no pair of images is whole", "matching"))
             return
         yield from self._first_pair(whole[0])
         yield from self._motions()
@@ -177,15 +177,15 @@ class Inspection:
             looks[camera][frame] = look(image, np.asarray(bundle["valid"]))
             digests[camera][frame] = hashlib.sha256(image.tobytes()).hexdigest()
         for damage in list(self.broken.values())[:FIRST_NAMED]:
-            self.say([fault(damage.code, damage.message, "images", remedy=damage.remedy)])
+            self.say(fault(damage.code, damage.message, "images", remedy=damage.remedy))
         total = len(self.frames) * len(CAMERAS)
         if self.broken:
-            self.say([fault("RIL-670", f"{len(self.broken)} of {total} images cannot be used", "images")])
+            self.say(fault("RIL-670", f"{len(self.broken)} of {total} images cannot be used", "images"))
         else:
             words = " and ".join(f"{w} x {h} {kind}" for w, h, kind in sorted(sizes))
-            self.say([fine("images", f"all {total} open, {words}")])
-        self.say(self._repeated(digests))
-        self.say(judge.judge_looks(looks, self.sequence.frame_names))
+            self.say(fine("images", f"all {total} open, {words}"))
+        self.say(*self._repeated(digests))
+        self.say(*judge.judge_looks(looks, self.sequence.frame_names))
 
     def _repeated(self, digests: Mapping[str, Mapping[int, str]]) -> list[Finding]:
         names, out = self.sequence.frame_names, []
@@ -220,7 +220,7 @@ class Inspection:
         except (MissingError, RilleError) as missing:
             error = _cause(missing.handles[0]) if isinstance(missing, MissingError) else missing
             text = f"frame {self.sequence.frame_names[pair]}: {error.message}"
-            self.say([fault(error.code, text, "matching", remedy=error.remedy)])
+            self.say(fault(error.code, text, "matching", remedy=error.remedy))
             return
         rig = self.sequence.rig
         rho, _ = inverse_depth(rig, m.left, m.right - m.left)
@@ -241,7 +241,7 @@ class Inspection:
         tasks = {(a, b): self.make.motion(a, b) for a, b in whole}
         yield Maybe(list(tasks.values()))
         for error in (_cause(task) for task in tasks.values() if task.ref is None):
-            self.say([fault(error.code, error.message, "motion", remedy=error.remedy)])
+            self.say(fault(error.code, error.message, "motion", remedy=error.remedy))
         motions = {step: task.ref.meta for step, task in tasks.items() if task.ref is not None}
         self.say(judge.judge_motion(motions, self.sequence.frame_names))
 

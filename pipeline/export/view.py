@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 
 Status = Literal["computed", "cached", "failed", "skipped"]
 
+UNSTATED = "nobody, so they are the defaults"
+"""Source of the limits of a vehicle that neither the user nor the sequence has stated."""
+
 
 @dataclass(frozen=True)
 class TaskRow:

@@ -92,50 +92,48 @@ def fault(code: str, text: str, subject: str, *, remedy: str = "") -> Finding:
     return Finding(code, text, subject, "FAIL", remedy)
 
 
-def judge_rig(rig: Rig) -> list[Finding]:
+def judge_rig(rig: Rig) -> Finding:
     """Baseline and sides, as the calibration has them."""
     b, x = rig.baseline, float(rig.T_right_left.translation[0])
     f = rig.left.fx
     if x > 0.5 * b:
-        return [fault("RIL-640", f"the right camera stands {x:g} m to the left", "rig", remedy="swap left and right")]
+        return fault("RIL-640", f"the right camera stands {x:g} m to the left", "rig", remedy="swap left and right")
     words = f"baseline {b:g} m, focal length {f:g} px, {rig.left.width} x {rig.left.height}"
     if not SMALL_BASELINE <= b <= LARGE_BASELINE:
-        return [doubt("RIL-641", words, "rig", remedy="is the baseline in metres?")]
+        return doubt("RIL-641", words, "rig", remedy="is the baseline in metres?")
     ratio = max(rig.left.fx / rig.right.fx, rig.right.fx / rig.left.fx)
     if ratio > 1.2:
-        return [
-            doubt(
-                "RIL-642", f"{words}; the right camera's is {rig.right.fx:g} px", "rig", remedy="two different lenses?"
-            )
-        ]
-    return [fine("rig", words)]
+        return doubt(
+            "RIL-642", f"{words}; the right camera's is {rig.right.fx:g} px", "rig", remedy="two different lenses?"
+        )
+    return fine("rig", words)
 
 
-def judge_times(times: Sequence[float] | None) -> list[Finding]:
+def judge_times(times: Sequence[float] | None) -> Finding:
     """Order, rate and gaps of the frames' times, s."""
     if times is None:
-        return [fine("times", "none: frames count as equally spaced")]
+        return fine("times", "none: frames count as equally spaced")
     steps = np.diff(np.asarray(times, dtype=np.float64))
     if not steps.size:
-        return [fine("times", "one frame")]
+        return fine("times", "one frame")
     if (steps <= 0).any():
         k = int(np.argmax(steps <= 0))
-        return [
-            fault("RIL-643", f"time goes back or rests from frame {k} to {k + 1}", "times", remedy="correct the times")
-        ]
+        return fault(
+            "RIL-643", f"time goes back or rests from frame {k} to {k + 1}", "times", remedy="correct the times"
+        )
     usual = float(np.median(steps))
     words = f"{1 / usual:.3g} frames a second over {float(steps.sum()):.4g} s"
     gaps = np.nonzero(steps > GAP * usual)[0]
     if gaps.size:
         worst = int(gaps[np.argmax(steps[gaps])])
         text = f"{words}; {gaps.size} gaps, the longest {steps[worst]:.3g} s from frame {worst} to {worst + 1}"
-        return [doubt("RIL-644", text, "times", remedy="frames may be missing; is the overlap kept there?")]
-    return [fine("times", words)]
+        return doubt("RIL-644", text, "times", remedy="frames may be missing; is the overlap kept there?")
+    return fine("times", words)
 
 
 def judge_truth(
     truth: Sequence[RigidTransform | None] | None, frames: Sequence[int], positions: Positions | None = None
-) -> list[Finding]:
+) -> Finding:
     """How many frames have truth, and how long the way is."""
     if truth is None and positions is not None:
         places, times = np.array(positions.positions), positions.times
@@ -145,25 +143,25 @@ def judge_truth(
         words = (
             f"positions only ({axes}), {len(places)} rows, {length:.4g} m, {when}; compared after a fit in the plane"
         )
-        return [fine("truth", words)]
+        return fine("truth", words)
     if truth is None:
-        return [fine("truth", "none: accuracy is only known against the cross-check")]
+        return fine("truth", "none: accuracy is only known against the cross-check")
     known = [T for T in (truth[k] for k in frames) if T is not None]
     length = sum(float(np.linalg.norm(b.translation - a.translation)) for a, b in pairwise(known))
     words = f"{len(known)} of {len(frames)} frames, {length:.4g} m"
     if len(known) < len(frames):
-        return [doubt("RIL-645", words, "truth", remedy="frames without truth are left out of the accuracy")]
-    return [fine("truth", words)]
+        return doubt("RIL-645", words, "truth", remedy="frames without truth are left out of the accuracy")
+    return fine("truth", words)
 
 
 def judge_attitude(
     attitude: Sequence[Rows | None] | None,
     truth: Sequence[RigidTransform | None] | None,
     frames: Sequence[int],
-) -> list[Finding]:
+) -> Finding | None:
     """Coverage of the attitude, and whether it turns as truth does."""
     if attitude is None:
-        return []
+        return None
     known = [k for k in frames if attitude[k] is not None]
     words = f"{len(known)} of {len(frames)} frames"
     apart = []
@@ -177,33 +175,31 @@ def judge_attitude(
         apart.append(math.degrees(float(np.linalg.norm(cv2.Rodrigues(sensed @ true.T)[0]))))
     if apart and float(np.median(apart)) > ATTITUDE_DEG:
         text = f"{words}; between frames it turns {np.median(apart):.1f} degrees otherwise than truth"
-        return [fault("RIL-646", text, "attitude", remedy="check T_body_left, the axes and degrees or radians")]
+        return fault("RIL-646", text, "attitude", remedy="check T_body_left, the axes and degrees or radians")
     if apart:
         words += f"; turns as truth does, to {np.median(apart):.2g} degrees a frame"
     if len(known) < len(frames):
-        return [doubt("RIL-647", words, "attitude", remedy="the other frames are matched without it")]
-    return [fine("attitude", words)]
+        return doubt("RIL-647", words, "attitude", remedy="the other frames are matched without it")
+    return fine("attitude", words)
 
 
-def judge_up(up: Sequence[tuple[float, float, float] | None] | None, frames: Sequence[int]) -> list[Finding]:
+def judge_up(up: Sequence[tuple[float, float, float] | None] | None, frames: Sequence[int]) -> Finding | None:
     """Whether the stated vertical can be one."""
     if up is None:
-        return []
+        return None
     known = [up[k] for k in frames if up[k] is not None]
     if not known:
-        return [
-            doubt(
-                "RIL-648", f"known of 0 of {len(frames)} frames", "up", remedy="the ground is levelled by its own plane"
-            )
-        ]
+        return doubt(
+            "RIL-648", f"known of 0 of {len(frames)} frames", "up", remedy="the ground is levelled by its own plane"
+        )
     # Camera frames have y downwards: up has a negative y where a camera is held upright.
     down = float(np.mean([v[1] for v in known if v is not None]))
     text = f"known of {len(known)} of {len(frames)} frames"
     if down > 0:
-        return [
-            doubt("RIL-649", f"{text}; it points down in the images", "up", remedy="held upside down, or a wrong sign?")
-        ]
-    return [fine("up", text)]
+        return doubt(
+            "RIL-649", f"{text}; it points down in the images", "up", remedy="held upside down, or a wrong sign?"
+        )
+    return fine("up", text)
 
 
 def judge_looks(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Finding]:
@@ -283,85 +279,79 @@ def _sharpness(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) ->
     return out
 
 
-def judge_matching(rate: float | None, depths: Floats, baseline: float) -> list[Finding]:
+def judge_matching(rate: float | None, depths: Floats, baseline: float) -> Finding:
     """Share of usable pixels that are matched, and how far away they lie (m)."""
     share = rate or 0.0
     if share < NO_MATCH:
         text = f"{100 * share:.1f} % of the first pair is matched"
-        return [
-            fault("RIL-656", text, "matching", remedy="do both images show one scene, taken at one time, and sharp?")
-        ]
+        return fault("RIL-656", text, "matching", remedy="do both images show one scene, taken at one time, and sharp?")
     near, middle, far = (float(v) for v in np.percentile(depths, [5, 50, 95])) if depths.size else (math.nan,) * 3
     text = f"{100 * share:.0f} % of the first pair is matched, depth {near:.3g} to {far:.3g} m, median {middle:.3g} m"
     if share < POOR_MATCH:
-        return [doubt("RIL-657", text, "matching", remedy="little texture, or little overlap of left and right")]
+        return doubt("RIL-657", text, "matching", remedy="little texture, or little overlap of left and right")
     if depths.size and middle > 200 * baseline:
         remedy = f"at {middle / baseline:.0f} baselines depth is a guess; is the baseline right?"
-        return [doubt("RIL-658", text, "matching", remedy=remedy)]
-    return [fine("matching", text)]
+        return doubt("RIL-658", text, "matching", remedy=remedy)
+    return fine("matching", text)
 
 
-def judge_sides(beyond: float) -> list[Finding]:
+def judge_sides(beyond: float) -> Finding:
     """Share of the matches that lie beyond infinity under the given rig."""
     text = f"{100 * beyond:.1f} % of the matches lie beyond infinity"
     if beyond > SWAPPED:
-        return [
-            fault("RIL-659", text, "sides", remedy="left and right are swapped, or the baseline has the wrong sign")
-        ]
+        return fault("RIL-659", text, "sides", remedy="left and right are swapped, or the baseline has the wrong sign")
     if beyond > DOUBTFUL:
-        return [
-            doubt("RIL-660", text, "sides", remedy="the toe-in of the calibration, or its principal points, are wrong")
-        ]
-    return [fine("sides", f"left is left: {text}")]
+        return doubt(
+            "RIL-660", text, "sides", remedy="the toe-in of the calibration, or its principal points, are wrong"
+        )
+    return fine("sides", f"left is left: {text}")
 
 
-def judge_epipolar(facts: Mapping[str, Any]) -> list[Finding]:
+def judge_epipolar(facts: Mapping[str, Any]) -> Finding:
     """Epipolar residuals under the given rig, and after adjusting it (facts of stage ``orientation``)."""
     if "residual_before_px" not in facts:
-        return [doubt("RIL-661", str(facts.get("words", "not checked")), "epipolar", remedy="see the matching")]
+        return doubt("RIL-661", str(facts.get("words", "not checked")), "epipolar", remedy="see the matching")
     before, after = float(facts["residual_before_px"]), float(facts["residual_after_px"])
     offset, roll = float(facts["row_offset"]), float(facts["roll_deg"])
     words = f"row offset {offset:+.2f} px, roll {roll:+.3f} degrees, residual {before:.2f} px RMS, adjusted {after:.2f}"
     if after > HOPELESS:
         remedy = "no rig explains these images; wrong calibration file, or lens distortion left in"
-        return [fault("RIL-662", words, "epipolar", remedy=remedy)]
+        return fault("RIL-662", words, "epipolar", remedy=remedy)
     if after > ROOM:
-        return [
-            doubt(
-                "RIL-663", words, "epipolar", remedy="is lens distortion left in the images, or the wrong file given?"
-            )
-        ]
+        return doubt(
+            "RIL-663", words, "epipolar", remedy="is lens distortion left in the images, or the wrong file given?"
+        )
     if before > ROOM or abs(offset) > ROWS_OK:
         remedy = "the calibration is off; reconstruct repairs what the images tell, `rille calibrate` the rest"
-        return [doubt("RIL-664", words, "epipolar", remedy=remedy)]
-    return [fine("epipolar", words)]
+        return doubt("RIL-664", words, "epipolar", remedy=remedy)
+    return fine("epipolar", words)
 
 
-def judge_synchrony(spreads: Mapping[int, list[float | None]]) -> list[Finding]:
+def judge_synchrony(spreads: Mapping[int, list[float | None]]) -> Finding | None:
     """Whether the right images are of the same moments; ``spreads`` [px] by shift, see
     :mod:`rille.pipeline.runs.synchrony`."""
     named = [value for value in spreads[0] if value is not None]
     if not named:
-        return []
+        return None
     found = best_shift(spreads)
     words = f"rows of {len(named)} pairs over the sequence spread by {float(np.median(named)):.2f} px"
     if found is None:
-        return [fine("simultaneous", f"{words}; no shift in time explains them better")]
+        return fine("simultaneous", f"{words}; no shift in time explains them better")
     shift, as_named, shifted = found
     text = (
         f"not simultaneous: left i with right i{shift:+d} spreads rows by {shifted:.2f} px, as named {as_named:.2f} px"
     )
-    return [fault("RIL-665", text, "simultaneous", remedy=f"pair each left image with the right one {_frames(shift)}")]
+    return fault("RIL-665", text, "simultaneous", remedy=f"pair each left image with the right one {_frames(shift)}")
 
 
 def _frames(shift: int) -> str:
     return f"{abs(shift)} frame{'s' if abs(shift) > 1 else ''} {'before' if shift < 0 else 'after'} it"
 
 
-def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Sequence[str]) -> list[Finding]:
+def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Sequence[str]) -> Finding:
     """Overlap of successive left images, of stage ``motion``'s facts."""
     if not motions:
-        return [fine("motion", "one frame: no trajectory")]
+        return fine("motion", "one frame: no trajectory")
     overlap = {k: float(m["overlap"] or 0.0) for k, m in motions.items()}
     length = [float(m["median_length"]) for m in motions.values() if m["median_length"] is not None]
     (a, b), least = min(overlap.items(), key=lambda kv: kv[1])
@@ -370,9 +360,9 @@ def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Se
         f"from frame {names[a]} to {names[b]}; motion {np.median(length) if length else math.nan:.1f} px"
     )
     if least < NO_OVERLAP:
-        return [
-            fault("RIL-666", text, "motion", remedy="the trajectory breaks there; add the frames between, or split it")
-        ]
+        return fault(
+            "RIL-666", text, "motion", remedy="the trajectory breaks there; add the frames between, or split it"
+        )
     if least < LITTLE_OVERLAP:
-        return [doubt("RIL-667", text, "motion", remedy="take every frame, or expect weak poses there")]
-    return [fine("motion", text)]
+        return doubt("RIL-667", text, "motion", remedy="take every frame, or expect weak poses there")
+    return fine("motion", text)

@@ -110,6 +110,7 @@ class Settled:
 def settings(options: Options) -> Settled:
     """Open a sequence and determine its configuration: defaults, presets, file and options of the user."""
     from rille.datasets.registry import open_sequence
+    from rille.pipeline.export.view import UNSTATED
     from rille.pipeline.flow import unread
     from rille.pipeline.runs.input_checks import judge_rig
 
@@ -124,11 +125,12 @@ def settings(options: Options) -> Settled:
         raise ConfigError("RIL-860", text, remedy="give its parameters to open_sequence")
     else:
         sequence = options.opened
-    doubts = [f"{v.code}: {v.text}: {v.remedy}" for v in judge_rig(sequence.rig) if v.level != "OK"]
+    found = judge_rig(sequence.rig)
     # A manifest warns of its baseline itself, with the key to change.
-    if doubts and not any("baseline" in line for line in sequence.warnings):
-        sequence = replace(sequence, warnings=(*sequence.warnings, *doubts))
-    vehicle, source = {}, "nobody, so they are the defaults"
+    if found.level != "OK" and not any("baseline" in line for line in sequence.warnings):
+        doubt = f"{found.code}: {found.text}: {found.remedy}"
+        sequence = replace(sequence, warnings=(*sequence.warnings, doubt))
+    vehicle, source = {}, UNSTATED
     if sequence.vehicle is not None:
         vehicle, source = {"vehicle": sequence.vehicle.model_dump()}, f"sequence {sequence.name}"
     if "vehicle" in for_stages:

@@ -23,7 +23,7 @@ def test_a_shift_of_the_right_images_is_found(data_dir, late):
             theirs = synchrony.features(cv2.imread(str(right[k + late + shift]), cv2.IMREAD_GRAYSCALE))
             values.append(synchrony.row_spread(rig, ours, theirs))
     found = synchrony.best_shift(spreads)
-    (verdict,) = judge_synchrony(spreads)
+    verdict = judge_synchrony(spreads)
     if late == 0:
         assert found is None
         assert verdict.level == "OK"
@@ -39,7 +39,7 @@ def test_at_rest_and_without_matches_nothing_is_said():
     assert synchrony.best_shift(at_rest) is None
     blank = {shift: [None, None] for shift in synchrony.SHIFTS}
     assert synchrony.best_shift(blank) is None
-    assert judge_synchrony(blank) == []
+    assert judge_synchrony(blank) is None
 
 
 def test_a_rig_that_is_off_is_no_shift():
