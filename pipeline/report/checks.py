@@ -14,13 +14,9 @@ from rille.pipeline.report import canvas, figures
 from rille.pipeline.report.canvas import Block, Table
 from rille.pipeline.report.gather import Calibration, Scene
 from rille.pipeline.report.words import length, number, quantity, spans, spread
-from rille.stages.calibration.parameter_selection import RelativeParams
 
 MOST_CURVES = 3
 """Parameters of the rig whose change over the pairs is drawn."""
-
-ASKED: float = RelativeParams.model_fields["significance"].default
-"""Standard deviations from which on a correction that the images ask for is reported."""
 
 MOST_FLAGS = 8
 """Flagged frames that a caption names with their reasons; agreement.csv has all."""
@@ -61,10 +57,11 @@ def rig(scene: Scene) -> Block | None:
 
 def _untold(scene: Scene, found: Calibration) -> list[str]:
     """What the images ask for but cannot tell from a principal point that is off, and what the truth says of it."""
+    least = scene.view.config.rig.significance
     unsure = [
         p
         for p in found.collected("parameters")
-        if not p.get("freed") and not p.get("observed") and p.get("sigma") and abs(p["asked"]) > ASKED * p["sigma"]
+        if not p.get("freed") and not p.get("observed") and p.get("sigma") and abs(p["asked"]) > least * p["sigma"]
     ]
     if not unsure:
         return []

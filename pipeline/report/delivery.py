@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from rille.pipeline.engine.plain import some
-from rille.pipeline.export.view import RunView
+from rille.pipeline.export.view import UNSTATED, RunView
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.words import metres, spans
-from rille.stages.hazard.vehicle import DEFAULT_VEHICLE
 
 Rows = list[dict[str, Any]]
 Items = list[dict[str, str]]
@@ -190,7 +189,7 @@ def _truth(view: RunView) -> Items:
 
 def _vehicle(view: RunView) -> Items:
     v = view.config.vehicle
-    if v != DEFAULT_VEHICLE or view.bundle(view.products.risk) is None:
+    if view.vehicle_source != UNSTATED or view.bundle(view.products.risk) is None:
         return []
     size = f"{metres(v.wheel_base)} between its axles, {metres(v.track)} between its wheels"
     why = (

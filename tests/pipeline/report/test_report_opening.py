@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from toys.finished import view, written
 
+from rille.pipeline.export.view import UNSTATED
 from rille.pipeline.report import checks, delivery, page, summary, tables, terrain_map
 from rille.pipeline.report.gather import Terrain
+from rille.stages.calibration.rig import RigParams
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import REASONS, RiskParams
 from rille.stages.hazard.vehicle import Vehicle
@@ -97,10 +99,10 @@ def test_standard_deviations_that_truth_contradicts_are_warned_of(nees, words):
     assert all(word in line for word, line in zip(words, found, strict=True))
 
 
-@pytest.mark.parametrize(("vehicle", "told"), [(Vehicle(), True), (Vehicle(track=0.5), False)])
-def test_limits_that_nobody_stated_are_told(tmp_path, vehicle, told):
-    config = SimpleNamespace(vehicle=vehicle, risk=RiskParams(), path=PathParams())
-    facts, read, _, _ = written(tmp_path, view(config=config))
+@pytest.mark.parametrize(("source", "told"), [(UNSTATED, True), ("user", False)])
+def test_limits_that_nobody_stated_are_told(tmp_path, source, told):
+    config = SimpleNamespace(vehicle=Vehicle(), risk=RiskParams(), path=PathParams())
+    facts, read, _, _ = written(tmp_path, view(config=config, vehicle_source=source))
     assert [m["kind"] for m in facts["absent"]] == ["vehicle"] * told
     assert ("0.700 m between its axles, 0.600 m between its wheels, up to 20°" in read.text) == told
 
@@ -108,6 +110,7 @@ def test_limits_that_nobody_stated_are_told(tmp_path, vehicle, told):
 @pytest.mark.parametrize(
     ("change", "scale", "words"),
     [
+        ({"significance": 10.0}, None, None),
         ({}, None, "compare a known length"),
         ({}, -0.31, "with it that of depth, is off by 0.31 %"),
         ({"asked": 0.1}, None, None),
@@ -118,7 +121,9 @@ def test_limits_that_nobody_stated_are_told(tmp_path, vehicle, told):
 def test_a_turn_that_the_images_ask_for_but_cannot_tell_is_judged_by_the_truth(change, scale, words):
     yaw = {"name": "yaw", "freed": False, "observed": False, "asked": 0.4, "sigma": 0.05} | change
     accuracy = None if scale is None else SimpleNamespace(meta={"metrics": {"scale_error": {"value": scale}}})
-    scene = SimpleNamespace(view=SimpleNamespace(products=SimpleNamespace(accuracy=accuracy), bundle=lambda h: h))
+    params = RigParams(significance=yaw.pop("significance", 4.0))
+    config, products = SimpleNamespace(rig=params), SimpleNamespace(accuracy=accuracy)
+    scene = SimpleNamespace(view=SimpleNamespace(config=config, products=products, bundle=lambda h: h))
     found = " ".join(checks._untold(scene, SimpleNamespace(collected=lambda name: [yaw])))
     assert words in found if words else found == ""
     assert "yaw +0.4000°" in found or not words

@@ -17,6 +17,7 @@ from rille.pipeline.export.view import RunView, TaskRow
 from rille.pipeline.flow.products import Products
 from rille.pipeline.report import canvas, gallery, summary
 from rille.pipeline.report.page import write_report
+from rille.stages.calibration.rig import RigParams
 from rille.stages.core.declare import Bundle
 from rille.stages.evaluation.accuracy import trajectory_accuracy
 from rille.stages.evaluation.accuracy_parts import metric as figure
@@ -272,7 +273,9 @@ def view(made: dict[str, Bundle] | None = None, *, truth: bool = True, **changes
         products=products(),
         bundle=lambda handle: store.get(handle) if isinstance(handle, str) else None,
         tasks=TASKS,
-        config=SimpleNamespace(vehicle=Vehicle(name="rover of the toy"), risk=RiskParams(), path=PathParams()),
+        config=SimpleNamespace(
+            vehicle=Vehicle(name="rover of the toy"), risk=RiskParams(), path=PathParams(), rig=RigParams()
+        ),
         config_toml="[locus]\ncell_size = 0.01  # <m>\n",
         seconds=12.3,
         versions={"rille": "0.1.0", "numpy": "2.4"},
