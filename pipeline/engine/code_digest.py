@@ -90,7 +90,7 @@ def package_of(module: str) -> str:
     return ".".join(module.split(".")[: 2 if module.startswith("rille.") else 1])
 
 
-def module_digests(module: str, own: Iterable[str] = OWN) -> dict[str, str]:
+def module_digests(module: str) -> dict[str, str]:
     """Digest of each own module that ``module`` reaches, itself included, by dotted name.
 
     Raises
@@ -98,13 +98,12 @@ def module_digests(module: str, own: Iterable[str] = OWN) -> dict[str, str]:
     ModuleNotFoundError
         ``module`` itself has no source file.
     """
-    packages = tuple(sorted({*own, package_of(module)}))
-    return dict(_reachable(module, packages))
+    return dict(_reachable(module))
 
 
-def code_digest(module: str, own: Iterable[str] = OWN) -> str:
+def code_digest(module: str) -> str:
     """One digest of :func:`module_digests`."""
-    return digest(module_digests(module, own))
+    return digest(module_digests(module))
 
 
 def tree_digest(own: Iterable[str] = OWN) -> str:
@@ -123,20 +122,21 @@ def tree_digest(own: Iterable[str] = OWN) -> str:
     return digest(found)
 
 
-def external_imports(module: str, own: Iterable[str] = OWN) -> set[str]:
+def external_imports(module: str) -> set[str]:
     """Top-level names of what a module and all own modules that it reaches import from elsewhere, but from Python."""
-    packages = tuple(sorted({*own, package_of(module)}))
+    own = {*OWN, package_of(module)}
     return {
         imported.partition(".")[0]
-        for name, _ in _reachable(module, packages)
+        for name, _ in _reachable(module)
         if (path := _file(name)) is not None
         for imported in _read(name, path).imports
-        if package_of(imported) not in packages and imported.partition(".")[0] not in sys.stdlib_module_names
+        if package_of(imported) not in own and imported.partition(".")[0] not in sys.stdlib_module_names
     }
 
 
 @cache
-def _reachable(module: str, packages: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
+def _reachable(module: str) -> tuple[tuple[str, str], ...]:
+    own = {*OWN, package_of(module)}
     if _file(module) is None:
         raise ModuleNotFoundError(f"module {module} has no source file", name=module)
     found: dict[str, str] = {}
@@ -144,7 +144,7 @@ def _reachable(module: str, packages: tuple[str, ...]) -> tuple[tuple[str, str],
     while queue:
         name = queue.pop()
         path = _file(name)
-        if name in found or path is None or package_of(name) not in packages:
+        if name in found or path is None or package_of(name) not in own:
             continue
         source = _read(name, path)
         found[name] = source.sha256

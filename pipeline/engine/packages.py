@@ -13,12 +13,11 @@ import ctypes
 import importlib.metadata
 import importlib.util
 import platform
-from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-from rille.pipeline.engine.code_digest import OWN, external_imports
+from rille.pipeline.engine.code_digest import external_imports
 from rille.stages.core.errors import RilleError
 
 KNOWN = {
@@ -44,7 +43,7 @@ class MissingPackageError(RilleError):
     """A package that a stage imports is not installed."""
 
 
-def versions(module: str, own: Iterable[str] = OWN) -> dict[str, str]:
+def versions(module: str) -> dict[str, str]:
     """Version and kind of each distribution that a module and what it reaches import, by the distribution's name.
 
     Raises
@@ -52,7 +51,7 @@ def versions(module: str, own: Iterable[str] = OWN) -> dict[str, str]:
     MissingPackageError
         One of them is not installed.
     """
-    names = external_imports(module, own) - HARMLESS
+    names = external_imports(module) - HARMLESS
     if "numba" in names:
         names.add("llvmlite")  # generates the code
     return dict(sorted(_version(name) for name in names))

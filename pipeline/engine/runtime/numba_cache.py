@@ -150,9 +150,9 @@ def folder() -> Path:
     return private_folder() / "kernels"
 
 
-def unused(now: float | None = None) -> list[Path]:
+def unused() -> list[Path]:
     """Kernels that nothing loaded for :data:`UNUSED_DAYS`."""
-    limit = (time.time() if now is None else now) - 86400 * UNUSED_DAYS
+    limit = time.time() - 86400 * UNUSED_DAYS
     return [path for path in sorted(folder().glob("*")) if path.stat().st_mtime <= limit]
 
 

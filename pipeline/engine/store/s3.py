@@ -23,6 +23,9 @@ from datetime import timedelta
 from functools import lru_cache
 from typing import Any, TypeVar
 
+import obstore
+from obstore.store import S3Store
+
 from rille.pipeline.engine.store.place import FORMAT, MARK, Item
 from rille.stages.core.errors import ConfigError, RilleError
 
@@ -76,21 +79,11 @@ class Bucket:
 
     def status(self, path: str, *, fresh: bool = False) -> Item | None:
         """Return the status of an object: from the survey if there is one, else by a request."""
-        import obstore
-
         # A bucket takes milliseconds for each question, so tens of thousands of look-ups use the listing.
         if not fresh and self._listed is not None:
             return self._listed.get(path)
 
-        def ask() -> Item | None:
-            try:
-                return _item(obstore.head(self._store, path))
-            except FileNotFoundError as error:
-                if _code(error) == "NoSuchBucket":
-                    raise
-                return None
-
-        found = self._again(ask)
+        found = self._unless_absent(lambda: _item(obstore.head(self._store, path)))
         if self._listed is not None and found is not None:
             self._listed[path] = found
         elif self._listed is not None:
@@ -99,27 +92,28 @@ class Bucket:
 
     def read(self, path: str, start: int = 0, stop: int | None = None) -> bytes | None:
         """Read an object, or a range of it."""
-        import obstore
-
         # A range of HTTP cannot be empty.
         if start == stop:
             return b""
 
-        def fetch() -> bytes | None:
+        options: Any = {} if stop is None else {"options": {"range": (start, stop)}}
+        return self._unless_absent(lambda: bytes(obstore.get(self._store, path, **options).bytes()))
+
+    def _unless_absent(self, read: Callable[[], T]) -> T | None:
+        """Read an object, None where there is none."""
+
+        def tried() -> T | None:
             try:
-                options: Any = {} if stop is None else {"options": {"range": (start, stop)}}
-                return bytes(obstore.get(self._store, path, **options).bytes())
+                return read()
             except FileNotFoundError as error:
                 if _code(error) == "NoSuchBucket":
                     raise
                 return None
 
-        return self._again(fetch)
+        return self._again(tried)
 
     def _again(self, read: Callable[[], T]) -> T:
         """Read once more where the connection broke within an answer: that is not tried again below."""
-        import obstore
-
         with self._clear_errors():
             # obstore retries requests, but not an answer whose connection breaks after its head.
             for _ in range(BROKEN):
@@ -129,8 +123,6 @@ class Bucket:
 
     def write(self, path: str, data: bytes) -> None:
         """Write an object, whatever was there."""
-        import obstore
-
         with self._clear_errors():
             obstore.put(self._store, path, data, use_multipart=False)
 
@@ -139,8 +131,6 @@ class Bucket:
 
         False may also mean that an earlier try of this very call was carried out, and its answer lost.
         """
-        import obstore
-
         with self._clear_errors():
             try:
                 # One request: the server tests the condition once, and a multipart upload cannot create-if-absent.
@@ -151,8 +141,6 @@ class Bucket:
 
     def delete(self, paths: Iterable[str]) -> None:
         """Remove objects."""
-        import obstore
-
         chosen = list(paths)
         for start in range(0, len(chosen), AT_ONCE):
             with self._clear_errors(), suppress(FileNotFoundError):
@@ -168,8 +156,6 @@ class Bucket:
 
     def move(self, path: str, to: str) -> None:
         """Copy an object within the server, and remove it."""
-        import obstore
-
         with self._clear_errors(), suppress(FileNotFoundError):
             obstore.copy(self._store, path, to)
         self.delete([path])
@@ -178,7 +164,6 @@ class Bucket:
 
     def list(self, area: str) -> list[Item]:
         """All objects."""
-        import obstore
 
         def pages() -> list[Item]:
             return [_item(found) for page in obstore.list(self._store, area or None, chunk_size=1000) for found in page]
@@ -191,16 +176,12 @@ class Bucket:
 
     @contextmanager
     def _clear_errors(self) -> Iterator[None]:
-        import obstore
-
         try:
             yield
         except (obstore.exceptions.BaseError, FileNotFoundError, PermissionError) as error:
             raise self._told(error) from None  # the original has the request at length
 
     def _told(self, error: BaseException) -> BucketError:
-        import obstore
-
         text, code, bucket = str(error), _code(error), self.location.split("/")[2]
         endpoint = _endpoint()
         if isinstance(error, obstore.exceptions.InvalidPathError):
@@ -250,8 +231,6 @@ def _endpoint() -> str:
 
 
 def _store(url: str, retry: dict[str, Any]) -> Any:
-    from obstore.store import S3Store
-
     bucket, _, prefix = url.removeprefix("s3://").partition("/")
     endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
     options: Any = {"timeout": "30s", "connect_timeout": "4s"}
