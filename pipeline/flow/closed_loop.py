@@ -466,9 +466,7 @@ class Drive:
         exact = make.source(source, "truth_dem", {"scene": self.scene})
         p.dem_accuracy = make.node(dem_accuracy, "dem_accuracy/world", {}, dem=p.tiles, truth=exact)
         p.truth_risk = make.hazards("risk/truth", [exact])
-        self.driven.truth_leg = best = self._leg(
-            "leg/truth", PlannerMemory(), {"whole": True}, risk=p.truth_risk, pose=self.poses[0]
-        )
+        best = self._leg("leg/truth", PlannerMemory(), {"whole": True}, risk=p.truth_risk, pose=self.poses[0])
         self._check({"trajectory": p.trajectory, "truth": true, "best": best})
 
     def _closed(self) -> str:

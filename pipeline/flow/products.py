@@ -39,7 +39,6 @@ class Driven:
     reason: str = ""
     place: Handle | None = None
     fix: Handle | None = None
-    truth_leg: Handle | None = None
     check: Handle | None = None
 
 

@@ -228,7 +228,7 @@ def _wiped(sheet: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
     return sheet
 
 
-def color_bar(drawn: Any, cax: Any, label: str, *, integer: bool = False) -> None:
+def color_bar(drawn: Any, cax: Any, label: str) -> None:
     """Colour bar with its unit: a strip of the map's colours, which draws faster than matplotlib's own."""
     from matplotlib.ticker import MaxNLocator
 
@@ -238,7 +238,7 @@ def color_bar(drawn: Any, cax: Any, label: str, *, integer: bool = False) -> Non
         strip, cmap=drawn.cmap, vmin=low, vmax=high, extent=(low, high, 0, 1), aspect="auto", interpolation="none"
     )
     cax.set_yticks([])
-    cax.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=integer))
+    cax.xaxis.set_major_locator(MaxNLocator(nbins=6))
     cax.set_xlabel(label, labelpad=1)
 
 
@@ -275,11 +275,11 @@ def round_length(value: float) -> float:
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-9))
 
 
-def polyline(ax: Any, points: Image, color: str = MARK, width: float = 1.8) -> None:
+def polyline(ax: Any, points: Image, color: str = MARK) -> None:
     """Line with a white casing, seen on any ground; a ring at its start and a disk at its end."""
     x, y = points[:, 0], points[:, 1]
-    ax.plot(x, y, color="white", linewidth=width + 1.8, zorder=6, solid_joinstyle="round")
-    ax.plot(x, y, color=color, linewidth=width, zorder=7, solid_joinstyle="round")
+    ax.plot(x, y, color="white", linewidth=3.6, zorder=6, solid_joinstyle="round")
+    ax.plot(x, y, color=color, linewidth=1.8, zorder=7, solid_joinstyle="round")
     ax.plot(x[:1], y[:1], "o", markersize=6, markerfacecolor="white", markeredgecolor=color, zorder=8)
     ax.plot(x[-1:], y[-1:], "o", markersize=6, markerfacecolor=color, markeredgecolor="white", zorder=8)
 

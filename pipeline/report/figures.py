@@ -186,13 +186,13 @@ def displacements(estimate: Floats, truth: Floats | None, names: Sequence[int], 
     return canvas.encode(fig, alt)
 
 
-def scalar_map(values: Floats, extent: Extent, label: str, alt: str, *, length: bool = True) -> Panel:
-    """A measured quantity (row, col); ``length``: metres, shown in mm where that fits; the unit is added."""
+def scalar_map(values: Floats, extent: Extent, label: str, alt: str) -> Panel:
+    """A measured length (row, col), m, shown in mm where that fits; the unit is added."""
     fig, ax, cax = canvas.map_axes(extent, bar=True)
-    factor, unit = canvas.metres_or_mm(values) if length else (1.0, "")
+    factor, unit = canvas.metres_or_mm(values)
     low, high = (v * factor for v in ranges.limits(values))
     drawn = _show(ax, values * factor, extent, cmap=canvas.color_map("viridis"), vmin=min(low, 0.0), vmax=high)
-    canvas.color_bar(drawn, cax, f"{label}, {unit}" if unit else label, integer=not length)
+    canvas.color_bar(drawn, cax, f"{label}, {unit}")
     return canvas.encode(fig, alt, photo=True)
 
 
@@ -246,9 +246,9 @@ def _not_narrower(ax: Any, span: float) -> None:
 # -- a quantity over frames or pairs, and residuals over the image
 
 
-def stack(heights: Sequence[float], *, foot: float = 0.42, left: float = 0.7) -> tuple[Any, list[Any]]:
+def stack(heights: Sequence[float]) -> tuple[Any, list[Any]]:
     """Figure with axes of the given heights (inches) below each other, one x axis for all."""
-    top, gap = 0.1, 0.14
+    top, gap, foot, left = 0.1, 0.14, 0.42, 0.7
     total = top + sum(heights) + gap * (len(heights) - 1) + foot
     fig, axes, y = canvas.figure(canvas.WIDTH, total), [], total - top
     for i, height in enumerate(heights):

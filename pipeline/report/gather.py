@@ -289,10 +289,9 @@ def _finite(line: Floats) -> Floats:
     return line[np.isfinite(line).all(axis=1)]
 
 
-def consecutive(view: RunView, count: int = 4) -> tuple[int, ...]:
-    """The first ``count`` successive frames whose images are there (fewer where there are fewer)."""
-    have = [f for f in view.frames[: 4 * count] if image(view, f) is not None]
-    return tuple(have[:count])
+def consecutive(view: RunView) -> tuple[int, ...]:
+    """The first four successive frames whose images are there (fewer where there are fewer)."""
+    return tuple(f for f in view.frames[:16] if image(view, f) is not None)[:4]
 
 
 _NONE = (np.empty((0, 2)), np.empty(0), np.empty(0))

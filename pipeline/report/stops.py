@@ -55,10 +55,10 @@ def strip(scene: Scene) -> Block | None:
     return Block("Stops", "Every pair", caption, tuple(panels), legend, strip=True)
 
 
-def within(panels: Sequence[Panel], budget: int = BUDGET) -> list[Panel]:
+def within(panels: Sequence[Panel]) -> list[Panel]:
     """All panels, or every second, third ... so that they fit the budget."""
     step = 1
-    while len(panels[::step]) > 1 and sum(p.size for p in panels[::step]) > budget:
+    while len(panels[::step]) > 1 and sum(p.size for p in panels[::step]) > BUDGET:
         step += 1
     return list(panels[::step])
 
