@@ -64,6 +64,8 @@ CHAPTERS = (
     ("The paper's figures", "paper", ("Figure 3", "Figure 6", "Figure 7", "Figure 8", "Figure 9")),
 )
 """Title, anchor and figures of each chapter, in the order in which a user asks."""
+SCRIPTS = ("map_profile.js", "map_space.js", "map.js")
+"""Of the map: the last one calls the others."""
 ALWAYS = ("trajectory", "matching", "key-figures", "times", "paper")
 """Chapters that hold more than figures."""
 
@@ -126,7 +128,7 @@ def render(
         tiles=_tiles(facts["metrics"], view.config.vehicle.max_slope_deg),
         tasks=len(view.tasks),
         cached=sum(t.status == "cached" for t in view.tasks),
-        script=resources.files("rille.pipeline.report").joinpath("map.js").read_text(encoding="utf-8"),
+        script="".join(resources.files("rille.pipeline.report").joinpath(name).read_text("utf-8") for name in SCRIPTS),
         files=files,
         table_2=rows,
         pair_table=tables.pair_columns(facts["pairs"]),
