@@ -17,12 +17,12 @@ def _facts(path: Bundle) -> dict[str, Any]:
 
 
 def _write_gpkg(folder: Path, view: Any) -> None:
-    path = view.bundle(view.products.path)
+    path = view.bundle(view.products.world_path)
     write_path_gpkg(folder / "path.gpkg", np.asarray(path["path"]), _facts(path), view.sequence.georeference)
 
 
 def _write_geojson(folder: Path, view: Any) -> None:
-    path = view.bundle(view.products.path)
+    path = view.bundle(view.products.world_path)
     write_path_geojson(folder / "path.geojson", np.asarray(path["path"]), _facts(path))
 
 
@@ -32,7 +32,7 @@ OUTPUTS = (
         "path over the merged terrain, its start and target, with their coordinate system",
         "QGIS, GDAL",
         _write_gpkg,
-        ("path",),
+        ("world_path",),
         knows=("sequence.georeference",),
         frame="world",
         facts={"crs": "engineering CRS, metres", "coordinates": "x y z, m"},
@@ -42,7 +42,7 @@ OUTPUTS = (
         "the same in metres of the world frame (not longitude and latitude)",
         "any text editor, QGIS",
         _write_geojson,
-        ("path",),
+        ("world_path",),
         frame="world",
         facts={"crs": "none: local metres, not WGS 84", "coordinates": "x y z, m"},
     ),

@@ -43,7 +43,7 @@ def whole(tiles: Sequence[Bundle], name: str, lattice: Lattice | None = None) ->
 
 def _height(view: Any) -> tuple[Lattice, NDArray[Any]]:
     """Elevations, or heights where the sequence has a place, m."""
-    lattice, elevation = whole(list(map(view.bundle, view.products.tiles)), "elevation")
+    lattice, elevation = whole(list(map(view.bundle, view.products.world_tiles)), "elevation")
     place = view.sequence.georeference
     return lattice, elevation if place is None else elevation.astype(np.float64) + place.origin[2]
 
@@ -64,7 +64,7 @@ def _raster(file: str, band: str, unit: str, values: Values) -> Callable[..., No
 
 
 def _merged(name: str) -> Values:
-    return lambda view: whole(list(map(view.bundle, view.products.tiles)), name)
+    return lambda view: whole(list(map(view.bundle, view.products.world_tiles)), name)
 
 
 def _slope(view: Any) -> tuple[Lattice, NDArray[Any]]:
@@ -108,7 +108,7 @@ BITS = 12
 
 def _write_risk(folder: Path, view: Any) -> None:
     """Write the class of each cell as a byte, with its colour and, beside it, its name."""
-    risk = view.bundle(view.products.risk)
+    risk = view.bundle(view.products.world_risk)
     tags = {"classes": ", ".join(f"{k} {name}" for k, name in enumerate(CLASSES))} | _vehicle(risk)
     lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
     # No nodata: class 3, unknown, is to be seen and counted like the others.
@@ -124,7 +124,7 @@ def _write_class_names(folder: Path, view: Any) -> None:
 
 
 def _write_reasons(folder: Path, view: Any) -> None:
-    risk = view.bundle(view.products.risk)
+    risk = view.bundle(view.products.world_risk)
     bands = {"reason": np.asarray(risk["reason"], np.uint16), "filled": np.asarray(risk["filled"], np.uint16)}
     tags = {"reason_bits": ", ".join(f"{bit} {name}" for name, bit in REASONS.items())}
     lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
@@ -133,7 +133,7 @@ def _write_reasons(folder: Path, view: Any) -> None:
 
 def _write_hazard(folder: Path, view: Any) -> None:
     """Write the probability of a hazard and the measures, in metres and degrees."""
-    risk = view.bundle(view.products.risk)
+    risk = view.bundle(view.products.world_risk)
     units = {a.name: a.unit for a in RISK.outputs if a.unit in ("m", "rad") and a.name != "elevation"}
     bands = {"p_hazard": risk["p_hazard"]}
     bands |= {name: np.degrees(risk[name]) if unit == "rad" else risk[name] for name, unit in units.items()}
@@ -197,12 +197,14 @@ def _style(kind: str, content: str) -> str:
 def _of_terrain(name: str, what: str, write: Callable[..., None], values: str, missing: str = "nan") -> Output:
     """Record of a raster of the merged terrain: a hole in the run must not look like unknown terrain."""
     facts = {**CRS, "values": values, "missing": missing}
-    return Output(name, what, GIS, write, ("tiles",), (), ("sequence.georeference",), "world", facts)
+    return Output(name, what, GIS, write, ("world_tiles",), (), ("sequence.georeference",), "world", facts)
 
 
 def _of_risk(name: str, what: str, write: Callable[..., None]) -> Output:
     """Record of a raster of the hazards."""
-    return Output(name, what, GIS, write, ("risk",), (), ("sequence.georeference",), "world", {**CRS, "values": what})
+    return Output(
+        name, what, GIS, write, ("world_risk",), (), ("sequence.georeference",), "world", {**CRS, "values": what}
+    )
 
 
 OUTPUTS = (
@@ -217,7 +219,7 @@ OUTPUTS = (
         "colours of dem.tif, which QGIS applies by itself",
         "QGIS",
         _write_dem_style,
-        ("tiles",),
+        ("world_tiles",),
         knows=("sequence.georeference",),
     ),
     _of_terrain(
@@ -244,14 +246,14 @@ OUTPUTS = (
         "merged ortho image, grey 0..255, or red, green and blue where the images have colours",
         GIS,
         _write_ortho,
-        ("tiles",),
+        ("world_tiles",),
         colour.READS,
         ("sequence.georeference", *colour.KNOWS),
         "world",
         {**CRS, "values": "grey value 0..255, or red, green, blue 1..255", "missing": "nan; of colours 0"},
     ),
     _of_risk("risk.tif", "risk map: class 0 safe, 1 caution, 2 hazard, 3 unknown, with colours", _write_risk),
-    Output("risk.tif.aux.xml", "names of the classes of risk.tif", GIS, _write_class_names, ("risk",)),
+    Output("risk.tif.aux.xml", "names of the classes of risk.tif", GIS, _write_class_names, ("world_risk",)),
     _of_risk("hazard.tif", "probability of a hazard, and the measures in metres and degrees", _write_hazard),
     _of_risk("reason.tif", "bits of the limits that a cell breaks; whether it was filled", _write_reasons),
     Output(
@@ -259,7 +261,7 @@ OUTPUTS = (
         "colours and names of the classes of risk.tif, which QGIS applies by itself",
         "QGIS",
         _write_risk_style,
-        ("risk",),
+        ("world_risk",),
     ),
 )
 STAGE = stage("output.rasters", "Rasters of the terrain and its hazards", OUTPUTS)

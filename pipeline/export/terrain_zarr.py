@@ -143,7 +143,7 @@ SLOPE = Array("slope", ("row", "col"), "float32", "degree", "inclination of the 
 
 def _write_output(folder: Path, view: Any) -> None:
     """All merged arrays, put together of the world tiles, and the slope."""
-    tiles, arrays = list(map(view.bundle, view.products.tiles)), {}
+    tiles, arrays = list(map(view.bundle, view.products.world_tiles)), {}
     for spec in merge.STAGE.outputs:
         if spec.dims == ("row", "col") and all(spec.name in tile.arrays for tile in tiles):
             lattice, values = whole(tiles, spec.name)
@@ -162,7 +162,7 @@ OUTPUTS = (
         "all merged arrays with units and coordinates",
         "xarray.open_zarr, GDAL",
         _write_output,
-        ("tiles",),
+        ("world_tiles",),
         knows=("sequence.georeference", "sequence.name"),
         frame="world",
         facts={

@@ -275,8 +275,8 @@ class Drive:
             self.pads = [make.node(start_area, "start_area", args | self.mounting, pose=pose, like=like)]
         # Two maps: of all that was seen, to plan far ahead, and of what was seen finely enough to drive on.
         stop.merged = self._merged(f"merge/{k}", None)
-        p.tiles = [stop.merged]
-        stop.risk = p.risk = make.hazards(f"risk/{k}", [stop.merged])
+        p.world_tiles = [stop.merged]
+        stop.risk = p.world_risk = make.hazards(f"risk/{k}", [stop.merged])
         near, finest = stop.merged, None
         if self.config.drive.detail > 0:
             stop.far = stop.risk
@@ -464,7 +464,7 @@ class Drive:
         stops = [RigidTransform.from_matrix(self.true[stop.frame]) for stop in self.driven.stops]
         source = self.simulation.truth_dem(self.arena().to_dict(), T_truth_world, stops)
         exact = make.source(source, "truth_dem", {"scene": self.scene})
-        p.dem_accuracy = make.node(dem_accuracy, "dem_accuracy/world", {}, dem=p.tiles, truth=exact)
+        p.dem_accuracy = make.node(dem_accuracy, "dem_accuracy/world", {}, dem=p.world_tiles, truth=exact)
         p.truth_risk = make.hazards("risk/truth", [exact])
         best = self._leg("leg/truth", PlannerMemory(), {"whole": True}, risk=p.truth_risk, pose=self.poses[0])
         self._check({"trajectory": p.trajectory, "truth": true, "best": best})

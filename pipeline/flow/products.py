@@ -68,10 +68,10 @@ class Products:
     world_dem: dict[int, Handle] = field(default_factory=dict)
     seams: dict[int, Handle] = field(default_factory=dict)
     overlap_audit: Handle | None = None
-    tiles: list[Handle] = field(default_factory=list)
+    world_tiles: list[Handle] = field(default_factory=list)
     trajectory: Handle | None = None
-    risk: Handle | None = None
-    path: Handle | None = None
+    world_risk: Handle | None = None
+    world_path: Handle | None = None
     accuracy: Handle | None = None
     position_accuracy: Handle | None = None
     accuracy_pieces: dict[int, Handle] = field(default_factory=dict)

@@ -153,9 +153,9 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     centres = {"centres": {str(f["pair"]): centre(f["box"]) for f in footprints}}
     p.overlap_audit = make.node(overlap_audit, "overlap_audit", centres, seams=list(p.seams.values()))
     levelled = yield make.node(radiometry, "radiometry", centres, seams=list(p.seams.values()))
-    p.tiles = merge_tiles(make.node, footprints, p.world_dem, levelled.meta["steps"])
-    p.risk = make.hazards("risk/world", p.tiles)
-    p.path = make.node(path, "path/world", {"use": "world", "heading": heading(posed.meta)}, risk=p.risk)
+    p.world_tiles = merge_tiles(make.node, footprints, p.world_dem, levelled.meta["steps"])
+    p.world_risk = make.hazards("risk/world", p.world_tiles)
+    p.world_path = make.node(path, "path/world", {"use": "world", "heading": heading(posed.meta)}, risk=p.world_risk)
     yield from assessment.of_world(make, [pairs[k] for k in there])
 
 

@@ -91,7 +91,7 @@ def local_paths(pairs: Rows) -> tuple[int, int]:
 
 def start_of_path(view: RunView) -> float | None:
     """Distance in plan, m, of the path's start from the first left camera, the origin of the world; None: no path."""
-    path = view.bundle(view.products.path)
+    path = view.bundle(view.products.world_path)
     if path is None or not len(path["path"]):
         return None
     return float(np.hypot(*np.asarray(path["path"])[0, :2]))
@@ -165,7 +165,7 @@ def _path(view: RunView) -> Items:
     drive = view.products.drive
     if drive is not None:
         return [] if drive.verdict == "goal" else [_item("no path", f"Drive: {drive.verdict}", drive.reason)]
-    path = view.bundle(view.products.path)
+    path = view.bundle(view.products.world_path)
     if path is None:
         return [_item("no path", "No path", "the path over the merged terrain was not computed")]
     if path.meta.get("found"):
@@ -189,7 +189,7 @@ def _truth(view: RunView) -> Items:
 
 def _vehicle(view: RunView) -> Items:
     v = view.config.vehicle
-    if view.vehicle_source != UNSTATED or view.bundle(view.products.risk) is None:
+    if view.vehicle_source != UNSTATED or view.bundle(view.products.world_risk) is None:
         return []
     size = f"{metres(v.wheel_base)} between its axles, {metres(v.track)} between its wheels"
     why = (

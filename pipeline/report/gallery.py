@@ -151,10 +151,10 @@ def _path_words(scene: Scene) -> str:
             "since the rover stands on it."
         )
     if scene.path is None:
-        found = scene.view.bundle(scene.view.products.path)
+        found = scene.view.bundle(scene.view.products.world_path)
         return "The path was not computed." if found is None else f"There is no path: {found.meta.get('reason')}."
     margin = length(scene.view.config.vehicle.margin)
-    path = scene.view.bundle(scene.view.products.path)
+    path = scene.view.bundle(scene.view.products.world_path)
     ground = "" if path is None else path.meta.get("ground", "")
     before, beyond = (path.meta.get("left_out_m") if path is not None else None) or (0.0, 0.0)
     vehicle = scene.view.config.vehicle
@@ -325,7 +325,7 @@ _FIGURES: tuple[tuple[str, Maker, Condition, str, str], ...] = (
         "Map",
         _map,
         _always,
-        "tiles risk path drive trajectory disparity rigs images undistorted screening",
+        "world_tiles world_risk world_path drive trajectory disparity rigs images undistorted screening",
         "config.vehicle config.risk.sigmas config.path.target sequence.rig sequence.truth",
     ),
     (
@@ -344,7 +344,13 @@ _FIGURES: tuple[tuple[str, Maker, Condition, str, str], ...] = (
         "rigs orientations accuracy",
         "sequence.rig config.rig.significance",
     ),
-    ("Figure 7. Ortho image and path", _terrain, _always, "tiles world_dem risk path", "config.vehicle"),
+    (
+        "Figure 7. Ortho image and path",
+        _terrain,
+        _always,
+        "world_tiles world_dem world_risk world_path",
+        "config.vehicle",
+    ),
     ("Figure 3. Local risk map", _local, _planned, "local_path local_risk drive", ""),
     ("Figure 8. Tracks", _tracks, _several, "images undistorted tracks resections", ""),
     (
@@ -368,7 +374,7 @@ _FIGURES: tuple[tuple[str, Maker, Condition, str, str], ...] = (
         "keyframes screening",
         "config.keyframes.rule config.keyframes.overlap",
     ),
-    ("Overlap", checks.overlaps, lambda scene: len(scene.view.products.world_dem) > 1, "tiles world_dem", ""),
+    ("Overlap", checks.overlaps, lambda scene: len(scene.view.products.world_dem) > 1, "world_tiles world_dem", ""),
     ("Seams", seams.worst, lambda scene: bool(scene.view.products.seams), "overlap_audit seams", ""),
     ("Seam audit", seams.models, lambda scene: bool(scene.view.products.seams), "overlap_audit seams", ""),
     # Never missed: a sequence without true elevations lacks nothing.

@@ -139,7 +139,7 @@ class Scene:
     @cached_property
     def world(self) -> Terrain | None:
         """Merged terrain, put together of its tiles."""
-        tiles = [b for b in map(self.view.bundle, self.view.products.tiles) if b is not None]
+        tiles = [b for b in map(self.view.bundle, self.view.products.world_tiles) if b is not None]
         if not tiles:
             return None
         names = [name for name in WORLD if all(name in tile.arrays for tile in tiles)]
@@ -149,12 +149,12 @@ class Scene:
     @cached_property
     def risk(self) -> Terrain | None:
         """Risk map of the merged terrain."""
-        return terrain(self.view.bundle(self.view.products.risk), "risk", "reason", "p_hazard", "inclination")
+        return terrain(self.view.bundle(self.view.products.world_risk), "risk", "reason", "p_hazard", "inclination")
 
     @cached_property
     def path(self) -> Floats | None:
         """Vertices (n, 3) of the path over the merged terrain; None without a path."""
-        return vertices(self.view.bundle(self.view.products.path))
+        return vertices(self.view.bundle(self.view.products.world_path))
 
     @cached_property
     def track(self) -> Track:

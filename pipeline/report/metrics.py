@@ -387,7 +387,7 @@ def _local_paths(pairs: Rows) -> dict[str, Metric]:
 
 
 def _path(view: RunView) -> dict[str, Metric]:
-    path = view.bundle(view.products.path)
+    path = view.bundle(view.products.world_path)
     if path is None or not path.meta.get("found"):
         return {}
     meta = path.meta

@@ -134,7 +134,7 @@ def _verdict(view: RunView, frames: list[dict[str, Any]], pairs: list[dict[str, 
     models = sum(r["modelled"] for r in pairs)
     apart = f", {placed} of them in the world" if placed < posed else ""
     stops = delivery.local_paths(pairs)
-    path = view.bundle(view.products.path)
+    path = view.bundle(view.products.world_path)
     length = None if path is None else path.meta.get("length_m")
     parts = [
         "one stereo pair" if len(frames) == 1 else f"{posed} of {len(frames)} frames posed{apart}",
@@ -188,7 +188,7 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
 READS = (
     "screening keyframes common_tilt crosschecks crosscheck agreement crosscheck_accuracy trajectory accuracy "
     "position_accuracy accuracy_pieces overlap_audit disparity orientations rigs level local_dem local_risk local_path "
-    "local_dem_accuracy resections refined world_dem tiles risk path dem_accuracy path_check drive"
+    "local_dem_accuracy resections refined world_dem world_tiles world_risk world_path dem_accuracy path_check drive"
 )
 KNOWS = (
     "frames vehicle_source config.vehicle config.crosscheck.enabled sequence.name sequence.frames sequence.frame_names "

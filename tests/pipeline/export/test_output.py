@@ -106,13 +106,13 @@ def test_what_a_record_does_not_name_is_out_of_reach() -> None:
     whole, made = run()
 
     def curious(folder: Path, given: Any) -> None:
-        assert given.bundle(given.products.risk) is made["risk"]
+        assert given.bundle(given.products.world_risk) is made["risk"]
         with pytest.raises(AttributeError):
-            given.products.path  # noqa: B018
+            given.products.world_path  # noqa: B018
         with pytest.raises(AttributeError):
             given.sequence.truth  # noqa: B018
 
-    output = Output("a", "", "", curious, ("risk",), (), ("sequence.name",))
+    output = Output("a", "", "", curious, ("world_risk",), (), ("sequence.name",))
     laid_out = task(output, whole)
     assert laid_out is not None
     from rille.pipeline.export.output import restore
@@ -122,17 +122,17 @@ def test_what_a_record_does_not_name_is_out_of_reach() -> None:
 
 def test_nothing_is_made_without_what_it_needs_and_holes_are_passed_on() -> None:
     whole, _ = run()
-    whole.products.path.ref = None
+    whole.products.world_path.ref = None
     path = next(o for _, o in outputs() if o.name == "path.gpkg")
     assert [handle.name for handle in handles(path, whole.products)] == ["path"]
     assert task(path, whole) is None
     risk = next(o for _, o in outputs() if o.name == "Map")
     laid_out = task(risk, whole)
     assert laid_out is not None
-    assert laid_out[0]["products"]["path"] is None
+    assert laid_out[0]["products"]["world_path"] is None
     named = [handle.name for handle in laid_out[1]]
     assert [name for name in named if not name.startswith(("image", "undistorted", "screening"))] == [
-        *("disparity0", "disparity4", "rig", "risk", "tile", "trajectory")
+        *("disparity0", "disparity4", "rig", "trajectory", "risk", "tile")
     ]
 
 

@@ -244,8 +244,13 @@ def products() -> Products:
         world_dem=each("world_dem", BASIC),
         local_dem_accuracy=each("local_dem_accuracy", BASIC),
     )
-    found.tracks, found.resections, found.tiles = ["track0", "track1"], ["resect0", "resect1"], ["tile"]
-    found.trajectory, found.risk, found.path, found.dem_accuracy = "trajectory", "risk", "path", "dem_accuracy"
+    found.tracks, found.resections, found.world_tiles = ["track0", "track1"], ["resect0", "resect1"], ["tile"]
+    found.trajectory, found.world_risk, found.world_path, found.dem_accuracy = (
+        "trajectory",
+        "risk",
+        "path",
+        "dem_accuracy",
+    )
     found.accuracy, found.path_check = "accuracy", "path_check"
     return found  # type: ignore[no-any-return]
 
