@@ -59,7 +59,8 @@ def complete(found: Mapping[str, Any], view: RunView, figures: Sequence[Figure])
     undrawn = [figure for figure in figures if figure.why]
     lost = [_item("figure" if figure.failed else "no figure", figure.title, figure.why) for figure in undrawn]
     missing = [*_failures(view), *found["missing"], *lost]
-    return Delivery([*done, *found["delivered"]], found["absent"], missing)
+    absent = [item for item in found["absent"] if item["kind"] != "vehicle" or view.vehicle_source == UNSTATED]
+    return Delivery([*done, *found["delivered"]], absent, missing)
 
 
 def has_truth(view: RunView) -> list[bool]:
@@ -188,8 +189,9 @@ def _truth(view: RunView) -> Items:
 
 
 def _vehicle(view: RunView) -> Items:
+    """That the limits are the defaults, of which each run knows for itself whether somebody stated them."""
     v = view.config.vehicle
-    if view.vehicle_source != UNSTATED or view.bundle(view.products.world_risk) is None:
+    if view.bundle(view.products.world_risk) is None:
         return []
     size = f"{metres(v.wheel_base)} between its axles, {metres(v.track)} between its wheels"
     why = (

@@ -191,8 +191,8 @@ READS = (
     "local_dem_accuracy resections refined world_dem world_tiles world_risk world_path dem_accuracy path_check drive"
 )
 KNOWS = (
-    "frames vehicle_source config.vehicle config.crosscheck.enabled sequence.name sequence.frames sequence.frame_names "
-    "sequence.rig sequence.truth sequence.truth_source sequence.truth_positions sequence.warnings sequence.notes "
+    "frames config.vehicle config.crosscheck.enabled sequence.name sequence.frames sequence.frame_names sequence.rig "
+    "sequence.truth sequence.truth_source sequence.truth_positions sequence.warnings sequence.notes "
     "sequence.evaluation_window"
 )
 OUTPUTS = (Output("facts", "", "", _write, (), tuple(READS.split()), tuple(KNOWS.split())),)
