@@ -309,14 +309,12 @@ def check(
     prepare()
     from rille.pipeline.commands import check as command
     from rille.pipeline.flow.unread import refuse_unchecked
-    from rille.pipeline.runs.session import choose_frames
     from rille.pipeline.runs.session import settings as settle
 
     given = options(seq, Settings(assignments=assignments, cache=cache), _RESULTS, frames=frames)
     settled = settle(given)
     refuse_unchecked(settled.given, settled.config)
-    chosen = choose_frames(frames, settled.sequence.frames)
-    return command.check(settled.sequence, settled.config, output=output, frames=chosen, cache=given.cache)
+    return command.check(settled.sequence, settled.config, output=output, frames=settled.frames, cache=given.cache)
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -13,7 +13,7 @@ from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import at
-from rille.pipeline.runs.session import Options, choose_frames, lay_out, settings
+from rille.pipeline.runs.session import Options, lay_out, settings
 from rille.stages.core.errors import ConfigError
 
 BOX, GAP = (150, 22), (20, 48)
@@ -35,7 +35,7 @@ def graph(options: Options, output: Path, *, tasks: bool = False) -> int:
     if draw is None:
         raise ConfigError("RIL-871", f"{output.name} is no name of a drawing", remedy="end it in .svg or .dot")
     settled = settings(options)
-    laid_out = lay_out(settled.sequence, settled.config, choose_frames(options.frames, settled.sequence.frames))
+    laid_out = lay_out(settled.sequence, settled.config, settled.frames)
     scheduler.run(laid_out, at(options.cache), scheduler.RunOptions(dry=True)).check()
     names, edges = parts(laid_out, tasks=tasks)
     atomic.write(output, draw(names, edges))

@@ -25,7 +25,7 @@ from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.runs import run_files
-from rille.pipeline.runs.session import Options, check_options, choose_frames, settings, warn_of_input
+from rille.pipeline.runs.session import Options, settings_of_run
 from rille.stages.core.errors import ConfigError
 
 REASONS = 3
@@ -40,12 +40,8 @@ BEHIND = "input "
 
 def plan(options: Options, *, verbose: bool = False) -> int:
     """Print what ``reconstruct`` with the same options would do; gives the exit code."""
-    check_options(options)
-    settled = settings(options)
-    sequence, config = settled.sequence, settled.config
-    unread.refuse_unreadable(settled.given, config, sequence)
-    warn_of_input(sequence)
-    frames = choose_frames(options.frames, sequence.frames)
+    settled = settings_of_run(options)
+    sequence, frames, config = settled.sequence, settled.frames, settled.config
     graph, store = Graph(), at(options.cache)
     products, drive = dataflow(graph, sequence, config, frames)
 

@@ -102,6 +102,7 @@ class Settled:
     """Input of a command; ``given``: dotted keys set by the user, ``vehicle_source``: the source of the limits."""
 
     sequence: Sequence
+    frames: tuple[int, ...]
     config: Any
     vehicle_source: str
     given: tuple[str, ...]
@@ -139,13 +140,27 @@ def settings(options: Options) -> Settled:
     layers = vehicle, configuration.expand(sequence.defaults)
     config = configuration.build(*layers, for_stages)
     given = unread.set_by_user(for_stages, config, configuration.build(*layers))
-    return Settled(sequence, config, source, given)
+    return Settled(sequence, choose_frames(options.frames, sequence.frames), config, source, given)
 
 
-def warn_of_input(sequence: Sequence) -> None:
-    """Print what is suspicious but possible in the input."""
-    for line in sequence.warnings:
+def settings_of_run(options: Options) -> Settled:
+    """The same for a run: what it cannot use is refused, what is suspicious but possible in the input is printed."""
+    from rille.pipeline.engine.executors.base import known
+    from rille.pipeline.engine.memory import limits
+    from rille.pipeline.flow import unread
+
+    # Before anything is read or written.
+    stages = configuration.stage_names() if options.force else set()
+    for name in sorted(options.force - stages):
+        raise ConfigError("RIL-060", f"--force {name!r} is no stage", remedy=f"one of {', '.join(sorted(stages))}")
+    known(options.executor, options.jobs)
+    if options.memory_limit is not None:
+        limits.parse(options.memory_limit)
+    settled = settings(options)
+    unread.refuse_unreadable(settled.given, settled.config, settled.sequence)
+    for line in settled.sequence.warnings:
         warn(line)
+    return settled
 
 
 def warn_of_results(graph: Graph) -> None:
@@ -224,19 +239,15 @@ def _reconstruct(options: Options) -> tuple[int, Path]:
 def _open(options: Options) -> _Opened:
     """Read the input and lay the run out."""
     from rille.pipeline.export.view import RunView
-    from rille.pipeline.flow import unread
     from rille.pipeline.flow.closed_loop import dataflow
 
-    check_options(options)
     started = datetime.now(UTC)
-    settled = settings(options)
-    sequence, config = settled.sequence, settled.config
-    unread.refuse_unreadable(settled.given, config, sequence)
-    warn_of_input(sequence)
+    settled = settings_of_run(options)
+    sequence, frames, config = settled.sequence, settled.frames, settled.config
     if options.verb == "drive" and sequence.simulation is None:
         raise ConfigError("RIL-059", f"{sequence.name} is recorded, it cannot be driven", remedy="drive mockup-loop")
-    frames = choose_frames(options.frames, sequence.frames)
-    text = _header(options) + configuration.to_toml(config, sequence.parameters)
+    header = f"# {options.command()}\n# rille reconstruct SEQ --config THIS_FILE uses the same parameters.\n\n"
+    text = header + configuration.to_toml(config, sequence.parameters)
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
     (folder / "config.toml").write_text(text, encoding="utf-8")
     graph, store = Graph(), at(options.cache)
@@ -358,30 +369,6 @@ def _all_read(opened: _Opened, arrived: int) -> int:
         text = f"--force {', '.join(idle)}: this run has no such task: leave it out"
         print(f"rille: error RIL-735: {text}", file=sys.stderr)
     return HOLES if lost or idle else COMPLETE
-
-
-def check_options(options: Options) -> None:
-    """Refuse a stage, an executor or an amount that cannot be, before anything is read or written."""
-    from rille.pipeline.engine.executors.base import known
-    from rille.pipeline.engine.memory import limits
-
-    _known_stages(options.force)
-    known(options.executor, options.jobs)
-    if options.memory_limit is not None:
-        limits.parse(options.memory_limit)
-
-
-def _known_stages(names: frozenset[str]) -> None:
-    """Refuse a stage to be forced that there is not."""
-    if not names:
-        return
-    known = configuration.stage_names()
-    for name in sorted(names - known):
-        raise ConfigError("RIL-060", f"--force {name!r} is no stage", remedy=f"one of {', '.join(sorted(known))}")
-
-
-def _header(options: Options) -> str:
-    return f"# {options.command()}\n# rille reconstruct SEQ --config THIS_FILE uses the same parameters.\n\n"
 
 
 def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
