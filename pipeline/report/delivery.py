@@ -7,7 +7,6 @@ for granted. Truth that the data do not have and a comparison that is switched o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,22 +24,16 @@ ANSWERS = ("no path", "crosscheck", "no figure")
 """Kinds of what is missing that are answers, or lie outside of the reconstruction: the run is complete with them."""
 
 
-@dataclass(frozen=True)
-class Delivery:
-    """``delivered`` in words; ``absent`` (neutral) and ``missing``: ``kind``, ``what``, ``why`` each."""
-
-    delivered: list[str]
-    absent: Items
-    missing: Items
-
-
 def is_complete(missing: Items) -> bool:
     """Whether what is missing leaves the reconstruction whole: answers and what lies outside of it."""
     return all(m["kind"] in ANSWERS for m in missing)
 
 
 def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
-    """List ``delivered``, ``absent`` and ``missing`` results as far as the artifacts tell."""
+    """List ``delivered``, ``absent`` and ``missing`` results as far as the artifacts tell.
+
+    The first in words; the others with ``kind``, ``what`` and ``why`` each; what is absent is no loss.
+    """
     view = scene.view
     missing = (
         _poses(frames)
@@ -52,15 +45,15 @@ def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
     return found | {"absent": _truth(view) + _crosscheck_off(view) + _vehicle(view)}
 
 
-def complete(found: Mapping[str, Any], view: RunView, figures: Sequence[Figure]) -> Delivery:
-    """All that a reader might take for granted, in one of the three states: with what became of tasks and figures."""
+def complete(found: Mapping[str, Any], view: RunView, figures: Sequence[Figure]) -> dict[str, Any]:
+    """The lists of :func:`account` with what became of tasks and figures: all that a reader might take for granted."""
     done = ["every task was done"] if view.tasks else []
     # A figure without its data is no loss of its own: they are listed, where they are one.
     undrawn = [figure for figure in figures if figure.why]
     lost = [_item("figure" if figure.failed else "no figure", figure.title, figure.why) for figure in undrawn]
     missing = [*_failures(view), *found["missing"], *lost]
     absent = [item for item in found["absent"] if item["kind"] != "vehicle" or view.vehicle_source == UNSTATED]
-    return Delivery([*done, *found["delivered"]], absent, missing)
+    return {"delivered": [*done, *found["delivered"]], "absent": absent, "missing": missing}
 
 
 def has_truth(view: RunView) -> list[bool]:

@@ -43,8 +43,8 @@ def gather(view: Any) -> dict[str, Any]:
 def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]) -> dict[str, Any]:
     """Everything that ``report.json`` holds, with what this run alone knows; the page has the same numbers."""
     found = delivery.complete(facts, view, figures)
-    complete = delivery.is_complete(found.missing)
-    state = "Incomplete" if not complete else "Complete but for what is listed" if found.missing else "Complete"
+    complete = delivery.is_complete(found["missing"])
+    state = "Incomplete" if not complete else "Complete but for what is listed" if found["missing"] else "Complete"
     rows, together = tables.table_2(view)
     clock = {
         "group": "Run",
@@ -64,9 +64,7 @@ def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]
         "complete": complete,
         **{key: value for key, value in facts.items() if key != "compared"},
         "verdict": f"{state}: {facts['verdict']}",
-        "delivered": found.delivered,
-        "absent": found.absent,
-        "missing": found.missing,
+        **found,
         "metrics": {**facts["metrics"], "wall_clock": clock},
         "stages": _stages(view),
         "table_2": [vars(t) for t in (*rows, together)],
