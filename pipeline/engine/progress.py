@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from typing import TYPE_CHECKING, Any, Protocol, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from rille.pipeline.engine.forecast import Forecast, Kinds
 from rille.pipeline.engine.plain import plain, raw
@@ -26,36 +26,12 @@ SLOW_COMPILE = 1.0
 """Seconds of compilation from which on it is reported to the user."""
 
 
-class Progress(Protocol):
-    """Receiver of the scheduler's progress; every method is called on the scheduler's thread."""
-
-    forecast: Forecast
-
-    def open(self, graph: Graph, earlier: Kinds | None, jobs: int) -> None:
-        """The run begins; the graph may still grow."""
-
-    def running(self, handle: Handle) -> None:
-        """A task was given to a worker."""
-
-    def resolved(self, handle: Handle) -> None:
-        """The outcome of a node is known: computed, cached, failed or skipped."""
-
-    def failed(self, label: str, error: BaseException) -> None:
-        """A task or an expansion failed."""
-
-    def detail(self, text: str) -> None:
-        """A word for who asks for more of them."""
-
-    def close(self, result: Result) -> None:
-        """The run has ended."""
-
-
 def make(mode: str = "auto", stream: TextIO | None = None, *, verbose: bool = False) -> Progress:
     """``auto`` (bar on a terminal, else plain), ``bar``, ``plain``, ``json``, ``quiet``; ``verbose``: with details."""
     stream = stream or sys.stderr
     if mode == "auto":
         mode = "bar" if stream.isatty() else "plain"
-    kinds: dict[str, type[Quiet]] = {"bar": Bar, "plain": Lines, "json": Json, "quiet": Quiet}
+    kinds: dict[str, type[Progress]] = {"bar": Bar, "plain": Lines, "json": Json, "quiet": Progress}
     if mode not in kinds:
         raise ConfigError("RIL-568", f"progress {mode!r} is unknown", remedy=f"one of auto, {', '.join(kinds)}")
     progress = kinds[mode](stream)
@@ -63,8 +39,8 @@ def make(mode: str = "auto", stream: TextIO | None = None, *, verbose: bool = Fa
     return progress
 
 
-class Quiet:
-    """Keeps the account that the others show, and says nothing."""
+class Progress:
+    """Receives the scheduler's progress, on its thread: keeps the account that others show, and says nothing."""
 
     verbose = False
 
@@ -76,20 +52,20 @@ class Quiet:
         self.done = 0
 
     def open(self, graph: Graph, earlier: Kinds | None, jobs: int) -> None:
-        """Begin the forecast with the tasks that are laid out."""
+        """The run begins: begin the forecast with the tasks that are laid out; the graph may still grow."""
         self.graph, self.seen = graph, len(graph.nodes)
         self.forecast = Forecast([h.label for h in graph.nodes], earlier, max(jobs, 1))
 
     def detail(self, text: str) -> None:
-        """Print it where that was asked for."""
+        """A word for who asks for more of them."""
         if self.verbose:
             print(f"rille: {plain(text)}", file=self.stream, flush=True)
 
     def running(self, handle: Handle) -> None:
-        """Not shown."""
+        """A task was given to a worker."""
 
     def resolved(self, handle: Handle) -> None:
-        """Count it, and what was laid out meanwhile."""
+        """The outcome of a node is known: count it, and what was laid out meanwhile."""
         self.done += 1
         if self.graph is not None:
             for added in self.graph.nodes[self.seen :]:
@@ -98,17 +74,17 @@ class Quiet:
         self.forecast.ended(handle)
 
     def failed(self, label: str, error: BaseException) -> None:
-        """Not shown."""
+        """A task or an expansion failed."""
 
     def close(self, result: Result) -> None:
-        """Nothing to end."""
+        """The run has ended."""
 
     def total(self) -> int:
         """Nodes known by now."""
         return len(self.graph.nodes) if self.graph else 0
 
 
-class Lines(Quiet):
+class Lines(Progress):
     """A line every few seconds, and one for each failure: for logs."""
 
     def open(self, graph: Graph, earlier: Kinds | None, jobs: int) -> None:
@@ -144,7 +120,7 @@ class Lines(Quiet):
         print(f"rille: {text}", file=self.stream, flush=True)
 
 
-class Json(Quiet):
+class Json(Progress):
     """One JSON object a line for every step: for programs."""
 
     def running(self, handle: Handle) -> None:
@@ -203,7 +179,7 @@ class Bar(Lines):
 
     def resolved(self, handle: Handle) -> None:
         """Move the bar."""
-        Quiet.resolved(self, handle)
+        Progress.resolved(self, handle)
         self._compiled(handle)
         self._move(handle.label)
 

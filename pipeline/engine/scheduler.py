@@ -42,7 +42,7 @@ from rille.pipeline.engine.memory import cost_model
 from rille.pipeline.engine.memory.admission import Admission, Waiting, account, largest
 from rille.pipeline.engine.memory.cost_model import input_bytes
 from rille.pipeline.engine.plain import some
-from rille.pipeline.engine.progress import Progress, Quiet
+from rille.pipeline.engine.progress import Progress
 from rille.pipeline.engine.runtime.environment import cores
 from rille.pipeline.engine.runtime.interrupts import Interrupts
 from rille.pipeline.engine.spec import Refs, key_of, recipe
@@ -152,7 +152,7 @@ class RunOptions:
     force: Collection[str] = ()
     dry: bool = False
     ledger: Path | None = None
-    progress: Progress = field(default_factory=Quiet)
+    progress: Progress = field(default_factory=Progress)
     memory_limit: float | None = None
     survey: Callable[[], Graph] | None = None
 

@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rille.pipeline.engine.plain import plain
-from rille.pipeline.engine.progress import clock
+from rille.pipeline.engine.progress import Progress, clock
 from rille.pipeline.engine.runtime import atomic
 
 if TYPE_CHECKING:
     from rille.pipeline.engine.forecast import Kinds
     from rille.pipeline.engine.graph import Graph, Handle
-    from rille.pipeline.engine.progress import Progress
     from rille.pipeline.engine.scheduler import Result
 
 INTERVAL = 1.0
@@ -65,14 +64,14 @@ def page(shown: Progress, path: Path | None) -> Iterator[Progress]:
     live.end('<p><strong>The run has come to its end: <a href="report.html">the report</a>.</strong></p>')
 
 
-class Live:
+class Live(Progress):
     """Passes each step on, and writes the page now and then."""
 
     def __init__(self, shown: Progress, path: Path) -> None:
         self.shown, self.path, self.began, self.forecast = shown, path, time.monotonic(), shown.forecast
         self.graph: Graph | None = None
         self.running_now: dict[str, None] = {}
-        self.done: Counter[str] = Counter()
+        self.ended: Counter[str] = Counter()
         self.failures: list[str] = []
         self.written = -INTERVAL
 
@@ -92,7 +91,7 @@ class Live:
         """Count it."""
         self.shown.resolved(handle)
         self.running_now.pop(handle.label, None)
-        self.done[handle.stage] += 1
+        self.ended[handle.stage] += 1
         self._write()
 
     def failed(self, label: str, error: BaseException) -> None:
@@ -127,14 +126,14 @@ class Live:
         if not self.path.parent.is_dir():  # the user removed the run: it ends with that message, not with a new folder
             return
         known = Counter(h.stage for h in self.graph.nodes) if self.graph is not None else Counter[str]()
-        ended, total = self.done.total(), known.total()
+        ended, total = self.ended.total(), known.total()
         body = [
             words,
             f'<progress aria-label="Tasks" value="{ended}" max="{max(total, 1)}"></progress>',
             f"<p>{ended} of {total} tasks known so far, after {clock(time.monotonic() - self.began)}.</p>",
             _list("Under way", self.running_now),
             _list("Failed", dict.fromkeys(self.failures)),
-            _table(known, self.done),
+            _table(known, self.ended),
         ]
         title = escape(f"{self.path.parent.parent.name} · {self.path.parent.name}")
         atomic.write(self.path, PAGE.format(title=title, body="\n".join(filter(None, body)), script=script))

@@ -13,7 +13,7 @@ from toys.browser import Browser
 
 from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.graph import Graph
-from rille.pipeline.engine.progress import Quiet
+from rille.pipeline.engine.progress import Progress
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.runs import live
 from rille.stages.core.declare import NoParams
@@ -38,7 +38,7 @@ def _run(folder: Path, cache: Path, *what: str) -> scheduler.Result:
     graph = Graph()
     for word in what:
         graph.node("toys.mischief", f"task <{word}>", NoParams(), {"what": word})
-    with live.page(Quiet(), folder / "live.html") as told:
+    with live.page(Progress(), folder / "live.html") as told:
         return scheduler.run(graph, Store(cache), scheduler.RunOptions(executor="inline", progress=told))
 
 
@@ -59,7 +59,7 @@ def test_it_loads_itself_anew_until_the_report_is_there(tmp_path: Path, cache: P
 
 def test_an_error_ends_it_without_a_report(tmp_path: Path, pages: list[str]) -> None:
     def stop() -> None:
-        with live.page(Quiet(), tmp_path / "live.html"):
+        with live.page(Progress(), tmp_path / "live.html"):
             raise OSError("no <space>")
 
     with pytest.raises(OSError, match="space"):
@@ -70,13 +70,13 @@ def test_an_error_ends_it_without_a_report(tmp_path: Path, pages: list[str]) -> 
 
 
 def test_a_removed_folder_stays_removed(tmp_path: Path) -> None:
-    with live.page(Quiet(), tmp_path / "gone" / "live.html"):
+    with live.page(Progress(), tmp_path / "gone" / "live.html"):
         pass
     assert not (tmp_path / "gone").exists()
 
 
 def test_who_does_not_ask_gets_the_usual_progress() -> None:
-    usual = Quiet()
+    usual = Progress()
     with live.page(usual, None) as told:
         assert told is usual
 
