@@ -131,7 +131,7 @@ def render(
         script="".join(resources.files("rille.pipeline.report").joinpath(name).read_text("utf-8") for name in SCRIPTS),
         files=files,
         table_2=rows,
-        pair_table=tables.pair_columns(facts["pairs"]),
+        pair_table=tables.pair_table(facts["pairs"]),
         reasons=reasons(),
         together=together,
         others=tables.other_stages(view),

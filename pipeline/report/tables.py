@@ -13,6 +13,7 @@ import numpy as np
 from rille.pipeline.export.artifacts import chain
 from rille.pipeline.export.view import RunView, TaskRow
 from rille.pipeline.report import gather
+from rille.pipeline.report.canvas import Table
 from rille.pipeline.report.words import metres, number, quantity, share
 
 TABLE_2: tuple[tuple[str, str, float, tuple[str, ...]], ...] = (
@@ -176,14 +177,12 @@ def pairs(scene: gather.Scene) -> list[dict[str, Any]]:
     return rows
 
 
-def pair_columns(rows: list[dict[str, Any]]) -> list[tuple[str, list[str], bool]]:
-    """Columns of the table of pairs that hold anything: head, words of each pair, and whether they are numbers."""
-    found = [(head, [r[name] for r in rows], shown) for head, name, shown in _PAIR_COLUMNS]
-    return [
-        (head, ["–" if v is None else shown(v) for v in values], shown is not str)
-        for head, values, shown in found
-        if any(v is not None for v in values)
-    ]
+def pair_table(rows: list[dict[str, Any]]) -> Table:
+    """Table of the pairs with the columns that hold anything."""
+    columns = [column for column in _PAIR_COLUMNS if any(r[column[1]] is not None for r in rows)]
+    cells = (["–" if r[name] is None else shown(r[name]) for _, name, shown in columns] for r in rows)
+    numbers = tuple(k for k, (_, _, shown) in enumerate(columns) if shown is not str)
+    return Table(tuple(head for head, _, _ in columns), tuple(map(tuple, cells)), numbers)
 
 
 _PAIR_COLUMNS: tuple[tuple[str, str, Callable[[Any], str]], ...] = (

@@ -8,6 +8,7 @@ from toys.finished import view, written
 
 from rille.pipeline.export.view import UNSTATED
 from rille.pipeline.report import checks, delivery, page, summary, tables, terrain_map
+from rille.pipeline.report.canvas import Table
 from rille.pipeline.report.gather import Terrain
 from rille.stages.calibration.rig import RigParams
 from rille.stages.geometry.lattice import Lattice
@@ -60,11 +61,9 @@ def test_every_reason_on_the_map_has_words():
 def test_columns_of_pairs_without_anything_are_left_out():
     given = {name: None for _, name, _ in tables._PAIR_COLUMNS}
     two = [given | {"frame": 0, "matched": 0.5}, given | {"frame": 4, "path": "found"}]
-    assert tables.pair_columns(two) == [
-        ("Frame", ["0", "4"], True),
-        ("Matched", ["50 %", "–"], True),
-        ("Path", ["–", "found"], False),
-    ]
+    assert tables.pair_table(two) == Table(
+        ("Frame", "Matched", "Path"), (("0", "50 %", "–"), ("4", "–", "found")), (0, 1)
+    )
 
 
 def test_where_stops_are_closed():
