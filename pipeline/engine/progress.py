@@ -98,11 +98,7 @@ class Lines(Progress):
         self._compiled(handle)
         if time.monotonic() - self.shown >= INTERVAL:
             self.shown = time.monotonic()
-            left = self.forecast.left()
-            self._say(
-                f"{self.done}/{self.total()} tasks, {handle.label} {handle.status}"
-                + (f", about {clock(left)} left" if left is not None else "")
-            )
+            self._say(f"{self.done}/{self.total()} tasks, {handle.label} {handle.status}{to_go(self.forecast)}")
 
     def _compiled(self, handle: Handle) -> None:
         if handle.compiling >= SLOW_COMPILE:
@@ -191,7 +187,7 @@ class Bar(Lines):
             completed=gone,
             total=None if left is None else gone + left,
             count=f"{self.done}/{self.total()}",
-            description=plain(label) + (f", about {clock(left)} left" if left is not None else ""),
+            description=plain(label) + to_go(self.forecast),
         )
 
     def close(self, result: Result) -> None:
@@ -212,6 +208,12 @@ def summary(result: Result) -> str:
     parts += [f"{n} {what}" for what, n in (("planned", total.planned), ("failed", total.failed)) if n]
     parts += [f"{total.skipped} left out"] if total.skipped else []
     return f"{', '.join(parts)} in {result.seconds:.1f} s"
+
+
+def to_go(forecast: Forecast) -> str:
+    """``, about 42 s left``; empty where nothing is known."""
+    left = forecast.left()
+    return "" if left is None else f", about {clock(left)} left"
 
 
 def clock(seconds: float) -> str:

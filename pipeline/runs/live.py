@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rille.pipeline.engine.plain import plain
-from rille.pipeline.engine.progress import Progress, clock
+from rille.pipeline.engine.progress import Progress, clock, to_go
 from rille.pipeline.engine.runtime import atomic
 
 if TYPE_CHECKING:
@@ -118,8 +118,7 @@ class Live(Progress):
     def _write(self) -> None:
         if time.monotonic() - self.written >= INTERVAL:
             self.written = time.monotonic()
-            left = self.forecast.left()
-            words = f"<p>{datetime.now(UTC):%H:%M:%S} UTC" + (f", about {clock(left)} left" if left is not None else "")
+            words = f"<p>{datetime.now(UTC):%H:%M:%S} UTC{to_go(self.forecast)}"
             self._put(words + ". If this time stands still for minutes, the run was killed.</p>", AGAIN)
 
     def _put(self, words: str, script: str) -> None:

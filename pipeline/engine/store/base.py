@@ -31,12 +31,11 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from rille.pipeline.engine.store.folder import Folder, StoreError
 from rille.pipeline.engine.store.index import Index
 from rille.pipeline.engine.store.lazy_arrays import LazyArrays
-from rille.pipeline.engine.store.location import Location, hints_folder, locate
+from rille.pipeline.engine.store.location import Location, folder_of, hints_folder, locate
 from rille.pipeline.engine.store.manifest import (
     FIRST,
     Manifest,
@@ -87,8 +86,7 @@ class Store:
 
     def hints(self, sequence: str) -> Path:
         """Folder of what earlier runs of a sequence leave for explanations and estimates."""
-        name = quote(sequence, safe="").replace(".", "%2E")  # no name leads out of it
-        return self.root / "hints" / (name or "-")
+        return self.root / "hints" / folder_of(sequence)
 
     def survey(self, sequence: str) -> None:
         """Before many look-ups: find out at once what is there, with few requests or readings.

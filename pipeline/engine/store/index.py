@@ -14,8 +14,8 @@ import sys
 import time
 import zlib
 from collections.abc import Iterable, Mapping
-from urllib.parse import quote
 
+from rille.pipeline.engine.store.location import folder_of
 from rille.pipeline.engine.store.manifest import Facts, Ref, parsed
 from rille.pipeline.engine.store.place import Item, Place
 from rille.stages.core.errors import RilleError
@@ -41,8 +41,7 @@ class Index:
 
     def __init__(self, place: Place, sequence: str) -> None:
         self._place = place
-        name = quote(sequence, safe="").replace(".", "%2E")  # no name leads out of it
-        self._folder = f"{AREA}/{name or '-'}"
+        self._folder = f"{AREA}/{folder_of(sequence)}"
         self._written: dict[str, float] = {}
         self.lines: dict[str, str] = {}
         room = MOST

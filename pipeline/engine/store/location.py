@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 from rille.stages.core.errors import ConfigError
 
@@ -49,6 +49,11 @@ def locate(given: Path | str) -> Location:
             "RIL-549", f"{prefix!r} is no prefix for a cache: letters, digits and ._=- only", remedy=remedy
         )
     return f"s3://{parts.netloc}/{prefix}".rstrip("/")
+
+
+def folder_of(sequence: str) -> str:
+    """Name of the folder of what is kept by sequence; no name leads out of where it lies."""
+    return quote(sequence, safe="").replace(".", "%2E") or "-"
 
 
 def hints_folder(cache: Location) -> Path:
