@@ -53,8 +53,8 @@ class Output:
     name : of the file.
     what : what it is, in words.
     opens : free programs that open it.
-    write : ``write(folder, view)`` writes it; None for what each run renders. It may write nothing, or for a name with
-        a ``*`` several files.
+    write : ``write(path, view)`` writes it; None for what each run renders. It may write nothing, or for a name with
+        a ``*`` several files beside ``path``.
     needs : fields of :class:`rille.pipeline.flow.products.Products` whose artifacts must all be there.
     reads : further ones, which may lack some.
     knows : facts of the view that it uses, such as ``sequence.georeference``; others it cannot reach.
@@ -86,7 +86,7 @@ def stage(name: str, summary: str, outputs: Sequence[Output]) -> Stage:
         write = by_name[args["file"]].write
         assert write is not None
         with TemporaryDirectory() as folder:
-            write(Path(folder), restore(args, inputs["read"]))
+            write(Path(folder) / args["file"], restore(args, inputs["read"]))
             return pack(Path(folder))
 
     # artifacts are opened one by one, and only a few at once are held

@@ -16,14 +16,14 @@ def _facts(path: Bundle) -> dict[str, Any]:
     return {k: v for k, v in path.meta.items() if not isinstance(v, dict)}
 
 
-def _write_gpkg(folder: Path, view: Any) -> None:
-    path = view.bundle(view.products.world_path)
-    write_path_gpkg(folder / "path.gpkg", np.asarray(path["path"]), _facts(path), view.sequence.georeference)
+def _write_gpkg(path: Path, view: Any) -> None:
+    planned = view.bundle(view.products.world_path)
+    write_path_gpkg(path, np.asarray(planned["path"]), _facts(planned), view.sequence.georeference)
 
 
-def _write_geojson(folder: Path, view: Any) -> None:
-    path = view.bundle(view.products.world_path)
-    write_path_geojson(folder / "path.geojson", np.asarray(path["path"]), _facts(path))
+def _write_geojson(path: Path, view: Any) -> None:
+    planned = view.bundle(view.products.world_path)
+    write_path_geojson(path, np.asarray(planned["path"]), _facts(planned))
 
 
 OUTPUTS = (

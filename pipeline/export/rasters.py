@@ -52,13 +52,13 @@ Values = Callable[[Any], tuple[Lattice, NDArray[Any]]]
 """Values of a raster, and the lattice they are on, of a view."""
 
 
-def _raster(file: str, band: str, unit: str, values: Values) -> Callable[..., None]:
+def _raster(band: str, unit: str, values: Values) -> Callable[..., None]:
     """Writer of a raster of one band."""
 
-    def write(folder: Path, view: Any) -> None:
+    def write(path: Path, view: Any) -> None:
         lattice, found = values(view)
         bands = {band: np.asarray(found, np.float32)}
-        write_raster(folder / file, bands, lattice, Meaning(unit), view.sequence.georeference)
+        write_raster(path, bands, lattice, Meaning(unit), view.sequence.georeference)
 
     return write
 
@@ -72,16 +72,16 @@ def _slope(view: Any) -> tuple[Lattice, NDArray[Any]]:
     return lattice, slope_deg(elevation, lattice.cell)
 
 
-def _write_hillshade(folder: Path, view: Any) -> None:
+def _write_hillshade(path: Path, view: Any) -> None:
     lattice, elevation = _merged("elevation")(view)
     bands, place = {"hillshade": hillshade(elevation, lattice.cell)}, view.sequence.georeference
-    write_raster(folder / "hillshade.tif", bands, lattice, Meaning(nodata=0, tags=LIGHT), place)
+    write_raster(path, bands, lattice, Meaning(nodata=0, tags=LIGHT), place)
 
 
-def _write_ortho(folder: Path, view: Any) -> None:
+def _write_ortho(path: Path, view: Any) -> None:
     """Write grey values as they are, or red, green and blue where the images have colours."""
     lattice, grey = _merged("ortho")(view)
-    place, path = view.sequence.georeference, folder / "ortho.tif"
+    place = view.sequence.georeference
     if not colour.coloured(view):
         write_raster(path, {"ortho": np.asarray(grey, np.float32)}, lattice, Meaning(), place)
         return
@@ -90,9 +90,9 @@ def _write_ortho(folder: Path, view: Any) -> None:
     write_raster(path, bands, lattice, Meaning(nodata=0), place)
 
 
-def _write_dem_style(folder: Path, view: Any) -> None:
+def _write_dem_style(path: Path, view: Any) -> None:
     low, high = ranges.ground_limits(_height(view)[1])
-    atomic.write(folder / "dem.qml", dem_style(low, high))
+    atomic.write(path, dem_style(low, high))
 
 
 CLASSES = {"safe": "#a6d7c3", "caution": "#f0d68a", "hazard": "#c8501e", "unknown (never entered)": "#8d8f98"}
@@ -106,32 +106,32 @@ BITS = 12
 """Significant bits of a written measure: 0.02 %, finer than any is known."""
 
 
-def _write_risk(folder: Path, view: Any) -> None:
+def _write_risk(path: Path, view: Any) -> None:
     """Write the class of each cell as a byte, with its colour and, beside it, its name."""
     risk = view.bundle(view.products.world_risk)
     tags = {"classes": ", ".join(f"{k} {name}" for k, name in enumerate(CLASSES))} | _vehicle(risk)
     lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
     # No nodata: class 3, unknown, is to be seen and counted like the others.
     meaning = Meaning(nodata=None, tags=tags, colours=list(CLASSES.values()))
-    write_raster(folder / "risk.tif", {"class": np.asarray(risk["risk"], np.uint8)}, lattice, meaning, place)
+    write_raster(path, {"class": np.asarray(risk["risk"], np.uint8)}, lattice, meaning, place)
 
 
-def _write_class_names(folder: Path, view: Any) -> None:
+def _write_class_names(path: Path, view: Any) -> None:
     # GeoTIFF has no names of classes: GDAL reads them from this file beside it (PAM).
     names = "".join(f"<Category>{name}</Category>" for name in CLASSES)
     text = f'<PAMDataset><PAMRasterBand band="1"><CategoryNames>{names}</CategoryNames></PAMRasterBand></PAMDataset>'
-    atomic.write(folder / "risk.tif.aux.xml", text)
+    atomic.write(path, text)
 
 
-def _write_reasons(folder: Path, view: Any) -> None:
+def _write_reasons(path: Path, view: Any) -> None:
     risk = view.bundle(view.products.world_risk)
     bands = {"reason": np.asarray(risk["reason"], np.uint16), "filled": np.asarray(risk["filled"], np.uint16)}
     tags = {"reason_bits": ", ".join(f"{bit} {name}" for name, bit in REASONS.items())}
     lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
-    write_raster(folder / "reason.tif", bands, lattice, Meaning(nodata=None, tags=tags), place)
+    write_raster(path, bands, lattice, Meaning(nodata=None, tags=tags), place)
 
 
-def _write_hazard(folder: Path, view: Any) -> None:
+def _write_hazard(path: Path, view: Any) -> None:
     """Write the probability of a hazard and the measures, in metres and degrees."""
     risk = view.bundle(view.products.world_risk)
     units = {a.name: a.unit for a in RISK.outputs if a.unit in ("m", "rad") and a.name != "elevation"}
@@ -140,7 +140,7 @@ def _write_hazard(folder: Path, view: Any) -> None:
     unit = {name: {"rad": "degree"}.get(units.get(name, ""), units.get(name, "")) for name in bands}
     given = {name: rounded(np.asarray(values, dtype=np.float32), BITS) for name, values in bands.items()}
     lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
-    write_raster(folder / "hazard.tif", given, lattice, Meaning(unit, tags=_vehicle(risk)), place)
+    write_raster(path, given, lattice, Meaning(unit, tags=_vehicle(risk)), place)
 
 
 def _vehicle(risk: Bundle) -> dict[str, str]:
@@ -155,8 +155,8 @@ def rounded(values: NDArray[np.float32], bits: int) -> NDArray[np.float32]:
     return np.asarray(np.ldexp(np.rint(mantissa * scale) / scale, exponent), dtype=np.float32)
 
 
-def _write_risk_style(folder: Path, view: Any) -> None:
-    atomic.write(folder / "risk.qml", risk_style())
+def _write_risk_style(path: Path, view: Any) -> None:
+    atomic.write(path, risk_style())
 
 
 def dem_style(low: float, high: float) -> str:
@@ -211,7 +211,7 @@ OUTPUTS = (
     _of_terrain(
         "dem.tif",
         "merged elevation, m, NaN undefined",
-        _raster("dem.tif", "elevation", "m", _height),
+        _raster("elevation", "m", _height),
         "elevation z of the cell centre, m",
     ),
     Output(
@@ -225,13 +225,13 @@ OUTPUTS = (
     _of_terrain(
         "dem_sigma.tif",
         "standard deviation of the elevation, m",
-        _raster("dem_sigma.tif", "elevation_std", "m", _merged("elevation_std")),
+        _raster("elevation_std", "m", _merged("elevation_std")),
         "standard deviation of the elevation, m",
     ),
     _of_terrain(
         "slope.tif",
         "inclination of the terrain, degrees",
-        _raster("slope.tif", "slope", "degree", _slope),
+        _raster("slope", "degree", _slope),
         "inclination of the terrain, degrees",
     ),
     _of_terrain(

@@ -141,7 +141,7 @@ def _array(
 SLOPE = Array("slope", ("row", "col"), "float32", "degree", "inclination of the terrain", "nan", "world")
 
 
-def _write_output(folder: Path, view: Any) -> None:
+def _write_output(path: Path, view: Any) -> None:
     """All merged arrays, put together of the world tiles, and the slope."""
     tiles, arrays = list(map(view.bundle, view.products.world_tiles)), {}
     for spec in merge.STAGE.outputs:
@@ -153,7 +153,7 @@ def _write_output(folder: Path, view: Any) -> None:
         "title": f"Merged terrain of the sequence {view.sequence.name}",
         "source": "stereo images: disparity by HFVM, elevation models by Locus, merged; Rille",
     }
-    write_terrain(folder / "terrain.zarr", arrays, lattice, view.sequence.georeference, about)
+    write_terrain(path, arrays, lattice, view.sequence.georeference, about)
 
 
 OUTPUTS = (

@@ -35,31 +35,31 @@ def _world(trajectory: Bundle, piece: int) -> str:
     return writers.UNLEVELLED if verticals[piece] == NO_VERTICAL else writers.FRAME
 
 
-def _write_kitti(folder: Path, view: Any) -> None:
-    write_trajectory_kitti(folder / "trajectory.kitti", world_poses(view.bundle(view.products.trajectory)))
+def _write_kitti(path: Path, view: Any) -> None:
+    write_trajectory_kitti(path, world_poses(view.bundle(view.products.trajectory)))
 
 
-def _write_tum(folder: Path, view: Any) -> None:
+def _write_tum(path: Path, view: Any) -> None:
     trajectory = view.bundle(view.products.trajectory)
     world = _world(trajectory, int(trajectory.meta.get("main", 0)))
-    write_trajectory_tum(folder / "trajectory.tum", world_poses(trajectory), stamps(view), world)
+    write_trajectory_tum(path, world_poses(trajectory), stamps(view), world)
 
 
-def _write_pieces(folder: Path, view: Any) -> None:
+def _write_pieces(path: Path, view: Any) -> None:
     trajectory = view.bundle(view.products.trajectory)
     for number in range(len(trajectory.meta.get("verticals", [""]))):
         if number != int(trajectory.meta.get("main", 0)):
-            path, world = folder / f"trajectory.piece{number + 1}.tum", _world(trajectory, number)
-            write_trajectory_tum(path, world_poses(trajectory, number), stamps(view), world)
+            piece, world = path.with_name(path.name.replace("*", str(number + 1))), _world(trajectory, number)
+            write_trajectory_tum(piece, world_poses(trajectory, number), stamps(view), world)
 
 
-def _write_crosscheck(folder: Path, view: Any) -> None:
+def _write_crosscheck(path: Path, view: Any) -> None:
     compared = compare(view)
     assert compared is not None
-    write_trajectory_tum(folder / "crosscheck.tum", compared.poses, stamps(view))
+    write_trajectory_tum(path, compared.poses, stamps(view))
 
 
-def _write_agreement(folder: Path, view: Any) -> None:
+def _write_agreement(path: Path, view: Any) -> None:
     compared, trajectory = compare(view), view.bundle(view.products.trajectory)
     assert compared is not None
     names = [view.sequence.frame_names[f] for f in view.frames]
@@ -68,7 +68,7 @@ def _write_agreement(folder: Path, view: Any) -> None:
         positions = world_poses(trajectory)[:, :, 3]
         columns |= {f"{a}_m": positions[:, k].tolist() for k, a in enumerate("xyz")}
     columns |= {f"crosscheck_{a}_m": compared.poses[:, k, 3].tolist() for k, a in enumerate("xyz")}
-    write_table(folder / "agreement.csv", columns | compared.columns())
+    write_table(path, columns | compared.columns())
 
 
 COMPARED = ("trajectory", "accuracy", "crosscheck_accuracy")

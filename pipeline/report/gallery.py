@@ -41,9 +41,9 @@ def _drawn(title: str, maker: Maker, expected: Condition, scene: Scene) -> Figur
 def _output(title: str, maker: Maker, expected: Condition, reads: str, knows: str) -> Output:
     """Record of a figure: a part of the page, kept as JSON."""
 
-    def write(folder: Path, view: Any) -> None:
+    def write(path: Path, view: Any) -> None:
         drawn = _drawn(title, maker, expected, Scene(view))
-        (folder / "figure.json").write_bytes(FIGURE.dump_json(drawn))
+        path.write_bytes(FIGURE.dump_json(drawn))
 
     return Output(title, "", "", write, (), tuple(reads.split()), ("frames", *knows.split()))
 

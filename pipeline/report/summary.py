@@ -75,8 +75,8 @@ def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]
     }
 
 
-def _write(folder: Path, view: Any) -> None:
-    (folder / "facts.json").write_text(json.dumps(gather(view), allow_nan=False), encoding="utf-8")
+def _write(path: Path, view: Any) -> None:
+    path.write_text(json.dumps(gather(view), allow_nan=False), encoding="utf-8")
 
 
 def find_warnings(scene: Scene) -> list[str]:

@@ -88,7 +88,7 @@ def test_a_task_makes_of_what_its_record_names_what_the_whole_run_would(
 ) -> None:
     whole, made = run(georeference)
     assert output.write is not None
-    output.write(tmp_path, whole)
+    output.write(tmp_path / output.name, whole)
     laid_out = task(output, whole)
     assert laid_out is not None
     args, inputs = laid_out
@@ -97,7 +97,7 @@ def test_a_task_makes_of_what_its_record_names_what_the_whole_run_would(
     found = module.STAGE.run(module.STAGE.params(), given, {"read": [made[handle.ref] for handle in inputs]})
     assert unpack(found) == unpack(pack(tmp_path))
     if module is gallery:
-        figure = FIGURE.validate_json(unpack(found)["figure.json"])
+        figure = FIGURE.validate_json(unpack(found)[output.name])
         assert "failed" not in figure.why
         assert figure in gallery.draw(whole)
 
@@ -151,7 +151,7 @@ def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
     whole, _ = run()
     for module in catalogue.MADE:
         for output in module.OUTPUTS:
-            output.write(tmp_path, whole)
+            output.write(tmp_path / output.name, whole)
     names = [p.name for p in tmp_path.iterdir()]
     facts = describe(names, FRAMES, [f"left{f:03d}" for f in FRAMES], [float(f) for f in FRAMES], clock=False)
     described = [o.name for o in catalogue.OUTPUTS if o.frame]
@@ -180,7 +180,7 @@ def test_all_files_of_a_run_state_one_system(georeference: Georeference | None, 
     whole, _ = run(georeference)
     for module in catalogue.MADE:
         for output in module.OUTPUTS:
-            output.write(tmp_path, whole)
+            output.write(tmp_path / output.name, whole)
     point_cloud.export(tmp_path, "laz", None)
     found = {}
     for path in tmp_path.glob("*.tif"):
