@@ -2,7 +2,7 @@
 
     RILLE_DATA=... python benchmarks/ablation.py [--half judged]
 
-Pairs: those that settings may be chosen with (``CHOSEN`` of ``benchmarks/robustness.py``) and the mockup, or with
+Pairs: those that settings may be chosen with (``CHOSEN`` of ``benchmarks/stereo/pairs.py``) and the mockup, or with
 ``--half judged`` the others. Time: processor seconds a pair on one thread, both directions, over those of OpenCV's SGBM
 3WAY on the same pairs in the same run. Bad-1 and bad-2 after filling over SGBM's, means of the pairs' ratios: once
 filled alike, once by Rille's own filling. Bad-2 of the matched, their median error and the completeness: means.
@@ -37,15 +37,13 @@ def main() -> None:
     from rille.pipeline.engine.runtime.environment import prepare_environment
 
     prepare_environment()
-    import robustness
     from stereo import methods
+    from stereo.pairs import halves, mockup
 
     methods.set_threads(1)
-    known = robustness.pairs()
-    names = [*robustness.CHOSEN, "mockup"] if given.half == "chosen" else list(robustness.JUDGED)
-    pairs = [known[name] for name in names]
+    pairs = [*halves()[given.half], *([mockup()] if given.half == "chosen" else [])]
     peer = next(m for m in methods.opencv() if m.name == "SGBM 3WAY")
-    print(f"pairs ({given.half}): {', '.join(names)}\n")
+    print(f"pairs ({given.half}): {', '.join(pair.name for pair in pairs)}\n")
     print(
         "| | time | filled: bad-1 | bad-2 | own filling: bad-1 | bad-2 | matched: bad-2 | median, px | completeness |"
     )

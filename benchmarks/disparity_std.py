@@ -3,11 +3,11 @@ their check.
 
 ``python benchmarks/disparity_std.py`` renders pairs of the built-in mockup (kept in ``--cache``), matches them and
 prints how many of the matched pixels err by less than one and two standard deviations, also on the photographed pairs
-of ``robustness.py`` (RILLE_DATA). ``--fit`` fits the factors anew to the pairs marked with a star for each ``--floor``,
-prints them, and says what they make of all pairs: to be done after every change of the matcher. Factors are those that
-make 68.3 % of the errors lie below std and 95.4 % below twice that, whatever the parts N, R, M of a pixel are: the
-minimum of the two quantiles' pinball losses of log(error / std). The floor cannot be fitted so, since the mockup has no
-lens and no gaps between pixels: it is chosen by the photographed pairs marked ``+``.
+of ``stereo/pairs.py`` (RILLE_DATA). ``--fit`` fits the factors anew to the pairs marked with a star for each
+``--floor``, prints them, and says what they make of all pairs: to be done after every change of the matcher. Factors
+are those that make 68.3 % of the errors lie below std and 95.4 % below twice that, whatever the parts N, R, M of a
+pixel are: the minimum of the two quantiles' pinball losses of log(error / std). The floor cannot be fitted so, since
+the mockup has no lens and no gaps between pixels: it is chosen by the photographed pairs marked ``+``.
 """
 
 from __future__ import annotations
@@ -66,12 +66,12 @@ def rendered(cache: Path, parameters: dict[str, Any], frame: int) -> tuple[Any, 
 
 def photographs() -> dict[str, tuple[Any, ...]]:
     """Photographed pairs whose disparity was measured; ``+``: for choosing, ``-``: for judging."""
-    import robustness
+    from stereo.pairs import halves
 
     return {
-        f"{'+' if name in robustness.CHOSEN else '-'} {name}": (pair.left, pair.right, pair.truth.u)
-        for name, pair in robustness.pairs().items()
-        if name in (*robustness.CHOSEN, *robustness.JUDGED)
+        f"{'+' if half == 'chosen' else '-'} {pair.name}": (pair.left, pair.right, pair.truth.u)
+        for half, pairs in halves().items()
+        for pair in pairs
     }
 
 

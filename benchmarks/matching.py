@@ -1,17 +1,27 @@
-"""Dense matching side by side: HFVM in every preset against OpenCV's and Pandora's matchers, in one process.
+"""Dense matching side by side: HFVM in every preset against OpenCV's matchers, Pandora and ELAS.
 
-Without arguments: accuracy on *motorcycle* and *cones* (where RILLE_DATA has them) and the first pair of the mockup;
-the same under a misaligned right camera; what is claimed on images that have nothing in common; time on three sizes:
-570 x 520 (the mockup's, and the paper's), the first pair of the KITTI street, and motorcycle enlarged by bicubic
-interpolation to 1.4 megapixels; last, what is claimed of the matcher, held against these figures. With ``--left --right
---truth``: accuracy, misalignment and time of that pair.
+Without arguments: ten pairs of Middlebury by halves, as ratios to SGBM 3WAY (settings were chosen with the first half);
+accuracy on *motorcycle* and *cones* (where RILLE_DATA has them) and the first pair of the mockup; the same under a
+misaligned right camera; what is claimed on images that have nothing in common; time on three sizes: 570 x 520 (the
+mockup's, and the paper's), the first pair of the KITTI street, and motorcycle enlarged by bicubic interpolation to 1.4
+megapixels; last, what is claimed of the matcher, held against these figures. With ``--left --right --truth``: accuracy,
+misalignment and time of that pair.
 
 All matchers get equal threads and are filled alike: a pixel without a match takes the column of the nearest match in
 its row, of two the background's; its row follows the epipolar lines of the matches, which are level for matchers of
-rows. Matchers along rows are told the truth's range of disparities and get images padded by it, so that they match at
-the left edge, too; HFVM is told nothing. HFVM is judged on its vector, the others on the column, so that rows cannot
-help them. Times: HFVM with pyramid, both directions, consistency and filling; the others one direction on the padded
-images.
+rows. Matchers along rows are told the truth's range of disparities; OpenCV's get images padded by it, so that they
+match at the left edge, too, Pandora and ELAS a frame of a few pixels, which serves them better. HFVM is told nothing.
+HFVM is judged on its vector, the others on the column, so that rows cannot help them. Times: HFVM with pyramid, both
+directions, consistency and filling, as Pandora and ELAS; OpenCV's one direction on the padded images.
+
+Pandora and ELAS are programs in environments of their own, of which ``--pandora`` and ``--elas`` name the Python:
+
+    python3 -m venv PANDORA && PANDORA/bin/pip install 'pandora[sgm]'
+    python3 -m venv ELAS && ELAS/bin/pip install numpy setuptools wheel
+    CPATH=$(ELAS/bin/python -c 'import numpy; print(numpy.get_include())') \
+        ELAS/bin/pip install --no-build-isolation pyelas
+
+They have no part in misalignment and in the time of three sizes.
 """
 
 from __future__ import annotations
@@ -47,7 +57,17 @@ TIMES = (
     ("cpu_ratio", "of processor time"),
     ("rounds", "rounds"),
 )
-PARTS = ("accuracy", "misalignment", "unrelated", "time")
+PEERS = (
+    ("bad1", "filled alike: bad-1"),
+    ("bad2", "bad-2"),
+    ("bad2_own", "own filling: bad-2"),
+    ("bad2_best", "filled alike: bad-2 / best peer's"),
+    ("completeness", "completeness"),
+    ("bad2_matched", "matched: bad-2"),
+    ("time", "processor time"),
+)
+PARTS = ("peers", "accuracy", "misalignment", "unrelated", "time")
+PICTURES = {"peers_picture": "peers", "misalignment_picture": "misalignment"}
 
 
 def arguments() -> argparse.Namespace:
@@ -71,15 +91,19 @@ def arguments() -> argparse.Namespace:
     )
     parser.add_argument("--rounds", type=int, default=7, help="timed rounds (default 7)")
     parser.add_argument("--budget", type=float, default=8.0, help="seconds of timing a method and pair (default 8)")
-    parser.add_argument("--picture", type=Path, help="draw the misalignment curve there, e.g. docs/misalignment.png")
+    parser.add_argument("--pandora", type=Path, metavar="PYTHON", help="of an environment with Pandora")
+    parser.add_argument("--elas", type=Path, metavar="PYTHON", help="of an environment with pyelas")
+    parser.add_argument("--peers-picture", type=Path, help="draw accuracy against time there, e.g. docs/peers.png")
+    parser.add_argument("--misalignment-picture", type=Path, help="draw its curve there, e.g. docs/misalignment.png")
     parser.add_argument("--json", type=Path, help="write all figures there")
     given = parser.parse_args()
     if len({given.left is None, given.right is None, given.truth is None}) > 1:
         parser.error("give --left, --right and --truth together")
     if given.threads < 1 or given.rounds < 1:
         parser.error("--threads and --rounds are at least 1")
-    if given.picture and given.only and "misalignment" not in given.only:
-        parser.error("--picture is drawn by the part misalignment")
+    for picture, part in PICTURES.items():
+        if getattr(given, picture) and given.only and part not in given.only:
+            parser.error(f"--{picture.replace('_', '-')} is drawn by the part {part}")
     return given
 
 
@@ -113,6 +137,32 @@ def table(title: str, headings: list[str], rows: list[list[Any]]) -> None:
         print("| " + " | ".join(words) + " |")
         if k == 0:
             print("|" + "|".join("-" * (w + 2) for w in widths) + "|")
+
+
+def peers(methods: list[Any], rounds: int, picture: Path | None) -> list[dict[str, Any]]:
+    from stereo import ratios
+    from stereo.pairs import halves
+
+    try:
+        known = halves()
+    except SystemExit as missing:
+        print(f"the part peers is left out: {missing}")
+        return []
+    found = []
+    for half, pairs in known.items():
+        mine = ratios.figures(pairs, methods, rounds, lambda name: say(f"peers: {name}"))
+        means = ratios.means(mine)
+        table(
+            f"{half} half ({', '.join(p.name for p in pairs)}): means; of bad-1, bad-2 and time of the ratios to "
+            f"{methods[0].name}, time: median",
+            ["method", *(words for _, words in PEERS)],
+            [[m["method"], *(m[key] for key, _ in PEERS)] for m in means],
+        )
+        if picture and half == "judged":
+            ratios.picture(means, picture)
+            print(f"\n{picture}")
+        found += [{"half": half, **f} for f in mine]
+    return found
 
 
 def accuracy(pairs: list[Any], methods: list[Any]) -> list[dict[str, Any]]:
@@ -211,7 +261,15 @@ def chosen_pairs(given: argparse.Namespace) -> tuple[list[Any], list[Any]]:
 def chosen_methods(given: argparse.Namespace) -> list[Any]:
     from stereo import methods
 
-    found = [*methods.opencv(), *methods.pandora(), *methods.hfvm(given.hfvm, given.threads)]
+    found = methods.opencv()
+    for name, words in methods.PEERS.items():
+        if (python := getattr(given, name)) is None:
+            print(f"{words} is left out: --{name} PYTHON is not given")
+        else:
+            method, version = methods.elsewhere(name, python)
+            print(f"{words} {version}")
+            found.append(method)
+    found += methods.hfvm(given.hfvm, given.threads)
     names = [n.strip() for n in given.methods.split(",")] if given.methods else [""]
     found = [m for m in found if any(m.name.startswith(n) for n in names)]
     if not found:
@@ -234,6 +292,7 @@ def main() -> None:
 
 def measure(given: argparse.Namespace) -> None:
     """All parts that were asked for."""
+    from stereo.limits import PEER
     from stereo.methods import set_threads
 
     set_threads(given.threads)
@@ -242,15 +301,21 @@ def measure(given: argparse.Namespace) -> None:
     methods = chosen_methods(given)
     print(f"{given.threads} thread{'s' * (given.threads > 1)} each; filled alike; missing pixels count as bad")
     found: dict[str, Any] = {"threads": given.threads}
+    if "peers" in parts and given.left is None:
+        if methods[0].name == PEER:
+            compared = [m for m in methods if m.name != "HFVM paper"]
+            found["peers"] = peers(compared, given.rounds, given.peers_picture)
+        else:
+            print(f"the part peers is left out: --methods leaves {PEER} out")
     if "accuracy" in parts:
         found["accuracy"] = accuracy(pairs, methods)
     if "misalignment" in parts:
-        compared = [m for m in methods if m.name == "SGBM 3WAY" or m.name.startswith("HFVM")]
-        found["misalignment"] = misalignment([p for p in pairs if p.parallel], compared, given.picture)
+        compared = [m for m in methods if m.name == PEER or m.name.startswith("HFVM")]
+        found["misalignment"] = misalignment([p for p in pairs if p.parallel], compared, given.misalignment_picture)
     if "unrelated" in parts and given.left is None:
         found["unrelated"] = unrelated(pairs, methods)
     if "time" in parts:
-        found["time"] = times(timed, methods, given.rounds, given.budget)
+        found["time"] = times(timed, [m for m in methods if m.told is None], given.rounds, given.budget)
     if given.left is None:
         found["claims"] = claims(found)
     if given.json:

@@ -14,18 +14,14 @@ hold there.
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-CHOSEN = ("motorcycle", "Baby1", "Cloth1", "Lampshade1", "Midd1")
-JUDGED = ("cones", "Bowling1", "Monopoly", "Rocks1", "Wood1")
 Grey = NDArray[np.uint8]
 
 
@@ -59,21 +55,6 @@ DEGRADATIONS: dict[str, Callable[[Grey], Grey]] = {
 """What is done to the right image; the knocks below move the truth, too."""
 
 
-def pairs() -> dict[str, Any]:
-    from stereo.pairs import measured, read_image, read_truth, with_truth
-
-    folder = Path(os.environ.get("RILLE_DATA") or "-") / "middlebury0506"
-    found = {pair.name: pair for pair in with_truth()}
-    for name in (*CHOSEN, *JUDGED):
-        if (folder / name).is_dir():
-            files = [folder / name / f"{part}.png" for part in ("view1", "view5", "disp1")]
-            found[name] = measured(name, *(read_image(f) for f in files[:2]), read_truth(files[2], 3.0))
-    missing = [name for name in (*CHOSEN, *JUDGED) if name not in found]
-    if missing:
-        raise SystemExit(f"RILLE_DATA holds no {', '.join(missing)}")
-    return found
-
-
 def cases() -> Iterable[tuple[str, Callable[[Any], Any]]]:
     from stereo.misalignment import knocked
 
@@ -98,20 +79,20 @@ def main() -> None:
     prepare_environment()
     from stereo import methods
     from stereo.measures import judge
+    from stereo.pairs import halves
 
     methods.set_threads(1)
     wanted = [f"HFVM {preset}" for preset in given.preset or ["default"]]
     peer = next(m for m in methods.opencv() if m.name == "SGBM 3WAY")
     mine = [m for m in methods.hfvm([], 1) if m.name in wanted]
-    known = pairs()
     print(
         "| half | matcher | right image | / own, as it is | / SGBM 3WAY | matched | bad-2 of them | within 1, 2 std |"
     )
     print("|---|---|---|---|---|---|---|---|")
-    for half, names in (("chosen", CHOSEN), ("judged", JUDGED)):
+    for half, pairs in halves().items():
         clean: dict[tuple[str, str], float] = {}
         for case, change in cases():
-            changed = {name: change(known[name]) for name in names}
+            changed = {pair.name: change(pair) for pair in pairs}
             peers = {name: judge(peer(pair), pair.truth)["bad2"] for name, pair in changed.items()}
             for method in (peer, *mine):
                 found = {name: judge(method(pair), pair.truth) for name, pair in changed.items()}

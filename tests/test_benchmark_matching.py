@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from benchmarks.stereo import limits, methods, pairs
+from benchmarks.stereo import limits, methods, pairs, ratios, timing
 from benchmarks.stereo.measures import Found, Truth, fill, judge, locking
 from benchmarks.stereo.misalignment import camera_of, conditions, knocked
 from benchmarks.stereo.pairs import Pair, measured, parallel, read_truth
@@ -217,6 +219,176 @@ class TestMethods:
         large = pairs.enlarged(pair, 14000.0)
         assert abs(large.left.size / 14000.0 - 1.0) < 0.02
         assert large.searching(224).range == (0, 224)
+
+
+PANDORA = """
+    from types import SimpleNamespace
+    import numpy as np
+    import rasterio
+
+    def check_conf(plan, machine):
+        assert plan["pipeline"]["optimization"]["optimization_method"] == "sgm"
+        return plan
+
+    def create_dataset_from_inputs(one):
+        with rasterio.open(one["img"]) as file:
+            return file.read(1), one["disp"]
+
+    def run(machine, left, right, plan):
+        machine.calls += 1
+        (image, (low, high)), (_, others) = left, right
+        assert others == [-high, -low]
+        d = np.full(image.shape, -7.0)
+        flags = np.zeros(image.shape, int)
+        d[:, 20], flags[:, 20] = np.nan, 1
+        flags[:, 21], flags[:, 22] = 2, 4
+        d[0], d[-1], d[:, 0], d[:, -1] = 99.0, 99.0, 99.0, 99.0
+        d[30, 2:5] = low, high, -machine.calls
+        return SimpleNamespace(data=d), SimpleNamespace(data=flags)
+
+    def both(*given):
+        d, flags = run(*given)
+        return ({"disparity_map": d, "validity_mask": flags},)
+"""
+"""A stand-in: 7 px everywhere, one column invalid, two filled; row 30 the limits of the range and the calls."""
+
+ELAS = """
+    import numpy as np
+    PRESET_MIDDLEBURY = 1
+
+    class Elas:
+        def set_preset(self, preset):
+            self.add_corners = True
+            self.ipol_gap_width = 5000
+
+        def process(self, left, right):
+            left, right = (image.astype(float) for image in (left, right))
+            far = [np.abs(left - np.roll(right, d, axis=1)) for d in range(self.disp_min, self.disp_max + 1)]
+            sums = [sum(np.roll(f, (y, x), (0, 1)) for y in (-2, 0, 2) for x in (-2, 0, 2)) for f in far]
+            found = np.argmin(sums, axis=0).astype(np.float32)
+            if not self.add_corners:
+                assert self.ipol_gap_width == 3
+                found[:, 28] = -1
+            return found, found
+"""
+"""A stand-in that finds whole disparities from 0 on; without corners it leaves a column out."""
+
+
+class TestPeersElsewhere:
+    """Stand-ins of the two libraries, found by the Python that runs ``peers.py``."""
+
+    @pytest.fixture(autouse=True)
+    def _libraries(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        folder = tmp_path / "pandora"
+        folder.mkdir()
+        (folder / "all.py").write_text(textwrap.dedent(PANDORA))
+        modules = {
+            "__init__": "from .all import both as run\ndef import_plugin(): pass",
+            "check_configuration": "from .all import check_conf",
+            "constants": "class Criteria:\n    "
+            + "; ".join(
+                f"PANDORA_MSK_PIXEL_{word} = {flag}"
+                for word, flag in (("INVALID", 1), ("FILLED_OCCLUSION", 2), ("FILLED_MISMATCH", 4))
+            ),
+            "img_tools": "from .all import create_dataset_from_inputs",
+            "state_machine": "class PandoraMachine:\n    calls = 0",
+        }
+        for name, text in modules.items():
+            (folder / f"{name}.py").write_text(text)
+        (tmp_path / "elas.py").write_text(textwrap.dedent(ELAS))
+        for name, version in (("pandora", "1.2"), ("pyelas", "3.4")):
+            described = tmp_path / f"{name}-{version}.dist-info"
+            described.mkdir()
+            (described / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+        monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+
+    def pair(self, disparity: int) -> Pair:
+        grey = np.rint(texture((80, 160), 1.0)).clip(0, 255).astype(np.uint8)
+        left, right = grey[:, 20:-20].copy(), grey[:, 20 + disparity : 140 + disparity].copy()
+        return measured("shift", left, right, Truth(np.full(left.shape, -disparity * 1.0), np.zeros(left.shape)))
+
+    def test_pandora(self) -> None:
+        method, version = methods.elsewhere("pandora", Path(sys.executable))
+        assert (method.name, version) == ("Pandora", "1.2")
+        pair = self.pair(7)
+        raw = method.run(pair)
+        result = method.read(raw, pair)
+        # the frame is two pixels wide, so that row 30 and columns 20 to 22 come two earlier
+        assert raw["disparity"].shape == pair.left.shape
+        assert np.flatnonzero(~result.matched[0]).tolist() == [18, 19, 20]
+        assert result.dense is not None
+        assert np.flatnonzero(np.isnan(result.dense[0][0])).tolist() == [18]
+        low, count = pair.range
+        assert raw["disparity"][28, :3].tolist() == [low + count - 1, -low, 2.0]
+        assert np.all(result.u[0][result.matched[0]] == -7.0)
+        wall, processor = method.told(raw) if method.told else (0.0, 0.0)
+        assert wall > 0
+        assert processor >= 0
+
+    @pytest.mark.parametrize("disparity", [7, -5])
+    def test_elas(self, disparity: int) -> None:
+        method, version = methods.elsewhere("elas", Path(sys.executable))
+        assert (method.name, version) == ("ELAS", "3.4")
+        pair = self.pair(disparity)
+        result = method(pair)
+        inner = np.s_[10:-10, 30:-30]
+        assert np.all(result.u[inner] == -disparity)
+        assert not result.rows
+        assert np.flatnonzero(~result.matched.all(axis=0)).tolist() == [20]
+        assert result.dense is not None
+        assert np.isfinite(result.dense[0]).all()
+
+    def test_time_is_what_the_program_tells(self) -> None:
+        told = iter([(2.0, 1.0), (4.0, 3.0)])
+        quick = methods.Method("quick", lambda pair: None, lambda raw, pair: found([[1.0]]), lambda raw: (0.5, 0.25))
+        slow = methods.Method("slow", lambda pair: None, lambda raw, pair: found([[1.0]]), lambda raw: next(told))
+        first, second = timing.timings(self.pair(7), [quick, slow], 2, 8.0)
+        assert (first["cpu_ratio"], second["cpu_ratio"], second["min_ratio"]) == (1.0, 4.0, 4.0)
+
+    def test_what_is_not_there_is_one_line(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.delenv("PYTHONPATH")
+        with pytest.raises(SystemExit, match=r"^ELAS, run by .*: .*PackageNotFoundError: .*pyelas$"):
+            methods.elsewhere("elas", Path(sys.executable))
+
+
+class TestRatios:
+    def found(self) -> list[dict[str, Any]]:
+        def one(pair: str, method: str, bad: float, own: float | None, cpu: float) -> dict[str, Any]:
+            rest = {"bad1": 2 * bad, "completeness": 0.8, "bad2_matched": bad / 4}
+            return {"pair": pair, "method": method, "bad2": bad, "bad2_own": own, "cpu_ratio": cpu, **rest}
+
+        return [
+            *(one("a", "first", 0.2, None, 1.0), one("a", "peer", 0.1, 0.3, 8.0), one("a", "HFVM x", 0.05, 0.1, 3.0)),
+            *(one("b", "first", 0.4, None, 1.0), one("b", "peer", 0.8, 0.4, 4.0), one("b", "HFVM x", 0.60, 0.2, 2.0)),
+        ]
+
+    def test_means_of_ratios(self) -> None:
+        first, peer, ours = ratios.means(self.found())
+        assert [row["method"] for row in (first, peer, ours)] == ["first", "peer", "HFVM x"]
+        # the best peers: 0.1 on a, 0.4 on b
+        assert (first["bad2"], first["bad2_own"], first["bad2_best"]) == pytest.approx((1.0, None, 1.5))
+        assert [peer[key] for key in ("bad1", "bad2", "bad2_own", "bad2_best")] == pytest.approx(
+            [1.25, 1.25, 1.25, 1.5]
+        )
+        assert [ours[key] for key in ("bad2", "bad2_own", "bad2_best", "time")] == pytest.approx([0.875, 0.5, 1.0, 2.5])
+        assert (ours["completeness"], ours["bad2_matched"]) == pytest.approx((0.8, 0.08125))
+
+    def test_picture(self, tmp_path: Path) -> None:
+        ratios.picture(ratios.means(self.found()), tmp_path / "new" / "peers.png")
+        image = cv2.imread(str(tmp_path / "new" / "peers.png"))
+        assert image is not None
+        assert min(image.shape[:2]) > 300
+
+    def test_every_matcher_is_judged_and_timed_on_every_pair(self) -> None:
+        shape = (20, 60)
+        pair = measured("p", *[np.zeros(shape, np.uint8)] * 2, parallel(np.full(shape, 9.0)))
+        right, wrong = (
+            methods.Method(name, lambda pair: None, lambda raw, pair, u=u: found(np.full(shape, u)), lambda raw: (1, 2))
+            for name, u in (("right", -9.0), ("wrong", -5.0))
+        )
+        figures = ratios.figures([pair, pair], [right, wrong], 2, lambda name: None)
+        assert [(f["method"], f["bad2"]) for f in figures] == [("right", 0.0), ("wrong", 1.0)] * 2
+        assert [f["cpu_ratio"] for f in figures] == [1.0] * 4
 
 
 class TestClaims:

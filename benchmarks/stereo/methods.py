@@ -1,14 +1,15 @@
-"""Matchers behind one interface: OpenCV's, Pandora's where installed, and HFVM in every preset."""
+"""Matchers behind one interface: OpenCV's, those in environments of their own, and HFVM in every preset."""
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 import json
-import logging
+import subprocess
 import tempfile
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, get_args
 
 import cv2
@@ -20,19 +21,35 @@ from .pairs import Pair
 
 BLOCK = 3
 CAP = 31
+BM_BLOCK = 15
+
+PEERS = {"pandora": "Pandora", "elas": "ELAS"}
+PROGRAM = Path(__file__).with_name("peers.py")
 
 
 @dataclass(frozen=True)
 class Method:
-    """A matcher; ``run`` is timed, ``read`` makes a :class:`Found` of what it gave."""
+    """A matcher; ``run`` is timed, ``read`` makes a :class:`Found` of what it gave.
+
+    ``told``: wall and processor seconds that a program elsewhere tells with its result.
+    """
 
     name: str
     run: Callable[[Pair], Any]
     read: Callable[[Any, Pair], Found]
+    told: Callable[[Any], tuple[float, float]] | None = None
 
     def __call__(self, pair: Pair) -> Found:
         """Match a pair."""
         return self.read(self.run(pair), pair)
+
+    def seconds(self, pair: Pair) -> tuple[float, float]:
+        """Wall and processor seconds of a run."""
+        start, start_cpu = time.perf_counter(), time.process_time()
+        raw = self.run(pair)
+        if self.told is not None:
+            return self.told(raw)
+        return time.perf_counter() - start, time.process_time() - start_cpu
 
 
 def set_threads(count: int) -> None:
@@ -47,7 +64,8 @@ def opencv() -> list[Method]:
     """Semi-global matching in three and eight directions, and block matching.
 
     Block 3, pre-filter 31, uniqueness 10 %, speckles of 100 pixels: of blocks 3, 5, 7, caps 31 and 63 and uniqueness
-    5 and 10 % the best on motorcycle and cones together.
+    5 and 10 % the best on motorcycle and cones together. Block matching of 15 x 15 pixels loses half a block of rows at
+    top and bottom, so its images get as many more.
     """
     smooth = {"P1": 8 * BLOCK**2, "P2": 32 * BLOCK**2}
     clean = {"disp12MaxDiff": 1, "uniquenessRatio": 10, "speckleWindowSize": 100, "speckleRange": 2}
@@ -62,12 +80,13 @@ def opencv() -> list[Method]:
 
     def block(pair: Pair) -> Any:
         low, count = pair.range
-        matcher = cv2.StereoBM_create(count, 15)
+        matcher = cv2.StereoBM_create(count, BM_BLOCK)
         matcher.setMinDisparity(low)
         matcher.setDisp12MaxDiff(clean["disp12MaxDiff"])
         matcher.setSpeckleWindowSize(clean["speckleWindowSize"])
         matcher.setSpeckleRange(clean["speckleRange"])
-        return matcher.compute(*_padded(pair))
+        rows = BM_BLOCK // 2
+        return matcher.compute(*_padded(pair, rows))[rows:-rows]
 
     return [
         Method("SGBM 3WAY", semiglobal(cv2.STEREO_SGBM_MODE_SGBM_3WAY), _read_opencv),
@@ -82,10 +101,9 @@ def _margins(pair: Pair) -> tuple[int, int]:
     return max(0, low + count), max(0, -low)
 
 
-def _padded(pair: Pair) -> tuple[NDArray[Any], NDArray[Any]]:
-    before, after = _margins(pair)
-    left, right = (cv2.copyMakeBorder(i, 0, 0, before, after, cv2.BORDER_REPLICATE) for i in (pair.left, pair.right))
-    return left, right
+def _padded(pair: Pair, rows: int = 0) -> list[NDArray[Any]]:
+    borders = rows, rows, *_margins(pair)
+    return [cv2.copyMakeBorder(i, *borders, cv2.BORDER_REPLICATE) for i in (pair.left, pair.right)]
 
 
 def _read_opencv(raw: Any, pair: Pair) -> Found:
@@ -96,60 +114,30 @@ def _read_opencv(raw: Any, pair: Pair) -> Found:
     return Found(np.where(good, -d, np.nan), np.where(good, 0.0, np.nan), good, rows=False)
 
 
-def pandora() -> list[Method]:
-    """Census and semi-global matching of CNES's Pandora, where it and its plugin libsgm are installed.
+def elsewhere(name: str, python: Path) -> tuple[Method, str]:
+    """Matcher of ``peers.py`` that this Python has in its environment, one process a call; and its version."""
 
-    Census 5 x 5, SGM with the default penalties, V-fit, median, accurate cross-check, median. Its own
-    interpolation is left out, since all are filled alike.
-    """
-    missing = [n for n in ("pandora", "pandora_plugin_libsgm") if importlib.util.find_spec(n) is None]
-    if missing:
-        print(f"Pandora is left out: {' and '.join(missing)} not installed (pip install 'pandora[sgm]')")
-        return []
-    return [Method("Pandora", _run_pandora, _read_pandora)]
+    def run(pair: Pair) -> Any:
+        with tempfile.TemporaryDirectory() as folder:
+            np.savez(f"{folder}/pair.npz", left=pair.left, right=pair.right, range=pair.range)
+            _ask(python, name, folder)
+            with np.load(f"{folder}/found.npz") as found:
+                return dict(found)
 
+    def read(raw: Any, pair: Pair) -> Found:
+        good, level = np.isfinite(raw["disparity"]), np.zeros(pair.left.shape)
+        return Found(-raw["disparity"], level, good, rows=False, dense=(-raw["filled"], level))
 
-PANDORA = {
-    "matching_cost": {"matching_cost_method": "census", "window_size": 5, "subpix": 1},
-    "optimization": {"optimization_method": "sgm"},
-    "disparity": {"disparity_method": "wta", "invalid_disparity": "NaN"},
-    "refinement": {"refinement_method": "vfit"},
-    "filter.before": {"filter_method": "median"},
-    "validation": {"validation_method": "cross_checking_accurate"},
-    "filter.after": {"filter_method": "median"},
-}
+    method = Method(PEERS[name], run, read, lambda raw: (float(raw["seconds"][0]), float(raw["seconds"][1])))
+    return method, _ask(python, name).strip()
 
 
-def _run_pandora(pair: Pair) -> Any:
-    import pandora
-    from pandora.check_configuration import check_conf
-    from pandora.img_tools import create_dataset_from_inputs
-    from pandora.state_machine import PandoraMachine
-
-    logging.getLogger("transitions").setLevel(logging.ERROR)
-    low, count = pair.range
-    high = low + count - 1
-    with tempfile.TemporaryDirectory() as folder:
-        inputs = {}
-        for side, image, limits in zip(("left", "right"), _padded(pair), ([-high, -low], [low, high]), strict=True):
-            path = f"{folder}/{side}.tif"
-            cv2.imwrite(path, image.astype(np.float32))
-            inputs[side] = {"img": path, "nodata": -9999, "disp": limits}
-        pandora.import_plugin()
-        machine = PandoraMachine()
-        configuration = check_conf({"input": inputs, "pipeline": PANDORA}, machine)
-        images = [create_dataset_from_inputs(configuration["input"][side]) for side in ("left", "right")]
-        return pandora.run(machine, *images, configuration)[0]
-
-
-def _read_pandora(raw: Any, pair: Pair) -> Found:
-    from pandora.constants import Criteria
-
-    before, _ = _margins(pair)
-    cut = np.s_[:, before : before + pair.left.shape[1]]
-    u = raw["disparity_map"].data[cut].astype(np.float64)
-    good = ((raw["validity_mask"].data[cut] & int(Criteria.PANDORA_MSK_PIXEL_INVALID)) == 0) & np.isfinite(u)
-    return Found(np.where(good, u, np.nan), np.where(good, 0.0, np.nan), good, rows=False)
+def _ask(python: Path, *words: str) -> str:
+    done = subprocess.run([python, PROGRAM, *words], capture_output=True, text=True, check=False)
+    if done.returncode:
+        said = done.stderr.strip().splitlines() or [f"ended with {done.returncode}"]
+        raise SystemExit(f"{PEERS[words[0]]}, run by {python}: {said[-1]}")
+    return done.stdout
 
 
 def hfvm(variants: list[str], threads: int) -> list[Method]:

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from .measures import Truth
 
 Grey = NDArray[np.uint8]
+CHOSEN = ("motorcycle", "Baby1", "Cloth1", "Lampshade1", "Midd1")
+JUDGED = ("cones", "Bowling1", "Monopoly", "Rocks1", "Wood1")
+"""Pairs that settings were chosen with, and pairs that had no part in it."""
 STEP = 16
 """OpenCV's matchers search a multiple of 16 disparities."""
 
@@ -100,6 +103,24 @@ def parallel(disparity: NDArray[np.float64]) -> Truth:
 
 def with_truth() -> list[Pair]:
     """The default pairs: motorcycle and cones (where RILLE_DATA has them), the first pair of the mockup."""
+    return [*_middlebury(), mockup()]
+
+
+def halves() -> dict[str, list[Pair]]:
+    """Middlebury's ten pairs: ``chosen`` and ``judged``."""
+    found = {pair.name: pair for pair in _middlebury()}
+    folder = _data("middlebury0506") or Path("-")
+    for name in (*CHOSEN, *JUDGED):
+        if (folder / name).is_dir():
+            files = [folder / name / f"{part}.png" for part in ("view1", "view5", "disp1")]
+            found[name] = measured(name, *(read_image(f) for f in files[:2]), read_truth(files[2], 3.0))
+    missing = [name for name in (*CHOSEN, *JUDGED) if name not in found]
+    if missing:
+        raise SystemExit(f"RILLE_DATA holds no {', '.join(missing)}")
+    return {half: [found[n] for n in names] for half, names in (("chosen", CHOSEN), ("judged", JUDGED))}
+
+
+def _middlebury() -> list[Pair]:
     found = []
     if (folder := _data("motorcycle")) is not None:
         files = [folder / f"motorcycle_{name}" for name in ("left.png", "right.png", "disp.npz")]
@@ -107,7 +128,7 @@ def with_truth() -> list[Pair]:
     if (folder := _data("cones")) is not None:
         files = [folder / f"cones_{name}.png" for name in ("image_02", "image_06", "disp_02")]
         found.append(measured("cones", *(read_image(f) for f in files[:2]), read_truth(files[2], 4.0)))
-    return [*found, mockup()]
+    return found
 
 
 def mockup() -> Pair:

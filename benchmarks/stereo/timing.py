@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable
 from statistics import median
 from typing import Any
@@ -18,20 +17,20 @@ def timings(pair: Pair, methods: Iterable[Method], repeats: int, budget: float) 
 
     ``min_ratio``: of the least times; ``median_ratio``: median of the rounds' own ratios; ``cpu_ratio``: of the least
     processor times (all threads added up), which other programs disturb least. One untimed round compiles and warms
-    up. A method that has used up ``budget`` seconds stops after three rounds, or after one that alone took twice that.
+    up; programs elsewhere do that themselves. A method that has used up ``budget`` seconds stops after three rounds,
+    or after one that alone took twice that.
     """
     methods = list(methods)
     for method in methods:
-        method.run(pair)
+        if method.told is None:
+            method.run(pair)
     taken: dict[str, list[tuple[float, float]]] = {m.name: [] for m in methods}
     for _ in range(repeats):
         for method in methods:
             mine = taken[method.name]
             if _enough([wall for wall, _ in mine], budget):
                 continue
-            start, start_cpu = time.perf_counter(), time.process_time()
-            method.run(pair)
-            mine.append((time.perf_counter() - start, time.process_time() - start_cpu))
+            mine.append(method.seconds(pair))
     first = taken[methods[0].name]
     first_wall, first_cpu = (min(t[i] for t in first) for i in (0, 1))
     return [
