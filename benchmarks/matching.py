@@ -153,8 +153,8 @@ def peers(methods: list[Any], rounds: int, picture: Path | None) -> list[dict[st
         mine = ratios.figures(pairs, methods, rounds, lambda name: say(f"peers: {name}"))
         means = ratios.means(mine)
         table(
-            f"{half} half ({', '.join(p.name for p in pairs)}): means; of bad-1, bad-2 and time of the ratios to "
-            f"{methods[0].name}, time: median",
+            f"{half} half ({', '.join(p.name for p in pairs)}): means over the pairs, of time the median; bad-1, "
+            f"filled bad-2 and time as ratios to {methods[0].name}",
             ["method", *(words for _, words in PEERS)],
             [[m["method"], *(m[key] for key, _ in PEERS)] for m in means],
         )
@@ -267,7 +267,7 @@ def chosen_methods(given: argparse.Namespace) -> list[Any]:
             print(f"{words} is left out: --{name} PYTHON is not given")
         else:
             method, version = methods.elsewhere(name, python)
-            print(f"{words} {version}")
+            print(f"{words}: {version}")
             found.append(method)
     found += methods.hfvm(given.hfvm, given.threads)
     names = [n.strip() for n in given.methods.split(",")] if given.methods else [""]

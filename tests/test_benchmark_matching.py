@@ -309,7 +309,7 @@ class TestPeersElsewhere:
 
     def test_pandora(self) -> None:
         method, version = methods.elsewhere("pandora", Path(sys.executable))
-        assert (method.name, version) == ("Pandora", "1.2")
+        assert (method.name, version) == ("Pandora", "pandora 1.2")
         pair = self.pair(7)
         raw = method.run(pair)
         result = method.read(raw, pair)
@@ -328,7 +328,7 @@ class TestPeersElsewhere:
     @pytest.mark.parametrize("disparity", [7, -5])
     def test_elas(self, disparity: int) -> None:
         method, version = methods.elsewhere("elas", Path(sys.executable))
-        assert (method.name, version) == ("ELAS", "3.4")
+        assert (method.name, version) == ("ELAS", "pyelas 3.4")
         pair = self.pair(disparity)
         result = method(pair)
         inner = np.s_[10:-10, 30:-30]

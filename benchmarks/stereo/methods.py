@@ -115,7 +115,7 @@ def _read_opencv(raw: Any, pair: Pair) -> Found:
 
 
 def elsewhere(name: str, python: Path) -> tuple[Method, str]:
-    """Matcher of ``peers.py`` that this Python has in its environment, one process a call; and its version."""
+    """Matcher of ``peers.py`` that this Python has in its environment, one process a call; and its distribution."""
 
     def run(pair: Pair) -> Any:
         with tempfile.TemporaryDirectory() as folder:

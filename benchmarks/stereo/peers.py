@@ -1,6 +1,6 @@
 """Matchers in environments of their own; this file is the program that their Python runs, and needs NumPy alone.
 
-    PYTHON peers.py pandora|elas            prints the version
+    PYTHON peers.py pandora|elas            prints name and version of the distribution
     PYTHON peers.py pandora|elas FOLDER     matches FOLDER/pair.npz, writes FOLDER/found.npz
 
 ``pair.npz``: grey images ``left`` and ``right`` (row, col), uint8; ``range``: least disparity, left minus right, and
@@ -122,7 +122,7 @@ def main(name: str, folder: str | None = None) -> None:
     """Match the pair in the folder, or tell the version."""
     matcher, distribution = MATCHERS[name]
     if folder is None:
-        print(version(distribution))
+        print(f"{distribution} {version(distribution)}")
         return
     with np.load(f"{folder}/pair.npz") as pair:
         low, count = map(int, pair["range"])
