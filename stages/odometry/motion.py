@@ -99,6 +99,7 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     a, b = a.above(level), b.above(level)
     hp = HfvmParams(
         band=0.0,
+        depth_edges=False,
         # At a coarse level no level is finest: all have the same rounds. At level 0 the matcher's own figures hold.
         fine_rounds=None if level else HfvmParams().fine_rounds,
         back_rounds=params.rounds if level else HfvmParams().back_rounds,

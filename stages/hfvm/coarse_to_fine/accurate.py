@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rille.stages.core.declare import AnyArray
-from rille.stages.hfvm.coarse_to_fine import compact, paths
+from rille.stages.hfvm.coarse_to_fine import paths
 from rille.stages.hfvm.coarse_to_fine.hierarchy import Band, FastSolver, Fine, Map, Solver, solver
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import Patch
@@ -59,5 +59,4 @@ def choose(params: HfvmParams) -> Solver:
 
 
 def _view(patch: Patch) -> paths.LevelView:
-    assert patch.grey is not None
-    return paths.LevelView(patch.words, compact.pack(patch.grey), np.ascontiguousarray(patch.grey))
+    return paths.LevelView(patch.words, patch.compact, patch.grey)

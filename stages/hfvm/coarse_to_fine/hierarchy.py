@@ -35,7 +35,16 @@ from rille.stages.hfvm.images.window import (
     tiles,
     whole,
 )
-from rille.stages.hfvm.level import consistency, epipolar, paper, propagation, search, subpixel, subpixel_lut
+from rille.stages.hfvm.level import (
+    consistency,
+    depth_edges,
+    epipolar,
+    paper,
+    propagation,
+    search,
+    subpixel,
+    subpixel_lut,
+)
 from rille.stages.hfvm.level.simd import SUM_RADIUS
 from rille.stages.imaging.pyramid import Pyramid
 
@@ -345,15 +354,20 @@ def level_tile(pair: Prepared, level: int, window: Window, above: State | None) 
     p, rounds, (shape, other) = pair.params, pair.solver.rounds(level), pair.shapes(level)
     # Two pixels for each round, half a median, and for the parents' neighbours a coarse pixel, two pixels wide.
     reach = 2 * rounds + p.median // 2 + 2
+    edges = level == 0 and p.depth_edges
+    if edges:
+        # Displacements are tried from so far away, and compared at windows whose features reach a pixel farther.
+        reach += depth_edges.REACH + depth_edges.RADIUS + 1
     # Even borders: the four pixels of a parent are searched together.
     outer = window.grow(reach, reach, shape).align(2, shape)
-    a = pair.left.patch(level, outer)
+    a = pair.left.patch(level, outer, deviation=edges)
     if above is None:
-        found = pair.solver.match(level, a, pair.right.patch(level, whole(other)), (shape, other), None, FREE)
+        b, up, band = pair.right.patch(level, whole(other)), None, FREE
     else:
-        up = hand_down(above, outer.parent(), p)
+        up, band = hand_down(above, outer.parent(), p), above.band
         # A centre is moved by a pixel at most, searched around, and changed by one in each half round.
-        x, y = p.search_columns + 1 + 2 * rounds, p.search_rows + 1 + 2 * rounds
+        change = 1 + 2 * rounds + (depth_edges.RADIUS + 1 if edges else 0)
+        x, y = p.search_columns + change, p.search_rows + change
         target = bounded(
             outer.y0 + 2 * int(np.min(up.v)) - y,
             outer.y1 + 2 * int(np.max(up.v)) + y,
@@ -361,11 +375,18 @@ def level_tile(pair: Prepared, level: int, window: Window, above: State | None) 
             outer.x1 + 2 * int(np.max(up.u)) + x,
             other,
         )
-        found = pair.solver.match(level, a, pair.right.patch(level, target), (shape, other), up, above.band)
-    inner = window.inside(outer)
+        b = pair.right.patch(level, target)
+    found = pair.solver.match(level, a, b, (shape, other), up, band)
     # Before the check of consistency, which asks one pixel of the other map: an outlier there refutes a match.
-    u, v = (consistency.median(np.asarray(plane), p.median)[inner] for plane in (found.u, found.v))
-    return {"u": u, "v": v, "undefined": np.asarray(found.undefined)[inner]}
+    u, v = (consistency.median(np.asarray(plane), p.median) for plane in (found.u, found.v))
+    if edges:
+        assert a.deviation is not None
+        left, right = (depth_edges.EdgeView(patch.compact, patch.grey) for patch in (a, b))
+        wanted = (a.deviation >= p.texture) & (pair.left.view.valid(level, a.window) != 0)
+        u, v = depth_edges.place(left, right, (u, v), wanted, offset(a, b))
+    arrays = {"u": u, "v": v, "undefined": np.asarray(found.undefined)}
+    inner = window.inside(outer)
+    return {name: array[inner] for name, array in arrays.items()}
 
 
 def consistent(pair: Prepared, level: int, a: Map, b: Map, window: Window) -> NDArray[np.bool_]:

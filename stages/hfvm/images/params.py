@@ -21,6 +21,7 @@ PAPER: Mapping[str, Any] = {
     "denoise_from": 1e6,
     "speckle": 1,
     "fill_reach": 100000,
+    "depth_edges": False,
     "refine": False,
 }
 """What preset ``paper`` sets differently; a value given by the user wins. Preset-only machinery ignores the rest."""
@@ -136,6 +137,11 @@ class HfvmParams(Params):
         le=32,
         description="limit of the propagation rounds from right to left at the finest level; that direction serves "
         "the consistency check only",
+    )
+    depth_edges: bool = Field(
+        default=True,
+        description="near a depth edge let pixels choose anew, by small windows, between the displacements on both "
+        "sides of it; false: a foreground reaches a few pixels beyond its outline",
     )
     centres: int = Field(
         default=5,

@@ -13,7 +13,8 @@ from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm.images import denoise, plane
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.window import Raster, Shape, Window, cut, tiles, whole
-from rille.stages.hfvm.level import features, paper
+from rille.stages.hfvm.level import compact, features, paper
+from rille.stages.hfvm.level.features import Words
 from rille.stages.hfvm.level.window_pair import WindowPair
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid
@@ -267,8 +268,14 @@ class Patch:
 
     window: Window
     words: AnyArray
-    grey: AnyArray | None
+    grey: AnyArray
     deviation: AnyArray | None
+
+    @cached_property
+    def compact(self) -> Words:
+        """Compact features; outside of the window its edge is repeated, so that the outermost ones are those of the
+        image only at the image's own border."""
+        return compact.pack(self.grey)
 
 
 @dataclass(frozen=True)
@@ -292,19 +299,19 @@ class Seen:
         """In strips of rows where not the whole is held: their room is small beside the features."""
         if self.held is not None or window.shape[0] <= STRIP:
             words, local, grey = self._strip(level, window)
-            # Only propagation along paths needs grey values, and it is done whole.
-            return Patch(window, words, grey if self.held is not None else None, local)
+            return Patch(window, words, grey, local)
         parts = [Window(y, min(y + STRIP, window.y1), window.x0, window.x1) for y in range(window.y0, window.y1, STRIP)]
         first = self._strip(level, parts[0])
         words = np.empty((window.shape[0], *first[0].shape[1:]), first[0].dtype)
         room = np.empty(window.shape, np.float32) if deviation else None
+        grey = np.empty(window.shape, np.float32)
         for part in parts:
-            some, local, _ = first if part is parts[0] else self._strip(level, part)
+            some, local, image = first if part is parts[0] else self._strip(level, part)
             rows = slice(part.y0 - window.y0, part.y1 - window.y0)
-            words[rows] = some
+            words[rows], grey[rows] = some, image
             if room is not None:
                 room[rows] = local
-        return Patch(window, words, None, room)
+        return Patch(window, words, grey, room)
 
     def _strip(self, level: int, window: Window) -> tuple[AnyArray, AnyArray, AnyArray]:
         # Features repeat the edge of what they are given: that may be the image's, but not a window's.
@@ -315,4 +322,5 @@ class Seen:
             planes = features.planes(grey)[(slice(None), *inner)]
             return paper.weighted(planes, self.params.weights), planes[6], grey[inner]
         words, deviation = features.pack(grey, self.params.weights)
-        return np.ascontiguousarray(words[inner]), np.ascontiguousarray(deviation[inner]), grey[inner]
+        words, deviation, grey = (np.ascontiguousarray(a[inner]) for a in (words, deviation, grey))
+        return words, deviation, grey

@@ -1,0 +1,104 @@
+"""Placement of depth edges: the kernel against its equation, and an outline that features had put too far out."""
+
+import numpy as np
+import pytest
+
+from rille.stages.hfvm.level import compact, depth_edges
+from rille.stages.hfvm.level.depth_edges import AROUND, BETTER, FAR, GREY, RADIUS, REACH, EdgeView, place
+
+ROWS, COLS = 40, 60
+
+
+def view(image):
+    return EdgeView(compact.pack(image), image)
+
+
+def by_the_equation(left, right, u, v, wanted, at):
+    """C(d) of every candidate, pixel by pixel."""
+    out = u.copy(), v.copy()
+    rows, cols = u.shape
+    a, b = (side.compact.view(np.uint8).reshape(*side.compact.shape, 8).astype(int) for side in (left, right))
+    grey = np.rint(left.grey).astype(int)
+    offsets = np.arange(-RADIUS, RADIUS + 1)
+    for y in range(REACH, rows - REACH):
+        for x in range(REACH, cols - REACH):
+            tried = [(int(u[y, x]), int(v[y, x]))]
+            for j, i in AROUND:
+                one = int(u[y + j, x + i]), int(v[y + j, x + i])
+                if all(max(abs(one[0] - p), abs(one[1] - q)) >= depth_edges.APART for p, q in tried):
+                    tried.append(one)
+            if len(tried) == 1 or not wanted[y, x]:
+                continue
+            costs = []
+            for du, dv in tried:
+                q, p = y + at[1] + dv + offsets[:, None], x + at[0] + du + offsets
+                if q.min() < 0 or p.min() < 0 or q.max() >= b.shape[0] or p.max() >= b.shape[1]:
+                    costs.append(None)
+                    continue
+                window = np.ix_(y + offsets, x + offsets)
+                weight = np.maximum(GREY - abs(grey[window] - grey[y, x]), 0)
+                costs.append(int((weight * np.minimum(abs(a[window] - b[q, p]).sum(axis=-1), FAR)).sum()))
+            if costs[0] is None:
+                continue
+            chosen, best = 0, BETTER[0] * costs[0]
+            for k, cost in enumerate(costs[1:], 1):
+                if cost is not None and BETTER[1] * cost < best:
+                    chosen, best = k, BETTER[1] * cost
+            out[0][y, x], out[1][y, x] = tried[chosen]
+    return out
+
+
+@pytest.mark.parametrize("at", [(0, 0), (7, -2)])
+def test_kernel_and_equation_agree(at):
+    rng = np.random.default_rng(1)
+    scene = rng.uniform(0, 60, (ROWS + 20, COLS + 20)).astype(np.float32)
+    left, right = (
+        scene[4 : 4 + ROWS, 8 : 8 + COLS],
+        scene[: ROWS + 9, : COLS + 4] + rng.normal(0, 1, (ROWS + 9, COLS + 4)),
+    )
+    left, right = np.ascontiguousarray(left), right.astype(np.float32)
+    u = (
+        np.repeat(rng.choice([2 - at[0], 5 - at[0], 8 - at[0]], (ROWS // 4, COLS // 4)), 4, axis=0)
+        .repeat(4, axis=1)
+        .astype(np.int16)
+    )
+    v = rng.integers(4 - at[1], 7 - at[1], (ROWS, COLS)).astype(np.int16)
+    wanted = rng.random((ROWS, COLS)) < 0.9
+    found = place(view(left), view(right), (u, v), wanted, at)
+    expected = by_the_equation(view(left), view(right), u, v, wanted, at)
+    np.testing.assert_array_equal(found[0], expected[0])
+    np.testing.assert_array_equal(found[1], expected[1])
+    assert (found[0] != u).any(), "something was decided anew"
+
+
+def pair(near=-9, far=-2):
+    """A textured square before a textured wall: left and right image, and the true columns of displacement."""
+    rng = np.random.default_rng(2)
+    wall = (60 + 30 * rng.random((ROWS, COLS + 20))).astype(np.float32)
+    square = (150 + 60 * rng.random((16, 20))).astype(np.float32)
+    left, right = wall[:, :COLS].copy(), wall[:, -far : COLS - far].copy()
+    truth = np.full((ROWS, COLS), far, np.int16)
+    left[12:28, 24:44], right[12:28, 24 + near : 44 + near] = square, square
+    truth[12:28, 24:44] = near
+    return left, right, truth
+
+
+def test_an_outline_that_was_too_wide_is_put_in_its_place():
+    left, right, truth = pair()
+    wide = truth.copy()
+    wide[9:31, 21:47] = truth[15, 30]
+    nothing = np.zeros_like(truth)
+    found, rows = place(view(left), view(right), (wide, nothing), np.ones(truth.shape, bool), (0, 0))
+    # Beside the square's left side the right image hides the wall, so that there is no evidence for it.
+    seen = np.ones(truth.shape, bool)
+    seen[12:28, 24 - 7 : 24] = False
+    assert np.mean((wide != truth)[seen]) > 0.08
+    assert np.mean((found != truth)[seen]) < 0.005
+    assert not rows.any()
+
+
+def test_without_evidence_nothing_changes():
+    _, _, truth = pair()
+    flat = view(np.full(truth.shape, 90, np.float32))
+    found = place(flat, flat, (truth, np.zeros_like(truth)), np.ones(truth.shape, bool), (0, 0))
+    np.testing.assert_array_equal(found[0], truth)
