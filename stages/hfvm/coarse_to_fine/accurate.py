@@ -12,6 +12,7 @@ from rille.stages.hfvm.coarse_to_fine.hierarchy import Band, FastSolver, Fine, M
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import Patch
 from rille.stages.hfvm.images.window import Shape
+from rille.stages.hfvm.level import compact
 
 
 @dataclass(frozen=True)
@@ -59,4 +60,4 @@ def choose(params: HfvmParams) -> Solver:
 
 
 def _view(patch: Patch) -> paths.LevelView:
-    return paths.LevelView(patch.words, patch.compact, patch.grey)
+    return paths.LevelView(patch.words, compact.pack(patch.grey), patch.grey)

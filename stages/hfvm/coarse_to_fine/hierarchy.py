@@ -36,6 +36,7 @@ from rille.stages.hfvm.images.window import (
     whole,
 )
 from rille.stages.hfvm.level import (
+    compact,
     consistency,
     depth_edges,
     epipolar,
@@ -381,7 +382,7 @@ def level_tile(pair: Prepared, level: int, window: Window, above: State | None) 
     u, v = (consistency.median(np.asarray(plane), p.median) for plane in (found.u, found.v))
     if edges:
         assert a.deviation is not None
-        left, right = (depth_edges.EdgeView(patch.compact, patch.grey) for patch in (a, b))
+        left, right = (depth_edges.EdgeView(compact.pack(patch.grey), patch.grey) for patch in (a, b))
         wanted = (a.deviation >= p.texture) & (pair.left.view.valid(level, a.window) != 0)
         u, v = depth_edges.place(left, right, (u, v), wanted, offset(a, b))
     arrays = {"u": u, "v": v, "undefined": np.asarray(found.undefined)}

@@ -13,8 +13,7 @@ from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm.images import denoise, plane
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.window import Raster, Shape, Window, cut, tiles, whole
-from rille.stages.hfvm.level import compact, features, paper
-from rille.stages.hfvm.level.features import Words
+from rille.stages.hfvm.level import features, paper
 from rille.stages.hfvm.level.window_pair import WindowPair
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid
@@ -270,12 +269,6 @@ class Patch:
     words: AnyArray
     grey: AnyArray
     deviation: AnyArray | None
-
-    @cached_property
-    def compact(self) -> Words:
-        """Compact features; outside of the window its edge is repeated, so that the outermost ones are those of the
-        image only at the image's own border."""
-        return compact.pack(self.grey)
 
 
 @dataclass(frozen=True)
