@@ -70,6 +70,7 @@ class Compiling:
         if not self.pending:
             self.since = time.perf_counter()
             self.usual = gc.get_threshold()
+            # Numba makes millions of objects that live until the kernel is done: a ninth of its time went into them.
             gc.set_threshold(*SELDOM)
         self.pending.add(key)
         _lock(key)

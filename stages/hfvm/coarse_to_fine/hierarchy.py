@@ -357,8 +357,7 @@ def level_tile(pair: Prepared, level: int, window: Window, above: State | None) 
     reach = 2 * rounds + p.median // 2 + 2
     edges = level == 0 and p.depth_edges
     if edges:
-        # Displacements are tried from so far away, and compared at windows whose features reach a pixel farther.
-        reach += depth_edges.REACH + depth_edges.RADIUS + 1
+        reach += depth_edges.REACH + depth_edges.READ
     # Even borders: the four pixels of a parent are searched together.
     outer = window.grow(reach, reach, shape).align(2, shape)
     a = pair.left.patch(level, outer, deviation=edges)
@@ -367,7 +366,7 @@ def level_tile(pair: Prepared, level: int, window: Window, above: State | None) 
     else:
         up, band = hand_down(above, outer.parent(), p), above.band
         # A centre is moved by a pixel at most, searched around, and changed by one in each half round.
-        change = 1 + 2 * rounds + (depth_edges.RADIUS + 1 if edges else 0)
+        change = 1 + 2 * rounds + (depth_edges.READ if edges else 0)
         x, y = p.search_columns + change, p.search_rows + change
         target = bounded(
             outer.y0 + 2 * int(np.min(up.v)) - y,
@@ -381,13 +380,18 @@ def level_tile(pair: Prepared, level: int, window: Window, above: State | None) 
     # Before the check of consistency, which asks one pixel of the other map: an outlier there refutes a match.
     u, v = (consistency.median(np.asarray(plane), p.median) for plane in (found.u, found.v))
     if edges:
-        assert a.deviation is not None
-        left, right = (depth_edges.EdgeView(compact.pack(patch.grey), patch.grey) for patch in (a, b))
-        wanted = (a.deviation >= p.texture) & (pair.left.view.valid(level, a.window) != 0)
-        u, v = depth_edges.place(left, right, (u, v), wanted, offset(a, b))
+        u, v = _edges_placed(pair, a, b, (u, v))
     arrays = {"u": u, "v": v, "undefined": np.asarray(found.undefined)}
     inner = window.inside(outer)
     return {name: array[inner] for name, array in arrays.items()}
+
+
+def _edges_placed(pair: Prepared, a: Patch, b: Patch, given: tuple[AnyArray, AnyArray]) -> tuple[AnyArray, AnyArray]:
+    """Displacements of a left window of the finest level, depth edges placed anew where there is texture."""
+    assert a.deviation is not None
+    left, right = (depth_edges.EdgeView(compact.pack(patch.grey), patch.grey) for patch in (a, b))
+    wanted = (a.deviation >= pair.params.texture) & (pair.left.view.valid(0, a.window) != 0)
+    return depth_edges.place(left, right, given, wanted, offset(a, b))
 
 
 def consistent(pair: Prepared, level: int, a: Map, b: Map, window: Window) -> NDArray[np.bool_]:

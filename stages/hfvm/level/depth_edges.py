@@ -35,6 +35,9 @@ RADIUS = 3
 SIDE = 2 * RADIUS + 1
 """Side of the window, pixels."""
 
+READ = RADIUS + 1
+"""Pixels around one that are read in either image: compact features reach one farther than the window."""
+
 APART = 4
 """Pixels by which displacements differ at a depth edge, along columns or rows. With 2 the errors among the matched
 were 6 % fewer still, and the time spent here doubled: slopes count then, too."""
@@ -70,8 +73,8 @@ def place(
     Parameters
     ----------
     given : (row, col) int16 columns and rows of displacement.
-    wanted : (row, col) bool, the pixels that may change; those nearer than :data:`RADIUS` to an edge of either image
-        stay, and so do those whose own displacement leads there.
+    wanted : (row, col) bool, the pixels that may change; those nearer than :data:`REACH` to an edge of the left window
+        stay, and those that their own displacement leads nearer than :data:`RADIUS` to one of the right window.
     at : column and row of the left window's first pixel in the right one.
     """
     out = given[0].copy(), given[1].copy()
