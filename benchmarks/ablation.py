@@ -21,9 +21,7 @@ STEPS = (
     ("no compact features in it", "path_compact=0"),
     ("no variational refinement", "variational_steps=0"),
     ("7 steps of it", "variational_steps=7"),
-    ("uncertain matches kept", "greatest_std=null"),
     ("lonely matches kept", "min_support=0"),
-    ("both kept", "greatest_std=null min_support=0"),
     ("no guided filling", "guided_fill=false"),
     ("two rounds at the finest level", "fine_rounds=2 back_rounds=2"),
 )

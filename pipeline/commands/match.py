@@ -102,11 +102,11 @@ def match_files(
 
 def warnings(found: Disparity, left: NDArray[Any], right: NDArray[Any]) -> list[str]:
     """List signs that two matched images do not fit, one line each with its figure."""
-    from rille.stages.core.validity import Validity, has, matched
+    from rille.stages.core.validity import Validity, has, matched_back
     from rille.stages.hfvm import doubt
     from rille.stages.hfvm.swap_check import swapped
 
-    ok = matched(found.validity)
+    ok = matched_back(found.validity, found.backmatch_error)
     share = float(ok.mean())
     if share < FEW:
         reasons = (

@@ -37,14 +37,13 @@ So many points because models that are half as wrong show half as small an error
 
 AND_THEN: tuple[tuple[str, str, Any, dict[str, Any]], ...] = (
     ("hfvm", "preset", "accurate", {"locus": {"refined_share": 0.5}}),
-    ("locus", "both", True, {"hfvm": {"greatest_std": 100.0}, "locus": {"max_jump": 5.0}}),
+    ("locus", "both", True, {"locus": {"max_jump": 5.0}}),
 )
 """The same, where this value of that section's key has not been overruled.
 
 With an accurate matcher the mean of what the disparity says and of what the images show is better than either. With
-both directions a cell's own standard deviation tells good from bad better than the matcher's limits do, so they leave
-it more to choose from: no greatest standard deviation of a match, and disparities may jump by 5 pixels (beyond that
-nothing is gained).
+both directions a cell's own standard deviation tells good from bad, so it is left more to choose from: disparities may
+jump by 5 pixels (beyond that nothing is gained).
 """
 
 

@@ -22,7 +22,7 @@ from rille.stages.calibration.relative_orientation import LEAST_MATCHES, RIG, Po
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Stage
 from rille.stages.core.errors import InputError
-from rille.stages.core.validity import matched
+from rille.stages.core.validity import matched_back
 from rille.stages.geometry.epipolar import corrected, distances
 from rille.stages.geometry.geometry import Rig
 
@@ -138,7 +138,8 @@ def _run(params: OrientationParams, args: Mapping[str, Any], inputs: Inputs) -> 
         raise InputError(
             "RIL-402", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
         )
-    usable = matched(np.asarray(disparity["validity"]))
+    # On planes of textureless regions row displacements were set, not measured.
+    usable = matched_back(np.asarray(disparity["validity"]), np.asarray(disparity["backmatch_error"]))
     if usable.shape != (rig.left.height, rig.left.width):
         raise InputError(
             "RIL-403",

@@ -43,6 +43,11 @@ def matched(validity: Mask) -> NDArray[np.bool_]:
     return has(validity, Validity.MATCHED)
 
 
+def matched_back(validity: Mask, backmatch_error: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Pixels with a measured disparity of their own, not that of the plane of a textureless region."""
+    return np.asarray(matched(validity) & np.isfinite(backmatch_error))
+
+
 def defined(validity: Mask) -> NDArray[np.bool_]:
     """Pixels with a disparity, interpolated ones included."""
     return has(validity, Validity.MATCHED | Validity.INTERPOLATED)

@@ -40,11 +40,12 @@ class Disparity:
 
     All arrays are (row, col) of the left image. ``column_disparity, row_disparity``: float32 pixels, NaN undefined;
     interpolated ones included. ``validity``: bits of :class:`~rille.stages.core.validity.Validity`.
-    ``backmatch_error``: float32 pixels, NaN where the match leaves the right image. ``distance``: float32 mean feature
-    distance at the whole-pixel match (byte steps; preset ``paper``: Eq. 1, grey levels), NaN where back-matching failed
-    by far. ``disparity_std``:
-    float32 pixels, standard deviation of the column disparity (see :mod:`~rille.stages.hfvm.finish.uncertainty`), NaN
-    where not ``MATCHED``. ``aligned``: whether the right image was pre-aligned by a plane.
+    ``backmatch_error``: float32 pixels, NaN where the match leaves the right image, and on the planes of textureless
+    regions (:mod:`~rille.stages.hfvm.finish.textureless`). ``distance``: float32 mean feature distance at the
+    whole-pixel match (byte steps; preset ``paper``: Eq. 1, grey levels), NaN on such planes and where back-matching
+    failed by far. ``disparity_std``: float32 pixels, standard deviation of the column disparity (see
+    :mod:`~rille.stages.hfvm.finish.uncertainty`), NaN where not ``MATCHED``. ``aligned``: whether the right image was
+    pre-aligned by a plane.
     """
 
     column_disparity: Map

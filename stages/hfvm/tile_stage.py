@@ -18,6 +18,7 @@ from rille.stages.core.errors import InputError
 from rille.stages.hfvm import tiled
 from rille.stages.hfvm.coarse_to_fine import hierarchy
 from rille.stages.hfvm.coarse_to_fine.hierarchy import Band, Map, Prepared, State
+from rille.stages.hfvm.finish import textureless
 from rille.stages.hfvm.finish.finish import Finish
 from rille.stages.hfvm.images import brightness
 from rille.stages.hfvm.images.params import HfvmParams
@@ -138,7 +139,7 @@ class TileInputs:
     def finish(self) -> Finish:
         """Steps of the finest level."""
         facts = self.inputs["band"].meta if "band" in self.inputs else self.facts
-        known = self.alignment, facts["near_sign"], self.facts["contrast"], band(facts)
+        known = self.alignment, facts["near_sign"], self.facts["contrast"]
         return Finish(self.pair(), self.right, self.params, *known)
 
     def window(self, shape: Shape) -> Window | None:
@@ -249,8 +250,22 @@ def _refine(task: TileInputs) -> Bundle:
 
 def _patches(task: TileInputs) -> Bundle:
     steps = task.finish()
-    refined = task.rasters("refined", ("validity",), steps.shape)
-    return Bundle({"gone": steps.patches(task.map("left_map", steps.shape), refined)}, {})
+    refined = task.rasters("refined", ("u", "v", "validity"), steps.shape)
+    gone = steps.patches(task.map("left_map", steps.shape), refined)
+    planes = steps.planes(refined, gone)
+    if planes is None:
+        return Bundle({"gone": gone}, {"planes": None})
+    meta = {"planes": {"terms": planes.terms, "f": planes.lines.f.tolist()}}
+    return Bundle({"gone": gone, "region": planes.region}, meta)
+
+
+def _planes(patches: Bundle, shape: Shape) -> textureless.Planes | None:
+    """What step ``patches`` found in a left image of ``shape``."""
+    told = patches.meta["planes"]
+    if told is None:
+        return None
+    lines = textureless.Lines.of(np.array(told["f"]), shape)
+    return textureless.Planes(np.asarray(patches["region"]), told["terms"], lines)
 
 
 def _final(task: TileInputs) -> Bundle:
@@ -263,6 +278,7 @@ def _final(task: TileInputs) -> Bundle:
         task.rasters("checked", ("error",), shape),
         task.rasters("refined", ("u", "v", "validity", "noise"), shape),
         task.inputs["patches"].raster("gone"),
+        _planes(task.inputs["patches"], shape),
     )
     if task.half:
         left, right = (task.inputs[port].raster("level_0").shape for port in ("left", "right"))
@@ -309,6 +325,7 @@ _PARTS = (
     Array("error", _GRID, "float32", "px", "error of matching there and back", optional=True),
     Array("noise", _GRID, "float32", "px", "variance by noise, squared pixels", optional=True),
     Array("gone", _GRID, "uint8", "1", "1 = in an isolated patch", optional=True),
+    Array("region", _GRID, "uint8", "1", "number of the textureless region, at half the resolution", optional=True),
 )
 _OPTIONAL = tuple(
     Array(a.name, a.dims, a.dtype, a.unit, a.long_name, a.nodata, a.frame, True)

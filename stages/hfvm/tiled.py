@@ -4,7 +4,7 @@
 ::
 
     coarse (levels down to plane_level, pre-alignment) -> level (each finer one, both ways; band between them)
-      -> fine, back -> check -> refine -> patches -> final
+      -> fine, back -> check -> refine -> patches, planes -> final
 
 Tiles are matched in any order and of any size with the same result, bit for bit; whole images are one tile.
 """
@@ -198,13 +198,10 @@ def match(
     b = brightness.levelled(b, begun.ratio)
     pair = prepare(a, begun.aligned or b, params, side)
     state = begun.state
-    band = state.band
     for level in range(state.level - 1, -1, -1):
-        # The finest level has none: filling follows that of the level above.
-        band = state.band
         tell(COARSE_SHARE + (FINE_SHARE - COARSE_SHARE) * 0.25 ** (level + 1), f"level {level}")
         state = hierarchy.run(pair, params, level, state)
-    steps = Finish(pair, b, params, begun.alignment, state.near_sign, begun.contrast, band)
+    steps = Finish(pair, b, params, begun.alignment, state.near_sign, begun.contrast)
     return Found(_finish(steps, state, side, order, tell), begun.alignment is not None)
 
 
@@ -221,7 +218,8 @@ def _finish(steps: Finish, state: State, side: int | None, order: Order, tell: T
     refined = over(shape, 0.5, "refinement", lambda w: steps.refine(w, checked))
     tell(FINE_SHARE + (1.0 - FINE_SHARE) * 0.85, "filling")
     gone = steps.patches(state.left, refined)
-    return over(shape, 0.9, "filling", lambda w: steps.final(w, fine, checked, refined, gone))
+    planes = steps.planes(refined, gone)
+    return over(shape, 0.9, "filling", lambda w: steps.final(w, fine, checked, refined, gone, planes))
 
 
 def _enlarged(

@@ -22,7 +22,7 @@ from pydantic import Field
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import DegenerateError, InputError
-from rille.stages.core.validity import matched
+from rille.stages.core.validity import matched_back
 from rille.stages.geometry.epipolar import exchanged, fits, inverse_depth
 from rille.stages.geometry.geometry import Rig, RigidTransform, level_rotation
 from rille.stages.geometry.pose_arrays import NO_VERTICAL
@@ -292,7 +292,7 @@ def _run(params: GroundFrameParams, args: Mapping[str, Any], inputs: Inputs) -> 
     facts = level(
         disparity["column_disparity"],
         disparity["row_disparity"],
-        matched(np.asarray(disparity["validity"])),
+        matched_back(np.asarray(disparity["validity"]), np.asarray(disparity["backmatch_error"])),
         Rig.from_dict(inputs["rig"].meta["rig"]),
         params,
         VerticalHint(args.get("up"), args.get("initial_up"), args.get("pitch")),

@@ -15,13 +15,24 @@ import numpy as np
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.validity import Validity, mark
 from rille.stages.hfvm.coarse_to_fine import hierarchy
-from rille.stages.hfvm.coarse_to_fine.hierarchy import Band, Map, Prepared
-from rille.stages.hfvm.finish import guided, refine, uncertainty, variational_refinement
+from rille.stages.hfvm.coarse_to_fine.hierarchy import Map, Prepared
+from rille.stages.hfvm.finish import guided, refine, textureless, uncertainty, variational_refinement
 from rille.stages.hfvm.images import denoise, plane
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import View
-from rille.stages.hfvm.images.window import Raster, Results, Window, around, blocks, cut, strips, whole
-from rille.stages.hfvm.level import consistency, epipolar, rowwise, simd
+from rille.stages.hfvm.images.window import (
+    Raster,
+    Results,
+    Window,
+    around,
+    blocks,
+    cut,
+    pick,
+    strips,
+    thinned,
+    whole,
+)
+from rille.stages.hfvm.level import consistency, epipolar, rowwise
 from rille.stages.hfvm.level.simd import SUM_RADIUS
 from rille.stages.hfvm.level.window_pair import WindowPair
 
@@ -38,7 +49,6 @@ class Finish:
     alignment: plane.Matrix | None
     near_sign: float
     contrast: float = 1.0
-    band: Band = hierarchy.FREE
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -170,7 +180,38 @@ class Finish:
             u[w.slices], v[w.slices] = cut(a.u, w), cut(a.v, w)
         return consistency.unsupported(u, v, keep, self.params.speckle).view(np.uint8)
 
-    def final(self, window: Window, fine: Rasters, checked: Rasters, refined: Rasters, gone: Raster) -> Results:
+    def planes(self, refined: Rasters, gone: Raster) -> textureless.Planes | None:
+        """Epipolar lines of the matches, and what they tell of textureless regions; None: they follow no lines.
+
+        Room: 2 bytes a pixel, and 4 for the features of each image where there are such regions.
+        """
+        p, shape = self.params, self.shape
+        if p.preset == "paper" or p.band == 0 or self.pair.levels <= textureless.LEVEL:
+            return None
+        above = self.pair.shapes(textureless.LEVEL)[0]
+        unmatched = np.ones((2 * above[0], 2 * above[1]), bool)
+        for w in strips(refined["validity"]):
+            unmatched[w.slices] = (cut(refined["validity"], w) != 0) | (cut(gone, w) != 0)
+        y, x = np.divmod(thinned(unmatched, hierarchy.FIT_SAMPLES, np.logical_not), unmatched.shape[1])
+        u, v = (pick(refined[name], y, x) for name in ("u", "v"))
+        found = epipolar.fit_points(x, y, u, v, shape, self.pair.shapes(0)[1])
+        if found is None or found[1] > epipolar.SHARP:
+            return None
+        lines = textureless.Lines.of(found[0], shape)
+        if not p.textureless:
+            return textureless.Planes(np.zeros(above, np.uint8), [], lines)
+        none = np.asarray(unmatched.reshape(above[0], 2, above[1], 2).all(axis=(1, 3)))
+        return textureless.find(self.pair, lines, none, lines.along(x, y, u, v), -(self.near_sign or -1.0))
+
+    def final(
+        self,
+        window: Window,
+        fine: Rasters,
+        checked: Rasters,
+        refined: Rasters,
+        gone: Raster,
+        planes: textureless.Planes | None,
+    ) -> Results:
         """Everything that :class:`~rille.stages.hfvm.Disparity` has.
 
         The result of a window depends on pixels around it: those within reach of the filling along rows, of the
@@ -184,10 +225,20 @@ class Finish:
         u, v = (cut(refined[name], outer).copy() for name in ("u", "v"))
         validity, removed = cut(refined["validity"], outer).copy(), cut(gone, outer) != 0
         left, valid = self.pair.left.view.grey(0, outer), self.pair.left.view.valid(0, outer)
+        error, distance = cut(checked["error"], outer).copy(), cut(fine["distance"], outer).copy()
         keep = validity == 0
         removed &= keep
         blank = consistency.supported(validity == Validity.NO_TEXTURE, keep & ~removed)
-        validity[blank], keep[blank] = 0, True
+        keep |= blank
+        plain, plain_std = np.zeros(keep.shape, bool), np.zeros(keep.shape, np.float32)
+        if planes is not None:
+            plain, plain_u, plain_v, plain_std = planes.cut(outer)
+            plain &= removed | ~keep
+            u[plain], v[plain] = plain_u[plain], plain_v[plain]
+            # What was found about another displacement does not apply.
+            error[plain], distance[plain] = consistency.FAILED, -1.0
+            keep, removed = keep | plain, removed & ~plain
+        validity[blank | plain] = 0
         # Matches with too few agreeing neighbours are too uncertain to count as measured, but remain the best guess.
         lonely = consistency.lonely(keep & ~removed, p.min_support)
         mark(validity, removed | lonely, Validity.SPECKLE)
@@ -195,24 +246,19 @@ class Finish:
         consistency.fill_rows(u, v, keep & ~removed, p.fill_reach, self.near_sign or -1.0, interpolated)
         keep &= ~removed & ~lonely
         noise = cut(refined["noise"], outer)
-        std = uncertainty.standard_deviation(noise, u, keep & ~blank, p)
+        # For the deviation of their neighbours both count as unmatched, like other pixels without texture.
+        std = uncertainty.standard_deviation(noise, u, keep & ~blank & ~plain, p)
         if blank.any():
-            # For the deviation of their neighbours they count as unmatched, like other pixels without texture.
             std[blank] = np.hypot(uncertainty.standard_deviation(noise, u, keep, p), uncertainty.BLANK)[blank]
-        if p.greatest_std is not None:
-            unsure = keep & (std > p.greatest_std)
-            mark(validity, unsure, Validity.OVER_THRESHOLD)
-            interpolated[unsure], std[unsure] = 1, np.nan
-            keep &= ~unsure
+        std[plain] = plain_std[plain]
         # A masked pixel is no part of the image, so it is not filled either.
         interpolated[valid == 0] = 0
         if p.guided_fill:
             u, v = guided.median(u, v, keep, interpolated, left)
-        if self.band.mu >= simd.SHARP:
+        if planes is not None:
             # A filled pixel has its neighbour's depth, not its row: between turned cameras rows change along a row.
-            epipolar.settle_rows(self.band.f, u, v, interpolated, outer.x0, outer.y0)
+            epipolar.settle_rows(planes.lines.f, u, v, interpolated, outer.x0, outer.y0)
         u, v = self._to_right(u, v, outer)
-        error, distance = cut(checked["error"], outer).copy(), cut(fine["distance"], outer).copy()
         consistency.conclude(validity, keep, interpolated, u, v, error, distance)
         arrays = {
             "column_disparity": u,

@@ -235,6 +235,15 @@ def line(terms, x, length):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def lines_at(f, x, y):  # type: ignore[no-untyped-def]
+    """As :func:`lines`, of single pixels (n,): (n, 3) float32."""
+    found = np.empty((len(x), 3), np.float32)
+    for n in range(len(x)):
+        found[n, 0], found[n, 1], found[n, 2] = line(row_terms(f, np.float64(y[n])), np.float32(x[n]), np.float32(1.0))
+    return found
+
+
+@njit(cache=True, nogil=True)
 def settle_rows(f, u, v, wanted, x0, y0):  # type: ignore[no-untyped-def]
     """Row displacements of the ``wanted`` pixels from their column displacements and their lines, in place.
 

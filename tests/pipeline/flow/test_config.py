@@ -25,13 +25,12 @@ def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -
     built = config.build({"locus": {"cell_size": 0.01}}, config.parse_assignments(["terrain.preset=accurate"]))
     assert (built.hfvm.preset, built.locus.both, built.merge.max_std_cells) == ("accurate", True, 0.7)
     assert (plain.locus.refined_share, built.locus.refined_share) == (1.0, 0.5)
-    assert (built.locus.cell_size, built.locus.max_jump, built.hfvm.greatest_std) == (0.01, 5.0, 100.0)
+    assert (built.locus.cell_size, built.locus.max_jump) == (0.01, 5.0)
     assert (plain.track.points, built.track.points) == (400, 2000)
-    assert config.build({"hfvm": {"preset": "accurate"}}).hfvm.greatest_std == 1.1
     assert built.hfvm.variational_steps == config.build({"hfvm": {"preset": "accurate"}}).hfvm.variational_steps
     built = config.build({"terrain": {"preset": "accurate"}}, config.parse_assignments(["locus.both=false"]))
     assert (built.hfvm.preset, built.locus.both) == ("accurate", False)
-    assert (built.hfvm.greatest_std, built.locus.max_jump) == (1.1, plain.locus.max_jump), "limits as without both"
+    assert built.locus.max_jump == plain.locus.max_jump, "as without both"
     built = config.build({"terrain": {"preset": "accurate"}, "hfvm": {"preset": "default"}})
     assert (built.locus.refined_share, built.locus.max_jump) == (1.0, 5.0), "one of each"
     assert config.build().locus.both is False, "the preset itself is not changed by what is laid over it"

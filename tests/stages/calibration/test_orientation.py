@@ -98,6 +98,17 @@ def test_stage_on_a_dense_disparity():
     assert again.meta == out.meta
 
 
+def test_matches_that_nothing_matched_back_have_no_say():
+    rig = toed_in_rig()
+    given, other = scene(knocked(rig, pitch_deg=0.4)), scene(knocked(rig, pitch_deg=0.4))
+    part = np.s_[: given["validity"].shape[0] // 2]
+    other["backmatch_error"][part] = np.nan
+    other["row_disparity"][part] += 40
+    whole, half = run(rig, given), run(rig, other)
+    assert half.meta["parameters"][0]["value"] == pytest.approx(whole.meta["parameters"][0]["value"], abs=0.05)
+    assert half["left"][:, 1].min() >= part.stop
+
+
 def test_nothing_matched_is_no_failure():
     rig = toed_in_rig()
     found = scene(rig)

@@ -385,17 +385,6 @@ def test_accurate_is_better_than_default_on_a_slanted_step_with_occlusion():
     assert error["accurate"] < error["default"]
 
 
-def test_unsure_matches_do_not_count_as_matched():
-    left, right, *_ = pair(lambda x, y: (-8.0 - 4.0 * (x > 80), 1.0), noise=3.0)
-    free = match(left, right, HfvmParams(preset="accurate", greatest_std=None))
-    found = match(left, right, HfvmParams(preset="accurate", greatest_std=0.2))
-    unsure = free.disparity_std > 0.2
-    assert 0 < unsure.sum() < 0.5 * unsure.size
-    np.testing.assert_array_equal(matched(found.validity), matched(free.validity) & ~unsure)
-    assert has(found.validity, Validity.OVER_THRESHOLD)[unsure].all()
-    assert has(found.validity, Validity.INTERPOLATED)[unsure].all()  # still the best guess
-
-
 def test_unrelated_images_give_few_matches():
     rng = np.random.default_rng(0)
     noise = [rng.integers(0, 256, (150, 200)).astype(np.uint8) for _ in range(2)]

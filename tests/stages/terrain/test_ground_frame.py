@@ -176,7 +176,11 @@ def test_stage_uses_only_measured_pixels_and_is_repeatable() -> None:
     filled[:, :60] = True
     column[filled] -= 20.0  # filled disparities may be anything
     validity = np.where(filled, Validity.INTERPOLATED, np.where(usable, Validity.MATCHED, 0)).astype(np.uint8)
+    error = np.zeros_like(validity, dtype="f4")
+    column[:, 60:80] -= 20.0
+    error[:, 60:80] = np.nan  # nothing was matched back
     maps = {"column_disparity": column.astype("f4"), "row_disparity": row.astype("f4"), "validity": validity}
+    maps |= {"backmatch_error": error}
     inputs = {"disparity": Bundle(maps, {}), "rig": Bundle({}, {"rig": RIG.to_dict()})}
     facts = level_stage.STAGE.run(PARAMS, {"pitch": math.radians(PITCH)}, inputs).meta
     assert facts["ground_height"] == pytest.approx(-HEIGHT, rel=1e-3)

@@ -1,0 +1,284 @@
+"""Matches of textureless regions, such as walls: what no window tells, a whole region does.
+
+Where an image shows next to nothing, a pixel's own match is chance. Distances of features, summed over a wide window,
+tell right from wrong there more often than not. So at level 1, in each large region without matches and texture:
+
+1. along its epipolar line each pixel takes the displacement with the least sum over :data:`SIDE` x :data:`SIDE` pixels
+   of the region, of all displacements that were matched and of farther ones (:data:`BEYOND`);
+2. a plane is fitted robustly: the displacement along the line is a linear function of column and row. The more a
+   window's sum exceeds that of its best displacement for all others, the more it counts;
+3. if clearly more windows agree with the plane than would by chance, the pixels whose windows do are matched, at the
+   plane's displacement. Their standard deviation is that of the agreeing windows.
+
+Windows that any of these displacements leads out of the right image have no vote, nor have those to which two are equal
+(a black or an overexposed sky). A window whose best displacement is the last one on either side does not agree. Half of
+a region must have a vote: what lies between a near thing and the image's border may be hidden in the right image.
+
+Chosen with motorcycle, Baby1, Cloth1, Lampshade1 and Midd1, as they are and with the right image degraded: on the wall
+of Midd1, three eighths of the image, wide windows alone are right for four in ten pixels, matches for two. Blocks of
+JPEG images look like structure: there a plane may be some pixels off.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rille.stages.core.declare import AnyArray
+from rille.stages.hfvm.coarse_to_fine.hierarchy import Prepared
+from rille.stages.hfvm.images import plane
+from rille.stages.hfvm.images.window import Window, whole
+from rille.stages.hfvm.level import epipolar
+from rille.stages.hfvm.level.features import distance
+from rille.stages.numeric.robust import MAD_TO_SIGMA
+
+LEVEL = 1
+"""Halving once halves noise, and a quarter of the pixels is to be searched."""
+
+DEVIATION = 1.0
+"""Grey levels of local deviation below which a pixel of the level may belong to a region."""
+
+RADIUS = 6
+SIDE = 2 * RADIUS + 1
+"""Side of the window, pixels of the level."""
+
+LEAST = 6 * SIDE * SIDE
+"""Least size of a region, and of the part of it that has a vote, pixels of the level."""
+
+FAR = 60
+"""Greatest distance of two features [byte steps]: about three times that of noise."""
+
+BEYOND = 0.5, 4
+"""Share of the range of the matched displacements that is searched beyond its far end, and pixels of the level: a wall
+is often farther than all else."""
+
+TOLERANCE = 1.0
+"""Pixels of the level: a displacement within twice as much agrees with a plane, and a plane is chosen by those within
+it: by wider ones tilted planes were chosen."""
+
+APART = 2
+"""Steps from the best one to those that it must be distinct from."""
+
+SURE = 6.0
+"""Standard deviations by which more windows agree than by chance: the plane is the best of some 10^5 different ones."""
+
+FLOOR = 0.2
+"""Least standard deviation, pixels of level 0: like :data:`rille.stages.hfvm.finish.uncertainty.BLANK`."""
+
+SAMPLES = 1000
+"""Displacements that a plane is fitted to."""
+
+TRIALS = 500
+"""Planes that are tried: where four in ten windows are right, 32 of them are."""
+
+ITERATIONS = 10
+
+
+class Lines(NamedTuple):
+    """Epipolar lines of the left image's pixels, with a direction: a fundamental matrix of level 0, the sign of the
+    direction, and whether they run along the rows rather than along the columns."""
+
+    f: epipolar.Matrix
+    sense: float
+    along_rows: bool
+
+    @staticmethod
+    def of(f: epipolar.Matrix, shape: tuple[int, ...]) -> Lines:
+        """Lines along which columns grow, or rows where they run along the columns."""
+        a, b, _ = epipolar.lines(f, (1, 1), shape[1] // 2, shape[0] // 2)[0, 0]
+        along_rows = bool(abs(b) >= abs(a))
+        return Lines(f, float(np.sign(b if along_rows else -a)), along_rows)
+
+    def at(self, window: Window, level: int = 0) -> AnyArray:
+        """Lines of the pixels of a window of a level (row, col, 4): direction, and the least displacement on them."""
+        up = plane.finer(level)
+        a, b, c = np.moveaxis(epipolar.lines(up.T @ self.f @ up, window.shape, window.x0, window.y0), 2, 0)
+        return np.stack([self.sense * b, -self.sense * a, -c * a, -c * b], axis=2)
+
+    def along(self, x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray) -> AnyArray:
+        """Displacements of pixels of level 0 (n,) along their lines, pixels."""
+        a, b, _ = epipolar.lines_at(self.f, x, y).T
+        return np.asarray(self.sense * (b * u - a * v))
+
+
+class Planes(NamedTuple):
+    """Matches on the planes of textureless regions.
+
+    ``region``: (row, col) of level 1, uint8, number of the region from 1 on, 0 where nothing is matched. ``terms``: of
+    each region, pixels of level 0: terms (1, x, y) of the displacement along ``lines``, and its standard deviation.
+    """
+
+    region: AnyArray
+    terms: list[list[float]]
+    lines: Lines
+
+    def cut(self, window: Window) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
+        """Of the pixels of a window of level 0: whether they are matched, columns, rows and standard deviations."""
+        above = window.parent()
+        twice = self.region[above.slices].repeat(2, axis=0).repeat(2, axis=1)
+        rows, cols = window.shape
+        region = twice[window.y0 % 2 :, window.x0 % 2 :][:rows, :cols]
+        y, x = np.nonzero(region)
+        g = np.array([4 * [0.0], *self.terms])[region[y, x]]
+        x0, y0 = x + window.x0, y + window.y0
+        a, b, c = epipolar.lines_at(self.lines.f, x0, y0).T
+        along = self.lines.sense * (g[:, 0] + g[:, 1] * x0 + g[:, 2] * y0)
+        u, v, std = np.zeros((3, *window.shape), np.float32)
+        u[y, x], v[y, x], std[y, x] = along * b - c * a, -along * a - c * b, g[:, 3]
+        return region != 0, u, v, std
+
+
+def find(pair: Prepared, lines: Lines, unmatched: AnyArray, along: AnyArray, far: float) -> Planes:
+    """Find the planes of the left image's textureless regions.
+
+    Parameters
+    ----------
+    unmatched : (row, col) bool of level 1: of the pixels of level 0 below none is matched.
+    along : displacements (n,) of matches along their lines, pixels of level 0.
+    far : sign of the column displacement of far things against near ones.
+    """
+    shape, other = pair.shapes(LEVEL)
+    label, terms = np.zeros(shape, np.uint8), list[list[float]]()
+    patch, valid = pair.left.patch(LEVEL, whole(shape), deviation=True), pair.left.view.valid(LEVEL, whole(shape))
+    assert patch.deviation is not None
+    regions = _regions(unmatched & (patch.deviation < DEVIATION) & (valid != 0))
+    if not regions:
+        return Planes(label, terms, lines)
+    right = pair.right.patch(LEVEL, whole(other)).words, pair.right.view.valid(LEVEL, whole(other))
+    steps = _steps(along, far if lines.along_rows else 0.0)
+    for window, region in regions:
+        images, ways = (patch.words[window.slices], right), lines.at(window, LEVEL)
+        seen, best, distinct = search(images, region, ways, steps, window)
+        y, x = np.nonzero(seen & (distinct > 0))
+        if len(y) < max(LEAST, 0.5 * np.count_nonzero(region)):
+            continue
+        votes = distinct[y, x].astype(np.float64)
+        g, error = _fit(x + window.x0, y + window.y0, best[y, x], votes)
+        agree = (error <= 2 * TOLERANCE) & (steps[1] < best[y, x]) & (best[y, x] < steps[-2])
+        if _sure(agree, votes, len(steps)):
+            terms.append(_at_level_0(g, error[agree]))
+            label[window.slices][y[agree], x[agree]] = len(terms)
+    return Planes(label, terms, lines)
+
+
+def _sure(agree: AnyArray, votes: AnyArray, steps: int) -> bool:
+    """Whether clearly more windows agree than of so many steps would by chance."""
+    chance = min(1.0, (4 * TOLERANCE + 1) / steps)
+    # Windows that do not overlap and are equally distinct would have to be as many to tell as much.
+    windows = votes.sum() ** 2 / np.sum(votes**2) / SIDE**2
+    spread = np.sqrt(chance * (1 - chance) / windows)
+    return bool(np.average(agree, weights=votes) >= chance + SURE * spread)
+
+
+def _at_level_0(g: AnyArray, error: AnyArray) -> list[float]:
+    """Terms of a plane in pixels of level 0, and the standard deviation of steps with this ``error``."""
+    # Pixel x of the level is (x + 1/2) 2^level - 1/2 of level 0, where displacements are 2^level as long.
+    scale = 2.0**LEVEL
+    middle = 0.5 / scale - 0.5
+    std = np.hypot(scale * MAD_TO_SIGMA * epipolar.typical(error), FLOOR)
+    return [float(t) for t in (scale * (g[0] + middle * (g[1] + g[2])), g[1], g[2], std)]
+
+
+def _steps(along: AnyArray, far: float) -> AnyArray:
+    """Displacements along the lines that are tried, pixels of the level; ``far``: sign of farther ones, 0 unknown."""
+    low, high = np.quantile(along, (0.005, 0.995)) * 0.5**LEVEL
+    beyond = BEYOND[0] * (high - low) + BEYOND[1]
+    # Those at the ends do not count.
+    low, high = low - (2 if far > 0 else beyond), high + (2 if far < 0 else beyond)
+    return np.arange(np.floor(low), np.ceil(high) + 1, dtype=np.float32)
+
+
+def _regions(weak: NDArray[np.bool_]) -> list[tuple[Window, NDArray[np.bool_]]]:
+    """Windows of the large regions that hang together, and which of their pixels belong to them."""
+    # What hangs together by a pixel or two is not one region.
+    opened = cv2.morphologyEx(weak.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    _, number, about, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
+    found = []
+    for n in np.flatnonzero(about[1:, cv2.CC_STAT_AREA] >= LEAST)[: np.iinfo(np.uint8).max] + 1:
+        x, y, wide, high, _ = (int(k) for k in about[n])
+        window = Window(y, y + high, x, x + wide)
+        found.append((window, number[window.slices] == n))
+    return found
+
+
+def search(
+    images: tuple[AnyArray, tuple[AnyArray, AnyArray]],
+    region: NDArray[np.bool_],
+    lines: AnyArray,
+    steps: AnyArray,
+    window: Window,
+) -> tuple[NDArray[np.bool_], AnyArray, AnyArray]:
+    """Search for the best step along the line of each pixel of a region.
+
+    Parameters
+    ----------
+    images : features of the left window; features and mask of the whole right image.
+    region : (row, col) bool, pixels of the window.
+    lines : of these pixels, see :meth:`Lines.at`.
+    steps : (n,) float32 pixels, ascending by 1.
+    window : where the left window lies.
+
+    Returns
+    -------
+    (row, col) bool, pixels of whose window no step leads out of the right image; float32, their best steps; float32,
+    by how much the sum is less than that of each step more than :data:`APART` from the best.
+    """
+    nothing = np.full(region.shape, np.inf, np.float32)
+    cost, chosen, outside = np.zeros_like(nothing), np.zeros_like(nothing), np.zeros(region.shape, np.uint8)
+    best, before, behind, ahead = nothing, nothing, nothing, nothing
+    passed: deque[AnyArray] = deque()
+    for step in steps:
+        _distances(images, region, lines, (step, window.x0, window.y0), (cost, outside))
+        # Sums of whole numbers below 2^24 are exact in any order.
+        total = cv2.boxFilter(cost, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        if len(passed) > APART:
+            before = np.minimum(before, passed.popleft())
+        passed.append(total)
+        better = total < best
+        # The least sums of the steps far enough behind the best and ahead of it.
+        behind = np.where(better, before, behind)
+        ahead = np.where(better, nothing, np.where(step - chosen > APART, np.minimum(ahead, total), ahead))
+        best, chosen = np.minimum(best, total), np.where(better, step, chosen)
+    seen = cv2.dilate(outside, np.ones((SIDE, SIDE), np.uint8)) == 0
+    return region & seen, chosen, np.minimum(behind, ahead) - best
+
+
+@njit(cache=True, nogil=True)
+def _distances(images, region, lines, at, out):  # type: ignore[no-untyped-def]
+    """Distances of a region's pixels to those a step away along their lines; ``outside`` is set where there is none."""
+    (left, (right, valid)), (step, x0, y0), (cost, outside) = images, at, out
+    rows, cols = right.shape
+    for y in range(region.shape[0]):
+        for x in range(region.shape[1]):
+            if region[y, x]:
+                line = lines[y, x]
+                i = np.int64(np.rint(x + x0 + step * line[0] + line[2]))
+                j = np.int64(np.rint(y + y0 + step * line[1] + line[3]))
+                if i >= 0 and i < cols and j >= 0 and j < rows and valid[j, i]:
+                    cost[y, x] = min(distance(left[y, x], right[j, i]), FAR)
+                else:
+                    outside[y, x] = 1
+
+
+def _fit(x: AnyArray, y: AnyArray, step: AnyArray, votes: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Terms (1, x, y) of the plane that steps with the most ``votes`` agree with, and how far each step is from it.
+
+    Random sample consensus with a fixed seed, then least squares with the weights of Cauchy squared.
+    """
+    terms, target = np.stack([np.ones(len(x)), x, y]).astype(np.float64), step.astype(np.float64)
+    every = max(1, len(x) // SAMPLES)
+    some, steps, votes = np.ascontiguousarray(terms[:, ::every]), target[::every].copy(), votes[::every]
+    three = np.random.default_rng(0).choice(len(steps), (TRIALS, 3), p=votes / votes.sum())
+    # Three windows on a line have no plane; what they then give has few votes.
+    planes = np.linalg.pinv(some.T[three]) @ steps[three][..., None]
+    near = np.abs(planes[..., 0] @ some - steps) <= TOLERANCE
+    g = planes[np.argmax(near @ votes), :, 0]
+    for _ in range(ITERATIONS):
+        error = epipolar.residuals(some, steps, -g)
+        g = np.linalg.solve(*epipolar.weighted_normal(some, steps, votes / (1.0 + (error / TOLERANCE) ** 2) ** 2))
+    return g, np.abs(epipolar.residuals(terms, target, -g))

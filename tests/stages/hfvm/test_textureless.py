@@ -1,0 +1,154 @@
+"""Matches of textureless regions: a wall of little contrast behind a textured thing, and walls that tell nothing."""
+
+import cv2
+import numpy as np
+import pytest
+
+from rille.stages.core.validity import matched
+from rille.stages.hfvm import tiled
+from rille.stages.hfvm.finish import textureless
+from rille.stages.hfvm.finish.textureless import APART, FAR, SIDE, Lines, Planes
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.views import Plain
+from rille.stages.hfvm.images.window import Window, whole
+from rille.stages.hfvm.level import features
+from rille.stages.hfvm.stage import match
+from rille.stages.imaging.pyramid import PyramidParams, build
+
+ROWS, COLS = 220, 300
+WALL = -8.0
+
+
+def texture(seed, deviation, shape=(ROWS, COLS + 80)):
+    noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(0, 1, shape), (0, 0), 1.5)
+    return deviation * noise / noise.std()
+
+
+def scene(wall=0.3, noise=0.05, tilt=0.0):
+    """A thing in front of a wall of little contrast; displacements of both (grey levels, pixels)."""
+    y, x = np.indices((ROWS, COLS), np.float32)
+    back, thing = texture(1, wall), texture(2, 25.0)
+
+    def shown(x_wall, x_thing):
+        """Grey values of the places that are seen on the wall and on the thing."""
+        wall, front = (cv2.remap(a, (at + 40).astype(np.float32), y, 1) for a, at in ((back, x_wall), (thing, x_thing)))
+        return 130 + np.where((x_thing >= 110) & (x_thing < 230) & (y >= 60), front, wall)
+
+    near = -26 - 8 * np.sin(y / 25)
+    left, right = shown(x, x), shown((x - WALL + tilt * COLS / 2) / (1 + tilt), x - near)
+    rng = np.random.default_rng(3)
+    left, right = (a + rng.normal(0, noise, a.shape) for a in (left, right))
+    is_wall = np.ones((ROWS, COLS), bool)
+    is_wall[50:, 100:240] = False
+    return left.astype(np.float32), right.astype(np.float32), WALL + tilt * (x - COLS / 2), is_wall
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.02])
+def test_a_wall_of_little_contrast_is_matched_on_its_plane(tilt):
+    left, right, u, wall = scene(tilt=tilt)
+    found, without = (match(left, right, HfvmParams(textureless=on)) for on in (True, False))
+    ok = matched(found.validity) & wall
+    assert ok[wall].mean() > 0.5 > 0.2 > matched(without.validity)[wall].mean()
+    error = np.hypot(found.column_disparity - u, found.row_disparity)[ok]
+    assert np.mean(error < 1) > 0.95
+    std = found.disparity_std[ok]
+    assert np.mean(error < std) > 0.6
+    assert np.mean(error < 2 * std) > 0.9
+    assert np.isnan(found.backmatch_error[ok & ~matched(without.validity)]).all(), "nothing was matched back"
+    filled = np.isfinite(found.column_disparity) & wall
+    assert np.mean(np.abs(found.column_disparity - u)[filled] < 2) > 0.95, "its gaps are filled from it"
+
+
+def test_images_with_a_baseline_along_the_columns_are_matched_alike():
+    left, right, u, wall = (np.ascontiguousarray(a.T) for a in scene())
+    found = match(left, right, HfvmParams(top_rows=0.5))
+    ok = matched(found.validity) & wall
+    assert ok[wall].mean() > 0.5
+    assert np.mean(np.hypot(found.column_disparity, found.row_disparity - u)[ok] < 1) > 0.95
+
+
+@pytest.mark.parametrize(("wall", "noise"), [(0.0, 0.0), (0.0, 0.2)], ids=["black", "noise"])
+def test_a_wall_that_tells_nothing_has_no_matches(wall, noise):
+    left, right, _, on_wall = scene(wall, noise)
+    found = match(left, right, HfvmParams())
+    assert matched(found.validity)[on_wall].mean() < 0.02
+
+
+def test_a_wall_whose_displacement_is_beyond_all_that_is_searched_is_left_alone():
+    left, right, _, on_wall = scene()
+    far = np.roll(right, 60, axis=1)
+    right[:, 235:] = far[:, 235:]
+    right[:50] = far[:50]
+    found = match(left, right, HfvmParams())
+    assert matched(found.validity)[on_wall].mean() < 0.1
+
+
+def test_tiles_give_the_same_to_the_bit():
+    left, right, *_ = scene(tilt=0.02)
+    views = [Plain.of(build(image, PyramidParams(), None)) for image in (left, right)]
+    once, tiles = (tiled.match(*views, HfvmParams(), None, lambda share, step: None, side) for side in (None, 77))
+    for name, values in once.arrays.items():
+        assert values.tobytes() == tiles.arrays[name].tobytes(), name
+
+
+def test_lines_of_a_level_lead_to_the_displacements_of_the_finest():
+    f = np.array([[1e-6, 2e-5, -0.01], [-3e-5, 1e-6, 1.0], [0.02, -1.0, 1.5]])
+    lines = Lines.of(f, (200, 300))
+    x, y = np.array([20, 150, 290]), np.array([10, 100, 190])
+    along = np.array([-30.0, 4.0, 11.0])
+    at = np.array([lines.at(Window(j, j + 1, i, i + 1))[0, 0] for i, j in zip(x, y, strict=True)])
+    u, v = along * at[:, 0] + at[:, 2], along * at[:, 1] + at[:, 3]
+    np.testing.assert_allclose(lines.along(x, y, u, v), along, atol=1e-3)
+    ends, starts = np.stack([x + u, y + v, np.ones(3)]), np.stack([x, y, np.ones(3)])
+    np.testing.assert_allclose(np.sum(ends * (f @ starts), axis=0), 0, atol=1e-3)
+    assert (np.diff(u[np.argsort(along)]) > 0).all()
+    # A pixel of level 1 stands for the middle of four, and its displacements are half as long.
+    four = lines.at(Window(40, 42, 60, 62)).mean(axis=(0, 1))
+    coarse = lines.at(Window(20, 21, 30, 31), 1)[0, 0]
+    np.testing.assert_allclose(coarse * (1, 1, 2, 2), four, atol=1e-4)
+
+
+@pytest.mark.parametrize("window", [Window(0, 9, 0, 13), Window(3, 8, 5, 12), Window(4, 9, 2, 13)])
+def test_a_window_of_planes_is_part_of_the_whole(window):
+    region = np.random.default_rng(0).integers(0, 3, (5, 7)).astype(np.uint8)
+    lines = Lines.of(np.array([[0, 0, 0], [0, 0, 1.0], [0, -1.0, 0.5]]), (9, 13))
+    planes = Planes(region, [[-8.0, 0.1, 0.0, 0.5], [3.0, 0.0, -0.2, 1.0]], lines)
+    everything = planes.cut(whole((9, 13)))
+    for part, all_of_it in zip(planes.cut(window), everything, strict=True):
+        np.testing.assert_array_equal(part, all_of_it[window.slices])
+    is_one = region.repeat(2, 0).repeat(2, 1)[:9, :13] == 1
+    np.testing.assert_allclose(everything[1][is_one], (-8 + 0.1 * np.indices((9, 13))[1])[is_one], rtol=1e-6)
+    np.testing.assert_array_equal(everything[3][is_one], 0.5)
+
+
+def test_search_and_its_definition_agree():
+    rng = np.random.default_rng(5)
+    images = [rng.normal(100, 0.4, (40, 60)).astype(np.float32) for _ in range(2)]
+    words, others = (features.pack(image, HfvmParams().weights)[0] for image in images)
+    valid = np.ones((40, 60), np.uint8)
+    valid[20:, 36:] = 0
+    window, steps = Window(5, 31, 12, 50), np.arange(-9, 4, dtype=np.float32)
+    region = np.zeros(window.shape, bool)
+    region[2:24, 3:36] = True
+    region[10:14, 12:20] = False
+    lines = Lines.of(np.array([[0, 0, 0], [0, 0, 1.0], [0, -1.0, -1.0]]), (40, 60)).at(window)
+    seen, best, distinct = textureless.search((words[window.slices], (others, valid)), region, lines, steps, window)
+    a, b = (w.view(np.uint8).reshape(*w.shape, 8).astype(int) for w in (words, others))
+    for y, x in rng.permutation(np.argwhere(region))[:60]:
+        around = np.s_[max(y - SIDE // 2, 0) : y + SIDE // 2 + 1, max(x - SIDE // 2, 0) : x + SIDE // 2 + 1]
+        j, i = (p[around][region[around]] for p in np.indices(region.shape))
+        sums, hidden = [], False
+        for step in steps.astype(int):
+            q, p = j + window.y0 + 1, i + window.x0 + step
+            inside = (q >= 0) & (q < 40) & (p >= 0) & (p < 60)
+            inside[inside] &= valid[q[inside], p[inside]] != 0
+            hidden |= not inside.all()
+            apart = np.abs(a[j + window.y0, i + window.x0] - b[np.clip(q, 0, 39), np.clip(p, 0, 59)]).sum(axis=1)
+            sums.append(np.minimum(apart, FAR)[inside].sum() if inside.all() else 0)
+        assert seen[y, x] == (not hidden)
+        if not hidden:
+            k = int(np.argmin(sums))
+            assert best[y, x] == steps[k]
+            others_least = min(total for n, total in enumerate(sums) if abs(n - k) > APART)
+            assert distinct[y, x] == others_least - sums[k]
+    assert 0.2 < seen[region].mean() < 1
