@@ -130,8 +130,8 @@ STALE: dict[str, set[str]] = {
 EXCEPTIONS: dict[str, set[str]] = {
     "keyframes.preset": {"orientation"} | RIG | MOVED,  # navigation sets parameters of other stages, too
     "locus.both": {"hfvm/back"} | LOCAL | MISSION,  # the other direction is matched as well
-    # limits of matches and number of points, with which all begins that is not an image
-    "terrain.preset": {"hfvm/back", "track"} | MATCHED | POSES | LOCAL | MISSION,
+    # the other direction, and more points; the matcher's own preset is given here
+    "terrain.preset": {"hfvm/back", "track"} | POSES | LOCAL | MISSION,
     "refine.enabled": REFINED - {"refine", "common_tilt"},  # without it there is less to compute
     "resect.landmarks": POSES - {"refine", "common_tilt"},  # refined are landmarks of the disparity alone
     "crosscheck.enabled": set(),  # without it there is less to compute
