@@ -116,6 +116,10 @@ def _statistic(path: Path, name: str) -> int:
     return 0
 
 
+KEPT = 128 << 20
+"""Bytes of freed memory that a process keeps for its next task."""
+
+
 def resident() -> int:
     """Resident memory of this process, bytes."""
     return int(psutil.Process().memory_info().rss)
@@ -125,9 +129,9 @@ class Meter:
     """Measures one task: ``memory`` is what it took beyond what the process holds before or after it, ``rest``.
 
     What earlier tasks have freed is given back to the system first, and what this one has freed at its end: a heap
-    that is kept for later would hide what a task takes, and workers would hold it for nothing. Fetching it anew took a
-    tenth of a task's time, so a task can be left unmeasured. Both figures are then None, as where the system cannot
-    tell, or where another task ran in the process meanwhile.
+    that is kept for later would hide what a task takes. Fetching it anew took a tenth of a task's time, so a task can
+    be left unmeasured; then only a heap that has grown by more than :data:`KEPT` is given back. Both figures are then
+    None, as where the system cannot tell, or where another task ran in the process meanwhile.
 
     >>> with Meter() as meter:
     ...     array = np.ones(10**7)
@@ -137,6 +141,9 @@ class Meter:
 
     _lock = threading.Lock()
     _running: list[Meter] = []  # noqa: RUF012 (of the process, on purpose)
+
+    _held = 0
+    """Resident memory of the process after freed memory was last given back."""
 
     memory: int | None = None
     rest: int | None = None
@@ -158,8 +165,9 @@ class Meter:
 
     def __exit__(self, *_: object) -> None:
         peak = _status()[1] if self._before else 0
-        if self._alone and self._measure:
+        if self._alone and (self._measure or resident() > Meter._held + KEPT):
             _trim()
+            Meter._held = resident()
         now = _status()[0] if self._before else 0
         with Meter._lock:
             Meter._running.remove(self)
