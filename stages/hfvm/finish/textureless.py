@@ -228,22 +228,17 @@ def search(
     (row, col) bool, pixels of whose window no step leads out of the right image; float32, their best steps; float32,
     by how much the sum is less than that of each step more than :data:`APART` from the best.
     """
-    nothing = np.full(region.shape, np.inf, np.float32)
-    cost, chosen, outside = np.zeros_like(nothing), np.zeros_like(nothing), np.zeros(region.shape, np.uint8)
-    best, before, behind, ahead = nothing, nothing, nothing, nothing
+    cost, chosen, outside = (np.zeros(region.shape, kind) for kind in (np.float32, np.float32, np.uint8))
+    best, before, behind, ahead = np.full((4, *region.shape), np.inf, np.float32)
     passed: deque[AnyArray] = deque()
     for step in steps:
         _distances(images, region, lines, (step, window.x0, window.y0), (cost, outside))
         # Sums of whole numbers below 2^24 are exact in any order.
         total = cv2.boxFilter(cost, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT)
         if len(passed) > APART:
-            before = np.minimum(before, passed.popleft())
+            np.minimum(before, passed.popleft(), out=before)
         passed.append(total)
-        better = total < best
-        # The least sums of the steps far enough behind the best and ahead of it.
-        behind = np.where(better, before, behind)
-        ahead = np.where(better, nothing, np.where(step - chosen > APART, np.minimum(ahead, total), ahead))
-        best, chosen = np.minimum(best, total), np.where(better, step, chosen)
+        _keep(total, step, before, (best, chosen, behind, ahead))
     seen = cv2.dilate(outside, np.ones((SIDE, SIDE), np.uint8)) == 0
     return region & seen, chosen, np.minimum(behind, ahead) - best
 
@@ -265,6 +260,21 @@ def _distances(images, region, lines, at, out):  # type: ignore[no-untyped-def]
                     outside[y, x] = 1
 
 
+@njit(cache=True, nogil=True)
+def _keep(total, step, before, out):  # type: ignore[no-untyped-def]
+    """The best step so far of each pixel, and the least sums of the steps far enough behind it and ahead of it.
+
+    ``before``: the least sum of all steps more than APART behind this one.
+    """
+    best, chosen, behind, ahead = out
+    for y in range(total.shape[0]):
+        for x in range(total.shape[1]):
+            if total[y, x] < best[y, x]:
+                best[y, x], chosen[y, x], behind[y, x], ahead[y, x] = total[y, x], step, before[y, x], np.inf
+            elif step - chosen[y, x] > APART:
+                ahead[y, x] = min(ahead[y, x], total[y, x])
+
+
 def _fit(x: AnyArray, y: AnyArray, step: AnyArray, votes: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Terms (1, x, y) of the plane that steps with the most ``votes`` agree with, and how far each step is from it.
 
@@ -274,10 +284,10 @@ def _fit(x: AnyArray, y: AnyArray, step: AnyArray, votes: AnyArray) -> tuple[Any
     every = max(1, len(x) // SAMPLES)
     some, steps, votes = np.ascontiguousarray(terms[:, ::every]), target[::every].copy(), votes[::every]
     three = np.random.default_rng(0).choice(len(steps), (TRIALS, 3), p=votes / votes.sum())
-    # Three windows on a line have no plane; what they then give has few votes.
-    planes = np.linalg.pinv(some.T[three]) @ steps[three][..., None]
-    near = np.abs(planes[..., 0] @ some - steps) <= TOLERANCE
-    g = planes[np.argmax(near @ votes), :, 0]
+    # Three windows on a line have no plane; held weakly, what they give has few votes.
+    planes = np.linalg.solve(some.T[three] + 1e-6 * np.eye(3), steps[three][..., None])[..., 0]
+    near = np.abs(planes @ some - steps) <= TOLERANCE
+    g = planes[np.argmax(near @ votes)]
     for _ in range(ITERATIONS):
         error = epipolar.residuals(some, steps, -g)
         g = np.linalg.solve(*epipolar.weighted_normal(some, steps, votes / (1.0 + (error / TOLERANCE) ** 2) ** 2))
