@@ -21,7 +21,7 @@ from rille.datasets.mockup.params import MockupParams
 from rille.datasets.mockup.sequence import mockup
 from rille.datasets.protocol import Source
 from rille.pipeline.flow import config
-from rille.stages.core.validity import matched
+from rille.stages.core.validity import matched_back
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.surface import plane
@@ -144,9 +144,8 @@ def _reconstructed(
 ) -> tuple[Lattice, tuple[RigidTransform, tuple[float, float]], tuple[Floats32, Floats32]]:
     """Lattice, frame and range of elevations, and elevations with their standard deviation, by a vertical."""
     given = pair.matches(pair.forth)
-    facts = level(
-        given.column, given.row, matched(pair.forth.validity), pair.rig, GroundFrameParams(), VerticalHint(up=up)
-    )
+    usable = matched_back(pair.forth.validity, pair.forth.backmatch_error)
+    facts = level(given.column, given.row, usable, pair.rig, GroundFrameParams(), VerticalHint(up=up))
     lattice = lattice or local_lattice(pair.rig, facts, CELL, pair.params)
     T_local_left = RigidTransform.from_matrix(facts["T_local_left"])
     low, high = z_range(facts["plane"], facts["relief"], list(lattice.bounds))

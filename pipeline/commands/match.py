@@ -102,12 +102,11 @@ def match_files(
 
 def warnings(found: Disparity, left: NDArray[Any], right: NDArray[Any]) -> list[str]:
     """List signs that two matched images do not fit, one line each with its figure."""
-    from rille.stages.core.validity import Validity, has, matched_back
+    from rille.stages.core.validity import Validity, has, matched, matched_back
     from rille.stages.hfvm import doubt
     from rille.stages.hfvm.swap_check import swapped
 
-    ok = matched_back(found.validity, found.backmatch_error)
-    share = float(ok.mean())
+    share = float(matched(found.validity).mean())
     if share < FEW:
         reasons = (
             (Validity.NO_TEXTURE, "have no texture (black, saturated or blank)"),
@@ -125,6 +124,7 @@ def warnings(found: Disparity, left: NDArray[Any], right: NDArray[Any]) -> list[
     if blank > BLANK:
         text = f"{100 * blank:.0f} % of the pixels have no texture (black, saturated or blank) and cannot match"
         return [warning("RIL-701", text)]
+    ok = matched_back(found.validity, found.backmatch_error)
     if swapped(found.column_disparity, found.row_disparity, ok):
         median = float(np.median(found.column_disparity[ok]))
         text = (

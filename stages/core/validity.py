@@ -18,7 +18,7 @@ class Validity(IntFlag):
     """Bits of the ``validity`` arrays (uint8)."""
 
     MATCHED = 1
-    """Found, and consistent under back-matching."""
+    """Found, and consistent under back-matching; or, without that, on the plane of a textureless region."""
     INTERPOLATED = 2
     """Filled from consistent neighbours; not a measurement."""
     BACKMATCH_FAILED = 4
@@ -44,7 +44,11 @@ def matched(validity: Mask) -> NDArray[np.bool_]:
 
 
 def matched_back(validity: Mask, backmatch_error: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Pixels with a measured disparity of their own, not that of the plane of a textureless region."""
+    """Pixels whose own match was confirmed by matching back.
+
+    ``backmatch_error`` (row, col): float32 pixels. It is NaN on planes of textureless regions, whose displacements lie
+    on the matcher's epipolar lines by construction: they say nothing about cameras.
+    """
     return np.asarray(matched(validity) & np.isfinite(backmatch_error))
 
 

@@ -256,16 +256,16 @@ def _patches(task: TileInputs) -> Bundle:
     if planes is None:
         return Bundle({"gone": gone}, {"planes": None})
     meta = {"planes": {"terms": planes.terms, "f": planes.lines.f.tolist()}}
-    return Bundle({"gone": gone, "region": planes.region}, meta)
+    return Bundle({"gone": gone, "region": np.asarray(planes.region)}, meta)
 
 
 def _planes(patches: Bundle, shape: Shape) -> textureless.Planes | None:
     """What step ``patches`` found in a left image of ``shape``."""
-    told = patches.meta["planes"]
-    if told is None:
+    facts = patches.meta["planes"]
+    if facts is None:
         return None
-    lines = textureless.Lines.of(np.array(told["f"]), shape)
-    return textureless.Planes(np.asarray(patches["region"]), told["terms"], lines)
+    lines = textureless.Lines.of(np.array(facts["f"]), shape)
+    return textureless.Planes(patches.raster("region"), facts["terms"], lines)
 
 
 def _final(task: TileInputs) -> Bundle:

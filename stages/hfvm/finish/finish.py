@@ -181,11 +181,13 @@ class Finish:
         return consistency.unsupported(u, v, keep, self.params.speckle).view(np.uint8)
 
     def planes(self, refined: Rasters, gone: Raster) -> textureless.Planes | None:
-        """Epipolar lines of the matches, and what they tell of textureless regions; None: they follow no lines.
+        """Epipolar lines of the matches, and the planes of textureless regions; None: the matches follow no lines.
 
-        Room: 2 bytes a pixel, and 4 for the features of each image where there are such regions.
+        Room: 2 bytes a pixel, and for the features of the next level 4; 14 a pixel of the window of the region at hand,
+        and 4 for the other image's features.
         """
         p, shape = self.params, self.shape
+        # Without a band rows are free: they are not to be set by lines.
         if p.preset == "paper" or p.band == 0 or self.pair.levels <= textureless.LEVEL:
             return None
         above = self.pair.shapes(textureless.LEVEL)[0]
@@ -195,13 +197,14 @@ class Finish:
         y, x = np.divmod(thinned(unmatched, hierarchy.FIT_SAMPLES, np.logical_not), unmatched.shape[1])
         u, v = (pick(refined[name], y, x) for name in ("u", "v"))
         found = epipolar.fit_points(x, y, u, v, shape, self.pair.shapes(0)[1])
-        if found is None or found[1] > epipolar.SHARP:
+        # Negated, so that NaN is refused as well.
+        if found is None or not found[1] <= epipolar.SHARP:
             return None
         lines = textureless.Lines.of(found[0], shape)
         if not p.textureless:
             return textureless.Planes(np.zeros(above, np.uint8), [], lines)
         none = np.asarray(unmatched.reshape(above[0], 2, above[1], 2).all(axis=(1, 3)))
-        return textureless.find(self.pair, lines, none, lines.along(x, y, u, v), -(self.near_sign or -1.0))
+        return textureless.find(self.pair, lines, none, lines.along(x, y, u, v), -self.near_sign)
 
     def final(
         self,
@@ -230,15 +233,16 @@ class Finish:
         removed &= keep
         blank = consistency.supported(validity == Validity.NO_TEXTURE, keep & ~removed)
         keep |= blank
-        plain, plain_std = np.zeros(keep.shape, bool), np.zeros(keep.shape, np.float32)
+        on_plane, plane_std = np.zeros(keep.shape, bool), np.zeros(keep.shape, np.float32)
         if planes is not None:
-            plain, plain_u, plain_v, plain_std = planes.cut(outer)
-            plain &= removed | ~keep
-            u[plain], v[plain] = plain_u[plain], plain_v[plain]
+            on_plane, plane_u, plane_v, plane_std = planes.cut(outer)
+            # A pixel of the level above is usable if most of its four are.
+            on_plane &= (valid != 0) & (removed | ~keep)
+            u[on_plane], v[on_plane] = plane_u[on_plane], plane_v[on_plane]
             # What was found about another displacement does not apply.
-            error[plain], distance[plain] = consistency.FAILED, -1.0
-            keep, removed = keep | plain, removed & ~plain
-        validity[blank | plain] = 0
+            error[on_plane], distance[on_plane] = consistency.FAILED, -1.0
+            keep, removed = keep | on_plane, removed & ~on_plane
+        validity[blank | on_plane] = 0
         # Matches with too few agreeing neighbours are too uncertain to count as measured, but remain the best guess.
         lonely = consistency.lonely(keep & ~removed, p.min_support)
         mark(validity, removed | lonely, Validity.SPECKLE)
@@ -246,11 +250,12 @@ class Finish:
         consistency.fill_rows(u, v, keep & ~removed, p.fill_reach, self.near_sign or -1.0, interpolated)
         keep &= ~removed & ~lonely
         noise = cut(refined["noise"], outer)
-        # For the deviation of their neighbours both count as unmatched, like other pixels without texture.
-        std = uncertainty.standard_deviation(noise, u, keep & ~blank & ~plain, p)
+        # For the deviation of their neighbours all without texture count as unmatched.
+        std = uncertainty.standard_deviation(noise, u, keep & ~blank & ~on_plane, p)
         if blank.any():
             std[blank] = np.hypot(uncertainty.standard_deviation(noise, u, keep, p), uncertainty.BLANK)[blank]
-        std[plain] = plain_std[plain]
+        on_plane &= keep
+        std[on_plane] = plane_std[on_plane]
         # A masked pixel is no part of the image, so it is not filled either.
         interpolated[valid == 0] = 0
         if p.guided_fill:

@@ -15,6 +15,7 @@ import math
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
@@ -232,6 +233,13 @@ def line(terms, x, length):  # type: ignore[no-untyped-def]
     c = terms[4] + x * (terms[5] + x * terms[6])
     scale = length / max(np.sqrt(a * a + b * b), LEAST_NORMAL)
     return a * scale, b * scale, c * scale
+
+
+@register_jitable
+def on_line(line, along):  # type: ignore[no-untyped-def]
+    """Displacement (column, row) on a line (a, b, c) of unit normal, ``along`` pixels from the shortest one on it."""
+    a, b, c = line
+    return along * b - c * a, -along * a - c * b
 
 
 @njit(cache=True, nogil=True)

@@ -7,11 +7,11 @@ import pytest
 from rille.stages.core.validity import matched
 from rille.stages.hfvm import tiled
 from rille.stages.hfvm.finish import textureless
-from rille.stages.hfvm.finish.textureless import APART, FAR, SIDE, Lines, Planes
+from rille.stages.hfvm.finish.textureless import APART, CAP, SIDE, Lines, Planes
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import Plain
 from rille.stages.hfvm.images.window import Window, whole
-from rille.stages.hfvm.level import features
+from rille.stages.hfvm.level import epipolar, features
 from rille.stages.hfvm.stage import match
 from rille.stages.imaging.pyramid import PyramidParams, build
 
@@ -91,21 +91,38 @@ def test_tiles_give_the_same_to_the_bit():
         assert values.tobytes() == tiles.arrays[name].tobytes(), name
 
 
-def test_lines_of_a_level_lead_to_the_displacements_of_the_finest():
+def test_masked_pixels_and_lonely_matches_have_neither_match_nor_standard_deviation():
+    left, right, _, wall = scene()
+    usable = np.ones(left.shape, np.uint8)
+    usable[:, 60] = 0
+    found = match(left, right, HfvmParams(min_support=0.7), valid=(usable, None))
+    ok = matched(found.validity)
+    assert ok[wall].mean() > 0.3
+    assert not ok[:, 60].any()
+    np.testing.assert_array_equal(np.isfinite(found.disparity_std), ok)
+
+
+def test_a_plane_through_two_columns_of_windows():
+    y, x = (a.ravel() for a in np.mgrid[0:1000, 0:2])
+    step = np.rint(-7 + 0.01 * y + 0.0 * x)
+    step[::3] = np.random.default_rng(0).integers(-30, 5, len(step[::3]))
+    g, error = textureless._fit(x, y, step, np.ones(len(x)))
+    assert g[2] == pytest.approx(0.01, abs=2e-4)
+    assert np.mean(error < 1) > 0.65
+
+
+def test_lines_lead_to_displacements_and_back():
     f = np.array([[1e-6, 2e-5, -0.01], [-3e-5, 1e-6, 1.0], [0.02, -1.0, 1.5]])
     lines = Lines.of(f, (200, 300))
     x, y = np.array([20, 150, 290]), np.array([10, 100, 190])
     along = np.array([-30.0, 4.0, 11.0])
-    at = np.array([lines.at(Window(j, j + 1, i, i + 1))[0, 0] for i, j in zip(x, y, strict=True)])
-    u, v = along * at[:, 0] + at[:, 2], along * at[:, 1] + at[:, 3]
+    u, v = epipolar.on_line(epipolar.lines_at(f, x, y).T, lines.sense * along)
     np.testing.assert_allclose(lines.along(x, y, u, v), along, atol=1e-3)
     ends, starts = np.stack([x + u, y + v, np.ones(3)]), np.stack([x, y, np.ones(3)])
     np.testing.assert_allclose(np.sum(ends * (f @ starts), axis=0), 0, atol=1e-3)
     assert (np.diff(u[np.argsort(along)]) > 0).all()
-    # A pixel of level 1 stands for the middle of four, and its displacements are half as long.
-    four = lines.at(Window(40, 42, 60, 62)).mean(axis=(0, 1))
-    coarse = lines.at(Window(20, 21, 30, 31), 1)[0, 0]
-    np.testing.assert_allclose(coarse * (1, 1, 2, 2), four, atol=1e-4)
+    for i, j, expected in zip(x, y, epipolar.lines_at(f, x, y), strict=True):
+        np.testing.assert_allclose(epipolar.lines(f, (1, 1), i, j)[0, 0], expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("window", [Window(0, 9, 0, 13), Window(3, 8, 5, 12), Window(4, 9, 2, 13)])
@@ -131,7 +148,7 @@ def test_search_and_its_definition_agree():
     region = np.zeros(window.shape, bool)
     region[2:24, 3:36] = True
     region[10:14, 12:20] = False
-    lines = Lines.of(np.array([[0, 0, 0], [0, 0, 1.0], [0, -1.0, -1.0]]), (40, 60)).at(window)
+    lines = epipolar.lines(np.array([[0, 0, 0], [0, 0, 1.0], [0, -1.0, -1.0]]), window.shape, window.x0, window.y0)
     seen, best, distinct = textureless.search((words[window.slices], (others, valid)), region, lines, steps, window)
     a, b = (w.view(np.uint8).reshape(*w.shape, 8).astype(int) for w in (words, others))
     for y, x in rng.permutation(np.argwhere(region))[:60]:
@@ -144,7 +161,7 @@ def test_search_and_its_definition_agree():
             inside[inside] &= valid[q[inside], p[inside]] != 0
             hidden |= not inside.all()
             apart = np.abs(a[j + window.y0, i + window.x0] - b[np.clip(q, 0, 39), np.clip(p, 0, 59)]).sum(axis=1)
-            sums.append(np.minimum(apart, FAR)[inside].sum() if inside.all() else 0)
+            sums.append(np.minimum(apart, CAP)[inside].sum() if inside.all() else 0)
         assert seen[y, x] == (not hidden)
         if not hidden:
             k = int(np.argmin(sums))
