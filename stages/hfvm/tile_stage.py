@@ -264,7 +264,7 @@ def _planes(patches: Bundle, shape: Shape) -> textureless.Planes | None:
     facts = patches.meta["planes"]
     if facts is None:
         return None
-    lines = textureless.Lines.of(np.array(facts["f"]), shape)
+    lines = textureless.EpipolarLines.of(np.array(facts["f"]), shape)
     return textureless.Planes(patches.raster("region"), facts["terms"], lines)
 
 

@@ -200,7 +200,7 @@ class Finish:
         # Negated, so that NaN is refused as well.
         if found is None or not found[1] <= epipolar.SHARP:
             return None
-        lines = textureless.Lines.of(found[0], shape)
+        lines = textureless.EpipolarLines.of(found[0], shape)
         if not p.textureless:
             return textureless.Planes(np.zeros(above, np.uint8), [], lines)
         none = np.asarray(unmatched.reshape(above[0], 2, above[1], 2).all(axis=(1, 3)))

@@ -84,7 +84,7 @@ TRIALS = 500
 ITERATIONS = 10
 
 
-class Lines(NamedTuple):
+class EpipolarLines(NamedTuple):
     """Epipolar lines of the left image's pixels, with a direction: a fundamental matrix of level 0, the sign of the
     direction, and whether they run along the rows rather than along the columns."""
 
@@ -93,11 +93,11 @@ class Lines(NamedTuple):
     along_rows: bool
 
     @staticmethod
-    def of(f: epipolar.Matrix, shape: tuple[int, ...]) -> Lines:
+    def of(f: epipolar.Matrix, shape: tuple[int, ...]) -> EpipolarLines:
         """Lines along which columns grow, or rows where they run along the columns."""
         a, b, _ = epipolar.lines(f, (1, 1), shape[1] // 2, shape[0] // 2)[0, 0]
         along_rows = bool(abs(b) >= abs(a))
-        return Lines(f, float(np.sign(b if along_rows else -a)), along_rows)
+        return EpipolarLines(f, float(np.sign(b if along_rows else -a)), along_rows)
 
     def along(self, x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray) -> AnyArray:
         """Displacements (n,) of pixels of level 0 along their lines, pixels: what :func:`epipolar.on_line` undoes."""
@@ -114,7 +114,7 @@ class Planes(NamedTuple):
 
     region: Raster
     terms: list[list[float]]
-    lines: Lines
+    lines: EpipolarLines
 
     def cut(self, window: Window) -> tuple[NDArray[np.bool_], AnyArray, AnyArray, AnyArray]:
         """Of the pixels of a window of level 0: whether they are matched, columns, rows and standard deviations."""
@@ -131,7 +131,7 @@ class Planes(NamedTuple):
         return np.asarray(region != 0), u, v, std
 
 
-def find(pair: Prepared, lines: Lines, unmatched: AnyArray, along: AnyArray, far_sign: float) -> Planes:
+def find(pair: Prepared, lines: EpipolarLines, unmatched: AnyArray, along: AnyArray, far_sign: float) -> Planes:
     """Find the planes of the left image's textureless regions.
 
     Parameters

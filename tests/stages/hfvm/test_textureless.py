@@ -7,7 +7,7 @@ import pytest
 from rille.stages.core.validity import matched
 from rille.stages.hfvm import tiled
 from rille.stages.hfvm.finish import textureless
-from rille.stages.hfvm.finish.textureless import APART, CAP, SIDE, Lines, Planes
+from rille.stages.hfvm.finish.textureless import APART, CAP, SIDE, EpipolarLines, Planes
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import Plain
 from rille.stages.hfvm.images.window import Window, whole
@@ -113,7 +113,7 @@ def test_a_plane_through_two_columns_of_windows():
 
 def test_lines_lead_to_displacements_and_back():
     f = np.array([[1e-6, 2e-5, -0.01], [-3e-5, 1e-6, 1.0], [0.02, -1.0, 1.5]])
-    lines = Lines.of(f, (200, 300))
+    lines = EpipolarLines.of(f, (200, 300))
     x, y = np.array([20, 150, 290]), np.array([10, 100, 190])
     along = np.array([-30.0, 4.0, 11.0])
     u, v = epipolar.on_line(epipolar.lines_at(f, x, y).T, lines.sense * along)
@@ -128,7 +128,7 @@ def test_lines_lead_to_displacements_and_back():
 @pytest.mark.parametrize("window", [Window(0, 9, 0, 13), Window(3, 8, 5, 12), Window(4, 9, 2, 13)])
 def test_a_window_of_planes_is_part_of_the_whole(window):
     region = np.random.default_rng(0).integers(0, 3, (5, 7)).astype(np.uint8)
-    lines = Lines.of(np.array([[0, 0, 0], [0, 0, 1.0], [0, -1.0, 0.5]]), (9, 13))
+    lines = EpipolarLines.of(np.array([[0, 0, 0], [0, 0, 1.0], [0, -1.0, 0.5]]), (9, 13))
     planes = Planes(region, [[-8.0, 0.1, 0.0, 0.5], [3.0, 0.0, -0.2, 1.0]], lines)
     everything = planes.cut(whole((9, 13)))
     for part, all_of_it in zip(planes.cut(window), everything, strict=True):
