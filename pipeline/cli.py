@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cyclopts import App, CycloptsError, MissingArgumentError
+from cyclopts import App, CycloptsError, MissingArgumentError, UnusedCliTokensError
 from rich.console import Console
 
 from rille.pipeline.commands import cache as cache_commands
@@ -340,8 +340,10 @@ def _run(argv: list[str] | None) -> int:
         return INTERRUPTED
     except CycloptsError as error:
         words = " ".join(("rille", *(error.command_chain or ())))
-        hint = f" `{words} --help` says what it takes." if isinstance(error, MissingArgumentError) else ""
-        _print_error("RIL-001", f"{error}{hint}")
+        extra = isinstance(error, UnusedCliTokensError)
+        text = f"unexpected {', '.join(map(repr, error.unused_tokens or ()))}." if extra else str(error)
+        hint = f" `{words} --help` says what it takes." if extra or isinstance(error, MissingArgumentError) else ""
+        _print_error("RIL-001", f"{text}{hint}")
         return USAGE
     except BrokenPipeError:  # who read the output has had enough of it
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

@@ -155,3 +155,8 @@ def test_help(place: Place, command: str) -> None:
     done = place.here(*command.split(), "--help")
     assert (done.status, done.err) == (0, "")
     assert done.lines[0].startswith(f"Usage: rille {command}".strip())
+
+
+def test_a_word_too_many_is_named(place: Place) -> None:
+    done = place.here("match", "a.png", "b.png", "c.tif")
+    assert done.err == "rille: error RIL-001: unexpected 'c.tif'. `rille match --help` says what it takes.\n"
