@@ -65,7 +65,7 @@ FIELDS: Mapping[str, str] = {
 """Last part of the present name, by the former section and key."""
 
 GONE: Mapping[str, str] = {
-    "hfvm.greatest_std": "it lowered no error and is gone: leave it out; each match has its standard deviation",
+    "hfvm.greatest_std": "what is filled was no better with it and it is gone: leave it out",
     "refine.stereo": "it gained little and is gone: leave it out",
 }
 

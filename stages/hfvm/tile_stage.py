@@ -255,17 +255,16 @@ def _patches(task: TileInputs) -> Bundle:
     planes = steps.planes(refined, gone)
     if planes is None:
         return Bundle({"gone": gone}, {"planes": None})
-    meta = {"planes": {"terms": planes.terms, "f": planes.lines.f.tolist()}}
+    meta = {"planes": {"terms": planes.terms, "f": planes.f.tolist()}}
     return Bundle({"gone": gone, "region": np.asarray(planes.region)}, meta)
 
 
-def _planes(patches: Bundle, shape: Shape) -> textureless.Planes | None:
-    """What step ``patches`` found in a left image of ``shape``."""
+def _planes(patches: Bundle) -> textureless.Planes | None:
+    """What step ``patches`` found."""
     facts = patches.meta["planes"]
     if facts is None:
         return None
-    lines = textureless.EpipolarLines.of(np.array(facts["f"]), shape)
-    return textureless.Planes(patches.raster("region"), facts["terms"], lines)
+    return textureless.Planes(patches.raster("region"), facts["terms"], np.array(facts["f"]))
 
 
 def _final(task: TileInputs) -> Bundle:
@@ -278,7 +277,7 @@ def _final(task: TileInputs) -> Bundle:
         task.rasters("checked", ("error",), shape),
         task.rasters("refined", ("u", "v", "validity", "noise"), shape),
         task.inputs["patches"].raster("gone"),
-        _planes(task.inputs["patches"], shape),
+        _planes(task.inputs["patches"]),
     )
     if task.half:
         left, right = (task.inputs[port].raster("level_0").shape for port in ("left", "right"))

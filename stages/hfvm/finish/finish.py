@@ -200,11 +200,12 @@ class Finish:
         # Negated, so that NaN is refused as well.
         if found is None or not found[1] <= epipolar.SHARP:
             return None
-        lines = textureless.EpipolarLines.of(found[0], shape)
+        f = epipolar.oriented(found[0], shape)
         if not p.textureless:
-            return textureless.Planes(np.zeros(above, np.uint8), [], lines)
+            return textureless.Planes(np.zeros(above, np.uint8), [], f)
         none = np.asarray(unmatched.reshape(above[0], 2, above[1], 2).all(axis=(1, 3)))
-        return textureless.find(self.pair, lines, none, lines.along(x, y, u, v), -self.near_sign)
+        along = epipolar.along_line(epipolar.lines_at(f, x, y), u, v)
+        return textureless.find(self.pair, f, none, along, -self.near_sign)
 
     def final(
         self,
@@ -262,7 +263,7 @@ class Finish:
             u, v = guided.median(u, v, keep, interpolated, left)
         if planes is not None:
             # A filled pixel has its neighbour's depth, not its row: between turned cameras rows change along a row.
-            epipolar.settle_rows(planes.lines.f, u, v, interpolated, outer.x0, outer.y0)
+            epipolar.settle_rows(planes.f, u, v, interpolated, outer.x0, outer.y0)
         u, v = self._to_right(u, v, outer)
         consistency.conclude(validity, keep, interpolated, u, v, error, distance)
         arrays = {

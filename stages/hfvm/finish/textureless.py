@@ -84,37 +84,17 @@ TRIALS = 500
 ITERATIONS = 10
 
 
-class EpipolarLines(NamedTuple):
-    """Epipolar lines of the left image's pixels, with a direction: a fundamental matrix of level 0, the sign of the
-    direction, and whether they run along the rows rather than along the columns."""
-
-    f: epipolar.Matrix
-    sense: float
-    along_rows: bool
-
-    @staticmethod
-    def of(f: epipolar.Matrix, shape: tuple[int, ...]) -> EpipolarLines:
-        """Lines along which columns grow, or rows where they run along the columns."""
-        a, b, _ = epipolar.lines(f, (1, 1), shape[1] // 2, shape[0] // 2)[0, 0]
-        along_rows = bool(abs(b) >= abs(a))
-        return EpipolarLines(f, float(np.sign(b if along_rows else -a)), along_rows)
-
-    def along(self, x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray) -> AnyArray:
-        """Displacements (n,) of pixels of level 0 along their lines, pixels: what :func:`epipolar.on_line` undoes."""
-        a, b, _ = epipolar.lines_at(self.f, x, y).T
-        return np.asarray(self.sense * (b * u - a * v))
-
-
 class Planes(NamedTuple):
     """Matches on the planes of textureless regions.
 
     ``region``: (row, col) of level 1, uint8, number of the region from 1 on, 0 where nothing is matched. ``terms``: of
-    each region, pixels of level 0: terms (1, x, y) of the displacement along ``lines``, and its standard deviation.
+    each region, pixels of level 0: terms (1, x, y) of the displacement along the lines of ``f``, and its standard
+    deviation.
     """
 
     region: Raster
     terms: list[list[float]]
-    lines: EpipolarLines
+    f: epipolar.Matrix
 
     def cut(self, window: Window) -> tuple[NDArray[np.bool_], AnyArray, AnyArray, AnyArray]:
         """Of the pixels of a window of level 0: whether they are matched, columns, rows and standard deviations."""
@@ -124,18 +104,19 @@ class Planes(NamedTuple):
         y, x = np.nonzero(region)
         g = np.array([4 * [0.0], *self.terms])[region[y, x]]
         x0, y0 = x + window.x0, y + window.y0
-        along = self.lines.sense * (g[:, 0] + g[:, 1] * x0 + g[:, 2] * y0)
+        along = g[:, 0] + g[:, 1] * x0 + g[:, 2] * y0
         u, v, std = np.zeros((3, *window.shape), np.float32)
-        u[y, x], v[y, x] = epipolar.on_line(epipolar.lines_at(self.lines.f, x0, y0).T, along)
+        u[y, x], v[y, x] = epipolar.on_line(epipolar.lines_at(self.f, x0, y0), along)
         std[y, x] = g[:, 3]
         return np.asarray(region != 0), u, v, std
 
 
-def find(pair: Prepared, lines: EpipolarLines, unmatched: AnyArray, along: AnyArray, far_sign: float) -> Planes:
+def find(pair: Prepared, f: epipolar.Matrix, unmatched: AnyArray, along: AnyArray, far_sign: float) -> Planes:
     """Find the planes of the left image's textureless regions.
 
     Parameters
     ----------
+    f : fundamental matrix of level 0, see :func:`rille.stages.hfvm.level.epipolar.oriented`.
     unmatched : (row, col) bool of level 1: of the pixels of level 0 below none is matched.
     along : displacements (n,) of matches along their lines, pixels of level 0.
     far_sign : sign of the column displacement of far things against near ones; 0 unknown.
@@ -144,22 +125,23 @@ def find(pair: Prepared, lines: EpipolarLines, unmatched: AnyArray, along: AnyAr
     label, terms = np.zeros(shape, np.uint8), list[list[float]]()
     patch, valid = pair.left.patch(LEVEL, whole(shape), deviation=True), pair.left.view.valid(LEVEL, whole(shape))
     assert patch.deviation is not None
-    up, steps, right = plane.finer(LEVEL), _steps(along, far_sign if lines.along_rows else 0.0), None
+    steps = _steps(along, far_sign if epipolar.along_rows(f, pair.shapes(0)[0]) else 0.0)
+    up, right = plane.finer(LEVEL), None
     for window, region in _regions(unmatched & (patch.deviation < DEVIATION) & (valid != 0)):
         right = right or (pair.right.patch(LEVEL, whole(other)).words, pair.right.view.valid(LEVEL, whole(other)))
-        its_lines = epipolar.lines(up.T @ lines.f @ up, window.shape, window.x0, window.y0)
+        its_lines = epipolar.lines(up.T @ f @ up, window.shape, window.x0, window.y0)
         images = np.ascontiguousarray(patch.words[window.slices]), right
-        seen, best, distinct = search(images, region, its_lines, lines.sense * steps, window)
+        seen, best, distinct = search(images, region, its_lines, steps, window)
         y, x = np.nonzero(seen & (distinct > 0))
         if len(y) < max(LEAST, 0.5 * np.count_nonzero(region)):
             continue
-        votes, step = distinct[y, x].astype(np.float64), lines.sense * best[y, x].astype(np.float64)
+        votes, step = distinct[y, x].astype(np.float64), best[y, x].astype(np.float64)
         g, error = _fit(x + window.x0, y + window.y0, step, votes)
         agree = (error <= TOLERANCE) & (steps[1] < step) & (step < steps[-2])
         if _sure(agree, votes, len(steps)):
             terms.append(_at_level_0(g, error[agree]))
             label[window.slices][y[agree], x[agree]] = len(terms)
-    return Planes(label, terms, lines)
+    return Planes(label, terms, f)
 
 
 def _sure(agree: AnyArray, votes: AnyArray, steps: int) -> bool:
@@ -217,7 +199,7 @@ def search(
     images : features of the left window; features and mask of the whole right image.
     region : (row, col) bool, pixels of the window.
     lines : of these pixels, see :func:`rille.stages.hfvm.level.epipolar.lines`.
-    steps : (n,) float32 pixels, ascending or descending by 1.
+    steps : (n,) float32 pixels, ascending by 1.
     window : where the left window lies.
 
     Returns
@@ -268,7 +250,7 @@ def _keep(total, step, least_passed, out):  # type: ignore[no-untyped-def]
             if total[y, x] < least[y, x]:
                 least[y, x], best[y, x] = total[y, x], step
                 least_behind[y, x], least_ahead[y, x] = least_passed[y, x], np.inf
-            elif abs(step - best[y, x]) > APART:
+            elif step - best[y, x] > APART:
                 least_ahead[y, x] = min(least_ahead[y, x], total[y, x])
 
 

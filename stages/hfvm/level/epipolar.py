@@ -235,6 +235,12 @@ def line(terms, x, length):  # type: ignore[no-untyped-def]
     return a * scale, b * scale, c * scale
 
 
+def along_line(line: AnyArray, u: AnyArray, v: AnyArray) -> AnyArray:
+    """How far along their lines (3, n) displacements lead, pixels: what :func:`on_line` undoes."""
+    a, b, _ = line
+    return np.asarray(b * u - a * v)
+
+
 @register_jitable
 def on_line(line, along):  # type: ignore[no-untyped-def]
     """Displacement (column, row) on a line (a, b, c) of unit normal, ``along`` pixels from the shortest one on it."""
@@ -244,11 +250,23 @@ def on_line(line, along):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def lines_at(f, x, y):  # type: ignore[no-untyped-def]
-    """As :func:`lines`, of single pixels (n,): (n, 3) float32."""
-    found = np.empty((len(x), 3), np.float32)
+    """As :func:`lines`, of single pixels (n,): (3, n) float32."""
+    found = np.empty((3, len(x)), np.float32)
     for n in range(len(x)):
-        found[n, 0], found[n, 1], found[n, 2] = line(row_terms(f, np.float64(y[n])), np.float32(x[n]), np.float32(1.0))
+        found[0, n], found[1, n], found[2, n] = line(row_terms(f, np.float64(y[n])), np.float32(x[n]), np.float32(1.0))
     return found
+
+
+def along_rows(f: Matrix, shape: tuple[int, ...]) -> bool:
+    """Whether the lines of an image of ``shape`` run along the rows rather than along the columns."""
+    a, b, _ = lines(f, (1, 1), shape[1] // 2, shape[0] // 2)[0, 0]
+    return bool(abs(b) >= abs(a))
+
+
+def oriented(f: Matrix, shape: tuple[int, ...]) -> Matrix:
+    """The matrix with the sign by which :func:`on_line` leads to greater columns, or rows on upright lines."""
+    a, b, _ = lines(f, (1, 1), shape[1] // 2, shape[0] // 2)[0, 0]
+    return f if (b if along_rows(f, shape) else -a) > 0 else -f
 
 
 @njit(cache=True, nogil=True)

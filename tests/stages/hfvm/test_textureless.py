@@ -7,7 +7,7 @@ import pytest
 from rille.stages.core.validity import matched
 from rille.stages.hfvm import tiled
 from rille.stages.hfvm.finish import textureless
-from rille.stages.hfvm.finish.textureless import APART, CAP, SIDE, EpipolarLines, Planes
+from rille.stages.hfvm.finish.textureless import APART, CAP, SIDE, Planes
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import Plain
 from rille.stages.hfvm.images.window import Window, whole
@@ -113,23 +113,23 @@ def test_a_plane_through_two_columns_of_windows():
 
 def test_lines_lead_to_displacements_and_back():
     f = np.array([[1e-6, 2e-5, -0.01], [-3e-5, 1e-6, 1.0], [0.02, -1.0, 1.5]])
-    lines = EpipolarLines.of(f, (200, 300))
+    f = epipolar.oriented(-f, (200, 300))
     x, y = np.array([20, 150, 290]), np.array([10, 100, 190])
     along = np.array([-30.0, 4.0, 11.0])
-    u, v = epipolar.on_line(epipolar.lines_at(f, x, y).T, lines.sense * along)
-    np.testing.assert_allclose(lines.along(x, y, u, v), along, atol=1e-3)
+    u, v = epipolar.on_line(epipolar.lines_at(f, x, y), along)
+    np.testing.assert_allclose(epipolar.along_line(epipolar.lines_at(f, x, y), u, v), along, atol=1e-3)
     ends, starts = np.stack([x + u, y + v, np.ones(3)]), np.stack([x, y, np.ones(3)])
     np.testing.assert_allclose(np.sum(ends * (f @ starts), axis=0), 0, atol=1e-3)
     assert (np.diff(u[np.argsort(along)]) > 0).all()
-    for i, j, expected in zip(x, y, epipolar.lines_at(f, x, y), strict=True):
+    for i, j, expected in zip(x, y, epipolar.lines_at(f, x, y).T, strict=True):
         np.testing.assert_allclose(epipolar.lines(f, (1, 1), i, j)[0, 0], expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("window", [Window(0, 9, 0, 13), Window(3, 8, 5, 12), Window(4, 9, 2, 13)])
 def test_a_window_of_planes_is_part_of_the_whole(window):
     region = np.random.default_rng(0).integers(0, 3, (5, 7)).astype(np.uint8)
-    lines = EpipolarLines.of(np.array([[0, 0, 0], [0, 0, 1.0], [0, -1.0, 0.5]]), (9, 13))
-    planes = Planes(region, [[-8.0, 0.1, 0.0, 0.5], [3.0, 0.0, -0.2, 1.0]], lines)
+    f = np.array([[0, 0, 0], [0, 0, 1.0], [0, -1.0, 0.5]])
+    planes = Planes(region, [[-8.0, 0.1, 0.0, 0.5], [3.0, 0.0, -0.2, 1.0]], f)
     everything = planes.cut(whole((9, 13)))
     for part, all_of_it in zip(planes.cut(window), everything, strict=True):
         np.testing.assert_array_equal(part, all_of_it[window.slices])
