@@ -55,7 +55,7 @@ def plane(lattice: Lattice) -> Surface:
         # Whole rows at once: filling (r, c, 3) by its last axis takes several times as long.
         line, up = np.zeros((cols.size, 3)), np.zeros((cols.size, 3))
         line[:, 0], up[:, 2] = xs[cols.astype(np.intp)], 1.0
-        feet, normals = (np.tile(v.ravel(), (rows.size, 1)).reshape(rows.size, cols.size, 3) for v in (line, up))
+        feet, normals = (np.broadcast_to(v, (rows.size, cols.size, 3)).copy() for v in (line, up))
         feet[..., 1] = ys[rows.astype(np.intp)][:, None]
         return feet, normals
 

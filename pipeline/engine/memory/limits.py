@@ -116,8 +116,8 @@ def _statistic(path: Path, name: str) -> int:
     return 0
 
 
-KEPT = 64 << 20
-"""Bytes by which a process may grow before it gives freed memory back."""
+SELDOM = 64
+"""Unmeasured tasks after which a process gives freed memory back."""
 
 
 def resident() -> int:
@@ -130,8 +130,9 @@ class Meter:
 
     What earlier tasks have freed is given back to the system first, and what this one has freed at its end: a heap
     that is kept for later would hide what a task takes. Fetching it anew took a tenth of a task's time, so a task can
-    be left unmeasured; then freed memory is given back only if the process has grown by more than :data:`KEPT`. Both
-    figures are then None, as where the system cannot tell, or where another task ran in the process meanwhile.
+    be left unmeasured; then freed memory is given back after every :data:`SELDOM` tasks, so that a heap in pieces does
+    not grow. Both figures are then None, as where the system cannot tell, or where another task ran in the process
+    meanwhile.
 
     >>> with Meter() as meter:
     ...     array = np.ones(10**7)
@@ -142,8 +143,8 @@ class Meter:
     _lock = threading.Lock()
     _running: list[Meter] = []  # noqa: RUF012 (of the process, on purpose)
 
-    _held = 0
-    """Least resident memory of the process since freed memory was last given back."""
+    _since = 0
+    """Tasks since freed memory was last given back."""
 
     memory: int | None = None
     rest: int | None = None
@@ -165,11 +166,10 @@ class Meter:
 
     def __exit__(self, *_: object) -> None:
         peak = _status()[1] if self._before else 0
-        if self._alone and (self._measure or resident() > Meter._held + KEPT):
+        Meter._since += 1
+        if self._alone and (self._measure or Meter._since >= SELDOM):
             _trim()
-            Meter._held = resident()
-        elif self._alone:
-            Meter._held = min(Meter._held, resident())
+            Meter._since = 0
         now = _status()[0] if self._before else 0
         with Meter._lock:
             Meter._running.remove(self)
