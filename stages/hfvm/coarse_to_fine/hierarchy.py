@@ -380,18 +380,20 @@ def level_tile(pair: Prepared, level: int, window: Window, above: State | None) 
     # Before the check of consistency, which asks one pixel of the other map: an outlier there refutes a match.
     u, v = (consistency.median(np.asarray(plane), p.median) for plane in (found.u, found.v))
     if edges:
-        u, v = _edges_placed(pair, a, b, (u, v))
+        u, v = _edges_placed(pair, a, b, (u, v), above.near_sign if above else 0.0)
     arrays = {"u": u, "v": v, "undefined": np.asarray(found.undefined)}
     inner = window.inside(outer)
     return {name: array[inner] for name, array in arrays.items()}
 
 
-def _edges_placed(pair: Prepared, a: Patch, b: Patch, given: tuple[AnyArray, AnyArray]) -> tuple[AnyArray, AnyArray]:
+def _edges_placed(
+    pair: Prepared, a: Patch, b: Patch, given: tuple[AnyArray, AnyArray], near_sign: float
+) -> tuple[AnyArray, AnyArray]:
     """Displacements of a left window of the finest level, depth edges placed anew where there is texture."""
     assert a.deviation is not None
     left, right = (depth_edges.EdgeView(compact.pack(patch.grey), patch.grey) for patch in (a, b))
     wanted = (a.deviation >= pair.params.texture) & (pair.left.view.valid(0, a.window) != 0)
-    return depth_edges.place(left, right, given, wanted, offset(a, b))
+    return depth_edges.place(left, right, given, wanted, offset(a, b), near_sign)
 
 
 def consistent(pair: Prepared, level: int, a: Map, b: Map, window: Window) -> NDArray[np.bool_]:

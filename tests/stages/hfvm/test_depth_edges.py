@@ -13,7 +13,7 @@ def view(image):
     return EdgeView(compact.pack(image), image)
 
 
-def by_the_equation(left, right, u, v, wanted, at):
+def by_the_equation(left, right, u, v, wanted, at, near_sign):
     """C(d) of every candidate, pixel by pixel."""
     out = u.copy(), v.copy()
     rows, cols = u.shape
@@ -42,14 +42,15 @@ def by_the_equation(left, right, u, v, wanted, at):
                 continue
             chosen, best = 0, BETTER[0] * costs[0]
             for k, cost in enumerate(costs[1:], 1):
-                if cost is not None and BETTER[1] * cost < best:
-                    chosen, best = k, BETTER[1] * cost
+                farther = near_sign * (tried[k][0] - tried[0][0]) < 0
+                if cost is not None and BETTER[not farther] * cost < best:
+                    chosen, best = k, BETTER[not farther] * cost
             out[0][y, x], out[1][y, x] = tried[chosen]
     return out
 
 
-@pytest.mark.parametrize("at", [(0, 0), (7, -2)])
-def test_kernel_and_equation_agree(at):
+@pytest.mark.parametrize(("at", "near_sign"), [((0, 0), -1.0), ((7, -2), 1.0), ((7, -2), 0.0)])
+def test_kernel_and_equation_agree(at, near_sign):
     rng = np.random.default_rng(1)
     scene = rng.uniform(0, 60, (ROWS + 20, COLS + 20)).astype(np.float32)
     left, right = (
@@ -64,8 +65,8 @@ def test_kernel_and_equation_agree(at):
     )
     v = rng.integers(4 - at[1], 7 - at[1], (ROWS, COLS)).astype(np.int16)
     wanted = rng.random((ROWS, COLS)) < 0.9
-    found = place(view(left), view(right), (u, v), wanted, at)
-    expected = by_the_equation(view(left), view(right), u, v, wanted, at)
+    found = place(view(left), view(right), (u, v), wanted, at, near_sign)
+    expected = by_the_equation(view(left), view(right), u, v, wanted, at, near_sign)
     np.testing.assert_array_equal(found[0], expected[0])
     np.testing.assert_array_equal(found[1], expected[1])
     assert (found[0] != u).any(), "something was decided anew"
@@ -88,7 +89,7 @@ def test_an_outline_that_was_too_wide_is_put_in_its_place():
     wide = truth.copy()
     wide[9:31, 21:47] = truth[15, 30]
     nothing = np.zeros_like(truth)
-    found, rows = place(view(left), view(right), (wide, nothing), np.ones(truth.shape, bool), (0, 0))
+    found, rows = place(view(left), view(right), (wide, nothing), np.ones(truth.shape, bool), (0, 0), -1.0)
     # Beside the square's left side the right image hides the wall, so that there is no evidence for it.
     seen = np.ones(truth.shape, bool)
     seen[12:28, 24 - 7 : 24] = False
@@ -100,5 +101,5 @@ def test_an_outline_that_was_too_wide_is_put_in_its_place():
 def test_without_evidence_nothing_changes():
     _, _, truth = pair()
     flat = view(np.full(truth.shape, 90, np.float32))
-    found = place(flat, flat, (truth, np.zeros_like(truth)), np.ones(truth.shape, bool), (0, 0))
+    found = place(flat, flat, (truth, np.zeros_like(truth)), np.ones(truth.shape, bool), (0, 0), -1.0)
     np.testing.assert_array_equal(found[0], truth)
