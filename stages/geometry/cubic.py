@@ -1,4 +1,4 @@
-"""Cubic interpolation of grey values, without derivatives."""
+"""Cubic interpolation of grey values."""
 
 from __future__ import annotations
 
@@ -7,16 +7,15 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True, inline="always")
-def cubic(a, x, y):  # type: ignore[no-untyped-def]
-    """Catmull-Rom value (float32) of ``a`` at (x, y), a pixel or more inside; that of ``sample_cubic`` to the bit."""
-    # Unsigned indices need no check for counting from the end.
+def cubic(a, x, y, x0=0, y0=0):  # type: ignore[no-untyped-def]
+    """Catmull-Rom value (float32) at (x, y), a pixel or more inside, of an image that ``a`` shows from x0, y0."""
     whole_x, whole_y = np.int64(x), np.int64(y)
-    i, j, step = np.uint64(whole_x), np.uint64(whole_y), np.uint64(1)
+    # Unsigned indices need no check for counting from the end. In float32 fractions must not depend on the window.
+    i, j, step = np.uint64(whole_x - x0), np.uint64(whole_y - y0), np.uint64(1)
     t, s = np.float32(x) - np.float32(whole_x), np.float32(y) - np.float32(whole_y)
     left, right, far = i - step, i + step, i + step + step
     above, below, bottom = j - step, j + step, j + step + step
-    # Constants of type float32: with Python's own numba would compute in float64, and round otherwise than
-    # sample_cubic.
+    # Constants of type float32: with Python's own numba would compute in float64, and round otherwise.
     h, one, two = np.float32(0.5), np.float32(1.0), np.float32(2.0)
     three, four, five = np.float32(3.0), np.float32(4.0), np.float32(5.0)
     w0, w3 = h * t * (two * t - one - t * t), h * t * t * (t - one)

@@ -42,8 +42,8 @@ class Disparity:
     interpolated ones included. ``validity``: bits of :class:`~rille.stages.core.validity.Validity`.
     ``backmatch_error``: float32 pixels, NaN where the match leaves the right image, and on the planes of textureless
     regions (:mod:`~rille.stages.hfvm.finish.textureless`). ``distance``: float32 mean feature distance at the
-    whole-pixel match (byte steps; preset ``paper``: Eq. 1, grey levels), NaN on such planes and where back-matching
-    failed by far. ``disparity_std``: float32 pixels, standard deviation of the column disparity (see
+    whole-pixel match (byte steps; preset ``paper``: Eq. 1, grey levels), NaN on such planes and where the match
+    leaves the right image. ``disparity_std``: float32 pixels, standard deviation of the column disparity (see
     :mod:`~rille.stages.hfvm.finish.uncertainty`), NaN where not ``MATCHED``. ``aligned``: whether the right image was
     pre-aligned by a plane.
     """

@@ -118,7 +118,7 @@ class _Read(Sequence[AnyArray]):
 
 
 def grey(image: AnyArray) -> Floats32:
-    """Floats32 (row, col) as float32 grey 0..255: uint8 as it is, uint16 over 257, floating point taken as 0..255.
+    """Image (row, col) as float32 grey 0..255: uint8 as it is, uint16 over 257, floating point taken as 0..255.
 
     Raises
     ------

@@ -53,7 +53,7 @@ def match_points(
 
     Notes
     -----
-    A point is lost where its prediction, its template or its match leaves the image or lies on a masked pixel, where
+    A point is lost where its prediction leaves the image, where it or its match does or lies on a masked pixel, where
     the least distance exceeds :data:`THRESHOLD` or lies on the border of the search area, and where back-matching
     fails.
     """

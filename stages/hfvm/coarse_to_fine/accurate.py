@@ -22,7 +22,6 @@ class AccurateSolver:
     fast: FastSolver
     params: HfvmParams
     uses_band: bool = True
-    whole: bool = True
 
     def rounds(self, level: int) -> int:
         """Rounds of propagation at a level."""

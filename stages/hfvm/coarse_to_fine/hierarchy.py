@@ -5,8 +5,9 @@ back-match, interpolate what failed, and hand the doubled map down as search cen
 is fitted anew to the consistent matches, where the solver uses one.
 
 A level is matched window by window (:func:`level_tile`), each wider than what is kept of it by as much as its steps
-reach: two pixels a round of propagation, the median's half side, and one pixel of the coarser level for the parents.
-So the result does not depend on how the image is cut up; one window that is the whole image is one way among others.
+reach: two pixels a round of propagation, the median's half side, one pixel of the coarser level for the parents, and on
+the finest level what the placement of depth edges reads. So the result does not depend on how the image is cut up; one
+window that is the whole image is one way among others.
 """
 
 from __future__ import annotations
@@ -104,10 +105,6 @@ class Solver(Protocol):
     def uses_band(self) -> bool:
         """Whether ``match`` uses the band."""
 
-    @property
-    def whole(self) -> bool:
-        """Whether it can match whole images only."""
-
     def rounds(self, level: int) -> int:
         """Rounds of propagation at a level; a displacement travels, and changes by, two pixels a round."""
 
@@ -118,7 +115,7 @@ class Solver(Protocol):
         """Integer map of ``a`` from the filled map of the level above, of the windows' parents; None: top level."""
 
     def fine(self, a: Patch, b: Patch, m: Map, wanted: AnyArray) -> Fine:
-        """Sub-pixel map where ``wanted`` is not zero, sound a pixel farther in than :data:`SUM_RADIUS`."""
+        """Sub-pixel map where ``wanted`` is not zero, sound :data:`SUM_RADIUS` in from where ``a`` is cut."""
 
 
 def offset(a: Patch, b: Patch) -> tuple[int, int]:
@@ -135,7 +132,6 @@ class FastSolver:
 
     params: HfvmParams
     uses_band: bool = True
-    whole: bool = False
     back: bool = False
     room: dict[str, AnyArray] = field(default_factory=dict)
 
@@ -192,7 +188,6 @@ class PaperSolver:
 
     params: HfvmParams
     uses_band: bool = False
-    whole: bool = False
 
     def rounds(self, level: int) -> int:
         """There is no propagation."""
@@ -347,7 +342,7 @@ def settle(pair: Prepared, level: int, left: Map, right: Map, near_sign: float) 
 def level_tiles(pair: Prepared, level: int) -> list[Window]:
     """Tiles that a level is matched in; the top level, whose search is exhaustive, is one."""
     top = level == pair.levels - 1
-    return tiles(pair.shapes(level)[0], None if top or pair.solver.whole else pair.side)
+    return tiles(pair.shapes(level)[0], None if top else pair.side)
 
 
 def level_tile(pair: Prepared, level: int, window: Window, above: State | None) -> Results:

@@ -21,7 +21,7 @@ from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm.coarse_to_fine import path_simd
 from rille.stages.hfvm.coarse_to_fine.path_simd import MOST, NONE
 from rille.stages.hfvm.level.features import Words, distance
-from rille.stages.hfvm.level.propagation import pack_map, unpack
+from rille.stages.hfvm.level.propagation import columns, pack, pack_map, rows_of, unpack
 
 UNIT = 4
 """Cost of a byte step of Table 1's features, so that weaker ones can be weighed as integers."""
@@ -130,16 +130,16 @@ def _gather(left, right, share, maps, above, band, found):  # type: ignore[no-un
         for x in range(cols):
             tried = 0
             for j, i in OWN:
-                us[tried], vs[tried] = _columns(maps[y, x]) + i, _rows(maps[y, x]) + j
+                us[tried], vs[tried] = columns(maps[y, x]) + i, rows_of(maps[y, x]) + j
                 tried += 1
             for j, i in AROUND:
                 near = maps[_inside(y + j, rows), _inside(x + i, cols)]
-                us[tried], vs[tried] = _columns(near), _rows(near)
+                us[tried], vs[tried] = columns(near), rows_of(near)
                 tried += 1
             if above.size:
                 for j, i in ABOVE:
                     far = above[_inside(y // 2 + j, above.shape[0]), _inside(x // 2 + i, above.shape[1])]
-                    us[tried], vs[tried] = _columns(far), _rows(far)
+                    us[tried], vs[tried] = columns(far), rows_of(far)
                     tried += 1
             count = 0
             for n in range(tried):
@@ -165,17 +165,6 @@ def _gather(left, right, share, maps, above, band, found):  # type: ignore[no-un
                     break
             for k in range(count, MOST):
                 found.u[y, x, k], found.v[y, x, k], found.cost[y, x, k] = 0, 0, NONE
-
-
-@njit(cache=True, nogil=True)
-def _columns(packed):  # type: ignore[no-untyped-def]
-    """Columns of a packed displacement, v << 16 | u."""
-    return np.int64(np.int16(packed & 0xFFFF))
-
-
-@njit(cache=True, nogil=True)
-def _rows(packed):  # type: ignore[no-untyped-def]
-    return np.int64(packed >> 16)
 
 
 @njit(cache=True, nogil=True)
@@ -224,6 +213,4 @@ def _choose(found, total, maps):  # type: ignore[no-untyped-def]
                 # Strictly less: the pixel's own displacement comes first and wins ties.
                 if found.cost[y, x, k] != NONE and total[y, x, k] < total[y, x, best]:
                     best = k
-            maps[y, x] = (np.int32(found.v[y, x, best]) << np.int32(16)) | (
-                np.int32(found.u[y, x, best]) & np.int32(0xFFFF)
-            )
+            maps[y, x] = pack(np.int64(found.u[y, x, best]), np.int64(found.v[y, x, best]))

@@ -134,9 +134,7 @@ class Finish:
         # What is cut may be the raster itself.
         bits = bits.copy()
         keep = bits == 0
-        # The relief's windows are not bounded: it is given the whole image.
-        all_of_it = p.variational_steps or outer == whole(self.shape)
-        target = whole(shape) if all_of_it else self._read(outer, u, v, keep)
+        target = whole(shape) if outer == whole(self.shape) else self._read(outer, u, v, keep)
         place = WindowPair(outer.x0, outer.y0, target.x0, target.y0, shape[0], shape[1])
         left, valid = self.pair.left.view.grey(0, outer), self.right.valid(0, target)
         image = self.right.grey(0, target)
@@ -224,8 +222,8 @@ class Finish:
         p = self.params
         near = uncertainty.SURROUNDINGS // 2 + consistency.CROWD // 2 + consistency.SUPPORT // 2
         extra = guided.RADIUS if p.guided_fill else 0
-        # Filling reaches along rows alone, so that columns need more than rows.
-        outer = window.grow(near + extra, max(near, p.fill_reach) + extra, self.shape)
+        # Filling reaches along rows alone; whether the match that it ends at is borne out, its surroundings say.
+        outer = window.grow(near + extra, max(near, p.fill_reach + consistency.SUPPORT // 2) + extra, self.shape)
         u, v = (cut(refined[name], outer).copy() for name in ("u", "v"))
         validity, removed = cut(refined["validity"], outer).copy(), cut(gone, outer) != 0
         left, valid = self.pair.left.view.grey(0, outer), self.pair.left.view.valid(0, outer)

@@ -16,8 +16,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
+from rille.stages.geometry.cubic import cubic
 from rille.stages.hfvm.images.params import HfvmParams
-from rille.stages.hfvm.images.resample import sample_cubic
 from rille.stages.hfvm.images.window import Shape, Window, bounded, whole
 from rille.stages.hfvm.level.epipolar import residuals, typical, weighted_normal
 from rille.stages.hfvm.level.window_pair import WindowPair
@@ -34,7 +34,8 @@ MOST_DISTORTION = 2.0
 """Beyond this the plane is no ground but a bad fit."""
 
 TOLERANCE = 1.0
-"""Pixels of the coarse level: a match this near the plane belongs to it (half weight)."""
+"""Pixels of the coarse level: a match within twice this belongs to the plane; at this distance it has a quarter of the
+weight."""
 
 MARGIN = 1.0 / 16.0
 """Share of the width added around the aligned image, for what stands out of the plane."""
@@ -132,26 +133,20 @@ def translation(by: float) -> Matrix:
     return np.array([[1.0, 0.0, by], [0.0, 1.0, by], [0.0, 0.0, 1.0]])
 
 
-def fit_plane(u: AnyArray, v: AnyArray, consistent: AnyArray, tolerance: float) -> tuple[Matrix, float] | None:
-    """Homography of the dominant plane, and the share of matches within ``tolerance`` pixels of it; None: too few.
+def fit_points(
+    x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray, shape: Shape, tolerance: float
+) -> tuple[Matrix, float] | None:
+    """Homography of the dominant plane, and the share of matches within twice ``tolerance`` of it; None: too few.
 
     Parameters
     ----------
-    u, v : (row, col) displacements of one level, pixels.
-    consistent : (row, col) bool, pixels to use.
+    x, y, u, v : (n,) columns, rows and displacements of matches of one level, which has ``shape``; pixels.
+    tolerance : pixels; a match this far from the plane has a quarter of the weight.
 
     Returns
     -------
     (3, 3) float64 H with ``(x + u, y + v, 1) ~ H (x, y, 1)``, and the share.
     """
-    y, x = np.nonzero(consistent)
-    return fit_points(x, y, u[y, x], v[y, x], consistent.shape, tolerance)
-
-
-def fit_points(
-    x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray, shape: Shape, tolerance: float
-) -> tuple[Matrix, float] | None:
-    """Fit a plane as :func:`fit_plane` does, to matches (n,) of an image of ``shape``."""
     if len(y) < LEAST_MATCHES:
         return None
     # In half image sides all eight terms are of like size, so that one weak hold suits them all.
@@ -240,5 +235,5 @@ def warp(image, valid, h, out, out_valid, place):  # type: ignore[no-untyped-def
                 continue
             # The nearest pixel decides: masked ones beside it carry grey from above and do not darken the kernel.
             if valid[int(q + 0.5) - iy0, int(p + 0.5) - ix0]:
-                out[row, col] = sample_cubic(image, np.float32(p), np.float32(q), ix0, iy0)[0]
+                out[row, col] = cubic(image, np.float32(p), np.float32(q), ix0, iy0)
                 out_valid[row, col] = 1

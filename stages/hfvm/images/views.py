@@ -180,14 +180,14 @@ class Aligned:
     @staticmethod
     def of(right: View, h: plane.Matrix, left: View, kept: int, side: int | None) -> Aligned:
         """View whose levels from ``kept`` on are computed here and now, ``side`` pixels of level 0 at a time."""
-        m = plane.margin(left.shapes[0])
-        shape: Shape = (left.shapes[0][0] + 2 * m, left.shapes[0][1] + 2 * m)
-        shapes = pyramid_shapes(shape, len(left.shapes))
-        bare = Aligned(right, h, left.shapes[0], shapes, (), (), len(shapes), 0.0)
+        bare = Aligned.again(right, h, left, 0.0)
+        shapes = bare.shapes
+        # The coarsest level in any case: few levels may end above the one that is asked for.
+        kept = min(kept, len(shapes) - 1)
         images, masks = ([np.empty(s, k) for s in shapes[kept:]] for k in (np.float32, np.uint8))
         # Tiles begin where a pixel of the top level does: no pixel of any level then lies in two of them.
         step = 2 ** (len(shapes) - 1)
-        for window in tiles(shape, None if side is None else -(-side // step) * step):
+        for window in tiles(shapes[0], None if side is None else -(-side // step) * step):
             part = bare.part(window)
             for n in range(kept, len(shapes)):
                 y, x = window.y0 >> n, window.x0 >> n

@@ -100,18 +100,12 @@ def pack(image: AnyArray, weights: tuple[float, ...]) -> tuple[Words, Planes]:
     words : (row, col) uint64, byte l is feature l: 128 + round(2 w_l sign(f_l) sqrt|f_l|), clipped.
     deviation : (row, col) float32, local standard deviation, grey levels (feature 6).
     """
-    words, deviation = pack_batch(np.asarray(image, dtype=np.float32)[None], weights)
-    return words[0], deviation[0]
-
-
-def pack_batch(images: AnyArray, weights: tuple[float, ...]) -> tuple[Words, Planes]:
-    """As :func:`pack`, of a batch (image, row, col)."""
-    images = np.ascontiguousarray(images, dtype=np.float32)
+    image = np.ascontiguousarray(image, dtype=np.float32)
     # One piece of memory: great ones come in great pages, and fresh memory costs more than filling it.
-    room = np.empty(3 * images.size, np.float32)
-    words, deviation = room[: 2 * images.size].view(np.uint64), room[2 * images.size :]
-    words, deviation = words.reshape(images.shape), deviation.reshape(images.shape)
-    _pack_all(images, np.asarray(weights, np.float32) * np.float32(STEPS_PER_UNIT), words, deviation)
+    room = np.empty(3 * image.size, np.float32)
+    words, deviation = room[: 2 * image.size].view(np.uint64), room[2 * image.size :]
+    words, deviation = words.reshape(image.shape), deviation.reshape(image.shape)
+    _pack_all(image, np.asarray(weights, np.float32) * np.float32(STEPS_PER_UNIT), words, deviation)
     return words, deviation
 
 
@@ -120,18 +114,17 @@ BAND = 64
 
 
 @njit(cache=True, nogil=True)
-def _pack_all(images, scale, words, deviation):  # type: ignore[no-untyped-def]
-    """Features of whole images, each completed by repeating its edge."""
-    count, rows, cols = images.shape
+def _pack_all(image, scale, words, deviation):  # type: ignore[no-untyped-def]
+    """Features of a whole image, completed by repeating its edge."""
+    rows, cols = image.shape
     room = np.empty((BAND + 2 * RADIUS, cols + 2 * RADIUS), np.float32)
-    for i in range(count):
-        for start in range(0, rows, BAND):
-            size = min(BAND, rows - start) + 2 * RADIUS
-            for j in range(size):
-                row, out = images[i, min(max(start + j - RADIUS, 0), rows - 1)], room[j]
-                out[:RADIUS], out[RADIUS + cols :] = row[0], row[cols - 1]
-                copy_line(row, out[RADIUS:])
-            pack_rows(room[:size], start, scale, words[i], deviation[i])
+    for start in range(0, rows, BAND):
+        size = min(BAND, rows - start) + 2 * RADIUS
+        for j in range(size):
+            row, out = image[min(max(start + j - RADIUS, 0), rows - 1)], room[j]
+            out[:RADIUS], out[RADIUS + cols :] = row[0], row[cols - 1]
+            copy_line(row, out[RADIUS:])
+        pack_rows(room[:size], start, scale, words, deviation)
 
 
 @njit(cache=True, nogil=True)

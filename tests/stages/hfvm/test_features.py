@@ -63,12 +63,6 @@ def test_packed_bytes_are_the_rounded_signed_square_roots():
     np.testing.assert_allclose(deviation, planes[6], atol=2e-3)
 
 
-def test_packed_batch_equals_single_images():
-    batch = np.stack([image(seed=1), image(seed=2)])
-    words, _ = features.pack_batch(batch, WEIGHTS)
-    np.testing.assert_array_equal(words[1], features.pack(batch[1], WEIGHTS)[0])
-
-
 def test_flat_image_has_the_middle_byte_and_no_deviation():
     words, deviation = features.pack(np.full((9, 9), 200, np.float32), WEIGHTS)
     assert (unpack(words)[:6] == 128).all()

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from matching_scenes import pair
 
+from rille.stages.core.validity import Validity
 from rille.stages.hfvm import tiled
+from rille.stages.hfvm.finish.finish import Finish
 from rille.stages.hfvm.images import plane
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import Aligned, Plain
@@ -138,6 +140,33 @@ def test_parameters_that_widen_the_reach_widen_the_surroundings():
     params = HfvmParams(**more, search_rows=3, fill_reach=15, min_support=0.4, guided_fill=True, centres=5)
     once = tiled.match(*views, params, None, quiet, None)
     found = in_tiles(views, params, 53, 0)
+    for name, values in once.arrays.items():
+        assert values.tobytes() == found.arrays[name].tobytes(), name
+
+
+def test_a_filled_pixel_does_not_depend_on_where_its_surroundings_are_cut():
+    """A gap is filled from a match without texture, which pixels beyond the reach of the filling refute."""
+    shape, p = (60, 400), HfvmParams()
+    view = Plain.of(build(np.random.default_rng(0).uniform(0, 255, shape), PyramidParams()))
+    steps = Finish(tiled.prepare(view, view, p, None), view, p, None, -1.0)
+    maps = {name: np.zeros(shape, np.float32) for name in ("u", "v", "noise", "distance", "error")}
+    bits = np.zeros(shape, np.uint8)
+    bits[:, 80:100] = bits[30, 100:] = Validity.BACKMATCH_FAILED
+    bits[30, 100] = Validity.NO_TEXTURE
+
+    def final(window):
+        return steps.final(window, maps, maps, {**maps, "validity": bits}, np.zeros(shape, np.uint8), None)
+
+    once = final(whole(shape))
+    for side in (64, 100 + p.fill_reach):
+        for name, values in gather(shape, ((w, final(w)) for w in tiles(shape, side))).items():
+            assert values.tobytes() == once[name].tobytes(), (name, side)
+
+
+def test_an_image_with_fewer_levels_than_alignment_asks_for():
+    views, params = both(sheared), HfvmParams(plane_level=6)
+    once, found = tiled.match(*views, params, None, quiet, None), in_tiles(views, params, 100, 0)
+    assert once.aligned
     for name, values in once.arrays.items():
         assert values.tobytes() == found.arrays[name].tobytes(), name
 
