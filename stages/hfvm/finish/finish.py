@@ -14,6 +14,7 @@ import numpy as np
 
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.validity import Validity, mark
+from rille.stages.geometry import spline
 from rille.stages.hfvm.coarse_to_fine import hierarchy
 from rille.stages.hfvm.coarse_to_fine.hierarchy import Map, Prepared
 from rille.stages.hfvm.finish import guided, refine, textureless, uncertainty, variational_refinement
@@ -137,9 +138,7 @@ class Finish:
         target = whole(shape) if outer == whole(self.shape) else self._read(outer, u, v, keep)
         place = WindowPair(outer.x0, outer.y0, target.x0, target.y0, shape[0], shape[1])
         left, valid = self.pair.left.view.grey(0, outer), self.right.valid(0, target)
-        image = self.right.grey(0, target)
-        if self.contrast != 1.0:
-            image = image * np.float32(self.contrast)
+        image = self._spline(target)
         to_right = partial(self._to_right, window=outer)
         u, v, rest, noise = refine.refine(left, refine.RightWindow(image, valid, place, to_right), u, v, keep, p)
         removed = self.pair.left.view.removed_noise**2, (self.contrast * self.pair.right.view.removed_noise) ** 2
@@ -157,6 +156,14 @@ class Finish:
         mark(bits, keep & ~found, Validity.OUT_OF_IMAGE)
         arrays = {"u": u, "v": v, "validity": bits, "noise": noise}
         return {name: np.ascontiguousarray(a[window.inside(outer)]) for name, a in arrays.items()}
+
+    def _spline(self, window: Window) -> AnyArray:
+        """Coefficients of the spline through a window of the right image, which is given the left one's contrast."""
+        wide = window.grow(spline.RADIUS, spline.RADIUS, self.right.shapes[0])
+        image = self.right.grey(0, wide)
+        if self.contrast != 1.0:
+            image = image * np.float32(self.contrast)
+        return np.ascontiguousarray(spline.coefficients(image)[window.inside(wide)])
 
     def _read(self, window: Window, u: AnyArray, v: AnyArray, keep: AnyArray) -> Window:
         """What refinement may read of the right image: ends of displacements that drift to any side."""

@@ -27,12 +27,13 @@ Frame = Callable[[AnyArray, AnyArray], tuple[AnyArray, AnyArray]]
 
 @dataclass(frozen=True)
 class RightWindow:
-    """A window of the right image: grey values (row, col) float32, 1 = usable uint8, and where both windows lie.
+    """A window of the right image: coefficients (row, col) float32 of its cubic spline, 1 = usable uint8; where both
+    windows lie.
 
     ``to_right``: from the frame in which steps are taken to the right image; default: it is the right image's.
     """
 
-    grey: AnyArray
+    spline: AnyArray
     valid: AnyArray
     place: WindowPair
     to_right: Frame = lambda u, v: (u, v)
@@ -79,7 +80,7 @@ def refine(
     for step in range(params.refine_steps):
         last = first if step == 0 else np.empty(u.shape, np.float32)
         there_u, there_v = target.to_right(now_u, now_v)
-        right = rowwise.Right(target.grey, target.valid, target.place)
+        right = rowwise.Right(target.spline, target.valid, target.place)
         window = rowwise.WindowOf(params.refine_radius, np.float32(params.refine_noise))
         told = rowwise.StepArrays(step_u, step_v, last, per_noise)
         rowwise.lucas_kanade(left, right, (there_u, there_v), keep, window, told)

@@ -16,10 +16,10 @@ where they do not lie on lines. Solved by a fixed number of Gauss-Seidel sweeps 
 from __future__ import annotations
 
 import numpy as np
-import scipy
 from numba import njit
 
 from rille.stages.core.declare import AnyArray
+from rille.stages.geometry.spline import slopes, weights
 from rille.stages.hfvm.coarse_to_fine.hierarchy import evenly
 from rille.stages.hfvm.finish.refine import FARTHEST
 from rille.stages.hfvm.images.params import HfvmParams
@@ -56,7 +56,7 @@ FULL_STEPS = 2
 
 def fit(
     left: AnyArray,
-    right: AnyArray,
+    spline: AnyArray,
     right_valid: AnyArray,
     u: AnyArray,
     v: AnyArray,
@@ -67,7 +67,8 @@ def fit(
 
     Parameters
     ----------
-    left, right : (row, col) float32 grey values.
+    left : (row, col) float32 grey values.
+    spline : (row, col) float32 coefficients of the right image's cubic spline.
     right_valid : (row, col) uint8, 1 = usable.
     u, v : (row, col) float32 displacements to start from, pixels.
     keep : (row, col) bool, pixels to use and to improve; the others are returned as they are.
@@ -80,8 +81,7 @@ def fit(
     """
     start_u, start_v = u, v
     u, v = np.where(keep, u, np.float32(0)), np.where(keep, v, np.float32(0))
-    spline = scipy.ndimage.spline_filter(right, 3, np.float32, mode="mirror")
-    lines, trust = _lines(u, v, keep, right.shape)
+    lines, trust = _lines(u, v, keep, spline.shape)
     soft_steps = max(0, min(SOFT_STEPS, params.variational_steps - FULL_STEPS))
     for step in range(params.variational_steps):
         stiffness = params.variational_stiffness * (SOFT_STIFFNESS if step < soft_steps else 1.0)
@@ -124,7 +124,6 @@ def _warped(left, spline, right_valid, u, v, keep, out):  # type: ignore[no-unty
     """
     rows, cols = left.shape
     last_x, last_y, half = spline.shape[1] - 2, spline.shape[0] - 2, np.float32(0.5)
-    w, slope = np.empty((2, 4), np.float32), np.empty((2, 4), np.float32)
     for y in range(rows):
         for x in range(cols):
             xr, yr = np.float32(x) + u[y, x], np.float32(y) + v[y, x]
@@ -133,31 +132,19 @@ def _warped(left, spline, right_valid, u, v, keep, out):  # type: ignore[no-unty
             if not right_valid[np.int64(yr + half), np.int64(xr + half)]:
                 continue
             i, j = np.int64(xr), np.int64(yr)
-            _weights(xr - np.float32(i), w[0], slope[0])
-            _weights(yr - np.float32(j), w[1], slope[1])
+            t, s = xr - np.float32(i), yr - np.float32(j)
+            wx, wy, dx, dy = weights(t), weights(s), slopes(t), slopes(s)
             value = gx = gy = np.float32(0.0)
             for k in range(4):
                 across = along = np.float32(0.0)
                 for m in range(4):
                     c = spline[j - 1 + k, i - 1 + m]
-                    across += w[0, m] * c
-                    along += slope[0, m] * c
-                value += w[1, k] * across
-                gx += w[1, k] * along
-                gy += slope[1, k] * across
+                    across += wx[m] * c
+                    along += dx[m] * c
+                value += wy[k] * across
+                gx += wy[k] * along
+                gy += dy[k] * across
             out[0, y, x], out[1, y, x], out[2, y, x], out[3, y, x] = 1, gx, gy, left[y, x] - value
-
-
-@njit(cache=True, nogil=True)
-def _weights(t, w, slope):  # type: ignore[no-untyped-def]
-    """Weights of the cubic B-spline's coefficients at -1, 0, 1, 2 for a point at ``t``, and their derivatives."""
-    half, one, two, three = np.float32(0.5), np.float32(1.0), np.float32(2.0), np.float32(3.0)
-    four, six = np.float32(4.0), np.float32(6.0)
-    q = one - t
-    w[0], w[3] = q * q * q / six, t * t * t / six
-    w[1], w[2] = (four - three * t * t * (two - t)) / six, (four - three * q * q * (two - q)) / six
-    slope[0], slope[3] = -half * q * q, half * t * t
-    slope[1], slope[2] = half * t * (three * t - four), -half * q * (three * q - four)
 
 
 def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int]) -> tuple[AnyArray, float]:

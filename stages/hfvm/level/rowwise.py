@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
+from rille.stages.geometry.spline import weights
 from rille.stages.hfvm.level.window_pair import WindowPair
 from rille.stages.numeric.line import copy_line
 
@@ -18,9 +19,10 @@ PLANES = 10
 
 
 class Right(NamedTuple):
-    """A window of the right image: grey values float32, 1 = usable uint8, and where both windows lie."""
+    """A window of the right image: coefficients of its cubic spline float32, 1 = usable uint8, and where both windows
+    lie."""
 
-    grey: Any
+    spline: Any
     valid: Any
     place: WindowPair
 
@@ -128,37 +130,24 @@ def box(planes, radius, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def cubic(image, at, width, t, s):  # type: ignore[no-untyped-def]
-    """Catmull-Rom value of a flat float32 image of ``width`` columns: sum_k sum_m w_k(s) w_m(t) image[k, m].
+def spline_value(coefficients, at, width, t, s):  # type: ignore[no-untyped-def]
+    """Value of a cubic spline: sum_k sum_m w_k(s) w_m(t) coefficients[k, m]; these are flat, in rows of ``width``.
 
     ``at``: index of the pixel above and left of the point's own; ``t, s``: the point's distance right of and below it,
-    within a pixel. 4 x 4 pixels from ``at - width - 1`` on are read.
+    within a pixel. 4 x 4 coefficients from ``at - width - 1`` on are read.
     """
-    across, down = _catmull_rom(t), _catmull_rom(s)
+    across, down = weights(t), weights(s)
     nil = np.float32(0.0)
     c0, c1, c2, c3 = nil, nil, nil, nil
     for k in range(4):
         # Unsigned indices need no check for counting from the end.
         i = np.uint64(at + (k - 1) * width - 1)
-        c0 += down[k] * image[i]
-        c1 += down[k] * image[i + np.uint64(1)]
-        c2 += down[k] * image[i + np.uint64(2)]
-        c3 += down[k] * image[i + np.uint64(3)]
+        c0 += down[k] * coefficients[i]
+        c1 += down[k] * coefficients[i + np.uint64(1)]
+        c2 += down[k] * coefficients[i + np.uint64(2)]
+        c3 += down[k] * coefficients[i + np.uint64(3)]
     # Rows first, then pairs of columns: this order fixes the rounding of published artifacts.
     return (across[0] * c0 + across[2] * c2) + (across[1] * c1 + across[3] * c3)
-
-
-@njit(cache=True, nogil=True)
-def _catmull_rom(t):  # type: ignore[no-untyped-def]
-    """Weights of the samples at -1, 0, 1, 2 for a point at ``t``, 0..1; polynomials in Horner's form."""
-    half, one, two = np.float32(0.5), np.float32(1.0), np.float32(2.0)
-    three_halves, five_halves = np.float32(1.5), np.float32(2.5)
-    return (
-        ((-half * t + one) * t - half) * t,
-        (three_halves * t - five_halves) * t * t + one,
-        ((-three_halves * t + two) * t + half) * t,
-        (half * t - half) * t * t,
-    )
 
 
 @njit(cache=True, nogil=True)
@@ -170,17 +159,17 @@ def _products(left, right, now, keep, y, radius, out):  # type: ignore[no-untype
     """
     rows, cols = left.shape
     (u, v), (x0, y0, rx0, ry0, rrows, rcols) = now, right.place
-    width = right.grey.shape[1]
+    width = right.spline.shape[1]
     if y < 0 or y >= rows:
         out[:] = np.float32(0.0)
         return
     one, half, nil = np.float32(1.0), np.float32(0.5), np.float32(0.0)
-    # The cubic kernel reads one pixel before and two after.
+    # A spline reads one coefficient before and two after.
     last_x, last_y = np.float32(rcols - 2), np.float32(rrows - 2)
     end = radius + cols
     n, gx, gy, rest = out[0, radius:end], out[1, radius:end], out[2, radius:end], out[3, radius:end]
     lu, lv, grey = u[y], v[y], left[y]
-    flat, taking = right.grey.reshape(-1), keep[y]
+    flat, taking = right.spline.reshape(-1), keep[y]
     for x in range(cols):
         xr, yr = np.float32(x + x0) + lu[x], np.float32(y + y0) + lv[x]
         n[x] = rest[x] = nil
@@ -190,7 +179,7 @@ def _products(left, right, now, keep, y, radius, out):  # type: ignore[no-untype
             continue
         i, j = np.int64(xr), np.int64(yr)
         at = (j - ry0) * width + i - rx0
-        value = cubic(flat, at, width, xr - np.float32(i), yr - np.float32(j))
+        value = spline_value(flat, at, width, xr - np.float32(i), yr - np.float32(j))
         n[x], rest[x] = one, grey[x] - value
     above, below = left[max(y - 1, 0)], left[min(y + 1, rows - 1)]
     # As if the edge were repeated: a difference over one pixel, halved like those over two.

@@ -12,21 +12,17 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numba import njit
 
 from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.geometry.spline import coefficients, slopes, weights
 from rille.stages.geometry.surface import Surface
 
 BLOCK_ROWS = 32  # rows of cells in one call, so that a large surface's feet stay small in memory
 
 LANES = 32
 """Cells that are looked at together."""
-POLE = math.sqrt(3.0) - 2.0
-TO_SPLINE = np.float32(math.sqrt(3.0) * POLE ** np.abs(np.arange(-12, 13)))
-"""Filter that makes a cubic spline's coefficients of an image's row or column (Unser 1999, the inverse of 1/6, 4/6,
-1/6); what is cut off is less than single precision."""
 TAPS = 16
 """Coefficients that a value depends on, each of a cell in a plane of its own."""
 VALUE, ALONG_X, ALONG_Y = (k * LANES for k in range(3))
@@ -59,11 +55,8 @@ class OrthoPair(NamedTuple):
 
 def views(left: Floats, right: Floats, left_image: Floats32, right_image: Floats32, centre: Floats) -> Views:
     """Views of two images (row, col), grey values; ``centre`` of the left camera in the frame of the surface, m."""
-    splines = [
-        cv2.sepFilter2D(image, cv2.CV_32F, TO_SPLINE, TO_SPLINE, borderType=cv2.BORDER_REFLECT_101)
-        for image in (left_image, right_image)
-    ]
-    return Views(left, right, (splines[0], splines[1]), np.asarray(centre, np.float64))
+    splines = coefficients(left_image), coefficients(right_image)
+    return Views(left, right, splines, np.asarray(centre, np.float64))
 
 
 def look(views: Views, surface: Surface, elevation: Floats | Floats32, room: OrthoPair | None = None) -> OrthoPair:
@@ -215,7 +208,7 @@ def read(n, spline, at, taps, values):  # type: ignore[no-untyped-def]
                 taps[(4 * k + i) * LANES + m] = flat[first + k * width + i]
     for m in range(n):
         x, y = np.float32(at[m] - int(at[m])), np.float32(at[LANES + m] - int(at[LANES + m]))
-        wx, wy, dx, dy = _weights(x), _weights(y), _slopes(x), _slopes(y)
+        wx, wy, dx, dy = weights(x), weights(y), slopes(x), slopes(y)
         a = taps[m], taps[LANES + m], taps[2 * LANES + m], taps[3 * LANES + m]
         b = taps[4 * LANES + m], taps[5 * LANES + m], taps[6 * LANES + m], taps[7 * LANES + m]
         c = taps[8 * LANES + m], taps[9 * LANES + m], taps[10 * LANES + m], taps[11 * LANES + m]
@@ -228,18 +221,3 @@ def read(n, spline, at, taps, values):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _sum(w, c):  # type: ignore[no-untyped-def]
     return w[0] * c[0] + w[1] * c[1] + w[2] * c[2] + w[3] * c[3]
-
-
-@njit(cache=True, nogil=True)
-def _weights(t):  # type: ignore[no-untyped-def]
-    """Weights of four coefficients at ``t`` from the second to the third one."""
-    q, four, three, two, sixth = np.float32(1) - t, np.float32(4), np.float32(3), np.float32(2), np.float32(1 / 6)
-    second, third = four - three * t * t * (two - t), four - three * q * q * (two - q)
-    return q * q * q * sixth, second * sixth, third * sixth, t * t * t * sixth
-
-
-@njit(cache=True, nogil=True)
-def _slopes(t):  # type: ignore[no-untyped-def]
-    """Derivatives of the weights."""
-    q, half, three, four = np.float32(1) - t, np.float32(0.5), np.float32(3), np.float32(4)
-    return -half * q * q, half * t * (three * t - four), -half * q * (three * q - four), half * t * t

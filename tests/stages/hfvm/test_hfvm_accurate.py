@@ -8,6 +8,7 @@ from matching_scenes import Texture, pair, seen
 
 from rille.stages.core.errors import RilleError
 from rille.stages.core.validity import Validity, has, matched
+from rille.stages.geometry.spline import coefficients
 from rille.stages.hfvm.coarse_to_fine import paths
 from rille.stages.hfvm.finish import guided, variational_refinement
 from rille.stages.hfvm.images.params import ACCURATE, HfvmParams
@@ -215,12 +216,16 @@ def slanted(noise):
     return pair(displacement, (90, 120), (90, 160), noise=noise)
 
 
+def relief(left, right, start, keep):
+    return variational_refinement.fit(left, coefficients(right), np.ones(right.shape, np.uint8), *start, keep, ACC)
+
+
 def test_relief_restores_a_slanted_plane():
     left, right, u, v = slanted(noise=2.0)
     keep = seen(u, v, right.shape, 8)
     rng = np.random.default_rng(0)
     start = [(a + rng.normal(0, 0.2, a.shape)).astype(np.float32) for a in (u, v)]
-    found_u, found_v = variational_refinement.fit(left, right, np.ones(right.shape, np.uint8), *start, keep, ACC)
+    found_u, found_v = relief(left, right, start, keep)
     error = np.hypot(found_u - u, found_v - v)
     # A plane bends nowhere. One pixel tells sqrt(2) noise / gradient = .4 px (gradient about 7 a pixel in either
     # direction); stiffness averages some 7 x 7 pixels: .06 px.
@@ -236,7 +241,7 @@ def test_matches_far_off_their_line_are_led_to_it():
     astray[30:40, 50:60] = astray[60:63, 80:83] = True
     assert keep[astray].all()
     start = u.astype(np.float32), np.where(astray, v + 2.0, v).astype(np.float32)
-    found_u, found_v = variational_refinement.fit(left, right, np.ones(right.shape, np.uint8), *start, keep, ACC)
+    found_u, found_v = relief(left, right, start, keep)
     # As far off as the others, whose rows the lines fitted to all of them hold.
     assert np.abs(found_v - v)[astray].max() < 0.1
     assert np.hypot(found_u - u, found_v - v)[astray].max() < 1.0
@@ -246,7 +251,7 @@ def test_relief_keeps_a_step():
     left, right, u, occluded = stairs()
     keep = ~occluded & seen(u, 0 * u, left.shape, 4)
     start = (u.astype(np.float32), np.zeros(u.shape, np.float32))
-    found, _ = variational_refinement.fit(left, right, np.ones(right.shape, np.uint8), *start, keep, ACC)
+    found, _ = relief(left, right, start, keep)
     # Four times the bend beyond which stiffness gives way; a linear smoother would leave pixels here.
     assert np.abs(found - u)[keep].max() < 0.5
     assert np.median(np.abs(found - u)[keep]) < 0.02
@@ -300,10 +305,10 @@ def test_relief_of_nothing_is_nothing():
     left, right, u, v = slanted(noise=0.0)
     start = (u.astype(np.float32), v.astype(np.float32))
     none = np.zeros(u.shape, bool)
-    found = variational_refinement.fit(left, right, np.ones(right.shape, np.uint8), *start, none, ACC)
+    found = relief(left, right, start, none)
     np.testing.assert_array_equal(found[0], start[0])
     flat = np.full_like(left, 7.0), np.full_like(right, 7.0)
-    found = variational_refinement.fit(*flat, np.ones(right.shape, np.uint8), *start, ~none, ACC)
+    found = relief(*flat, start, ~none)
     assert np.isfinite(found[0]).all()
     assert np.abs(found[0] - start[0]).max() < 0.05
 

@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from rille.stages.core.validity import Validity, has
 from rille.stages.geometry.geometry import Rig
+from rille.stages.geometry.spline import coefficients
 from rille.stages.hfvm.coarse_to_fine import hierarchy
 from rille.stages.hfvm.finish import refine, uncertainty
 from rille.stages.hfvm.images import plane
@@ -194,7 +195,7 @@ class TestPlane:
 
 def whole_image(grey):
     """All of a right image, usable everywhere."""
-    return refine.RightWindow(grey, np.ones(grey.shape, np.uint8), WindowPair(0, 0, 0, 0, *grey.shape))
+    return refine.RightWindow(coefficients(grey), np.ones(grey.shape, np.uint8), WindowPair(0, 0, 0, 0, *grey.shape))
 
 
 class TestRefine:

@@ -5,6 +5,7 @@ import pytest
 from matching_scenes import pair
 
 from rille.stages.core.validity import matched
+from rille.stages.geometry.spline import coefficients
 from rille.stages.hfvm.finish import refine
 from rille.stages.hfvm.finish.uncertainty import REFINED, neighbours, standard_deviation
 from rille.stages.hfvm.images.params import HfvmParams
@@ -16,7 +17,7 @@ PARAMS = HfvmParams()
 
 def whole_image(grey):
     """All of a right image, usable everywhere."""
-    return refine.RightWindow(grey, np.ones(grey.shape, np.uint8), WindowPair(0, 0, 0, 0, *grey.shape))
+    return refine.RightWindow(coefficients(grey), np.ones(grey.shape, np.uint8), WindowPair(0, 0, 0, 0, *grey.shape))
 
 
 def test_noise_part_is_the_inverse_structure_tensor_of_the_window():

@@ -1,0 +1,81 @@
+"""Cubic splines through the pixels of an image: coefficients, and their weights at a point between pixels.
+
+The value at a point is the sum of 4 x 4 coefficients, times a weight along the row and one along the column. Unlike a
+local cubic kernel, a spline keeps detail of few pixels. Unser (1999), doi:10.1109/79.799930.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike
+
+from rille.stages.core.arrays import Floats32
+
+RADIUS = 10
+"""Pixels to either side that a coefficient depends on; what is cut off is less than a thousandth of a grey level."""
+
+POLE = math.sqrt(3.0) - 2.0
+TAPS = np.float32(math.sqrt(3.0) * POLE ** np.arange(RADIUS + 1))
+"""The inverse of the filter 1/6, 4/6, 1/6, from the middle to one side."""
+
+
+def coefficients(image: ArrayLike) -> Floats32:
+    """Coefficients (row, col) float32 of the cubic spline through the pixels of an image (row, col).
+
+    The image goes on mirrored at its borders. Those of a window are the image's to the bit, :data:`RADIUS` pixels in
+    from where it is cut.
+    """
+    grey = np.asarray(image, np.float32)
+    mirrored = np.pad(grey, RADIUS, mode="reflect")
+    along = np.empty((mirrored.shape[0], grey.shape[1]), np.float32)
+    found = np.empty(grey.shape, np.float32)
+    _filter_rows(mirrored, TAPS, along)
+    _filter_columns(along, TAPS, found)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _filter_rows(image, taps, out):  # type: ignore[no-untyped-def]
+    """``out`` (row, col) from an ``image`` with :data:`RADIUS` columns more to either side."""
+    cols = out.shape[1]
+    for y in range(out.shape[0]):
+        row, total = image[y], out[y]
+        middle = row[RADIUS : RADIUS + cols]
+        for x in range(cols):
+            total[x] = taps[0] * middle[x]
+        for k in range(1, RADIUS + 1):
+            before, behind = row[RADIUS - k : RADIUS - k + cols], row[RADIUS + k : RADIUS + k + cols]
+            for x in range(cols):
+                total[x] += taps[k] * (before[x] + behind[x])
+
+
+@njit(cache=True, nogil=True)
+def _filter_columns(image, taps, out):  # type: ignore[no-untyped-def]
+    """``out`` (row, col) from an ``image`` with :data:`RADIUS` rows more above and below."""
+    rows, cols = out.shape
+    for y in range(rows):
+        total, middle = out[y], image[y + RADIUS]
+        for x in range(cols):
+            total[x] = taps[0] * middle[x]
+        for k in range(1, RADIUS + 1):
+            above, below = image[y + RADIUS - k], image[y + RADIUS + k]
+            for x in range(cols):
+                total[x] += taps[k] * (above[x] + below[x])
+
+
+@njit(cache=True, nogil=True)
+def weights(t):  # type: ignore[no-untyped-def]
+    """Weights of the coefficients at -1, 0, 1, 2 for a point at ``t``, 0..1; float32."""
+    q, four, three, two, sixth = np.float32(1) - t, np.float32(4), np.float32(3), np.float32(2), np.float32(1 / 6)
+    second, third = four - three * t * t * (two - t), four - three * q * q * (two - q)
+    return q * q * q * sixth, second * sixth, third * sixth, t * t * t * sixth
+
+
+@njit(cache=True, nogil=True)
+def slopes(t):  # type: ignore[no-untyped-def]
+    """Derivatives of :func:`weights`."""
+    q, half, three, four = np.float32(1) - t, np.float32(0.5), np.float32(3), np.float32(4)
+    return -half * q * q, half * t * (three * t - four), -half * q * (three * q - four), half * t * t
