@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from rille.datasets.cameras.kitti import decompose
 from rille.datasets.images import files
-from rille.datasets.images.pairing import ends
+from rille.datasets.images.pairing import ends, natural
 from rille.datasets.manifest.rig import LONGEST_BASELINE, off_centre
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.text.names import derived_name
@@ -263,7 +263,7 @@ def list_pairs(layout: KittiLayout) -> Listing:
             f"{ours[alone[0]]} has no partner in {layout.folder / side} (and {len(alone) - 1} more)",
             remedy="add the missing images or remove these",
         )
-    names = sorted(present, key=lambda s: (len(s), s) if s.isdigit() else (0, s))
+    names = sorted(present, key=lambda name: (natural(name), name))
     if not names:
         raise InputError(
             "RIL-210",

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import re
 import struct
+import threading
 import zlib
 from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import cv2
@@ -30,7 +34,13 @@ MOST_BYTES = 2**29
 """Of one image file."""
 
 FEWER_BITS = "save it with 8 or 16 bits a sample"
-COPY_AGAIN = "copy the file again, or leave its frame out with --frames"
+COPY_AGAIN = "copy the file again, or remove it"
+
+JPEG = b"\xff\xd8"
+PADDING = 16
+"""Bytes before a JPEG's end marker that are no damage: webcams pad their images."""
+
+_STDERR = threading.Lock()
 
 COLOUR = Array(
     "colour", ("row", "col", "band"), "uint8", "grey", "red, green and blue of the left image", optional=True
@@ -62,9 +72,41 @@ def _damage(data: bytes) -> str:
     if data.startswith(PNG_SIGNATURE):
         return _png_damage(data)
     # the end marker may be followed by padding, but nothing else ends a JPEG
-    if data.startswith(b"\xff\xd8") and b"\xff\xd9" not in data[-4096:]:
+    if data.startswith(JPEG) and b"\xff\xd9" not in data[-4096:]:
         return f"is truncated (the JPEG breaks off at byte {len(data)})"
     return ""
+
+
+def _unpacked(data: bytes) -> tuple[NDArray[Any] | None, str]:
+    """Image of an encoded file as it is stored, None: it cannot be decoded; and what speaks against it, in words.
+
+    libjpeg tells of damage on the process's stderr alone, and gives some image all the same.
+    """
+    if not data.startswith(JPEG):
+        return _decoded(data), ""
+    with _STDERR, TemporaryFile() as aside:
+        try:
+            kept = os.dup(2)
+        except OSError:  # the program was started without stderr
+            return _decoded(data), ""
+        try:
+            os.dup2(aside.fileno(), 2)
+            image = _decoded(data)
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+        aside.seek(0)
+        said = aside.read().decode(errors="replace").strip()
+    padding = re.fullmatch(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9", said)
+    return image, "" if padding and int(padding[1]) <= PADDING else said
+
+
+def _decoded(data: bytes) -> NDArray[Any] | None:
+    try:
+        # Unchanged: 16 bits stay 16, and no orientation tag turns the image away from its calibration.
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
 
 
 def decode(data: bytes, name: str, wanted: Header | None = None) -> Grey:
@@ -100,13 +142,11 @@ def decode_colour(data: bytes, name: str, wanted: Header | None = None) -> tuple
     header = _sound(read_header(BytesIO(data)), name)
     if wanted is not None:
         check_size((*header[:2], wanted[2]), wanted, name)
-    try:
-        # Unchanged: 16 bits stay 16, and no orientation tag turns the image away from its calibration.
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        image = None
+    image, complaint = _unpacked(data)
     if image is None:
         raise InputError("RIL-763", f"{name} cannot be decoded", remedy=COPY_AGAIN)
+    if complaint:
+        raise InputError("RIL-170", f"{name} is damaged ({complaint})", remedy=COPY_AGAIN)
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError("RIL-172", f"{name} has samples of type {image.dtype}", remedy=FEWER_BITS)
     colour: NDArray[np.uint8] | None = None

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.protocol import CAMERAS, Sequence
-from rille.pipeline.commands.options import COMPLETE, FAILED
+from rille.pipeline.commands.options import COMPLETE, FAILED, check_output
 from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
@@ -79,13 +79,14 @@ def check(
     RilleError
         The picture cannot be written.
     """
+    path = output if output is not None else Path(f"{sequence.name}-check.png")
+    check_output(path, ".png", ".pdf", ".svg")
     chosen = frames if frames is not None else tuple(range(sequence.frames))
     if config is None:
         config = configuration.build(configuration.expand(sequence.defaults))
     graph, store = Graph(), at(cache)
     name(graph, sequence, chosen)
     inspection = Inspection(Builder(graph, sequence, config), chosen, store)
-    path = output if output is not None else Path(f"{sequence.name}-check.png")
     graph.flow(inspection.steps())
     # In this process: workers would take longer to start than most of this takes.
     result = scheduler.run(graph, store, scheduler.RunOptions(executor="inline", keep_going=True))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from rille.pipeline.commands import compare_dem
+from rille.pipeline.commands.options import check_output
 from rille.pipeline.engine import events
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.export.read_dem import read_elevation
@@ -31,6 +32,7 @@ def compare(a: Path, b: Path, output: Path) -> int:
     reports = [_report(run) for run in (a, b)]
     settings = [_flat(tomllib.loads((run / "config.toml").read_text(encoding="utf-8"))) for run in (a, b)]
     # Before anything is printed: where the picture cannot be written there is one line, and no half of a comparison.
+    check_output(output, ".png", ".pdf", ".svg")
     terrain = _elevations(a, b, output)
     print(f"A {lookup.name(a)}\nB {lookup.name(b)}")
     for line in (*_parameters(*settings), *_tasks(a, b), *_figures(*reports), _positions(a, b), terrain):

@@ -19,6 +19,7 @@ from rille.pipeline.commands.options import (
     Run,
     Runs,
     cache_folder,
+    check_output,
     flag,
     prepare,
 )
@@ -205,6 +206,8 @@ def _export(run: Path, kind: Form, output: Path | None, cache: str | None) -> st
         return str(write(run, output or run / kind, at(cache_folder(cache))))
     from rille.pipeline.export.programs import point_cloud
 
+    if output is not None:
+        check_output(output)
     path, words = point_cloud.export(run, kind, output)
     return f"{path}  {words}"
 

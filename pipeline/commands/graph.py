@@ -9,12 +9,12 @@ from collections import Counter
 from html import escape
 from pathlib import Path
 
+from rille.pipeline.commands.options import check_output
 from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import at
 from rille.pipeline.runs.session import Options, lay_out, settings
-from rille.stages.core.errors import ConfigError
 
 BOX, GAP = (150, 22), (20, 48)
 """Width and height of a box, and of the space between two, pixels."""
@@ -31,9 +31,8 @@ def graph(options: Options, output: Path, *, tasks: bool = False) -> int:
     ConfigError
         The file's name ends neither in ``.svg`` nor in ``.dot``.
     """
-    draw = {".svg": svg, ".dot": dot}.get(output.suffix)
-    if draw is None:
-        raise ConfigError("RIL-871", f"{output.name} is no name of a drawing", remedy="end it in .svg or .dot")
+    check_output(output, ".svg", ".dot")
+    draw = svg if output.suffix.lower() == ".svg" else dot
     settled = settings(options)
     laid_out = lay_out(settled.sequence, settled.config, settled.frames)
     scheduler.run(laid_out, at(options.cache), scheduler.RunOptions(dry=True)).check()

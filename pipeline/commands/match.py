@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE, HOLES
+from rille.pipeline.commands.options import COMPLETE, HOLES, check_output
 from rille.pipeline.engine.plain import raw, warn
 from rille.pipeline.flow import config as configuration
+from rille.pipeline.runs.input_checks import FEW_BITS
 from rille.stages.core.errors import ConfigError, InputError
+from rille.stages.imaging.image_quality import unused_bits
 
 if TYPE_CHECKING:
     from rille.stages.hfvm.stage import Disparity
@@ -64,15 +66,22 @@ def match_files(
     Raises
     ------
     ConfigError
-        Two outputs have one name.
+        An output is a folder, no TIFF, an image that is read, or the other output.
     InputError
         An image or the prior cannot be read, or the prior is not of the left image's size.
     """
     from rille.datasets.images.files import read_grey
     from rille.pipeline.export.writers import write_confidence, write_disparity
 
-    if confidence is not None and confidence.resolve() == output.resolve():
-        raise ConfigError("RIL-043", f"--confidence and --output are both {output}", remedy="give them two names")
+    taken = {left.resolve(): "an image", right.resolve(): "an image"}
+    for name, path in (("--output", output), ("--confidence", confidence)):
+        if path is None:
+            continue
+        check_output(path, ".tif", ".tiff")
+        if path.resolve() in taken:
+            what = taken[path.resolve()]
+            raise ConfigError("RIL-043", f"{name} and {what} are both {path}", remedy="give another name")
+        taken[path.resolve()] = name
     # Images and the prior are checked before the matcher is imported, which takes seconds.
     images = read_grey(left), read_grey(right)
     given = _prior(prior, images[0].shape) if prior is not None else None
@@ -91,13 +100,21 @@ def match_files(
     write_disparity(output, column, row, tags | {"FILLED": str(dense).lower()})
     if confidence is not None:
         write_confidence(confidence, found.disparity_std, found.validity, found.backmatch_error, tags)
-    for line in warnings(found, *images):
+    for line in (*_depths(images), *warnings(found, *images)):
         warn(line)
     share = float(matched(found.validity).mean())
     typical = f", standard deviation {np.nanmedian(found.disparity_std):.2f} px (median)" if share else ""
     figures = f"matched {100 * share:.1f} %, defined {100 * float(kept.mean()):.1f} % of {kept.size} pixels"
     print(f"{output}  {figures}{typical}")
     return COMPLETE if share >= FEW else HOLES
+
+
+def _depths(images: Iterable[NDArray[Any]]) -> list[str]:
+    unused = min(map(unused_bits, images))
+    if unused < FEW_BITS:
+        return []
+    text = f"samples use {16 - unused} of their 16 bits, which costs contrast: multiply them by {2**unused}"
+    return [warning("RIL-705", text)]
 
 
 def warnings(found: Disparity, left: NDArray[Any], right: NDArray[Any]) -> list[str]:

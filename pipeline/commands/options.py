@@ -123,6 +123,23 @@ def cache_folder(given: str | Path | None) -> Path | str:
     return locate(given or os.environ.get("RILLE_CACHE") or Path(".rille/cache"))
 
 
+def check_output(path: Path, *endings: str) -> None:
+    """Refuse a name that the file to be written cannot have, before anything is computed.
+
+    Raises
+    ------
+    ConfigError
+        ``path`` is a folder, or has none of the ``endings`` where there are any.
+    """
+    from rille.stages.core.errors import ConfigError
+
+    if path.is_dir():
+        raise ConfigError("RIL-047", f"the output {path} is a folder", remedy="name a file in it")
+    if endings and path.suffix.lower() not in endings:
+        allowed = " or ".join(endings)
+        raise ConfigError("RIL-871", f"the output {path} has another ending", remedy=f"end it in {allowed}")
+
+
 def prepare() -> None:
     """One thread a library, and safe kernels, before NumPy and numba are imported."""
     from rille.pipeline.engine.runtime.environment import prepare_environment

@@ -10,7 +10,8 @@ import io
 import json
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -122,8 +123,7 @@ def write_raster(
         "UNIT": ", ".join(dict.fromkeys(units)),
         "CELL_SIZE_M": f"{lattice.cell:.12g}",
     }
-    # The driver COG writes as it closes, which comes before the move to the final name.
-    with atomic.replacing(path) as temporary, rasterio.open(temporary, "w", **profile) as file:
+    with _gdal_file(path, profile) as file:
         for number, (name, values) in enumerate(bands.items(), start=1):
             file.write(np.asarray(values), number)
             file.set_band_description(number, name)
@@ -133,6 +133,21 @@ def write_raster(
             file.write_colormap(1, {k: tuple(bytes.fromhex(c[1:])) for k, c in enumerate(meaning.colours)})
         file.units = tuple("metre" if u == "m" else u for u in units)
         file.update_tags(**facts, **{key.upper(): value for key, value in meaning.tags.items()})
+
+
+@contextmanager
+def _gdal_file(path: Path, profile: Mapping[str, Any]) -> Iterator[Any]:
+    """A raster of ``profile`` to write to, which becomes the file ``path`` at the end.
+
+    It is made in memory: where the disk is full GDAL says nothing, and leaves a file that nobody can read.
+    """
+    from rasterio.io import MemoryFile
+
+    with MemoryFile() as memory:
+        with memory.open(**profile) as file:
+            yield file
+        # The driver COG writes as it closes.
+        atomic.write(path, bytes(memory.getbuffer()))
 
 
 def raster_transform(lattice: Lattice, place: Georeference | None) -> Any:
@@ -314,16 +329,15 @@ def _write_image(path: Path, bands: Mapping[str, tuple[NDArray[Any], str]], tags
     """Write arrays (row, col) on image pixels, with their units, as bands of a float32 TIFF, NaN undefined."""
     import warnings
 
-    import rasterio
     from rasterio.errors import NotGeoreferencedWarning
 
     height, width = next(iter(bands.values()))[0].shape
     profile = {"driver": "GTiff", "height": height, "width": width, "count": len(bands), "dtype": "float32"}
     # 3 is TIFF's predictor of floats; GTiff does not choose by itself, as COG does.
     profile |= {"nodata": float("nan"), "compress": "deflate", "predictor": 3}
-    with atomic.replacing(path) as temporary, warnings.catch_warnings():
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)  # an image has no place on the ground
-        with rasterio.open(temporary, "w", **profile) as file:
+        with _gdal_file(path, profile) as file:
             for number, (name, (values, _)) in enumerate(bands.items(), start=1):
                 file.write(np.asarray(values, dtype=np.float32), number)
                 file.set_band_description(number, name)

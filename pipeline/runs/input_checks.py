@@ -37,6 +37,9 @@ UNLIKE_GREY = 1.5
 CLIPPED = 0.2
 """Share of black or of white pixels. A white sky takes less than this; more means clipped ground."""
 
+FEW_BITS = 2
+"""Highest bits that no sample of 16-bit images has, from which on they may be those of a camera with 14 or fewer."""
+
 UNIFORM = 1.0
 """Standard deviation of an image [grey levels], below which it is blank."""
 
@@ -205,7 +208,15 @@ def judge_up(up: Sequence[tuple[float, float, float] | None] | None, frames: Seq
 def judge_looks(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Finding]:
     """Exposure and sharpness of all images, by camera and frame."""
     opened = {camera: of for camera, of in looks.items() if of}
-    return [*_uniform(opened, names), *_exposure(opened, names), *_sharpness(opened, names)]
+    return [*_uniform(opened, names), *_depth(opened), *_exposure(opened, names), *_sharpness(opened, names)]
+
+
+def _depth(looks: Mapping[str, Mapping[int, Look]]) -> list[Finding]:
+    unused = min((v.unused_bits for of in looks.values() for v in of.values()), default=0)
+    if unused < FEW_BITS:
+        return []
+    text = f"samples use {16 - unused} of their 16 bits: all images are taken as {2**unused} times as dark as they are"
+    return [doubt("RIL-896", text, "images", remedy=f"multiply the samples by {2**unused}")]
 
 
 def _uniform(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Finding]:

@@ -34,7 +34,7 @@ class Look:
     """One image in figures: mean grey 0..255, deviation, shares of dark and bright clipped pixels, sharpness.
 
     ``detail`` is what lies between two and four pixels, RMS over the deviation: where even that is gone, noise alone
-    decides on the sharpness.
+    decides on the sharpness. ``unused_bits``: see :func:`unused_bits`.
     """
 
     mean: float
@@ -43,6 +43,12 @@ class Look:
     bright: float
     sharpness: float
     detail: float = 0.0
+    unused_bits: int = 0
+
+
+def unused_bits(image: NDArray[Any]) -> int:
+    """Highest bits of 16-bit samples that no pixel of an image has: the file may hold the 12 bits of a camera."""
+    return 16 - int(image.max(initial=0)).bit_length() if image.dtype == np.uint16 else 0
 
 
 def look(image: NDArray[Any], valid: Bytes) -> Look:
@@ -52,7 +58,8 @@ def look(image: NDArray[Any], valid: Bytes) -> Look:
     if not values.size:
         return Look(math.nan, 0.0, 0.0, 0.0, math.nan)
     clipped = float((values <= LOW).mean()), float((values >= HIGH).mean())
-    return Look(float(values.mean()), float(values.std()), *clipped, *texture(image, valid))
+    found = *clipped, *texture(image, valid), unused_bits(image)
+    return Look(float(values.mean()), float(values.std()), *found)
 
 
 def texture(image: NDArray[Any], valid: Bytes) -> tuple[float, float]:

@@ -75,6 +75,30 @@ def test_damaged_and_foreign_files_are_named(tmp_path, grey):
         files.read_grey(tmp_path / "absent.png")
 
 
+def photograph():
+    """A JPEG whose entropy-coded data are long."""
+    return bytearray(encoded(np.random.default_rng(3).integers(0, 255, (96, 128)).astype(np.uint8), ".jpg"))
+
+
+def test_a_jpeg_that_libjpeg_complains_about_is_refused(capfd):
+    data = photograph()
+    data[len(data) // 2 : len(data) // 2 + 200] = bytes(200)
+    with raises("RIL-170", "Corrupt JPEG data"):
+        files.decode(bytes(data), "x")
+    short = bytes(photograph()[: len(data) // 2]) + b"\xff\xd9"
+    with raises("RIL-170", "premature end"):
+        files.decode(short, "x")
+    # What libjpeg says is in the error, and nowhere else.
+    assert capfd.readouterr().err == ""
+
+
+def test_a_few_bytes_of_padding_before_the_end_are_no_damage(capfd):
+    data = photograph()
+    padded = bytes(data[:-2]) + bytes([7, 7, 7]) + b"\xff\xd9"
+    np.testing.assert_array_equal(files.decode(padded, "x"), files.decode(bytes(data), "x"))
+    assert capfd.readouterr().err == ""
+
+
 def run(source):
     stage = files16.STAGE if source.module.endswith("16") else files.STAGE
     bundle = stage.run(NoParams(), source.args | source.hints, {})

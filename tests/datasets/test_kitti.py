@@ -262,6 +262,13 @@ def test_a_number_left_out_of_the_count_is_a_lost_frame(folder, rows):
     assert (s.truth[1] is None) == (rows == 4)
 
 
+def test_numbers_in_names_count_as_numbers(folder):
+    for side in ("image_l", "image_r"):
+        for k in range(3):
+            (folder / side / f"{k:06d}.png").rename(folder / side / f"img{4 * k + 2}.png")
+    assert open_sequence(str(folder)).frame_names == ("img2", "img6", "img10")
+
+
 def test_numbers_that_do_not_count_on_by_one_are_names(folder):
     for side in ("image_l", "image_r"):
         (folder / side / "000002.png").rename(folder / side / "000007.png")

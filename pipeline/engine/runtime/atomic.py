@@ -5,6 +5,7 @@ What an interruption leaves behind is named ``.tmp-...``, which no pattern of ou
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import uuid
@@ -19,7 +20,13 @@ LEFTOVER = ".tmp-"
 def replacing(path: Path) -> Iterator[Path]:
     """Temporary path of the same name, of a file or folder that becomes ``path`` if the block ends without an error.
 
-    A folder that was there is removed first: for a moment there is none, but never a mixture.
+    A folder takes the place of one that was there, which is removed first: for a moment there is none, but never a
+    mixture. A file never does: that would be a user's folder, with all that is in it.
+
+    Raises
+    ------
+    IsADirectoryError
+        A file was made, and ``path`` is a folder.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     apart = _beside(path)
@@ -30,6 +37,8 @@ def replacing(path: Path) -> Iterator[Path]:
         with _naming(path):
             yield apart / path.name
         if path.is_dir() and not path.is_symlink():
+            if not (apart / path.name).is_dir():
+                raise _is_folder(path)
             # os.replace cannot replace a folder that is not empty.
             shutil.rmtree(path)
         os.replace(apart / path.name, path)
@@ -44,6 +53,8 @@ def write(path: Path, data: bytes | str) -> None:
     try:
         with _naming(path):
             temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+        if path.is_dir():
+            raise _is_folder(path)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -101,6 +112,10 @@ def _naming(path: Path) -> Iterator[None]:
     except OSError as error:
         error.filename = error.filename or str(path)
         raise
+
+
+def _is_folder(path: Path) -> IsADirectoryError:
+    return IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
 
 
 def _folder(folder: Path, temporary: Path) -> list[Path]:

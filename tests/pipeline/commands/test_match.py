@@ -66,8 +66,37 @@ def test_confidence_has_three_bands_that_fit_the_disparity(folder):
     np.testing.assert_array_equal(ok, np.isfinite(column))
     np.testing.assert_array_equal(ok, np.isfinite(std))
     assert (error[ok] <= 1).all()
-    with raises("RIL-043"):
-        run(folder, confidence=folder / "out.tif")
+
+
+def test_outputs_that_cannot_be_are_refused_before_matching(folder):
+    params = command.matcher_params(None, ())
+    (folder / "results.tif").mkdir()
+    before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+
+    def refused(code, *words, output="out.tif", **options):
+        with raises(code, *words):
+            command.match_files(
+                folder / "left.png", folder / "right.png", folder / output, params, dense=False, **options
+            )
+
+    refused("RIL-043", "--confidence and --output", confidence=folder / "out.tif")
+    refused("RIL-047", "results.tif is a folder", output="results.tif")
+    refused("RIL-047", "is a folder", output=".")
+    refused("RIL-047", "is a folder", confidence=folder)
+    refused("RIL-871", ".tif or .tiff", output="out.npy")
+    (folder / "left.png").rename(folder / "left.tif")
+    with raises("RIL-043", "an image"):
+        command.match_files(folder / "left.tif", folder / "right.png", folder / "left.tif", params, dense=False)
+    (folder / "left.tif").rename(folder / "left.png")
+    assert {path.name: path.stat().st_mtime_ns for path in folder.iterdir()} == before
+
+
+def test_images_of_a_camera_of_12_bits_are_told(folder, capsys):
+    for name in ("left.png", "right.png"):
+        image = cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(folder / name), image.astype(np.uint16) * 16)
+    run(folder)
+    assert "RIL-705: samples use 12 of their 16 bits" in capsys.readouterr().err
 
 
 def test_prior_as_written_is_read_and_used(folder):

@@ -66,6 +66,19 @@ def test_a_block_that_fails_leaves_what_was_there(tmp_path):
     assert names(tmp_path) == ["file.tif", "folder.zarr", "x"]
 
 
+@pytest.mark.parametrize("full", [False, True])
+def test_a_file_never_takes_the_place_of_a_folder(tmp_path, full):
+    folder = tmp_path / "results"
+    folder.mkdir()
+    if full:
+        (folder / "thesis.txt").write_text("years")
+    with pytest.raises(IsADirectoryError, match="results"), atomic.replacing(folder) as temporary:
+        temporary.write_text("a file")
+    with pytest.raises(IsADirectoryError, match="results"):
+        atomic.write(folder, "a file")
+    assert names(tmp_path) == ["results"] + full * ["thesis.txt"]
+
+
 def test_no_other_module_moves_files_into_place():
     pattern = re.compile(r"os\.(replace|link|fsync)\(|\.tmp\b|temporary\.(replace|rename)\(")
     found = [p for p in PIPELINE.rglob("*.py") if p.name != "atomic.py" and pattern.search(p.read_text("utf-8"))]
