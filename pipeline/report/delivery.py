@@ -140,9 +140,9 @@ def _local_paths(pairs: Rows, *, merged: bool) -> Items:
     reasons = dict.fromkeys(r["path"] for r in without)
     at = {reason: [r["frame"] for r in without if r["path"] == reason] for reason in reasons}
     why = "; ".join(f"{reason} ({_among(frames, stops)}{_ahead(without, reason)})" for reason, frames in at.items())
-    why += (
-        "; a path over the merged terrain was found all the same: one stop sees what another does not" if merged else ""
-    )
+    if merged:
+        why += "; a path over the merged terrain was found all the same"
+        why += ": one stop sees what another does not" if asked > 1 else ""
     return [_item("no path", f"{asked - found} of {asked} stops have no local path", why)]
 
 

@@ -152,7 +152,7 @@ class Folder:
                     f"the cache {self.root} may not be used ({os.strerror(error.errno)})",
                     remedy="choose another folder with --cache",
                 ) from error
-            if isinstance(error, NotADirectoryError):
+            if isinstance(error, NotADirectoryError | FileExistsError) and not self.root.is_dir():
                 raise StoreError(
                     "RIL-576", f"the cache {self.root} is not a folder", remedy="choose one with --cache"
                 ) from error

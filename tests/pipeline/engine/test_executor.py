@@ -10,12 +10,15 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
+from raising import raises
 from toys.chain import build
 
 from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.executors import base
 from rille.pipeline.engine.executors.dask_client import WorkerDiedError
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store import maintenance
@@ -163,3 +166,9 @@ def test_an_edit_computes_again_exactly_what_it_can_change(editable):
     real = editable(old="SCALE = 2.0", new="SCALE = 3.0")
     assert {n for n, v in real.items() if v[0] == "computed"} == {*(f"scale/{i}" for i in range(4)), "total"}
     assert real["total"][2] == "input parts changed (4 of 4)"
+
+
+@pytest.mark.parametrize("client", [5, SimpleNamespace(scheduler=None)])
+def test_what_is_no_open_client_is_refused(client):
+    with raises("RIL-539", "no open Client"):
+        base.known(client)

@@ -68,6 +68,8 @@ def test_a_cache_that_cannot_be_written_is_refused_before_anything_is_computed(t
     (tmp_path / "file").touch()
     with raises("RIL-576", "not a folder"):
         Store(tmp_path / "file" / "cache").writable()
+    with raises("RIL-576", "not a folder"):
+        Store(tmp_path / "file").writable()
 
 
 SMALL = ["--frames", "0:2", "--set", "crosscheck.enabled=false", "--set", "hfvm.preset=fast"]

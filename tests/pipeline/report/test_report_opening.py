@@ -84,6 +84,9 @@ def test_a_missing_local_path_names_the_shorter_list_of_stops_and_whether_there_
     assert most["why"].startswith(
         "closed (all stops but frame 4); a path over the merged terrain was found all the same"
     )
+    (one,) = delivery._local_paths(rows("closed"), merged=True)
+    assert "one stop sees" in most["why"]
+    assert one["why"].endswith("found all the same")
     (all_of_them,) = delivery._local_paths(rows("closed", "closed"), merged=False)
     assert all_of_them["why"] == "closed (frames 0, 2)"
     assert delivery._local_paths(rows("found", None), merged=True) == []
