@@ -110,8 +110,16 @@ def assignments(settings: Mapping[str, Settings]) -> list[str]:
                 "RIL-861", f"{section}={values!r} is no section", remedy=f'give {section}={{"name": value}}'
             )
         for name, value in values.items():
-            words = tomli_w.dumps({"v": list(value) if isinstance(value, tuple) else value}).strip()
-            found.append(f"{section}.{name}={' '.join(words.removeprefix('v = ').split())}")
+            try:
+                lines = tomli_w.dumps({"v": value}).removeprefix("v = ").splitlines()
+            except TypeError:
+                raise ConfigError(
+                    "RIL-866",
+                    f"{section}.{name} = {value!r} is no value of TOML",
+                    remedy="give a number, a text, True or False, or a list of these; or leave it out",
+                ) from None
+            # Only a list has several lines: the line feed of a text is escaped.
+            found.append(f"{section}.{name}={' '.join(line.strip() for line in lines)}")
     return found
 
 

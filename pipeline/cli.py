@@ -320,9 +320,13 @@ def check(
 def main(argv: list[str] | None = None) -> None:
     """Entry point of ``rille``."""
     with plain_output():
-        code = _run(argv)
-        # Here, where a reader that has gone is still an exception: at exit Python would print a traceback.
-        sys.stdout.flush()
+        try:
+            code = _run(argv)
+            # Here, where a reader that has gone is still an exception: at exit Python would print a traceback.
+            sys.stdout.flush()
+        except BrokenPipeError:  # who read the output has had enough of it
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            code = FAILED
     sys.exit(code)
 
 
@@ -345,9 +349,8 @@ def _run(argv: list[str] | None) -> int:
         hint = f" `{words} --help` says what it takes." if extra or isinstance(error, MissingArgumentError) else ""
         _print_error("RIL-001", f"{text}{hint}")
         return USAGE
-    except BrokenPipeError:  # who read the output has had enough of it
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        return FAILED
+    except BrokenPipeError:
+        raise
     except Exception as error:
         return _complain(error, debug)
 

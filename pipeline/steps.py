@@ -234,7 +234,8 @@ def terrain(disparity: xarray.Dataset, pair: StereoPair, **locus: Any) -> xarray
     from rille.pipeline.flow.reconstruction import vertical
     from rille.stages.terrain.locus import stage as locus_stage
 
-    given, size = _bundle(disparity, "rille.match"), (pair.sequence.rig.left.height, pair.sequence.rig.left.width)
+    given = _bundle(disparity, "column_disparity", "rille.match")
+    size = pair.sequence.rig.left.height, pair.sequence.rig.left.width
     if disparity.column_disparity.shape != size:
         raise InputError(
             "RIL-865",
@@ -289,7 +290,7 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
         limits = dict(vehicle)
     settings = _merged(dem, {"vehicle": limits, "risk": risk})
     make, given = _builder(None, settings), _placeholder("dem")
-    found = _computed(make.hazards("risk", [given]), {given: _bundle(dem, "rille.terrain")}, {})
+    found = _computed(make.hazards("risk", [given]), {given: _bundle(dem, "elevation", "rille.terrain")}, {})
     return _dataset(risk_stage.STAGE, found, settings)
 
 
@@ -338,7 +339,7 @@ def path(
     settings = _merged(hazards, {"path": {**path, **ends}})
     make, given = _builder(None, settings), _placeholder("risk")
     planned = make.node(path_stage, "path", {} if ends else {"use": "local"}, risk=given)
-    found = _computed(planned, {given: _bundle(hazards, "rille.hazards")}, {})
+    found = _computed(planned, {given: _bundle(hazards, "risk", "rille.hazards")}, {})
     return _dataset(path_stage.STAGE, found, settings)
 
 
@@ -393,7 +394,8 @@ def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
 
 
 def _carried(meta: Settings, settings: Settings) -> dict[str, str]:
-    return {"rille": json.dumps({"meta": dict(meta), "settings": dict(settings)})}
+    # A setting may be a number of NumPy.
+    return {"rille": json.dumps({"meta": dict(meta), "settings": dict(settings)}, default=np.generic.item)}
 
 
 def _settings(data: Any) -> dict[str, Any]:
@@ -412,9 +414,12 @@ def _merged(data: xarray.Dataset, *more: Settings) -> dict[str, Any]:
     return settings
 
 
-def _bundle(data: xarray.Dataset, maker: str) -> Bundle:
-    if "rille" not in data.attrs:
-        raise InputError("RIL-864", "the dataset has no attribute rille", remedy=f"give what {maker} returns")
+def _bundle(data: xarray.Dataset, variable: str, maker: str) -> Bundle:
+    """What a step before has made; ``variable`` tells its datasets from those of the other steps."""
+    there = {"attribute rille": "rille" in data.attrs, variable: variable in getattr(data, "data_vars", ())}
+    for what, found in there.items():
+        if not found:
+            raise InputError("RIL-864", f"the dataset has no {what}", remedy=f"give what {maker} returns")
     arrays = {str(name): np.asarray(array) for name, array in data.data_vars.items()}
     return Bundle(arrays, json.loads(data.attrs["rille"])["meta"])
 

@@ -178,6 +178,7 @@ def doubts(found: RigCalibration, boards: Boards, model: str) -> list[str]:
         for r in found.residuals
         if not r.used
     ]
+    used = [view for view, r in zip(boards.views, found.residuals, strict=True) if r.used]
     if found.rms > MANY_BAD_PX:
         text = f"corners miss by {found.rms:.2f} px RMS: is the board flat, are the images paired rightly?"
         lines.append(warning("RIL-696", text))
@@ -186,7 +187,7 @@ def doubts(found: RigCalibration, boards: Boards, model: str) -> list[str]:
         if share > VAGUE_FOCAL:
             text = f"{side} focal length is known to {100 * share:.1f} % only; take views with the board tilted"
             lines.append(warning("RIL-697", text))
-        seen = cover([v.left if side == "left" else v.right for v in boards.views], boards.size)
+        seen = cover([v.left if side == "left" else v.right for v in used], boards.size)
         if seen < LEAST_COVER:
             text = f"the corners span {100 * seen:.0f} % of the {side} image; distortion beyond is a guess"
             lines.append(warning("RIL-698", text))

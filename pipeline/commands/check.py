@@ -94,7 +94,7 @@ def check(
     Result(failures=[f for f in result.failures if not (f.stage and isinstance(f.error, RilleError))]).check()
     found = inspection.found
     if inspection.match is not None and len(inspection.match.left):
-        draw(path, sequence.name, sequence.frame_names[inspection.frames[0]], inspection.match)
+        draw(path, sequence.name, sequence.frame_names[inspection.match.frame], inspection.match)
         print(f"picture       {path}")
     counts = {level: sum(v.level == level for v in found) for level in ("OK", "WARN", "FAIL")}
     print(f"{sequence.name}: {counts['FAIL']} fail, {counts['WARN']} to look at, {counts['OK']} fine")
@@ -103,8 +103,9 @@ def check(
 
 @dataclass(frozen=True)
 class Match:
-    """The first pair: its left image (row, col), thinned matches (n, 2), their residuals (n,) px, and all facts."""
+    """The first whole pair: left image (row, col), thinned matches (n, 2), their residuals (n,) px, and all facts."""
 
+    frame: int
     image: NDArray[Any]
     left: Floats
     right: Floats
@@ -210,6 +211,7 @@ class Inspection:
             found = self.store.open(oriented)
             points = {name: np.asarray(found[name], dtype=np.float64) for name in ("left", "right")}
             self.match = m = Match(
+                pair,
                 np.asarray(self.store.open(image)["image"]),
                 points["left"],
                 points["right"],
@@ -248,9 +250,9 @@ class Inspection:
 
     def _simultaneous(self) -> Steps:
         """Rows of some pairs over the whole sequence, with the right images as named and shifted in time."""
-        last = max(self.frames)
-        # Frames whose right images exist for every shift: else a shift would be judged by other frames.
-        inner = [k for k in self.frames if k - 2 >= 0 and k + 2 <= last]
+        looked_at = {*self.frames, *self.lost}
+        # Frames whose right images were looked at for every shift: else a shift would be judged by other frames.
+        inner = [k for k in self.frames if looked_at.issuperset(k + shift for shift in synchrony.SHIFTS)]
         chosen = sorted({inner[int(k)] for k in np.linspace(0, len(inner) - 1, MOST_PAIRS).round()}) if inner else []
         spreads: dict[int, list[float | None]] = {shift: [] for shift in synchrony.SHIFTS}
         for frame in chosen:

@@ -5,7 +5,7 @@ What depends on results that are still to come is drawn as the last run had it, 
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from html import escape
 from pathlib import Path
 
@@ -61,10 +61,13 @@ def dot(names: Names, edges: Edges) -> str:
 def svg(names: Names, edges: Edges) -> str:
     """A drawing: each name in the row behind all that it reads and that was created before it."""
     rows: dict[str, int] = {}
+    read = defaultdict[str, list[str]](list)
+    for a, b in edges:
+        read[b].append(a)
     for name in names:
         # A stage that reads itself through others (`locus` by `pose`) stays where it was first created: its loop is
         # drawn upwards.
-        rows[name] = 1 + max((rows[a] for a, b in edges if b == name and a in rows), default=-1)
+        rows[name] = 1 + max((rows[a] for a in read[name] if a in rows), default=-1)
     filled, places = Counter[int](), {}
     for name, row in rows.items():
         places[name] = (filled[row] * (BOX[0] + GAP[0]), row * (BOX[1] + GAP[1]))

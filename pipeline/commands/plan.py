@@ -61,11 +61,11 @@ def plan(options: Options, *, verbose: bool = False) -> int:
         raise ConfigError("RIL-733", text, remedy=unread.remedy(lost, config))
     jobs = options.jobs or cores()
     hints = store.hints(graph.sequence)
-    for line in describe(graph, result, recall(hints) or {}, jobs, verbose=verbose):
-        print(line)
     known = cost_model.recall(hints)
     limit = None if options.memory_limit is None else limits.parse(options.memory_limit)
     shares = account(known, limit, options.executor, jobs, largest(graph, known))
+    for line in describe(graph, result, recall(hints) or {}, shares.workers, verbose=verbose):
+        print(line)
     for line in needs(graph, known, shares):
         print(line)
     # Last, so that the table stands above the refusal and shows which task it is.
@@ -99,7 +99,7 @@ def needs(graph: Graph, known: Costs, shares: Account) -> Iterable[str]:
         yield "the largest tasks will wait for one another: together they would exceed the limit"
 
 
-def describe(graph: Graph, result: Result, earlier: Kinds, jobs: int, *, verbose: bool = False) -> Iterable[str]:
+def describe(graph: Graph, result: Result, earlier: Kinds, workers: int, *, verbose: bool = False) -> Iterable[str]:
     """Lines of the plan: a table by stage with reasons, totals, and what it rests on."""
     by_stage: dict[str, list[Handle]] = defaultdict(list)
     for handle in graph.nodes:
@@ -111,7 +111,7 @@ def describe(graph: Graph, result: Result, earlier: Kinds, jobs: int, *, verbose
         yield f"{stage:19s} {len(handles) - len(planned):7d} {len(planned):7d}  {'; '.join(reasons)}".rstrip()
         if verbose:
             yield from (f"    {h.label}: {h.reason}" for h in planned)
-    yield from _totals(graph, result, earlier, jobs)
+    yield from _totals(graph, result, earlier, workers)
 
 
 def _reasons(planned: list[Handle]) -> list[str]:
@@ -128,14 +128,14 @@ def _short(reason: str) -> str:
     return reason if len(reason) <= WIDTH else reason[: WIDTH - 3] + "..."
 
 
-def _totals(graph: Graph, result: Result, earlier: Kinds, jobs: int) -> Iterable[str]:
+def _totals(graph: Graph, result: Result, earlier: Kinds, workers: int) -> Iterable[str]:
     planned = [h for h in graph.nodes if h.status == "planned"]
     cached = len(graph.nodes) - len(planned)
     line = f"{len(graph.nodes)} tasks known: {cached} cached, {len(planned)} to do"
     untimed = sorted({h.stage for h in planned if kind(h.label) not in earlier})
     work = sum(earlier.get(kind(h.label), (0.0, 0.0, 0.0))[1] for h in planned)
     if planned and len(untimed) < len({h.stage for h in planned}):
-        line += f", about {work / jobs:.0f} s with {jobs} workers by earlier runs"
+        line += f", about {work / workers:.0f} s with {count(workers, 'worker')} by earlier runs"
         line += f" (never timed: {', '.join(untimed)})" if untimed else ""
     yield line
     if result.assumed:

@@ -38,7 +38,7 @@ def driven() -> frozenset[str]:
     return frozenset({"drive", *modules("closed_loop")} - {*of_both})
 
 
-CHECKED = frozenset(("undistort", "pyramid", "motion", "hfvm", "orientation"))
+CHECKED = frozenset(("undistort", "pyramid", "motion", "hfvm", "tiling", "orientation"))
 """Sections that ``rille check`` reads."""
 
 CHOICES = ("terrain.preset", "keyframes.preset")

@@ -36,9 +36,7 @@ class Holding:
 
 def holdings(store: Store, folder: Path) -> list[Holding]:
     """List the artifacts by sequence and stage: the largest sequence first, its stages in order of size."""
-    used: dict[str, str] = {}
-    for place in roots.folders(store, folder):
-        used |= lookup.keys(place)
+    used = lookup.keys(roots.folders(store, folder))
     kept = pins.keys(store)
     pinned_by = {key: found["run"] for found in pins.pins(store) for key in found["keys"]}
     found: dict[tuple[str, str], Holding] = {}

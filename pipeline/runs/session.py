@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shlex
 import shutil
 import sys
 from collections.abc import Iterator
@@ -23,7 +24,7 @@ from rille.pipeline.engine.code_digest import remember
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.packages import installed
-from rille.pipeline.engine.plain import warn
+from rille.pipeline.engine.plain import plain, warn
 from rille.pipeline.engine.store.base import GoneError, Store, at
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.store.location import Location, hints_folder, locate
@@ -65,11 +66,13 @@ class Options:
     """The sequence itself, where it is open already."""
 
     def command(self) -> str:
-        """The command line that repeats this run."""
+        """The command line that repeats this run, as a shell takes it, in one line."""
         words = ["rille", self.verb, self.sequence]
-        words += [f"--config {self.config}"] if self.config else []
-        words += [f"--frames {self.frames}"] if self.frames else []
-        return " ".join(words + [f"--set {a}" for a in self.assignments])
+        words += ["--config", str(self.config)] if self.config else []
+        words += ["--frames", self.frames] if self.frames else []
+        words += [word for a in self.assignments for word in ("--set", a)]
+        # A line feed within a list of TOML is as good as a space; in `config.toml` this is a comment of one line.
+        return plain(shlex.join(words).replace("\n", " "))
 
 
 def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
@@ -113,7 +116,6 @@ def settings(options: Options) -> Settled:
     from rille.datasets.registry import open_sequence
     from rille.pipeline.export.view import UNSTATED
     from rille.pipeline.flow import unread
-    from rille.pipeline.runs.input_checks import judge_rig
 
     read = configuration.read_toml(options.config) if options.config else {}
     # Over the file: --set is said now, --config may be old.
@@ -123,14 +125,9 @@ def settings(options: Options) -> Settled:
         sequence = open_sequence(options.sequence, for_dataset, hints_folder(locate(options.cache)) / "files.json")
     elif for_dataset:
         text = f"{next(iter(for_dataset))}: the sequence is open already"
-        raise ConfigError("RIL-860", text, remedy="give its parameters to open_sequence")
+        raise ConfigError("RIL-860", text, remedy="give its parameters to rille.open")
     else:
         sequence = options.opened
-    found = judge_rig(sequence.rig)
-    # A manifest warns of its baseline itself, with the key to change.
-    if found.level != "OK" and not any("baseline" in line for line in sequence.warnings):
-        doubt = f"{found.code}: {found.text}: {found.remedy}"
-        sequence = replace(sequence, warnings=(*sequence.warnings, doubt))
     vehicle, source = {}, UNSTATED
     if sequence.vehicle is not None:
         vehicle, source = {"vehicle": sequence.vehicle.model_dump()}, f"sequence {sequence.name}"
@@ -148,6 +145,7 @@ def settings_of_run(options: Options) -> Settled:
     from rille.pipeline.engine.executors.base import known
     from rille.pipeline.engine.memory import limits
     from rille.pipeline.flow import unread
+    from rille.pipeline.runs.input_checks import judge_rig
 
     # Before anything is read or written.
     stages = configuration.stage_names() if options.force else set()
@@ -158,9 +156,14 @@ def settings_of_run(options: Options) -> Settled:
         limits.parse(options.memory_limit)
     settled = settings(options)
     unread.refuse_unreadable(settled.given, settled.config, settled.sequence)
-    for line in settled.sequence.warnings:
+    sequence, found = settled.sequence, judge_rig(settled.sequence.rig)
+    # A manifest warns of its baseline itself, with the key to change.
+    if found.level != "OK" and not any("baseline" in line for line in sequence.warnings):
+        doubt = f"{found.code}: {found.text}: {found.remedy}"
+        sequence = replace(sequence, warnings=(*sequence.warnings, doubt))
+    for line in sequence.warnings:
         warn(line)
-    return settled
+    return replace(settled, sequence=sequence)
 
 
 def warn_of_results(graph: Graph) -> None:
@@ -393,5 +396,6 @@ def _point_latest(folder: Path) -> None:
     """Move ``latest`` to a finished run in one step."""
     # symlink_to cannot replace a link; a rename can, in one step, so a reader finds the earlier or the new run.
     link = folder.parent / f".latest-{os.getpid()}"
+    link.unlink(missing_ok=True)  # of a killed run: in a container numbers of processes repeat
     link.symlink_to(folder.name, target_is_directory=True)
     link.replace(folder.parent / "latest")

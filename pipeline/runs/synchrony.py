@@ -20,7 +20,7 @@ from rille.stages.numeric.robust import mad_sigma
 Floats = NDArray[np.float64]
 
 SHIFTS = (0, -1, 1, -2, 2)
-"""Frames by which the right images may be late; nought first, so that it wins a draw."""
+"""Frames by which the right images may be late; nought: as they are named."""
 
 FEATURES = 1500
 RATIO = 0.75

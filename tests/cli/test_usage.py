@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
 
 import pytest
 from cyclopts import App
-from place import Place
+from place import RILLE, Place
 
 from rille.pipeline.cli import app
 
@@ -160,3 +162,13 @@ def test_help(place: Place, command: str) -> None:
 def test_a_word_too_many_is_named(place: Place) -> None:
     done = place.here("match", "a.png", "b.png", "c.tif")
     assert done.err == "rille: error RIL-001: unexpected 'c.tif'. `rille match --help` says what it takes.\n"
+
+
+def test_a_reader_that_has_gone_is_no_traceback() -> None:
+    """The few lines are still in Python's buffer when the command has ended."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    given = {"stdout": writer, "stderr": subprocess.PIPE, "env": {**os.environ, "PYTHONUNBUFFERED": ""}}
+    done = subprocess.run([str(RILLE), "datasets", "list"], check=False, text=True, **given)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (1, "")

@@ -17,6 +17,7 @@ from toys.browser import Browser
 import rille
 from rille.pipeline import api
 from rille.pipeline.engine import code_digest, events
+from rille.pipeline.flow import config as configuration
 
 MOCKUP = {"frames": 3, "image_width": 285, "image_height": 260, "focal_length": 300.0}
 STAGES = {"keyframes": {"stride": 2}, "locus": {"cell_size": 0.004}, "hfvm": {"preset": "fast"}}
@@ -113,10 +114,20 @@ def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
         rille.reconstruct(sequence, runs=tmp_path, cache=tmp_path / "cache", mockup={"frames": 4})
     with raises("RIL-861"):
         rille.reconstruct(sequence, locus=0.002)  # type: ignore[arg-type]
+    for nothing in (None, np.float32(0.002), tmp_path):
+        with raises("RIL-866", "locus.cell_size"):
+            rille.reconstruct(sequence, locus={"cell_size": nothing})
     with raises("RIL-862"):
         _ = rille.Run(tmp_path).terrain
     with pytest.raises(AttributeError):
         _ = rille.nothing
+
+
+@pytest.mark.parametrize("value", ["two  blanks", "a\nline", 'a "quote"', [[1, 2], [3, 4]], True, 1e-7])
+def test_settings_come_back_from_their_assignments(value: object) -> None:
+    words = api.assignments({"section": {"key": value}})
+    assert "\n" not in words[0]
+    assert configuration.parse_assignments(words) == {"section": {"key": value}}
 
 
 def test_its_examples_run() -> None:

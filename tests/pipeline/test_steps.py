@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import json
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,11 @@ def test_the_vehicle_may_be_a_file(dem: Any, tmp_path: Path) -> None:
     np.testing.assert_array_equal(one.risk, other.risk)
 
 
+def test_settings_may_be_numbers_of_numpy(disparity: Any, pair: rille.StereoPair) -> None:
+    dem = rille.terrain(disparity, pair, cell_size=np.float32(0.0078125))
+    assert json.loads(dem.attrs["rille"])["settings"]["locus"]["cell_size"] == 0.0078125
+
+
 def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: Any, dem: Any) -> None:
     import xarray
 
@@ -100,6 +106,14 @@ def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: 
     assert [p.frame for p in pair.sequence] == [0, 1, 2]
     with raises("RIL-864", "rille.terrain"):
         rille.hazards(xarray.Dataset())
+    for step, other, maker in (
+        (lambda data: rille.terrain(data, pair), dem, "rille.match"),
+        (lambda data: rille.terrain(data, pair), pair.left, "rille.match"),
+        (rille.hazards, disparity, "rille.terrain"),
+        (rille.path, dem, "rille.hazards"),
+    ):
+        with raises("RIL-864", maker):
+            step(other)
     with raises("RIL-865", "(260, 285)"):
         rille.terrain(disparity.isel(row=slice(5)), pair)
     with raises("RIL-027", "hfvm.no"):

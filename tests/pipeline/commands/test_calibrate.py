@@ -12,7 +12,10 @@ import pytest
 from raising import raises
 
 from rille.datasets.cameras import read_cameras, rig_of
-from rille.pipeline.commands.calibrate import calibrate, cover
+from rille.pipeline.commands.calibrate import Boards, calibrate, cover, doubts
+from rille.stages.calibration.target import MODELS, BoardView, RigCalibration, ViewResidual
+from rille.stages.geometry.geometry import Camera, RigidTransform
+from rille.stages.geometry.lens import Lens
 
 BOARDS = {"chessboard_opencv": ("9x6", 0.025), "chessboard_bumblebee2": ("6x4", 0.03)}
 
@@ -139,3 +142,14 @@ def test_views_of_no_flat_board_write_nothing(data_dir, tmp_path, monkeypatch):
     with raises("RIL-800", "6 x 4"):
         calibrate(tmp_path, tmp_path, square=0.03, corners="6x4", keep_bad=True, output=tmp_path / "rig.yaml")
     assert not (tmp_path / "rig.yaml").exists()
+
+
+def test_views_that_are_left_out_cover_nothing():
+    small, whole = ([[5.0, 5.0], [15.0, 5.0], [15.0, 15.0], [5.0, 15.0]], [[0.0, 0], [100, 0], [100, 80], [0, 80]])
+    views = [BoardView(name, np.array(p), np.array(p)) for name, p in (("used", small), ("bad", whole))]
+    lens = Lens(Camera(100, 100, 50, 40, 100, 80), "radtan", (0.0, 0.0, 0.0, 0.0))
+    sigma = {f"{side} {name}": 0.0 for side in ("left", "right") for name in ("fx", *MODELS["radtan4"])}
+    seen = tuple(ViewResidual(v.name, 0.1, 0.1, 0.1, used=v.name == "used") for v in views)
+    found = RigCalibration(lens, lens, RigidTransform.identity(), sigma, 0.1, seen)
+    told = doubts(found, Boards((2, 2), (100, 80), views), "radtan4")
+    assert [line[:7] for line in told] == ["RIL-695", "RIL-698", "RIL-698"]

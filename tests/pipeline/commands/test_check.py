@@ -11,7 +11,10 @@ import pytest
 from raising import raises
 
 from rille.datasets.registry import open_sequence
+from rille.pipeline.commands import check as command
 from rille.pipeline.commands.check import check
+from rille.pipeline.runs import session
+from rille.pipeline.runs.input_checks import judge_rig
 
 ROWS, COLUMNS, MARGIN = 120, 200, 40
 
@@ -85,7 +88,9 @@ def test_rows_that_are_off_are_measured(tmp_path, capsys):
     assert float(text.split("row offset")[1].split()[0]) == pytest.approx(3.0, abs=0.1)
 
 
-def test_damaged_images_are_named_and_the_rest_is_looked_at(tmp_path, capsys):
+def test_damaged_images_are_named_and_the_rest_is_looked_at(tmp_path, capsys, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(command, "draw", lambda path, name, frame, match: drawn.append((frame, match.frame)))
     path = folder(tmp_path / "wall")
     broken = path / "right" / "000.png"
     broken.write_bytes(broken.read_bytes()[:-200])
@@ -94,6 +99,7 @@ def test_damaged_images_are_named_and_the_rest_is_looked_at(tmp_path, capsys):
     assert any("000.png" in text and "truncated" in text for text in lines)
     assert any("RIL-670: 1 of 8 images" in text for text in lines)
     assert line(lines, "matching").startswith("OK")
+    assert drawn == [("001", 1)], "the picture names the pair that it shows"
 
 
 def test_nothing_whole_is_no_crash(tmp_path, capsys):
@@ -133,6 +139,24 @@ def test_frames_are_chosen_and_warnings_repeated(tmp_path, capsys):
     assert "2 of 4 pairs" in line(lines, "sequence")
     assert "WARN  input         the baseline is odd" in lines
     assert "from frame 001 to 003" in line(lines, "motion")
+
+
+def test_shifts_in_time_are_judged_where_they_were_looked_at(tmp_path, capsys):
+    path = folder(tmp_path / "wall", frames=9)
+    _, lines = run(path, capsys)
+    assert "rows of 5 pairs" in line(lines, "simultaneous")
+    _, lines = run(path, capsys, frames=(0, 4, 8))
+    assert not [text for text in lines if "simultaneous" in text], "no frame has a neighbour among these"
+
+
+def test_a_doubtful_rig_is_one_finding(tmp_path):
+    path = folder(tmp_path / "wall", frames=1)
+    calibration = path / "calib.txt"
+    calibration.write_text(calibration.read_text().replace("-32.0", "-1.0"))
+    options = session.Options(str(path), cache=tmp_path / "cache")
+    assert judge_rig(session.settings(options).sequence.rig).code == "RIL-641"
+    assert not session.settings(options).sequence.warnings, "check judges the rig itself"
+    assert "RIL-641" in " ".join(session.settings_of_run(options).sequence.warnings)
 
 
 def test_a_picture_that_cannot_be_written_says_so(tmp_path, capsys):

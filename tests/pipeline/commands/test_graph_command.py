@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,6 +25,21 @@ def test_every_task_is_in_the_drawing(tmp_path: Path, tasks: bool, capsys: pytes
     text = (tmp_path / "graph.dot").read_text()
     assert ('"mockup.render" -> "pyramid"' in text) != tasks
     assert text.count("label=") == len(words)
+
+
+def test_every_arrow_is_looked_at_a_few_times_only() -> None:
+    """Of a long sequence there are hundreds of thousands."""
+
+    class Counted(Counter[tuple[str, str]]):
+        turns = 0
+
+        def __iter__(self) -> Iterator[tuple[str, str]]:
+            self.turns += 1
+            return super().__iter__()
+
+    edges = Counted((str(k), str(k + 1)) for k in range(50))
+    assert graph.svg(Counter(map(str, range(51))), edges).count("<path") == 50
+    assert edges.turns < 5
 
 
 def test_other_names_are_refused(tmp_path: Path) -> None:

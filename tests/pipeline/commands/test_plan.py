@@ -10,9 +10,11 @@ from rille.pipeline.commands import plan
 from rille.pipeline.engine import forecast, scheduler
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.memory import cost_model
+from rille.pipeline.engine.reference import REFERENCE
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow.closed_loop import dataflow
+from rille.pipeline.runs import session
 
 SECONDS = {"numbers": (0.0, 2.0, 0.0), "scale": (0.0, 3.0, 0.0), "total": (0.0, 1.0, 0.0)}
 
@@ -36,6 +38,12 @@ def test_of_an_empty_cache_says_what_it_cannot_know(cache):
     assert told[1].split() == ["numbers", "0", "4", "never", "computed", "(4)"]
     assert told[-2] == "4 tasks known: 0 cached, 4 to do, about 4 s with 2 workers by earlier runs"
     assert told[-1].startswith("more tasks follow, known only after numbers/0, numbers/1, numbers/2")
+
+
+def test_the_time_is_that_of_the_workers_that_there_will_be(cache, monkeypatch, capsys):
+    monkeypatch.setattr(plan, "recall", lambda hints: REFERENCE)
+    plan.plan(session.Options("mockup-short", ("mockup.frames=2",), jobs=2, executor="inline", cache=cache))
+    assert "s with 1 worker by earlier runs" in capsys.readouterr().out
 
 
 def test_when_all_is_cached_nothing_is_to_do(cache):

@@ -77,7 +77,7 @@ def test_a_drive_refuses_how_a_recorded_rig_moves(assignment):
 
 def test_check_refuses_what_it_does_not_read(tmp_path):
     config = configuration.build({})
-    unread.refuse_unchecked(["hfvm.preset", "motion.level"], config)
+    unread.refuse_unchecked(["hfvm.preset", "motion.level", "tiling.memory"], config)
     with raises("RIL-731", "locus.both"):
         unread.refuse_unchecked(["hfvm.preset", "locus.both"], config)
 

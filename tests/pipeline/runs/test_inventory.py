@@ -14,7 +14,7 @@ from rille.pipeline.commands import cache as commands
 from rille.pipeline.engine.store import maintenance
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import artifact_path, frame, length
-from rille.pipeline.runs import inventory, lookup, pins
+from rille.pipeline.runs import inventory, lookup, pins, roots
 
 
 def grow_old(folder):
@@ -43,6 +43,15 @@ def test_the_cache_is_listed_by_the_run_that_used_it_last(two, capsys):
     assert "no kept run" in capsys.readouterr().out
     inventory.ls(folder / "cache", folder / "runs", as_json=True)
     assert {r["stage"] for r in json.loads(capsys.readouterr().out)} == {"numbers", "scale", "total"}
+
+
+def test_the_last_run_is_the_last_one_of_all_folders(tmp_path):
+    store = Store(tmp_path / "cache")
+    first = run(tmp_path, "20260101T000000Z")
+    # Of a folder whose name comes first, a run that came last.
+    shutil.copytree(first, tmp_path / "a" / "toy" / "20260201T000000Z")
+    roots.note(store, tmp_path / "a")
+    assert {row.last_run for row in inventory.holdings(store, tmp_path / "runs")} == {"toy/20260201T000000Z"}
 
 
 def test_a_pin_outlives_the_folder_of_its_run(two, capsys):
@@ -94,4 +103,4 @@ def test_deep_verification_decodes_what_was_computed(two, capsys):
     assert maintenance.verify(store) == (18, [])
     assert commands.verify(cache=folder / "cache", deep=True) == 1
     assert f"{manifest['label']} (numbers): mask decoded to another digest; set aside" in capsys.readouterr().err
-    assert lookup.keys(folder / "runs")[key].startswith("toy/")
+    assert lookup.keys([folder / "runs"])[key].startswith("toy/")

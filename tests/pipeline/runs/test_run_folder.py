@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shlex
+import tomllib
 from datetime import UTC, datetime
 
 import pytest
@@ -25,3 +28,19 @@ def test_a_link_to_a_run_that_has_gone_is_moved(tmp_path):
     folder = session._make_folder(tmp_path, NOW, "plan")
     session._point_latest(folder)
     assert (tmp_path / "latest").resolve() == folder
+
+
+def test_a_link_that_a_killed_run_of_this_number_left_is_replaced(tmp_path):
+    (tmp_path / f".latest-{os.getpid()}").symlink_to("killed")
+    folder = session._make_folder(tmp_path, NOW, "plan")
+    session._point_latest(folder)
+    assert (tmp_path / "latest").resolve() == folder
+
+
+def test_the_command_of_a_run_is_one_line_that_a_shell_takes(tmp_path):
+    assignments = ("drive.goal=[0.1,\n2.0]", "hfvm.preset=fast", "a.b=\x1b")
+    command = session.Options("my data", assignments, config=tmp_path / "my file.toml").command()
+    assert tomllib.loads(f"# {command}\n") == {}
+    words = shlex.split(command)
+    assert words[:5] == ["rille", "reconstruct", "my data", "--config", str(tmp_path / "my file.toml")]
+    assert words[5:9] == ["--set", "drive.goal=[0.1, 2.0]", "--set", "hfvm.preset=fast"]
