@@ -32,7 +32,7 @@ def reconstruct(
     frames: str | None = None,
     runs: str | Path = "runs",
     cache: str | Path | None = None,
-    executor: str = "",
+    executor: str = "dask",
     **settings: Settings,
 ) -> Run:
     """Run the whole chain, or what of it is not cached yet, and write its files and its report.
@@ -81,18 +81,15 @@ def reconstruct(
     prepare()
     from rille.pipeline.runs import session
 
-    given: dict[str, Any] = {"executor": executor} if executor else {}
-    if client is not None:
-        given["executor"] = client
     opened = seq.source if isinstance(seq, StereoSequence) else None
     options = session.Options(
         str(seq) if opened is None else opened.name,
         assignments=tuple(assignments(settings)),
         frames=frames,
+        executor=executor if client is None else client,
         runs=Path(runs),
         cache=cache_folder(cache),
         opened=opened,
-        **given,
     )
     return Run(session.perform(options)[1])
 

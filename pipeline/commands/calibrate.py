@@ -87,7 +87,7 @@ def calibrate(
     found = calibrate_rig(points, boards.views, boards.size, model, keep_bad=keep_bad)
     _refuse_clutter(found, boards)
     with reported("RIL-012", f"cannot write {output}", remedy="choose another --output"):
-        output.write_text(_yaml(found, boards, square, model), encoding="utf-8")
+        output.write_text(_yaml(found, boards, square), encoding="utf-8")
     origin = "given" if given else "found"
     print(f"board        {boards.corners[0]} x {boards.corners[1]} inner corners ({origin}), squares of {square:g} m")
     print("\n".join([*_views(found, boards), "", *_parameters(found, model), ""]))
@@ -235,11 +235,11 @@ def _parameters(found: RigCalibration, model: str) -> list[str]:
 
 
 def _value(lens: Any, name: str, model: str) -> float:
-    pinhole = {"fx": lens.camera.fx, "fy": lens.camera.fy, "cx": lens.camera.cx, "cy": lens.camera.cy}
-    return float(pinhole[name] if name in pinhole else lens.coefficients[MODELS[model].index(name)])
+    names = MODELS[model]
+    return float(lens.coefficients[names.index(name)] if name in names else getattr(lens.camera, name))
 
 
-def _yaml(found: RigCalibration, boards: Boards, square: float, model: str) -> str:
+def _yaml(found: RigCalibration, boards: Boards, square: float) -> str:
     """The file's text: keys as OpenCV's stereo samples have them, then how it was found."""
     # In memory: the file is written by Python, whose errors say what is wrong.
     file = cv2.FileStorage("rig.yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)

@@ -24,7 +24,6 @@ from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.scheduler import Result
 from rille.pipeline.engine.store.base import Store, at
 from rille.pipeline.engine.store.location import Location
-from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow.builders import Builder, name
 from rille.pipeline.runs import input_checks as judge
 from rille.pipeline.runs import synchrony
@@ -54,20 +53,20 @@ FIRST_NAMED = 3
 
 def check(
     sequence: Sequence,
-    config: Any = None,
+    config: Any,
     *,
     output: Path | None = None,
-    frames: tuple[int, ...] | None = None,
-    cache: Location = Path(".rille/cache"),
+    frames: tuple[int, ...],
+    cache: Location,
 ) -> int:
     """Judge a sequence: prints a line for each finding, and draws the first pair's epipolar residuals.
 
     Parameters
     ----------
     sequence : what to look at.
-    config : parameters of the stages; what suits the sequence by default.
+    config : parameters of the stages.
     output : PNG to write; ``SEQUENCE-check.png`` here by default.
-    frames : frames to look at; all by default.
+    frames : frames to look at.
     cache : folder of cached artifacts.
 
     Returns
@@ -81,12 +80,9 @@ def check(
     """
     path = output if output is not None else Path(f"{sequence.name}-check.png")
     check_output(path, ".png", ".pdf", ".svg")
-    chosen = frames if frames is not None else tuple(range(sequence.frames))
-    if config is None:
-        config = configuration.build(configuration.expand(sequence.defaults))
     graph, store = Graph(), at(cache)
-    name(graph, sequence, chosen)
-    inspection = Inspection(Builder(graph, sequence, config), chosen, store)
+    name(graph, sequence, frames)
+    inspection = Inspection(Builder(graph, sequence, config), frames, store)
     graph.flow(inspection.steps())
     # In this process: workers would take longer to start than most of this takes.
     result = scheduler.run(graph, store, scheduler.RunOptions(executor="inline", keep_going=True))
@@ -113,6 +109,12 @@ class Match:
     weight: Floats
     facts: Mapping[str, Any]
     rate: float | None
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Which matches (n,) count: those with a weight, or all where none has one."""
+        weighed = self.weight > 0
+        return weighed if weighed.any() else np.ones(len(weighed), bool)
 
 
 @dataclass
@@ -227,11 +229,10 @@ class Inspection:
             return
         rig = self.sequence.rig
         rho, _ = inverse_depth(rig, m.left, m.right - m.left)
-        inlier = m.weight > 0 if (m.weight > 0).any() else np.ones(len(m.left), bool)
-        ahead = inlier & (rho > 0)
+        ahead = m.used & (rho > 0)
         self.say(judge.judge_matching(m.rate, 1.0 / rho[ahead], rig.baseline))
         if len(m.left):
-            beyond = beyond_infinity(rig, m.left[inlier], m.right[inlier])
+            beyond = beyond_infinity(rig, m.left[m.used], m.right[m.used])
             self.say(judge.judge_sides(float((beyond > BEYOND).mean())))
         self.say(judge.judge_epipolar(m.facts))
 
@@ -292,31 +293,29 @@ def draw(path: Path, name: str, frame: str, match: Match) -> None:
     RilleError
         The file cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    used = match.weight > 0 if (match.weight > 0).any() else np.ones(len(match.left), bool)
+    points, residual = match.left[match.used], match.residual[match.used]
     # Scaled by the bulk, not by the worst match: a few outliers would wash all the others out.
-    limit = max(0.5, float(np.percentile(np.abs(match.residual[used]), 98)))
-    shades = {"c": match.residual[used], "s": 9, "cmap": "coolwarm", "vmin": -limit, "vmax": limit, "linewidths": 0}
+    limit = max(0.5, float(np.percentile(np.abs(residual), 98)))
+    shades = {"c": residual, "s": 9, "cmap": "coolwarm", "vmin": -limit, "vmax": limit, "linewidths": 0}
     shown = match.image.astype(np.float32)
     height = min(WIDTH * shown.shape[0] / shown.shape[1], 0.8 * WIDTH)
     fig = Figure(figsize=(WIDTH, height + LOWER), layout="constrained")
-    FigureCanvasAgg(fig)
     parts: Any = fig.subfigures(2, 1, height_ratios=[height, LOWER])
     top, below = parts
     ax = top.subplots()
     ax.imshow(shown, cmap="gray", vmin=np.percentile(shown, 1), vmax=np.percentile(shown, 99))
-    drawn = ax.scatter(match.left[used, 0], match.left[used, 1], **shades)
+    drawn = ax.scatter(*points.T, **shades)
     top.colorbar(drawn, ax=ax, label="px below the line", pad=0.01, aspect=30)
     ax.set_title(f"{name}, frame {frame}: epipolar residuals of the right image under the given rig", fontsize=10)
     ax.set(xlabel="column", ylabel="row")
     plots = below.subplots(1, 3)
     for ax, axis, label in ((plots[0], 0, "column in the left image"), (plots[1], 1, "row in the left image")):
-        ax.scatter(match.left[used, axis], match.residual[used], s=3, color="0.3", linewidths=0)
+        ax.scatter(points[:, axis], residual, s=3, color="0.3", linewidths=0)
         ax.axhline(0.0, color="tab:red", linewidth=1)
         ax.set(xlabel=label, ylabel="residual, px", ylim=(-1.5 * limit, 1.5 * limit))
-    plots[2].hist(match.residual[used], bins=60, range=(-1.5 * limit, 1.5 * limit), color="0.5")
+    plots[2].hist(residual, bins=60, range=(-1.5 * limit, 1.5 * limit), color="0.5")
     plots[2].set(xlabel="residual, px", ylabel="matches")
     with reported("RIL-016", f"cannot write {path}", remedy="choose another --output"):
         fig.savefig(path, dpi=110)

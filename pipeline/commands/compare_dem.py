@@ -24,7 +24,6 @@ Floats = NDArray[np.float64]
 SLOPES_DEG = np.array([0.0, 2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0])
 RANGES = 8
 """Bins of range, of equal width."""
-ORDER = ("rmse", "nmad", "p95", "bias", "median")
 WORDS = {"rmse": "RMSE", "nmad": "NMAD", "p95": "95 %", "bias": "bias", "median": "median"}
 
 
@@ -204,7 +203,7 @@ def _print(found: dict[str, Any]) -> None:
 
 
 def _line(f: dict[str, float]) -> str:
-    return "  ".join(f"{WORDS[k]} {1e3 * f[k]:.3g} mm" for k in ORDER if k in f)
+    return "  ".join(f"{words} {1e3 * f[k]:.3g} mm" for k, words in WORDS.items() if k in f)
 
 
 def draw(path: Path, found: dict[str, Any], error: Floats, slope: Floats, distance: Floats | None) -> None:

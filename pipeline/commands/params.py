@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import difflib
 import textwrap
-from collections.abc import Iterable, Iterator
-from typing import Any, Literal, get_args, get_origin
+from collections.abc import Iterator
+from typing import Literal, get_args, get_origin
 
 import tomli_w
 from pydantic.fields import FieldInfo
@@ -80,7 +80,9 @@ def rows(values: Params) -> Iterator[tuple[str, str, str, str]]:
 
 def _permitted(field: FieldInfo) -> str:
     """Choices or bounds in words."""
-    choices = [repr(c) for kind in _kinds(field.annotation) for c in get_args(kind) if get_origin(kind) is Literal]
+    # The union of a choice with None has its Literal one level down.
+    kinds = (field.annotation, *get_args(field.annotation))
+    choices = [repr(c) for kind in kinds for c in get_args(kind) if get_origin(kind) is Literal]
     bounds = [
         f"{sign} {getattr(limit, name):g}"
         for limit in field.metadata
@@ -88,9 +90,3 @@ def _permitted(field: FieldInfo) -> str:
         if hasattr(limit, name)
     ]
     return ", ".join([*choices, *bounds])
-
-
-def _kinds(annotation: Any) -> Iterable[Any]:
-    """An annotation, and the members of a union."""
-    # The union of a choice with None has its Literal one level down.
-    return (annotation, *get_args(annotation))

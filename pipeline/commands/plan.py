@@ -64,9 +64,8 @@ def plan(options: Options, *, verbose: bool = False) -> int:
     known = cost_model.recall(hints)
     limit = None if options.memory_limit is None else limits.parse(options.memory_limit)
     shares = account(known, limit, options.executor, jobs, largest(graph, known))
-    for line in describe(graph, result, recall(hints) or {}, shares.workers, verbose=verbose):
-        print(line)
-    for line in needs(graph, known, shares):
+    told = describe(graph, result, recall(hints) or {}, shares.workers, verbose=verbose)
+    for line in (*told, *needs(graph, known, shares)):
         print(line)
     # Last, so that the table stands above the refusal and shows which task it is.
     Admission(known, shares, automatic=limit is None).check(graph)

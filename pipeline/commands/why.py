@@ -115,8 +115,7 @@ def _recipe(made: Mapping[str, Any]) -> Iterable[str]:
 def _defaults(name: str) -> dict[str, Any]:
     if name not in modules():
         return {}
-    found: dict[str, Any] = json.loads(stage(name).params().model_dump_json())
-    return found
+    return stage(name).params().model_dump(mode="json")
 
 
 def _since(run: Path, row: Mapping[str, Any], made: Mapping[str, Any], store: Store) -> Iterable[str]:
@@ -136,11 +135,10 @@ def _since(run: Path, row: Mapping[str, Any], made: Mapping[str, Any], store: St
             known = "another key; its artifact has gone, so what differs is not known"
             yield f"since         {lookup.name(before)}: {known}"
             return
-        same = ", and yet the result is the same to the bit" if other.get("digest") == row.get("digest") else ""
         found = provenance.differences(then["provenance"], made["provenance"]) or ["the key has another format"]
         yield from (f"since         {lookup.name(before)}: {difference}" for difference in found)
-        if same:
-            yield f"since         {lookup.name(before)}: another key{same}"
+        if other.get("digest") == row.get("digest"):
+            yield f"since         {lookup.name(before)}: another key, and yet the result is the same to the bit"
         return
     yield "since         no earlier run of this sequence had this task"
 

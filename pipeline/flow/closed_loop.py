@@ -129,11 +129,7 @@ class Way:
 
 
 class EndedError(Exception):
-    """The drive is over."""
-
-    def __init__(self, verdict: str, reason: str) -> None:
-        super().__init__(verdict, reason)
-        self.verdict, self.reason = verdict, reason
+    """The drive is over: verdict and reason."""
 
 
 class Drive:
@@ -185,7 +181,7 @@ class Drive:
         try:
             yield from self.legs()
         except EndedError as end:
-            verdict, reason = end.verdict, end.reason
+            verdict, reason = end.args
         except MissingError:
             verdict, reason = self.outcome()
         closed = self._closed()
@@ -393,7 +389,7 @@ class Drive:
         frames, rows, key = way.frames, way.rows, self.pairs[-1]
         segment = self.make.segment(frames, key)
         self.products.tracks.append(segment.track)
-        args = {"rows": [rows[f] for f in frames], "vehicle": self.config.vehicle.model_dump(mode="json")}
+        args = {"rows": [rows[f] for f in frames], "vehicle": self.make.given_vehicle}
         assert stop.sense is not None
         given = {"sense": stop.sense, "resect": segment.resection}
         stop.safety = self.make.node(fault_monitor, f"fault_monitor/{stop.index}", args | self.mounting, **given)
@@ -433,15 +429,15 @@ class Drive:
 
     def _obstacles(self, stop: Stop, way: Way, segment: Segment, key: Pair) -> Handle:
         """Whether the images on the way show what the last model does not."""
-        p, vehicle, frames = self.config.obstacle_monitor, self.config.vehicle, way.frames
+        p, frames = self.config.obstacle_monitor, way.frames
         wheels = np.array([way.said.meta["odometry"][way.rows[f]] for f in frames])
-        compared = obstacle_monitor.pairs(wheels, vehicle.wheel_diameter, p)
+        compared = obstacle_monitor.pairs(wheels, self.config.vehicle.wheel_diameter, p)
         params = self.config.motion.model_copy(update={"level": p.level})
         motions = []
         for a, b in ((frames[i], frames[j]) for i, j in compared):
             inputs = {"a": self.make.pyramid(a, "left"), "b": self.make.pyramid(b, "left")}
             motions.append(self.graph.node(motion, f"motion/way/{a}-{b}", params, {"frames": [a, b]}, {}, inputs))
-        args = {"pairs": [list(c) for c in compared], "vehicle": vehicle.model_dump(mode="json"), **self.mounting}
+        args = {"pairs": [list(c) for c in compared], "vehicle": self.make.given_vehicle, **self.mounting}
         known = {"dem": key.dem, "resect": segment.resection, "rig": key.rig}
         return self.make.node(obstacle_monitor, f"obstacle_monitor/{stop.index}", args, **known, motions=motions)
 
@@ -479,7 +475,7 @@ class Drive:
         d = self.driven
         legs = [(s.row, s.drive) for s in d.stops if s.drive is not None and not _failed(s.drive)]
         assert d.place is not None
-        args = {"rows": [0, *(row for row, _ in legs)], "vehicle": self.config.vehicle.model_dump(mode="json")}
+        args = {"rows": [0, *(row for row, _ in legs)], "vehicle": self.make.given_vehicle}
         drives = [d.place, *(drive for _, drive in legs)]
         d.check = self.make.node(drive_check, "drive_check", args, drives=drives, **known)
 

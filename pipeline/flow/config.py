@@ -47,6 +47,18 @@ jump by 5 pixels (beyond that nothing is gained).
 """
 
 
+NAVIGATION: dict[str, Any] = {
+    "hfvm": {"preset": "fast"},
+    "motion": {"level": 3},
+    "track": {"points": 200},
+    "orientation": {"samples": 600},
+}
+"""What ``keyframes.preset = "navigation"`` sets in other sections, where nothing is given there.
+
+What a trajectory needs of disparities and displacements, half the resolution of each gives.
+"""
+
+
 class TerrainParams(Params):
     """One choice for all stages that make elevations."""
 
@@ -179,43 +191,26 @@ def build(*layers: Mapping[str, Any]) -> Params:
     nested: dict[str, Any] = {}
     for layer in layers:
         merge(nested, layer)
-    nested = _with_accurate_terrain(nested)
-    _navigate(nested)
+    if _preset(nested, "terrain") == "accurate":
+        nested = _beneath(nested, ACCURATE_TERRAIN)
+        for section, key, value, more in AND_THEN:
+            given = nested[section]
+            if isinstance(given, Mapping) and given[key] == value:
+                nested = _beneath(nested, more)
+    if _preset(nested, "keyframes") == "navigation":
+        nested = _beneath(nested, NAVIGATION)
     built: Params = validate(model(), nested, (), DATASET_SECTIONS)
     return built
 
 
-def _with_accurate_terrain(nested: dict[str, Any]) -> dict[str, Any]:
-    terrain = nested.get("terrain")
-    if not isinstance(terrain, Mapping) or terrain.get("preset") != "accurate":
-        return nested
-    # The preset goes beneath: whatever the user gives for one of its keys wins.
-    nested = merge(merge({}, ACCURATE_TERRAIN), nested)
-    for section, key, value, more in AND_THEN:
-        given = nested[section]
-        if isinstance(given, Mapping) and given[key] == value:
-            nested = merge(merge({}, more), nested)
-    return nested
+def _preset(nested: Mapping[str, Any], section: str) -> Any:
+    values = nested.get(section)
+    return values.get("preset") if isinstance(values, Mapping) else None
 
 
-NAVIGATION: Mapping[str, Mapping[str, Any]] = {
-    "hfvm": {"preset": "fast"},
-    "motion": {"level": 3},
-    "track": {"points": 200},
-    "orientation": {"samples": 600},
-}
-"""What ``keyframes.preset = "navigation"`` sets in other sections, where nothing is given there."""
-
-
-def _navigate(nested: dict[str, Any]) -> None:
-    """What a trajectory needs of disparities and displacements, half the resolution of each gives."""
-    select = nested.get("keyframes")
-    if not isinstance(select, Mapping) or select.get("preset") != "navigation":
-        return
-    for section, values in NAVIGATION.items():
-        given = nested.setdefault(section, {})
-        if isinstance(given, dict):
-            nested[section] = {**values, **given}
+def _beneath(nested: Mapping[str, Any], preset: Mapping[str, Any]) -> dict[str, Any]:
+    """A preset beneath what is given: whatever the user gives for one of its keys wins."""
+    return merge(merge({}, preset), nested)
 
 
 def validate(kind: type[Params], values: Mapping[str, Any], prefix: tuple[str, ...], also: Iterable[str] = ()) -> Any:

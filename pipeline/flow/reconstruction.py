@@ -102,9 +102,10 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     chain = list(found.meta["chain"])
     missing = [{"frame": f, "cause": why} for f, why in make.sequence.lost.items() if f in frames]
     lost = sorted([*missing, *found.meta["lost"]], key=lambda item: item["frame"])
+    row = {frame: k for k, frame in enumerate(frames)}
     marked = {
         "unfit": [chain.index(f) for f in found.meta["unfit"]],
-        "behind": [k for k, (a, b) in enumerate(pairwise(chain), 1) if frames.index(b) > frames.index(a) + 1],
+        "behind": [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1],
     }
     marks = {name: at for name, at in marked.items() if at}
     p.keyframes = make.node(keyframes, "keyframes", {"frames": len(chain)} | marks, steps=steps(make, chain))
@@ -133,7 +134,6 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
 
     # The world is that of the largest unbroken piece: its models, straight on the world lattice.
     start, end = posed.meta["pieces"][posed.meta["main"]]
-    row = {frame: k for k, frame in enumerate(frames)}
     # Pairs of other pieces have poses in frames of their own: nothing says where they lie in this world.
     there = [k for k in basic if start <= k <= end and posed.meta["positions"][row[k]]]
     for k in there:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["present"]
-
 SECTIONS: Mapping[str, str] = {
     "ceiling": "occlusion_bounds",
     "continuity": "frame_screening",

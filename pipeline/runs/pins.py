@@ -42,7 +42,7 @@ def unpin(store: Store, text: str) -> str:
         It is not pinned.
     """
     pinned = [found["run"] for found in pins(store)]
-    wanted = {text, "/".join(Path(text).absolute().resolve().parts[-2:])}
+    wanted = {text, "/".join(Path(text).resolve().parts[-2:])}
     # Names end in the time of their run: the latest comes first.
     for name in sorted(pinned, reverse=True):
         if wanted & {name, *name.split("/")}:

@@ -18,7 +18,7 @@ FOLDER = "roots"
 
 def note(store: Store, runs: Path) -> None:
     """Remember a folder of runs, once."""
-    folder = str(runs.absolute().resolve())
+    folder = str(runs.resolve())
     # By machine and folder: a shared cache has users on several, and each notes itself once.
     named = hashlib.sha256(f"{platform.node()}\0{folder}".encode()).hexdigest()[:16]
     path = store.root / FOLDER / f"{named}.json"
@@ -30,7 +30,7 @@ def note(store: Store, runs: Path) -> None:
 
 def folders(store: Store, runs: Path) -> list[Path]:
     """``runs`` and all remembered folders that are there."""
-    return sorted({runs.absolute().resolve(), *(folder for folder, _, _ in _noted(store) if folder.is_dir())})
+    return sorted({runs.resolve(), *(folder for folder, _, _ in _noted(store) if folder.is_dir())})
 
 
 def check_all_seen(store: Store) -> None:

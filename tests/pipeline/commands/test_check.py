@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from raising import raises
 
+from rille.datasets.protocol import Sequence
 from rille.datasets.registry import open_sequence
 from rille.pipeline.commands import check as command
 from rille.pipeline.commands.check import check
+from rille.pipeline.flow import config as configuration
 from rille.pipeline.runs import session
 from rille.pipeline.runs.input_checks import judge_rig
 
@@ -47,9 +49,14 @@ def folder(path: Path, *, rows: float = 0.0, frames: int = 4) -> Path:
     return path
 
 
+def look(sequence: Sequence, output: Path, cache: Path, frames: tuple[int, ...] | None = None) -> int:
+    """The check of a sequence, of all frames by default, with the parameters that suit it."""
+    config = configuration.build(configuration.expand(sequence.defaults))
+    return check(sequence, config, output=output, frames=frames or tuple(range(sequence.frames)), cache=cache)
+
+
 def run(path: Path, capsys: pytest.CaptureFixture[str], **kw) -> tuple[int, list[str]]:
-    sequence = open_sequence(str(path))
-    code = check(sequence, output=path.parent / "check.png", cache=path.parent / "cache", **kw)
+    code = look(open_sequence(str(path)), path.parent / "check.png", path.parent / "cache", **kw)
     return code, capsys.readouterr().out.splitlines()
 
 
@@ -134,7 +141,7 @@ def test_one_image_for_both_sides_fails(tmp_path, capsys):
 
 def test_frames_are_chosen_and_warnings_repeated(tmp_path, capsys):
     sequence = replace(open_sequence(str(folder(tmp_path / "wall"))), warnings=("the baseline is odd",))
-    assert check(sequence, output=tmp_path / "a.png", frames=(1, 3), cache=tmp_path / "cache") == 0
+    assert look(sequence, tmp_path / "a.png", tmp_path / "cache", frames=(1, 3)) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "2 of 4 pairs" in line(lines, "sequence")
     assert "WARN  input         the baseline is odd" in lines
@@ -162,4 +169,4 @@ def test_a_doubtful_rig_is_one_finding(tmp_path):
 def test_a_picture_that_cannot_be_written_says_so(tmp_path, capsys):
     sequence = open_sequence(str(folder(tmp_path / "wall", frames=1)))
     with raises("RIL-016"):
-        check(sequence, output=tmp_path / "no" / "such" / "a.png", cache=tmp_path / "cache")
+        look(sequence, tmp_path / "no" / "such" / "a.png", tmp_path / "cache")
