@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable
@@ -35,7 +36,7 @@ Files
                           calibration error is in it, while images and truth are those of the true cameras
   calib.txt               the same as P = K [R | t], 3 x 4 row-major a line, left then right; the reference frame is the
                           left camera's, so that the left one is K [I | 0] and the right one K [R_right_left | t]
-  poses.txt               T_truth_left, 3 x 4 row-major, a line a frame (KITTI's form)
+  poses.txt               T_truth_left, 3 x 4 row-major, a line a frame (KITTI's form); nan where it is not known
   times.txt               seconds, a line a frame
   disparity/NAME.npz      column, row: float32 (row, col) pixels, right minus left, NaN without surface; occluded:
                           0 both cameras see the point, 1 hidden from the right one, 2 outside its image, 3 no surface;
@@ -48,7 +49,7 @@ Files
 
 
 def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs: Iterable[int] | None = None) -> Path:
-    """Write a sequence to a folder, wholly or not at all.
+    """Write a sequence to a folder, wholly or not at all; frames without a pair of images are left out.
 
     Parameters
     ----------
@@ -61,8 +62,15 @@ def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs:
     Raises
     ------
     InputError
-        The folder has something in it, or cannot be made.
+        The folder has something in it, or cannot be made; or the images have lens distortion, which the files that
+        are written have no place for.
     """
+    if sequence.lenses:
+        raise InputError(
+            "RIL-184",
+            f"the images of {sequence.name} have lens distortion, which calib.txt cannot say",
+            remedy="export a sequence without; this one is plain files already",
+        )
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise InputError("RIL-165", f"{directory} is not empty", remedy="name a folder that does not exist yet")
     chosen = tuple(
@@ -88,14 +96,15 @@ def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs:
 
 
 def _write(sequence: Sequence, folder: Path, materialise: Materialise, pairs: tuple[int, ...]) -> None:
+    frames = [k for k in range(sequence.frames) if k not in sequence.lost]
     for camera in CAMERAS:
-        for frame, name in enumerate(sequence.frame_names):
-            _write_image(folder, camera, name, materialise(sequence.image(frame, camera)))
+        for k in frames:
+            _write_image(folder, camera, sequence.frame_names[k], materialise(sequence.image(k, camera)))
     _write_rig(sequence, folder)
     if sequence.truth is not None:
-        _write_rows(folder / "poses.txt", [_known(pose).to_list() for pose in sequence.truth])
+        _write_rows(folder / "poses.txt", [_numbers(sequence.truth[k]) for k in frames])
     if sequence.times is not None:
-        _write_rows(folder / "times.txt", [[t] for t in sequence.times])
+        _write_rows(folder / "times.txt", [[sequence.times[k]] for k in frames])
     for frame in pairs:
         if sequence.truth_disparity is not None:
             _write_disparity(folder, sequence.frame_names[frame], materialise(sequence.truth_disparity(frame)))
@@ -104,7 +113,7 @@ def _write(sequence: Sequence, folder: Path, materialise: Materialise, pairs: tu
     camera_ = sequence.rig.left
     text = README.format(
         name=sequence.name,
-        frames=sequence.frames,
+        frames=len(frames),
         width=camera_.width,
         height=camera_.height,
         notes="\n".join(sequence.notes),
@@ -171,7 +180,8 @@ def _write_dem(sequence: Sequence, folder: Path, frame: int, materialise: Materi
         "rows": y_max - y_min + 1,
         "cols": x_max - x_min + 1,
     }
-    T_truth_left = _known(sequence.truth[frame])
+    T_truth_left = sequence.truth[frame]
+    assert T_truth_left is not None  # only a simulated sequence has a DEM, and its poses have no gap
     local = RigidTransform(level_rotation(T_truth_left.rotation[2]), np.zeros(3))
     T_truth_local = T_truth_left @ local.inverse()
     truth = materialise(sequence.truth_dem(lattice, T_truth_local, (frame,)))
@@ -181,7 +191,6 @@ def _write_dem(sequence: Sequence, folder: Path, frame: int, materialise: Materi
     np.savez_compressed(path, T_truth_local=T_truth_local.matrix34, **arrays, **lattice)
 
 
-def _known(pose: RigidTransform | None) -> RigidTransform:
-    """A simulated pose: none has a gap."""
-    assert pose is not None
-    return pose
+def _numbers(pose: RigidTransform | None) -> list[float]:
+    """Twelve numbers, rows of [R | t]; NaN for a gap."""
+    return [math.nan] * 12 if pose is None else pose.to_list()

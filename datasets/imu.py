@@ -69,6 +69,13 @@ BRIDGE = 0.1
 """s; longest gap in the samples over which the rate is interpolated."""
 
 
+GYROSCOPE, ACCELEROMETER = ("gyr", "w_", "ang", "omega", "rate"), ("acc", "a_", "lin", "force")
+"""How names of columns begin."""
+
+ORDER = ([1, 2, 3], [4, 5, 6])
+"""Columns of rates and forces where no names tell."""
+
+
 @dataclass(frozen=True)
 class ImuRecord:
     """A record: times (n,), s; rates (n, 3), rad/s, and specific forces (n, 3), m/s^2, along the sensor's axes."""
@@ -127,8 +134,7 @@ def read_imu(path: Path, *, unit: str = "auto") -> ImuRecord:
             f"{path}, line {table.lines[0]}: {table.columns} columns are no IMU record",
             remedy="give time, three rates (rad/s) and three accelerations (m/s^2) a row",
         )
-    gyro = _named(table, ("gyr", "w_", "ang", "omega", "rate")) or [1, 2, 3]
-    accelerometer = _named(table, ("acc", "a_", "lin", "force")) or [4, 5, 6]
+    gyro, accelerometer = _columns(table)
     times, warnings = seconds(table.text(0), table.name, unit=unit, lines=table.lines)
     rates, forces = table.numbers(gyro), table.numbers(accelerometer)
     if any("deg" in table.header[k] for k in gyro if table.header):
@@ -137,6 +143,21 @@ def read_imu(path: Path, *, unit: str = "auto") -> ImuRecord:
     _possible(forces, HARDEST, "m/s^2", table)
     _plausible(rates, forces, table.name)
     return ImuRecord(np.array(times), rates, forces, table.name, warnings)
+
+
+def _columns(table: TextTable) -> tuple[list[int], list[int]]:
+    """Columns of the rates and of the forces, x y z each."""
+    found = [_named(table, GYROSCOPE), _named(table, ACCELEROMETER)]
+    named = [(columns, place) for columns, place in zip(found, ORDER, strict=True) if columns]
+    # Names of one sensor alone: the other is in the usual order only if this one is.
+    if len(named) == 1 and named[0][0] != named[0][1]:
+        raise InputError(
+            "RIL-191",
+            f"{table.name}: of its columns {', '.join(table.header)} only those of one sensor are recognised",
+            remedy="order the columns time, rates, accelerations, or name them gyro_x ... acc_x ...",
+        )
+    gyro, accelerometer = (columns or place for columns, place in zip(found, ORDER, strict=True))
+    return gyro, accelerometer
 
 
 def _named(table: TextTable, starts: tuple[str, ...]) -> list[int]:

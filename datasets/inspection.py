@@ -33,6 +33,9 @@ MOST_TEXTS = 200
 STAMP = re.compile(r"(?<!\d)[1-9]\d{9,}")
 """Seconds since 1970 have ten digits, their fractions more; frame numbers have fewer, or zeros in front."""
 
+UNWRITABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+"""In a name: control characters and line separators, which would end a comment, and bytes that are not UTF-8."""
+
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
@@ -95,11 +98,14 @@ def inspect(folder: Path) -> Findings:
     Raises
     ------
     InputError
-        ``folder`` is not a folder, or its images cannot be divided into those of a left and a right camera.
+        ``folder`` is not a folder, its images cannot be divided into those of a left and a right camera, or the name of
+        a file that is looked at cannot stand in a manifest.
     """
     if not folder.is_dir():
         raise InputError("RIL-193", f"{folder} is no folder", remedy="name a folder that holds images of two cameras")
-    paths = list(_files(folder, Search()))
+    paths = [p for p in _files(folder, Search()) if p.suffix.lower() in (*SUFFIXES, *CALIBRATIONS, *TABLES)]
+    for path in paths:
+        _writable(_relative(path, folder))
     found = Findings(folder, find_views(folder, [p for p in paths if p.suffix.lower() in SUFFIXES]))
     texts = [p for p in paths if p.suffix.lower() in (*CALIBRATIONS, *TABLES)]
     # Each is tried as a calibration and as a table; thousands of them (one an image) would take minutes.
@@ -123,6 +129,15 @@ def _files(folder: Path, search: Search, depth: int = 0) -> Iterable[Path]:
     if depth < DEPTH:
         for inner in (e for e in entries if e.is_dir(follow_symlinks=False)):
             yield from _files(Path(inner.path), search, depth + 1)
+
+
+def _writable(name: str) -> None:
+    if UNWRITABLE.search(name):
+        raise InputError(
+            "RIL-185",
+            f"the name {name!r} has a line break, or is not in UTF-8: no manifest holds it",
+            remedy="rename it",
+        )
 
 
 def _relative(path: Path, folder: Path) -> str:

@@ -140,8 +140,8 @@ def _first(names: list[str]) -> str:
 
 def _rows(
     path: Path, count: int, what: str, gaps: bool = False, skip: re.Pattern[str] | None = None
-) -> list[tuple[str, NDArray[np.float64]]]:
-    """Lines of a text file: (label or "", numbers); each must have ``count`` finite numbers, or only NaN for a gap.
+) -> list[tuple[int, str, NDArray[np.float64]]]:
+    """Rows of a text file: (line, label or "", numbers); each must have ``count`` finite ones, or only NaN for a gap.
 
     ``skip``: lines with such a label are passed over.
     """
@@ -159,7 +159,7 @@ def _rows(
             raise InputError(
                 "RIL-200", f"{path}, line {k}: not {count} numbers", remedy=f"correct that line of the {what}"
             )
-        out.append((label.strip(), values))
+        out.append((k, label.strip(), values))
     return out
 
 
@@ -174,7 +174,7 @@ def read_projections(path: Path, pair: tuple[str, str]) -> tuple[NDArray[np.floa
             f"{path} is missing",
             remedy="put the calibration there: a 3 x 4 projection matrix a line, left and right",
         )
-    rows = [(label, v.reshape(3, 4)) for label, v in _rows(path, 12, "calibration", skip=OTHER)]
+    rows = [(label, v.reshape(3, 4)) for _, label, v in _rows(path, 12, "calibration", skip=OTHER)]
     labelled = {label: p for label, p in rows if label}
     wanted = [f"P{side[-1]}" for side in pair]
     for form in ("P{}", "P_rect_0{}"):
@@ -284,7 +284,7 @@ def list_pairs(layout: KittiLayout) -> Listing:
 
 def _counted(names: list[str]) -> list[str]:
     """Names with the numbers that a running count leaves out; as they are where most do not count on by one."""
-    if len(names) < 3 or not all(name.isdigit() for name in names):
+    if len(names) < 3 or not all(name.isdecimal() for name in names):
         return names
     numbers = [int(name) for name in names]
     steps = np.diff(numbers)
@@ -294,14 +294,12 @@ def _counted(names: list[str]) -> list[str]:
     return [given.get(k, f"{k:0{len(names[0])}d}") for k in range(numbers[0], numbers[-1] + 1)]
 
 
-def _per_frame(
-    path: Path, numbers: int, listing: Listing, what: str
-) -> tuple[list[NDArray[np.float64] | None], list[int]]:
-    """A row a frame, and the lines they stand in; rows of the frames with images alone leave None for the others."""
-    rows = [values for _, values in _rows(path, numbers, what, gaps=what == "poses")]
+def _per_frame(path: Path, numbers: int, listing: Listing, what: str) -> list[tuple[int, NDArray[np.float64]] | None]:
+    """A row a frame with the line it stands in; rows of the frames with images alone leave None for the others."""
+    rows = [(line, values) for line, _, values in _rows(path, numbers, what, gaps=what == "poses")]
     frames, there = len(listing.names), [k for k in range(len(listing.names)) if k not in listing.lost]
     if len(rows) == frames:
-        return list(rows), list(range(1, frames + 1))
+        return list(rows)
     if len(rows) != len(there):
         missing = f" ({len(listing.lost)} of {frames} frames lack an image)" if listing.lost else ""
         raise InputError(
@@ -310,15 +308,15 @@ def _per_frame(
             remedy="give one line a pair, or remove the file",
         )
     by_frame = dict(zip(there, rows, strict=True))
-    return [by_frame.get(k) for k in range(frames)], list(range(1, len(rows) + 1))
+    return [by_frame.get(k) for k in range(frames)]
 
 
 def _times(path: Path, listing: Listing) -> tuple[tuple[float, ...], tuple[str, ...]]:
     """Time of each frame, s, and warnings; between its neighbours where a frame without images has none."""
-    rows, lines = _per_frame(path, 1, listing, "times")
+    rows = _per_frame(path, 1, listing, "times")
     known = [k for k, row in enumerate(rows) if row is not None]
-    given = [float(row[0]) for row in rows if row is not None]
-    found, warnings = seconds(given, str(path), lines=lines)
+    given = [(line, float(values[0])) for line, values in filter(None, rows)]
+    found, warnings = seconds([t for _, t in given], str(path), lines=[line for line, _ in given])
     return tuple(float(t) for t in np.interp(np.arange(len(rows)), known, found)), warnings
 
 
@@ -337,10 +335,9 @@ def open_kitti(layout: KittiLayout, digests: files.Digests) -> Sequence:
     times: tuple[float, ...] | None = None
     warnings: tuple[str, ...] = ()
     if layout.poses is not None:
-        rows, _ = _per_frame(layout.poses, 12, listing, "poses")
         truth = tuple(
-            None if row is None or np.isnan(row).all() else _pose(row, k, layout.poses) @ T_reference_left
-            for k, row in enumerate(rows, start=1)
+            None if row is None or np.isnan(row[1]).all() else _pose(row[1], row[0], layout.poses) @ T_reference_left
+            for row in _per_frame(layout.poses, 12, listing, "poses")
         )
     if layout.times is not None:
         times, warnings = _times(layout.times, listing)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 import pkgutil
 from collections.abc import Mapping
 from functools import cache
@@ -194,11 +195,12 @@ def _none_left(sections: Mapping[str, Any], name: str) -> None:
 
 def _split(name_or_path: str) -> tuple[Path, str | None]:
     """Folder, and the sequence's number where it is given as ROOT:NN."""
-    path = Path(name_or_path).expanduser()
+    # Not pathlib's, which raises where there is no such user.
+    path = Path(os.path.expanduser(name_or_path))
     root, colon, number = name_or_path.rpartition(":")
     # A path that exists is taken whole: folders may have a colon in their names.
     if not path.exists() and colon and root:
-        return Path(root).expanduser(), number
+        return Path(os.path.expanduser(root)), number
     return path, None
 
 

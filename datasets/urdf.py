@@ -83,8 +83,8 @@ def read_urdf(path: Path, camera: str = "", stated: Vehicle | None = None) -> Ro
     if len(wheels) < 2:
         raise _error(path, f"has {len(wheels)} wheels (continuous joints of links with a cylinder or sphere)")
     length, width = np.ptp(centres[:, :2], axis=0)
-    # The lowest wheel carries: castors and raised wheels do not touch flat ground.
-    ground = float(centres[:, 2].min()) - radius
+    # The lowest wheel carries, by its own radius: castors and raised wheels do not touch flat ground.
+    ground = min(float(z) - wheel.radius for z, wheel in zip(centres[:, 2], wheels.values(), strict=True))
     others = [one for name, those in shapes.items() if name not in turning for one in those]
     low = min((float(one.points[:, 2].min()) for one in others), default=ground)
     sizes = {"wheel_diameter": 2 * radius, "wheel_base": length, "track": width, "clearance": low - ground}

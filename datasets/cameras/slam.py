@@ -25,7 +25,7 @@ def kalibr(f: Fields, path: Path) -> list[CalibratedCamera]:
     names = sorted((key for key in f.values if CAMERA.fullmatch(key)), key=lambda key: int(key[3:]))
     parts = [f.sub(name) for name in names]
     poses: list[RigidTransform | None] = [None] * len(parts)
-    if all("T_cn_cnm1" in part for part in parts[1:]):
+    if len(parts) > 1 and all("T_cn_cnm1" in part for part in parts[1:]):
         poses = [RigidTransform.identity()]
         for part in parts[1:]:
             # Each camera is stated from the one before, so that poses multiply along the chain.

@@ -57,7 +57,7 @@ def parse_corners(text: str) -> tuple[int, int]:
         It is not two numbers of at least ``LEAST_SIDE``.
     """
     columns, _, rows = text.lower().partition("x")
-    if not (columns.isdigit() and rows.isdigit() and min(int(columns), int(rows)) >= LEAST_SIDE):
+    if not (columns.isdecimal() and rows.isdecimal() and min(int(columns), int(rows)) >= LEAST_SIDE):
         raise ConfigError(
             "RIL-151",
             f"--corners {text!r} is not COLUMNSxROWS",

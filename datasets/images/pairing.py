@@ -43,7 +43,7 @@ class ImagePair:
 
 def natural(text: str) -> tuple[tuple[int, int | str], ...]:
     """Sorting key in which numbers count as numbers: ``a2`` before ``a10``."""
-    return tuple((0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", text) if part)
+    return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", text) if part)
 
 
 def ends(names: Sequence[str]) -> str:

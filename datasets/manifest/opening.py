@@ -108,7 +108,7 @@ def root_folder(text: str, path: Path) -> Path:
             )
         return os.environ[match[1]]
 
-    root = path.resolve().parent / Path(VARIABLE.sub(value, text)).expanduser()
+    root = path.resolve().parent / os.path.expanduser(VARIABLE.sub(value, text))
     if not os.path.isdir(root):
         raise InputError(
             "RIL-215", f"{path}: root = {text!r}: there is no folder {root}", remedy="correct root, or its variable"

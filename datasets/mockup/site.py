@@ -46,6 +46,8 @@ def prepare(
         if place is None:
             continue
         far = _distance(scene, place[0], place[1], height.shape, cell)
+        if not (far <= place[2]).any():  # beside the bed, or less than a cell: no ground has a height to take
+            continue
         weight = np.clip((place[2] + EDGE - far) / EDGE, 0.0, 1.0)
         # Smoothstep: the slope has no kink at either end of the edge.
         weight = weight * weight * (3.0 - 2.0 * weight)

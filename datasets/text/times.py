@@ -31,6 +31,10 @@ LARGEST = 10**20
 """Above it a value is no time in any unit: nanoseconds reach it in the year 5138."""
 
 
+SMALLEST = Decimal("1e-20")
+"""Below it a value other than 0 is no time either, and quotients of such leave what a Decimal can hold."""
+
+
 def seconds(
     values: Sequence[str | int | float],
     what: str,
@@ -101,7 +105,7 @@ def _decimal(value: str | int | float, what: str, line: int) -> Decimal:
         exact = Decimal(text)
     except (InvalidOperation, ValueError):
         exact = Decimal("nan")
-    if not exact.is_finite() or exact.copy_abs() > LARGEST:
+    if not exact.is_finite() or exact.copy_abs() > LARGEST or 0 < exact.copy_abs() < SMALLEST:
         raise InputError("RIL-291", f"{what}, line {line}: {value!r} is not a time", remedy="give numbers, one a frame")
     return exact
 

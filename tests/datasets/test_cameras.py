@@ -204,6 +204,16 @@ def test_kalibr_by_the_imu(tmp_path):
     np.testing.assert_allclose(rig_of(left, right)[0].T_right_left.translation, SHIFT, atol=1e-12)
 
 
+def test_kalibr_of_one_camera(tmp_path):
+    """It stands where the IMU says, or nowhere: in a chain of one camera no link is missing."""
+    one = "cam0: {{intrinsics: [190, 190, 250, 250], resolution: [512, 512]{}}}\n"
+    pose = ", T_cam_imu: [[1, 0, 0, 0.2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+    (camera,) = read_cameras(written(tmp_path, one.format(pose)))
+    np.testing.assert_allclose(camera.T_camera_reference.translation, [0.2, 0, 0])
+    (camera,) = read_cameras(written(tmp_path, one.format("")))
+    assert camera.T_camera_reference is None
+
+
 SENSOR = """%YAML:1.0
 sensor_type: camera
 T_BS:

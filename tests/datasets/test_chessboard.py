@@ -106,7 +106,7 @@ def test_lengths_that_are_not_metres(square, hint):
 
 def test_corners_as_text():
     assert parse_corners("9x6") == (9, 6)
-    for bad in ("9", "9x", "x6", "2x6", "9by6", "9x-6"):
+    for bad in ("9", "9x", "x6", "2x6", "9by6", "9x-6", "9x6²", "9x²"):
         with raises("RIL-151"):
             parse_corners(bad)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from rille.datasets.export import export
 from rille.datasets.mockup import sequence as seq
 from rille.datasets.registry import open_sequence
 from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.lens import Lens
 
 
 @pytest.fixture(scope="module")
@@ -93,3 +95,23 @@ def test_interrupted_export_leaves_nothing(tmp_path, tiny, materialise):
     with pytest.raises(KeyboardInterrupt):
         export(seq.mockup(tiny), tmp_path / "bed", breaks_off)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_gaps_of_truth_are_kept_and_lost_frames_are_left_out(tiny, tmp_path, materialise):
+    sequence = seq.mockup(tiny)
+    truth = (None, *sequence.truth[1:])
+    folder = export(replace(sequence, lost={1: "gone"}, truth=truth), tmp_path / "out", materialise, pairs=())
+    back = open_sequence(str(folder))
+    assert back.frame_names == ("000000", "000002")
+    assert back.times == (sequence.times[0], sequence.times[2])
+    assert back.truth[0] is None
+    np.testing.assert_array_equal(back.truth[1].translation, truth[2].translation)
+
+
+def test_lens_distortion_is_refused(tiny, tmp_path, materialise):
+    """Raw images beside an ideal camera's calibration would be taken for undistorted ones."""
+    sequence = seq.mockup(tiny)
+    lens = Lens(sequence.rig.left, "radtan", (0.1, 0.0, 0.0, 0.0))
+    with raises("RIL-184"):
+        export(replace(sequence, lenses={"left": lens}), tmp_path / "out", materialise)
+    assert not (tmp_path / "out").exists()

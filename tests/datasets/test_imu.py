@@ -240,3 +240,26 @@ def test_a_value_beyond_any_sensor_is_refused_with_its_line(tmp_path, column, va
     (tmp_path / "imu.csv").write_text("".join(",".join(row) + "\n" for row in rows))
     with raises("RIL-854", "line 2", unit):
         read_imu(tmp_path / "imu.csv", unit="s")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        "time,acc_x,acc_y,acc_z,wx,wy,wz",
+        "time,ax,ay,az,gyro_x,gyro_y,gyro_z",
+        "time,ang_acc_x,ang_acc_y,ang_acc_z,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z",
+    ],
+)
+def test_no_column_is_taken_for_another_sensors(tmp_path, names):
+    """Of names that tell one sensor alone, out of the usual order, the other is nowhere: not in that one's columns."""
+    row = [9.81] * (len(names.split(",")) - 1)
+    with raises("RIL-191", "only those of one sensor"):
+        read_imu(record_file(tmp_path, names, [(0.0, *row), (0.1, *row)]))
+
+
+def test_names_of_one_sensor_in_the_usual_order_are_enough(tmp_path):
+    rows = [(t, 1, 2, 3, 0, 0, 9.81) for t in (0.0, 0.1)]
+    for names in ("time,gyro_x,gyro_y,gyro_z,ax,ay,az", "time,wx,wy,wz,acc_x,acc_y,acc_z"):
+        found = read_imu(record_file(tmp_path, names, rows))
+        assert found.rates[0].tolist() == [1, 2, 3]
+        assert found.forces[0].tolist() == [0, 0, 9.81]

@@ -279,3 +279,12 @@ def test_a_manifest_takes_kittis_calibration_of_the_cameras_that_are_there(tmp_p
     assert (sequence.rig.left.fx, sequence.rig.baseline) == (60.0, pytest.approx(baseline))
     assert sequence.times is None  # zeros in front: numbers of frames, no times
     assert sequence.frames == 2
+
+
+@pytest.mark.parametrize("name", ['notes\nroot = "elsewhere".yaml', "caf\udce9.yaml"])
+def test_names_that_no_manifest_can_hold_are_refused(tmp_path, name):
+    """A line break would end the comment that a name stands in; bytes that are not UTF-8 cannot be written."""
+    write_images(tmp_path, [f"{side}/{k}.png" for side in ("left", "right") for k in range(2)])
+    (tmp_path / name).write_text("")
+    with raises("RIL-185"):
+        inspect(tmp_path)

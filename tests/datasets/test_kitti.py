@@ -299,3 +299,19 @@ def test_real_street(data_dir, materialise):
     image = materialise(s.image(50, "left"))["image"]
     assert image.shape == (370, 1226)
     assert image.dtype == np.uint8
+
+
+def test_complaints_name_the_line_of_the_file(folder):
+    """Also where a blank line, or a frame without images, makes lines and frames differ."""
+    for side in ("image_l", "image_r"):
+        picture(folder / side / "000003.png")
+    (folder / "image_r" / "000001.png").unlink()
+    good, bad = line(np.hstack([np.eye(3), np.zeros((3, 1))])), line(np.hstack([2 * np.eye(3), np.zeros((3, 1))]))
+    for text, at in (("\n".join([good, bad, good]), 2), ("\n".join([good, "", good, bad]), 4)):
+        (folder / "poses.txt").write_text(text)
+        with raises("RIL-333", f"poses.txt, line {at}:"):
+            open_sequence(str(folder))
+    (folder / "poses.txt").unlink()
+    (folder / "times.txt").write_text("0\n\n2\n1\n")
+    with raises("RIL-293", "times.txt, line 4:"):
+        open_sequence(str(folder))

@@ -83,6 +83,7 @@ def test_numbers_in_names_sort_as_numbers():
     names = [f"a{k}b{j}" for k in (1, 2, 10) for j in (3, 20)]
     shuffled = random.Random(4).sample(names, len(names))
     assert sorted(shuffled, key=natural) == names
+    assert natural("1²") > natural("1")  # a digit to Python, but no number
 
 
 @pytest.mark.parametrize(

@@ -85,6 +85,8 @@ def test_an_unknown_folder_or_file_says_how_to_open_it(tmp_path):
         open_sequence("field.toml")
     with raises("RIL-276", "'no/such/folder'"):
         open_sequence("no/such/folder")
+    with raises("RIL-276", "'~nobody-of-that-name/folder'"):
+        open_sequence("~nobody-of-that-name/folder")
     with raises("RIL-276", "'nasa-k10'", "'nasa_k10'"):
         open_sequence("nasa-k10")
 

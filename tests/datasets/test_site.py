@@ -30,3 +30,10 @@ def test_the_pad_is_cut_along_the_ground(slope_deg: float) -> None:
     assert np.ptp(ring) < 5.0 * p.relief
     outside = far > PAD[2] + EDGE
     assert np.array_equal(height[outside], np.asarray(scene["height"])[outside])
+
+
+@pytest.mark.parametrize("patch", [(5.0, 5.0, 0.1), (0.0013, 0.3, 0.0005)])
+def test_a_patch_without_ground_changes_nothing(patch: tuple[float, float, float]) -> None:
+    """One beside the bed, and one smaller than a cell: there is no height to lay it at."""
+    scene = build_scene(SceneParams(bed_width=0.4, bed_length=0.4, cell=0.004))
+    np.testing.assert_array_equal(prepare(scene, None, patch)["height"], scene["height"])

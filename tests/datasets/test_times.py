@@ -71,6 +71,7 @@ def test_a_gap_is_a_line_with_its_figure():
         (["1", "2", "1.5"], ("RIL-293", "line 23", "1.5")),
         (["1", "two"], ("RIL-291", "line 22", "'two'")),
         (["1", "nan"], ("RIL-291", "line 22", "'nan'")),
+        (["0", "1e-999999999", "1", "2"], ("RIL-291", "line 22")),
     ],
 )
 def test_what_is_wrong_names_the_line(stamps, expected):

@@ -88,3 +88,14 @@ def test_a_manifest_takes_what_it_does_not_state_itself(tmp_path):
     sequence = open_manifest(manifest, Digests())
     assert (sequence.vehicle.track, sequence.vehicle.wheel_base, sequence.vehicle.name) == (0.6, 0.8, "tester")
     assert sequence.pitch == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(("large", "small"), [("-1", "1"), ("1", "-1")])
+def test_ground_lies_under_wheels_of_two_sizes(tmp_path, large, small):
+    """Wheels of 0.15 and 0.12 m that stand on one ground: it is as far below the smaller axles as those are thick."""
+    text = rover()
+    for y in (-1, 1):
+        before = wheel(f"w{small}{y}", 0.4 * int(small), 0.25 * y)
+        text = text.replace(before, before.replace('"0.15"', '"0.12"').replace(" 0.05", " 0.02"))
+    assert text.count('"0.12"') == text.count('"0.15"') == 2
+    assert read_urdf(put(tmp_path, text)).vehicle.clearance == pytest.approx(0.25)
