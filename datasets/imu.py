@@ -16,16 +16,15 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.datasets.poses import coverage
 from rille.datasets.protocol import Rows
 from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.times import GAP, seconds
+from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp
 
-Floats = NDArray[np.float64]
 Up = tuple[float, float, float] | None
 
 GRAVITY = 9.81
@@ -96,14 +95,12 @@ class Inertial:
     attitude : R_reference_left row by row, the reference being the sensor's frame at its first sample in use; None
         where the record does not reach or is cut off from the longest unbroken part by a gap.
     up : unit vector of up in the left camera's frame; None where the force is not gravity's reaction.
-    bias : rad/s, what the gyroscope reads in rest; None where the record has no rest.
     warnings : what is missing or suspicious, one line each.
     notes : what was assumed.
     """
 
     attitude: tuple[Rows | None, ...] = ()
     up: tuple[Up, ...] = ()
-    bias: tuple[float, float, float] | None = None
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -111,15 +108,11 @@ class Inertial:
 # -- reading -----------------------------------------------------------------------------------------------------------
 
 
-def read_imu(path: Path, *, unit: str = "auto") -> ImuRecord:
+def read_imu(path: Path) -> ImuRecord:
     """Table of time, rates about x y z and specific forces along them.
 
     Columns are recognised by their names (``w_RS_S_x [rad s^-1]``, ``gyro_x``, ``acc_x`` ...); without names they must
     be in this order. Names that say ``deg`` are converted.
-
-    Parameters
-    ----------
-    unit : of the times, see :func:`rille.datasets.text.times.seconds`.
 
     Raises
     ------
@@ -135,7 +128,7 @@ def read_imu(path: Path, *, unit: str = "auto") -> ImuRecord:
             remedy="give time, three rates (rad/s) and three accelerations (m/s^2) a row",
         )
     gyro, accelerometer = _columns(table)
-    times, warnings = seconds(table.text(0), table.name, unit=unit, lines=table.lines)
+    times, warnings = seconds(table.text(0), table.name, lines=table.lines)
     rates, forces = table.numbers(gyro), table.numbers(accelerometer)
     if any("deg" in table.header[k] for k in gyro if table.header):
         rates = np.deg2rad(rates)
@@ -261,8 +254,7 @@ def at_frames(imu: ImuRecord, at: Sequence[float], T_imu_left: RigidTransform) -
         attitude.append(None if R_reference_imu is None else _rows(R_reference_imu @ R_imu_left))
         up.append(None if force is None else _unit(R_imu_left.T @ force))
     warnings = coverage(attitude, at, f"attitude from {imu.name}")
-    known = None if bias is None else (float(bias[0]), float(bias[1]), float(bias[2]))
-    return Inertial(tuple(attitude), tuple(up), known, warnings, notes)
+    return Inertial(tuple(attitude), tuple(up), warnings, notes)
 
 
 def stretches(imu: ImuRecord, bias: Floats | None, start: float, end: float) -> list[Stretch]:

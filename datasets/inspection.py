@@ -159,7 +159,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     for path in images:
         at = side_of(_relative(path.with_suffix(""), folder))
         if at is not None:
-            groups[at[0], _place(path, folder, at[2])][at[1]].append(path)
+            groups[at[0], _place(path, at[2])][at[1]].append(path)
     both = {key: sides for key, sides in groups.items() if all(sides)}
     if not both:
         named = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
@@ -191,7 +191,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     )
 
 
-def _place(path: Path, folder: Path, without: str) -> str:
+def _place(path: Path, without: str) -> str:
     """Where a file of a set lies: its folder with the side's token taken out, and its kind."""
     return f"{without.rpartition('/')[0]} {path.suffix.lower()}"
 

@@ -85,8 +85,9 @@ def recognise(path: Path, number: str | None = None) -> KittiLayout | None:
     if (path / "sequences").is_dir():
         there = sorted(d.name for d in (path / "sequences").iterdir() if d.is_dir() and image_folders(d))
         if number is None and len(there) != 1:
+            example = there[0] if there else "00"
             raise InputError(
-                "RIL-197", f"{path} holds {len(there)} sequences", remedy=f"choose one, e.g. {path}:{_first(there)}"
+                "RIL-197", f"{path} holds {len(there)} sequences", remedy=f"choose one, e.g. {path}:{example}"
             )
         number = number if number is not None else there[0]
         if number not in there:
@@ -132,10 +133,6 @@ def open_layout(path: Path, number: str | None, digests: files.Digests) -> Seque
             remedy=f"`rille init {path}` writes a manifest that says what is needed",
         )
     return open_kitti(layout, digests)
-
-
-def _first(names: list[str]) -> str:
-    return names[0] if names else "00"
 
 
 def _rows(

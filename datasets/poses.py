@@ -23,15 +23,13 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.times import seconds
 from rille.datasets.text.warning import warning
+from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
-
-Floats = NDArray[np.float64]
 
 FORMATS = ("auto", "kitti", "tum", "euroc", "csv")
 QUATERNION, POSITION, ANGLES = ("qw", "qx", "qy", "qz"), ("x", "y", "z"), ("roll", "pitch", "yaw")
@@ -79,14 +77,13 @@ class TimedPoses:
     warnings: tuple[str, ...] = ()
 
 
-def read_poses(path: Path, format: str = "auto", *, unit: str = "auto") -> TimedPoses:
+def read_poses(path: Path, format: str = "auto") -> TimedPoses:
     """Poses of a file (forms: see module).
 
     Parameters
     ----------
     format : one of the forms; ``auto`` takes the columns' names where there are any, else 12 or 16 numbers a row for
         ``kitti``, commas for ``euroc`` and blanks for ``tum``.
-    unit : of the times, see :func:`rille.datasets.text.times.seconds`.
 
     Raises
     ------
@@ -114,7 +111,7 @@ def read_poses(path: Path, format: str = "auto", *, unit: str = "auto") -> Timed
     at = None
     warnings: tuple[str, ...] = ()
     if "time" in columns:
-        at, warnings = seconds(table.text(columns["time"]), table.name, unit=unit, lines=table.lines)
+        at, warnings = seconds(table.text(columns["time"]), table.name, lines=table.lines)
     if angles is None:
         rotations = _quaternions(table, columns)
     else:

@@ -16,15 +16,13 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from rille.datasets.text.reading import read_text
+from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.hazard.vehicle import Vehicle
-
-Floats = NDArray[np.float64]
 
 LARGE = 0.7
 """Share of the greatest radius from which a turning link is a wheel, and no castor or mast."""

@@ -7,14 +7,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.datasets.cameras.model import UNKNOWN_SIZE
+from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.lens import Lens
-
-Floats = NDArray[np.float64]
 
 CORRECT = "correct the calibration file"
 

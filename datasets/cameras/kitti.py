@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.cameras.fields import Fields
-from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
+from rille.datasets.cameras.model import CalibratedCamera
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
 from rille.stages.geometry.lens import Lens
@@ -67,7 +67,7 @@ def _rectified(fields: Fields, label: str) -> CalibratedCamera:
     except InputError as error:
         raise error.at(fields.file) from error
     number = label.rpartition("_")[2] if label.startswith("P_rect") else ""
-    camera = fields.camera(label, (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), _size(fields, f"S_rect_{number}"))
+    camera = fields.camera(label, (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), fields.pair_of_pixels(f"S_rect_{number}"))
     return CalibratedCamera(label, Lens(camera, "none", ()), T_camera_reference)
 
 
@@ -98,7 +98,7 @@ def decompose(projection: NDArray[np.float64], name: str) -> tuple[NDArray[np.fl
 
 
 def _raw(fields: Fields, label: str, number: str) -> CalibratedCamera:
-    camera = fields.pinhole(label, _size(fields, f"S_{number}"))
+    camera = fields.pinhole(label, fields.pair_of_pixels(f"S_{number}"))
     coefficients = fields.numbers(f"D_{number}") if f"D_{number}" in fields else ()
     lens = fields.lens(f"D_{number}", camera, "radtan" if coefficients else "none", coefficients)
     pose = None
@@ -106,7 +106,3 @@ def _raw(fields: Fields, label: str, number: str) -> CalibratedCamera:
         R, t = fields.matrix(f"R_{number}", 3, 3), np.array(fields.numbers(f"T_{number}", 3))
         pose = RigidTransform(orthonormal(R), t)  # seven digits in the files
     return CalibratedCamera(label, lens, pose)
-
-
-def _size(fields: Fields, key: str) -> tuple[int, int]:
-    return fields.pair_of_pixels(key) if key in fields else UNKNOWN_SIZE

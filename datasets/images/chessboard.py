@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import ConfigError, InputError
 
-Floats = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
 LEAST_SIDE = 3

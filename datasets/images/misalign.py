@@ -14,15 +14,14 @@ from typing import Any
 import cv2
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 from pydantic import Field
 
+from rille.datasets.images import files
 from rille.datasets.protocol import Sequence, Source
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from rille.stages.geometry.geometry import rotation_exp
 from rille.stages.geometry.lens import Lens
-
-Floats = NDArray[np.float64]
 
 KERNEL = 4
 """Pixels along either side that cubic interpolation reads."""
@@ -142,9 +141,6 @@ STAGE = Stage(
     summary="right image as a knocked camera would have taken it",
     params=MisalignParams,
     inputs=("image",),
-    outputs=(
-        Array("image", ("row", "col"), "uint8", "grey", "image"),
-        Array("valid", ("row", "col"), "uint8", "1", "1 = usable"),
-    ),
+    outputs=files.STAGE.outputs[:2],
     run=_run,
 )

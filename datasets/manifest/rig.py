@@ -27,27 +27,7 @@ USUAL_VIEW_DEG = (5.0, 175.0)
 OFF_CENTRE = 0.1
 """Of the width: principal points lie nearer to the centre, unless images were scaled or cut after the calibration."""
 
-COMMON_WIDTHS = (
-    320,
-    512,
-    640,
-    672,
-    720,
-    752,
-    800,
-    848,
-    960,
-    1024,
-    1226,
-    1242,
-    1280,
-    1440,
-    1600,
-    1920,
-    2448,
-    2560,
-    3840,
-)
+USUAL_WIDTHS = (320, 512, 640, 672, 720, 752, 800, 848, 960, 1024, 1226, 1242, 1280, 1440, 1600, 1920, 2448, 2560, 3840)
 """px, of images as cameras give them."""
 
 SAME = 0.01
@@ -260,7 +240,7 @@ def off_centre(camera: Camera, side: str, size: tuple[int, int]) -> list[str]:
 
     if off(*size) <= OFF_CENTRE:
         return []
-    scaled = [(width, round(width * size[1] / size[0])) for width in COMMON_WIDTHS if width != size[0]]
+    scaled = [(width, round(width * size[1] / size[0])) for width in USUAL_WIDTHS if width != size[0]]
     width, height = min(scaled, key=lambda s: off(*s))
     fits = off(width, height) < OFF_CENTRE / 2
     hint = f": it fits {width} x {height}, scale by {size[0] / width:.4g}" if fits else ""

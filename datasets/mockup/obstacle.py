@@ -12,6 +12,7 @@ from rille.datasets.mockup import scene as bed
 from rille.datasets.mockup import terrain
 from rille.datasets.mockup.params import SceneParams
 from rille.datasets.mockup.rover import RoverParams, heading_of
+from rille.datasets.mockup.site import distance
 from rille.stages.core.declare import Bundle, Inputs, Stage
 from rille.stages.geometry.geometry import RigidTransform
 
@@ -30,10 +31,8 @@ def on_path(path: np.ndarray, way: float, aside: float) -> tuple[float, float]:
 def lay(scene: Bundle, x: float, y: float, height: float) -> dict[str, Any]:
     """Arrays of the scene with a round stone of profile 1 - q^4, as wide as twice its height on either side."""
     arrays: dict[str, Any] = {name: np.asarray(scene[name]) for name in scene.arrays}
-    lattice, z = scene.meta["lattice"], np.array(arrays["height"])
-    dx = lattice["x0"] + lattice["cell"] * np.arange(z.shape[1]) - x
-    dy = lattice["y0"] - lattice["cell"] * np.arange(z.shape[0]) - y
-    q = np.hypot(dx[None, :], dy[:, None]) / (1.2 * height)
+    z = np.array(arrays["height"])
+    q = distance(scene, x, y, z.shape, scene.meta["lattice"]["cell"]) / (1.2 * height)
     inside = q < 1.0
     ground = float(np.median(z[inside])) if inside.any() else 0.0
     z[inside] = np.maximum(z[inside], ground + height * (1.0 - q[inside] ** 4))

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from rille.stages.core.arrays import Floats
 
 NUDGE = 1e-7
 """Cells: how far a ray is pushed over a block's border; 1e-10 m on a 1 mm grid."""

@@ -14,16 +14,14 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.wheels import HeightGrid, Stand, stand
-
-Floats = NDArray[np.float64]
 
 STEP = 0.005
 """m; the drive is simulated, and its placements are recorded, in steps of this length."""

@@ -13,15 +13,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.datasets.mockup.params import MockupParams
 from rille.datasets.protocol import CAMERAS, Rows, Sequence, Source
 from rille.stages.core.declare import NoParams
 from rille.stages.core.errors import ConfigError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
-
-Floats = NDArray[np.float64]
+from rille.stages.hazard.vehicle import Vehicle
 
 START = -0.1
 """m, y of the first position in the bed frame: the near edge of the bed lies below the first images."""
@@ -192,10 +190,8 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
     )
 
 
-def vehicle_at_scale() -> Any:
+def vehicle_at_scale() -> Vehicle:
     """The rover at 1:10: a 0.8 m wide, 1 m long one with 0.3 m wheels at full scale."""
-    from rille.stages.hazard.vehicle import Vehicle
-
     return Vehicle(
         name="rover at 1:10",
         wheel_diameter=0.03,

@@ -18,7 +18,8 @@ EDGE = 0.06
 """m; over which the pad passes into the ground around it."""
 
 
-def _distance(scene: Bundle, x: float, y: float, shape: tuple[int, ...], spacing: float) -> NDArray[np.float64]:
+def distance(scene: Bundle, x: float, y: float, shape: tuple[int, ...], spacing: float) -> NDArray[np.float64]:
+    """Distance (row, col), metres, of the nodes of a grid of the bed from a point of it."""
     lattice = scene.meta["lattice"]
     dx = lattice["x0"] + spacing * np.arange(shape[1]) - x
     dy = lattice["y0"] - spacing * np.arange(shape[0]) - y
@@ -45,7 +46,7 @@ def prepare(
     for place in (pad, blank):
         if place is None:
             continue
-        far = _distance(scene, place[0], place[1], height.shape, cell)
+        far = distance(scene, place[0], place[1], height.shape, cell)
         if not (far <= place[2]).any():  # beside the bed, or less than a cell: no ground has a height to take
             continue
         weight = np.clip((place[2] + EDGE - far) / EDGE, 0.0, 1.0)
@@ -59,7 +60,7 @@ def prepare(
     if blank is not None:
         for level in range(bed.MIPS):
             texture = arrays[f"albedo_{level}"]
-            far = _distance(scene, blank[0], blank[1], texture.shape, 0.5 * cell * 2**level)
+            far = distance(scene, blank[0], blank[1], texture.shape, 0.5 * cell * 2**level)
             arrays[f"albedo_{level}"] = np.where(far <= blank[2], np.uint8(128), texture)
     return arrays
 

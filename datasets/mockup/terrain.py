@@ -11,8 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rille.datasets.mockup.params import SceneParams
-
-Floats32 = NDArray[np.float32]
+from rille.stages.core.arrays import Floats32
 
 OCTAVES = (0.5, 0.25, 0.125, 0.0625, 0.03125, 0.015625, 0.0078125, 0.00390625)
 """Spacings of the relief's octaves, metres. Finer relief is drawn as grain: no camera resolves its shape."""

@@ -97,9 +97,9 @@ def read_text(path: Path, what: str, most: int = SMALL) -> str:
     return text
 
 
-def read_lines(path: Path, what: str, most: int = TABLE) -> list[str]:
+def read_lines(path: Path, what: str) -> list[str]:
     """Lines of a table (see :func:`read_text`)."""
-    lines = read_text(path, what, most).splitlines()
+    lines = read_text(path, what, TABLE).splitlines()
     _no_long_line(lines, path, what)
     return lines
 

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
-from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 
 
@@ -60,20 +59,6 @@ def plane(lattice: Lattice) -> Surface:
         return feet, normals
 
     return Surface(lattice.rows, lattice.cols, locate, grid)
-
-
-def inclined(lattice: Lattice, T_frame_plane: RigidTransform) -> Surface:
-    """A plane of any pose: cells of ``lattice`` in its own x and y, elevation along its own z.
-
-    ``T_frame_plane``: pose of the plane in the frame of the feet.
-    """
-    level = plane(lattice)
-
-    def locate(rows: Floats, cols: Floats) -> tuple[Floats, Floats]:
-        feet, normals = level.locate(rows, cols)
-        return T_frame_plane.apply(feet), normals @ T_frame_plane.rotation.T
-
-    return Surface(lattice.rows, lattice.cols, locate)
 
 
 def cylinder(centre: ArrayLike, radius: float, angles: ArrayLike, heights: ArrayLike, *, inside: bool) -> Surface:

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes, Floats, Floats32
 
-Flags = Bytes
-
 LEAST_TRIALS = 8
 """Known cells nearby that must tell the error of an interpolation; with fewer, half the range of its rim stands in."""
 
@@ -25,8 +23,7 @@ def close_holes(
     min_known: float,
     *,
     judged: bool = False,
-    rim: float = 0.5,
-) -> tuple[Floats32, Floats32, Flags]:
+) -> tuple[Floats32, Floats32, Bytes]:
     """Interpolate unknown cells that lie between known ones.
 
     A cell is closed when known cells face each other across it, along a row, a column or a diagonal, with at most
@@ -41,15 +38,14 @@ def close_holes(
     n, min_known : side of the window, cells, odd, and the share of its n x n cells that must be known.
     judged : whether the standard deviation has the error of the interpolation too. It is found where the answer is
         known: the same lines, laid through known cells of the window, tell by how much they miss them.
-    rim : share of the rim's range that is the standard deviation where it is not judged; 0.5 holds all of it.
 
     Returns
     -------
-    Closed elevation, its standard deviation (not below the largest of the rim's; unless ``judged``, not below ``rim``
-    of its range either), and flags (uint8, 1 = closed here).
+    Closed elevation, its standard deviation (not below the largest of the rim's; unless ``judged``, not below half of
+    its range either), and flags (uint8, 1 = closed here).
     """
     z, s = elevation.copy(), elevation_std.copy()
-    return z, s, close_into((z, s), elevation, max_gap, n, min_known, judged=judged, rim=rim)
+    return z, s, close_into((z, s), elevation, max_gap, n, min_known, judged=judged)
 
 
 def close_into(
@@ -61,8 +57,11 @@ def close_into(
     *,
     judged: bool = False,
     rim: float = 0.5,
-) -> Flags:
-    """Interpolate in place: in ``closed``, copies of the elevation and its standard deviation; return the flags."""
+) -> Bytes:
+    """Interpolate in place: in ``closed``, copies of the elevation and its standard deviation; return the flags.
+
+    ``rim``: share of the rim's range that is the standard deviation where it is not judged; 0.5 holds all of it.
+    """
     z, s = closed
     filled = np.zeros(elevation.shape, dtype=np.uint8)
     cells = candidates(elevation, n, min_known)

@@ -21,7 +21,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.core.declare import Bundle, Inputs, Params, Stage
@@ -31,7 +30,6 @@ from rille.stages.odometry.covisibility import Step
 from rille.stages.odometry.keyframes import LEAST_BLOCKS
 from rille.stages.odometry.step_table import changes_of, steps_of
 
-Floats = NDArray[np.float64]
 Steps = Mapping[tuple[int, int], float]
 Asks = dict[str, list[Any]]
 
