@@ -89,8 +89,11 @@ def _took(handle: Handle) -> dict[str, Any]:
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """Rows of a ledger, one a node; a last line cut short by a crash is left out."""
-    return [row for row in _lines(path) if "label" in row]
+    """Rows of a ledger, one a node: the last of each, whose artifact may have been found damaged and computed again.
+
+    A last line cut short by a crash is left out.
+    """
+    return list({row["label"]: row for row in _lines(path) if "label" in row}.values())
 
 
 def facts(path: Path) -> dict[str, Any]:

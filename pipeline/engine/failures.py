@@ -18,7 +18,7 @@ def reported(code: str, words: str, *, remedy: str, kind: type[RilleError] = Ril
     try:
         yield
     except OSError as error:
-        raise kind(code, f"{words}: {error.strerror}", remedy=remedy) from error
+        raise kind(code, f"{words}: {error.strerror or error}", remedy=remedy) from error
 
 
 def translated(error: BaseException) -> RilleError | None:

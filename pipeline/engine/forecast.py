@@ -38,7 +38,7 @@ without compiling, and seconds of compiling."""
 
 FILE = "seconds.json"
 
-RENDERED = ("scene", "image", "truth_dem", "dem_accuracy", "risk/truth", "path_check")
+RENDERED = ("scene", "image/", "truth_dem", "dem_accuracy", "risk/truth", "path_check")
 """Kinds of the reference that take otherwise, or are not there, where the images are not rendered."""
 
 
@@ -136,7 +136,7 @@ class Forecast:
                 seconds = round(tally.seconds / tally.computed, 4)
                 compiling = round(max(compiling, tally.compiling), 2)
             later = self.known[name] - self.at_first[name]
-            found[name] = (round(later / self.opened, 6), seconds, compiling)
+            found[name] = (round(later / max(self.opened, 1), 6), seconds, compiling)
         return found
 
 
@@ -145,7 +145,7 @@ def recall(hints: Path) -> dict[str, tuple[float, float, float]] | None:
     try:
         known = json.loads((hints / FILE).read_text(encoding="utf-8"))
         return {str(name): (float(share), float(mean), float(first)) for name, (share, mean, first) in known.items()}
-    except (OSError, ValueError, AttributeError, TypeError):
+    except (OSError, ValueError, AttributeError, TypeError, RecursionError):
         return None
 
 

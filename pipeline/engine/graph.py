@@ -2,7 +2,7 @@
 
 >>> def chain(graph: Graph) -> Generator[Wait, Any, list[Handle]]:
 ...     chosen = yield graph.node(keyframes, "keyframes", KeyframesParams(), {"frames": 9})
-...     return [graph.node(hfvm, f"hfvm/{k}", params, {"pair": k}, inputs=images[k]) for k in select.meta["basic"]]
+...     return [graph.node(hfvm, f"hfvm/{k}", params, {"pair": k}, inputs=images[k]) for k in chosen.meta["basic"]]
 >>> graph = Graph()
 >>> matched = graph.flow(chain(graph))
 

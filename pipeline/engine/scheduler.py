@@ -96,11 +96,12 @@ class Result:
     unknown: list[str] = field(default_factory=list)
     seconds: float = 0.0
     executor_started: bool = False
+    interrupted: bool = False
 
     @property
     def ok(self) -> bool:
-        """Whether nothing failed and nothing was left out."""
-        return not self.failures and not any(c.skipped for c in self.counts.values())
+        """Whether it came to its end, nothing failed and nothing was left out."""
+        return not self.interrupted and not self.failures and not any(c.skipped for c in self.counts.values())
 
     def total(self) -> Counts:
         """Counts over all stages."""
@@ -215,6 +216,7 @@ class _Run:
                 self._loop(interrupts)
                 self._leave_out()
         except BaseException:
+            self.result.interrupted = True
             self._close(kill=True)
             raise
         else:
@@ -229,7 +231,9 @@ class _Run:
                 self.known.save(self.graph.nodes)
             self.result.keys = {h.key for h in self.graph.nodes if h.ref is not None}
             self.result.seconds = time.perf_counter() - begin
-            self.ledger.run(seconds=round(self.result.seconds, 3), ok=self.result.ok)
+            # Without "ok" a ledger is that of a run which did not come to its end.
+            ended = {} if self.result.interrupted else {"ok": self.result.ok}
+            self.ledger.run(seconds=round(self.result.seconds, 3), **ended)
             self.progress.close(self.result)
             self.ledger.close()
         return self.result
@@ -495,7 +499,6 @@ class _Run:
             for handle in (first, *others):
                 handle.ref = ref
                 self._resolve(handle, "computed" if handle is first and not outcome.cached else "cached")
-        self._unblock(key, first)
 
     def _put_back(self, handle: Handle, error: BaseException) -> bool:
         """Put a task back whose input was damaged or gone when it was read, behind what must be computed again."""
@@ -521,20 +524,21 @@ class _Run:
             self.missing.push(handle)
         return True
 
-    def _unblock(self, key: str, source: Handle) -> None:
-        """Send on what waited for a key to be computed again."""
-        for waiting in [w for w, keys in self.blocked.items() if key in keys]:
-            first = self.to_compute[waiting][0]
+    def _unblock(self, source: Handle) -> None:
+        """Send on what waited for a node to be computed again, or leave it out where that did not succeed."""
+        for waiting in [w for w, keys in self.blocked.items() if source.key in keys]:
             if not source.done:
-                del self.blocked[waiting]
+                # Left out before, if it waited for another that was left out.
+                if self.blocked.pop(waiting, None) is None:
+                    continue
                 for handle in self.to_compute.pop(waiting):
                     handle.status = "pending"
                     self._break(handle, source)
                 continue
-            self.blocked[waiting].discard(key)
+            self.blocked[waiting].discard(source.key)
             if not self.blocked[waiting]:
                 del self.blocked[waiting]
-                self.missing.push(first)
+                self.missing.push(self.to_compute[waiting][0])
 
     def _failed(self, failure: Failure) -> None:
         self.result.failures.append(failure)
@@ -569,12 +573,13 @@ class _Run:
             elif not self.waits[dependant.index] and dependant.status == "pending":
                 self.chainable.discard(dependant)
                 heapq.heappush(self.ready, dependant.index)
+        self._unblock(handle)
 
     def _break(self, handle: Handle, by: Handle) -> None:
         """An input of ``handle`` will not come, or in a plan is still to come."""
         if handle.status != "pending":
             return
-        planned = by.status == "planned"
+        planned, handle.ref = by.status == "planned", None
         handle.reason = f"input {by.label} is to be computed" if planned else f"{by.label} {_FATE[by.status]}"
         self._resolve(handle, "planned" if planned else "skipped")
 

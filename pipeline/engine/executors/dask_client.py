@@ -7,7 +7,8 @@ of dask, which costs a fraction of fetching a result. Measured with trivial task
 
 A worker that dies takes along what it was given, of which it ran one at most: all come back as not begun, and each of
 them is then submitted alone. Who is alone for the third time when its worker dies is the culprit, unless idle workers
-died with it: then somebody killed them all. On this machine the
+died with it: then somebody killed them all. (A scheduler of others counts as one death as many as its setting
+``distributed.scheduler.allowed-failures`` permits, and one more.) On this machine the
 workers are spawned, never forked; they never see Ctrl-C, end with this process, and speak TLS on the loopback with keys
 of this run alone, because whoever reaches a scheduler of dask can run code as its user. This process hosts that
 scheduler, and hands over to it what it has to say without any socket.
@@ -204,20 +205,21 @@ class Dask:
             if self._held and not self._futures:
                 self._beside = {pid for pid in self._pids() if _resident(pid)}
                 self._send([self._held.pop(min(self._held))])
-            with suppress(queue.Empty):
-                # Not for ever: a worker that dies and a scheduler that is lost send no event.
-                landed += self._hear(self._events.get(timeout=WATCH))
-                while True:
-                    landed += self._hear(self._events.get_nowait())
-            landed += self._watch()
+            # Not for ever: a worker that dies and a scheduler that is lost send no event.
+            landed = self._hear(WATCH) + self._watch()
         return landed
 
-    def _hear(self, event: bytes) -> Landed:
-        number, name, outcome = pickle.loads(event)
-        if (future := self._futures.get(number)) is None or future.key != name:
-            return []  # it ran again because its worker died after it had said so
-        del self._futures[number]
-        return [(number, outcome)]
+    def _hear(self, timeout: float) -> Landed:
+        """All that has ended; the first of it is waited for."""
+        landed: Landed = []
+        with suppress(queue.Empty):
+            while True:
+                number, name, outcome = pickle.loads(self._events.get(timeout=0 if landed else timeout))
+                # Of another name: it ran again because its worker died after it had said so.
+                if (future := self._futures.get(number)) is not None and future.key == name:
+                    del self._futures[number]
+                    landed.append((number, outcome))
+        return landed
 
     def _watch(self) -> Landed:
         """Look at what was lost; now and then at the memory of a suspect's worker, and whether there are workers."""
@@ -235,7 +237,9 @@ class Dask:
             self._looked = time.monotonic()
         # A finished future is no loss: the event with its outcome is on its way.
         lost = [n for n, future in self._futures.items() if future.status not in ("pending", "finished")]
-        return [(number, self._lost(number, self._futures.pop(number), len(lost) == 1)) for number in lost]
+        # A task must not come back before the inputs that it had: it would wait for what is no more in flight.
+        landed = self._hear(0) if lost else []
+        return landed + [(n, self._lost(n, self._futures.pop(n), len(lost) == 1)) for n in lost if n in self._futures]
 
     def _revive(self) -> None:
         """Start a worker again that is gone for two looks: its nanny does not where it died just as it began."""
@@ -262,7 +266,8 @@ class Dask:
             return NotBegun()
         seen = f", last seen with {self._seen[number] / 1e6:.0f} MB" if self._seen[number] else ""
         remedy = "give it more memory with fewer --jobs, or run it with --executor inline to see the crash"
-        died = DEATHS if self._deaths[number] >= DEATHS else TRIES
+        # A scheduler of others begins it anew after so many deaths, before it gives it back.
+        died = (DEATHS if self._deaths[number] >= DEATHS else TRIES) * (error.allowed_failures + 1)
         text = f"{died} worker processes died while they ran it{seen}"
         return Failed(WorkerDiedError("RIL-586", text, remedy=remedy), "")
 

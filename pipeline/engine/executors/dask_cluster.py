@@ -5,8 +5,9 @@ the same cache: a probe is written by each side and read by the other. One that 
 and the run does not begin. A worker that joins later is examined at its first task, which fails there.
 
 A worker that is lost in the midst of a task gives it back to the scheduler, which begins it elsewhere; after more
-deaths than its setting ``distributed.scheduler.allowed-failures`` (3) the task has failed. What had been committed
-before the worker was lost is found there, not computed again.
+deaths than its setting ``distributed.scheduler.allowed-failures`` (3) the task comes back to this process, which tries
+it alone, and fails it after the third time. What had been committed before the worker was lost is found there, not
+computed again.
 """
 
 from __future__ import annotations

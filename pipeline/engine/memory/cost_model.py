@@ -253,14 +253,18 @@ def recall(hints: Path) -> Costs:
         known = json.loads((hints / FILE).read_text(encoding="utf-8"))
         groups = {
             stage: {
-                name: Group(int(g["runs"]), int(g["tasks"]), [(s[0], s[1], s[2], s[3]) for s in g["samples"]])
+                name: Group(int(g["runs"]), int(g["tasks"]), [_sample(*s) for s in g["samples"]])
                 for name, g in named.items()
             }
             for stage, named in known["stages"].items()
         }
         return Costs(groups, [float(r) for r in known["rests"]])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         return Costs()
+
+
+def _sample(size: Any, memory: Any, result: Any, stored: Any) -> Sample:
+    return float(size), None if memory is None else float(memory), float(result), float(stored)
 
 
 def remember(hints: Path, handles: Iterable[Handle]) -> None:

@@ -87,10 +87,11 @@ class Compiling:
     def take(self) -> float:
         """The seconds since this was last asked."""
         seconds, self.seconds = self.seconds, 0.0
-        for key in self.pending:  # numba failed to compile them
-            _unlock(key)
-        self.pending.clear()
-        gc.set_threshold(*self.usual)
+        if self.pending:  # numba failed to compile them
+            for key in self.pending:
+                _unlock(key)
+            self.pending.clear()
+            gc.set_threshold(*self.usual)
         return seconds
 
 
@@ -152,8 +153,11 @@ def folder() -> Path:
 
 def unused() -> list[Path]:
     """Kernels that nothing loaded for :data:`UNUSED_DAYS`."""
-    limit = time.time() - 86400 * UNUSED_DAYS
-    return [path for path in sorted(folder().glob("*")) if path.stat().st_mtime <= limit]
+    limit, found = time.time() - 86400 * UNUSED_DAYS, []
+    for path in sorted(folder().glob("*")):
+        with suppress(FileNotFoundError):  # numba renames a file as soon as it is written
+            found += [path] if path.stat().st_mtime <= limit else []
+    return found
 
 
 class _Finder(importlib.abc.MetaPathFinder):

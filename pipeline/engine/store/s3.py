@@ -37,7 +37,7 @@ HASTY = {"max_retries": 2, "retry_timeout": timedelta(seconds=5)}
 """For the first contact, where a wrong address is likelier than a server in trouble."""
 
 BROKEN = 3
-"""Answers broken off, of one reading, before the last try."""
+"""Times that a listing is begun anew because its answer was broken off."""
 
 BACK_OFF = {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=4), "base": 2}
 
@@ -102,24 +102,13 @@ class Bucket:
     def _unless_absent(self, read: Callable[[], T]) -> T | None:
         """Read an object, None where there is none."""
 
-        def tried() -> T | None:
+        with self._clear_errors():
             try:
                 return read()
             except FileNotFoundError as error:
                 if _code(error) == "NoSuchBucket":
                     raise
                 return None
-
-        return self._again(tried)
-
-    def _again(self, read: Callable[[], T]) -> T:
-        """Read once more where the connection broke within an answer: that is not tried again below."""
-        with self._clear_errors():
-            # obstore retries requests, but not an answer whose connection breaks after its head.
-            for _ in range(BROKEN):
-                with suppress(obstore.exceptions.GenericError):
-                    return read()
-            return read()
 
     def write(self, path: str, data: bytes) -> None:
         """Write an object, whatever was there."""
@@ -164,11 +153,16 @@ class Bucket:
 
     def list(self, area: str) -> list[Item]:
         """All objects."""
-
-        def pages() -> list[Item]:
-            return [_item(found) for page in obstore.list(self._store, area or None, chunk_size=1000) for found in page]
-
-        return self._again(pages)
+        with self._clear_errors():
+            for trial in range(BROKEN + 1):
+                try:
+                    pages = obstore.list(self._store, area or None, chunk_size=1000)
+                    return [_item(found) for page in pages for found in page]
+                except obstore.exceptions.GenericError as error:
+                    # obstore tries requests again, and readings that break off within the answer, but not a listing.
+                    if trial == BROKEN or "RetryError" in str(error):
+                        raise
+        raise AssertionError("unreachable")
 
     def url(self, path: str) -> str:
         """Return the URL of an archive in fsspec's notation (fsspec needs s3fs to open it)."""
@@ -216,7 +210,9 @@ class Bucket:
 
 
 def _item(found: Any) -> Item:
-    return Item(found["path"], found["size"], str(found["e_tag"]).strip('"'), found["last_modified"].timestamp())
+    # A server that gives no tag says nothing of changes: "None" as a mark would be that of every content.
+    mark = (found["e_tag"] or "").strip('"')
+    return Item(found["path"], found["size"], mark, found["last_modified"].timestamp())
 
 
 def _code(error: BaseException) -> str:

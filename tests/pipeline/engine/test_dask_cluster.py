@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import pickle
+import queue
 import signal
 from collections import Counter
 from contextlib import ExitStack
+from types import SimpleNamespace
 
 import pytest
 from hands import by_hand
@@ -79,6 +82,39 @@ def test_what_waits_for_a_suspect_of_the_same_batch_comes_back(hands, tmp_path):
         workers.close()
     assert [(number, type(outcome)) for number, outcome in back] == [(1, base.NotBegun), (2, base.NotBegun)]
     assert (made[0], type(made[1])) == (0, Outcome)
+
+
+def test_a_task_does_not_come_back_before_the_inputs_that_it_had(monkeypatch):
+    workers = object.__new__(dask_client.Dask)
+    workers._cluster, workers._held, workers._refused, workers._deaths = None, {}, set(), Counter()
+    workers._events, workers._looked = queue.SimpleQueue(), 0.0
+
+    def threads():
+        """While the scheduler is asked, the input ends, and the worker of the next task dies."""
+        workers._events.put(pickle.dumps((0, "input", "made")))
+        workers._futures[1].status = "error"
+        return 2
+
+    workers._presence = SimpleNamespace(threads=threads)
+    workers._futures = {
+        number: SimpleNamespace(key=key, status="pending") for number, key in enumerate(["input", "next"])
+    }
+    monkeypatch.setattr(workers, "_lost", lambda *_: "not begun")
+    assert workers.wait() == [(0, "made"), (1, "not begun")]
+
+
+@pytest.mark.parametrize(("allowed", "died"), [(0, 3), (3, 12)])
+def test_a_culprit_is_told_with_all_workers_that_it_took_along(allowed, died):
+    from distributed import KilledWorker
+
+    workers = object.__new__(dask_client.Dask)
+    workers._deaths, workers._tries, workers._seen, workers._beside = Counter(), Counter(), Counter(), set()
+    future = SimpleNamespace(
+        key="task", status="error", exception=lambda: KilledWorker("task", SimpleNamespace(address="w"), allowed)
+    )
+    first, second, third = (workers._lost(0, future, True) for _ in range(3))
+    assert (type(first), type(second)) == (base.NotBegun, base.NotBegun)
+    assert str(third.error).startswith(f"{died} worker processes died")
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

@@ -68,8 +68,23 @@ def test_what_a_run_leaves_is_what_the_next_one_starts_from(tmp_path: Any) -> No
     forecast.remember(tmp_path, run)
     found = forecast.recall(tmp_path)
     assert found == {"image": (0.0, 1.0, 4.0), "match": (0.0, 1.0, 4.0), "map": (0.125, 5.0, 0.0)}
-    (tmp_path / forecast.FILE).write_text('{"image": 3}')
-    assert forecast.recall(tmp_path) is None
+    for damaged in ('{"image": 3}', "[" * 100_000):
+        (tmp_path / forecast.FILE).write_text(damaged)
+        assert forecast.recall(tmp_path) is None
+
+
+def test_a_run_that_opens_with_no_task_leaves_what_its_tasks_took(tmp_path: Any) -> None:
+    run = Forecast([], None, 1)
+    run.added("map/0")
+    end(run, "map/0", 5.0)
+    forecast.remember(tmp_path, run)
+    assert forecast.recall(tmp_path) == {"map": (1.0, 5.0, 0.0)}
+
+
+def test_images_that_are_not_rendered_are_expected_without_what_renders_them() -> None:
+    expected = Forecast(["motion/0"], None, 1).earlier
+    assert not {"scene", "image/left", "truth_dem/local", "risk/truth"} & expected.keys()
+    assert {"image_quality", "risk/world"} <= expected.keys()
 
 
 def test_a_kind_that_is_switched_off_is_not_expected() -> None:

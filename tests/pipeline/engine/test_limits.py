@@ -128,6 +128,19 @@ def test_nothing_measured_is_a_guess_and_says_so():
     assert (found.measured, found.spread) == (False, 0.5)
 
 
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        '{"stages": {"toy": {"x": {"runs": Infinity, "tasks": 1, "samples": []}}}, "rests": []}',
+        '{"stages": {"toy": {"x": {"runs": 1, "tasks": 1, "samples": [["a", "b", "c", "d"]]}}}, "rests": []}',
+        pytest.param("[" * 100_000, id="deep"),
+    ],
+)
+def test_damaged_costs_count_as_none(tmp_path, damaged):
+    (tmp_path / cost_model.FILE).write_text(damaged)
+    assert cost_model.recall(tmp_path).groups == {}
+
+
 def test_tasks_of_like_size_are_foreseen_by_their_median_and_its_spread():
     found = known([(10.0, 80 * MB, 5.0, 2.0), (11.0, 100 * MB, 5.0, 2.0), (12.0, 130 * MB, 7.0, 3.0)]).foresee(
         SPEC, 11.0

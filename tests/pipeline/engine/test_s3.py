@@ -8,6 +8,7 @@ import random
 import subprocess
 import sys
 import threading
+from datetime import datetime
 from pathlib import Path
 
 import google_crc32c
@@ -136,6 +137,27 @@ def test_servers_in_trouble_change_nothing(url, right, proxied, how, monkeypatch
     store = at(url)
     assert len(list(store.place.list("artifacts"))) == NODES, "a commit whose answer was lost is one's own"
     assert maintenance.verify(store) == (NODES, [])
+
+
+@pytest.mark.parametrize("read", [lambda b: b.read("a"), lambda b: b.list(""), lambda b: b.status("a")])
+def test_a_server_in_trouble_is_asked_as_often_as_was_said(url, proxied, read, monkeypatch):
+    monkeypatch.setattr(s3, "BACK_OFF", {**s3.BACK_OFF, "init_backoff": s3.timedelta(milliseconds=5)})
+    proxy = proxied(lambda *_: "refuse")
+    with raises("RIL-511"):
+        read(s3.Bucket(url, {**s3.HASTY, "max_retries": 2}))
+    assert proxy.troubled == 3
+
+
+@pytest.mark.parametrize("method", ["read", "list"])
+def test_answers_that_break_off_are_asked_for_again(url, proxied, method):
+    s3.Bucket(url).write("area/a", b"0123456789" * 100)
+    proxy = proxied(lambda _method, _path, count: "cut" if count <= 2 else "")
+    bucket = s3.Bucket(url)
+    if method == "read":
+        assert bucket.read("area/a") == b"0123456789" * 100
+    else:
+        assert [item.path for item in bucket.list("area")] == ["area/a"]
+    assert proxy.troubled >= 2
 
 
 def test_a_server_that_ignores_conditions_is_refused(url, proxied):
@@ -267,6 +289,11 @@ def rille(url, environment, *words):
     command = [sys.executable, "-m", "rille.pipeline.cli", "cache", "verify", "--cache", url, *words]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
     return done.returncode, done.stderr.strip()
+
+
+def test_an_object_without_a_tag_has_no_mark():
+    known = {"path": "a", "size": 1, "last_modified": datetime.now()}
+    assert [s3._item({**known, "e_tag": tag}).mark for tag in (None, '"ab"')] == ["", "ab"]
 
 
 def test_each_mistake_is_one_line(port, tmp_path, monkeypatch, proxied, url):

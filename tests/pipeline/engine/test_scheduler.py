@@ -16,6 +16,7 @@ from toys.scale import ScaleParams
 
 from rille.pipeline.engine import events as ledger
 from rille.pipeline.engine import packages, progress, scheduler
+from rille.pipeline.engine.executors import base
 from rille.pipeline.engine.graph import Graph, Maybe
 from rille.pipeline.engine.spec import Spec, recipe
 from rille.pipeline.engine.store import maintenance
@@ -108,6 +109,76 @@ def test_a_damaged_artifact_is_computed_again_and_nothing_else(cache):
     assert [h.label for h in graph.nodes if h.status == "computed"] == ["numbers/1"]
     assert graph.nodes[1].reason == "was computed before, its artifact is gone or damaged"
     assert digests(graph) == before
+
+
+class Removed(progress.Progress):
+    """Removes artifacts just as the task ``last`` is given to a worker."""
+
+    def __init__(self, *paths):
+        super().__init__()
+        self.paths = list(paths)
+
+    def running(self, handle):
+        while handle.label == "last" and self.paths:
+            self.paths.pop().unlink()
+
+
+def in_a_row(*whats, **first):
+    """Tasks each of which reads the one before; ``first`` are arguments of the first."""
+
+    def make(graph):
+        node = graph.node("toys.mischief", whats[0], NO, {"what": "", **first})
+        for what in whats[1:]:
+            node = graph.node("toys.mischief", what, NO, {"what": "", "w": what}, inputs={"after": node})
+
+    return make
+
+
+@pytest.mark.parametrize("keep_going", [False, True])
+def test_where_healing_fails_all_that_waits_is_left_out_and_told(cache, tmp_path, keep_going):
+    tally = tmp_path / "tally"
+    earlier, _ = run(cache, make=in_a_row("first", "second", tally=str(tally)))
+    tally.unlink()
+    tally.mkdir()  # now the first task fails
+    graph, result = run(
+        cache,
+        make=in_a_row("first", "second", "last", "rest", tally=str(tally)),
+        progress=Removed(*(cache / h.ref.path for h in earlier.nodes)),
+        keep_going=keep_going,
+        ledger=tmp_path / "ledger.jsonl",
+    )
+    assert [f.label for f in result.failures] == ["first"]
+    told = {row["label"]: (row["status"], row["reason"]) for row in ledger.read(tmp_path / "ledger.jsonl")}
+    assert told.pop("first")[0] == "failed"
+    by = {"second": "first failed", "last": "second was skipped", "rest": "last was skipped"}
+    assert told == {label: ("skipped", reason) for label, reason in by.items()}
+    assert not any(h.done for h in graph.nodes)
+    assert result.keys == set()
+
+
+def test_what_waits_for_healing_goes_on_if_another_worker_has_healed_it(cache, tmp_path, monkeypatch):
+    class Dying(base.Inline):
+        """Its worker dies, once, after it has committed the task that others wait for."""
+
+        died = False
+
+        def wait(self):
+            ((number, outcome),) = super().wait()
+            if number == 0 and not self.died:
+                self.died, outcome = True, base.NotBegun()
+            return [(number, outcome)]
+
+    earlier, _ = run(cache, make=in_a_row("first"))
+    monkeypatch.setattr(scheduler, "make", lambda *_: Dying())
+    graph, result = run(
+        cache,
+        make=in_a_row("first", "last"),
+        progress=Removed(cache / earlier.nodes[0].ref.path),
+        ledger=tmp_path / "ledger.jsonl",
+    )
+    assert result.ok
+    assert statuses(graph) == {"first": "cached", "last": "computed"}
+    assert [row["label"] for row in ledger.read(tmp_path / "ledger.jsonl")] == ["first", "last"], "one line a node"
 
 
 def test_dry_run_computes_nothing_and_explains(cache):
@@ -237,7 +308,7 @@ def interruptible():
     signal.signal(signal.SIGINT, before)
 
 
-def test_an_interrupt_where_python_forgets_it_stops_the_run_all_the_same(cache, capfd, interruptible):
+def test_an_interrupt_where_python_forgets_it_stops_the_run_all_the_same(cache, tmp_path, capfd, interruptible):
     class Forgotten:
         def __del__(self):
             signal.raise_signal(signal.SIGINT)
@@ -256,7 +327,8 @@ def test_an_interrupt_where_python_forgets_it_stops_the_run_all_the_same(cache, 
         graph.flow(rest())
 
     with pytest.raises(KeyboardInterrupt):
-        run(cache, make=make)
+        run(cache, make=make, ledger=tmp_path / "ledger.jsonl")
+    assert "ok" not in ledger.facts(tmp_path / "ledger.jsonl"), "it did not come to its end"
     assert [node.status for node in done] == ["pending"], "the flow went on, the run did not"
     assert capfd.readouterr().err == ""
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
