@@ -12,6 +12,7 @@ from typing import Any, TextIO
 
 from rille.pipeline.engine.graph import Handle
 from rille.pipeline.engine.memory.cost_model import input_bytes
+from rille.pipeline.engine.spec import each
 
 
 class Ledger:
@@ -30,9 +31,7 @@ class Ledger:
             return
         row: dict[str, Any] = {"label": handle.label, "stage": handle.stage, "status": handle.status}
         if handle.inputs:
-            row["inputs"] = {
-                p: [h.label for h in g] if isinstance(g, list) else g.label for p, g in handle.inputs.items()
-            }
+            row["inputs"] = each(lambda h: h.label, handle.inputs)
         if handle.reason:
             row["reason"] = handle.reason
         if handle.key:

@@ -21,7 +21,7 @@ from functools import cache
 from types import ModuleType
 from typing import Any, Generic, TypeVar
 
-from rille.pipeline.engine.spec import Refs, Spec
+from rille.pipeline.engine.spec import Refs, Spec, each, flat
 from rille.pipeline.engine.store.manifest import Ref
 from rille.stages.core.declare import Params
 
@@ -79,11 +79,11 @@ class Handle:
 
     def upstream(self) -> list[Handle]:
         """Handles of all inputs, in order of the ports."""
-        return [h for given in self.inputs.values() for h in (given if isinstance(given, list) else [given])]
+        return flat(self.inputs)
 
     def refs(self) -> Refs:
         """References of all inputs by port; call it when they are done."""
-        return {p: [_ref(h) for h in g] if isinstance(g, list) else _ref(g) for p, g in self.inputs.items()}
+        return each(_ref, self.inputs)
 
 
 class MissingError(Exception):

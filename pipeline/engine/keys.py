@@ -13,40 +13,11 @@ False
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 from json.encoder import encode_basestring_ascii as _quoted
 from typing import Any
 
 from pydantic import BaseModel
-
-
-def canonical(value: Any, where: str = "value") -> Any:
-    """Tagged JSON tree of ``value``; every JSON list in it starts with its tag, so no two values share a tree.
-
-    Raises
-    ------
-    TypeError
-        A part of the value has no canonical form; the message names the place.
-    """
-    # By type, not isinstance: an enumeration is an int or str, too, and would share the digest of its value.
-    if value is None or isinstance(value, bool) or type(value) is str or type(value) is int:
-        return value
-    if isinstance(value, float):
-        return ["float", "nan" if math.isnan(value) else float(value).hex()]
-    if isinstance(value, BaseModel):
-        fields = {name: getattr(value, name) for name in type(value).model_fields}
-        return ["model", type(value).__name__, canonical(fields, where)]
-    if isinstance(value, dict):
-        for key in value:
-            if type(key) is not str:
-                raise TypeError(f"{where} has the key {key!r}: keys are text")
-        return {key: canonical(item, f"{where}.{key}") for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return ["list", *(canonical(item, f"{where}[{i}]") for i, item in enumerate(value))]
-    if isinstance(value, set | frozenset):
-        return ["set", *sorted((canonical(item, where) for item in value), key=_text)]
-    raise TypeError(f"{where} is a {type(value).__name__}, which has no canonical form: give plain JSON values")
 
 
 def digest(value: Any, where: str = "value") -> str:
@@ -55,24 +26,15 @@ def digest(value: Any, where: str = "value") -> str:
 
 
 def text(value: Any, where: str = "value") -> str:
-    """The canonical form as JSON without spaces, keys in order; without building the tree, for plans ask it often.
+    """The canonical form: JSON without spaces, keys in order; each JSON list starts with its tag, so no two values
+    share a form.
 
     Raises
     ------
     TypeError
-        As :func:`canonical`.
+        A part of the value has no canonical form; the message names the place.
     """
-    try:
-        return _plain(value)
-    except _FormlessError:
-        return _text(canonical(value, where))
-
-
-class _FormlessError(Exception):
-    """Something has no canonical form; :func:`canonical` says what, and where."""
-
-
-def _plain(value: Any) -> str:
+    # By type, not isinstance: an enumeration is an int or str, too, and would share the digest of its value.
     kind = type(value)
     if kind is str:
         return _quoted(value)
@@ -81,18 +43,15 @@ def _plain(value: Any) -> str:
     if isinstance(value, float):
         return f'["float","{"nan" if math.isnan(value) else float(value).hex()}"]'
     if isinstance(value, dict):
-        if not all(type(key) is str for key in value):
-            raise _FormlessError
-        return "{" + ",".join([f"{_quoted(key)}:{_plain(value[key])}" for key in sorted(value)]) + "}"
+        for key in value:
+            if type(key) is not str:
+                raise TypeError(f"{where} has the key {key!r}: keys are text")
+        return "{" + ",".join([f"{_quoted(key)}:{text(value[key], f'{where}.{key}')}" for key in sorted(value)]) + "}"
     if isinstance(value, list | tuple):
-        return ",".join(['["list"', *map(_plain, value)]) + "]"
+        return ",".join(['["list"', *[text(item, f"{where}[{i}]") for i, item in enumerate(value)]]) + "]"
     if isinstance(value, set | frozenset):
-        return ",".join(['["set"', *sorted(map(_plain, value))]) + "]"
+        return ",".join(['["set"', *sorted(text(item, where) for item in value)]) + "]"
     if isinstance(value, BaseModel):
         fields = {name: getattr(value, name) for name in type(value).model_fields}
-        return f'["model",{_quoted(type(value).__name__)},{_plain(fields)}]'
-    raise _FormlessError
-
-
-def _text(tree: Any) -> str:
-    return json.dumps(tree, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+        return f'["model",{_quoted(type(value).__name__)},{text(fields, where)}]'
+    raise TypeError(f"{where} is a {type(value).__name__}, which has no canonical form: give plain JSON values")

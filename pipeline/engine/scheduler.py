@@ -27,7 +27,7 @@ import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,7 @@ from rille.pipeline.engine.plain import some
 from rille.pipeline.engine.progress import Progress
 from rille.pipeline.engine.runtime.environment import cores
 from rille.pipeline.engine.runtime.interrupts import Interrupts
-from rille.pipeline.engine.spec import Refs, key_of, recipe
+from rille.pipeline.engine.spec import Refs, each, key_of, recipe
 from rille.pipeline.engine.store.base import GoneError, NonDeterministicError, Store
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.task import CodeChangedError, Outcome
@@ -105,8 +105,7 @@ class Result:
 
     def total(self) -> Counts:
         """Counts over all stages."""
-        fields = ("computed", "cached", "failed", "skipped", "planned", "seconds")
-        return Counts(**{f: sum(getattr(c, f) for c in self.counts.values()) for f in fields})
+        return Counts(**{f.name: sum(getattr(c, f.name) for c in self.counts.values()) for f in fields(Counts)})
 
     def check(self, *, holes: bool = False) -> None:
         """Raise the first failure as one line with its label: the original error of Rille, or what wraps another.
@@ -399,9 +398,8 @@ class _Run:
         for dependant in self.dependants.get(handle.index, ()):
             if dependant.status == "pending":
                 self._chain(dependant)
-        refs = {p: [_given(h) for h in g] if isinstance(g, list) else _given(g) for p, g in handle.inputs.items()}
         root, force = self.store.location, handle.stage in self.force
-        return Task(handle.index, root, handle.spec, refs, handle.key, force)
+        return Task(handle.index, root, handle.spec, each(_given, handle.inputs), handle.key, force)
 
     def _arrive(self, handle: Handle, outcome: Outcome | Failed | NotBegun) -> None:
         """Take up what the executor gives back."""
@@ -431,13 +429,13 @@ class _Run:
         broken = self._broken(handle)
         if broken is not None:
             self._break(handle, broken)
-        for each in again:
-            if each.status != "pending":
+        for node in again:
+            if node.status != "pending":
                 continue
-            if self.waits[each.index]:
-                self._chain(each)
+            if self.waits[node.index]:
+                self._chain(node)
             else:
-                heapq.heappush(self.ready, each.index)
+                heapq.heappush(self.ready, node.index)
 
     @staticmethod
     def _broken(handle: Handle) -> Handle | None:

@@ -12,10 +12,10 @@ import hashlib
 import importlib
 import pickle
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from rille.pipeline.engine.code_digest import module_digests
 from rille.pipeline.engine.keys import text
@@ -29,6 +29,19 @@ FORMAT = 2
 
 Refs = Mapping[str, Ref | list[Ref]]
 """Input port to the artifact given there, or to the list of them."""
+
+A = TypeVar("A")
+B = TypeVar("B")
+
+
+def each(change: Callable[[A], B], ports: Mapping[str, A | list[A]]) -> dict[str, B | list[B]]:
+    """What ``change`` makes of each thing that is given to a port; a list stays one."""
+    return {p: [change(g) for g in given] if isinstance(given, list) else change(given) for p, given in ports.items()}
+
+
+def flat(ports: Mapping[str, A | list[A]]) -> list[A]:
+    """All that is given, in order of the ports."""
+    return [g for given in ports.values() for g in (given if isinstance(given, list) else [given])]
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,13 +108,13 @@ def resolve(module: str) -> Stage:
 
 def recipe(spec: Spec, refs: Refs) -> dict[str, Any]:
     """All that determines a result; its digest is the key."""
-    return {**_shared(spec.module).parts, "params": spec.params, "args": dict(spec.args), "inputs": _digests(refs)}
+    return {**_shared(spec.module).parts, "params": spec.params, "args": dict(spec.args), "inputs": each(_digest, refs)}
 
 
 def key_of(spec: Spec, refs: Refs) -> str:
     """Key of a task, ``digest(recipe(spec, refs))``; what many tasks share is put into its canonical form only once."""
     common = _shared(spec.module)
-    args, inputs = text(dict(spec.args), f"{spec.label}.args"), text(_digests(refs))
+    args, inputs = text(dict(spec.args), f"{spec.label}.args"), text(each(_digest, refs))
     parts = f'{{"args":{args},{common.before},"inputs":{inputs},"params":{spec.canonical},{common.after}}}'
     return hashlib.sha256(parts.encode()).hexdigest()
 
@@ -134,5 +147,5 @@ def _shared(module: str) -> _Common:
     return _Common(fixed, ",".join(texts[:3]), ",".join(texts[3:]))
 
 
-def _digests(refs: Refs) -> dict[str, Any]:
-    return {p: [r.digest for r in ref] if isinstance(ref, list) else ref.digest for p, ref in refs.items()}
+def _digest(ref: Ref) -> str:
+    return ref.digest

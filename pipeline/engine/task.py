@@ -5,7 +5,6 @@ Between tasks only :class:`~rille.pipeline.engine.store.manifest.Ref` travel.
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import resource
@@ -17,7 +16,7 @@ from pathlib import Path
 from rille.pipeline.engine.memory.cost_model import tells_more
 from rille.pipeline.engine.memory.limits import Meter
 from rille.pipeline.engine.runtime.numba_cache import COMPILING
-from rille.pipeline.engine.spec import Refs, Spec, key_of, recipe
+from rille.pipeline.engine.spec import Refs, Spec, each, flat, key_of, recipe
 from rille.pipeline.engine.store.base import Store, at
 from rille.pipeline.engine.store.manifest import Ref
 from rille.stages.core.declare import Bundle, check_outputs
@@ -65,7 +64,7 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
     """Give the artifact of a task, computing and committing it where it is absent (or ``force`` is set).
 
     ``key`` is what the client expects; a worker that would compute another thing refuses. Failures of input and
-    output (``OSError``, ``TimeoutError``) are tried three times; what a stage raises otherwise is not tried again.
+    output (``OSError``) are tried three times; what a stage raises otherwise is not tried again.
     """
     begin, started = time.perf_counter(), time.time()
     # Computed here as well, from this process's own source files: the client's may be newer.
@@ -84,14 +83,14 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
                 return Outcome(ref, True, time.perf_counter() - begin, _peak_rss(), started)
             first = spec.module not in _run
             COMPILING.take()  # of what ran before in this process
-            size = sum(r.nbytes for ref in refs.values() for r in (ref if isinstance(ref, list) else [ref]))
+            size = sum(ref.nbytes for ref in flat(refs))
             with Meter(measure=tells_more((spec.module, spec.canonical), size)) as meter:
                 ref, kernel = _compute(store, spec, refs, own)
             seconds = time.perf_counter() - begin
             _run.add(spec.module)
             measured = (started, kernel, meter.memory, meter.rest, first, COMPILING.take())
             return Outcome(ref, False, seconds, _peak_rss(), *measured)
-        except (OSError, TimeoutError) as error:
+        except OSError as error:
             # A missing file does not appear by waiting; a network drive that stumbled recovers.
             if isinstance(error, PERMANENT) or trial == TRIES - 1:
                 raise
@@ -101,7 +100,7 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
 
 def _compute(store: Store, spec: Spec, refs: Refs, key: str) -> tuple[Ref, float]:
     stage = spec.stage
-    inputs = {p: [store.open(r) for r in ref] if isinstance(ref, list) else store.open(ref) for p, ref in refs.items()}
+    inputs = each(store.open, refs)
     started = time.time()
     begin = time.perf_counter()
     result = stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
@@ -120,8 +119,7 @@ def _compute(store: Store, spec: Spec, refs: Refs, key: str) -> tuple[Ref, float
         "seconds": kernel,
         "peak_rss": _peak_rss(),
     }
-    ref = store.commit(stage, key, result, label=spec.label, provenance=json.loads(json.dumps(provenance)))
-    return ref, kernel
+    return store.commit(stage, key, result, label=spec.label, provenance=provenance), kernel
 
 
 def _peak_rss() -> int:

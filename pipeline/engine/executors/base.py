@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from rille.pipeline.engine.runtime.interrupts import held
-from rille.pipeline.engine.spec import Spec
+from rille.pipeline.engine.spec import Spec, flat
 from rille.pipeline.engine.store.location import Location
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import Outcome, ensure
@@ -52,9 +52,8 @@ class Task:
 
     def upstream(self) -> list[int]:
         """Numbers of the tasks in flight that it waits for."""
-        given = [g for port in self.refs.values() for g in (port if isinstance(port, list) else [port])]
         # Each once and in a fixed order: a worker pairs the results that it gets with these numbers by their position.
-        return list(dict.fromkeys(g for g in given if isinstance(g, int)))
+        return list(dict.fromkeys(g for g in flat(self.refs) if isinstance(g, int)))
 
     def run(self, made: Mapping[int, Ref]) -> Outcome | Failed:
         """Run it here, with the artifacts of the tasks that it waited for."""

@@ -134,10 +134,8 @@ class Dask:
     def __init__(self, client: Any, cache: Location, slots: int, cluster: Any, *, ours: bool = True) -> None:
         self._client, self.slots, self._cluster, self._ours = client, slots, cluster, ours
         self._run, self._submitted = f"rille-{uuid.uuid4().hex}", 0
-        self._presence, self._looked = (
-            dask_cluster.Presence(client, BIRTH if cluster else dask_cluster.NO_WORKERS),
-            time.monotonic(),
-        )
+        self._presence = dask_cluster.Presence(client, BIRTH if cluster else dask_cluster.NO_WORKERS)
+        self._looked = time.monotonic()
         self._futures: dict[int, Any] = {}
         self._gone: set[Any] = set()
         self._events: queue.SimpleQueue[bytes] = queue.SimpleQueue()

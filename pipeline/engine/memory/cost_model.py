@@ -8,22 +8,21 @@ from other parameters of its stage, else by the guess of the stage's declaration
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Hashable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import median
+from statistics import fmean, linear_regression, median
 from typing import TYPE_CHECKING, Any
 
-from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.runtime import atomic
-from rille.stages.core.declare import Params
+from rille.pipeline.engine.spec import Spec, each
 
 if TYPE_CHECKING:
     from rille.pipeline.engine.graph import Handle
-    from rille.pipeline.engine.spec import Spec
 
 FILE = "costs.json"
 KEPT = 64
@@ -92,7 +91,6 @@ class Costs:
     def __init__(self, groups: dict[str, dict[str, Group]] | None = None, rests: list[float] | None = None) -> None:
         self.groups = groups or {}
         self.rests = rests or []
-        self._names: dict[int, tuple[Params, str]] = {}
         self._foreseen: dict[tuple[str, str, float], Foreseen] = {}
 
     @property
@@ -103,7 +101,7 @@ class Costs:
 
     def foresee(self, spec: Spec, size: float) -> Foreseen:
         """Foresee the cost of a task with ``size`` bytes of input."""
-        stage, params = spec.stage, self._name(spec.params)
+        stage, params = spec.stage, _name(spec)
         asked = (stage.name, params, size)
         if asked not in self._foreseen:
             self._foreseen[asked] = self._compute(spec, params, size)
@@ -129,20 +127,14 @@ class Costs:
         source = "no earlier run: a guess of the stage's declaration"
         return Foreseen(guess.fixed + guess.factor * size, GUESS, result, result, source, False)
 
-    def _name(self, params: Params) -> str:
-        known = self._names.get(id(params))
-        if known is None:
-            known = self._names[id(params)] = (params, digest(params)[:16])  # held, so that its id stays its own
-        return known[1]
-
     def learn(self, handles: Iterable[Handle]) -> None:
         """Take in what was computed now."""
         new: dict[tuple[str, str], list[Sample]] = defaultdict(list)
         computed = [h for h in handles if h.status == "computed" and h.ref is not None]
-        warm = {(h.stage, self._name(h.spec.params)) for h in computed if not h.first and h.memory is not None}
+        warm = {(h.stage, _name(h.spec)) for h in computed if not h.first and h.memory is not None}
         for h in computed:
             assert h.ref is not None
-            name = h.stage, self._name(h.spec.params)
+            name = h.stage, _name(h.spec)
             measured = h.memory if not h.first or name not in warm else None  # imports and compiling are not its own
             new[name].append((input_bytes(h), measured, float(h.ref.nbytes), float(h.ref.stored)))
             self.rests += [] if h.rest is None else [float(h.rest)]
@@ -156,6 +148,11 @@ class Costs:
             for old in list(groups)[:-GROUPS]:
                 del groups[old]
         self._foreseen.clear()
+
+
+def _name(spec: Spec) -> str:
+    """The digest of a task's parameters, shortened."""
+    return hashlib.sha256(spec.canonical.encode()).hexdigest()[:16]
 
 
 _sizes: dict[Hashable, list[float]] = {}
@@ -211,15 +208,14 @@ def _at(samples: list[tuple[float, float]], size: float) -> tuple[float, float]:
 
 def _line(samples: list[tuple[float, float]]) -> tuple[float, float]:
     """Least squares with neither intercept nor slope below zero; of one size only, in proportion."""
-    n = len(samples)
-    mx, my = sum(x for x, _ in samples) / n, sum(y for _, y in samples) / n
-    var = sum((x - mx) ** 2 for x, _ in samples)
-    slope = max(0.0, sum((x - mx) * (y - my) for x, y in samples) / var) if var > 0 else my / mx if mx else 0.0
-    intercept = my - slope * mx
-    if intercept >= 0:
-        return intercept, slope
+    x, y = zip(*samples, strict=True)
+    if min(x) == max(x):
+        return (0.0, fmean(y) / x[0]) if x[0] else (fmean(y), 0.0)
+    slope, intercept = linear_regression(x, y)
+    if slope < 0:
+        return fmean(y), 0.0
     # Refitted through the origin: with the intercept merely cut to 0 the slope would stay too steep.
-    return 0.0, sum(x * y for x, y in samples) / sum(x * x for x, _ in samples)
+    return (intercept, slope) if intercept >= 0 else (0.0, linear_regression(x, y, proportional=True).slope)
 
 
 def count(n: int, what: str) -> str:
@@ -236,9 +232,8 @@ def input_bytes(handle: Handle, expected: Mapping[int, float] | None = None) -> 
     size = handle.expect + sum(parts)
     more = handle.spec.stage.memory.size
     if more is not None:
-        metas = {p: [_meta(h) for h in g] if isinstance(g, list) else _meta(g) for p, g in handle.inputs.items()}
         with suppress(Exception):  # an estimate only, and facts may be still to come
-            size += more(handle.spec.params, handle.spec.args, metas)
+            size += more(handle.spec.params, handle.spec.args, each(_meta, handle.inputs))
     return size
 
 

@@ -5,8 +5,7 @@ has changed (numba#1833), it trusts what it finds (a file cut short fails every 
 and two processes that compile two signatures of one function at once may both take the same number. Here
 
 - a kernel is known by the digest of its module and of all own modules that this one reaches
-(:mod:`rille.pipeline.engine.code_digest`), so
-  that an edit compiles anew what it can change, and nothing else;
+  (:mod:`rille.pipeline.engine.code_digest`), so that an edit compiles anew what it can change, and nothing else;
 - each entry is a file of its own, named by its key; it holds the key and a checksum, against damage;
 - of processes that need the same kernel at once one compiles it, the others wait and load it;
 - a kernel has no wrapper for callers in C, and one that kernels call has none for callers in Python either: if Python
@@ -70,7 +69,6 @@ class Compiling:
         if not self.pending:
             self.since = time.perf_counter()
             self.usual = gc.get_threshold()
-            # Numba makes millions of objects that live until the kernel is done: a ninth of its time went into them.
             gc.set_threshold(*SELDOM)
         self.pending.add(key)
         _lock(key)

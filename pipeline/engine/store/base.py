@@ -81,9 +81,6 @@ class Store:
         self.place: Place = _place(self.location)
         self._index: Index | None = None
 
-    def __fspath__(self) -> str:
-        return str(self.root)
-
     def hints(self, sequence: str) -> Path:
         """Folder of what earlier runs of a sequence leave for explanations and estimates."""
         return self.root / "hints" / folder_of(sequence)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import tempfile
@@ -11,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from rille.pipeline.engine.failures import CLOSED, FULL
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.place import FORMAT, MARK, Item
 from rille.stages.core.errors import RilleError
@@ -140,13 +140,13 @@ class Folder:
         try:
             yield
         except OSError as error:
-            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            if error.errno in FULL:
                 raise StoreError(
                     "RIL-574",
                     f"no space left for the cache {self.root}",
                     remedy="free space, clear the cache, or choose another folder with --cache",
                 ) from error
-            if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+            if error.errno in CLOSED:
                 raise StoreError(
                     "RIL-575",
                     f"the cache {self.root} may not be used ({os.strerror(error.errno)})",

@@ -133,4 +133,4 @@ def used_since(place: Place, limit: float) -> set[str]:
                 _read(place, item, keys, MOST)
             except (ValueError, RilleError):
                 continue
-    return keys.keys() | set()
+    return set(keys)

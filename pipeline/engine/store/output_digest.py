@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rille.pipeline.engine.keys import canonical, digest
+from rille.pipeline.engine.keys import digest, text
 from rille.stages.core.declare import AnyArray
 
 
@@ -59,4 +59,4 @@ def _refuse_non_finite(value: Any, where: str) -> None:
     elif isinstance(value, float) and not np.isfinite(value):
         raise TypeError(f"{where} is {value}: metadata is JSON, use None for what is undefined")
     else:
-        canonical(value, where)
+        text(value, where)

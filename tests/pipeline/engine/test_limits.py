@@ -117,7 +117,7 @@ SPEC = Spec("toys.numbers", "n", NumbersParams())
 
 
 def known(samples, params=None, tasks=None):
-    name = Costs()._name(params or NumbersParams())
+    name = cost_model._name(Spec("toys.numbers", "x", params or NumbersParams()))
     return Costs({"numbers": {name: Group(3, tasks or len(samples), samples)}})
 
 
