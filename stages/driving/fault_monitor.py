@@ -98,8 +98,8 @@ def judge(
     key = RigidTransform.from_matrix(poses[0]) @ T_vehicle_left.inverse()
     steepest = params.max_tilt * float(vehicle["max_slope_deg"])
     for k in range(1, len(poses)):
-        # Rounding may carry the cosine of an upright vehicle beyond 1.
-        tilt = math.degrees(math.acos(min(1.0, float((T_vehicle_left.rotation @ up[k])[2]))))
+        # Rounding may carry the cosine of a vehicle that is upright, or upside down, beyond 1.
+        tilt = math.degrees(math.acos(np.clip((T_vehicle_left.rotation @ up[k])[2], -1.0, 1.0)))
         if tilt > steepest:
             return Verdict(k, "attitude", f"tilt of {tilt:.1f} degrees by the inclinometer, {steepest:.1f} permitted")
         if acceleration[k] > params.max_acceleration:

@@ -76,7 +76,8 @@ class ObstacleMonitorParams(Params):
 
 @dataclass(frozen=True)
 class LastModel:
-    """The last elevation model: heights (row, col), m, and the greatest of them within the blur, both NaN unknown."""
+    """The last elevation model: heights (row, col), m, NaN unknown; ``top`` the greatest of them within the blur, -inf
+    where none is known; ``points`` (n, 3), m, of the known cells."""
 
     lattice: Lattice
     height: Floats

@@ -89,7 +89,9 @@ def trajectory_accuracy(
     metrics |= _drift(P, aligned, judged)
     metrics |= _relative(P, Q)
     metrics |= _displacement(arrays["displacement"], arrays["displacement_truth"])
-    metrics |= _kitti(P, Q) | by_steps(P, Q) | by_shares(P[judged], Q[judged]) | by_cause(P, Q)
+    # With the frames between that have no pose: the true path leads on there.
+    whole = slice(judged[0], judged[-1] + 1)
+    metrics |= _kitti(P, Q) | by_steps(P, Q) | by_shares(P[whole], Q[whole]) | by_cause(P, Q)
     if covariance is not None:
         metrics |= against_claims(P, aligned, covariance)
     return arrays, metrics

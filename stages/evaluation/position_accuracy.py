@@ -172,7 +172,8 @@ def _candidates(moments: Floats, truth: TruePositions) -> Floats:
     step = 0.5 * float(np.median(np.diff(moments))) if len(moments) > 1 else 0.1
     if low < 0.0 < high:
         low, high = max(low, -REACH), min(high, REACH)
-        step = max(step, (high - low) / MOST)
+        # Of images a minute apart half a frame is more than all that is searched.
+        step = min(max(step, (high - low) / MOST), 0.5 * (high - low))
         return np.asarray(step * np.arange(np.ceil(low / step), np.floor(high / step) + 1))
     return np.linspace(low, high, int(np.clip((high - low) / step, 2, MOST)) + 1)
 

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from rille.stages.core.arrays import Floats
-from rille.stages.evaluation.accuracy_parts import Metric, along, angle, inverse, metric, relative_error, rms
+from rille.stages.evaluation.accuracy_parts import Metric, along, angle, inverse, metric, posed, relative_error, rms
 from rille.stages.geometry.geometry import cross_matrix, rotation_log
 
 STEPS = (1, 2, 5, 10, 20, 50)
@@ -43,11 +43,14 @@ def by_steps(P: Floats, Q: Floats) -> dict[str, Metric]:
 
 
 def by_shares(P: Floats, Q: Floats) -> dict[str, Metric]:
-    """Relative errors over sections of 10 to 80 % of the true path, from every frame: mean, over their length."""
-    way, gaps = along(Q)
+    """Relative errors over sections of 10 to 80 % of the true path, from every frame, but not over a gap of the truth:
+    mean, over their length."""
+    way, _ = along(Q)
     total = float(way[-1])
-    if gaps or total < LEAST_MOVED:
-        why = "not applicable: the truth has gaps" if gaps else "not applicable: the camera did not move"
+    # Equal at both ends of a section: no frame between is without truth.
+    gaps = np.cumsum(~posed(Q))
+    if total < LEAST_MOVED:
+        why = "not applicable: the camera did not move"
         return {"sections_translation": metric(None, "%", why), "sections_rotation": metric(None, "deg/m", why)}
     errors = []
     for share in SHARES:
@@ -56,10 +59,10 @@ def by_shares(P: Floats, Q: Floats) -> dict[str, Metric]:
         last = last[first]
         E = relative_error(P, Q, first, last)
         length = way[last] - way[first]
-        known = np.isfinite(E).all(axis=(1, 2)) & (length > 0)
+        known = posed(E) & (gaps[first] == gaps[last]) & (length > 0)
         errors += list(np.stack([np.linalg.norm(E[known, :3, 3], axis=1), angle(E[known])], 1) / length[known, None])
     if not errors:
-        why = "not applicable: no section has poses at both ends"
+        why = "not applicable: no section has poses at both ends and truth throughout"
         return {"sections_translation": metric(None, "%", why), "sections_rotation": metric(None, "deg/m", why)}
     shift, turn = np.mean(errors, axis=0)
     how = f"mean relative error of {len(errors)} sections of 10-80 % of the path, from every frame"

@@ -125,8 +125,10 @@ def find_path(
     Raises
     ------
     InputError
-        Start or target lies outside the map, in a hazard or on unknown ground, or they are the same cell; or the
-        vehicle is wider than the map.
+        Start or target lies outside the map, in a hazard or on unknown ground; or rows are to lie across the heading,
+        and it has no direction.
+    DegenerateError
+        The vehicle is wider than the map.
     """
     p = params or PathParams()
     check_size(vehicle, lattice.shape, lattice.cell)
@@ -192,7 +194,7 @@ def _by_rows(
 ) -> Route:
     ground = _ground(maps, lattice, RowGrid.over(lattice, heading), vehicle, p)
     grid = ground.grid
-    first, last = (None if point is None else grid.index(point) for point in ends)
+    first, last = (None if point is None else grid.nearest(point) for point in ends)
     # One vehicle length, from the front of the front wheels to the back of the rear ones.
     tolerance = math.ceil((vehicle.wheel_base + vehicle.wheel_diameter) / lattice.cell)
     span = row_span(~ground.closed)

@@ -84,6 +84,11 @@ class RowGrid:
         right, ahead = point[0] * dy - point[1] * dx, point[0] * dx + point[1] * dy
         return round(self.j0 - ahead / self.cell), round(right / self.cell - self.i0)
 
+    def nearest(self, point: Point) -> tuple[int, int]:
+        """Row and column of the cell nearest to a point, metres: a turned grid leaves out the tips of the lattice."""
+        row, col = self.index(point)
+        return min(max(row, 0), self.rows - 1), min(max(col, 0), self.cols - 1)
+
     def sample(self, lattice: Lattice, array: NDArray[Any], outside: float) -> NDArray[Any]:
         """An array on the lattice brought to this grid by nearest neighbour."""
         # No copy where nothing is turned, which is every path of a stop.

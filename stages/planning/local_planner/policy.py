@@ -172,7 +172,7 @@ def _onwards(
     bound = math.radians(p.max_turn_deg)
     leg = first_metres(plan[: _sure(plan)], p.max_length * base)
     # A last piece to the goal may be shorter.
-    if length_of(leg) < min(p.min_length * base, length_of(way) - 1e-9):
+    if length_of(leg) < min(p.min_length * base, length_of(plan) - 1e-9):
         return None
     seen = None if target is None else target.last_view(leg, bound)
     facing = 0.0

@@ -80,3 +80,10 @@ def test_a_heading_that_the_wheels_do_not_know_stops() -> None:
     found = judged(**leg(turn=math.radians(3.0)))
     assert (found.stop, found.kind) == (3, "slip")
     assert "9.0 degrees in heading" in found.reason
+
+
+def test_a_vehicle_that_lies_upside_down_stops() -> None:
+    up = leg()["up"].copy()
+    up[2] *= -1.0 - 1e-15
+    found = judged(up=up)
+    assert (found.stop, found.kind) == (2, "attitude")

@@ -257,3 +257,17 @@ def test_truth_with_gaps_and_a_trajectory_without_poses_as_artifacts() -> None:
     check_outputs(STAGE, out)
     value = {name: m["value"] for name, m in out.meta["metrics"].items()}
     assert value == {"frames": 4, "frames_missing": 4, "frames_without_truth": 1, "frames_judged": 0}
+
+
+def test_shares_of_the_path_count_what_lies_between_poses_that_were_lost() -> None:
+    """Out, lost on a way to the side and back, and on: an error of a metre is small against the 40 m of the detour."""
+    line = np.concatenate([np.arange(11.0), np.full(40, 10.0), np.arange(10.0, 21.0)])
+    aside = np.concatenate([np.zeros(11), np.arange(1.0, 21.0), np.arange(19.0, -1.0, -1.0), np.zeros(11)])
+    true = np.tile(np.eye(3, 4), (len(line), 1, 1))
+    true[:, 0, 3], true[:, 2, 3] = aside, line
+    estimate = true.copy()
+    estimate[11:51] = np.nan
+    estimate[51:, 0, 3] += 1.0
+    found = trajectory_accuracy(estimate, true)[1]
+    assert found["path_length"]["value"] == pytest.approx(60.0)
+    assert found["sections_translation"]["value"] < 100.0 / 40.0

@@ -144,3 +144,11 @@ def test_stage():
     check_outputs(STAGE, out)
     assert np.isnan(out["position_truth"][:, 2]).all()
     assert "positions only, after a rigid fit in the plane" in out.meta["metrics"]["position_rmse"]["how"]
+
+
+@pytest.mark.parametrize("apart", [21.0, 60.0])
+def test_images_that_are_farther_apart_than_any_offset_that_is_searched(apart: float) -> None:
+    moments = apart * np.arange(12)
+    places = np.stack([0.01 * moments, np.sin(moments), np.zeros(12)], axis=1)
+    _, metrics, _ = position_accuracy(places, TruePositions(places[:, :2], moments, 2.0 * apart), moments)
+    assert metrics["position_rmse"]["value"] == pytest.approx(0.0, abs=1e-9)

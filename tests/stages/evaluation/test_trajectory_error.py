@@ -72,9 +72,14 @@ def test_rest_and_gaps_are_said():
     rest = np.tile(np.eye(4), (10, 1, 1))
     assert by_shares(rest, rest)["sections_translation"]["value"] is None
     assert "not move" in by_cause(rest, rest)["scale_error"]["how"]
-    gap = straight()
-    gap[5] = np.nan
-    assert "gaps" in by_shares(straight(), gap)["sections_translation"]["how"]
+    full, gap = straight(), straight()
+    gap[20] = np.nan
+    # Of 41 frames: sections of 4, 8, ... 32 steps, of which those from before frame 20 to beyond it are left out.
+    how = [by_shares(full, true)["sections_translation"]["how"] for true in (full, gap)]
+    assert "of 184 sections" in how[0]
+    assert "of 80 sections" in how[1]
+    gap[1:-1] = np.nan
+    assert "throughout" in by_shares(full, gap)["sections_translation"]["how"]
 
 
 def test_right_claims_give_one_and_halved_deviations_four():

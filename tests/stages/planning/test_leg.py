@@ -504,3 +504,11 @@ def test_what_was_seen_from_near_and_stays_doubtful_is_not_looked_at_from_farthe
     )
     assert (back.verdict, back.gear.tolist()) == ("look", [-1])
     assert closed.verdict == "closed"
+
+
+@pytest.mark.parametrize("degrees", range(10, 180, 20))
+def test_a_goal_nearer_than_the_shortest_leg_is_driven_to_though_the_way_is_made_straighter(degrees: int) -> None:
+    angle = math.radians(degrees)
+    goal = 0.06 * math.cos(angle), 0.3 + 0.06 * math.sin(angle)
+    leg = plan_leg(ground(), (0.0, 0.3, 0.0), goal, P.model_copy(update={"min_length": 1.0}))
+    assert leg.verdict in ("drive", "turn")

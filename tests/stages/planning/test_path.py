@@ -303,3 +303,13 @@ def test_the_stage(blocked: bool) -> None:
     assert out.meta["climb_m"] == pytest.approx(0.1 * steps * CELL, abs=0.1 * CELL + 1e-6)
     assert out.meta["length_m"] == pytest.approx(steps * CELL * math.hypot(1, 0.1), rel=1e-3)
     assert out["reachable"].any()
+
+
+@pytest.mark.parametrize(("col", "row"), [(0, 0), (0, -1), (-1, 0), (-1, -1)])
+def test_a_path_may_begin_at_the_tip_of_the_map_beyond_the_rows_that_lie_across_it(col: int, row: int) -> None:
+    lattice = Lattice.at(-3, 40, CELL, 44, 46)
+    start, target = (float(lattice.xs()[col]), float(lattice.ys()[row])), (0.2, 0.15)
+    for ends in ((start, target), (target, start)):
+        route = find_path(maps(*level(lattice)), lattice, SHORT, ends=ends, params=PathParams(planner="auto"))
+        assert len(route.xyz)
+        assert np.abs(route.xyz[[0, -1], :2] - np.array(ends)).max() < 2.0 * CELL
