@@ -66,8 +66,8 @@ LABELS: Mapping[str, str] = {
 """Words for the names that the assessing stages use."""
 LABELS = {
     **LABELS,
-    **{f"rpe_{n}_translation_rmse": f"Relative error over {n} frames, translation" for n in STEPS[1:]},
-    **{f"rpe_{n}_rotation_rmse": f"Relative error over {n} frames, rotation" for n in STEPS[1:]},
+    **{f"rpe_{n}_translation_rmse": f"Relative error over {n} frames, translation" for n in STEPS},
+    **{f"rpe_{n}_rotation_rmse": f"Relative error over {n} frames, rotation" for n in STEPS},
 }
 
 AGREEMENT: Mapping[str, str] = {

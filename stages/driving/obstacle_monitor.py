@@ -76,11 +76,10 @@ class ObstacleMonitorParams(Params):
 
 @dataclass(frozen=True)
 class LastModel:
-    """The last elevation model: heights (row, col), m, NaN unknown; ``top`` the greatest of them within the blur, -inf
-    where none is known; ``points`` (n, 3), m, of the known cells."""
+    """The last elevation model: ``points`` (n, 3) of the known cells, m; ``top`` (row, col), the greatest height within
+    the blur, m, -inf where none is known."""
 
     lattice: Lattice
-    height: Floats
     top: Floats
     points: Floats
 
@@ -92,7 +91,7 @@ class LastModel:
         # The highest nearby: an error of the pose by that much must not make a known stone rise.
         top = scipy.ndimage.maximum_filter(np.where(np.isnan(z), -np.inf, z), side, mode="nearest")
         known = np.isfinite(z)
-        return LastModel(lattice, z, top, np.column_stack([lattice.xy()[known], z[known]]))
+        return LastModel(lattice, top, np.column_stack([lattice.xy()[known], z[known]]))
 
     def top_at(self, xy: Floats) -> Floats:
         """Greatest height near points (n, 2); -inf where nothing near is known, NaN outside."""
@@ -144,12 +143,12 @@ def look(
 ) -> Points:
     """Compute the points that two images show ahead of the vehicle, and which of them rise above the model."""
     wheel = vehicle.wheel_diameter
-    T_vehicle_local = T_vehicle_left @ view.now.inverse()
+    T_now = view.now.inverse()
+    T_vehicle_local = T_vehicle_left @ T_now
     ahead = T_vehicle_local.apply(surface.points)
     wide = 0.5 * vehicle.track + p.side_margin * wheel
     near = (np.abs(ahead[:, 0]) <= wide) & (ahead[:, 1] > 0.5 * vehicle.wheel_base) & (ahead[:, 1] <= p.reach * wheel)
     cells = surface.points[near]
-    T_now = view.now.inverse()
     pixel, cells, first = _seen(view, cells, camera)
     found = np.stack([view.column[pixel[:, 1], pixel[:, 0]], view.row[pixel[:, 1], pixel[:, 0]]], axis=1)
     target = first + found.astype(np.float64)

@@ -150,7 +150,7 @@ def _drift(P: Floats, aligned: Floats, judged: NDArray[np.intp]) -> dict[str, Me
 
 def _relative(P: Floats, Q: Floats) -> dict[str, Metric]:
     E = relative_error(P, Q, slice(None, -1), slice(1, None))
-    E = E[np.isfinite(E).all(axis=(1, 2))]
+    E = E[posed(E)]
     if len(E) == 0:
         none = "not applicable: no two successive frames have poses"
         return {k: metric(None, u, none) for k, u in (("rpe_translation_rmse", "m"), ("rpe_rotation_rmse", "deg"))}
@@ -224,13 +224,8 @@ def _nothing(estimate: Floats) -> dict[str, Floats]:
     position = estimate[:, :, 3].copy()
     # The report draws the estimate all the same, without a curve of the truth.
     none = np.full_like(position, np.nan)
-    displacement = np.diff(position, axis=0)
-    return {
-        "position": position,
-        "position_truth": none,
-        "displacement": displacement,
-        "displacement_truth": none[1:].copy(),
-    }
+    arrays = {"position": position, "position_truth": none}
+    return arrays | {"displacement": np.diff(position, axis=0), "displacement_truth": none[1:].copy()}
 
 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

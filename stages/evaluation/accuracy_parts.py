@@ -22,7 +22,7 @@ def metric(value: float | int | None, unit: str, how: str) -> Metric:
 
 
 def posed(poses: Floats) -> Bools:
-    """Which of the poses (frame, 3, 4) are there, i.e. without NaN."""
+    """Which of the poses (frame, 3, 4), or other matrices, are there, i.e. without NaN."""
     return np.asarray(np.isfinite(poses).all(axis=(1, 2)))
 
 

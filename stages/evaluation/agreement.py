@@ -158,30 +158,25 @@ def unbroken(theirs: NDArray[np.int64], ours: NDArray[np.int64]) -> NDArray[np.i
 
 
 def _metrics(arrays: Mapping[str, Floats], facts: Mapping[str, Any], length: float) -> dict[str, Metric]:
-    def rms_of(name: str) -> float | None:
+    def rms_of(name: str) -> float:
+        """NaN where no frame has a value, of which :func:`metric` makes None."""
         values = arrays[name][np.isfinite(arrays[name])]
-        return float(np.sqrt(np.mean(values**2))) if values.size else None
+        return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
 
     distance, angle, step, step_angle = (rms_of(name) for name in REASONS)
     after = "after one rotation and translation, no scale"
     return {
         "rmse": metric(distance, "m", f"RMS disagreement of positions {after}"),
-        "rmse_rotation": metric(_degrees(angle), "deg", f"RMS disagreement of orientations {after}"),
+        "rmse_rotation": metric(math.degrees(angle), "deg", f"RMS disagreement of orientations {after}"),
         "step_rmse": metric(step, "m", "RMS disagreement of the motion between successive frames"),
-        "step_rmse_rotation": metric(_degrees(step_angle), "deg", "the same, rotation"),
+        "step_rmse_rotation": metric(math.degrees(step_angle), "deg", "the same, rotation"),
         "length": metric(length, "m", "length of our trajectory over the compared frames"),
-        "share": metric(
-            100.0 * distance / length if distance is not None and length > 0 else None, "%", "rmse over the length"
-        ),
+        "share": metric(100.0 * distance / length if length > 0 else None, "%", "rmse over the length"),
         "scale_ratio": metric(
             facts["scale_ratio"], "1", "scale that would fit the crosscheck to ours best; 1 where both agree"
         ),
         "rmse_scaled": metric(facts["rmse_scaled_m"], "m", "RMS disagreement of positions with that scale"),
     }
-
-
-def _degrees(angle: float | None) -> float | None:
-    return None if angle is None else math.degrees(angle)
 
 
 def _run(params: AgreementParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

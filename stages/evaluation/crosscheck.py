@@ -21,6 +21,7 @@ from pydantic import Field, model_validator
 
 from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from rille.stages.evaluation.accuracy_parts import posed
 from rille.stages.geometry.geometry import Camera, Rig
 
 PIXEL_CENTRE = 0.5
@@ -34,6 +35,9 @@ MASK_SCALES = 3.0
 
 SMALL_IMAGE = 150_000
 """Pixels up to which an image is doubled: of a street at 320 x 96, all of 29 frames have a pose so, 8 without it."""
+
+MAX_RATIO, MAX_DISTANCE = 0.8, 0.7
+"""COLMAP's limits of a match: angle to the nearest descriptor over that to the second, and that angle, radians."""
 
 MIN_MATCHES = 15
 """COLMAP's own limit for a pair of images to count."""
@@ -151,25 +155,24 @@ def _away_from_mask(points: Floats, scale: Floats, valid: NDArray[Any]) -> Bools
     return np.asarray(inside > MASK_SCALES * scale)
 
 
-def match(a: Features, b: Features, max_ratio: float = 0.8, max_distance: float = 0.7) -> NDArray[np.uint32]:
+def match(a: Features, b: Features) -> NDArray[np.uint32]:
     """Indices (m, 2) of matching features: nearest in both directions, and clearly nearer than the second.
 
-    The criteria and defaults are those of COLMAP's matcher, angles between descriptors in radians. Products of bytes
-    summed over 128 stay below 2**24 and are thus exact in float32, in any order of summation; a matrix product is
-    some ten times faster than COLMAP's loops.
+    Products of bytes summed over 128 stay below 2**24 and are thus exact in float32, in any order of summation; a
+    matrix product is some ten times faster than COLMAP's loops.
     """
     if min(len(a.points), len(b.points)) == 0:
         return np.zeros((0, 2), np.uint32)
     # All descriptors have nearly the same length, so the greatest product is the least angle.
-    forward = _nearest(a.descriptors @ b.descriptors.T, max_ratio, max_distance)
+    forward = _nearest(a.descriptors @ b.descriptors.T)
     rows = np.flatnonzero(forward >= 0)
     wanted, place = np.unique(forward[rows], return_inverse=True)
-    backward = _nearest(b.descriptors[wanted] @ a.descriptors.T, max_ratio, max_distance)
+    backward = _nearest(b.descriptors[wanted] @ a.descriptors.T)
     rows = rows[backward[place] == rows]
     return np.stack([rows, forward[rows]], axis=1).astype(np.uint32)
 
 
-def _nearest(products: Floats32, max_ratio: float, max_distance: float) -> NDArray[np.intp]:
+def _nearest(products: Floats32) -> NDArray[np.intp]:
     """Column of the nearest descriptor of each row, -1 where there is no clear one; spoils ``products``."""
     rows = np.arange(len(products))
     best = products.argmax(axis=1)
@@ -178,7 +181,7 @@ def _nearest(products: Floats32, max_ratio: float, max_distance: float) -> NDArr
     products[rows, best] = -1.0
     second = np.maximum(products.max(axis=1), 0.0)
     near, next_near = (np.arccos(np.minimum(p / UNIT_BYTES**2, 1.0)) for p in (first, second))
-    return np.where((near <= max_distance) & (near < max_ratio * next_near), best, -1)
+    return np.where((near <= MAX_DISTANCE) & (near < MAX_RATIO * next_near), best, -1)
 
 
 def image_pairs(frames: int, span: int) -> list[tuple[int, int]]:
@@ -225,7 +228,7 @@ def _run(params: CrosscheckParams, args: Mapping[str, Any], inputs: Inputs) -> B
         _read(best, poses, observations)
         meta["points"], meta["observations"] = int(best.num_points3D()), int(observations.sum())
         meta["reprojection_px"] = float(best.compute_mean_reprojection_error())
-    registered = np.isfinite(poses).all(axis=(1, 2))
+    registered = posed(poses)
     meta["registered"] = int(registered.sum())
     meta["unregistered"] = [f for f, ok in zip(frames, registered, strict=True) if not ok]
     meta["reason"] = "" if models else _why(meta)

@@ -65,10 +65,10 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         raise InputError("RIL-320", "no elevation model to compare with truth")
     elevation = mosaic(parts, np.nan, lattice)
     true = np.asarray(truth["elevation"])
-    judged = (np.asarray(truth["seen"]) != 0) & in_window(lattice, args.get("window"))
+    seen, inside = np.asarray(truth["seen"]) != 0, in_window(lattice, args.get("window"))
     error = (elevation - true).astype(np.float32)
-    metrics = dem_accuracy(elevation, true, judged)
-    unseen = np.isfinite(elevation) & (np.asarray(truth["seen"]) == 0) & in_window(lattice, args.get("window"))
+    metrics = dem_accuracy(elevation, true, seen & inside)
+    unseen = np.isfinite(elevation) & ~seen & inside
     metrics["unseen"] = metric(int(unseen.sum()), "cells", "cells given that not both cameras see")
     if "tilt_deg" in truth.meta:
         how = "between the vertical of the model and the true one; the errors of elevation are against the tilted truth"

@@ -9,7 +9,7 @@ n . t + (q x n) . w (Rosenholm and Torlegard 1988; for shifts alone: Nuth and Ka
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -220,8 +220,7 @@ def _gauss_newton(
 def _with_rms(b: Grid, slopes: Floats, points: Floats, state: Alignment, before: Floats) -> Alignment:
     after = _difference(b, slopes, state.apply(points))[0]
     rms = tuple(float(np.sqrt(np.nanmean(e * e))) if np.isfinite(e).any() else float("nan") for e in (before, after))
-    kept = state.rotation, state.translation, state.centre, state.sigma, state.iterations, state.points
-    return Alignment(*kept, (rms[0], rms[1]))
+    return replace(state, rms=(rms[0], rms[1]))
 
 
 def errors(a: Grid, b: Grid, alignment: Alignment | None = None) -> Floats:

@@ -15,7 +15,7 @@ from rille.stages.core.arrays import Floats
 from rille.stages.evaluation.accuracy_parts import Metric, along, angle, inverse, metric, posed, relative_error, rms
 from rille.stages.geometry.geometry import cross_matrix, rotation_log
 
-STEPS = (1, 2, 5, 10, 20, 50)
+STEPS = (2, 5, 10, 20, 50)
 """Numbers of frames between the two poses of a relative error."""
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
 """Lengths of sections, as shares of the true path."""
@@ -28,11 +28,11 @@ MEANINGFUL = 3.0
 def by_steps(P: Floats, Q: Floats) -> dict[str, Metric]:
     """Relative errors of poses (n, 4, 4) over several numbers of frames, all pairs that far apart."""
     found: dict[str, Metric] = {}
-    for step in STEPS[1:]:
+    for step in STEPS:
         if step >= len(P):
             continue
         E = relative_error(P, Q, slice(None, -step), slice(step, None))
-        E = E[np.isfinite(E).all(axis=(1, 2))]
+        E = E[posed(E)]
         if len(E) == 0:
             continue
         how = f"of the motion over {step} frames, {len(E)} pairs"
@@ -78,7 +78,7 @@ def by_cause(P: Floats, Q: Floats) -> dict[str, Metric]:
     With p and q the estimated and the true displacement in the camera of the earlier frame: the scale is the
     least-squares factor of q, the direction the angle between their means, and what remains scatters.
     """
-    here = np.asarray(np.isfinite(P).all(axis=(1, 2)) & np.isfinite(Q).all(axis=(1, 2)))
+    here = posed(P) & posed(Q)
     both = here[:-1] & here[1:]
     dP, dQ = (inverse(T[:-1][both]) @ T[1:][both] for T in (P, Q))
     p, q = dP[:, :3, 3], dQ[:, :3, 3]
@@ -132,9 +132,8 @@ def against_claims(P: Floats, aligned: Floats, covariance: Floats) -> dict[str, 
     ``covariance`` (n, 6, 6) of (position m, rotation rad) in the world whose origin is the first posed frame, which is
     exact: ``aligned`` is the truth with the first poses made equal.
     """
-    known = np.asarray(np.isfinite(P).all(axis=(1, 2)) & np.isfinite(aligned).all(axis=(1, 2)))
-    known = np.asarray(known & np.isfinite(covariance).all(axis=(1, 2)))
-    claimed = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(covariance).all(axis=(1, 2))
+    claimed = posed(P) & posed(covariance)
+    known = claimed & posed(aligned)
     # The first frame is exact by definition and has no covariance to judge.
     rows, origin = np.flatnonzero(known)[1:], int(np.argmax(claimed))
     if len(rows) == 0 or not known[origin] or not (np.linalg.eigvalsh(covariance[rows])[:, 0] > 0).all():

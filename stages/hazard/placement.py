@@ -116,21 +116,20 @@ def stride(vehicle: Vehicle, cell: float) -> int:
     return max(1, int(vehicle.wheel_diameter / (PLACES_PER_WHEEL * cell) + 1e-6))
 
 
-def place(high: Floats32, low: Floats32, vehicle: Vehicle, cell: float, whole: Bools | None = None) -> Places:
+def place(high: Floats32, low: Floats32, vehicle: Vehicle, cell: float, whole: Bools) -> Places:
     """Put the vehicle down everywhere.
 
     Parameters
     ----------
     high, low : (row, col) float32, metres, highest and lowest ground in each coarse cell, NaN unknown.
     cell : side of a coarse cell, metres.
-    whole : (row, col) coarse cells that are wholly known; None: those with a height.
+    whole : (row, col) coarse cells that are wholly known.
     """
     stance = Stance.of(vehicle, cell)
-    gaps = np.isnan(high) if whole is None else ~whole
     reach = int(max(np.abs(stance.wheels).max(), np.abs(stance.belly).max()))
     stand, belly = (running_max(high, n) for n in (stance.wheel_reach, stance.belly_reach))
     ground = -running_max(-low, stance.wheel_reach)
-    patchy = [running_max(gaps.astype(np.float32), n) > 0 for n in (stance.wheel_reach, stance.belly_reach)]
+    patchy = [running_max((~whole).astype(np.float32), n) > 0 for n in (stance.wheel_reach, stance.belly_reach)]
     padded = [
         np.pad(np.where(np.isfinite(a), a, np.float32(np.nan)), reach, constant_values=np.nan)
         for a in (stand, ground, belly)

@@ -165,18 +165,12 @@ def _found(
     stretch: bool,
     p: PathParams,
 ) -> Route:
-    found, (start, target) = None, ends
-    if p.planner != "grid8":
-        found = _by_rows(maps, lattice, vehicle, heading, ends, p)
-    if p.planner == "grid8" or (
-        p.planner == "auto"
-        and found is not None
-        and not len(found.cells)
-        and (target is not None or (stretch and start is None))
-    ):
-        found = _by_grid(maps, lattice, vehicle, ends, p, found)
-    assert found is not None
-    return found
+    if p.planner == "grid8":
+        return _by_grid(maps, lattice, vehicle, ends, p, None)
+    found, (start, target) = _by_rows(maps, lattice, vehicle, heading, ends, p), ends
+    if p.planner == "rows" or len(found.cells) or (target is None and (start is not None or not stretch)):
+        return found
+    return _by_grid(maps, lattice, vehicle, ends, p, found)
 
 
 def _ground(maps: Maps, lattice: Lattice, grid: RowGrid, vehicle: Vehicle, p: PathParams) -> PathMaps:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -107,10 +107,7 @@ class RowGrid:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON form."""
-        return {"ahead": list(self.ahead), "i0": self.i0, "j0": self.j0, "cell": self.cell} | {
-            "rows": self.rows,
-            "cols": self.cols,
-        }
+        return asdict(self) | {"ahead": list(self.ahead)}
 
 
 class PathPrices(NamedTuple):

@@ -49,7 +49,7 @@ def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> di
         "found": len(xyz) > 0,
         "planner": route.planner,
         "ground": route.ground,
-        "reason": found.reason or "" if len(xyz) else _why(found, maps, vehicle),
+        "reason": found.reason if len(xyz) else _why(found, maps, vehicle),
         "blocking_row": found.blocking_row,
         "blocking_y": None if found.blocking_row is None else (grid.j0 - found.blocking_row) * grid.cell,
         "beside_unknown": route.ground != GROUNDS[0],

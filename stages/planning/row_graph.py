@@ -19,10 +19,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Bytes
+from rille.stages.numeric.line import copy_line
 from rille.stages.planning.configuration_space import LEFT, RIGHT, STRAIGHT
 
 Ints = NDArray[np.integer[Any]]
-Ways = Bytes
 Cell = tuple[int, int]
 
 UNREACHED = np.iinfo(np.int64).max // 4
@@ -59,7 +59,7 @@ FREE = Charges()
 
 
 def sweep(
-    height: Ints, ways: Ways, sources: Bools, charges: Charges = FREE
+    height: Ints, ways: Bytes, sources: Bools, charges: Charges = FREE
 ) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
     """Least cost from any source to every cell of the row graph, towards row 0.
 
@@ -104,7 +104,7 @@ def _sweep(height, ways, charges, sources, cost, move):  # type: ignore[no-untyp
             low, high = cols, -1
             continue
         if r + 1 < rows:
-            _copy_ways(ways[r + 1], around)
+            copy_line(ways[r + 1], around[1:])
         inner = slice(left, right)
         # Times the number of rows: the steps beside the charge of all moves sideways of a path weigh less than a unit.
         _scale(height[r, inner], 4 * rows, here[left + 1 : right + 1])
@@ -141,12 +141,6 @@ def _between(mask):  # type: ignore[no-untyped-def]
     while not mask[end - 1]:
         end -= 1
     return first, end
-
-
-@njit(cache=True, nogil=True)
-def _copy_ways(ways, out):  # type: ignore[no-untyped-def]
-    for c in range(ways.shape[0]):
-        out[c + 1] = ways[c]
 
 
 @njit(cache=True, nogil=True)
@@ -191,7 +185,7 @@ def _unpack(best, cost, move):  # type: ignore[no-untyped-def]
         move[c] = np.int8(best[c] & 3) if best[c] < far else np.int8(-1)
 
 
-def leading(ways: Ways, limit: int) -> Bools:
+def leading(ways: Bytes, limit: int) -> Bools:
     """Free cells (row, col) from which a row up to ``limit`` can be reached."""
     out = np.empty(ways.shape, dtype=np.bool_)
     _leading(ways, limit, out)
@@ -213,7 +207,7 @@ def _leading(ways, limit, out):  # type: ignore[no-untyped-def]
 
 def plan(
     height: Ints,
-    ways: Ways,
+    ways: Bytes,
     tolerance: int = 0,
     ends: tuple[Cell | None, Cell | None] = (None, None),
     span: tuple[int, int] | None = None,

@@ -73,7 +73,8 @@ def fit_plane(
             last, theta = theta, np.asarray(np.linalg.solve(weighted.T @ rays, weighted.T @ rho), dtype=np.float64)
             if np.abs(theta - last).max() <= SETTLED * np.abs(theta).max():
                 break
-        share = float(np.mean(_score(theta[None], rays, rho, sigma, tolerance) > 0))
+        expected = rays @ theta
+        share = float(np.mean((expected > HORIZON * sigma) & (np.abs(rho - expected) < tolerance)))
         # theta = -n / h: its length is one over the height.
         length = float(np.linalg.norm(theta))
         if share >= MIN_SHARE and bool(allowed(-theta[None] / length)[0]):
@@ -88,14 +89,9 @@ def fit_plane(
 MIN_POINTS = 100
 SETTLED = 1e-9  # share of the plane's parameters: of a height of metres, nanometres
 MIN_SHARE = 0.05
+HORIZON = 5.0  # standard deviations of an inverse depth below which it agrees with any plane, and is not counted
 SCORED = 1200  # points, about, that planes are compared on: the best one is then fitted to all
 HYPOTHESES = 1000  # an all-ground sample of three is among them (p > .999) where a fifth of the pixels are ground
-
-
-def _score(theta: Floats, rays: Floats, rho: Floats, sigma: Floats, tolerance: Floats) -> Floats:
-    """Truncated quadratic agreement (m, n) of planes (m, 3); the horizon agrees with any: not counted."""
-    expected = theta @ rays.T
-    return np.where(expected > 5.0 * sigma, np.maximum(0.0, 1.0 - ((rho - expected) / tolerance) ** 2), 0.0)
 
 
 def _consensus(
@@ -119,13 +115,13 @@ def _consensus(
     if not len(theta):
         return None
     totals, some = np.empty(len(theta)), slice(None, None, max(1, len(rays) // SCORED))
-    _totals(theta, rays[some], rho[some], 5.0 * sigma[some], tolerance[some] ** -2.0, totals)
+    _totals(theta, rays[some], rho[some], HORIZON * sigma[some], tolerance[some] ** -2.0, totals)
     return np.asarray(theta[int(np.argmax(totals))], dtype=np.float64)
 
 
 @njit(cache=True, nogil=True)
 def _totals(theta, rays, rho, horizon, information, out):  # type: ignore[no-untyped-def]
-    """Sums (m,) of :func:`_score` over the points."""
+    """Truncated quadratic agreement (m,) of planes (m, 3) with the points, summed."""
     for m in range(len(theta)):
         a, b, c = theta[m]
         total = 0.0

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
@@ -52,13 +53,12 @@ class MapLocalizationParams(Params):
 class Fix:
     """``place`` x, y (m), heading (rad), z (m) of the local frame; ``covariance`` (4, 4) of them.
 
-    ``score`` mean truncated square, ``overlap`` share; ``other``: the next best placement (x, y, heading) and by how
-    much its chi2 is larger, None where the search has only one minimum.
+    ``overlap`` share; ``other``: the next best placement (x, y, heading) and by how much its chi2 is larger, None where
+    the search has only one minimum.
     """
 
     place: Floats
     covariance: Floats
-    score: float
     overlap: float
     rms: float
     cells: int
@@ -193,14 +193,7 @@ def _other(
     scores: Floats, best: tuple[int, ...], axes: tuple[Floats, Floats, Floats], weight: float
 ) -> tuple[Floats, float] | None:
     """The least of the local minima that do not touch the best one's valley, and its chi2 above the best."""
-    padded = np.pad(scores, 1, constant_values=np.inf)
-    h, i, j = scores.shape
-    low = np.ones(scores.shape, bool)
-    for a in range(3):
-        for b in range(3):
-            for c in range(3):
-                if (a, b, c) != (1, 1, 1):
-                    low &= scores <= padded[a : a + h, b : b + i, c : c + j]
+    low = scores == scipy.ndimage.minimum_filter(scores, 3, mode="constant", cval=np.inf)
     # More than three steps: nearer minima belong to the same valley.
     away = np.max(np.abs(np.indices(scores.shape) - np.array(best).reshape(3, 1, 1, 1)), axis=0) > 3
     low &= away & np.isfinite(scores)
@@ -248,8 +241,7 @@ def _refine(
     rms = float(np.sqrt((weight * r**2).sum() / max(weight.sum(), 1e-12)))
     # By the errors found, and as many independent cells as there are correlation lengths.
     covariance: Floats = np.asarray(np.linalg.inv(normal) * rms**2 * max(1.0, n / independent), dtype=np.float64)
-    score = float(np.mean(np.minimum(np.abs(r), params.truncation * sigma) ** 2))
-    return Fix(place, covariance, score, n / len(points), rms, n, other)
+    return Fix(place, covariance, n / len(points), rms, n, other)
 
 
 def _differences(points: Floats, ground: Floats, lattice: Lattice, place: Floats) -> tuple[Floats, Floats]:
@@ -271,22 +263,15 @@ def _sample(ground, rows, cols):  # type: ignore[no-untyped-def]
     return out[0], out[1], out[2]
 
 
-def transform(found: Fix) -> RigidTransform:
-    """T_global_local of a placement."""
-    x, y, heading, z = found.place
-    return RigidTransform(rotation_exp([0.0, 0.0, heading]), np.array([x, y, z]))
-
-
-def handed_in(pose: tuple[float, float, float, float]) -> RigidTransform:
-    """T_global_local of a pose x, y, z (m), heading (rad) that was handed in."""
-    x, y, z, heading = pose
-    return RigidTransform(rotation_exp([0.0, 0.0, heading]), np.array([x, y, z]))
+def _transform(x: float, y: float, heading: float, z: float) -> list[float]:
+    """T_global_local of a place (m, rad), 12 numbers."""
+    return RigidTransform(rotation_exp([0.0, 0.0, heading]), np.array([x, y, z])).to_list()
 
 
 def _run(params: MapLocalizationParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     if "pose" in args:
         x, y, z, heading = (float(v) for v in args["pose"])
-        return Bundle({}, {"T_global_local": handed_in((x, y, z, heading)).to_list(), "source": "handed in"})
+        return Bundle({}, {"T_global_local": _transform(x, y, heading, z), "source": "handed in"})
     dem, given = inputs["dem"], inputs["map"]
     lattice = Lattice.from_dict(given.meta["lattice"])
     points = thin(np.asarray(dem["elevation"]), Lattice.from_dict(dem.meta["lattice"]), lattice.cell)
@@ -295,7 +280,7 @@ def _run(params: MapLocalizationParams, args: Mapping[str, Any], inputs: Inputs)
     found = fix(points, np.asarray(given["elevation"]), lattice, (x, y, heading), sigma, params)
     std = np.sqrt(np.diag(found.covariance))
     meta: dict[str, Any] = {
-        "T_global_local": transform(found).to_list(),
+        "T_global_local": _transform(*found.place),
         "source": "aligned to the global map",
         "std": [float(v) for v in std],
         "covariance": found.covariance.tolist(),

@@ -113,10 +113,9 @@ def audit(seams: Sequence[Facts], centres: Mapping[int, Sequence[float]]) -> tup
         near = np.isin(np.arange(len(every)), model.seams)
         factor = _factor(sizes, blamed if blamed.any() else near)
         others = sorted({int(end) for end in ends[model.seams].ravel()} - {worst})
-        entry = _entry(model, plane, [every[number] for number in of[worst]])
         listed.append(
             {"pair": worst}
-            | entry
+            | _entry(model, plane, [every[number] for number in of[worst]])
             | {
                 "chi2": chi2,
                 "score": chi2 / factor,

@@ -70,17 +70,11 @@ def slope_deg(elevation: ArrayLike, cell: float) -> Floats32:
     return np.asarray(np.degrees(np.arctan(np.hypot(gx, gy))), np.float32)
 
 
-def hillshade(elevation: ArrayLike, cell: float, *, azimuth_deg: float = 315.0, altitude_deg: float = 45.0) -> Bytes:
-    """Shaded relief (rows, cols), 1 (facing away) to 255 (facing the light), 0 unknown: GDAL's form.
-
-    Parameters
-    ----------
-    elevation, cell : as of :func:`gradient`.
-    azimuth_deg : where the light comes from, degrees clockwise from y; 315 is the upper left, as on maps.
-    altitude_deg : degrees above the horizon.
-    """
+def hillshade(elevation: ArrayLike, cell: float) -> Bytes:
+    """Shaded relief (rows, cols), 1 (facing away) to 255 (facing the light), 0 unknown: GDAL's form, in light from the
+    upper left, as on maps, 45 degrees above the horizon."""
     gx, gy = gradient(elevation, cell)
-    azimuth, altitude = math.radians(azimuth_deg), math.radians(altitude_deg)
+    azimuth, altitude = math.radians(315.0), math.radians(45.0)  # azimuth clockwise from y
     light = np.cos(altitude) * np.sin(azimuth), np.cos(altitude) * np.cos(azimuth), np.sin(altitude)
     facing = (light[2] - gx * light[0] - gy * light[1]) / np.sqrt(1.0 + gx * gx + gy * gy)
     shade = 1.0 + 254.0 * np.maximum(facing, 0.0)

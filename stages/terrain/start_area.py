@@ -49,8 +49,8 @@ def _run(params: StartAreaParams, args: Mapping[str, Any], inputs: Inputs) -> Bu
     sigma = np.float32(params.sigma * float(args["wheel_diameter"]))
     arrays = {
         "elevation": elevation,
-        "elevation_std": np.where(known, sigma, np.float32(np.nan)).astype(np.float32),
-        "residual": np.where(known, np.float32(0.0), np.float32(np.nan)).astype(np.float32),
+        "elevation_std": np.where(known, sigma, np.float32(np.nan)),
+        "residual": np.where(known, np.float32(0.0), np.float32(np.nan)),
         "ortho": np.full(elevation.shape, np.nan, np.float32),
     }
     return Bundle(arrays, {"lattice": lattice.to_dict(), "frame": "world", "pair": NOBODY})

@@ -78,8 +78,10 @@ class Ground:
 
         No margin is kept from hazards by sigma alone: sigma is the room for error there.
         """
-        near, margin = self._near(x, y), self.vehicle.margin
-        known = (gaps.gap > np.where(near, self.here[0], margin) - slack) & self._seen(gaps, near)
+        near, margin = self._away(x, y) <= HERE, self.vehicle.margin
+        known = (gaps.gap > np.where(near, self.here[0], margin) - slack) & (
+            gaps.unknown > np.where(near, self.unknown_here, 0.0)
+        )
         known &= gaps.doubtful > np.where(near, self.here[1], 0.0)
         # Hazards that are likely but not proven may be planned over, at a price: seen from nearer most of them go.
         opened = gaps.proven > np.where(near, self.here[2], margin) - slack
@@ -88,16 +90,9 @@ class Ground:
             opened &= known | (np.hypot(x - cx, y - cy) > self.p.failed_view_radius * self.vehicle.wheel_base)
         return known, opened | known
 
-    def _near(self, x: Floats, y: Floats) -> Bools:
-        """Which points lie in the start area (:data:`HERE`)."""
-        return np.asarray(self._away(x, y) <= HERE)
-
     def _away(self, x: Floats, y: Floats) -> Floats:
         """Distance from the start [wheelbases]."""
         return np.asarray(np.hypot(x - self.start[0], y - self.start[1]) / self.vehicle.wheel_base)
-
-    def _seen(self, gaps: Gaps, near: Bools) -> Bools:
-        return np.asarray(gaps.unknown > np.where(near, self.unknown_here, 0.0))
 
     def _price(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Bools, Floats]:
         """Poses that may be driven, and the price of a metre, infinite where none may be planned."""

@@ -142,7 +142,7 @@ def seen_so_far(near: Bundle, far: Bundle | None, p: LocalPlannerParams) -> tupl
 
 
 def _length(path: Floats) -> float:
-    return float(np.hypot(*np.diff(path, axis=0).T).sum()) if len(path) > 1 else 0.0
+    return float(np.hypot(*np.diff(path, axis=0).T).sum())
 
 
 STAGE = Stage(

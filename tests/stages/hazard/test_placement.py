@@ -17,7 +17,7 @@ CELL = 0.004
 def test_on_a_plane_tilt_and_slope_are_its_gradient(direction: float) -> None:
     y, x = np.mgrid[:90, :90] * CELL
     z = (0.3 * (x * math.cos(direction) + y * math.sin(direction))).astype(np.float32)
-    found = place(z, z, MODEL, CELL)
+    found = place(z, z, MODEL, CELL, np.isfinite(z))
     inner = np.s_[32:-32, 32:-32]
     # wheels are put on the nearest cell, so a side and an axle are not quite at right angles: half a cell of 80 mm
     for values in (found.tilt[inner], found.slope[inner]):
@@ -39,7 +39,7 @@ def test_a_stone_under_a_wheel_tilts_the_vehicle_as_three_wheels_do() -> None:
     at = Stance.of(MODEL, CELL)
     row, col = (int(v) for v in at.wheels[0, 0])
     high, low = stone(30 + row, 30 + col, 0.01)
-    found = place(high, low, MODEL, CELL)
+    found = place(high, low, MODEL, CELL, np.isfinite(high))
     span = 2 * abs(row) * CELL, 2 * abs(col) * CELL
     assert found.tilt[30, 30] == pytest.approx(math.hypot(0.01 / span[0], 0.01 / span[1]), rel=0.01)
     assert found.slope[30, 30] == 0.0  # the ground beneath is level
@@ -47,7 +47,7 @@ def test_a_stone_under_a_wheel_tilts_the_vehicle_as_three_wheels_do() -> None:
 
 def test_a_stone_under_the_belly_rises_by_its_height_and_tilts_nothing() -> None:
     high, low = stone(30, 30, 0.02)
-    found = place(high, low, MODEL, CELL)
+    found = place(high, low, MODEL, CELL, np.isfinite(high))
     assert found.rise[30, 30] == pytest.approx(0.02, rel=1e-5)
     assert found.tilt[30, 30] == 0.0
     assert found.rise[0, 0] == 0.0
@@ -58,7 +58,7 @@ def test_wheels_that_stand_higher_than_the_ground_below_count_as_level_with_it()
     high = np.zeros((61, 61), dtype=np.float32)
     y, x = np.mgrid[-30:31, -30:31] * CELL
     high[np.hypot(x, y) < 0.04] = -0.01
-    assert place(high, high, MODEL, CELL).rise[30, 30] == 0.0
+    assert place(high, high, MODEL, CELL, np.isfinite(high)).rise[30, 30] == 0.0
 
 
 def test_unknown_ground_under_one_wheel_is_told_and_the_others_are_still_judged() -> None:
@@ -66,7 +66,7 @@ def test_unknown_ground_under_one_wheel_is_told_and_the_others_are_still_judged(
     high, low = stone(*(int(v) + 30 for v in at.wheels[0, 0]), 0.01)
     r, c = (int(v) + 30 for v in at.wheels[0, 3])
     high[r - 4 : r + 5, c - 4 : c + 5] = low[r - 4 : r + 5, c - 4 : c + 5] = np.nan
-    found = place(high, low, MODEL, CELL)
+    found = place(high, low, MODEL, CELL, np.isfinite(high))
     assert 0.0 < found.unstood[30, 30] < 1.0
     assert found.tilt[30, 30] > 0.1
 
