@@ -165,7 +165,7 @@ class Merged:
     elevation_std: Floats32
     spread: Floats32
     count: NDArray[np.uint16]
-    source: NDArray[np.int16]
+    source: NDArray[np.int32]
     ortho: Floats32
     filled: Bytes
     relief_std: Floats32
@@ -249,7 +249,7 @@ def _empty(tile: Lattice) -> Merged:
         elevation_std=nan.copy(),
         spread=nan.copy(),
         count=np.zeros(tile.shape, np.uint16),
-        source=np.full(tile.shape, -1, np.int16),
+        source=np.full(tile.shape, -1, np.int32),
         ortho=nan.copy(),
         filled=np.zeros(tile.shape, np.uint8),
         relief_std=nan.copy(),
@@ -305,7 +305,7 @@ STAGE = Stage(
         raster("elevation_std", "m", "standard deviation of the elevation, poses included", "float32", "nan", "world"),
         raster("spread", "m", "standard deviation of the merged models about the elevation", "float32", "nan", "world"),
         raster("count", "1", "number of merged models", "uint16", "0", "world"),
-        raster("source", "1", "pair of the greatest weight", "int16", "-1", "world"),
+        raster("source", "1", "pair of the greatest weight", "int32", "-1", "world"),
         raster("ortho", "grey", "grey value, 0..255", "float32", "nan", "world"),
         raster("relief_std", "m", "standard deviation of the elevation against that around", "float32", "nan", "world"),
         raster("filled", "1", "1 where a small hole was closed by interpolation", "uint8", "", "world"),

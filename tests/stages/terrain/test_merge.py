@@ -89,6 +89,10 @@ def test_of_equal_weights_the_first_pair_is_the_source() -> None:
         assert (merged.source == 4).all()
 
 
+def test_a_pair_late_in_a_long_sequence_is_the_source() -> None:
+    assert (merge([layer(70_000, 0.1)], TILE, PARAMS).source == 70_000).all()
+
+
 @given(st.integers(1, 6), st.integers(0, 20))
 def test_the_mean_lies_among_the_models(count: int, seed: int) -> None:
     layers = noisy(count, seed)
