@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from rille.datasets.georeference import Georeference
@@ -27,12 +28,16 @@ FRAMES: dict[str, dict[str, Any]] = {
     },
 }
 
-IN_PLACE = (".tif", ".gpkg")
-"""Endings of the files whose coordinates are those of the sequence's CRS where it has one."""
 _PLACED = {
     "frame": "georeference",
     "crs": "that of georeference: easting, northing, height; metres; rasters are turned by the azimuth, not resampled",
 }
+IN_PLACE = {
+    ".tif": _PLACED
+    | {"raster": "row 0 at the greatest y of the world frame; the geotransform gives the corner of the first cell"},
+    ".gpkg": _PLACED,
+}
+"""By their endings, the files whose coordinates are those of the sequence's CRS where it has one: what is then said."""
 
 
 def describe(
@@ -61,7 +66,7 @@ def describe(
         world |= {"definition": UNLEVELLED}
     known = {output.name: output.about for output in OUTPUTS if output.name in written and output.about}
     if place is not None:
-        known = {name: facts | _PLACED if name.endswith(IN_PLACE) else facts for name, facts in known.items()}
+        known = {name: facts | IN_PLACE.get(Path(name).suffix, {}) for name, facts in known.items()}
     return {
         "format": FORMAT,
         "units": {"length": "m", "angle": "rad, deg where the name says so", "time": "s" if clock else "frame number"},

@@ -88,7 +88,8 @@ def _write(
             **coordinates,
         }
         if name == "elevation":
-            about |= {"positive": "up", "ancillary_variables": " ".join(n for n in arrays if n not in (name, "ortho"))}
+            others = (n for n in arrays if n not in (name, "ortho", SLOPE.name))
+            about |= {"positive": "up", "ancillary_variables": " ".join(others)}
         if spec.unit in UNITS:
             about["quantity"] = spec.unit
         _array(group, name, values, ("y", "x"), about, spec.nodata)

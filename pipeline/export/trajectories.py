@@ -29,6 +29,11 @@ def stamps(view: Any) -> list[float]:
     return [float(f) if times is None else times[f] for f in view.frames]
 
 
+def _main(trajectory: Bundle) -> int:
+    """The piece whose frame is the world."""
+    return int(trajectory.meta.get("main", 0))
+
+
 def _world(trajectory: Bundle, piece: int) -> str:
     """Frame of a piece in words."""
     verticals = list(trajectory.meta.get("verticals", [""]))
@@ -41,22 +46,21 @@ def _write_kitti(path: Path, view: Any) -> None:
 
 def _write_tum(path: Path, view: Any) -> None:
     trajectory = view.bundle(view.products.trajectory)
-    world = _world(trajectory, int(trajectory.meta.get("main", 0)))
-    write_trajectory_tum(path, world_poses(trajectory), stamps(view), world)
+    write_trajectory_tum(path, world_poses(trajectory), stamps(view), _world(trajectory, _main(trajectory)))
 
 
 def _write_pieces(path: Path, view: Any) -> None:
     trajectory = view.bundle(view.products.trajectory)
     for number in range(len(trajectory.meta.get("verticals", [""]))):
-        if number != int(trajectory.meta.get("main", 0)):
+        if number != _main(trajectory):
             piece, world = path.with_name(path.name.replace("*", str(number + 1))), _world(trajectory, number)
             write_trajectory_tum(piece, world_poses(trajectory, number), stamps(view), world)
 
 
 def _write_crosscheck(path: Path, view: Any) -> None:
-    compared = compare(view)
+    compared, trajectory = compare(view), view.bundle(view.products.trajectory)
     assert compared is not None
-    write_trajectory_tum(path, compared.poses, stamps(view))
+    write_trajectory_tum(path, compared.poses, stamps(view), _world(trajectory, _main(trajectory)))
 
 
 def _write_agreement(path: Path, view: Any) -> None:

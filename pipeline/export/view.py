@@ -51,7 +51,7 @@ class RunView:
     tasks : every task of the plan.
     config : validated configuration with all defaults, one section a stage, and ``vehicle``.
     bundle : the artifact of a handle, None where there is none (also for None); only what makes outputs needs it.
-    config_toml : the same, as it was written to ``config.toml``.
+    config_toml : the configuration, as it was written to ``config.toml``.
     seconds : wall-clock time of the run so far.
     versions : distribution or program to version.
     command : the command line that repeats this run.

@@ -252,7 +252,8 @@ def _cell(value: Any) -> str:
     if value is None or (isinstance(value, float) and not np.isfinite(value)):
         return ""
     if isinstance(value, float):
-        return f"{value:.9g}"
+        # Nine digits of seconds since 1970 would be steps of ten seconds.
+        return f"{value:.9g}" if abs(value) < 1e6 else f"{value:.15g}"
     # Names come from who wrote the data: what a terminal would obey is spelt out, what a spreadsheet would run quoted.
     text = plain(str(value))
     return f"'{text}" if isinstance(value, str) and text.startswith(FORMULA) else text
@@ -314,8 +315,7 @@ def write_confidence(
     ----------
     std, backmatch_error : (row, col) float32 pixels, NaN undefined.
     validity : (row, col) uint8, bits of :class:`rille.stages.core.validity.Validity`; written as whole numbers, and as
-    the tag
-        ``VALIDITY`` says.
+        the tag ``VALIDITY`` says.
     tags : more metadata.
     """
     from rille.stages.core.validity import Validity

@@ -14,8 +14,8 @@ SMALL = {"m": ("mm", 1000.0, 0.1), "m²": ("cm²", 10000.0, 0.01)}
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """Value with a sensible number of digits; a dash where there is none."""
-    if value is None:
+    """Value with a sensible number of digits; a dash where there is none (None, NaN)."""
+    if value is None or value != value:
         return "–"
     if isinstance(value, bool) or not isinstance(value, int | float):
         return str(value)
@@ -28,7 +28,9 @@ def number(value: Any, digits: int = 3) -> str:
 
 
 def quantity(value: Any, unit: str) -> str:
-    """Value with its unit, small lengths and areas in mm and cm²."""
+    """Value with its unit, small lengths and areas in mm and cm²; a dash where there is none (None, NaN)."""
+    if value is None or value != value:
+        return "–"
     if isinstance(value, float) and unit in SMALL and abs(value) < 1e-9:
         value = 0  # rounding
     if isinstance(value, int | float) and unit in SMALL and value != 0 and abs(value) < SMALL[unit][2]:
@@ -40,7 +42,7 @@ def quantity(value: Any, unit: str) -> str:
         return f"{number(100 * value)} %"
     if value == 1 and unit in ("frames", "cells"):
         unit = unit[:-1]
-    return f"{number(value)} {unit}".strip() if value is not None else "–"
+    return f"{number(value)} {unit}".strip()
 
 
 def metres(value: Any) -> str:

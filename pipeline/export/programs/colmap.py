@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts, check_new
 from rille.stages.core.declare import Bundle
@@ -74,20 +75,30 @@ def export_run(run: Path, target: Path, store: Store) -> str:
     bundles = RunArtifacts(run, store)
     rig = Rig.from_dict(bundles.one("calibration").meta["rig"])
     segments = _segments(bundles)
-    images = {f: b for s in segments for f in _ends(s.track)[:1] if (b := bundles.find(f"image/left/{f}")) is not None}
-    model = build(rig, bundles.one("trajectory"), _names(run), segments, images)
-    target.mkdir(parents=True, exist_ok=True)
-    model.write_text(str(target))
+    images = {key: found for s in segments if (found := _image(bundles, key := _ends(s.track)[0])) is not None}
+    # A drive has a trajectory at each stop: the last one is all of it.
+    model = build(rig, bundles.one("trajectory", last=True), _names(run), segments, images)
+    with atomic.replacing(target) as folder:
+        folder.mkdir()
+        model.write_text(str(folder))
     return (
         f"{target}: {model.num_reg_frames()} frames of 2 images, {model.num_points3D()} points, "
         f"{model.compute_mean_reprojection_error():.2f} px; open it with colmap gui --import_path"
     )
 
 
+def _image(bundles: RunArtifacts, frame: int) -> Bundle | None:
+    """The left image of an ideal camera."""
+    undistorted = bundles.find(f"undistort/left/{frame}")
+    return bundles.find(f"image/left/{frame}") if undistorted is None else undistorted
+
+
 def _segments(bundles: RunArtifacts) -> list[MatchedSegment]:
     """The segments of a run in their order."""
-    tracked = sorted(bundles.pairs("track", "resect"), key=lambda pair: _ends(pair[0])[0])
-    keys = [_ends(track)[0] for track, _ in tracked]
+    # A leg of a drive that was stopped is tracked once more, up to there: the later one counts.
+    of_key = {_ends(pair[0])[0]: pair for pair in bundles.pairs("track", "resect")}
+    keys = sorted(of_key)
+    tracked = [of_key[key] for key in keys]
     points = [(np.asarray(resection["landmarks"]), np.asarray(resection["inlier"])) for _, resection in tracked]
     # Where disparities were tilted, the adjustment without the tilt is the one whose poses count.
     for label in ("refine/untilted", "refine"):
@@ -215,8 +226,9 @@ def _points(
     columns, rows = (
         np.clip(np.nan_to_num(pixels[:, 0, k]).astype(int), 0, n - 1) for k, n in enumerate(grey.shape[::-1])
     )
-    # COLMAP's colours have 8 bits: of 16 the high byte.
-    values = grey[rows, columns] >> (8 * (grey.itemsize - 1))
+    values = grey[rows, columns]
+    # COLMAP's colours have 8 bits: of 16 the high byte. Undistorted images are floats of 0..255.
+    values = np.rint(values) if values.dtype.kind == "f" else values >> (8 * (values.itemsize - 1))
     # A point seen once would slide along its ray in any adjustment of the model.
     for k in map(int, np.flatnonzero(np.isfinite(world).all(1) & (agrees.sum(1) + twice.sum(1) > 1))):
         elements = []

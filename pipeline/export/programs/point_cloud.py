@@ -64,7 +64,10 @@ def _beside(run: Path, name: str, terrain: DemFile) -> NDArray[np.float64] | Non
     if found.values.shape != terrain.values.shape or found.transform != terrain.transform:
         raise InputError("RIL-602", f"{path} and dem.tif have other cells", remedy="make the run again")
     with rasterio.open(path) as raster:
-        return found.values if raster.count == 1 else np.moveaxis(raster.read().astype(np.float64), 0, 2)
+        if raster.count == 1:
+            return found.values
+        bands = raster.read(out_dtype="float64", masked=True).filled(np.nan)
+        return np.asarray(np.moveaxis(bands, 0, 2), np.float64)
 
 
 def write_laz(

@@ -35,13 +35,13 @@ class RunArtifacts:
         row = next((r for r in self.rows if r["label"] == label), None)
         return None if row is None else self._open(row)
 
-    def one(self, label: str) -> Bundle:
-        """The artifact of this label, or the first whose label begins with it."""
+    def one(self, label: str, *, last: bool = False) -> Bundle:
+        """The artifact of this label, or the first (or last) whose label begins with it."""
         # With the slash, "merge" does not find a stage whose name merely begins so.
-        row = next((r for r in self.rows if f"{r['label']}/".startswith(f"{label}/")), None)
-        if row is None:
+        rows = [r for r in self.rows if f"{r['label']}/".startswith(f"{label}/")]
+        if not rows:
             raise InputError("RIL-609", f"the run has no {label}", remedy="finish it with rille reconstruct")
-        return self._open(row)
+        return self._open(rows[-1 if last else 0])
 
     def all(self, stage: str) -> list[Bundle]:
         """All artifacts of a stage."""

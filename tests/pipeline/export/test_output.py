@@ -175,6 +175,19 @@ def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
     np.testing.assert_array_equal(crosscheck.timestamps, range(5))
 
 
+def test_both_trajectories_state_one_frame_where_the_vertical_is_not_known(tmp_path: Path) -> None:
+    whole, made = run()
+    made["trajectory"] = Bundle(made["trajectory"].arrays, made["trajectory"].meta | {"verticals": ["none"], "main": 0})
+    heads = []
+    for name in ("trajectory.tum", "crosscheck.tum"):
+        output = next(o for _, o in outputs() if o.name == name)
+        assert output.write is not None
+        output.write(tmp_path / name, whole)
+        heads.append((tmp_path / name).read_text().splitlines()[0])
+    assert heads[0] == heads[1]
+    assert "nothing tells of the vertical" in heads[0]
+
+
 @pytest.mark.parametrize("georeference", [None, PLACE], ids=["local", "placed"])
 def test_all_files_of_a_run_state_one_system(georeference: Georeference | None, tmp_path: Path) -> None:
     whole, _ = run(georeference)
@@ -190,6 +203,7 @@ def test_all_files_of_a_run_state_one_system(georeference: Georeference | None, 
     with laspy.open(tmp_path / "cloud.laz") as cloud:
         found["cloud.laz"] = pyproj.CRS.from_wkt(next(v.string for v in cloud.header.vlrs if v.record_id == 2112))
     terrain = xarray.open_zarr(tmp_path / "terrain.zarr")
+    assert set(terrain.elevation.attrs["ancillary_variables"].split()) == {"elevation_std", "spread", "count"}
     local = pyproj.CRS.from_wkt(terrain.spatial_ref.attrs["crs_wkt"])
     found["terrain.zarr"] = local if georeference is None else pyproj.CRS.from_cf(terrain.crs.attrs)
     assert len(found) >= 10

@@ -223,6 +223,13 @@ def test_tables_leave_empty_what_is_not_known(tmp_path: Path) -> None:
     ]
 
 
+def test_times_since_1970_keep_their_microseconds(tmp_path: Path) -> None:
+    write_table(tmp_path / "a.csv", {"time_s": [1403636579.763555, 1403636579.813555, 0.1 + 0.2]})
+    rows = [row["time_s"] for row in csv.DictReader((tmp_path / "a.csv").open())]
+    assert rows[2] == "0.3"
+    np.testing.assert_allclose(np.array(rows[:2], float) - 1403636579, [0.763555, 0.813555], atol=1e-5)
+
+
 def test_only_what_was_written_is_described() -> None:
     facts = describe(["dem.tif", "notes.txt"], [3], ["left003"], [0.5], clock=True)
     assert list(facts["files"]) == ["dem.tif"]
@@ -232,4 +239,6 @@ def test_only_what_was_written_is_described() -> None:
     placed = describe(["dem.tif", "path.geojson"], [3], ["left003"], [0.5], clock=True, place=place)
     assert placed["files"]["dem.tif"]["frame"] == "georeference"
     assert placed["files"]["path.geojson"]["frame"] == "world"
+    assert facts["files"]["dem.tif"]["raster"].endswith("north is y")
+    assert "north" not in placed["files"]["dem.tif"]["raster"], "the raster is turned by the azimuth"
     assert placed["georeference"]["origin"] == [1.0, 2.0, 3.0]

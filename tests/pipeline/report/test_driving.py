@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from rille.pipeline.report.driving import tracks
+from rille.pipeline.report.words import metres, number
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 
@@ -30,3 +31,7 @@ def test_tracks_of_a_drive_that_lost_frames():
     assert np.isnan(truth[0]).all()
     np.testing.assert_allclose(found[[0, 2, 3]], wheels[[0, 2, 3]], atol=1e-12)
     np.testing.assert_allclose(truth[1:], wheels[1:], atol=1e-12)
+
+
+def test_a_gap_is_a_dash_in_words():
+    assert [number(np.nan), metres(np.nan), metres(None)] == ["–"] * 3

@@ -1,10 +1,15 @@
 """A run as a COLMAP model: written, read again, and compared with what went in."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pycolmap
+import pytest
 from raising import raises
 
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.export.programs import colmap
 from rille.pipeline.export.programs.colmap import MatchedSegment, build, export_run
 from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import Validity
@@ -97,6 +102,62 @@ def test_an_adjustment_of_the_model_keeps_its_scale():
     first, last = (model.frames[k].rig_from_world.inverse().translation for k in (1, 2))
     true = poses[2].translation - poses[0].translation
     assert abs(np.linalg.norm(last - first) / np.linalg.norm(true) - 1.0) < 0.02
+
+
+class Artifacts:
+    """A store whose references are labels."""
+
+    def __init__(self, made):
+        self.made = made
+
+    def lookup(self, stage, key):
+        return key
+
+    def open(self, ref):
+        return self.made[ref]
+
+
+def driven(folder):
+    """The folder and the artifacts of a drive of one leg, which was stopped; lenses were undone."""
+    trajectory, segments, _, _ = parts()
+    track, resection, matches = segments[0].track, segments[0].resection, segments[0].matches
+    start = Bundle({"poses": trajectory["poses"][:1]}, {"frames": FRAMES[:1]})
+    made = {
+        "calibration": Bundle({}, {"rig": RIG.to_dict()}),
+        f"hfvm/{FRAMES[0]}": matches[FRAMES[0]],
+        f"image/left/{FRAMES[0]}": Bundle({"image": np.full((480, 640), 200, np.uint8)}, {}),
+        f"undistort/left/{FRAMES[0]}": Bundle({"image": np.full((480, 640), 76.6, np.float32)}, {}),
+        "trajectory/0": start,
+        "track/3": track,
+        "resect/3": resection,
+        "track/3/stopped": track,
+        "resect/3/stopped": resection,
+        "trajectory/1": trajectory,
+    }
+    rows = [{"label": name, "stage": name.split("/")[0], "status": "computed", "key": name} for name in made]
+    (folder / "ledger.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (folder / "frames.json").write_text("{}")
+    return Artifacts(made)
+
+
+def test_a_drive_gives_its_whole_trajectory_and_each_point_once(tmp_path):
+    export_run(tmp_path, tmp_path / "model", driven(tmp_path))
+    model = pycolmap.Reconstruction(str(tmp_path / "model"))
+    assert model.num_reg_frames() == 2
+    assert model.num_points3D() == 40
+    assert {tuple(p.color) for p in model.points3D.values()} == {(77, 77, 77)}, "of the image without distortion"
+
+
+def test_a_model_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    class Full:
+        def write_text(self, folder):
+            (Path(folder) / "cameras.txt").write_text("half")
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(colmap, "build", lambda *_: Full())
+    with pytest.raises(OSError, match="No space"):
+        export_run(tmp_path, tmp_path / "model", driven(tmp_path))
+    assert {p.name for p in tmp_path.iterdir()} == {"ledger.jsonl", "frames.json"}
 
 
 def test_what_is_no_run_or_has_content_is_said(tmp_path):

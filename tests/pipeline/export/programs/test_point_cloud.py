@@ -17,6 +17,7 @@ from terrain_runs import LATTICE, PLACE, elevation, finished
 from rille.datasets.georeference import Georeference
 from rille.pipeline.export.programs import point_cloud
 from rille.pipeline.export.read_dem import read_elevation
+from rille.pipeline.export.writers import Meaning, write_raster
 
 KNOWN = np.isfinite(elevation())
 
@@ -159,3 +160,12 @@ def test_cells_without_an_image_are_grey(tmp_path: Path) -> None:
     (mesh,) = trimesh.load(tmp_path / "a.glb").geometry.values()
     texture = np.asarray(mesh.visual.material.baseColorTexture.convert("L"))
     assert np.unique(texture).tolist() == [7, point_cloud.UNSEEN]
+
+
+def test_cells_without_an_image_are_grey_in_a_coloured_run_too(tmp_path: Path) -> None:
+    run = finished(tmp_path)
+    bands = np.full((3, *KNOWN.shape), 90, np.uint8)
+    bands[:, 20:25] = 0  # 0 means unknown in the file
+    write_raster(run / "ortho.tif", dict(zip(("red", "green", "blue"), bands, strict=True)), LATTICE, Meaning(nodata=0))
+    path, _ = point_cloud.export(run, "ply", None)
+    assert np.unique(trimesh.load(path).colors[:, :3]).tolist() == [90, point_cloud.UNSEEN]
