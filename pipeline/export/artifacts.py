@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rille.pipeline.export.view import RunView
 from rille.stages.core.declare import Bundle
+from rille.stages.evaluation import accuracy
 from rille.stages.geometry.geometry import Rig
 
 Floats = NDArray[Any]
@@ -29,12 +30,8 @@ def image(view: RunView, frame: int) -> Bundle | None:
 def by_frame(view: RunView, bundle: Bundle, name: str) -> Floats:
     """An array of an artifact with one row for each chosen frame, NaN where it has none."""
     values = np.asarray(bundle[name], dtype=np.float64)
-    row = {frame: i for i, frame in enumerate(bundle.meta.get("frames") or view.frames[: len(values)])}
-    out = np.full((len(view.frames), *values.shape[1:]), np.nan)
-    for i, frame in enumerate(view.frames):
-        if frame in row:
-            out[i] = values[row[frame]]
-    return out
+    frames = list(bundle.meta.get("frames") or view.frames[: len(values)])
+    return accuracy.by_frame(values, frames, list(view.frames))
 
 
 def chain(view: RunView) -> tuple[int, ...]:

@@ -70,7 +70,7 @@ def compare(view: RunView) -> Comparison | None:
     if trajectory is not None and "piece" in trajectory.arrays:  # other pieces lie in frames of their own
         piece = by_frame(view, trajectory, "piece")
         found["poses"][(piece >= 0) & (piece != trajectory.meta["main"])] = np.nan
-    flagged = np.nan_to_num(by_frame(view, bundle, "flagged").astype(np.float64)) > 0
+    flagged = np.nan_to_num(by_frame(view, bundle, "flagged")) > 0
     p = view.products
     error, theirs = (_error(view, view.bundle(handle)) for handle in (p.accuracy, p.crosscheck_accuracy))
     return Comparison(view.frames, **found, flagged=flagged, error=error, error_crosscheck=theirs, meta=bundle.meta)

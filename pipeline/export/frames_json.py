@@ -64,7 +64,7 @@ def describe(
     if vertical == NO_VERTICAL:
         world |= {"axes": {"x": "right", "y": "optical axis of the first camera", "z": "that camera's up"}}
         world |= {"definition": UNLEVELLED}
-    known = {output.name: output.about for output in OUTPUTS if output.name in written and output.about}
+    known = {o.name: {"frame": o.frame, **o.facts} for o in OUTPUTS if o.name in written and o.frame}
     if place is not None:
         known = {name: facts | IN_PLACE.get(Path(name).suffix, {}) for name, facts in known.items()}
     return {

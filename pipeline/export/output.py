@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
@@ -71,11 +71,6 @@ class Output:
     knows: tuple[str, ...] = ()
     frame: str = ""
     facts: Mapping[str, str] = field(default_factory=dict)
-
-    @cached_property
-    def about(self) -> dict[str, str]:
-        """Entry of the file in ``frames.json``; empty for files without coordinates."""
-        return {"frame": self.frame, **self.facts} if self.frame else {}
 
 
 def stage(name: str, summary: str, outputs: Sequence[Output]) -> Stage:

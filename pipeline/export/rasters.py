@@ -134,13 +134,14 @@ def _write_reasons(path: Path, view: Any) -> None:
 def _write_hazard(path: Path, view: Any) -> None:
     """Write the probability of a hazard and the measures, in metres and degrees."""
     risk = view.bundle(view.products.world_risk)
-    units = {a.name: a.unit for a in RISK.outputs if a.unit in ("m", "rad") and a.name != "elevation"}
-    bands = {"p_hazard": risk["p_hazard"]}
-    bands |= {name: np.degrees(risk[name]) if unit == "rad" else risk[name] for name, unit in units.items()}
-    unit = {name: {"rad": "degree"}.get(units.get(name, ""), units.get(name, "")) for name in bands}
+    bands, units = {"p_hazard": risk["p_hazard"]}, {"p_hazard": ""}
+    for a in RISK.outputs:
+        if a.unit in ("m", "rad") and a.name != "elevation":
+            bands[a.name] = np.degrees(risk[a.name]) if a.unit == "rad" else risk[a.name]
+            units[a.name] = "degree" if a.unit == "rad" else a.unit
     given = {name: rounded(np.asarray(values, dtype=np.float32), BITS) for name, values in bands.items()}
     lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
-    write_raster(path, given, lattice, Meaning(unit, tags=_vehicle(risk)), place)
+    write_raster(path, given, lattice, Meaning(units, tags=_vehicle(risk)), place)
 
 
 def _vehicle(risk: Bundle) -> dict[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -139,8 +139,7 @@ def _of_run(path: Path) -> DemFile:
             f"{path} has no dem.tif",
             remedy="give the folder of a finished run, RUNS/sequence/latest, or a GeoTIFF",
         )
-    found = read_tiff(path / "dem.tif")
-    return DemFile(str(path), found.values, found.transform, found.crs, _cameras(path), found.warnings)
+    return replace(read_tiff(path / "dem.tif"), name=str(path), viewpoints=_cameras(path))
 
 
 def _cameras(run: Path) -> NDArray[np.float64] | None:

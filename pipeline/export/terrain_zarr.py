@@ -56,46 +56,36 @@ def write_terrain(
     place : of the world frame, where it is known.
     facts : attributes of the whole group, e.g. ``title``, ``source``.
     """
-    with atomic.replacing(path) as temporary:
-        _write(temporary, arrays, lattice, place, facts)
-
-
-def _write(
-    folder: Path,
-    arrays: Mapping[str, tuple[Array, NDArray[Any]]],
-    lattice: Lattice,
-    place: Georeference | None,
-    facts: Mapping[str, Any],
-) -> None:
     import zarr
     from zarr.storage import LocalStore
 
     attributes = {"Conventions": CONVENTIONS, **facts, "frame": FRAME, "cell_size_m": lattice.cell}
     if place is not None:
         attributes |= {f"georeference_{name}": value for name, value in place.to_dict().items()}
-    group = zarr.create_group(store=LocalStore(folder), zarr_format=2, attributes=attributes)
-    _coordinates(group, lattice, place)
-    coordinates = {"coordinates": "spatial_ref"}
-    if place is not None:
-        coordinates = {"coordinates": "spatial_ref easting northing", "grid_mapping": "crs: easting northing"}
-    for name, (spec, values) in arrays.items():
-        about: dict[str, Any] = {
-            "units": UNITS.get(spec.unit, spec.unit),
-            "long_name": spec.long_name,
-            "frame": spec.frame or "world",
-            # GDAL's own attribute for the system of a zarr array.
-            "_CRS": {"wkt": ENGINEERING_CRS},
-            **coordinates,
-        }
-        if name == "elevation":
-            others = (n for n in arrays if n not in (name, "ortho", SLOPE.name))
-            about |= {"positive": "up", "ancillary_variables": " ".join(others)}
-        if spec.unit in UNITS:
-            about["quantity"] = spec.unit
-        _array(group, name, values, ("y", "x"), about, spec.nodata)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # zarr says that readers of other languages may not know consolidated metadata
-        zarr.consolidate_metadata(LocalStore(folder))
+    with atomic.replacing(path) as folder:
+        group = zarr.create_group(store=LocalStore(folder), zarr_format=2, attributes=attributes)
+        _coordinates(group, lattice, place)
+        coordinates = {"coordinates": "spatial_ref"}
+        if place is not None:
+            coordinates = {"coordinates": "spatial_ref easting northing", "grid_mapping": "crs: easting northing"}
+        for name, (spec, values) in arrays.items():
+            about: dict[str, Any] = {
+                "units": UNITS.get(spec.unit, spec.unit),
+                "long_name": spec.long_name,
+                "frame": spec.frame or "world",
+                # GDAL's own attribute for the system of a zarr array.
+                "_CRS": {"wkt": ENGINEERING_CRS},
+                **coordinates,
+            }
+            if name == "elevation":
+                others = (n for n in arrays if n not in (name, "ortho", SLOPE.name))
+                about |= {"positive": "up", "ancillary_variables": " ".join(others)}
+            if spec.unit in UNITS:
+                about["quantity"] = spec.unit
+            _array(group, name, values, ("y", "x"), about, spec.nodata)
+        # zarr says that readers of other languages may not know consolidated metadata.
+        with warnings.catch_warnings(action="ignore"):
+            zarr.consolidate_metadata(LocalStore(folder))
 
 
 def _coordinates(group: Any, lattice: Lattice, place: Georeference | None) -> None:

@@ -198,24 +198,22 @@ def _map_sheet(extent: Extent, bar: bool, max_height: float) -> tuple[Any, Any, 
     return fig, ax, cax
 
 
-def image_axes(shape: tuple[int, ...], *, bar: bool = False) -> tuple[Any, Any, Any]:
+def image_axes(shape: tuple[int, ...]) -> tuple[Any, Any, Any]:
     """Figure filled by an image of ``shape`` (rows, cols), axes in pixels, and axes for a colour bar below it.
 
     Images of one shape share one sheet, see :func:`map_axes`.
     """
-    return _wiped(_image_sheet(shape[0], shape[1], bar))
+    return _wiped(_image_sheet(shape[0], shape[1]))
 
 
 @lru_cache(maxsize=4)
-def _image_sheet(rows: int, cols: int, bar: bool) -> tuple[Any, Any, Any]:
-    height = WIDTH * rows / cols
-    foot = 0.6 if bar else 0.0
+def _image_sheet(rows: int, cols: int) -> tuple[Any, Any, Any]:
+    height, foot = WIDTH * rows / cols, 0.6
     fig = figure(WIDTH, height + foot)
     total = height + foot
     ax = fig.add_axes((0.0, foot / total, 1.0, height / total))
     ax.set_axis_off()
-    cax = fig.add_axes((0.04, 0.41 / total, 0.92, 0.12 / total)) if bar else None
-    return fig, ax, cax
+    return fig, ax, fig.add_axes((0.04, 0.41 / total, 0.92, 0.12 / total))
 
 
 def _wiped(sheet: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:

@@ -159,13 +159,13 @@ def basic_pairs(scene: Scene) -> Block | None:
     meta = bundle.meta
     tracked = chain(view)
     pairs = [tracked[i] for i in meta.get("basic", ())]
-    overlap = np.array([np.nan if v is None else v for v in meta.get("overlap") or [None] * len(pairs)], dtype=float)
-    moved = np.array([np.nan if v is None else v for v in meta.get("displacement") or ()], dtype=float)
+    # None becomes NaN.
+    overlap = np.array(meta.get("overlap") or [None] * len(pairs), dtype=float)
+    moved = np.array(meta.get("displacement") or (), dtype=float)
     if len(moved) != len(tracked) - 1:
         moved = np.full(len(tracked) - 1, np.nan)
     params = getattr(view.config, "keyframes", None)
-    by_overlap = getattr(params, "rule", "") == "overlap"
-    wanted = params.overlap if by_overlap and params is not None else None
+    wanted = params.overlap if params is not None and params.rule == "overlap" else None
     known = overlap[np.isfinite(overlap)]
     shares = f"{known.min():.0%} to {known.max():.0%}" if len(known) else "not known"
     alt = f"Overlap of successive basic pairs {shares}; displacement between frames {spread(moved)} px"
@@ -300,32 +300,30 @@ def _side_by_side(scene: Scene) -> Table | None:
 def overlaps(scene: Scene) -> Block | None:
     """Disagreement of elevation models that see the same ground."""
     world, differences = scene.world, scene.differences
-    panels = []
-    several = None
-    if world is not None and world.get("spread") is not None and world.get("count") is not None:
-        several = np.where(world.arrays["count"] > 1, world.arrays["spread"], np.nan)
-        if np.isfinite(several).any():
+    panels, words = [], []
+    if world is not None and {"spread", "count"} <= world.arrays.keys():
+        count = world.arrays["count"]
+        several = np.where(count > 1, world.arrays["spread"], np.nan)
+        known = int(np.isfinite(several).sum())
+        if known:
             alt = f"Standard deviation of the merged models about their mean, {spread(several)} m"
             panels.append(figures.scalar_map(several, world.extent, "deviation of the models", alt))
+            words.append(
+                "First: standard deviation of the models that were merged in a cell "
+                f"({known / max(int((count > 0).sum()), 1):.0%} of the mapped cells have more than one), "
+                f"median {length(float(np.median(ranges.sample(several))))}."
+            )
     if differences:
         rows = np.array([(d.median, d.deviation, d.predicted) for d in differences])
-        pairs = [d.pair for d in differences]
-        words_ = f"median {spread(rows[:, 0])} m, deviation {spread(rows[:, 1])} m"
-        alt = f"Elevation differences of successive models: {words_}"
-        panels.append(figures.differences(pairs, rows[:, 0], rows[:, 1], rows[:, 2], alt))
-    if not panels:
-        return None
-    words = []
-    if several is not None and np.isfinite(several).any():
-        share = float(np.isfinite(several).sum()) / max(int((world.arrays["count"] > 0).sum()), 1)  # type: ignore[union-attr]
-        median = float(np.median(ranges.sample(several)))
-        words.append(
-            f"First: standard deviation of the models that were merged in a cell ({share:.0%} of the mapped cells have "
-            f"more than one), median {length(median)}."
+        alt = (
+            f"Elevation differences of successive models: median {spread(rows[:, 0])} m, "
+            f"deviation {spread(rows[:, 1])} m"
         )
-    if differences:
+        panels.append(figures.differences([d.pair for d in differences], rows[:, 0], rows[:, 1], rows[:, 2], alt))
         words.append(
             "Elevation of each model minus that of the one before, in the cells that both have: a median beside zero "
             "is an error of pose or rig, a deviation above the expected one is noise that the σ does not know."
         )
+    if not panels:
+        return None
     return Block("Overlap", "Where elevation models overlap", " ".join(words), tuple(panels))

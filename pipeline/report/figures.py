@@ -16,6 +16,7 @@ from rille.pipeline.export import ranges
 from rille.pipeline.report import canvas
 from rille.pipeline.report.canvas import Extent, Panel
 from rille.stages.core.validity import defined, matched
+from rille.stages.evaluation.crosscheck import grey_bytes
 from rille.stages.hazard.risk import HAZARDOUS
 
 Floats = NDArray[Any]
@@ -27,12 +28,12 @@ CELLS = 24
 
 def photo(image: Floats, alt: str) -> Panel:
     """A camera image; ``image`` (row, col) grey or (row, col, 3), of 8 or 16 bits or float 0..255."""
-    return canvas.panel(canvas.fitted(grey(image)), alt, photo=True)
+    return canvas.panel(canvas.fitted(grey_bytes(image)), alt, photo=True)
 
 
 def disparity(values: Floats, label: str, alt: str) -> Panel:
     """One component of the disparity (row, col), pixels, NaN undefined, with its colour bar (Figure 6)."""
-    fig, ax, cax = canvas.image_axes(values.shape, bar=True)
+    fig, ax, cax = canvas.image_axes(values.shape)
     low, high = ranges.limits(values)
     style = {"cmap": canvas.color_map("viridis"), "vmin": low, "vmax": high, "interpolation": "none"}
     drawn = ax.imshow(canvas.shrink(values), aspect="auto", **style)
@@ -69,7 +70,7 @@ def elevation_with_path(elevation: Floats, risk: Bytes | None, path: Floats | No
     shown = np.where(blocked, np.nan, elevation * factor)
     low, high = ranges.ground_limits(shown)
     drawn = _show(ax, shown, extent, cmap=_greys(), vmin=low, vmax=high)
-    if path is not None and len(path):
+    if path is not None:
         canvas.polyline(ax, path, color=canvas.HAZARDOUS)
     canvas.color_bar(drawn, cax, f"elevation, {unit}")
     canvas.scale_bar(ax, extent)
@@ -83,7 +84,7 @@ def risk_map(risk: Bytes, path: Floats | None, extent: Extent, alt: str, *, far:
     """
     fig, ax, _ = canvas.map_axes(extent)
     _show(ax, paint(risk, *canvas.RISK), extent)
-    if path is not None and len(path):
+    if path is not None:
         canvas.polyline(ax, path)
     if far is not None and len(far):
         size = max(2.0, min(12.0, 500.0 / len(far)))
@@ -102,7 +103,7 @@ def cost_to_go(cost: Floats, path: Floats | None, extent: Extent, alt: str) -> P
     drawn = _show(
         ax, finite * factor, extent, cmap=canvas.color_map("cividis"), vmin=0, vmax=ranges.limits(finite)[1] * factor
     )
-    if path is not None and len(path):
+    if path is not None:
         canvas.polyline(ax, path)
     canvas.color_bar(drawn, cax, f"cost of the path, {unit}")
     return canvas.encode(fig, alt, photo=True)
@@ -114,7 +115,7 @@ def tracks(image: Floats, trails: Sequence[Floats], inlier: Sequence[bool], alt:
     from PIL import ImageDraw
 
     fine = 2  # drawn twice as large and averaged, for smooth lines
-    ground = canvas.fitted(grey(image), scale=fine)
+    ground = canvas.fitted(grey_bytes(image), scale=fine)
     picture = Pillow.fromarray(ground).convert("RGB")
     pen, factor = ImageDraw.Draw(picture), ground.shape[1] / image.shape[1]
     for trail, good in zip(trails, inlier, strict=True):
@@ -143,8 +144,6 @@ def trajectory(
     """
     everything = np.concatenate([p[:, :2] for p in (left, right, truth, other) if p is not None and len(p)])
     everything = everything[np.isfinite(everything).all(axis=1)]
-    if not len(everything):
-        everything = np.zeros((1, 2))
     centre, span = 0.5 * (everything.min(axis=0) + everything.max(axis=0)), np.ptp(everything, axis=0)
     half = np.maximum(0.5 * span, 0.18 * max(float(span.max()), 1e-3)) * 1.12
     extent = (centre[0] - half[0], centre[0] + half[0], centre[1] - half[1], centre[1] + half[1])
@@ -219,14 +218,6 @@ def _greys() -> Any:
     return LinearSegmentedColormap.from_list("greys", ["#5a5a5a", "#ffffff"]).with_extremes(bad="black")
 
 
-def grey(image: Floats) -> Bytes:
-    """8 bits of an image of 8 or 16 bits, or of float 0..255 (NaN black)."""
-    if image.dtype == np.uint8:
-        return np.asarray(image)
-    values = image / np.float32(257.0) if image.dtype == np.uint16 else np.nan_to_num(image)
-    return np.asarray(np.clip(np.rint(values), 0, 255), dtype=np.uint8)
-
-
 def paint(classes: Bytes, *colors: str) -> Floats:
     """Colours (row, col, 3) in 0..1 of classes 0, 1, 2 ..."""
     from matplotlib.colors import to_rgb
@@ -276,7 +267,7 @@ def residual_map(points: Floats, values: Floats, size: tuple[int, int], bound: f
     grid = np.full(rows * cols, np.nan)
     for at, part in zip(found, np.split(values[order], first[1:]), strict=True):
         grid[at] = np.median(part)
-    fig, ax, cax = canvas.image_axes((size[1], size[0]), bar=True)
+    fig, ax, cax = canvas.image_axes((size[1], size[0]))
     colors = canvas.color_map("PuOr")
     drawn = ax.imshow(
         grid.reshape(rows, cols), cmap=colors, vmin=-bound, vmax=bound, aspect="auto", interpolation="none"

@@ -22,12 +22,6 @@ Maker = Callable[[Scene], Block | None]
 Condition = Callable[[Scene], bool]
 
 
-def draw(view: Any) -> list[Figure]:
-    """Draw every figure whose artifacts are there, in the order of the page."""
-    scene = Scene(view)
-    return [_drawn(title, maker, expected, scene) for title, maker, expected, *_ in _FIGURES]
-
-
 def _drawn(title: str, maker: Maker, expected: Condition, scene: Scene) -> Figure:
     try:
         block = maker(scene)
@@ -150,14 +144,12 @@ def _path_words(scene: Scene) -> str:
             "Of a round patch at the start no camera saw anything: where the map has one, it is taken for flat ground, "
             "since the rover stands on it."
         )
+    path, vehicle = scene.view.bundle(scene.view.products.world_path), scene.view.config.vehicle
+    if path is None:
+        return "The path was not computed."
     if scene.path is None:
-        found = scene.view.bundle(scene.view.products.world_path)
-        return "The path was not computed." if found is None else f"There is no path: {found.meta.get('reason')}."
-    margin = length(scene.view.config.vehicle.margin)
-    path = scene.view.bundle(scene.view.products.world_path)
-    ground = "" if path is None else path.meta.get("ground", "")
-    before, beyond = (path.meta.get("left_out_m") if path is not None else None) or (0.0, 0.0)
-    vehicle = scene.view.config.vehicle
+        return f"There is no path: {path.meta.get('reason')}."
+    before, beyond = path.meta.get("left_out_m") or (0.0, 0.0)
     start = start_words(scene.view, " It ")
     rest = f"{start}." if start else ""
     x, y = scene.path[-1, :2]
@@ -176,10 +168,10 @@ def _path_words(scene: Scene) -> str:
         "outline": "no unknown ground comes under its outline",
         "wheels": "its wheels stay on known ground, its belly does not everywhere",
         "middle": "its middle stays on known ground, its wheels do not everywhere",
-    }.get(ground, "unknown ground is not entered")
+    }.get(path.meta.get("ground", ""), "unknown ground is not entered")
     return (
         "The path (black line; the vehicle stands at its start, a disk at its end) is that of the vehicle's middle; "
-        f"its wheels keep {margin} from hazards; {known}.{rest}"
+        f"its wheels keep {length(vehicle.margin)} from hazards; {known}.{rest}"
     )
 
 

@@ -62,13 +62,10 @@ LABELS: Mapping[str, str] = {
     "unknown_cells": "Unknown cells crossed",
     "crossed_cells": "Cells crossed",
     "hazardous_share": "Truly hazardous cells",
-}
-"""Words for the names that the assessing stages use."""
-LABELS = {
-    **LABELS,
     **{f"rpe_{n}_translation_rmse": f"Relative error over {n} frames, translation" for n in STEPS},
     **{f"rpe_{n}_rotation_rmse": f"Relative error over {n} frames, rotation" for n in STEPS},
 }
+"""Words for the names that the assessing stages use."""
 
 AGREEMENT: Mapping[str, str] = {
     "rmse": "Disagreement of position, RMS",

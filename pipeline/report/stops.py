@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from rille.pipeline.export import artifacts, ranges
 from rille.pipeline.report import canvas, gather
 from rille.pipeline.report.canvas import Block, Panel
-from rille.pipeline.report.figures import grey, paint
+from rille.pipeline.report.figures import paint
 from rille.pipeline.report.gather import Scene, Terrain
 from rille.stages.core.validity import matched
+from rille.stages.evaluation.crosscheck import grey_bytes
 
 Bytes = NDArray[np.uint8]
 
@@ -69,7 +70,7 @@ def column(scene: Scene, pair: int, width: int) -> Panel:
 
     view, pictures, words = scene.view, [], []
     image = artifacts.image(view, pair)
-    seen = None if image is None else grey(np.asarray(image["image"]))
+    seen = None if image is None else grey_bytes(np.asarray(image["image"]))
     found = view.bundle(view.products.disparity[pair])
     assert found is not None
     there, values = matched(np.asarray(found["validity"])), np.asarray(found["column_disparity"])

@@ -175,7 +175,7 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
     for t in view.tasks:
         zero = {"computed": 0, "cached": 0, "failed": 0, "skipped": 0, "seconds": 0.0, "seconds_when_computed": 0.0}
         row = found.setdefault(t.stage, zero)
-        row[t.status] = row.get(t.status, 0) + 1
+        row[t.status] += 1
         row["seconds"] += (t.seconds or 0.0) if t.status == "computed" else 0.0
         row["seconds_when_computed"] += t.seconds or 0.0
     for row in found.values():
@@ -185,7 +185,7 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
 
 READS = (
     "screening keyframes common_tilt crosschecks crosscheck agreement crosscheck_accuracy trajectory accuracy "
-    "position_accuracy accuracy_pieces overlap_audit disparity orientations rigs level local_dem local_risk local_path "
+    "position_accuracy overlap_audit disparity orientations rigs level local_dem local_risk local_path "
     "local_dem_accuracy resections refined world_dem world_tiles world_risk world_path dem_accuracy path_check drive"
 )
 KNOWS = (

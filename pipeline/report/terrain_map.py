@@ -20,6 +20,7 @@ from rille.pipeline.export.artifacts import Floats
 from rille.pipeline.report import canvas
 from rille.pipeline.report.gather import Scene, Terrain
 from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lattice import mosaic
 from rille.stages.hazard.risk import REASONS, UNKNOWN
 from rille.stages.odometry.resection.trajectory import world_poses
 from rille.stages.terrain.shading import slope_deg
@@ -94,15 +95,9 @@ def _plane(world: Terrain, name: str, step: int) -> Floats:
 def _of_risk(scene: Scene, name: str, missing: float) -> Floats:
     """An array of the risk map on the cells of the terrain."""
     assert scene.world is not None
-    shape = scene.world.lattice.shape
-    found = None if scene.risk is None else scene.risk.get(name)
-    if scene.risk is None or found is None:
-        return np.full(shape, missing)
-    out = np.full(shape, missing, dtype=found.dtype)
-    common = scene.world.lattice.intersection(scene.risk.lattice)
-    if common is not None:
-        out[scene.world.lattice.window(common)] = found[scene.risk.lattice.window(common)]
-    return out
+    if scene.risk is None or name not in scene.risk.arrays:
+        return np.full(scene.world.lattice.shape, missing)
+    return mosaic([(scene.risk.lattice, scene.risk.arrays[name])], missing, scene.world.lattice)
 
 
 def _steps(values: Floats, low: float, span: float, steps: int) -> NDArray[np.int64]:

@@ -101,9 +101,8 @@ def write_laz(
     cloud.return_number[:] = cloud.number_of_returns[:] = 1
     if ortho is not None:
         look = _colours(ortho)[row, col].astype(np.uint16) * np.uint16(257)  # LAS has colours of 16 bits
-        red, green, blue = look.T if look.ndim == 2 else (look, look, look)
-        cloud.intensity = look if look.ndim == 1 else np.rint(look @ LUMA).astype(np.uint16)
-        cloud.red, cloud.green, cloud.blue = red, green, blue
+        cloud.intensity = np.rint(look @ LUMA).astype(np.uint16)
+        cloud.red, cloud.green, cloud.blue = look.T
     if sigma is not None:
         cloud.sigma = sigma[row, col].astype(np.float32)
     with atomic.replacing(path) as temporary:
@@ -122,8 +121,7 @@ def write_ply(
     x, y = terrain.transform @ (col + 0.5, row + 0.5)
     columns = {"x": x, "y": y, "z": terrain.values[row, col]}
     if ortho is not None:
-        look = _colours(ortho)[row, col]
-        columns["red"], columns["green"], columns["blue"] = look.T if look.ndim == 2 else (look, look, look)
+        columns["red"], columns["green"], columns["blue"] = _colours(ortho)[row, col].T
     if sigma is not None:
         columns["sigma"] = sigma[row, col].astype(np.float32)
     points = np.empty(row.size, [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
@@ -176,8 +174,9 @@ def write_glb(
 
 
 def _colours(ortho: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Grey or colours of 8 bits, of the ortho image's shape; :data:`UNSEEN` where it has no value."""
-    return np.rint(np.clip(np.nan_to_num(ortho, nan=UNSEEN), 0, 255)).astype(np.uint8)
+    """Red, green and blue (rows, cols, 3) of an ortho image, grey or coloured; :data:`UNSEEN` where it has no value."""
+    bands = ortho if ortho.ndim == 3 else np.repeat(ortho[..., None], 3, axis=2)
+    return np.rint(np.clip(np.nan_to_num(bands, nan=UNSEEN), 0, 255)).astype(np.uint8)
 
 
 def _mesh(terrain: DemFile, step: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
@@ -210,9 +209,7 @@ def _texture(ortho: NDArray[np.float64] | None) -> Any:
     if max(image.size) > MAX_TEXTURE:
         image.thumbnail((MAX_TEXTURE, MAX_TEXTURE))
     # glTF's material is a metal unless told otherwise, and would mirror instead of showing the texture.
-    return PBRMaterial(
-        name="ortho", baseColorTexture=image.convert("RGB"), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
-    )
+    return PBRMaterial(name="ortho", baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
 
 
 Writer = Callable[[Path, DemFile, "NDArray[np.float64] | None", "NDArray[np.float64] | None"], str]
