@@ -146,7 +146,7 @@ def decode_colour(data: bytes, name: str, wanted: Header | None = None) -> tuple
     if image is None:
         raise InputError("RIL-763", f"{name} cannot be decoded", remedy=COPY_AGAIN)
     if complaint:
-        raise InputError("RIL-170", f"{name} is damaged ({complaint})", remedy=COPY_AGAIN)
+        raise InputError("RIL-192", f"{name} is damaged ({complaint})", remedy=COPY_AGAIN)
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError("RIL-172", f"{name} has samples of type {image.dtype}", remedy=FEWER_BITS)
     colour: NDArray[np.uint8] | None = None

@@ -134,7 +134,7 @@ def known(kind: Any, jobs: int | None = None) -> None:
         It is neither one of the kinds nor an address nor a ``Client`` of dask, or there are no ``jobs``.
     """
     if not isinstance(kind, str) and getattr(kind, "scheduler", None) is None:
-        raise ConfigError("RIL-539", f"{kind!r} is no open Client of dask", remedy="open one, or leave client out")
+        raise ConfigError("RIL-588", f"{kind!r} is no open Client of dask", remedy="open one, or leave client out")
     if isinstance(kind, str) and kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
         raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
     if jobs is not None and jobs < 1:

@@ -170,5 +170,5 @@ def test_an_edit_computes_again_exactly_what_it_can_change(editable):
 
 @pytest.mark.parametrize("client", [5, SimpleNamespace(scheduler=None)])
 def test_what_is_no_open_client_is_refused(client):
-    with raises("RIL-539", "no open Client"):
+    with raises("RIL-588", "no open Client"):
         base.known(client)
