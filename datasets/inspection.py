@@ -18,7 +18,7 @@ import numpy as np
 
 from rille.datasets.cameras import CalibratedCamera, read_cameras
 from rille.datasets.images.pairing import SIDES, SUFFIXES, common_size, natural, pair_up, side_of
-from rille.datasets.poses import read_positions
+from rille.datasets.poses import names_positions, read_positions
 from rille.datasets.text.reading import Search, read_lines
 from rille.stages.core.errors import InputError, RilleError
 
@@ -116,7 +116,13 @@ def inspect(folder: Path) -> Findings:
     used = set(found.calibration.files if found.calibration else ()) | set(found.others)
     for path in texts:
         relative = _relative(path, folder)
-        kind = table_kind(path, found.views.pairs) if path.suffix.lower() in TABLES and relative not in used else ""
+        if path.suffix.lower() not in TABLES or relative in used:
+            continue
+        try:
+            kind = table_kind(path, found.views.pairs)
+        except InputError as error:
+            found.unread.append(str(error))
+            continue
         if kind:
             found.tables.setdefault(kind, []).append(relative)
     return found
@@ -279,7 +285,13 @@ def _calibration(names: tuple[str, ...], cameras: list[CalibratedCamera]) -> Fou
 
 
 def table_kind(path: Path, pairs: int) -> str:
-    """What a table of numbers holds, by its header and first row: truth, imu, attitude, times, or nothing."""
+    """What a table of numbers holds, by its header and first row: truth, imu, attitude, times, or nothing.
+
+    Raises
+    ------
+    InputError
+        It is one of true positions, by the names of its columns, that cannot be read.
+    """
     try:
         lines = [line.strip() for line in read_lines(path, "table") if line.strip()]
     except InputError:
@@ -304,10 +316,7 @@ def table_kind(path: Path, pairs: int) -> str:
 
 def _are_positions(path: Path, pairs: int) -> bool:
     """Whether named columns are positions without rotation, and with times, or one a pair."""
-    try:
-        found = read_positions(path, "csv", {})
-    except InputError:
-        return False
+    found = read_positions(path, "csv", {}) if names_positions(path) else None
     return found is not None and (found.times is not None or len(found.positions) == pairs)
 
 

@@ -174,6 +174,14 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
     return TimedPositions(at, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings)
 
 
+def names_positions(path: Path) -> bool:
+    """Whether a file is a table whose columns are named as x and y, or east and north."""
+    try:
+        return {"x", "y"} <= _meanings(read_table(path, "pose file")).keys()
+    except InputError:
+        return False
+
+
 def _column(table: TextTable, told: str | int) -> int:
     """Number from 0 of a column that the manifest names or numbers."""
     if isinstance(told, str) and told.strip().lower() in table.header:

@@ -61,7 +61,7 @@ def _images(found: Findings) -> str:
 
 def _cameras(found: Findings) -> str:
     calibration, lines = found.calibration, ["[cameras]"]
-    lines += [f"# Not readable as calibration: {line}" for line in found.unread]
+    lines += [f"# Not readable: {line}" for line in found.unread]
     if calibration is None:
         lines.append(f"# {NEEDED}: no calibration was found; give a file, two files, or figures in pixels")
         lines.append(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import Annotated
 
 from cyclopts import App
@@ -10,6 +11,16 @@ from cyclopts import App
 from rille.pipeline.commands.options import COMPLETE, FAILED, RUNS, CacheFolder, Debug, Run, Runs, cache_folder, flag
 
 app = App(name="cache", help="Look after the cache of artifacts.")
+
+
+def _there(cache: str | None) -> Path | str:
+    """The place of a cache; a folder that there is not was mistyped more often than it is empty."""
+    from rille.stages.core.errors import ConfigError
+
+    place = cache_folder(cache)
+    if isinstance(place, Path) and not place.is_dir():
+        raise ConfigError("RIL-589", f"there is no cache {place}", remedy="name it with --cache")
+    return place
 
 
 @app.command
@@ -23,7 +34,7 @@ def verify(
     from rille.pipeline.engine.store import maintenance
     from rille.pipeline.engine.store.base import at
 
-    sound, damaged = maintenance.verify(at(cache_folder(cache)), deep=deep)
+    sound, damaged = maintenance.verify(at(_there(cache)), deep=deep)
     for found in damaged:
         print(f"rille: {found.label or found.key[:12]} ({found.stage}): {found.reason}; set aside", file=sys.stderr)
     print(f"{sound} artifacts are sound, {len(damaged)} damaged")
@@ -77,7 +88,7 @@ def ls(
     """List what the cache holds by sequence and stage: number, sizes, age, and the run that used it last."""
     from rille.pipeline.runs import inventory
 
-    return inventory.ls(cache_folder(cache), runs, as_json=as_json)
+    return inventory.ls(_there(cache), runs, as_json=as_json)
 
 
 @app.command

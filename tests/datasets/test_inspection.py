@@ -123,6 +123,15 @@ def test_tables_are_told_by_content(tmp_path, lines, kind):
     assert table_kind(tmp_path / "table.txt", 2) == kind
 
 
+def test_true_positions_that_cannot_be_read_are_told(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    write_lines(tmp_path / "truth.csv", ["time,x,y", "0,1,2", "1,nan,3"])
+    found = inspect(tmp_path)
+    assert not found.tables
+    (line,) = found.unread
+    assert "truth.csv, line 3: 'nan'" in line
+
+
 def test_single_numbers_are_times_whatever_their_count_where_the_name_says_so(tmp_path):
     write_lines(tmp_path / "times.txt", ["0.0", "0.5", "1.0"])
     assert table_kind(tmp_path / "times.txt", 2) == "times"
