@@ -16,9 +16,8 @@ from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE, HOLES, check_output
 from rille.pipeline.engine.plain import raw, warn
 from rille.pipeline.flow import config as configuration
-from rille.pipeline.runs.input_checks import FEW_BITS
 from rille.stages.core.errors import ConfigError, InputError
-from rille.stages.imaging.image_quality import unused_bits
+from rille.stages.imaging.image_quality import FEW_BITS, unused_bits
 
 if TYPE_CHECKING:
     from rille.stages.hfvm.stage import Disparity

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rille.datasets.protocol import Positions, Rows
 from rille.pipeline.runs.synchrony import best_shift
 from rille.stages.geometry.geometry import Rig, RigidTransform
-from rille.stages.imaging.image_quality import Look
+from rille.stages.imaging.image_quality import FEW_BITS, Look
 
 Floats = NDArray[np.float64]
 Level = Literal["OK", "WARN", "FAIL"]
@@ -36,9 +36,6 @@ UNLIKE_GREY = 1.5
 
 CLIPPED = 0.2
 """Share of black or of white pixels. A white sky takes less than this; more means clipped ground."""
-
-FEW_BITS = 2
-"""Highest bits that no sample of 16-bit images has, from which on they may be those of a camera with 14 or fewer."""
 
 UNIFORM = 1.0
 """Standard deviation of an image [grey levels], below which it is blank."""

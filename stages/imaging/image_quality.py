@@ -23,6 +23,9 @@ from rille.stages.imaging.pyramid import grey
 LOW, HIGH = 2.0, 253.0
 """Grey values at which an 8-bit image is taken as clipped."""
 
+FEW_BITS = 2
+"""Highest bits that no sample of 16-bit images has, from which on they may be those of a camera with 14 or fewer."""
+
 BANDS = (0.25, 0.5, 0.75)
 """Of the height: where the strips lie whose sharpness stands for the image's."""
 STRIP = 32

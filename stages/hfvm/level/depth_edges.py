@@ -99,8 +99,8 @@ def place(
 
 
 @njit(cache=True, nogil=True)
-def _place(grey, words, right_shape, given, wanted, place, out):  # type: ignore[no-untyped-def]
-    (u, v), (out_u, out_v), (at, near) = given, out, place
+def _place(grey, words, right_shape, given, wanted, sides, out):  # type: ignore[no-untyped-def]
+    (u, v), (out_u, out_v), (at, near) = given, out, sides
     (rows, cols), (high, wide) = u.shape, right_shape
     columns, downs = np.empty(len(AROUND) + 1, np.int32), np.empty(len(AROUND) + 1, np.int32)
     weights = np.zeros(SIDE * SIDE, np.int32)
