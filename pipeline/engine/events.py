@@ -68,18 +68,20 @@ class Ledger:
 
 def _took(handle: Handle) -> dict[str, Any]:
     """Times (seconds; of day since 1970) and bytes of a computed task; see
-    :class:`~rille.pipeline.engine.task.Outcome`."""
+    :class:`~rille.pipeline.engine.task.Measured`."""
+    measured = handle.measured
     assert handle.ref is not None
+    assert measured is not None
     return {
-        "started": round(handle.started, 4),
-        "ended": round(handle.started + handle.seconds, 4),
+        "started": round(measured.started, 4),
+        "ended": round(measured.started + handle.seconds, 4),
         "seconds": round(handle.seconds, 4),
-        "kernel": round(handle.kernel, 4),
-        "peak_rss": handle.peak_rss,
-        "memory": handle.memory,
-        "rest": handle.rest,
-        "first": handle.first,
-        "compiling": round(handle.compiling, 4),
+        "kernel": round(measured.kernel, 4),
+        "peak_rss": measured.peak_rss,
+        "memory": measured.memory,
+        "rest": measured.rest,
+        "first": measured.first,
+        "compiling": round(measured.compiling, 4),
         "worker": handle.worker,
         "input_bytes": round(input_bytes(handle)),
         "bytes": handle.ref.nbytes,

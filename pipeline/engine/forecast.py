@@ -84,8 +84,9 @@ class Forecast:
         if handle.status == "computed":
             self.begun = True
             tally.computed += 1
-            tally.seconds += max(0.0, handle.seconds - handle.compiling)
-            tally.compiling += handle.compiling
+            compiling = 0.0 if handle.measured is None else handle.measured.compiling
+            tally.seconds += max(0.0, handle.seconds - compiling)
+            tally.compiling += compiling
         elif self.begun:
             tally.found += 1
 

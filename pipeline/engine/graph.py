@@ -23,6 +23,7 @@ from typing import Any, Generic, TypeVar
 
 from rille.pipeline.engine.spec import Refs, Spec, each, flat
 from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.task import Measured
 from rille.stages.core.declare import Params
 
 Expansion = Callable[..., None]
@@ -36,10 +37,8 @@ class Handle:
     ``status`` is ``pending``, ``running``, ``computed``, ``cached``, ``failed``, ``skipped`` or, when dry, ``planned``.
     ``reason`` says in words why it was not found in the cache, or why it was skipped. ``earlier``, of a planned node,
     is what the same label led to before: a plan takes its facts for what is to come. ``expect`` are bytes (decoded)
-    that it reads from outside. Of a computed node: ``seconds`` of the call and of the stage's own ``kernel``, when it
-    ``started`` (seconds since 1970), and the figures of a :class:`rille.pipeline.engine.memory.limits.Meter`
-    (``first``: with imports and kernels; ``compiling``: seconds for which kernels were compiled), and the name of the
-    dask ``worker`` that ran it.
+    that it reads from outside. Of a computed node: ``seconds`` of the call, what else was ``measured``, and the name of
+    the dask ``worker`` that ran it.
     """
 
     index: int
@@ -52,13 +51,7 @@ class Handle:
     key: str = ""
     expect: float = 0.0
     seconds: float = 0.0
-    kernel: float = 0.0
-    started: float = 0.0
-    peak_rss: int = 0
-    memory: int | None = None
-    rest: int | None = None
-    first: bool = False
-    compiling: float = 0.0
+    measured: Measured | None = None
     worker: str = ""
     error: BaseException | None = None
 

@@ -101,8 +101,8 @@ class Lines(Progress):
             self._say(f"{self.done}/{self.total()} tasks, {handle.label} {handle.status}{to_go(self.forecast)}")
 
     def _compiled(self, handle: Handle) -> None:
-        if handle.compiling >= SLOW_COMPILE:
-            self._say(f"{handle.stage}: compiling, once: {handle.compiling:.0f} s")
+        if handle.measured is not None and handle.measured.compiling >= SLOW_COMPILE:
+            self._say(f"{handle.stage}: compiling, once: {handle.measured.compiling:.0f} s")
 
     def failed(self, label: str, error: BaseException) -> None:
         """Say so at once."""

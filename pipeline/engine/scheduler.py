@@ -489,9 +489,7 @@ class _Run:
                 self._resolve(handle, "failed")
             self._failed(Failure(first.label, first.stage, outcome.error, outcome.traceback))
         else:
-            first.seconds, first.peak_rss, first.kernel = outcome.seconds, outcome.peak_rss, outcome.kernel
-            first.started, first.memory, first.rest = outcome.started, outcome.memory, outcome.rest
-            first.first, first.compiling, first.worker = outcome.first, outcome.compiling, sys.intern(outcome.worker)
+            first.seconds, first.measured, first.worker = outcome.seconds, outcome.measured, sys.intern(outcome.worker)
             # Each unpickled reference brings names of its own.
             ref = replace(outcome.ref, stage=first.stage, key=first.key)
             for handle in (first, *others):
@@ -562,6 +560,8 @@ class _Run:
             self.progress.resolved(handle)
         else:  # healed: it counts once, as what became of it last
             setattr(counts, before, getattr(counts, before) - 1)
+        if handle.measured is not None and handle.measured.memory is None:
+            handle.measured = None  # the ledger has it; at the end the cost model asks for memory alone
         for dependant in self.dependants.pop(handle.index, []):
             self.waits[dependant.index] -= 1
             if not self.waits[dependant.index]:

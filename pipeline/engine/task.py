@@ -33,27 +33,41 @@ class CodeChangedError(RilleError):
     """The source code or the packages of a worker are not those of the client."""
 
 
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What the call of a task took.
+
+    ``started`` is when it began (seconds since 1970), ``kernel`` are the seconds of the stage itself, ``compiling``
+    those for which kernels were compiled; ``peak_rss`` is the peak memory of the process until then, bytes; ``memory``
+    and ``rest`` are a :class:`~rille.pipeline.engine.memory.limits.Meter`'s figures; ``first`` says that the process
+    had not run the stage before (it imports, and compiles or loads kernels).
+    """
+
+    started: float
+    kernel: float
+    peak_rss: int
+    memory: int | None
+    rest: int | None
+    first: bool
+    compiling: float
+
+
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a task: its artifact, whether it was cached, seconds and peak memory [bytes] of the call.
+    """Outcome of a task: its artifact, seconds of the call, and what else it took (None: the artifact was cached).
 
-    ``kernel`` are the seconds of the stage itself, ``started`` is when the call began (seconds since 1970); ``memory``
-    and ``rest`` are a :class:`~rille.pipeline.engine.memory.limits.Meter`'s figures, ``first`` says that the process
-    had not run the stage before (it imports, and compiles or loads kernels); ``compiling`` are the seconds for which it
-    compiled; ``worker`` is the name of the dask worker that ran it.
+    ``worker`` is the name of the dask worker that ran it.
     """
 
     ref: Ref
-    cached: bool
     seconds: float
-    peak_rss: int
-    started: float = 0.0
-    kernel: float = 0.0
-    memory: int | None = None
-    rest: int | None = None
-    first: bool = False
-    compiling: float = 0.0
+    measured: Measured | None
     worker: str = ""
+
+    @property
+    def cached(self) -> bool:
+        """Whether nothing was computed."""
+        return self.measured is None
 
 
 _run: set[str] = set()
@@ -80,7 +94,7 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
         try:
             ref = None if force else store.lookup(spec.stage.name, own)
             if ref is not None:
-                return Outcome(ref, True, time.perf_counter() - begin, _peak_rss(), started)
+                return Outcome(ref, time.perf_counter() - begin, None)
             first = spec.module not in _run
             COMPILING.take()  # of what ran before in this process
             size = sum(ref.nbytes for ref in flat(refs))
@@ -88,8 +102,8 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
                 ref, kernel = _compute(store, spec, refs, own)
             seconds = time.perf_counter() - begin
             _run.add(spec.module)
-            measured = (started, kernel, meter.memory, meter.rest, first, COMPILING.take())
-            return Outcome(ref, False, seconds, _peak_rss(), *measured)
+            measured = Measured(started, kernel, _peak_rss(), meter.memory, meter.rest, first, COMPILING.take())
+            return Outcome(ref, seconds, measured)
         except OSError as error:
             # A missing file does not appear by waiting; a network drive that stumbled recovers.
             if isinstance(error, PERMANENT) or trial == TRIES - 1:

@@ -131,13 +131,16 @@ class Costs:
         """Take in what was computed now."""
         new: dict[tuple[str, str], list[Sample]] = defaultdict(list)
         computed = [h for h in handles if h.status == "computed" and h.ref is not None]
-        warm = {(h.stage, _name(h.spec)) for h in computed if not h.first and h.memory is not None}
+        # The scheduler keeps what was measured of those tasks alone whose memory was.
+        warm = {(h.stage, _name(h.spec)) for h in computed if h.measured is not None and not h.measured.first}
         for h in computed:
             assert h.ref is not None
-            name = h.stage, _name(h.spec)
-            measured = h.memory if not h.first or name not in warm else None  # imports and compiling are not its own
-            new[name].append((input_bytes(h), measured, float(h.ref.nbytes), float(h.ref.stored)))
-            self.rests += [] if h.rest is None else [float(h.rest)]
+            name, measured, memory = (h.stage, _name(h.spec)), h.measured, None
+            if measured is not None:
+                # Imports and compiling are not the task's own.
+                memory = measured.memory if not measured.first or name not in warm else None
+                self.rests += [] if measured.rest is None else [float(measured.rest)]
+            new[name].append((input_bytes(h), memory, float(h.ref.nbytes), float(h.ref.stored)))
         self.rests = self.rests[-KEPT:]
         for (stage, params), samples in new.items():
             groups = self.groups.setdefault(stage, {})
