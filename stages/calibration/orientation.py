@@ -23,7 +23,7 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import matched_back
-from rille.stages.geometry.epipolar import corrected, distances
+from rille.stages.geometry.epipolar import corrected, distances, standing
 from rille.stages.geometry.geometry import Rig
 
 
@@ -105,7 +105,7 @@ def orient(rig: Rig, matches: PointPairs, params: RelativeParams) -> tuple[dict[
         "parameters": [p.to_dict() for p in decision.parameters],
         "row_offset": float(np.median(before[inlier])),
         "roll_deg": math.degrees(decision.parameters[2].asked),
-        "words": misalignment(float(np.median(before[inlier])), decision),
+        "words": misalignment(rig, float(np.median(before[inlier])), decision),
         "residual_before_px": rms(before, weight),
         "residual_after_px": rms(after, weight),
         "median_before_px": float(np.median(np.abs(before[inlier]))),
@@ -114,15 +114,21 @@ def orient(rig: Rig, matches: PointPairs, params: RelativeParams) -> tuple[dict[
     return _arrays(before, after, weight), facts
 
 
-def misalignment(offset: float, decision: Decision) -> str:
-    """Describe in words how the right image departs from the given rig: row offset (pixels) and freed parameters."""
-    parts = [f"rows of the right image lie {abs(offset):.2f} px too {'low' if offset > 0 else 'high'}"]
+def misalignment(rig: Rig, offset: float, decision: Decision) -> str:
+    """Describe in words how the right image departs from the given rig: offset across lines (pixels) and freed
+    parameters."""
+    # The offset tells already of the angle that makes it.
+    if standing(rig):
+        lines, where, told = "columns", "far right" if offset > 0 else "far left", "yaw"
+    else:
+        lines, where, told = "rows", "low" if offset > 0 else "high", "pitch"
+    parts = [f"{lines} of the right image lie {abs(offset):.2f} px too {where}"]
     for p in decision.parameters:
         degrees = math.degrees(p.value)
         # Positive roll turns x (right) to y (down), which is clockwise as one sees the image.
         if p.freed and p.name == "roll":
             parts.append(f"it is turned by {abs(degrees):.2f} degrees {'' if degrees > 0 else 'anti'}clockwise")
-        elif p.freed and p.name != "pitch":
+        elif p.freed and p.name != told:
             parts.append(f"{p.name.replace('_', ' ')} is off by {degrees:+.2f} degrees")
     return ", ".join(parts)
 

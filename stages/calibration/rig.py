@@ -188,7 +188,7 @@ def _contradiction(given: Rig, pairs: Sequence[PointPairs], decision: Decision, 
     signed = [distances(given, np.zeros(RIG), m.left, m.right)[0] for m in pairs]
     # The same points before and after: residuals of two sets of inliers say nothing about a repair.
     inlier = np.concatenate(decision.fit.weights) > 0
-    words = misalignment(float(np.median(np.concatenate(signed)[inlier])), decision)
+    words = misalignment(given, float(np.median(np.concatenate(signed)[inlier])), decision)
     done = "kept because rig.mode = fixed" if mode == "fixed" else "repaired"
     lines = [f"the calibration contradicts the images: {words}; {done}"]
     hidden = [p for p in decision.parameters if not p.observed]

@@ -8,7 +8,8 @@ centre about the left camera's, across the baseline in the image plane and along
 The residual is the distance of the right point from the epipolar line of the left one, in pixels of the right image:
 the first-order (Sampson) error of a correspondence whose left pixel is exact, as it is in a disparity map of the left
 image (Hartley and Zisserman 2004, section 11.4.3). On a usual rig it is the row offset: positive where the right
-image's content lies below its line.
+image's content lies below its line; where one camera stands above the other it is the column offset, positive to the
+right.
 """
 
 from __future__ import annotations
@@ -29,6 +30,12 @@ MAJORITY = 0.5
 
 STEP = 1e-6
 """Radians: step of the central differences of depth."""
+
+
+def standing(rig: Rig) -> bool:
+    """Whether one camera stands above the other: epipolar lines run down the image then, and not along its rows."""
+    centre = -rig.T_right_left.rotation.T @ rig.T_right_left.translation
+    return bool(abs(centre[1]) / rig.baseline >= math.cos(math.radians(45.0)))
 
 
 def corrected(rig: Rig, correction: Floats) -> Rig:
@@ -160,8 +167,7 @@ def _centre(rig: Rig, correction: Floats) -> tuple[Floats, Floats]:
     """Right camera's centre (3,) in the left frame, metres, and its derivatives (3, 2) by the two swings."""
     given = -rig.T_right_left.rotation.T @ rig.T_right_left.translation
     unit = given / np.linalg.norm(given)
-    # Of a rig whose baseline is nearly vertical, across is the x axis.
-    axis = np.array([0.0, 1.0, 0.0]) if abs(unit[1]) < math.cos(math.radians(45.0)) else np.array([1.0, 0.0, 0.0])
+    axis = np.array([1.0, 0.0, 0.0]) if standing(rig) else np.array([0.0, 1.0, 0.0])
     across = axis - unit * float(unit @ axis)
     across /= np.linalg.norm(across)
     forward = np.cross(unit, across)

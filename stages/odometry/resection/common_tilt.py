@@ -2,9 +2,9 @@
 
 A right image whose rows lie too low may have been turned (pitch), or have its principal point there; epipolar lines
 hardly tell the two apart, and a rig that is repaired takes the turn. The wrong choice tilts disparities: by ``f x y`` a
-radian, nothing along both axes of the image and most in its corners, which bends the path to one side. Tracks see depth
-once more, by parallax, so all segments together measure the tilt
-(:func:`rille.stages.odometry.resection.bundle_adjustment.tilt_of`).
+radian, nothing along both axes of the image and most in its corners, which bends the path to one side. Where one camera
+stands above the other, it is columns and yaw. Tracks see depth once more, by parallax, so all segments together measure
+the tilt (:func:`rille.stages.odometry.resection.bundle_adjustment.tilt_of`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
+from rille.stages.geometry.epipolar import standing
 from rille.stages.geometry.geometry import Rig
 from rille.stages.numeric.robust import huber_weight, mad_sigma
 
@@ -61,9 +62,10 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
 
 
 def _words(tilt: float, sigma: float, rig: Rig) -> str:
+    angle, focal, lines = ("yaw", rig.right.fx, "columns") if standing(rig) else ("pitch", rig.right.fy, "rows")
     return (
         f"the tracks contradict the disparities: {math.degrees(abs(tilt)):.2f} +- {math.degrees(sigma):.2f} degrees of"
-        f" pitch stand for a principal point that is {abs(tilt) * rig.right.fy:.1f} rows off; undone in the trajectory,"
+        f" {angle} stand for a principal point that is {abs(tilt) * focal:.1f} {lines} off; undone in the trajectory,"
         " not in elevations: calibrate anew"
     )
 

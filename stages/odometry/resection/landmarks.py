@@ -262,12 +262,17 @@ def intersect(elevation: Floats32, lattice: Lattice, origin: Floats, directions:
     out = np.full(len(directions), np.nan)
     if not np.isfinite(elevation).any():
         return out
+    low, high = float(np.nanmin(elevation)), float(np.nanmax(elevation))
+    x, y = lattice.xs(), lattice.ys()
+    box = np.array([[x[0], x[-1]], [y[-1], y[0]], [low - lattice.cell, high + lattice.cell]])
     for i, direction in enumerate(directions):
-        span = _span(elevation, lattice, origin, direction)
+        span = _span(box, origin, direction)
         if span is None:
             continue
-        first, last, step = span
-        s = np.arange(first, last + step, step)
+        first, last = span
+        step = 0.5 * lattice.cell / float(np.sqrt((direction**2).sum()))
+        # No farther than the box: beyond it the surface would be extrapolated.
+        s = np.minimum(np.arange(first, last + step, step), last)
         height = _height(elevation, lattice, origin, direction, s)
         seen = np.isfinite(height)
         below = np.flatnonzero(seen & (height <= 0))
@@ -278,13 +283,8 @@ def intersect(elevation: Floats32, lattice: Lattice, origin: Floats, directions:
     return out
 
 
-def _span(
-    elevation: Floats32, lattice: Lattice, origin: Floats, direction: Floats
-) -> tuple[float, float, float] | None:
-    """First and last parameter of the ray inside the model's box, and the step of half a cell; None: it misses."""
-    low, high = float(np.nanmin(elevation)), float(np.nanmax(elevation))
-    x, y = lattice.xs(), lattice.ys()
-    box = np.array([[x[0], x[-1]], [y[-1], y[0]], [low - lattice.cell, high + lattice.cell]])
+def _span(box: Floats, origin: Floats, direction: Floats) -> tuple[float, float] | None:
+    """First and last parameter of the ray inside a box (3, 2), least and greatest coordinates; None: it misses."""
     first, last = 0.0, np.inf
     for axis in range(3):
         # A ray along an axis stays in or out of the box there.
@@ -294,8 +294,7 @@ def _span(
             continue
         a, b = sorted((box[axis] - origin[axis]) / direction[axis])
         first, last = max(first, float(a)), min(last, float(b))
-    step = 0.5 * lattice.cell / float(np.sqrt((direction**2).sum()))
-    return (first, last, step) if first < last < np.inf else None
+    return (first, last) if first < last < np.inf else None
 
 
 def _height(elevation: Floats32, lattice: Lattice, origin: Floats, direction: Floats, s: Floats) -> Floats:

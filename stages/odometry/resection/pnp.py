@@ -265,7 +265,9 @@ def _square(data, o, n, pose):  # type: ignore[no-untyped-def]
     gu, gv = sigma_d * fx / z * (wx - u * wz), sigma_d * fy / z * (wy - v * wz)
     eu, ev = fx * u + cx - pixel[0], fy * v + cy - pixel[1]
     mixed = gu * eu + gv * ev
-    return (eu * eu + ev * ev - mixed * mixed / (sigma * sigma + gu * gu + gv * gv)) / (sigma * sigma)
+    square = eu * eu + ev * ev - mixed * mixed / (sigma * sigma + gu * gu + gv * gv)
+    # Just before the camera both terms are huge, and rounding may leave a negative difference, without a root.
+    return max(square, 0.0) / (sigma * sigma)
 
 
 @njit(cache=True, nogil=True)

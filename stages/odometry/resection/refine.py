@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, Inputs, Stage
 from rille.stages.core.errors import ConfigError
+from rille.stages.geometry.epipolar import standing
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
 from rille.stages.numeric.robust import huber_weight
@@ -85,7 +86,8 @@ def views_of(track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig) -
 def _tilt_pattern(position: Floats, T_local_key: RigidTransform, rig: Rig) -> Floats:
     """Pixels (n,) along its line that a landmark's right image moves for a radian across it: ``f x y``."""
     x, y, z = rig.T_right_left.apply(T_local_key.inverse().apply(position)).T
-    return np.asarray(np.where(z > 0, rig.right.fx * x * y / np.where(z > 0, z, 1.0) ** 2, 0.0))
+    focal = rig.right.fy if standing(rig) else rig.right.fx
+    return np.asarray(np.where(z > 0, focal * x * y / np.where(z > 0, z, 1.0) ** 2, 0.0))
 
 
 def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -55,6 +56,15 @@ def test_words_and_figures_of_a_knock():
     assert facts["row_offset"] == pytest.approx(3.0, abs=0.4)
     assert facts["median_after_px"] < 0.2 < 1.0 < facts["median_before_px"]
     assert 0 < facts["outliers"] < 0.2 * facts["matches"]
+
+
+def test_words_of_a_knock_where_one_camera_stands_above_the_other():
+    rig = street_rig()
+    standing = replace(rig, T_right_left=RigidTransform(np.eye(3), np.array([0.0, -rig.baseline, 0.0])))
+    m = matches(knocked(standing, yaw_deg=0.24, roll_deg=0.3), street_depth)
+    _, facts = orient(standing, m, RelativeParams())
+    assert facts["words"].startswith("columns of the right image lie 3.")
+    assert facts["words"].endswith(" px too far right, it is turned by 0.30 degrees clockwise")
 
 
 def scene(true: Rig):

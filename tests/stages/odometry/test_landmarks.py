@@ -137,6 +137,15 @@ def test_ray_that_enters_from_below_is_rejected_and_a_hole_forgets():
     assert hit == pytest.approx(0.5 / 0.3, abs=1e-5)
 
 
+def test_ray_that_meets_the_ground_beyond_the_model_misses_it():
+    lattice = Lattice.snap((-1.0, 1.0, 0.5, 3.0), 0.1)
+    elevation = np.full(lattice.shape, -0.5, np.float32)
+    at = np.array([2.999, 3.001])  # the last row of cells is at y = 3.0
+    s = intersect(elevation, lattice, np.zeros(3), np.column_stack([0 * at, 0 * at + 1.0, -0.5 / at]))
+    assert s[0] == pytest.approx(2.999, abs=1e-6)
+    assert np.isnan(s[1])
+
+
 def test_empty_model_gives_nothing():
     lattice = Lattice.snap((-1.0, 1.0, 0.5, 3.0), 0.1)
     found = landmarks_from_dem(

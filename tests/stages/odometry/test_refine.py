@@ -248,16 +248,28 @@ def test_the_stage_undoes_a_tilt_and_says_so():
     assert off[1] < 3 * off[0] + 0.002
 
 
-def test_the_pattern_of_a_tilt_is_what_a_turned_camera_and_a_moved_row_make():
+STANDING = Rig(
+    replace(CAMERA, fy=300.0), replace(CAMERA, fy=300.0), RigidTransform(np.eye(3), np.array([0.0, -0.2, 0.0]))
+)
+
+
+@pytest.mark.parametrize(("rig", "axis", "along"), [(RIG, [1.0, 0.0, 0.0], 0), (STANDING, [0.0, 1.0, 0.0], 1)])
+def test_the_pattern_of_a_tilt_is_what_a_turned_camera_and_a_moved_row_or_column_make(rig, axis, along):
     X = np.random.default_rng(3).uniform([-2.0, -1.0, 3.0], [2.0, 1.0, 6.0], (50, 3))
     theta = 1e-5
-    turned = CAMERA.project(RIG.T_right_left.apply(X) @ rotation_exp([theta, 0.0, 0.0]).T)
-    straight = CAMERA.project(RIG.T_right_left.apply(X))
-    pattern = _tilt_pattern(X, RigidTransform.identity(), RIG)
-    np.testing.assert_allclose(np.abs(turned - straight)[:, 0] / theta, np.abs(pattern), rtol=1e-3, atol=1e-2)
+    turned = rig.right.project(rig.T_right_left.apply(X) @ rotation_exp(theta * np.array(axis)).T)
+    straight = rig.right.project(rig.T_right_left.apply(X))
+    pattern = _tilt_pattern(X, RigidTransform.identity(), rig)
+    np.testing.assert_allclose(np.abs(turned - straight)[:, along] / theta, np.abs(pattern), rtol=1e-3, atol=1e-2)
     # The whole of it is one sign: a tilt of either sign fits.
-    sign = np.sign((turned - straight)[:, 0] * pattern)
+    sign = np.sign((turned - straight)[:, along] * pattern)
     assert np.all(sign[np.abs(pattern) > 1.0] == sign[np.abs(pattern) > 1.0][0])
+
+
+def test_a_tilt_is_told_by_the_angle_and_the_axis_of_its_rig():
+    words = [tilt_stage._words(0.01, 0.001, rig) for rig in (RIG, STANDING)]
+    assert "0.57 +- 0.06 degrees of pitch stand for a principal point that is 5.0 rows off" in words[0]
+    assert "0.57 +- 0.06 degrees of yaw stand for a principal point that is 5.0 columns off" in words[1]
 
 
 def bundles(tracks_of_last=True):

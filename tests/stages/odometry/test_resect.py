@@ -94,6 +94,16 @@ def test_jacobian_against_central_differences():
             np.testing.assert_allclose(analytic[i, :, k], root @ numeric[i] / (2 * h), rtol=1e-5, atol=1e-4)
 
 
+def test_a_landmark_just_before_the_camera_has_a_finite_error():
+    """Of 2000 landmarks that far hypotheses put there; one NaN among the scores would win over all other poses."""
+    rng = np.random.default_rng(8)
+    landmarks = np.column_stack([rng.uniform([-30, -2], [30, 2], (2000, 2)), 10.0 ** rng.uniform(-6, -4, 2000)])
+    per_pixel = landmarks + np.array([0.0, 0.0, 30.0])
+    pixels = rng.uniform([0, 0], [600, 500], (2000, 2))
+    obs = Observations(landmarks[None], per_pixel[None], np.full((1, 2000), 0.2), pixels[None], CAMERA, 0.2, 0.1)
+    assert np.isfinite(norms(obs, Poses.of(RigidTransform.identity()))).all()
+
+
 def test_exact_data_give_the_exact_pose():
     rng = np.random.default_rng(2)
     for _ in range(5):
