@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from rille.stages.core.arrays import Floats32
 
 RADIUS = 10
-"""Pixels to either side that a coefficient depends on; what is cut off is less than a thousandth of a grey level."""
+"""Pixels to either side that a coefficient depends on; what is cut off is about a thousandth of a grey level."""
 
 POLE = math.sqrt(3.0) - 2.0
 TAPS = np.float32(math.sqrt(3.0) * POLE ** np.arange(RADIUS + 1))

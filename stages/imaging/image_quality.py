@@ -95,7 +95,8 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
     found = [texture(image[r : r + STRIP], valid[r : r + STRIP]) for r in first]
     sharp = [s for s, _ in found if math.isfinite(s)]
     # A quarter of the pixels tells mean and deviation well enough.
-    some, mask = grey(np.ascontiguousarray(image[::2, ::2])), (valid[::2, ::2] != 0).astype(np.uint8)
+    some = grey(np.ascontiguousarray(image[::2, ::2]))
+    mask = ((valid[::2, ::2] != 0) & np.isfinite(some)).astype(np.uint8)
     (mean,), (deviation,) = (a.ravel() for a in cv2.meanStdDev(some, mask=mask))
     return {
         "mean": float(mean) if mask.any() else None,

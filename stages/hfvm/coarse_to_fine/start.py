@@ -49,6 +49,10 @@ def check(prior: tuple[AnyArray, AnyArray] | None, shape: tuple[int, ...]) -> Pr
             f"prior disparities {u.shape} and {v.shape} and the left image {shape} differ",
             remedy="give disparities of the left image, one a pixel",
         )
+    return _bounded(u, v)
+
+
+def _bounded(u: AnyArray, v: AnyArray) -> Prior:
     # NaN is not less, and so unknown as well.
     known = (np.abs(u) < MOST) & (np.abs(v) < MOST)
     return Prior(np.where(known, u, np.float32(np.nan)), np.where(known, v, np.float32(np.nan)))
@@ -58,7 +62,8 @@ def align(prior: Prior | None, h: plane.Matrix) -> Prior | None:
     """The prior towards the aligned right image: see :func:`rille.stages.hfvm.images.plane.decompose`."""
     if prior is None:
         return None
-    return Prior(*plane.decompose(h, prior.u, prior.v))
+    # Ends that come to lie near the horizon of the plane are led farther than the given ones.
+    return _bounded(*plane.decompose(h, prior.u, prior.v))
 
 
 def impose(pair: hierarchy.Prepared, state: hierarchy.State, prior: Prior | None) -> hierarchy.State:

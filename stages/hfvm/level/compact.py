@@ -1,4 +1,4 @@
-"""A second, compact feature set: grey steps from a pixel to its eight neighbours (preset ``accurate``).
+"""A second, compact feature set: grey steps from a pixel to its eight neighbours.
 
 The kernels of Table 1 reach six pixels and so carry a foreground's disparity beyond its edge. Where the choice among
 candidates has been narrowed down by them, steps that reach one pixel place the edge. As the other features they enter

@@ -85,7 +85,7 @@ def local_mean(u, v, keep, radius, stride, out_u, out_v):  # type: ignore[no-unt
 
 @njit(cache=True, nogil=True)
 def _add_up(parts, cols, out):  # type: ignore[no-untyped-def]
-    """Add to ``out`` its neighbours: sums over as many columns as ``parts`` (plane, col + 2 radius) is wider."""
+    """Write to ``out`` (plane, col) sums over 2 radius + 1 columns of ``parts`` (plane, col + 2 radius)."""
     for k in range(parts.shape[0]):
         part, total = parts[k], out[k]
         # The usual radius in one pass, summed in the order of the loops below: the bits must be the same.

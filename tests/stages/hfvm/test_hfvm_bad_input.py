@@ -8,6 +8,7 @@ from raising import raises
 
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Validity, defined, has, matched
+from rille.stages.hfvm.coarse_to_fine import start
 from rille.stages.hfvm.finish.refine import contrast
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.level.consistency import patches, unsupported
@@ -222,6 +223,18 @@ def test_prior_of_another_size_or_beyond_all_bounds():
         match(left, right, prior=(np.zeros((3, 3)), np.zeros((3, 3))))
     absurd = np.full(left.shape, 1e9), np.full(left.shape, -np.inf)
     np.testing.assert_array_equal(match(left, right, prior=absurd).validity, match(left, right).validity)
+
+
+def test_prior_that_a_plane_leads_beyond_all_bounds_is_unknown():
+    # A plane whose horizon lies 16000 px to the right, and given displacements that end just before it.
+    horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0 / 16000.0, 0.0, 1.0]])
+    ends = np.full((64, 64), 15900.0, np.float32)
+    led = start.align(start.check((ends, 0 * ends), ends.shape), horizon)
+    assert led is not None
+    np.testing.assert_array_less(np.abs(led.u[np.isfinite(led.u)]), start.MOST)
+    near = start.align(start.check((0 * ends, 0 * ends), ends.shape), horizon)
+    assert near is not None
+    assert np.isfinite(near.u).all()
 
 
 def test_progress_grows_from_nothing_to_all():

@@ -37,3 +37,11 @@ def test_a_black_image_deviates_by_nothing_and_equal_images_have_one_digest():
     assert out.meta["right"]["digest"] == glance(image.copy(), np.ones_like(image))["digest"]
     assert out.meta["right"]["digest"] != out.meta["left"]["digest"]
     assert glance(image, np.zeros_like(image))["mean"] is None
+
+
+def test_pixels_that_are_not_finite_count_as_little_as_masked_ones():
+    image = picture().astype(np.float32)
+    holes, valid = image.copy(), np.ones(image.shape, np.uint8)
+    holes[40:60, 100:140], valid[40:60, 100:140] = np.nan, 0
+    found, masked = glance(holes, np.ones_like(valid)), glance(image, valid)
+    assert {**found, "digest": ""} == {**masked, "digest": ""}
