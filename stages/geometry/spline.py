@@ -32,38 +32,25 @@ def coefficients(image: ArrayLike) -> Floats32:
     mirrored = np.pad(grey, RADIUS, mode="reflect")
     along = np.empty((mirrored.shape[0], grey.shape[1]), np.float32)
     found = np.empty(grey.shape, np.float32)
-    _filter_rows(mirrored, TAPS, along)
-    _filter_columns(along, TAPS, found)
+    _filter(mirrored, RADIUS, 1, TAPS, along)
+    _filter(along, RADIUS * grey.shape[1], grey.shape[1], TAPS, found)
     return found
 
 
 @njit(cache=True, nogil=True)
-def _filter_rows(image, taps, out):  # type: ignore[no-untyped-def]
-    """``out`` (row, col) from an ``image`` with :data:`RADIUS` columns more to either side."""
-    cols = out.shape[1]
+def _filter(image, first, step, taps, out):  # type: ignore[no-untyped-def]
+    """``out`` (row, col) from an ``image`` with :data:`RADIUS` pixels more to both sides, ``step`` pixels apart in
+    reading order; ``first``: where the first pixel of ``out`` stands in it."""
+    flat, width, cols = image.reshape(-1), image.shape[1], out.shape[1]
     for y in range(out.shape[0]):
-        row, total = image[y], out[y]
-        middle = row[RADIUS : RADIUS + cols]
+        at, total = first + y * width, out[y]
+        middle = flat[at : at + cols]
         for x in range(cols):
             total[x] = taps[0] * middle[x]
         for k in range(1, RADIUS + 1):
-            before, behind = row[RADIUS - k : RADIUS - k + cols], row[RADIUS + k : RADIUS + k + cols]
+            before, behind = flat[at - k * step : at - k * step + cols], flat[at + k * step : at + k * step + cols]
             for x in range(cols):
                 total[x] += taps[k] * (before[x] + behind[x])
-
-
-@njit(cache=True, nogil=True)
-def _filter_columns(image, taps, out):  # type: ignore[no-untyped-def]
-    """``out`` (row, col) from an ``image`` with :data:`RADIUS` rows more above and below."""
-    rows, cols = out.shape
-    for y in range(rows):
-        total, middle = out[y], image[y + RADIUS]
-        for x in range(cols):
-            total[x] = taps[0] * middle[x]
-        for k in range(1, RADIUS + 1):
-            above, below = image[y + RADIUS - k], image[y + RADIUS + k]
-            for x in range(cols):
-                total[x] += taps[k] * (above[x] + below[x])
 
 
 @njit(cache=True, nogil=True)

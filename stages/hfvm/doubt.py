@@ -56,8 +56,7 @@ def sample(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> Place
     found = np.flatnonzero(matched)
     if len(found) < LEAST:
         return None
-    found = found[np.linspace(0, len(found) - 1, min(SAMPLES, len(found))).astype(np.intp)]
-    y, x = np.unravel_index(found, matched.shape)
+    y, x = np.unravel_index(_strided(found, SAMPLES), matched.shape)
     left = np.stack([x, y], 1).astype(np.float64)
     return left, left + np.stack([column[y, x], row[y, x]], 1)
 
@@ -87,10 +86,7 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
     """
     a, b = (np.ascontiguousarray(image, np.float32) for image in (left, right))
     keep = _inside(places[0], a.shape, PATCH) & _inside(places[1], b.shape, PATCH)
-    chosen = np.flatnonzero(keep)
-    chosen = (
-        chosen[np.linspace(0, len(chosen) - 1, min(PATCHES, len(chosen))).astype(np.intp)] if len(chosen) else chosen
-    )
+    chosen = _strided(np.flatnonzero(keep), PATCHES)
     told = []
     for (x, y), (p, q) in zip(*(np.rint(side[chosen]).astype(int) for side in places), strict=True):
         patch = a[y - PATCH : y + PATCH + 1, x - PATCH : x + PATCH + 1]
@@ -109,6 +105,11 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
         elsewhere = score[here & (np.hypot(j - q, i - p) >= APART)]
         told.append(elsewhere.size > 0 and float(elsewhere.max()) >= own - WORSE)
     return float(np.mean(told)) if len(told) >= LEAST // 4 else 0.0
+
+
+def _strided(found: AnyArray, most: int) -> AnyArray:
+    """At most so many of the given ones, evenly strided from the first to the last."""
+    return found[np.linspace(0, len(found) - 1, min(most, len(found))).astype(np.intp)]
 
 
 def _inside(places: AnyArray, shape: tuple[int, ...], margin: int) -> NDArray[np.bool_]:

@@ -5,7 +5,8 @@ Nothing is rectified and no calibration is used. ``match`` works on plain arrays
 
 - ``tiled`` composes the matcher of windows: for images in memory here, as tasks in ``tile_stage`` and ``join_stage``.
 - ``images`` holds the parameters, and gives each window its grey values, masks and features.
-- ``coarse_to_fine`` goes down the pyramid; its solver of a level is the fast search or that of preset ``accurate``.
+- ``coarse_to_fine`` goes down the pyramid; its solver of a level is the fast search, with preset ``accurate`` improved
+  along paths, or that of preset ``paper``.
 - ``level`` matches one level: features, search, propagation, the paper's version to the letter, consistency.
 - ``finish`` treats the finest level: sub-pixel refinement, standard deviations, filling.
 """

@@ -326,11 +326,7 @@ _PARTS = (
     Array("gone", _GRID, "uint8", "1", "1 = in an isolated patch", optional=True),
     Array("region", _GRID, "uint8", "1", "number of the textureless region, at half the resolution", optional=True),
 )
-_OPTIONAL = tuple(
-    Array(a.name, a.dims, a.dtype, a.unit, a.long_name, a.nodata, a.frame, True)
-    for a in OUTPUTS
-    if a.name not in ("distance", "validity")
-)
+_OPTIONAL = tuple(replace(a, optional=True) for a in OUTPUTS if a.name not in ("distance", "validity"))
 STAGE = Stage(
     name="hfvm_tile",
     version=1,

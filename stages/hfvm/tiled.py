@@ -18,7 +18,7 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.validity import matched
-from rille.stages.hfvm.coarse_to_fine import accurate, hierarchy, start
+from rille.stages.hfvm.coarse_to_fine import hierarchy, start
 from rille.stages.hfvm.coarse_to_fine.hierarchy import Prepared, State
 from rille.stages.hfvm.finish import refine
 from rille.stages.hfvm.finish.finish import Finish
@@ -89,7 +89,7 @@ def prepare(left: View, right: View, params: HfvmParams, side: int | None) -> Pr
     """The matcher of two views; features of whole levels are held where the images are matched whole."""
     np.empty(KEPT, np.uint8)  # freed at once, and never touched
     seen = [Seen(view, params, {} if side is None else None) for view in (left, right)]
-    return Prepared(seen[0], seen[1], accurate.choose(params), params, side)
+    return Prepared(seen[0], seen[1], hierarchy.solver(params), params, side)
 
 
 def coarse(left: View, right: View, params: HfvmParams, side: int | None, prior: start.Prior | None = None) -> Coarse:

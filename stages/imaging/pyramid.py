@@ -209,18 +209,12 @@ def halved(image: Floats32, mask: Mask, levels: int, least: np.float32 = MOST) -
     """
     images, masks = [image], [mask]
     for _ in range(levels - 1):
-        image, mask = _halve(image, mask, least)
-        images.append(image)
-        masks.append(mask)
+        rows, cols = images[-1].shape
+        shape = (rows + 1) // 2, (cols + 1) // 2
+        images.append(np.empty(shape, np.float32))
+        masks.append(np.empty(shape, np.uint8))
+        _means(images[-2], masks[-2], least, images[-1], masks[-1])
     return Pyramid(tuple(images), tuple(masks))
-
-
-def _halve(image: Floats32, mask: Mask, least: np.float32) -> tuple[Floats32, Mask]:
-    rows, cols = image.shape
-    coarse = np.empty(((rows + 1) // 2, (cols + 1) // 2), np.float32)
-    valid = np.empty(coarse.shape, np.uint8)
-    _means(image, mask, least, coarse, valid)
-    return coarse, valid
 
 
 @njit(cache=True, nogil=True)

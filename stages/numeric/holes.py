@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes, Floats, Floats32
+from rille.stages.numeric.windows import window_count
 
 LEAST_TRIALS = 8
 """Known cells nearby that must tell the error of an interpolation; with fewer, half the range of its rim stands in."""
@@ -76,10 +76,7 @@ def candidates(elevation: Floats32, n: int, min_known: float) -> NDArray[np.int6
     unknown = np.isnan(elevation)
     if not unknown.any():
         return np.empty(0, dtype=np.int64)
-    known = cv2.boxFilter(
-        (~unknown).view(np.uint8), cv2.CV_32S, (n, n), normalize=False, borderType=cv2.BORDER_CONSTANT
-    )
-    return np.flatnonzero(unknown & (known >= min_known * n * n))
+    return np.flatnonzero(unknown & (window_count(~unknown, n) >= min_known * n * n))
 
 
 STEPS = np.array([[0, 1], [1, 0], [1, 1], [1, -1]])

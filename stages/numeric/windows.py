@@ -11,23 +11,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.core.arrays import Bools, Floats, Floats32
 
 
 def window_sum(a: NDArray, n: int) -> Floats:
     """Sum (row, col), float64, over the window; whole numbers add up exactly."""
-    total: Floats = _box(np.ascontiguousarray(a, dtype=np.float64), n)
+    total: Floats = _box(np.ascontiguousarray(a, dtype=np.float64), -1, n)
     return total
 
 
 def window_sum32(a: NDArray, n: int) -> Floats32:
     """As :func:`window_sum`, added up in float64 too, but float32 before and after: half of the memory."""
-    total: Floats32 = _box(np.ascontiguousarray(a, dtype=np.float32), n)
+    total: Floats32 = _box(np.ascontiguousarray(a, dtype=np.float32), -1, n)
     return total
 
 
-def _box(values: NDArray, n: int) -> Any:
-    return cv2.boxFilter(values, -1, (n, n), normalize=False, borderType=cv2.BORDER_CONSTANT)
+def window_count(mask: Bools, n: int) -> NDArray[np.int32]:
+    """Number (row, col) of cells in the window that are set."""
+    total: NDArray[np.int32] = _box(mask.view(np.uint8), cv2.CV_32S, n)
+    return total
+
+
+def _box(values: NDArray, depth: int, n: int) -> Any:
+    return cv2.boxFilter(values, depth, (n, n), normalize=False, borderType=cv2.BORDER_CONSTANT)
 
 
 def window_mean(a: Floats32, n: int) -> Floats32:

@@ -13,13 +13,14 @@ window that is the whole image is one way among others.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
+from rille.stages.hfvm.coarse_to_fine import paths
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import Patch, Plain, Seen
 from rille.stages.hfvm.images.window import (
@@ -128,7 +129,8 @@ ROOM = (("packed", np.int32), ("data", np.int32), ("dirty", np.uint8))
 
 @dataclass(frozen=True)
 class FastSolver:
-    """Packed features, several centres, band, propagation (preset ``default``)."""
+    """Packed features, several centres, band, propagation; of preset ``accurate`` also along paths, which cross the
+    whole image."""
 
     params: HfvmParams
     uses_band: bool = True
@@ -164,6 +166,12 @@ class FastSolver:
         beside = 2 if level > 0 else 1 if rounds > 1 else 0
         propagation.checkerboard(words, (packed, data, dirty), soft, p.smoothness, rounds, beside, at)
         propagation.unpack(packed, u, v)
+        if p.path_rounds:
+            coarse = None if up is None else (np.asarray(up.u), np.asarray(up.v))
+            weights = paths.Weights(p.path_compact, p.path_small, p.path_large, p.path_grey)
+            left, right = (paths.LevelView(patch.words, compact.pack(patch.grey), patch.grey) for patch in (a, b))
+            soft_lines = band.lines(a.window), band.mu
+            u, v = paths.propagate(left, right, (u, v), coarse, soft_lines, weights, p.path_rounds)
         return Map(u, v, np.zeros(shape, bool))
 
     def _room(self, name: str, shape: tuple[int, ...], kind: type) -> AnyArray:
@@ -277,7 +285,7 @@ def prepare(left: Pyramid, right: Pyramid, params: HfvmParams) -> Prepared:
 
 
 def solver(params: HfvmParams) -> Solver:
-    """One-level matcher of a preset; without propagation along paths."""
+    """One-level matcher of a preset."""
     return PaperSolver(params) if params.preset == "paper" else FastSolver(params)
 
 
@@ -484,13 +492,6 @@ def sample(pair: Prepared, state: State) -> Sample:
     return Sample(places, x, y, u, v)
 
 
-def evenly(ok: AnyArray, count: int) -> NDArray[np.bool_]:
-    """About ``count`` evenly strided pixels of a mask."""
-    chosen = np.zeros(ok.shape, dtype=bool)
-    chosen.reshape(-1)[thinned(ok, count, lambda a: a != 0)] = True
-    return chosen
-
-
 def with_band(pair: Prepared, state: State) -> State:
     """The state with the epipolar band for the next finer level, where there is one and it can be fitted."""
     if not (pair.solver.uses_band and pair.params.band > 0 and state.level > 0):
@@ -504,4 +505,4 @@ def with_band(pair: Prepared, state: State) -> State:
     mu = pair.params.band * min(1.0, epipolar.SHARP / max(spread, 1e-9)) ** 2
     # Told once, by the first level that has a band; finer ones keep it.
     sign = state.near_sign or epipolar.near_sign(f, s.u, shape, other)
-    return State(state.level, state.left, state.right, state.left_ok, state.right_ok, Band(epipolar.finer(f), mu), sign)
+    return replace(state, band=Band(epipolar.finer(f), mu), near_sign=sign)

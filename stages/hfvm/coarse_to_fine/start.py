@@ -9,7 +9,7 @@ known beforehand, the result of the coarse levels stays; it costs a tenth of the
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +80,7 @@ def impose(pair: hierarchy.Prepared, state: hierarchy.State, prior: Prior | None
     masks = [side.view.valid(state.level, whole(side.view.shapes[state.level])) for side in (pair.left, pair.right)]
     left_ok = (np.asarray(state.left_ok) | known) & (masks[0] != 0)
     right_ok = (np.asarray(state.right_ok) | hit) & (masks[1] != 0)
-    return hierarchy.State(state.level, left, right, left_ok, right_ok, state.band, state.near_sign)
+    return replace(state, left=left, right=right, left_ok=left_ok, right_ok=right_ok)
 
 
 def _coarse(prior: Prior, level: int, shape: tuple[int, ...]) -> tuple[AnyArray, AnyArray, NDArray[np.bool_]]:

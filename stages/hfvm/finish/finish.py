@@ -140,7 +140,7 @@ class Finish:
         left, valid = self.pair.left.view.grey(0, outer), self.right.valid(0, target)
         image = self._spline(target)
         to_right = partial(self._to_right, window=outer)
-        u, v, rest, noise = refine.refine(left, refine.RightWindow(image, valid, place, to_right), u, v, keep, p)
+        u, v, rest, noise = refine.refine(left, rowwise.Right(image, valid, place), to_right, u, v, keep, p)
         removed = self.pair.left.view.removed_noise**2, (self.contrast * self.pair.right.view.removed_noise) ** 2
         alike, variance = refine.surroundings(rest, self.pair.deviation(0, outer), keep, removed)
         if p.refine:

@@ -11,7 +11,6 @@ alike even between turned views; grey values are read from the right image itsel
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -19,24 +18,9 @@ from numba import njit
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.level import rowwise
-from rille.stages.hfvm.level.window_pair import WindowPair
 
 Frame = Callable[[AnyArray, AnyArray], tuple[AnyArray, AnyArray]]
 """Displacements to the right image of those in the frame in which steps are taken, both (row, col) float32 pixels."""
-
-
-@dataclass(frozen=True)
-class RightWindow:
-    """A window of the right image: coefficients (row, col) float32 of its cubic spline, 1 = usable uint8; where both
-    windows lie.
-
-    ``to_right``: from the frame in which steps are taken to the right image; default: it is the right image's.
-    """
-
-    spline: AnyArray
-    valid: AnyArray
-    place: WindowPair
-    to_right: Frame = lambda u, v: (u, v)
 
 
 CORRELATION_SIDE = 9
@@ -58,14 +42,21 @@ SATURATED = 250.0
 
 
 def refine(
-    left: AnyArray, target: RightWindow, u: AnyArray, v: AnyArray, keep: AnyArray, params: HfvmParams
+    left: AnyArray,
+    right: rowwise.Right,
+    to_right: Frame,
+    u: AnyArray,
+    v: AnyArray,
+    keep: AnyArray,
+    params: HfvmParams,
 ) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
     """Displacements without the perspective bias, in the frame in which they are given.
 
     Parameters
     ----------
     left : (row, col) float32 grey values.
-    target : the window of the right image. Pixels nearer than :func:`reach` to a cut are not sound.
+    right : the window of the right image. Pixels nearer than :func:`reach` to a cut are not sound.
+    to_right : from the frame in which steps are taken to the right image.
     u, v : (row, col) float32, smoothed displacements, pixels.
     keep : (row, col) bool, pixels that have one.
 
@@ -79,8 +70,7 @@ def refine(
     now_u, now_v, last = u, v, first
     for step in range(params.refine_steps):
         last = first if step == 0 else np.empty(u.shape, np.float32)
-        there_u, there_v = target.to_right(now_u, now_v)
-        right = rowwise.Right(target.spline, target.valid, target.place)
+        there_u, there_v = to_right(now_u, now_v)
         window = rowwise.WindowOf(params.refine_radius, np.float32(params.refine_noise))
         told = rowwise.StepArrays(step_u, step_v, last, per_noise)
         rowwise.lucas_kanade(left, right, (there_u, there_v), keep, window, told)

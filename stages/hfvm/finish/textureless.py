@@ -40,6 +40,7 @@ from rille.stages.hfvm.images.window import Raster, Window, cut, whole
 from rille.stages.hfvm.level import epipolar
 from rille.stages.hfvm.level.features import distance
 from rille.stages.numeric.robust import MAD_TO_SIGMA
+from rille.stages.numeric.windows import window_sum32
 
 LEVEL = 1
 """Halving once halves noise, and a quarter of the pixels is to be searched."""
@@ -212,8 +213,7 @@ def search(
     passed: deque[AnyArray] = deque()
     for step in steps:
         _distances(images, region, lines, (step, window.x0, window.y0), (cost, outside))
-        # Sums of whole numbers below 2^24 are exact in any order.
-        total = cv2.boxFilter(cost, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        total = window_sum32(cost, SIDE)
         if len(passed) > APART:
             np.minimum(least_passed, passed.popleft(), out=least_passed)
         passed.append(total)

@@ -20,9 +20,9 @@ from numba import njit
 
 from rille.stages.core.declare import AnyArray
 from rille.stages.geometry.spline import slopes, weights
-from rille.stages.hfvm.coarse_to_fine.hierarchy import evenly
 from rille.stages.hfvm.finish.refine import FARTHEST
 from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.window import thinned
 from rille.stages.hfvm.level import epipolar
 from rille.stages.numeric.windows import window_sum
 
@@ -149,7 +149,8 @@ def _warped(left, spline, right_valid, u, v, keep, out):  # type: ignore[no-unty
 
 def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int]) -> tuple[AnyArray, float]:
     """Epipolar lines (row, col, 3) fitted to the matches, and how far to trust them, 0..1; 0 where not determined."""
-    found = epipolar.fit(u, v, evenly(keep, FIT_SAMPLES), right_shape)
+    y, x = np.divmod(thinned(keep, FIT_SAMPLES, lambda a: a != 0), keep.shape[1])
+    found = epipolar.fit_points(x, y, u[y, x], v[y, x], keep.shape, right_shape)
     if found is None:
         return np.zeros((*u.shape, 3), np.float32), 0.0
     return epipolar.lines(found[0], u.shape), min(1.0, (SHARP / max(found[1], 1e-9)) ** 2)

@@ -14,7 +14,7 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray
-from rille.stages.hfvm.images.views import View
+from rille.stages.hfvm.images.views import Changed, View
 from rille.stages.hfvm.images.window import Raster, Shape, Window, pick, thinned, whole
 from rille.stages.hfvm.level.epipolar import residuals, typical, weighted_normal
 
@@ -45,21 +45,10 @@ def terms(x: AnyArray, y: AnyArray, level: int, shape: Shape) -> Floats:
 
 
 @dataclass(frozen=True)
-class Levelled:
+class Levelled(Changed):
     """A view whose brightness is multiplied by the exponential of a polynomial (:func:`terms`)."""
 
-    view: View
     ratio: Floats
-
-    @property
-    def shapes(self) -> tuple[Shape, ...]:
-        """Rows and columns of each level."""
-        return tuple(self.view.shapes)
-
-    @property
-    def blank(self) -> float:
-        """Grey level where no level is valid."""
-        return self.view.blank
 
     @property
     def removed_noise(self) -> float:
@@ -69,10 +58,6 @@ class Levelled:
     def grey(self, level: int, window: Window) -> AnyArray:
         """Grey values, 0 where masked."""
         return self.view.grey(level, window) * self._factor(level, window)
-
-    def valid(self, level: int, window: Window) -> AnyArray:
-        """Mask."""
-        return self.view.valid(level, window)
 
     def filled(self, level: int, window: Window) -> AnyArray:
         """Grey values, those of masked pixels from above."""

@@ -101,7 +101,28 @@ class Plain:
 
 
 @dataclass(frozen=True)
-class Denoised:
+class Changed:
+    """What a view with other grey values has in common with the ``view`` that it is of."""
+
+    view: View
+
+    @property
+    def shapes(self) -> Sequence[Shape]:
+        """Rows and columns of each level."""
+        return self.view.shapes
+
+    @property
+    def blank(self) -> float:
+        """Grey level where no level is valid."""
+        return self.view.blank
+
+    def valid(self, level: int, window: Window) -> AnyArray:
+        """Mask."""
+        return self.view.valid(level, window)
+
+
+@dataclass(frozen=True)
+class Denoised(Changed):
     """A noisy view, each level denoised by the noise that halving has left (:mod:`rille.stages.hfvm.images.denoise`).
 
     With a binomial kernel on the finest level alone bad-2 of five noisy pairs was 2 % and the median error 5 % larger.
@@ -114,23 +135,9 @@ class Denoised:
         """Noise of the view before."""
         return self.view.noise
 
-    @property
-    def shapes(self) -> Sequence[Shape]:
-        """Rows and columns of each level."""
-        return self.view.shapes
-
-    @property
-    def blank(self) -> float:
-        """Grey level where no level is valid."""
-        return self.view.blank
-
     def grey(self, level: int, window: Window) -> AnyArray:
         """Grey values, 0 where masked."""
         return np.where(self.valid(level, window) != 0, self.filled(level, window), np.float32(0.0))
-
-    def valid(self, level: int, window: Window) -> AnyArray:
-        """Mask."""
-        return self.view.valid(level, window)
 
     def filled(self, level: int, window: Window) -> AnyArray:
         """Grey values, those of masked pixels from above."""

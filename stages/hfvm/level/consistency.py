@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.validity import Validity
-from rille.stages.numeric.windows import window_sum
+from rille.stages.numeric.windows import window_count
 
 Map = NDArray[np.float32]
 
@@ -185,8 +185,7 @@ def lonely(keep: AnyArray, share: float) -> NDArray[np.bool_]:
     """Pixels of ``keep`` in whose neighbourhood (CROWD x CROWD, clipped at the border) less than ``share`` is kept."""
     if share <= 0:
         return np.zeros(keep.shape, dtype=bool)
-    around = window_sum(keep.astype(np.float32), CROWD)
-    room = window_sum(np.ones(keep.shape, np.float32), CROWD)
+    around, room = (window_count(a, CROWD) for a in (keep, np.ones_like(keep)))
     return np.asarray(keep & (around < share * room))
 
 
@@ -199,13 +198,8 @@ def supported(blank: AnyArray, keep: AnyArray) -> NDArray[np.bool_]:
     y, x = np.nonzero(blank)
     found = np.zeros(blank.shape, bool)
     if y.size:
-        # Counts of whole numbers, at the few pixels that are asked for: a third of the time of sums everywhere.
-        consistent, textured = (
-            cv2.boxFilter(
-                a.view(np.uint8), cv2.CV_32S, (SUPPORT, SUPPORT), normalize=False, borderType=cv2.BORDER_CONSTANT
-            )[y, x]
-            for a in (keep | blank, keep)
-        )
+        # At the few pixels that are asked for: a third of the time of shares everywhere.
+        consistent, textured = (window_count(a, SUPPORT)[y, x] for a in (keep | blank, keep))
         tall, wide = (
             np.minimum(at + SUPPORT // 2 + 1, n) - np.maximum(at - SUPPORT // 2, 0)
             for at, n in zip((y, x), blank.shape, strict=True)

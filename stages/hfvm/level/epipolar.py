@@ -41,28 +41,21 @@ ITERATIONS, SETTLED = 10, 1e-4
 """At most so many; fewer once no term changes by more than this share of its prior deviation."""
 
 
-def fit(u: AnyArray, v: AnyArray, wanted: AnyArray, right_shape: tuple[int, int]) -> tuple[Matrix, float] | None:
-    """Fundamental matrix of one level's map, or None where it is not determined.
+def fit_points(
+    x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray, left_shape: tuple[int, ...], right_shape: tuple[int, ...]
+) -> tuple[Matrix, float] | None:
+    """Fundamental matrix of matches of one level, or None where it is not determined.
 
     Parameters
     ----------
-    u, v : (row, col) float32 displacements, pixels.
-    wanted : (row, col) bool, pixels to use.
-    right_shape : rows and columns of the other image.
+    x, y, u, v : (n,) columns, rows and displacements, pixels.
+    left_shape, right_shape : rows and columns of both images.
 
     Returns
     -------
     F : (3, 3) float64 with ``(x + u, y + v, 1) F (x, y, 1)^T = 0`` in pixels of this level.
     spread : median distance of the matches from their lines, pixels.
     """
-    y, x = np.nonzero(wanted)
-    return fit_points(x, y, u[y, x], v[y, x], wanted.shape, right_shape)
-
-
-def fit_points(
-    x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray, left_shape: tuple[int, ...], right_shape: tuple[int, ...]
-) -> tuple[Matrix, float] | None:
-    """As :func:`fit`, of matches (n,) of images of these shapes."""
     if len(y) < LEAST_MATCHES:
         return None
     scale = 0.5 * max(left_shape)
@@ -180,27 +173,25 @@ def near_sign(f: Matrix, u: AnyArray, left_shape: tuple[int, ...], right_shape: 
 def lines(f: Matrix, shape: tuple[int, ...], x0: int = 0, y0: int = 0) -> NDArray[np.float32]:
     """Epipolar line of every left pixel: unit normal and offset (row, col, 3) with n . displacement + c = 0.
 
-    ``x0, y0``: first column and row of a window.
+    Zeros where ``f`` is zero. ``x0, y0``: first column and row of a window.
     """
-    found = np.empty((3, shape[0], shape[1]), np.float32)
-    write_lines(f, found, x0, y0)
-    return np.ascontiguousarray(np.moveaxis(found, 0, 2))
+    found = np.empty((*shape, 3), np.float32)
+    _lines(f, found, x0, y0)
+    return found
 
 
 @njit(cache=True, nogil=True)
-def write_lines(f, found, x0=0, y0=0):  # type: ignore[no-untyped-def]
-    """As :func:`lines`, into the planes ``found`` (3, row, col); zeros where ``f`` is zero."""
-    for j in range(found.shape[1]):
+def _lines(f, found, x0, y0):  # type: ignore[no-untyped-def]
+    for j in range(found.shape[0]):
         y = np.float64(j + y0)
-        first, second, third = found[0, j], found[1, j], found[2, j]
-        for i in range(found.shape[2]):
+        for i in range(found.shape[1]):
             x = np.float64(i + x0)
             a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
             b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
             c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
             # Without a band all is zero, and 0 / 0 must stay 0.
             scale = 1.0 / max(np.sqrt(a * a + b * b), 1e-12)
-            first[i], second[i], third[i] = a * scale, b * scale, (c + a * x + b * y) * scale
+            found[j, i, 0], found[j, i, 1], found[j, i, 2] = a * scale, b * scale, (c + a * x + b * y) * scale
 
 
 @njit(cache=True, nogil=True)

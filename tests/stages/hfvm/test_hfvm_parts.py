@@ -109,11 +109,17 @@ def turned(rig):
     return Rig(rig.left, rig.right, type(t)(turn @ t.rotation @ turn.T, turn @ t.translation))
 
 
+def fit(u, v, wanted):
+    """Matrix and spread of the wanted pixels of a map."""
+    y, x = np.nonzero(wanted)
+    return epipolar.fit_points(x, y, u[y, x], v[y, x], wanted.shape, wanted.shape)
+
+
 class TestEpipolar:
     @pytest.mark.parametrize("change", [lambda r: r, turned], ids=["along rows", "along columns"])
     def test_lines_of_a_convergent_rig_despite_outliers(self, change):
         u, v, wanted, true_u, true_v = rig_matches(change(convergent_rig()))
-        f, spread = epipolar.fit(u, v, wanted, wanted.shape)
+        f, spread = fit(u, v, wanted)
         line = epipolar.lines(f, wanted.shape)
         off = np.abs(line[..., 0] * true_u + line[..., 1] * true_v + line[..., 2])
         # The weak prior pulls exact matches off by a small part of the half pixel that a match is good for.
@@ -123,11 +129,11 @@ class TestEpipolar:
     def test_too_few_matches_give_no_band(self):
         wanted = np.zeros((50, 60), bool)
         wanted[0, :30] = True
-        assert epipolar.fit(zeros(50, 60), zeros(50, 60), wanted, (50, 60)) is None
+        assert fit(zeros(50, 60), zeros(50, 60), wanted) is None
 
     def test_finer_level_keeps_the_constraint(self):
         u, v, wanted, *_ = rig_matches(convergent_rig(), outliers=0.0)
-        f, _ = epipolar.fit(u, v, wanted, wanted.shape)
+        f, _ = fit(u, v, wanted)
         y, x = np.nonzero(wanted)
         fine = 2 * np.stack([x + 0.5, y + 0.5]) - 0.5
         fine_right = 2 * np.stack([x + u[wanted] + 0.5, y + v[wanted] + 0.5]) - 0.5
@@ -140,11 +146,11 @@ class TestEpipolar:
         rig = convergent_rig()
         u, v, wanted, *_ = rig_matches(rig, outliers=0.0)
         assert np.median(u[wanted]) > 0  # beyond the crossing of the axes: the sign of u alone would mislead
-        f, _ = epipolar.fit(u, v, wanted, wanted.shape)
+        f, _ = fit(u, v, wanted)
         assert epipolar.near_sign(f, u[wanted], wanted.shape, wanted.shape) == -1.0
         swapped = Rig(rig.right, rig.left, rig.T_right_left.inverse())
         u, v, wanted, *_ = rig_matches(swapped, outliers=0.0)
-        f, _ = epipolar.fit(u, v, wanted, wanted.shape)
+        f, _ = fit(u, v, wanted)
         assert epipolar.near_sign(f, u[wanted], wanted.shape, wanted.shape) == 1.0
 
 
@@ -194,8 +200,9 @@ class TestPlane:
 
 
 def whole_image(grey):
-    """All of a right image, usable everywhere."""
-    return refine.RightWindow(coefficients(grey), np.ones(grey.shape, np.uint8), WindowPair(0, 0, 0, 0, *grey.shape))
+    """All of a right image, usable everywhere, in whose frame steps are taken."""
+    place = WindowPair(0, 0, 0, 0, *grey.shape)
+    return rowwise.Right(coefficients(grey), np.ones(grey.shape, np.uint8), place), lambda u, v: (u, v)
 
 
 class TestRefine:
@@ -205,7 +212,7 @@ class TestRefine:
         start_u, start_v = (u + 0.3).astype(np.float32), (v - 0.3).astype(np.float32)
         keep = np.ones(u.shape, bool)
         found_u, found_v, rest, _ = refine.refine(
-            left, whole_image(right), start_u, start_v, keep, HfvmParams(refine_steps=2)
+            left, *whole_image(right), start_u, start_v, keep, HfvmParams(refine_steps=2)
         )
         inner = np.s_[12:-12, 12:-12]
         gradient = np.sqrt(np.mean(np.gradient(right)[1] ** 2))
@@ -220,7 +227,7 @@ class TestRefine:
         left, right, *_ = pair(lambda x, y: (-6.0, 0.0))
         wrong = np.full(left.shape, 20.0, np.float32)
         found_u, _, _, _ = refine.refine(
-            left, whole_image(right), wrong, wrong, np.zeros(left.shape, bool), HfvmParams()
+            left, *whole_image(right), wrong, wrong, np.zeros(left.shape, bool), HfvmParams()
         )
         np.testing.assert_array_equal(found_u, wrong)
 

@@ -9,6 +9,7 @@ from rille.stages.geometry.spline import coefficients
 from rille.stages.hfvm.finish import refine
 from rille.stages.hfvm.finish.uncertainty import REFINED, neighbours, standard_deviation
 from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.level import rowwise
 from rille.stages.hfvm.level.window_pair import WindowPair
 from rille.stages.hfvm.stage import match
 
@@ -16,15 +17,16 @@ PARAMS = HfvmParams()
 
 
 def whole_image(grey):
-    """All of a right image, usable everywhere."""
-    return refine.RightWindow(coefficients(grey), np.ones(grey.shape, np.uint8), WindowPair(0, 0, 0, 0, *grey.shape))
+    """All of a right image, usable everywhere, in whose frame steps are taken."""
+    place = WindowPair(0, 0, 0, 0, *grey.shape)
+    return rowwise.Right(coefficients(grey), np.ones(grey.shape, np.uint8), place), lambda u, v: (u, v)
 
 
 def test_noise_part_is_the_inverse_structure_tensor_of_the_window():
     image = np.random.default_rng(0).uniform(0, 255, (15, 17)).astype(np.float32)
     keep = np.ones(image.shape, bool)
     nothing = np.zeros(image.shape, np.float32)
-    per_noise = refine.refine(image, whole_image(image), nothing, nothing, keep, PARAMS)[3]
+    per_noise = refine.refine(image, *whole_image(image), nothing, nothing, keep, PARAMS)[3]
     y, x = 7, 8
     window = np.s_[y - 2 : y + 3, x - 2 : x + 3]
     gy, gx = np.gradient(image.astype(np.float64))
@@ -76,7 +78,7 @@ def test_edges_along_the_rows_leave_the_column_uncertain():
     keep, flat = np.ones(x.shape, bool), np.zeros(x.shape, np.float32)
     found = []
     for image in (across := (128 + 60 * np.sin(x)).astype(np.float32), across.T.copy()):
-        noise = 150.0 * refine.refine(image, whole_image(image), flat, flat, keep, PARAMS)[3]
+        noise = 150.0 * refine.refine(image, *whole_image(image), flat, flat, keep, PARAMS)[3]
         found.append(standard_deviation(noise, flat, keep, PARAMS)[30, 30])
     up, along = found
     assert beyond_floor(along) > 5 * beyond_floor(up)

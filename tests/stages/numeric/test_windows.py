@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rille.stages.numeric.windows import window_mean, window_sum, window_sum32
+from rille.stages.numeric.windows import window_count, window_mean, window_sum, window_sum32
 
 
 @pytest.mark.parametrize("n", [1, 3, 7, 25])
@@ -14,12 +14,12 @@ def test_sums_and_means_equal_loops(n: int) -> None:
     z = rng.normal(size=(13, 17)).astype(np.float32)
     z[rng.random(z.shape) < 0.2] = np.nan
     z[:3, :4] = np.nan
-    sums, means = window_sum(~np.isnan(z), n), window_mean(z, n)
+    sums, counts, means = window_sum(~np.isnan(z), n), window_count(~np.isnan(z), n), window_mean(z, n)
     for r in range(z.shape[0]):
         for c in range(z.shape[1]):
             part = z[max(r - n // 2, 0) : r + n // 2 + 1, max(c - n // 2, 0) : c + n // 2 + 1].astype(float)
             known = ~np.isnan(part)
-            assert sums[r, c] == known.sum()
+            assert sums[r, c] == counts[r, c] == known.sum()
             if known.any():
                 assert means[r, c] == pytest.approx(part[known].mean(), abs=2.5e-7)  # float32 of about 2
             else:
