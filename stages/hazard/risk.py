@@ -26,7 +26,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -111,7 +110,8 @@ def risk_map(
 
     Parameters
     ----------
-    elevation, elevation_std : (row, col) float32, metres, NaN unknown.
+    elevation, elevation_std : (row, col), metres, NaN unknown; what is infinite, or infinitely uncertain, is unknown
+        ground, and ground of unknown standard deviation counts as exact.
     cell : side of a cell, metres.
     vehicle : limits.
     params : parameters; None for the defaults.
@@ -130,24 +130,14 @@ def risk_map(
     p = params or RiskParams()
     check_size(vehicle, elevation.shape, cell)
     window = p.window * vehicle.wheel_diameter
-    z, s = elevation.copy(), np.empty(elevation.shape, dtype=np.float32)
-    _finite(np.ascontiguousarray(elevation_std, dtype=np.float32), s)
+    unknown = np.isinf(elevation) | np.isinf(elevation_std)
+    elevation = np.where(unknown, np.nan, elevation).astype(np.float32)
+    z, s = elevation.copy(), np.where(np.isfinite(elevation_std), elevation_std, 0.0).astype(np.float32)
     gap, side = p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell)
     filled = close_into((z, s), elevation, gap, side, p.min_known, rim=RIM)
     rules = Rules(p.sigmas, p.caution, p.max_p, p.min_known)
     classes = classify(HazardInput(elevation, z, s, cell, vehicle, window), filled, rules)
     return classes | {"filled": filled, "elevation": z}
-
-
-@njit(cache=True, nogil=True)
-def _finite(source, out):  # type: ignore[no-untyped-def]
-    """A copy with 0 for what is not finite."""
-    for r in range(out.shape[0]):
-        line, target = source[r], out[r]
-        for c in range(out.shape[1]):
-            v = line[c]
-            # NaN and infinity minus themselves are NaN, which equals nothing.
-            target[c] = v if v - v == np.float32(0.0) else np.float32(0.0)
 
 
 def check_size(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> None:

@@ -161,6 +161,16 @@ def test_a_step_proven_by_few_cells_is_hazardous() -> None:
     assert (out["risk"][40:43, 60:66] == HAZARDOUS).all()
 
 
+def test_ground_that_is_infinitely_uncertain_is_unknown() -> None:
+    z, std = np.zeros((120, 120)), np.zeros((120, 120))
+    missing = z.copy()
+    missing[20:60, 20:60] = np.nan
+    endless, unsure = z.copy(), std.copy()
+    endless[20:60, 20:60] = unsure[20:60, 20:60] = np.inf
+    for found in (judge(endless), judge(z, std=unsure)):
+        np.testing.assert_equal(found, judge(missing))
+
+
 def test_nothing_known_and_a_map_too_small() -> None:
     out = judge(np.full((100, 100), np.nan))
     assert (out["risk"] == UNKNOWN).all()
