@@ -60,7 +60,12 @@ META: dict[str, dict[str, Any]] = {
     "locus": {"lattice": LATTICE},
     "frame_screening": {"asks": {"bridges": [], "sides": []}, "chain": list(FRAMES), "unfit": [], "lost": []},
     "trajectory": {"frames": list(FRAMES), "positions": [[0.0, 0.0, 0.0]] * 5, "pieces": [[0, 4]], "main": 0},
-    "crosscheck_join": {"frames": list(FRAMES), "positions": [[0.0, 0.0, 0.0]] * 5},
+    "crosscheck_join": {
+        "frames": list(FRAMES),
+        "positions": [[0.0, 0.0, 0.0]] * 5,
+        "pieces": [list(FRAMES)],
+        "longest": 0,
+    },
     "common_tilt": {"undone": False},
     "radiometry": {"steps": {"2": 3}},
 }

@@ -55,8 +55,9 @@ def _of_crosscheck(make: Builder, joined: Handle, known: Handle) -> Steps:
     found = yield joined
     posed = [f for f, position in zip(found.meta["frames"], found.meta["positions"], strict=True) if position]
     if any(_truth(make, frame) is not None for frame in posed):
+        args = {"piece": found.meta["longest"]} if len(found.meta["pieces"]) > 1 else {}
         make.products.crosscheck_accuracy = make.node(
-            accuracy, "accuracy/crosscheck", {}, trajectory=joined, truth=known
+            accuracy, "accuracy/crosscheck", args, trajectory=joined, truth=known
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -250,14 +250,14 @@ def _elevation(view: RunView, pairs: Rows) -> dict[str, Metric]:
     found: dict[str, Metric] = {}
     rmse = [r["rmse_m"] for r in pairs if r["rmse_m"] is not None]
     shares = [r["completeness"] for r in pairs if r["completeness"] is not None]
-    if rmse and shares:
+    if shares:
         where = "within the evaluation window" if view.sequence.evaluation_window else "over the whole model"
         least = (
             f"{len(rmse)} of {len(pairs)} pairs; {min(shares):.0%} to {max(shares):.0%} of the cells both cameras see"
         )
         for name, label, value, over in (
-            ("median", "Elevation error of a pair, RMS, median", statistics.median(rmse), "median over pairs"),
-            ("max", "Elevation error of a pair, RMS, worst", max(rmse), "worst pair"),
+            ("median", "Elevation error of a pair, RMS, median", _of(statistics.median, rmse), "median over pairs"),
+            ("max", "Elevation error of a pair, RMS, worst", _of(max, rmse), "worst pair"),
         ):
             how = f"RMS of local elevation minus exact elevation {where}, {over}"
             found[f"dem_pairs_rmse_{name}"] = _metric(label, value, "m", how, least)
@@ -304,6 +304,11 @@ def _path_check(view: RunView) -> dict[str, Metric]:
         "length_ratio": "Length of the path over the shortest",
     }
     return _labelled(found, "path_check_", labels)
+
+
+def _of(figure: Callable[[list[float]], float], values: list[float]) -> float | None:
+    """A figure of values, None of none."""
+    return figure(values) if values else None
 
 
 def _metric(label: str, value: Any, unit: str, how: str, completeness: str | None = None) -> Metric:

@@ -84,8 +84,7 @@ def trajectory_accuracy(
         "displacement": np.diff(P[:, :3, 3], axis=0),
         "displacement_truth": np.diff(aligned[:, :3, 3], axis=0),
     }
-    metrics = _counts(has_pose, has_truth)
-    metrics |= _absolute(P[judged], Q[judged], aligned[judged])
+    metrics = _absolute(P[judged], Q[judged], aligned[judged])
     metrics |= _drift(P, aligned, judged)
     metrics |= _relative(P, Q)
     metrics |= _displacement(arrays["displacement"], arrays["displacement_truth"])
@@ -94,7 +93,11 @@ def trajectory_accuracy(
     metrics |= _kitti(P, Q) | by_steps(P, Q) | by_shares(P[whole], Q[whole]) | by_cause(P, Q)
     if covariance is not None:
         metrics |= against_claims(P, aligned, covariance)
-    return arrays, metrics
+    if len(judged) == 1:
+        # Its errors are 0 by the alignment, which is no answer.
+        why = "not applicable: one frame alone has a pose and truth, and by it they are aligned"
+        metrics = {name: metric(None, figure["unit"], why) for name, figure in metrics.items()}
+    return arrays, _counts(has_pose, has_truth) | metrics
 
 
 def _counts(has_pose: Bools, has_truth: Bools) -> dict[str, Metric]:
@@ -131,15 +134,16 @@ def _absolute(P: Floats, Q: Floats, aligned: Floats) -> dict[str, Metric]:
 
 def _drift(P: Floats, aligned: Floats, judged: NDArray[np.intp]) -> dict[str, Metric]:
     last = judged[-1]
-    way, gaps = along(aligned[judged[0] : last + 1])
+    way, bridged = along(aligned[judged[0] : last + 1, :3, 3])
     length = float(way[-1])
     error = float(np.linalg.norm(P[last, :3, 3] - aligned[last, :3, 3]))
     turn = math.degrees(float(angle(inverse(aligned[last]) @ P[last])))
     percent = 100.0 * error / length if length > 0 else None
     how = "error of the last position with the first poses made equal"
-    bridged = f", straight over {gaps} gap{'s' if gaps > 1 else ''} of the truth" if gaps else ""
     return {
-        "path_length": metric(length, "m", f"true length from the first to the last posed frame{bridged}"),
+        "path_length": metric(
+            length, "m", f"true length from the first to the last frame with pose and truth{bridged}"
+        ),
         "final_error": metric(error, "m", how),
         "final_rotation_error": metric(turn, "deg", "rotation error of the last pose, first poses made equal"),
         "drift": metric(
@@ -179,7 +183,7 @@ def _displacement(estimate: Floats, truth: Floats) -> dict[str, Metric]:
 
 
 def _kitti(P: Floats, Q: Floats) -> dict[str, Metric]:
-    way, _ = along(Q)
+    way, _ = along(Q[:, :3, 3])
     has_truth = np.isfinite(Q[:, 0, 0])
     errors = []
     for first in range(0, len(Q), KITTI_STEP):

@@ -64,10 +64,14 @@ def rms(vectors: Floats) -> float:
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
-def along(poses: Floats) -> tuple[Floats, int]:
-    """Way (frame,) from the first frame along positions, m, straight over frames without any; how many such gaps."""
+def along(positions: Floats) -> tuple[Floats, str]:
+    """Way (frame,) from the first frame along positions (frame, 2 or 3), m, straight over gaps; and that in words.
+
+    The words follow a length of the true path, and are empty where no frame between two others is without a position.
+    """
     # Interpolated over frames without a position, so that the way of every frame is a number to search in.
-    there = np.isfinite(poses[:, :3, 3]).all(axis=1)
-    rows = np.flatnonzero(there)
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[rows, :3, 3], axis=0), axis=1))])
-    return np.interp(np.arange(len(poses)), rows, way), int((np.diff(rows) > 1).sum())
+    rows = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions[rows], axis=0), axis=1))])
+    gaps = int((np.diff(rows) > 1).sum())
+    bridged = f", straight over {gaps} gap{'s' if gaps > 1 else ''} of the truth" if gaps else ""
+    return np.interp(np.arange(len(positions)), rows, way), bridged

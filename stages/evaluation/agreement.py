@@ -185,13 +185,16 @@ def _run(params: AgreementParams, args: Mapping[str, Any], inputs: Inputs) -> Bu
     ours, theirs = np.asarray(trajectory["poses"]), by_frame(np.asarray(other["piece_poses"]), given, frames)
     number = dict(zip(given, np.asarray(other["piece"]).tolist(), strict=True))
     piece = np.array([number.get(f, -1) for f in frames], dtype=np.int64)
+    own = np.zeros(len(frames), dtype=np.int64)
     if "piece" in trajectory.arrays:
-        piece = unbroken(piece, np.asarray(trajectory["piece"], dtype=np.int64))
+        own = np.asarray(trajectory["piece"], dtype=np.int64)
+        piece = unbroken(piece, own)
     arrays, facts = compare(ours, theirs, piece)
     flags, limits = flag(arrays, params)
     compared = np.isfinite(arrays["distance"])
-    positions = ours[compared, :, 3]
-    length = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+    # Our pieces lie in frames of their own: from one to the next there is no way.
+    there = np.diff(own[compared]) == 0
+    length = float(np.linalg.norm(np.diff(ours[compared, :, 3], axis=0), axis=1)[there].sum())
     meta = {
         "frames": frames,
         "compared": int(compared.sum()),

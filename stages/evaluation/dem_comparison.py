@@ -25,6 +25,7 @@ Align = Literal["shift", "tilt", "rigid"]
 
 MEANS_FROM = 1.5  # ratio of cells from which the finer model's cells are averaged instead of interpolated
 LEAST_SHARE = 0.5  # of a coarse cell's area that the finer cells must know
+BORDER = 1e-6  # of a coarse cell: a centre nearer than this to a border lies on it
 FREE = {"shift": [0, 1, 2], "tilt": [2, 3, 4], "rigid": [0, 1, 2, 3, 4, 5]}  # of tx ty tz wx wy wz
 MOST_POINTS = 300_000  # that an alignment uses: six unknowns need no more
 ITERATIONS = 50
@@ -78,17 +79,25 @@ def interpolate(grid: Grid, xy: Floats, values: Floats | None = None) -> Floats:
 
 
 def cell_means(fine: Grid, target: Grid) -> Floats:
-    """Mean (rows, cols) of the finer cells whose centres lie in each target cell, where they know half of it."""
+    """Mean (rows, cols) of the finer cells whose centres lie in each target cell, where they know half of it.
+
+    A centre on the border of two or four target cells counts to each of them alike.
+    """
     known = np.isfinite(fine.values)
-    index = np.rint(target.index(fine.centres()[known])).astype(np.intp)
+    where, values = target.index(fine.centres()[known]), fine.values[known]
     shape = target.values.shape
-    inside = ((index >= 0) & (index < shape)).all(axis=1)
-    flat = np.ravel_multi_index((index[inside, 0], index[inside, 1]), shape)
     size = shape[0] * shape[1]
-    count = np.bincount(flat, minlength=size)
-    total = np.bincount(flat, weights=fine.values[known][inside], minlength=size)
-    enough = count >= LEAST_SHARE * (target.cell / fine.cell) ** 2
-    return np.where(enough, total / np.maximum(count, 1), np.nan).reshape(shape)
+    count, total = np.zeros(size), np.zeros(size)
+    # Lattices of which one has twice the cells of the other put centres on borders: rounded to one side, they would
+    # shift the means, or leave every other cell nearly without any. Moved to all four sides, they are shared out.
+    for nudge in itertools.product((-BORDER, BORDER), repeat=2):
+        index = np.rint(where + nudge).astype(np.intp)
+        inside = ((index >= 0) & (index < shape)).all(axis=1)
+        flat = np.ravel_multi_index((index[inside, 0], index[inside, 1]), shape)
+        count += 0.25 * np.bincount(flat, minlength=size)
+        total += 0.25 * np.bincount(flat, weights=values[inside], minlength=size)
+    enough = count >= LEAST_SHARE * (target.cell / fine.cell) ** 2 * (1.0 - 1e-9)
+    return np.where(enough, total / np.where(enough, count, 1.0), np.nan).reshape(shape)
 
 
 def common(a: Grid, b: Grid) -> tuple[Grid, Grid, str]:

@@ -52,15 +52,18 @@ def way(parts: Sequence[Mapping[str, Floats]]) -> float:
 
 
 def localisation(estimate: Floats, truth: Floats, length: float) -> tuple[Floats, dict[str, Metric]]:
-    """Error (frame,) m of the positions (frame, 3, 4), and the one at the end."""
+    """Error (frame,) m of the poses (frame, 3, 4), NaN of a frame without one; and that of the last that has one."""
     P, Q = square(estimate), square(truth)
     error = np.linalg.norm(P[:, :3, 3] - (P[0] @ inverse(Q[0]) @ Q)[:, :3, 3], axis=1)
-    last = float(error[-1])
-    how = "of the last position, after making the first poses equal"
+    # A drive that ends because tracking is lost has no pose at its last image.
+    known = np.flatnonzero(np.isfinite(error))
+    last = float(error[known[-1]])
+    which = "last position" if known[-1] == len(error) - 1 else "last position that is known"
+    how = f"of the {which}, after making the first poses equal"
     return error, {
         "localisation_error": metric(last, "m", how),
         "localisation_share": metric(last / length if length > 0 else None, "1", f"{how}, over the length driven"),
-        "greatest_error": metric(float(error.max()), "m", "of any position, after making the first poses equal"),
+        "greatest_error": metric(float(np.nanmax(error)), "m", "of any position, after making the first poses equal"),
     }
 
 
@@ -92,7 +95,7 @@ STAGE = Stage(
     params=NoParams,
     inputs=("drives*", "trajectory?", "truth?", "best?"),
     outputs=(
-        Array("error", ("frame",), "float64", "m", "distance of the estimated from the true position"),
+        Array("error", ("frame",), "float64", "m", "distance of the estimated from the true position", "nan"),
         Array("way", ("position", "xyz"), "float64", "m", "true position of the vehicle on the ground", frame="truth"),
     ),
     run=_run,

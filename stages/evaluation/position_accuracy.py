@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.evaluation.accuracy import by_frame
-from rille.stages.evaluation.accuracy_parts import Metric, metric, rms
+from rille.stages.evaluation.accuracy_parts import Metric, along, metric, rms
 from rille.stages.odometry.resection.trajectory import world_poses
 
 LEAST = 4
@@ -76,7 +76,9 @@ class TruePositions:
         after = np.clip(np.searchsorted(t, moments, side="left"), 1, max(len(t) - 1, 1))
         known = (moments >= t[0]) & (moments <= t[-1])
         if len(t) > 1:
-            known &= t[after] - t[after - 1] <= self.max_gap
+            at_row = np.minimum(np.abs(moments - t[after - 1]), np.abs(moments - t[after])) <= WITHIN
+            # At a row itself a gap beside it does not matter.
+            known &= (t[after] - t[after - 1] <= self.max_gap) | at_row
         moved = np.stack([np.interp(moments, t, axis) for axis in self.positions.T], axis=1)
         return np.where(known[:, None], moved, np.nan)
 
@@ -270,17 +272,20 @@ def _figures(estimate: Floats, truth: Floats, both: Bools, how: str) -> dict[str
         return counts | {name: metric(None, unit, why) for name, unit in units.items()}
     error = (estimate[:, : truth.shape[1]] - truth)[both]
     away = np.linalg.norm(error, axis=1)
-    length = float(np.linalg.norm(np.diff(truth[both], axis=0), axis=1).sum())
+    first, last = np.flatnonzero(both)[[0, -1]]
+    # With the truth of frames between that have no pose: the true path leads on there.
+    way, bridged = along(truth[first : last + 1])
+    length = float(way[-1])
     apart = float(np.linalg.norm(error[-1] - error[0]))
     axes = "in x, y and z" if truth.shape[1] == 3 else "in x and y"
     values = {
         "position_rmse": (float(np.sqrt(np.mean(away**2))), f"RMS error {axes}, {compared} of {n} frames, {how}"),
         "position_median": (float(np.median(away)), f"median error {axes}, {how}"),
         "position_max": (float(away.max()), f"largest error {axes}, {how}"),
-        "path_length": (length, "true length from the first to the last compared frame"),
+        "path_length": (length, f"true length from the first to the last compared frame{bridged}"),
         "position_drift": (
             100.0 * apart / length if length > 0 else None,
-            f"error of the way from the first to the last compared frame over the true length, {how}",
+            f"error of the way from the first to the last compared frame over the true length{bridged}, {how}",
         ),
     }
     return counts | {name: metric(value, units[name], words) for name, (value, words) in values.items()}

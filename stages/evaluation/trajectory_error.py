@@ -45,7 +45,7 @@ def by_steps(P: Floats, Q: Floats) -> dict[str, Metric]:
 def by_shares(P: Floats, Q: Floats) -> dict[str, Metric]:
     """Relative errors over sections of 10 to 80 % of the true path, from every frame, but not over a gap of the truth:
     mean, over their length."""
-    way, _ = along(Q)
+    way, _ = along(Q[:, :3, 3])
     total = float(way[-1])
     # Equal at both ends of a section: no frame between is without truth.
     gaps = np.cumsum(~posed(Q))
@@ -90,8 +90,10 @@ def by_cause(P: Floats, Q: Floats) -> dict[str, Metric]:
     rest = p - scale * q
     # Standard error of a least-squares factor: residual variance over the sum of squares.
     bound = float(np.sqrt((rest**2).sum() / (3 * len(p) - 1) / (q * q).sum()))
-    swing = _between(q.mean(0), p.mean(0))
-    direction = math.degrees(float(np.linalg.norm(rotation_log(swing[None])[0])))
+    a, b = q.mean(0), p.mean(0)
+    swing = _between(a, b)
+    pointed = min(float(np.linalg.norm(a)), float(np.linalg.norm(b))) >= LEAST_MOVED
+    direction = math.degrees(math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b)))
     turns = rotation_log(np.swapaxes(dQ[:, :3, :3], 1, 2) @ dP[:, :3, :3])
     mean, count = turns.mean(0), len(turns)
     bias = float(np.linalg.norm(mean))
@@ -107,7 +109,11 @@ def by_cause(P: Floats, Q: Floats) -> dict[str, Metric]:
             " focal length",
         ),
         "direction_error": metric(
-            direction, "deg", "between the mean motions, estimated and true, in the camera; hangs on mount and pitch"
+            direction if pointed else None,
+            "deg",
+            "between the mean motions, estimated and true, in the camera; hangs on mount and pitch"
+            if pointed
+            else "not applicable: motions that cancel have no mean direction",
         ),
         "rotation_bias": metric(
             per_metre, "deg/m", f"mean rotation error{steady}; hangs on principal point and lens distortion"
@@ -117,9 +123,9 @@ def by_cause(P: Floats, Q: Floats) -> dict[str, Metric]:
 
 
 def _between(a: Floats, b: Floats) -> Floats:
-    """Least rotation (3, 3) from the direction of a to that of b; the identity where either is none."""
+    """Least rotation (3, 3) from the direction of a to that of b; the identity where either is none, or they oppose."""
     size = float(np.linalg.norm(a) * np.linalg.norm(b))
-    # Opposite directions have no least rotation.
+    # Beyond a right angle the scale is negative, and has turned the motion already.
     if size < LEAST_MOVED**2 or float(a @ b) <= 0:
         return np.eye(3)
     k = cross_matrix(np.cross(a, b) / size)
@@ -136,8 +142,15 @@ def against_claims(P: Floats, aligned: Floats, covariance: Floats) -> dict[str, 
     known = claimed & posed(aligned)
     # The first frame is exact by definition and has no covariance to judge.
     rows, origin = np.flatnonzero(known)[1:], int(np.argmax(claimed))
-    if len(rows) == 0 or not known[origin] or not (np.linalg.eigvalsh(covariance[rows])[:, 0] > 0).all():
-        return {"nees": metric(None, "", "not applicable: no covariances of frames behind the first")}
+    why = ""
+    if len(rows) == 0:
+        why = "no covariances of frames behind the first"
+    elif not known[origin]:
+        why = "the first posed frame, where the covariances begin, has no truth"
+    elif not (np.linalg.eigvalsh(covariance[rows])[:, 0] > 0).all():
+        why = "a covariance is singular"
+    if why:
+        return {"nees": metric(None, "", f"not applicable: {why}")}
     turn = rotation_log(aligned[rows, :3, :3] @ np.swapaxes(P[rows, :3, :3], 1, 2))
     error = np.concatenate([aligned[rows, :3, 3] - P[rows, :3, 3], turn], axis=1)
     weighed = np.linalg.solve(covariance[rows], error[..., None])[..., 0]

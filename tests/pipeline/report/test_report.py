@@ -18,7 +18,7 @@ from rille.datasets.mockup.sequence import vehicle_at_scale
 from rille.pipeline.export import ranges
 from rille.pipeline.export.view import TaskRow
 from rille.pipeline.flow.products import Driven, Products
-from rille.pipeline.report import canvas, figures, gather, stops, summary, tables, words
+from rille.pipeline.report import canvas, figures, gather, metrics, stops, summary, tables, words
 from rille.pipeline.report.canvas import Figure
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import RilleError
@@ -124,6 +124,20 @@ def test_truth_is_aligned_by_the_first_frame_alone(whole: Written) -> None:
     assert [r["error_m"] for r in facts["frames"]] == pytest.approx([0.0] * 6, abs=1e-12)
     assert facts["truth"] == {"used": True, "source": "exact poses"}
     assert "exact poses" in page_.text
+
+
+def test_pairs_without_any_cell_have_no_error_but_a_completeness() -> None:
+    found = metrics._elevation(view(), [{"rmse_m": None, "completeness": 0.0, "tilt_deg": None}])
+    assert found["dem_pairs_rmse_max"]["value"] is None
+    assert found["dem_pairs_rmse_median"]["value"] is None
+    assert found["dem_pairs_completeness_min"]["value"] == 0.0
+
+
+def test_the_median_of_a_large_map_of_which_little_is_known_is_that_of_all_that_is() -> None:
+    rng = np.random.default_rng(0)
+    values = np.full(4_000_000, np.nan)
+    values[rng.choice(values.size, 2000, replace=False)] = np.arange(2000.0)
+    assert len(ranges.sample(values.reshape(2000, 2000))) == 2000
 
 
 def test_error_never_without_completeness(whole: Written) -> None:

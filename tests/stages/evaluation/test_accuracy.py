@@ -271,3 +271,23 @@ def test_shares_of_the_path_count_what_lies_between_poses_that_were_lost() -> No
     found = trajectory_accuracy(estimate, true)[1]
     assert found["path_length"]["value"] == pytest.approx(60.0)
     assert found["sections_translation"]["value"] < 100.0 / 40.0
+
+
+def test_one_frame_with_pose_and_truth_has_no_errors_instead_of_none_at_all() -> None:
+    true = walk(1, 9)
+    one = np.full_like(true, np.nan)
+    one[4] = true[4]
+    _, ours = trajectory_accuracy(disturbed(true, 1), one)
+    assert ours["frames_judged"]["value"] == 1
+    judged = {name: m for name, m in ours.items() if not name.startswith("frames")}
+    assert {"ate_rmse", "final_error", "path_length", "drift"} < judged.keys()
+    assert all(m["value"] is None and "one frame alone" in m["how"] for m in judged.values())
+
+
+def test_the_length_is_that_of_the_frames_with_truth() -> None:
+    true = walk(1, 9)
+    half = true.copy()
+    half[5:] = np.nan
+    length = trajectory_accuracy(true, half)[1]["path_length"]
+    assert length["value"] == pytest.approx(np.linalg.norm(np.diff(true[:5, :, 3], axis=0), axis=1).sum())
+    assert "to the last frame with pose and truth" in length["how"]

@@ -181,3 +181,15 @@ def test_a_resting_camera_is_aligned_by_its_orientations() -> None:
     # the mean of 20 noisy orientations on either side: a few 1e-4 rad in all, not the chance of the noise's shape
     assert out.meta["metrics"]["rmse_rotation"]["value"] < math.degrees(5e-4)
     assert out.meta["scale_ratio"] is None
+
+
+def test_from_one_of_our_pieces_to_the_next_there_is_no_way() -> None:
+    true = drive(20)
+    ours = true.copy()
+    ours[10:] = moved(true[10:], true[10, :, :3].T, -true[10, :, :3].T @ true[10, :, 3])  # begins at its own origin
+    frames = list(range(20))
+    given = Bundle({"poses": ours, "piece": np.repeat([0, 1], 10).astype(np.int16)}, {"frames": frames})
+    other = Bundle({"piece_poses": true, "piece": np.zeros(20, np.int16)}, {"frames": frames, "pieces": [frames]})
+    metrics = STAGE.run(AgreementParams(), {}, {"trajectory": given, "crosscheck": other}).meta["metrics"]
+    assert metrics["rmse"]["value"] == pytest.approx(0.0, abs=1e-9)
+    assert metrics["length"]["value"] == pytest.approx(18.0)

@@ -65,6 +65,21 @@ def test_the_finer_model_is_averaged_where_it_knows_half_a_cell() -> None:
     assert common(target, g)[2].startswith("B averaged")
 
 
+@pytest.mark.parametrize("ratio", [2, 3, 4])
+def test_a_plane_on_lattices_of_multiples_of_their_cells_is_the_same_plane(ratio: int) -> None:
+    def plane(cell: float, n: int) -> Grid:
+        empty = grid(np.zeros((n, n)), cell=cell)
+        x, y = np.moveaxis(empty.centres(), -1, 0)
+        return Grid(0.3 * x + 0.2 * y, empty.matrix)
+
+    fine, coarse = plane(0.01, 20 * ratio + 1), plane(0.01 * ratio, 21)
+    fine.values[:5] = np.nan  # the first row of target cells knows too little, the second more than half
+    error = errors(*common(fine, coarse)[:2])
+    inner = error[3:-1, 1:-1]  # outermost cells are covered on one side alone
+    assert np.isfinite(inner).all()
+    assert np.abs(inner).max() < 1e-12
+
+
 def test_equal_cells_are_not_resampled_and_turned_ones_are_interpolated() -> None:
     whole = terrain()
     part = Grid(whole.values[10:40, 20:60], whole.matrix + np.array([[0, 0, 20.0], [0, 0, -10.0]]))

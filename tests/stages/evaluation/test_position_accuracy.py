@@ -152,3 +152,23 @@ def test_images_that_are_farther_apart_than_any_offset_that_is_searched(apart: f
     places = np.stack([0.01 * moments, np.sin(moments), np.zeros(12)], axis=1)
     _, metrics, _ = position_accuracy(places, TruePositions(places[:, :2], moments, 2.0 * apart), moments)
     assert metrics["position_rmse"]["value"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_row_itself_is_known_whatever_gap_lies_before_it():
+    times = np.array([0.0, 3.0, 3.1, 6.0])
+    rows = TruePositions(np.stack([times, times], axis=1), times, 0.5)
+    there = rows.at(np.array([0.0, 1.0, 3.0, 3.05, 5.0, 6.0]))[:, 0]
+    np.testing.assert_allclose(there, [0.0, np.nan, 3.0, 3.05, np.nan, 6.0])
+
+
+def test_the_true_way_leads_on_where_poses_were_lost_and_straight_where_truth_is():
+    angle = np.linspace(0.0, np.pi, 101)
+    half_circle = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    lost = half_circle.copy()
+    lost[5:-5] = np.nan
+    length = position_accuracy(lost, TruePositions(half_circle))[1]["path_length"]
+    assert length["value"] == pytest.approx(np.pi, rel=1e-3)
+    assert "straight" not in length["how"]
+    length = position_accuracy(half_circle, TruePositions(lost))[1]["path_length"]
+    assert length["value"] < 2.4
+    assert "straight over 1 gap of the truth" in length["how"]

@@ -111,3 +111,27 @@ def test_covariances_reach_the_figures():
     assert figures["nees"]["value"] == pytest.approx(0.0, abs=1e-9)
     assert "nees" not in trajectory_accuracy(true, true)[1]
     assert square(true).shape == (12, 4, 4)
+
+
+def test_the_direction_is_told_beyond_a_right_angle_and_not_of_motions_that_cancel():
+    true = straight()
+    for degrees in (89.0, 91.0, 150.0, 180.0):
+        turned = np.eye(4)
+        turned[:3, :3] = rotation_exp([0.0, np.radians(degrees), 0.0])
+        found = by_cause(turned @ true @ np.linalg.inv(turned), true)
+        assert found["direction_error"]["value"] == pytest.approx(degrees)
+    there_and_back = straight()
+    there_and_back[:, 2, 3] = 0.5 * (np.arange(41) % 2)
+    found = by_cause(there_and_back, there_and_back)["direction_error"]
+    assert found["value"] is None
+    assert "cancel" in found["how"]
+
+
+def test_why_claims_are_not_judged_is_said():
+    poses, claimed = straight(5), np.tile(np.eye(6), (5, 1, 1))
+    late, singular = poses.copy(), claimed.copy()
+    late[0] = np.nan
+    singular[3, 5, 5] = 0.0
+    assert "the first posed frame" in against_claims(poses, late, claimed)["nees"]["how"]
+    assert "singular" in against_claims(poses, poses, singular)["nees"]["how"]
+    assert "behind the first" in against_claims(poses[:1], poses[:1], claimed[:1])["nees"]["how"]

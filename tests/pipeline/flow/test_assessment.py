@@ -1,0 +1,39 @@
+"""What is judged by truth: the piece of the other program's trajectory that has poses, whichever it is."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rille.pipeline.flow import assessment
+from rille.stages.core.declare import Bundle, NoParams
+from rille.stages.evaluation import accuracy, crosscheck_join, truth
+
+
+@pytest.mark.parametrize("split", [0, 3, 9])
+def test_the_other_program_s_longest_piece_is_judged(split: int) -> None:
+    poses = np.tile(np.eye(3, 4), (12, 1, 1))
+    poses[:, 2, 3] = np.arange(12.0)
+    frames = list(range(12))
+    windows = [
+        Bundle({"poses": poses[a:b]}, {"frames": frames[a:b], "registered": b - a, "points": 1, "reason": ""})
+        for a, b in ((0, split), (split, 12))
+    ]
+    joined = crosscheck_join.STAGE.run(NoParams(), {"frames": frames}, {"windows": windows})
+    known = truth.STAGE.run(NoParams(), {"poses": poses.reshape(12, 12).tolist(), "frames": frames}, {})
+    given: list[dict[str, Any]] = []
+    make: Any = SimpleNamespace(
+        node=lambda stage, label, args, **inputs: given.append(args),
+        sequence=SimpleNamespace(truth=poses),
+        products=SimpleNamespace(),
+    )
+    steps: Any = assessment._of_crosscheck(make, "joined", "known")  # type: ignore[arg-type]
+    next(steps)
+    with pytest.raises(StopIteration):
+        steps.send(joined)
+    metrics = accuracy.STAGE.run(NoParams(), given[0], {"trajectory": joined, "truth": known}).meta["metrics"]
+    assert metrics["frames_judged"]["value"] == max(split, 12 - split)
+    assert metrics["drift"]["value"] == pytest.approx(0.0, abs=1e-9)
