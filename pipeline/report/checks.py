@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from rille.pipeline.export.comparison import Comparison
 from rille.pipeline.report import canvas, figures
 from rille.pipeline.report.canvas import Block, Table
 from rille.pipeline.report.gather import Calibration, Scene
+from rille.pipeline.report.metrics import LABELS
 from rille.pipeline.report.words import length, number, quantity, spans, spread
 
 MOST_CURVES = 3
@@ -273,14 +273,7 @@ def _crosscheck_words(found: Comparison, lost: list[int], *, repaired: bool) -> 
     return " ".join(w for w in words if w)
 
 
-SIDE_BY_SIDE: Mapping[str, str] = {
-    "drift": "Drift at the end",
-    "ate_rmse": "Absolute trajectory error, best fit",
-    "rpe_translation_rmse": "Relative error, translation",
-    "rpe_rotation_rmse": "Relative error, rotation",
-    "kitti_translation": "KITTI translation error",
-    "frames_missing": "Frames without a pose in the world",
-}
+SIDE_BY_SIDE = ("drift", "ate_rmse", "rpe_translation_rmse", "rpe_rotation_rmse", "kitti_translation", "frames_missing")
 
 
 def _side_by_side(scene: Scene) -> Table | None:
@@ -290,10 +283,10 @@ def _side_by_side(scene: Scene) -> Table | None:
     if ours is None or theirs is None:
         return None
     rows = []
-    for name, label in SIDE_BY_SIDE.items():
+    for name in SIDE_BY_SIDE:
         pair = [b.meta.get("metrics", {}).get(name) for b in (ours, theirs)]
         if all(m is not None and m["value"] is not None for m in pair):
-            rows.append((label, *(quantity(m["value"], m["unit"]) for m in pair)))
+            rows.append((LABELS[name], *(quantity(m["value"], m["unit"]) for m in pair)))
     return Table(("Against the truth", "ours", "COLMAP"), tuple(rows), (1, 2)) if rows else None
 
 
