@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -26,6 +25,9 @@ from rille.stages.hazard.vehicle import Vehicle
 
 LARGE = 0.7
 """Share of the greatest radius from which a turning link is a wheel, and no castor or mast."""
+
+SUNK = 0.1
+"""Share of the radius by which a link that does not turn may lie below the ground: a castor is placed no better."""
 
 MOST_LINKS = 300
 """Robots with hands have a hundred; the way from each to the first is walked."""
@@ -44,9 +46,10 @@ class Robot:
 
 @dataclass(frozen=True)
 class _Shape:
-    """Points (n, 3) that bound a shape, in the frame of the first link, m, and its radius where it is round."""
+    """Centre (3,) of a shape and its lowest height, in the frame of the first link, m; its radius where it is round."""
 
-    points: Floats
+    centre: Floats
+    low: float
     radius: float = 0.0
 
 
@@ -77,14 +80,25 @@ def read_urdf(path: Path, camera: str = "", stated: Vehicle | None = None) -> Ro
     turning = {name: s for name, s in shapes.items() if s and joints.get(name, ("",) * 3)[2] == "continuous"}
     radius = max((s[0].radius for s in turning.values()), default=0.0)
     wheels = {name: s[0] for name, s in turning.items() if s[0].radius >= LARGE * radius > 0}
-    centres = np.array([wheel.points.mean(axis=0) for wheel in wheels.values()])
+    centres = np.array([wheel.centre for wheel in wheels.values()])
     if len(wheels) < 2:
-        raise _error(path, f"has {len(wheels)} wheels (continuous joints of links with a cylinder or sphere)")
+        raise _error(
+            path,
+            f"has {len(wheels)} wheels (continuous joints of links with a cylinder or sphere)",
+            "give its wheels cylinders for their meshes, or state the vehicle in [vehicle] instead",
+        )
     length, width = np.ptp(centres[:, :2], axis=0)
     # The lowest wheel carries, by its own radius: castors and raised wheels do not touch flat ground.
     ground = min(float(z) - wheel.radius for z, wheel in zip(centres[:, 2], wheels.values(), strict=True))
-    others = [one for name, those in shapes.items() if name not in turning for one in those]
-    low = min((float(one.points[:, 2].min()) for one in others), default=ground)
+    lows = {name: min(one.low for one in those) for name, those in shapes.items() if those and name not in turning}
+    low = min(lows.values(), default=ground)
+    # A castor on a fixed joint stands on the ground, and then nothing tells the clearance.
+    if low < ground - SUNK * radius and (stated is None or "clearance" not in stated.model_fields_set):
+        raise _error(
+            path,
+            f"has {min(lows, key=lambda name: lows[name])!r} {ground - low:.3g} m below the ground under its wheels",
+            "correct it, or state clearance in [vehicle]",
+        )
     sizes = {"wheel_diameter": 2 * radius, "wheel_base": length, "track": width, "clearance": low - ground}
     found: dict[str, Any] = {name: round(float(value), 6) for name, value in sizes.items() if value > 1e-3}
     found |= {"name": robot.get("name")} if robot.get("name") else {}
@@ -150,17 +164,22 @@ def _shapes(link: ElementTree.Element, T_base_link: RigidTransform, path: Path) 
     """Shapes of a link that have a size of their own; those of collisions before those that are drawn."""
     found = []
     for part in link.findall("collision") or link.findall("visual"):
-        size, radius = np.zeros(3), 0.0
+        size, radius, T = np.zeros(3), 0.0, T_base_link @ _origin(part, path)
+        x, y, z = np.abs(T.rotation[2])
+        # How far it reaches below its centre: to a corner of a box, the rim of a cylinder, a radius of a sphere.
+        reach = 0.0
         for shape in part.iterfind("geometry/*"):
             if shape.tag == "box":
-                size = _numbers(shape.get("size", ""), 3, path)
+                size = np.abs(_numbers(shape.get("size", ""), 3, path))
+                reach = 0.5 * float(size @ (x, y, z))
             elif shape.tag in ("cylinder", "sphere"):
-                radius = float(_numbers(shape.get("radius", ""), 1, path)[0])
-                length = _numbers(shape.get("length", "0"), 1, path)[0] if shape.tag == "cylinder" else 2 * radius
-                size = np.array([2 * radius, 2 * radius, length])
+                radius = reach = float(_numbers(shape.get("radius", ""), 1, path)[0])
+                size = np.array([radius])
+            if shape.tag == "cylinder":
+                size = np.array([radius, _numbers(shape.get("length", "0"), 1, path)[0]])
+                reach = radius * math.hypot(x, y) + 0.5 * float(size[1]) * z
         if size.any():
-            corners = np.array(list(product((-0.5, 0.5), repeat=3))) * size
-            found.append(_Shape((T_base_link @ _origin(part, path)).apply(corners), radius))
+            found.append(_Shape(T.translation, float(T.translation[2]) - reach, radius))
     return found
 
 

@@ -117,8 +117,8 @@ def drive(
 ) -> int:
     """Drive a simulated rover to a goal in a closed loop: stop, map, plan, drive, localise, repeat.
 
-    Prints how it ended (goal, no path, safety stop and why) and the folder of the report. What the rover does is set
-    like any parameter: rover.slip=0.3, drive.goal=[0.2,1.1].
+    Prints how it ended (goal, no path, safety stop, stops, and why) and the folder of the report. What the rover does
+    is set like any parameter: rover.slip=0.3, drive.goal=[0.2,1.1].
 
     Parameters
     ----------

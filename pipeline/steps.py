@@ -416,7 +416,10 @@ def _merged(data: xarray.Dataset, *more: Settings) -> dict[str, Any]:
 
 def _bundle(data: xarray.Dataset, variable: str, maker: str) -> Bundle:
     """What a step before has made; ``variable`` tells its datasets from those of the other steps."""
-    there = {"attribute rille": "rille" in data.attrs, variable: variable in getattr(data, "data_vars", ())}
+    there = {
+        "attribute rille": "rille" in getattr(data, "attrs", ()),
+        variable: variable in getattr(data, "data_vars", ()),
+    }
     for what, found in there.items():
         if not found:
             raise InputError("RIL-864", f"the dataset has no {what}", remedy=f"give what {maker} returns")

@@ -49,7 +49,10 @@ def gc(
     dry_run: Annotated[bool, flag("List by stage what would be removed, and remove nothing.")] = False,
     debug: Debug = False,
 ) -> int:
-    """Remove artifacts that no kept and no pinned run refers to, and leftovers of interrupted runs."""
+    """Remove artifacts that no kept and no pinned run refers to, and leftovers of interrupted runs.
+
+    What was made or used within a day stays: a run may be under way.
+    """
     from rille.pipeline.engine import events
     from rille.pipeline.engine.memory.limits import words
     from rille.pipeline.engine.store import maintenance
@@ -57,7 +60,7 @@ def gc(
     from rille.pipeline.runs import lookup, pins, roots
     from rille.stages.core.errors import ConfigError
 
-    store = at(cache_folder(cache))
+    store = at(_there(cache))
     # Before any key is gathered: artifacts of runs that cannot be seen from here would count as unused.
     roots.check_all_seen(store)
     ledgers = [path for folder in roots.folders(store, runs) for path in folder.glob(f"*/*/{lookup.LEDGER}")]
@@ -104,7 +107,7 @@ def pin(
     from rille.pipeline.runs import lookup, pins
 
     folder = lookup.find(run, runs)
-    print(f"pinned {lookup.name(folder)}: {pins.pin(at(cache_folder(cache)), folder)} artifacts")
+    print(f"pinned {lookup.name(folder)}: {pins.pin(at(_there(cache)), folder)} artifacts")
     return COMPLETE
 
 
@@ -120,5 +123,5 @@ def unpin(run: str, *, cache: CacheFolder = None, debug: Debug = False) -> int:
     from rille.pipeline.engine.store.base import at
     from rille.pipeline.runs import pins
 
-    print(f"unpinned {pins.unpin(at(cache_folder(cache)), run)}")
+    print(f"unpinned {pins.unpin(at(_there(cache)), run)}")
     return COMPLETE

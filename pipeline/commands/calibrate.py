@@ -23,8 +23,8 @@ from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
-from rille.stages.calibration.target import MODELS, BoardView, RigCalibration, calibrate_rig
-from rille.stages.core.errors import InputError
+from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig
+from rille.stages.core.errors import InputError, told
 
 LEAST_COVER = 0.5
 """Share of an image that all corners together should span: beyond them, distortion is extrapolated."""
@@ -38,6 +38,11 @@ MANY_BAD_PX = 1.0
 
 NO_BOARD = 0.1
 """Residual over the spacing of the corners from which they are not those of a flat board: print errs by hundredths."""
+
+
+SAME_PX = 1.0
+"""RMS distance of all corners, pixels, below which two views show the board at one place: noise moves them by tenths, a
+hand by many."""
 
 
 @dataclass
@@ -128,13 +133,21 @@ def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | N
     Raises
     ------
     InputError
-        An image cannot be read, or no board of one size is found.
+        An image cannot be read, left and right ones differ in size, or too few pairs show a board of one size.
     """
     images = {p.name: [chessboard.eight_bit(read_grey(f)) for f in (p.left, p.right)] for p in pairs}
     sizes = Counter((i.shape[1], i.shape[0]) for both in images.values() for i in both)
     # One picture of another size is a slip; the others still calibrate.
     size = max(sizes, key=lambda s: (sizes[s], s))
     fit = {n: both for n, both in images.items() if all((i.shape[1], i.shape[0]) == size for i in both)}
+    if not fit:
+        name, both = next(iter(images.items()))
+        left, right = (f"{i.shape[1]} x {i.shape[0]}" for i in both)
+        raise InputError(
+            "RIL-960",
+            f"left and right images differ in size: view {name} has {left} and {right} pixels",
+            remedy="give pictures of one size, as the cameras will have when they are used",
+        )
     if corners is None:
         corners = chessboard.find_size(image for both in fit.values() for image in both)
     out = Boards(corners, size)
@@ -147,8 +160,26 @@ def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | N
         if points[0] is None or points[1] is None:
             out.left_out.append((name, f"no whole board in the {' nor in the '.join(missing)} image"))
             continue
-        out.views.append(BoardView(name, points[0], chessboard.same_order(points[0], points[1], corners)))
+        view = BoardView(name, points[0], chessboard.same_order(points[0], points[1], corners))
+        same = next((other.name for other in out.views if _apart(view, other) < SAME_PX), None)
+        if same is not None:
+            out.left_out.append((name, f"the board stands as in view {same}"))
+            continue
+        out.views.append(view)
+    if out.left_out and len(out.views) < LEAST_VIEWS:
+        raise InputError(
+            "RIL-961",
+            f"the board of {corners[0]} x {corners[1]} inner corners is of use in {len(out.views)} of {len(images)} "
+            f"pairs, {LEAST_VIEWS} are the least ({told(out.left_out, lambda one: f'{one[0]}: {one[1]}')})",
+            remedy="move the board between pictures, all of it in view and in focus; "
+            "inner corners are one fewer than squares, along each side",
+        )
     return out
+
+
+def _apart(a: BoardView, b: BoardView) -> float:
+    """RMS distance of the corners of two views, pixels, of the image in which they differ more."""
+    return max(float(np.sqrt(((p - q) ** 2).sum(-1).mean())) for p, q in ((a.left, b.left), (a.right, b.right)))
 
 
 def _refuse_clutter(found: RigCalibration, boards: Boards) -> None:

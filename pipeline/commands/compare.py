@@ -67,22 +67,26 @@ def _parameters(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _tasks(a: Path, b: Path) -> Iterator[str]:
-    """Counts by stage: tasks with another result, and those that one run alone has."""
-    one, other = ({row["label"]: row for row in events.read(run / lookup.LEDGER)} for run in (a, b))
+    """Counts by stage: tasks with another result, and those of which one run alone or neither has a result."""
+    every = [{row["label"]: row for row in events.read(run / lookup.LEDGER)} for run in (a, b)]
+    # A task that failed or was left out has no digest.
+    one, other = ({label: row for label, row in rows.items() if row.get("digest")} for rows in every)
     common = [label for label in one if label in other]
-    changed = [label for label in common if one[label].get("digest") != other[label].get("digest")]
+    changed = [label for label in common if one[label]["digest"] != other[label]["digest"]]
+    neither = [label for label in every[0] if label in every[1] and label not in one and label not in other]
     yield f"tasks         {len(common) - len(changed)} with the same result, {len(changed)} with another"
     for words, rows, labels in (
         ("another result", one, changed),
         ("in A alone", one, [label for label in one if label not in other]),
         ("in B alone", other, [label for label in other if label not in one]),
+        ("without a result in both", every[0], neither),
     ):
         for stage, count in Counter(rows[label]["stage"] for label in labels).items():
             yield f"  {stage}: {count} {words}"
 
 
 def _figures(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
-    """Figures of the report that differ; times are no results."""
+    """Figures of the report that differ or that one run alone has; times are no results."""
     one, other = a["metrics"], b["metrics"]
     both = [name for name in one if name in other and name != "wall_clock"]
     differ = [name for name in both if one[name]["value"] != other[name]["value"]]
@@ -92,6 +96,11 @@ def _figures(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
     equal = f"{len(both) - len(differ)} equal, {len(differ) - len(seen)} equal to three digits"
     yield f"figures       {equal}, {len(seen)} differ"
     yield from (f"  {one[name]['label']}: {' -> '.join(shown[name])}" for name in seen)
+    for words, metrics, without in (("in A alone", one, other), ("in B alone", other, one)):
+        alone = [name for name in metrics if name not in without and name != "wall_clock"]
+        yield from (
+            f"  {metrics[n]['label']}: {quantity(metrics[n]['value'], metrics[n]['unit'])} {words}" for n in alone
+        )
 
 
 def _positions(a: Path, b: Path) -> str:

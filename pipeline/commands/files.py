@@ -207,7 +207,7 @@ def _export(run: Path, kind: Form, output: Path | None, cache: str | None) -> st
     from rille.pipeline.export.programs import point_cloud
 
     if output is not None:
-        check_output(output)
+        check_output(output, f".{kind}")
     path, words = point_cloud.export(run, kind, output)
     return f"{path}  {words}"
 

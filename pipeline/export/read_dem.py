@@ -11,6 +11,7 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
+from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
 
 METRE = ("m", "metre", "metres", "meter", "meters")
@@ -93,7 +94,10 @@ def read_tiff(path: Path, *, length: bool = True) -> DemFile:
             # Refused below, in a line of our own.
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             with rasterio.open(path) as file:
-                values = file.read(1, out_dtype="float64", masked=True).filled(np.nan)
+                # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
+                values = (
+                    file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
+                )
                 crs, transform, unit = file.crs, file.transform, file.units[0]
     except RasterioError as error:
         raise InputError("RIL-629", f"{path} cannot be read as a raster ({error})", remedy="give a GeoTIFF") from error
@@ -115,7 +119,7 @@ def read_tiff(path: Path, *, length: bool = True) -> DemFile:
             "RIL-632", f"{path} has elevations in {unit!r}, not in metres", remedy="convert it, e.g. with gdal_calc"
         )
     if length and not unit:
-        doubts.append(f"{path} states no unit of its elevations: taken as metres")
+        doubts.append(warning("RIL-962", f"{path} states no unit of its elevations: taken as metres"))
     return DemFile(
         str(path), values, transform, "" if crs is None else crs.to_wkt(version="WKT2_2019"), None, tuple(doubts)
     )

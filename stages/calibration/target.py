@@ -200,6 +200,9 @@ class Adjustment:
     def _alone(self, points: list[Floats]) -> tuple[Floats, list[RigidTransform]]:
         boards = [self.board.astype(np.float32).reshape(1, -1, 3)] * len(points)
         flat = [p.astype(np.float32).reshape(1, -1, 2) for p in points]
+        threads = cv2.getNumThreads()
+        # Threads add up the views in any order: the last digits, and so the keys of all that uses the rig, would vary.
+        cv2.setNumThreads(1)
         try:
             if self.model == "fisheye":
                 flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
@@ -211,6 +214,8 @@ class Adjustment:
             raise DegenerateError(
                 "RIL-311", UNDETERMINED, remedy=f"{MORE_VIEWS}, or a model with fewer coefficients"
             ) from error
+        finally:
+            cv2.setNumThreads(threads)
         _, k, d, rotations, translations = out
         count = len(MODELS[self.model])
         lens = np.concatenate([[k[0, 0], k[1, 1], k[0, 2], k[1, 2]], np.ravel(d)[:count]])

@@ -114,5 +114,7 @@ def hazard_words(maps: Maps, at: tuple[int, int], vehicle: Vehicle) -> str:
             continue
         value, unit = float(maps[m.band][at]), "deg" if m.in_degrees else "m"
         value = limit - value if m.left else math.degrees(value) if m.in_degrees else value
-        told.append(f"{m.words} {value:.3g} {unit}, vehicle.{m.limit} {limit:g}")
+        # Below the limit by itself: the figure alone would seem to say that the ground is permitted.
+        doubt = "" if value > limit else " plus risk.sigmas standard deviations"
+        told.append(f"{m.words} {value:.3g} {unit}{doubt}, vehicle.{m.limit} {limit:g}")
     return "; ".join(told)

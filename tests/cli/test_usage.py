@@ -103,6 +103,7 @@ WRONG = {
         ("no-such-run --to laz", "RIL-067"),
         ("runs/other --to colmap", "RIL-067"),
         ("runs/other/latest --to laz --to glb -o x", "RIL-020"),
+        ("runs/other/latest --to laz -o cloud.ply", "RIL-871"),
     ],
     "compare-dem": [
         ("runs/other/latest", "RIL-001"),
@@ -120,9 +121,9 @@ WRONG = {
     "cache": [("no-such-command", "RIL-001")],
     "cache ls": [("--no-such-option", "RIL-001")],
     "cache verify": [("--no-such-option", "RIL-001"), ("--cache no-such-folder", "RIL-589")],
-    "cache gc": [("--no-such-option", "RIL-001")],
-    "cache pin": [("no-such-run", "RIL-067"), ("", "RIL-001")],
-    "cache unpin": [("no-such-run", "RIL-563"), ("", "RIL-001")],
+    "cache gc": [("--no-such-option", "RIL-001"), ("--cache no-such-folder", "RIL-589")],
+    "cache pin": [("no-such-run", "RIL-067"), ("", "RIL-001"), ("other --cache no-such-folder", "RIL-589")],
+    "cache unpin": [("no-such-run", "RIL-563"), ("", "RIL-001"), ("other --cache no-such-folder", "RIL-589")],
 }
 
 

@@ -54,6 +54,28 @@ def test_footprint_clearance_and_pitch(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("shape", "low"),
+    [
+        ('<sphere radius="0.1"/>', 0.1),
+        ('<cylinder radius="0.1" length="0.2"/>', 0.1 * math.sqrt(2)),
+        ('<box size="0.2 0.2 0.2"/>', 0.1 * math.sqrt(2)),
+    ],
+)
+def test_turned_shapes_reach_as_low_as_they_are(tmp_path, shape, low):
+    """By 45 degrees about x and 30 about z: the sphere counted as low as the corner of its box, 0.039 m too low."""
+    turned = f'<origin rpy="{math.pi / 4} 0 {math.pi / 6}" xyz="0 0 0.25"/>'
+    text = rover().replace('<origin xyz="0 0 0.25"/>', turned).replace('<box size="0.7 0.4 0.2"/>', shape)
+    assert read_urdf(put(tmp_path, text)).vehicle.clearance == pytest.approx(0.25 - low + 0.1, abs=1e-6)
+
+
+def test_a_cylinder_turned_about_itself_is_as_low_as_before(tmp_path):
+    origin = f'<origin rpy="{math.pi / 2} {math.pi / 4} 0" xyz="0 0 0.25"/>'
+    text = rover().replace('<origin xyz="0 0 0.25"/>', origin)
+    text = text.replace('<box size="0.7 0.4 0.2"/>', '<cylinder radius="0.1" length="0.4"/>')
+    assert read_urdf(put(tmp_path, text)).vehicle.clearance == pytest.approx(0.25, abs=1e-6)
+
+
+@pytest.mark.parametrize(
     ("text", "fact"),
     [
         (rover().replace("continuous", "fixed"), "0 wheels"),
@@ -66,6 +88,8 @@ def test_footprint_clearance_and_pitch(tmp_path):
         (rover(roll=0.2), "rolled"),
         (rover().replace('xyz="0 0 0.25"', 'xyz="0 0 0.05"'), "belly"),
         (rover().replace("left_optical", "eye_optical"), "eye_optical"),
+        (rover().replace('xyz="0 0 0.25"', 'xyz="0 0 -0.1"'), "'base' 0.1 m below the ground"),
+        (rover().replace('<cylinder radius="0.15" length="0.1"/>', '<mesh filename="wheel.stl"/>'), "[vehicle]"),
     ],
 )
 def test_what_is_wrong_is_one_line(tmp_path, text, fact):

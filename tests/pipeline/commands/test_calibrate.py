@@ -102,14 +102,30 @@ def test_complaints_say_what_to_change(tmp_path):
         calibrate(folder, folder, **(given | {"square": 25}))
     with raises("RIL-153"):
         calibrate(folder, folder, **given)
-    with raises("RIL-309"):
+    with raises("RIL-961", "9 x 6", "0 of 2", "no whole board in the left nor in the right image"):
         calibrate(folder, folder, corners="9x6", **given)
+    small = images(tmp_path / "small")
+    for path in small.glob("right*"):
+        cv2.imwrite(str(path), np.full((24, 32), 128, np.uint8))
+    with raises("RIL-960", "64 x 48 and 32 x 24"):
+        calibrate(small, small, **given)
     with raises("RIL-011"):
         calibrate(folder / "left*.bmp", folder, **given)
     (tmp_path / "plain").mkdir()
     (folder / "left0.png").rename(tmp_path / "plain" / "0.png")
     with raises("RIL-010"):
         calibrate(tmp_path / "plain", tmp_path / "plain", **given)
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+@pytest.mark.data
+def test_pictures_of_a_board_at_rest_are_one_view(data_dir, tmp_path):
+    """Five copies of a view gave a baseline of 0.40 +- 0.03 m, truly 0.083 m."""
+    for k in range(5):
+        for side in ("left", "right"):
+            shutil.copy(data_dir / "chessboard_opencv" / f"{side}01.jpg", tmp_path / f"{side}{k}.jpg")
+    with raises("RIL-961", "1 of 5", "1: the board stands as in view 0"):
+        calibrate(tmp_path, tmp_path, square=0.025, corners="9x6", output=tmp_path / "rig.yaml")
     assert not (tmp_path / "rig.yaml").exists()
 
 

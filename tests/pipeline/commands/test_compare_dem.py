@@ -69,6 +69,19 @@ def test_a_coarse_raster_of_another_program(tmp_path: Path) -> None:
     assert "states no CRS" in found["warnings"][0]
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_whole_numbers_with_a_scale_are_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Models of planets come so: 16 bits of millimetres above a datum."""
+    z = 100.0 + 0.001 * np.arange(1200.0).reshape(30, 40)
+    metres = tiff(tmp_path / "metres.tif", z, 0.5, 0.0, 0.0)
+    scaled = tiff(tmp_path / "scaled.tif", (z - 100.0) / 0.001, 0.5, 0.0, 0.0, unit="")
+    with rasterio.open(scaled, "r+") as file:
+        file.scales, file.offsets = (0.001,), (100.0,)
+    compare(scaled, metres, output=tmp_path / "out")
+    assert json.loads((tmp_path / "out.json").read_text())["figures"]["rmse"] < 1e-5
+    assert "RIL-962: " in capsys.readouterr().err  # no unit
+
+
 def coarse_cells(found: dict) -> int:
     return int(found["b"]["rows"] * found["b"]["cols"])
 

@@ -54,6 +54,19 @@ def test_exact_corners_give_the_rig_back(model):
     assert max(r.epipolar for r in found.residuals) < 1e-3
 
 
+def test_threads_do_not_change_a_bit():
+    """A rig that differs in its last digits would have all that depends on it computed anew."""
+    threads = cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(4)
+        views = tuple(scene("radtan", 30, noise=0.2))
+        starts = {Adjustment(BOARD, views, SIZE, "radtan").start().tobytes() for _ in range(6)}
+        assert cv2.getNumThreads() == 4
+    finally:
+        cv2.setNumThreads(threads)
+    assert len(starts) == 1
+
+
 @pytest.mark.parametrize("model", [*sorted(LENSES), "rational"])
 def test_jacobian_against_central_differences(model):
     lenses = LENSES.get(model) or tuple((*lens, 0.02, 0.01, 0.003) for lens in LENSES["radtan"])

@@ -244,6 +244,16 @@ def test_a_start_that_cannot_be_stood_on_is_refused_with_the_figure(kind: int, e
         find_path(given, lattice, SHORT, ends=((0.0, 0.06), None))
 
 
+def test_a_hazard_of_doubt_alone_is_said_to_be_one() -> None:
+    """``step 0.008 m, vehicle.max_step 0.01`` reads as permitted ground."""
+    lattice = Lattice.at(-20, 40, CELL, 41, 41)
+    risk, z = level(lattice)
+    risk[30:39, 15:26] = HAZARDOUS
+    given = maps(risk, z) | {"step": np.full(lattice.shape, 0.008, dtype=np.float32)}
+    with raises("RIL-408", "0.008 m plus risk.sigmas", "vehicle.max_step", "0.01"):
+        find_path(given, lattice, SHORT, ends=((0.0, 0.06), None))
+
+
 def test_a_vehicle_wider_than_the_map_is_refused() -> None:
     lattice = Lattice.at(0, 40, CELL, 40, 5)
     with raises("RIL-431", "0.095", "0.05"):
