@@ -1,14 +1,16 @@
 """ROS 1 and ROS 2 bags and mcap files with the images of two cameras and their ``camera_info``.
 
-Pairs are images of equal ``header.stamp``. Images of a topic with ``rect`` in its name are rectified: their camera is
-``P``; of others it is ``K`` with the distortion ``D``, and ``R`` and ``P`` of both cameras say how they stand to each
-other (REP 104 and ``sensor_msgs/msg/CameraInfo``). An IMU and wheel odometry count where ``/tf_static`` says how their
-frame stands to the left camera's: the IMU gives the vertical and rotations, odometry predicts.
+Pairs are images of equal ``header.stamp``. Images of a topic with a word in its name that begins with ``rect`` are
+rectified: their camera is ``P``; of others it is ``K`` with the distortion ``D``, and ``R`` and ``P`` of both cameras
+say how they stand to each other (REP 104 and ``sensor_msgs/msg/CameraInfo``). An IMU and wheel odometry count where
+``/tf_static`` says how their frame stands to the left camera's: the IMU gives the vertical and rotations, odometry
+predicts.
 """
 
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +43,9 @@ FORMS = (
 SUFFIXES = (".bag", ".mcap", ".db3")
 INFO, IMU, ODOMETRY = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
 FRAMES = "/tf_static"
+
+RECTIFIED = re.compile(r"(?<![a-z])rect")
+"""In a topic's name; not as in unrectified, corrected or direct."""
 
 LONGEST_GAP = 0.5
 """s; odometry is interpolated over no longer gap."""
@@ -136,7 +141,7 @@ def _topics(reader: Any, path: Path, wanted: str | None) -> tuple[str, str]:
     for topic in images:
         found = side_of(topic)
         if found is not None:
-            rank = (kinds[topic] == bag.COMPRESSED, "rect" not in topic)
+            rank = (kinds[topic] == bag.COMPRESSED, not RECTIFIED.search(topic))
             pairs.setdefault((*rank, found[0], found[2]), {})[found[1]] = topic
     whole = {key: sides for key, sides in pairs.items() if len(sides) == 2}
     best = [sides for key, sides in whole.items() if key[:2] == min(whole)[:2]]
@@ -206,7 +211,7 @@ def _camera(reader: Any, path: Path, topic: str) -> tuple[CalibratedCamera, np.n
         )
     # ROS 1 names the fields K, D, R and P, ROS 2 k, d, r and p.
     given = {key.lower(): getattr(message, key) for key in dir(message) if key.lower() in ("k", "d", "r", "p")}
-    rectified = "rect" in topic
+    rectified = RECTIFIED.search(topic) is not None
     entries: dict[str, Any] = {
         "image_width": message.width,
         "image_height": message.height,

@@ -29,7 +29,7 @@ Conventions
   The pairs are not rectified: the cameras may converge. No lens distortion.
 
 Files
-  left/, right/           grey 8-bit images, one a frame, the same name left and right
+  left/, right/           grey images of 8 or 16 bits, one a frame, the same name left and right
   valid/left, valid/right 255 = usable, 0 = background (only where something is masked)
   rig.json                both cameras (fx, fy, cx, cy, width, height) and T_right_left (12 numbers, rows of [R | t]),
                           as they are given to a reconstruction; a simulated

@@ -17,10 +17,10 @@ from typing import cast
 
 import numpy as np
 
-from rille.datasets.poses import coverage
+from rille.datasets.poses import coverage, times_of
 from rille.datasets.protocol import Rows
 from rille.datasets.text.tables import TextTable, read_table
-from rille.datasets.text.times import GAP, seconds
+from rille.datasets.text.times import GAP
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp
@@ -112,7 +112,7 @@ def read_imu(path: Path) -> ImuRecord:
     """Table of time, rates about x y z and specific forces along them.
 
     Columns are recognised by their names (``w_RS_S_x [rad s^-1]``, ``gyro_x``, ``acc_x`` ...); without names they must
-    be in this order. Names that say ``deg`` are converted.
+    be in this order. Names that say ``deg`` are converted, and so are times whose name states a unit.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def read_imu(path: Path) -> ImuRecord:
             remedy="give time, three rates (rad/s) and three accelerations (m/s^2) a row",
         )
     gyro, accelerometer = _columns(table)
-    times, warnings = seconds(table.text(0), table.name, lines=table.lines)
+    times, warnings = times_of(table, 0)
     rates, forces = table.numbers(gyro), table.numbers(accelerometer)
     if any("deg" in table.header[k] for k in gyro if table.header):
         rates = np.deg2rad(rates)

@@ -321,8 +321,8 @@ def _are_positions(path: Path, pairs: int) -> bool:
 
 
 def _kind_of_row(row: np.ndarray, rows: int, pairs: int, named: str) -> str:
-    if row.size == 12:
-        rotation = row.reshape(3, 4)[:, :3]
+    if row.size in (12, 16):
+        rotation = row.reshape(-1, 4)[:3, :3]
         return "truth" if np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 else ""
     if row.size >= 8 and abs(np.linalg.norm(row[4:8]) - 1) < 1e-3:
         return "truth"

@@ -111,7 +111,7 @@ def read_poses(path: Path, format: str = "auto") -> TimedPoses:
     at = None
     warnings: tuple[str, ...] = ()
     if "time" in columns:
-        at, warnings = seconds(table.text(columns["time"]), table.name, lines=table.lines)
+        at, warnings = times_of(table, columns["time"])
     if angles is None:
         rotations = _quaternions(table, columns)
     else:
@@ -166,12 +166,15 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
     at: tuple[float, ...] | None = None
     warnings: tuple[str, ...] = ()
     if "time" in meant:
-        column = meant["time"]
-        said = TIME_UNIT.search(table.header[column]) if table.header else None
-        unit = said[1] if said else "auto"
-        at, warnings = seconds(table.text(column), table.name, unit=unit, lines=table.lines)
+        at, warnings = times_of(table, meant["time"])
     rows = table.numbers([meant[axis] for axis in POSITION if axis in meant])
     return TimedPositions(at, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings)
+
+
+def times_of(table: TextTable, column: int) -> tuple[tuple[float, ...], tuple[str, ...]]:
+    """Times of a column and warnings (:func:`rille.datasets.text.times.seconds`), in the unit that its name states."""
+    said = TIME_UNIT.search(table.header[column]) if table.header else None
+    return seconds(table.text(column), table.name, unit=said[1] if said else "auto", lines=table.lines)
 
 
 def names_positions(path: Path) -> bool:

@@ -1,4 +1,7 @@
-"""Calibrations of BoofCV: one pinhole camera with radial and tangential distortion, or a stereo pair."""
+"""Calibrations of BoofCV: one pinhole camera with radial and tangential distortion, or a stereo pair.
+
+Its pixel (0, 0) reaches from (0, 0) to (1, 1) (boofcv.org, Coordinate Systems), so that half a pixel is taken off.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,7 @@ def _lens(f: Fields) -> Lens:
     p = f.sub("pinhole")
     if abs(p.number("skew", 0.0)) > 1e-6 * p.number("fx"):
         raise p.error("RIL-104", "skew", f"= {p.number('skew'):g} is not 0", "calibrate without skew")
-    values = (p.number("fx"), p.number("fy"), p.number("cx"), p.number("cy"))
+    values = (p.number("fx"), p.number("fy"), p.number("cx") - 0.5, p.number("cy") - 0.5)
     camera = p.camera("fx", values, p.size("width", "height"))
     if "radial_tangential" not in f:
         return Lens(camera)

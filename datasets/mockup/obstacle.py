@@ -29,7 +29,7 @@ def on_path(path: np.ndarray, way: float, aside: float) -> tuple[float, float]:
 
 
 def lay(scene: Bundle, x: float, y: float, height: float) -> dict[str, Any]:
-    """Arrays of the scene with a round stone of profile 1 - q^4, as wide as twice its height on either side."""
+    """Arrays of the scene with a round stone of profile 1 - q^4, whose radius is 1.2 times its height."""
     arrays: dict[str, Any] = {name: np.asarray(scene[name]) for name in scene.arrays}
     z = np.array(arrays["height"])
     q = distance(scene, x, y, z.shape, scene.meta["lattice"]["cell"]) / (1.2 * height)

@@ -147,6 +147,6 @@ SHORT = {"frames": 9, "bed_width": 1.2, "bed_length": 1.2}
 
 RECORDED_ONLY = (
     *("frames", "forward", "sideways", "turn_deg", "roll_deg", "roll_swing_deg", "jitter_deg"),
-    "attitude_noise_deg",
+    *("up_noise_deg", "attitude_noise_deg"),
 )
-"""Parameters of a recorded motion and of the attitude given with it; a driven rover has ``RoverParams`` instead."""
+"""Parameters of a recorded motion and of the vertical and attitude given with it; a rover has ``RoverParams``."""

@@ -69,6 +69,11 @@ class HeightField:
         -----
         A ray that enters the bed's outline below the surface (through its side) meets nothing.
         """
+        t = self.contact(origins, directions)
+        return np.where(np.isneginf(t), np.nan, t)
+
+    def contact(self, origins: Floats, directions: Floats) -> Floats:
+        """As :meth:`cast`, but negative infinity where the ray enters through the side of the bed."""
         return np.asarray(
             _cast(
                 self.height,
@@ -88,7 +93,7 @@ def _to_grid(xyz: Floats, x0: float, y0: float, cell: float) -> Floats:
 
 @njit(cache=True, nogil=True)
 def _cast(height, maxima, offsets, shapes, origins, directions):  # type: ignore[no-untyped-def]
-    """Ray parameters (n,) in grid coordinates (column, row, metres)."""
+    """Ray parameters (n,) in grid coordinates (column, row, metres), see :meth:`HeightField.contact`."""
     n = directions.shape[0]
     out = np.full(n, np.nan)
     top = offsets.shape[0] - 1
@@ -160,8 +165,7 @@ def _cast(height, maxima, offsets, shapes, origins, directions):  # type: ignore
             f0 = oz + at * dz - (h00 + bc * u + br * v + bcr * u * v)
             # Below the surface already: the ray came in through the bed's side and meets nothing, or it is rounding.
             if f0 <= 0.0:
-                if not first or f0 > -1e-9:
-                    out[i] = at
+                out[i] = at if not first or f0 > -1e-9 else -np.inf
                 break
             f1 = dz - bc * dc - br * dr - bcr * (u * dr + v * dc)
             f2 = -bcr * dc * dr

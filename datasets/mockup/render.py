@@ -53,13 +53,14 @@ def transform(T_dst_src: RigidTransform, points: NDArray[np.float64]) -> NDArray
 
 
 class _Bed(NamedTuple):
-    """Grids (row, col) of the bed: ``height`` m, ``sunlit`` and ``tint``; ``grid``: x0, y0 and cell, m; ``sun`` (3,)
-    direction towards it."""
+    """Grids (row, col) of the bed: ``height`` m, ``sunlit`` and ``tint``; ``grid``: x0, y0 and cell, m; ``rise``: m
+    upwards a metre ahead; ``sun`` (3,) direction towards it."""
 
     height: NDArray[np.float32]
     sunlit: NDArray[np.uint8]
     tint: NDArray[np.uint8]
     grid: tuple[float, float, float]
+    rise: float
     sun: NDArray[np.float64]
 
 
@@ -75,7 +76,7 @@ class _Albedo(NamedTuple):
 @njit(cache=True, nogil=True)
 def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ignore[no-untyped-def]
     """Radiance (n,) of the hit points, NaN where a ray hit nothing."""
-    height, sunlit, tint, (x0, y0, cell), sun = bed
+    height, sunlit, tint, (x0, y0, cell), rise, sun = bed
     texture, offsets, shapes = albedo
     n = directions.shape[0]
     out = np.full(n, np.nan, np.float32)
@@ -100,8 +101,9 @@ def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ign
         lit = _bilinear(sunlit, r, c) / 255.0
         # Lunar-Lambert: Lommel and Seeliger's law, which knows no limb darkening, mixed with Lambert's.
         direct = lit * (2.0 * LUNAR * mu0 / (mu0 + mu) + (1.0 - LUNAR) * mu0) if mu0 > 0.0 else 0.0
-        # grain is draped over rocks, not projected from above, so that walls that face the drive are not streaked
-        drape = (origin[2] + t * dz) / cell
+        # grain is draped over rocks, not projected from above, so that walls that face the drive are not streaked; a
+        # slope's own rise drapes nothing, lest its far end lies beyond the grain
+        drape = (origin[2] + t * dz - rise * y) / cell
         # footprint on the ground: an ellipse drawn out along the line of sight
         stretch = min(1.0 / mu, 8.0)
         taps = int(stretch + 0.5)
@@ -175,6 +177,7 @@ def radiance(
         np.ascontiguousarray(scene["sunlit"][:]),
         np.ascontiguousarray(scene["tint"][:]),
         (field.x0, field.y0, field.cell),
+        math.tan(math.radians(light["slope_deg"])),
         sun_direction(light["sun_elevation_deg"], light["sun_azimuth_deg"]),
     )
     albedo = _Albedo(

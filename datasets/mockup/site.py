@@ -43,6 +43,7 @@ def prepare(
     height, cell = arrays["height"].copy(), float(scene.meta["lattice"]["cell"])
     ahead = scene.meta["lattice"]["y0"] - cell * np.arange(height.shape[0])[:, None]
     slope = (math.tan(math.radians(scene.meta["scene"]["slope_deg"])) * ahead).astype(np.float32)
+    level = np.float32(0.0)
     for place in (pad, blank):
         if place is None:
             continue
@@ -52,16 +53,19 @@ def prepare(
         weight = np.clip((place[2] + EDGE - far) / EDGE, 0.0, 1.0)
         # Smoothstep: the slope has no kink at either end of the edge.
         weight = weight * weight * (3.0 - 2.0 * weight)
-        plane = slope + np.median((height - slope)[far <= place[2]])
-        height = (height + weight * (plane - height)).astype(np.float32)
+        level = np.median((height - slope)[far <= place[2]])
+        height = (height + weight * (slope + level - height)).astype(np.float32)
         arrays["tint"] = np.where(weight > 0.5, np.uint8(100), arrays["tint"])
     arrays["height"] = height
     arrays["sunlit"] = terrain.sunlit(height, SceneParams(**scene.meta["scene"]))
     if blank is not None:
-        for level in range(bed.MIPS):
-            texture = arrays[f"albedo_{level}"]
-            far = distance(scene, blank[0], blank[1], texture.shape, 0.5 * cell * 2**level)
-            arrays[f"albedo_{level}"] = np.where(far <= blank[2], np.uint8(128), texture)
+        for k in range(bed.MIPS):
+            texture = arrays[f"albedo_{k}"]
+            # The grain is draped: what lies at a height has that of as much farther ahead. And a texel of a coarser
+            # level lies in the middle of those that it is the mean of, half of them behind the first one.
+            middle = 0.25 * cell * (2**k - 1)
+            far = distance(scene, blank[0] - middle, blank[1] + level + middle, texture.shape, 0.5 * cell * 2**k)
+            arrays[f"albedo_{k}"] = np.where(far <= blank[2], np.uint8(128), texture)
     return arrays
 
 

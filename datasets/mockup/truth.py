@@ -41,9 +41,9 @@ def visible(
         inside = np.asarray(((pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1])).all(axis=1))
     free = np.zeros(len(points), dtype=bool)
     directions = points[inside] - T_bed_camera.translation
-    t = field.cast(T_bed_camera.translation[None, :], directions)
+    t = field.contact(T_bed_camera.translation[None, :], directions)
     length = np.sqrt((directions**2).sum(axis=1))
-    # a ray that just misses the point it aims at has grazed it: seen
+    # a ray that just misses the point it aims at has grazed it: seen; one that comes in through the bed's side: hidden
     free[inside] = ~((1.0 - t) * length > TOLERANCE)
     return pixels, inside, free
 

@@ -147,6 +147,19 @@ def test_raw_images_have_lenses_and_the_rectification_says_how_the_cameras_stand
     assert sequence.rig.T_right_left.apply(point) == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("name", ["image_unrectified", "direct/image_raw"])
+def test_a_word_that_only_ends_in_rect_does_not_make_images_rectified(tmp_path, name):
+    bag, right = Bag(), [*P]
+    right[3] = -25.0
+    for side, p in (("left", P), ("right", right)):
+        place = f"/{side}/{name}".rpartition("/")[0]
+        bag.info(f"{place}/camera_info", (64, 48), p, [55, 0, 30, 0, 56, 25, 0, 0, 1], [-0.3, 0.1, 0, 0, 0])
+        bag.image(f"/{side}/{name}", START, picture(0, side == "right"))
+    sequence = open_sequence(str(bag.write(tmp_path)))
+    assert sequence.lenses is not None
+    assert sequence.rig.left.fx == 55.0
+
+
 def test_colour_depth_and_compression(tmp_path):
     deep = open_sequence(str(street(dtype=np.uint16).write(tmp_path / "deep")))
     assert (pixels(deep, 1, "right") == picture(1, 1, np.uint16)).all()

@@ -290,8 +290,9 @@ right:
 
 
 def test_boofcv_right_to_left(tmp_path):
+    """Its coordinates begin at the corner of the first pixel."""
     left, right = read_cameras(written(tmp_path, BOOF))
-    assert left.lens == Lens(Camera(524.6, 526.9, 312.4, 247.4, 640, 480), "radtan", (-0.36, 0.17, 0.001, 0.002))
+    assert left.lens == Lens(Camera(524.6, 526.9, 311.9, 246.9, 640, 480), "radtan", (-0.36, 0.17, 0.001, 0.002))
     np.testing.assert_allclose(centre(right.T_camera_reference), [120, 0.5, -0.25])
 
 

@@ -216,6 +216,8 @@ def test_columns_by_order_and_by_name(tmp_path):
     named = read_imu(record_file(tmp_path, header, [(0.0, 4, 5, 6, 90, 0, 180), (0.1, 4, 5, 6, 90, 0, 180)]))
     np.testing.assert_array_equal(named.forces, plain.forces)
     np.testing.assert_allclose(named.rates, [[np.pi / 2, 0, np.pi]] * 2)
+    header = header.replace("time", "time [ms]")
+    assert read_imu(record_file(tmp_path, header, [(0, 4, 5, 6, 1, 0, 1), (100, 4, 5, 6, 1, 0, 1)])).times[1] == 0.1
 
 
 @pytest.mark.parametrize(

@@ -104,6 +104,7 @@ def test_an_image_without_partner_is_marked(tmp_path):
     ("lines", "kind"),
     [
         (["1 0 0 0 0 1 0 0 0 0 1 0"] * 2, "truth"),
+        (["1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"] * 2, "truth"),
         (["700 0 30 0 0 700 20 0 0 0 1 0"] * 2, ""),
         (["# time x y z qx qy qz qw", "0.1 0 0 0 0 0 0.6 0.8"], "truth"),
         (["#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z", "1403,0.9,2.2,0.9,0.8,0.6,0.0,0.0,0.1,0.2"], "truth"),

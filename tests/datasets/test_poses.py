@@ -50,6 +50,12 @@ def test_forms_of_one_pose(tmp_path, text, format):
     np.testing.assert_array_equal(found.poses[0].translation, [1, 2, 3])
 
 
+@pytest.mark.parametrize(("name", "factor"), [("time_ms", 1e-3), ("timestamp [ns]", 1e-9), ("t_s", 1.0), ("time", 1.0)])
+def test_the_name_of_a_column_states_the_unit_of_its_times(tmp_path, name, factor):
+    found = read(tmp_path, f"{name},qw,qx,qy,qz\n0,1,0,0,0\n100,1,0,0,0\n")
+    assert found.times == (0.0, pytest.approx(100 * factor))
+
+
 def test_matrices_have_no_times_and_become_rotations(tmp_path):
     rows = "0 -1 0 1 1 0 0 2 0 0 1 3\n0.99995 0.01 0 4 -0.01 0.99995 0 5 0 0 1 6\n"
     found = read(tmp_path, rows)

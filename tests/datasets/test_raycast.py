@@ -8,6 +8,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from rille.datasets.mockup.raycast import HeightField
+from rille.datasets.mockup.truth import visible
+from rille.stages.geometry.geometry import Camera, RigidTransform
 
 
 def bilinear(field: HeightField, x, y):
@@ -44,6 +46,20 @@ def test_rays_that_miss_give_nan():
     # through the side of a raised bed: the ray enters the outline below the surface
     raised = HeightField.build(np.ones((5, 5), np.float32), 0.0, 4.0, 1.0)
     assert np.isnan(raised.cast(np.array([[-1.0, 2.0, 0.5]]), np.array([[1.0, 0.0, 0.0]])))[0]
+
+
+def test_what_lies_behind_the_side_of_the_bed_is_hidden():
+    height = np.zeros((11, 11), np.float32)
+    height[-1] = 0.1  # the near edge, y = 0
+    field = HeightField.build(height, -0.5, 1.0, 0.1)
+    camera = Camera(100.0, 100.0, 99.5, 99.5, 200, 200)
+    looking_ahead = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    points = np.array([[0.0, 0.5, 0.0], [0.02, 0.9, 0.0]])
+    for z, seen in ((0.05, False), (0.3, True)):
+        T = RigidTransform(looking_ahead, np.array([0.0, -0.2, z]))
+        _, inside, free = visible(field, camera, T, points)
+        assert inside.all()
+        assert (free == seen).all()
 
 
 @settings(max_examples=25, deadline=None)

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from rille.datasets.mockup.params import SceneParams
-from rille.datasets.mockup.scene import build_scene
+from rille.datasets.mockup.render import radiance
+from rille.datasets.mockup.scene import build_scene, height_field
 from rille.datasets.mockup.site import EDGE, prepare
+from rille.stages.core.declare import Bundle
+from rille.stages.geometry.geometry import Camera, RigidTransform
 
 PAD = (0.0, 0.3, 0.15)
 
@@ -37,3 +40,20 @@ def test_a_patch_without_ground_changes_nothing(patch: tuple[float, float, float
     """One beside the bed, and one smaller than a cell: there is no height to lay it at."""
     scene = build_scene(SceneParams(bed_width=0.4, bed_length=0.4, cell=0.004))
     np.testing.assert_array_equal(prepare(scene, None, patch)["height"], scene["height"])
+
+
+@pytest.mark.parametrize("slope_deg", [-15.0, 0.0, 20.0])
+def test_grain_covers_a_slope_and_lacks_in_the_patch_where_it_is_stated(slope_deg: float) -> None:
+    """The grain is draped over what rises from the bed; the slope itself shifts it nowhere."""
+    p = SceneParams(bed_width=0.4, bed_length=1.2, cell=0.004, relief=0.0, rocks=0.0, craters=0.0, slope_deg=slope_deg)
+    plain = build_scene(p)
+    scene = Bundle(prepare(plain, None, (0.0, 0.8, 0.1)), dict(plain.meta))
+    # straight down from so far above that a pixel sees 4 mm of the bed, whatever its height
+    down = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.6, 40.0]))
+    light = radiance(scene, height_field(scene), Camera(1e4, 1e4, 49.5, 149.5, 100, 300), down, 1)[0][:, 0, :, 0]
+    y = 0.6 - 0.004 * (np.arange(300) - 149.5)
+    contrast = np.abs(np.diff(light[:, 40:60], axis=0)).mean(axis=1) / np.nanmean(light)
+    inside = np.abs(y[1:] - 0.8) < 0.075
+    covered = (y[1:] > 0.02) & (y[1:] < 1.18) & (np.abs(y[1:] - 0.8) > 0.11)
+    assert contrast[inside].max() < 0.01
+    assert contrast[covered].min() > 0.02

@@ -66,7 +66,7 @@ def test_what_no_such_run_can_read_is_refused_before_anything_is_computed(tmp_pa
     assert not (tmp_path / "cache" / "artifacts").exists()
 
 
-@pytest.mark.parametrize("assignment", ["mockup.forward=0.1", "mockup.frames=3"])
+@pytest.mark.parametrize("assignment", ["mockup.forward=0.1", "mockup.frames=3", "mockup.up_noise_deg=1.0"])
 def test_a_drive_refuses_how_a_recorded_rig_moves(assignment):
     given = configuration.parse_assignments([assignment])
     with raises("RIL-734", assignment.partition("=")[0]):
