@@ -13,12 +13,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
 from rille.datasets.poses import coverage, times_of
-from rille.datasets.protocol import Rows
+from rille.datasets.protocol import Rows, rows_of
 from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.times import GAP
 from rille.stages.core.arrays import Floats
@@ -251,7 +250,7 @@ def at_frames(imu: ImuRecord, at: Sequence[float], T_imu_left: RigidTransform) -
     for p, moment in zip(part, at, strict=True):
         R_reference_imu = parts[p].attitude(moment) if p is not None and p == longest else None
         force = parts[p].up(moment) if p is not None else None
-        attitude.append(None if R_reference_imu is None else _rows(R_reference_imu @ R_imu_left))
+        attitude.append(None if R_reference_imu is None else rows_of(orthonormal(R_reference_imu @ R_imu_left)))
         up.append(None if force is None else _unit(R_imu_left.T @ force))
     warnings = coverage(attitude, at, f"attitude from {imu.name}")
     return Inertial(tuple(attitude), tuple(up), warnings, notes)
@@ -340,10 +339,6 @@ def _overlap(imu: ImuRecord, at: Sequence[float]) -> None:
             "no common time",
             remedy="check that both have the same clock and unit; a constant offset can be stated",
         )
-
-
-def _rows(rotation: Floats) -> Rows:
-    return cast(Rows, tuple(tuple(float(v) for v in row) for row in orthonormal(rotation)))
 
 
 def _unit(vector: Floats) -> Up:

@@ -22,12 +22,13 @@ from rille.datasets.cameras.kitti import decompose
 from rille.datasets.images import files
 from rille.datasets.images.pairing import ends, natural
 from rille.datasets.manifest.rig import LONGEST_BASELINE, off_centre
+from rille.datasets.poses import rounded_pose
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.text.names import derived_name
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.times import seconds
 from rille.stages.core.errors import InputError
-from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, orthonormal
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 
 PAIRS = (
     ("image_0", "image_1"),
@@ -333,7 +334,9 @@ def open_kitti(layout: KittiLayout, digests: files.Digests) -> Sequence:
     warnings: tuple[str, ...] = ()
     if layout.poses is not None:
         truth = tuple(
-            None if row is None or np.isnan(row[1]).all() else _pose(row[1], row[0], layout.poses) @ T_reference_left
+            None
+            if row is None or np.isnan(row[1]).all()
+            else rounded_pose(row[1].reshape(3, 4), f"{layout.poses}, line {row[0]}") @ T_reference_left
             for row in _per_frame(layout.poses, 12, listing, "poses")
         )
     if layout.times is not None:
@@ -355,13 +358,3 @@ def open_kitti(layout: KittiLayout, digests: files.Digests) -> Sequence:
         defaults=STREET if rig.baseline >= CAR else {},
         warnings=(*warnings, *off_centre(rig.left, "left", size[:2]), *off_centre(rig.right, "right", size[:2])),
     )
-
-
-def _pose(row: NDArray[np.float64], line: int, path: Path) -> RigidTransform:
-    """One line of poses; written with few digits, so that its rotation is made orthonormal."""
-    m = row.reshape(3, 4)
-    try:
-        RigidTransform(m[:, :3], m[:, 3])
-    except InputError as error:
-        raise error.at(f"{path}, line {line}") from error
-    return RigidTransform(orthonormal(m[:, :3]), m[:, 3])

@@ -274,7 +274,7 @@ def _quaternions(table: TextTable, columns: Mapping[str, int]) -> Floats:
 
 
 def _matrices(table: TextTable) -> tuple[RigidTransform, ...]:
-    """Poses of rows of [R | t]; written with few digits, so that their rotations are made orthonormal."""
+    """Poses of rows of [R | t]."""
     if table.columns not in (12, 16):
         raise InputError(
             "RIL-267",
@@ -282,14 +282,22 @@ def _matrices(table: TextTable) -> tuple[RigidTransform, ...]:
             remedy="give 12 numbers a line, or state the format",
         )
     values = table.numbers(range(table.columns)).reshape(len(table.rows), -1, 4)[:, :3]
-    out = []
-    for m, line in zip(values, table.lines, strict=True):
-        try:
-            RigidTransform(m[:, :3], m[:, 3])
-        except InputError as error:
-            raise error.at(f"{table.name}, line {line}") from error
-        out.append(RigidTransform(orthonormal(m[:, :3]), m[:, 3]))
-    return tuple(out)
+    return tuple(rounded_pose(m, f"{table.name}, line {line}") for m, line in zip(values, table.lines, strict=True))
+
+
+def rounded_pose(m: Floats, where: str) -> RigidTransform:
+    """Pose of [R | t] (3, 4), written with few digits, so that its rotation is made orthonormal.
+
+    Raises
+    ------
+    InputError
+        It is not even roughly a rotation; the message begins with ``where``.
+    """
+    try:
+        RigidTransform(m[:, :3], m[:, 3])
+    except InputError as error:
+        raise error.at(where) from error
+    return RigidTransform(orthonormal(m[:, :3]), m[:, 3])
 
 
 def interpolate(timed: TimedPoses, at: Sequence[float], max_gap: float) -> tuple[RigidTransform | None, ...]:

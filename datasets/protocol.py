@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from rille.datasets.georeference import Georeference
 from rille.datasets.text.names import check_name
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Rig, RigidTransform
@@ -25,6 +26,12 @@ CAMERAS = ("left", "right")
 
 Rows = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 """A 3 x 3 rotation, row by row."""
+
+
+def rows_of(rotation: Floats) -> Rows:
+    """A rotation (3, 3) as plain numbers."""
+    a, b, c = ((float(x), float(y), float(z)) for x, y, z in rotation)
+    return a, b, c
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from rille.datasets.cameras import boofcv, colmap, kitti, middlebury, opencv, pd
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from rille.datasets.cameras.pair import rig_of
-from rille.datasets.cameras.text import parse_xml, parse_yaml
+from rille.datasets.cameras.text import parse_nested
 from rille.datasets.text.reading import read_text
 from rille.stages.core.errors import InputError
 
@@ -58,8 +58,7 @@ def read_cameras(path: Path) -> list[CalibratedCamera]:
     for recognises, read in PLAIN:
         if recognises(text):
             return read(text, path)
-    parse = parse_xml if text.lstrip().startswith("<") else parse_yaml
-    fields = Fields(parse(text, str(path)), str(path))
+    fields = Fields(parse_nested(text, str(path)), str(path))
     for knows, read_fields in NESTED:
         if knows(fields):
             return read_fields(fields, path)

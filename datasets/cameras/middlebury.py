@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from rille.datasets.cameras.fields import Fields
-from rille.datasets.cameras.model import CalibratedCamera, stereo_cameras
+from rille.datasets.cameras.model import CalibratedCamera, parallel, stereo_cameras
 from rille.datasets.cameras.text import assignments
-from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
 
 
@@ -27,5 +24,4 @@ def middlebury(text: str, path: Path) -> list[CalibratedCamera]:
     f = Fields(values, str(path))
     size = f.size("width", "height")
     left, right = (Lens(f.pinhole(key, size)) for key in ("cam0", "cam1"))
-    shift = np.array([-f.number("baseline") / 1000, 0.0, 0.0])
-    return stereo_cameras(left, right, RigidTransform(np.eye(3), shift))
+    return stereo_cameras(left, right, parallel(f.number("baseline") / 1000))

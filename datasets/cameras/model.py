@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
 
@@ -33,6 +35,11 @@ class CalibratedCamera:
         """Width and height of its images, pixels; None where the file does not say."""
         size = (self.lens.camera.width, self.lens.camera.height)
         return None if size == UNKNOWN_SIZE else size
+
+
+def parallel(baseline: float) -> RigidTransform:
+    """T_right_left of cameras that look the same way, the right one ``baseline`` along the left one's x axis."""
+    return RigidTransform(np.eye(3), np.array([-baseline, 0.0, 0.0]))
 
 
 def stereo_cameras(left: Lens, right: Lens, T_right_left: RigidTransform) -> list[CalibratedCamera]:

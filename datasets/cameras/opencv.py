@@ -8,9 +8,8 @@ import numpy as np
 
 from rille.datasets.cameras.fields import Fields, by_count
 from rille.datasets.cameras.model import CalibratedCamera
-from rille.datasets.cameras.text import parse_xml, parse_yaml
+from rille.datasets.cameras.text import parse_nested
 from rille.datasets.text.reading import read_text
-from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
 
@@ -114,8 +113,7 @@ def _beside(path: Path) -> RigidTransform | None:
     if not other.is_file():
         return None
     text = read_text(other, "calibration")
-    parse = parse_xml if text.lstrip().startswith("<") else parse_yaml
-    return _relative(Fields(parse(text, str(other)), str(other)))
+    return _relative(Fields(parse_nested(text, str(other)), str(other)))
 
 
 def _unrectified(f: Fields, rotation: str, projection: str) -> RigidTransform:
@@ -125,7 +123,4 @@ def _unrectified(f: Fields, rotation: str, projection: str) -> RigidTransform:
         raise f.error("RIL-125", projection, f"has the focal length {P[0, 0]:g}")
     # sensor_msgs/msg/CameraInfo: P[0, 3] is -fx' times the baseline, fx' = P[0, 0], and 0 of the left camera.
     T = RigidTransform(np.eye(3), np.array([P[0, 3] / P[0, 0], P[1, 3] / P[0, 0], 0.0]))
-    try:
-        return RigidTransform(R, np.zeros(3)).inverse() @ T
-    except InputError as error:
-        raise f.error(error.code, rotation, f"is no pose: {error.message}") from error
+    return f.rigid(rotation, R, np.zeros(3)).inverse() @ T

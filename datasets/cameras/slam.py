@@ -5,10 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import numpy as np
-
 from rille.datasets.cameras.fields import Fields
-from rille.datasets.cameras.model import CalibratedCamera, stereo_cameras
+from rille.datasets.cameras.model import CalibratedCamera, parallel, stereo_cameras
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
 
@@ -82,7 +80,7 @@ def orbslam(f: Fields, path: Path) -> list[CalibratedCamera]:
         return stereo_cameras(left, right, f.pose("Stereo.T_c1_c2").inverse())
     if "Stereo.b" in f or "Camera.bf" in f:
         baseline = f.number("Stereo.b") if "Stereo.b" in f else f.number("Camera.bf") / left.camera.fx
-        return stereo_cameras(left, left, RigidTransform(np.eye(3), np.array([-abs(baseline), 0.0, 0.0])))
+        return stereo_cameras(left, left, parallel(abs(baseline)))
     return [CalibratedCamera(path.stem, left)]
 
 

@@ -43,6 +43,11 @@ def assignments(text: str) -> list[tuple[str, str]]:
     return found
 
 
+def parse_nested(text: str, file: str) -> Mapping[Any, Any]:
+    """Entries of XML, YAML or JSON, whichever it is (see :func:`parse_xml` and :func:`parse_yaml`)."""
+    return parse_xml(text, file) if text.lstrip().startswith("<") else parse_yaml(text, file)
+
+
 def parse_yaml(text: str, file: str) -> Mapping[Any, Any]:
     """Entries of a YAML or JSON file; empty where it holds something else than entries."""
     body = HEADER.sub("", text, count=1)

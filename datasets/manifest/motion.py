@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from rille.datasets.imu import at_frames, read_imu
 from rille.datasets.manifest.model import Attitude, Imu, Manifest, PoseFile, Times, Truth
 from rille.datasets.manifest.rig import direction
 from rille.datasets.poses import coverage, interpolate, read_poses, read_positions
-from rille.datasets.protocol import Positions, Rows
+from rille.datasets.protocol import Positions, Rows, rows_of
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.times import seconds
 from rille.stages.core.errors import InputError
@@ -186,14 +185,10 @@ def _truth(section: Truth, root: Path, name: str, motion: KnownMotion, count: in
 
 def _attitude(section: Attitude, root: Path, name: str, motion: KnownMotion, count: int) -> None:
     poses = _poses(section, "attitude", root, name, motion, count)
-    motion.attitude = tuple(None if pose is None else _rows(pose) for pose in poses)
+    motion.attitude = tuple(None if pose is None else rows_of(pose.rotation) for pose in poses)
     if section.up is not None:
         what = f"{name}: attitude.up"
         motion.up = tuple(None if p is None else direction(section.up, p.inverse(), what) for p in poses)
-
-
-def _rows(pose: RigidTransform) -> Rows:
-    return cast(Rows, tuple(tuple(float(v) for v in row) for row in np.asarray(pose.rotation)))
 
 
 def _imu(section: Imu, root: Path, name: str, motion: KnownMotion) -> None:

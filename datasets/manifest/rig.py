@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rille.datasets.cameras import CalibratedCamera, read_cameras, rig_of
+from rille.datasets.cameras.model import parallel
 from rille.datasets.manifest.model import Cameras, Manifest, PinholeLens, RigSection
 from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
@@ -211,7 +212,7 @@ def _stated(section: RigSection, name: str) -> RigidTransform | None:
             remedy="give the distance of the cameras; where the left one stands to the right, "
             "they are swapped: exchange images.left and images.right",
         )
-    return RigidTransform(np.eye(3), np.array([-section.baseline, 0.0, 0.0]))
+    return parallel(section.baseline)
 
 
 def _check_baseline(baseline: float, section: RigSection, name: str) -> list[str]:

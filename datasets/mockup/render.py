@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rille.datasets.mockup.params import RenderParams
 from rille.datasets.mockup.raycast import HeightField
-from rille.datasets.mockup.scene import height_field
+from rille.datasets.mockup.scene import MIPS, height_field
 from rille.datasets.mockup.terrain import EMISSION
 from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Stage
 from rille.stages.geometry.geometry import Camera, RigidTransform
@@ -64,20 +64,10 @@ class _Bed(NamedTuple):
     sun: NDArray[np.float64]
 
 
-class _Albedo(NamedTuple):
-    """Levels of the albedo, each half as fine as the one before, one behind the other: values, where each begins, and
-    the shape of each (level, 2)."""
-
-    texture: NDArray[np.uint8]
-    offsets: NDArray[np.int64]
-    shapes: NDArray[np.int64]
-
-
 @njit(cache=True, nogil=True)
 def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ignore[no-untyped-def]
-    """Radiance (n,) of the hit points, NaN where a ray hit nothing."""
+    """Radiance (n,) of the hit points, NaN where a ray hit nothing; ``albedo``: its levels, the finest first."""
     height, sunlit, tint, (x0, y0, cell), rise, sun = bed
-    texture, offsets, shapes = albedo
     n = directions.shape[0]
     out = np.full(n, np.nan, np.float32)
     for i in range(n):
@@ -111,7 +101,7 @@ def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ign
         ax, ay = vx / flat * minor * stretch, vy / flat * minor * stretch
         level = math.log2(max(minor * stretch / taps / (0.5 * cell), 1.0))
         # Just below the last level, since the one above it is read as well.
-        level = min(level, offsets.shape[0] - 1.001)
+        level = min(level, len(albedo) - 1.001)
         low = int(level)
         f = level - low
         total = 0.0
@@ -120,8 +110,8 @@ def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ign
             # The albedo has two texels a cell; rows grow where y falls.
             tr = 2.0 * (r - drape - a * ay / cell)
             tc = 2.0 * (c + a * ax / cell)
-            total += (1.0 - f) * _texel(texture, offsets, shapes, low, tr, tc)
-            total += f * _texel(texture, offsets, shapes, low + 1, tr, tc)
+            total += (1.0 - f) * _texel(albedo, low, tr, tc)
+            total += f * _texel(albedo, low + 1, tr, tc)
         # 128 and 100 are the bytes that stand for 1 in the albedo and in the tint.
         out[i] = total / taps / 128.0 * _bilinear(tint, r, c) / 100.0 * (direct + AMBIENT)
     return out
@@ -139,18 +129,11 @@ def _bilinear(a, r, c):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _texel(texture, offsets, shapes, level, r, c):  # type: ignore[no-untyped-def]
+def _texel(albedo, level, r, c):  # type: ignore[no-untyped-def]
     """Bilinear value of one level of the albedo at (row, column) of level 0."""
     size = float(1 << level)
-    rows, cols = shapes[level, 0], shapes[level, 1]
     # A texel of a coarser level lies in the middle of those that it is the mean of, not on the first of them.
-    r = min(max((r + 0.5) / size - 0.5, 0.0), rows - 1.000001)
-    c = min(max((c + 0.5) / size - 0.5, 0.0), cols - 1.000001)
-    i, j = int(r), int(c)
-    u, v = r - i, c - j
-    at = offsets[level] + i * cols + j
-    top = (1.0 - v) * texture[at] + v * texture[at + 1]
-    return (1.0 - u) * top + u * ((1.0 - v) * texture[at + cols] + v * texture[at + cols + 1])
+    return _bilinear(albedo[level], (r + 0.5) / size - 0.5, (c + 0.5) / size - 0.5)
 
 
 def sun_direction(elevation_deg: float, azimuth_deg: float) -> NDArray[np.float64]:
@@ -170,7 +153,8 @@ def radiance(
     rays = camera_rays(camera, T_bed_camera, sampling)
     origin = T_bed_camera.translation
     distance = field.cast(origin[None, :], rays)
-    mips = [np.asarray(scene[f"albedo_{k}"][:]) for k in range(sum(n.startswith("albedo_") for n in scene.arrays))]
+    # Copies, lest some levels are read-only and others not: one type for all.
+    albedo = tuple(np.array(scene[f"albedo_{k}"][:], order="C") for k in range(MIPS))
     light = scene.meta["scene"]
     bed = _Bed(
         field.height,
@@ -179,11 +163,6 @@ def radiance(
         (field.x0, field.y0, field.cell),
         math.tan(math.radians(light["slope_deg"])),
         sun_direction(light["sun_elevation_deg"], light["sun_azimuth_deg"]),
-    )
-    albedo = _Albedo(
-        np.concatenate([m.ravel() for m in mips]),
-        np.concatenate([[0], np.cumsum([m.size for m in mips])[:-1]]).astype(np.int64),
-        np.array([m.shape for m in mips], dtype=np.int64),
     )
     values = _shade(bed, albedo, np.ascontiguousarray(origin), rays, distance, 1.0 / (sampling * camera.fx))
     blocks = values.reshape(camera.height, sampling, camera.width, sampling)

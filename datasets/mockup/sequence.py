@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from rille.datasets.mockup.params import MockupParams
-from rille.datasets.protocol import CAMERAS, Rows, Sequence, Source
+from rille.datasets.protocol import CAMERAS, Rows, Sequence, Source, rows_of
 from rille.stages.core.declare import NoParams
 from rille.stages.core.errors import ConfigError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
@@ -112,8 +112,7 @@ def _attitude(p: MockupParams, truth: list[RigidTransform]) -> tuple[Rows, ...] 
     for pose in truth:
         error = rotation_exp(np.deg2rad(p.attitude_noise_deg) * rng.standard_normal(3))
         # The sensor errs about the camera's axes: the error stands before R_left_bed, the transposed rotation.
-        a, b, c = ((float(x), float(y), float(z)) for x, y, z in (error @ pose.rotation.T).T)
-        out.append((a, b, c))
+        out.append(rows_of((error @ pose.rotation.T).T))
     return tuple(out)
 
 
@@ -147,9 +146,6 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
             "T_bed_camera": poses[camera][frame].to_list(),
         }
         return Source("rille.datasets.mockup.render", p.render(), args, inputs={"scene": scene})
-
-    def pair(frame: int) -> list[list[float]]:
-        return [poses[c][frame].to_list() for c in CAMERAS]
 
     def disparity(frame: int) -> Source:
         args = {"frame": frame, "rig": rig.to_dict(), "T_bed_left": poses["left"][frame].to_list()}

@@ -70,9 +70,8 @@ def prepare(
 
 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    places = {name: None if args[name] is None else tuple(args[name]) for name in ("pad", "blank")}
     scene = inputs["scene"]
-    return Bundle(prepare(scene, places["pad"], places["blank"]), dict(scene.meta))
+    return Bundle(prepare(scene, args["pad"], args["blank"]), dict(scene.meta))
 
 
 STAGE = Stage(
