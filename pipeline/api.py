@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import tomli_w
 
-from rille.pipeline.steps import StereoSequence
+from rille.pipeline.steps import StereoSequence, check_place, check_sections
 from rille.stages.core.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
@@ -81,6 +81,8 @@ def reconstruct(
     prepare()
     from rille.pipeline.runs import session
 
+    if not isinstance(seq, StereoSequence):
+        check_place(seq)
     opened = seq.source if isinstance(seq, StereoSequence) else None
     options = session.Options(
         str(seq) if opened is None else opened.name,
@@ -91,7 +93,8 @@ def reconstruct(
         cache=cache_folder(cache),
         opened=opened,
     )
-    return Run(session.perform(options)[1])
+    # Absolute: the program may change its folder, or send the run to another.
+    return Run(session.perform(options)[1].resolve())
 
 
 def assignments(settings: Mapping[str, Settings]) -> list[str]:
@@ -101,11 +104,8 @@ def assignments(settings: Mapping[str, Settings]) -> list[str]:
     ['locus.cell_size=0.002', 'locus.both=true', 'drive.goal=[ 0.1, 2.0, ]']
     """
     found = []
+    check_sections(settings)
     for section, values in settings.items():
-        if not isinstance(values, Mapping):
-            raise ConfigError(
-                "RIL-861", f"{section}={values!r} is no section", remedy=f'give {section}={{"name": value}}'
-            )
         for name, value in values.items():
             try:
                 lines = tomli_w.dumps({"v": value}).removeprefix("v = ").splitlines()
@@ -161,7 +161,7 @@ class Run:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is missing."""
+        """Whether nothing of the reconstruction is missing; that there is no path, say, is an answer."""
         return bool(self.report["complete"])
 
     @property
@@ -174,7 +174,7 @@ class Run:
     def terrain(self) -> xarray.Dataset:
         """The merged terrain: ``elevation``, its standard deviation and more on (y, x), metres in the world frame.
 
-        ``terrain.to_netcdf(path)`` saves it.
+        y falls: ``terrain.sel(y=slice(0.6, 0.4))``. ``terrain.to_netcdf(path)`` and ``terrain.to_zarr(path)`` save it.
 
         Raises
         ------
@@ -186,6 +186,8 @@ class Run:
         found: xarray.Dataset = xarray.open_zarr(self._file("terrain.zarr"))
         for variable in found.variables.values():
             variable.attrs.pop("_CRS", None)  # GDAL's own, a mapping: NetCDF stores none; `spatial_ref` says the same
+            for codec in ("compressors", "filters"):  # those of zarr 2, which `to_zarr` refuses in its own format 3
+                variable.encoding.pop(codec, None)
         return found
 
     @property

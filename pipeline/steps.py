@@ -22,6 +22,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,7 @@ import numpy as np
 from rille.datasets import registry
 from rille.datasets.protocol import Sequence
 from rille.stages.core.declare import Bundle, NoParams, Stage
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.geometry.geometry import Rig
 
 if TYPE_CHECKING:
@@ -51,6 +52,9 @@ class StereoSequence:
     drawn: dict[str, Bundle] = field(default_factory=dict, repr=False, compare=False)
     """Images that were read or rendered already, by label."""
 
+    def __repr__(self) -> str:
+        return f"<StereoSequence {self.name}: {len(self)} pairs>"
+
     @property
     def name(self) -> str:
         """Short name, also of the folder of its runs."""
@@ -65,7 +69,8 @@ class StereoSequence:
         return self.source.frames
 
     def __getitem__(self, frame: int) -> StereoPair:
-        number = frame + len(self) if frame < 0 else frame
+        number = index(frame)
+        number += len(self) if number < 0 else 0
         if not 0 <= number < len(self):
             raise IndexError(f"pair {frame} of {len(self)}")
         if number in self.source.lost:
@@ -110,7 +115,7 @@ class StereoPair:
         found = _computed(_builder(self, self.settings).image(self.frame, camera), {}, self.sequence.drawn)
         valid = found.arrays.get("valid")
         return xarray.DataArray(
-            np.asarray(found["image"]),
+            np.array(found["image"]),  # a copy: what a user draws into it must not reach the next step
             dims=("row", "col"),
             coords={} if valid is None else {"valid": (("row", "col"), np.asarray(valid))},
             name=f"{camera}_image",
@@ -142,7 +147,28 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
     >>> len(sequence), sequence[0].left.dims
     (9, ('row', 'col'))
     """
+    check_place(path)
+    check_sections(settings)
     return StereoSequence(registry.open_sequence(str(path), settings))
+
+
+def check_place(path: object) -> None:
+    """Refuse what can be no name or path of a sequence."""
+    if not isinstance(path, str | Path):
+        raise InputError(
+            "RIL-970",
+            f"a {type(path).__name__} is no sequence",
+            remedy="give a name, a path, or what rille.open returns",
+        )
+
+
+def check_sections(settings: Mapping[str, object]) -> None:
+    """Refuse a parameter that is given without its section."""
+    for section, values in settings.items():
+        if not isinstance(values, Mapping):
+            raise ConfigError(
+                "RIL-861", f"{section}={values!r} is no section", remedy=f'give {section}={{"name": value}}'
+            )
 
 
 def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
@@ -232,9 +258,10 @@ def terrain(disparity: xarray.Dataset, pair: StereoPair, **locus: Any) -> xarray
     (-0.18, 'm')
     """
     from rille.pipeline.flow.reconstruction import vertical
+    from rille.stages.hfvm import stage as hfvm_stage
     from rille.stages.terrain.locus import stage as locus_stage
 
-    given = _bundle(disparity, "column_disparity", "rille.match")
+    given = _bundle(disparity, hfvm_stage.STAGE, "column_disparity", "rille.match")
     size = pair.sequence.rig.left.height, pair.sequence.rig.left.width
     if disparity.column_disparity.shape != size:
         raise InputError(
@@ -281,6 +308,7 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
     """
     from rille.pipeline.flow import config
     from rille.stages.hazard import risk as risk_stage
+    from rille.stages.terrain.locus import stage as locus_stage
 
     limits: dict[str, Any] = {}
     if isinstance(vehicle, str | Path):
@@ -290,7 +318,9 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
         limits = dict(vehicle)
     settings = _merged(dem, {"vehicle": limits, "risk": risk})
     make, given = _builder(None, settings), _placeholder("dem")
-    found = _computed(make.hazards("risk", [given]), {given: _bundle(dem, "elevation", "rille.terrain")}, {})
+    found = _computed(
+        make.hazards("risk", [given]), {given: _bundle(dem, locus_stage.STAGE, "elevation", "rille.terrain")}, {}
+    )
     return _dataset(risk_stage.STAGE, found, settings)
 
 
@@ -333,13 +363,14 @@ def path(
     >>> found.path[-1].values.round(2)[:2].tolist()
     [0.19, 0.63]
     """
+    from rille.stages.hazard import risk as risk_stage
     from rille.stages.planning import path as path_stage
 
     ends = {name: list(end) for name, end in (("target", goal), ("start", start)) if end is not None}
     settings = _merged(hazards, {"path": {**path, **ends}})
     make, given = _builder(None, settings), _placeholder("risk")
     planned = make.node(path_stage, "path", {} if ends else {"use": "local"}, risk=given)
-    found = _computed(planned, {given: _bundle(hazards, "risk", "rille.hazards")}, {})
+    found = _computed(planned, {given: _bundle(hazards, risk_stage.STAGE, "risk", "rille.hazards")}, {})
     return _dataset(path_stage.STAGE, found, settings)
 
 
@@ -414,8 +445,8 @@ def _merged(data: xarray.Dataset, *more: Settings) -> dict[str, Any]:
     return settings
 
 
-def _bundle(data: xarray.Dataset, variable: str, maker: str) -> Bundle:
-    """What a step before has made; ``variable`` tells its datasets from those of the other steps."""
+def _bundle(data: xarray.Dataset, stage: Stage, variable: str, maker: str) -> Bundle:
+    """What a step before has made by ``stage``; ``variable`` tells its datasets from those of the other steps."""
     there = {
         "attribute rille": "rille" in getattr(data, "attrs", ()),
         variable: variable in getattr(data, "data_vars", ()),
@@ -424,6 +455,15 @@ def _bundle(data: xarray.Dataset, variable: str, maker: str) -> Bundle:
         if not found:
             raise InputError("RIL-864", f"the dataset has no {what}", remedy=f"give what {maker} returns")
     arrays = {str(name): np.asarray(array) for name, array in data.data_vars.items()}
+    # A mask over the whole dataset makes floats of bits, with NaN for what is masked.
+    for array in stage.outputs:
+        given = arrays.get(array.name)
+        if given is not None and np.dtype(array.dtype).kind != "f" and given.dtype.kind == "f":
+            raise InputError(
+                "RIL-971",
+                f"{array.name} is {given.dtype}, it was {array.dtype}",
+                remedy=f"mask it by a whole number, e.g. data.assign({array.name}=data.{array.name}.where(mask, 0))",
+            )
     return Bundle(arrays, json.loads(data.attrs["rille"])["meta"])
 
 

@@ -30,6 +30,10 @@ if not (_HERE / "stages").is_dir():  # a checkout: the packages lie beside this 
     __path__.append(str(_HERE.parent))
 
 
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})  # a notebook completes names that are not loaded yet
+
+
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__} has no attribute {name}")

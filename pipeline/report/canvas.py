@@ -14,6 +14,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from threading import Lock
 from typing import Any
 from urllib.parse import quote
 
@@ -170,6 +171,10 @@ def map_axes(extent: Extent, *, bar: bool = False, max_height: float = 6.0) -> t
     sheet, wiped by each call: making axes with their ticks takes matplotlib longer than painting the map.
     """
     return _wiped(_map_sheet(tuple(float(v) for v in extent), bar, max_height))
+
+
+DRAWING = Lock()
+"""Held while a figure is drawn: sheets are shared, and a worker may have several threads."""
 
 
 @lru_cache(maxsize=8)

@@ -88,7 +88,7 @@ def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
     remedy = f"give START:STOP[:STEP] within 0:{count}"
     try:
         parts = [int(p) if p else None for p in text.split(":")]
-    except ValueError:
+    except (ValueError, AttributeError):  # from Python it may be no text
         raise ConfigError("RIL-055", f"--frames {text!r} is not a range", remedy=remedy) from None
     if not 2 <= len(parts) <= 3 or any(p is not None and p < 0 for p in parts) or parts[2:] == [0]:
         raise ConfigError("RIL-056", f"--frames {text!r} is not a range", remedy=remedy)

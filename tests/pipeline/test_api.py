@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -72,6 +73,30 @@ def test_the_terrain_is_saved_as_netcdf(run: rille.Run, tmp_path: Path) -> None:
         assert again.spatial_ref.crs_wkt == run.terrain.spatial_ref.crs_wkt
 
 
+def test_the_terrain_is_saved_as_zarr(run: rille.Run, tmp_path: Path) -> None:
+    run.terrain.to_zarr(tmp_path / "terrain.zarr", consolidated=False)
+    again = xarray.open_zarr(tmp_path / "terrain.zarr", consolidated=False)
+    np.testing.assert_array_equal(again.elevation, run.terrain.elevation)
+    np.testing.assert_array_equal(again["count"], run.terrain["count"])
+
+
+def test_a_run_stays_where_it_is_when_the_program_changes_its_folder(
+    run: rille.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = run.folder.parents[2]
+    monkeypatch.chdir(folder)
+    sequence = rille.open("mockup-short", mockup=MOCKUP)
+    again = rille.reconstruct(sequence, runs="here", cache="cache", executor="inline", **STAGES)  # type: ignore[arg-type]
+    monkeypatch.chdir(tmp_path)
+    assert again.folder.parents[1] == folder / "here"
+    np.testing.assert_array_equal(again.terrain.elevation, run.terrain.elevation)
+    assert pickle.loads(pickle.dumps(again)) == rille.open_run(again.folder)
+
+
+def test_names_are_completed_before_they_are_loaded() -> None:
+    assert {*rille.__all__} <= {*dir(rille)}
+
+
 def test_the_map_of_the_report_answers_with_the_values_of_the_rasters(
     run: rille.Run, chromium: str, tmp_path: Path
 ) -> None:
@@ -114,6 +139,15 @@ def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
         rille.reconstruct(sequence, runs=tmp_path, cache=tmp_path / "cache", mockup={"frames": 4})
     with raises("RIL-861"):
         rille.reconstruct(sequence, locus=0.002)  # type: ignore[arg-type]
+    with raises("RIL-861", "frames=3"):
+        rille.open("mockup-short", frames=3)  # type: ignore[arg-type]
+    for nothing in (None, sequence[0], [sequence[0]]):
+        for take in (rille.open, rille.reconstruct):
+            with raises("RIL-970", type(nothing).__name__):
+                take(nothing)  # type: ignore[operator]
+    for number in (2, slice(0, 2), [0, 1]):
+        with raises("RIL-055", repr(number)):
+            rille.reconstruct(sequence, frames=number, runs=tmp_path, cache=tmp_path / "cache")  # type: ignore[arg-type]
     for nothing in (None, np.float32(0.002), tmp_path):
         with raises("RIL-866", "locus.cell_size"):
             rille.reconstruct(sequence, locus={"cell_size": nothing})

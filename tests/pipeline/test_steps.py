@@ -121,3 +121,28 @@ def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: 
         rille.match(pair.left, pair.right, no=1)
     with raises("RIL-027", "vehicle.wings"):
         rille.hazards(dem, vehicle={"wings": 2})
+
+
+def test_what_a_user_draws_into_an_image_stays_with_them() -> None:
+    pair = rille.open("mockup-short", mockup=MOCKUP | {"frames": 1})[0]
+    before = pair.left
+    pair.left[:50] = 0
+    np.testing.assert_array_equal(pair.left, before)
+
+
+def test_pairs_are_counted_by_whole_numbers(pair: rille.StereoPair) -> None:
+    sequence = pair.sequence
+    assert sequence[-1] == sequence[np.int64(2)] == sequence[2]
+    for wrong in (slice(0, 2), "000000", 1.0):
+        with pytest.raises(TypeError, match="integer"):
+            _ = sequence[wrong]  # type: ignore[index]
+    assert repr(sequence) == "<StereoSequence mockup-short: 3 pairs>"
+
+
+def test_pixels_are_masked_by_their_validity(pair: rille.StereoPair, disparity: Any, dem: Any) -> None:
+    sure = disparity.disparity_std < float(disparity.disparity_std.median())
+    with raises("RIL-971", "validity"):
+        rille.terrain(disparity.where(sure), pair)
+    masked = disparity.assign(validity=disparity.validity.where(sure, 0))
+    fewer = rille.terrain(masked, pair, cell_size=0.004)
+    assert 0 < int(fewer.elevation.notnull().sum()) < int(dem.elevation.notnull().sum())

@@ -10,6 +10,7 @@ and the workers run alike.
 
 from __future__ import annotations
 
+import multiprocessing
 import pickle
 import re
 import traceback
@@ -131,12 +132,25 @@ def known(kind: Any, jobs: int | None = None) -> None:
     Raises
     ------
     ConfigError
-        It is neither one of the kinds nor an address nor a ``Client`` of dask, or there are no ``jobs``.
+        It is neither one of the kinds nor an address nor an open ``Client`` of dask, or there are no ``jobs``; or this
+        process is a worker that imports its program.
     """
-    if not isinstance(kind, str) and getattr(kind, "scheduler", None) is None:
-        raise ConfigError("RIL-588", f"{kind!r} is no open Client of dask", remedy="open one, or leave client out")
+    if not isinstance(kind, str):
+        from distributed import Client
+
+        # A closed one has no scheduler; calls of an asynchronous one give coroutines.
+        if not isinstance(kind, Client) or kind.scheduler is None or kind.asynchronous:
+            text = f"{kind!r} is no open Client of dask, or an asynchronous one"
+            raise ConfigError("RIL-588", text, remedy="give Client(...) without asynchronous=True, or leave client out")
     if isinstance(kind, str) and kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
         raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
+    # A spawned worker imports the program's main module first: without a guard it would start workers of its own.
+    if kind == "dask" and getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise ConfigError(
+            "RIL-972",
+            "a worker that starts came to this call",
+            remedy='put what the program does under `if __name__ == "__main__":`',
+        )
     if jobs is not None and jobs < 1:
         raise ConfigError("RIL-540", f"{jobs} jobs are not permitted", remedy="give 1 or more")
 

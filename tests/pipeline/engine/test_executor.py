@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import shutil
@@ -14,6 +15,7 @@ from types import SimpleNamespace
 
 import psutil
 import pytest
+from distributed import Client, LocalCluster
 from raising import raises
 from toys.chain import build
 
@@ -172,3 +174,38 @@ def test_an_edit_computes_again_exactly_what_it_can_change(editable):
 def test_what_is_no_open_client_is_refused(client):
     with raises("RIL-588", "no open Client"):
         base.known(client)
+
+
+def test_of_clusters_and_clients_only_a_synchronous_client_is_taken():
+    async def refused():
+        async with (
+            LocalCluster(n_workers=0, processes=False, dashboard_address=None, asynchronous=True) as cluster,
+            Client(cluster, asynchronous=True) as client,
+        ):
+            for given in (cluster, client):
+                with raises("RIL-588"):
+                    base.known(given)
+
+    asyncio.run(refused())
+    with LocalCluster(n_workers=0, processes=False, dashboard_address=None) as cluster, Client(cluster) as client:
+        base.known(client)
+        with raises("RIL-588"):
+            base.known(cluster)
+
+
+def test_a_program_without_a_guard_is_refused_where_its_workers_import_it(tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text(
+        "import multiprocessing\n"
+        "from rille.pipeline.engine.executors import base\n"
+        "base.known('inline'), base.known('dask')\n"
+        "if __name__ == '__main__':\n"
+        "    child = multiprocessing.get_context('spawn').Process(target=print)\n"
+        "    child.start()\n"
+        "    child.join()\n"
+        "    raise SystemExit(child.exitcode)\n"
+    )
+    found = subprocess.run([sys.executable, program], capture_output=True, text=True)
+    assert found.returncode == 1
+    assert 'under `if __name__ == "__main__":`' in found.stderr
+    assert "line 3" in found.stderr, "the place in the program"
