@@ -190,7 +190,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     Raises
     ------
     InputError
-        An image is not grey.
+        An image is not grey, or its values are floating point from 0 to 1.
     ConfigError
         A parameter is unknown, or not permitted.
 
@@ -212,6 +212,10 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     carried = _settings(left)
     built: Any = config.build(carried, {"hfvm": hfvm})
     images = [np.asarray(image) for image in (left, right)]
+    for camera, image in zip(("left", "right"), images, strict=True):
+        if image.dtype.kind == "f" and 0 < np.nanmax(image, initial=0) <= 1:
+            text = f"the {camera} image's values end at {np.nanmax(image):.3g}: floating point is taken as 0..255"
+            raise InputError("RIL-973", text, remedy="multiply by 255")
     valid = [np.asarray(image.valid) if "valid" in getattr(image, "coords", ()) else None for image in (left, right)]
     first, second = (pyramid.build(image, built.pyramid, mask) for image, mask in zip(images, valid, strict=True))
     side = tiles.side(built.tiling, built.hfvm, (images[0].shape, images[1].shape))

@@ -5,14 +5,19 @@ sequence: ``reconstruct``, ``open_run`` (:mod:`rille.pipeline.api`).
 """
 
 from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rille.pipeline.api import Run, open_run, reconstruct
     from rille.pipeline.steps import StereoPair, StereoSequence, hazards, match, open, path, terrain
+    from rille.stages.core.errors import RilleError
+
+    __version__: str
 
 __all__ = [
+    "RilleError",
     "Run",
     "StereoPair",
     "StereoSequence",
@@ -35,8 +40,10 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return version("rille")
     if name not in __all__:
         raise AttributeError(f"module {__name__} has no attribute {name}")
     # Loaded at first use: `import rille` must not import NumPy before threads are set.
-    home = "api" if name in ("Run", "open_run", "reconstruct") else "steps"
-    return getattr(import_module(f"rille.pipeline.{home}"), name)
+    homes = {"RilleError": "stages.core.errors"} | dict.fromkeys(("Run", "open_run", "reconstruct"), "pipeline.api")
+    return getattr(import_module(f"rille.{homes.get(name, 'pipeline.steps')}"), name)

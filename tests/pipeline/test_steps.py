@@ -58,6 +58,18 @@ def test_each_step_has_the_values_of_a_run(pair: rille.StereoPair, disparity: An
             np.testing.assert_array_equal(found[name], stored[name], err_msg=f"{label} {name}")
 
 
+def test_match_refuses_grey_values_from_0_to_1() -> None:
+    right = np.random.default_rng(1).random((40, 60))
+    with raises("RIL-973", "the right image"):
+        rille.match(np.float32(255) * right, right)
+
+
+def test_the_package_says_its_version_and_what_it_raises() -> None:
+    with pytest.raises(rille.RilleError):
+        rille.open("nix")
+    assert rille.__version__ in Path("pyproject.toml").read_text(encoding="utf-8")
+
+
 def test_match_has_the_values_of_the_command(pair: rille.StereoPair, tmp_path: Path) -> None:
     import cv2
 
