@@ -95,7 +95,7 @@ def models(scene: Scene) -> Block | None:
         if named
         else "No model stands out.",
         "Bias (at the middle of a model) and tilt explain a model's seams best, its neighbours held; the worst model "
-        " was taken out before the next one was judged. A model stands out where chance and the other "
+        "was taken out before the next one was judged. A model stands out where chance and the other "
         "models' poses give as much only once in ten thousand; it is beyond its σ where the error is larger than its "
         "own standard deviations allow.",
     ]

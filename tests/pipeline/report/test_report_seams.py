@@ -70,6 +70,7 @@ def test_the_model_to_blame_stands_first(scene: Any) -> None:
     assert block is not None
     assert block.table is not None
     assert "look first at pair 8." in block.caption
+    assert "  " not in block.caption
     first, *rest = block.table.rows
     assert (first[0], first[-1]) == ("8", "stands out, beyond its σ")
     assert first[1].startswith("+20 mm ±")
