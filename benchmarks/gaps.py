@@ -68,7 +68,7 @@ def trajectory(folder: Path, frames: tuple[int, ...], cache: Path) -> Any:
     from rille.datasets.registry import open_sequence
     from rille.pipeline.engine import scheduler
     from rille.pipeline.engine.graph import Graph, Handle
-    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.engine.store.base import Store
     from rille.pipeline.flow import config
     from rille.pipeline.flow.closed_loop import dataflow
     from rille.stages.evaluation import truth
@@ -83,7 +83,7 @@ def trajectory(folder: Path, frames: tuple[int, ...], cache: Path) -> Any:
                 self.nodes.remove(handle)
             return handle
 
-    graph, store = Odometry(), at(cache)
+    graph, store = Odometry(), Store(cache)
     settings = config.build({"crosscheck": {"enabled": False}})
     products, _ = dataflow(graph, open_sequence(str(folder)), settings, frames)
     scheduler.run(graph, store, scheduler.RunOptions(executor="inline"))

@@ -50,7 +50,7 @@ def drive(settings: list[str]) -> dict[str, Any]:
 
     from rille.pipeline.engine import scheduler
     from rille.pipeline.engine.graph import Graph
-    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.engine.store.base import Store
     from rille.pipeline.flow.closed_loop import Drive
 
     begin = time.perf_counter()
@@ -62,7 +62,7 @@ def drive(settings: list[str]) -> dict[str, Any]:
         return {"verdict": "not driven", "reason": "", "path_exists": False, "seconds": time.perf_counter() - begin}
     graph, folder = Graph(), Path(tempfile.mkdtemp(prefix="loop-"))
     try:
-        store = at(folder)
+        store = Store(folder)
         flow = Drive(graph, sequence, config_of([*layers, {"drive": {"goal": goal}}]))
         flow.build()
         result = scheduler.run(graph, store, scheduler.RunOptions(executor="inline", keep_going=True))

@@ -33,7 +33,7 @@ from evo.tools import file_interface
 from rosbags.highlevel import AnyReader
 
 import rille
-from rille.pipeline.engine.store.base import at
+from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.location import locate
 from rille.pipeline.export.programs import colmap as colmap_export
 
@@ -211,7 +211,7 @@ def back_projection(o: Opened) -> tuple[float, float]:
     rows = {r["name"]: r for r in json.loads((o.run / "report.json").read_text())["frames"] if r["rms_px"] is not None}
     with tempfile.TemporaryDirectory() as folder:
         limit, colmap_export.FARTHEST = colmap_export.FARTHEST, np.inf
-        colmap_export.export_run(o.run, Path(folder) / "all", at(o.cache))
+        colmap_export.export_run(o.run, Path(folder) / "all", Store(o.cache))
         colmap_export.FARTHEST = limit
         model = pycolmap.Reconstruction(f"{folder}/all")
     found = []

@@ -111,7 +111,7 @@ def main() -> None:
     start_process(1)
     from rille.pipeline.commands.options import cache_folder
     from rille.pipeline.engine import events
-    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.engine.store.base import Store
     from rille.pipeline.runs import lookup
     from rille.pipeline.runs.session import Options, reconstruct
 
@@ -120,7 +120,7 @@ def main() -> None:
         sys.exit("the run is not complete")
     folder = lookup.find(given.run or SEQUENCE, given.runs)
     rows = {row["label"]: row for row in events.read(folder / lookup.LEDGER)}
-    store, found = at(cache), []
+    store, found = Store(cache), []
     for label, row in rows.items():
         if row["stage"] == "dem_accuracy" and row["status"] in ("computed", "cached"):
             say(label)

@@ -197,17 +197,21 @@ def why(
     task
         The task's label, as in the run's ledger.jsonl: hfvm/12, locus/world/12, trajectory.
     """
-    from rille.pipeline.commands import why as command
+    from rille.pipeline.commands.why import describe
+    from rille.pipeline.engine.store.base import Store
+    from rille.pipeline.runs import lookup
 
-    return command.why(run, task, folder=runs, cache=cache_folder(cache))
+    print("\n".join(describe(lookup.find(run, runs), task, Store(cache_folder(cache)))))
+    return COMPLETE
 
 
 @app.command
 def timing(run: Run = "latest", *, runs: Runs = RUNS, debug: Debug = False) -> int:
     """Show where the time of a run went, against the least time that its tasks permit."""
-    from rille.pipeline.runs import critical_path as command
+    from rille.pipeline.runs import critical_path, lookup
 
-    return command.show(run, runs)
+    print("\n".join(critical_path.describe(lookup.find(run, runs))))
+    return COMPLETE
 
 
 @app.command

@@ -29,7 +29,7 @@ def trial(settings: list[str]) -> dict[str, Any]:
     """One leg with a stone on it; figures of the stone."""
     from rille.pipeline.engine import scheduler
     from rille.pipeline.engine.graph import Graph
-    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.engine.store.base import Store
     from rille.pipeline.flow.closed_loop import Drive, EndedError, TrueStand
     from rille.pipeline.flow.products import Stop
 
@@ -43,7 +43,7 @@ def trial(settings: list[str]) -> dict[str, Any]:
     sequence, layers = prepared(settings)
     graph, folder = Graph(), Path(tempfile.mkdtemp(prefix="obstacles-"))
     try:
-        store = at(folder)
+        store = Store(folder)
         flow = OneLeg(graph, sequence, config_of(layers))
         flow.build()
         result = scheduler.run(graph, store, scheduler.RunOptions(executor="inline", keep_going=True))

@@ -32,9 +32,9 @@ def verify(
 ) -> int:
     """Read every artifact and compare its checksums; damaged ones are named and recomputed by the next run."""
     from rille.pipeline.engine.store import maintenance
-    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.engine.store.base import Store
 
-    sound, damaged = maintenance.verify(at(_there(cache)), deep=deep)
+    sound, damaged = maintenance.verify(Store(_there(cache)), deep=deep)
     for found in damaged:
         print(f"rille: {found.label or found.key[:12]} ({found.stage}): {found.reason}; set aside", file=sys.stderr)
     print(f"{sound} artifacts are sound, {len(damaged)} damaged")
@@ -56,11 +56,11 @@ def gc(
     from rille.pipeline.engine import events
     from rille.pipeline.engine.memory.limits import words
     from rille.pipeline.engine.store import maintenance
-    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.engine.store.base import Store
     from rille.pipeline.runs import lookup, pins, roots
     from rille.stages.core.errors import ConfigError
 
-    store = at(_there(cache))
+    store = Store(_there(cache))
     # Before any key is gathered: artifacts of runs that cannot be seen from here would count as unused.
     roots.check_all_seen(store)
     ledgers = [path for folder in roots.folders(store, runs) for path in folder.glob(f"*/*/{lookup.LEDGER}")]
@@ -103,11 +103,11 @@ def pin(
     debug: Debug = False,
 ) -> int:
     """Keep all artifacts of a run: gc leaves them alone, even if the run's folder is removed."""
-    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.engine.store.base import Store
     from rille.pipeline.runs import lookup, pins
 
     folder = lookup.find(run, runs)
-    print(f"pinned {lookup.name(folder)}: {pins.pin(at(_there(cache)), folder)} artifacts")
+    print(f"pinned {lookup.name(folder)}: {pins.pin(Store(_there(cache)), folder)} artifacts")
     return COMPLETE
 
 
@@ -120,8 +120,8 @@ def unpin(run: str, *, cache: CacheFolder = None, debug: Debug = False) -> int:
     run
         SEQUENCE (its latest pin), SEQUENCE/ID, or ID.
     """
-    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.engine.store.base import Store
     from rille.pipeline.runs import pins
 
-    print(f"unpinned {pins.unpin(at(_there(cache)), run)}")
+    print(f"unpinned {pins.unpin(Store(_there(cache)), run)}")
     return COMPLETE

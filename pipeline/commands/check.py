@@ -22,7 +22,7 @@ from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.scheduler import Result
-from rille.pipeline.engine.store.base import Store, at
+from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.location import Location
 from rille.pipeline.flow.builders import Builder, name
 from rille.pipeline.runs import input_checks as judge
@@ -80,7 +80,7 @@ def check(
     """
     path = output if output is not None else Path(f"{sequence.name}-check.png")
     check_output(path, ".png", ".pdf", ".svg")
-    graph, store = Graph(), at(cache)
+    graph, store = Graph(), Store(cache)
     name(graph, sequence, frames)
     inspection = Inspection(Builder(graph, sequence, config), frames, store)
     graph.flow(inspection.steps())

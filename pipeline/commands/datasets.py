@@ -49,7 +49,7 @@ def export_dataset(
     from rille.datasets.export import export
     from rille.datasets.registry import open_sequence
     from rille.pipeline.engine.spec import Spec
-    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.engine.store.base import Store
     from rille.pipeline.engine.task import ensure
     from rille.pipeline.flow import config
     from rille.stages.core.errors import ConfigError
@@ -60,7 +60,7 @@ def export_dataset(
             "RIL-063", f"--set {next(iter(others))}: not a section of a sequence", remedy="set mockup.key=value"
         )
     place = cache_folder(cache)
-    store = at(place)
+    store = Store(place)
     # Before minutes of rendering.
     store.writable()
 

@@ -200,10 +200,10 @@ def export(
 def _export(run: Path, kind: Form, output: Path | None, cache: str | None) -> str:
     """Write one form; what was written, in words."""
     if kind in ("colmap", "nav2", "grid_map"):
-        from rille.pipeline.engine.store.base import at
+        from rille.pipeline.engine.store.base import Store
 
         write = import_module(f"rille.pipeline.export.programs.{kind}").export_run
-        return str(write(run, output or run / kind, at(cache_folder(cache))))
+        return str(write(run, output or run / kind, Store(cache_folder(cache))))
     from rille.pipeline.export.programs import point_cloud
 
     if output is not None:

@@ -13,7 +13,7 @@ from rille.pipeline.commands.options import check_output
 from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.engine.store.base import at
+from rille.pipeline.engine.store.base import Store
 from rille.pipeline.runs.session import Options, lay_out, settings
 
 BOX, GAP = (150, 22), (20, 48)
@@ -35,7 +35,7 @@ def graph(options: Options, output: Path, *, tasks: bool = False) -> int:
     draw = svg if output.suffix.lower() == ".svg" else dot
     settled = settings(options)
     laid_out = lay_out(settled.sequence, settled.config, settled.frames)
-    scheduler.run(laid_out, at(options.cache), scheduler.RunOptions(dry=True)).check()
+    scheduler.run(laid_out, Store(options.cache), scheduler.RunOptions(dry=True)).check()
     names, edges = parts(laid_out, tasks=tasks)
     atomic.write(output, draw(names, edges))
     print(f"{output}  {len(laid_out.nodes)} tasks of {len({h.stage for h in laid_out.nodes})} stages")

@@ -15,12 +15,12 @@ from rille.pipeline.engine.forecast import Kinds, kind, recall
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.memory import cost_model, limits
 from rille.pipeline.engine.memory.admission import Account, Admission, account, forecast, largest
-from rille.pipeline.engine.memory.cost_model import Costs, Foreseen, count
+from rille.pipeline.engine.memory.cost_model import Costs, Foreseen
 from rille.pipeline.engine.memory.limits import words
-from rille.pipeline.engine.plain import some
+from rille.pipeline.engine.plain import brief, count, some
 from rille.pipeline.engine.runtime.environment import cores
 from rille.pipeline.engine.scheduler import Result
-from rille.pipeline.engine.store.base import at
+from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
@@ -42,7 +42,7 @@ def plan(options: Options, *, verbose: bool = False) -> int:
     """Print what ``reconstruct`` with the same options would do; gives the exit code."""
     settled = settings_of_run(options)
     sequence, frames, config = settled.sequence, settled.frames, settled.config
-    graph, store = Graph(), at(options.cache)
+    graph, store = Graph(), Store(options.cache)
     products, drive = dataflow(graph, sequence, config, frames)
 
     def outputs() -> None:
@@ -116,15 +116,11 @@ def describe(graph: Graph, result: Result, earlier: Kinds, workers: int, *, verb
 def _reasons(planned: list[Handle]) -> list[str]:
     """The reasons of a stage's tasks, own ones first, the most frequent first, with their number."""
     own = Counter(h.reason for h in planned if not h.reason.startswith(BEHIND))
-    listed = [f"{_short(reason)} ({n})" for reason, n in own.most_common(REASONS)]
+    listed = [f"{brief(reason, WIDTH)} ({n})" for reason, n in own.most_common(REASONS)]
     if len(own) > REASONS:
         listed.append(f"{len(own) - REASONS} other reasons")
     follow = len(planned) - own.total()
     return listed + ([f"an input is to be computed ({follow})"] if follow else [])
-
-
-def _short(reason: str) -> str:
-    return reason if len(reason) <= WIDTH else reason[: WIDTH - 3] + "..."
 
 
 def _totals(graph: Graph, result: Result, earlier: Kinds, workers: int) -> Iterable[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,9 +10,8 @@ from typing import Any
 from rille.pipeline.engine import events, provenance
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.memory.limits import words
-from rille.pipeline.engine.plain import some
-from rille.pipeline.engine.store.base import Store, at
-from rille.pipeline.engine.store.location import Location
+from rille.pipeline.engine.plain import brief, some
+from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import artifact_path
 from rille.pipeline.flow.config import modules, stage
 from rille.pipeline.runs import lookup
@@ -24,13 +22,8 @@ SHORT = 12
 INPUTS = 8
 """Inputs of one port that are listed; more are counted."""
 
-
-def why(text: str, label: str, *, folder: Path, cache: Location) -> int:
-    """Print all that is known of one task of a run."""
-    run = lookup.find(text, folder)
-    for line in describe(run, label, at(cache)):
-        print(line)
-    return 0
+WIDTH = 70
+"""Characters of a value."""
 
 
 def describe(run: Path, label: str, store: Store) -> Iterable[str]:
@@ -100,9 +93,9 @@ def _recipe(made: Mapping[str, Any]) -> Iterable[str]:
     defaults = _defaults(made["stage"])
     for name, value in past["params"].items():
         differs = name in defaults and defaults[name] != value
-        note = f"   (default: {_text(defaults[name])})" if differs else ""
-        yield f"parameter     {made['stage']}.{name} = {_text(value)}{note}"
-    yield from (f"argument      {name} = {_text(value)}" for name, value in past["args"].items())
+        note = f"   (default: {brief(defaults[name], WIDTH)})" if differs else ""
+        yield f"parameter     {made['stage']}.{name} = {brief(value, WIDTH)}{note}"
+    yield from (f"argument      {name} = {brief(value, WIDTH)}" for name, value in past["args"].items())
     modules = sorted(past["code"])
     yield f"code          {digest(past['code'])[:SHORT]} of {len(modules)} modules: {some(modules, 6)}"
     packages = ", ".join(f"{name} {version}" for name, version in sorted(past["env"].items()))
@@ -141,8 +134,3 @@ def _since(run: Path, row: Mapping[str, Any], made: Mapping[str, Any], store: St
             yield f"since         {lookup.name(before)}: another key, and yet the result is the same to the bit"
         return
     yield "since         no earlier run of this sequence had this task"
-
-
-def _text(value: Any) -> str:
-    text = value if isinstance(value, str) else json.dumps(value)
-    return text if len(text) <= 70 else f"{text[:67]}..."

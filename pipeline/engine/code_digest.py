@@ -16,17 +16,17 @@ from __future__ import annotations
 import ast
 import hashlib
 import importlib.util
-import json
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
+
+from pydantic import TypeAdapter
 
 from rille.pipeline.engine.keys import digest
-from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.engine.runtime.hints import read_hint, write_hint
 
 OWN = ("rille.stages", "rille.datasets")
 
@@ -34,11 +34,21 @@ FORGET = 8
 """States of the sources that are remembered, before those not in use are forgotten."""
 
 
-@dataclass(frozen=True)
-class _Source:
+class _Source(NamedTuple):
     sha256: str
     imports: tuple[str, ...]
     """Absolute dotted names that the module may import (attributes among them)."""
+
+
+@dataclass
+class _Kept:
+    """What the file of the memory holds; ``digest`` is that of the sources."""
+
+    digest: str
+    sources: dict[str, _Source]
+
+
+_KEPT = TypeAdapter(_Kept)
 
 
 class _Memory:
@@ -46,30 +56,27 @@ class _Memory:
 
     def __init__(self) -> None:
         self.path: Path | None = None
-        self.known: dict[str, list[Any]] = {}
+        self.known: dict[str, _Source] = {}
         self.used: set[str] = set()
         self.new = False
         self._reader = hashlib.sha256(f"{sys.version}\0".encode() + Path(__file__).read_bytes()).digest()
 
     def load(self, path: Path) -> None:
-        self.path, self.known, self.new = path, {}, False
-        with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
-            found = json.loads(path.read_text(encoding="utf-8"))
-            self.known = found["sources"] if found["digest"] == digest(found["sources"]) else {}
+        self.path, self.new = path, False
+        found = read_hint(path, _KEPT)
+        self.known = found.sources if found is not None and found.digest == digest(found.sources) else {}
 
     def name(self, module: str, path: Path, data: bytes) -> str:
         return hashlib.sha256(self._reader + f"{module}\0{path.name}\0".encode() + data).hexdigest()
 
     def save(self) -> None:
-        """Best effort, as all hints are."""
         if self.path is None or not self.new:
             return
         # Each edit adds an entry: without this the file would grow with every save of every module.
         if len(self.known) > FORGET * len(self.used):
             self.known = {name: self.known[name] for name in self.used}
-        with suppress(OSError):
-            atomic.write(self.path, json.dumps({"digest": digest(self.known), "sources": self.known}))
-            self.new = False
+        write_hint(self.path, {"digest": digest(self.known), "sources": self.known})
+        self.new = False
 
 
 _memory = _Memory()
@@ -189,10 +196,9 @@ def _read(name: str, path: Path) -> _Source:
         # Relative imports count from the package: of an __init__ that is the module itself.
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
         text = hashlib.sha256(ast.dump(tree).encode()).hexdigest()
-        _memory.known[known] = [text, sorted(set(_imports(tree, package)))]
+        _memory.known[known] = _Source(text, tuple(sorted(set(_imports(tree, package)))))
         _memory.new = True
-    sha256, imports = _memory.known[known]
-    return _Source(sha256, tuple(imports))
+    return _memory.known[known]
 
 
 def _imports(tree: ast.AST, package: str) -> Iterator[str]:

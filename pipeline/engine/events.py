@@ -68,21 +68,20 @@ class Ledger:
 
 def _took(handle: Handle) -> dict[str, Any]:
     """Times (seconds; of day since 1970) and bytes of a computed task; see
-    :class:`~rille.pipeline.engine.task.Measured`."""
-    measured = handle.measured
+    :class:`~rille.pipeline.engine.graph.Took`."""
+    took = handle.took
     assert handle.ref is not None
-    assert measured is not None
     return {
-        "started": round(measured.started, 4),
-        "ended": round(measured.started + handle.seconds, 4),
-        "seconds": round(handle.seconds, 4),
-        "kernel": round(measured.kernel, 4),
-        "peak_rss": measured.peak_rss,
-        "memory": measured.memory,
-        "rest": measured.rest,
-        "first": measured.first,
-        "compiling": round(measured.compiling, 4),
-        "worker": handle.worker,
+        "started": round(took.started, 4),
+        "ended": round(took.started + took.seconds, 4),
+        "seconds": round(took.seconds, 4),
+        "kernel": round(took.kernel, 4),
+        "peak_rss": took.peak_rss,
+        "memory": took.memory,
+        "rest": took.rest,
+        "first": took.first,
+        "compiling": round(took.compiling, 4),
+        "worker": took.worker,
         "input_bytes": round(input_bytes(handle)),
         "bytes": handle.ref.nbytes,
         "stored": handle.ref.stored,

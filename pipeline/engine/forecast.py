@@ -16,17 +16,17 @@ What is earlier comes from the last run of the sequence; before the first one it
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pydantic import TypeAdapter
+
 from rille.pipeline.engine.reference import REFERENCE
-from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.engine.runtime.hints import read_hint, write_hint
 
 if TYPE_CHECKING:
     from rille.pipeline.engine.graph import Handle
@@ -35,6 +35,7 @@ Kinds = Mapping[str, tuple[float, float, float]]
 """Of each kind of task: tasks laid out on the way over all those laid out when the run opened, mean seconds of a task
 without compiling, and seconds of compiling."""
 
+_KINDS = TypeAdapter(dict[str, tuple[float, float, float]])
 
 FILE = "seconds.json"
 
@@ -84,9 +85,8 @@ class Forecast:
         if handle.status == "computed":
             self.begun = True
             tally.computed += 1
-            compiling = 0.0 if handle.measured is None else handle.measured.compiling
-            tally.seconds += max(0.0, handle.seconds - compiling)
-            tally.compiling += compiling
+            tally.seconds += max(0.0, handle.took.seconds - handle.took.compiling)
+            tally.compiling += handle.took.compiling
         elif self.begun:
             tally.found += 1
 
@@ -143,15 +143,10 @@ class Forecast:
 
 def recall(hints: Path) -> dict[str, tuple[float, float, float]] | None:
     """Read the forecast that the last run of a sequence left in ``hints``; None if there is none of use."""
-    try:
-        known = json.loads((hints / FILE).read_text(encoding="utf-8"))
-        return {str(name): (float(share), float(mean), float(first)) for name, (share, mean, first) in known.items()}
-    except (OSError, ValueError, AttributeError, TypeError, RecursionError):
-        return None
+    return read_hint(hints / FILE, _KINDS)
 
 
 def remember(hints: Path, forecast: Forecast) -> None:
-    """Leave it for the next run; best effort."""
+    """Leave it for the next run."""
     if forecast.begun:
-        with suppress(OSError):
-            atomic.write(hints / FILE, json.dumps((recall(hints) or {}) | forecast.summary()))
+        write_hint(hints / FILE, (recall(hints) or {}) | forecast.summary())

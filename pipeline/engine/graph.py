@@ -23,11 +23,34 @@ from typing import Any, Generic, TypeVar
 
 from rille.pipeline.engine.spec import Refs, Spec, each, flat
 from rille.pipeline.engine.store.manifest import Ref
-from rille.pipeline.engine.task import Measured
 from rille.stages.core.declare import Params
 
 Expansion = Callable[..., None]
 T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Took:
+    """What a task took: ``seconds`` and peak memory [bytes] of the call, ``kernel`` seconds of the stage itself.
+
+    ``started`` is when the call began (seconds since 1970); ``memory`` and ``rest`` are a
+    :class:`~rille.pipeline.engine.memory.limits.Meter`'s figures, ``first`` says that the process had not run the stage
+    before (it imports, and compiles or loads kernels); ``compiling`` are the seconds for which it compiled; ``worker``
+    is the name of the dask worker that ran it.
+    """
+
+    seconds: float = 0.0
+    peak_rss: int = 0
+    started: float = 0.0
+    kernel: float = 0.0
+    memory: int | None = None
+    rest: int | None = None
+    first: bool = False
+    compiling: float = 0.0
+    worker: str = ""
+
+
+NOTHING = Took()
 
 
 @dataclass(eq=False, slots=True)
@@ -37,8 +60,7 @@ class Handle:
     ``status`` is ``pending``, ``running``, ``computed``, ``cached``, ``failed``, ``skipped`` or, when dry, ``planned``.
     ``reason`` says in words why it was not found in the cache, or why it was skipped. ``earlier``, of a planned node,
     is what the same label led to before: a plan takes its facts for what is to come. ``expect`` are bytes (decoded)
-    that it reads from outside. Of a computed node: ``seconds`` of the call, what else was ``measured``, and the name of
-    the dask ``worker`` that ran it.
+    that it reads from outside. ``took``: of a computed node, what that took.
     """
 
     index: int
@@ -50,9 +72,7 @@ class Handle:
     reason: str = ""
     key: str = ""
     expect: float = 0.0
-    seconds: float = 0.0
-    measured: Measured | None = None
-    worker: str = ""
+    took: Took = NOTHING
     error: BaseException | None = None
 
     @property

@@ -6,6 +6,7 @@ would set the terminal's title, hide lines, or move the cursor over a complaint;
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from collections.abc import Iterator, Sequence
@@ -44,6 +45,17 @@ def raw(stream: Any) -> Any:
 def warn(line: str) -> None:
     """Print a warning on stderr; a line that begins with a code (``RIL-680: ...``) shows it where an error would."""
     print(f"rille: warning{' ' if line.startswith('RIL-') else ': '}{' '.join(line.split())}", file=sys.stderr)
+
+
+def brief(value: Any, most: int) -> str:
+    """A text, or a value as JSON; of more than ``most`` characters the first, and three dots."""
+    text = value if isinstance(value, str) else json.dumps(value)
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
+def count(n: int, what: str) -> str:
+    """``1 task``, ``3 tasks``."""
+    return f"{n} {what}{'' if n == 1 else 's'}"
 
 
 def some(names: Sequence[str], most: int) -> str:

@@ -101,8 +101,8 @@ class Lines(Progress):
             self._say(f"{self.done}/{self.total()} tasks, {handle.label} {handle.status}{to_go(self.forecast)}")
 
     def _compiled(self, handle: Handle) -> None:
-        if handle.measured is not None and handle.measured.compiling >= SLOW_COMPILE:
-            self._say(f"{handle.stage}: compiling, once: {handle.measured.compiling:.0f} s")
+        if handle.took.compiling >= SLOW_COMPILE:
+            self._say(f"{handle.stage}: compiling, once: {handle.took.compiling:.0f} s")
 
     def failed(self, label: str, error: BaseException) -> None:
         """Say so at once."""
@@ -130,7 +130,7 @@ class Json(Progress):
             event=handle.status,
             label=handle.label,
             stage=handle.stage,
-            seconds=round(handle.seconds, 4),
+            seconds=round(handle.took.seconds, 4),
             done=self.done,
             total=self.total(),
             left=self.forecast.left(),

@@ -13,7 +13,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rille.pipeline.engine.runtime import atomic
+from pydantic import TypeAdapter
+
+from rille.pipeline.engine.plain import brief
+from rille.pipeline.engine.runtime.hints import read_hint, write_hint
 
 if TYPE_CHECKING:
     from rille.pipeline.engine.graph import Handle
@@ -28,6 +31,8 @@ SHOWN = 3
 
 Keys = dict[str, list[str]]
 """Stage and label to keys, the latest first."""
+
+_KEYS = TypeAdapter(Keys)
 
 
 class Known:
@@ -76,14 +81,13 @@ class Known:
         return next((ref for k in self._own.get(_name(stage, label), []) if (ref := store.lookup(stage, k))), None)
 
     def save(self, nodes: Iterable[Handle]) -> None:
-        """Note what a run used; best effort."""
+        """Note what a run used."""
         known = _read(self._path)
         used = {_name(h.stage, h.label): h.key for h in nodes if h.ref is not None}
         if all(known.get(name, [""])[0] == key for name, key in used.items()):
             return
         known |= {name: [key, *(k for k in known.get(name, []) if k != key)][:KEPT] for name, key in used.items()}
-        with suppress(OSError):
-            atomic.write(self._path, json.dumps(known))
+        write_hint(self._path, known)
 
 
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
@@ -107,12 +111,7 @@ def _values(where: str, old: Any, new: Any) -> list[str]:
         return [text for n in names for text in _values(f"{where}.{n}", old.get(n), new.get(n))]
     if old == new and type(old) is type(new):
         return []
-    return [f"{where} {_short(old)} -> {_short(new)}"]
-
-
-def _short(value: Any) -> str:
-    text = value if isinstance(value, str) else json.dumps(value)
-    return text if len(text) <= 40 else text[:37] + "..."
+    return [f"{where} {brief(old, 40)} -> {brief(new, 40)}"]
 
 
 def _inputs(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
@@ -144,11 +143,7 @@ def _name(stage: str, label: str) -> str:
 
 
 def _read(path: Path) -> Keys:
-    """A damaged file counts as empty."""
-    with suppress(OSError, ValueError, AttributeError):
-        found = json.loads(path.read_text(encoding="utf-8")).items()
-        return {name: [k for k in keys if isinstance(k, str)] for name, keys in found if isinstance(keys, list)}
-    return {}
+    return read_hint(path, _KEYS) or {}
 
 
 def _written(path: Path) -> float:

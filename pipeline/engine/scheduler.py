@@ -36,7 +36,7 @@ from rille.pipeline.engine.events import Ledger
 from rille.pipeline.engine.executors.base import Executor, Failed, Given, NotBegun, Task, light, make
 from rille.pipeline.engine.executors.base import known as check
 from rille.pipeline.engine.failures import translated
-from rille.pipeline.engine.graph import Expansion, Graph, Handle
+from rille.pipeline.engine.graph import Expansion, Graph, Handle, Took
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.memory import cost_model
 from rille.pipeline.engine.memory.admission import Admission, Waiting, account, largest
@@ -83,7 +83,7 @@ class Failure:
 
 @dataclass
 class Result:
-    """Outcome of a run. ``keys`` are the artifacts it used (roots for clearing the cache).
+    """Outcome of a run.
 
     Of a dry run: ``assumed`` are labels whose earlier result served to lay out what follows, ``unknown`` those that
     hide it.
@@ -91,7 +91,6 @@ class Result:
 
     counts: dict[str, Counts] = field(default_factory=dict)
     failures: list[Failure] = field(default_factory=list)
-    keys: set[str] = field(default_factory=set)
     assumed: list[str] = field(default_factory=list)
     unknown: list[str] = field(default_factory=list)
     seconds: float = 0.0
@@ -228,7 +227,6 @@ class _Run:
             gc.unfreeze()
             if not self.dry:
                 self.known.save(self.graph.nodes)
-            self.result.keys = {h.key for h in self.graph.nodes if h.ref is not None}
             self.result.seconds = time.perf_counter() - begin
             # Without "ok" a ledger is that of a run which did not come to its end.
             ended = {} if self.result.interrupted else {"ok": self.result.ok}
@@ -270,7 +268,7 @@ class _Run:
         for handle in self.graph.nodes[self.admitted :]:
             self.admitted += 1
             upstream = {h.index: h for h in handle.upstream()}
-            broken = next((h for h in upstream.values() if h.status in ("failed", "skipped", "planned")), None)
+            broken = self._broken(handle)
             for up in upstream.values():
                 if up.status in ("pending", "running"):
                     self.waits[handle.index] += 1
@@ -439,7 +437,8 @@ class _Run:
 
     @staticmethod
     def _broken(handle: Handle) -> Handle | None:
-        return next((h for h in handle.upstream() if h.status in _FATE), None)
+        """The first input that will not come, or in a plan is still to come."""
+        return next((h for h in handle.upstream() if h.status in _FATE or h.status == "planned"), None)
 
     def _begin(self) -> None:
         """Look ahead, share the memory out, and start the workers that it leaves room for."""
@@ -489,8 +488,8 @@ class _Run:
                 self._resolve(handle, "failed")
             self._failed(Failure(first.label, first.stage, outcome.error, outcome.traceback))
         else:
-            first.seconds, first.measured, first.worker = outcome.seconds, outcome.measured, sys.intern(outcome.worker)
-            # Each unpickled reference brings names of its own.
+            # What is unpickled brings names of its own each time.
+            first.took = replace(outcome.took, worker=sys.intern(outcome.took.worker))
             ref = replace(outcome.ref, stage=first.stage, key=first.key)
             for handle in (first, *others):
                 handle.ref = ref
@@ -553,15 +552,15 @@ class _Run:
             handle.earlier = self.known.latest(self.store, handle.stage, handle.label)
         counts = self.result.counts.setdefault(handle.stage, Counts())
         setattr(counts, status, getattr(counts, status) + 1)
-        counts.seconds += handle.seconds
+        counts.seconds += handle.took.seconds
         self.ledger.write(handle)
         before = self.recomputed.pop(handle.index, None)
         if before is None:
             self.progress.resolved(handle)
         else:  # healed: it counts once, as what became of it last
             setattr(counts, before, getattr(counts, before) - 1)
-        if handle.measured is not None and handle.measured.memory is None:
-            handle.measured = None  # the ledger has it; at the end the cost model asks for memory alone
+        if status == "computed" and handle.took.memory is None:
+            handle.took = Took(handle.took.seconds)  # the ledger has the rest, and the cost model asks for memory alone
         for dependant in self.dependants.pop(handle.index, []):
             self.waits[dependant.index] -= 1
             if not self.waits[dependant.index]:

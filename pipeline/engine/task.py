@@ -13,11 +13,12 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from rille.pipeline.engine.graph import Took
 from rille.pipeline.engine.memory.cost_model import tells_more
 from rille.pipeline.engine.memory.limits import Meter
 from rille.pipeline.engine.runtime.numba_cache import COMPILING
 from rille.pipeline.engine.spec import Refs, Spec, each, flat, key_of, recipe
-from rille.pipeline.engine.store.base import Store, at
+from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import Ref
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.core.errors import RilleError
@@ -33,41 +34,13 @@ class CodeChangedError(RilleError):
     """The source code or the packages of a worker are not those of the client."""
 
 
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """What the call of a task took.
-
-    ``started`` is when it began (seconds since 1970), ``kernel`` are the seconds of the stage itself, ``compiling``
-    those for which kernels were compiled; ``peak_rss`` is the peak memory of the process until then, bytes; ``memory``
-    and ``rest`` are a :class:`~rille.pipeline.engine.memory.limits.Meter`'s figures; ``first`` says that the process
-    had not run the stage before (it imports, and compiles or loads kernels).
-    """
-
-    started: float
-    kernel: float
-    peak_rss: int
-    memory: int | None
-    rest: int | None
-    first: bool
-    compiling: float
-
-
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a task: its artifact, seconds of the call, and what else it took (None: the artifact was cached).
-
-    ``worker`` is the name of the dask worker that ran it.
-    """
+    """Outcome of a task: its artifact, whether it was cached, and what it took."""
 
     ref: Ref
-    seconds: float
-    measured: Measured | None
-    worker: str = ""
-
-    @property
-    def cached(self) -> bool:
-        """Whether nothing was computed."""
-        return self.measured is None
+    cached: bool
+    took: Took
 
 
 _run: set[str] = set()
@@ -89,12 +62,12 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
             f"{spec.label}: source code or packages of the worker are not those the run began with",
             remedy="run again, and edit nothing meanwhile",
         )
-    store = at(root)
+    store = Store(root)
     for trial in range(TRIES):
         try:
             ref = None if force else store.lookup(spec.stage.name, own)
             if ref is not None:
-                return Outcome(ref, time.perf_counter() - begin, None)
+                return Outcome(ref, True, Took(time.perf_counter() - begin, _peak_rss(), started))
             first = spec.module not in _run
             COMPILING.take()  # of what ran before in this process
             size = sum(ref.nbytes for ref in flat(refs))
@@ -102,8 +75,8 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
                 ref, kernel = _compute(store, spec, refs, own)
             seconds = time.perf_counter() - begin
             _run.add(spec.module)
-            measured = Measured(started, kernel, _peak_rss(), meter.memory, meter.rest, first, COMPILING.take())
-            return Outcome(ref, seconds, measured)
+            measured = (started, kernel, meter.memory, meter.rest, first, COMPILING.take())
+            return Outcome(ref, False, Took(seconds, _peak_rss(), *measured))
         except OSError as error:
             # A missing file does not appear by waiting; a network drive that stumbled recovers.
             if isinstance(error, PERMANENT) or trial == TRIES - 1:

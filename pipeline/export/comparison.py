@@ -67,7 +67,7 @@ def compare(view: RunView) -> Comparison | None:
     names = ("poses", "distance", "angle", "step_distance", "step_angle")
     found = {name: by_frame(view, bundle, name) for name in names}
     trajectory = view.bundle(view.products.trajectory)
-    if trajectory is not None and "piece" in trajectory.arrays:  # other pieces lie in frames of their own
+    if trajectory is not None:  # other pieces lie in frames of their own
         piece = by_frame(view, trajectory, "piece")
         found["poses"][(piece >= 0) & (piece != trajectory.meta["main"])] = np.nan
     flagged = np.nan_to_num(by_frame(view, bundle, "flagged")) > 0

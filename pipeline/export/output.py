@@ -11,7 +11,7 @@ these files: the page and ``report.json`` are rendered by each run around what i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -93,20 +93,22 @@ def stage(name: str, summary: str, outputs: Sequence[Output]) -> Stage:
 
 def handles(output: Output, products: Any) -> list[Any]:
     """Handles of all artifacts that an output reads, each once."""
-    return list(
-        {id(h): h for name in (*output.needs, *output.reads) for h in _handles(getattr(products, name))}.values()
-    )
+    there: There = {}
+    for name in (*output.needs, *output.reads):
+        _layout(getattr(products, name), there, lambda _: True)
+    return [handle for _, handle in there.values()]
 
 
 def task(output: Output, view: Any) -> tuple[dict[str, Any], list[Any]] | None:
     """Arguments and inputs of the task that makes an output; None where what it needs is not there."""
     for name in output.needs:
-        needed = list(_handles(getattr(view.products, name)))
+        needed = handles(Output(name, "", "", needs=(name,)), view.products)
         if not needed or not all(map(_due, needed)):
             return None
-    there: dict[int, tuple[int, Any]] = {}
+    there: There = {}
     # Sorted: the arguments enter the task's key, and a set's order differs from process to process.
-    layout = {name: _layout(getattr(view.products, name), there) for name in sorted({*output.needs, *output.reads})}
+    names = sorted({*output.needs, *output.reads})
+    layout = {name: _layout(getattr(view.products, name), there, _due) for name in names}
     facts = {name: plain(_get(view, name)) for name in output.knows}
     return {"file": output.name, "products": layout, "facts": facts}, [handle for _, handle in there.values()]
 
@@ -158,36 +160,25 @@ def plain(value: Any) -> Any:
     return value
 
 
-def _handles(value: Any) -> Iterator[Any]:
-    """All handles within dictionaries, lists and dataclasses."""
-    if hasattr(value, "spec") and hasattr(value, "ref"):
-        yield value
-    elif isinstance(value, Mapping):
-        for item in value.values():
-            yield from _handles(item)
-    elif isinstance(value, list | tuple):
-        for item in value:
-            yield from _handles(item)
-    elif is_dataclass(value):
-        for f in fields(value):
-            yield from _handles(getattr(value, f.name))
+There = dict[int, tuple[int, Any]]
+"""Handles with their numbers, by their ids."""
 
 
-def _layout(value: Any, there: dict[int, tuple[int, Any]]) -> Any:
-    """Plain form of what holds handles; those of artifacts are collected in ``there`` and replaced by their number.
+def _layout(value: Any, there: There, wanted: Callable[[Any], bool]) -> Any:
+    """Plain form of what holds handles; wanted ones are collected in ``there`` and replaced by their number.
 
     A dictionary is sorted: tasks are laid out in the order in which results come, which is not always the same.
     """
     if hasattr(value, "spec") and hasattr(value, "ref"):
-        if not _due(value):
+        if not wanted(value):
             return None
         return {"read": there.setdefault(id(value), (len(there), value))[0]}
     if isinstance(value, Mapping):
-        return {"by": [[key, _layout(value[key], there)] for key in sorted(value)]}
+        return {"by": [[key, _layout(value[key], there, wanted)] for key in sorted(value)]}
     if isinstance(value, list | tuple):
-        return [_layout(item, there) for item in value]
+        return [_layout(item, there, wanted) for item in value]
     if is_dataclass(value):
-        return {"of": {f.name: _layout(getattr(value, f.name), there) for f in fields(value)}}
+        return {"of": {f.name: _layout(getattr(value, f.name), there, wanted) for f in fields(value)}}
     return value
 
 

@@ -29,15 +29,9 @@ def stamps(view: Any) -> list[float]:
     return [float(f) if times is None else times[f] for f in view.frames]
 
 
-def _main(trajectory: Bundle) -> int:
-    """The piece whose frame is the world."""
-    return int(trajectory.meta.get("main", 0))
-
-
 def _world(trajectory: Bundle, piece: int) -> str:
     """Frame of a piece in words."""
-    verticals = list(trajectory.meta.get("verticals", [""]))
-    return writers.UNLEVELLED if verticals[piece] == NO_VERTICAL else writers.FRAME
+    return writers.UNLEVELLED if trajectory.meta["verticals"][piece] == NO_VERTICAL else writers.FRAME
 
 
 def _write_kitti(path: Path, view: Any) -> None:
@@ -46,13 +40,13 @@ def _write_kitti(path: Path, view: Any) -> None:
 
 def _write_tum(path: Path, view: Any) -> None:
     trajectory = view.bundle(view.products.trajectory)
-    write_trajectory_tum(path, world_poses(trajectory), stamps(view), _world(trajectory, _main(trajectory)))
+    write_trajectory_tum(path, world_poses(trajectory), stamps(view), _world(trajectory, trajectory.meta["main"]))
 
 
 def _write_pieces(path: Path, view: Any) -> None:
     trajectory = view.bundle(view.products.trajectory)
-    for number in range(len(trajectory.meta.get("verticals", [""]))):
-        if number != _main(trajectory):
+    for number in range(len(trajectory.meta["verticals"])):
+        if number != trajectory.meta["main"]:
             piece, world = path.with_name(path.name.replace("*", str(number + 1))), _world(trajectory, number)
             write_trajectory_tum(piece, world_poses(trajectory, number), stamps(view), world)
 
@@ -60,7 +54,7 @@ def _write_pieces(path: Path, view: Any) -> None:
 def _write_crosscheck(path: Path, view: Any) -> None:
     compared, trajectory = compare(view), view.bundle(view.products.trajectory)
     assert compared is not None
-    write_trajectory_tum(path, compared.poses, stamps(view), _world(trajectory, _main(trajectory)))
+    write_trajectory_tum(path, compared.poses, stamps(view), _world(trajectory, trajectory.meta["main"]))
 
 
 def _write_agreement(path: Path, view: Any) -> None:

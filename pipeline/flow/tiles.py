@@ -6,6 +6,8 @@ not computed again when these parameters change.
 
 from __future__ import annotations
 
+from typing import Any
+
 from pydantic import Field
 
 from rille.pipeline.engine.graph import Graph, Handle
@@ -93,31 +95,27 @@ class Tiles:
         maps: dict[str, list[Handle]] = {}
         inputs: dict[str, Handle | list[Handle]] = {"coarse": self.coarse}
         for level in range(self.top - 1, -1, -1):
-            maps = {way: self._each(level, way, inputs) for way in ("left", "right")}
+            maps = {
+                way: self._tiles("level", f"{level}/{way}", {"level": level, "way": way}, **inputs)
+                for way in ("left", "right")
+            }
             inputs |= {f"{way}_map": maps[way] for way in maps}
             if level > 0:
                 inputs["band"] = self._node("band", f"band/{level}", {"level": level}, **inputs)
         facts = {k: v for k, v in inputs.items() if k in ("coarse", "band")}
-        fine = self._tiles("fine", {"way": "left"}, "/left", left_map=maps["left"], **facts)
-        back = self._tiles("fine", {"way": "right"}, "/right", right_map=maps["right"], **facts)
-        checked = self._tiles("check", {}, "", fine=fine, back=back, **facts)
-        refined = self._tiles("refine", {}, "", checked=checked, **facts)
+        fine = self._tiles("fine", "fine/left", {"way": "left"}, left_map=maps["left"], **facts)
+        back = self._tiles("fine", "fine/right", {"way": "right"}, right_map=maps["right"], **facts)
+        checked = self._tiles("check", "check", {}, fine=fine, back=back, **facts)
+        refined = self._tiles("refine", "refine", {}, checked=checked, **facts)
         patches = self._node("patches", "patches", {}, left_map=maps["left"], refined=refined, **facts)
-        final = self._tiles("final", {}, "", fine=fine, checked=checked, refined=refined, patches=patches, **facts)
+        final = self._tiles("final", "final", {}, fine=fine, checked=checked, refined=refined, patches=patches, **facts)
         args = {"side": self.side}
         given: dict[str, Handle | list[Handle]] = {**self.images, "coarse": self.coarse, "tiles": final}
         return self.graph.node(join_stage, self.label, self.params, args, {}, given)
 
-    def _each(self, level: int, way: str, inputs: dict[str, Handle | list[Handle]]) -> list[Handle]:
-        args = {"level": level, "way": way}
-        return [
-            self._node("level", f"{level}/{way}/{tile}", {**args, "tile": tile}, **inputs)
-            for tile in range(self._count(level, way))
-        ]
-
-    def _tiles(self, step: str, args: dict[str, str], label: str, **inputs: Handle | list[Handle]) -> list[Handle]:
-        count = self._count(0, args.get("way", "left"))
-        return [self._node(step, f"{step}{label}/{k}", {**args, "tile": k}, **inputs) for k in range(count)]
+    def _tiles(self, step: str, label: str, args: dict[str, Any], **inputs: Handle | list[Handle]) -> list[Handle]:
+        count = self._count(args.get("level", 0), args.get("way", "left"))
+        return [self._node(step, f"{label}/{k}", {**args, "tile": k}, **inputs) for k in range(count)]
 
     def _count(self, level: int, way: str) -> int:
         """Tiles of a level; of the right image whether it will be aligned or not."""

@@ -13,8 +13,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, lru_cache
-from threading import Lock
+from functools import cache
 from typing import Any
 from urllib.parse import quote
 
@@ -153,32 +152,19 @@ def _style() -> None:
 
 
 def figure(width: float, height: float) -> Any:
-    """Empty figure on the Agg canvas, inches."""
+    """Empty figure, inches."""
     # Not pyplot, which keeps every figure alive and looks for a display.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     _style()
-    fig = Figure(figsize=(width, height), dpi=DPI, facecolor="none")
-    FigureCanvasAgg(fig)
-    return fig
+    return Figure(figsize=(width, height), dpi=DPI, facecolor="none")
 
 
 def map_axes(extent: Extent, *, bar: bool = False, max_height: float = 6.0) -> tuple[Any, Any, Any]:
     """Figure, axes of equal scale (metres), and axes for a colour bar below them (None without ``bar``).
 
-    Maps of one extent are equally large with and without a bar, so that they compare side by side. They share one
-    sheet, wiped by each call: making axes with their ticks takes matplotlib longer than painting the map.
+    Maps of one extent are equally large with and without a bar, so that they compare side by side.
     """
-    return _wiped(_map_sheet(tuple(float(v) for v in extent), bar, max_height))
-
-
-DRAWING = Lock()
-"""Held while a figure is drawn: sheets are shared, and a worker may have several threads."""
-
-
-@lru_cache(maxsize=8)
-def _map_sheet(extent: Extent, bar: bool, max_height: float) -> tuple[Any, Any, Any]:
     left, right, top, foot = 0.62, 0.15, 0.12, 0.5 + (0.62 if bar else 0.0)
     dx, dy = max(extent[1] - extent[0], 1e-9), max(extent[3] - extent[2], 1e-9)
     width = WIDTH - left - right
@@ -193,8 +179,7 @@ def _map_sheet(extent: Extent, bar: bool, max_height: float) -> tuple[Any, Any, 
     x, y = 0.5 * (extent[0] + extent[1]), 0.5 * (extent[2] + extent[3])
     ax.set_xlim(x - 0.5 * scale * width, x + 0.5 * scale * width)
     ax.set_ylim(y - 0.5 * scale * height, y + 0.5 * scale * height)
-    # The sheet is used again: what is drawn on it must not move its limits.
-    ax.set_autoscale_on(False)
+    ax.set_autoscale_on(False)  # what is drawn on it must not move its limits
     ax.locator_params(nbins=6)
     ax.set_xlabel("x, m", labelpad=1)
     ax.set_ylabel("y, m")
@@ -204,31 +189,13 @@ def _map_sheet(extent: Extent, bar: bool, max_height: float) -> tuple[Any, Any, 
 
 
 def image_axes(shape: tuple[int, ...]) -> tuple[Any, Any, Any]:
-    """Figure filled by an image of ``shape`` (rows, cols), axes in pixels, and axes for a colour bar below it.
-
-    Images of one shape share one sheet, see :func:`map_axes`.
-    """
-    return _wiped(_image_sheet(shape[0], shape[1]))
-
-
-@lru_cache(maxsize=4)
-def _image_sheet(rows: int, cols: int) -> tuple[Any, Any, Any]:
-    height, foot = WIDTH * rows / cols, 0.6
+    """Figure filled by an image of ``shape`` (rows, cols), axes in pixels, and axes for a colour bar below it."""
+    height, foot = WIDTH * shape[0] / shape[1], 0.6
     fig = figure(WIDTH, height + foot)
     total = height + foot
     ax = fig.add_axes((0.0, foot / total, 1.0, height / total))
     ax.set_axis_off()
     return fig, ax, fig.add_axes((0.04, 0.41 / total, 0.92, 0.12 / total))
-
-
-def _wiped(sheet: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
-    """Take off what the last figure has drawn; the axes with their limits and ticks stay."""
-    for ax in sheet[1:]:
-        for artist in [] if ax is None else [*ax.images, *ax.lines, *ax.collections, *ax.texts]:
-            artist.remove()
-        if ax is not None:
-            ax.set_facecolor("none")
-    return sheet
 
 
 def color_bar(drawn: Any, cax: Any, label: str) -> None:

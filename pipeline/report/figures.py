@@ -63,16 +63,13 @@ def ortho(grey: Floats, extent: Extent, alt: str) -> Panel:
 
 def elevation_with_path(elevation: Floats, risk: Bytes | None, path: Floats | None, extent: Extent, alt: str) -> Panel:
     """Elevation (row, col) m, bright is high; unknown and hazardous black; the path on it (Figure 7, right)."""
-    fig, ax, cax = canvas.map_axes(extent, bar=True)
     blocked = ~np.isfinite(elevation) if risk is None else risk >= HAZARDOUS
     factor, unit = canvas.metres_or_mm(elevation)
     # The grey scale starts well above black, so that black means "not to be driven" only.
     shown = np.where(blocked, np.nan, elevation * factor)
-    low, high = ranges.ground_limits(shown)
-    drawn = _show(ax, shown, extent, cmap=_greys(), vmin=low, vmax=high)
+    fig, ax = _scaled_map(shown, extent, _greys(), ranges.ground_limits(shown), f"elevation, {unit}")
     if path is not None:
         canvas.polyline(ax, path, color=canvas.HAZARDOUS)
-    canvas.color_bar(drawn, cax, f"elevation, {unit}")
     canvas.scale_bar(ax, extent)
     return canvas.encode(fig, alt, photo=True)
 
@@ -97,15 +94,12 @@ def risk_map(risk: Bytes, path: Floats | None, extent: Extent, alt: str, *, far:
 
 def cost_to_go(cost: Floats, path: Floats | None, extent: Extent, alt: str) -> Panel:
     """Cost (row, col), m, of the best path to each cell; not reachable is grey (Figure 3)."""
-    fig, ax, cax = canvas.map_axes(extent, bar=True)
     finite = np.where(np.isfinite(cost), cost, np.nan)
     factor, unit = canvas.metres_or_mm(finite)
-    drawn = _show(
-        ax, finite * factor, extent, cmap=canvas.color_map("cividis"), vmin=0, vmax=ranges.limits(finite)[1] * factor
-    )
+    bounds = 0, ranges.limits(finite)[1] * factor
+    fig, ax = _scaled_map(finite * factor, extent, canvas.color_map("cividis"), bounds, f"cost of the path, {unit}")
     if path is not None:
         canvas.polyline(ax, path)
-    canvas.color_bar(drawn, cax, f"cost of the path, {unit}")
     return canvas.encode(fig, alt, photo=True)
 
 
@@ -187,11 +181,10 @@ def displacements(estimate: Floats, truth: Floats | None, names: Sequence[int], 
 
 def scalar_map(values: Floats, extent: Extent, label: str, alt: str) -> Panel:
     """A measured length (row, col), m, shown in mm where that fits; the unit is added."""
-    fig, ax, cax = canvas.map_axes(extent, bar=True)
     factor, unit = canvas.metres_or_mm(values)
     low, high = (v * factor for v in ranges.limits(values))
-    drawn = _show(ax, values * factor, extent, cmap=canvas.color_map("viridis"), vmin=min(low, 0.0), vmax=high)
-    canvas.color_bar(drawn, cax, f"{label}, {unit}")
+    colors = canvas.color_map("viridis")
+    fig, _ = _scaled_map(values * factor, extent, colors, (min(low, 0.0), high), f"{label}, {unit}")
     return canvas.encode(fig, alt, photo=True)
 
 
@@ -199,12 +192,20 @@ def error_map(
     error: Floats, extent: Extent, alt: str, *, label: str = "elevation minus truth", bound: float | None = None
 ) -> Panel:
     """Difference of elevations (row, col), m, symmetric about zero; colours end at ``bound``, m, or where 3 % lie."""
-    fig, ax, cax = canvas.map_axes(extent, bar=True)
     factor, unit = canvas.metres_or_mm(error)
     bound = factor * (ranges.limits(np.abs(error), 0, 97)[1] if bound is None else bound)
-    drawn = _show(ax, error * factor, extent, cmap=canvas.color_map("PuOr"), vmin=-bound, vmax=bound)
-    canvas.color_bar(drawn, cax, f"{label}, {unit}")
+    fig, _ = _scaled_map(error * factor, extent, canvas.color_map("PuOr"), (-bound, bound), f"{label}, {unit}")
     return canvas.encode(fig, alt, photo=True)
+
+
+def _scaled_map(
+    values: Floats, extent: Extent, colors: Any, bounds: tuple[float, float], label: str
+) -> tuple[Any, Any]:
+    """Figure and axes of a map in colours between two bounds, with the colour bar below it."""
+    fig, ax, cax = canvas.map_axes(extent, bar=True)
+    drawn = _show(ax, values, extent, cmap=colors, vmin=bounds[0], vmax=bounds[1])
+    canvas.color_bar(drawn, cax, label)
+    return fig, ax
 
 
 def _show(ax: Any, values: Floats, extent: Extent, **style: Any) -> Any:

@@ -24,8 +24,7 @@ Condition = Callable[[Scene], bool]
 
 def _drawn(title: str, maker: Maker, expected: Condition, scene: Scene) -> Figure:
     try:
-        with canvas.DRAWING:
-            block = maker(scene)
+        block = maker(scene)
     except (OSError, MemoryError, RilleError):  # not the figure's own fault: another try may draw it
         raise
     except Exception as error:  # a figure must not cost the run its report; the failure is shown in it

@@ -212,19 +212,16 @@ def trajectory(view: RunView) -> Track:
     bundle = view.bundle(view.products.trajectory)
     if bundle is not None:
         poses = world_poses(bundle)
-        for i, frame in enumerate(bundle.meta.get("frames", view.frames[: len(poses)])):
+        for i, frame in enumerate(bundle.meta["frames"]):
             if frame not in row:
                 continue
-            there = bool(np.isfinite(poses[i]).all())
-            # Without pieces, all poses are of piece 0, and no pose is -1.
-            piece[row[frame]] = int(bundle["piece"][i]) if "piece" in bundle.arrays else there - 1
-            if not there:
+            piece[row[frame]] = int(bundle["piece"][i])
+            if not np.isfinite(poses[i]).all():
                 continue
             posed[frame] = pose = RigidTransform.from_matrix(poses[i])
             left[row[frame]] = pose.translation
-            segment[row[frame]] = int(bundle["segment"][i]) if "segment" in bundle.arrays else -1
-            if "covariance" in bundle.arrays:
-                sigma[row[frame]] = np.sqrt(max(float(np.trace(bundle["covariance"][i][:3, :3])), 0.0))
+            segment[row[frame]] = int(bundle["segment"][i])
+            sigma[row[frame]] = np.sqrt(max(float(np.trace(bundle["covariance"][i][:3, :3])), 0.0))
             if frame in view.products.disparity:
                 right.append((pose @ used_rig(view, frame).T_right_left.inverse()).translation)
     true = truth_in_world(view, posed)

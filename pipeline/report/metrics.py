@@ -78,6 +78,27 @@ AGREEMENT: Mapping[str, str] = {
 }
 """Words for the figures of the comparison with the other program."""
 
+PATH = (
+    ("path_climb", "climb_m", "Climb of the path", "m", "sum of its rises"),
+    ("path_inclination", "max_inclination", "Steepest ground on the path", "deg", "local inclination, largest"),
+    ("path_tilt", "max_tilt", "Greatest tilt on the path", "deg", "of the vehicle, at the worst heading"),
+    (
+        "path_clearance",
+        "least_clearance",
+        "Room under the belly on the path, least",
+        "m",
+        "left under the belly of a vehicle whose ground clearance is stated, at the worst heading",
+    ),
+    (
+        "path_p_hazard",
+        "max_p_hazard",
+        "Greatest hazard probability on the path",
+        "1",
+        "probability that a measure exceeds its limit, largest of the path's cells",
+    ),
+)
+"""Figures of the path where it has them: name, fact of the artifact (angles in radians), label, unit and how."""
+
 SHORTEST = "Shortest path on the exact map"
 
 KEY = frozenset(
@@ -397,20 +418,10 @@ def _path(view: RunView) -> dict[str, Metric]:
     how = "in plan; nearer ground is not seen, or not to be driven on"
     away = delivery.start_of_path(view)
     found["path_start"] = _metric("Start of the path from the first camera", away, "m", how)
-    if meta.get("climb_m") is not None:
-        found["path_climb"] = _metric("Climb of the path", meta["climb_m"], "m", "sum of its rises")
-    if meta.get("max_inclination") is not None:
-        value = float(np.degrees(meta["max_inclination"]))
-        found["path_inclination"] = _metric("Steepest ground on the path", value, "deg", "local inclination, largest")
-    if meta.get("max_tilt") is not None:
-        value = float(np.degrees(meta["max_tilt"]))
-        found["path_tilt"] = _metric("Greatest tilt on the path", value, "deg", "of the vehicle, at the worst heading")
-    if meta.get("least_clearance") is not None:
-        how = "left under the belly of a vehicle whose ground clearance is stated, at the worst heading"
-        found["path_clearance"] = _metric("Room under the belly on the path, least", meta["least_clearance"], "m", how)
-    if meta.get("max_p_hazard") is not None:
-        how = "probability that a measure exceeds its limit, largest of the path's cells"
-        found["path_p_hazard"] = _metric("Greatest hazard probability on the path", meta["max_p_hazard"], "1", how)
+    for name, fact, label, unit, how in PATH:
+        value = meta.get(fact)
+        if value is not None:
+            found[name] = _metric(label, float(np.degrees(value)) if unit == "deg" else value, unit, how)
     return found
 
 

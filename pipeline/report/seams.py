@@ -102,8 +102,7 @@ def models(scene: Scene) -> Block | None:
     rows = tuple(
         (
             str(m["pair"]),
-            f"{_signed(m['bias'])} ± {_size(m['sigma'][0])}",
-            *(f"{_degrees(t)} ± {number(math.degrees(s), 2)}°" for t, s in zip(m["tilt"], m["sigma"][1:], strict=True)),
+            *_fitted(m, m["sigma"]),
             _size(m["systematic"]),
             _size(m["expected"]),
             ", ".join(word for key, word in VERDICTS if m[key]) or "as expected",
@@ -136,19 +135,27 @@ def _plane(at: Facts, extent: canvas.Extent, shape: tuple[int, ...]) -> NDArray[
 def _seam_table(found: Facts) -> Table:
     rows = []
     for s in found["seams"][:MOST_ROWS]:
-        sigma = np.sqrt(np.maximum(np.diag(np.array(s["covariance"])), 0.0))
+        sigma = np.sqrt(np.maximum(np.diag(np.array(s["covariance"])), 0.0)).tolist()
         rows.append(
             (
                 f"{s['pair']} – {s['other']}",
                 str(s["cells"]),
-                f"{_signed(s['bias'])} ± {_size(sigma[0])}",
-                *(f"{_degrees(t)} ± {number(math.degrees(e), 2)}°" for t, e in zip(s["tilt"], sigma[1:], strict=True)),
+                *_fitted(s, sigma),
                 _size(s["noise"]),
                 _size(s["expected"]),
             )
         )
     head = ("Seam", "cells", "bias", "tilt along x", "tilt along y", "noise", "expected noise")
     return Table(head, tuple(rows), tuple(range(1, 7)))
+
+
+def _fitted(plane: Facts, sigma: Sequence[float]) -> list[str]:
+    """Bias and both tilts of a plane, each with its standard deviation."""
+    tilts = zip(plane["tilt"], sigma[1:], strict=True)
+    return [
+        f"{_signed(plane['bias'])} ± {_size(sigma[0])}",
+        *(f"{_degrees(t)} ± {number(math.degrees(s), 2)}°" for t, s in tilts),
+    ]
 
 
 def _size(metres: float) -> str:

@@ -165,8 +165,7 @@ def _frusta(scene: Scene) -> list[Any]:
     corners = [(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)]
     rays = np.array([((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0) for u, v in corners])
     points = np.vstack([np.zeros(3), far * rays])
-    poses = world_poses(bundle)
-    for frame, pose in zip(bundle.meta.get("frames", view.frames[: len(poses)]), poses, strict=False):
+    for frame, pose in zip(bundle.meta["frames"], world_poses(bundle), strict=True):
         if frame in view.products.disparity and np.isfinite(pose).all():
             found.append(np.round(RigidTransform.from_matrix(pose).apply(points), 4).tolist())
     return found

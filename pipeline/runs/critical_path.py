@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine import events
-from rille.pipeline.engine.memory.cost_model import count
+from rille.pipeline.engine.plain import count
 from rille.pipeline.runs import lookup
 
 FACTOR, START = 1.15, 5.0
@@ -137,10 +137,3 @@ def _chain(chain: tuple[tuple[str, float], ...]) -> str:
     shown = [f"{label} {seconds:.1f}" for label, seconds in chain if seconds >= 0.05]
     short = len(chain) - len(shown)
     return ", ".join(shown) + (f" and {short} of less than 0.05 s" if short else "")
-
-
-def show(text: str, folder: Path) -> int:
-    """Print the timing of a run."""
-    for line in describe(lookup.find(text, folder)):
-        print(line)
-    return 0

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from rille.pipeline.engine.memory.limits import words
-from rille.pipeline.engine.store.base import Store, at
+from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.location import Location
 from rille.pipeline.engine.store.maintenance import artifacts
 from rille.pipeline.engine.store.manifest import reference
@@ -37,7 +37,6 @@ class Holding:
 def holdings(store: Store, folder: Path) -> list[Holding]:
     """List the artifacts by sequence and stage: the largest sequence first, its stages in order of size."""
     used = lookup.keys(roots.folders(store, folder))
-    kept = pins.keys(store)
     pinned_by = {key: found["run"] for found in pins.pins(store) for key in found["keys"]}
     found: dict[tuple[str, str], Holding] = {}
     for stage, key in artifacts(store):
@@ -53,7 +52,7 @@ def holdings(store: Store, folder: Path) -> list[Holding]:
         row.artifacts, row.bytes, row.stored = row.artifacts + 1, row.bytes + ref.nbytes, row.stored + ref.stored
         row.oldest, row.newest = min(row.oldest, made), max(row.newest, made)
         row.last_run = max(row.last_run, run, key=lambda r: r.rpartition("/")[2])
-        row.pinned += key in kept
+        row.pinned += key in pinned_by
     whole: dict[str, int] = {}
     for row in found.values():
         whole[row.sequence] = whole.get(row.sequence, 0) + row.stored
@@ -75,7 +74,7 @@ def describe(rows: list[Holding], pinned: Iterable[str]) -> Iterable[str]:
 
 def ls(cache: Location, folder: Path, *, as_json: bool) -> int:
     """Print what the cache holds."""
-    store = at(cache)
+    store = Store(cache)
     rows = holdings(store, folder)
     if as_json:
         print(json.dumps([asdict(r) for r in rows], indent=1))

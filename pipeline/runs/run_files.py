@@ -62,7 +62,7 @@ def task_rows(graph: Graph, store: Store) -> tuple[TaskRow, ...]:
     """One row a task, with the seconds that it took whenever it was computed."""
     rows = []
     for h in graph.nodes:
-        seconds: float | None = h.seconds if h.status == "computed" else None
+        seconds: float | None = h.took.seconds if h.status == "computed" else None
         if h.status == "cached":
             manifest = store.manifest(h.stage, h.key)
             seconds = float(manifest["provenance"]["seconds"]) if manifest else None
@@ -78,9 +78,7 @@ def write(folder: Path, view: RunView, made: Made, store: Store) -> Items:
         ref = made[output.name].ref if output.name in made else None
         if ref is not None:
             place(store.open(ref), folder)
-    trajectory = view.products.trajectory
-    meta = {} if trajectory is None or trajectory.ref is None else trajectory.ref.meta
-    atomic.write(folder / "frames.json", json.dumps(_frames(folder, view, meta), indent=1) + "\n")
+    atomic.write(folder / "frames.json", json.dumps(_frames(folder, view), indent=1) + "\n")
     facts = json.loads(_content(made["facts"], store))
     figures = [
         FIGURE.validate_json(_content(made[o.name], store)) for o in gallery.OUTPUTS if made[o.name].ref is not None
@@ -88,9 +86,10 @@ def write(folder: Path, view: RunView, made: Made, store: Store) -> Items:
     return write_report(folder, view, facts, figures)
 
 
-def _frames(folder: Path, view: RunView, trajectory: Any) -> dict[str, Any]:
+def _frames(folder: Path, view: RunView) -> dict[str, Any]:
     """What the frames of all files are."""
-    names, times = view.sequence.frame_names, view.sequence.times
+    names, times, trajectory = view.sequence.frame_names, view.sequence.times, view.products.trajectory
+    meta = None if trajectory is None or trajectory.ref is None else trajectory.ref.meta
     return describe(
         [file.name for file in folder.iterdir()],
         view.frames,
@@ -98,7 +97,7 @@ def _frames(folder: Path, view: RunView, trajectory: Any) -> dict[str, Any]:
         stamps(view),
         clock=times is not None,
         place=view.sequence.georeference,
-        vertical=list(trajectory.get("verticals", [""]))[int(trajectory.get("main", 0))],
+        vertical="" if meta is None else meta["verticals"][meta["main"]],
     )
 
 

@@ -25,7 +25,7 @@ from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.packages import installed
 from rille.pipeline.engine.plain import plain, warn
-from rille.pipeline.engine.store.base import GoneError, Store, at
+from rille.pipeline.engine.store.base import GoneError, Store
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.store.location import Location, hints_folder, locate
 from rille.pipeline.flow import config as configuration
@@ -253,7 +253,7 @@ def _open(options: Options) -> _Opened:
     text = header + configuration.to_toml(config, sequence.parameters)
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
     (folder / "config.toml").write_text(text, encoding="utf-8")
-    graph, store = Graph(), at(options.cache)
+    graph, store = Graph(), Store(options.cache)
     products, drive = dataflow(graph, sequence, config, frames)
     view = RunView(
         run_id=folder.name,

@@ -12,7 +12,7 @@ from torn import chain, look
 from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store import s3 as requests
-from rille.pipeline.engine.store.base import at
+from rille.pipeline.engine.store.base import Store
 
 METHODS = {"refuse": ("GET", "PUT", "POST"), "deafen": ("PUT",), "cut": ("GET",)}
 WORDS = {
@@ -54,7 +54,7 @@ def test_a_server_in_trouble(calm, bucket, through, row, monkeypatch, how):
         for _ in range(2):  # cold, then warm
             graph = Graph()
             chain.build(graph)
-            result = scheduler.run(graph, at(f"{prefix}/{trial}"), scheduler.RunOptions(executor="inline", jobs=3))
+            result = scheduler.run(graph, Store(f"{prefix}/{trial}"), scheduler.RunOptions(executor="inline", jobs=3))
             computed += result.total().computed
             wrong += [h.label for h in graph.nodes if h.ref is None or h.ref.digest != calm["labels"][h.label]]
         found = look.published(f"{prefix}/{trial}")
@@ -69,14 +69,14 @@ def test_a_store_that_ignores_conditional_puts_is_refused(calm, bucket, through,
     prefix = bucket[0]
     graph = Graph()
     chain.build(graph, frames=2, size=20)
-    scheduler.run(graph, at(prefix), scheduler.RunOptions(executor="inline")).check()
-    before = {e.path: e.mark for e in at(prefix).place.list("")}
+    scheduler.run(graph, Store(prefix), scheduler.RunOptions(executor="inline")).check()
+    before = {e.path: e.mark for e in Store(prefix).place.list("")}
     proxy = through(lambda *_: "blind")
     for place in (prefix, f"{prefix}/new"):
         with raises("RIL-516"):
-            at(place)
+            Store(place)
     wrote = [path for method, path in proxy.requests if method == "PUT" and "/probe/" not in path]
     proxy.trouble = lambda *_: ""
-    after = {e.path: e.mark for e in at(prefix).place.list("") if e.path.startswith("artifacts")}
+    after = {e.path: e.mark for e in Store(prefix).place.list("") if e.path.startswith("artifacts")}
     lost = [path for path, etag in before.items() if path.startswith("artifacts") and after.get(path) != etag]
     row("bucket that ignores conditional puts", 2, lost, wrote, 0, 0, "refused before anything is computed")

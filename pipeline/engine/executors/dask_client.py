@@ -358,7 +358,7 @@ def _work(run: str, pickled: bytes, *made: Ref | None) -> Ref | None:
         outcome = task.run(refs)
     worker = get_worker()
     if isinstance(outcome, Outcome):
-        outcome = replace(outcome, worker=str(worker.name))
+        outcome = replace(outcome, took=replace(outcome.took, worker=str(worker.name)))
     name = worker.get_current_task()
     # Events travel as msgpack, which has no types of ours: bytes pass.
     _ended[name] = pickle.dumps((task.number, name, outcome))

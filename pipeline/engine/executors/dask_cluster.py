@@ -23,7 +23,7 @@ from typing import Any
 
 from rille.pipeline.engine.code_digest import OWN, tree_digest
 from rille.pipeline.engine.packages import version
-from rille.pipeline.engine.store.base import Store, at
+from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.location import Location
 from rille.stages.core.errors import ConfigError, RilleError
 
@@ -69,7 +69,7 @@ def introduce(location: Location, token: str, name: str) -> dict[str, Any]:
     threads = [v for v in ONE_THREAD if os.environ.get(v) != "1"]
     facts: dict[str, Any] = {"identity": identity(), "threads": threads, "cache": ""}
     try:
-        store = at(location)
+        store = Store(location)
         if read_probe(store, token) != token.encode():
             facts["cache"] = "the client's probe is not there"
         write_probe(store, f"{token}-{name}")
@@ -96,7 +96,7 @@ def examine(client: Any, cache: Location) -> None:
     ConfigError
         The first such worker, with the difference.
     """
-    store, token, ours = at(cache), uuid.uuid4().hex, identity()
+    store, token, ours = Store(cache), uuid.uuid4().hex, identity()
     workers = {address: f"w{k}" for k, address in enumerate(sorted(client.nthreads()))}
     names = [token, *(f"{token}-{short}" for short in workers.values())]
     try:

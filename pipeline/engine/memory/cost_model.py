@@ -9,16 +9,18 @@ from other parameters of its stage, else by the guess of the stage's declaration
 from __future__ import annotations
 
 import hashlib
-import json
 from collections import defaultdict
 from collections.abc import Hashable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import fmean, linear_regression, median
 from typing import TYPE_CHECKING, Any
 
-from rille.pipeline.engine.runtime import atomic
+from pydantic import TypeAdapter
+
+from rille.pipeline.engine.plain import count
+from rille.pipeline.engine.runtime.hints import read_hint, write_hint
 from rille.pipeline.engine.spec import Spec, each
 
 if TYPE_CHECKING:
@@ -85,6 +87,17 @@ class Group:
     samples: list[Sample] = field(default_factory=list)
 
 
+@dataclass
+class Kept:
+    """What the file holds: groups by stage and parameters, and the memory of workers between tasks [bytes]."""
+
+    stages: dict[str, dict[str, Group]]
+    rests: list[float]
+
+
+_KEPT = TypeAdapter(Kept)
+
+
 class Costs:
     """Costs remembered with a cache."""
 
@@ -131,16 +144,14 @@ class Costs:
         """Take in what was computed now."""
         new: dict[tuple[str, str], list[Sample]] = defaultdict(list)
         computed = [h for h in handles if h.status == "computed" and h.ref is not None]
-        # The scheduler keeps what was measured of those tasks alone whose memory was.
-        warm = {(h.stage, _name(h.spec)) for h in computed if h.measured is not None and not h.measured.first}
+        warm = {(h.stage, _name(h.spec)) for h in computed if not h.took.first and h.took.memory is not None}
         for h in computed:
             assert h.ref is not None
-            name, measured, memory = (h.stage, _name(h.spec)), h.measured, None
-            if measured is not None:
-                # Imports and compiling are not the task's own.
-                memory = measured.memory if not measured.first or name not in warm else None
-                self.rests += [] if measured.rest is None else [float(measured.rest)]
-            new[name].append((input_bytes(h), memory, float(h.ref.nbytes), float(h.ref.stored)))
+            name, took = (h.stage, _name(h.spec)), h.took
+            # Imports and compiling are not its own.
+            measured = took.memory if not took.first or name not in warm else None
+            new[name].append((input_bytes(h), measured, float(h.ref.nbytes), float(h.ref.stored)))
+            self.rests += [] if took.rest is None else [float(took.rest)]
         self.rests = self.rests[-KEPT:]
         for (stage, params), samples in new.items():
             groups = self.groups.setdefault(stage, {})
@@ -221,11 +232,6 @@ def _line(samples: list[tuple[float, float]]) -> tuple[float, float]:
     return (intercept, slope) if intercept >= 0 else (0.0, linear_regression(x, y, proportional=True).slope)
 
 
-def count(n: int, what: str) -> str:
-    """``1 task``, ``3 tasks``."""
-    return f"{n} {what}{'' if n == 1 else 's'}"
-
-
 def input_bytes(handle: Handle, expected: Mapping[int, float] | None = None) -> float:
     """Bytes that a task works on: its inputs decoded, what it reads from outside, and what its stage adds.
 
@@ -247,31 +253,15 @@ def _meta(handle: Handle) -> Any:
 
 def recall(hints: Path) -> Costs:
     """Read the costs from a sequence's folder of hints; empty if they cannot be read."""
-    try:
-        known = json.loads((hints / FILE).read_text(encoding="utf-8"))
-        groups = {
-            stage: {
-                name: Group(int(g["runs"]), int(g["tasks"]), [_sample(*s) for s in g["samples"]])
-                for name, g in named.items()
-            }
-            for stage, named in known["stages"].items()
-        }
-        return Costs(groups, [float(r) for r in known["rests"]])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
-        return Costs()
-
-
-def _sample(size: Any, memory: Any, result: Any, stored: Any) -> Sample:
-    return float(size), None if memory is None else float(memory), float(result), float(stored)
+    found = read_hint(hints / FILE, _KEPT)
+    return Costs() if found is None else Costs(found.stages, found.rests)
 
 
 def remember(hints: Path, handles: Iterable[Handle]) -> None:
-    """Add what was computed now; best effort."""
+    """Add what was computed now."""
     computed = [h for h in handles if h.status == "computed"]
     if not computed:
         return
     costs = recall(hints)
     costs.learn(computed)
-    stages = {stage: {name: vars(g) for name, g in named.items()} for stage, named in costs.groups.items()}
-    with suppress(OSError):
-        atomic.write(hints / FILE, json.dumps({"stages": stages, "rests": costs.rests}))
+    write_hint(hints / FILE, asdict(Kept(costs.groups, costs.rests)))

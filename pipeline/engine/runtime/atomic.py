@@ -34,11 +34,14 @@ def replacing(path: Path) -> Iterator[Path]:
     # beside it (GDAL does) are removed with the folder.
     apart.mkdir()
     try:
-        with _naming(path):
+        try:
             yield apart / path.name
+        except OSError as error:
+            error.filename = error.filename or str(path)  # that of a write to a full disk has none
+            raise
+        if path.is_dir() and not (apart / path.name).is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         if path.is_dir() and not path.is_symlink():
-            if not (apart / path.name).is_dir():
-                raise _is_folder(path)
             # os.replace cannot replace a folder that is not empty.
             shutil.rmtree(path)
         os.replace(apart / path.name, path)
@@ -48,16 +51,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
 def write(path: Path, data: bytes | str) -> None:
     """Replace a file (text is UTF-8). It is not flushed: for what may be lost, but not be half."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = _beside(path)
-    try:
-        with _naming(path):
-            temporary.write_bytes(data.encode() if isinstance(data, str) else data)
-        if path.is_dir():
-            raise _is_folder(path)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as temporary:
+        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
 def create(path: Path, pieces: Iterable[bytes]) -> bool:
@@ -102,20 +97,6 @@ def remove(path: Path, modified: float) -> None:
         pass  # made anew meanwhile
     finally:
         aside.unlink()
-
-
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Give an error the name of the file that was to be written: that of a write to a full disk has none."""
-    try:
-        yield
-    except OSError as error:
-        error.filename = error.filename or str(path)
-        raise
-
-
-def _is_folder(path: Path) -> IsADirectoryError:
-    return IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
 
 
 def _folder(folder: Path, temporary: Path) -> list[Path]:

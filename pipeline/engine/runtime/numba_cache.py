@@ -17,6 +17,7 @@ and two processes that compile two signatures of one function at once may both t
 from __future__ import annotations
 
 import errno
+import fcntl
 import gc
 import hashlib
 import importlib.abc
@@ -116,12 +117,8 @@ def _lock(key: str) -> None:
     until = time.monotonic() + PATIENCE
     while True:
         try:
-            import fcntl  # not on every system
-
             # A lock of the system ends with the process; a lock file would outlive a crash.
             fcntl.lockf(_locks(), fcntl.LOCK_EX | fcntl.LOCK_NB, 1, _byte(key))
-            return
-        except ImportError:
             return
         except OSError as error:
             if error.errno not in (errno.EACCES, errno.EAGAIN) or time.monotonic() > until:
@@ -130,9 +127,7 @@ def _lock(key: str) -> None:
 
 
 def _unlock(key: str) -> None:
-    with suppress(ImportError, OSError):
-        import fcntl
-
+    with suppress(OSError):
         fcntl.lockf(_locks(), fcntl.LOCK_UN, 1, _byte(key))
 
 

@@ -33,8 +33,7 @@ def private_folder() -> Path:
 
 def _places() -> list[Path]:
     base = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
-    user = os.geteuid() if hasattr(os, "geteuid") else "user"
-    temporary = Path(tempfile.gettempdir()).absolute() / f"rille-{user}"
+    temporary = Path(tempfile.gettempdir()).absolute() / f"rille-{os.geteuid()}"
     return [base / "rille", temporary] if base.is_absolute() else [temporary]
 
 
@@ -43,8 +42,6 @@ def _is_private(path: Path) -> bool:
 
     Above the parent the permissions are the system's, and are trusted.
     """
-    if not hasattr(os, "geteuid"):  # Windows: a profile's folders are the user's
-        return True
     own, parent = path.lstat(), path.parent.stat()  # lstat: a link may lead anywhere
     others = stat.S_IWGRP | stat.S_IWOTH
     return (

@@ -253,6 +253,3 @@ def _place(location: Location) -> Place:
     from rille.pipeline.engine.store.s3 import connect
 
     return connect(location)
-
-
-at = Store

@@ -64,7 +64,7 @@ class LazyArrays(Mapping[str, AnyArray]):
 
     def __getitem__(self, name: str) -> AnyArray:
         if name not in self._loaded:
-            self._loaded[name] = self._read(name, (...,))
+            self._loaded[name] = self.part(name, (...,))
         return self._loaded[name]
 
     def anew(self) -> LazyArrays:
@@ -74,16 +74,13 @@ class LazyArrays(Mapping[str, AnyArray]):
         return other
 
     def part(self, name: str, window: tuple[Any, ...]) -> AnyArray:
-        """Part of an array, which is not kept: only the chunks that hold it are read."""
-        return self._read(name, window)
+        """Part of an array, which is not kept: only the chunks that hold it are read.
 
-    def raster(self, name: str) -> LazyRaster:
-        """An array that is read by window, each time anew."""
-        if name not in self:
-            raise KeyError(f"{self._manifest['stage']} has no array {name!r}")
-        return LazyRaster(self, name, tuple(self._manifest["arrays"][name]["shape"]))
-
-    def _read(self, name: str, window: tuple[Any, ...]) -> AnyArray:
+        Raises
+        ------
+        DamagedError
+            One of them is not as it was written; the artifact is set aside.
+        """
         if name not in self:
             raise KeyError(f"{self._manifest['stage']} has no array {name!r}, only {', '.join(self) or 'metadata'}")
         import zarr
@@ -102,6 +99,12 @@ class LazyArrays(Mapping[str, AnyArray]):
             f"artifact {self._manifest['label']} ({self._manifest['stage']}) is damaged, {wrong}; it was set aside",
             remedy="run again: it will be recomputed",
         )
+
+    def raster(self, name: str) -> LazyRaster:
+        """An array that is read by window, each time anew."""
+        if name not in self:
+            raise KeyError(f"{self._manifest['stage']} has no array {name!r}")
+        return LazyRaster(self, name, tuple(self._manifest["arrays"][name]["shape"]))
 
     def _one_chunk(self, name: str) -> AnyArray | None:
         """An array that is one chunk, as most are; None: it is not, or has other codecs than we write.

@@ -30,6 +30,9 @@ UNSEEN = 128
 MAX_TEXTURE = 4096
 """Greatest edge of the texture, pixels: what every WebGL implementation takes."""
 
+Layer = NDArray[np.float64] | None
+"""Values of the cells of a terrain, (rows, cols) or of colours (rows, cols, 3), where the run has them."""
+
 
 def export(run: Path, kind: str, output: Path | None) -> tuple[Path, str]:
     """Write the terrain of a run in another form; gives the file and what is in it.
@@ -55,7 +58,7 @@ def export(run: Path, kind: str, output: Path | None) -> tuple[Path, str]:
         return target, write(target, terrain, ortho, sigma)
 
 
-def _beside(run: Path, name: str, terrain: DemFile) -> NDArray[np.float64] | None:
+def _beside(run: Path, name: str, terrain: DemFile) -> Layer:
     """Another raster of the run on the same cells, (rows, cols) or of colours (rows, cols, 3); None: there is none."""
     path = run / f"{name}.tif"
     if not path.is_file():
@@ -70,9 +73,7 @@ def _beside(run: Path, name: str, terrain: DemFile) -> NDArray[np.float64] | Non
         return np.asarray(np.moveaxis(bands, 0, 2), np.float64)
 
 
-def write_laz(
-    path: Path, terrain: DemFile, ortho: NDArray[np.float64] | None, sigma: NDArray[np.float64] | None
-) -> str:
+def write_laz(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
     """Write a point for each known cell: x, y, z, intensity and colour of the ortho image, ``sigma`` of z (m).
 
     LAS 1.4, point format 7, the CRS as WKT. A step of the coordinates is a thousandth of a cell or less, an elevation
@@ -110,9 +111,7 @@ def write_laz(
     return f"{row.size} points"
 
 
-def write_ply(
-    path: Path, terrain: DemFile, ortho: NDArray[np.float64] | None, sigma: NDArray[np.float64] | None
-) -> str:
+def write_ply(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
     """Write a point for each known cell as binary PLY: x, y, z, colour of the ortho image, ``sigma`` of z (m).
 
     Coordinates are 64-bit floats: eastings of 32 bits would jump by decimetres. A comment states the CRS as WKT.
@@ -137,9 +136,7 @@ def write_ply(
     return f"{row.size} points"
 
 
-def write_glb(
-    path: Path, terrain: DemFile, ortho: NDArray[np.float64] | None, sigma: NDArray[np.float64] | None
-) -> str:
+def write_glb(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
     """Write the triangles between known neighbouring cells, with the ortho image as texture.
 
     glTF's axes are x right, y up, z towards the viewer: x = x, y = z, z = -y of the terrain's frame. Coordinates are
@@ -199,7 +196,7 @@ def _mesh(terrain: DemFile, step: int) -> tuple[NDArray[np.float64], NDArray[np.
     return np.column_stack([x, y, z[used]]), faces, np.column_stack([at[0] / cols, 1.0 - at[1] / rows])
 
 
-def _texture(ortho: NDArray[np.float64] | None) -> Any:
+def _texture(ortho: Layer) -> Any:
     if ortho is None:
         return None
     from PIL import Image
@@ -212,7 +209,7 @@ def _texture(ortho: NDArray[np.float64] | None) -> Any:
     return PBRMaterial(name="ortho", baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
 
 
-Writer = Callable[[Path, DemFile, "NDArray[np.float64] | None", "NDArray[np.float64] | None"], str]
+Writer = Callable[[Path, DemFile, Layer, Layer], str]
 FORMATS: dict[str, tuple[str, Writer]] = {
     "laz": ("cloud.laz", write_laz),
     "ply": ("cloud.ply", write_ply),

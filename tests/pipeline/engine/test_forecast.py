@@ -16,9 +16,8 @@ OPENED = [f"image/{k}" for k in range(4)] + [f"match/{k}" for k in range(4)]
 
 
 def end(run: Forecast, label: str, seconds: float, status: str = "computed", compiling: float = 0.0) -> None:
-    handle: Any = SimpleNamespace(
-        label=label, status=status, seconds=seconds, measured=SimpleNamespace(compiling=compiling)
-    )
+    took = SimpleNamespace(seconds=seconds, compiling=compiling)
+    handle: Any = SimpleNamespace(label=label, status=status, took=took)
     run.ended(handle)
 
 

@@ -190,7 +190,7 @@ def learned(cache, tmp_path):
     """Folders of caches that know what a hog takes, and hold none; and the digests that it gives."""
     graph = hogs(seconds=0.0)
     scheduler.run(graph, Store(cache), scheduler.RunOptions(executor="inline")).check()
-    assert [h.measured.memory for h in graph.nodes] == [pytest.approx(HOG, rel=0.15)] * 3
+    assert [h.took.memory for h in graph.nodes] == [pytest.approx(HOG, rel=0.15)] * 3
 
     def make(name):
         (tmp_path / name).mkdir()

@@ -20,7 +20,7 @@ from toys import chain
 from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store import maintenance, manifest, s3
-from rille.pipeline.engine.store.base import at
+from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.folder import Folder
 from rille.pipeline.engine.store.location import hints_folder, locate
 from rille.pipeline.engine.store.manifest import artifact_path
@@ -71,7 +71,7 @@ def right(tmp_path_factory):
 def run(cache, **options):
     graph = Graph()
     chain.build(graph, frames=FRAMES)
-    result = scheduler.run(graph, at(cache), scheduler.RunOptions(executor="inline", **options))
+    result = scheduler.run(graph, Store(cache), scheduler.RunOptions(executor="inline", **options))
     result.check()
     return graph, result
 
@@ -99,7 +99,7 @@ def test_cold_and_warm_give_what_a_folder_gives(url, right, proxied):
     assert result.total().cached == NODES
     assert not result.executor_started
     assert len(proxy.requests) <= 4, "the mark, two listings, an index: not one request an artifact"
-    values = at(url).open(warm.nodes[0].ref)["values"]
+    values = Store(url).open(warm.nodes[0].ref)["values"]
     assert values.shape == (40, 40)
 
 
@@ -114,7 +114,7 @@ def test_another_machine_reads_the_index_once(url, right, proxied, tmp_path, mon
 
 def test_a_damaged_index_is_no_matter(url, right):
     run(url)
-    store = at(url)
+    store = Store(url)
     (entry,) = store.place.list("index")
     for data in (b"", b"no gzip", gzip.compress(b"x" * 50), store.place.read(entry.path)[:-9]):
         store.place.write(entry.path, data)
@@ -134,7 +134,7 @@ def test_servers_in_trouble_change_nothing(url, right, proxied, how, monkeypatch
         graph, _ = run(url)
         assert digests(graph) == right
     assert proxy.troubled >= 2
-    store = at(url)
+    store = Store(url)
     assert len(list(store.place.list("artifacts"))) == NODES, "a commit whose answer was lost is one's own"
     assert maintenance.verify(store) == (NODES, [])
 
@@ -163,21 +163,21 @@ def test_answers_that_break_off_are_asked_for_again(url, proxied, method):
 def test_a_server_that_ignores_conditions_is_refused(url, proxied):
     proxied(lambda *_: "blind")
     with raises("RIL-516"):
-        at(url)
+        Store(url)
     with raises("RIL-516"):
-        at(url)  # nothing was noted
+        Store(url)  # nothing was noted
 
 
 def test_a_bucket_moved_to_another_server_is_tried_again(url, proxied):
-    commit(at(url))
+    commit(Store(url))
     proxied(lambda *_: "blind")
     with raises("RIL-516"):
-        at(url)
+        Store(url)
 
 
 def test_of_a_race_one_is_published(url):
-    place, refs = at(url).place, []
-    threads = [threading.Thread(target=lambda: refs.append(commit(at(url)))) for _ in range(4)]
+    place, refs = Store(url).place, []
+    threads = [threading.Thread(target=lambda: refs.append(commit(Store(url)))) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -186,13 +186,13 @@ def test_of_a_race_one_is_published(url):
     assert len({r.path for r in refs}) == 1
     assert [e.path for e in place.list("artifacts")] == [refs[0].path], "the losers leave nothing"
     with raises("RIL-577"):
-        commit(at(url), value=2.0)
+        commit(Store(url), value=2.0)
 
 
 def test_a_commit_is_one_object(url, proxied):
-    at(url)
+    Store(url)
     proxy = proxied(lambda method, path, count: "")
-    bucket = at(url)
+    bucket = Store(url)
     del proxy.requests[:]
     ref = commit(bucket)
     assert [path.rpartition("/")[2] for method, path in proxy.requests if method == "PUT"] == [f"{ref.key}.zarr.zip"]
@@ -204,7 +204,7 @@ def test_a_commit_is_one_object(url, proxied):
 def test_damage_is_healed(url, right, way):
     """A missing object and another size are seen at the look-up, another content when it is read."""
     run(url)
-    store = at(url)
+    store = Store(url)
     entry = next(e for e in store.place.list("artifacts/numbers"))
     data = bytearray(store.place.read(entry.path))
     key = entry.path.split("/")[-1].partition(".")[0]
@@ -229,7 +229,7 @@ def test_damage_is_healed(url, right, way):
 
 def test_a_task_heals_its_damaged_input(url, right):
     graph, _ = run(url)
-    store = at(url)
+    store = Store(url)
     total = next(h for h in graph.nodes if h.stage == "total")
     scaled = next(h for h in graph.nodes if h.stage == "scale")
     data = bytearray(store.place.read(scaled.ref.path))
@@ -243,7 +243,7 @@ def test_a_task_heals_its_damaged_input(url, right):
 
 def test_verify_and_gc(url):
     graph, _ = run(url)
-    store = at(url)
+    store = Store(url)
     kept = {h.key for h in graph.nodes if h.stage != "total"}
     total = next(h for h in graph.nodes if h.stage == "total")
     assert maintenance.gc(store, kept).artifacts == 0, "it was made within the grace"
@@ -264,19 +264,19 @@ def test_verify_and_gc(url):
 
 def test_what_a_run_used_lately_is_spared(url):
     run(url)
-    assert maintenance.gc(at(url), set(), grace=0.0, dry_run=True).artifacts in (
+    assert maintenance.gc(Store(url), set(), grace=0.0, dry_run=True).artifacts in (
         0,
         NODES,
     )  # the clock of a whole second
-    assert maintenance.gc(at(url), set(), grace=3600).artifacts == 0
+    assert maintenance.gc(Store(url), set(), grace=3600).artifacts == 0
 
 
 def test_no_secret_is_written_anywhere(url, tmp_path, capfd, proxied):
     run(url, ledger=tmp_path / "ledger.jsonl")
     with raises("RIL-508") as wrong:
-        at("s3://no-such-bucket/x")
+        Store("s3://no-such-bucket/x")
     said = str(wrong.value) + repr(wrong.value) + "".join(capfd.readouterr())
-    stored = at(url).place
+    stored = Store(url).place
     contents = [stored.read(e.path) for e in stored.list("")]
     contents += [gzip.decompress(c) for c in contents if c[:2] == b"\x1f\x8b"]
     contents += [p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()] + [said.encode()]
@@ -299,16 +299,16 @@ def test_an_object_without_a_tag_has_no_mark():
 def test_each_mistake_is_one_line(port, tmp_path, monkeypatch, proxied, url):
     monkeypatch.setattr(s3, "HASTY", {**s3.HASTY, "max_retries": 1})
     with raises("RIL-508"):
-        at("s3://missing/x")
+        Store("s3://missing/x")
     proxied(lambda *_: "refuse")
     with raises("RIL-511", "503", "s3://bucket"):
-        at(url)
+        Store(url)
     proxied(lambda *_: "forbid")
     with raises("RIL-510"):
-        at(url)
+        Store(url)
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     with raises("RIL-512", "127.0.0.1:9"):
-        at(url)
+        Store(url)
     assert rille("s3://Bad_Bucket/x", dict(os.environ)) == (
         2,
         "rille: error RIL-548: 'Bad_Bucket' is no name of a bucket: give --cache s3://bucket/prefix, and credentials"
@@ -339,25 +339,25 @@ def test_locations():
     assert locate("folder/x") == Path("folder/x")
     assert hints_folder(Path("c")) == Path("c")
     assert hints_folder("s3://bucket/a/b").name == "bucket+a+b"
-    assert isinstance(at("some/folder").place, Folder)
+    assert isinstance(Store("some/folder").place, Folder)
 
 
 def test_of_a_window_only_the_chunks_are_fetched_that_it_touches(url, proxied):
     rng = np.random.default_rng(0)
     whole = Bundle({"values": rng.random((2500, 1100)), "mask": np.zeros((3, 4), dtype=np.uint8)}, {"frame": 0})
-    ref = at(url).commit(numbers.STAGE, "k" * 64, whole, label="numbers/0")
+    ref = Store(url).commit(numbers.STAGE, "k" * 64, whole, label="numbers/0")
     proxy = proxied(lambda *_: "")
-    opened = at(url).open(ref)
+    opened = Store(url).open(ref)
     del proxy.ranges[:]
     part = opened.part("values", (slice(1000, 1040), slice(5, 9)))
     assert (part == whole["values"][1000:1040, 5:9]).all()
     asked = sorted(proxy.ranges)
-    members = at(url).manifest(ref.stage, ref.key)["files"]
+    members = Store(url).manifest(ref.stage, ref.key)["files"]
     wanted = [members[f"values/{name}"] for name in ("c.0.0", "c.1.0", "zarr.json")]
     assert asked == sorted(f"bytes={start}-{start + size - 1}" for start, size, _ in wanted)
     assert (opened.raster("values")[2499:, 1024:] == whole["values"][2499:, 1024:]).all()
     assert (opened["values"] == whole["values"]).all()
-    at(url).place.delete([ref.path])
+    Store(url).place.delete([ref.path])
     with raises("RIL-504", "missing"):
         opened.part("values", (slice(2400, 2500), slice(1030, 1040)))
 
@@ -381,16 +381,16 @@ def test_an_object_of_an_odd_name_leaves_the_bucket_usable(url, port, right, nam
     assert digests(warm) == right
     assert result.total().cached == NODES
     with raises("RIL-766"):
-        maintenance.gc(at(url), set(), grace=0.0)
+        maintenance.gc(Store(url), set(), grace=0.0)
 
 
 @pytest.mark.parametrize("name", ["artifacts/x", "artifacts/a/b/c/d", "data/x", "data/a/b/c/d", "index/x", "notes.txt"])
 def test_objects_of_others_are_passed_over_and_stay(url, port, name):
-    commit(at(url))
+    commit(Store(url))
     whole = f"{url.removeprefix('s3://bucket/')}/{name}"
     put(port, whole)
-    assert maintenance.verify(at(url)) == (1, [])
-    assert maintenance.gc(at(url), set(), grace=-60.0).artifacts == 1
+    assert maintenance.verify(Store(url)) == (1, [])
+    assert maintenance.gc(Store(url), set(), grace=-60.0).artifacts == 1
     assert s3.Bucket(url).read(name) is not None or name.startswith("index")
 
 
@@ -411,12 +411,12 @@ def test_objects_of_others_are_passed_over_and_stay(url, port, name):
     ],
 )
 def test_a_manifest_that_is_wrong_by_intent_counts_as_damaged(url, change):
-    store = at(url)
+    store = Store(url)
     ref = commit(store)
     data = store.place.read(ref.path)
     store.place.write(ref.path, manifest.frame(store.manifest(ref.stage, ref.key) | change) + data)
-    assert at(url).lookup(ref.stage, ref.key) is None
-    assert at(url).lookup(ref.stage, ref.key) is None, "it was set aside"
+    assert Store(url).lookup(ref.stage, ref.key) is None
+    assert Store(url).lookup(ref.stage, ref.key) is None, "it was set aside"
     for text in (b"[" * 100_000, b'{"path": ' * 50_000, b"[]", b"1" * 5000):
         with pytest.raises(ValueError):  # noqa: PT011
             manifest.unframe(manifest._HEAD % (google_crc32c.value(text), len(text)) + text + b"}\n")

@@ -153,7 +153,6 @@ def test_where_healing_fails_all_that_waits_is_left_out_and_told(cache, tmp_path
     by = {"second": "first failed", "last": "second was skipped", "rest": "last was skipped"}
     assert told == {label: ("skipped", reason) for label, reason in by.items()}
     assert not any(h.done for h in graph.nodes)
-    assert result.keys == set()
 
 
 def test_what_waits_for_healing_goes_on_if_another_worker_has_healed_it(cache, tmp_path, monkeypatch):
@@ -230,7 +229,7 @@ def test_with_keep_going_the_rest_finishes_and_the_ledger_accounts_for_all(cache
     assert (result.total().computed, result.total().failed, result.total().skipped) == (3, 2, 4)
     rows = ledger.read(file)
     assert sorted(r["label"] for r in rows) == sorted(h.label for h in graph.nodes)
-    assert ledger.keys(file) == result.keys == {h.key for h in graph.nodes if h.done}
+    assert ledger.keys(file) == {h.key for h in graph.nodes if h.done}
     assert all(r["digest"] and r["seconds"] > 0 for r in rows if r["status"] == "computed")
 
 

@@ -196,9 +196,9 @@ def test_what_is_missing_comes_first(tmp_path: Path) -> None:
 
 def test_frames_without_a_pose_are_named(tmp_path: Path) -> None:
     made = bundles()
-    poses = made["trajectory"]["poses"].copy()
-    poses[[2, 3, 5]] = np.nan
-    made["trajectory"] = Bundle({**made["trajectory"].arrays, "poses": poses}, made["trajectory"].meta)
+    poses, piece = (made["trajectory"][name].copy() for name in ("poses", "piece"))
+    poses[[2, 3, 5]], piece[[2, 3, 5]] = np.nan, -1
+    made["trajectory"] = Bundle({**made["trajectory"].arrays, "poses": poses, "piece": piece}, made["trajectory"].meta)
     facts, _, _, _ = written(tmp_path, view(made))
     lost = next(m for m in facts["missing"] if m["kind"] == "no pose")
     assert lost["what"] == "3 of 6 frames have no pose"

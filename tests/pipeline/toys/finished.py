@@ -109,8 +109,9 @@ def bundles() -> dict[str, Bundle]:
                 "poses": poses,
                 "covariance": np.tile(1e-8 * np.eye(6), (6, 1, 1)),
                 "segment": np.array([0, 0, 0, 0, 0, 1], dtype=np.int16),
+                "piece": np.zeros(6, dtype=np.int16),
             },
-            {"frames": list(FRAMES)},
+            {"frames": list(FRAMES), "pieces": [[0, 5]], "main": 0, "verticals": ["attitude"]},
         ),
     }
     error = np.where(np.isfinite(z), 4e-4, np.nan).astype(np.float32)

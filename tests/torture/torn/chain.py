@@ -53,13 +53,13 @@ def run(cache, executor="inline", ledger=None, jobs=2, memory=None, environment=
     os.environ.update(environment or {})
     from rille.pipeline.engine import scheduler
     from rille.pipeline.engine.graph import Graph
-    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.engine.store.base import Store
 
     graph = Graph()
     build(graph, **options)
     made = scheduler.run(
         graph,
-        at(cache),
+        Store(cache),
         scheduler.RunOptions(executor=executor, jobs=jobs, keep_going=True, ledger=Path(ledger) if ledger else None),
     )
     nodes = {
@@ -79,14 +79,14 @@ def clear(cache, runs, until, grace, environment=None):
     os.environ.update(environment or {})
     from rille.pipeline.engine import events as ledger
     from rille.pipeline.engine.store import maintenance
-    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.engine.store.base import Store
 
     times = removed = 0
     while not Path(until).exists():
         kept = set()
         for path in Path(runs).glob("*/*/ledger.jsonl"):
             kept |= ledger.keys(path)
-        removed += maintenance.gc(at(cache), kept, grace=grace).artifacts
+        removed += maintenance.gc(Store(cache), kept, grace=grace).artifacts
         times += 1
         time.sleep(0.002)
     return {"times": times, "removed": removed}
