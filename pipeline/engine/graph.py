@@ -1,13 +1,14 @@
 """The task graph: nodes that name a stage, and flows that add nodes once earlier results are known.
 
->>> def chain(graph: Graph) -> Generator[Wait, Any, list[Handle]]:
+>>> def chain(graph: Graph) -> Generator[Wait, Any, None]:
 ...     chosen = yield graph.node(keyframes, "keyframes", KeyframesParams(), {"frames": 9})
-...     return [graph.node(hfvm, f"hfvm/{k}", params, {"pair": k}, inputs=images[k]) for k in chosen.meta["basic"]]
+...     for k in chosen.meta["basic"]:
+...         graph.node(hfvm, f"hfvm/{k}", params, {"pair": k}, inputs=images[k])
 >>> graph = Graph()
->>> matched = graph.flow(chain(graph))
+>>> graph.flow(chain(graph))
 
 A flow is a generator: it yields what it waits for, and goes on with the references of that once they are there
-(:meth:`Graph.flow`). Several run side by side, and one may wait for what others return.
+(:meth:`Graph.flow`). Several run side by side; what one is made of, it takes in by ``yield from``.
 
 A :class:`Handle` stands for a node; after (or during) the run its ``status`` and ``ref`` say what became of it.
 Order of creation is priority: what is created first runs first.
@@ -19,14 +20,13 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from types import ModuleType
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from rille.pipeline.engine.spec import Refs, Spec, each, flat
 from rille.pipeline.engine.store.manifest import Ref
 from rille.stages.core.declare import Params
 
 Expansion = Callable[..., None]
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,18 +114,7 @@ class Maybe:
     handles: Sequence[Handle]
 
 
-@dataclass(eq=False)
-class Flow(Generic[T]):
-    """A generator on its way, and once it is ``done`` what it returned, or what it missed."""
-
-    steps: Generator[Wait, Any, T]
-    done: bool = False
-    value: T | None = None
-    missed: MissingError | None = None
-    followers: list[Callable[[], None]] = field(default_factory=list)
-
-
-Wait = Handle | Maybe | Sequence[Handle] | Flow[Any] | Sequence[Flow[Any]]
+Wait = Handle | Maybe | Sequence[Handle]
 """What a flow may yield."""
 
 
@@ -178,56 +167,37 @@ class Graph:
         self.nodes.append(handle)
         return handle
 
-    def flow(self, steps: Generator[Wait, Any, T]) -> Flow[T]:
+    def flow(self, steps: Generator[Wait, Any, None]) -> None:
         """Run a generator on the client until it waits, and again when what it waits for is there.
 
-        It yields a handle, a list of handles, :class:`Maybe`, a flow, or a list of flows, and gets a reference, a list
-        of references, or what the flows returned. Where one will never be, ``MissingError`` is raised in it.
+        It yields a handle, a list of handles, or :class:`Maybe`, and gets a reference, or a list of references. Where
+        one will never be, ``MissingError`` is raised in it.
         """
-        flow = Flow(steps)
         self.unfinished += 1
-        self._go_on(flow, lambda: next(steps))
-        return flow
+        self._go_on(steps, lambda: next(steps))
 
-    def _go_on(self, flow: Flow[Any], step: Callable[[], Wait]) -> None:
+    def _go_on(self, steps: Generator[Wait, Any, None], step: Callable[[], Wait]) -> None:
         try:
             wanted = step()
-        except StopIteration as end:
-            flow.done, flow.value = True, end.value
-        except MissingError as error:
-            flow.done, flow.missed = True, error
-            self.expansions.append((error.handles, lambda *_: None, False))  # the run's end says what it waited for
-        else:
-            self._wait(flow, wanted)
-        if flow.done:
+        except StopIteration:
             self.unfinished -= 1
-            for follower in flow.followers:
-                follower()
-
-    def _wait(self, flow: Flow[Any], wanted: Wait) -> None:
-        one, maybe = isinstance(wanted, Handle | Flow), isinstance(wanted, Maybe)
-        several: Any = wanted.handles if isinstance(wanted, Maybe) else wanted
-        parts: list[Any] = [wanted] if one else list(several)
-
-        def answer(values: list[Any], missed: MissingError | None) -> None:
-            if missed is not None:
-                self._go_on(flow, lambda: flow.steps.throw(missed))
-            else:
-                self._go_on(flow, lambda: flow.steps.send(values[0] if one else values))
+            return
+        except MissingError as error:
+            self.unfinished -= 1
+            self.expansions.append((error.handles, lambda *_: None, False))  # the run's end says what it waited for
+            return
+        one, maybe = isinstance(wanted, Handle), isinstance(wanted, Maybe)
+        several = wanted.handles if isinstance(wanted, Maybe) else wanted
+        handles = [several] if isinstance(several, Handle) else list(several)
 
         def resume(*refs: Ref | None) -> None:
-            lost = [h for h, ref in zip(parts, refs, strict=True) if ref is None]
-            answer(list(refs), MissingError(lost) if lost and not maybe else None)
+            lost = [handle for handle, ref in zip(handles, refs, strict=True) if ref is None]
+            if lost and not maybe:
+                self._go_on(steps, lambda: steps.throw(MissingError(lost)))
+            else:
+                self._go_on(steps, lambda: steps.send(refs[0] if one else list(refs)))
 
-        if not any(isinstance(part, Flow) for part in parts):
-            self.expansions.append((parts, resume, True))
-            return
-        # Waits for one flow after the other: the last to end wakes this one, whichever it is.
-        behind = next((part for part in parts if not part.done), None)
-        if behind is not None:
-            behind.followers.append(lambda: self._wait(flow, wanted))
-        else:
-            answer([part.value for part in parts], next((p.missed for p in parts if p.missed is not None), None))
+        self.expansions.append((handles, resume, True))
 
 
 _NONE: dict[str, Any] = {}
