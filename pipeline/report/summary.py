@@ -14,6 +14,7 @@ from rille.pipeline.report import delivery, seams, tables
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.metrics import metrics
+from rille.pipeline.report.words import metres
 
 FORMAT = 2
 """Raised when the meaning of a key of report.json changes."""
@@ -105,8 +106,24 @@ def find_warnings(scene: Scene) -> list[str]:
         bad = [frame for frame, flagged in zip(view.frames, compared.flagged, strict=True) if flagged]
         share = f"{len(bad)} of {len(view.frames)} frames"
         lines.append(f"trajectory and COLMAP disagree more than elsewhere at {share}: {delivery.which(bad)}")
+    lines += _unlike(view)
     # A name in the data may hold line feeds, and a warning is one line.
     return list(dict.fromkeys(" ".join(str(line).split()) for line in lines))
+
+
+UNLIKE = 50.0
+"""RMS disagreement of two trajectories [per cent of the length] from which on they have nothing in common. Of a camera
+at rest, whose length is noise, it stays below."""
+
+
+def _unlike(view: RunView) -> list[str]:
+    """Trajectory and crosscheck are not alike anywhere: no frame then stands out."""
+    agreement = view.bundle(view.products.agreement)
+    figures = {} if agreement is None else agreement.meta["metrics"]
+    rmse, length, share = (figures.get(name, {}).get("value") for name in ("rmse", "length", "share"))
+    if share is None or share <= UNLIKE:
+        return []
+    return [f"trajectory and COLMAP have nothing in common: {metres(rmse)} RMS over {metres(length)}; one is wrong"]
 
 
 SIGMA_OFF = 3.0

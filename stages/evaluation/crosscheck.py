@@ -3,8 +3,10 @@
 Nothing of the chain enters. Features, verification of matches, registration, triangulation and bundle adjustment are
 pycolmap's (Schönberger & Frahm 2016, doi:10.1109/CVPR.2016.445; SIFT, Lowe 2004,
 doi:10.1023/B:VISI.0000029664.99615.94). What both share is the given calibration: the two cameras are one rig whose
-relative pose and intrinsics are held, so that the scale is metric. Everything runs in memory, on one thread and with
-given seeds, so that the same images give the same bytes.
+relative pose and intrinsics are held, so that the scale is metric. A model begins with the two images of one frame,
+whose baseline is known. Of its own, COLMAP begins with any two: at the scale that they then have by chance the rig's
+baseline may seem to be nothing, and the model grows to thousands of times its size. Everything runs in memory, on one
+thread and with given seeds, so that the same images give the same bytes.
 """
 
 from __future__ import annotations
@@ -71,11 +73,11 @@ class CrosscheckParams(Params):
         "at 8 times the time; null: -1 for images of up to 150 000 pixels, which show too few features else, and 0",
     )
     init_min_tri_angle: float = Field(
-        default=1.0,
+        default=0.1,
         gt=0,
         lt=90,
-        description="smallest triangulation angle [degrees] of COLMAP's first two images; its default of 16 rejects "
-        "every start of a forward drive",
+        description="smallest triangulation angle [degrees] of the left and right image that COLMAP begins with; 0.1 "
+        "is a pixel of disparity at a focal length of 600",
     )
     seed: int = Field(default=0, ge=0, description="seed of COLMAP's random sampling")
 
@@ -209,13 +211,13 @@ def _run(params: CrosscheckParams, args: Mapping[str, Any], inputs: Inputs) -> B
     with pycolmap.Database.open(":memory:") as database:
         cameras = _write_rig(database, rig)
         verified = _write_frames(database, cameras, features, params)
-        models = _map(database, params) if verified else []
+        models = _models(database, params, {k: v for (k, j), v in verified.items() if j == k + 1 and k % 2})
     poses, observations = np.full((len(frames), 3, 4), np.nan), np.zeros(len(frames), np.int32)
     meta: dict[str, Any] = {
         "frames": frames,
         "features": float(np.median([len(f.points) for f in features])),
         "pairs": len(image_pairs(len(frames), params.span)),
-        "pairs_verified": verified,
+        "pairs_verified": len(verified),
         "models": len(models),
         "points": 0,
         "observations": 0,
@@ -238,7 +240,7 @@ def _run(params: CrosscheckParams, args: Mapping[str, Any], inputs: Inputs) -> B
 def _why(meta: Mapping[str, Any]) -> str:
     if meta["pairs_verified"] == 0:
         return f"no two images match (median {meta['features']:.0f} features an image)"
-    return f"{meta['pairs_verified']} of {meta['pairs']} image pairs match, but no two images start a model"
+    return f"{meta['pairs_verified']} of {meta['pairs']} image pairs match, but left and right start no model"
 
 
 def _write_rig(database: Any, rig: Rig) -> list[Any]:
@@ -268,8 +270,10 @@ def _camera(number: int, camera: Camera) -> Any:
     return out
 
 
-def _write_frames(database: Any, cameras: list[Any], features: list[Features], params: CrosscheckParams) -> int:
-    """Features and verified matches to the database; the number of image pairs that match."""
+def _write_frames(
+    database: Any, cameras: list[Any], features: list[Features], params: CrosscheckParams
+) -> dict[tuple[int, int], int]:
+    """Features and verified matches to the database; how many of each image pair that matches."""
     import pycolmap
 
     for k in range(len(features) // 2):
@@ -284,7 +288,7 @@ def _write_frames(database: Any, cameras: list[Any], features: list[Features], p
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed, options.ransac.num_threads = params.seed, 1
     options.detect_watermark = False
-    verified = 0
+    verified = {}
     for i, j in image_pairs(len(features) // 2, params.span):
         a, b = features[i - 1], features[j - 1]
         matches = match(a, b)
@@ -295,12 +299,29 @@ def _write_frames(database: Any, cameras: list[Any], features: list[Features], p
         )
         database.write_matches(i, j, matches)
         database.write_two_view_geometry(i, j, geometry)
-        verified += len(geometry.inlier_matches) >= MIN_MATCHES
+        if len(geometry.inlier_matches) >= MIN_MATCHES:
+            verified[i, j] = len(geometry.inlier_matches)
     return verified
 
 
-def _map(database: Any, params: CrosscheckParams) -> list[Any]:
-    """Incremental mapping with the rig and all intrinsics held."""
+def _models(database: Any, params: CrosscheckParams, stereo: dict[int, int]) -> list[Any]:
+    """Models, each begun with the best stereo pair that no model holds yet, as long as it might become the greatest.
+
+    ``stereo``: verified matches with the right image, by number of the left one.
+    """
+    models, left, most = [], set(stereo), 0
+    while len(left) > most:
+        start = max(left, key=lambda number: (stereo[number], -number))
+        left.discard(start)
+        for model in _map(database, params, (start, start + 1)):
+            models.append(model)
+            left -= {2 * frame - 1 for frame in model.reg_frame_ids()}
+            most = max(most, model.num_reg_frames())
+    return models
+
+
+def _map(database: Any, params: CrosscheckParams, start: tuple[int, int]) -> list[Any]:
+    """Incremental mapping from two images on, with the rig and all intrinsics held."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
@@ -311,6 +332,8 @@ def _map(database: Any, params: CrosscheckParams) -> list[Any]:
     options.ba_refine_focal_length = options.ba_refine_principal_point = False
     options.ba_refine_extra_params = options.ba_refine_sensor_from_rig = False
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    options.init_image_id1, options.init_image_id2 = start
+    options.multiple_models, options.init_num_trials = False, 1
     options.mapper.init_min_tri_angle = params.init_min_tri_angle
     options.min_model_size, options.extract_colors = 2, False
     pycolmap.set_random_seed(params.seed)

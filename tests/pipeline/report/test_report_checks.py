@@ -28,7 +28,7 @@ from toys.finished import (
 )
 
 from rille.pipeline.export import artifacts
-from rille.pipeline.report import canvas, figures, gather
+from rille.pipeline.report import canvas, figures, gather, summary
 from rille.stages.core.declare import Bundle
 from rille.stages.hazard.risk import RiskParams
 from rille.stages.hazard.vehicle import Vehicle
@@ -64,6 +64,16 @@ def test_suspicions_stand_before_the_figures(self_checked: Written) -> None:
     ]
     text = page_.text
     assert text.index("rows are off by 0.60 px") < text.index("Accuracy Quantity")
+
+
+@pytest.mark.parametrize(("share", "told"), [(None, 0), (12.0, 0), (190_000.0, 1)])
+def test_a_crosscheck_that_is_wrong_as_a_whole_is_told(share: float | None, told: int) -> None:
+    figures = {name: {"value": value} for name, value in (("rmse", 512.3), ("length", 0.27), ("share", share))}
+    view = SimpleNamespace(
+        products=SimpleNamespace(agreement=""), bundle=lambda _: SimpleNamespace(meta={"metrics": figures})
+    )
+    words = "trajectory and COLMAP have nothing in common: 512 m RMS over 0.270 m; one is wrong"
+    assert summary._unlike(view) == [words] * told  # type: ignore[arg-type]
 
 
 def test_the_other_program_is_compared_frame_by_frame(self_checked: Written) -> None:

@@ -114,6 +114,16 @@ def test_a_wrong_rig_is_held_not_repaired(scene: Any) -> None:
     assert bad > 1.5 * good
 
 
+def test_without_a_stereo_pair_nothing_has_a_scale(scene: Any) -> None:
+    """The left images alone would give a model of any size."""
+    _, images = scene
+    covered = [bundle(image["image"], np.zeros(image["image"].shape, np.uint8)) for image in images["right"]]
+    found = run({"left": images["left"], "right": covered}, [0, 1, 2, 3])
+    assert found.meta["pairs_verified"] >= 3
+    assert (found.meta["models"], found.meta["registered"]) == (0, 0)
+    assert "left and right start no model" in found.meta["reason"]
+
+
 def test_a_frame_that_fits_nowhere_is_listed_and_the_rest_stays(scene: Any) -> None:
     _, inputs = scene
     noise = np.random.default_rng(1).integers(0, 255, (2, 240, 320), dtype=np.uint8)
