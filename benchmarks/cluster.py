@@ -34,13 +34,13 @@ class Measured:
     stored: float = 95e3
     """Bytes an artifact."""
     scan: float = 1.5e-3
-    """Seconds a frame of the slowest tasks that read the whole sequence: ``select``, ``trajectory``."""
+    """Seconds a frame of the slowest tasks that read the whole sequence: ``keyframes``, ``trajectory``."""
 
 
 LIMITS = (
     ("index", "the index is too large to be read: a warm run reads every manifest"),
     ("client", "the client holds more than 4 GB"),
-    ("scan", "one task takes more than a minute: select and trajectory go through all frames"),
+    ("scan", "one task takes more than a minute: keyframes and trajectory go through all frames"),
     ("scheduler", "the scheduler has less time for a task than it needs: more workers gain nothing"),
 )
 

@@ -87,7 +87,7 @@ def _measured(ensure: Callable[..., Any]) -> Callable[..., Any]:
     def timed(*args: Any, **more: Any) -> Any:
         begin = _spent()
         outcome = ensure(*args, **more)
-        return replace(outcome, kernel=_spent() - begin)
+        return replace(outcome, took=replace(outcome.took, kernel=_spent() - begin))
 
     return timed
 

@@ -130,7 +130,7 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
     Parameters
     ----------
     path
-        A name from ``rille datasets``, a folder, or a manifest.
+        A name from ``rille datasets list``, a folder, or a manifest.
     settings
         Parameters of the sequence by section, e.g. ``mockup={"frames": 5}``.
 

@@ -8,6 +8,21 @@ from pathlib import Path
 import pytest
 
 from benchmarks import scale
+from rille.pipeline.engine.graph import Took
+from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.task import Outcome
+
+
+def test_the_processor_time_of_a_task_is_told_as_that_of_its_stage() -> None:
+    ref = Ref("0", "merge", "0", {})
+
+    def ensure() -> Outcome:
+        sum(k * k for k in range(100_000))
+        return Outcome(ref, False, Took(seconds=9.0))
+
+    told = scale._measured(ensure)()
+    assert (told.ref, told.cached, told.took.seconds) == (ref, False, 9.0)
+    assert 0 < told.took.kernel < 9
 
 
 @pytest.mark.slow

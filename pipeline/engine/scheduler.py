@@ -11,7 +11,8 @@ computed: ``status`` of the handles is ``cached`` or ``planned``, and ``reason``
 on results still to come is laid out by those of an earlier run where there was one (``Result.assumed``), else it is not
 known (``Result.unknown``).
 
-What a stage raises is not tried again, and what depends on it is skipped. Where the data do not determine an answer
+What a stage raises is not tried again (but for ``OSError``: :mod:`rille.pipeline.engine.task`), and what depends on it
+is skipped. Where the data do not determine an answer
 (:class:`~rille.stages.core.errors.DegenerateError`) everything else finishes: the run has a hole. After any other error
 nothing new is begun, unless with ``keep_going``. An artifact that is found damaged, or gone, when a task reads it is
 computed again, and the task after it. A task that kills its worker process is tried three times. In every case the

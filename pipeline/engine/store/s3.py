@@ -5,7 +5,7 @@ Credentials, region and endpoint come from the environment alone (``AWS_ACCESS_K
 answers only the error code is shown. Server errors and lost connections are tried again for half a minute, at the first
 contact for a few seconds.
 
-A commit relies on ``If-None-Match: *``: of two that write a manifest one must be refused. A server that ignores it
+A commit relies on ``If-None-Match: *``: of two that write an artifact one must be refused. A server that ignores it
 would let the second overwrite what was published, so the first contact with a prefix tries it, and refuses the server
 if both writes succeed. That it passed is noted in the object ``rille.json`` with the endpoint it was tried at.
 An artifact is one object, and an object is there whole or not at all: nothing is left over, whenever a run is killed.
