@@ -3,9 +3,9 @@
 A kind of task is its label without numbers, such as ``locus/world``. The time left is the sum over kinds of *tasks to
 come x seconds a task*, over the workers, and of the seconds for which kernels are still to be compiled:
 
-- Tasks to come are those laid out already, or as many as a run of this size has: what is laid out on the way grows with
-  the number of tasks that are laid out when it opens. Of a kind some of whose tasks were found in the cache after
-  computing began, the same share of the rest is expected to be found.
+- Tasks to come are those laid out already, or as many as a run of this size has: the number of tasks that are laid out
+  later grows with the number at the start. If some tasks of a kind were found in the cache after computing began, the
+  same share of the others is expected there.
 - Seconds a task are the mean of those measured in this run. For a kind that has not run yet they are the earlier ones
   times the pace: the median of measured over earlier seconds, each kind weighed by the root of its seconds.
 - Compiling is expected as before, times the share of it that the kinds so far did compile: none where the kernels

@@ -12,11 +12,11 @@ on results still to come is laid out by those of an earlier run where there was 
 known (``Result.unknown``).
 
 What a stage raises is not tried again (but for ``OSError``: :mod:`rille.pipeline.engine.task`), and what depends on it
-is skipped. Where the data do not determine an answer
-(:class:`~rille.stages.core.errors.DegenerateError`) everything else finishes: the run has a hole. After any other error
-nothing new is begun, unless with ``keep_going``. An artifact that is found damaged, or gone, when a task reads it is
-computed again, and the task after it. A task that kills its worker process is tried three times. In every case the
-ledger has one line for each node that is missing, with the reason.
+is skipped. Where the data do not determine an answer (:class:`~rille.stages.core.errors.DegenerateError`) everything
+else finishes: the run has a hole. After any other error nothing new is begun, unless with ``keep_going``. An artifact
+that is found damaged, or gone, when a task reads it is computed again, and the task after it. A task that kills its
+worker process is tried three times. In every case the ledger has one line for each node that is missing, with the
+reason.
 """
 
 from __future__ import annotations

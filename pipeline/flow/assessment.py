@@ -1,4 +1,4 @@
-"""Estimates against truth: of a recorded sequence these tasks alone read it, and no estimate reads them.
+"""Estimates compared with truth: of a recorded sequence only these tasks read the truth, and no estimate reads them.
 
 ::
 

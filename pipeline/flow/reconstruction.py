@@ -23,15 +23,15 @@
 Frames that show no motion (black, of another scene, left and right exchanged) are lost: ``frame_screening`` finds them
 by their ``image_quality``, by motions and bridges over a lost frame, and by ``swap_check`` (left against right).
 
-A segment needs landmarks only relative to its own basic pair, so all are resected and refined at once (and refined
-again, where ``common_tilt`` finds a tilt of all disparities); ``trajectory`` chains them, and Locus then runs a second
-time, straight on the shared world lattice: nothing is resampled. With ``locus.both`` it reads the disparities of both
-images (``hfvm/back``). What depends on data (which pairs are basic, how far the world reaches) follows as results
+A segment needs landmarks only relative to its own basic pair, so all segments are resected and refined in parallel (and
+refined again if ``common_tilt`` finds a tilt of all disparities). ``trajectory`` chains them. Locus then runs a second
+time, directly on the shared world lattice, so nothing is resampled. With ``locus.both`` it reads the disparities of
+both images (``hfvm/back``). What depends on data (which pairs are basic, how far the world reaches) follows as results
 arrive: ``reconstruction`` is a generator that yields tasks and goes on with their results. Ports of single stages are
 in ``builders``, the leaves in ``assessment``; outputs are added last, by :mod:`rille.pipeline.runs.run_files`.
 
-The world is cut into tiles once and for all; a tile's task has those models alone as inputs that have a cell in it. A
-pair that is added, or moved by another pose, is merged anew in the tiles that it touches and touched, no others.
+The world is divided into fixed tiles. The task of a tile reads only the models that have a cell in it. If a pair is
+added or gets another pose, only the tiles that its model touches, or touched before, are merged again.
 """
 
 from __future__ import annotations

@@ -3,15 +3,15 @@
 A task is a future that depends on the futures of the tasks that make its inputs, so that the scheduler chains them
 without asking this process. They are submitted many at a time, as one graph; what became of each comes back as an event
 of dask, which costs a fraction of fetching a result. Measured with trivial tasks on two cores, all processes together:
-1.6 ms of processor a task so, 2.2 one by one with results fetched.
+1.6 ms of processor time a task, against 2.2 ms if tasks are submitted one by one and results are fetched.
 
-A worker that dies takes along what it was given, of which it ran one at most: all come back as not begun, and each of
-them is then submitted alone. Who is alone for the third time when its worker dies is the culprit, unless idle workers
-died with it: then somebody killed them all. (A scheduler of others counts as one death as many as its setting
-``distributed.scheduler.allowed-failures`` permits, and one more.) On this machine the
-workers are spawned, never forked; they never see Ctrl-C, end with this process, and speak TLS on the loopback with keys
-of this run alone, because whoever reaches a scheduler of dask can run code as its user. This process hosts that
-scheduler, and hands over to it what it has to say without any socket.
+If a worker dies, all tasks that it was given come back as not begun (it ran one at most), and each is then submitted
+alone. A task fails when a worker has died for the third time while it ran this task alone; a death does not count if
+idle workers died at the same time, because then somebody killed them all. (A scheduler of others reports a death only
+after one death more than its ``distributed.scheduler.allowed-failures``.) On this machine workers are spawned, never
+forked; they never see Ctrl-C, end with this process, and speak TLS on the loopback with keys of this run alone, because
+whoever reaches a scheduler of dask can run code as its user. This process hosts that scheduler, and hands over to it
+what it has to say without any socket.
 """
 
 from __future__ import annotations

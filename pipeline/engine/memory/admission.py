@@ -6,8 +6,8 @@ pass one that has to wait, but not for ever. One that does not fit even alone is
 it smaller. On a cluster given by address the memory is the workers' own business, unless a limit is given for all of
 it.
 
-Executors get more tasks than they run at a time, so that workers need not wait: what counts is the sum of the greatest
-so many of all that they have, whichever run together.
+Executors get more tasks than they run at a time, so that workers need not wait. Nobody knows which of them
+run together, so the sum takes the largest: as many as can run at a time, of all that the executor has.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Memory: how much may be used here, and how much a task took.
 
-The limit is what is free: of the machine, and of every control group (v1 or v2) that this process is in, whichever is
-least; what others hold is left to them, what the kernel can drop at once (page cache) counts as free.
+The limit is the free memory of the machine, or of a control group (v1 or v2) that this process is in, whichever is
+least. Memory that other processes hold is not free; memory that the kernel can drop at once (page cache) is.
 
 A :class:`Meter` reads the greatest resident memory of the process while a task runs. Linux lets a process set that mark
 back (``/proc/self/clear_refs``); elsewhere, or where several tasks share the process, nothing is measured.

@@ -2,8 +2,8 @@
 
 A hint beside the artifacts, ``index/<sequence>/<name>``, written at the end of a run: a gzip of lines, one for each
 artifact that it used, with the mark of its file (:class:`~rille.pipeline.engine.store.place.Item`) and what the
-manifest says of digest, sizes and facts. Where the mark is another one, or the index is damaged, the manifest is read
-as if there were no index. Clearing up spares what an index names that is younger than its grace.
+manifest says of digest, sizes and facts. If the mark differs, or the index is damaged, the manifest is read as if
+there were no index. Clearing up spares what an index names that is younger than its grace.
 """
 
 from __future__ import annotations
