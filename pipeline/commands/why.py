@@ -42,7 +42,8 @@ def describe(run: Path, label: str, store: Store) -> Iterable[str]:
     yield from _inputs(row, {r["label"]: r for r in rows})
     if made is None:
         if "key" in row and row["status"] in ("computed", "cached"):
-            yield f"artifact      {row['key'][:SHORT]} has gone from {store.root}: parameters and code are not known"
+            gone = f"{row['key'][:SHORT]} has gone from {store.root}, or the run used another cache (--cache)"
+            yield f"artifact      {gone}: parameters and code are not known"
         return
     yield from _recipe(made)
     yield from _since(run, row, made, store)

@@ -7,6 +7,7 @@ would set the terminal's title, hide lines, or move the cursor over a complaint;
 from __future__ import annotations
 
 import json
+import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
@@ -66,5 +67,10 @@ def some(names: Sequence[str], most: int) -> str:
 @contextmanager
 def plain_output() -> Iterator[None]:
     """Everything that is printed within is plain."""
-    with redirect_stdout(PlainStream(sys.stdout)), redirect_stderr(PlainStream(sys.stderr)):
+    with redirect_stdout(PlainStream(_open(sys.stdout))), redirect_stderr(PlainStream(_open(sys.stderr))):
         yield
+
+
+def _open(stream: TextIO | None) -> TextIO:
+    """The stream, or one that leads nowhere: a shell's ``>&-`` leaves none."""
+    return open(os.devnull, "w", encoding="utf-8") if stream is None else stream

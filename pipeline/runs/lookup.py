@@ -71,7 +71,9 @@ def describe(chosen: Iterable[Path]) -> Iterator[str]:
         facts = events.facts(run / LEDGER)
         seconds = facts.get("total", facts.get("seconds"))
         missing = ended["failed"] + ended["skipped"]
-        state = "interrupted" if "ok" not in facts else f"{missing} missing" if missing else "complete"
+        # "ok": all tasks have ended; "total": the files and the report are written, too.
+        whole = "complete" if "total" in facts else "interrupted"
+        state = "interrupted" if "ok" not in facts else f"{missing} missing" if missing else whole
         took = "" if seconds is None else f"{seconds:.1f}"
         yield f"{name(run):44s} {state:12s} {ended['computed']:8d} {ended['cached']:8d} {took:>8s}"
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import platform
 from collections.abc import Iterator
 from pathlib import Path
 
-from rille.pipeline.engine.failures import reported
+from rille.pipeline.engine.failures import CLOSED, reported
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.folder import StoreError
@@ -17,7 +18,7 @@ FOLDER = "roots"
 
 
 def note(store: Store, runs: Path) -> None:
-    """Remember a folder of runs, once."""
+    """Remember a folder of runs, once; a cache that may only be read is used without a note."""
     folder = str(runs.resolve())
     # By machine and folder: a shared cache has users on several, and each notes itself once.
     named = hashlib.sha256(f"{platform.node()}\0{folder}".encode()).hexdigest()[:16]
@@ -25,7 +26,12 @@ def note(store: Store, runs: Path) -> None:
     if path.exists():
         return
     with reported("RIL-741", f"cannot write in {store.root}", remedy="check --cache", kind=StoreError):
-        atomic.write(path, json.dumps({"folder": folder, "host": platform.node()}))
+        try:
+            atomic.write(path, json.dumps({"folder": folder, "host": platform.node()}))
+        except OSError as error:
+            # A run that finds everything needs no more; any other is refused by the store, which knows better words.
+            if error.errno not in (*CLOSED, errno.ENOTDIR, errno.EEXIST):
+                raise
 
 
 def folders(store: Store, runs: Path) -> list[Path]:

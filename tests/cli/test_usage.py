@@ -173,3 +173,10 @@ def test_a_reader_that_has_gone_is_no_traceback() -> None:
     done = subprocess.run([str(RILLE), "datasets", "list"], check=False, text=True, **given)
     os.close(writer)
     assert (done.returncode, done.stderr) == (1, "")
+
+
+def test_closed_streams_lead_nowhere() -> None:
+    done = subprocess.run(f"'{RILLE}' datasets list >&-", check=False, shell=True, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    done = subprocess.run(f"'{RILLE}' datasets lst 2>&-", check=False, shell=True, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "")

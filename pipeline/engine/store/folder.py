@@ -120,11 +120,25 @@ class Folder:
                 self._prune(path)
 
     def clear(self, items: Iterable[Item]) -> None:
-        """Remove files as :meth:`delete` does, but those that somebody used or changed since they were listed."""
+        """Remove files as :meth:`delete` does, but those that somebody used or changed since they were listed.
+
+        Raises
+        ------
+        StoreError
+            This user may not remove some of them; all others are gone.
+        """
+        refused: OSError | None = None
         for item in items:
-            with suppress(OSError):
+            try:
                 atomic.remove(self.root / item.path, item.modified)
+            except OSError as error:  # another error: somebody else cleared it away
+                refused = error if error.errno in CLOSED else refused
+                continue
+            with suppress(OSError):
                 self._prune(item.path)
+        if refused is not None:
+            with self._clear_errors():
+                raise refused
 
     def _prune(self, path: str) -> None:
         for above in list(Path(path).parents)[:-2]:  # the areas themselves stay

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -14,6 +15,7 @@ from toys import chain
 from rille.pipeline.commands import cache
 from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.maintenance import artifacts
 from rille.pipeline.runs import pins, roots
@@ -63,3 +65,36 @@ def test_a_pin_alone_is_enough_to_clear_the_rest(used, tmp_path):
     pins.pin(used, tmp_path / "work" / "runs" / "toy" / "1")
     shutil.rmtree(tmp_path / "work")
     assert collect(used, tmp_path / "elsewhere") == 9
+
+
+def test_a_cache_that_may_only_be_read_is_used_without_a_note(used, tmp_path, monkeypatch):
+    def fail(number: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    for refused in (errno.EACCES, errno.EROFS, errno.ENOTDIR):
+        monkeypatch.setattr(atomic, "write", lambda *_, number=refused: fail(number))
+        roots.note(used, tmp_path / "mine")
+    monkeypatch.setattr(atomic, "write", lambda *_: fail(errno.ENOSPC))
+    with raises("RIL-741", "No space left"):
+        roots.note(used, tmp_path / "mine")
+
+
+def test_what_may_not_be_removed_is_no_success(used, tmp_path, monkeypatch):
+    owned, remove = next(used.root.glob("artifacts/*/*/*.zip")), atomic.remove
+
+    def refuse(path: Path, modified: float) -> None:
+        if path == owned:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        remove(path, modified)
+
+    graph, run = Graph(), tmp_path / "work" / "runs" / "toy" / "2"
+    chain.build(graph, seed=1)
+    run.mkdir()
+    scheduler.run(graph, used, scheduler.RunOptions(executor="inline", ledger=run / "ledger.jsonl"))
+    shutil.rmtree(run.parent / "1")
+    shutil.rmtree(used.root / "index", ignore_errors=True)  # written where a run took long enough
+    monkeypatch.setattr(atomic, "remove", refuse)
+    with raises("RIL-575", "Permission denied"):
+        collect(used, run.parents[1])
+    assert owned.exists()
+    assert len(list(artifacts(used))) == 10, "the others are gone"
