@@ -97,7 +97,12 @@ def judge(
     # Motions are those of the vehicle's middle, as the wheels report them, not of the camera, which a turn swings.
     key = RigidTransform.from_matrix(poses[0]) @ T_vehicle_left.inverse()
     steepest = params.max_tilt * float(vehicle["max_slope_deg"])
+    sensors = (("attitude", "inclinometer"), ("acceleration", "accelerometer"), ("slip", "wheel odometry"))
     for k in range(1, len(poses)):
+        for (kind, sensor), values in zip(sensors, readings, strict=True):
+            # NaN is beyond no threshold.
+            if not np.isfinite(values[k]).all():
+                return Verdict(k, kind, f"the {sensor} gives no reading")
         # Rounding may carry the cosine of a vehicle that is upright, or upside down, beyond 1.
         tilt = math.degrees(math.acos(np.clip((T_vehicle_left.rotation @ up[k])[2], -1.0, 1.0)))
         if tilt > steepest:

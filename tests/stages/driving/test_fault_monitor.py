@@ -56,6 +56,20 @@ def test_a_tilt_beyond_the_vehicles_stops() -> None:
     assert judged(up=up).stop is None
 
 
+@pytest.mark.parametrize(
+    ("name", "kind", "sensor"),
+    [
+        ("up", "attitude", "inclinometer"),
+        ("acceleration", "acceleration", "accelerometer"),
+        ("odometry", "slip", "wheel odometry"),
+    ],
+)
+def test_a_sensor_without_a_reading_stops(name: str, kind: str, sensor: str) -> None:
+    values = leg()[name].copy()
+    values[2] = np.nan
+    assert judged(**{name: values}) == Verdict(2, kind, f"the {sensor} gives no reading")
+
+
 def test_a_bump_stops() -> None:
     found = judged(acceleration=np.array([9.0, 0.1, 0.1, 0.1, 3.5]))
     assert (found.stop, found.kind) == (4, "acceleration")  # what came before the leg is not its own
