@@ -119,7 +119,7 @@ at rest, whose length is noise, it stays below."""
 def _unlike(view: RunView) -> list[str]:
     """Trajectory and crosscheck are not alike anywhere: no frame then stands out."""
     agreement = view.bundle(view.products.agreement)
-    figures = {} if agreement is None else agreement.meta["metrics"]
+    figures = {} if agreement is None else agreement.meta.get("metrics", {})
     rmse, length, share = (figures.get(name, {}).get("value") for name in ("rmse", "length", "share"))
     if share is None or share <= UNLIKE:
         return []
