@@ -84,18 +84,15 @@ def lay_out(graph: Any, paths: dict[str, Path], shape: tuple[int, int]) -> dict[
     return pyramids
 
 
-def table(graph: Any, ledger: Path, seconds: float) -> None:
+def table(graph: Any, seconds: float) -> None:
     """One line a step: tasks, processor seconds, greatest memory of a process until its end."""
     steps = defaultdict(list)
-    from rille.pipeline.engine import events
-
-    rows = {row["label"]: row for row in events.read(ledger) if row["status"] == "computed"}
     for handle in graph.nodes:
-        if handle.label in rows:
-            steps[handle.spec.args.get("step", handle.stage)].append(rows[handle.label])
-    for step, took in steps.items():
-        peak, total = max(row["peak_rss"] for row in took) / 1e6, sum(row["seconds"] for row in took)
-        print(f"{step:12s} {len(took):4d} tasks {total:8.1f} s   process {peak:6.0f} MB", flush=True)
+        if handle.status == "computed":
+            steps[handle.spec.args.get("step", handle.stage)].append(handle)
+    for step, handles in steps.items():
+        peak, total = max(h.took.peak_rss for h in handles) / 1e6, sum(h.took.seconds for h in handles)
+        print(f"{step:12s} {len(handles):4d} tasks {total:8.1f} s   process {peak:6.0f} MB", flush=True)
     print(f"elapsed {seconds:.0f} s", flush=True)
 
 
@@ -116,15 +113,12 @@ def judge(store: Any, ref: Any, shape: tuple[int, int]) -> None:
     )
 
 
-def run(graph: Any, store: Any, jobs: int) -> None:
-    """Run a graph, and print its :func:`table`."""
+def run(graph: Any, store: Any, jobs: int) -> float:
     from rille.pipeline.engine import scheduler
 
-    with tempfile.TemporaryDirectory() as folder:
-        ledger = Path(folder) / "ledger.jsonl"
-        result = scheduler.run(graph, store, scheduler.RunOptions(jobs=jobs, ledger=ledger))
-        result.check()
-        table(graph, ledger, result.seconds)
+    result = scheduler.run(graph, store, scheduler.RunOptions(jobs=jobs))
+    result.check()
+    return float(result.seconds)
 
 
 def main() -> None:
@@ -151,7 +145,7 @@ def main() -> None:
         paths = make_pair(Path(folder), shape)
         graph = Graph()
         lay_out(graph, paths, shape)
-        run(graph, store, options.jobs)
+        table(graph, run(graph, store, options.jobs))
         side = tiles.side(tiles.Tiling(tile=options.tile, memory=options.memory), params, (shape, shape))
         print(f"{shape[1]} x {shape[0]}, preset {options.preset}, tiles of {side}", flush=True)
         graph = Graph()
@@ -165,10 +159,10 @@ def main() -> None:
             other = Graph()
             args = (params, PyramidParams(), lay_out(other, paths, shape), (shape, shape), side, "hfvm")
             tiled = tiles.Tiles(other, *args).build()
-            run(other, store, options.jobs)
+            table(other, run(other, store, options.jobs))
             judge(store, tiled.ref, shape)
         if whole is not None:
-            run(graph, store, 1)
+            table(graph, run(graph, store, 1))
             same = side is None or whole.ref.digest == tiled.ref.digest
             print("digests are equal" if same else "DIGESTS DIFFER")
 

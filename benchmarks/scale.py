@@ -264,7 +264,7 @@ class Watch(threading.Thread):
 
 def measure(pairs: int, cache: str, executor: str, jobs: int, what: str) -> dict[str, Any]:
     """One cold run, one plan of what is cached, or one warm run a day later, in this process."""
-    from rille.pipeline.engine import events, scheduler
+    from rille.pipeline.engine import scheduler
     from rille.pipeline.engine.code_digest import tree_digest
     from rille.pipeline.engine.store.base import Store
 
@@ -285,7 +285,7 @@ def measure(pairs: int, cache: str, executor: str, jobs: int, what: str) -> dict
     watch.stop()
     cpu -= watch.own
     n = len(graph.nodes)
-    processor = sum(row.get("kernel", 0.0) for row in events.read(ledger))
+    processor = sum(h.took.kernel for h in graph.nodes)
     return {
         "nodes": n,
         "computed": result.total().computed,

@@ -37,7 +37,7 @@ from rille.pipeline.engine.events import Ledger
 from rille.pipeline.engine.executors.base import Executor, Failed, Given, NotBegun, Task, light, make
 from rille.pipeline.engine.executors.base import known as check
 from rille.pipeline.engine.failures import translated
-from rille.pipeline.engine.graph import Expansion, Graph, Handle, Took
+from rille.pipeline.engine.graph import Expansion, Graph, Handle
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.memory import cost_model
 from rille.pipeline.engine.memory.admission import Admission, Waiting, account, largest
@@ -560,8 +560,6 @@ class _Run:
             self.progress.resolved(handle)
         else:  # healed: it counts once, as what became of it last
             setattr(counts, before, getattr(counts, before) - 1)
-        if status == "computed" and handle.took.memory is None:
-            handle.took = Took(handle.took.seconds)  # the ledger has the rest, and the cost model asks for memory alone
         for dependant in self.dependants.pop(handle.index, []):
             self.waits[dependant.index] -= 1
             if not self.waits[dependant.index]:

@@ -82,10 +82,6 @@ class Track:
         return np.asarray(np.isfinite(self.left).all(axis=1))
 
 
-LEAST_CELLS = 100
-"""Common cells below which a median says little."""
-
-
 @dataclass(frozen=True)
 class Difference:
     """Elevation of the model of ``pair`` minus that of ``before``, in the world, over their common cells, m.
@@ -322,7 +318,7 @@ def _difference(view: RunView, before: int, pair: int) -> Difference | None:
     )
     difference, expected = z[1] - z[0], np.hypot(*sigma)
     cells = int(np.isfinite(difference).sum())
-    if cells < LEAST_CELLS:
+    if cells < ranges.FEW:
         return None
     sampled = ranges.sample(difference)
     median = float(np.median(sampled))

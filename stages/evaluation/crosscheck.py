@@ -211,7 +211,7 @@ def _run(params: CrosscheckParams, args: Mapping[str, Any], inputs: Inputs) -> B
     with pycolmap.Database.open(":memory:") as database:
         cameras = _write_rig(database, rig)
         verified = _write_frames(database, cameras, features, params)
-        models = _models(database, params, {k: v for (k, j), v in verified.items() if j == k + 1 and k % 2})
+        models = _models(database, params, verified)
     poses, observations = np.full((len(frames), 3, 4), np.nan), np.zeros(len(frames), np.int32)
     meta: dict[str, Any] = {
         "frames": frames,
@@ -304,11 +304,13 @@ def _write_frames(
     return verified
 
 
-def _models(database: Any, params: CrosscheckParams, stereo: dict[int, int]) -> list[Any]:
+def _models(database: Any, params: CrosscheckParams, verified: dict[tuple[int, int], int]) -> list[Any]:
     """Models, each begun with the best stereo pair that no model holds yet, as long as it might become the greatest.
 
-    ``stereo``: verified matches with the right image, by number of the left one.
+    ``verified``: number of matches of each image pair (:func:`image_pairs`).
     """
+    # Pairs of one camera lie an even number of images apart.
+    stereo = {left: count for (left, other), count in verified.items() if other == left + 1}
     models, left, most = [], set(stereo), 0
     while len(left) > most:
         start = max(left, key=lambda number: (stereo[number], -number))
