@@ -9,7 +9,8 @@ the first.
 
 A point that is lost keeps its predicted position and may be found again. Buckets of the image that have run empty get
 new points at intermediate frames; such a point is looked up backwards in the key frame, where its coordinates are
-known, and dropped if it is not found there.
+known, and dropped if it is not found there. Where the exposure changes, it is undone first
+(:mod:`rille.stages.odometry.exposure`).
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ from rille.stages.core.declare import Array, Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.odometry.affine_lk import HALF, Templates, align
-from rille.stages.odometry.affinity import NEIGHBOURS, fit_affinity, known, known_median
+from rille.stages.odometry.affinity import NEIGHBOURS, fit_affinity, known
+from rille.stages.odometry.exposure import levelled
+from rille.stages.odometry.level_displacements import LevelDisplacements
 from rille.stages.odometry.moravec import clear_of_mask, interest_points
 from rille.stages.odometry.point_search import match_points
 
@@ -71,15 +74,6 @@ class TrackParams(Params):
 
 
 @dataclass(frozen=True)
-class LevelDisplacements:
-    """Coarse displacements (rows, cols) of a pyramid level, in level 0 pixels, NaN undefined."""
-
-    column: Floats32
-    row: Floats32
-    level: int
-
-
-@dataclass(frozen=True)
 class Tracks:
     """``points`` (n, frames, 2) column, row, NaN lost; ``birth`` (n,) frame index; ``distance`` (n, frames), NaN."""
 
@@ -103,6 +97,7 @@ def track(frames: Sequence[Pyramid], motions: Sequence[LevelDisplacements], para
     """
     if len(motions) != len(frames) - 1:
         raise InputError("RIL-447", f"{len(frames)} frames need {len(frames) - 1} motions, not {len(motions)}")
+    frames = levelled(frames, motions)
     first = frames[0]
     seeds = interest_points(first.images[0], first.valid[0], params.points, noise=params.noise, border=BORDER)
     state = _State.born(seeds.astype(np.float64), 0, len(frames))
@@ -142,7 +137,7 @@ class _State:
 
 def _advance(state: _State, frames: Sequence[Pyramid], motion: LevelDisplacements, j: int, params: TrackParams) -> None:
     """Find all points of frame j - 1 in frame j."""
-    predicted = state.expected + displacement_at(motion, state.expected)
+    predicted = state.expected + motion.at(state.expected)
     # A template is drawn under the affinity of its surroundings, from the coarse displacements, which outliers do not
     # pull.
     smooth, _ = fit_affinity(state.expected, predicted, known(predicted), state.expected)
@@ -202,22 +197,6 @@ def _align(
     )
     good = clear_of_mask(b.valid[0], place, HALF)
     return np.where(good[:, None], place, np.nan), np.where(good, error, np.nan)
-
-
-def displacement_at(motion: LevelDisplacements, points: Floats) -> Floats:
-    """Coarse displacement (n, 2) at points (n, 2), pixels: median of the defined ones among 3 x 3; NaN none."""
-    k = 0.5**motion.level
-    rows, cols = motion.column.shape
-    # Pixel of the coarse level that holds the point: edges lie half a pixel before the centres.
-    centre = np.floor((np.nan_to_num(points) + 0.5) * k).astype(np.intp)
-    dy, dx = (o.ravel() for o in np.mgrid[-1:2, -1:2])
-    y, x = np.clip(centre[:, 1:] + dy, 0, rows - 1), np.clip(centre[:, :1] + dx, 0, cols - 1)
-    both = np.stack([motion.column[y, x], motion.row[y, x]], -1).astype(np.float64)
-    there = np.asarray(np.isfinite(both).all(axis=-1))
-    count = there.sum(axis=1)
-    both = np.where(there[..., None], both, np.nan)
-    value = np.stack([known_median(both[..., k], count) for k in range(2)], axis=-1)
-    return np.where(known(points)[:, None], value, np.nan)
 
 
 def _run(params: TrackParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

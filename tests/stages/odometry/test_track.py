@@ -9,11 +9,11 @@ from raising import raises
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.imaging.pyramid import PyramidParams, build
 from rille.stages.odometry.affinity import common_similarity, fit_affinity, known_median
+from rille.stages.odometry.exposure import log_ratio
+from rille.stages.odometry.level_displacements import LevelDisplacements
 from rille.stages.odometry.track import (
     STAGE,
-    LevelDisplacements,
     TrackParams,
-    displacement_at,
     track,
 )
 
@@ -146,7 +146,7 @@ def test_displacement_is_looked_up_at_the_pixel_centre_of_the_coarse_level():
     motion = LevelDisplacements(column, np.arange(25, dtype=np.float32).reshape(5, 5), 2)
     # Coarse pixel 2 reaches from 7.5 to 11.5.
     at = np.array([[7.6, 7.6], [1.5, 1.5], [np.nan, 3.0]])
-    found = displacement_at(motion, at)
+    found = motion.at(at)
     np.testing.assert_array_equal(found[0], [7.0, 12.0])  # median of the eight neighbours of row value 12
     assert found[1, 0] == 7.0
     assert np.isnan(found[2]).all()
@@ -282,3 +282,36 @@ def test_median_of_what_is_known_is_numpys():
     assert np.isnan(found[3])
     rest = known > 0
     np.testing.assert_array_equal(found[rest], np.nanmedian(values[rest], axis=1))
+
+
+def test_points_are_found_in_frames_of_other_exposure():
+    frames, places = sequence([1.0, 1.0, 1.0, 1.0], [(0, 0), (5.3, -2.6), (9.1, -6.2), (13.0, -9.0)])
+    bright = [1.0, 1.4, 0.6, 1.05]
+    other = [
+        build(np.clip(frame.images[0] * np.float32(factor), 0, 255), PyramidParams(levels=4))
+        for frame, factor in zip(frames, bright, strict=True)
+    ]
+    same, found = (track(f, motions(places, error=1.5), PARAMS) for f in (frames, other))
+    known = [np.isfinite(t.points[..., 0]).sum(axis=0) for t in (same, found)]
+    assert (known[1][1:] > 0.9 * known[0][1:]).all()
+    assert np.nanmedian(errors(found, places)[:, 1:]) < 0.03
+
+
+@pytest.mark.parametrize("level", [0, 2])
+def test_the_ratio_of_brightness_is_that_of_the_pixels_that_displacements_connect(level):
+    frames, _ = sequence([1.0, 1.0], [(0, 0), (8.0, -4.0)], noise=0.0)
+    shape = [n >> level for n in (ROWS, COLS)]
+    motion = LevelDisplacements(np.full(shape, 8.0, np.float32), np.full(shape, -4.0, np.float32), level)
+    darker = build(frames[1].images[0] * np.float32(0.7), PyramidParams(levels=4))
+    assert log_ratio(frames[0], darker, motion) == pytest.approx(np.log(0.7), abs=1e-5)
+    assert log_ratio(darker, frames[0], LevelDisplacements(-motion.column, -motion.row, level)) == pytest.approx(
+        -np.log(0.7), abs=1e-5
+    )
+
+
+def test_too_few_displacements_tell_no_brightness():
+    frames, _ = sequence([1.0, 1.0], [(0, 0), (0, 0)])
+    few = np.full((ROWS // 4, COLS // 4), np.nan, np.float32)
+    few[0, :99] = 0.0
+    darker = build(frames[1].images[0] * np.float32(0.5), PyramidParams(levels=4))
+    assert log_ratio(frames[0], darker, LevelDisplacements(few, few, 2)) == 0.0
