@@ -44,8 +44,7 @@ def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
     LEFT.R and RIGHT.P (rectification, as ORB-SLAM2 keeps it) are read too.
     """
     sides = next((left, right) for left, right in SIDES if left[0] in f and right[0] in f)
-    size = _size(f)
-    lenses = [_lens(f, matrix, distortion, size) for matrix, distortion in sides]
+    lenses = [_lens(f, *keys, _size(f, str(k))) for k, keys in enumerate(sides, start=1)]
     poses: tuple[RigidTransform | None, RigidTransform | None]
     if "RIGHT.P" in f and "LEFT.R" in f:
         poses = _unrectified(f, "LEFT.R", "LEFT.P"), _unrectified(f, "RIGHT.R", "RIGHT.P")
@@ -88,8 +87,9 @@ def _lens(f: Fields, matrix: str, distortion: str, size: tuple[int, int]) -> Len
     return f.lens(distortion or matrix, camera, model, coefficients)
 
 
-def _size(f: Fields) -> tuple[int, int]:
-    for key in ("image_size", "imageSize", "resolution"):
+def _size(f: Fields, side: str = "") -> tuple[int, int]:
+    """Width and height; ``side``: 1 left, 2 right, whose sizes ``rille calibrate`` writes apart if they differ."""
+    for key in (f"image_size{side}", "image_size", "imageSize", "resolution"):
         if key in f:
             return f.pair_of_pixels(key)
     width = next((key for key in WIDTHS if key in f), WIDTHS[0])

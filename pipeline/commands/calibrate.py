@@ -23,7 +23,7 @@ from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
-from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig
+from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, Sizes, calibrate_rig
 from rille.stages.core.errors import InputError, told
 
 LEAST_COVER = 0.5
@@ -47,10 +47,10 @@ hand by many."""
 
 @dataclass
 class Boards:
-    """Boards found in the images: ``views``, and in ``left_out`` name and reason of the pairs that cannot be used."""
+    """Boards found in the images of two sizes: ``views``, and in ``left_out`` name and reason of pairs of no use."""
 
     corners: tuple[int, int]
-    size: tuple[int, int]
+    sizes: Sizes
     views: list[BoardView] = field(default_factory=list)
     left_out: list[tuple[str, str]] = field(default_factory=list)
 
@@ -89,7 +89,7 @@ def calibrate(
     chessboard.board_points((3, 3), square)  # a wrong unit is told before minutes of detection
     boards = find_boards(pairing.pair_up(*_files(left, right)), given)
     points = chessboard.board_points(boards.corners, square)
-    found = calibrate_rig(points, boards.views, boards.size, model, keep_bad=keep_bad)
+    found = calibrate_rig(points, boards.views, boards.sizes, model, keep_bad=keep_bad)
     _refuse_clutter(found, boards)
     with reported("RIL-012", f"cannot write {output}", remedy="choose another --output"):
         output.write_text(_yaml(found, boards, square), encoding="utf-8")
@@ -133,27 +133,20 @@ def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | N
     Raises
     ------
     InputError
-        An image cannot be read, left and right ones differ in size, or too few pairs show a board of one size.
+        An image cannot be read, or too few pairs show a board of one size.
     """
     images = {p.name: [chessboard.eight_bit(read_grey(f)) for f in (p.left, p.right)] for p in pairs}
-    sizes = Counter((i.shape[1], i.shape[0]) for both in images.values() for i in both)
+    sizes = {name: (_size(left), _size(right)) for name, (left, right) in images.items()}
     # One picture of another size is a slip; the others still calibrate.
-    size = max(sizes, key=lambda s: (sizes[s], s))
-    fit = {n: both for n, both in images.items() if all((i.shape[1], i.shape[0]) == size for i in both)}
-    if not fit:
-        name, both = next(iter(images.items()))
-        left, right = (f"{i.shape[1]} x {i.shape[0]}" for i in both)
-        raise InputError(
-            "RIL-960",
-            f"left and right images differ in size: view {name} has {left} and {right} pixels",
-            remedy="give pictures of one size, as the cameras will have when they are used",
-        )
+    usual = Counter(sizes.values()).most_common(1)[0][0]
+    fit = {name: both for name, both in images.items() if sizes[name] == usual}
     if corners is None:
         corners = chessboard.find_size(image for both in fit.values() for image in both)
-    out = Boards(corners, size)
+    out = Boards(corners, usual)
     for name, both in images.items():
         if name not in fit:
-            out.left_out.append((name, f"its images are not {size[0]} x {size[1]} pixels as most are"))
+            most = " and ".join(f"{width} x {height}" for width, height in dict.fromkeys(usual))
+            out.left_out.append((name, f"its images are not {most} pixels as most are"))
             continue
         points = [chessboard.find_corners(image, corners) for image in both]
         missing = [side for side, p in zip(("left", "right"), points, strict=True) if p is None]
@@ -175,6 +168,11 @@ def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | N
             "inner corners are one fewer than squares, along each side",
         )
     return out
+
+
+def _size(image: NDArray[np.uint8]) -> tuple[int, int]:
+    """Width and height."""
+    return image.shape[1], image.shape[0]
 
 
 def _apart(a: BoardView, b: BoardView) -> float:
@@ -213,12 +211,12 @@ def doubts(found: RigCalibration, boards: Boards, model: str) -> list[str]:
     if found.rms > MANY_BAD_PX:
         text = f"corners miss by {found.rms:.2f} px RMS: is the board flat, are the images paired rightly?"
         lines.append(warning("RIL-696", text))
-    for side, lens in (("left", found.left), ("right", found.right)):
+    for side, lens, size in zip(("left", "right"), (found.left, found.right), boards.sizes, strict=True):
         share = found.sigma[f"{side} fx"] / lens.camera.fx
         if share > VAGUE_FOCAL:
             text = f"{side} focal length is known to {100 * share:.1f} % only; take views with the board tilted"
             lines.append(warning("RIL-697", text))
-        seen = cover([v.left if side == "left" else v.right for v in used], boards.size)
+        seen = cover([v.left if side == "left" else v.right for v in used], size)
         if seen < LEAST_COVER:
             text = f"the corners span {100 * seen:.0f} % of the {side} image; distortion beyond is a guess"
             lines.append(warning("RIL-698", text))
@@ -274,8 +272,13 @@ def _yaml(found: RigCalibration, boards: Boards, square: float) -> str:
     """The file's text: keys as OpenCV's stereo samples have them, then how it was found."""
     # In memory: the file is written by Python, whose errors say what is wrong.
     file = cv2.FileStorage("rig.yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
-    file.write("image_width", boards.size[0])
-    file.write("image_height", boards.size[1])
+    left, right = boards.sizes
+    if left == right:
+        file.write("image_width", left[0])
+        file.write("image_height", left[1])
+    else:
+        file.write("image_size1", np.array(left))
+        file.write("image_size2", np.array(right))
     file.write("distortion_model", found.left.model)
     for k, lens in ((1, found.left), (2, found.right)):
         file.write(f"M{k}", lens.camera.matrix)

@@ -246,7 +246,8 @@ def _exposure(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> 
             text = (
                 f"{camera} brightness jumps by {ratio[k]:.2f} from frame {names[frames[k]]} to {names[frames[k + 1]]}"
             )
-            out.append(doubt("RIL-652", text, "exposure", remedy="it is levelled, but what turns black or white is lost: fix the exposure if you can"))
+            remedy = "it is levelled, but what turns black or white is lost: fix the exposure if you can"
+            out.append(doubt("RIL-652", text, "exposure", remedy=remedy))
     both = [k for k in looks.get("left", {}) if k in looks.get("right", {})]
     if both and not out:
         pairs = [(looks["left"][k].mean, looks["right"][k].mean) for k in both]

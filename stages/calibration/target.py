@@ -30,6 +30,9 @@ MODELS: Mapping[str, tuple[str, ...]] = {
 }
 """Names of the coefficients of each model, in OpenCV's order; radtan4 is radtan without k3."""
 
+Sizes = tuple[tuple[int, int], tuple[int, int]]
+"""Width and height of the left and of the right images, pixels."""
+
 LEAST_VIEWS = 3
 """Two views determine a camera only just, and nothing would tell a bad one."""
 
@@ -95,7 +98,7 @@ class RigCalibration:
 
 
 def calibrate_rig(
-    board: Floats, views: Sequence[BoardView], size: tuple[int, int], model: str = "radtan", *, keep_bad: bool = False
+    board: Floats, views: Sequence[BoardView], sizes: Sizes, model: str = "radtan", *, keep_bad: bool = False
 ) -> RigCalibration:
     """Calibrate both cameras and their relative pose from views of a board.
 
@@ -103,7 +106,7 @@ def calibrate_rig(
     ----------
     board : (n, 3) corners in the board's own frame, z = 0, metres.
     views : at least ``LEAST_VIEWS``.
-    size : width and height of the images, pixels.
+    sizes : of the images, which may differ.
     model : one of ``MODELS``.
     keep_bad : use also views whose residuals are far above the others'.
 
@@ -119,13 +122,13 @@ def calibrate_rig(
     if model not in MODELS:
         raise ConfigError("RIL-308", f"distortion model {model!r} is unknown", remedy=f"one of {', '.join(MODELS)}")
     _enough(views)
-    task = Adjustment(board, tuple(views), size, model)
+    task = Adjustment(board, tuple(views), sizes, model)
     x = task.solve(task.start(), robust=True)
     first = task.residuals(x)
     # Half a pixel at least: where all views fit to a tenth, four tenths are still a good view.
     limit = max(BAD_PX, BAD_RATIO * float(np.median([r.worst for r in first])))
     good = [k for k, r in enumerate(first) if keep_bad or r.worst <= limit]
-    used = Adjustment(board, tuple(views[k] for k in good), size, model)
+    used = Adjustment(board, tuple(views[k] for k in good), sizes, model)
     _enough(used.views)
     # From the first solution, now without the bad views' poses.
     x = used.solve(np.concatenate([x[: used.shared], *(x[task.pose(k)] for k in good)]))
@@ -172,7 +175,7 @@ class Adjustment:
 
     board: Floats
     views: tuple[BoardView, ...]
-    size: tuple[int, int]
+    sizes: Sizes
     model: str
 
     @property
@@ -191,25 +194,25 @@ class Adjustment:
 
     def start(self) -> Floats:
         """Each camera on its own, and the relative pose that agrees best with those of all views."""
-        left, left_poses = self._alone([v.left for v in self.views])
-        right, right_poses = self._alone([v.right for v in self.views])
+        left, left_poses = self._alone(0, [v.left for v in self.views])
+        right, right_poses = self._alone(1, [v.right for v in self.views])
         between = [r @ ll.inverse() for ll, r in zip(left_poses, right_poses, strict=True)]
         middle = min(between, key=lambda T: sum(_apart(T, other) for other in between))
         return np.concatenate([left, right, *(_vector(T) for T in [middle, *left_poses])])
 
-    def _alone(self, points: list[Floats]) -> tuple[Floats, list[RigidTransform]]:
+    def _alone(self, side: int, points: list[Floats]) -> tuple[Floats, list[RigidTransform]]:
         boards = [self.board.astype(np.float32).reshape(1, -1, 3)] * len(points)
         flat = [p.astype(np.float32).reshape(1, -1, 2) for p in points]
-        threads = cv2.getNumThreads()
+        size, threads = self.sizes[side], cv2.getNumThreads()
         # Threads add up the views in any order: the last digits, and so the keys of all that uses the rig, would vary.
         cv2.setNumThreads(1)
         try:
             if self.model == "fisheye":
                 flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
-                out = cv2.fisheye.calibrate(boards, flat, self.size, np.zeros((3, 3)), np.zeros(4), flags=flags)
+                out = cv2.fisheye.calibrate(boards, flat, size, np.zeros((3, 3)), np.zeros(4), flags=flags)
             else:
                 flags = {"rational": cv2.CALIB_RATIONAL_MODEL, "radtan4": cv2.CALIB_FIX_K3}.get(self.model, 0)
-                out = cv2.calibrateCamera(boards, flat, self.size, None, None, flags=flags)
+                out = cv2.calibrateCamera(boards, flat, size, None, None, flags=flags)
         except cv2.error as error:
             raise DegenerateError(
                 "RIL-311", UNDETERMINED, remedy=f"{MORE_VIEWS}, or a model with fewer coefficients"
@@ -288,13 +291,13 @@ class Adjustment:
 
     def lenses(self, x: Floats) -> tuple[Lens, Lens]:
         """Left and right lens."""
-        left, right = (self._lens(x[k * self.lens : (k + 1) * self.lens]) for k in range(2))
+        left, right = (self._lens(k, x[k * self.lens : (k + 1) * self.lens]) for k in range(2))
         return left, right
 
-    def _lens(self, x: Floats) -> Lens:
+    def _lens(self, side: int, x: Floats) -> Lens:
         fx, fy, cx, cy, *coefficients = (float(v) for v in x)
         name = "radtan" if self.model == "radtan4" else self.model
-        return Lens(Camera(fx, fy, cx, cy, *self.size), name, tuple(coefficients))
+        return Lens(Camera(fx, fy, cx, cy, *self.sizes[side]), name, tuple(coefficients))
 
     def rig(self, x: Floats) -> Rig:
         """The rig with the cameras' pinhole parts."""

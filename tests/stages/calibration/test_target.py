@@ -10,6 +10,7 @@ from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 SIZE = (640, 480)
+SIZES = (SIZE, SIZE)
 ROWS, COLUMNS = np.indices((6, 9))
 BOARD = 0.03 * np.stack([COLUMNS, ROWS, np.zeros(ROWS.shape)], axis=-1).reshape(-1, 3)
 LENSES = {
@@ -30,7 +31,7 @@ def scene(model: str, count: int = 10, noise: float = 0.0, rig: RigidTransform =
         tilt = rng.uniform(-0.6, 0.6, 3)
         away = np.array([rng.uniform(-0.15, 0.05), rng.uniform(-0.12, -0.03), rng.uniform(0.35, 0.6)])
         pose = np.concatenate([tilt, away])
-        task = Adjustment(BOARD, (), SIZE, model)
+        task = Adjustment(BOARD, (), SIZES, model)
         T = rig @ RigidTransform(rotation_exp(tilt), away)
         other = np.concatenate([cv2.Rodrigues(T.rotation)[0].ravel(), T.translation])
         zero = np.zeros((len(BOARD), 2))
@@ -44,7 +45,7 @@ def scene(model: str, count: int = 10, noise: float = 0.0, rig: RigidTransform =
 
 @pytest.mark.parametrize("model", sorted(LENSES))
 def test_exact_corners_give_the_rig_back(model):
-    found = calibrate_rig(BOARD, scene(model), SIZE, model)
+    found = calibrate_rig(BOARD, scene(model), SIZES, model)
     assert found.rms < 1e-4  # corners enter OpenCV's start as float32, but not the adjustment
     for lens, true in zip((found.left, found.right), LENSES[model], strict=True):
         got = [lens.camera.fx, lens.camera.fy, lens.camera.cx, lens.camera.cy]
@@ -54,13 +55,20 @@ def test_exact_corners_give_the_rig_back(model):
     assert max(r.epipolar for r in found.residuals) < 1e-3
 
 
+def test_cameras_of_two_sizes_each_keep_their_own():
+    found = calibrate_rig(BOARD, scene("radtan4"), ((640, 480), (1280, 720)), "radtan4")
+    assert [(lens.camera.width, lens.camera.height) for lens in (found.left, found.right)] == [(640, 480), (1280, 720)]
+    # The right camera's start is another, from the centre of the larger image; its optimum is the same.
+    assert found.right.camera.cx == pytest.approx(316.0, abs=1e-2)
+
+
 def test_threads_do_not_change_a_bit():
     """A rig that differs in its last digits would have all that depends on it computed anew."""
     threads = cv2.getNumThreads()
     try:
         cv2.setNumThreads(4)
         views = tuple(scene("radtan", 30, noise=0.2))
-        starts = {Adjustment(BOARD, views, SIZE, "radtan").start().tobytes() for _ in range(6)}
+        starts = {Adjustment(BOARD, views, SIZES, "radtan").start().tobytes() for _ in range(6)}
         assert cv2.getNumThreads() == 4
     finally:
         cv2.setNumThreads(threads)
@@ -71,7 +79,7 @@ def test_threads_do_not_change_a_bit():
 def test_jacobian_against_central_differences(model):
     lenses = LENSES.get(model) or tuple((*lens, 0.02, 0.01, 0.003) for lens in LENSES["radtan"])
     views = tuple(BoardView("v", v.left, v.right) for v in scene("radtan4", 2))
-    task = Adjustment(BOARD, views, SIZE, model)
+    task = Adjustment(BOARD, views, SIZES, model)
     rng = np.random.default_rng(1)
     poses = [np.concatenate([rng.uniform(-0.3, 0.3, 3), [-0.1, -0.05, 0.5]]) for _ in views]
     between = np.concatenate([[0.01, -0.02, 0.03], [-0.12, 0.0, 0.01]])
@@ -91,13 +99,13 @@ def test_claimed_errors_are_those_that_noise_makes():
     standard deviations of the mean square are 4 sqrt(2 / 300) = 0.33.
     """
     exact = scene("radtan4", 6)
-    true = Adjustment(BOARD, tuple(exact), SIZE, "radtan4")
+    true = Adjustment(BOARD, tuple(exact), SIZES, "radtan4")
     x = true.solve(true.start())
     squares = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
         pairs = [(p + 0.1 * rng.standard_normal(p.shape) for p in (v.left, v.right)) for v in exact]
-        noisy = Adjustment(BOARD, tuple(BoardView(f"v{k}", *p) for k, p in enumerate(pairs)), SIZE, "radtan4")
+        noisy = Adjustment(BOARD, tuple(BoardView(f"v{k}", *p) for k, p in enumerate(pairs)), SIZES, "radtan4")
         found = noisy.solve(x)
         rms, sigma = noisy.errors(found)
         pulls = (found - x)[: noisy.shared] / [sigma[name] for name in noisy.names()]
@@ -110,7 +118,7 @@ def test_claimed_errors_are_those_that_noise_makes():
 
 def test_agrees_with_opencv_on_one_rig():
     views = scene("radtan", 8, noise=0.1)
-    found = calibrate_rig(BOARD, views, SIZE, "radtan")
+    found = calibrate_rig(BOARD, views, SIZES, "radtan")
     boards = [BOARD.astype(np.float32)] * len(views)
     sides = [[getattr(v, side).astype(np.float32) for v in views] for side in ("left", "right")]
     alone = [cv2.calibrateCamera(boards, points, SIZE, None, None) for points in sides]
@@ -134,7 +142,7 @@ def spoiled(views: list[BoardView], k: int) -> list[BoardView]:
 
 def test_a_bad_view_is_named_and_left_out_and_does_no_harm():
     views = scene("radtan4", 10, noise=0.1)
-    good, bad = calibrate_rig(BOARD, views, SIZE, "radtan4"), calibrate_rig(BOARD, spoiled(views, 4), SIZE, "radtan4")
+    good, bad = calibrate_rig(BOARD, views, SIZES, "radtan4"), calibrate_rig(BOARD, spoiled(views, 4), SIZES, "radtan4")
     assert [r.name for r in bad.residuals if not r.used] == ["v4"]
     assert bad.residuals[4].worst > 2
     assert all(r.used for r in good.residuals)
@@ -144,7 +152,7 @@ def test_a_bad_view_is_named_and_left_out_and_does_no_harm():
 
 def test_a_bad_view_stays_where_that_is_asked_for():
     views = spoiled(scene("radtan4", 10, noise=0.1), 4)
-    kept = calibrate_rig(BOARD, views, SIZE, "radtan4", keep_bad=True)
+    kept = calibrate_rig(BOARD, views, SIZES, "radtan4", keep_bad=True)
     assert all(r.used for r in kept.residuals)
     assert kept.rms > 1
 
@@ -152,20 +160,20 @@ def test_a_bad_view_stays_where_that_is_asked_for():
 def test_what_cannot_be_calibrated_says_so():
     views = scene("radtan4", 6)
     with raises("RIL-309"):
-        calibrate_rig(BOARD, views[:2], SIZE, "radtan4")
+        calibrate_rig(BOARD, views[:2], SIZES, "radtan4")
     with raises("RIL-308"):
-        calibrate_rig(BOARD, views, SIZE, "barrel")
+        calibrate_rig(BOARD, views, SIZES, "barrel")
     swapped = [BoardView(v.name, v.right, v.left) for v in views]
     with raises("RIL-310"):
-        calibrate_rig(BOARD, swapped, SIZE, "radtan4")
+        calibrate_rig(BOARD, swapped, SIZES, "radtan4")
 
 
 def test_one_view_repeated_is_refused_or_its_vagueness_told():
     one = scene("radtan4", 1, noise=0.1)[0]
     again = [BoardView(f"v{k}", one.left, one.right) for k in range(5)]
-    found = calibrate_rig(BOARD, scene("radtan4", 10, noise=0.1), SIZE, "radtan4")
+    found = calibrate_rig(BOARD, scene("radtan4", 10, noise=0.1), SIZES, "radtan4")
     try:
-        vague = calibrate_rig(BOARD, again, SIZE, "radtan4")
+        vague = calibrate_rig(BOARD, again, SIZES, "radtan4")
     except DegenerateError:
         return
     assert vague.sigma["left fx"] > 5 * found.sigma["left fx"]
@@ -173,5 +181,5 @@ def test_one_view_repeated_is_refused_or_its_vagueness_told():
 
 def test_names_stand_for_all_shared_unknowns():
     for model in MODELS:
-        task = Adjustment(BOARD, (), SIZE, model)
+        task = Adjustment(BOARD, (), SIZES, model)
         assert len(task.names()) == task.shared == len(set(task.names()))
