@@ -322,7 +322,10 @@ def judge_epipolar(facts: Mapping[str, Any]) -> Finding:
         return doubt("RIL-661", str(facts.get("words", "not checked")), "epipolar", remedy="see the matching")
     before, after = float(facts["residual_before_px"]), float(facts["residual_after_px"])
     offset, roll = float(facts["row_offset"]), float(facts["roll_deg"])
-    words = f"row offset {offset:+.2f} px, roll {roll:+.3f} degrees, residual {before:.2f} px RMS, adjusted {after:.2f}"
+    words = (
+        f"off the epipolar lines {offset:+.2f} px, roll {roll:+.3f} degrees, residual {before:.2f} px RMS, "
+        f"adjusted {after:.2f}"
+    )
     if after > HOPELESS:
         remedy = "no rig explains these images; wrong calibration file, or lens distortion left in"
         return fault("RIL-662", words, "epipolar", remedy=remedy)

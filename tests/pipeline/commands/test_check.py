@@ -92,7 +92,7 @@ def test_rows_that_are_off_are_measured(tmp_path, capsys):
     text = line(lines, "epipolar")
     assert text.startswith("WARN")
     # the right image's content lies 3 px lower; matching on smooth texture errs by hundredths
-    assert float(text.split("row offset")[1].split()[0]) == pytest.approx(3.0, abs=0.1)
+    assert float(text.split("off the epipolar lines")[1].split()[0]) == pytest.approx(3.0, abs=0.1)
 
 
 def test_damaged_images_are_named_and_the_rest_is_looked_at(tmp_path, capsys, monkeypatch):
