@@ -85,14 +85,14 @@ def open_bag(path: Path, topics: str | None = None) -> Sequence:
         taken = {c: _images(reader, path, topic) for c, topic in zip(CAMERAS, chosen, strict=True)}
         cameras = [_camera(reader, path, topic) for topic in chosen]
         stamps, warnings = _common(path, chosen, *taken.values())
-        size = taken["left"][stamps[0]].size
-        for camera, topic in zip(CAMERAS, chosen, strict=True):
+        left, right = (taken[camera][stamps[0]].size for camera in CAMERAS)
+        for camera, topic, size in zip(CAMERAS, chosen, (left, right), strict=True):
             for stamp in stamps:
                 check_size(taken[camera][stamp].size, size, f"image {stamp} of {topic} in {path}")
         times, more = seconds(stamps, str(path), unit="ns")
         frame = taken["left"][stamps[0]].frame
         inertial, odometry, unused = _movement(reader, path, times, frame, cameras[0][1])
-    rig, lenses = rig_of(cameras[0][0], cameras[1][0], size[:2])
+    rig, lenses = rig_of(cameras[0][0], cameras[1][0], (left[:2], right[:2]))
 
     def image(number: int, camera: str) -> Source:
         one = taken[camera][stamps[number]]

@@ -18,7 +18,7 @@ from rille.datasets.cameras import CalibratedCamera, read_cameras, rig_of
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.text import parse_yaml
 from rille.datasets.images import files
-from rille.datasets.images.pairing import ImagePair, common_size
+from rille.datasets.images.pairing import ImagePair, common_headers
 from rille.datasets.imu import Inertial, at_frames, read_imu
 from rille.datasets.poses import coverage, interpolate, read_poses
 from rille.datasets.protocol import CAMERAS, Sequence, Source
@@ -111,14 +111,15 @@ def open_euroc(layout: EurocLayout, digests: files.Digests) -> Sequence:
         or IMU have no time in common with the images.
     """
     frames = list_frames(layout)
-    size = common_size(frames.pairs)
+    headers = common_headers(frames.pairs)
     cameras = {camera: _camera(layout.folder / name) for camera, name in FOLDERS.items()}
-    rig, lenses = rig_of(cameras["left"], cameras["right"], size[:2])
+    rig, lenses = rig_of(cameras["left"], cameras["right"], (headers[0][:2], headers[1][:2]))
     known = _movement(layout, frames.times, cameras["left"])
 
     def image(frame: int, camera: str) -> Source:
         pair = frames.pairs[frame]
-        return files.image_source(pair.left if camera == "left" else pair.right, frame, camera, size, digests)
+        path, header = (pair.left, headers[0]) if camera == "left" else (pair.right, headers[1])
+        return files.image_source(path, frame, camera, header, digests)
 
     inertial = known.inertial
     return Sequence(

@@ -17,10 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from rille.datasets.cameras import CalibratedCamera, read_cameras
-from rille.datasets.images.pairing import SIDES, SUFFIXES, common_size, natural, pair_up, side_of
+from rille.datasets.images.pairing import SIDES, SUFFIXES, common_headers, natural, pair_up, side_of
 from rille.datasets.poses import names_positions, read_positions
 from rille.datasets.text.reading import Search, read_lines
 from rille.stages.core.errors import InputError, RilleError
+from rille.stages.geometry.geometry import Sizes
 
 DEPTH = 4
 """Folders below the given one that are looked into; more is another data set."""
@@ -47,7 +48,7 @@ class FoundImages:
     ----------
     left, right : patterns relative to the folder.
     pairs : number of pairs.
-    size : width and height if all images have the same.
+    sizes : of the left and of the right images, if all of a side have the same.
     why : how left and right were recognised.
     trouble : why the images cannot be paired; empty if they can.
     stamped : whether the file names are times since an epoch.
@@ -57,7 +58,7 @@ class FoundImages:
     left: str
     right: str
     pairs: int
-    size: tuple[int, int] | None
+    sizes: Sizes | None
     why: str
     trouble: str = ""
     stamped: bool = False
@@ -72,10 +73,14 @@ class FoundCalibration:
     """
 
     files: tuple[str, ...]
-    size: tuple[int, int] | None
+    sizes: tuple[tuple[int, int] | None, tuple[int, int] | None]
     baseline: float | None
     cameras: int
     names: tuple[str, str] | None = None
+
+    def suits(self, sizes: Sizes | None) -> bool:
+        """Whether it is of images of these sizes, as far as both are known."""
+        return sizes is None or all(own in (None, size) for own, size in zip(self.sizes, sizes, strict=True))
 
 
 @dataclass
@@ -177,11 +182,12 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     # Most pairs first; of as many, the surest token (SIDES).
     key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0]))
     left, right = both[key]
-    size, trouble, pairs = None, "", 0
+    sizes, trouble, pairs = None, "", 0
     try:
         matched = pair_up(left, right)
         pairs = len(matched)
-        size = common_size(matched)[:2]
+        one, other = common_headers(matched)
+        sizes = one[:2], other[:2]
     except InputError as error:
         trouble = str(error)
     tokens = SIDES[key[0]]
@@ -189,7 +195,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         pattern(left, folder),
         pattern(right, folder),
         pairs,
-        size,
+        sizes,
         f"{len(left)} left and {len(right)} right images, told apart by {tokens[0]!r} and {tokens[1]!r}",
         trouble,
         all(STAMP.search(path.stem) for path in left),
@@ -248,9 +254,8 @@ def _find_calibration(found: Findings, texts: list[Path]) -> None:
     ]
     candidates += [_calibration((name,), [camera]) for name, camera in single.items()]
     if candidates:
-        size = found.views.size
         found.calibration = max(
-            candidates, key=lambda c: (c.size in (None, size), c.cameras, c.baseline is not None, -len(c.files))
+            candidates, key=lambda c: (c.suits(found.views.sizes), c.cameras, c.baseline is not None, -len(c.files))
         )
         found.others = [name for name in read if name not in found.calibration.files]
 
@@ -278,7 +283,7 @@ def _calibration(names: tuple[str, ...], cameras: list[CalibratedCamera]) -> Fou
     baseline = None
     if len(poses) == 2 and poses[0] is not None and poses[1] is not None:
         baseline = float(np.linalg.norm((poses[1] @ poses[0].inverse()).translation))
-    return FoundCalibration(names, cameras[0].size, baseline, len(cameras))
+    return FoundCalibration(names, (cameras[0].size, cameras[-1].size), baseline, len(cameras))
 
 
 # -- tables ------------------------------------------------------------------------------------------------------------

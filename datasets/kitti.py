@@ -28,7 +28,7 @@ from rille.datasets.text.names import derived_name
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.times import seconds
 from rille.stages.core.errors import InputError
-from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes
 
 PAIRS = (
     ("image_0", "image_1"),
@@ -193,13 +193,13 @@ def read_projections(path: Path, pair: tuple[str, str]) -> tuple[NDArray[np.floa
     return rows[0][1], rows[1][1]
 
 
-def read_rig(layout: KittiLayout, width: int, height: int) -> tuple[Rig, RigidTransform]:
-    """The rig, and T_reference_left (poses are those of the reference frame)."""
+def read_rig(layout: KittiLayout, sizes: Sizes) -> tuple[Rig, RigidTransform]:
+    """The rig of images of these sizes, and T_reference_left (poses are those of the reference frame)."""
     cameras, poses = [], []
-    for projection, name in zip(read_projections(layout.calib, layout.pair), layout.pair, strict=True):
+    for projection, name, size in zip(read_projections(layout.calib, layout.pair), layout.pair, sizes, strict=True):
         k, T_camera_reference = decompose(projection, name)
         fx, fy, cx, cy = (float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
-        cameras.append(Camera(fx, fy, cx, cy, width, height))
+        cameras.append(Camera(fx, fy, cx, cy, *size))
         poses.append(T_camera_reference)
     T_right_left = poses[1] @ poses[0].inverse()
     rig = Rig(cameras[0], cameras[1], T_right_left)
@@ -327,8 +327,9 @@ def open_kitti(layout: KittiLayout, digests: files.Digests) -> Sequence:
         A partner is missing, sizes or depths differ, a text file does not parse, or counts do not agree.
     """
     listing = list_pairs(layout)
-    paths, size = listing.paths, files.common_header([p for c in CAMERAS for p in listing.paths[c].values()])
-    rig, T_reference_left = read_rig(layout, size[0], size[1])
+    paths = listing.paths
+    headers = {camera: files.common_header(list(paths[camera].values())) for camera in CAMERAS}
+    rig, T_reference_left = read_rig(layout, (headers["left"][:2], headers["right"][:2]))
     truth: tuple[RigidTransform | None, ...] | None = None
     times: tuple[float, ...] | None = None
     warnings: tuple[str, ...] = ()
@@ -343,7 +344,7 @@ def open_kitti(layout: KittiLayout, digests: files.Digests) -> Sequence:
         times, warnings = _times(layout.times, listing)
 
     def image(frame: int, camera: str) -> Source:
-        return files.image_source(paths[camera][frame], frame, camera, size, digests)
+        return files.image_source(paths[camera][frame], frame, camera, headers[camera], digests)
 
     return Sequence(
         name=layout.name,
@@ -356,5 +357,5 @@ def open_kitti(layout: KittiLayout, digests: files.Digests) -> Sequence:
         truth_source=f"poses of {layout.poses.name}, as recorded" if layout.poses is not None else "",
         lost=listing.lost,
         defaults=STREET if rig.baseline >= CAR else {},
-        warnings=(*warnings, *off_centre(rig.left, "left", size[:2]), *off_centre(rig.right, "right", size[:2])),
+        warnings=(*warnings, *off_centre(rig.left, "left"), *off_centre(rig.right, "right")),
     )

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.stages.core.errors import InputError
-from rille.stages.geometry.geometry import Rig
+from rille.stages.geometry.geometry import Rig, Sizes
 from rille.stages.geometry.lens import Lens
 
 LEAST_BASELINE = 1e-6
@@ -17,14 +17,14 @@ SIDEWAYS = 0.5
 
 
 def rig_of(
-    left: CalibratedCamera, right: CalibratedCamera, size: tuple[int, int] | None = None
+    left: CalibratedCamera, right: CalibratedCamera, sizes: Sizes | None = None
 ) -> tuple[Rig, dict[str, Lens] | None]:
     """Ideal rig, and the real lenses of its cameras.
 
     Parameters
     ----------
     left, right : cameras whose poses refer to one frame.
-    size : width and height of the images, pixels; needed where the calibration does not say.
+    sizes : of the images; needed where the calibration does not say.
 
     Returns
     -------
@@ -37,7 +37,8 @@ def rig_of(
     InputError
         The image size or the relative pose is not known, the cameras stand in one place, or are swapped.
     """
-    lenses = {"left": _sized(left, size), "right": _sized(right, size)}
+    of_left, of_right = sizes or (None, None)
+    lenses = {"left": _sized(left, of_left), "right": _sized(right, of_right)}
     if left.T_camera_reference is None or right.T_camera_reference is None:
         lacking = left if left.T_camera_reference is None else right
         raise InputError(

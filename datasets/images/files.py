@@ -247,9 +247,9 @@ class Digests:
         return self._known[key]
 
 
-def image_source(path: Path, frame: int, camera: str, size: tuple[int, int, int], digests: Digests) -> Source:
-    """Source of one file; ``size`` is the width, height and bits that it must have."""
-    width, height, depth = size
+def image_source(path: Path, frame: int, camera: str, header: Header, digests: Digests) -> Source:
+    """Source of one file; ``header`` is the width, height and bits that it must have."""
+    width, height, depth = header
     args = {
         "sha256": digests.sha256(path),
         "camera": camera,
@@ -262,14 +262,14 @@ def image_source(path: Path, frame: int, camera: str, size: tuple[int, int, int]
     return Source(module, NoParams(), args, hints={"path": str(path.resolve())})
 
 
-def check_size(found: tuple[int, int, int], wanted: tuple[int, int, int], name: str) -> None:
-    """Refuse an image whose width, height or depth differs from the sequence's."""
+def check_size(found: Header, wanted: Header, name: str) -> None:
+    """Refuse an image whose width, height or depth differs from those of its camera's other images."""
     if found != wanted:
         words = [f"{w} x {h}, {d} bits" for w, h, d in (found, wanted)]
         raise InputError(
             "RIL-176",
-            f"{name} is {words[0]}; the sequence has {words[1]}",
-            remedy="all images of a sequence must have one size and depth; leave the frame out or convert it",
+            f"{name} is {words[0]}; others of its camera are {words[1]}",
+            remedy="all images of a camera must have one size and depth; leave the frame out or convert it",
         )
 
 

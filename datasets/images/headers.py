@@ -16,6 +16,9 @@ from typing import BinaryIO
 Header = tuple[int, int, int]
 """Width and height, pixels, and bits a sample as they are decoded, 8 or 16 (more where they are no integers)."""
 
+Headers = tuple[Header, Header]
+"""Of the left and of the right images: two cameras need not be alike."""
+
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 NETPBM = re.compile(rb"P([1-6])(?:\s|#[^\r\n]{0,200}[\r\n]){1,50}(\d{1,9})(?:\s|#[^\r\n]{0,200}[\r\n]){1,50}(\d{1,9})")

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rille.datasets.images import files
+from rille.datasets.images.headers import Headers
 from rille.stages.core.errors import InputError
 
 SUFFIXES = (*files.SUFFIXES, ".ppm", ".bmp")
@@ -196,9 +197,10 @@ def _named(pairs: list[tuple[Path, Path]]) -> tuple[ImagePair, ...]:
     return tuple(ImagePair(name, *pair) for name, pair in zip(names, pairs, strict=True))
 
 
-def common_size(pairs: Sequence[ImagePair]) -> tuple[int, int, int]:
-    """Width, height and bits that all images share (see :func:`rille.datasets.images.files.common_header`).
+def common_headers(pairs: Sequence[ImagePair]) -> Headers:
+    """Width, height and bits that all images of a side share (see :func:`rille.datasets.images.files.common_header`).
 
     Pairs of which a file is absent are left out.
     """
-    return files.common_header([path for pair in pairs if not pair.absent for path in (pair.left, pair.right)])
+    whole = [pair for pair in pairs if not pair.absent]
+    return files.common_header([pair.left for pair in whole]), files.common_header([pair.right for pair in whole])

@@ -16,7 +16,7 @@ from typing import Any
 
 from rille.datasets.georeference import georeference
 from rille.datasets.images import files
-from rille.datasets.images.pairing import ImagePair, common_size, pair_up
+from rille.datasets.images.pairing import ImagePair, common_headers, pair_up
 from rille.datasets.manifest.model import Images, read_manifest
 from rille.datasets.manifest.motion import read_motion
 from rille.datasets.manifest.rig import read_optics
@@ -40,8 +40,8 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
     manifest, name = read_manifest(path), str(path)
     root = root_folder(manifest.root, path)
     pairs = find_pairs(manifest.images, root, name)
-    size = common_size(pairs)
-    optics = read_optics(manifest, root, name, size[:2])
+    headers = common_headers(pairs)
+    optics = read_optics(manifest, root, name, (headers[0][:2], headers[1][:2]))
     motion = read_motion(manifest, root, name, pairs)
     up = motion.up
     if up is None and optics.up is not None:
@@ -49,7 +49,8 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
 
     def image(frame: int, camera: str) -> Source:
         pair = pairs[frame]
-        return files.image_source(pair.left if camera == "left" else pair.right, frame, camera, size, digests)
+        path, header = (pair.left, headers[0]) if camera == "left" else (pair.right, headers[1])
+        return files.image_source(path, frame, camera, header, digests)
 
     world = manifest.world
     pitch = None if world.pitch_deg is None else math.radians(world.pitch_deg)

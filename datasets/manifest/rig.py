@@ -13,7 +13,7 @@ from rille.datasets.cameras.model import parallel
 from rille.datasets.manifest.model import Cameras, Manifest, PinholeLens, RigSection
 from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
-from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes
 from rille.stages.geometry.lens import Lens
 
 LONGEST_BASELINE = 20.0
@@ -48,42 +48,54 @@ class Optics:
     warnings: tuple[str, ...]
 
 
-def read_optics(manifest: Manifest, root: Path, name: str, size: tuple[int, int]) -> Optics:
+def read_optics(manifest: Manifest, root: Path, name: str, sizes: Sizes) -> Optics:
     """Rig and lenses of a manifest.
 
     Parameters
     ----------
     root : folder that calibration files are relative to.
     name : what to call the manifest in an error.
-    size : width and height of the images, pixels.
+    sizes : of the images.
 
     Raises
     ------
     InputError
         The cameras or their relative pose are not stated, contradict the images, or cannot be.
     """
-    left, right = _cameras(manifest.cameras, root, name, size)
+    left, right = _cameras(manifest.cameras, root, name, sizes)
     # Before anything compares lengths: the manifest's own are metres.
     left, right = (_scaled(camera, manifest.rig.unit) for camera in (left, right))
     up = _up(manifest, left, name)
     left, right, lines = _placed(left, right, manifest.rig, name)
     try:
-        rig, lenses = rig_of(left, right, size)
+        rig, lenses = rig_of(left, right, sizes)
     except InputError as error:
         raise error.at(name) from error
     lines += _check_baseline(rig.baseline, manifest.rig, name)
-    lines += [line for c, side in ((left, "left"), (right, "right")) for line in _unusual(c.lens.camera, side, size)]
+    # Of the images' size, which a calibration need not state.
+    for camera, side, size in zip((left, right), ("left", "right"), sizes, strict=True):
+        lines += _unusual(replace(camera.lens.camera, width=size[0], height=size[1]), side)
     return Optics(rig, lenses, up, tuple(lines))
 
 
-def _cameras(section: Cameras, root: Path, name: str, size: tuple[int, int]) -> tuple[CalibratedCamera, ...]:
+def _cameras(section: Cameras, root: Path, name: str, sizes: Sizes) -> tuple[CalibratedCamera, ...]:
     if section.left is not None and section.right is not None:
-        stated = {"left": section.left, "right": section.right}
-        return tuple(_one(value, side, root, name, size) for side, value in stated.items())
+        stated = ("left", section.left, sizes[0]), ("right", section.right, sizes[1])
+        return tuple(_one(value, side, root, name, size) for side, value, size in stated)
+    found: tuple[CalibratedCamera, ...] = ()
     if section.file is not None:
-        return _of_file(section, root / section.file, name)
-    if section.stated:
-        return tuple(_one(section, side, root, name, size) for side in ("left", "right"))
+        found = _of_file(section, root / section.file, name)
+    elif section.stated:
+        found = tuple(_one(section, side, root, name, sizes[0]) for side in ("left", "right"))
+    if found and found[0].lens == found[1].lens and sizes[0] != sizes[1]:
+        left, right = (f"{width} x {height}" for width, height in sizes)
+        raise InputError(
+            "RIL-960",
+            f"{name}: left images have {left} pixels, right ones {right}, and one camera is stated for both",
+            remedy="give cameras.left and cameras.right",
+        )
+    if found:
+        return found
     raise InputError(
         "RIL-235",
         f"{name}: the cameras are not known",
@@ -233,12 +245,13 @@ def _check_baseline(baseline: float, section: RigSection, name: str) -> list[str
     return []
 
 
-def off_centre(camera: Camera, side: str, size: tuple[int, int]) -> list[str]:
+def off_centre(camera: Camera, side: str) -> list[str]:
     """A line on a principal point more than a tenth of the width off the centre, with the size that it would fit."""
 
     def off(width: float, height: float) -> float:
         return max(abs(camera.cx - width / 2), abs(camera.cy - height / 2)) / width
 
+    size = camera.width, camera.height
     if off(*size) <= OFF_CENTRE:
         return []
     scaled = [(width, round(width * size[1] / size[0])) for width in USUAL_WIDTHS if width != size[0]]
@@ -249,14 +262,14 @@ def off_centre(camera: Camera, side: str, size: tuple[int, int]) -> list[str]:
     return [warning("RIL-689", f"{side} camera: principal point {place}{hint}")]
 
 
-def _unusual(camera: Camera, side: str, size: tuple[int, int]) -> list[str]:
+def _unusual(camera: Camera, side: str) -> list[str]:
     """Lines on a camera that is possible but strange."""
     lines = []
-    view = math.degrees(2 * math.atan(size[0] / 2 / camera.fx))
+    view = math.degrees(2 * math.atan(camera.width / 2 / camera.fx))
     if not USUAL_VIEW_DEG[0] <= view <= USUAL_VIEW_DEG[1]:
         text = f"{side} camera: fx = {camera.fx:g} px gives an angle of view of {view:.3g} degrees; is it in pixels?"
         lines.append(warning("RIL-690", text))
-    lines += off_centre(camera, side, size)
+    lines += off_centre(camera, side)
     if not 0.8 < camera.fx / camera.fy < 1.25:
         text = f"{side} camera: fx = {camera.fx:g} and fy = {camera.fy:g} px differ much: no square pixels"
         lines.append(warning("RIL-691", text))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import tomli_w
 
 from rille.datasets.inspection import Findings, FoundCalibration
@@ -50,13 +52,18 @@ def _pairs(**values: object) -> str:
 def _images(found: Findings) -> str:
     views = found.views
     lines = [f"[images]\n# {views.why}."]
-    if views.size is None:
+    if views.sizes is None:
         lines.append(f"# {NEEDED}: correct the patterns: {views.trouble}")
     else:
-        lines.append(f"# They make {counted(views.pairs, 'pair')} of {views.size[0]} x {views.size[1]} pixels.")
+        lines.append(f"# They make {counted(views.pairs, 'pair')} of {size_words(views.sizes)} pixels.")
     lines.append(_pairs(left=views.left, right=views.right).rstrip())
     lines.append('# pair = "auto"  # or "name", "number", "order"')
     return "\n".join(lines) + "\n"
+
+
+def size_words(sizes: Iterable[tuple[int, int] | None]) -> str:
+    """Sizes that are known, each once."""
+    return " and ".join(dict.fromkeys(f"{size[0]} x {size[1]}" for size in sizes if size is not None))
 
 
 def _cameras(found: Findings) -> str:
@@ -76,9 +83,10 @@ def _cameras(found: Findings) -> str:
 
 def _calibration_lines(calibration: FoundCalibration, found: Findings) -> list[str]:
     lines = []
-    if calibration.size and found.views.size and calibration.size != found.views.size:
-        size = "{} x {}".format(*calibration.size)
-        lines.append(f"# {NEEDED}: this calibration is of {size} pixels; give one of the images' size")
+    if not calibration.suits(found.views.sizes):
+        lines.append(
+            f"# {NEEDED}: this calibration is of {size_words(calibration.sizes)} pixels; give one of the images' size"
+        )
     if len(calibration.files) == 2:
         lines.append(_pairs(left=calibration.files[0], right=calibration.files[1]).rstrip())
     else:

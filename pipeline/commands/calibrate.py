@@ -23,8 +23,9 @@ from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
-from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, Sizes, calibrate_rig
+from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig
 from rille.stages.core.errors import InputError, told
+from rille.stages.geometry.geometry import Sizes
 
 LEAST_COVER = 0.5
 """Share of an image that all corners together should span: beyond them, distortion is extrapolated."""

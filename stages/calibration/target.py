@@ -19,7 +19,7 @@ import numpy as np
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.geometry.epipolar import distances
-from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes, rotation_exp
 from rille.stages.geometry.lens import Lens
 
 MODELS: Mapping[str, tuple[str, ...]] = {
@@ -29,9 +29,6 @@ MODELS: Mapping[str, tuple[str, ...]] = {
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
 """Names of the coefficients of each model, in OpenCV's order; radtan4 is radtan without k3."""
-
-Sizes = tuple[tuple[int, int], tuple[int, int]]
-"""Width and height of the left and of the right images, pixels."""
 
 LEAST_VIEWS = 3
 """Two views determine a camera only just, and nothing would tell a bad one."""

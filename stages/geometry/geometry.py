@@ -23,6 +23,9 @@ from numpy.typing import ArrayLike
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 
+Sizes = tuple[tuple[int, int], tuple[int, int]]
+"""Width and height of the left and of the right images, pixels; two cameras need not be alike."""
+
 
 @dataclass(frozen=True)
 class Camera:

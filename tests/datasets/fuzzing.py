@@ -55,7 +55,7 @@ def manifest(path: Path) -> None:
 def calibration(path: Path) -> None:
     cameras = read_cameras(path)
     if len(cameras) == 2:
-        rig_of(cameras[0], cameras[1], cameras[0].size or (640, 480))
+        rig_of(cameras[0], cameras[1], tuple(camera.size or (640, 480) for camera in cameras[:2]))
 
 
 def rigs(path: Path) -> None:

@@ -456,7 +456,7 @@ def camera(x, size=SIZE, coefficients=(), name="one"):
 
 def test_rig_of_cameras_without_size(tmp_path):
     bent = (-0.1, 0.0, 0.0, 0.0)
-    rig, lenses = rig_of(camera(1.0, UNKNOWN_SIZE), camera(1.3, UNKNOWN_SIZE, bent), (320, 200))
+    rig, lenses = rig_of(camera(1.0, UNKNOWN_SIZE), camera(1.3, UNKNOWN_SIZE, bent), ((320, 200), (320, 200)))
     assert rig.baseline == pytest.approx(0.3)
     assert (rig.left.width, rig.left.height) == (320, 200)
     # Only the camera that has distortion has a lens.
@@ -473,18 +473,18 @@ def test_fisheye_rig_has_the_focal_length_of_its_ideal_camera():
 
 
 @pytest.mark.parametrize(
-    ("left", "right", "size", "expected"),
+    ("left", "right", "sizes", "expected"),
     [
         (camera(0.0), camera(None, name="two"), None, ("RIL-128",)),
         (camera(0.3), camera(0.0), None, ("RIL-130", "0.3")),
         (camera(0.2), camera(0.2), None, ("RIL-129",)),
         (camera(0.0, UNKNOWN_SIZE), camera(0.1), None, ("RIL-132",)),
-        (camera(0.0), camera(0.1), (641, 480), ("RIL-131", "640 x 480", "641 x 480")),
+        (camera(0.0), camera(0.1), ((641, 480), (640, 480)), ("RIL-131", "640 x 480", "641 x 480")),
     ],
 )
-def test_rigs_that_cannot_be(left, right, size, expected):
+def test_rigs_that_cannot_be(left, right, sizes, expected):
     with raises(*expected) as error:
-        rig_of(left, right, size)
+        rig_of(left, right, sizes)
     assert error.value.remedy
 
 
@@ -518,7 +518,7 @@ def epipolar_distance(rig, lenses, p, q):
 def read_pair(folder, files, images):
     left, right = (cv2.imread(str(folder / image), cv2.IMREAD_GRAYSCALE) for image in images)
     cameras = [camera for file in files for camera in read_cameras(folder / file)]
-    return *rig_of(*cameras, (left.shape[1], left.shape[0])), *matches(left, right)
+    return *rig_of(*cameras, tuple((image.shape[1], image.shape[0]) for image in (left, right))), *matches(left, right)
 
 
 @pytest.mark.data
@@ -570,7 +570,7 @@ def test_projections_without_labels_are_kittis_and_poses_are_none(tmp_path):
     file = tmp_path / "calib.txt"
     file.write_text("700 0 320 0 0 700 120 0 0 0 1 0\n700 0 320 -350 0 700 120 0 0 0 1 0\n")
     left, right = read_cameras(file)
-    rig, *_ = rig_of(left, right, (640, 240))
+    rig, *_ = rig_of(left, right, ((640, 240), (640, 240)))
     assert rig.left.fx == 700
     assert rig.baseline == pytest.approx(0.5)
     file.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)

@@ -67,7 +67,7 @@ def test_pairs_are_told_from_names(tmp_path, files, left, right, pairs):
     write_images(tmp_path, files)
     views = inspect(tmp_path).views
     assert (views.left, views.right, views.pairs, views.trouble) == (left, right, pairs, "")
-    assert views.size == (SIZE if files[0].endswith("png") else views.size)
+    assert views.sizes == ((SIZE, SIZE) if files[0].endswith("png") else views.sizes)
 
 
 def test_names_that_are_time_stamps(tmp_path):

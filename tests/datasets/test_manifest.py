@@ -6,6 +6,7 @@ import math
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from folders import CAMERAS, write_images, write_lines, write_sequence
@@ -118,6 +119,47 @@ def test_cameras_may_differ(tmp_path):
     )
     rig = opened(write_sequence(tmp_path, cameras=cameras)).rig
     assert (rig.left.fx, rig.left.fy, rig.right.fx, rig.right.fy, rig.right.cx) == (60, 60, 61, 62, 30)
+
+
+def smaller_right_images(folder: Path) -> Path:
+    """A sequence whose left images have 64 x 48 pixels and whose right ones half as many a side."""
+    manifest = write_sequence(folder)
+    for path in sorted(folder.rglob("*.png")):
+        if "right" in str(path.relative_to(folder)):
+            cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[::2, ::2])
+    return manifest
+
+
+def test_two_cameras_may_have_two_sizes_of_images(tmp_path):
+    manifest = smaller_right_images(tmp_path)
+    with raises("RIL-960", "64 x 48", "32 x 24"):
+        opened(manifest)
+    both = "[cameras.left]\nfx = 60.0\ncx = 31.5\ncy = 23.5\n[cameras.right]\nfx = 30.0\ncx = 15.5\ncy = 11.5\n"
+    manifest.write_text(manifest.read_text().replace(CAMERAS, both))
+    sequence = opened(manifest)
+    assert [(c.width, c.height) for c in (sequence.rig.left, sequence.rig.right)] == [(64, 48), (32, 24)]
+    taken = [sequence.image(0, camera).args for camera in ("left", "right")]
+    assert [(args["width"], args["height"]) for args in taken] == [(64, 48), (32, 24)]
+
+
+def test_a_calibration_that_states_two_sizes_is_that_of_images_of_two_sizes(tmp_path):
+    manifest = smaller_right_images(tmp_path)
+    manifest.write_text(manifest.read_text().replace(CAMERAS, '[cameras]\nfile = "rig.yaml"\n'))
+    rig = """%YAML:1.0
+image_size1: [64, 48]
+image_size2: [{}]
+M1: [60., 0., 31.5, 0., 60., 23.5, 0., 0., 1.]
+D1: [0., 0., 0., 0.]
+M2: [30., 0., 15.5, 0., 30., 11.5, 0., 0., 1.]
+D2: [0., 0., 0., 0.]
+R: [1., 0., 0., 0., 1., 0., 0., 0., 1.]
+T: [-0.1, 0., 0.]
+"""
+    (tmp_path / "rig.yaml").write_text(rig.format("32, 24"))
+    assert opened(manifest).rig.right.width == 32
+    (tmp_path / "rig.yaml").write_text(rig.format("64, 48"))
+    with raises("RIL-131", "64 x 48", "32 x 24"):
+        opened(manifest)
 
 
 def test_direction_of_up_is_that_of_the_left_camera_where_no_file_states_another(tmp_path):
@@ -432,7 +474,7 @@ def test_a_key_under_a_header_that_is_a_comment_is_explained(tmp_path):
     ],
 )
 def test_a_principal_point_off_the_centre_says_which_size_it_fits(size, centre, expected):
-    lines = off_centre(Camera(400.0, 400.0, *centre, *size), "left", size)
+    lines = off_centre(Camera(400.0, 400.0, *centre, *size), "left")
     assert len(lines) == (expected is not None)
     assert expected is None or expected in lines[0]
     assert size != (640, 480) or "scale by" not in lines[0]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from rille.datasets.images.pairing import common_size, natural, pair_up, side_of
+from rille.datasets.images.pairing import common_headers, natural, pair_up, side_of
 
 
 def paths(*names: str) -> list[Path]:
@@ -112,15 +112,15 @@ def test_sizes_are_compared(tmp_path):
     for name, shape in (("a_l", (4, 6)), ("a_r", (4, 6)), ("b_l", (4, 6)), ("b_r", (5, 6))):
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros(shape, np.uint8))
     pairs = pair_up(sorted(tmp_path.glob("*_l.png")), sorted(tmp_path.glob("*_r.png")))
-    assert common_size(pairs[:1]) == (6, 4, 8)
+    assert common_headers(pairs[:1]) == ((6, 4, 8), (6, 4, 8))
     with raises("RIL-176", "b_r.png", "6 x 5", "6 x 4"):
-        common_size(pairs)
+        common_headers(pairs)
 
 
 def test_size_of_another_kind_of_file_is_read(tmp_path):
     for side in "lr":
         cv2.imwrite(str(tmp_path / f"a_{side}.pgm"), np.zeros((4, 6), np.uint16))
-    assert common_size(pair_up([tmp_path / "a_l.pgm"], [tmp_path / "a_r.pgm"])) == (6, 4, 16)
+    assert common_headers(pair_up([tmp_path / "a_l.pgm"], [tmp_path / "a_r.pgm"])) == ((6, 4, 16), (6, 4, 16))
 
 
 def test_unequal_counts_name_both_ends():

@@ -98,7 +98,7 @@ def test_two_labels_are_a_rig(tmp_path):
     shifted = components("CAHV", C=C + SHIFT, V=901 * DOWN + 383.5 * A)
     right = read_cameras(put(tmp_path, pds("CAHV", shifted), name="right.LBL"))[0]
     assert left.lens.camera.width == UNKNOWN_SIZE[0]
-    rig, lenses = rig_of(left, right, (1024, 768))
+    rig, lenses = rig_of(left, right, ((1024, 768), (1024, 768)))
     assert rig.baseline == pytest.approx(0.3)
     assert rig.T_right_left.translation == pytest.approx([-0.3, 0, 0], abs=1e-12)
     assert set(lenses) == {"left"}  # its rows are skewed
