@@ -179,6 +179,9 @@ def align(a: Grid, b: Grid, kind: Align) -> Alignment:
         state = Alignment(rotation, state.translation + full[:3], centre, spread, iteration, used, (0.0, 0.0))
         if np.abs(step / unit).max() < 1e-4:
             return _with_rms(b, slopes, points, state, start)
+    # Cells at a border that come and go from step to step keep the motion from settling, but within its own errors.
+    if (np.abs(step) < sigma).all():
+        return _with_rms(b, slopes, points, state, start)
     raise DegenerateError(
         "RIL-324",
         f"no alignment after {ITERATIONS} steps: the last one still moved by {np.abs(step / unit).max():.2g} cells",

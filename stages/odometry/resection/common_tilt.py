@@ -37,13 +37,14 @@ def common_tilt(parts: Floats, prior_sigma: float) -> tuple[float, float]:
     parts = parts[parts[:, 0] > 0]
     if len(parts) < 3:
         return 0.0, float("inf")
-    information, value = parts[:, 0], parts[:, 1] / parts[:, 0]
+    claimed, value = parts[:, 0], parts[:, 1] / parts[:, 0]
+    information = claimed
     for _ in range(5):  # of a segment that is far off, no more than of one at two deviations
         tilt = float((information * value).sum() / information.sum())
-        off = np.abs(value - tilt) * np.sqrt(information)
+        off = np.abs(value - tilt) * np.sqrt(claimed)
         # At least what the segments claim: few of them may agree by chance.
         spread = max(1.0, mad_sigma(off, 0.0))
-        information = parts[:, 0] * huber_weight(off, 2.0 * spread)
+        information = claimed * huber_weight(off, 2.0 * spread)
     total = float(information.sum()) / spread**2
     prior = prior_sigma**-2.0
     # Mean of Gaussians: the prior's is 0.

@@ -101,6 +101,9 @@ def test_stage_on_a_dense_disparity():
     assert np.sqrt(np.mean(out["residual_after"][inlier] ** 2)) == pytest.approx(
         out.meta["residual_after_px"], rel=1e-5
     )
+    for name in ("before", "after"):
+        middle = np.median(np.abs(out[f"residual_{name}"][inlier]))
+        assert out.meta[f"median_{name}_px"] == pytest.approx(middle, rel=1e-5)
     assert out.meta["residual_after_px"] < 0.2 < out.meta["residual_before_px"]
     assert out.meta["pair"] == 7
     again = run(rig, scene(knocked(rig, pitch_deg=0.4, roll_deg=-0.5)))

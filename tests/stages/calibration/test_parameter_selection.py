@@ -56,6 +56,18 @@ def test_toe_in_of_a_street_is_held_even_where_it_is_wrong():
     assert math.degrees(decision.parameters[1].asked) == pytest.approx(0.5, abs=0.1)
 
 
+def test_an_angle_that_departs_alone_is_likelier_a_principal_point_and_with_others_a_knock():
+    rig = street_rig()
+    anyhow = PARAMS.model_copy(update={"max_depth_error": 1.0})
+    alone, both = (
+        decide(rig, [matches(knocked(rig, yaw_deg=0.3, roll_deg=roll), street_depth, pair=k) for k in range(3)], anyhow)
+        for roll in (0.0, 0.3)
+    )
+    assert not alone.changed
+    assert "likelier a principal point" in alone.parameters[1].why
+    assert freed(both) == {"yaw", "roll"}
+
+
 def test_matches_beyond_infinity_show_a_wrong_toe_in():
     """Depth is surely wrong, and the keystone of the rows says by how much."""
     rig = street_rig()

@@ -8,11 +8,15 @@ from rig_scenes import knocked, matches, street_depth, street_rig
 
 from rille.stages.calibration.relative_orientation import (
     BLOCKS,
+    SIZE,
+    TERMS,
     PointPairs,
     Priors,
+    _smooth_terms,
     _weigh,
     adjust,
     consider_covariance,
+    precision,
     settle,
     solution,
 )
@@ -122,6 +126,29 @@ def test_normal_equations_and_weights_by_plain_numpy():
     information = expected / (noise**2 * max(1.0, together / noise**2))
     np.testing.assert_allclose(normal, design.T @ (design * information[:, None]), rtol=1e-9)
     np.testing.assert_allclose(pull, -design.T @ (information * constant), rtol=1e-9)
+
+
+def test_the_gain_is_half_the_drop_of_the_weighed_squares():
+    m = matches(knocked(street_rig(), pitch_deg=0.3), street_depth)
+    fit = adjust(street_rig(), [m], ANGLES, PRIORS, rival=True)
+    x, _, gain = solution(fit, ANGLES, PRIORS, rival=True)
+    total = fit.normal + precision(ANGLES, PRIORS, max(PRIORS.term, fit.smooth), rival=True)
+
+    def squares(at):
+        return at @ total @ at - 2.0 * fit.pull @ at
+
+    assert gain == pytest.approx(0.5 * (squares(np.zeros(SIZE)) - squares(x)))
+
+
+def test_smooth_terms_are_legendre_polynomials_from_border_to_border():
+    rig = street_rig()
+    w, h = rig.left.width - 1.0, rig.left.height - 1.0
+    ends = np.array([[w, h], [0.0, h], [w, 0.0], [0.5 * w, 0.5 * h]])
+    found = _smooth_terms(rig, PointPairs(0, ends, ends))
+    for column, (i, j) in zip(found.T, TERMS, strict=True):
+        size = np.sqrt((2 * i + 1) * (2 * j + 1))  # of a term that is 1 in the corner: then its RMS is 1
+        middle = {0: 1.0, 1: 0.0, 2: -0.5, 3: 0.0}
+        np.testing.assert_allclose(column / size, [1.0, (-1) ** i, (-1) ** j, middle[i] * middle[j]], atol=1e-12)
 
 
 def test_a_large_correction_is_found_though_derivatives_are_shared():

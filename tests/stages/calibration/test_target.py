@@ -150,6 +150,36 @@ def test_a_bad_view_is_named_and_left_out_and_does_no_harm():
     np.testing.assert_allclose(bad.T_right_left.matrix34, good.T_right_left.matrix34, atol=3e-4)
 
 
+@pytest.mark.parametrize(("usual", "worse"), [(0.03, 0.25), (0.2, 0.5)])
+def test_a_view_is_good_below_half_a_pixel_or_four_times_the_others(usual, worse):
+    views = scene("radtan4", 10, noise=usual)
+    views[4] = scene("radtan4", 10, noise=worse)[4]
+    found = calibrate_rig(BOARD, views, SIZE, "radtan4")
+    assert all(r.used for r in found.residuals)
+    assert found.residuals[4].worst > min(0.5, 4 * np.median([r.worst for r in found.residuals]))
+
+
+def test_cameras_turned_upside_down_are_no_solution():
+    """Negative focal lengths, and all poses turned by half a turn about the axis: not one projection changes."""
+    task = Adjustment(BOARD, tuple(scene("radtan4", 4)), SIZE, "radtan4")
+    x = task.solve(task.start())
+    turn = RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    for first in (0, task.lens):
+        x[[first, first + 1, first + 6, first + 7]] *= -1.0
+    for k in range(len(task.views)):
+        x[task.pose(k)] = moved(turn, x[task.pose(k)])
+    x[2 * task.lens : task.shared] = moved(turn, x[2 * task.lens : task.shared], turn)
+    assert np.abs(task.evaluate(x)[0]).max() < 1e-3
+    with raises("RIL-312"):
+        task.solve(x)
+
+
+def moved(turn: RigidTransform, pose: np.ndarray, before: RigidTransform | None = None) -> np.ndarray:
+    """Rotation vector and translation of ``turn @ pose @ before``."""
+    T = turn @ RigidTransform(rotation_exp(pose[:3]), pose[3:]) @ (before or RigidTransform.identity())
+    return np.concatenate([cv2.Rodrigues(T.rotation)[0].ravel(), T.translation])
+
+
 def test_a_bad_view_stays_where_that_is_asked_for():
     views = spoiled(scene("radtan4", 10, noise=0.1), 4)
     kept = calibrate_rig(BOARD, views, SIZES, "radtan4", keep_bad=True)

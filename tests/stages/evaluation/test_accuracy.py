@@ -245,6 +245,16 @@ def test_kitti_sections_do_not_cross_a_gap_of_the_truth() -> None:
     assert some["value"] == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.parametrize("lost", [1, 50, 100])
+def test_a_kitti_section_has_truth_from_its_first_to_its_last_frame(lost: int) -> None:
+    straight = np.tile(np.eye(3, 4), (102, 1, 1))
+    straight[:, 2, 3] = np.arange(102.0)  # the only section ends at frame 101
+    gappy = straight.copy()
+    gappy[lost] = np.nan
+    full, none = (trajectory_accuracy(straight, t)[1]["kitti_translation"]["value"] for t in (straight, gappy))
+    assert (full, none) == (0.0, None)
+
+
 def test_truth_with_gaps_and_a_trajectory_without_poses_as_artifacts() -> None:
     true = walk(3, 4)
     poses = [None if k == 2 else p.reshape(12).tolist() for k, p in enumerate(true)]

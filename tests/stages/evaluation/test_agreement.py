@@ -10,7 +10,7 @@ from evo.core import metrics as evo_metrics
 from evo.core.trajectory import PosePath3D
 
 from rille.stages.core.declare import Bundle, check_outputs
-from rille.stages.evaluation.agreement import STAGE, AgreementParams, compare, flag
+from rille.stages.evaluation.agreement import STAGE, AgreementParams, _at_rest, compare, flag
 from rille.stages.evaluation.pose_alignment import moved
 from rille.stages.geometry.geometry import rotation_exp
 
@@ -152,6 +152,13 @@ def test_each_piece_is_laid_on_ours_by_itself_and_a_lone_frame_not_at_all() -> N
     assert out.meta["not_compared"] == [22]
     assert out.meta["pieces"] == 3
     assert np.isnan(out["step_distance"][5])
+
+
+@pytest.mark.parametrize(("step", "rests"), [(0.099, False), (0.101, True)])
+def test_a_camera_rests_within_ten_times_what_its_steps_differ_by(step: float, rests: bool) -> None:
+    poses = np.tile(np.eye(3, 4), (40, 1, 1))
+    poses[:, 0, 3] = np.where(np.arange(40) % 2, 1.0, -1.0)  # a metre from their mean
+    assert _at_rest(poses, np.array([np.nan] + [step] * 39)) == rests
 
 
 def test_a_camera_at_rest_has_no_scale() -> None:

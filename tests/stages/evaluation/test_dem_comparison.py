@@ -131,6 +131,25 @@ def test_a_known_motion_is_found(kind: str) -> None:
     assert figures(after)["nmad"] < 0.01 < 0.1 < abs(figures(a.values - b.values)["median"])
 
 
+@pytest.mark.parametrize("kind", ["shift", "tilt", "rigid"])
+@pytest.mark.parametrize("noise", [0.02, 0.2])
+def test_noise_keeps_no_alignment_from_being_found(kind: str, noise: float) -> None:
+    for seed in range(8):
+        b = terrain()
+        a = Grid(b.values + 0.1 + noise * np.random.default_rng(seed).standard_normal(b.values.shape), b.matrix)
+        found = align(a, b, kind)  # type: ignore[arg-type]
+        assert (np.abs(found.translation - [0.0, 0.0, -0.1]) <= 5.0 * found.sigma[:3]).all()
+
+
+def test_the_stated_deviations_are_those_of_least_squares() -> None:
+    flat = grid(np.zeros((60, 70)))
+    noisy = Grid(0.05 * np.random.default_rng(2).standard_normal((60, 70)), flat.matrix)
+    found = align(noisy, flat, "tilt")
+    x, y = np.moveaxis(flat.centres(), -1, 0)
+    spread = [x.size, ((y - y.mean()) ** 2).sum(), ((x - x.mean()) ** 2).sum()]
+    np.testing.assert_allclose(found.sigma[2:5], 0.05 / np.sqrt(spread), rtol=0.1)
+
+
 def test_a_motion_that_the_terrain_does_not_show_is_refused() -> None:
     rng = np.random.default_rng(0)
     flat = grid(np.zeros((50, 60)))

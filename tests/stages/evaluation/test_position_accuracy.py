@@ -114,6 +114,13 @@ def test_height_is_shifted_and_never_tilted():
     assert fit_in_plane(places, places + np.array([0, 0, 7.0])).error < 1e-9
 
 
+def test_first_and_last_moments_may_miss_the_rows_by_a_rounding():
+    known = TruePositions(np.array([[0.0, 0.0], [1.0, 2.0]]), np.array([5.0, 5.2]), 0.2)
+    found = known.at(np.array([5.0 - 5e-7, 5.2 + 5e-7, 5.0 - 5e-6, 5.2 + 5e-6]))
+    np.testing.assert_allclose(found[:2], known.positions)
+    assert np.isnan(found[2:]).all()
+
+
 def test_gaps_and_few_frames():
     known = truth(2, 0.0)
     rows = (known.times < 2.0) | (known.times > 3.0)

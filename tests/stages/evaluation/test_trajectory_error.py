@@ -8,7 +8,7 @@ from test_accuracy import disturbed, evo_path, evo_value, walk
 
 from rille.stages.evaluation.accuracy import trajectory_accuracy
 from rille.stages.evaluation.accuracy_parts import square
-from rille.stages.evaluation.trajectory_error import against_claims, by_cause, by_shares
+from rille.stages.evaluation.trajectory_error import _between, against_claims, by_cause, by_shares
 from rille.stages.geometry.geometry import rotation_exp, rotation_log
 
 
@@ -135,3 +135,10 @@ def test_why_claims_are_not_judged_is_said():
     assert "the first posed frame" in against_claims(poses, late, claimed)["nees"]["how"]
     assert "singular" in against_claims(poses, poses, singular)["nees"]["how"]
     assert "behind the first" in against_claims(poses[:1], poses[:1], claimed[:1])["nees"]["how"]
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, 1.5])
+def test_the_least_rotation_between_two_directions(angle: float) -> None:
+    axis, a = np.array([2.0, -1.0, 2.0]) / 3.0, np.array([1.0, 2.0, 0.0])  # at right angles
+    turn = rotation_exp(angle * axis)
+    np.testing.assert_allclose(_between(a, 3.0 * turn @ a), turn, atol=1e-12)

@@ -76,6 +76,15 @@ def test_the_pupil_moves_as_the_equations_say():
         assert origin == pytest.approx(pupil(t) * np.array(AXIS), abs=1e-12)
 
 
+@pytest.mark.parametrize("linearity", [1.0, 0.37, 0.0, -0.5])
+def test_the_reach_is_where_pixels_turn_back(linearity):
+    t = np.linspace(0.0, 1.5, 150_001)
+    x = t if linearity == 0 else (np.tan if linearity > 0 else np.sin)(linearity * t) / linearity
+    out = (1.01 - 0.2 * x**2 - 0.02 * x**4) * x
+    lens = Bending((0.0, 0.0, 1.0), (0.01, -0.2, -0.02), linearity=linearity)
+    assert lens.reach() == pytest.approx(t[np.argmax(out)], abs=1e-4)
+
+
 def test_what_the_lens_does_not_see_has_no_pixel():
     camera = Cahvore(C, A, H, V, Bending(AXIS, (0.0, -0.5, 0.0)))  # 1 - 1.5 x^2 vanishes at 0.816, 39 degrees
     ahead, beyond, behind = (np.array(C) + np.array(A) * d + ACROSS * s for d, s in ((1, 0.5), (1, 0.95), (-1, 0.1)))

@@ -63,6 +63,12 @@ def test_barrel_of_one_tenth_by_hand():
     np.testing.assert_allclose(lens.undistort([[160.0, 40.0]]), [[150.0, 40.0]], atol=1e-6)
 
 
+def test_the_skew_of_a_rover_s_camera_lowers_what_lies_to_the_right():
+    lens = Lens(UNIT, "cahvore", (3.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
+    np.testing.assert_allclose(lens.distort([[90.0, 40.0], [10.0, 70.0]], UNIT), [[90.0, 41.2], [10.0, 68.8]])
+    np.testing.assert_allclose(lens.undistort([[90.0, 41.2], [10.0, 68.8]], UNIT), [[90.0, 40.0], [10.0, 70.0]])
+
+
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 def test_undistort_inverts_distort_over_the_whole_raw_image(lens):
     c = lens.camera
@@ -138,6 +144,15 @@ def test_ideal_camera_of_a_narrow_fisheye_sees_its_edges():
     ideal = lens.ideal_camera()
     assert ideal.fx == pytest.approx(320 / math.tan(0.32))
     np.testing.assert_allclose(lens.distort([[0.0, 320.0], [640.0, 320.0]]), [[0.0, 320.0], [640.0, 320.0]], atol=1e-6)
+
+
+@pytest.mark.parametrize("edge", [(0.0, 320.0), (640.0, 320.0), (320.0, 0.0), (320.0, 640.0)])
+def test_the_farthest_edge_of_a_narrow_fisheye_decides(edge):
+    # The principal point lies off the middle, away from the edge.
+    cx, cy = (320.0 + 0.1 * (320.0 - v) for v in edge)
+    lens = Lens(Camera(1000.0, 1000.0, cx, cy, 641, 641), "fisheye", (0.0, 0.0, 0.0, 0.0))
+    at = [(edge[0], cy)] if edge[1] == 320.0 else [(cx, edge[1])]
+    np.testing.assert_allclose(lens.distort(at), at, atol=1e-6)
 
 
 def test_ideal_camera_of_a_wide_fisheye_keeps_most_of_its_resolution():

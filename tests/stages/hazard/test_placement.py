@@ -71,6 +71,38 @@ def test_unknown_ground_under_one_wheel_is_told_and_the_others_are_still_judged(
     assert found.tilt[30, 30] > 0.1
 
 
+def test_places_against_a_look_at_every_wheel_and_part_of_the_belly() -> None:
+    rng, cell = np.random.default_rng(2), 0.012
+    high = rng.normal(0.0, 0.01, (26, 29)).astype(np.float32)
+    low = high - rng.uniform(0.0, 0.01, high.shape).astype(np.float32)
+    high[rng.random(high.shape) < 0.1] = np.nan
+    low[np.isnan(high)] = np.nan
+    whole = np.isfinite(high) & (rng.random(high.shape) < 0.95)
+    found, at = place(high, low, MODEL, cell, whole), Stance.of(MODEL, cell)
+
+    def look(maps: list[np.ndarray], r: int, c: int, reach: int) -> list[float]:
+        """Highest value of each map around a cell; NaN where none is known or the cell is not on the map."""
+        if not (0 <= r < high.shape[0] and 0 <= c < high.shape[1]):
+            return [math.nan] * len(maps)
+        part = np.s_[max(r - reach, 0) : r + reach + 1, max(c - reach, 0) : c + reach + 1]
+        return [max(a[part][~np.isnan(a[part])], default=math.nan) for a in maps]
+
+    for r in range(0, high.shape[0], 2):
+        for c in range(high.shape[1]):
+            squares, rises, gaps = [[], []], [0.0], []
+            for wheels, belly, spans in zip(at.wheels, at.belly, at.spans.astype(float), strict=True):
+                stood = np.array([look([high, -low, ~whole], r + y, c + x, at.wheel_reach) for y, x in wheels])
+                under = np.array([look([high, ~whole], r + y, c + x, at.belly_reach) for y, x in belly])
+                for square, (fl, fr, rl, rr) in zip(squares, (stood[:, 0], -stood[:, 1]), strict=True):
+                    sides = np.abs([fl - rl, fr - rr, fl - fr, rl - rr]) / spans
+                    square.append(sum(max(s[~np.isnan(s)], default=0.0) ** 2 for s in (sides[:2], sides[2:])))
+                over = np.nan_to_num(under[:, :1] - stood[:, 0])
+                rises.append((at.weights * np.maximum(over, 0.0)).sum(axis=1).max())
+                gaps += [*np.nan_to_num(stood[:, 2], nan=1.0), *np.nan_to_num(under[:, 1], nan=1.0)]
+            expected = [*(math.sqrt(max(s)) for s in squares), max(rises), np.mean(gaps)]
+            np.testing.assert_allclose([a[r, c] for a in found], expected, rtol=1e-4, atol=1e-6)
+
+
 def test_bilinear_weights_and_places() -> None:
     at = Stance.of(MODEL, CELL)
     np.testing.assert_allclose(at.weights.sum(axis=1), 1.0, rtol=1e-6)

@@ -5,7 +5,13 @@ import pytest
 
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.odometry.resection.landmarks import intersect, landmarks_from_dem, landmarks_from_disparity, relief
+from rille.stages.odometry.resection.landmarks import (
+    intersect,
+    landmarks_from_dem,
+    landmarks_from_disparity,
+    matches_at,
+    relief,
+)
 
 CAMERA = Camera(400.0, 400.0, 159.5, 119.5, 320, 240)
 TOE_IN = RigidTransform(rotation_exp(np.array([0.01, 0.15, 0.02])), np.array([-0.1, 0.003, 0.008]))
@@ -86,6 +92,15 @@ def test_filled_missing_and_torn_disparities_give_no_landmark():
     assert found.lost["without a consistent stereo match"] == 5
 
 
+def test_the_last_row_and_column_have_disparities_and_nothing_lies_beyond():
+    column, row, valid, _ = plane_disparity()
+    points = np.array([[319.0, 239.0], [0.0, 0.0], [319.0, 100.5], [319.1, 100.0], [100.0, 239.1]])
+    found, ok = matches_at(points, column, row, valid)
+    assert ok.tolist() == [True, True, True, False, False]
+    middle = np.array([m[100:102, 319].mean(dtype=float) for m in (column, row)])
+    np.testing.assert_allclose(found[:3], [[column[-1, -1], row[-1, -1]], [column[0, 0], row[0, 0]], middle])
+
+
 def test_rays_that_do_not_meet_give_no_landmark():
     column, row, valid, _ = plane_disparity()
     found = from_disparity(np.array([[150.0, 150.0]]), (column, row + np.float32(3.0), valid))
@@ -135,6 +150,15 @@ def test_ray_that_enters_from_below_is_rejected_and_a_hole_forgets():
     elevation[y <= 1.0] = np.nan  # a hole before the hit does no harm
     hit = intersect(elevation, lattice, np.zeros(3), np.array([[0.0, 1.0, -0.3]]))[0]
     assert hit == pytest.approx(0.5 / 0.3, abs=1e-5)
+
+
+def test_every_ray_down_to_flat_ground_meets_it():
+    lattice = Lattice.snap((-1.0, 1.0, 0.5, 3.0), 0.1)
+    at = np.random.default_rng(1).uniform([-0.9, 0.6], [0.9, 2.9], (500, 2))
+    length = np.random.default_rng(2).uniform(0.3, 3.0, 500)
+    down = np.column_stack([at, np.full(500, -0.3)]) / length[:, None]
+    flat = np.full(lattice.shape, -0.3, np.float32)
+    np.testing.assert_allclose(intersect(flat, lattice, np.zeros(3), down), length, rtol=1e-6)
 
 
 def test_ray_that_meets_the_ground_beyond_the_model_misses_it():

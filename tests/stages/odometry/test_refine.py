@@ -13,6 +13,7 @@ from rille.stages.odometry.resection.bundle_adjustment import (
     RefineParams,
     SegmentState,
     SegmentTracks,
+    _step,
     adjust,
     cost_of,
     normal,
@@ -22,7 +23,16 @@ from rille.stages.odometry.resection.bundle_adjustment import (
 )
 from rille.stages.odometry.resection.common_tilt import common_tilt
 from rille.stages.odometry.resection.landmarks import landmarks_from_disparity
-from rille.stages.odometry.resection.refine import STAGE, _tilt_pattern, claims, parts, views_of
+from rille.stages.odometry.resection.refine import (
+    STAGE,
+    SegmentOut,
+    SegmentStart,
+    _adjusted,
+    _tilt_pattern,
+    claims,
+    parts,
+    views_of,
+)
 from rille.stages.odometry.resection.resect import ResectParams
 
 CAMERA = Camera(500.0, 500.0, 299.5, 199.5, 600, 400)
@@ -115,12 +125,85 @@ def test_a_bias_of_all_disparities_is_found_by_many_segments():
     assert bias == pytest.approx(0.3, abs=0.1)
 
 
+def test_landmarks_are_freed_of_the_bias():
+    starts, out = [], []
+    for k in range(5):
+        views, state, _ = scene(30 + k, bias=0.3)
+        starts.append(SegmentStart(views, state, [1, 2, 3], np.arange(150)))
+        sizes = (4, 3, 4), (4, 6, 6), (4, 6, 7), (150, 3)
+        out.append(SegmentOut(*(np.zeros(size) for size in sizes), np.zeros((150, 4), np.uint8)))
+    _adjusted(starts, out, RefineParams(bias_sigma=1.0))
+    off = []
+    for one, found in zip(starts, out, strict=True):
+        along = one.views.along
+        truth = along * np.sqrt(100.0 / along[:, 2:])  # along[2] is Z^2 / (f B)
+        off.append(((found.landmarks - truth) * along).sum(1) / (along**2).sum(1))
+    assert abs(np.mean(off)) < 0.1  # pixels; as given, -0.3
+
+
 def test_the_cost_never_rises_and_an_optimum_stays():
     views, start, _ = scene(3)
     (state,), *_ = adjust([(views, start)], PARAMS)
     (again,), _, before, after = adjust([(views, state)], RefineParams(iterations=1))
     assert after <= before
     np.testing.assert_allclose(again.t, state.t, atol=1e-4)
+
+
+def test_the_cost_that_is_told_is_that_of_the_result():
+    parts = [scene(30 + k, bias=0.3)[:2] for k in range(2)]
+    states, bias, before, after = adjust(parts, RefineParams(bias_sigma=1.0, iterations=1))
+    assert abs(bias) > 0.01
+    assert before == sum(cost_of(views, start, 0.0, 0.2) for views, start in parts)
+    again = sum(cost_of(views, state, bias, 0.2) for (views, _), state in zip(parts, states, strict=True))
+    assert after == pytest.approx(0.5 * bias**2 + again, rel=1e-12)
+
+
+def test_a_step_solves_the_damped_equations_of_all_unknowns():
+    """Poses and depths of two segments and their one bias in one matrix, whose diagonal is damped (Marquardt)."""
+    given, damping, prior, bias, n, m = [scene(50 + k, n=20)[:2] for k in range(2)], 0.3, 100.0, 0.05, 20, 18
+    parts = [normal(views, state, bias, 0.2) for views, state in given]
+    size = 2 * (m + n) + 1
+    whole, gradient = np.zeros((size, size)), np.zeros(size)
+    whole[-1, -1], gradient[-1] = prior, prior * bias
+    for k, (A, B, d, ga, gd) in enumerate(parts):
+        poses = [*range(k * (m + n), k * (m + n) + m), size - 1]
+        depths = range(k * (m + n) + m, (k + 1) * (m + n))
+        whole[np.ix_(poses, poses)] += A
+        whole[np.ix_(poses, depths)], whole[np.ix_(depths, poses)] = B, B.T
+        whole[np.ix_(depths, depths)] = np.diag(d)
+        gradient[poses] += ga
+        gradient[depths] = gd
+    right = np.linalg.solve(whole + damping * np.diag(np.diag(whole)), -gradient)
+    common, steps = _step(parts, prior, bias, damping)
+    found = np.concatenate([*(np.append(pose.ravel(), depth) for pose, depth in steps), [common]])
+    np.testing.assert_allclose(found, right, rtol=1e-6, atol=1e-9)
+
+
+def test_what_a_segment_tells_of_the_tilt_is_what_remains_of_all_unknowns():
+    """Poses, depths and the bias eliminated from the whole matrix, derivatives by differences."""
+    views, state, _ = scene(6, n=25, frames=3)
+    (state,), bias, *_ = adjust([(views, state)], PARAMS)
+    n, m = 25, 2
+
+    def residuals(x):
+        """Whitened errors of tracks, of depths and of the bias; the last unknown tilts the landmarks alone."""
+        moved, b = state.moved(x[:12].reshape(m, 6), x[12 : 12 + n]), bias + x[-2]
+        X = views.position + (moved.depth + b + x[-1] * views.tilt)[:, None] * views.along
+        tracks = [
+            (CAMERA.project(X @ R.T + t) - p) / 0.2 for R, t, p in zip(moved.R, moved.t, views.pixels, strict=True)
+        ]
+        return np.concatenate([*(t.ravel() for t in tracks), moved.depth / views.sigma, [b / 0.1]])
+
+    here = residuals(np.zeros(12 + n + 2))
+    steps = 1e-6 * np.eye(12 + n + 2)
+    J = np.array([(residuals(e) - residuals(-e)) / 2e-6 for e in steps]).T
+    size = np.linalg.norm(here[: 2 * m * n].reshape(-1, 2), axis=1)
+    weight = np.concatenate([np.repeat(np.minimum(1, 2.5 / size), 2), np.ones(n + 1)])
+    N, g = J.T @ (weight[:, None] * J), J.T @ (weight * here)
+    others = np.linalg.solve(N[:-1, :-1], np.column_stack([N[:-1, -1], g[:-1]]))
+    information, pull = tilt_of(views, state, bias, PARAMS)
+    assert information == pytest.approx(N[-1, -1] - N[-1, :-1] @ others[:, 0], rel=1e-3)
+    assert pull == pytest.approx(-(g[-1] - N[-1, :-1] @ others[:, 1]), rel=1e-3, abs=1e-3 * np.sqrt(information))
 
 
 def test_the_covariance_is_the_inverse_of_the_whole_normal_matrix():
@@ -214,6 +297,25 @@ def test_a_tilt_that_is_not_there_is_not_believed():
     assert abs(tilt) < PARAMS.tilt_significance * sigma
     # Two segments say nothing of their scatter.
     assert common_tilt(parts[:2], SIGMA) == (0.0, float("inf"))
+
+
+def test_the_common_tilt_is_the_mean_with_its_prior_and_a_segment_far_off_counts_as_one_at_two_deviations():
+    information, prior = 4e6, 3e6
+    same = np.tile([information, information * 0.001], (12, 1))
+    tilt, sigma = common_tilt(same, prior**-0.5)
+    assert tilt == pytest.approx(0.001 * 12 * information / (12 * information + prior))
+    assert sigma == pytest.approx((12 * information + prior) ** -0.5)
+    # Huber's mean: eleven at 0 and one far off balance where 11 t = 2 deviations.
+    same[:, 1] = [0.0] * 11 + [20.0 * information**0.5]
+    assert common_tilt(same, 1e6)[0] == pytest.approx(2.0 * information**-0.5 / 11, rel=1e-3)
+
+
+def test_segments_that_scatter_by_more_than_they_claim_widen_the_tilt():
+    rng = np.random.default_rng(1)
+    value = 0.003 * rng.standard_normal(400)
+    tilt, sigma = common_tilt(np.column_stack([np.full(400, 1e6), 1e6 * value]), 1e6)  # claimed: 0.001
+    assert sigma == pytest.approx(0.003 / 20.0, rel=0.15)
+    assert abs(tilt) < 4.0 * sigma
 
 
 def test_the_stage_undoes_a_tilt_and_says_so():
@@ -345,3 +447,5 @@ def test_a_lost_frame_stays_lost():
     )
     frames = views_of(track, resection, known, RIG).frames
     assert frames == [2]
+    resection.arrays["poses"][2] = np.nan
+    assert views_of(track, resection, known, RIG) is None

@@ -38,6 +38,18 @@ def test_on_a_plane_it_stands_square(gx: float, gy: float, heading: float) -> No
     assert found.clearance == pytest.approx(0.025 + rest, abs=2 * slope * CELL + 1e-6)
 
 
+def test_a_wheel_rests_on_the_node_that_its_sphere_meets_first() -> None:
+    z = np.random.default_rng(1).normal(0.0, 0.01, (18, 22))
+    z[3, 4] = np.nan
+    found = HeightGrid.of(z, 0.0, 0.0, 0.004, 0.03).resting
+    rows, cols = np.indices(z.shape)
+    for r, c in np.ndindex(z.shape):
+        away2 = ((rows - r) ** 2 + (cols - c) ** 2) * 0.004**2
+        near = (away2 <= 0.015**2) & np.isfinite(z)
+        expected = (z[near] + np.sqrt(0.015**2 - away2[near])).max() - 0.015
+        assert found[r, c] == pytest.approx(np.nan if np.isnan(z[r, c]) else expected, nan_ok=True)
+
+
 def test_one_wheel_on_a_block_tilts_by_half_of_it_each_way() -> None:
     z = np.where((X < 0) & (Y > 0), 0.01, 0.0)  # under the front left wheel
     found = stand(ground(z), 0.0, 0.0, 0.0, ROVER)

@@ -32,6 +32,7 @@ from rille.stages.terrain.locus.kernel import (
     meet,
     pixels,
     raise_to,
+    roots,
     spans,
 )
 
@@ -99,10 +100,40 @@ def test_points_of_lanes_and_of_steps_equal_single_points() -> None:
     assert 0.1 < found / (2 * STEPS * len(feet)) < 0.98
 
 
+def test_on_the_last_row_and_column_no_pixel_is_read_beyond_the_image() -> None:
+    plain = np.ones((HEIGHT, WIDTH), np.float32)
+    seen = Observed(np.ones(2 * HEIGHT * WIDTH, np.float32), plain, plain, np.ones(2))
+    lanes, room = np.zeros(LINE_PLANES * LANES), np.zeros(POINT_PLANES * POINTS)
+    for m, (x, y) in enumerate([(WIDTH - 1, 5), (5, HEIGHT - 1), (WIDTH - 1.01, HEIGHT - 1.01), (0, 0), (-0.01, 5)]):
+        for a in (kernel.LEFT_A, kernel.RIGHT_A):
+            lanes[a + m], lanes[a + LANES + m], lanes[a + 2 * LANES + m] = x, y, 1.0
+    raise_to(lanes, 5, (HEIGHT, WIDTH), room)
+    meet(5, EPIPOLE, seen, room)
+    assert np.isfinite([pixels(room, kernel.S, m) for m in range(5)]).tolist() == [False, False, True, True, False]
+
+
+def test_a_root_beside_a_kink_is_found_in_every_lane() -> None:
+    """s falls from 3 to -0.05 px before column 11 and by 0.01 px behind it: a plain chord would creep to the kink."""
+    disparity = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    disparity[:, 10:13, 0] = 7.05, -0.05, -1.07
+    plain = np.ones((HEIGHT, WIDTH), np.float32)
+    lanes, room = np.zeros(kernel.ROOT_PLANES * LANES), np.zeros(POINT_PLANES * POINTS)
+    for plane, value in ((kernel.LEFT_A, (10.5, 10.0, 1.0)), (kernel.RIGHT_A, (11.0, 10.0, 1.0))):
+        for k in range(3):
+            lanes[plane + k * LANES :][:LANES] = value[k]
+    lanes[kernel.LEFT_B :][:LANES] = 1.0  # column 10.5 + z
+    # Every other lane has a bracket that ends at the kink.
+    ends = [(0.0, 3.0, 0.5, -0.05) if k % 2 else (0.0, 3.0, 1.0, -0.06) for k in range(LANES)]
+    lanes[kernel.Z0 : kernel.Z0 + 4 * LANES] = np.array(ends).T.ravel()
+    roots(LANES, lanes, np.array([-1.0, 0.0, 0.0]), Observed(disparity.ravel(), plain, plain, np.ones(2)), room)
+    found = lanes[kernel.ROOT : kernel.ROOT + LANES]
+    np.testing.assert_allclose(found, 0.5 - 0.05 / 6.1, atol=kernel.SOLVED_PX / 6.1)
+
+
 def test_lines_end_where_an_image_does_and_steps_are_a_pixel_at_most() -> None:
     feet, normals, lanes = cells(30, 0.6)
     n = len(feet)
-    lanes[LOW : LOW + n], lanes[HIGH : HIGH + n] = 0.05, 0.1
+    lanes[LOW : LOW + n], lanes[HIGH : HIGH + n] = 0.05, np.where(np.arange(n) % 2, 0.1, 3.0)
     clip(n, SIZES, -0.4, 2.0, lanes)
     spans(n, lanes)
     short = 0
@@ -122,6 +153,6 @@ def test_lines_end_where_an_image_does_and_steps_are_a_pixel_at_most() -> None:
             line = np.array([pixel(p, feet[k] + v * normals[k]) for v in np.linspace(bottom, top, int(count) + 1)])
             assert np.linalg.norm(np.diff(line, axis=0), axis=1).max() <= 1.0 + 1e-9
         start, last = (bottom + lanes[plane + k] * dz for plane in (START, LAST))
-        assert start >= min(0.1 + MARGIN * dz, top) - 1e-9
+        assert min(lanes[HIGH + k] + MARGIN * dz, top) - 1e-9 <= start <= top + 1e-9
         assert last <= 0.05 - MARGIN * dz
     assert short > n // 2

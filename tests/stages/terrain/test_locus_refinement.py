@@ -2,17 +2,29 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.ndimage
 from raising import raises
 from terrain_scenes import disparity, pitched, plane, smooth_noise, toed_in_rig
 
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.surface import Surface
 from rille.stages.geometry.surface import plane as reference_plane
 from rille.stages.terrain.locus import views as locus_views
-from rille.stages.terrain.locus.refinement import UNKNOWN_BEND, refine, standard_deviation
+from rille.stages.terrain.locus.refinement import (
+    BEND,
+    FACTOR,
+    FLOOR,
+    LEAST_CORRELATION,
+    STIFFNESS,
+    UNKNOWN_BEND,
+    _stiffness,
+    refine,
+    standard_deviation,
+)
 from rille.stages.terrain.locus.solve import ONE_SIDED, Dem, Matches, join
 from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
-from rille.stages.terrain.locus.views import Views, look, views
+from rille.stages.terrain.locus.views import OrthoPair, Views, look, views
 
 RIG = toed_in_rig()
 T_LOCAL_LEFT = pitched(35.0, roll_deg=3.0)
@@ -109,6 +121,40 @@ def test_derivatives_are_those_of_finite_differences() -> None:
     np.testing.assert_allclose(seen.area[known], area[known], rtol=0.03)
 
 
+def test_derivatives_along_tilted_normals_are_those_of_finite_differences() -> None:
+    normal, dz = np.array([0.2, -0.3, 1.0]) / np.sqrt(1.13), 1e-4
+
+    def locate(rows: np.ndarray, cols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        feet = np.dstack([LATTICE.xy(), TRUTH])[rows.astype(int), cols.astype(int)]
+        return feet - 0.01 * normal, np.broadcast_to(normal, feet.shape)
+
+    surface = Surface(*LATTICE.shape, locate)
+    low, seen, high = (look(through(), surface, np.full(LATTICE.shape, 0.01 + k * dz)) for k in (-1, 0, 1))
+    known = np.isfinite(low.left + high.left)
+    assert known.mean() > 0.9
+    assert rms((seen.left - texture(LATTICE.xy().reshape(-1, 2)).reshape(LATTICE.shape))[known]) < 0.3
+    for side in ("left", "right"):
+        change = (getattr(high, side) - getattr(low, side)) / (2 * dz)
+        found = getattr(seen, f"{side}_slope")
+        assert rms((change - found)[known]) < 0.01 * rms(found[known])
+
+
+def test_cells_are_seen_that_lie_inside_both_images() -> None:
+    wide = Lattice.snap((-0.6, 0.6, 0.3, 1.2), 0.02)
+    points = np.dstack([wide.xy(), np.full(wide.shape, -HEIGHT)])
+    seen = look(through(), reference_plane(wide), points[..., 2])
+    T_left_local = T_LOCAL_LEFT.inverse()
+    left, right = (
+        RIG.left.project(T_left_local.apply(points)),
+        RIG.right.project((RIG.T_right_left @ T_left_local).apply(points)),
+    )
+    size = np.array([RIG.left.width, RIG.left.height])
+    inside = np.all([(p >= 1) & (p < size - 2) for p in (left, right)], axis=(0, 3))
+    assert 0.1 < inside.mean() < 0.9
+    for shown in seen:
+        np.testing.assert_array_equal(np.isfinite(shown), inside)
+
+
 def test_errors_of_the_disparity_are_taken_out() -> None:
     column = noisy()
     before, after = pixels(model(column, right=None)), pixels(model(column))
@@ -180,6 +226,60 @@ def test_undefined_cells_stay_undefined_and_cast_doubt() -> None:
     scale = seen.scale[29, 42]
     assert std[29, 42] > 0.2 * UNKNOWN_BEND / scale / 7  # beside a hole: one of 49 cells would do
     assert std[29, 42] > 2.0 * std[10, 42]
+
+
+def rough() -> tuple[np.ndarray, OrthoPair]:
+    """Elevations with a cell that nobody saw, and random grey values there."""
+    rng = np.random.default_rng(11)
+    shape = (12, 15)
+    z, left, right = (rng.normal(size=shape).astype(np.float32) for _ in range(3))
+    z[5, 6] = np.nan
+    maps = dict.fromkeys(OrthoPair._fields, np.ones(shape, np.float32))
+    maps |= {"left": left, "right": left + right, "scale": rng.uniform(1.0, 2.0, shape).astype(np.float32)}
+    return z, OrthoPair(**maps)
+
+
+def test_the_standard_deviation_is_that_of_the_equation_in_plain_numpy() -> None:
+    z, seen = rough()
+    known, scale = np.isfinite(z), seen.scale
+    bend, step, products = np.zeros(z.shape), np.zeros(z.shape), np.zeros((3, *z.shape))
+    inner = np.zeros(z.shape, bool)
+    inner[1:-1, 1:-1] = True
+    for axis in (0, 1):
+        middle = np.moveaxis(z, axis, 0)
+        second = middle[:-2] - 2.0 * middle[1:-1] + middle[2:]
+        np.moveaxis(bend, axis, 0)[1:-1] += np.abs(second)
+        central = [0.5 * (np.roll(a, -1, axis) - np.roll(a, 1, axis)) for a in (z, seen.left, seen.right)]
+        step += central[0] ** 2
+        products += [central[1] * central[2], central[1] ** 2, central[2] ** 2]
+    bend[~np.isfinite(bend)] = (UNKNOWN_BEND / scale)[~np.isfinite(bend)]
+    whole = inner & np.isfinite(step) & known
+    step, products = np.where(whole, step, 0.0), np.where(whole, products, 0.0)
+
+    def total(a: np.ndarray, side: int) -> np.ndarray:
+        return scipy.ndimage.convolve(a.astype(float), np.ones((side, side)), mode="constant")
+
+    b2 = total(np.where(known, bend**2, 0.0), 7) / total(np.ones(z.shape), 7)
+    t2 = total(step, 7) / total(known, 7)
+    both, of_left, of_right = (total(a, 5) for a in products)
+    r = np.clip(both / np.sqrt(of_left * of_right), LEAST_CORRELATION, 1.0)
+    given = np.full(z.shape, 0.3)
+    expected = np.sqrt((FLOOR / scale) ** 2 + FACTOR**2 * (given**2 + b2 + t2) / r**2)
+    found = standard_deviation(z, seen, given)
+    np.testing.assert_allclose(found[known], expected[known], rtol=1e-4)
+    assert found[5, 6] == 0.3
+
+
+def test_stiffness_gives_way_to_the_second_difference() -> None:
+    z, seen = rough()
+    across, down = np.zeros((2, *z.shape), np.float32)
+    _stiffness(z, seen.scale, across, down)
+    for found, axis in ((across, 1), (down, 0)):
+        s = seen.scale
+        d = s * (np.roll(z, 1, axis) - 2.0 * z + np.roll(z, -1, axis)) / BEND
+        expected = np.moveaxis(np.where(np.isfinite(d), STIFFNESS * s**2 / (1.0 + d**2), 0.0), axis, 0)
+        expected[[0, -1]] = 0.0
+        np.testing.assert_allclose(np.moveaxis(found, axis, 0), expected, rtol=1e-4)
 
 
 def test_the_result_does_not_depend_on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -77,6 +77,35 @@ def test_in_the_dark_there_is_no_contrast_to_match() -> None:
     assert found[20, 42] > 3.0 * found[20, 15]
 
 
+def test_in_the_dark_contrast_is_at_most_the_noise() -> None:
+    elevation, seen = ground()
+    seen[:2] -= GREY
+    found = std(elevation, seen)[20, 25]
+    np.testing.assert_allclose(found, expected(grey=1.4826 * NOISE), rtol=5e-3)
+
+
+def test_what_both_images_show_alike_is_no_difference() -> None:
+    elevation, seen = ground(rise=0.0)
+    seen[0] = seen[1] = np.random.default_rng(1).uniform(50.0, 150.0, SHAPE)
+    np.testing.assert_allclose(std(elevation, seen), FLOOR / SCALE, rtol=1e-3)
+
+
+def test_a_single_cell_speaks_for_itself() -> None:
+    """One cell that both directions gave is the mean of its window; so is the only cell that is known."""
+    elevation, seen = ground(rise=0.0)
+    seen[1] = seen[0]
+    apart = uniform(np.nan)
+    apart[20, 25] = AWAY
+    np.testing.assert_allclose(
+        std(elevation, seen, apart=apart)[20, 25], np.hypot(FLOOR / SCALE, APART * AWAY), rtol=1e-3
+    )
+    elevation[:20], elevation[21:], elevation[20, :25], elevation[20, 26:] = (np.nan,) * 4
+    found = std(elevation, seen, moved=SHIFT, apart=np.nan)[20, 25]
+    np.testing.assert_allclose(
+        found, np.sqrt(FLOOR**2 + (APART * ALONE) ** 2 + (MOVED * SCALE * SHIFT) ** 2) / SCALE, rtol=1e-3
+    )
+
+
 def test_where_one_direction_found_nothing_a_difference_is_supposed() -> None:
     apart = uniform(AWAY)
     apart[:, 20:] = np.nan

@@ -61,6 +61,31 @@ def test_two_models_by_hand() -> None:
     np.testing.assert_allclose(merged.ortho, 100.0, atol=0.01)  # the best image, not a double exposure
 
 
+def test_two_models_of_any_standard_deviations_by_the_equations() -> None:
+    rng = np.random.default_rng(8)
+    z, std, residual, ortho = (
+        rng.uniform(*ends, (2, *TILE.shape)) for ends in ((0, 1), (0.05, 0.2), (0, 0.3), (9, 200))
+    )
+    merged = merge([layer(k, z[k], std[k], residual[k], ortho[k]) for k in range(2)], TILE, PARAMS)
+    weight = 1.0 / (std**2 * (1.0 + (residual / PARAMS.residual_scale) ** 2))
+    share = weight / weight.sum(axis=0)
+    mean = (share * z).sum(axis=0)
+    alone, together = ((share * std) ** 2).sum(axis=0), (share * std).sum(axis=0) ** 2
+    sharp = (weight / weight.max(axis=0)) ** merge_stage.SHARPNESS
+    np.testing.assert_allclose(merged.elevation, mean, rtol=1e-5)
+    np.testing.assert_allclose(merged.relief_std, np.sqrt(alone), rtol=1e-5)
+    np.testing.assert_allclose(merged.elevation_std**2, (1 - PARAMS.alike) * alone + PARAMS.alike * together, rtol=1e-5)
+    np.testing.assert_allclose(merged.spread, np.sqrt((share * (z - mean) ** 2).sum(axis=0)), rtol=1e-4)
+    np.testing.assert_allclose(merged.ortho, (sharp * ortho).sum(axis=0) / sharp.sum(axis=0), rtol=1e-4)
+    np.testing.assert_array_equal(merged.source, weight.argmax(axis=0))
+
+
+def test_cells_without_grey_values_have_an_elevation() -> None:
+    merged = merge([layer(0, 1.0, ortho=np.nan), layer(1, 1.0, ortho=np.nan)], TILE, PARAMS)
+    np.testing.assert_allclose(merged.elevation, 1.0)
+    assert np.isnan(merged.ortho).all()
+
+
 def test_one_model_passes_through() -> None:
     one = noisy(1)[0]
     merged = merge([one], TILE, PARAMS)
@@ -114,6 +139,15 @@ def test_one_model_that_contradicts_does_not_pull(where: int) -> None:
     assert np.abs(merged.elevation).max() < 0.02
     assert (merged.count == 3).all()
     assert (merged.source != where).all()
+
+
+def test_of_three_models_the_third_has_less_weight_by_the_biweight() -> None:
+    z, std = np.array([0.0, 0.1, 0.5]), 0.1
+    merged = merge([layer(k, v, std) for k, v in enumerate(z)], TILE, PARAMS)
+    off = np.abs(z - np.median(z))
+    unit = 4.685 * max(1.4826 * np.median(off), std)
+    weight = (1.0 - (off / unit) ** 2) ** 2
+    np.testing.assert_allclose(merged.elevation, (weight * z).sum() / weight.sum(), rtol=1e-5)
 
 
 def test_equal_models_have_no_spread() -> None:
