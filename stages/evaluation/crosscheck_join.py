@@ -89,7 +89,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     frames = [int(f) for f in args["frames"]]
     parts = [(list(b.meta["frames"]), np.asarray(b["poses"])) for b in inputs["windows"]]
     chained, piece, ties = join(frames, parts)
-    lengths = np.bincount(piece[piece >= 0]) if (piece >= 0).any() else np.zeros(0, np.intp)
+    lengths = np.bincount(piece[piece >= 0])
     longest = int(lengths.argmax()) if lengths.size else -1
     poses = np.where((piece == longest)[:, None, None] & (longest >= 0), chained, np.nan)
     facts = [{k: b.meta[k] for k in ("frames", "registered", "points", "reason")} for b in inputs["windows"]]

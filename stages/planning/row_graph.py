@@ -98,7 +98,7 @@ def _sweep(height, ways, charges, sources, cost, move):  # type: ignore[no-untyp
         here, before = lines[r % 2], lines[1 - r % 2]
         first, end = _between(sources[r])
         left, right = max(min(low - 1, first), 0), min(max(high + 2, end), cols)
-        cost[r, : min(left, cols)], move[r, : min(left, cols)] = UNREACHED, -1
+        cost[r, :left], move[r, :left] = UNREACHED, -1
         cost[r, max(right, left) :], move[r, max(right, left) :] = UNREACHED, -1
         if right <= left:
             low, high = cols, -1
