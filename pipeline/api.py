@@ -161,7 +161,10 @@ class Run:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing of the reconstruction is missing; that there is no path, say, is an answer."""
+        """Whether nothing of the reconstruction is missing; that there is no path, say, is an answer.
+
+        A drive is complete where it reached its goal.
+        """
         return bool(self.report["complete"])
 
     @property

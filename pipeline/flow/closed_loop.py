@@ -34,7 +34,7 @@ import math
 from collections.abc import Generator
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -57,6 +57,8 @@ from rille.stages.planning.local_planner import stage as local_planner
 from rille.stages.planning.local_planner.look import PlannerMemory
 from rille.stages.terrain import map_localization, merge, occlusion_bounds, start_area
 
+Sigma = Annotated[float, Field(ge=0)]
+
 
 class DriveParams(Params):
     """The loop itself; what happens on a leg and at a stop is the stages' own."""
@@ -73,7 +75,7 @@ class DriveParams(Params):
         default=None,
         description="rough pose of the first left camera in the global map: x, y [m], heading [degrees to the left]",
     )
-    prior_sigma: tuple[float, float] = Field(
+    prior_sigma: tuple[Sigma, Sigma] = Field(
         default=(0.1, 5.0), description="standard deviations of that pose: position [m], heading [degrees]"
     )
     pose: tuple[float, float, float, float] | None = Field(
@@ -152,6 +154,13 @@ class Drive:
         if config.locus.cell_size is None:
             raise ConfigError(
                 "RIL-032", "a drive needs locus.cell_size", remedy="set it to about an eighth of a wheel, metres"
+            )
+        d, overview = config.drive, sequence.simulation.overview
+        if d.frame == "map" and d.pose is None and (d.prior is None or overview is None):
+            raise ConfigError(
+                "RIL-033",
+                "drive.frame=map needs drive.pose, or drive.prior and a global map",
+                remedy="set drive.pose=[x, y, z, degrees], or drive.prior and rover.map_cell",
             )
         self.graph, self.sequence, self.config = graph, sequence, config
         self.make = DriveBuilder(graph, sequence, config, self)
@@ -239,13 +248,10 @@ class Drive:
         args: dict[str, Any] = {}
         if d.pose is not None:
             args["pose"] = [*d.pose[:3], math.radians(d.pose[3])]
-        elif d.prior is None or self.simulation.overview is None:
-            raise ConfigError(
-                "RIL-033",
-                "drive.frame=map needs drive.pose, or drive.prior and a global map",
-                remedy="set drive.pose=[x, y, z, degrees], or drive.prior and rover.map_cell",
-            )
         else:
+            # Checked before the drive began.
+            assert d.prior is not None
+            assert self.simulation.overview is not None
             overview = self.make.source(self.simulation.overview, "overview", {"scene": self.scene})
             inputs = {"dem": self.pairs[0].dem, "map": overview}
             args["prior"] = [*d.prior[:2], math.radians(d.prior[2])]

@@ -158,7 +158,8 @@ def _ahead(rows: Rows, reason: str) -> str:
 def _path(view: RunView) -> Items:
     drive = view.products.drive
     if drive is not None:
-        return [] if drive.verdict == "goal" else [_item("no path", f"Drive: {drive.verdict}", drive.reason)]
+        # No answer: a drive is asked for its goal, and all that it did not come to is missing with that.
+        return [] if drive.verdict == "goal" else [_item("drive", f"Drive: {drive.verdict}", drive.reason)]
     path = view.bundle(view.products.world_path)
     if path is None:
         return [_item("no path", "No path", "the path over the merged terrain was not computed")]

@@ -230,7 +230,9 @@ def _by_grid(
             cells = grid8.trace(step, first)
             break
     reason = "" if len(cells) else "start and target are not connected by ground that the vehicle may cross"
-    base = before.plan if before is not None else Plan(nothing, cost, np.zeros(grid.cols, dtype=bool), 0)
+    # What rows found lies on their grid: where that is turned, its rows are none of this one.
+    same = before is not None and before.grid == grid
+    base = before.plan if before is not None and same else Plan(nothing, cost, np.zeros(grid.cols, dtype=bool), 0)
     found = replace(base, cells=cells, cost=cost, reachable=np.zeros(grid.cols, dtype=bool), reason=reason)
     if len(cells):
         found = replace(found, target_row=int(cells[-1, 0]), blocking_row=None)

@@ -73,11 +73,14 @@ class HeightGrid:
         return np.where(inside, (1 - u) * top + u * foot, np.nan)
 
     def part(self, x: tuple[float, float], y: tuple[float, float], wheel_diameter: float) -> HeightGrid:
-        """The ground of a box alone, wheels recomputed."""
+        """The ground of a box alone, wheels recomputed; of a box beside the ground, the edge that is next to it."""
         c0, c1 = (int((v - self.x0) / self.cell) for v in x)
         r0, r1 = (int((self.y0 - v) / self.cell) for v in (y[1], y[0]))
-        r0, r1 = max(r0, 0), min(r1 + 2, self.height.shape[0])
-        c0, c1 = max(c0, 0), min(c1 + 2, self.height.shape[1])
+        # Never fewer than two nodes a side, between which heights are bilinear.
+        (r0, r1), (c0, c1) = (
+            (min(max(first, 0), n - 2), min(max(end + 2, 2), n))
+            for first, end, n in ((r0, r1, self.height.shape[0]), (c0, c1, self.height.shape[1]))
+        )
         part = self.height[r0:r1, c0:c1]
         return HeightGrid.of(part, self.x0 + c0 * self.cell, self.y0 - r0 * self.cell, self.cell, wheel_diameter)
 

@@ -10,8 +10,9 @@ import pytest
 from raising import raises
 
 from rille.datasets.mockup.obstacle import on_path
-from rille.datasets.mockup.rover import RoverParams, SentLeg, drive_leg, heading_of, images_at
+from rille.datasets.mockup.rover import RoverParams, SentLeg, bed_ground, drive_leg, heading_of, images_at
 from rille.datasets.mockup.sequence import vehicle_at_scale
+from rille.stages.core.declare import Bundle
 from rille.stages.planning.wheels import HeightGrid
 
 VEHICLE = vehicle_at_scale()
@@ -85,6 +86,16 @@ def test_beside_the_bed_it_is_not_placed() -> None:
     with raises("RIL-250"):
         drive_leg(
             FLAT, VEHICLE, (0.5, 0.0, 0.0), (0.0, 0.0, 0.0), SentLeg(PATH, [1, 1], 0.0), EXACT, np.random.default_rng(0)
+        )
+
+
+@pytest.mark.parametrize("at", [(5.0, 5.0), (-5.0, -5.0), (0.0, 5.0), (5.0, 0.0), (0.0, -5.0)])
+def test_far_from_the_bed_it_is_not_placed(at: tuple[float, float]) -> None:
+    lattice = {"x0": -0.5, "y0": 0.5, "cell": 0.004}
+    ground = bed_ground(Bundle({"height": FLAT.height}, {"lattice": lattice}), VEHICLE, at, 0.3)
+    with raises("RIL-250"):
+        drive_leg(
+            ground, VEHICLE, (*at, 0.0), (0.0, 0.0, 0.0), SentLeg(PATH, [1, 1], 0.0), EXACT, np.random.default_rng(0)
         )
 
 

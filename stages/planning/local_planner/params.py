@@ -5,7 +5,7 @@ Costs are factors of a metre's cost; a metre over known, free ground costs 1.
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from rille.stages.core.declare import Params
 
@@ -93,3 +93,12 @@ class LocalPlannerParams(Params):
     failed_view_radius: float = Field(
         0.8, gt=0, description="radius [wheelbases] of the unknown ground that is closed then"
     )
+
+    @model_validator(mode="after")
+    def _the_longest_leg_is_no_shorter_than_the_shortest(self) -> LocalPlannerParams:
+        if self.max_length < self.min_length:
+            raise ValueError(
+                f"max_length {self.max_length:g} wheelbases is less than min_length {self.min_length:g}: "
+                "no leg would be long enough; raise max_length or lower min_length"
+            )
+        return self

@@ -228,6 +228,18 @@ def test_a_drive_needs_a_goal_and_a_cell(store: Path) -> None:
         Drive(Graph(), sequence, config.build({}))
 
 
+@pytest.mark.parametrize("given", [{}, {"prior": (0.0, 0.35, 0.0)}])
+def test_a_goal_in_a_map_without_a_pose_or_a_map_is_refused_before_anything_is_computed(given: dict[str, Any]) -> None:
+    drive = {"goal": (0.0, 1.0), "frame": "map", **given}
+    with raises("RIL-033"):
+        Drive(Graph(), open_sequence("mockup-loop"), config.build({"drive": drive, "locus": {"cell_size": 0.004}}))
+
+
+def test_a_prior_of_negative_deviation_is_refused() -> None:
+    with raises("RIL-027", "drive.prior_sigma.0"):
+        config.build(config.expand(config.parse_assignments(["drive.prior_sigma=[-0.1, 5.0]"])))
+
+
 @pytest.mark.slow
 def test_a_goal_in_a_global_map_is_found_from_a_rough_prior(store: Path) -> None:
     more = ("rover.map_cell=0.03", "drive.frame=map", "drive.goal=[0.0, 0.6]", "drive.max_stops=1")

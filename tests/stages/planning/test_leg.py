@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from leg_scenes import AT, CAMERAS, GOAL, LATTICE, ROVER, START, P, X, Y, ground
+from pydantic import ValidationError
 from raising import raises
 
 from rille.stages.core.declare import Bundle
@@ -36,6 +37,12 @@ def test_over_free_ground_it_goes_straight_one_leg_far() -> None:
     assert np.abs(leg.path[:, 0]).max() < 1e-9
     assert leg.path[-1, 1] == pytest.approx(P.max_length * ROVER.wheel_base, abs=1e-9)
     assert leg.gear.tolist() == [1]
+
+
+def test_a_longest_leg_below_the_shortest_is_refused() -> None:
+    """Over ground that is known to the goal no leg would be long enough."""
+    with pytest.raises(ValidationError, match=r"max_length 0.2 wheelbases is less than min_length 0.3"):
+        LocalPlannerParams(max_length=0.2)
 
 
 def test_the_leg_ends_before_a_wheel_stands_on_unknown_ground() -> None:

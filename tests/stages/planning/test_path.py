@@ -192,6 +192,25 @@ def test_behind_a_wall_rows_fail_and_grid8_goes_round() -> None:
     assert np.diff(route.xyz[:, 1]).min() < 0  # it goes back
 
 
+def test_where_a_turned_grid_is_blocked_is_not_told_on_another_one() -> None:
+    """A wall lies across the line from start to target; the row that it closes is one of the turned grid alone."""
+    lattice = Lattice.at(100, 100, CELL, 60, 60)
+    risk, z = level(lattice)
+    risk[np.abs(np.subtract.outer(np.arange(60), np.arange(60))) <= 1] = HAZARDOUS
+    ends = ((1.1, 0.5), (1.5, 0.9))
+
+    def told(planner: str) -> tuple[object, object]:
+        route = find_path(maps(risk, z), lattice, SHORT, ends=ends, params=PathParams(planner=planner))
+        facts = describe(route, maps(risk, z), lattice, SHORT)
+        assert not facts["found"]
+        return facts["blocking_row"], facts["blocking_y"]
+
+    row, ahead = told("rows")
+    assert ahead == pytest.approx(math.sqrt(2.0), abs=0.1)
+    assert row is not None
+    assert told("auto") == (None, None)
+
+
 @pytest.mark.parametrize("datum", [0.0, 3e5])
 def test_heights_far_from_the_datum_cost_what_they_differ(datum: float) -> None:
     """300 km are 1.5e9 steps of 0.2 mm, which are kept in 64 bits; float32 there tells 0.03 m apart."""
