@@ -39,6 +39,7 @@ def drive(sequence: Any, config: Any, goal: tuple[float, float]) -> dict[str, An
     from driving.exact_bed import ExactBed, place_of
 
     from rille.stages.core.declare import Bundle
+    from rille.stages.geometry.geometry import way_length
     from rille.stages.hazard.risk import risk_map
     from rille.stages.planning.local_planner.look import FieldOfView, PlannerMemory
     from rille.stages.planning.local_planner.stage import SeenGround, next_leg, shortest_way
@@ -73,7 +74,7 @@ def drive(sequence: Any, config: Any, goal: tuple[float, float]) -> dict[str, An
             follows = memory.after(leg.verdict, (*place, heading), leg.where)
         before = (leg.rest, leg.rest_gear) if len(leg.rest_gear) else None
         T = bed.at(*after(leg, heading))
-        stops, way = stops + 1, way + float(np.hypot(*np.diff(leg.path, axis=0).T).sum())
+        stops, way = stops + 1, way + way_length(leg.path)
     verdict = leg.verdict if follows == "end" else "stops"
     return {"verdict": verdict, "reason": leg.reason, "way": way, "shortest_way": best, "stops": stops}
 

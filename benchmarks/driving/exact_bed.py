@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from rille.datasets.mockup import scene as bed
 from rille.datasets.mockup.raycast import HeightField
-from rille.datasets.mockup.rover import bed_ground, heading_of
+from rille.datasets.mockup.rover import bed_ground
 from rille.datasets.mockup.sequence import true_rig
 from rille.datasets.mockup.site import prepare
 from rille.datasets.mockup.truth_dem import seen_by, true_dem
 from rille.pipeline.flow.closed_loop import arena
 from rille.stages.core.declare import Bundle
-from rille.stages.geometry.geometry import RigidTransform, level_rotation
+from rille.stages.geometry.geometry import RigidTransform, from_above, level_rotation
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.wheels import HeightGrid, stand
@@ -98,5 +98,5 @@ class ExactBed:
 
 def place_of(T_world_vehicle: RigidTransform) -> tuple[tuple[float, float], float]:
     """x, y (m) and heading (rad) of a pose."""
-    x, y, _ = T_world_vehicle.translation
-    return (float(x), float(y)), heading_of(T_world_vehicle)
+    x, y, heading = from_above(T_world_vehicle)
+    return (x, y), heading

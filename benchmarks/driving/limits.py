@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driving.exact_bed import ExactBed
-from rille.datasets.mockup.rover import heading_of
+from rille.stages.geometry.geometry import from_above
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.local_planner.route import length_of, pieces, straightened
@@ -50,11 +50,11 @@ def shortest_within_limits(bed: ExactBed, goal: tuple[float, float], params: Any
     """Length, m, of the shortest way from the start to a goal (world frame) for the planner's grid; None: none."""
     vehicle, ground, T_bed_world = bed.vehicle, bed.ground, bed.T_world_bed.inverse()
     T_bed_vehicle = T_bed_world @ bed.T_world_vehicle
-    x, y = (float(v) for v in T_bed_vehicle.translation[:2])
+    x, y, heading = from_above(T_bed_vehicle)
     gx, gy, _ = T_bed_world.apply([*goal, bed.T_world_vehicle.translation[2]])
     rows, cols = ground.height.shape
     sides = ground.x0, ground.x0 + ground.cell * (cols - 1), ground.y0 - ground.cell * (rows - 1), ground.y0
-    heading, spacing = heading_of(T_bed_vehicle), params.spacing * vehicle.wheel_diameter
+    spacing = params.spacing * vehicle.wheel_diameter
     grid = PoseGrid.over(Lattice.snap(sides, ground.cell), (x, y), heading, spacing)
     limits = Limits(ground, vehicle)
 

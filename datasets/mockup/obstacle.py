@@ -11,10 +11,10 @@ import numpy as np
 from rille.datasets.mockup import scene as bed
 from rille.datasets.mockup import terrain
 from rille.datasets.mockup.params import SceneParams
-from rille.datasets.mockup.rover import RoverParams, heading_of
+from rille.datasets.mockup.rover import RoverParams
 from rille.datasets.mockup.site import distance
 from rille.stages.core.declare import Bundle, Inputs, Stage
-from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.geometry import RigidTransform, heading_of
 
 
 def on_path(path: np.ndarray, way: float, aside: float) -> tuple[float, float]:

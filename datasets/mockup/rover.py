@@ -19,7 +19,7 @@ from pydantic import Field
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import InputError
-from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.geometry import RigidTransform, from_above, way_length
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.wheels import HeightGrid, Stand, stand
 
@@ -114,11 +114,6 @@ class _Drive:
         return True
 
 
-def heading_of(T: RigidTransform) -> float:
-    """Angle (rad, to the left of y) of the y axis of a frame, seen from above."""
-    return math.atan2(-T.rotation[0, 1], T.rotation[1, 1])
-
-
 class SentLeg(NamedTuple):
     """``path`` (vertex, 2) m, from the rover's estimated position on; ``gear`` of each piece, 1 ahead or -1 back;
     ``turn`` on the spot at the end, rad."""
@@ -146,7 +141,7 @@ def drive_leg(
     """
     path, gear, turn = sent
     slip = p.slip + p.slip_sigma * float(rng.standard_normal())
-    length = float(np.hypot(*np.diff(path, axis=0).T).sum()) if len(path) > 1 else 0.0
+    length = way_length(path)
     drift = math.radians(p.heading_sigma_deg) * float(rng.standard_normal()) / max(length, STEP)
     spin = 1.0 + p.turn_sigma * float(rng.standard_normal())
     first = stand(ground, *before, vehicle)
@@ -195,16 +190,18 @@ def images_at(wheels: Floats, p: RoverParams) -> list[int]:
 
 
 def bed_ground(scene: Bundle, vehicle: Vehicle, at: tuple[float, float], reach: float) -> HeightGrid:
-    """The bed around a point."""
-    lattice = scene.meta["lattice"]
-    whole = HeightGrid(
-        lattice["x0"], lattice["y0"], lattice["cell"], np.asarray(scene["height"], np.float64), *2 * [_NONE]
+    """The bed within ``reach`` metres of a point, along either axis."""
+    height = np.asarray(scene["height"], np.float64)
+    x0, y0, cell = (scene.meta["lattice"][name] for name in ("x0", "y0", "cell"))
+    (x, y), (n, m) = at, height.shape
+    # Never fewer than two nodes a side, between which heights are bilinear: beside the bed, those next to it.
+    rows, cols = (
+        slice(min(max(int(low / cell), 0), most - 2), min(max(int(high / cell) + 2, 2), most))
+        for low, high, most in ((y0 - (y + reach), y0 - (y - reach), n), (x - reach - x0, x + reach - x0, m))
     )
-    box = [(v - reach, v + reach) for v in at]
-    return whole.part(box[0], box[1], vehicle.wheel_diameter)
-
-
-_NONE = np.zeros((0, 0))
+    return HeightGrid.of(
+        height[rows, cols], x0 + cols.start * cell, y0 - rows.start * cell, cell, vehicle.wheel_diameter
+    )
 
 
 def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
@@ -213,17 +210,14 @@ def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     # The placement at the start is leg -1, and a seed must not be negative.
     rng = np.random.default_rng([params.seed, 70, 1 + int(args["leg"])])
     if "before" in inputs:
-        T = RigidTransform.from_matrix(np.asarray(inputs["before"]["vehicle"])[int(args["row"])])
-        before = float(T.translation[0]), float(T.translation[1]), heading_of(T)
-        believed = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1]) @ T_left_vehicle
+        before = from_above(RigidTransform.from_matrix(np.asarray(inputs["before"]["vehicle"])[int(args["row"])]))
+        start = from_above(RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1]) @ T_left_vehicle)
         path, gear = np.asarray(inputs["leg"]["path"])[:, :2], np.asarray(inputs["leg"]["gear"]).tolist()
-        start = float(believed.translation[0]), float(believed.translation[1]), heading_of(believed)
         turn = float(inputs["leg"].meta["turn"])
     else:
         before = *params.start, math.radians(params.heading_deg)
         path, gear, start, turn = np.zeros((1, 2)), [], (0.0, 0.0, 0.0), 0.0
-    length = float(np.hypot(*np.diff(path, axis=0).T).sum()) if len(path) > 1 else 0.0
-    ground = bed_ground(scene, vehicle, before[:2], length + REACH)
+    ground = bed_ground(scene, vehicle, before[:2], way_length(path) + REACH)
     d = drive_leg(ground, vehicle, before, start, SentLeg(path, gear, turn), params, rng)
     wheels = np.array(d.wheels)
     frames = images_at(wheels, params)

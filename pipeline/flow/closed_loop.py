@@ -385,10 +385,7 @@ class Drive:
                 stop.event = f"lost image {shares}: stopped and taken again as image {again}"
                 self.make.pyramid(again, "left")
                 frames.append(again)
-        kept = [f for f in frames if f not in lost]
-        if len(kept) < 2:
-            raise EndedError("safety stop", "tracking is lost: " + stop.event)
-        return kept
+        return [f for f in frames if f not in lost]
 
     def _judge(self, stop: Stop, way: Way) -> Generator[Wait, Any, TrueStand]:
         """Track and resect the images of a leg: it is over at its end, or where a safety stop or an obstacle was."""
@@ -426,8 +423,7 @@ class Drive:
         if terminal or self.troubles >= self.config.drive.max_safety_stops:
             often = f", {self.troubles} legs in a row" if self.troubles > 1 else ""
             # What was driven up to a safety stop belongs to the trajectory and to the assessment.
-            if len(frames) > 1:  # else it stands where the trajectory ends already
-                self._located(len(self.driven.stops))
+            self._located(len(self.driven.stops))
             raise EndedError("safety stop", reason + often)
         assert stop.drive is not None
         end = frames[-1]

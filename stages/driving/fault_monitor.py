@@ -21,7 +21,7 @@ from pydantic import Field
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, Inputs, Params, Stage
-from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.geometry import RigidTransform, heading_of
 
 
 class FaultMonitorParams(Params):
@@ -122,7 +122,7 @@ def judge(
 
 def _disagreement(wheels: Floats, moved: RigidTransform, base: float, params: FaultMonitorParams) -> str:
     """In what way wheels and vision contradict each other, in words; empty: they do not."""
-    turn = math.atan2(-moved.rotation[0, 1], moved.rotation[1, 1])
+    turn = heading_of(moved)
     # The remainder, since headings jump by a full turn.
     apart = math.degrees(abs(math.remainder(turn - float(wheels[2]), 2 * math.pi)))
     if apart > params.max_turn_deg:

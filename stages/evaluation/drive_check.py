@@ -19,6 +19,7 @@ import numpy as np
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.evaluation.accuracy_parts import Metric, inverse, metric, square
+from rille.stages.geometry.geometry import way_length
 
 
 def judged(drive: Mapping[str, Any], row: int) -> dict[str, Floats]:
@@ -48,7 +49,7 @@ def placements(parts: Sequence[Mapping[str, Floats]], vehicle: Mapping[str, Any]
 
 def way(parts: Sequence[Mapping[str, Floats]]) -> float:
     """Length of the true way seen from above, m."""
-    return float(sum(np.hypot(*np.diff(p["trail"][:, :2, 3], axis=0).T).sum() for p in parts))
+    return sum(way_length(p["trail"][:, :, 3]) for p in parts)
 
 
 def localisation(estimate: Floats, truth: Floats, length: float) -> tuple[Floats, dict[str, Metric]]:

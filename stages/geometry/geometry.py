@@ -172,6 +172,21 @@ class Rig:
         )
 
 
+def heading_of(T: RigidTransform) -> float:
+    """Angle (rad, to the left of y) of the y axis of a frame, seen from above."""
+    return math.atan2(-T.rotation[0, 1], T.rotation[1, 1])
+
+
+def from_above(T: RigidTransform) -> tuple[float, float, float]:
+    """Place x, y (m) and heading (rad, see :func:`heading_of`) of a frame."""
+    return float(T.translation[0]), float(T.translation[1]), heading_of(T)
+
+
+def way_length(points: Floats) -> float:
+    """Length (m) of a line through points (n, at least 2), m, seen from above."""
+    return float(np.hypot(*np.diff(points[:, :2], axis=0).T).sum())
+
+
 def cross_matrix(v: Floats) -> Floats:
     """[v]x (..., 3, 3) of vectors (..., 3): ``[v]x u = v x u``."""
     z = np.zeros(v.shape[:-1])

@@ -72,18 +72,6 @@ class HeightGrid:
         foot = (1 - v) * what[r + 1, c] + v * what[r + 1, c + 1]
         return np.where(inside, (1 - u) * top + u * foot, np.nan)
 
-    def part(self, x: tuple[float, float], y: tuple[float, float], wheel_diameter: float) -> HeightGrid:
-        """The ground of a box alone, wheels recomputed; of a box beside the ground, the edge that is next to it."""
-        c0, c1 = (int((v - self.x0) / self.cell) for v in x)
-        r0, r1 = (int((self.y0 - v) / self.cell) for v in (y[1], y[0]))
-        # Never fewer than two nodes a side, between which heights are bilinear.
-        (r0, r1), (c0, c1) = (
-            (min(max(first, 0), n - 2), min(max(end + 2, 2), n))
-            for first, end, n in ((r0, r1, self.height.shape[0]), (c0, c1, self.height.shape[1]))
-        )
-        part = self.height[r0:r1, c0:c1]
-        return HeightGrid.of(part, self.x0 + c0 * self.cell, self.y0 - r0 * self.cell, self.cell, wheel_diameter)
-
 
 def highest(z: Floats, reach: float) -> Floats:
     """Largest bilinear height (row, col) in the square of ``reach`` cells to each side of a node; NaN is left out."""

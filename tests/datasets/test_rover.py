@@ -10,9 +10,10 @@ import pytest
 from raising import raises
 
 from rille.datasets.mockup.obstacle import on_path
-from rille.datasets.mockup.rover import RoverParams, SentLeg, bed_ground, drive_leg, heading_of, images_at
+from rille.datasets.mockup.rover import RoverParams, SentLeg, bed_ground, drive_leg, images_at
 from rille.datasets.mockup.sequence import vehicle_at_scale
 from rille.stages.core.declare import Bundle
+from rille.stages.geometry.geometry import heading_of
 from rille.stages.planning.wheels import HeightGrid
 
 VEHICLE = vehicle_at_scale()

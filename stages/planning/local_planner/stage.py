@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, Inputs, Stage
-from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.geometry import Rig, RigidTransform, from_above, way_length
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.classification import HAZARDOUS, UNKNOWN, UNSEEN_BIT
 from rille.stages.hazard.vehicle import Vehicle
@@ -91,8 +90,7 @@ def _run(params: LocalPlannerParams, args: Mapping[str, Any], inputs: Inputs) ->
     T_world_left = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1])
     T_vehicle_left = RigidTransform.from_matrix(args["T_vehicle_left"])
     T = T_world_left @ T_vehicle_left.inverse()
-    # The heading counts from the world's y axis to the left, and the vehicle's y axis is its second column.
-    stand = float(T.translation[0]), float(T.translation[1]), math.atan2(-T.rotation[0, 1], T.rotation[1, 1])
+    stand = from_above(T)
     goal = (float(args["goal"][0]), float(args["goal"][1]))
     closed = [(float(x), float(y)) for x, y in args["closed"]]
     stands = [(float(x), float(y), float(heading)) for x, y, heading in args["stands"]]
@@ -116,8 +114,8 @@ def _run(params: LocalPlannerParams, args: Mapping[str, Any], inputs: Inputs) ->
         "start": list(stand),
         "goal": list(goal),
         "left_m": math.hypot(goal[0] - stand[0], goal[1] - stand[1]),
-        "length_m": _length(found.path),
-        "way_m": _length(found.way),
+        "length_m": way_length(found.path),
+        "way_m": way_length(found.way),
     }
     arrays: dict[str, NDArray[Any]] = {"path": found.path, "gear": found.gear, "way": found.way}
     arrays |= {"rest": found.rest, "rest_gear": found.rest_gear, "cost_to_go": found.cost}
@@ -139,10 +137,6 @@ def seen_so_far(near: Bundle, far: Bundle | None, p: LocalPlannerParams) -> tupl
         unknown &= ~(maps[2] < p.p_clear)
         glanced = unknown & (maps[0] < HAZARDOUS)
     return Hazards(*maps), KnownGround(unknown, glanced, maps[2] >= p.p_costly)
-
-
-def _length(path: Floats) -> float:
-    return float(np.hypot(*np.diff(path, axis=0).T).sum())
 
 
 STAGE = Stage(
