@@ -30,7 +30,7 @@ SUNK = 0.1
 """Share of the radius by which a link that does not turn may lie below the ground: a castor is placed no better."""
 
 MOST_LINKS = 300
-"""Robots with hands have a hundred; the way from each to the first is walked."""
+"""And joints: robots with hands have a hundred; the way from each link to the first is walked."""
 
 ROLL = math.radians(2.0)
 """Roll beyond which the pitch alone does not describe how a camera is mounted."""
@@ -73,8 +73,9 @@ def read_urdf(path: Path, camera: str = "", stated: Vehicle | None = None) -> Ro
         if child is not None and parent is not None:
             joints[child.get("link", "")] = (parent.get("link", ""), _origin(joint, path), joint.get("type", ""))
     links = {link.get("name", ""): link for link in robot.iter("link")}
-    if len(links) > MOST_LINKS:
-        raise _error(path, f"has {len(links)} links, at most {MOST_LINKS} are read", "leave out what is no part of it")
+    if max(len(links), len(joints)) > MOST_LINKS:
+        extent = f"{len(links)} links and {len(joints)} joints"
+        raise _error(path, f"has {extent}, at most {MOST_LINKS} are read", "leave out what is no part of it")
     places = {name: _place(name, joints, path) for name in links}
     shapes = {name: _shapes(link, places[name], path) for name, link in links.items()}
     turning = {name: s for name, s in shapes.items() if s and joints.get(name, ("",) * 3)[2] == "continuous"}

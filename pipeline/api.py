@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import webbrowser
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import tomli_w
 
+from rille.datasets.text.reading import TABLE, read_lines, read_text
 from rille.pipeline.steps import StereoSequence, check_place, check_sections
 from rille.stages.core.errors import ConfigError, InputError
 
@@ -156,8 +158,8 @@ class Run:
     @cached_property
     def report(self) -> Mapping[str, Any]:
         """All facts of the report (``report.json``)."""
-        found: dict[str, Any] = json.loads(self._file("report.json").read_text(encoding="utf-8"))
-        return found
+        with self._reading():
+            return dict(self._json("report.json"))
 
     @property
     def complete(self) -> bool:
@@ -165,13 +167,14 @@ class Run:
 
         A drive is complete where it reached its goal.
         """
-        return bool(self.report["complete"])
+        with self._reading():
+            return bool(self.report["complete"])
 
     @property
     def metrics(self) -> Mapping[str, Any]:
         """Figures by name: each has ``value``, ``unit`` and ``how`` it is found."""
-        found: dict[str, Any] = self.report["metrics"]
-        return found
+        with self._reading():
+            return dict(self.report["metrics"])
 
     @property
     def terrain(self) -> xarray.Dataset:
@@ -183,10 +186,16 @@ class Run:
         ------
         InputError
             The run has none.
+        ConfigError
+            It is not as Rille writes it.
         """
         import xarray
 
-        found: xarray.Dataset = xarray.open_zarr(self._file("terrain.zarr"))
+        from rille.pipeline.export.read_dem import open_group
+
+        with self._reading():
+            open_group(self._file("terrain.zarr"))  # of a size that may be read
+            found: xarray.Dataset = xarray.open_zarr(self._file("terrain.zarr"))
         for variable in found.variables.values():
             variable.attrs.pop("_CRS", None)  # GDAL's own, a mapping: NetCDF stores none; `spatial_ref` says the same
             for codec in ("compressors", "filters"):  # those of zarr 2, which `to_zarr` refuses in its own format 3
@@ -204,35 +213,47 @@ class Run:
         ------
         InputError
             The run has none.
+        ConfigError
+            It is not as Rille writes it.
         """
         import numpy as np
         import xarray
 
-        poses = np.loadtxt(self._file("trajectory.kitti"), ndmin=2).reshape(-1, 3, 4)
-        facts = json.loads(self._file("frames.json").read_text(encoding="utf-8"))
-        frames, about = facts["frames"], facts["frames_of_reference"]["world"]
-        return xarray.Dataset(
-            {
-                "position": (
-                    ("frame", "axis"),
-                    poses[:, :, 3],
-                    {"units": "m", "long_name": "centre of the left camera"},
-                ),
-                "rotation": (("frame", "axis", "camera_axis"), poses[:, :, :3], {"units": "1"}),
-            },
-            {
-                "frame": [frame["frame"] for frame in frames],
-                "name": ("frame", [frame["name"] for frame in frames]),
-                "time": ("frame", [frame["time"] for frame in frames], {"units": "s"}),
-                "axis": list(AXES),
-                "camera_axis": list(AXES),
-            },
-            {"frame": about["definition"]},
-        )
+        with self._reading():
+            lines = read_lines(self._file("trajectory.kitti"), "trajectory")
+            poses = np.loadtxt(lines, ndmin=2).reshape(-1, 3, 4)
+            facts = self._json("frames.json")
+            frames, about = facts["frames"], facts["frames_of_reference"]["world"]
+            return xarray.Dataset(
+                {
+                    "position": (
+                        ("frame", "axis"),
+                        poses[:, :, 3],
+                        {"units": "m", "long_name": "centre of the left camera"},
+                    ),
+                    "rotation": (("frame", "axis", "camera_axis"), poses[:, :, :3], {"units": "1"}),
+                },
+                {
+                    "frame": [frame["frame"] for frame in frames],
+                    "name": ("frame", [frame["name"] for frame in frames]),
+                    "time": ("frame", [frame["time"] for frame in frames], {"units": "s"}),
+                    "axis": list(AXES),
+                    "camera_axis": list(AXES),
+                },
+                {"frame": about["definition"]},
+            )
 
     def show(self) -> None:
         """Open the report in the web browser."""
         webbrowser.open(self._file("report.html").resolve().as_uri())
+
+    def _reading(self) -> AbstractContextManager[None]:
+        from rille.pipeline.runs import lookup
+
+        return lookup.reading(self.folder)
+
+    def _json(self, name: str) -> Any:
+        return json.loads(read_text(self._file(name), name, TABLE))
 
     def _file(self, name: str) -> Path:
         path = self.folder / name

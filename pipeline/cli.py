@@ -201,7 +201,9 @@ def why(
     from rille.pipeline.engine.store.base import Store
     from rille.pipeline.runs import lookup
 
-    print("\n".join(describe(lookup.find(run, runs), task, Store(cache_folder(cache)))))
+    folder = lookup.find(run, runs)
+    with lookup.reading(folder):
+        print("\n".join(describe(folder, task, Store(cache_folder(cache)))))
     return COMPLETE
 
 
@@ -210,7 +212,9 @@ def timing(run: Run = "latest", *, runs: Runs = RUNS, debug: Debug = False) -> i
     """Show where the time of a run went, against the least time that its tasks permit."""
     from rille.pipeline.runs import critical_path, lookup
 
-    print("\n".join(critical_path.describe(lookup.find(run, runs))))
+    folder = lookup.find(run, runs)
+    with lookup.reading(folder):
+        print("\n".join(critical_path.describe(folder)))
     return COMPLETE
 
 

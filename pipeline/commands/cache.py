@@ -53,7 +53,6 @@ def gc(
 
     What was made or used within a day stays: a run may be under way.
     """
-    from rille.pipeline.engine import events
     from rille.pipeline.engine.memory.limits import words
     from rille.pipeline.engine.store import maintenance
     from rille.pipeline.engine.store.base import Store
@@ -64,7 +63,7 @@ def gc(
     # Before any key is gathered: artifacts of runs that cannot be seen from here would count as unused.
     roots.check_all_seen(store)
     ledgers = [path for folder in roots.folders(store, runs) for path in folder.glob(f"*/*/{lookup.LEDGER}")]
-    kept = pins.keys(store).union(*map(events.keys, ledgers))
+    kept = pins.keys(store).union(*(lookup.used(path.parent) for path in ledgers if path.is_file()))
     if not kept:
         raise ConfigError(
             "RIL-744",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from rille.datasets.text.reading import TABLE, read_lines, read_text, read_toml
 from rille.pipeline.commands import compare_dem
 from rille.pipeline.commands.options import check_output
 from rille.pipeline.engine import events
@@ -29,24 +29,24 @@ def compare(a: Path, b: Path, output: Path) -> int:
     ConfigError
         One of the runs did not come to its end, or the picture cannot be written.
     """
-    reports = [_report(run) for run in (a, b)]
-    settings = [_flat(tomllib.loads((run / "config.toml").read_text(encoding="utf-8"))) for run in (a, b)]
-    # Before anything is printed: where the picture cannot be written there is one line, and no half of a comparison.
+    # All before anything is printed: where something cannot be read or written there is no half of a comparison.
     check_output(output, ".png", ".pdf", ".svg")
+    with lookup.reading(a, b):
+        reports = [_report(run) for run in (a, b)]
+        settings = [_flat(read_toml(run / "config.toml", "configuration")) for run in (a, b)]
+        lines = [*_parameters(*settings), *_tasks(a, b), *_figures(*reports), _positions(a, b)]
     terrain = _elevations(a, b, output)
-    print(f"A {lookup.name(a)}\nB {lookup.name(b)}")
-    for line in (*_parameters(*settings), *_tasks(a, b), *_figures(*reports), _positions(a, b), terrain):
-        print(line)
+    print("\n".join([f"A {lookup.name(a)}", f"B {lookup.name(b)}", *lines, terrain]))
     return 0
 
 
 def _report(run: Path) -> dict[str, Any]:
-    try:
-        found: dict[str, Any] = json.loads((run / "report.json").read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    path = run / "report.json"
+    if not path.exists():
         raise ConfigError(
             "RIL-890", f"run {lookup.name(run)} did not come to its end", remedy="run the same command again"
-        ) from None
+        )
+    found: dict[str, Any] = json.loads(read_text(path, "report", TABLE))
     return found
 
 
@@ -107,7 +107,8 @@ def _positions(a: Path, b: Path) -> str:
     paths = [run / "trajectory.tum" for run in (a, b)]
     if not all(path.exists() for path in paths):
         return "positions     not both runs have a trajectory"
-    one, other = ({row[0]: row[1:4] for row in np.loadtxt(path, ndmin=2)} for path in paths)
+    rows = (np.loadtxt(read_lines(path, "trajectory"), ndmin=2) for path in paths)
+    one, other = ({row[0]: row[1:4] for row in found} for found in rows)
     common = [time for time in one if time in other]
     if not common:
         return "positions     no frame has a pose in both"

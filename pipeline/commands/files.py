@@ -192,8 +192,9 @@ def export(
     from rille.pipeline.runs import lookup
 
     folder = lookup.find(run, runs)
-    for kind in to:
-        print(_export(folder, kind, output, cache))
+    with lookup.reading(folder):
+        for kind in to:
+            print(_export(folder, kind, output, cache))
     return COMPLETE
 
 

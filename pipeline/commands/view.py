@@ -20,7 +20,7 @@ def view(run: Path) -> int:
         The run has none.
     """
     page = run / "report.html"
-    if not page.exists():
+    if not page.is_file():
         raise ConfigError("RIL-891", f"run {lookup.name(run)} has no report", remedy="run the same command again")
     # Over SSH there may be a text browser, which would take the terminal.
     if sys.platform == "darwin" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):

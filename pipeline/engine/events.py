@@ -14,6 +14,9 @@ from rille.pipeline.engine.graph import Handle
 from rille.pipeline.engine.memory.cost_model import input_bytes
 from rille.pipeline.engine.spec import each
 
+LONGEST = 100_000_000
+"""Bytes of a line; one that reads a million artifacts has less. A file of holes is one line without an end."""
+
 
 class Ledger:
     """Writes to a file, or nowhere."""
@@ -117,14 +120,15 @@ def expansions(path: Path) -> list[tuple[list[str], list[str]]]:
 
 def _lines(path: Path) -> list[dict[str, Any]]:
     rows = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        try:
-            rows.append(json.loads(line))
-        except ValueError:
-            break
+    with path.open("rb") as file:
+        while line := file.readline(LONGEST):
+            try:
+                rows.append(json.loads(line.decode()))
+            except (ValueError, RecursionError):
+                break
     return rows
 
 
 def keys(path: Path) -> set[str]:
     """Keys of all artifacts that the run of a ledger used: what clearing the cache must keep."""
-    return {row["key"] for row in read(path) if row["status"] in ("computed", "cached") and "key" in row}
+    return {str(row["key"]) for row in read(path) if row["status"] in ("computed", "cached") and "key" in row}

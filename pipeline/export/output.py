@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
@@ -25,6 +25,7 @@ from pydantic import BaseModel
 from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.runtime import atomic
 from rille.stages.core.declare import Array, Bundle, Memory, NoParams, Stage
+from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.hazard.vehicle import Vehicle
 
@@ -208,11 +209,27 @@ def pack(folder: Path) -> Bundle:
 
 
 def unpack(bundle: Bundle) -> dict[str, bytes]:
-    """Content of each file of an artifact, by its name."""
+    """Content of each file of an artifact, by its name.
+
+    Raises
+    ------
+    InputError
+        It holds no such files, or a name leads out of the folder of the run: others may write to a shared cache.
+    """
     data, at, found = np.asarray(bundle["content"]).tobytes(), 0, {}
-    for name, size in bundle.meta["files"]:
-        found[name] = data[at : at + size]
-        at += size
+    try:
+        for name, size in bundle.meta["files"]:
+            path = PurePath(name)
+            if path.is_absolute() or ".." in path.parts:
+                raise ValueError(f"{name!r} lies outside of a run")
+            found[name] = data[at : at + size]
+            at += size
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError(
+            "RIL-983",
+            f"an artifact of the cache holds no files of a run ({error})",
+            remedy="somebody forged it: use another cache",
+        ) from error
     return found
 
 

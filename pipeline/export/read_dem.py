@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,12 @@ from numpy.typing import NDArray
 
 from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
+
+MOST_CELLS = 500_000_000
+"""Of an elevation model that is read whole: 4 GB; a file of some bytes may claim any number."""
+
+LONGEST_AXIS = 10_000_000
+"""Cells; coordinates are read whole even where nothing else is."""
 
 METRE = ("m", "metre", "metres", "meter", "meters")
 
@@ -93,7 +100,8 @@ def read_tiff(path: Path, *, length: bool = True) -> DemFile:
         with warnings.catch_warnings():
             # Refused below, in a line of our own.
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as file:
+            with rasterio.open(path, driver="GTiff") as file:  # other drivers open other files, by name or address
+                _check_cells(path, file.height, file.width)
                 # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
                 values = (
                     file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
@@ -123,6 +131,15 @@ def read_tiff(path: Path, *, length: bool = True) -> DemFile:
     return DemFile(
         str(path), values, transform, "" if crs is None else crs.to_wkt(version="WKT2_2019"), None, tuple(doubts)
     )
+
+
+def _check_cells(path: Path, rows: int, cols: int) -> None:
+    if rows * cols > MOST_CELLS:
+        raise InputError(
+            "RIL-981",
+            f"{path} has {rows} x {cols} cells, at most {MOST_CELLS / 1e6:g} million are read",
+            remedy="cut it, or resample it to larger cells",
+        )
 
 
 def _metric_crs(path: Path, crs: Any) -> None:
@@ -161,16 +178,39 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
     return np.asarray(centres[:, :2], np.float64)
 
 
-def _of_zarr(path: Path) -> DemFile:
+def open_group(path: Path) -> Any:
+    """A zarr group to read, whose axes and chunks are no longer than any that Rille writes.
+
+    Raises
+    ------
+    InputError
+        One of them is.
+    ValueError, OSError, KeyError, TypeError
+        It is no zarr group.
+    """
     import zarr
     from zarr.storage import LocalStore
 
+    group = zarr.open_group(store=LocalStore(path, read_only=True), mode="r")
+    for name, array in group.arrays():
+        if max(array.shape, default=0) > LONGEST_AXIS or math.prod(array.chunks) > MOST_CELLS:
+            size = " x ".join(map(str, array.shape))
+            raise InputError(
+                "RIL-982", f"{path}: {name} has {size} values, too many to be read", remedy="give terrain.zarr of a run"
+            )
+    return group
+
+
+def _of_zarr(path: Path) -> DemFile:
     try:
-        group: Any = zarr.open_group(store=LocalStore(path, read_only=True), mode="r")
+        group = open_group(path)
+        _check_cells(path, *group["elevation"].shape)
         x, y, z = (np.asarray(group[name][...], np.float64) for name in ("x", "y", "elevation"))
         unit = str(group["elevation"].attrs.get("units", "m"))
         crs = str(group["spatial_ref"].attrs["crs_wkt"]) if "spatial_ref" in group else ""
-    except (KeyError, ValueError, OSError, TypeError) as error:
+    except InputError:
+        raise
+    except (KeyError, ValueError, OSError, TypeError, RuntimeError) as error:
         raise InputError(
             "RIL-636",
             f"{path} has no elevation with coordinates x and y ({error})",

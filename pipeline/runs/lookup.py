@@ -5,25 +5,50 @@ from __future__ import annotations
 import difflib
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine import events
 from rille.pipeline.engine.plain import some
-from rille.stages.core.errors import ConfigError
+from rille.stages.core.errors import ConfigError, RilleError
 
 LEDGER = "ledger.jsonl"
 
 
 def all_runs(runs: Path) -> list[Path]:
     """Folders of all runs that have a ledger, in order of time within each sequence."""
-    # The link `latest` leads to a run that is there already.
-    return sorted(p.parent for p in runs.glob(f"*/*/{LEDGER}") if not p.parent.is_symlink())
+    # The link `latest` leads to a run that is there already; a pipe would block for ever.
+    return sorted(p.parent for p in runs.glob(f"*/*/{LEDGER}") if p.is_file() and not p.parent.is_symlink())
 
 
 def name(run: Path) -> str:
     """``sequence/run id``."""
     return f"{run.parent.name}/{run.name}"
+
+
+@contextmanager
+def reading(*runs: Path) -> Iterator[None]:
+    """Say in one line that files of these runs are not as Rille writes them, whatever they hold instead.
+
+    A run's folder may come from others, and be damaged or edited on the way.
+
+    Raises
+    ------
+    ConfigError
+        They are not.
+    """
+    try:
+        yield
+    except RilleError:
+        raise
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError) as error:
+        which, what = " or ".join(map(name, runs)), f"{type(error).__name__}: {error}"
+        raise ConfigError(
+            "RIL-980",
+            f"files of run {which} are not as Rille writes them ({what})",
+            remedy="run the same command again, or remove its folder",
+        ) from error
 
 
 def find(text: str, runs: Path) -> Path:
@@ -67,15 +92,20 @@ def describe(chosen: Iterable[Path]) -> Iterator[str]:
     """Lines of the table of runs, the latest last."""
     yield f"{'run':44s} {'state':12s} {'computed':>8s} {'cached':>8s} {'seconds':>8s}"
     for run in sorted(chosen, key=lambda r: r.name):
-        ended = Counter(row["status"] for row in events.read(run / LEDGER))
-        facts = events.facts(run / LEDGER)
-        seconds = facts.get("total", facts.get("seconds"))
-        missing = ended["failed"] + ended["skipped"]
-        # "ok": all tasks have ended; "total": the files and the report are written, too.
-        whole = "complete" if "total" in facts else "interrupted"
-        state = "interrupted" if "ok" not in facts else f"{missing} missing" if missing else whole
-        took = "" if seconds is None else f"{seconds:.1f}"
-        yield f"{name(run):44s} {state:12s} {ended['computed']:8d} {ended['cached']:8d} {took:>8s}"
+        with reading(run):
+            yield _line(run)
+
+
+def _line(run: Path) -> str:
+    ended = Counter(row["status"] for row in events.read(run / LEDGER))
+    facts = events.facts(run / LEDGER)
+    seconds = facts.get("total", facts.get("seconds"))
+    missing = ended["failed"] + ended["skipped"]
+    # "ok": all tasks have ended; "total": the files and the report are written, too.
+    whole = "complete" if "total" in facts else "interrupted"
+    state = "interrupted" if "ok" not in facts else f"{missing} missing" if missing else whole
+    took = "" if seconds is None else f"{seconds:.1f}"
+    return f"{name(run):44s} {state:12s} {ended['computed']:8d} {ended['cached']:8d} {took:>8s}"
 
 
 def show(sequence: str, runs: Path) -> int:
@@ -129,5 +159,17 @@ def keys(folders: Iterable[Path]) -> dict[str, str]:
     """Each key that any run in these folders of runs used, with the name of the last run (by time) that did."""
     found: dict[str, str] = {}
     for run in sorted((run for runs in folders for run in all_runs(runs)), key=lambda r: r.name):
-        found |= dict.fromkeys(events.keys(run / LEDGER), name(run))
+        found |= dict.fromkeys(used(run), name(run))
     return found
+
+
+def used(run: Path) -> set[str]:
+    """Keys of all artifacts that a run used.
+
+    Raises
+    ------
+    ConfigError
+        Its ledger is none, so that this is not known.
+    """
+    with reading(run):
+        return events.keys(run / LEDGER)

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rille.pipeline.engine import events
+from rille.datasets.text.reading import TABLE, read_text
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
@@ -20,7 +20,7 @@ FOLDER = "pins"
 
 def pin(store: Store, run: Path) -> int:
     """Keep all artifacts that a run used; gives their number."""
-    keys = sorted(events.keys(run / lookup.LEDGER))
+    keys = sorted(lookup.used(run))
     path = _path(store, lookup.name(run))
     body = json.dumps({"run": lookup.name(run), "pinned": round(time.time()), "keys": keys})
     with reported("RIL-562", f"cannot pin in {store.root}", remedy="check --cache", kind=StoreError):
@@ -63,9 +63,9 @@ def pins(store: Store) -> list[dict[str, Any]]:
     found = []
     for path in sorted((store.root / FOLDER).glob("*.json")):
         try:
-            one = json.loads(path.read_text(encoding="utf-8"))
+            one = json.loads(read_text(path, "pin", TABLE))
             found.append({"run": str(one["run"]), "pinned": float(one["pinned"]), "keys": list(one["keys"])})
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise StoreError(
                 "RIL-564", f"the pin {path} cannot be read", remedy="pin that run again, or remove the file"
             ) from error

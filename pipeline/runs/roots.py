@@ -9,6 +9,7 @@ import platform
 from collections.abc import Iterator
 from pathlib import Path
 
+from rille.datasets.text.reading import read_text
 from rille.pipeline.engine.failures import CLOSED, reported
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
@@ -57,8 +58,8 @@ def _noted(store: Store) -> Iterator[tuple[Path, str, Path]]:
     """Folder of runs, machine, and the file that says so."""
     for path in sorted((store.root / FOLDER).glob("*.json")):
         try:
-            noted = json.loads(path.read_text(encoding="utf-8"))
+            noted = json.loads(read_text(path, "note"))
             yield Path(noted["folder"]), str(noted["host"]), path
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             remedy = "remove it, once you know that no run needs this cache"
             raise StoreError("RIL-742", f"{path} cannot be read", remedy=remedy) from error

@@ -82,6 +82,12 @@ def test_a_cylinder_turned_about_itself_is_as_low_as_before(tmp_path):
         (rover().replace('"0.15"', '"wide"'), "wide"),
         (rover().replace('"0.15"', '"${r}"'), "xacro"),
         ("<robot>" + "".join(f'<link name="{k}"/>' for k in range(301)) + "</robot>", "301 links"),
+        (
+            "<robot>"
+            + "".join(f'<joint><parent link="{k + 1}"/><child link="{k}"/></joint>' for k in range(301))
+            + "</robot>",
+            "301 joints",
+        ),
         ("<robot", "parsed"),
         ("<sdf/>", "<sdf>"),
         (rover().replace('<child link="mast"/>', '<child link="base"/>'), "circle"),

@@ -16,8 +16,9 @@ T = TypeVar("T")
 
 def read_hint(path: Path, kind: TypeAdapter[T]) -> T | None:
     """What was left in a file; None if there is none, or something else."""
+    # A pipe would block for ever, a device never ends.
     with suppress(OSError, ValueError):
-        return kind.validate_json(path.read_bytes())
+        return None if not path.is_file() else kind.validate_json(path.read_bytes())
     return None
 
 

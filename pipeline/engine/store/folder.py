@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import stat
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
@@ -75,10 +76,12 @@ class Folder:
         return self.status(item.path)
 
     def read(self, path: str, start: int = 0, stop: int | None = None) -> bytes | None:
-        """Read a part of a file."""
+        """Read a part of a file; None where there is none, but a pipe or a device, say."""
         with self._clear_errors():
             try:
-                with open(f"{self.root}/{path}", "rb", buffering=0) as file:
+                with open(f"{self.root}/{path}", "rb", buffering=0, opener=_at_once) as file:
+                    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                        return None
                     return os.pread(file.fileno(), stop - start, start) if stop is not None else file.read()
             except (FileNotFoundError, IsADirectoryError):
                 return None
@@ -173,7 +176,12 @@ class Folder:
             raise
 
 
-def _item(path: str, stat: os.stat_result) -> Item:
-    racy = max(stat.st_mtime, stat.st_ctime) > time.time() - RACY
-    mark = "" if racy else f"{stat.st_ino:x}.{stat.st_size:x}.{stat.st_mtime_ns:x}.{stat.st_ctime_ns:x}"
-    return Item(path, stat.st_size, mark, stat.st_mtime)
+def _at_once(path: str, flags: int) -> int:
+    """Open a file; of a pipe, do not wait for who writes to it."""
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
+def _item(path: str, found: os.stat_result) -> Item:
+    racy = max(found.st_mtime, found.st_ctime) > time.time() - RACY
+    mark = "" if racy else f"{found.st_ino:x}.{found.st_size:x}.{found.st_mtime_ns:x}.{found.st_ctime_ns:x}"
+    return Item(path, found.st_size, mark, found.st_mtime)

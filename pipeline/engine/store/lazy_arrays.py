@@ -90,7 +90,12 @@ class LazyArrays(Mapping[str, AnyArray]):
             if whole is not None:
                 return whole if window == (...,) else whole[window].copy()
             store = _reading(lambda key: self._member(f"{name}/{key}"), self._slow)
-            return np.asarray(zarr.open_array(store=store, mode="r")[window])
+            array = zarr.open_array(store=store, mode="r")
+            found = self._manifest["arrays"][name]
+            # Its own description is the archive's, and may claim any size; that of the manifest was looked at.
+            if [list(array.shape), array.dtype.str] != [found["shape"], found["dtype"]]:
+                raise _WrongError(f"{name} is described in two ways")
+            return np.asarray(array[window])
         except _WrongError as error:
             wrong = str(error)
         self._damaged(wrong)

@@ -37,8 +37,11 @@ MEMBER = re.compile(r"(?!.*(^|/)\.\.?(/|$))[\w.-]+(/[\w.-]+)*")
 STAGE = r"\w+(?:\.\w+)*"
 """Name of a stage, as it stands in paths (``locus``, ``mockup.scene``)."""
 
-NUMERIC = re.compile(r"[<>|][biufc]\d{1,2}")
+NUMERIC = re.compile(r"[<>|](b1|[iu][1248]|f[248]|c8|c16)")
 """NumPy's name of a type of numbers."""
+
+MOST_RATIO = 1000
+"""Bytes of arrays for one of the archive: lz4 makes 255 of one."""
 
 _HEAD = b'{"crc32c": "%08x", "bytes": %10d, "manifest": '
 _HEAD_SIZE = len(_HEAD % (0, 0))
@@ -183,6 +186,8 @@ def _sound(found: Any) -> Manifest:
         for name, about in manifest["arrays"].items():
             if not MEMBER.fullmatch(name) or not NUMERIC.fullmatch(about["dtype"]) or not _counts(*about["shape"]):
                 raise ValueError(name)
+            if _nbytes(about) > MOST_RATIO * size:
+                raise ValueError(name)
         words = *(manifest[name] for name in ("stage", "key", "label", "digest", "attempt")), *manifest["meta"]
         if not all(isinstance(word, str) for word in words):
             raise ValueError("text")
@@ -195,10 +200,15 @@ def _counts(*values: Any) -> bool:
     return all(type(n) is int and n >= 0 for n in values)
 
 
+def _nbytes(about: Mapping[str, Any]) -> int:
+    size: int = int(about["dtype"][2:]) * math.prod(about["shape"])
+    return size
+
+
 def reference(manifest: Manifest) -> Ref:
     """Return the reference to the artifact of a manifest."""
     m = manifest
-    nbytes = sum(int(a["dtype"][2:]) * math.prod(a["shape"]) for a in m["arrays"].values())
+    nbytes = sum(map(_nbytes, m["arrays"].values()))
     text = json.dumps(m["meta"], separators=(",", ":"))
     facts = Facts(zlib.compress(text.encode()) if len(text) > LONG else text)
     return Ref(m["key"], m["stage"], m["digest"], facts, nbytes, m["size"])

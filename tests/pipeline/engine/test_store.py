@@ -257,6 +257,40 @@ def test_a_description_that_is_plausible_but_wrong_never_reaches_a_reader(cache,
         Store(cache).open(ref)["elevation"]
 
 
+def forge(cache, change):
+    """Change the manifest as somebody would who can compute its checksum."""
+    data = file_of(cache).read_bytes()
+    size = manifest.length(data)
+    found = json.loads(data[:size])["manifest"]
+    change(found)
+    file_of(cache).write_bytes(manifest.frame(found) + data[size:])
+
+
+@pytest.mark.parametrize("about", [{"shape": [10**6, 10**6]}, {"dtype": "<f99"}, {"dtype": "|O8"}])
+def test_a_forged_manifest_that_claims_what_no_archive_holds_is_a_miss(cache, about):
+    commit(cache)
+    forge(cache, lambda found: found["arrays"]["elevation"].update(about))
+    assert Store(cache).lookup("toy", KEY) is None
+
+
+def test_a_forged_archive_never_makes_an_array_of_another_size(cache, monkeypatch):
+    ref = commit(cache)
+    data, described = file_of(cache).read_bytes(), zarr_group.encode
+
+    def other(stage, given):
+        files, arrays = described(stage, given)
+        about = json.loads(files["elevation/zarr.json"]) | {"shape": [10**7, 10**7]}
+        return {**files, "elevation/zarr.json": json.dumps(about).encode()}, arrays
+
+    file_of(cache).unlink()
+    monkeypatch.setattr("rille.pipeline.engine.store.base.encode", other)
+    assert commit(cache).digest == ref.digest
+    assert file_of(cache).read_bytes() != data
+    monkeypatch.setattr("rille.pipeline.engine.store.lazy_arrays.LazyArrays._one_chunk", lambda *_: None)
+    with raises("RIL-504", "two ways"):
+        Store(cache).open(ref)["elevation"]
+
+
 def test_what_another_run_has_put_right_meanwhile_is_not_set_aside(cache):
     """A reader of the damaged file learns of it when a sound one is there again."""
     ref = commit(cache)

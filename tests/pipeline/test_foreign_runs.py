@@ -1,0 +1,226 @@
+"""Folders of runs and artifacts that others made: whatever they hold, one line, and nothing outside is touched."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+import zarr
+from affine import Affine
+from pydantic import TypeAdapter
+from raising import raises
+
+from rille.pipeline.api import open_run
+from rille.pipeline.cli import main
+from rille.pipeline.engine.runtime.hints import read_hint
+from rille.pipeline.engine.store.folder import Folder
+from rille.pipeline.export.output import place
+from rille.pipeline.export.read_dem import read_elevation
+from rille.stages.core.declare import Bundle
+
+ROW = '{"label": "a", "stage": "hfvm", "status": "computed", "key": "k", "seconds": 1, "kernel": 1, "digest": "d"}\n'
+ENDED = '{"run": {"ok": true, "total": 1.0}}\n'
+POSE = "1 0 0 0 0 1 0 0 0 0 1 0\n"
+DEEP = "[" * 100_000
+
+
+@pytest.fixture(autouse=True)
+def _never_hangs() -> Iterator[None]:
+    before = signal.signal(signal.SIGALRM, lambda *_: pytest.fail("it hangs"))
+    signal.alarm(30)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Two runs of one sequence that are right, the later of which is given."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cache").mkdir()
+    for number in "12":
+        folder = tmp_path / "runs" / "seq" / number
+        folder.mkdir(parents=True)
+        (folder / "ledger.jsonl").write_text(ROW + ENDED)
+        (folder / "report.json").write_text('{"complete": true, "metrics": {}}')
+        (folder / "config.toml").write_text("")
+    return folder
+
+
+def told(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[Any, list[str]]:
+    """Exit code and codes of the errors of a command."""
+    with pytest.raises(SystemExit) as ended:
+        main(list(words))
+    lines = capsys.readouterr().err.splitlines()
+    return ended.value.code, [line.split(":")[1].split()[-1] for line in lines]
+
+
+COMPARE = ("compare", "seq/1", "seq/2")
+WHY = ("why", "seq/2", "a", "--cache", "cache")
+TIMING = ("timing", "seq/2")
+GC = ("cache", "gc", "--dry-run", "--cache", "cache")
+
+
+def test_runs_that_are_right_are_read(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (COMPARE, WHY, ("runs",), GC):
+        assert told(capsys, *words) == (0, [])
+
+
+@pytest.mark.parametrize("words", [("runs",), WHY, COMPARE, TIMING, GC, ("cache", "pin", "seq/2", "--cache", "cache")])
+@pytest.mark.parametrize("line", ["5\n", '{"label": [1]}\n', '{"label": "a"}\n{"label": "b", "digest": "e"}\n'])
+def test_a_ledger_that_is_none(run: Path, words: tuple[str, ...], line: str, capsys: Any) -> None:
+    (run / "ledger.jsonl").write_text(line)
+    assert told(capsys, *words) == (2, ["RIL-980"])
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('{"run": 5}\n', ("runs",)),
+        ('{"run": {"ok": true, "total": "x"}}\n', ("runs",)),
+        (ROW.replace('"key"', '"inputs": {"x": 5}, "key"'), WHY),
+        (ROW + ROW.replace('"a"', '"b"').replace('"key"', '"inputs": {"x": "b"}, "key"'), TIMING),
+        (ROW + '{"run": {"jobs": 0, "total": 1.0}}\n', TIMING),
+    ],
+)
+def test_a_ledger_with_lines_of_another_form(run: Path, line: str, words: tuple[str, ...], capsys: Any) -> None:
+    (run / "ledger.jsonl").write_text(line)
+    assert told(capsys, *words) == (2, ["RIL-980"])
+
+
+def test_a_ledger_that_is_no_text_ends_there(run: Path, capsys: Any) -> None:
+    for content in (b"\xff\xfe\xff", DEEP.encode()):
+        (run / "ledger.jsonl").write_bytes(content)
+        assert told(capsys, "runs") == (0, [])
+
+
+def test_a_pipe_in_place_of_a_ledger_is_no_run(run: Path, capsys: Any) -> None:
+    (run / "ledger.jsonl").unlink()
+    os.mkfifo(run / "ledger.jsonl")
+    assert told(capsys, "runs") == (0, [])
+    assert told(capsys, *GC) == (0, [])
+    assert told(capsys, *WHY) == (2, ["RIL-067"])
+
+
+@pytest.mark.parametrize("content", ["[]", "{}", '{"metrics": 5}', '{"metrics": {"a": 5}}', "{", DEEP])
+def test_a_report_that_is_none(run: Path, content: str, capsys: Any) -> None:
+    for number in "12":
+        (run.parent / number / "report.json").write_text(content)
+    assert told(capsys, *COMPARE) == (2, ["RIL-980"])
+
+
+@pytest.mark.parametrize("name", ["report.json", "config.toml", "trajectory.tum"])
+def test_a_pipe_in_place_of_a_file_of_a_run(run: Path, name: str, capsys: Any) -> None:
+    for number in "12":
+        (run.parent / number / name).unlink(missing_ok=True)
+        os.mkfifo(run.parent / number / name)
+    assert told(capsys, *COMPARE) == (2, ["RIL-138"])
+
+
+@pytest.mark.parametrize("content", ["a b c\n", "1 2 3 4\n1 2\n"])
+def test_a_trajectory_that_is_none(run: Path, content: str, capsys: Any) -> None:
+    for number in "12":
+        (run.parent / number / "trajectory.tum").write_text(content)
+    assert told(capsys, *COMPARE) == (2, ["RIL-980"])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "ask"),
+    [
+        ("report.json", "{", lambda run: run.report),
+        ("report.json", "{}", lambda run: run.metrics),
+        ("report.json", DEEP, lambda run: run.complete),
+        ("trajectory.kitti", "1 2 3\n", lambda run: run.trajectory),
+        ("trajectory.kitti", POSE, lambda run: run.trajectory),
+        ("terrain.zarr", "x", lambda run: run.terrain),
+    ],
+)
+def test_from_python(run: Path, name: str, content: str, ask: Callable[[Any], Any]) -> None:
+    (run / "frames.json").write_text("{}")
+    (run / name).write_text(content)
+    with raises("RIL-980"):
+        ask(open_run(run))
+
+
+def huge(folder: Path, axis: int) -> None:
+    """A zarr group that claims a square of so many cells, and holds none."""
+    group = zarr.create_group(store=str(folder), zarr_format=2)
+    for name, dims in {"x": ["x"], "y": ["y"], "elevation": ["y", "x"]}.items():
+        shape = (axis,) * len(dims)
+        group.create_array(name, shape=shape, chunks=(1000,) * len(dims), dtype="f8").attrs["_ARRAY_DIMENSIONS"] = dims
+
+
+def test_a_zarr_group_that_claims_more_than_can_be_read(run: Path) -> None:
+    huge(run / "terrain.zarr", 10**10)
+    with raises("RIL-982"):
+        assert open_run(run).terrain
+    with raises("RIL-982"):
+        read_elevation(run / "terrain.zarr")
+    huge(run / "wide.zarr", 10**6)
+    with raises("RIL-981"):
+        read_elevation(run / "wide.zarr")
+
+
+def test_a_raster_that_claims_more_than_can_be_read(tmp_path: Path) -> None:
+    path, transform = tmp_path / "dem.tif", Affine(0.1, 0, 0, 0, -0.1, 0)
+    with rasterio.open(
+        path, "w", "GTiff", 60_000, 60_000, 1, dtype="float32", transform=transform, SPARSE_OK=True, tiled=True
+    ):
+        pass
+    with raises("RIL-981"):
+        read_elevation(path)
+
+
+def test_a_raster_that_names_other_files_is_not_followed(tmp_path: Path) -> None:
+    with rasterio.open(
+        tmp_path / "own.tif", "w", "GTiff", 4, 4, 1, dtype="float32", transform=Affine(0.5, 0, 0, 0, -0.5, 0)
+    ) as own:
+        own.write(np.ones((1, 4, 4), np.float32))
+    (tmp_path / "dem.tif").write_text(
+        '<VRTDataset rasterXSize="4" rasterYSize="4"><GeoTransform>0,0.5,0,0,0,-0.5</GeoTransform>'
+        '<VRTRasterBand dataType="Float32" band="1"><SimpleSource>'
+        f'<SourceFilename relativeToVRT="0">{tmp_path / "own.tif"}</SourceFilename>'
+        "</SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+    with raises("RIL-629"):
+        read_elevation(tmp_path / "dem.tif")
+
+
+@pytest.mark.parametrize("name", ["../outside", "a/../../outside", "{}/outside"])
+def test_a_forged_artifact_writes_nothing_outside_of_a_run(tmp_path: Path, name: str) -> None:
+    (tmp_path / "run").mkdir()
+    forged = Bundle({"content": np.zeros((1, 1024), np.uint8)}, {"files": [[name.format(tmp_path), 3]]})
+    with raises("RIL-983"):
+        place(forged, tmp_path / "run")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_json_of_a_ledger_is_read_line_by_line(run: Path, capsys: Any) -> None:
+    (run / "ledger.jsonl").write_text(json.dumps({"label": "a\ud800", "stage": "s", "status": "failed"}) + "\n" + ENDED)
+    assert told(capsys, "runs") == (0, [])
+
+
+@pytest.mark.parametrize("name", ["roots/a.json", "pins/a.json"])
+@pytest.mark.parametrize("content", [DEEP, None])
+def test_notes_of_a_cache_that_are_none(run: Path, name: str, content: str | None, capsys: Any) -> None:
+    path = Path("cache") / name
+    path.parent.mkdir()
+    if content is None:
+        os.mkfifo(path)
+    else:
+        path.write_text(content)
+    assert told(capsys, *GC) == (1, ["RIL-742" if name.startswith("roots") else "RIL-564"])
+
+
+def test_pipes_in_a_cache_hold_nothing(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "hint")
+    assert read_hint(tmp_path / "hint", TypeAdapter(list[int])) is None
+    assert Folder(tmp_path).read("hint") is None
+    assert Folder(tmp_path).read("hint", 0, 10) is None
