@@ -282,7 +282,7 @@ def _final(task: TileInputs) -> Bundle:
     if task.half:
         left, right = (task.inputs[port].raster("level_0").shape for port in ("left", "right"))
         mask = task.inputs["left"].raster("valid_0")
-        found = tiled.enlarged(found, mask, window.child(left), right)
+        found = tiled.enlarged(found, task.alignment, mask, window.child(left), right)
     return Bundle(found, {})
 
 

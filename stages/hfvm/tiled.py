@@ -38,8 +38,9 @@ KEPT = 31 << 20
 """Bytes: glibc keeps freed memory up to twice the greatest piece it has seen freed, if that is below 32 MiB, and
 hands it out again; else each array of a match comes as fresh pages, and those cost an eighth of the whole time."""
 
-FEW = 0.35
-"""Share of consistent pixels below which the images may be turned: chance alone makes up to .23 of them so."""
+FEW = 0.45
+"""Share of consistent pixels below which the images may be turned: chance alone makes up to .23 of them so, with preset
+``accurate``, which smooths more, up to .40."""
 
 MANY, AGAIN = 0.85, 2
 """Share of consistent pixels from which on no other brightness is tried, and how often matches correct it."""
@@ -49,10 +50,16 @@ Order = Callable[[list[Window]], list[Window]]
 
 @dataclass(frozen=True)
 class Found:
-    """Arrays of :class:`rille.stages.hfvm.Disparity` by name, and whether the right image was pre-aligned."""
+    """Arrays of :class:`rille.stages.hfvm.Disparity` by name, and the homography by which the right image was
+    pre-aligned, or None."""
 
     arrays: Results
-    aligned: bool
+    alignment: plane.Matrix | None
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the right image was pre-aligned."""
+        return self.alignment is not None
 
 
 @dataclass(frozen=True)
@@ -107,14 +114,15 @@ def coarse(left: View, right: View, params: HfvmParams, side: int | None, prior:
     s = hierarchy.sample(pair, state)
     h = plane.find(s.places, s.u, s.v, state.level, left.shapes, params)
     if h is not None:
-        return replace(_along(left, right, params, side, h, state.near_sign, prior), ratio=ratio)
-    if not params.turned or prior is not None or share(state) > FEW:
+        found = replace(_along(left, right, params, side, h, state.near_sign, prior), ratio=ratio)
+    # A plane may also be fitted to the few matches that chance makes.
+    if not params.turned or prior is not None or share(found.state) > FEW:
         return found
     h = viewpoint.find(left, right)
     if h is None:
         return found
     turned = _along(left, right, params, side, h)
-    return replace(turned, ratio=ratio) if share(turned.state) > share(state) else found
+    return replace(turned, ratio=ratio) if share(turned.state) > share(found.state) else found
 
 
 def _levelled(left: View, right: View, params: HfvmParams, side: int | None) -> tuple[Prepared, State, Floats | None]:
@@ -202,7 +210,7 @@ def match(
         tell(COARSE_SHARE + (FINE_SHARE - COARSE_SHARE) * 0.25 ** (level + 1), f"level {level}")
         state = hierarchy.run(pair, params, level, state)
     steps = Finish(pair, b, params, begun.alignment, state.near_sign, begun.contrast)
-    return Found(_finish(steps, state, side, order, tell), begun.alignment is not None)
+    return Found(_finish(steps, state, side, order, tell), begun.alignment)
 
 
 def _finish(steps: Finish, state: State, side: int | None, order: Order, tell: Tell) -> Results:
@@ -239,19 +247,24 @@ def _enlarged(
     def parts() -> Iterator[tuple[Window, Results]]:
         for w in tiles(half[0].shapes[0], side):
             window = w.child(shapes[0])
-            yield window, enlarged({k: cut(a, w) for k, a in found.arrays.items()}, left.masks[0], window, shapes[1])
+            arrays = {k: cut(a, w) for k, a in found.arrays.items()}
+            yield window, enlarged(arrays, found.alignment, left.masks[0], window, shapes[1])
 
-    return Found(gather(shapes[0], parts()), found.aligned)
+    return Found(gather(shapes[0], parts()), found.alignment)
 
 
-def enlarged(found: Results, mask: Raster, window: Window, right_shape: Shape) -> Results:
+def enlarged(
+    found: Results, alignment: plane.Matrix | None, mask: Raster, window: Window, right_shape: Shape
+) -> Results:
     """Results at half the resolution as those of a window of full resolution; displacements, twice as great, stand for
-    2 x 2 pixels each. ``mask``: of the left image, at full resolution."""
+    2 x 2 pixels each. ``alignment``: homography of the right image, in pixels of half the resolution, or None.
+    ``mask``: of the left image, at full resolution."""
     names = "column_disparity", "row_disparity", "validity", "backmatch_error", "distance"
     out: Results = {name: np.empty(window.shape, np.uint8 if name == "validity" else np.float32) for name in names}
     maps, larger = (tuple(given[name] for name in names) for given in (found, out))
     size = right_shape[0], right_shape[1]
-    resample.enlarge(maps, cut(mask, window), size, larger, window.x0, window.y0)
+    h = np.zeros((0, 3, 3)) if alignment is None else plane.to_level_0(alignment, 1)[None]
+    resample.enlarge(maps, cut(mask, window), size, (h, np.linalg.inv(h)), larger, window.x0, window.y0)
     std = (2.0 * found["disparity_std"]).repeat(2, axis=0)[: window.shape[0]].repeat(2, axis=1)[:, : window.shape[1]]
     std = np.where(matched(out["validity"]), std, np.float32(np.nan)).astype(np.float32)
     return {**out, "disparity_std": std}

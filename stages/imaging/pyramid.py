@@ -127,7 +127,7 @@ def grey(image: AnyArray) -> Floats32:
     """
     if image.ndim != 2 or image.size == 0:
         raise InputError("RIL-411", f"image of shape {image.shape} is not (row, col)", remedy="give one grey channel")
-    if image.dtype == np.uint16:
+    if np.issubdtype(image.dtype, np.uint16):  # of either byte order, as archives keep the big end first
         return image.astype(np.float32) * np.float32(1.0 / 257.0)
     if image.dtype == np.uint8 or image.dtype.kind == "f":
         return np.ascontiguousarray(image, dtype=np.float32)

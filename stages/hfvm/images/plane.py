@@ -30,8 +30,8 @@ ITERATIONS = 15
 
 LEAST_MATCHES = 60
 
-MOST_DISTORTION = 2.0
-"""Beyond this the plane is no ground but a bad fit."""
+MOST_DISTORTION = 3.0
+"""Beyond this the plane is no ground but a bad fit; views turned by 180 degrees have 2, and more if scaled."""
 
 TOLERANCE = 1.0
 """Pixels of the coarse level: a match within twice this belongs to the plane; at this distance it has a quarter of the

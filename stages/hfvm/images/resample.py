@@ -12,11 +12,13 @@ FOUND = np.uint8(Validity.MATCHED | Validity.INTERPOLATED)
 
 
 @njit(cache=True, nogil=True)
-def enlarge(maps, valid, right_shape, out, x0=0, y0=0):  # type: ignore[no-untyped-def]
+def enlarge(maps, valid, right_shape, alignment, out, x0=0, y0=0):  # type: ignore[no-untyped-def]
     """Displacements of the next finer level: each doubled, for 2 x 2 pixels.
 
     ``maps`` and ``out``: column and row displacements, validity, error of matching back, distance; each (row, col).
-    Both images' pixel centres shift alike, so nothing is to be added. A masked pixel (``valid`` 0) is undefined, and
+    Both images' pixel centres shift alike, so nothing is to be added; but where the right image was aligned, the four
+    pixels are moved as the plane moves them. ``alignment``: its homography (1, 3, 3) at this level, nothing (0, 3, 3)
+    without one, and the inverse. A masked pixel (``valid`` 0) is undefined, and
     so is one whose displacement then leaves the right image; both are marked. ``x0, y0``: first column and row of a
     window (even).
     """
@@ -27,6 +29,8 @@ def enlarge(maps, valid, right_shape, out, x0=0, y0=0):  # type: ignore[no-untyp
         for x in range(out_u.shape[1]):
             j, i = y >> 1, x >> 1
             a, b, bit = two * u[j, i], two * v[j, i], bits[j, i]
+            if len(alignment[0]):
+                a, b = _beside(alignment[0][0], alignment[1][0], (x + x0, y + y0), (a, b))
             xr, yr = x + x0 + a, y + y0 + b
             # A negated comparison, so that NaN is outside.
             outside = not (xr >= 0 and xr <= right_shape[1] - 1 and yr >= 0 and yr <= right_shape[0] - 1)
@@ -37,3 +41,21 @@ def enlarge(maps, valid, right_shape, out, x0=0, y0=0):  # type: ignore[no-untyp
             out_u[y, x], out_v[y, x], out_bits[y, x] = a, b, bit
             # An error in pixels doubles with them, a feature distance does not.
             out_error[y, x], out_distance[y, x] = two * error[j, i], distance[j, i]
+
+
+@njit(cache=True, nogil=True)
+def _beside(h, back, pixel, displacement):  # type: ignore[no-untyped-def]
+    """Displacement of a pixel beside the middle of its square of 2 x 2, whose ``displacement`` is given."""
+    (x, y), (u, v) = pixel, displacement
+    middle_x, middle_y = (x & ~1) + 0.5, (y & ~1) + 0.5
+    p, q = _mapped(back, middle_x + u, middle_y + v)
+    p, q = _mapped(h, p + (x - middle_x), q + (y - middle_y))
+    return np.float32(p - x), np.float32(q - y)
+
+
+@njit(cache=True, nogil=True)
+def _mapped(h, x, y):  # type: ignore[no-untyped-def]
+    """Place to which a homography maps another one, NaN beyond its horizon."""
+    w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+    w = w if w > 0.0 else np.nan
+    return (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w

@@ -6,7 +6,7 @@ import pytest
 from matching_scenes import Texture, pair, seen
 
 from rille.stages.core.validity import matched
-from rille.stages.hfvm.images import viewpoint
+from rille.stages.hfvm.images import plane, viewpoint
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import Plain
 from rille.stages.hfvm.stage import match
@@ -41,6 +41,25 @@ def test_turned_views_are_matched_in_their_own_frame(degrees, scale, slant):
     # What was interpolated follows the turned surface, too.
     assert np.mean(error[both] < 1) > 0.97
     assert np.mean(matched(match(left, right, HfvmParams(turned=False)).validity)) < 0.02
+
+
+@pytest.mark.parametrize(("preset", "degrees", "wide"), [("fast", 180, 0.2), ("accurate", 150, 0.1)])
+@pytest.mark.parametrize("known", [False, True])
+def test_other_presets_match_turned_views_alike(preset, degrees, wide, known):
+    left, right, u, v = turned(degrees)
+    found = match(left, right, HfvmParams(preset=preset), prior=(u, v) if known else None)
+    both = seen(u, v, right.shape, 12)
+    error = np.hypot(found.column_disparity - u, found.row_disparity - v)
+    assert np.mean(matched(found.validity)[both]) > 0.9
+    # Half the resolution, too, gives each pixel of a square of 2 x 2 its own displacement, else errors reach 1.4.
+    assert np.percentile(error[both & matched(found.validity)], 95) < wide
+
+
+def test_a_plane_fitted_to_chance_matches_does_not_rule_out_a_turn(monkeypatch):
+    left, right, u, v = turned(60)
+    monkeypatch.setattr(plane, "find", lambda *_: np.array([[1.0, 0.3, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]))
+    found = match(left, right)
+    assert np.mean(matched(found.validity)[seen(u, v, right.shape, 12)]) > 0.9
 
 
 def test_keypoints_tell_the_homography_at_full_resolution():
