@@ -112,7 +112,7 @@ def coarse(left: View, right: View, params: HfvmParams, side: int | None, prior:
     if params.preset == "paper":
         return found
     s = hierarchy.sample(pair, state)
-    h = plane.find(s.places, s.u, s.v, state.level, left.shapes, params)
+    h = plane.find(s.x, s.y, s.u, s.v, state.level, left.shapes, params)
     if h is not None:
         found = replace(_along(left, right, params, side, h, state.near_sign, prior), ratio=ratio)
     # A plane may also be fitted to the few matches that chance makes.
@@ -132,7 +132,7 @@ def _levelled(left: View, right: View, params: HfvmParams, side: int | None) -> 
     top = hierarchy.run(pair, params, params.plane_level + 2)
     ratio: Floats | None = None
     if params.preset == "paper":
-        return pair, _down(pair, params, top), None
+        return pair, hierarchy.run(pair, params, params.plane_level, top), None
     if share(top) < MANY:
         guess = brightness.guess(left, right, top.level)
         if brightness.greatest(guess) > brightness.NOTABLE:
@@ -140,7 +140,7 @@ def _levelled(left: View, right: View, params: HfvmParams, side: int | None) -> 
             found = hierarchy.run(other, params, params.plane_level + 2)
             if share(found) > share(top):
                 pair, top, ratio = other, found, guess
-    state = _down(pair, params, top)
+    state = hierarchy.run(pair, params, params.plane_level, top)
     for _ in range(AGAIN):
         told = brightness.matched(left, right, state.level, state.left.u, state.left.v, state.left_ok)
         if told is None or brightness.greatest(told - (0.0 if ratio is None else ratio)) <= brightness.NOTABLE:
@@ -151,11 +151,6 @@ def _levelled(left: View, right: View, params: HfvmParams, side: int | None) -> 
             break
         pair, state, ratio = other, found, told
     return pair, state, ratio
-
-
-def _down(pair: Prepared, params: HfvmParams, state: State) -> State:
-    """The state of ``plane_level``, where that is below."""
-    return hierarchy.run(pair, params, params.plane_level, state) if state.level > params.plane_level else state
 
 
 def _along(

@@ -309,13 +309,12 @@ class State:
 
 
 def run(pair: Prepared, params: HfvmParams, stop: int, start: State | None = None, near_sign: float = 0.0) -> State:
-    """Match from the top level (or below ``start``) down to level ``stop``, all in memory.
+    """Match from the top level (or below ``start``) down to level ``stop``, or the top if that is below, all in memory.
 
     ``near_sign``: -1 where nearer things have lesser column displacements, +1 greater; 0 = find out.
     """
-    state = start
-    top = pair.levels - 1 if start is None else start.level - 1
-    for level in range(top, min(stop, top) - 1, -1):
+    state, above = start, pair.levels if start is None else start.level
+    for level in range(above - 1, min(stop, pair.levels - 1) - 1, -1):
         state = _level(pair, level, state, near_sign)
     assert state is not None
     return state
@@ -465,9 +464,8 @@ def fine(pair: Prepared, state: State) -> Fine:
 
 @dataclass(frozen=True)
 class Sample:
-    """Sub-pixel matches of a level, in reading order: flat indices, columns, rows, displacements (n,)."""
+    """Sub-pixel matches of a level, in reading order: columns, rows, displacements (n,)."""
 
-    places: NDArray[np.int64]
     x: AnyArray
     y: AnyArray
     u: AnyArray
@@ -477,8 +475,7 @@ class Sample:
 def sample(pair: Prepared, state: State) -> Sample:
     """About :data:`FIT_SAMPLES` evenly strided consistent matches of a level."""
     shape = state.left.u.shape
-    places = thinned(state.left_ok, FIT_SAMPLES, lambda ok: ok != 0)
-    y, x = np.divmod(places, shape[1])
+    y, x = np.divmod(thinned(state.left_ok, FIT_SAMPLES, lambda ok: ok != 0), shape[1])
     u, v = np.empty(len(y), np.float32), np.empty(len(y), np.float32)
     for w in tiles(shape, pair.side):
         here = (y >= w.y0) & (y < w.y1) & (x >= w.x0) & (x < w.x1)
@@ -489,7 +486,7 @@ def sample(pair: Prepared, state: State) -> Sample:
         wanted[at] = True
         found = fine_tile(pair, state.level, state.left, w, wanted)
         u[here], v[here] = found.u[at], found.v[at]
-    return Sample(places, x, y, u, v)
+    return Sample(x, y, u, v)
 
 
 def with_band(pair: Prepared, state: State) -> State:

@@ -71,7 +71,7 @@ def refine(
     for step in range(params.refine_steps):
         last = first if step == 0 else np.empty(u.shape, np.float32)
         there_u, there_v = to_right(now_u, now_v)
-        window = rowwise.WindowOf(params.refine_radius, np.float32(params.refine_noise))
+        window = params.refine_radius, np.float32(params.refine_noise)
         told = rowwise.StepArrays(step_u, step_v, last, per_noise)
         rowwise.lucas_kanade(left, right, (there_u, there_v), keep, window, told)
         if not params.refine:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
@@ -20,9 +21,6 @@ from rille.stages.geometry.cubic import cubic
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.window import Shape, Window, bounded, whole
 from rille.stages.hfvm.level.epipolar import residuals, typical, weighted_normal
-from rille.stages.hfvm.level.window_pair import WindowPair
-from rille.stages.imaging import pyramid
-from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
 Matrix = NDArray[np.float64]
 
@@ -42,16 +40,15 @@ MARGIN = 1.0 / 16.0
 
 
 def find(
-    places: AnyArray, u: AnyArray, v: AnyArray, level: int, shapes: Sequence[Shape], params: HfvmParams
+    x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray, level: int, shapes: Sequence[Shape], params: HfvmParams
 ) -> Matrix | None:
     """Homography from aligned pixels to right image pixels (level 0), or None where alignment would not help.
 
     Parameters
     ----------
-    places : flat indices of matches of a level; ``u, v``: their displacements, pixels.
+    x, y, u, v : (n,) columns, rows and displacements of matches of a level, pixels.
     shapes : of the left image's levels.
     """
-    y, x = np.divmod(places, shapes[level][1])
     found = fit_points(x, y, u, v, shapes[level], TOLERANCE)
     if found is None or found[1] < params.plane_share:
         return None
@@ -60,24 +57,24 @@ def find(
     return h if params.plane_distortion <= shear < MOST_DISTORTION else None
 
 
-def align(right: Pyramid, h: Matrix, left_shape: tuple[int, ...], params: PyramidParams) -> Pyramid:
-    """Pyramid of the right image resampled to the left one's geometry, with a margin (see :func:`margin`)."""
-    m = margin(left_shape)
-    image = np.empty((left_shape[0] + 2 * m, left_shape[1] + 2 * m), np.float32)
-    valid = np.empty(image.shape, np.uint8)
-    grey, usable = right.filled[0], right.valid[0]
-    place = WindowPair(0, 0, 0, 0, *usable.shape)
-    warp(grey, usable, h @ translation(-m), image, valid, place)
-    return pyramid.build(image, params, valid)
+@register_jitable
+def mapped(h, x, y):  # type: ignore[no-untyped-def]
+    """Column and row to which a homography maps a place, both to be divided by the third number, which is positive on
+    this side of the horizon."""
+    return (
+        h[0, 0] * x + h[0, 1] * y + h[0, 2],
+        h[1, 0] * x + h[1, 1] * y + h[1, 2],
+        h[2, 0] * x + h[2, 1] * y + h[2, 2],
+    )
 
 
 def source(h: Matrix, window: Window, shape: Shape) -> Window:
     """Window of an image of ``shape`` that :func:`warp` reads for a window of its result."""
     y, x = np.meshgrid([window.y0, window.y1 - 1], [window.x0, window.x1 - 1], indexing="ij")
-    w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+    p, q, w = mapped(h, x, y)
     if (w <= 1e-3).any():  # the horizon crosses it: a quadrangle does not hold it
         return whole(shape)
-    p, q = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+    p, q = p / w, q / w
     # Near the horizon ends run off to numbers that no index holds.
     top, bottom, first, last = (int(np.clip(a, -4, 1 << 30)) for a in (q.min(), q.max(), p.min(), p.max()))
     # Four pixels hold the cubic kernel, which reads two beyond its own, and what truncation takes off.
@@ -114,13 +111,10 @@ def decompose(h: Matrix, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Displacements (row, col) of a whole left image to the aligned right image: the inverse of :func:`compose`."""
     g = np.linalg.inv(h @ translation(-margin(u.shape)))
     y, x = np.indices(u.shape, dtype=np.float64)
-    p, q = x + u, y + v
-    w = g[2, 0] * p + g[2, 1] * q + g[2, 2]
+    p, q, w = mapped(g, x + u, y + v)
     # Points beyond the horizon would come back mirrored.
     w = np.where(w > 0, w, np.nan)
-    aligned_u = (g[0, 0] * p + g[0, 1] * q + g[0, 2]) / w - x
-    aligned_v = (g[1, 0] * p + g[1, 1] * q + g[1, 2]) / w - y
-    return aligned_u.astype(np.float32), aligned_v.astype(np.float32)
+    return (p / w - x).astype(np.float32), (q / w - y).astype(np.float32)
 
 
 def margin(left_shape: tuple[int, ...]) -> int:
@@ -200,11 +194,11 @@ def finer(level: int) -> Matrix:
 def distortion(h: Matrix, shape: tuple[int, int]) -> float:
     """Greatest element of the derivative's departure from the identity, each taken as the median over an image."""
     y, x = np.meshgrid(np.linspace(0, shape[0] - 1, 5), np.linspace(0, shape[1] - 1, 5), indexing="ij")
-    w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+    p, q, w = mapped(h, x, y)
     # So near the horizon it is no ground but a bad fit, which infinity has refused.
     if (w <= 0.1).any():
         return np.inf
-    p, q = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+    p, q = p / w, q / w
     parts = [
         (h[0, 0] - p * h[2, 0]) / w - 1,
         (h[0, 1] - p * h[2, 1]) / w,
@@ -226,10 +220,10 @@ def warp(image, valid, h, out, out_valid, place):  # type: ignore[no-untyped-def
         for col in range(cols):
             y, x = row + y0, col + x0
             out[row, col], out_valid[row, col] = 0.0, 0
-            w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+            p, q, w = mapped(h, x, y)
             if w <= 1e-6:
                 continue
-            p, q = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+            p, q = p / w, q / w
             # The cubic kernel reads one pixel before and two after.
             if not (p >= 1 and p < width - 2 and q >= 1 and q < height - 2):
                 continue

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from rille.stages.core.validity import Validity
+from rille.stages.hfvm.images import plane
 
 MATCHED, OUT_OF_IMAGE = np.uint8(Validity.MATCHED), np.uint8(Validity.OUT_OF_IMAGE)
 FOUND = np.uint8(Validity.MATCHED | Validity.INTERPOLATED)
@@ -48,14 +49,9 @@ def _beside(h, back, pixel, displacement):  # type: ignore[no-untyped-def]
     """Displacement of a pixel beside the middle of its square of 2 x 2, whose ``displacement`` is given."""
     (x, y), (u, v) = pixel, displacement
     middle_x, middle_y = (x & ~1) + 0.5, (y & ~1) + 0.5
-    p, q = _mapped(back, middle_x + u, middle_y + v)
-    p, q = _mapped(h, p + (x - middle_x), q + (y - middle_y))
-    return np.float32(p - x), np.float32(q - y)
-
-
-@njit(cache=True, nogil=True)
-def _mapped(h, x, y):  # type: ignore[no-untyped-def]
-    """Place to which a homography maps another one, NaN beyond its horizon."""
-    w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+    p, q, w = plane.mapped(back, middle_x + u, middle_y + v)
+    # Beyond the horizon there is no place.
     w = w if w > 0.0 else np.nan
-    return (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+    p, q, w = plane.mapped(h, p / w + (x - middle_x), q / w + (y - middle_y))
+    w = w if w > 0.0 else np.nan
+    return np.float32(p / w - x), np.float32(q / w - y)

@@ -27,13 +27,6 @@ class Right(NamedTuple):
     place: WindowPair
 
 
-class WindowOf(NamedTuple):
-    """Least-squares window: its radius, pixels, and the noise assumed in it, squared grey levels a pixel."""
-
-    radius: int
-    noise: Any
-
-
 class StepArrays(NamedTuple):
     """What a step writes, (row, col) float32: new displacements, pixels; residual variance *before* the step (inf:
     none), squared grey levels; variance of the column displacement for a unit of variance of the grey levels."""
@@ -200,11 +193,13 @@ def _products(left, right, now, keep, y, radius, out):  # type: ignore[no-untype
 def lucas_kanade(left, right, now, keep, window, new):  # type: ignore[no-untyped-def]
     """One mean-free step for every kept pixel, from ``now`` (columns and rows of displacement) to ``new``.
 
+    ``window``: its radius, pixels, and the noise assumed in it, squared grey levels a pixel, float32.
+
     The gradient is the left image's (inverse compositional form). float32 throughout: every window is summed afresh, so
     nothing adds up. Reach: the window's radius, and of the left image a pixel more.
     """
     rows, cols = left.shape
-    radius = window.radius
+    radius, noise = window
     size = 2 * radius + 1
     fresh = np.zeros((PLANES, cols + 2 * radius), np.float32)
     ring = np.zeros((size, PLANES * cols), np.float32)
@@ -219,7 +214,7 @@ def lucas_kanade(left, right, now, keep, window, new):  # type: ignore[no-untype
         _add_rows(ring, y + radius + 1, total)
         least = np.float32(0.5 * size * size)
         row = StepArrays(new.u[y], new.v[y], new.energy[y], new.per_noise[y])
-        _solve(s, least, window.noise, keep[y], (now[0][y], now[1][y]), row)
+        _solve(s, least, noise, keep[y], (now[0][y], now[1][y]), row)
 
 
 @njit(cache=True, nogil=True)

@@ -14,6 +14,7 @@ from rille.stages.hfvm.coarse_to_fine import hierarchy
 from rille.stages.hfvm.finish import refine, uncertainty
 from rille.stages.hfvm.images import plane
 from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.views import Aligned, Plain
 from rille.stages.hfvm.images.window import whole
 from rille.stages.hfvm.level import consistency, epipolar, rowwise, subpixel_lut
 from rille.stages.hfvm.level.window_pair import WindowPair
@@ -183,10 +184,9 @@ class TestPlane:
 
     def test_aligned_image_is_the_left_one_and_displacements_compose_back(self):
         left, right, u, v = pair(self.displacement, (100, 120), (120, 170))
-        aligned = plane.align(build(right, PyramidParams()), self.H, left.shape, PyramidParams())
-        m = plane.margin(left.shape)
-        inner = aligned.images[0][m:-m, m:-m]
-        seen = aligned.valid[0][m:-m, m:-m] == 1
+        views = [Plain.of(build(image, PyramidParams())) for image in (left, right)]
+        aligned, m = Aligned.of(views[1], self.H, views[0], 0, None), plane.margin(left.shape)
+        inner, seen = aligned.images[0][m:-m, m:-m], aligned.masks[0][m:-m, m:-m] == 1
         assert seen.mean() > 0.5
         # Cubic interpolation of wavelengths from 5 px, grey range 200: about a percent of it.
         assert np.abs(inner - left)[seen].mean() < 2.0

@@ -14,6 +14,7 @@ from rille.stages.hfvm.images import plane
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import Aligned, Plain
 from rille.stages.hfvm.images.window import Mosaic, Window, bounded, gather, pick, thinned, tiles, whole
+from rille.stages.hfvm.level.window_pair import WindowPair
 from rille.stages.imaging.pyramid import PyramidParams, build
 
 
@@ -182,7 +183,12 @@ def test_aligned_windows_are_parts_of_the_aligned_pyramid():
     mask[40:90, 60:150] = 0
     right = Plain.of(build(right.images[0], PyramidParams(), mask))
     h = np.array([[1.0, -0.5, 12.0], [0.01, 1.0, 0.0], [0.0, 1e-4, 1.0]])
-    expected = Plain.of(plane.align(right_pyramid(right), h, left.shapes[0], PyramidParams(levels=len(left.shapes))))
+    m = plane.margin(left.shapes[0])
+    image = np.empty([n + 2 * m for n in left.shapes[0]], np.float32)
+    valid = np.empty(image.shape, np.uint8)
+    grey, place = right.filled(0, whole(right.shapes[0])), WindowPair(0, 0, 0, 0, *right.shapes[0])
+    plane.warp(grey, right.masks[0], h @ plane.translation(-m), image, valid, place)
+    expected = Plain.of(build(image, PyramidParams(levels=len(left.shapes)), valid))
     kept = Aligned.of(right, h, left, 0, None)
     bare = Aligned.again(right, h, left, kept.blank)
     some = Aligned.of(right, h, left, 2, 50)
@@ -194,12 +200,6 @@ def test_aligned_windows_are_parts_of_the_aligned_pyramid():
                 np.testing.assert_array_equal(
                     getattr(view, read)(level, window), getattr(expected, read)(level, window)
                 )
-
-
-def right_pyramid(view):
-    from rille.stages.imaging.pyramid import Pyramid
-
-    return Pyramid(tuple(np.asarray(a) for a in view.images), tuple(np.asarray(a) for a in view.masks))
 
 
 class Elsewhere:
