@@ -41,6 +41,9 @@ the vehicle, so it is lower by half.
 LARGE = 1 << 30
 """Heights above it are kept in 64 bits."""
 
+FINEST = 16
+"""Units of cost of a cell's length, at least: with fewer, prices of a metre would round to nothing on fine cells."""
+
 
 @dataclass(frozen=True)
 class RowGrid:
@@ -125,9 +128,10 @@ class PathPrices(NamedTuple):
 
 
 class _CellPrices(NamedTuple):
-    """The same in units a cell, so that the kernel works in 32 bits."""
+    """The same in units a cell, so that the kernel works in 32 bits; a height is rounded to ``parts`` units."""
 
     unit: np.float32
+    parts: np.int32
     caution: int
     uncertainty: np.float32
     p_certain: np.float32
@@ -154,9 +158,9 @@ class _Masks(NamedTuple):
 class PathMaps:
     """The maps on a grid.
 
-    ``unit``: metres of height that cost one; ``stand`` (row, col) float32 m, mean height under a wheel; ``height`` the
-    same in units, 0 where closed; ``toll`` (row, col) units, of caution and doubtful ground; ``closed`` (row, col):
-    where the vehicle's middle may not be.
+    ``unit``: metres of height that cost one, the unit of the prices or a part of it; ``stand`` (row, col) float32 m,
+    mean height under a wheel; ``height`` the same in units, 0 where closed; ``toll`` (row, col) units, of caution and
+    doubtful ground; ``closed`` (row, col): where the vehicle's middle may not be.
     """
 
     def __init__(
@@ -174,7 +178,9 @@ class PathMaps:
             uncertainty costs, ``p_hazard``.
         """
         unit, caution, uncertainty, p_certain = prices
-        self.grid, self.unit = grid, unit
+        # Heights are told apart by the unit of the prices; costs are counted in parts of it where cells are fine.
+        parts = max(1, math.ceil(FINEST * unit / grid.cell))
+        self.grid, self.unit = grid, unit / parts
         risk = grid.sample(lattice, maps["risk"], UNKNOWN)
         reason = grid.sample(lattice, maps["reason"], 0)
         known = "p_hazard" in maps
@@ -183,16 +189,18 @@ class PathMaps:
         self.stand = grid.sample(lattice, mean, np.nan)
         masks = _Masks(*(np.empty(risk.shape, dtype=np.bool_) for _ in range(4)))
         self.closed = masks.closed
-        toll = round(caution * grid.cell / unit)
-        dearest = toll + round(uncertainty * grid.cell / unit)
+        toll = round(caution * grid.cell / self.unit)
+        dearest = toll + round(uncertainty * grid.cell / self.unit)
         self.height: Ints = np.empty(risk.shape, dtype=np.int32)
         self.toll: Ints = np.empty(risk.shape, dtype=np.int16 if dearest <= np.iinfo(np.int16).max else np.int64)
         # A limit of 1 is none, even where rounding lifts a probability above it.
         limit = np.float32(p_certain if p_certain < 1 else np.inf)
-        each = _CellPrices(np.float32(unit), toll, np.float32(uncertainty * grid.cell / unit), limit)
+        doubt = np.float32(uncertainty * grid.cell / self.unit)
+        each = _CellPrices(np.float32(unit), np.int32(parts), toll, doubt, limit)
         if _lay(_Sampled(risk, reason, chance, self.stand), each, masks, self.height, self.toll):
             # Heights of a tall world in small units do not fit 32 bits.
-            self.height = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(unit)).astype(np.int64)
+            whole = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(unit))
+            self.height = parts * whole.astype(np.int64)
         self._stand = FreePlaces(masks.wheels, masks.body, vehicle, grid.cell, masks.unknown, masks.closed)
         self._ways: dict[str, Bytes] = {}
         self._parts: dict[str, tuple[NDArray[np.int32], Ints]] = {}
@@ -234,7 +242,7 @@ class PathMaps:
 def _lay(maps, prices, masks, height, toll):  # type: ignore[no-untyped-def]
     """Fill the masks, the heights in units and the tolls; ``prices`` in units. Whether some height is too large."""
     risk, reason, chance, stand = maps
-    unit, caution, uncertainty, p_certain = prices
+    unit, parts, caution, uncertainty, p_certain = prices
     unknown, closed, wheels, body = masks
     large = np.uint8(0)
     for r in range(risk.shape[0]):
@@ -249,8 +257,8 @@ def _lay(maps, prices, masks, height, toll):  # type: ignore[no-untyped-def]
         for c in range(risk.shape[1]):
             v = np.rint(stand[r, c] / unit) if risk[r, c] < HAZARDOUS else np.float32(0.0)
             # Casts what is too large to anything: the caller then makes the heights anew in 64 bits.
-            height[r, c] = np.int32(v)
-            large |= np.uint8(abs(v) > np.float32(LARGE))
+            height[r, c] = np.int32(v) * parts
+            large |= np.uint8(abs(v) * np.float32(parts) > np.float32(LARGE))
         for c in range(risk.shape[1]):
             # NaN, which is unknown and closed, costs nothing
             p = chance[r, c] if chance[r, c] > np.float32(0.0) else np.float32(0.0)

@@ -112,6 +112,31 @@ def test_a_path_over_level_ground_does_not_follow_the_noise_of_its_elevations() 
     assert aside[1] < 0.5 * aside[0]
 
 
+@pytest.mark.parametrize("fine", [1, 4, 10])
+def test_prices_of_a_metre_hold_on_cells_of_any_size(fine: int) -> None:
+    """A cell of 1 mm is four steps of 0.24 mm, of which 0.2 times what a diagonal is longer would round to nothing."""
+    cell, rover = CELL / fine, SHORT.model_copy(update={"max_step": 0.012})
+    lattice = Lattice.at(-20 * fine, 60 * fine, cell, 60 * fine, 41 * fine)
+    risk, z = level(lattice)
+    z += np.random.default_rng(3).normal(0.0, 0.002, (60, 41)).astype(np.float32).repeat(fine, 0).repeat(fine, 1)
+    winding, straight = (
+        describe(
+            find_path(maps(risk, z), lattice, rover, params=PathParams(planner="rows", detour_cost=cost)),
+            maps(risk, z),
+            lattice,
+            rover,
+        )
+        for cost in (0.0, 0.2)
+    )
+    assert straight["length_m"] < 0.99 * winding["length_m"]
+    higher = rover.model_copy(update={"max_step": 0.12})
+    by_grid = find_path(
+        maps(risk, 0.0 * z), lattice, higher, ends=((0.0, 0.1), (0.1, 0.5)), params=PathParams(planner="grid8")
+    )
+    length = np.hypot(*np.diff(by_grid.xyz[:, :2], axis=0).T).sum()
+    assert length == pytest.approx(0.3 + 0.1 * math.sqrt(2.0), rel=0.01)
+
+
 def test_caution_ground_is_avoided_where_the_detour_is_short() -> None:
     lattice = Lattice.at(-20, 60, CELL, 60, 41)
     risk, z = level(lattice)
