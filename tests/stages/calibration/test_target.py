@@ -154,14 +154,14 @@ def test_a_bad_view_is_named_and_left_out_and_does_no_harm():
 def test_a_view_is_good_below_half_a_pixel_or_four_times_the_others(usual, worse):
     views = scene("radtan4", 10, noise=usual)
     views[4] = scene("radtan4", 10, noise=worse)[4]
-    found = calibrate_rig(BOARD, views, SIZE, "radtan4")
+    found = calibrate_rig(BOARD, views, SIZES, "radtan4")
     assert all(r.used for r in found.residuals)
     assert found.residuals[4].worst > min(0.5, 4 * np.median([r.worst for r in found.residuals]))
 
 
 def test_cameras_turned_upside_down_are_no_solution():
     """Negative focal lengths, and all poses turned by half a turn about the axis: not one projection changes."""
-    task = Adjustment(BOARD, tuple(scene("radtan4", 4)), SIZE, "radtan4")
+    task = Adjustment(BOARD, tuple(scene("radtan4", 4)), SIZES, "radtan4")
     x = task.solve(task.start())
     turn = RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     for first in (0, task.lens):
