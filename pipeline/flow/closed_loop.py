@@ -41,6 +41,7 @@ from pydantic import Field
 
 from rille.datasets.protocol import Sequence, Simulation
 from rille.pipeline.engine.graph import Graph, Handle, MissingError, Wait
+from rille.pipeline.engine.plain import count
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow.builders import Builder, Pair, Segment, name
 from rille.pipeline.flow.products import Driven, Products, Stop
@@ -334,7 +335,8 @@ class Drive:
             stop.event = leg["reason"]
             raise EndedError(leg["verdict"], leg["reason"])
         if stop.index + 1 >= self.config.drive.max_stops:
-            raise EndedError("stops", f"{stop.index + 1} stops and {1000 * leg['left_m']:.0f} mm from the goal")
+            left = f"{1000 * leg['left_m']:.0f} mm from the goal"
+            raise EndedError("stops", f"{count(stop.index + 1, 'stop')} and {left}")
         self.planned, stop.event = stop.leg, leg["reason"]
 
     def _leg(self, label: str, memory: PlannerMemory, more: dict[str, Any], **inputs: Handle) -> Handle:

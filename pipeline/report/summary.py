@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rille.pipeline.engine.plain import count
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView
 from rille.pipeline.report import delivery, seams, tables
@@ -165,7 +166,8 @@ def _way_words(view: RunView, length: float | None) -> str:
     """What came of the path, or of the drive."""
     if view.products.drive is not None:
         drive = view.products.drive
-        return f"{drive.verdict} after {len(drive.stops)} stops" + (f" ({drive.reason})" if drive.reason else "")
+        reason = f" ({drive.reason})" if drive.reason else ""
+        return f"{drive.verdict} after {count(len(drive.stops), 'stop')}{reason}"
     return "no path" if length is None else f"a path of {length:.3g} m{delivery.start_words(view)}"
 
 

@@ -27,6 +27,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from importlib import import_module
 from importlib.util import find_spec
 from multiprocessing import resource_tracker
 from typing import Any
@@ -315,6 +316,9 @@ class SetUp(WorkerPlugin):  # type: ignore[misc]
     def setup(self, worker: Any) -> None:
         """Set the process up, and remember in what it differs."""
         prepare_environment()
+        # Nearly all stages import them: the seconds of a worker's first task are then its own.
+        for name in ("cv2", "numba"):
+            import_module(name)
         self._worker = worker
         differs = dask_cluster.unlike(dask_cluster.identity(), self.ours) if self.ours else ""
         _runs[self.run] = f"worker {worker.name} differs: {differs}" if differs else ""
