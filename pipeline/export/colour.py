@@ -26,10 +26,10 @@ KNOWS = ("frames", "sequence.rig")
 """What an output needs besides the merged tiles, see :class:`rille.pipeline.export.output.Output`."""
 
 
-def coloured(view: Any) -> bool:
-    """Whether the left images have colours: all of a sequence have, or none."""
-    first = next((image for f in view.frames if (image := artifacts.image(view, f)) is not None), None)
-    return first is not None and "colour" in first.arrays
+def coloured(view: Any, source: NDArray[Any]) -> bool:
+    """Whether a left image of the pairs in ``source`` has colours; one that is dark has none, whatever the others."""
+    images = (artifacts.image(view, int(pair)) for pair in np.unique(source))
+    return any(image is not None and "colour" in image.arrays for image in images)
 
 
 def ortho(view: Any, lattice: Lattice, merged: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:

@@ -12,19 +12,23 @@ from numpy.typing import NDArray
 from rille.pipeline.export.artifacts import Floats, by_frame
 from rille.pipeline.export.view import RunView
 from rille.stages.core.declare import Bundle
+from rille.stages.evaluation.agreement import carried
 
 
 @dataclass(frozen=True)
 class Comparison:
     """Our trajectory and that of the crosscheck, one row a chosen frame, NaN where either has no pose.
 
-    ``poses`` (frame, 3, 4): the crosscheck's left cameras in our world. ``distance`` m, ``angle`` rad: disagreement of
-    the poses; ``step_distance``, ``step_angle``: of the motion since the frame before. ``error``, ``error_crosscheck``
-    m: distance of either from the truth, first poses equal. ``flagged``: not to be trusted without a look.
+    ``poses`` (frame, 3, 4): the crosscheck's left cameras in our world, NaN where ours is in a piece apart.
+    ``registered`` (frame,): whether the crosscheck has posed it, in whatever piece. ``distance`` m, ``angle`` rad:
+    disagreement of the poses; ``step_distance``, ``step_angle``: of the motion since the frame before. ``error``,
+    ``error_crosscheck`` m: distance of either from the truth, first poses equal. ``flagged``: not to be trusted without
+    a look.
     """
 
     frames: tuple[int, ...]
     poses: Floats
+    registered: NDArray[np.bool_]
     distance: Floats
     angle: Floats
     step_distance: Floats
@@ -33,11 +37,6 @@ class Comparison:
     error: Floats
     error_crosscheck: Floats
     meta: Mapping[str, Any]
-
-    @property
-    def registered(self) -> NDArray[np.bool_]:
-        """Which frames the crosscheck has posed."""
-        return np.asarray(np.isfinite(self.poses).all(axis=(1, 2)))
 
     def reasons(self) -> list[str]:
         """Why each frame is flagged, in words; empty where it is not."""
@@ -66,14 +65,16 @@ def compare(view: RunView) -> Comparison | None:
         return None
     names = ("poses", "distance", "angle", "step_distance", "step_angle")
     found = {name: by_frame(view, bundle, name) for name in names}
+    registered = np.asarray(np.isfinite(found["poses"]).all(axis=(1, 2)))
     trajectory = view.bundle(view.products.trajectory)
-    if trajectory is not None:  # other pieces lie in frames of their own
-        piece = by_frame(view, trajectory, "piece")
-        found["poses"][(piece >= 0) & (piece != trajectory.meta["main"])] = np.nan
+    if trajectory is not None:  # other pieces lie in frames of their own, and so do the frames lost behind them
+        piece = np.nan_to_num(by_frame(view, trajectory, "piece"), nan=-1).astype(np.int64)
+        found["poses"][carried(piece) != trajectory.meta["main"]] = np.nan
     flagged = np.nan_to_num(by_frame(view, bundle, "flagged")) > 0
     p = view.products
     error, theirs = (_error(view, view.bundle(handle)) for handle in (p.accuracy, p.crosscheck_accuracy))
-    return Comparison(view.frames, **found, flagged=flagged, error=error, error_crosscheck=theirs, meta=bundle.meta)
+    judged = {**found, "registered": registered, "flagged": flagged, "error": error, "error_crosscheck": theirs}
+    return Comparison(view.frames, **judged, meta=bundle.meta)
 
 
 def _error(view: RunView, accuracy: Bundle | None) -> Floats:

@@ -18,7 +18,7 @@ FRAMES: dict[str, dict[str, Any]] = {
     "world": {
         "handedness": "right",
         "axes": {"x": "right", "y": "ahead", "z": "up"},
-        "origin": "centre of the left camera at the first frame",
+        "origin": "centre of the left camera at the first frame that has a pose here",
         "definition": FRAME,
     },
     "left camera": {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -74,7 +75,9 @@ def _slope(view: Any) -> tuple[Lattice, NDArray[Any]]:
 
 def _write_hillshade(path: Path, view: Any) -> None:
     lattice, elevation = _merged("elevation")(view)
-    bands, place = {"hillshade": hillshade(elevation, lattice.cell)}, view.sequence.georeference
+    place = view.sequence.georeference
+    # The raster is turned by the azimuth where it has a place: there the light has to come from the map's upper left.
+    bands = {"hillshade": hillshade(elevation, lattice.cell, 0.0 if place is None else place.azimuth)}
     write_raster(path, bands, lattice, Meaning(nodata=0, tags=LIGHT), place)
 
 
@@ -82,10 +85,11 @@ def _write_ortho(path: Path, view: Any) -> None:
     """Write grey values as they are, or red, green and blue where the images have colours."""
     lattice, grey = _merged("ortho")(view)
     place = view.sequence.georeference
-    if not colour.coloured(view):
+    source = _merged("source")(view)[1]
+    if not colour.coloured(view, source):
         write_raster(path, {"ortho": np.asarray(grey, np.float32)}, lattice, Meaning(), place)
         return
-    merged = {"ortho": grey} | {name: _merged(name)(view)[1] for name in ("elevation", "source")}
+    merged = {"ortho": grey, "elevation": _merged("elevation")(view)[1], "source": source}
     bands = dict(zip(("red", "green", "blue"), np.moveaxis(colour.ortho(view, lattice, merged), 2, 0), strict=True))
     write_raster(path, bands, lattice, Meaning(nodata=0), place)
 
@@ -162,7 +166,9 @@ def _write_risk_style(path: Path, view: Any) -> None:
 
 def dem_style(low: float, high: float) -> str:
     """QGIS style of elevations, in metres."""
-    values = [f"{low + (high - low) * k / (len(ELEVATIONS) - 1):.6g}" for k in range(len(ELEVATIONS))]
+    # Heights above the sea need more digits than six to tell the steps of a low relief apart.
+    digits = max(6, 4 + math.ceil(math.log10(max(abs(low), abs(high)) / (high - low))))
+    values = [f"{low + (high - low) * k / (len(ELEVATIONS) - 1):.{digits}g}" for k in range(len(ELEVATIONS))]
     items = "".join(
         f'<item value="{value}" label="{value}" color="{colour}" alpha="255"/>\n'
         for value, colour in zip(values, ELEVATIONS, strict=True)
@@ -213,7 +219,7 @@ OUTPUTS = (
         "dem.tif",
         "merged elevation, m, NaN undefined",
         _raster("elevation", "m", _height),
-        "elevation z of the cell centre, m",
+        "elevation z of the cell centre, m; where the sequence has a place on Earth, its height there",
     ),
     Output(
         "dem.qml",

@@ -43,8 +43,8 @@ def rig(scene: Scene) -> Block | None:
     if panels:
         words.append(
             "In the maps the left image is divided into cells; a colour is the median distance of the right points "
-            "from their epipolar lines, positive below the line. Distances that change smoothly over the image tell of "
-            "a rig (or lens) that is not as given; speckle is noise of matching."
+            "from their epipolar lines, positive below the line (to the right of a steep one). Distances that change "
+            "smoothly over the image tell of a rig (or lens) that is not as given; speckle is noise of matching."
         )
     if drift is not None:
         words.append(
@@ -156,8 +156,9 @@ def basic_pairs(scene: Scene) -> Block | None:
     bundle = view.bundle(view.products.keyframes)
     if bundle is None or len(view.frames) < 2:
         return None
-    meta = bundle.meta
-    tracked = chain(view)
+    meta, tracked = bundle.meta, chain(view)
+    if len(tracked) < 2:  # all others are lost: there was nothing to choose from
+        return None
     pairs = [tracked[i] for i in meta.get("basic", ())]
     # None becomes NaN.
     overlap = np.array(meta.get("overlap") or [None] * len(pairs), dtype=float)

@@ -63,7 +63,8 @@ def _disparities(scene: Scene) -> Block | None:
     panels.append(figures.validity(classes, f"How the disparity of each pixel of {name} came about: {words}"))
     caption = (
         f"Left image of the first basic pair ({name}); row and column disparities of its pixels, right minus left, in "
-        "pixels, blank where undefined; and which of them were measured in both directions, which interpolated. "
+        "pixels, blank where undefined; and which of them were measured (in both directions, or on the plane of a "
+        "textureless region), which interpolated. "
         "Nothing was rectified, so rows may differ too."
     )
     colors = (canvas.MEASURED, canvas.INTERPOLATED, canvas.UNDEFINED)
@@ -76,15 +77,15 @@ def _terrain(scene: Scene) -> Block | None:
     world = scene.world
     if world is None:
         return None
-    pairs = len(scene.view.products.world_dem)
+    pairs = sum(scene.view.bundle(handle) is not None for handle in scene.view.products.world_dem.values())
     ortho, elevation = world.get("ortho"), world.get("elevation")
+    risk = None if scene.risk is None or scene.risk.lattice != world.lattice else scene.risk.arrays["risk"]
     panels = []
     if ortho is not None:
         panels.append(
             figures.ortho(ortho, world.extent, f"Ortho image merged from {pairs} stereo pairs, seen from above")
         )
     if elevation is not None:
-        risk = None if scene.risk is None or scene.risk.lattice != world.lattice else scene.risk.arrays["risk"]
         alt = f"Elevation as grey values, {spread(elevation)} m, with the path over it"
         panels.append(figures.elevation_with_path(elevation, risk, scene.path, world.extent, alt))
     path = (
@@ -94,8 +95,9 @@ def _terrain(scene: Scene) -> Block | None:
     )
     caption = (
         f"First: ortho image merged from {pairs} basic pairs, cells of {length(world.lattice.cell)}; undefined and "
-        "occluded cells are blank. Second: elevation, bright is high; unknown and hazardous cells are "
-        f"black{path}. World frame: x right and y ahead of the first left camera, which is at (0, 0)."
+        "occluded cells are blank. Second: elevation, bright is high; unknown "
+        f"{'' if risk is None else 'and hazardous '}cells are black{path}. World frame: x right and y ahead of the "
+        "first left camera, which is at (0, 0)."
     )
     return Block(
         "Figure 7", "Figure 7. Merged ortho image, and the path on the elevation model", caption, tuple(panels)
@@ -328,7 +330,13 @@ _FIGURES: tuple[tuple[str, Maker, Condition, str, str], ...] = (
         "sequence.truth sequence.simulation.T_vehicle_left",
     ),
     ("Figure 6. Disparities", _disparities, _always, "disparity images undistorted", ""),
-    ("Stops", stops.strip, _planned, "disparity images undistorted local_dem local_risk local_path drive", ""),
+    (
+        "Stops",
+        stops.strip,
+        _planned,
+        "disparity images undistorted local_dem local_risk local_path drive",
+        "sequence.rig",
+    ),
     (
         "Rig",
         checks.rig,

@@ -362,7 +362,10 @@ def _matching(pairs: Rows) -> dict[str, Metric]:
     every = f"{len(matched)} of {len(pairs)} basic pairs"
     found = {}
     if matched:
-        how = "pixels of the left image with a measured, back-matched disparity (not interpolated): mean over pairs"
+        how = (
+            "pixels of the left image with a measured disparity, back-matched or on the plane of a textureless region "
+            "(not interpolated): mean over pairs"
+        )
         found["matched"] = _metric("Matched pixels", statistics.fmean(matched), "1", how, every)
     sources = sorted({r["vertical"] for r in pairs if r["vertical"]})
     if sources:

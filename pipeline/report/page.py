@@ -20,6 +20,7 @@ from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.delivery import Items
 from rille.pipeline.report.summary import summarise
 from rille.pipeline.report.words import coordinate, metres, number, quantity, seconds, share
+from rille.stages.geometry.geometry import Rig
 from rille.stages.hazard.measures import MEASURES
 
 TILES = (
@@ -139,7 +140,15 @@ def render(
         true_mean=view.sequence.truth is not None and facts["truth"]["used"],
         compared=compared,
         place=view.sequence.georeference,
+        cameras=_cameras(view.sequence.rig),
     )
+
+
+def _cameras(rig: Rig) -> tuple[str, str]:
+    """Size of the images and focal length in words, of both cameras where they differ."""
+    sizes = [f"{camera.width} × {camera.height} pixels" for camera in (rig.left, rig.right)]
+    lengths = [f"{number(camera.fx, 4)} px" for camera in (rig.left, rig.right)]
+    return tuple(a if a == b else f"{a} (right: {b})" for a, b in (sizes, lengths))  # type: ignore[return-value]
 
 
 def reasons() -> list[tuple[str, str]]:

@@ -20,6 +20,7 @@ from rille.pipeline.report.figures import paint
 from rille.pipeline.report.gather import Scene, Terrain
 from rille.stages.core.validity import matched
 from rille.stages.evaluation.crosscheck import grey_bytes
+from rille.stages.geometry.geometry import Rig
 
 Bytes = NDArray[np.uint8]
 
@@ -35,8 +36,8 @@ RESERVE = 0.75
 
 def strip(scene: Scene) -> Block | None:
     """The figure; None where no pair was matched."""
-    disparity = scene.view.products.disparity
-    pairs = [p for p, handle in disparity.items() if scene.view.bundle(handle) is not None]
+    view, disparity = scene.view, scene.view.products.disparity
+    pairs = [p for p, handle in disparity.items() if view.bundle(handle) is not None]
     if not pairs:
         return None
     cost = column(scene, pairs[len(pairs) // 2], WIDEST).size / WIDEST**2
@@ -44,16 +45,25 @@ def strip(scene: Scene) -> Block | None:
     shown = pairs[::step]
     width = min(WIDEST, int(math.sqrt(RESERVE * BUDGET / (len(shown) * cost))))
     panels = within([column(scene, pair, width) for pair in shown])
-    judged = any(scene.view.bundle(handle) is not None for handle in scene.view.products.local_risk.values())
+    judged = any(view.bundle(handle) is not None for handle in view.products.local_risk.values())
     some = "" if len(panels) == len(pairs) else f" {len(panels)} of {len(pairs)} pairs are shown."
     caption = (
-        "Each column is a basic pair, from the top: left image; its matches, coloured by column disparity (blue: far); "
+        "Each column is a basic pair, from the top: left image; its matches, coloured by "
+        f"{depth_band(view.sequence.rig)[0].replace('_', ' ')} (blue: far); "
         f"elevations of its own model{'; its hazards with the local path (black)' if judged else ''}. Pictures are "
         f"{width} pixels wide, so that the page stays below 5 MB.{some}"
     )
     names = ("safe", "caution", "hazard", "unknown")
     legend = tuple(zip(canvas.RISK, names, strict=True)) if judged else ()
     return Block("Stops", "Every pair", caption, tuple(panels), legend, strip=True)
+
+
+def depth_band(rig: Rig) -> tuple[str, int]:
+    """Component of the disparity along the baseline, and the sign by which it is the smaller the nearer a point is."""
+    right, below, _ = rig.T_right_left.inverse().translation
+    # Right minus left: a camera to the right (or below) sees what is near farther to the left (or above).
+    band, along = ("column_disparity", right) if abs(right) >= abs(below) else ("row_disparity", below)
+    return band, 1 if along >= 0 else -1
 
 
 def within(panels: Sequence[Panel]) -> list[Panel]:
@@ -73,7 +83,8 @@ def column(scene: Scene, pair: int, width: int) -> Panel:
     seen = None if image is None else grey_bytes(np.asarray(image["image"]))
     found = view.bundle(view.products.disparity[pair])
     assert found is not None
-    there, values = matched(np.asarray(found["validity"])), np.asarray(found["column_disparity"])
+    band, sign = depth_band(view.sequence.rig)
+    there, values = matched(np.asarray(found["validity"])), sign * np.asarray(found[band])
     if seen is not None:
         pictures += [_scaled(Image.fromarray(seen).convert("RGBA"), width)]
     pictures += [_scaled(_matches(seen, values, there), width)]
@@ -108,7 +119,7 @@ def _matches(seen: Bytes | None, disparity: NDArray[Any], there: NDArray[np.bool
     from PIL import Image
 
     low, high = ranges.limits(np.where(there, disparity, np.nan))
-    # Right minus left is the smaller the nearer a point is: turned round, so that blue is far.
+    # The smaller the nearer a point is: turned round, so that blue is far.
     colors = _ramp((high - disparity) / max(high - low, 1e-9))
     ground = np.full(there.shape, 96, np.uint8) if seen is None or seen.shape != there.shape else seen
     grounds = np.repeat(ground[..., None], 3, axis=-1)

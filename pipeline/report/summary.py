@@ -101,7 +101,7 @@ def find_warnings(scene: Scene) -> list[str]:
     ):
         bundle = view.bundle(handle)
         lines += (bundle.meta.get("warnings") or []) if bundle is not None else []
-    lines += _sigma_warning(view)
+    lines += _sigma_warning(view) + _displaced(view)
     compared = scene.comparison
     if compared is not None and compared.flagged.any():
         bad = [frame for frame, flagged in zip(view.frames, compared.flagged, strict=True) if flagged]
@@ -125,6 +125,20 @@ def _unlike(view: RunView) -> list[str]:
     if share is None or share <= UNLIKE:
         return []
     return [f"trajectory and COLMAP have nothing in common: {metres(rmse)} RMS over {metres(length)}; one is wrong"]
+
+
+def _displaced(view: RunView) -> list[str]:
+    """The place on Earth is that of a camera which is not the origin of this run's world."""
+    trajectory = view.bundle(view.products.trajectory)
+    if view.sequence.georeference is None or trajectory is None:
+        return []
+    first = trajectory.meta["pieces"][trajectory.meta["main"]][0]
+    if first == 0:
+        return []
+    return [
+        f"this run's world begins at frame {first}: rasters and path.gpkg are displaced on Earth, unless world.origin "
+        f"and world.azimuth_deg are those of frame {first}"
+    ]
 
 
 SIGMA_OFF = 3.0
@@ -210,7 +224,7 @@ READS = (
 KNOWS = (
     "frames config.vehicle config.crosscheck.enabled sequence.name sequence.frames sequence.frame_names sequence.rig "
     "sequence.truth sequence.truth_source sequence.truth_positions sequence.warnings sequence.notes "
-    "sequence.evaluation_window"
+    "sequence.evaluation_window sequence.georeference"
 )
 OUTPUTS = (Output("facts", "", "", _write, (), tuple(READS.split()), tuple(KNOWS.split())),)
 STAGE = stage("output.facts", "Figures and tables of the report in numbers", OUTPUTS)

@@ -127,7 +127,7 @@ def _picture(*planes: NDArray[Any]) -> str:
 
 def _look(scene: Scene, world: Terrain, step: int) -> Floats:
     """Grey values of the ortho image (row, col), or its colours (row, col, 3), NaN undefined."""
-    if {"ortho", "source"} <= world.arrays.keys() and colour.coloured(scene.view):
+    if {"ortho", "source"} <= world.arrays.keys() and colour.coloured(scene.view, world.arrays["source"]):
         rgb = colour.ortho(scene.view, world.lattice, world.arrays)[::step, ::step].astype(np.float64)
         return np.where(rgb > 0, rgb, np.nan)
     return _plane(world, "ortho", step)
@@ -162,7 +162,9 @@ def _frusta(scene: Scene) -> list[Any]:
         return []
     camera, found = view.sequence.rig.left, []
     far = 2.0 * view.sequence.rig.baseline
-    corners = [(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)]
+    # Pixel centres are whole numbers: the image begins half a pixel before the first.
+    right, foot = camera.width - 0.5, camera.height - 0.5
+    corners = [(-0.5, -0.5), (right, -0.5), (right, foot), (-0.5, foot)]
     rays = np.array([((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0) for u, v in corners])
     points = np.vstack([np.zeros(3), far * rays])
     for frame, pose in zip(bundle.meta["frames"], world_poses(bundle), strict=True):

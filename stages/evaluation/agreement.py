@@ -139,17 +139,20 @@ def flag(arrays: Mapping[str, Floats], params: AgreementParams) -> tuple[Bytes, 
     return flags, limits
 
 
+def carried(piece: NDArray[np.integer[Any]]) -> NDArray[np.integer[Any]]:
+    """Piece (frame,) that each frame counts to: a lost one (-1) to that of the posed one before it, or to the first."""
+    posed = np.flatnonzero(piece >= 0)
+    if not posed.size:
+        return piece
+    return piece[posed[np.maximum(np.searchsorted(posed, np.arange(len(piece)), side="right") - 1, 0)]]
+
+
 def unbroken(theirs: NDArray[np.int64], ours: NDArray[np.int64]) -> NDArray[np.int64]:
     """Pieces (frame,) that are unbroken in both trajectories, -1 where the other program has none.
 
     A frame that we lost counts to our piece before it, so that the other program's pose of it is shown.
     """
-    posed = np.flatnonzero(ours >= 0)
-    if not posed.size:
-        return theirs
-    # The last posed frame at or before each one; frames before the first count to it.
-    before = posed[np.maximum(np.searchsorted(posed, np.arange(len(ours)), side="right") - 1, 0)]
-    both = np.stack([theirs, ours[before]])
+    both = np.stack([theirs, carried(ours)])
     known = theirs >= 0
     piece = np.full(len(theirs), -1, dtype=np.int64)
     # A piece is a pair of piece numbers, ours and theirs, counted anew.

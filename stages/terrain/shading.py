@@ -70,11 +70,15 @@ def slope_deg(elevation: ArrayLike, cell: float) -> Floats32:
     return np.asarray(np.degrees(np.arctan(np.hypot(gx, gy))), np.float32)
 
 
-def hillshade(elevation: ArrayLike, cell: float) -> Bytes:
+def hillshade(elevation: ArrayLike, cell: float, turned: float = 0.0) -> Bytes:
     """Shaded relief (rows, cols), 1 (facing away) to 255 (facing the light), 0 unknown: GDAL's form, in light from the
-    upper left, as on maps, 45 degrees above the horizon."""
+    upper left, as on maps, 45 degrees above the horizon.
+
+    ``turned``: azimuth of y on the map that is shown, radians clockwise from its top; elsewhere relief would look
+    inverted, lit from below.
+    """
     gx, gy = gradient(elevation, cell)
-    azimuth, altitude = math.radians(315.0), math.radians(45.0)  # azimuth clockwise from y
+    azimuth, altitude = math.radians(315.0) - turned, math.radians(45.0)  # azimuth clockwise from y
     light = np.cos(altitude) * np.sin(azimuth), np.cos(altitude) * np.cos(azimuth), np.sin(altitude)
     facing = (light[2] - gx * light[0] - gy * light[1]) / np.sqrt(1.0 + gx * gx + gy * gy)
     shade = 1.0 + 254.0 * np.maximum(facing, 0.0)

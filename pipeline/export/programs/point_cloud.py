@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 import rasterio
 from numpy.typing import NDArray
 
@@ -76,7 +77,7 @@ def _beside(run: Path, name: str, terrain: DemFile) -> Layer:
 def write_laz(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
     """Write a point for each known cell: x, y, z, intensity and colour of the ortho image, ``sigma`` of z (m).
 
-    LAS 1.4, point format 7, the CRS as WKT. A step of the coordinates is a thousandth of a cell or less, an elevation
+    LAS 1.4, point format 7, the CRS as WKT 1. A step of the coordinates is a thousandth of a cell or less, an elevation
     is off by half a step at most.
     """
     import laspy
@@ -90,8 +91,8 @@ def write_laz(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
     header.offsets = [float(np.floor(v.min())) for v in (x, y, terrain.values[row, col])]
     header.scales = np.full(3, 10.0 ** np.floor(np.log10(terrain.cell / STEPS)))
     if terrain.crs:
-        # LAS 1.4 allows only WKT with point formats 6 to 10, and wants this bit set.
-        header.vlrs.append(WktCoordinateSystemVlr(terrain.crs))
+        # LAS 1.4 allows only WKT with point formats 6 to 10, wants this bit set, and knows the first version alone.
+        header.vlrs.append(WktCoordinateSystemVlr(pyproj.CRS(terrain.crs).to_wkt("WKT1_GDAL")))
         header.global_encoding.wkt = True
     if sigma is not None:
         about = laspy.ExtraBytesParams("sigma", type=np.float32, description="standard deviation of z, m")

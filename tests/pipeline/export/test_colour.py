@@ -64,7 +64,7 @@ def test_each_cell_takes_the_colour_of_its_pair_and_keeps_the_merged_grey():
 
 def test_grey_sequences_write_grey_ortho_images(tmp_path):
     view, _ = run()
-    assert not colour.coloured(view)
+    assert not colour.coloured(view, np.zeros((1, 1), int))
     _write_ortho(tmp_path / "ortho.tif", view)
     with rasterio.open(tmp_path / "ortho.tif") as found:
         assert (found.count, found.dtypes[0]) == (1, "float32")
@@ -80,3 +80,13 @@ def test_files_give_their_colours_and_the_grey_of_before(depth):
     same = np.repeat(bgr[..., :1], 3, axis=2)
     assert decode_colour(cv2.imencode(".png", same)[1].tobytes(), "a.png")[1] is None
     assert decode_colour(cv2.imencode(".png", bgr[..., 0])[1].tobytes(), "a.png")[1] is None
+
+
+def test_a_first_image_that_is_dark_does_not_take_the_colours_of_all():
+    view = View(200)
+    assert "colour" in view.bundle("image1").arrays
+    dark = Bundle({"image": np.zeros((120, 160), np.uint8)}, {})
+    given = view.bundle
+    view.bundle = lambda name: dark if name == "image0" else given(name)
+    assert colour.coloured(view, np.array([[-1, 0], [0, 1]]))
+    assert not colour.coloured(view, np.array([[-1, 0]]))

@@ -202,7 +202,12 @@ def test_all_files_of_a_run_state_one_system(georeference: Georeference | None, 
     with laspy.open(tmp_path / "cloud.laz") as cloud:
         found["cloud.laz"] = pyproj.CRS.from_wkt(next(v.string for v in cloud.header.vlrs if v.record_id == 2112))
     terrain = xarray.open_zarr(tmp_path / "terrain.zarr")
-    assert set(terrain.elevation.attrs["ancillary_variables"].split()) == {"elevation_std", "spread", "count"}
+    assert set(terrain.elevation.attrs["ancillary_variables"].split()) == {
+        "elevation_std",
+        "spread",
+        "count",
+        "source",
+    }
     local = pyproj.CRS.from_wkt(terrain.spatial_ref.attrs["crs_wkt"])
     found["terrain.zarr"] = local if georeference is None else pyproj.CRS.from_cf(terrain.crs.attrs)
     assert len(found) >= 10

@@ -242,3 +242,9 @@ def test_only_what_was_written_is_described() -> None:
     assert facts["files"]["dem.tif"]["raster"].endswith("north is y")
     assert "north" not in placed["files"]["dem.tif"]["raster"], "the raster is turned by the azimuth"
     assert placed["georeference"]["origin"] == [1.0, 2.0, 3.0]
+
+
+def test_the_style_of_a_low_relief_high_above_the_sea_has_distinct_steps() -> None:
+    style = ElementTree.fromstring(dem_style(1834.50, 1834.52))
+    values = [float(item.attrib["value"]) for item in style.iter("item")]
+    np.testing.assert_allclose(np.diff(values), 0.02 / 8, rtol=0.02)

@@ -23,6 +23,7 @@ from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.delivery import is_complete
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import RilleError
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.hazard.risk import RiskParams
 from rille.stages.odometry.resection.trajectory import _account
 from rille.stages.planning.path import PathParams
@@ -437,3 +438,41 @@ def test_a_curve_of_many_frames_does_not_fill_the_page() -> None:
         return len(few.uri) + len(both.uri)
 
     assert size(4000) < 4 * size(400)
+
+
+@pytest.mark.parametrize(
+    ("centre", "band", "sign"),
+    [
+        ((0.1, 0.01, 0.0), "column_disparity", 1),
+        ((-0.1, 0.01, 0.0), "column_disparity", -1),
+        ((0.01, 0.1, 0.0), "row_disparity", 1),
+        ((0.01, -0.1, 0.0), "row_disparity", -1),
+    ],
+)
+def test_near_points_have_the_smaller_disparity_along_the_baseline(
+    centre: tuple[float, float, float], band: str, sign: int
+) -> None:
+    camera = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
+    rig = Rig(camera, camera, RigidTransform(np.eye(3), -np.array(centre)))
+    points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 5.0]])
+    near, far = camera.project(rig.T_right_left.apply(points)) - camera.project(points)
+    assert stops.depth_band(rig) == (band, sign)
+    axis = ("column_disparity", "row_disparity").index(band)
+    assert sign * near[axis] < sign * far[axis]
+
+
+def test_both_cameras_are_told_where_they_differ(tmp_path: Path) -> None:
+    given = view()
+    small = Camera(30.0, 30.0, 15.5, 11.5, 32, 24)
+    rig = replace(given.sequence.rig, right=small)
+    _, page_, _, _ = written(tmp_path, replace(given, sequence=replace(given.sequence, rig=rig)))
+    assert page_.text.count("images of 64 × 48 pixels (right: 32 × 24 pixels)") == 2
+    assert "focal length 60 px (right: 30 px)" in page_.text
+
+
+def test_a_model_that_failed_was_not_merged(tmp_path: Path) -> None:
+    made = bundles()
+    del made["world_dem4"], made["risk"]
+    _, page_, _, _ = written(tmp_path, view(made))
+    assert "ortho image merged from 1 basic pairs" in page_.text
+    assert "unknown cells are black" in page_.text

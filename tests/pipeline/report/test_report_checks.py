@@ -27,7 +27,9 @@ from toys.finished import (
     written,
 )
 
+from rille.datasets.georeference import Georeference
 from rille.pipeline.export import artifacts
+from rille.pipeline.export.comparison import compare
 from rille.pipeline.report import canvas, figures, gather, summary
 from rille.stages.core.declare import Bundle
 from rille.stages.hazard.risk import RiskParams
@@ -215,3 +217,44 @@ def test_trails_end_where_the_landmark_is() -> None:
 def decoded(panel: canvas.Panel) -> np.ndarray:
     """Pixels of an encoded panel."""
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(panel.uri.split(",")[1]))).convert("RGB"))
+
+
+def in_pieces(piece: list[int], main: int) -> dict[str, Bundle]:
+    """Artifacts of a run whose trajectory falls into pieces."""
+    made = bundles() | checks()
+    trajectory = made["trajectory"]
+    rows = [np.flatnonzero(np.array(piece) == k) for k in range(max(piece) + 1)]
+    facts = {"pieces": [[int(r[0]), int(r[-1])] for r in rows], "main": main, "verticals": ["attitude"] * len(rows)}
+    made["trajectory"] = Bundle(trajectory.arrays | {"piece": np.array(piece, dtype=np.int16)}, trajectory.meta | facts)
+    return made
+
+
+def test_frames_in_another_piece_are_posed_by_the_other_program_all_the_same(tmp_path: Path) -> None:
+    made = in_pieces([0, 0, 0, 1, -1, -1], 0)
+    found = compare(view(made, products=checked()))
+    assert found is not None
+    # COLMAP has lost frame 5 alone. Frame 4 lies behind the other piece, so in its frame.
+    assert found.registered.tolist() == [True] * 5 + [False]
+    assert np.isfinite(found.poses).all(axis=(1, 2)).tolist() == [True] * 3 + [False] * 3
+    facts, page_, _, _ = written(tmp_path, view(made, products=checked()))
+    assert "COLMAP has no pose of frame 5" in [m["why"] for m in facts["missing"]]
+    assert "Not posed by COLMAP: 5." in page_.text
+
+
+@pytest.mark.parametrize(("main", "told"), [(0, 0), (1, 1)])
+def test_a_place_on_earth_is_that_of_the_first_camera(main: int, told: int) -> None:
+    run = view(in_pieces([0, 0, 1, 1, 1, 1], main))
+    assert summary._displaced(run) == []
+    here = replace(run.sequence, georeference=Georeference("EPSG:32633", (5e5, 5.2e6, 300.0), 0.5))
+    lines = summary._displaced(replace(run, sequence=here))
+    assert len(lines) == told
+    assert all("world begins at frame 2" in line for line in lines)
+
+
+def test_one_frame_that_is_left_of_all_is_no_choice_of_pairs(tmp_path: Path) -> None:
+    made, found = bundles() | checks(), checked()
+    found.screening = "screening"  # type: ignore[assignment]
+    made["screening"] = Bundle({}, {"chain": [0]})
+    made["keyframes"] = Bundle({}, {"basic": [0], "overlap": [None], "why": ["first frame"], "displacement": []})
+    facts, _, _, _ = written(tmp_path, view(made, products=found))
+    assert not [m for m in facts["missing"] if m["kind"] == "figure"]

@@ -101,7 +101,7 @@ def bundles() -> dict[str, Bundle]:
     poses = np.array([level_pose(i * STEP).matrix34 for i in FRAMES])
     count = np.where(np.isfinite(z), 2, 0).astype(np.uint16)
     made = {
-        "tile": Bundle({**dem, "count": count, "spread": sigma}, lattice),
+        "tile": Bundle({**dem, "count": count, "spread": sigma, "source": np.zeros(z.shape, np.int32)}, lattice),
         "risk": Bundle(bands, lattice),
         "path": Bundle({"path": path, "cost_to_go": cost, "reachable": (risk[10] == 0).astype(np.uint8)}, path_meta),
         "trajectory": Bundle(

@@ -49,6 +49,9 @@ def test_slope_and_light() -> None:
     assert hillshade(plane(side, -side), 0.5)[3, 3] == 255
     assert hillshade(plane(-side, side), 0.5)[3, 3] == 1
     assert hillshade(plane(0.0, 0.0), 0.5)[3, 3] == round(1 + 254 * np.sqrt(0.5))
+    # Turned upside down, the same slope faces away from the map's upper left.
+    assert hillshade(plane(side, -side), 0.5, np.pi)[3, 3] == 1
+    assert hillshade(plane(side, side), 0.5, 0.5 * np.pi)[3, 3] == 255
     hole = plane(0.0, 0.0)
     hole[3, 3] = np.nan
     assert hillshade(hole, 0.5)[3, 3] == 0

@@ -32,6 +32,7 @@ def test_laspy_reads_every_known_cell(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.asarray(las.red) // 257, np.nonzero(KNOWN)[1] * 3)
     np.testing.assert_array_equal(np.asarray(las.sigma), np.float32(0.004))
     (wkt,) = [v.string for v in las.header.vlrs if v.record_id == 2112]
+    assert wkt.startswith("LOCAL_CS[")  # LAS 1.4 knows WKT 1 alone
     crs = pyproj.CRS.from_wkt(wkt)
     assert crs.is_engineering
     assert {a.unit_name for a in crs.axis_info} == {"metre"}
@@ -43,6 +44,8 @@ def test_a_georeferenced_run_gives_points_on_earth(tmp_path: Path) -> None:
     expected = PLACE.apply(np.column_stack([LATTICE.xy()[KNOWN], elevation()[KNOWN]]))
     # float32 heights near 1800 m have steps of 0.12 mm
     np.testing.assert_allclose(las.xyz, expected, atol=1.3e-4)
+    (wkt,) = [v.string for v in las.header.vlrs if v.record_id == 2112]
+    assert wkt.startswith("PROJCS[")
     assert las.header.parse_crs().to_epsg() == 32633
 
 
