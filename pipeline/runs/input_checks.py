@@ -98,13 +98,17 @@ def judge_rig(rig: Rig) -> Finding:
     f = rig.left.fx
     if x > 0.5 * b:
         return fault("RIL-640", f"the right camera stands {x:g} m to the left", "rig", remedy="swap left and right")
+    right = rig.right
     words = f"baseline {b:g} m, focal length {f:g} px, {rig.left.width} x {rig.left.height}"
+    if (right.width, right.height) != (rig.left.width, rig.left.height):
+        words += f"; right {right.fx:g} px, {right.width} x {right.height}"
     if not SMALL_BASELINE <= b <= LARGE_BASELINE:
         return doubt("RIL-641", words, "rig", remedy="is the baseline in metres?")
-    ratio = max(rig.left.fx / rig.right.fx, rig.right.fx / rig.left.fx)
-    if ratio > 1.2:
+    # Of the image's width, since the cameras may have two sizes of images.
+    ratio = (f / rig.left.width) / (right.fx / right.width)
+    if max(ratio, 1 / ratio) > 1.2:
         return doubt(
-            "RIL-642", f"{words}; the right camera's is {rig.right.fx:g} px", "rig", remedy="two different lenses?"
+            "RIL-642", f"{words}; the right camera's is {right.fx:g} px", "rig", remedy="two different lenses?"
         )
     return fine("rig", words)
 

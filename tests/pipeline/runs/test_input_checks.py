@@ -35,6 +35,12 @@ def test_two_lenses():
     assert input_checks.judge_rig(rig(-0.1, Camera(700.0, 700.0, 160.0, 120.0, 320, 240))).level == "WARN"
 
 
+def test_one_lens_before_two_sizes_of_images():
+    found = input_checks.judge_rig(rig(-0.1, Camera(250.0, 250.0, 80.0, 60.0, 160, 120)))
+    assert found.level == "OK"
+    assert "right 250 px, 160 x 120" in found.text
+
+
 def test_times():
     assert input_checks.judge_times(None).level == input_checks.judge_times([3.0]).level == "OK"
     assert "10 frames a second over 0.3 s" in input_checks.judge_times([0.0, 0.1, 0.2, 0.3]).text
