@@ -20,7 +20,7 @@ from rille.stages.geometry.geometry import Camera, RigidTransform, level_rotatio
 
 Materialise = Callable[[Source], Bundle]
 
-README = """{name}: {frames} stereo pairs, {width} x {height} pixels.
+README = """{name}: {frames} stereo pairs, {size} pixels.
 {notes}
 Conventions
   Pixel centres are at integer (column, row); (0, 0) is the centre of the top left pixel. Lengths are metres.
@@ -110,12 +110,11 @@ def _write(sequence: Sequence, folder: Path, materialise: Materialise, pairs: tu
             _write_disparity(folder, sequence.frame_names[frame], materialise(sequence.truth_disparity(frame)))
         if sequence.truth_dem is not None and sequence.truth is not None and sequence.evaluation_window is not None:
             _write_dem(sequence, folder, frame, materialise)
-    camera_ = sequence.rig.left
+    sizes = [f"{camera.width} x {camera.height}" for camera in (sequence.rig.left, sequence.rig.right)]
     text = README.format(
         name=sequence.name,
         frames=len(frames),
-        width=camera_.width,
-        height=camera_.height,
+        size=sizes[0] if sizes[0] == sizes[1] else f"left {sizes[0]}, right {sizes[1]}",
         notes="\n".join(sequence.notes),
         truth_source=sequence.truth_source or "no truth is known",
     )

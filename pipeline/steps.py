@@ -219,7 +219,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
             raise InputError("RIL-973", text, remedy="multiply by 255")
     valid = [np.asarray(image.valid) if "valid" in getattr(image, "coords", ()) else None for image in (left, right)]
     first, second = (pyramid.build(image, built.pyramid, mask) for image, mask in zip(images, valid, strict=True))
-    side = tiles.side(built.tiling, built.hfvm, (images[0].shape, images[1].shape))
+    side = tiles.side(built.tiling, built.hfvm, built.pyramid, (images[0].shape, images[1].shape))
     found = hfvm_stage.match_pyramids(first, second, built.hfvm, side=side)
     arrays = {name: value for name, value in vars(found).items() if name != "aligned"}
     meta = hfvm_stage.facts(arrays, built.hfvm, found.aligned, int(np.count_nonzero(first.valid[0])))

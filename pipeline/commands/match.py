@@ -88,8 +88,9 @@ def match_files(
     from rille.pipeline.flow import tiles
     from rille.stages.core.validity import matched
     from rille.stages.hfvm.stage import match
+    from rille.stages.imaging.pyramid import PyramidParams
 
-    side = tiles.side(tiles.Tiling(), params, (images[0].shape, images[1].shape))
+    side = tiles.side(tiles.Tiling(), params, PyramidParams(), (images[0].shape, images[1].shape))
     with _progress(max(image.size for image in images), sys.stderr) as tell:
         found = match(*images, params, prior=given, tell=tell, side=side)
     kept = np.isfinite(found.column_disparity) if dense else matched(found.validity)
@@ -109,7 +110,8 @@ def match_files(
 
 
 def _depths(images: Iterable[NDArray[Any]]) -> list[str]:
-    unused = min(map(unused_bits, images))
+    # One of two cameras may give 8 bits.
+    unused = min((bits for bits in map(unused_bits, images) if bits is not None), default=0)
     if unused < FEW_BITS:
         return []
     text = f"samples use {16 - unused} of their 16 bits, which costs contrast: multiply them by {2**unused}"
@@ -141,7 +143,8 @@ def warnings(found: Disparity, left: NDArray[Any], right: NDArray[Any]) -> list[
         text = f"{100 * blank:.0f} % of the pixels have no texture (black, saturated or blank) and cannot match"
         return [warning("RIL-701", text)]
     ok = matched_back(found.validity, found.backmatch_error)
-    if swapped(found.column_disparity, found.row_disparity, ok):
+    # Of images of unlike size nobody knows how their middles correspond, and so which displacement far things have.
+    if left.shape == right.shape and swapped(found.column_disparity, found.row_disparity, ok):
         median = float(np.median(found.column_disparity[ok]))
         text = (
             f"disparities have the sign of swapped images (median {median:+.1f} px, right minus left): if this is "

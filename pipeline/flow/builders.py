@@ -203,7 +203,7 @@ class Builder:
         ports = {"left": self.pyramid(pair, camera), "right": self.pyramid(pair, other)}
         cameras = {"left": self.sequence.rig.left, "right": self.sequence.rig.right}
         first, second = ((cameras[name].height, cameras[name].width) for name in (camera, other))
-        side = tiles.side(self.config.tiling, self.config.hfvm, (first, second))
+        side = tiles.side(self.config.tiling, self.config.hfvm, self.config.pyramid, (first, second))
         if side is None:
             return self.node(hfvm, label, {"pair": pair}, **ports)
         given = self.config.hfvm, self.config.pyramid, ports, (first, second), side

@@ -32,9 +32,6 @@ where there are large ones).
 STEP, LEAST = 128, 256
 """Pixels: sides that are chosen are multiples of the one, and not below the other: surroundings would outweigh it."""
 
-SMALL = 64
-"""Pixels: images with a shorter side have no coarse levels that tiles could start from."""
-
 
 class Tiling(Params):
     """When a pair is matched in tiles; no result depends on it."""
@@ -53,9 +50,13 @@ class Tiling(Params):
     )
 
 
-def side(tiling: Tiling, params: HfvmParams, shapes: tuple[Shape, Shape]) -> int | None:
+def side(tiling: Tiling, params: HfvmParams, pyramid: PyramidParams, shapes: tuple[Shape, Shape]) -> int | None:
     """Side of the tiles of a pair of images, pixels; None: it is matched whole, as one task."""
-    if tiled.is_whole(params) or tiling.tile == 0 or min(*shapes[0], *shapes[1]) < SMALL:
+    if tiled.is_whole(params) or tiling.tile == 0:
+        return None
+    # Tiles start from the maps of ``plane_level``, which both images must have: an aligned right image has as many
+    # levels as the left one, and its maps would begin elsewhere than planned.
+    if min(map(len, _levels(params, pyramid, shapes))) <= params.plane_level:
         return None
     chosen = tiling.tile
     if chosen is None:
@@ -64,6 +65,15 @@ def side(tiling: Tiling, params: HfvmParams, shapes: tuple[Shape, Shape]) -> int
         most = int((tiling.memory * 1e6 / TILE_BYTES) ** 0.5)
         chosen = max(most // STEP * STEP, LEAST)
     return chosen if chosen < max(*shapes[0], *shapes[1]) else None
+
+
+def _levels(params: HfvmParams, pyramid: PyramidParams, shapes: tuple[Shape, Shape]) -> tuple[list[Shape], ...]:
+    """Rows and columns of the levels at which the left and the right image are matched."""
+    left, right = (pyramid_shapes(s, pyramid.levels, pyramid.min_side) for s in shapes)
+    # Preset fast matches at half the resolution: the finest level is not read at all.
+    if params.finest and min(len(left), len(right)) > params.finest:
+        return left[1:], right[1:]
+    return left, right
 
 
 class Tiles:
@@ -80,21 +90,17 @@ class Tiles:
         label: str,
     ) -> None:
         self.graph, self.params, self.images, self.side, self.label = graph, params, images, side, label
-        left, right = (pyramid_shapes(s, pyramid.levels, pyramid.min_side) for s in shapes)
-        # Preset fast matches at half the resolution: the finest level is not read at all.
-        if params.finest and min(len(left), len(right)) > params.finest:
-            left, right = left[1:], right[1:]
+        left, right = _levels(params, pyramid, shapes)
         self.left = left
         m = margin(left[0])
         self.right = [right, pyramid_shapes((left[0][0] + 2 * m, left[0][1] + 2 * m), len(left))]
-        self.top = min(params.plane_level, len(left) - 1, len(right) - 1)
 
     def build(self) -> Handle:
         """Add all of them; the last one has the disparities."""
         self.coarse = self._node("coarse", "coarse", {})
         maps: dict[str, list[Handle]] = {}
         inputs: dict[str, Handle | list[Handle]] = {"coarse": self.coarse}
-        for level in range(self.top - 1, -1, -1):
+        for level in range(self.params.plane_level - 1, -1, -1):
             maps = {
                 way: self._tiles("level", f"{level}/{way}", {"level": level, "way": way}, **inputs)
                 for way in ("left", "right")

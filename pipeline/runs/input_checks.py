@@ -98,17 +98,16 @@ def judge_rig(rig: Rig) -> Finding:
     f = rig.left.fx
     if x > 0.5 * b:
         return fault("RIL-640", f"the right camera stands {x:g} m to the left", "rig", remedy="swap left and right")
-    right = rig.right
     words = f"baseline {b:g} m, focal length {f:g} px, {rig.left.width} x {rig.left.height}"
-    if (right.width, right.height) != (rig.left.width, rig.left.height):
-        words += f"; right {right.fx:g} px, {right.width} x {right.height}"
+    if (rig.right.width, rig.right.height) != (rig.left.width, rig.left.height):
+        words += f", right {rig.right.fx:g} px, {rig.right.width} x {rig.right.height}"
     if not SMALL_BASELINE <= b <= LARGE_BASELINE:
         return doubt("RIL-641", words, "rig", remedy="is the baseline in metres?")
-    # Of the image's width, since the cameras may have two sizes of images.
-    ratio = (f / rig.left.width) / (right.fx / right.width)
-    if max(ratio, 1 / ratio) > 1.2:
+    # In pixels and in image widths: one lens before sensors of unlike pixels, or of unlike width, is no mistake.
+    ratios = rig.right.fx / f, rig.right.fx / f * rig.left.width / rig.right.width
+    if all(max(ratio, 1 / ratio) > 1.2 for ratio in ratios):
         return doubt(
-            "RIL-642", f"{words}; the right camera's is {right.fx:g} px", "rig", remedy="two different lenses?"
+            "RIL-642", f"{words}; the right camera's is {rig.right.fx:g} px", "rig", remedy="two different lenses?"
         )
     return fine("rig", words)
 
@@ -213,10 +212,14 @@ def judge_looks(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -
 
 
 def _depth(looks: Mapping[str, Mapping[int, Look]]) -> list[Finding]:
-    unused = min((v.unused_bits for of in looks.values() for v in of.values()), default=0)
+    found = [(v.unused_bits, camera) for camera, of in looks.items() for v in of.values() if v.unused_bits is not None]
+    unused, _ = min(found, default=(0, ""))
     if unused < FEW_BITS:
         return []
-    text = f"samples use {16 - unused} of their 16 bits: all images are taken as {2**unused} times as dark as they are"
+    # One of two cameras may give 8 bits.
+    deep = {camera for _, camera in found}
+    which = "all images" if len(deep) == len(looks) else f"all {deep.pop()} images"
+    text = f"samples use {16 - unused} of their 16 bits: {which} are taken as {2**unused} times as dark as they are"
     return [doubt("RIL-896", text, "images", remedy=f"multiply the samples by {2**unused}")]
 
 

@@ -27,7 +27,7 @@ RATIO = 0.75
 """Of the best match's distance to the next best one (Lowe 2004)."""
 
 REACH = 0.1
-"""Share of the height that a match may depart from its line: what departs more is mismatched."""
+"""Share of the right image's height that a match may depart from its line: what departs more is mismatched."""
 
 LEAST = 40
 """Matches, below which a pair says nothing."""
@@ -64,7 +64,7 @@ def row_spread(rig: Rig, left: tuple[Floats, Any] | None, right: tuple[Floats, A
     rows = np.array(good)
     apart, _ = distances(rig, np.zeros(5), left[0][rows[:, 0]], right[0][rows[:, 1]])
     # Before the spread is taken: far mismatches would hide what a shift does to the others.
-    apart = apart[np.abs(apart) < REACH * rig.left.height]
+    apart = apart[np.abs(apart) < REACH * rig.right.height]
     if len(apart) < LEAST:
         return None
     return mad_sigma(apart)

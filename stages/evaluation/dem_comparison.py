@@ -115,8 +115,9 @@ def common(a: Grid, b: Grid) -> tuple[Grid, Grid, str]:
         how = f"{name} averaged from {fine.cell:g} m to {target.cell:g} m (half of a cell's area known at least)"
     else:
         values = interpolate(fine, target.centres())
-        shift = fine.index(target.centres()[0, 0])
-        same = abs(ratio - 1.0) < 1e-9 and np.abs(shift - np.rint(shift)).max() < 1e-6
+        # All four, since one model may be turned against the other about one of them.
+        corners = fine.index(target.centres()[[0, 0, -1, -1], [0, -1, 0, -1]])
+        same = abs(ratio - 1.0) < 1e-9 and np.abs(corners - np.rint(corners)).max() < 1e-6
         how = "the same cells, nothing resampled" if same else f"{name} interpolated bilinearly to the other's cells"
     brought = Grid(values, target.matrix)
     pair = (brought, target) if name == "A" else (target, brought)

@@ -46,12 +46,15 @@ class Look:
     bright: float
     sharpness: float
     detail: float = 0.0
-    unused_bits: int = 0
+    unused_bits: int | None = None
 
 
-def unused_bits(image: NDArray[Any]) -> int:
-    """Highest bits of 16-bit samples that no pixel of an image has: the file may hold the 12 bits of a camera."""
-    return 16 - int(image.max(initial=0)).bit_length() if image.dtype == np.uint16 else 0
+def unused_bits(image: NDArray[Any]) -> int | None:
+    """Highest bits of 16-bit samples that no pixel of an image has: the file may hold the 12 bits of a camera.
+
+    None of another depth.
+    """
+    return 16 - int(image.max(initial=0)).bit_length() if image.dtype == np.uint16 else None
 
 
 def look(image: NDArray[Any], valid: Bytes) -> Look:

@@ -54,6 +54,18 @@ def test_plain_files_say_the_same(exported, materialise):
     text = (folder / "README.txt").read_text()
     assert "right minus left" in text
     assert "T_truth_left" in text
+    left = sequence.rig.left
+    assert f"stereo pairs, {left.width} x {left.height} pixels." in text
+
+
+def test_both_sizes_are_stated_where_they_differ(exported, materialise, tmp_path):
+    sequence, _ = exported
+    rig = replace(sequence.rig, right=replace(sequence.rig.right, width=99, height=77))
+    folder = export(replace(sequence, rig=rig), tmp_path / "two", materialise, pairs=())
+    left = sequence.rig.left
+    assert (
+        f"stereo pairs, left {left.width} x {left.height}, right 99 x 77 pixels." in (folder / "README.txt").read_text()
+    )
 
 
 def test_dem_cells_project_onto_the_true_disparity(exported, tiny):

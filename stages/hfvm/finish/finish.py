@@ -39,6 +39,10 @@ from rille.stages.hfvm.level.window_pair import WindowPair
 
 Rasters = Mapping[str, Raster]
 
+LIKE = 1.2
+"""Scale of the right image up to which errors of displacements count as they are: it is not constant, nor are they
+known any better."""
+
 
 @dataclass(frozen=True)
 class Finish:
@@ -61,6 +65,12 @@ class Finish:
         """Parameters of the refinement: an image that a plane has aligned is sheared, and takes a step more."""
         p = self.params
         return p if self.alignment is None else p.model_copy(update={"refine_steps": p.refine_steps + 1})
+
+    @property
+    def scale(self) -> float:
+        """Pixels of the right image that one of the left image stands for; 1 where they are alike."""
+        found = 1.0 if self.alignment is None else plane.scale(self.alignment, self.shape)
+        return 1.0 if 1.0 / LIKE <= found <= LIKE else found
 
     def fine(self, window: Window, a: Map) -> Results:
         """Map of a window of the left image with fractions of a pixel, means of like neighbours; feature distances.
@@ -277,7 +287,8 @@ class Finish:
             "validity": validity,
             "backmatch_error": error,
             "distance": distance,
-            "disparity_std": std,
+            # Found in pixels of the aligned image, as displacements were.
+            "disparity_std": std * np.float32(self.scale),
         }
         return {name: np.ascontiguousarray(a[window.inside(outer)]) for name, a in arrays.items()}
 

@@ -9,6 +9,7 @@ matches say how: no calibration is used, and displacements are given in the orig
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -189,6 +190,13 @@ def finer(level: int) -> Matrix:
     k = 2.0**level
     # Pixel x of the level covers k pixels from k x on, whose middle is k x + (k - 1) / 2: at level 1 it is 2x + 0.5.
     return np.array([[k, 0.0, 0.5 * k - 0.5], [0.0, k, 0.5 * k - 0.5], [0.0, 0.0, 1.0]])
+
+
+def scale(h: Matrix, shape: Shape) -> float:
+    """Pixels of the right image that one in the middle of an aligned image is wide and high, in the geometric mean."""
+    w = mapped(h, 0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1))[2]
+    # The determinant of the derivative of a homography.
+    return math.sqrt(abs(float(np.linalg.det(h))) / abs(w) ** 3)
 
 
 def distortion(h: Matrix, shape: tuple[int, int]) -> float:

@@ -116,13 +116,15 @@ class Observed(NamedTuple):
 
     ``disparity`` (2 rows cols,) column and row disparity (right minus left) of each pixel in turn, pixels, NaN where it
     must not be used; ``std`` (rows, cols) its standard deviation, pixels; ``image`` (rows, cols) grey values;
-    ``limits`` (2,) greatest residual and greatest jump in the bilinear cell, pixels.
+    ``limits`` (2,) greatest residual and greatest jump in the bilinear cell, pixels; ``scale`` (2,) pixels of the right
+    image that one of the left one is wide and high.
     """
 
     disparity: Floats32
     std: Floats32
     image: Floats32
     limits: Floats
+    scale: Floats
 
 
 # Functions that take arrays and run once a cell are inlined where they are called: to count the references of their
@@ -545,7 +547,7 @@ def accept(n, found, cells, lanes, seen, points, out):  # type: ignore[no-untype
     ``found``: number of each root's lane in the search; afterwards it begins with those of the roots that do not stand.
     ``cells``: the place in ``out`` of each lane of the search.
     """
-    disparity, std, image, limits = seen
+    disparity, std, image, limits, scale = seen
     width, refused = image.shape[1], 0
     for m in range(n):
         s, across = pixels(points, S, m), pixels(points, ACROSS, m)
@@ -554,7 +556,7 @@ def accept(n, found, cells, lanes, seen, points, out):  # type: ignore[no-untype
         up, down = lanes[UPWARDS + m], lanes[DOWNWARDS + m]
         slope = up if down != down else (down if up != up else min(up, down))
         at = 2 * int(points[PIXEL + m])
-        if residual <= limits[0] and slope > 0.0 and not _is_jump(at, at + 2 * width, disparity, limits[1]):
+        if residual <= limits[0] and slope > 0.0 and not _is_jump(at, at + 2 * width, disparity, scale, limits[1]):
             c, r, fx, fy = int(points[X + m]), int(points[Y + m]), points[FX + m], points[FY + m]
             top = image[r, c] * (1.0 - fx) + image[r, c + 1] * fx
             bottom = image[r + 1, c] * (1.0 - fx) + image[r + 1, c + 1] * fx
@@ -569,10 +571,15 @@ def accept(n, found, cells, lanes, seen, points, out):  # type: ignore[no-untype
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _is_jump(i, j, disparity, max_jump):  # type: ignore[no-untyped-def]
-    """Whether the disparities of a bilinear cell differ by more than ``max_jump`` (a depth discontinuity)."""
-    u = _range(disparity[i], disparity[i + 2], disparity[j], disparity[j + 2])
-    v = _range(disparity[i + 1], disparity[i + 3], disparity[j + 1], disparity[j + 3])
+def _is_jump(i, j, disparity, scale, max_jump):  # type: ignore[no-untyped-def]
+    """Whether the disparities of a bilinear cell differ by more than ``max_jump`` (a depth discontinuity).
+
+    In pixels of the left image: what an unlike scale of the right one adds from pixel to pixel is no jump.
+    """
+    wide, high = scale
+    a, b = wide - 1.0, high - 1.0
+    u = _range(disparity[i], disparity[i + 2] - a, disparity[j], disparity[j + 2] - a) / wide
+    v = _range(disparity[i + 1], disparity[i + 3], disparity[j + 1] - b, disparity[j + 3] - b) / high
     return u * u + v * v > max_jump * max_jump
 
 

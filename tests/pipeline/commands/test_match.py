@@ -99,6 +99,24 @@ def test_images_of_a_camera_of_12_bits_are_told(folder, capsys):
     assert "RIL-705: samples use 12 of their 16 bits" in capsys.readouterr().err
 
 
+def test_one_image_of_8_bits_hides_no_unused_bits_of_the_other(folder, capsys):
+    image = cv2.imread(str(folder / "left.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(folder / "left.png"), image.astype(np.uint16) * 16)
+    run(folder)
+    assert "RIL-705: samples use 12 of their 16 bits" in capsys.readouterr().err
+
+
+def test_order_of_images_of_unlike_size_is_not_judged(folder, capsys):
+    wide = texture((96, 160))
+    cv2.imwrite(str(folder / "left.png"), wide[:, 30:150])
+    cv2.imwrite(str(folder / "right.png"), wide)
+    run(folder)
+    assert "RIL-702" not in capsys.readouterr().err
+    cv2.imwrite(str(folder / "right.png"), wide[:, :120])
+    run(folder)
+    assert "RIL-702" in capsys.readouterr().err
+
+
 def test_prior_as_written_is_read_and_used(folder):
     run(folder)
     plain = read_disparity(folder / "out.tif")

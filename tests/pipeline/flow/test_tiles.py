@@ -95,15 +95,24 @@ def test_wrong_size_of_the_camera_is_one_clear_line(tmp_path, images):
 
 def test_tiles_follow_size_and_memory():
     small, large, params = ((600, 800),) * 2, ((4300, 5800),) * 2, HfvmParams()
-    assert tiles.side(Tiling(), params, small) is None
-    side = tiles.side(Tiling(), params, large)
+    assert tiles.side(Tiling(), params, PyramidParams(), small) is None
+    side = tiles.side(Tiling(), params, PyramidParams(), large)
     assert side is not None
     assert tiles.TILE_BYTES * side**2 <= 1e9
-    assert tiles.side(Tiling(memory=300), params, large) < side
-    assert tiles.side(Tiling(tile=0), params, large) is None
-    assert tiles.side(Tiling(tile=256), params, small) == 256
-    assert tiles.side(Tiling(tile=800), params, small) is None
-    assert tiles.side(Tiling(tile=256), HfvmParams(preset="accurate"), large) is None
+    assert tiles.side(Tiling(memory=300), params, PyramidParams(), large) < side
+    assert tiles.side(Tiling(tile=0), params, PyramidParams(), large) is None
+    assert tiles.side(Tiling(tile=256), params, PyramidParams(), small) == 256
+    assert tiles.side(Tiling(tile=800), params, PyramidParams(), small) is None
+    assert tiles.side(Tiling(tile=256), HfvmParams(preset="accurate"), PyramidParams(), large) is None
+
+
+def test_a_pair_is_whole_where_an_image_lacks_the_level_that_tiles_start_from():
+    tiling, shapes = Tiling(tile=96), ((200, 300), (96, 150))
+    assert tiles.side(tiling, HfvmParams(plane_level=3), PyramidParams(), shapes) == 96
+    # The right image ends at level 3; aligned to the left one it has level 4, which no task would have been there for.
+    assert tiles.side(tiling, HfvmParams(plane_level=4), PyramidParams(), shapes) is None
+    assert tiles.side(tiling, HfvmParams(plane_level=3, preset="fast"), PyramidParams(), shapes) is None
+    assert tiles.side(tiling, HfvmParams(), PyramidParams(levels=1), shapes) is None
 
 
 def test_tiling_is_a_section_of_the_configuration():

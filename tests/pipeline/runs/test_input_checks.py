@@ -35,10 +35,13 @@ def test_two_lenses():
     assert input_checks.judge_rig(rig(-0.1, Camera(700.0, 700.0, 160.0, 120.0, 320, 240))).level == "WARN"
 
 
-def test_one_lens_before_two_sizes_of_images():
-    found = input_checks.judge_rig(rig(-0.1, Camera(250.0, 250.0, 80.0, 60.0, 160, 120)))
-    assert found.level == "OK"
-    assert "right 250 px, 160 x 120" in found.text
+def test_a_camera_of_another_size_is_stated_and_no_mistake():
+    half = input_checks.judge_rig(rig(-0.1, Camera(250.0, 250.0, 80.0, 60.0, 160, 120)))
+    assert half.level == "OK"
+    assert half.text.endswith("500 px, 320 x 240, right 250 px, 160 x 120")
+    wide = Camera(500.0, 500.0, 320.0, 120.0, 640, 240)
+    assert input_checks.judge_rig(rig(-0.1, wide)).level == "OK"
+    assert input_checks.judge_rig(rig(-0.1, Camera(700.0, 700.0, 80.0, 60.0, 160, 120))).level == "WARN"
 
 
 def test_times():
@@ -136,6 +139,10 @@ def test_samples_that_leave_bits_empty_are_told():
     found = input_checks.judge_looks(looks(twelve, twelve), NAMES)
     assert [(f.code, "12 of their 16 bits" in f.text, f.remedy) for f in found if f.level != "OK"] == [
         ("RIL-896", True, "multiply the samples by 16")
+    ]
+    eight = [changed(unused_bits=None)] * 5
+    assert [f.text.split(": ")[1] for f in input_checks.judge_looks(looks(twelve, eight), NAMES) if f.code] == [
+        "all left images are taken as 16 times as dark as they are"
     ]
     # One bit is a matter of exposure.
     dark = [changed(unused_bits=1)] * 5

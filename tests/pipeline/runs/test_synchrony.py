@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import cv2
+import numpy as np
 import pytest
 
 from rille.datasets.registry import open_sequence
 from rille.pipeline.runs import synchrony
 from rille.pipeline.runs.input_checks import judge_synchrony
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 
 
 @pytest.mark.data
@@ -32,6 +34,16 @@ def test_a_shift_of_the_right_images_is_found(data_dir, late):
         assert found[0] == -late
         assert verdict.level == "FAIL"
         assert f"right i{-late:+d}" in verdict.text
+
+
+def test_what_departs_too_far_is_told_by_the_right_images_own_height():
+    left, right = (Camera(100.0 * s, 100.0 * s, 50.0 * s, 50.0 * s, 100 * s, 100 * s) for s in (1, 4))
+    rig = Rig(left, right, RigidTransform(np.eye(3), np.array([-0.1, 0.0, 0.0])))
+    rng = np.random.default_rng(0)
+    points, features = rng.uniform(10, 90, (200, 2)), np.eye(200, dtype=np.float32)
+    # A twentieth of the right image's height is a fifth of the left one's.
+    theirs = 4 * points + np.column_stack([np.full(200, -8.0), 20 + rng.normal(0, 1, 200)])
+    assert synchrony.row_spread(rig, (points, features), (theirs, features)) == pytest.approx(1.0, abs=0.2)
 
 
 def test_at_rest_and_without_matches_nothing_is_said():

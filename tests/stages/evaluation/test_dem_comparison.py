@@ -92,6 +92,8 @@ def test_equal_cells_are_not_resampled_and_turned_ones_are_interpolated() -> Non
     assert "bilinearly" in how
     # bilinear: an eighth of the second derivatives of both axes, each at most 0.8/25 + 0.8/49 + 0.3 * 0.1
     assert np.nanmax(np.abs(errors(a, b))) < 2 * (0.8 / 25 + 0.8 / 49 + 0.3 * 0.31**2) / 8
+    # Turned about a cell that they have in common.
+    assert "bilinearly" in common(terrain(turn=0.5), whole)[2]
     with raises("RIL-323"):
         common(grid(np.ones((3, 3))), grid(np.ones((3, 3)), x0=100.0))
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from matching_scenes import pair
+from matching_scenes import Texture, pair
 
 from rille.stages.core.validity import matched
 from rille.stages.geometry.spline import coefficients
@@ -53,6 +53,30 @@ def test_relief_and_border_parts_by_their_definition():
     relief, border = neighbours(plane, np.ones(x.shape, bool))
     assert relief.max() < 1e-9
     np.testing.assert_array_equal(border, 0)
+
+
+def scaled(scale):
+    """A left image, and a right one that shows it nine pixels to the left and in ``scale`` times as many pixels."""
+    texture, rng = Texture(), np.random.default_rng(1)
+    y, x = np.indices((150, 200), dtype=np.float64)
+    yr, xr = np.indices((round(150 * scale), round(200 * scale)), dtype=np.float64)
+    images = texture(x, y), texture(xr / scale + 9, yr / scale)
+    left, right = (np.clip(a + rng.normal(0, 2, a.shape), 0, 255) for a in images)
+    return left, right, scale * (x - 9) - x
+
+
+def test_in_pixels_of_the_right_image_whatever_its_scale():
+    errors, claims = {}, {}
+    for scale in (0.5, 1.0, 2.0):
+        left, right, u = scaled(scale)
+        found = match(left, right)
+        ok = matched(found.validity)
+        assert ok.mean() > 0.85
+        errors[scale] = np.quantile(np.abs(found.column_disparity - u)[ok], 0.68)
+        claims[scale] = np.median(found.disparity_std[ok])
+    for scale in (0.5, 2.0):
+        assert claims[scale] / claims[1.0] == pytest.approx(scale, rel=0.2)
+        assert errors[scale] < claims[scale]
 
 
 def test_undefined_exactly_where_nothing_was_matched():

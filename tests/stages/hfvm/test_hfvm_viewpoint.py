@@ -82,3 +82,14 @@ def test_unrelated_views_are_refused(right):
     }
     views = [Plain.of(build(image, PyramidParams())) for image in (Texture(0)(x, y), images[right])]
     assert viewpoint.find(*views) is None
+
+
+@pytest.mark.data
+def test_images_of_unlike_size_are_looked_at_in_their_own_scale_however_many_chance_makes_consistent(data_dir):
+    left, right = (
+        cv2.imread(str(data_dir / "kitti06_51" / side / "000000.png"), cv2.IMREAD_GRAYSCALE)[:, :800]
+        for side in ("image_l", "image_r")
+    )
+    half = cv2.resize(left, (400, left.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    # Of the few coarse pixels of the small image a half is consistent by chance.
+    assert matched(match(half, right, HfvmParams(preset="fast")).validity).mean() > 0.6

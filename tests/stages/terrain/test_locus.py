@@ -10,7 +10,7 @@ from terrain_scenes import ball, box, disparity, interpolation_error, nearest, p
 
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.core.validity import Validity
-from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.surface import Surface, cylinder, sphere
 from rille.stages.geometry.surface import plane as reference_plane
@@ -80,6 +80,40 @@ def test_a_rig_whose_right_camera_is_ahead() -> None:
     # Here the baseline that counts is its part across the ray, so the bound is the kernel's own sensitivity.
     errors = interpolation_error(*(np.where(maps[2], m, np.nan) for m in maps[:2])) + 1e-3
     assert (np.abs(dem.elevation - truth) <= 1.5 * dem.elevation_std * errors / PARAMS.sigma_disparity)[seen].all()
+
+
+def scaled(scale: float) -> Rig:
+    """The rig with a right camera of so many times as many pixels a side."""
+    c = RIG.right
+    centre = ((v + 0.5) * scale - 0.5 for v in (c.cx, c.cy))
+    right = Camera(c.fx * scale, c.fy * scale, *centre, round(c.width * scale), round(c.height * scale))
+    return Rig(RIG.left, right, RIG.T_right_left)
+
+
+@pytest.mark.parametrize("scale", [0.5, 4.0])
+def test_a_right_camera_of_another_scale_sees_no_jumps_of_its_own(scale: float) -> None:
+    rig = scaled(scale)
+    found = [
+        np.isfinite(solve(disparity(one, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT)), (-1.0, -0.3), one).elevation)
+        for one in (RIG, rig)
+    ]
+    # At its borders the cells that the right image shows differ by a pixel.
+    assert (found[0] == found[1]).mean() > 0.98
+    assert found[1].mean() > 0.8
+    # A jump is one in pixels of the left image.
+    seen = found[0] & found[1]
+    column, row, usable = disparity(rig, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
+    rows, cols = np.indices(column.shape)
+    odd = np.where((rows + cols) % 2, scale * 2.0, 0.0)
+    even = reconstruct(
+        pair(column + odd, row, usable),
+        rig,
+        T_LOCAL_LEFT,
+        reference_plane(LATTICE),
+        (-1.0, -0.3),
+        LocusParams(max_jump=1.0),
+    )
+    assert not np.isfinite(even.elevation[seen]).any()
 
 
 def test_ortho_image_is_the_grey_value_of_the_left_projection() -> None:
@@ -342,6 +376,13 @@ def bundles(rig: Rig, height: float, noise: np.random.Generator) -> dict[str, Bu
     up = T_LOCAL_LEFT.rotation[2].tolist()
     level = level_stage.STAGE.run(level_stage.GroundFrameParams(), {"up": up}, inputs)
     return inputs | {"level": level, "left": Bundle({"level_0": IMAGE}, {})}
+
+
+@pytest.mark.parametrize(("scale", "focal"), [(1.0, RIG.left.fx), (2.0, RIG.left.fx), (0.5, 0.5 * RIG.right.fx)])
+def test_the_coarser_pixel_tells_what_is_smoothed_away(scale: float, focal: float) -> None:
+    inputs = bundles(scaled(scale), HEIGHT, np.random.default_rng(2))
+    local = stage.STAGE.run(LocusParams(cell_size=0.02), {"pair": 3, "frame": "local"}, inputs)
+    assert local.meta["pixel_rad"] == pytest.approx(1.0 / focal)
 
 
 def test_stage_in_both_frames() -> None:

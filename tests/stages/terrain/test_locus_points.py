@@ -77,7 +77,7 @@ def test_points_of_lanes_and_of_steps_equal_single_points() -> None:
     disparity = rng.normal(size=(HEIGHT, WIDTH, 2)).astype(np.float32)
     disparity[10:12, 5:9] = np.nan
     plain = np.ones((HEIGHT, WIDTH), np.float32)
-    seen = Observed(disparity.ravel(), plain, plain, np.ones(2))
+    seen = Observed(disparity.ravel(), plain, plain, np.ones(2), np.ones(2))
     room = np.zeros(POINT_PLANES * POINTS)
     step, dz, found = 3.0, 0.02, 0
     for way in (-1.0, 1.0):
@@ -102,7 +102,7 @@ def test_points_of_lanes_and_of_steps_equal_single_points() -> None:
 
 def test_on_the_last_row_and_column_no_pixel_is_read_beyond_the_image() -> None:
     plain = np.ones((HEIGHT, WIDTH), np.float32)
-    seen = Observed(np.ones(2 * HEIGHT * WIDTH, np.float32), plain, plain, np.ones(2))
+    seen = Observed(np.ones(2 * HEIGHT * WIDTH, np.float32), plain, plain, np.ones(2), np.ones(2))
     lanes, room = np.zeros(LINE_PLANES * LANES), np.zeros(POINT_PLANES * POINTS)
     for m, (x, y) in enumerate([(WIDTH - 1, 5), (5, HEIGHT - 1), (WIDTH - 1.01, HEIGHT - 1.01), (0, 0), (-0.01, 5)]):
         for a in (kernel.LEFT_A, kernel.RIGHT_A):
@@ -125,7 +125,13 @@ def test_a_root_beside_a_kink_is_found_in_every_lane() -> None:
     # Every other lane has a bracket that ends at the kink.
     ends = [(0.0, 3.0, 0.5, -0.05) if k % 2 else (0.0, 3.0, 1.0, -0.06) for k in range(LANES)]
     lanes[kernel.Z0 : kernel.Z0 + 4 * LANES] = np.array(ends).T.ravel()
-    roots(LANES, lanes, np.array([-1.0, 0.0, 0.0]), Observed(disparity.ravel(), plain, plain, np.ones(2)), room)
+    roots(
+        LANES,
+        lanes,
+        np.array([-1.0, 0.0, 0.0]),
+        Observed(disparity.ravel(), plain, plain, np.ones(2), np.ones(2)),
+        room,
+    )
     found = lanes[kernel.ROOT : kernel.ROOT + LANES]
     np.testing.assert_allclose(found, 0.5 - 0.05 / 6.1, atol=kernel.SOLVED_PX / 6.1)
 
