@@ -18,6 +18,7 @@ from rille.datasets.cameras import CalibratedCamera, read_cameras, rig_of
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.text import parse_yaml
 from rille.datasets.images import files
+from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import ImagePair, common_headers
 from rille.datasets.imu import Inertial, at_frames, read_imu
 from rille.datasets.poses import coverage, interpolate, read_poses
@@ -113,7 +114,7 @@ def open_euroc(layout: EurocLayout, digests: files.Digests) -> Sequence:
     frames = list_frames(layout)
     headers = common_headers(frames.pairs)
     cameras = {camera: _camera(layout.folder / name) for camera, name in FOLDERS.items()}
-    rig, lenses = rig_of(cameras["left"], cameras["right"], (headers[0][:2], headers[1][:2]))
+    rig, lenses = rig_of(cameras["left"], cameras["right"], sizes_of(headers))
     known = _movement(layout, frames.times, cameras["left"])
 
     def image(frame: int, camera: str) -> Source:

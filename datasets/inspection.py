@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from rille.datasets.cameras import CalibratedCamera, read_cameras
+from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import SIDES, SUFFIXES, common_headers, natural, pair_up, side_of
 from rille.datasets.poses import names_positions, read_positions
 from rille.datasets.text.reading import Search, read_lines
@@ -186,8 +187,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     try:
         matched = pair_up(left, right)
         pairs = len(matched)
-        one, other = common_headers(matched)
-        sizes = one[:2], other[:2]
+        sizes = sizes_of(common_headers(matched))
     except InputError as error:
         trouble = str(error)
     tokens = SIDES[key[0]]

@@ -13,11 +13,19 @@ from contextlib import suppress
 from io import SEEK_CUR
 from typing import BinaryIO
 
+from rille.stages.geometry.geometry import Sizes
+
 Header = tuple[int, int, int]
 """Width and height, pixels, and bits a sample as they are decoded, 8 or 16 (more where they are no integers)."""
 
 Headers = tuple[Header, Header]
 """Of the left and of the right images: two cameras need not be alike."""
+
+
+def sizes_of(headers: Headers) -> Sizes:
+    """Width and height of the left and of the right images, pixels."""
+    return headers[0][:2], headers[1][:2]
+
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 

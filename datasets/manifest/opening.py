@@ -16,6 +16,7 @@ from typing import Any
 
 from rille.datasets.georeference import georeference
 from rille.datasets.images import files
+from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import ImagePair, common_headers, pair_up
 from rille.datasets.manifest.model import Images, read_manifest
 from rille.datasets.manifest.motion import read_motion
@@ -41,7 +42,7 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
     root = root_folder(manifest.root, path)
     pairs = find_pairs(manifest.images, root, name)
     headers = common_headers(pairs)
-    optics = read_optics(manifest, root, name, (headers[0][:2], headers[1][:2]))
+    optics = read_optics(manifest, root, name, sizes_of(headers))
     motion = read_motion(manifest, root, name, pairs)
     up = motion.up
     if up is None and optics.up is not None:

@@ -179,6 +179,12 @@ def test_a_step_solves_the_damped_equations_of_all_unknowns():
     np.testing.assert_allclose(found, right, rtol=1e-6, atol=1e-9)
 
 
+def whitened(views, state, X, bias):
+    """Errors of tracks, of depths and of the bias over their standard deviations; ``X`` (n, 3) landmarks, m."""
+    tracks = [(CAMERA.project(X @ R.T + t) - p) / 0.2 for R, t, p in zip(state.R, state.t, views.pixels, strict=True)]
+    return np.concatenate([*(t.ravel() for t in tracks), state.depth / views.sigma, [bias / 0.1]])
+
+
 def test_what_a_segment_tells_of_the_tilt_is_what_remains_of_all_unknowns():
     """Poses, depths and the bias eliminated from the whole matrix, derivatives by differences."""
     views, state, _ = scene(6, n=25, frames=3)
@@ -189,10 +195,7 @@ def test_what_a_segment_tells_of_the_tilt_is_what_remains_of_all_unknowns():
         """Whitened errors of tracks, of depths and of the bias; the last unknown tilts the landmarks alone."""
         moved, b = state.moved(x[:12].reshape(m, 6), x[12 : 12 + n]), bias + x[-2]
         X = views.position + (moved.depth + b + x[-1] * views.tilt)[:, None] * views.along
-        tracks = [
-            (CAMERA.project(X @ R.T + t) - p) / 0.2 for R, t, p in zip(moved.R, moved.t, views.pixels, strict=True)
-        ]
-        return np.concatenate([*(t.ravel() for t in tracks), moved.depth / views.sigma, [b / 0.1]])
+        return whitened(views, moved, X, b)
 
     here = residuals(np.zeros(12 + n + 2))
     steps = 1e-6 * np.eye(12 + n + 2)
@@ -216,10 +219,7 @@ def test_the_covariance_is_the_inverse_of_the_whole_normal_matrix():
         """Whitened errors of tracks, of depths and of the bias."""
         moved, b = state.moved(x[:12].reshape(m, 6), x[12 : 12 + n]), bias + x[-1]
         X = views.position + (moved.depth + b)[:, None] * views.along
-        tracks = [
-            (CAMERA.project(X @ R.T + t) - p) / 0.2 for R, t, p in zip(moved.R, moved.t, views.pixels, strict=True)
-        ]
-        return np.concatenate([*(t.ravel() for t in tracks), moved.depth / views.sigma, [b / 0.1]])
+        return whitened(views, moved, X, b)
 
     steps = 1e-6 * np.eye(12 + n + 1)
     J = np.array([(residuals(e) - residuals(-e)) / 2e-6 for e in steps]).T
