@@ -324,7 +324,7 @@ _PARTS = (
     Array("error", _GRID, "float32", "px", "error of matching there and back", optional=True),
     Array("noise", _GRID, "float32", "px", "variance by noise, squared pixels", optional=True),
     Array("gone", _GRID, "uint8", "1", "1 = in an isolated patch", optional=True),
-    Array("region", _GRID, "uint8", "1", "number of the textureless region, at half the resolution", optional=True),
+    Array("region", _GRID, "int8", "1", "number of the textureless region, at half the resolution", optional=True),
 )
 _OPTIONAL = tuple(replace(a, optional=True) for a in OUTPUTS if a.name not in ("distance", "validity"))
 STAGE = Stage(

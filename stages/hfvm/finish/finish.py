@@ -198,8 +198,8 @@ class Finish:
     def planes(self, refined: Rasters, gone: Raster) -> textureless.Planes | None:
         """Epipolar lines of the matches, and the planes of textureless regions; None: the matches follow no lines.
 
-        Room: 2 bytes a pixel, and for the features of the next level 4; 14 a pixel of the window of the region at hand,
-        and 4 for the other image's features.
+        Room: 2 bytes a pixel, and for the features of the next level 4; 16 a pixel of the window of the region at hand,
+        and 6 for the other image's features and claims.
         """
         p, shape = self.params, self.shape
         # Without a band rows are free: they are not to be set by lines.
@@ -217,7 +217,7 @@ class Finish:
             return None
         f = epipolar.oriented(found[0], shape)
         if not p.textureless:
-            return textureless.Planes(np.zeros(above, np.uint8), [], f)
+            return textureless.Planes(np.zeros(above, np.int8), [], f)
         none = np.asarray(unmatched.reshape(above[0], 2, above[1], 2).all(axis=(1, 3)))
         along = epipolar.along_line(epipolar.lines_at(f, x, y), u, v)
         return textureless.find(self.pair, f, none, along, -self.near_sign)
@@ -249,21 +249,22 @@ class Finish:
         removed &= keep
         blank = consistency.supported(validity == Validity.NO_TEXTURE, keep & ~removed)
         keep |= blank
-        on_plane, plane_std = np.zeros(keep.shape, bool), np.zeros(keep.shape, np.float32)
+        region, plane_std = np.zeros(keep.shape, np.int8), np.zeros(keep.shape, np.float32)
         if planes is not None:
-            on_plane, plane_u, plane_v, plane_std = planes.cut(outer)
+            region, plane_u, plane_v, plane_std = planes.cut(outer)
             # A pixel of the level above is usable if most of its four are.
-            on_plane &= (valid != 0) & (removed | ~keep)
-            u[on_plane], v[on_plane] = plane_u[on_plane], plane_v[on_plane]
-            # What was found about another displacement does not apply.
-            error[on_plane], distance[on_plane] = consistency.FAILED, -1.0
-            keep, removed = keep | on_plane, removed & ~on_plane
+            region[(valid == 0) | (keep & ~removed)] = 0
+            u, v = np.where(region != 0, plane_u, u), np.where(region != 0, plane_v, v)
+        on_plane, beside = region > 0, region < 0
+        # What was found about another displacement does not apply.
+        error[on_plane], distance[on_plane] = consistency.FAILED, -1.0
+        keep, removed = keep | on_plane, removed & ~on_plane
         validity[blank | on_plane] = 0
         # Matches with too few agreeing neighbours are too uncertain to count as measured, but remain the best guess.
         lonely = consistency.lonely(keep & ~removed, p.min_support)
         mark(validity, removed | lonely, Validity.SPECKLE)
-        interpolated = lonely.astype(np.uint8)
-        consistency.fill_rows(u, v, keep & ~removed, p.fill_reach, self.near_sign or -1.0, interpolated)
+        interpolated = (lonely | beside).astype(np.uint8)
+        consistency.fill_rows(u, v, (keep & ~removed) | beside, p.fill_reach, self.near_sign or -1.0, interpolated)
         keep &= ~removed & ~lonely
         noise = cut(refined["noise"], outer)
         # For the deviation of their neighbours all without texture count as unmatched.

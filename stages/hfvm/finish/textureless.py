@@ -8,13 +8,16 @@ and texture:
    of the region, of all displacements that were matched and of farther ones (:data:`BEYOND`);
 2. a plane is fitted robustly: the displacement along the line is a linear function of column and row. The more a
    window's sum exceeds that of its best displacement for all others, the more it counts;
-3. if clearly more windows agree with the plane than would by chance, the pixels whose windows do are matched, at the
-   plane's displacement. Their standard deviation is that of the agreeing windows.
+3. if clearly more windows agree with the plane than would by chance, pixels are matched at its displacement whose
+   windows speak no more against it than those that agree do: their sum there exceeds their least by as little. Their
+   standard deviation is that of the agreeing windows. The rest of the region is filled with the plane.
 
-Windows that any of these displacements leads out of the right image have no vote, nor have those to which two are equal
-(a black or an overexposed sky). A window whose best displacement is one of the last two on either side does not agree.
-Half of a region must have a vote: what lies between a near thing and the image's border may be hidden in the right
-image.
+A window has a vote if most displacements leave it inside the right image, and if its match there is mutual: of all
+windows that any displacement leads to the same right pixel, one with the same displacement is the most alike. What the
+right image hides, such as the strip beside a near thing, has no match, and takes what belongs to another. Windows to
+which two displacements are equal (a black or an overexposed sky) have no vote either. A window whose best displacement
+is one of the last two on either side does not agree. Half of a region must have a vote: what lies between a near thing
+and the image's border may be hidden in the right image.
 
 Chosen with motorcycle, Baby1, Cloth1, Lampshade1 and Midd1, as they are and with the right image degraded: on the wall
 of Midd1, three eighths of the image, wide windows are right for four in ten pixels, matches for two. Blocks of JPEG
@@ -40,7 +43,7 @@ from rille.stages.hfvm.images.window import Raster, Window, cut, whole
 from rille.stages.hfvm.level import epipolar
 from rille.stages.hfvm.level.features import distance
 from rille.stages.numeric.robust import MAD_TO_SIGMA
-from rille.stages.numeric.windows import window_sum32
+from rille.stages.numeric.windows import window_count, window_sum32
 
 LEVEL = 1
 """Halving once halves noise, and a quarter of the pixels is to be searched."""
@@ -55,8 +58,8 @@ SIDE = 2 * RADIUS + 1
 LEAST = 6 * SIDE * SIDE
 """Least size of a region, and of the part of it that has a vote, pixels of the level."""
 
-MOST = 255
-"""Regions of an image; their numbers fit a byte."""
+MOST = 127
+"""Regions of an image; their numbers fit a byte with a sign."""
 
 CAP = 60
 """Greatest distance of two features [byte steps]: about three times that of noise."""
@@ -72,9 +75,15 @@ chosen); windows agree with it that are nearer than the other. No whole numbers,
 APART = 2
 """Steps from the best one to those that it must be distinct from."""
 
+SEEN = 0.5
+"""Share of the displacements that leave a window with a vote inside the right image."""
+
 SURE = 6.0
 """Standard deviations by which more windows agree than by chance: of a range of 40 displacements at each of three
 corners there are some 10^5 different planes, and the best one is taken."""
+
+ALIKE = 0.95
+"""Share of the agreeing windows that speak no more against the plane than a window may whose pixel is matched."""
 
 SAMPLES = 1000
 """Displacements that a plane is fitted to."""
@@ -85,31 +94,35 @@ TRIALS = 500
 ITERATIONS = 10
 
 
-class Planes(NamedTuple):
-    """Matches on the planes of textureless regions.
+Images = tuple[AnyArray, tuple[AnyArray, AnyArray]]
+"""Features of a window of the left image; features and mask of the whole right image."""
 
-    ``region``: (row, col) of level 1, uint8, number of the region from 1 on, 0 where nothing is matched. ``terms``: of
-    each region, pixels of level 0: terms (1, x, y) of the displacement along the lines of ``f``, and its standard
-    deviation.
+
+class Planes(NamedTuple):
+    """Planes of textureless regions.
+
+    ``region``: (row, col) of level 1, int8, number of the region from 1 on, negative where it is not matched but filled
+    alone; 0 elsewhere. ``terms``: of each region, pixels of level 0: terms (1, x, y) of the displacement along the
+    lines of ``f``, and its standard deviation.
     """
 
     region: Raster
     terms: list[list[float]]
     f: epipolar.Matrix
 
-    def cut(self, window: Window) -> tuple[NDArray[np.bool_], AnyArray, AnyArray, AnyArray]:
-        """Of the pixels of a window of level 0: whether they are matched, columns, rows and standard deviations."""
+    def cut(self, window: Window) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
+        """Region, as above, of the pixels of a window of level 0; columns, rows, standard deviations of its plane."""
         twice = cut(self.region, window.parent()).repeat(2, axis=0).repeat(2, axis=1)
         rows, cols = window.shape
         region = twice[window.y0 % 2 :, window.x0 % 2 :][:rows, :cols]
         y, x = np.nonzero(region)
-        g = np.array([4 * [0.0], *self.terms])[region[y, x]]
+        g = np.array([4 * [0.0], *self.terms])[np.abs(region[y, x])]
         x0, y0 = x + window.x0, y + window.y0
         along = g[:, 0] + g[:, 1] * x0 + g[:, 2] * y0
         u, v, std = np.zeros((3, *window.shape), np.float32)
         u[y, x], v[y, x] = epipolar.on_line(epipolar.lines_at(self.f, x0, y0), along)
         std[y, x] = g[:, 3]
-        return np.asarray(region != 0), u, v, std
+        return region, u, v, std
 
 
 def find(pair: Prepared, f: epipolar.Matrix, unmatched: AnyArray, along: AnyArray, far_sign: float) -> Planes:
@@ -123,7 +136,7 @@ def find(pair: Prepared, f: epipolar.Matrix, unmatched: AnyArray, along: AnyArra
     far_sign : sign of the column displacement of far things against near ones; 0 unknown.
     """
     shape, other = pair.shapes(LEVEL)
-    label, terms = np.zeros(shape, np.uint8), list[list[float]]()
+    label, terms = np.zeros(shape, np.int8), list[list[float]]()
     patch, valid = pair.left.patch(LEVEL, whole(shape), deviation=True), pair.left.view.valid(LEVEL, whole(shape))
     assert patch.deviation is not None
     steps = _steps(along, far_sign if epipolar.along_rows(f, pair.shapes(0)[0]) else 0.0)
@@ -132,22 +145,27 @@ def find(pair: Prepared, f: epipolar.Matrix, unmatched: AnyArray, along: AnyArra
         right = right or (pair.right.patch(LEVEL, whole(other)).words, pair.right.view.valid(LEVEL, whole(other)))
         its_lines = epipolar.lines(up.T @ f @ up, window.shape, window.x0, window.y0)
         images = np.ascontiguousarray(patch.words[window.slices]), right
-        seen, best, distinct = search(images, region, its_lines, steps, window)
-        y, x = np.nonzero(seen & (distinct > 0))
+        found = search(images, region, its_lines, steps, window)
+        usable = (found.tried >= SEEN * len(steps)) & (found.distinct > 0)
+        y, x = np.nonzero(usable & found.mutual)
         if len(y) < max(LEAST, 0.5 * np.count_nonzero(region)):
             continue
-        votes, step = distinct[y, x].astype(np.float64), best[y, x].astype(np.float64)
+        votes, step = found.distinct[y, x].astype(np.float64), found.best[y, x].astype(np.float64)
         g, error = _fit(x + window.x0, y + window.y0, step, votes)
-        agree = (error <= TOLERANCE) & (steps[1] < step) & (step < steps[-2])
-        if _sure(agree, votes, len(steps)):
+        excess = _excess(images, region, its_lines, window, g, found.least)
+        agree = (error <= TOLERANCE) & (steps[1] < step) & (step < steps[-2]) & np.isfinite(excess[y, x])
+        if _sure(agree, votes, found.tried[y, x]):
             terms.append(_at_level_0(g, error[agree]))
-            label[window.slices][y[agree], x[agree]] = len(terms)
+            alike = excess <= np.quantile(excess[y[agree], x[agree]], ALIKE)
+            # What has another match of its own is not of this plane.
+            label[window.slices][region & ~(usable & found.mutual)] = -len(terms)
+            label[window.slices][usable & alike] = len(terms)
     return Planes(label, terms, f)
 
 
-def _sure(agree: AnyArray, votes: AnyArray, steps: int) -> bool:
-    """Whether clearly more windows agree than of so many steps would by chance."""
-    chance = 2 * TOLERANCE / steps
+def _sure(agree: AnyArray, votes: AnyArray, tried: AnyArray) -> bool:
+    """Whether clearly more windows agree than would by chance of the steps ``tried`` in each."""
+    chance = np.average(2 * TOLERANCE / tried, weights=votes)
     # Windows that do not overlap and are equally distinct would have to be as many to tell as much.
     windows = votes.sum() ** 2 / np.sum(votes**2) / SIDE**2
     spread = np.sqrt(chance * (1 - chance) / windows)
@@ -186,56 +204,123 @@ def _regions(weak: NDArray[np.bool_]) -> Iterator[tuple[Window, NDArray[np.bool_
         yield window, number[window.slices] == n + 1
 
 
+class Searched(NamedTuple):
+    """What a search tells of each pixel of a region, (row, col).
+
+    ``tried``: int32, steps that leave all of its window inside the right image. ``best, least``: float32, the step with
+    the least sum of distances over the window, and that sum. ``distinct``: float32, by how much the sum of each step
+    more than :data:`APART` from the best one exceeds it, 0 where there is none. ``mutual``: bool, whether no step so
+    far from it leads a window more alike to the same pixel.
+    """
+
+    tried: AnyArray
+    best: AnyArray
+    least: AnyArray
+    distinct: AnyArray
+    mutual: NDArray[np.bool_]
+
+
 def search(
-    images: tuple[AnyArray, tuple[AnyArray, AnyArray]],
+    images: Images,
     region: NDArray[np.bool_],
     lines: AnyArray,
     steps: AnyArray,
     window: Window,
-) -> tuple[NDArray[np.bool_], AnyArray, AnyArray]:
+) -> Searched:
     """Search for the best step along the line of each pixel of a region.
 
     Parameters
     ----------
-    images : features of the left window; features and mask of the whole right image.
     region : (row, col) bool, pixels of the window.
     lines : of these pixels, see :func:`rille.stages.hfvm.level.epipolar.lines`.
     steps : (n,) float32 pixels, ascending by 1.
     window : where the left window lies.
-
-    Returns
-    -------
-    (row, col) bool, pixels of whose window no step leads out of the right image; float32, their best steps; float32,
-    by how much the sum is less than that of each step more than :data:`APART` from the best.
     """
-    cost, best, outside = (np.zeros(region.shape, kind) for kind in (np.float32, np.float32, np.uint8))
+    rows, cols = images[1][1].shape
+    best, tried = np.zeros(region.shape, np.float32), np.zeros(region.shape, np.int32)
     least, least_passed, least_behind, least_ahead = np.full((4, *region.shape), np.inf, np.float32)
+    size = np.maximum(window_count(region, SIDE), 1)
+    claims = np.full((2, rows, cols), np.inf, np.float32)
     passed: deque[AnyArray] = deque()
     for step in steps:
-        _distances(images, region, lines, (step, window.x0, window.y0), (cost, outside))
-        total = window_sum32(cost, SIDE)
+        at = np.full(region.shape, step), window.x0, window.y0
+        total = _sums(images, region, lines, at)
+        tried += np.isfinite(total)
+        _claim(total / size, lines, at, claims)
         if len(passed) > APART:
             np.minimum(least_passed, passed.popleft(), out=least_passed)
         passed.append(total)
         _keep(total, step, least_passed, (least, best, least_behind, least_ahead))
-    seen = cv2.dilate(outside, np.ones((SIDE, SIDE), np.uint8)) == 0
-    return region & seen, best, np.minimum(least_behind, least_ahead) - least
+    rival = np.minimum(least_behind, least_ahead)
+    distinct = np.subtract(rival, least, out=np.zeros_like(rival), where=np.isfinite(rival))
+    mutual = np.zeros_like(region)
+    _claimed(least, lines, (best, window.x0, window.y0), claims[1], mutual)
+    return Searched(tried, best, least, distinct, mutual)
+
+
+def _excess(
+    images: Images, region: NDArray[np.bool_], lines: AnyArray, window: Window, g: AnyArray, least: AnyArray
+) -> AnyArray:
+    """By how much a pixel's distance, mean of the window, is greater at a plane of terms ``g`` than at ``least``, the
+    window's least sum; infinite where the plane leads out of the right image."""
+    y, x = np.indices(region.shape)
+    step = (g[0] + g[1] * (x + window.x0) + g[2] * (y + window.y0)).astype(np.float32)
+    sums = _sums(images, region, lines, (step, window.x0, window.y0))
+    more = np.subtract(sums, least, out=np.full_like(sums, np.inf), where=np.isfinite(sums) & np.isfinite(least))
+    return np.asarray(more / np.maximum(window_count(region, SIDE), 1))
+
+
+def _sums(images: Images, region: NDArray[np.bool_], lines: AnyArray, at: tuple[AnyArray, int, int]) -> AnyArray:
+    """Sum (row, col) of the distances of a region's pixels in each window, float32; infinite outside of the region and
+    where one of them leads out of the right image."""
+    cost, outside = np.zeros(region.shape, np.float32), np.zeros(region.shape, np.uint8)
+    _distances(images, region, lines, at, (cost, outside))
+    total = window_sum32(cost, SIDE)
+    total[(cv2.dilate(outside, np.ones((SIDE, SIDE), np.uint8)) != 0) | ~region] = np.inf
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _end(lines, y, x, at):  # type: ignore[no-untyped-def]
+    """Row and column of the right image that its step along its line leads a pixel to."""
+    step, x0, y0 = at
+    u, v = epipolar.on_line((lines[y, x, 0], lines[y, x, 1], lines[y, x, 2]), step[y, x])
+    return np.int64(np.rint(y + y0 + v)), np.int64(np.rint(x + x0 + u))
 
 
 @njit(cache=True, nogil=True)
 def _distances(images, region, lines, at, out):  # type: ignore[no-untyped-def]
-    """Distances of a region's pixels to those a step away along their lines; ``outside`` is set where there is none."""
-    (left, (right, valid)), (step, x0, y0), (cost, outside) = images, at, out
+    """Distances of a region's pixels to those their step away along their lines; ``outside``: whether there is none."""
+    (left, (right, valid)), (cost, outside) = images, out
     rows, cols = right.shape
     for y in range(region.shape[0]):
         for x in range(region.shape[1]):
             if region[y, x]:
-                u, v = epipolar.on_line((lines[y, x, 0], lines[y, x, 1], lines[y, x, 2]), step)
-                i, j = np.int64(np.rint(x + x0 + u)), np.int64(np.rint(y + y0 + v))
-                if i >= 0 and i < cols and j >= 0 and j < rows and valid[j, i]:
+                j, i = _end(lines, y, x, at)
+                outside[y, x] = i < 0 or i >= cols or j < 0 or j >= rows or not valid[j, i]
+                if not outside[y, x]:
                     cost[y, x] = min(distance(left[y, x], right[j, i]), CAP)
-                else:
-                    outside[y, x] = 1
+
+
+@njit(cache=True, nogil=True)
+def _claim(mean, lines, at, claims):  # type: ignore[no-untyped-def]
+    """Of each right pixel the least ``mean`` distance of the windows led to it, and the step that did."""
+    for y in range(mean.shape[0]):
+        for x in range(mean.shape[1]):
+            if mean[y, x] < np.inf:
+                j, i = _end(lines, y, x, at)
+                if mean[y, x] < claims[0, j, i]:
+                    claims[0, j, i], claims[1, j, i] = mean[y, x], at[0][y, x]
+
+
+@njit(cache=True, nogil=True)
+def _claimed(least, lines, at, steps, mutual):  # type: ignore[no-untyped-def]
+    """Whether the step that claims the right pixel is like the pixel's own."""
+    for y in range(least.shape[0]):
+        for x in range(least.shape[1]):
+            if least[y, x] < np.inf:
+                j, i = _end(lines, y, x, at)
+                mutual[y, x] = abs(steps[j, i] - at[0][y, x]) <= APART
 
 
 @njit(cache=True, nogil=True)
