@@ -179,7 +179,10 @@ def test_search_and_its_definition_agree():
     np.testing.assert_array_equal(found.tried, np.isfinite(sums).sum(axis=2))
     for y, x in inside_region[found.tried[region] > 0]:
         k = int(np.argmin(sums[y, x]))
-        assert found.best[y, x] == steps[k]
+        before, least, after = np.pad(sums[y, x], 1, constant_values=np.inf)[k : k + 3]
+        rise = max(before, after) - least
+        fraction = 0.5 * (before - after) / rise if np.isfinite(rise) and rise > 0 else 0.0
+        assert found.best[y, x] == pytest.approx(steps[k] + fraction, abs=1e-5)
         assert found.least[y, x] == sums[y, x, k]
         rival = min(total for n, total in enumerate(sums[y, x]) if abs(n - k) > APART)
         assert found.distinct[y, x] == (rival - sums[y, x, k] if np.isfinite(rival) else 0)
