@@ -21,13 +21,13 @@ is one of the last two on either side does not agree. Two fifths of a region (:d
 lies between a near thing and the image's border may be hidden in the right image.
 
 Chosen with motorcycle, Baby1, Cloth1, Lampshade1 and Midd1, as they are and with the right image degraded: on the wall
-of Midd1, three eighths of the image, wide windows are right for four in ten pixels, matches for two. Blocks of JPEG
-images look like structure: there a plane may be some pixels off.
+of Midd1, three eighths of the image, wide windows are right for four in ten pixels, matches for two. That matches must
+be mutual, and how many, was chosen with Monopoly as well. Blocks of JPEG images look like structure: there a plane may
+be some pixels off.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -39,12 +39,11 @@ from numpy.typing import NDArray
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm.coarse_to_fine.hierarchy import Prepared
 from rille.stages.hfvm.finish.uncertainty import BLANK
+from rille.stages.hfvm.finish.wide_search import RADIUS, SIDE, excess, search
 from rille.stages.hfvm.images import plane
 from rille.stages.hfvm.images.window import Raster, Window, cut, whole
 from rille.stages.hfvm.level import epipolar
-from rille.stages.hfvm.level.features import distance
 from rille.stages.numeric.robust import MAD_TO_SIGMA
-from rille.stages.numeric.windows import window_count, window_sum32
 
 LEVEL = 1
 """Halving once halves noise, and a quarter of the pixels is to be searched."""
@@ -52,18 +51,11 @@ LEVEL = 1
 DEVIATION = 1.0
 """Grey levels of local deviation below which a pixel of the level may belong to a region."""
 
-RADIUS = 6
-SIDE = 2 * RADIUS + 1
-"""Side of the window, pixels of the level."""
-
 LEAST = 6 * SIDE * SIDE
 """Least size of a region, and of the part of it that has a vote, pixels of the level."""
 
 MOST = 127
 """Regions of an image; their numbers fit a byte with a sign."""
-
-CAP = 60
-"""Greatest distance of two features [byte steps]: about three times that of noise."""
 
 BEYOND = 0.5, 4
 """Share of the range of the matched displacements that is searched beyond its far end, and pixels of the level: a wall
@@ -72,9 +64,6 @@ is often farther than all else."""
 NEAR, TOLERANCE = 1.25, 2.5
 """Pixels of the level: the plane is that with the most votes nearer than the one (with the other tilted planes were
 chosen); windows agree with it that are nearer than the other. No whole numbers, as displacements are."""
-
-APART = 2
-"""Steps from the best one to those that it must be distinct from."""
 
 STEEPEST = NEAR / RADIUS
 """Displacements a pixel: across the windows of a steeper plane no displacement is right."""
@@ -100,10 +89,6 @@ TRIALS = 500
 """Planes that are tried: where four in ten windows are right, 32 of them are."""
 
 ITERATIONS = 10
-
-
-Images = tuple[AnyArray, tuple[AnyArray, AnyArray]]
-"""Features of a window of the left image; features and mask of the whole right image."""
 
 
 class Planes(NamedTuple):
@@ -160,12 +145,12 @@ def find(pair: Prepared, f: epipolar.Matrix, unmatched: AnyArray, along: AnyArra
             continue
         votes, step = found.distinct[y, x].astype(np.float64), found.best[y, x].astype(np.float64)
         g, error = _fit(x + window.x0, y + window.y0, step, votes)
-        excess = _excess(images, region, its_lines, window, g, found.least)
+        more = excess(images, region, its_lines, window, g, found.least)
         inner = (steps[1] + 0.5 < step) & (step < steps[-2] - 0.5)
-        agree = (error <= TOLERANCE) & inner & np.isfinite(excess[y, x])
+        agree = (error <= TOLERANCE) & inner & np.isfinite(more[y, x])
         if _sure(agree, votes, found.tried[y, x]):
             terms.append(_at_level_0(g, error[agree]))
-            alike = excess <= np.quantile(excess[y[agree], x[agree]], ALIKE)
+            alike = more <= np.quantile(more[y[agree], x[agree]], ALIKE)
             # What has another match of its own is not of this plane.
             label[window.slices][region & ~(usable & found.mutual)] = -len(terms)
             label[window.slices][usable & alike] = len(terms)
@@ -211,156 +196,6 @@ def _regions(weak: NDArray[np.bool_]) -> Iterator[tuple[Window, NDArray[np.bool_
         x, y, wide, high, _ = (int(k) for k in about[n + 1])
         window = Window(y, y + high, x, x + wide)
         yield window, number[window.slices] == n + 1
-
-
-class Searched(NamedTuple):
-    """What a search tells of each pixel of a region, (row, col).
-
-    ``tried``: int32, steps that leave all of its window inside the right image. ``best, least``: float32, the step with
-    the least sum of distances over the window, moved by a fraction, and that sum. ``distinct``: float32, by how much
-    the sum of each step more than :data:`APART` from the best one exceeds it, 0 where there is none. ``mutual``: bool,
-    whether no step so far from it leads a window more alike to the same pixel.
-    """
-
-    tried: AnyArray
-    best: AnyArray
-    least: AnyArray
-    distinct: AnyArray
-    mutual: NDArray[np.bool_]
-
-
-def search(
-    images: Images,
-    region: NDArray[np.bool_],
-    lines: AnyArray,
-    steps: AnyArray,
-    window: Window,
-) -> Searched:
-    """Search for the best step along the line of each pixel of a region.
-
-    Parameters
-    ----------
-    region : (row, col) bool, pixels of the window.
-    lines : of these pixels, see :func:`rille.stages.hfvm.level.epipolar.lines`.
-    steps : (n,) float32 pixels, ascending by 1.
-    window : where the left window lies.
-    """
-    rows, cols = images[1][1].shape
-    best, tried = np.zeros(region.shape, np.float32), np.zeros(region.shape, np.int32)
-    least, before, after, previous, passed, behind, ahead = np.full((7, *region.shape), np.inf, np.float32)
-    size = np.maximum(window_count(region, SIDE), 1)
-    claims = np.full((2, rows, cols), np.inf, np.float32)
-    last: deque[AnyArray] = deque()
-    for step in steps:
-        at = np.full(region.shape, step), window.x0, window.y0
-        total = _sums(images, region, lines, at)
-        tried += np.isfinite(total)
-        _claim(total / size, lines, at, claims)
-        if len(last) > APART:
-            np.minimum(passed, last.popleft(), out=passed)
-        last.append(total)
-        _keep(total, step, (previous, passed), (least, best, before, after, behind, ahead))
-        previous = total
-    rival = np.minimum(behind, ahead)
-    distinct = np.subtract(rival, least, out=np.zeros_like(rival), where=np.isfinite(rival))
-    mutual = np.zeros_like(region)
-    _claimed(least, lines, (best, window.x0, window.y0), claims[1], mutual)
-    return Searched(tried, best + _fraction(before, least, after), least, distinct, mutual)
-
-
-def _fraction(before: AnyArray, least: AnyArray, after: AnyArray) -> AnyArray:
-    """Where two lines of opposite slopes through three sums meet, steps from the middle one; 0 at an end of the steps.
-
-    Sums of absolute differences are more like two lines than like a parabola.
-    """
-    inner = np.isfinite(before) & np.isfinite(after)
-    rise = np.subtract(np.maximum(before, after), least, out=np.zeros_like(least), where=inner)
-    fall = np.subtract(before, after, out=np.zeros_like(least), where=inner)
-    return np.divide(0.5 * fall, rise, out=np.zeros_like(least), where=rise > 0)
-
-
-def _excess(
-    images: Images, region: NDArray[np.bool_], lines: AnyArray, window: Window, g: AnyArray, least: AnyArray
-) -> AnyArray:
-    """By how much a pixel's distance, mean of the window, is greater at a plane of terms ``g`` than at ``least``, the
-    window's least sum; infinite where the plane leads out of the right image."""
-    y, x = np.indices(region.shape)
-    step = (g[0] + g[1] * (x + window.x0) + g[2] * (y + window.y0)).astype(np.float32)
-    sums = _sums(images, region, lines, (step, window.x0, window.y0))
-    more = np.subtract(sums, least, out=np.full_like(sums, np.inf), where=np.isfinite(sums) & np.isfinite(least))
-    return np.asarray(more / np.maximum(window_count(region, SIDE), 1))
-
-
-def _sums(images: Images, region: NDArray[np.bool_], lines: AnyArray, at: tuple[AnyArray, int, int]) -> AnyArray:
-    """Sum (row, col) of the distances of a region's pixels in each window, float32; infinite outside of the region and
-    where one of them leads out of the right image."""
-    cost, outside = np.zeros(region.shape, np.float32), np.zeros(region.shape, np.uint8)
-    _distances(images, region, lines, at, (cost, outside))
-    total = window_sum32(cost, SIDE)
-    total[(cv2.dilate(outside, np.ones((SIDE, SIDE), np.uint8)) != 0) | ~region] = np.inf
-    return total
-
-
-@njit(cache=True, nogil=True)
-def _end(lines, y, x, at):  # type: ignore[no-untyped-def]
-    """Row and column of the right image that its step along its line leads a pixel to."""
-    step, x0, y0 = at
-    u, v = epipolar.on_line((lines[y, x, 0], lines[y, x, 1], lines[y, x, 2]), step[y, x])
-    return np.int64(np.rint(y + y0 + v)), np.int64(np.rint(x + x0 + u))
-
-
-@njit(cache=True, nogil=True)
-def _distances(images, region, lines, at, out):  # type: ignore[no-untyped-def]
-    """Distances of a region's pixels to those their step away along their lines; ``outside``: whether there is none."""
-    (left, (right, valid)), (cost, outside) = images, out
-    rows, cols = right.shape
-    for y in range(region.shape[0]):
-        for x in range(region.shape[1]):
-            if region[y, x]:
-                j, i = _end(lines, y, x, at)
-                outside[y, x] = i < 0 or i >= cols or j < 0 or j >= rows or not valid[j, i]
-                if not outside[y, x]:
-                    cost[y, x] = min(distance(left[y, x], right[j, i]), CAP)
-
-
-@njit(cache=True, nogil=True)
-def _claim(mean, lines, at, claims):  # type: ignore[no-untyped-def]
-    """Of each right pixel the least ``mean`` distance of the windows led to it, and the step that did."""
-    for y in range(mean.shape[0]):
-        for x in range(mean.shape[1]):
-            if mean[y, x] < np.inf:
-                j, i = _end(lines, y, x, at)
-                if mean[y, x] < claims[0, j, i]:
-                    claims[0, j, i], claims[1, j, i] = mean[y, x], at[0][y, x]
-
-
-@njit(cache=True, nogil=True)
-def _claimed(least, lines, at, steps, mutual):  # type: ignore[no-untyped-def]
-    """Whether the step that claims the right pixel is like the pixel's own."""
-    for y in range(least.shape[0]):
-        for x in range(least.shape[1]):
-            if least[y, x] < np.inf:
-                j, i = _end(lines, y, x, at)
-                mutual[y, x] = abs(steps[j, i] - at[0][y, x]) <= APART
-
-
-@njit(cache=True, nogil=True)
-def _keep(total, step, earlier, out):  # type: ignore[no-untyped-def]
-    """The best step so far of each pixel, and its sum; the sums beside it; the least ones far behind it and ahead.
-
-    ``earlier``: the sums of the step before; the least of all steps more than APART behind this one.
-    """
-    (previous, passed), (least, best, before, after, behind, ahead) = earlier, out
-    for y in range(total.shape[0]):
-        for x in range(total.shape[1]):
-            if total[y, x] < least[y, x]:
-                least[y, x], best[y, x] = total[y, x], step
-                before[y, x], after[y, x] = previous[y, x], np.inf
-                behind[y, x], ahead[y, x] = passed[y, x], np.inf
-            elif step - best[y, x] == 1:
-                after[y, x] = total[y, x]
-            elif step - best[y, x] > APART:
-                ahead[y, x] = min(ahead[y, x], total[y, x])
 
 
 def _fit(x: AnyArray, y: AnyArray, step: AnyArray, votes: AnyArray) -> tuple[AnyArray, AnyArray]:

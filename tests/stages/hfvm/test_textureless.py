@@ -7,7 +7,8 @@ import pytest
 from rille.stages.core.validity import matched
 from rille.stages.hfvm import tiled
 from rille.stages.hfvm.finish import textureless
-from rille.stages.hfvm.finish.textureless import APART, CAP, SIDE, Planes
+from rille.stages.hfvm.finish.textureless import Planes
+from rille.stages.hfvm.finish.wide_search import APART, CAP, SIDE, search
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import Plain
 from rille.stages.hfvm.images.window import Window, whole
@@ -156,7 +157,7 @@ def test_search_and_its_definition_agree():
     region[2:24, 3:36] = True
     region[10:14, 12:20] = False
     lines = epipolar.lines(np.array([[0, 0, 0], [0, 0, 1.0], [0, -1.0, -1.0]]), window.shape, window.x0, window.y0)
-    found = textureless.search((words[window.slices], (others, valid)), region, lines, steps, window)
+    found = search((words[window.slices], (others, valid)), region, lines, steps, window)
     a, b = (w.view(np.uint8).reshape(*w.shape, 8).astype(int) for w in (words, others))
     inside_region = np.argwhere(region)
     sums, sizes = np.full((*region.shape, len(steps)), np.inf), np.zeros(region.shape)
