@@ -26,7 +26,8 @@ from numba import njit
 
 from rille.stages.core.arrays import Floats32
 from rille.stages.core.declare import AnyArray
-from rille.stages.hfvm.level.features import Words, distance
+from rille.stages.hfvm.level import edge_simd, simd
+from rille.stages.hfvm.level.features import Words
 
 REACH = 4
 """Pixels to the farthest ones whose displacement is tried: features put an edge a few pixels too far out."""
@@ -98,13 +99,19 @@ def place(
     return out
 
 
+window_cost = edge_simd.make_window_cost(simd.widest(), SIDE, GREY, FAR)
+"""``window_cost((left, right), grey, (here, there), (cols, right cols))``: C between the windows that begin at words
+``left[here]`` and ``right[there]``; all arrays are flat. ``grey``: int16, of the left image; of each of its rows a
+value more than the window's is read.
+"""
+
+
 @njit(cache=True, nogil=True)
 def _place(grey, words, right_shape, given, wanted, sides, out):  # type: ignore[no-untyped-def]
     (u, v), (out_u, out_v), (at, near) = given, out, sides
     (rows, cols), (high, wide) = u.shape, right_shape
     columns, downs = np.empty(len(AROUND) + 1, np.int32), np.empty(len(AROUND) + 1, np.int32)
-    weights = np.zeros(SIDE * SIDE, np.int32)
-    flat, around = (u.ravel(), v.ravel()), np.array([j * cols + i for j, i in AROUND])
+    flat, around = (u.ravel(), v.ravel(), grey.ravel()), np.array([j * cols + i for j, i in AROUND])
     for y in range(REACH, rows - REACH):
         for x in range(REACH, cols - REACH):
             if not wanted[y, x]:
@@ -112,7 +119,6 @@ def _place(grey, words, right_shape, given, wanted, sides, out):  # type: ignore
             count = _candidates(flat[0], flat[1], y * cols + x, around, columns, downs)
             if count == 1:
                 continue
-            _weigh(grey, y, x, weights)
             best, chosen = np.int64(ALL), 0
             for k in range(count):
                 q, p = y + at[1] + downs[k], x + at[0] + columns[k]
@@ -120,7 +126,7 @@ def _place(grey, words, right_shape, given, wanted, sides, out):  # type: ignore
                     # The pixel's own displacement comes first.
                     factor = BETTER[0] if k == 0 or near * (columns[k] - columns[0]) < 0 else BETTER[1]
                     first = (y - RADIUS) * cols + x - RADIUS, (q - RADIUS) * wide + p - RADIUS
-                    cost = factor * _cost(words, first, (cols, wide), weights, best // factor)
+                    cost = factor * window_cost(words, flat[2], first, (cols, wide))
                     if cost < best:
                         best, chosen = cost, k
                 elif k == 0:
@@ -140,28 +146,3 @@ def _candidates(u, v, at, around, columns, downs):  # type: ignore[no-untyped-de
             columns[count], downs[count] = column, down
             count += 1
     return count
-
-
-@njit(cache=True, nogil=True)
-def _weigh(grey, y, x, weights):  # type: ignore[no-untyped-def]
-    own = np.int32(grey[y, x])
-    for j in range(SIDE):
-        row, some = grey[y + j - RADIUS, x - RADIUS : x + RADIUS + 1], weights[j * SIDE : j * SIDE + SIDE]
-        for i in range(SIDE):
-            some[i] = max(np.int32(GREY) - abs(np.int32(row[i]) - own), np.int32(0))
-
-
-@njit(cache=True, nogil=True)
-def _cost(words, first, width, weights, most):  # type: ignore[no-untyped-def]
-    """C between the windows that begin at ``first`` in both images, of ``width`` columns; given up after the row with
-    which it exceeds ``most``."""
-    left, right = words
-    total = np.int64(0)
-    for j in range(SIDE):
-        a, b, n = np.uint64(first[0] + j * width[0]), np.uint64(first[1] + j * width[1]), np.uint64(j * SIDE)
-        for i in range(SIDE):
-            k = np.uint64(i)
-            total += weights[n + k] * min(distance(left[a + k], right[b + k]), FAR)
-        if total > most:
-            break
-    return total

@@ -6,7 +6,7 @@ from numba import njit
 from scipy import ndimage
 
 from rille.stages.geometry.spline import coefficients
-from rille.stages.hfvm.level import rowwise, simd, strip_simd
+from rille.stages.hfvm.level import edge_simd, rowwise, simd, strip_simd
 
 WIDTHS = sorted({0, simd.widest()})
 
@@ -36,6 +36,23 @@ def test_sums_over_windows(width):
             moves = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]
             expected = [sad(here, right[3 + j : 8 + j, 4 + k + i : 9 + k + i].ravel()).sum() for j, i in moves]
             assert [*four[1 + k : 2 + k].view(np.uint16), last[1 + k]] == expected
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_the_cost_of_a_window_of_like_pixels(width):
+    window_cost = edge_simd.make_window_cost(width, 7, 16, 600)
+
+    @njit
+    def call(left, right, grey, at_left, at_right):
+        return window_cost((left, right), grey, (at_left, at_right), (np.int64(13), np.int64(15)))
+
+    left, right = words(117, 2), words(105, 3)
+    grey = np.random.default_rng(4).integers(0, 40, 117).astype(np.int16)
+    # The right window ends with the image.
+    at = [(np.arange(7)[:, None] * cols + np.arange(first, first + 7)).ravel() for cols, first in ((13, 18), (15, 8))]
+    weights = np.maximum(16 - abs(grey[at[0]].astype(int) - grey[at[0][24]]), 0)
+    expected = (weights * np.minimum(sad(left[at[0]], right[at[1]]), 600)).sum()
+    assert call(left, right, grey, 18, 8) == expected
 
 
 def test_all_widths_search_alike():
