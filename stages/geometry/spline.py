@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
@@ -29,7 +30,7 @@ def coefficients(image: ArrayLike) -> Floats32:
     from where it is cut.
     """
     grey = np.asarray(image, np.float32)
-    mirrored = np.pad(grey, RADIUS, mode="reflect")
+    mirrored = cv2.copyMakeBorder(grey, *4 * (RADIUS,), cv2.BORDER_REFLECT_101)
     along = np.empty((mirrored.shape[0], grey.shape[1]), np.float32)
     found = np.empty(grey.shape, np.float32)
     _filter(mirrored, RADIUS, 1, TAPS, along)

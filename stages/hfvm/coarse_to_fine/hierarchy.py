@@ -38,7 +38,6 @@ from rille.stages.hfvm.images.window import (
     whole,
 )
 from rille.stages.hfvm.level import (
-    compact,
     consistency,
     depth_edges,
     epipolar,
@@ -169,7 +168,7 @@ class FastSolver:
         if p.path_rounds:
             coarse = None if up is None else (np.asarray(up.u), np.asarray(up.v))
             weights = paths.Weights(p.path_compact, p.path_small, p.path_large, p.path_grey)
-            left, right = (paths.LevelView(patch.words, compact.pack(patch.grey), patch.grey) for patch in (a, b))
+            left, right = (paths.LevelView(patch.words, patch.compact, patch.grey) for patch in (a, b))
             soft_lines = band.lines(a.window), band.mu
             u, v = paths.propagate(left, right, (u, v), coarse, soft_lines, weights, p.path_rounds)
         return Map(u, v, np.zeros(shape, bool))
@@ -393,7 +392,7 @@ def _edges_placed(
 ) -> tuple[AnyArray, AnyArray]:
     """Displacements of a left window of the finest level, depth edges placed anew where there is texture."""
     assert a.deviation is not None
-    left, right = (depth_edges.EdgeView(compact.pack(patch.grey), patch.grey) for patch in (a, b))
+    left, right = (depth_edges.EdgeView(patch.compact, patch.grey) for patch in (a, b))
     wanted = (a.deviation >= pair.params.texture) & (pair.left.view.valid(0, a.window) != 0)
     return depth_edges.place(left, right, given, wanted, offset(a, b), near_sign)
 

@@ -218,7 +218,7 @@ class Finish:
         f = epipolar.oriented(found[0], shape)
         if not p.textureless:
             return textureless.Planes(np.zeros(above, np.int8), [], f)
-        none = np.asarray(unmatched.reshape(above[0], 2, above[1], 2).all(axis=(1, 3)))
+        none = (unmatched[::2, ::2] & unmatched[::2, 1::2]) & (unmatched[1::2, ::2] & unmatched[1::2, 1::2])
         along = epipolar.along_line(epipolar.lines_at(f, x, y), u, v)
         return textureless.find(self.pair, f, none, along, -self.near_sign)
 

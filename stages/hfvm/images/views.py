@@ -13,7 +13,7 @@ from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm.images import denoise, plane
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.window import Raster, Shape, Window, cut, tiles, whole
-from rille.stages.hfvm.level import features, paper
+from rille.stages.hfvm.level import compact, features, paper
 from rille.stages.hfvm.level.window_pair import WindowPair
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid
@@ -276,6 +276,11 @@ class Patch:
     words: AnyArray
     grey: AnyArray
     deviation: AnyArray | None
+
+    @cached_property
+    def compact(self) -> AnyArray:
+        """Compact features; both directions of a match ask for them."""
+        return compact.pack(self.grey)
 
 
 @dataclass(frozen=True)

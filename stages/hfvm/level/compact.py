@@ -7,6 +7,7 @@ as signed square roots, one byte each, and know nothing of the images' brightnes
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numba import njit
 
@@ -32,7 +33,7 @@ def pack(image: AnyArray) -> Words:
     (row, col) uint64, byte k is ``128 + round(8 sign(s) sqrt|s|)`` of the step s to neighbour k, clipped.
     """
     words = np.empty(image.shape, np.uint64)
-    _pack(np.pad(np.asarray(image, np.float32), 1, mode="edge"), words)
+    _pack(cv2.copyMakeBorder(np.asarray(image, np.float32), 1, 1, 1, 1, cv2.BORDER_REPLICATE), words)
     return words
 
 
