@@ -250,7 +250,7 @@ class Finish:
         blank = consistency.supported(validity == Validity.NO_TEXTURE, keep & ~removed)
         keep |= blank
         region, plane_std = np.zeros(keep.shape, np.int8), np.zeros(keep.shape, np.float32)
-        if planes is not None:
+        if planes is not None and planes.terms:
             region, plane_u, plane_v, plane_std = planes.cut(outer)
             # A pixel of the level above is usable if most of its four are.
             region[(valid == 0) | (keep & ~removed)] = 0
@@ -270,7 +270,7 @@ class Finish:
         # For the deviation of their neighbours all without texture count as unmatched.
         std = uncertainty.standard_deviation(noise, u, keep & ~blank & ~on_plane, p)
         if blank.any():
-            std[blank] = np.hypot(uncertainty.standard_deviation(noise, u, keep, p), uncertainty.BLANK)[blank]
+            std[blank] = np.hypot(uncertainty.standard_deviation(noise, u, keep, p)[blank], uncertainty.BLANK)
         on_plane &= keep
         std[on_plane] = plane_std[on_plane]
         # A masked pixel is no part of the image, so it is not filled either.

@@ -108,7 +108,7 @@ class Planes(NamedTuple):
         twice = cut(self.region, window.parent()).repeat(2, axis=0).repeat(2, axis=1)
         rows, cols = window.shape
         region = twice[window.y0 % 2 :, window.x0 % 2 :][:rows, :cols]
-        y, x = np.nonzero(region)
+        y, x = np.divmod(np.flatnonzero(region), cols)
         g = np.array([4 * [0.0], *self.terms])[np.abs(region[y, x])]
         x0, y0 = x + window.x0, y + window.y0
         along = g[:, 0] + g[:, 1] * x0 + g[:, 2] * y0
@@ -212,7 +212,7 @@ def _fit(x: AnyArray, y: AnyArray, step: AnyArray, votes: AnyArray) -> tuple[Any
     planes = np.linalg.solve(t.T[three] + 1e-6 * np.eye(3), d[three][..., None])[..., 0]
     # Should all be steep, the flat one is left.
     planes = np.vstack([[np.median(d), 0.0, 0.0], planes[(np.abs(planes[:, 1:]) <= STEEPEST).all(axis=1)]])
-    g = planes[np.argmax(_support(planes, t, d, weight))]
+    g = planes[np.argmax(_support(planes, t, d, weight.astype(np.int64)))]
     for _ in range(ITERATIONS):
         error = epipolar.residuals(t, d, -g)
         normal, side = epipolar.weighted_normal(t, d, weight / (1.0 + (error / NEAR) ** 2) ** 2)
@@ -222,11 +222,11 @@ def _fit(x: AnyArray, y: AnyArray, step: AnyArray, votes: AnyArray) -> tuple[Any
 
 @njit(cache=True, nogil=True)
 def _support(planes, terms, step, votes):  # type: ignore[no-untyped-def]
-    """Votes (n,) of the steps that are near each plane."""
-    found = np.zeros(len(planes))
+    """Votes (n,) of the steps that are near each plane; whole numbers, which are added up several at once."""
+    found = np.zeros(len(planes), np.int64)
+    one, x, y, nothing = terms[0], terms[1], terms[2], np.int64(0)
     for n in range(len(planes)):
-        g = planes[n]
+        a, b, c = planes[n, 0], planes[n, 1], planes[n, 2]
         for k in range(len(step)):
-            if abs(g[0] * terms[0, k] + g[1] * terms[1, k] + g[2] * terms[2, k] - step[k]) <= NEAR:
-                found[n] += votes[k]
+            found[n] += votes[k] if abs(a * one[k] + b * x[k] + c * y[k] - step[k]) <= NEAR else nothing
     return found

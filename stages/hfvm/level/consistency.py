@@ -195,7 +195,8 @@ def supported(blank: AnyArray, keep: AnyArray) -> NDArray[np.bool_]:
     ``blank``: consistent, but without texture. Nearly all pixels around are consistent, too, and enough of them are
     matches (``keep``). Among failures, as on a wall without any texture, consistent pixels are chance.
     """
-    y, x = np.nonzero(blank)
+    # A single index is found many times faster than two.
+    y, x = np.divmod(np.flatnonzero(blank), blank.shape[1])
     found = np.zeros(blank.shape, bool)
     if y.size:
         # At the few pixels that are asked for: a third of the time of shares everywhere.
