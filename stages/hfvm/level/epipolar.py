@@ -82,6 +82,7 @@ def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float
     # y' = y: the baseline lies along the rows.
     prior[6] = -1.0
     precision = np.diag(PRIOR**-2.0)
+    pull = precision @ prior
     g, change = prior, math.inf
     spread = math.inf
     for step in range(ITERATIONS):
@@ -94,18 +95,19 @@ def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float
             break
         spread = wide
         normal, side = weighted_normal(terms, yr, 1.0 / (1.0 + (residual / spread) ** 2) / sigma**2)
-        new = np.linalg.solve(normal + precision, precision @ prior - side)
-        g, change = new, float(np.max(np.abs(new - g) / PRIOR))
+        new = np.linalg.solve(normal + precision, pull - side)
+        g, change = new, float((np.abs(new - g) / PRIOR).max())
     residual = residuals(terms, yr, g)
     cost = float(np.sum(np.log1p((residual / sigma) ** 2)) + np.sum(((g - prior) / PRIOR) ** 2))
     f = np.array([[g[1], g[2], g[0]], [g[3], g[4], 1.0], [g[5], g[6], g[7]]])
     return f, cost, typical(residual)
 
 
-def typical(residual: AnyArray) -> float:
+@njit(cache=True, nogil=True)
+def typical(residual):  # type: ignore[no-untyped-def]
     """Median magnitude (the upper one of two)."""
     size = np.abs(residual)
-    return float(np.partition(size, size.size // 2)[size.size // 2])
+    return np.partition(size, size.size // 2)[size.size // 2]
 
 
 @njit(cache=True, nogil=True)
