@@ -8,6 +8,7 @@ import tomli_w
 
 from rille.datasets.inspection import Findings, FoundCalibration
 from rille.datasets.manifest.rig import LONGEST_BASELINE
+from rille.datasets.text.count import count
 from rille.datasets.text.names import derived_name
 
 NEEDED = "NEEDED"
@@ -35,11 +36,6 @@ def manifest_text(found: Findings, root: str) -> str:
     return "\n".join(parts)
 
 
-def counted(count: int, word: str) -> str:
-    """``1 pair``, ``2 pairs``."""
-    return f"{count} {word}{'' if count == 1 else 's'}"
-
-
 def needs(text: str) -> list[str]:
     """What a manifest's text marks as needed, one line each."""
     return [line.split(NEEDED, 1)[1].lstrip(": ") for line in text.splitlines() if f"# {NEEDED}:" in line]
@@ -55,7 +51,7 @@ def _images(found: Findings) -> str:
     if views.sizes is None:
         lines.append(f"# {NEEDED}: correct the patterns: {views.trouble}")
     else:
-        lines.append(f"# They make {counted(views.pairs, 'pair')} of {size_words(views.sizes)} pixels.")
+        lines.append(f"# They make {count(views.pairs, 'pair')} of {size_words(views.sizes)} pixels.")
     lines.append(_pairs(left=views.left, right=views.right).rstrip())
     lines.append('# pair = "auto"  # or "name", "number", "order"')
     return "\n".join(lines) + "\n"

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from rille.datasets.bags import is_bag
 from rille.datasets.inspection import Findings, inspect
-from rille.datasets.manifest.text import counted, manifest_text, needs, size_words
+from rille.datasets.manifest.text import manifest_text, needs, size_words
 from rille.datasets.registry import hindrance
+from rille.datasets.text.count import count
 from rille.datasets.text.names import derived_name
 from rille.pipeline.commands.options import COMPLETE
 from rille.pipeline.engine.failures import reported
@@ -78,7 +79,7 @@ def _report(found: Findings, path: Path, needed: list[str]) -> list[str]:
     """What was found, what is needed, and what to type next."""
     views, calibration = found.views, found.calibration
     size = f", {size_words(views.sizes)} pixels" if views.sizes else ""
-    lines = [f"images       {counted(views.pairs, 'pair')}{size}: {views.left} and {views.right}"]
+    lines = [f"images       {count(views.pairs, 'pair')}{size}: {views.left} and {views.right}"]
     if calibration is not None:
         baseline = f", baseline {calibration.baseline:.6g}" if calibration.baseline is not None else ""
         lines.append(f"calibration  {' and '.join(calibration.files)}{baseline}")

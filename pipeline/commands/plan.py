@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 
+from rille.datasets.text.count import count
 from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.forecast import Kinds, kind, recall
 from rille.pipeline.engine.graph import Graph, Handle
@@ -17,7 +18,7 @@ from rille.pipeline.engine.memory import cost_model, limits
 from rille.pipeline.engine.memory.admission import Account, Admission, account, forecast, largest
 from rille.pipeline.engine.memory.cost_model import Costs, Foreseen
 from rille.pipeline.engine.memory.limits import words
-from rille.pipeline.engine.plain import brief, count, some
+from rille.pipeline.engine.plain import brief, some
 from rille.pipeline.engine.runtime.environment import cores
 from rille.pipeline.engine.scheduler import Result
 from rille.pipeline.engine.store.base import Store

@@ -54,11 +54,6 @@ def brief(value: Any, most: int) -> str:
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
-def count(n: int, what: str) -> str:
-    """``1 task``, ``3 tasks``."""
-    return f"{n} {what}{'' if n == 1 else 's'}"
-
-
 def some(names: Sequence[str], most: int) -> str:
     """``a, b, c and 4 more``: the first ``most`` names, and the number of the others."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

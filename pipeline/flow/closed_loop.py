@@ -40,8 +40,8 @@ import numpy as np
 from pydantic import Field
 
 from rille.datasets.protocol import Sequence, Simulation
+from rille.datasets.text.count import count
 from rille.pipeline.engine.graph import Graph, Handle, MissingError, Wait
-from rille.pipeline.engine.plain import count
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow.builders import Builder, Pair, Segment, name
 from rille.pipeline.flow.products import Driven, Products, Stop

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rille.pipeline.engine.plain import count
+from rille.datasets.text.count import count
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView
 from rille.pipeline.report import delivery, seams, tables
@@ -112,7 +112,7 @@ def find_warnings(scene: Scene) -> list[str]:
     return list(dict.fromkeys(" ".join(str(line).split()) for line in lines))
 
 
-UNLIKE = 50.0
+NOTHING_COMMON = 50.0
 """RMS disagreement of two trajectories [per cent of the length] from which on they have nothing in common. Of a camera
 at rest, whose length is noise, it stays below."""
 
@@ -122,7 +122,7 @@ def _unlike(view: RunView) -> list[str]:
     agreement = view.bundle(view.products.agreement)
     figures = {} if agreement is None else agreement.meta.get("metrics", {})
     rmse, length, share = (figures.get(name, {}).get("value") for name in ("rmse", "length", "share"))
-    if share is None or share <= UNLIKE:
+    if share is None or share <= NOTHING_COMMON:
         return []
     return [f"trajectory and COLMAP have nothing in common: {metres(rmse)} RMS over {metres(length)}; one is wrong"]
 
@@ -187,7 +187,7 @@ def _way_words(view: RunView, length: float | None) -> str:
 
 def _sequence(view: RunView) -> dict[str, Any]:
     s = view.sequence
-    left = s.rig.left
+    left, right = s.rig.left, s.rig.right
     return {
         "name": s.name,
         "frames": len(view.frames),
@@ -197,6 +197,9 @@ def _sequence(view: RunView) -> dict[str, Any]:
         "image_width_px": left.width,
         "image_height_px": left.height,
         "focal_length_px": left.fx,
+        "right_image_width_px": right.width,
+        "right_image_height_px": right.height,
+        "right_focal_length_px": right.fx,
         "baseline_m": s.rig.baseline,
         "basic_pairs": sorted(view.products.disparity),
     }

@@ -14,8 +14,8 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any
 
+from rille.datasets.text.count import count
 from rille.pipeline.engine import events
-from rille.pipeline.engine.plain import count
 from rille.pipeline.runs import lookup
 
 FACTOR, START = 1.15, 5.0

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rille.datasets.protocol import Positions, Rows
 from rille.pipeline.runs.synchrony import best_shift
 from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.scale import alike
 from rille.stages.imaging.image_quality import FEW_BITS, Look
 
 Floats = NDArray[np.float64]
@@ -105,7 +106,7 @@ def judge_rig(rig: Rig) -> Finding:
         return doubt("RIL-641", words, "rig", remedy="is the baseline in metres?")
     # In pixels and in image widths: one lens before sensors of unlike pixels, or of unlike width, is no mistake.
     ratios = rig.right.fx / f, rig.right.fx / f * rig.left.width / rig.right.width
-    if all(max(ratio, 1 / ratio) > 1.2 for ratio in ratios):
+    if not any(map(alike, ratios)):
         return doubt(
             "RIL-642", f"{words}; the right camera's is {rig.right.fx:g} px", "rig", remedy="two different lenses?"
         )

@@ -18,6 +18,7 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.validity import matched
+from rille.stages.geometry.scale import other_size
 from rille.stages.hfvm.coarse_to_fine import hierarchy, start
 from rille.stages.hfvm.coarse_to_fine.hierarchy import Prepared, State
 from rille.stages.hfvm.finish import refine
@@ -41,9 +42,6 @@ hands it out again; else each array of a match comes as fresh pages, and those c
 FEW = 0.45
 """Share of consistent pixels below which the images may be turned: chance alone makes up to .23 of them so, with preset
 ``accurate``, which smooths more, up to .40."""
-
-UNLIKE = 1.3
-"""Ratio of the images' widths or heights from which on they may show things so unlike in size that none matches."""
 
 MANY, AGAIN = 0.85, 2
 """Share of consistent pixels from which on no other brightness is tried, and how often matches correct it."""
@@ -121,17 +119,13 @@ def coarse(left: View, right: View, params: HfvmParams, side: int | None, prior:
     if not params.turned or prior is not None:
         return found
     # A plane may also be fitted to the few matches that chance makes.
-    if share(found.state) > FEW and (h is not None or not _unlike(left.shapes[0], right.shapes[0])):
+    if share(found.state) > FEW and (h is not None or not other_size(left.shapes[0], right.shapes[0])):
         return found
     h = viewpoint.find(left, right)
     if h is None:
         return found
     turned = _along(left, right, params, side, h)
     return replace(turned, ratio=ratio) if share(turned.state) > share(found.state) else found
-
-
-def _unlike(a: Shape, b: Shape) -> bool:
-    return any(max(m, n) > UNLIKE * min(m, n) for m, n in zip(a, b, strict=True))
 
 
 def _levelled(left: View, right: View, params: HfvmParams, side: int | None) -> tuple[Prepared, State, Floats | None]:

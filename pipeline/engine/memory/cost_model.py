@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter
 
-from rille.pipeline.engine.plain import count
+from rille.datasets.text.count import count
 from rille.pipeline.engine.runtime.hints import read_hint, write_hint
 from rille.pipeline.engine.spec import Spec, each
 
@@ -36,7 +36,7 @@ EACH_RUN = 16
 GROUPS = 6
 """Sets of parameters remembered of a stage."""
 
-LIKE = 1.25
+SIMILAR = 1.25
 """Tasks are of like size if their inputs differ by no more than this factor."""
 
 SPREAD = 0.1
@@ -179,7 +179,7 @@ def tells_more(kind: Hashable, size: float) -> bool:
     It is unless :data:`MEASURED` tasks of its kind, a stage with its parameters, had inputs of like size or greater.
     """
     known = _sizes.setdefault(kind, [])
-    if len(known) == MEASURED and size <= LIKE * known[0]:
+    if len(known) == MEASURED and size <= SIMILAR * known[0]:
         return False
     known[:] = sorted([*known, size])[-MEASURED:]
     return True
@@ -204,7 +204,7 @@ def _joined(groups: list[Group]) -> Group | None:
 def _at(samples: list[tuple[float, float]], size: float) -> tuple[float, float]:
     """Value at a size, and its relative uncertainty, of samples ``(size, value)``."""
     # Like sizes first: cost is seldom a straight line over a wide range of sizes.
-    near = [y for x, y in samples if x == size or (x and size and 1 / LIKE <= x / size <= LIKE)]
+    near = [y for x, y in samples if x == size or (x and size and 1 / SIMILAR <= x / size <= SIMILAR)]
     if near:
         middle = median(near)
         off = max(abs(y - middle) for y in near) / middle if middle else 0.0

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.scale import of_rig
 from rille.stages.geometry.surface import Surface
 from rille.stages.terrain.locus.kernel import BlockCells, Observed, PairCameras, search
 
 COARSE = 8  # cells a coarse cell is wide: a 64th of the cells search the whole range
 BLOCK_ROWS = 32  # rows of cells in one kernel call, so that a large surface stays small in memory
-LIKE = 1.2  # ratio of focal lengths up to which cameras are alike: it adds a fifth of a pixel to a jump at most
 ONE_SIDED = 2.0  # matched one way alone: errors of such cells are two to three times as large
 
 
@@ -82,9 +82,7 @@ class PairArrays:
         disparity[~given.usable] = np.nan
         std = np.full(shape, sigma) if given.std is None else given.std
         grey, std = (np.ascontiguousarray(a, np.float32) for a in (maps[2], std))
-        scale = np.array([rig.right.fx / rig.left.fx, rig.right.fy / rig.left.fy])
-        scale[np.maximum(scale, 1.0 / scale) <= LIKE] = 1.0
-        self.seen = Observed(disparity.ravel(), std, grey, np.array(limits), scale)
+        self.seen = Observed(disparity.ravel(), std, grey, np.array(limits), of_rig(rig))
         epipole = rig.right.matrix @ rig.T_right_left.translation
         sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)
         self.cameras = PairCameras(*projections(rig, T_surface_left), epipole, sizes)

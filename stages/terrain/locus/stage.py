@@ -27,12 +27,13 @@ from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.core.validity import matched
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.scale import coarser_focal
 from rille.stages.geometry.surface import Surface, plane
 from rille.stages.terrain.ground import view_ground
 from rille.stages.terrain.ground_frame import z_range as plane_z_range
 from rille.stages.terrain.locus.empty import explain
 from rille.stages.terrain.locus.refinement import refine, standard_deviation
-from rille.stages.terrain.locus.solve import LIKE, Dem, Matches, PairArrays, join, projections, solve
+from rille.stages.terrain.locus.solve import Dem, Matches, PairArrays, join, projections, solve
 from rille.stages.terrain.locus.uncertainty import from_both
 from rille.stages.terrain.locus.views import Views, views
 
@@ -295,7 +296,7 @@ def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
         "pair": args["pair"],
         "z_range": z_range,
         "T_frame_left": T.to_list(),
-        "pixel_rad": _pixel(rig),
+        "pixel_rad": 1.0 / coarser_focal(rig),
         "defined": float(np.mean(np.isfinite(dem.elevation))),
         "median_residual": _median(dem.residual),
         "median_elevation_std": _median(dem.elevation_std),
@@ -303,11 +304,6 @@ def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     if args["frame"] == "world" and "covariance" in inputs["trajectory"].arrays:
         meta["pose_covariance"] = np.asarray(inputs["trajectory"]["covariance"])[int(args["row"])].ravel().tolist()
     return Bundle(vars(dem), meta)
-
-
-def _pixel(rig: Rig) -> float:
-    """Angle of a pixel, rad: of the right camera where its pixels are the coarser ones, which hide what is smaller."""
-    return 1.0 / (rig.left.fx if LIKE * rig.right.fx >= rig.left.fx else rig.right.fx)
 
 
 def usable(validity: ArrayLike, backmatch_error: ArrayLike, params: LocusParams) -> Bools:

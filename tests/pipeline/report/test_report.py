@@ -465,7 +465,14 @@ def test_both_cameras_are_told_where_they_differ(tmp_path: Path) -> None:
     given = view()
     small = Camera(30.0, 30.0, 15.5, 11.5, 32, 24)
     rig = replace(given.sequence.rig, right=small)
-    _, page_, _, _ = written(tmp_path, replace(given, sequence=replace(given.sequence, rig=rig)))
+    facts, page_, _, _ = written(tmp_path, replace(given, sequence=replace(given.sequence, rig=rig)))
+    told = facts["sequence"]
+    assert (told["image_width_px"], told["image_height_px"], told["focal_length_px"]) == (64, 48, 60.0)
+    assert [told[f"right_{name}"] for name in ("image_width_px", "image_height_px", "focal_length_px")] == [
+        32,
+        24,
+        30.0,
+    ]
     assert page_.text.count("images of 64 × 48 pixels (right: 32 × 24 pixels)") == 2
     assert "focal length 60 px (right: 30 px)" in page_.text
 

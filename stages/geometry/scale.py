@@ -1,0 +1,43 @@
+"""Scale of the right image of a pair against the left one: how many of its pixels one of the left image stands for.
+
+Two cameras may have pixels or lenses of unlike size; so may the images that are given, without any calibration.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rille.stages.core.arrays import Floats
+from rille.stages.geometry.geometry import Rig
+
+ALIKE = 1.2
+"""Scale up to which two cameras, or a slanted view, count as alike: it adds a fifth of a pixel to an error at most."""
+
+OTHER_SIZE = 1.3
+"""Ratio of the images' widths or heights from which on they may show things so unlike in size that none matches."""
+
+
+def alike(scale: float) -> bool:
+    """Whether a scale, of either image against the other, is none to speak of."""
+    return max(scale, 1.0 / scale) <= ALIKE
+
+
+def counted(scale: float) -> float:
+    """The scale to count with: 1 where the images are alike."""
+    return 1.0 if alike(scale) else scale
+
+
+def of_rig(rig: Rig) -> Floats:
+    """Scale (2,) along columns and rows by the focal lengths; 1 where they are alike."""
+    return np.array([counted(rig.right.fx / rig.left.fx), counted(rig.right.fy / rig.left.fy)])
+
+
+def coarser_focal(rig: Rig) -> float:
+    """Focal length along columns, pixels, of the camera whose pixels are the coarser ones, which hide what is smaller;
+    the left one's where they are alike."""
+    return rig.left.fx if of_rig(rig)[0] >= 1.0 else rig.right.fx
+
+
+def other_size(a: tuple[int, ...], b: tuple[int, ...]) -> bool:
+    """Whether images of two shapes may show things in unlike size, with no calibration to tell."""
+    return any(max(m, n) > OTHER_SIZE * min(m, n) for m, n in zip(a, b, strict=True))
