@@ -22,9 +22,11 @@ from rille.datasets.cameras import CalibratedCamera, opencv, rig_of
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.images import bag
 from rille.datasets.images.files import Digests, check_size
+from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import side_of
 from rille.datasets.imu import ImuRecord, Inertial, at_frames
 from rille.datasets.kitti import CAR, STREET
+from rille.datasets.manifest.rig import unusual_cameras
 from rille.datasets.poses import TimedPoses, interpolate
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.text.names import derived_name
@@ -92,7 +94,9 @@ def open_bag(path: Path, topics: str | None = None) -> Sequence:
         times, more = seconds(stamps, str(path), unit="ns")
         frame = taken["left"][stamps[0]].frame
         inertial, odometry, unused = _movement(reader, path, times, frame, cameras[0][1])
-    rig, lenses = rig_of(cameras[0][0], cameras[1][0], (left[:2], right[:2]))
+    pair, sizes = (cameras[0][0], cameras[1][0]), sizes_of((left, right))
+    rig, lenses = rig_of(*pair, sizes)
+    lines = unusual_cameras(pair, sizes)
 
     def image(number: int, camera: str) -> Source:
         one = taken[camera][stamps[number]]
@@ -116,7 +120,7 @@ def open_bag(path: Path, topics: str | None = None) -> Sequence:
         odometry=odometry,
         defaults=STREET if rig.baseline >= CAR else {},
         notes=inertial.notes,
-        warnings=(*warnings, *more, *unused, *inertial.warnings),
+        warnings=(*warnings, *more, *lines, *unused, *inertial.warnings),
     )
 
 

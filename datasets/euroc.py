@@ -21,6 +21,7 @@ from rille.datasets.images import files
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import ImagePair, common_headers
 from rille.datasets.imu import Inertial, at_frames, read_imu
+from rille.datasets.manifest.rig import unusual_cameras
 from rille.datasets.poses import coverage, interpolate, read_poses
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.text.names import derived_name
@@ -137,7 +138,7 @@ def open_euroc(layout: EurocLayout, digests: files.Digests) -> Sequence:
         attitude=inertial.attitude if any(inertial.attitude) else None,
         defaults=ROOM,
         notes=inertial.notes,
-        warnings=frames.warnings + known.warnings,
+        warnings=(*frames.warnings, *unusual_cameras(cameras.values(), sizes_of(headers)), *known.warnings),
     )
 
 

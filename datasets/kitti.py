@@ -19,9 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.cameras.kitti import decompose
+from rille.datasets.cameras.pair import check_focal
 from rille.datasets.images import files
+from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import ends, natural
-from rille.datasets.manifest.rig import LONGEST_BASELINE, off_centre
+from rille.datasets.manifest.rig import LONGEST_BASELINE, unusual
 from rille.datasets.poses import rounded_pose
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.text.names import derived_name
@@ -200,6 +202,7 @@ def read_rig(layout: KittiLayout, sizes: Sizes) -> tuple[Rig, RigidTransform]:
         k, T_camera_reference = decompose(projection, name)
         fx, fy, cx, cy = (float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
         cameras.append(Camera(fx, fy, cx, cy, *size))
+        check_focal(cameras[-1], name)
         poses.append(T_camera_reference)
     T_right_left = poses[1] @ poses[0].inverse()
     rig = Rig(cameras[0], cameras[1], T_right_left)
@@ -329,7 +332,7 @@ def open_kitti(layout: KittiLayout, digests: files.Digests) -> Sequence:
     listing = list_pairs(layout)
     paths = listing.paths
     headers = {camera: files.common_header(list(paths[camera].values())) for camera in CAMERAS}
-    rig, T_reference_left = read_rig(layout, (headers["left"][:2], headers["right"][:2]))
+    rig, T_reference_left = read_rig(layout, sizes_of((headers["left"], headers["right"])))
     truth: tuple[RigidTransform | None, ...] | None = None
     times: tuple[float, ...] | None = None
     warnings: tuple[str, ...] = ()
@@ -357,5 +360,5 @@ def open_kitti(layout: KittiLayout, digests: files.Digests) -> Sequence:
         truth_source=f"poses of {layout.poses.name}, as recorded" if layout.poses is not None else "",
         lost=listing.lost,
         defaults=STREET if rig.baseline >= CAR else {},
-        warnings=(*warnings, *off_centre(rig.left, "left"), *off_centre(rig.right, "right")),
+        warnings=(*warnings, *unusual(rig.left, "left"), *unusual(rig.right, "right")),
     )

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.stages.core.errors import InputError
-from rille.stages.geometry.geometry import Rig, Sizes
+from rille.stages.geometry.geometry import Camera, Rig, Sizes
 from rille.stages.geometry.lens import Lens
 
 LEAST_BASELINE = 1e-6
@@ -14,6 +14,27 @@ LEAST_BASELINE = 1e-6
 
 SIDEWAYS = 0.5
 """Share of the baseline along the left camera's columns from which it has a side (a vertical rig has none)."""
+
+
+SHORTEST, LONGEST = 0.005, 1000.0
+"""Shares of an image's side between which a focal length is one: the angle of view is 179 or 0.06 degrees."""
+
+
+def check_focal(camera: Camera, name: str) -> None:
+    """Refuse a focal length that no lens has before images of this size.
+
+    Raises
+    ------
+    InputError
+        It is one.
+    """
+    for f, what, side in ((camera.fx, "fx", camera.width), (camera.fy, "fy", camera.height)):
+        if not SHORTEST <= f / side <= LONGEST:
+            raise InputError(
+                "RIL-987",
+                f"camera {name}: {what} = {f:g} px cannot be that of images of {camera.width} x {camera.height} pixels",
+                remedy="give fx and fy in pixels",
+            )
 
 
 def rig_of(
@@ -35,7 +56,8 @@ def rig_of(
     Raises
     ------
     InputError
-        The image size or the relative pose is not known, the cameras stand in one place, or are swapped.
+        The image size or the relative pose is not known, a focal length cannot be, the cameras stand in one place, or
+        are swapped.
     """
     of_left, of_right = sizes or (None, None)
     lenses = {"left": _sized(left, of_left), "right": _sized(right, of_right)}
@@ -82,5 +104,6 @@ def _sized(camera: CalibratedCamera, size: tuple[int, int] | None) -> Lens:
             remedy="give the size of the images",
         )
     width, height = camera.size or size or (0, 0)
-    lens = camera.lens
-    return replace(lens, camera=replace(lens.camera, width=width, height=height))
+    lens = replace(camera.lens, camera=replace(camera.lens.camera, width=width, height=height))
+    check_focal(lens.camera, camera.name)
+    return lens

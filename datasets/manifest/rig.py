@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -72,10 +73,7 @@ def read_optics(manifest: Manifest, root: Path, name: str, sizes: Sizes) -> Opti
     except InputError as error:
         raise error.at(name) from error
     lines += _check_baseline(rig.baseline, manifest.rig, name)
-    # Of the images' size, which a calibration need not state.
-    for camera, side, size in zip((left, right), ("left", "right"), sizes, strict=True):
-        lines += _unusual(replace(camera.lens.camera, width=size[0], height=size[1]), side)
-    return Optics(rig, lenses, up, tuple(lines))
+    return Optics(rig, lenses, up, (*lines, *unusual_cameras((left, right), sizes)))
 
 
 def _cameras(section: Cameras, root: Path, name: str, sizes: Sizes) -> tuple[CalibratedCamera, ...]:
@@ -262,7 +260,14 @@ def off_centre(camera: Camera, side: str) -> list[str]:
     return [warning("RIL-689", f"{side} camera: principal point {place}{hint}")]
 
 
-def _unusual(camera: Camera, side: str) -> list[str]:
+def unusual_cameras(cameras: Iterable[CalibratedCamera], sizes: Sizes) -> tuple[str, ...]:
+    """Lines on a left and a right camera that are possible but strange, given images of these sizes."""
+    # A calibration need not state the size.
+    given = [replace(c.lens.camera, width=w, height=h) for c, (w, h) in zip(cameras, sizes, strict=True)]
+    return *unusual(given[0], "left"), *unusual(given[1], "right")
+
+
+def unusual(camera: Camera, side: str) -> list[str]:
     """Lines on a camera that is possible but strange."""
     lines = []
     view = math.degrees(2 * math.atan(camera.width / 2 / camera.fx))

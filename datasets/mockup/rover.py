@@ -56,7 +56,9 @@ class RoverParams(Params):
     )
     speed: float = Field(0.05, gt=0, description="driving speed [m/s]; with it, bumps become accelerations")
     odometry_sigma: float = Field(
-        0.01, ge=0, description="relative standard deviation of the distance that the wheels report"
+        0.01,
+        ge=0,
+        description="relative standard deviation of the distances and turns that the wheels report, as of their radius",
     )
     attitude_sigma_deg: float = Field(
         0.2, ge=0, description="standard deviation of the inclinometer's error about each axis [degrees]"

@@ -36,7 +36,8 @@ def verify(
 
     sound, damaged = maintenance.verify(Store(_there(cache)), deep=deep)
     for found in damaged:
-        print(f"rille: {found.label or found.key[:12]} ({found.stage}): {found.reason}; set aside", file=sys.stderr)
+        where = "set aside" if found.aside else "it stays, for the cache cannot be written"
+        print(f"rille: {found.label or found.key[:12]} ({found.stage}): {found.reason}; {where}", file=sys.stderr)
     print(f"{sound} artifacts are sound, {len(damaged)} damaged")
     return FAILED if damaged else COMPLETE
 

@@ -20,12 +20,15 @@ from numpy.typing import NDArray
 from rille.datasets.images import chessboard, pairing
 from rille.datasets.images.files import read_grey
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE
+from rille.pipeline.commands.options import COMPLETE, check_output
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig
 from rille.stages.core.errors import InputError, told
 from rille.stages.geometry.geometry import Sizes
+
+ENDINGS = (".yaml", ".yml")
+"""Of the name of a rig's file, where it has one."""
 
 LEAST_COVER = 0.5
 """Share of an image that all corners together should span: beyond them, distortion is extrapolated."""
@@ -80,12 +83,13 @@ def calibrate(
     Raises
     ------
     ConfigError
-        An option is not permitted; ``square`` is no length in metres.
+        An option is not permitted, ``output`` names another kind of file; ``square`` is no length in metres.
     InputError
         Images are missing, unpaired or show no board, or the sides are swapped.
     DegenerateError
         The views do not determine the rig.
     """
+    check_output(output, *(ENDINGS if output.suffix else ()))
     given = None if corners is None else chessboard.parse_corners(corners)
     chessboard.board_points((3, 3), square)  # a wrong unit is told before minutes of detection
     boards = find_boards(pairing.pair_up(*_files(left, right)), given)

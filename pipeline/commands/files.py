@@ -192,9 +192,8 @@ def export(
     from rille.pipeline.runs import lookup
 
     folder = lookup.find(run, runs)
-    with lookup.reading(folder):
-        for kind in to:
-            print(_export(folder, kind, output, cache))
+    for kind in to:
+        print(_export(folder, kind, output, cache))
     return COMPLETE
 
 
@@ -202,9 +201,11 @@ def _export(run: Path, kind: Form, output: Path | None, cache: str | None) -> st
     """Write one form; what was written, in words."""
     if kind in ("colmap", "nav2", "grid_map"):
         from rille.pipeline.engine.store.base import Store
+        from rille.pipeline.runs import lookup
 
-        write = import_module(f"rille.pipeline.export.programs.{kind}").export_run
-        return str(write(run, output or run / kind, Store(cache_folder(cache))))
+        write, store = import_module(f"rille.pipeline.export.programs.{kind}").export_run, Store(cache_folder(cache))
+        with lookup.reading(run):
+            return str(write(run, output or run / kind, store))
     from rille.pipeline.export.programs import point_cloud
 
     if output is not None:
@@ -230,7 +231,8 @@ def compare_dem(
     Parameters
     ----------
     a
-        GeoTIFF, zarr group with elevation, x and y, or a run: its folder or name (mockup, latest).
+        GeoTIFF, ESRI ASCII grid (.asc), zarr group with elevation, x and y, or a run: its folder or name (mockup,
+        latest).
     b
         Reference, likewise.
     align

@@ -189,8 +189,12 @@ def matcher_params(preset: str | None, assignments: tuple[str, ...]) -> Any:
             "RIL-046", f"--set {other}: match has the section hfvm only", remedy="write --set hfvm.key=value"
         )
     values: dict[str, Any] = dict(nested.get("hfvm", {}))
-    if preset is not None:
-        values["preset"] = preset
+    if preset is not None and values.setdefault("preset", preset) != preset:
+        raise ConfigError(
+            "RIL-986",
+            f"--preset {preset} and --set hfvm.preset={values['preset']} contradict each other",
+            remedy="leave one of them out",
+        )
     return configuration.validate(configuration.stage("hfvm").params, values, ("hfvm",))
 
 

@@ -60,7 +60,7 @@ class Handle:
     ``status`` is ``pending``, ``running``, ``computed``, ``cached``, ``failed``, ``skipped`` or, when dry, ``planned``.
     ``reason`` says in words why it was not found in the cache, or why it was skipped. ``earlier``, of a planned node,
     is what the same label led to before: a plan takes its facts for what is to come. ``expect`` are bytes (decoded)
-    that it reads from outside. ``took``: of a computed node, what that took.
+    that it works on and no input has, as what it reads from outside. ``took``: of a computed node, what that took.
     """
 
     index: int
@@ -146,8 +146,8 @@ class Graph:
         """Add a task and give its handle.
 
         ``stage`` is the module that declares it, or its dotted name. ``inputs`` maps each port of the stage to a
-        handle, or to a list of them for a port declared ``name*``; ``expect`` are decoded bytes of what it reads from
-        outside, for estimates.
+        handle, or to a list of them for a port declared ``name*``; ``expect`` are decoded bytes that it works on and no
+        input has, as what it reads from outside, for estimates.
 
         Raises
         ------

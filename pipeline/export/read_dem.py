@@ -1,4 +1,4 @@
-"""Elevation models read back: from a GeoTIFF, from a run's folder, or from a zarr group of Rille."""
+"""Elevation models read back: from a GeoTIFF or ESRI ASCII grid, a run's folder, or a zarr group of Rille."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from rille.datasets.text.warning import warning
+from rille.pipeline.export.foreign_raster import driver_of, open_raster, place_of
 from rille.stages.core.errors import InputError
 
 MOST_CELLS = 500_000_000
@@ -58,8 +59,9 @@ def read_elevation(path: Path) -> DemFile:
 
     Parameters
     ----------
-    path : GeoTIFF (its first band), folder of a run (its ``dem.tif``, with the cameras of ``trajectory.kitti``), or
-        zarr group with ``elevation`` and its coordinates ``x`` and ``y`` (``terrain.zarr`` of a run, an artifact).
+    path : GeoTIFF (its first band) or ESRI ASCII grid (``.asc``), folder of a run (its ``dem.tif``, with the cameras
+        of ``trajectory.kitti``), or zarr group with ``elevation`` and its coordinates ``x`` and ``y``
+        (``terrain.zarr`` of a run, an artifact).
 
     Raises
     ------
@@ -68,14 +70,16 @@ def read_elevation(path: Path) -> DemFile:
     """
     if not path.exists():
         raise InputError(
-            "RIL-627", f"{path} does not exist", remedy="give a GeoTIFF, the folder of a run, or a zarr group"
+            "RIL-627",
+            f"{path} does not exist",
+            remedy="give a GeoTIFF or ESRI ASCII grid, the folder of a run, or a zarr group",
         )
     if any((path / name).is_file() for name in ("zarr.json", ".zgroup")):
         found = _of_zarr(path)
     elif path.is_dir():
         found = _of_run(path)
     else:
-        found = read_tiff(path)
+        found = read_raster(path)
     if not np.isfinite(found.values).any():
         raise InputError(
             "RIL-628", f"{path} has no known cell among {found.values.size}", remedy="give another elevation model"
@@ -83,40 +87,34 @@ def read_elevation(path: Path) -> DemFile:
     return found
 
 
-def read_tiff(path: Path, *, length: bool = True) -> DemFile:
-    """First band of a GeoTIFF; ``length``: it holds metres.
+def read_raster(path: Path, *, length: bool = True) -> DemFile:
+    """First band of a GeoTIFF, or an ESRI ASCII grid; ``length``: it holds metres.
 
     Raises
     ------
     InputError
         It cannot be read, has no geotransform, or has another unit.
     """
-    import warnings
-
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+    from rasterio.errors import RasterioError
 
     try:
-        with warnings.catch_warnings():
-            # Refused below, in a line of our own.
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path, driver="GTiff") as file:  # other drivers open other files, by name or address
-                _check_cells(path, file.height, file.width)
-                # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
-                values = (
-                    file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
-                )
-                crs, transform, unit = file.crs, file.transform, file.units[0]
+        with open_raster(path, driver_of(path)) as file:
+            _check_cells(path, file.height, file.width)
+            # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
+            values = file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
+            crs, transform, unit = file.crs, place_of(file, path), file.units[0]
     except RasterioError as error:
-        raise InputError("RIL-629", f"{path} cannot be read as a raster ({error})", remedy="give a GeoTIFF") from error
-    # GDAL gives the identity where a file states no geotransform.
+        raise InputError(
+            "RIL-629", f"{path} cannot be read as a raster ({error})", remedy="give a GeoTIFF, or an ESRI ASCII grid"
+        ) from error
     if transform == Affine.identity():
         raise InputError("RIL-630", f"{path} has no geotransform", remedy="give a raster that says where its cells are")
     # Lengths of the cell's sides, not a and e: a raster may be turned.
-    if not np.isclose(np.hypot(transform.a, transform.d), np.hypot(transform.b, transform.e), rtol=1e-6):
+    across, down = np.hypot(transform.a, transform.d), np.hypot(transform.b, transform.e)
+    if not (0.0 < abs(transform.determinant) < math.inf and np.isclose(across, down, rtol=1e-6, atol=0.0)):
         raise InputError(
             "RIL-631",
-            f"{path} has cells of {np.hypot(transform.a, transform.d):g} x {np.hypot(transform.b, transform.e):g}",
+            f"{path} has cells of {across:g} x {down:g}",
             remedy="resample it to square cells, e.g. with gdalwarp -tr",
         )
     doubts = []
@@ -160,7 +158,7 @@ def _of_run(path: Path) -> DemFile:
             f"{path} has no dem.tif",
             remedy="give the folder of a finished run, RUNS/sequence/latest, or a GeoTIFF",
         )
-    return replace(read_tiff(path / "dem.tif"), name=str(path), viewpoints=_cameras(path))
+    return replace(read_raster(path / "dem.tif"), name=str(path), viewpoints=_cameras(path))
 
 
 def _cameras(run: Path) -> NDArray[np.float64] | None:

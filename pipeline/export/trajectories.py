@@ -61,7 +61,9 @@ def _write_agreement(path: Path, view: Any) -> None:
     compared, trajectory = compare(view), view.bundle(view.products.trajectory)
     assert compared is not None
     names = [view.sequence.frame_names[f] for f in view.frames]
-    columns: dict[str, list[Any]] = {"frame": list(view.frames), "name": names, "time_s": stamps(view)}
+    columns: dict[str, list[Any]] = {"frame": list(view.frames), "name": names}
+    if view.sequence.times is not None:
+        columns["time_s"] = stamps(view)
     if trajectory is not None:
         positions = world_poses(trajectory)[:, :, 3]
         columns |= {f"{a}_m": positions[:, k].tolist() for k, a in enumerate("xyz")}
@@ -128,9 +130,9 @@ OUTPUTS = (
         (*WHEN, "sequence.frame_names"),
         "world",
         {
-            "columns": "frame number, name, time; positions of both trajectories; disagreement of pose and of the "
-            "motion since the frame before; flagged 0 or 1, and for what; distance of either from the truth, where "
-            "there is truth",
+            "columns": "frame number, name, time where the sequence has a clock; positions of both trajectories; "
+            "disagreement of pose and of the motion since the frame before; flagged 0 or 1, and for what; distance of "
+            "either from the truth, where there is truth",
             "units": "s, m, deg as the column's name ends",
             "missing": "empty",
         },

@@ -24,6 +24,7 @@ from rille.datasets.images.files import MOST_BYTES
 from rille.datasets.text.reading import open_regular
 from rille.pipeline.engine.plain import plain
 from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.export.foreign_raster import open_raster
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.lattice import Lattice
 
@@ -357,29 +358,24 @@ def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.
     InputError
         The file cannot be read, its two bands are not those, or it has another size.
     """
-    import warnings
-
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+    from rasterio.errors import RasterioError
 
     remedy = "give a TIFF with the bands column_disparity and row_disparity, as rille match writes"
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            # Pipes, devices and files that are too large are refused before GDAL opens them.
-            open_regular(path, "disparity", MOST_BYTES).close()
-            with rasterio.open(path, driver="GTiff") as file:  # other drivers open other files, by name
-                names = tuple(name for name in file.descriptions if name)
-                if file.count != 2 or names not in ((), ("column_disparity", "row_disparity")):
-                    found = ", ".join(names) or "without names"
-                    raise InputError("RIL-622", f"{path} has {file.count} bands ({found}), no disparity", remedy=remedy)
-                if shape and file.shape != shape:
-                    raise InputError(
-                        "RIL-044",
-                        f"{path} has {file.width} x {file.height} pixels, the left image {shape[1]} x {shape[0]}",
-                        remedy="give a disparity of this left image",
-                    )
-                column, row = file.read(out_dtype="float32", masked=True).filled(np.nan)
+        # Pipes, devices and files that are too large are refused before GDAL opens them.
+        open_regular(path, "disparity", MOST_BYTES).close()
+        with open_raster(path) as file:
+            names = tuple(name for name in file.descriptions if name)
+            if file.count != 2 or names not in ((), ("column_disparity", "row_disparity")):
+                found = ", ".join(names) or "without names"
+                raise InputError("RIL-622", f"{path} has {file.count} bands ({found}), no disparity", remedy=remedy)
+            if shape and file.shape != shape:
+                raise InputError(
+                    "RIL-044",
+                    f"{path} has {file.width} x {file.height} pixels, the left image {shape[1]} x {shape[0]}",
+                    remedy="give a disparity of this left image",
+                )
+            column, row = file.read(out_dtype="float32", masked=True).filled(np.nan)
     except RasterioError as error:
         raise InputError("RIL-623", f"{path} cannot be read as a TIFF ({error})", remedy=remedy) from error
     return np.ascontiguousarray(column), np.ascontiguousarray(row)

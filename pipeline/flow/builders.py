@@ -5,6 +5,7 @@ Reconstruction, closed loop and check are made of these.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass
@@ -37,6 +38,10 @@ T = TypeVar("T")
 
 NO_PARAMS = NoParams()
 """One object for all tasks without parameters: its canonical form is then made once."""
+
+
+PYRAMID_BYTES = 20 / 3
+"""Bytes of a pyramid for each pixel of its image: grey and mask, a third more for the levels above."""
 
 
 @dataclass(frozen=True)
@@ -205,7 +210,9 @@ class Builder:
         first, second = ((cameras[name].height, cameras[name].width) for name in (camera, other))
         side = tiles.side(self.config.tiling, self.config.hfvm, self.config.pyramid, (first, second))
         if side is None:
-            return self.node(hfvm, label, {"pair": pair}, **ports)
+            # A smaller right image may be aligned to the left one, and is then as large.
+            more = PYRAMID_BYTES * max(math.prod(first) - math.prod(second), 0)
+            return self.graph.node(hfvm, label, self.config.hfvm, {"pair": pair}, {}, ports, more)
         given = self.config.hfvm, self.config.pyramid, ports, (first, second), side
         return tiles.Tiles(self.graph, *given, label).build()
 

@@ -31,7 +31,8 @@ def name(run: Path) -> str:
 def reading(*runs: Path) -> Iterator[None]:
     """Say in one line that files of these runs are not as Rille writes them, whatever they hold instead.
 
-    A run's folder may come from others, and be damaged or edited on the way.
+    A run's folder may come from others, and be damaged or edited on the way. Nothing else belongs within: a fault of
+    the program's own would be told as one of the files.
 
     Raises
     ------
@@ -47,7 +48,8 @@ def reading(*runs: Path) -> Iterator[None]:
         raise ConfigError(
             "RIL-980",
             f"files of run {which} are not as Rille writes them ({what})",
-            remedy="run the same command again, or remove its folder",
+            remedy="run the same command again, or remove its folder; if it is your own and whole, this is a fault of "
+            "Rille, and --debug shows where",
         ) from error
 
 

@@ -26,6 +26,7 @@ import numpy as np
 from pydantic import Field
 
 from rille.stages.calibration.relative_orientation import (
+    PARTNERS,
     RIG,
     Linear,
     OrientationFit,
@@ -106,7 +107,7 @@ class RelativeParams(Params):
         return Priors(
             math.radians(self.prior_rotation_deg),
             math.radians(self.prior_baseline_deg),
-            self.prior_principal * rig.right.fx,
+            (self.prior_principal * rig.right.fx, self.prior_principal * rig.right.fy),
             self.systematic,
         )
 
@@ -269,8 +270,9 @@ class _Chooser:
         found = f"{math.degrees(value):+.3f} +- {math.degrees(sigma):.3f} degrees"
         error = self._depth_error(i, chosen)
         if error > p.max_depth_error and not self._infinity(i, chosen):
+            off = self.priors.principal[dict(PARTNERS).get(i, 0)]
             return (
-                f"not observed: a principal point that is {self.priors.principal:.1f} px off looks like it, so that "
+                f"not observed: a principal point that is {off:.1f} px off looks like it, so that "
                 f"{100 * error:.1f} % of depth would stay unknown; taken alone the images ask for {found}, "
                 f"which is {100 * depth:.1f} % of depth"
             )

@@ -82,13 +82,13 @@ class Priors:
     ----------
     rotation : of each of the three angles between the cameras, radians.
     baseline : of the direction of the baseline, radians.
-    principal : of the principal point, pixels.
+    principal : of the principal point, column and row, pixels.
     systematic : least RMS of the smooth error, pixels.
     """
 
     rotation: float
     baseline: float
-    principal: float
+    principal: tuple[float, float]
     systematic: float
 
     def held(self) -> Floats:
@@ -237,9 +237,7 @@ def precision(free: Sequence[bool], priors: Priors, smooth: float, *, rival: boo
     ``rival``: a principal point that is off may stand in for a free angle, as it always may for a held one. With it,
     what is knowable shows; without it, the angle takes all (lenses stay on their cameras when a mount turns).
     """
-    sigma = np.concatenate(
-        [priors.held(), np.full(PRINCIPAL, priors.principal), np.full(len(TERMS), smooth)], dtype=np.float64
-    )
+    sigma = np.concatenate([priors.held(), priors.principal, np.full(len(TERMS), smooth)], dtype=np.float64)
     # Free means: anywhere within a radian, which keeps the matrix regular where a scene says nothing at all.
     sigma[:RIG] = np.where(np.asarray(free), 1.0, sigma[:RIG])
     for angle, coordinate in PARTNERS:

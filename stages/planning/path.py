@@ -23,8 +23,8 @@ An elevation model is fan-shaped and ragged: the first and last rows with a free
 nowhere. So a start that is not given is, of the free cells within one vehicle length of the first row that lead on,
 the one nearest to that row's middle; the target likewise at the last row. A path counts as found when it comes within
 one vehicle length of the last row. A mission's map, on which the vehicle stands nowhere in particular, may be cut by
-ground that it cannot cross: then the connected ground over most rows is crossed, in any direction, and the length left
-out is reported (``left_out_m``).
+ground that it cannot cross: then the connected ground over most rows (of that around the end that is given, if one is)
+is crossed, in any direction, and the length left out is reported (``left_out_m``).
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def find_path(
     maps : arrays (row, col) of stage ``risk``: ``risk``, ``reason``, ``elevation``; the others serve messages.
     heading : driving direction (dx, dy) in the frame of the lattice; start and target together override it.
     ends : start and target, x, y, metres; None: see the module. Those of ``params`` are not looked at.
-    stretch : with neither of them, cross the connected ground over most rows where no path leads over all of them.
+    stretch : with no target, cross the connected ground over most rows where no path leads over all of them.
 
     Raises
     ------
@@ -167,8 +167,8 @@ def _found(
 ) -> Route:
     if p.planner == "grid8":
         return _by_grid(maps, lattice, vehicle, ends, p, None)
-    found, (start, target) = _by_rows(maps, lattice, vehicle, heading, ends, p), ends
-    if p.planner == "rows" or len(found.cells) or (target is None and (start is not None or not stretch)):
+    found, target = _by_rows(maps, lattice, vehicle, heading, ends, p), ends[1]
+    if p.planner == "rows" or len(found.cells) or (target is None and not stretch):
         return found
     return _by_grid(maps, lattice, vehicle, ends, p, found)
 
@@ -219,8 +219,8 @@ def _by_grid(
     given = tuple(None if point is None else grid.index(point) for point in ends)
     nothing = np.empty((0, 2), dtype=np.int64)
     cells, cost, name = nothing, np.full(ground.height.shape, UNREACHED), GROUNDS[0]
-    # With free ends a stricter ground would always find some path, on however small a part.
-    for name in ground.by_worth() if given == (None, None) else GROUNDS:
+    # With a free end a stricter ground would always find some path, on however small a part.
+    for name in GROUNDS if None not in given else ground.by_worth(given[0] or given[1]):
         ways = ground.ways(name)
         first, last = _chosen(ground, name, *given)
         if first is None or last is None or not ways[first] or not ways[last]:

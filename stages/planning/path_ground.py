@@ -217,11 +217,16 @@ class PathMaps:
             self._parts[below] = grid8.parts(self.ways(below))
         return self._parts[below]
 
-    def by_worth(self) -> list[str]:
-        """Sort :data:`GROUNDS` by rows covered by connected ground, weighted by :data:`WORTH`; most first."""
+    def by_worth(self, at: tuple[int, int] | None = None) -> list[str]:
+        """Sort :data:`GROUNDS` by rows covered by connected ground, weighted by :data:`WORTH`; most first.
+
+        ``at``: a cell (row, col); that of the ground around it alone counts.
+        """
 
         def worth(name: str) -> float:
-            spans = self.parts(name)[1]
+            number, spans = self.parts(name)
+            if at is not None:
+                spans = spans[number[at] : number[at] + 1] if number[at] >= 0 else spans[:0]
             return WORTH[name] * int((spans[:, 1] - spans[:, 0]).max(initial=0))
 
         return sorted(GROUNDS, key=worth, reverse=True)

@@ -18,6 +18,7 @@ from numba import njit
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import Rig
+from rille.stages.geometry.scale import of_rig
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,8 @@ class GroundView:
     """View of a plane by a pair: sampled pixels that hit the plane where both cameras see it.
 
     ``xy`` (n, 2) metres, local frame; ``slant`` (n,) distance from the left camera, m; ``along``, ``across`` (n,)
-    size on the ground of one pixel, m per pixel; ``slope`` (n,) ds/dZ, pixels of disparity per metre of elevation.
+    size on the ground of one pixel, m per pixel, of the right camera where its pixels are the coarser ones; ``slope``
+    (n,) ds/dZ, pixels of disparity per metre of elevation.
     """
 
     xy: Floats
@@ -208,7 +210,8 @@ def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> Groun
             "the two cameras see no common ground",
             remedy="check the pitch, the left/right order and T_right_left",
         )
-    size = _singular_values(jacobian[good])
+    # By columns and rows of the left image, a pixel of which is a part of a coarser one of the right.
+    size = _singular_values(jacobian[good] / np.minimum(of_rig(rig), 1.0))
     return GroundView(here[good, :2], _length(here[good]), size[:, 0], size[:, 1], slope[good])
 
 

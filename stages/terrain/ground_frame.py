@@ -26,6 +26,7 @@ from rille.stages.core.validity import matched_back
 from rille.stages.geometry.epipolar import exchanged, fits, inverse_depth
 from rille.stages.geometry.geometry import Rig, RigidTransform, level_rotation
 from rille.stages.geometry.pose_arrays import NO_VERTICAL
+from rille.stages.geometry.scale import coarser_focal
 from rille.stages.terrain.ground import MIN_POINTS, GroundPlane, fit_plane, rounded_cell, view_ground
 
 Samples = tuple[Floats, Floats, Floats]
@@ -194,7 +195,7 @@ def _on_ground(
 def _cell_without_ground(rho: Floats, rig: Rig) -> float:
     """Cell size, m, by what is seen instead, inverse depths ``rho`` (n,): a pixel at twice the nearest distance."""
     near = 1.0 / float(np.quantile(rho, 1.0 - NEAREST)) if rho.size else UNSEEN * rig.baseline
-    return rounded_cell(2.0 * near / rig.left.fx)
+    return rounded_cell(2.0 * near / coarser_focal(rig))
 
 
 def z_range(plane: list[float], relief: list[float], extent: list[float]) -> list[float]:

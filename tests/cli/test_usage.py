@@ -89,6 +89,7 @@ WRONG = {
         ("other/left other/right --square -1", "RIL-152"),
         ("other/left other/right --square 0.1 --corners 9", "RIL-151"),
         ("other/left other/right --square 0.1 --model bent", "RIL-001"),
+        ("other/left other/right --square 0.1 -o rig.json", "RIL-871"),
     ],
     "match": [
         ("other/left/000000.png", "RIL-001"),
@@ -96,6 +97,7 @@ WRONG = {
         ("other/left/000000.png other/calib.txt", "RIL-171"),
         ("other/left/000000.png other/right/000000.png --preset best", "RIL-001"),
         ("other/left/000000.png other/right/000000.png --set locus.cell_size=1", "RIL-046"),
+        ("other/left/000000.png other/right/000000.png --preset fast --set hfvm.preset=paper", "RIL-986"),
     ],
     "export": [
         ("other", "RIL-001"),

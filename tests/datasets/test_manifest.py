@@ -427,7 +427,7 @@ def test_bad_patterns(tmp_path, line, expected):
     ("parts", "line"),
     [
         ({"rig": "[rig]\nbaseline = 5.4\n"}, r"baseline 5\.4 m is unusual \(0\.02 to 2 m is common\)"),
-        ({"cameras": "[cameras]\nfx = 0.004\ncx = 31.5\ncy = 23.5\n"}, r"fx = 0\.004 px gives an angle of view of 180"),
+        ({"cameras": "[cameras]\nfx = 1.2\ncx = 31.5\ncy = 23.5\n"}, r"fx = 1\.2 px gives an angle of view of 176"),
         (
             {"cameras": "[cameras]\nfx = 60.0\ncx = 315.0\ncy = 23.5\n"},
             r"principal point \(315, 23\.5\) px is far from",
@@ -439,6 +439,12 @@ def test_unusual_figures_are_warnings(tmp_path, parts, line):
     warnings = opened(write_sequence(tmp_path, **parts)).warnings
     assert any(re.search(line, w) for w in warnings)
     assert len(warnings) <= 2
+
+
+@pytest.mark.parametrize("fx", [0.004, 0.1, 1e9])
+def test_focal_lengths_that_no_lens_has_are_refused_when_the_manifest_is_read(tmp_path, fx):
+    with raises("RIL-987", "64 x 48"):
+        opened(write_sequence(tmp_path, cameras=f"[cameras]\nfx = {fx!r}\ncx = 31.5\ncy = 23.5\n"))
 
 
 def test_missing_manifest(tmp_path):

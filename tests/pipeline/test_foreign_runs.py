@@ -149,6 +149,20 @@ def test_from_python(run: Path, name: str, content: str, ask: Callable[[Any], An
         ask(open_run(run))
 
 
+def test_a_fault_of_the_program_is_not_told_as_one_of_the_run(run: Path, capsys: Any, monkeypatch: Any) -> None:
+    def broken(*_: Any) -> Any:
+        raise ValueError("own")
+
+    monkeypatch.setattr("rille.pipeline.export.programs.point_cloud.export", broken)
+    assert told(capsys, "export", "seq/2", "--to", "laz") == (1, ["RIL-999"])
+
+
+@pytest.mark.parametrize("kind", ["colmap", "nav2", "grid_map"])
+def test_an_export_of_a_run_whose_ledger_is_none(run: Path, kind: str, capsys: Any) -> None:
+    (run / "ledger.jsonl").write_text('{"label": "a"}\n')
+    assert told(capsys, "export", "seq/2", "--to", kind, "--cache", "cache") == (2, ["RIL-980"])
+
+
 def huge(folder: Path, axis: int) -> None:
     """A zarr group that claims a square of so many cells, and holds none."""
     group = zarr.create_group(store=str(folder), zarr_format=2)
@@ -191,6 +205,39 @@ def test_a_raster_that_names_other_files_is_not_followed(tmp_path: Path) -> None
     )
     with raises("RIL-629"):
         read_elevation(tmp_path / "dem.tif")
+    (tmp_path / "dem.tif").rename(tmp_path / "dem.asc")
+    with raises("RIL-629"):
+        read_elevation(tmp_path / "dem.asc")
+
+
+@pytest.mark.parametrize("name", ["dem.tif", "dem.asc"])
+def test_a_mask_beside_a_raster_is_not_followed_either(tmp_path: Path, name: str) -> None:
+    def write(path: Path, kind: str) -> None:
+        with rasterio.open(path, "w", "GTiff", 4, 4, 1, dtype=kind, transform=Affine(0.5, 0, 0, 0, -0.5, 0)) as file:
+            file.write(np.ones((1, 4, 4), kind))
+
+    write(tmp_path / "dem.tif", "float32")
+    write(tmp_path / "own.tif", "uint8")
+    with rasterio.open(tmp_path / "own.tif", "r+") as file:
+        file.write(np.zeros((1, 4, 4), np.uint8))
+    (tmp_path / "dem.asc").write_text("ncols 4\nnrows 4\nxllcorner 0\nyllcorner -2\ncellsize 0.5\n" + "1 1 1 1\n" * 4)
+    (tmp_path / f"{name}.msk").write_text(
+        '<VRTDataset rasterXSize="4" rasterYSize="4"><Metadata><MDI key="INTERNAL_MASK_FLAGS_1">0</MDI></Metadata>'
+        '<VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
+        f'<SourceFilename relativeToVRT="0">{tmp_path / "own.tif"}</SourceFilename>'
+        "</SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+    assert np.isfinite(read_elevation(tmp_path / name).values).all()
+
+
+def test_an_ascii_grid_that_claims_more_than_can_be_read(tmp_path: Path) -> None:
+    head = "ncols 60000\nnrows 60000\nxllcorner 0\nyllcorner 0\ncellsize 1\n"
+    (tmp_path / "dem.asc").write_text(f"{head}1 2 3\n")
+    with raises("RIL-981"):
+        read_elevation(tmp_path / "dem.asc")
+    (tmp_path / "dem.asc").write_text(head.replace("60000", "6"))
+    with raises("RIL-629"):
+        read_elevation(tmp_path / "dem.asc")
 
 
 @pytest.mark.parametrize("name", ["../outside", "a/../../outside", "{}/outside"])

@@ -25,13 +25,14 @@ set aside, counts as absent and is computed again.
 from __future__ import annotations
 
 import json
-import sys
 import uuid
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from rille.datasets.text.warning import warning
+from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.store.folder import Folder, StoreError
 from rille.pipeline.engine.store.index import Index
 from rille.pipeline.engine.store.lazy_arrays import LazyArrays
@@ -91,8 +92,8 @@ class Store:
         ``sequence`` names what runs over the same images, whatever their parameters.
         """
         if self.place.earlier():
-            remedy = "'rille cache gc' removes them"
-            print(f"rille: artifacts of an earlier format in {self.location} are not read: {remedy}", file=sys.stderr)
+            text = f"artifacts of an earlier format in {self.location} are not read: 'rille cache gc' removes them"
+            warn(warning("RIL-985", text))
         self.place.survey()
         self._index = Index(self.place, sequence)
 
@@ -179,8 +180,8 @@ class Store:
                 "RIL-572", f"artifact {ref.stage} {ref.key[:12]} has gone from {self.location}", remedy="run again"
             )
 
-        def damaged(reason: str) -> None:
-            self.set_aside(ref.stage, ref.key, manifest, reason)
+        def damaged(reason: str) -> bool:
+            return self.set_aside(ref.stage, ref.key, manifest, reason)
 
         def read(start: int, stop: int) -> bytes | None:
             return self.place.read(ref.path, start, stop)
@@ -231,8 +232,8 @@ class Store:
             "RIL-573", f"cannot publish {path} in {self.location}", remedy="remove that file and run again"
         )
 
-    def set_aside(self, stage: str, key: str, manifest: Manifest | None, reason: str) -> None:
-        """Move a damaged artifact out of the way. Best effort: a cache may be read-only.
+    def set_aside(self, stage: str, key: str, manifest: Manifest | None, reason: str) -> bool:
+        """Move a damaged artifact out of the way; False: it stays, for the cache may be read-only.
 
         Another run may have done so before, and have published a sound one meanwhile: that one stays.
         """
@@ -242,9 +243,12 @@ class Store:
                 found = self._read_manifest(stage, key)
                 # Compare attempts, not keys: a sound artifact of the same key may have replaced the damaged one.
                 if found is None or manifest is None or found["attempt"] != manifest["attempt"]:
-                    return
+                    return True
             self.place.move(path, f"{aside}.zarr.zip")
-            self.place.write(f"{aside}.txt", f"{reason}\n".encode())
+            with suppress(OSError, RilleError):
+                self.place.write(f"{aside}.txt", f"{reason}\n".encode())
+            return True
+        return False
 
 
 def _place(location: Location) -> Place:

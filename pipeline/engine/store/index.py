@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
 import time
 import zlib
 from collections.abc import Iterable, Mapping
 
+from rille.datasets.text.warning import warning
+from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.store.location import folder_of
 from rille.pipeline.engine.store.manifest import Facts, Ref, parsed
 from rille.pipeline.engine.store.place import Item, Place
@@ -50,7 +51,7 @@ class Index:
                 room -= _read(place, item, self.lines, room)
                 self._written[item.path] = item.modified
             except ValueError as error:
-                print(f"rille: {item.path} in the cache is passed over: {error}", file=sys.stderr)
+                warn(warning("RIL-984", f"{item.path} in the cache is passed over: {error}"))
 
     def get(self, stage: str, item: Item, key: str) -> Ref | None:
         """Return the reference to an artifact if its file is unchanged since it was entered, else None."""

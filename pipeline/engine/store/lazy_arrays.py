@@ -42,10 +42,13 @@ Read = Callable[[int, int], bytes | None]
 
 
 class LazyArrays(Mapping[str, AnyArray]):
-    """Arrays of an artifact, each read at its first access; ``damaged(reason)`` is called before the error."""
+    """Arrays of an artifact, each read at its first access.
+
+    ``damaged(reason)`` is called before the error, and says whether the artifact is out of the way.
+    """
 
     def __init__(
-        self, read: Read, manifest: Mapping[str, Any], damaged: Callable[[str], None], *, slow: bool = False
+        self, read: Read, manifest: Mapping[str, Any], damaged: Callable[[str], bool], *, slow: bool = False
     ) -> None:
         self._fetch = read
         self._manifest = manifest
@@ -79,7 +82,7 @@ class LazyArrays(Mapping[str, AnyArray]):
         Raises
         ------
         DamagedError
-            One of them is not as it was written; the artifact is set aside.
+            One of them is not as it was written; the artifact is set aside, if the cache can be written.
         """
         if name not in self:
             raise KeyError(f"{self._manifest['stage']} has no array {name!r}, only {', '.join(self) or 'metadata'}")
@@ -98,11 +101,12 @@ class LazyArrays(Mapping[str, AnyArray]):
             return np.asarray(array[window])
         except _WrongError as error:
             wrong = str(error)
-        self._damaged(wrong)
+        aside = self._damaged(wrong)
+        found = "was set aside" if aside else "stays, for the cache cannot be written"
         raise DamagedError(
             "RIL-504",
-            f"artifact {self._manifest['label']} ({self._manifest['stage']}) is damaged, {wrong}; it was set aside",
-            remedy="run again: it will be recomputed",
+            f"artifact {self._manifest['label']} ({self._manifest['stage']}) is damaged, {wrong}; it {found}",
+            remedy="run again: it will be recomputed" if aside else "choose another folder with --cache",
         )
 
     def raster(self, name: str) -> LazyRaster:

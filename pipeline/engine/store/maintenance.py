@@ -29,12 +29,13 @@ LEFTOVER = re.compile(
 
 @dataclass(frozen=True)
 class Damage:
-    """A damaged artifact, set aside."""
+    """A damaged artifact; ``aside``: it is out of the way, as it is unless the cache cannot be written."""
 
     stage: str
     key: str
     label: str
     reason: str
+    aside: bool
 
 
 @dataclass
@@ -56,7 +57,8 @@ def artifacts(store: Store) -> Iterator[tuple[str, str]]:
 
 
 def verify(store: Store, *, deep: bool = False) -> tuple[int, list[Damage]]:
-    """Compare every byte of every artifact with the recorded checksums; damaged ones are set aside.
+    """Compare every byte of every artifact with the recorded checksums; damaged ones are set
+    aside, if the cache can be written.
 
     ``deep`` decodes every chunk as well and compares the digests (SHA-256) of what was computed.
 
@@ -75,8 +77,8 @@ def verify(store: Store, *, deep: bool = False) -> tuple[int, list[Damage]]:
         else:
             reason = damage(manifest, data) or (_decoded(manifest, data) if deep else "")
         if reason:
-            store.set_aside(stage, key, manifest, reason)
-            found.append(Damage(stage, key, manifest["label"] if manifest else "", reason))
+            aside = store.set_aside(stage, key, manifest, reason)
+            found.append(Damage(stage, key, manifest["label"] if manifest else "", reason, aside))
         sound += not reason
     return sound, found
 
@@ -84,7 +86,7 @@ def verify(store: Store, *, deep: bool = False) -> tuple[int, list[Damage]]:
 def _decoded(manifest: Manifest, data: bytes) -> str:
     """What is wrong with the decoded arrays or the metadata of an artifact; empty if nothing."""
     try:
-        digests = array_digests(LazyArrays(lambda start, stop: data[start:stop], manifest, lambda _: None))
+        digests = array_digests(LazyArrays(lambda start, stop: data[start:stop], manifest, lambda _: True))
     except DamagedError as error:
         return error.message
     wrong = [name for name, found in digests.items() if found != manifest["arrays"][name]["sha256"]]

@@ -43,12 +43,11 @@ def export_run(run: Path, target: Path, store: Store) -> str:
     Raises
     ------
     InputError
-        The folder holds no finished run with a risk map, its artifacts are gone from the cache, the target is not
+        The folder holds no run with a risk map, its artifacts are gone from the cache, the target is not
         empty, or the package that writes bags is missing.
     """
     check_new(target)
-    artifacts = RunArtifacts(run, store)
-    risk, tiles = artifacts.one("risk/world"), artifacts.all("merge")
+    risk, tiles, _ = RunArtifacts(run, store).world()
     with atomic.replacing(target) as folder, TemporaryDirectory(dir=folder.parent) as aside:
         bag = Path(aside) / target.name  # a bag's files have the name of its folder
         write(bag, risk, tiles)

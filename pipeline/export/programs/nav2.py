@@ -55,12 +55,11 @@ def export_run(run: Path, target: Path, store: Store) -> str:
     Raises
     ------
     InputError
-        ``run`` is not the folder of a finished run with a risk map, its artifacts are not in the cache, or ``target``
+        ``run`` is not the folder of a run with a risk map, its artifacts are not in the cache, or ``target``
         is not empty.
     """
     check_new(target)
-    artifacts = RunArtifacts(run, store)
-    risk, path = artifacts.one("risk/world"), artifacts.find("path/world")
+    risk, _, path = RunArtifacts(run, store).world()
     with atomic.replacing(target) as folder:
         folder.mkdir()
         write(folder, risk, path)

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 import pyproj
-import rasterio
 from numpy.typing import NDArray
 
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.colour import LUMA
-from rille.pipeline.export.read_dem import DemFile, read_elevation, read_tiff
+from rille.pipeline.export.foreign_raster import open_raster
+from rille.pipeline.export.read_dem import DemFile, read_elevation, read_raster
 from rille.stages.core.errors import InputError
 
 MADE = date(2000, 1, 1)
@@ -64,10 +64,10 @@ def _beside(run: Path, name: str, terrain: DemFile) -> Layer:
     path = run / f"{name}.tif"
     if not path.is_file():
         return None
-    found = read_tiff(path, length=False)
+    found = read_raster(path, length=False)
     if found.values.shape != terrain.values.shape or found.transform != terrain.transform:
         raise InputError("RIL-602", f"{path} and dem.tif have other cells", remedy="make the run again")
-    with rasterio.open(path) as raster:
+    with open_raster(path) as raster:
         if raster.count == 1:
             return found.values
         bands = raster.read(out_dtype="float64", masked=True).filled(np.nan)

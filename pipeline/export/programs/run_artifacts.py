@@ -1,7 +1,8 @@
-"""The artifacts that a finished run refers to, by their labels."""
+"""The artifacts that a run refers to, by their labels."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,10 @@ def check_new(target: Path) -> None:
     """Refuse a folder with something in it."""
     if target.exists() and any(target.iterdir()):
         raise InputError("RIL-607", f"{target} is not empty", remedy="give a new folder with --output")
+
+
+STOP = re.compile(r"risk/(\d{1,9})")
+"""Label of the hazards that a drive knew at a stop."""
 
 
 class RunArtifacts:
@@ -36,12 +41,27 @@ class RunArtifacts:
         return None if row is None else self._open(row)
 
     def one(self, label: str, *, last: bool = False) -> Bundle:
-        """The artifact of this label, or the first (or last) whose label begins with it."""
+        """The artifact of this label, else the first (or last) whose label begins with it."""
         # With the slash, "merge" does not find a stage whose name merely begins so.
-        rows = [r for r in self.rows if f"{r['label']}/".startswith(f"{label}/")]
+        begun = [r for r in self.rows if f"{r['label']}/".startswith(f"{label}/")]
+        rows = [r for r in begun if r["label"] == label] or begun
         if not rows:
-            raise InputError("RIL-609", f"the run has no {label}", remedy="finish it with rille reconstruct")
+            raise InputError(
+                "RIL-609",
+                f"the run has no {label}",
+                remedy="run the same command again if it was stopped; else its report says what failed",
+            )
         return self._open(rows[-1 if last else 0])
+
+    def world(self) -> tuple[Bundle, list[Bundle], Bundle | None]:
+        """Risk map of the world, tiles of its terrain, and the path over it, if there is one.
+
+        Of a drive they are what it knew at its last stop, and there is no path.
+        """
+        stops = [int(found[1]) for row in self.rows if (found := STOP.fullmatch(row["label"]))]
+        if stops and self.find("risk/world") is None:
+            return self.one(f"risk/{max(stops)}"), [self.one(f"merge/{max(stops)}")], None
+        return self.one("risk/world"), self.all("merge"), self.find("path/world")
 
     def all(self, stage: str) -> list[Bundle]:
         """All artifacts of a stage."""

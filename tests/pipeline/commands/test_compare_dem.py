@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import affine
 import numpy as np
 import pytest
 import rasterio
@@ -80,6 +81,43 @@ def test_whole_numbers_with_a_scale_are_metres(tmp_path: Path, capsys: pytest.Ca
     compare(scaled, metres, output=tmp_path / "out")
     assert json.loads((tmp_path / "out.json").read_text())["figures"]["rmse"] < 1e-5
     assert "RIL-962: " in capsys.readouterr().err  # no unit
+
+
+def grid(path: Path, values: np.ndarray, cell: float, x0: float, y0: float) -> Path:
+    """ESRI ASCII grid: lower left corner at (x0, y0)."""
+    head = {"ncols": values.shape[1], "nrows": values.shape[0], "xllcorner": x0, "yllcorner": y0, "cellsize": cell}
+    lines = [f"{key} {value}" for key, value in {**head, "NODATA_value": -9999}.items()]
+    rows = (" ".join(f"{v:.6f}" for v in row) for row in np.where(np.isfinite(values), values, -9999.0))
+    path.write_text("\n".join([*lines, *rows]) + "\n")
+    return path
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_an_ascii_grid_is_as_good_as_a_tiff(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    x0, _, y0, y1 = LATTICE.bounds
+    z = elevation()
+    compare(
+        tiff(tmp_path / "a.tif", z, 0.05, x0, y1), grid(tmp_path / "b.ASC", z, 0.05, x0, y0), output=tmp_path / "out"
+    )
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert found["figures"]["rmse"] < 1e-5
+    assert found["completeness"]["of_b"] == 1.0
+    assert "RIL-962: " in capsys.readouterr().err  # no unit
+    (tmp_path / "b.prj").write_text(rasterio.crs.CRS.from_epsg(4326).to_wkt())
+    assert "is in degrees" in refused(capsys, tmp_path / "a.tif", tmp_path / "b.ASC")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_tiff_with_a_world_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    z, place = elevation(), from_origin(-1.0, 4.5, 0.05, 0.05)
+    placed, bare = tiff(tmp_path / "a.tif", z, 0.05, -1.0, 4.5), tiff(tmp_path / "b.tif", z, 1, 0, 0, transform=None)
+    assert "has no geotransform" in refused(capsys, placed, bare)
+    (tmp_path / "b.tfw").write_text(affine.dumpsw(place))
+    compare(placed, bare, output=tmp_path / "out")
+    assert json.loads((tmp_path / "out.json").read_text())["figures"]["rmse"] == 0.0
+    capsys.readouterr()
+    (tmp_path / "b.tfw").write_text("0\n0\n0\n0\n1\n1\n")
+    assert "cells of 0 x 0" in refused(capsys, placed, bare)
 
 
 def coarse_cells(found: dict) -> int:

@@ -308,7 +308,7 @@ def test_artifacts_of_an_earlier_format_are_said_once_and_cleared(cache, capsys)
     (old / "a-01/zarr.json").write_bytes(b"{}")
     store = Store(cache)
     store.survey("s")
-    assert "earlier format" in capsys.readouterr().err
+    assert capsys.readouterr().err.startswith("rille: warning RIL-985: artifacts of an earlier format")
     assert store.lookup("toy", KEY) is None
     store.writable()
     ref = commit(cache)
@@ -340,6 +340,7 @@ def test_a_cache_that_may_not_be_written_is_one_line_and_still_read(cache, monke
     assert Store(cache).lookup("toy", KEY) == ref
     file_of(cache).write_bytes(b"")
     assert Store(cache).lookup("toy", KEY) is None, "damaged, though it cannot be set aside"
+    assert [found.aside for found in maintenance.verify(Store(cache))[1]] == [False]
     with raises("RIL-575") as caught:
         commit(cache)
     assert "\n" not in str(caught.value)

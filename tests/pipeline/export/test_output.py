@@ -164,6 +164,7 @@ def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
     assert [name for name, *_ in catalogue.listed(tmp_path)][:3] == ["report.html", "report.json", "trajectory.kitti"]
     assert all(words and programs for _, words, programs in catalogue.listed(tmp_path))
     rows = list(csv.DictReader((tmp_path / "agreement.csv").open()))
+    assert "time_s" not in rows[0], "numbers of frames are no seconds"
     assert [row["flagged"] for row in rows] == ["0", "0", "0", "1", "0", "0"]
     assert [row["flagged_for"] for row in rows] == ["", "", "", "position; rotation", "", ""]
     assert float(rows[3]["disagreement_m"]) == 0.002

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 from rille.datasets.registry import open_sequence
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.flow import config
-from rille.pipeline.flow.builders import Builder
+from rille.pipeline.flow.builders import PYRAMID_BYTES, Builder
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.flow.products import Products
 from rille.pipeline.flow.reconstruction import SEAMS, cells_in_both, overlaps, spread
@@ -66,6 +67,20 @@ def test_a_lost_frame_is_bridged_and_no_pyramid_is_made_twice() -> None:
     assert products.trajectory.spec.args["lost"] == [{"frame": 3, "cause": "black"}]
     assert list(products.world_dem) == [0, 4, 6]
     assert labels(graph, "accuracy") == ["accuracy"]
+
+
+def test_a_small_right_image_is_expected_to_take_the_room_of_a_left_one() -> None:
+    sequence = open_sequence("mockup-short", {})
+    rig = sequence.rig
+    small = replace(rig.right, width=rig.right.width // 4, height=rig.right.height // 4)
+    expected = []
+    for right in (rig.right, small):
+        make = Builder(Graph(), replace(sequence, rig=replace(rig, right=right)), config.build({}))
+        node, sizes = make.disparity(0), [one.width * one.height for one in (rig.left, right)]
+        expected.append(node.expect + PYRAMID_BYTES * sum(sizes))
+        # The other way the large image is the right one: what is there is enough.
+        assert make.backward(0).expect == 0.0
+    assert expected[0] == pytest.approx(expected[1])
 
 
 def test_a_model_is_compared_with_those_that_share_most_ground_however_often_a_place_is_seen() -> None:

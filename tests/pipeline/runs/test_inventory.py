@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -104,3 +105,21 @@ def test_deep_verification_decodes_what_was_computed(two, capsys):
     assert commands.verify(cache=folder / "cache", deep=True) == 1
     assert f"{manifest['label']} (numbers): mask decoded to another digest; set aside" in capsys.readouterr().err
     assert lookup.keys([folder / "runs"])[key].startswith("toy/")
+
+
+def test_what_cannot_be_set_aside_is_not_said_to_be(two, capsys, monkeypatch):
+    folder, _, _ = two
+    store = Store(folder / "cache")
+    stage, key = next(iter(maintenance.artifacts(store)))
+    path = folder / "cache" / artifact_path(stage, key)
+    path.write_bytes(bytes(path.stat().st_size))
+
+    def refuse(*_):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "rename", refuse)
+        assert commands.verify(cache=folder / "cache") == 1
+    assert "not readable; it stays, for the cache cannot be written" in capsys.readouterr().err
+    assert commands.verify(cache=folder / "cache") == 1
+    assert "not readable; set aside" in capsys.readouterr().err

@@ -198,3 +198,9 @@ def test_what_comes_to_nothing_together_is_left(monkeypatch):
     decision = decide(rig, pairs, PARAMS)
     assert not decision.changed
     assert "with the others" in decision.parameters[3].why
+
+
+def test_the_principal_point_is_as_certain_in_rays_along_either_axis():
+    rig = street_rig()
+    flat = replace(rig, right=replace(rig.right, fy=0.5 * rig.right.fy))
+    assert RelativeParams().priors(flat).principal == (0.005 * rig.right.fx, 0.0025 * rig.right.fy)

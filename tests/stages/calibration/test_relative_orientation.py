@@ -22,7 +22,7 @@ from rille.stages.calibration.relative_orientation import (
 )
 from rille.stages.geometry.epipolar import distances
 
-PRIORS = Priors(rotation=np.radians(0.05), baseline=np.radians(0.2), principal=3.5, systematic=0.1)
+PRIORS = Priors(rotation=np.radians(0.05), baseline=np.radians(0.2), principal=(3.5, 3.5), systematic=0.1)
 ANGLES = [True, True, True, False, False]
 
 

@@ -260,6 +260,33 @@ def test_a_map_that_is_cut_is_crossed_on_its_longer_side() -> None:
     assert beyond <= 2 * SHORT.half_length
 
 
+def test_from_a_start_alone_a_mission_goes_round_as_well() -> None:
+    lattice = Lattice.at(-30, 60, CELL, 61, 61)
+    risk, z = level(lattice)
+    risk[20, 8:53] = risk[20:45, 8] = risk[20:45, 52] = HAZARDOUS  # a cup that opens to the near side
+    ends = ((0.0, 0.25), None)
+    assert not len(find_path(maps(risk, z), lattice, SHORT, ends=ends).xyz)
+    route = find_path(maps(risk, z), lattice, SHORT, ends=ends, stretch=True)
+    assert route.planner == "grid8"
+    np.testing.assert_allclose(route.xyz[0, :2], [0.0, 0.25], atol=1e-9)
+    assert describe(route, maps(risk, z), lattice, SHORT)["left_out_m"][1] < 2 * SHORT.half_length
+
+
+@pytest.mark.parametrize("given", [0, 1])
+def test_an_end_alone_is_not_left_on_a_stub_of_the_strictest_ground(given: int) -> None:
+    lattice = Lattice.at(-15, 120, CELL, 110, 31)
+    risk, z = level(lattice)
+    risk[30:70] = UNKNOWN
+    risk[30:70, 12:19] = 0  # as wide as the wheels, not as the outline
+    vehicle = SHORT.model_copy(update={"track": 0.05})
+    risk[100:104] = HAZARDOUS  # cuts the map, so that rows lead nowhere
+    end = tuple(lattice.xy()[(95, 15) if given == 0 else (8, 15)])
+    ends = (end, None) if given == 0 else (None, end)
+    route = find_path(maps(risk, z), lattice, vehicle, ends=ends, stretch=True, params=PathParams(planner="grid8"))
+    assert route.ground == "wheels"
+    assert route.cells[0, 0] - route.cells[-1, 0] > 80
+
+
 @pytest.mark.parametrize(("at", "ground"), [(5, "outline"), (40, "wheels")])
 def test_unknown_ground_under_the_belly_is_passed_where_the_path_gains_a_third(at: int, ground: str) -> None:
     lattice = Lattice.at(-15, 120, CELL, 110, 31)

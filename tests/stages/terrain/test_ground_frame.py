@@ -14,7 +14,7 @@ from rille.stages.core.validity import Validity
 from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.terrain import ground_frame as level_stage
-from rille.stages.terrain.ground import _singular_values
+from rille.stages.terrain.ground import _singular_values, view_ground
 from rille.stages.terrain.ground_frame import GroundFrameParams, VerticalHint, level
 
 RIG = toed_in_rig()
@@ -208,3 +208,16 @@ def test_kitti_street(data_dir: Path) -> None:
 def test_singular_values_of_small_matrices():
     m = np.random.default_rng(4).normal(size=(50, 2, 2))
     np.testing.assert_allclose(_singular_values(m), np.linalg.svd(m, compute_uv=False), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize(("scale", "coarser"), [(4.0, 1.0), (0.9, 1.0), (0.25, 4.0)])
+def test_the_coarser_camera_tells_how_much_ground_a_pixel_covers(scale: float, coarser: float) -> None:
+    c = RIG.right
+    centre = ((v + 0.5) * scale - 0.5 for v in (c.cx, c.cy))
+    right = Camera(c.fx * scale, c.fy * scale, *centre, round(c.width * scale), round(c.height * scale))
+    other = Rig(RIG.left, right, RIG.T_right_left)
+    given, found = (view_ground(rig, POSE.rotation, [0.0, 0.0, -HEIGHT]) for rig in (RIG, other))
+    for name in ("along", "across"):
+        before, after = (float(np.median(getattr(view, name))) for view in (given, found))
+        assert after / before == pytest.approx(coarser, rel=0.05)
+    assert coarser / 2 < found.cell_size() / given.cell_size() < coarser * 2  # to 1, 2 or 5

@@ -1,12 +1,12 @@
 """A run as a COLMAP model: written, read again, and compared with what went in."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 from raising import raises
+from toys.artifacts import recorded
 
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs import colmap
@@ -104,19 +104,6 @@ def test_an_adjustment_of_the_model_keeps_its_scale():
     assert abs(np.linalg.norm(last - first) / np.linalg.norm(true) - 1.0) < 0.02
 
 
-class Artifacts:
-    """A store whose references are labels."""
-
-    def __init__(self, made):
-        self.made = made
-
-    def lookup(self, stage, key):
-        return key
-
-    def open(self, ref):
-        return self.made[ref]
-
-
 def driven(folder):
     """The folder and the artifacts of a drive of one leg, which was stopped; lenses were undone."""
     trajectory, segments, _, _ = parts()
@@ -134,10 +121,8 @@ def driven(folder):
         "resect/3/stopped": resection,
         "trajectory/1": trajectory,
     }
-    rows = [{"label": name, "stage": name.split("/")[0], "status": "computed", "key": name} for name in made]
-    (folder / "ledger.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     (folder / "frames.json").write_text("{}")
-    return Artifacts(made)
+    return recorded(folder, made)
 
 
 def test_a_drive_gives_its_whole_trajectory_and_each_point_once(tmp_path):

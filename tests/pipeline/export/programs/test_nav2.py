@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import yaml
+from raising import raises
+from toys.artifacts import recorded
 from toys.map_server import load
 
 from rille.pipeline.export.programs import nav2
@@ -53,3 +55,17 @@ def test_a_path_of_one_pose_and_of_none(tmp_path):
     assert "poses" in yaml.safe_load(nav2.path_message(np.zeros((1, 3))))
     nav2.write(tmp_path, risk(), Bundle({"path": np.empty((0, 3))}, {}))
     assert not (tmp_path / "path.yaml").exists()
+
+
+def test_of_a_drive_the_map_of_its_last_stop_is_written(tmp_path):
+    last, other = risk(), Bundle({}, {})
+    made = {f"risk/{k}{kind}": other for k in range(11) for kind in ("/near", "")} | {"risk/truth": other}
+    store = recorded(tmp_path, made | {"risk/10": last} | {f"merge/{k}": other for k in range(11)})
+    assert nav2.export_run(tmp_path, tmp_path / "nav2", store).endswith("600 cells, no path")
+    assert load(tmp_path / "nav2/keepout.yaml").at(*LATTICE.xy()[0, 0]) == (100 if last["risk"][0, 0] >= 2 else 0)
+
+
+def test_a_run_without_a_map_is_told_how_to_get_one(tmp_path):
+    with raises("RIL-609", "run the same command again"):
+        nav2.export_run(tmp_path, tmp_path / "nav2", recorded(tmp_path, {"calibration": Bundle({}, {})}))
+    assert not (tmp_path / "nav2").exists()

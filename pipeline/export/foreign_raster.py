@@ -1,0 +1,62 @@
+"""Rasters that others may have written, opened so that no file, nor one beside it, can name another that is then read.
+
+GDAL opens what a file says by any of its drivers: tiles of other files, addresses in the net. So the driver is given,
+one whose files hold all that they show; and what may lie beside a file (``.msk``, ``.ovr``, ``.aux.xml``) is not read.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import affine
+from affine import Affine
+
+from rille.datasets.text.reading import read_text
+from rille.stages.core.errors import InputError
+
+GRID = ".asc"
+"""Ending of an ESRI ASCII grid; what has another one is read as a TIFF."""
+
+WORLD_FILES = (".tfw", ".tifw", ".wld")
+
+ALONE = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
+"""GDAL's settings by which masks, overviews and notes beside a file are not looked for."""
+
+
+@contextmanager
+def open_raster(path: Path, driver: str = "GTiff") -> Iterator[Any]:
+    """A raster, open for reading by ``driver``: ``GTiff`` or ``AAIGrid``.
+
+    Raises
+    ------
+    rasterio.errors.RasterioError
+        It cannot be read by that driver.
+    """
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning
+
+    with warnings.catch_warnings():
+        # Whoever needs a place refuses the file in a line of their own.
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.Env(**ALONE), rasterio.open(path, driver=driver) as file:
+            yield file
+
+
+def driver_of(path: Path) -> str:
+    """The driver that reads an elevation model, by the ending of its name."""
+    return "AAIGrid" if path.suffix.lower() == GRID else "GTiff"
+
+
+def place_of(file: Any, path: Path) -> Affine:
+    """Corners of cells (column, row) to the CRS: as the raster or the world file beside it says, else the identity."""
+    # GDAL gives the identity where a file states no geotransform.
+    if file.transform != Affine.identity():
+        return file.transform
+    for beside in map(path.with_suffix, WORLD_FILES):
+        with suppress(InputError, ValueError, TypeError):
+            return affine.loadsw(read_text(beside, "world file"))
+    return file.transform
