@@ -213,11 +213,13 @@ def _at(samples: list[tuple[float, float]], size: float) -> tuple[float, float]:
     if size > max(sizes) < 2 * min(sizes):  # too much of a kind to tell a slope: in proportion, which is safe
         return median(y for _, y in samples) * size / median(sizes), GUESS
     intercept, slope = _line(samples)
-    off = max((abs(y - intercept - slope * x) / y for x, y in samples if y), default=0.0)
+    value = intercept + slope * size
+    # In bytes, not as a share of each: a tiny sample beside the line would make gigabytes of what is foreseen.
+    off = max(abs(y - intercept - slope * x) for x, y in samples) / value if value else 0.0
     typical = median(x for x, _ in samples)
     # The farther from the measured sizes, the less a straight line through them is believed.
     beyond = max(size, typical) / max(min(size, typical), 1.0)
-    return intercept + slope * size, max(2 * SPREAD, off) + 0.1 * min(beyond - 1, 5.0)
+    return value, max(2 * SPREAD, off) + 0.1 * min(beyond - 1, 5.0)
 
 
 def _line(samples: list[tuple[float, float]]) -> tuple[float, float]:

@@ -164,6 +164,13 @@ def test_other_sizes_follow_a_line_and_are_less_certain():
     assert one_size.memory == pytest.approx(9.5 * MB * 8 / 2.1), "no slope is to be told from these"
 
 
+def test_a_tiny_task_beside_the_line_does_not_make_the_great_ones_gigabytes():
+    samples = [(1 * MB, 0.02 * MB, 1.0, 1.0), (10 * MB, 12 * MB, 1.0, 1.0), (20 * MB, 26 * MB, 1.0, 1.0)]
+    found = known(samples).foresee(SPEC, 45 * MB)
+    assert found.memory == pytest.approx(58 * MB, rel=0.02)
+    assert found.most < 3 * found.memory
+
+
 def test_other_parameters_serve_where_there_is_nothing_better():
     found = known([(10.0, 80 * MB, 5.0, 2.0)], params=NumbersParams(seed=7)).foresee(SPEC, 10.0)
     assert found.memory == 80 * MB
