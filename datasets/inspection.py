@@ -18,7 +18,7 @@ import numpy as np
 
 from rille.datasets.cameras import CalibratedCamera, read_cameras
 from rille.datasets.images.headers import sizes_of
-from rille.datasets.images.pairing import SIDES, SUFFIXES, common_headers, natural, pair_up, side_of
+from rille.datasets.images.pairing import SIDES, SUFFIXES, ImagePair, common_headers, natural, pair_up, side_of
 from rille.datasets.poses import names_positions, read_positions
 from rille.datasets.text.reading import Search, read_lines
 from rille.stages.core.errors import InputError, RilleError
@@ -54,6 +54,7 @@ class FoundImages:
     trouble : why the images cannot be paired; empty if they can.
     stamped : whether the file names are times since an epoch.
     sides : the words or letters in the names that mark left and right.
+    absent : of the pairs that lack a file, what is missing; they are counted in ``pairs``.
     """
 
     left: str
@@ -64,6 +65,7 @@ class FoundImages:
     trouble: str = ""
     stamped: bool = False
     sides: tuple[str, str] = ("left", "right")
+    absent: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -183,10 +185,9 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     # Most pairs first; of as many, the surest token (SIDES).
     key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0]))
     left, right = both[key]
-    sizes, trouble, pairs = None, "", 0
+    sizes, trouble, matched = None, "", tuple[ImagePair, ...]()
     try:
-        matched = pair_up(left, right)
-        pairs = len(matched)
+        matched = pair_up(left, right, gaps=True)  # as the manifest opens
         sizes = sizes_of(common_headers(matched))
     except InputError as error:
         trouble = str(error)
@@ -194,12 +195,13 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     return FoundImages(
         pattern(left, folder),
         pattern(right, folder),
-        pairs,
+        len(matched),
         sizes,
         f"{len(left)} left and {len(right)} right images, told apart by {tokens[0]!r} and {tokens[1]!r}",
         trouble,
         all(STAMP.search(path.stem) for path in left),
         tokens,
+        tuple(pair.absent for pair in matched if pair.absent),
     )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import tomli_w
 
-from rille.datasets.inspection import Findings, FoundCalibration
+from rille.datasets.inspection import Findings, FoundCalibration, FoundImages
 from rille.datasets.manifest.rig import LONGEST_BASELINE
 from rille.datasets.text.count import count
 from rille.datasets.text.names import derived_name
@@ -51,10 +51,17 @@ def _images(found: Findings) -> str:
     if views.sizes is None:
         lines.append(f"# {NEEDED}: correct the patterns: {views.trouble}")
     else:
-        lines.append(f"# They make {count(views.pairs, 'pair')} of {size_words(views.sizes)} pixels.")
+        lines.append(f"# They make {pair_words(views)} of {size_words(views.sizes)} pixels.")
     lines.append(_pairs(left=views.left, right=views.right).rstrip())
     lines.append('# pair = "auto"  # or "name", "number", "order"')
     return "\n".join(lines) + "\n"
+
+
+def pair_words(views: FoundImages) -> str:
+    """How many pairs there are, and whether some lack an image."""
+    gaps, words = views.absent, count(views.pairs, "pair")
+    more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
+    return f"{words} ({gaps[0]}{more})" if gaps else words
 
 
 def size_words(sizes: Iterable[tuple[int, int] | None]) -> str:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 
 from rille.datasets.bags import is_bag
 from rille.datasets.inspection import Findings, inspect
-from rille.datasets.manifest.text import manifest_text, needs, size_words
+from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_words
 from rille.datasets.registry import hindrance
-from rille.datasets.text.count import count
 from rille.datasets.text.names import derived_name
 from rille.pipeline.commands.options import COMPLETE
 from rille.pipeline.engine.failures import reported
@@ -36,7 +36,7 @@ def init(directory: Path, output: Path | None = None, force: bool = False) -> in
     if output is None and not force and (directory.is_dir() or is_bag(directory)) and hindered is None:
         manifest = "" if is_bag(directory) else "; --output or --force writes a manifest nevertheless"
         print(f"{directory} opens as it is{manifest}")
-        print(f"\nnext:\n  rille check {directory}\n  rille reconstruct {directory}")
+        print("\n".join(_next(directory)))
         return COMPLETE
     if is_bag(directory):
         raise hindered or ConfigError(
@@ -79,13 +79,18 @@ def _report(found: Findings, path: Path, needed: list[str]) -> list[str]:
     """What was found, what is needed, and what to type next."""
     views, calibration = found.views, found.calibration
     size = f", {size_words(views.sizes)} pixels" if views.sizes else ""
-    lines = [f"images       {count(views.pairs, 'pair')}{size}: {views.left} and {views.right}"]
+    lines = [f"images       {pair_words(views)}{size}: {views.left} and {views.right}"]
     if calibration is not None:
         baseline = f", baseline {calibration.baseline:.6g}" if calibration.baseline is not None else ""
         lines.append(f"calibration  {' and '.join(calibration.files)}{baseline}")
     lines += [f"{kind:12s} {', '.join(files)}" for kind, files in found.tables.items()]
     lines += [f"wrote        {path}"]
     lines += [f"needed       {line}" for line in needed]
-    first = [f"edit {path}"] if needed else []
-    steps = [*first, f"rille check {path}", f"rille reconstruct {path}"]
-    return lines + ["", "next:"] + [f"  {step}" for step in steps]
+    return lines + _next(path, edit=bool(needed))
+
+
+def _next(path: Path, *, edit: bool = False) -> list[str]:
+    """What to type next, as a shell takes it."""
+    word = shlex.quote(str(path))
+    steps = [*([f"edit {word}"] if edit else []), f"rille check {word}", f"rille reconstruct {word}"]
+    return ["", "next:", *(f"  {step}" for step in steps)]

@@ -94,10 +94,21 @@ def test_images_that_cannot_be_told_apart(tmp_path):
 
 
 def test_an_image_without_partner_is_marked(tmp_path):
-    write_images(tmp_path, [*both("{side}/{name}.png", ["1", "2"]), "left/3.png"])
+    write_images(tmp_path, [*both("{side}/{name}.png", ["1"]), "left/2.png", "left/3.png"])
     found = inspect(tmp_path)
-    assert "3.png has no partner" in found.views.trouble
-    assert any("3.png has no partner" in line for line in needs(manifest_text(found, ".")))
+    assert "2.png has no partner" in found.views.trouble
+    assert any("2.png has no partner" in line for line in needs(manifest_text(found, ".")))
+
+
+def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
+    write_images(tmp_path, [*both("{side}/{name}.png", ["1", "2", "4"]), "left/3.png", "right/5.png"])
+    (tmp_path / "rig.yaml").write_text(ORB_SETTINGS.format(*SIZE, bf=6.0))
+    text = manifest_text(inspect(tmp_path), ".")
+    assert "# They make 5 pairs (right/3.png is missing and 1 more) of 64 x 48 pixels." in text
+    assert not needs(text)
+    path = tmp_path / "m.rille.toml"
+    path.write_text(text)
+    assert sorted(open_manifest(path, Digests()).lost) == [2, 4]
 
 
 @pytest.mark.parametrize(

@@ -71,6 +71,11 @@ def test_what_is_needed_is_printed(drive, capsys):
     assert "edit drive.rille.toml" in printed
 
 
+def test_next_steps_are_as_a_shell_takes_them(drive, tmp_path, capsys):
+    init(drive, tmp_path / "here" / "my drive.toml")
+    assert f"rille check '{tmp_path}/here/my drive.toml'" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(("place", "root"), [(".", "drive"), ("drive/left", ".."), ("far/away", None)])
 def test_elsewhere_the_manifest_still_finds_its_folder(drive, tmp_path, place, root):
     (drive / "calibration.yaml").write_text(SETTINGS)
