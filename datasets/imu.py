@@ -337,7 +337,7 @@ def _overlap(imu: ImuRecord, at: Sequence[float]) -> None:
             "RIL-190",
             f"{imu.name} reaches from {first:.3f} to {last:.3f} s, the frames from {at[0]:.3f} to {at[-1]:.3f} s: "
             "no common time",
-            remedy="check that both have the same clock and unit; a constant offset can be stated",
+            remedy="check that both have the same clock and unit; a manifest states a constant offset as time_offset",
         )
 
 

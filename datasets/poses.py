@@ -329,7 +329,7 @@ def interpolate(timed: TimedPoses, at: Sequence[float], max_gap: float) -> tuple
             "RIL-269",
             f"{timed.name} reaches from {t[0]:.3f} to {t[-1]:.3f} s, the frames from {wanted[0]:.3f} to "
             f"{wanted[-1]:.3f} s: no common time",
-            remedy="check that both have the same clock and unit; a constant offset can be stated",
+            remedy="check that both have the same clock and unit; a manifest states a constant offset as time_offset",
         )
     before = np.clip(np.searchsorted(t, wanted, side="right") - 1, 0, max(len(t) - 2, 0))
     after = np.minimum(before + 1, len(t) - 1)

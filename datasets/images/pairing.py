@@ -10,6 +10,7 @@ from pathlib import Path
 
 from rille.datasets.images import files
 from rille.datasets.images.headers import Headers
+from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
 
 SUFFIXES = (*files.SUFFIXES, ".ppm", ".bmp")
@@ -195,6 +196,21 @@ def _named(pairs: list[tuple[Path, Path]]) -> tuple[ImagePair, ...]:
     if len(set(names)) < len(names):
         names = [str(k) for k in range(len(pairs))]
     return tuple(ImagePair(name, *pair) for name, pair in zip(names, pairs, strict=True))
+
+
+def crossed(pairs: Sequence[ImagePair]) -> list[str]:
+    """A warning where pairs by order part images of one number, while others join them: as after a lost image."""
+    numbers = [(_number(pair.left.stem), _number(pair.right.stem)) for pair in pairs]
+    there = {right for _, right in numbers} - {None}
+    parted = [k for k, (left, right) in enumerate(numbers) if left != right and left in there]
+    if not parted or not any(left == right for left, right in numbers):
+        return []
+    first = pairs[parted[0]]
+    text = (
+        f"by order {first.left.name} is paired with {first.right.name}, though there is a right image of its number; "
+        f"so are {len(parted)} of {len(pairs)} pairs: was an image lost? pair by number or name"
+    )
+    return [warning("RIL-990", text)]
 
 
 def common_headers(pairs: Sequence[ImagePair]) -> Headers:

@@ -17,7 +17,7 @@ from typing import Any
 from rille.datasets.georeference import georeference
 from rille.datasets.images import files
 from rille.datasets.images.headers import sizes_of
-from rille.datasets.images.pairing import ImagePair, common_headers, pair_up
+from rille.datasets.images.pairing import ImagePair, common_headers, crossed, pair_up
 from rille.datasets.manifest.model import Images, read_manifest
 from rille.datasets.manifest.motion import read_motion
 from rille.datasets.manifest.rig import read_optics
@@ -82,7 +82,7 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
         lost={k: pair.absent for k, pair in enumerate(pairs) if pair.absent},
         defaults=dict(dotted(manifest.defaults)),
         notes=manifest.notes,
-        warnings=(*optics.warnings, *motion.warnings),
+        warnings=(*(crossed(pairs) if manifest.images.pair == "order" else ()), *optics.warnings, *motion.warnings),
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE, HOLES, check_output
+from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import raw, warn
 from rille.pipeline.flow import config as configuration
 from rille.stages.core.errors import ConfigError, InputError
@@ -97,9 +98,11 @@ def match_files(
     column = np.where(kept, found.column_disparity, np.nan)
     row = np.where(kept, found.row_disparity, np.nan)
     tags = {"LEFT": left.name, "RIGHT": right.name}
-    write_disparity(output, column, row, tags | {"FILLED": str(dense).lower()})
+    with _written(output):
+        write_disparity(output, column, row, tags | {"FILLED": str(dense).lower()})
     if confidence is not None:
-        write_confidence(confidence, found.disparity_std, found.validity, found.backmatch_error, tags)
+        with _written(confidence):
+            write_confidence(confidence, found.disparity_std, found.validity, found.backmatch_error, tags)
     for line in (*_depths(images), *warnings(found, *images)):
         warn(line)
     share = float(matched(found.validity).mean())
@@ -107,6 +110,10 @@ def match_files(
     figures = f"matched {100 * share:.1f} %, defined {100 * float(kept.mean()):.1f} % of {kept.size} pixels"
     print(f"{output}  {figures}{typical}")
     return COMPLETE if share >= FEW else HOLES
+
+
+def _written(path: Path) -> AbstractContextManager[None]:
+    return reported("RIL-991", f"{path} cannot be written", remedy="name another file", kind=InputError)
 
 
 def _depths(images: Iterable[NDArray[Any]]) -> list[str]:

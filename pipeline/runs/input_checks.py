@@ -252,7 +252,8 @@ def _exposure(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> 
         if ratio.size and ratio.max() > UNLIKE_GREY:
             k = int(np.argmax(ratio))
             text = (
-                f"{camera} brightness jumps by {ratio[k]:.2f} from frame {names[frames[k]]} to {names[frames[k + 1]]}"
+                f"{camera} brightness changes by a factor of {ratio[k]:.3g} "
+                f"from frame {names[frames[k]]} to {names[frames[k + 1]]}"
             )
             remedy = "it is levelled, but what turns black or white is lost: fix the exposure if you can"
             out.append(doubt("RIL-652", text, "exposure", remedy=remedy))

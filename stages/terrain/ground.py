@@ -83,7 +83,8 @@ def fit_plane(
     raise DegenerateError(
         "RIL-343",
         "the disparity shows no ground plane below the camera",
-        remedy="give the rig's pitch or an attitude, or check left/right order and the rig's calibration",
+        remedy="give the direction of up, the rig's pitch or an attitude, or check left/right order and the rig's "
+        "calibration",
     )
 
 

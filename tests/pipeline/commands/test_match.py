@@ -68,6 +68,22 @@ def test_confidence_has_three_bands_that_fit_the_disparity(folder):
     assert (error[ok] <= 1).all()
 
 
+@pytest.mark.parametrize("name", ["--output", "--confidence"])
+def test_an_output_that_cannot_be_written_is_named(folder, name):
+    (folder / "file").write_text("")
+    out = {"--output": "out.tif", "--confidence": "sure.tif"} | {name: "file/here.tif"}
+    params = command.matcher_params(None, ())
+    with raises("RIL-991", "file/here.tif cannot be written"):
+        command.match_files(
+            folder / "left.png",
+            folder / "right.png",
+            folder / out["--output"],
+            params,
+            confidence=folder / out["--confidence"],
+            dense=False,
+        )
+
+
 def test_outputs_that_cannot_be_are_refused_before_matching(folder):
     params = command.matcher_params(None, ())
     (folder / "results.tif").mkdir()

@@ -155,7 +155,7 @@ def test_samples_that_leave_bits_empty_are_told():
         ([GOOD] * 4 + [changed(sharpness=0.4)], [GOOD] * 5, "WARN", "frame f4 (40 % of usual)"),
         ([GOOD] * 5, [changed(sharpness=0.5)] * 5, "WARN", "right is 0.50 as sharp"),
         ([GOOD] * 5, [changed(mean=40.0)] * 5, "WARN", "right is 0.40 as bright"),
-        ([GOOD] * 3 + [changed(mean=180.0)] * 2, [GOOD] * 5, "WARN", "jumps by 1.80 from frame f2 to f3"),
+        ([GOOD] * 3 + [changed(mean=180.0)] * 2, [GOOD] * 5, "WARN", "changes by a factor of 1.8 from frame f2 to f3"),
         ([changed(bright=0.5)] * 5, [GOOD] * 5, "WARN", "50 % of the left images is white"),
         ([GOOD] * 5, [changed(deviation=0.1)] + [GOOD] * 4, "FAIL", "1 right images show nothing, first frame f0"),
     ],
