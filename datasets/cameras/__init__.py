@@ -35,6 +35,7 @@ NESTED: tuple[tuple[Callable[[Fields], bool], Callable[[Fields, Path], list[Cali
     (slam.is_kalibr, slam.kalibr),
     (slam.is_sensor, slam.sensor),
     (boofcv.is_boofcv, boofcv.boofcv),
+    (opencv.is_message, opencv.message),
     (opencv.is_single, opencv.single),
 )
 """Formats of nested entries. ORB-SLAM2 files that also hold unrectified cameras are read as those: the images are."""

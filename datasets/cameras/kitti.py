@@ -21,7 +21,9 @@ from rille.stages.geometry.geometry import RigidTransform, orthonormal
 from rille.stages.geometry.lens import Lens
 
 PROJECTION = re.compile(r"P(\d)(?:_roi)?|P_rect_(\d\d)")
-LINE = re.compile(r"^[ \t]*(P\d(?:_roi)?|P_rect_\d\d|K_\d\d)[ \t]*:", re.MULTILINE)
+LINE = re.compile(r"^[ \t]*(P\d(?:_roi)?|P_rect_\d\d|K_\d\d)[ \t]*:[ \t]*[-+.\d]", re.MULTILINE)
+"""A label and its first number: the `P1` of OpenCV's YAML is a matrix, or a list in brackets."""
+
 LEAST_FOCAL = 2.0
 """Pixels; rows of a pose have the same twelve numbers, but the first three of them are at most 1."""
 

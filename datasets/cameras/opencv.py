@@ -27,6 +27,13 @@ SIDES = (
 
 SINGLE = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K")
 DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D")
+MESSAGE = {
+    "K": "camera_matrix",
+    "D": "distortion_coefficients",
+    "R": "rectification_matrix",
+    "P": "projection_matrix",
+}
+"""Fields of ROS' message camera_info, in ROS 2 in small letters, and the keys of its files."""
 WIDTHS = ("image_width", "image_Width", "width", "LEFT.width", "Camera.width")
 HEIGHTS = ("image_height", "image_Height", "height", "LEFT.height", "Camera.height")
 ROTATIONS, TRANSLATIONS = ("R", "rotation_matrix"), ("T", "translation_vector")
@@ -52,6 +59,17 @@ def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
         T_right_left = _relative(f) or _beside(path)
         poses = (None if T_right_left is None else RigidTransform.identity()), T_right_left
     return [CalibratedCamera(name, lens, T) for name, lens, T in zip(("left", "right"), lenses, poses, strict=True)]
+
+
+def is_message(f: Fields) -> bool:
+    """Whether these are the fields of ROS' message camera_info."""
+    return "distortion_model" in f and any(all(key in f for key in keys) for keys in (MESSAGE, map(str.lower, MESSAGE)))
+
+
+def message(f: Fields, path: Path) -> list[CalibratedCamera]:
+    """One camera of ROS' message camera_info as ``topic echo`` prints it."""
+    values = {MESSAGE.get(key.upper(), key): value for key, value in f.values.items()}
+    return single(Fields(values, f.file), path)
 
 
 def is_single(f: Fields) -> bool:

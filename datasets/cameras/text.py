@@ -21,6 +21,8 @@ MOST_VALUES = 100_000
 HEADER = re.compile(r"\A%YAML:[0-9.]+[^\n]*\n(\s*---[^\n]*\n)?")
 """OpenCV's first lines, which no YAML parser accepts."""
 
+END = re.compile(r"^---\s*\Z", re.MULTILINE)
+"""What ROS prints behind each message; to YAML a second document begins there."""
 
 C_OR_PYTHON: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
@@ -50,7 +52,7 @@ def parse_nested(text: str, file: str) -> Mapping[Any, Any]:
 
 def parse_yaml(text: str, file: str) -> Mapping[Any, Any]:
     """Entries of a YAML or JSON file; empty where it holds something else than entries."""
-    body = HEADER.sub("", text, count=1)
+    body = END.sub("", HEADER.sub("", text, count=1))
     try:
         # Events are flat and cheap: what would be nested or multiplied is seen before anything is built.
         _check_extent(body, file)

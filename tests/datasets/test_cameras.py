@@ -40,6 +40,9 @@ def test_opencv_stereo_as_opencv_writes_it(tmp_path, suffix):
         storage.write(f"D{n}", np.array([[-0.3, 0.1, 1e-5, -2e-3, 0.02]]))
     storage.write("R", ROTATION)
     storage.write("T", SHIFT.reshape(3, 1))
+    for n in (1, 2):  # of the rectified images; in KITTI's files P1 is a label
+        storage.write(f"R{n}", np.eye(3))
+        storage.write(f"P{n}", np.eye(3, 4))
     storage.release()
     left, right = read_cameras(path)
     assert (left.name, right.name) == ("left", "right")
@@ -128,6 +131,36 @@ def test_ros_camera_info_holds_the_baseline_in_the_projection(tmp_path):
     # A point's rectified coordinates differ by the baseline alone.
     x = np.array([0.3, -0.2, 4.0])
     np.testing.assert_allclose(b @ rig.T_right_left.apply(x), a @ x - [0.12, 0, 0], atol=1e-12)
+
+
+MESSAGE = """header:
+  frame_id: camera
+height: 480
+width: 640
+distortion_model: plumb_bob
+d: [-0.1, 0.0, 0.0, 0.0, 0.0]
+k: [500.0, 0.0, 320.0, 0.0, 501.0, 240.0, 0.0, 0.0, 1.0]
+r: {rotation}
+p: [450.0, 0.0, 300.0, {shift}, 0.0, 450.0, 200.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+binning_x: 0
+---
+"""
+
+
+@pytest.mark.parametrize("capital", [False, True])
+def test_ros_message_as_echo_prints_it_says_what_the_file_says(tmp_path, capital):
+    rotation = numbers(rotation_exp([0.01, -0.03, 0.0]))
+    text = MESSAGE.format(rotation=rotation, shift=-54.0)
+    for key in "dkrp" if capital else "":  # ROS 1
+        text = text.replace(f"\n{key}:", f"\n{key.upper()}:")
+    file = ROS.format(
+        name="right", model="plumb_bob", count=5, values=[-0.1, 0, 0, 0, 0], rotation=rotation, shift=-54.0
+    )
+    found, expected = (read_cameras(written(tmp_path, t, f"{k}.yaml"))[0] for k, t in enumerate((text, file)))
+    assert found.size == (640, 480)
+    assert found.lens.coefficients == expected.lens.coefficients
+    assert found.lens.camera.matrix.tolist() == [[500, 0, 320], [0, 501, 240], [0, 0, 1]]
+    assert found.T_camera_reference.to_list() == expected.T_camera_reference.to_list()
 
 
 @pytest.mark.parametrize(
