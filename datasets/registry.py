@@ -126,6 +126,9 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
         sequence: Sequence | None = module.open_layout(path, number, digests)
         if sequence is not None:
             return sequence
+    if path.is_file():
+        remedy = "give the folder, of a ROS 2 bag too, or a manifest (.toml); `rille init FOLDER` writes one"
+        raise InputError("RIL-992", f"the file {name_or_path} is no sequence", remedy=remedy)
     if not path.is_dir():
         kind = "file" if path.suffix else "sequence"
         raise InputError("RIL-276", f"no {kind} {name_or_path!r}", remedy=_suggestion(name_or_path))

@@ -83,6 +83,9 @@ def test_an_unknown_folder_or_file_says_how_to_open_it(tmp_path):
         open_sequence(str(folder))
     with raises("RIL-276", "no file 'field.toml'"):
         open_sequence("field.toml")
+    with raises("RIL-992", "field.rille.txt is no sequence"):
+        (tmp_path / "field.rille.txt").touch()
+        open_sequence(str(tmp_path / "field.rille.txt"))
     with raises("RIL-276", "'no/such/folder'"):
         open_sequence("no/such/folder")
     with raises("RIL-276", "'~nobody-of-that-name/folder'"):
