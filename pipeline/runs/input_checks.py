@@ -213,13 +213,18 @@ def judge_looks(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -
 
 
 def _depth(looks: Mapping[str, Mapping[int, Look]]) -> list[Finding]:
-    found = [(v.unused_bits, camera) for camera, of in looks.items() for v in of.values() if v.unused_bits is not None]
+    return judge_bits({camera: [look.unused_bits for look in of.values()] for camera, of in looks.items()})
+
+
+def judge_bits(unused_bits: Mapping[str, Sequence[int | None]]) -> list[Finding]:
+    """Whether 16-bit samples hold fewer bits, by camera and image (None: samples of 8 bits)."""
+    found = [(bits, camera) for camera, of in unused_bits.items() for bits in of if bits is not None]
     unused, _ = min(found, default=(0, ""))
     if unused < FEW_BITS:
         return []
     # One of two cameras may give 8 bits.
     deep = {camera for _, camera in found}
-    which = "all images" if len(deep) == len(looks) else f"all {deep.pop()} images"
+    which = "all images" if len(deep) == len(unused_bits) else f"all {deep.pop()} images"
     text = f"samples use {16 - unused} of their 16 bits: {which} are taken as {2**unused} times as dark as they are"
     return [doubt("RIL-896", text, "images", remedy=f"multiply the samples by {2**unused}")]
 
