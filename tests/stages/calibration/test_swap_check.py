@@ -2,9 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter, map_coordinates
 
+from rille.stages.calibration import swap_check
+from rille.stages.core.declare import Bundle, NoParams
 from rille.stages.geometry.epipolar import fits
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.imaging import pyramid
 
 CAMERA = Camera(400.0, 400.0, 319.5, 239.5, 640, 480)
 
@@ -20,3 +24,39 @@ def test_matches_fit_one_way_round(toe_in):
     right = CAMERA.project(T.apply(points)) + rng.normal(0, 0.7, (4000, 2))
     assert fits(rig, left, right, 4.0) > 0.95
     assert fits(rig, right, left, 4.0) < 0.45
+
+
+def seen(camera, T, texture):
+    """Image of a textured wall, whose lower half is nearer, by a camera; T maps the left camera frame to its own."""
+    v, u = np.indices((camera.height, camera.width), np.float64)
+    centre = -T.translation
+    image = np.zeros(v.shape, np.float32)
+    # What is nearer covers the lower half of the view.
+    for depth, part in ((3.0, slice(None)), (1.5, slice(camera.height // 2, None))):
+        x = (u[part] - camera.cx) / camera.fx * depth + centre[0]
+        y = (v[part] - camera.cy) / camera.fy * depth + centre[1]
+        where = np.stack([y * 240.0 / depth + 300.0, x * 240.0 / depth + 400.0])
+        image[part] = map_coordinates(texture, where, order=1, mode="wrap")
+    return image
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5, 2.0])
+@pytest.mark.parametrize("swap", [False, True])
+def test_exchanged_images_are_told_at_any_scale_of_the_right_camera(scale, swap):
+    texture = gaussian_filter(np.random.default_rng(5).normal(128, 200, (700, 900)), 1.5).astype(np.float32)
+    left = Camera(240.0, 240.0, 159.5, 119.5, 320, 240)
+    right = Camera(
+        240.0 * scale, 240.0 * scale, 160 * scale - 0.5, 120 * scale - 0.5, round(320 * scale), round(240 * scale)
+    )
+    T = RigidTransform(np.eye(3), np.array([-0.2, 0.0, 0.0]))
+    images = [seen(left, RigidTransform.identity(), texture), seen(right, T, texture)]
+    # Sharper than its pixels would alias.
+    images = [gaussian_filter(image, max(0.0, k)) for image, k in zip(images, (0.7, 0.7 * scale), strict=True)]
+    inputs = {}
+    for side, image in zip(("left", "right"), images[::-1] if swap else images, strict=True):
+        built = pyramid.build(np.clip(image, 0, 255), pyramid.PyramidParams())
+        arrays = {f"level_{n}": level for n, level in enumerate(built.images)}
+        arrays |= {f"valid_{n}": mask for n, mask in enumerate(built.valid)}
+        inputs[side] = Bundle(arrays, {"levels": built.levels, "noise": built.noise})
+    found = swap_check.STAGE.run(NoParams(), {"frame": 0, "rig": Rig(left, right, T).to_dict()}, inputs).meta
+    assert found["swapped"] == swap, found
