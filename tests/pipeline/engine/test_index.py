@@ -119,7 +119,7 @@ def test_a_file_that_was_cut_short_is_seen_by_its_size(cache):
 
 
 @pytest.mark.parametrize(
-    "damage", [lambda d: b"", lambda d: d[:-3], lambda d: d[:70] + b"9" + d[71:], lambda d: b"\xff" * 99]
+    "damage", [lambda d: b"", lambda d: d[:-3], lambda d: d[:70] + bytes([d[70] ^ 1]) + d[71:], lambda d: b"\xff" * 99]
 )
 def test_a_damaged_index_counts_as_none(cache, damage, capsys):
     nodes, _, _ = run(cache)
@@ -136,6 +136,23 @@ def test_what_was_changed_a_moment_ago_is_not_entered(cache, monkeypatch):
     monkeypatch.setattr(folder, "RACY", 3600.0)
     run(cache)
     assert not indices(cache)
+
+
+def test_what_was_changed_a_moment_ago_is_read_again(cache, monkeypatch):
+    run(cache)
+    monkeypatch.setattr(folder, "RACY", 3600.0)
+    assert len(run(cache)[1]) == NODES
+
+
+def test_a_file_that_was_cut_short_during_the_run_is_not_entered(cache):
+    ref = run(cache)[0]["scale/1"][1]
+    shutil.rmtree(cache / "index")
+    store, again = Store(cache), Store(cache)
+    store.survey("s")
+    os.truncate(cache / ref.path, ref.stored - 1)
+    store.note([ref])
+    again.survey("s")
+    assert again.lookup(ref.stage, ref.key) is None
 
 
 def test_sequences_have_an_index_each_and_parameters_share_one(cache):

@@ -51,6 +51,29 @@ def test_a_parent_in_which_others_could_replace_it_is_not_used(base):
     assert private_folder() == base / "rille", "in a sticky folder nobody else can rename it"
 
 
+def test_a_parent_of_another_user_is_not_used(base, monkeypatch):
+    real = Path.stat
+
+    def stat(path, **how):
+        found = real(path, **how)
+        return os.stat_result((*found[:4], os.geteuid() + 1, *found[5:])) if path == base else found
+
+    monkeypatch.setattr(Path, "stat", stat)
+    assert private_folder().parent == Path(tempfile.gettempdir())
+
+
+def test_a_folder_on_a_disk_that_may_only_be_read_is_not_used(base, monkeypatch):
+    (base / "rille").mkdir(mode=0o700)
+    monkeypatch.setattr(private.os, "access", lambda path, mode: base not in path.parents)
+    assert private_folder().parent == Path(tempfile.gettempdir())
+
+
+def test_a_relative_place_counts_as_none(base, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    assert private_folder().parent == Path(tempfile.gettempdir())
+    assert not Path("relative").exists()
+
+
 def test_a_link_is_not_followed(base, tmp_path):
     (tmp_path / "theirs").mkdir(mode=0o700)
     (base / "rille").symlink_to(tmp_path / "theirs")

@@ -146,6 +146,14 @@ def test_a_manifest_may_be_long(cache):
     assert Store(cache).open(ref)["count"] == 3
 
 
+def test_what_another_run_has_put_there_meanwhile_is_not_taken_for_ours(cache):
+    ref = commit(cache)
+    file_of(cache).unlink()
+    commit(cache, value=2.0)
+    with raises("RIL-572", "toy"):
+        Store(cache).open(ref)
+
+
 def test_arrays_are_read_on_access_only(cache):
     read = Store(cache).open(commit(cache))
     file_of(cache).unlink()
@@ -169,7 +177,16 @@ def test_digest_ignores_layout_and_nan_payload_only(values):
     assert (array_digests({"a": other}) != digest) or np.isnan(values[1])
 
 
-@pytest.mark.parametrize("meta", [{"a": float("nan")}, {"a": [float("inf")]}, {"a": {1: 2}}, {"a": np.float32(1)}])
+def test_only_numbers_are_stored():
+    for array in (np.array([1j]), np.array(["a"]), np.array([None])):
+        with pytest.raises(TypeError, match="array a is"):
+            array_digests({"a": array})
+
+
+@pytest.mark.parametrize(
+    "meta",
+    [{"a": float("nan")}, {"a": [float("inf")]}, {"a": {1: 2}}, {"a": np.float32(1)}, {"a": {1}}, {"a": frozenset()}],
+)
 def test_meta_must_be_json(cache, meta):
     with pytest.raises(TypeError, match=r"meta\.a"):
         commit(cache, **meta)
@@ -197,6 +214,22 @@ def test_another_result_for_the_same_key_is_an_error_of_its_own(cache):
         commit(cache, extra=1)
     assert Store(cache).lookup("toy", KEY) == first
     assert maintenance.verify(Store(cache)) == (1, [])
+
+
+def test_an_artifact_that_goes_and_comes_again_between_two_looks_is_no_other_result(cache, monkeypatch):
+    ref, store = commit(cache), Store(cache)
+    path, gone, look = cache / ref.path, cache / "elsewhere", store.lookup
+
+    def meanwhile(*args, **options):
+        path.rename(gone)
+        try:
+            return look(*args, **options)
+        finally:
+            gone.rename(path)
+            monkeypatch.setattr(store, "lookup", look)
+
+    monkeypatch.setattr(store, "lookup", meanwhile)
+    assert store.commit(STAGE, KEY, bundle()) == ref
 
 
 KINDS = ("manifest", "zarr.json", "elevation/zarr.json", "elevation/c.0.0", "flag/c.0.0", "directory")
@@ -264,6 +297,21 @@ def forge(cache, change):
     found = json.loads(data[:size])["manifest"]
     change(found)
     file_of(cache).write_bytes(manifest.frame(found) + data[size:])
+
+
+def test_verify_finds_an_artifact_in_the_place_of_another(cache):
+    path = cache / commit(cache).path
+    path.with_name(f"ab{'c' * 62}.zarr.zip").write_bytes(path.read_bytes())
+    sound, found = maintenance.verify(Store(cache))
+    assert (sound, [d.key for d in found]) == (1, ["ab" + "c" * 62])
+
+
+def test_deep_verification_finds_facts_that_were_not_computed(cache):
+    commit(cache)
+    forge(cache, lambda found: found["meta"].update(none=1))
+    assert maintenance.verify(Store(cache)) == (1, [])
+    sound, found = maintenance.verify(Store(cache), deep=True)
+    assert (sound, [d.reason for d in found]) == (0, ["the metadata have another digest"])
 
 
 @pytest.mark.parametrize("about", [{"shape": [10**6, 10**6]}, {"dtype": "<f99"}, {"dtype": "|O8"}])
@@ -335,8 +383,10 @@ def test_a_cache_that_may_not_be_written_is_one_line_and_still_read(cache, monke
     def refuse(*args, **kwargs):
         raise OSError(errno.EROFS, "Read-only file system")
 
+    os.utime(cache / ref.path, (1.0, 1.0))  # so old that a look-up would touch it
     monkeypatch.setattr(Path, "mkdir", refuse)
     monkeypatch.setattr(os, "rename", refuse)
+    monkeypatch.setattr(os, "utime", refuse)
     assert Store(cache).lookup("toy", KEY) == ref
     file_of(cache).write_bytes(b"")
     assert Store(cache).lookup("toy", KEY) is None, "damaged, though it cannot be set aside"
@@ -389,6 +439,34 @@ def test_gc_keeps_what_is_named_or_young(cache):
     assert list((cache / "artifacts").iterdir()) == []
 
 
+def test_gc_takes_quarantine_and_old_indices_and_nothing_of_others(cache, monkeypatch):
+    monkeypatch.setattr(folder, "RACY", 0.0)
+    store, ref = Store(cache), commit(cache)
+    store.survey("s")
+    store.note([ref])
+    patch(cache, "flag/c.0.0", lambda data: bytes(len(data)))
+    maintenance.verify(store)
+    (cache / "notes.txt").write_text("of somebody else")
+    every = [path for path in cache.rglob("*") if path.is_file()]
+    assert sorted(p.relative_to(cache).parts[0] for p in every) == ["index", "notes.txt", "quarantine", "quarantine"]
+    assert maintenance.gc(store, {KEY}).bytes == 0, "all is young"
+    for path in every:
+        os.utime(path, (1.0, 1.0))
+    maintenance.gc(store, {KEY})
+    assert [path.name for path in cache.rglob("*") if path.is_file()] == ["notes.txt"]
+
+
+def test_gc_takes_kernels_that_nothing_uses_but_not_in_a_dry_run(cache, tmp_path, monkeypatch):
+    kernel, older = tmp_path / "a.nbc", tmp_path / "older"
+    older.mkdir()
+    for path in (kernel, older / "b.nbc"):
+        path.write_bytes(b"1234")
+    monkeypatch.setattr(maintenance.numba_cache, "unused", lambda: [kernel, older])
+    for dry_run in (True, False):
+        assert maintenance.gc(Store(cache), set(), dry_run=dry_run).bytes == 8
+        assert kernel.exists() == older.exists() == dry_run
+
+
 def test_gc_keeps_what_a_run_used_lately(cache, monkeypatch):
     monkeypatch.setattr(folder, "RACY", 0.0)
     store = Store(cache)
@@ -417,6 +495,7 @@ def test_a_run_over_an_old_cache_notes_what_it_touched(cache, monkeypatch):
     second.note([found])
     third = Store(cache)
     third.survey("s")
+    monkeypatch.setattr(third, "_read_manifest", lambda *_: pytest.fail("the index knows the mark that touching gave"))
     assert third.lookup("toy", KEY) == ref
 
 

@@ -6,6 +6,8 @@ import errno
 import json
 import os
 import shutil
+import time
+from itertools import pairwise
 
 import pytest
 from raising import raises
@@ -35,6 +37,9 @@ def test_the_cache_is_listed_by_the_run_that_used_it_last(two, capsys):
     assert rows["toy", "numbers"].artifacts == 8
     assert rows["toy", "numbers"].bytes == 8 * 40 * 40 * 5
     assert rows["toy", "numbers"].last_run == "toy/2"
+    numbers = [store.manifest(stage, key) for stage, key in maintenance.artifacts(store) if stage == "numbers"]
+    made = [manifest["provenance"]["started"] for manifest in numbers]
+    assert (rows["toy", "numbers"].oldest, rows["toy", "numbers"].newest) == (min(made), max(made))
     on_disk = sum(p.stat().st_size for p in (folder / "cache/artifacts").rglob("*") if p.is_file())
     assert sum(r.stored for r in rows.values()) == on_disk
     shutil.rmtree(first)
@@ -44,6 +49,24 @@ def test_the_cache_is_listed_by_the_run_that_used_it_last(two, capsys):
     assert "no kept run" in capsys.readouterr().out
     inventory.ls(folder / "cache", folder / "runs", as_json=True)
     assert {r["stage"] for r in json.loads(capsys.readouterr().out)} == {"numbers", "scale", "total"}
+
+
+def test_the_largest_comes_first(tmp_path):
+    run(tmp_path, "1", "a", frames=1)
+    run(tmp_path, "1", "z", seed=1, size=200)
+    rows = inventory.holdings(Store(tmp_path / "cache"), tmp_path / "runs")
+    assert [r.sequence for r in rows] == 3 * ["z"] + 3 * ["a"]
+    assert all(a.stored >= b.stored for a, b in pairwise(rows) if a.sequence == b.sequence)
+
+
+@pytest.mark.parametrize(
+    ("newest", "oldest", "words"),
+    [(30, 30, " 30 s "), (300, 310, " 5 min "), (7 * 3600, 7 * 3600, " 7 h "), (7200, 3 * 86400, " 2 h..3 d ")],
+)
+def test_ages_are_told_in_the_largest_unit(newest, oldest, words):
+    now = time.time()
+    row = inventory.Holding("s", "locus", 2, 10, 10, oldest=now - oldest, newest=now - newest)
+    assert words in list(inventory.describe([row], []))[1]
 
 
 def test_the_last_run_is_the_last_one_of_all_folders(tmp_path):
@@ -62,6 +85,8 @@ def test_a_pin_outlives_the_folder_of_its_run(two, capsys):
     assert pins.pin(store, first) == 9
     shutil.rmtree(folder / "runs")
     grow_old(folder)
+    rows = [r for r in inventory.holdings(store, folder / "runs") if r.stage == "numbers"]
+    assert {(r.last_run, r.artifacts, r.pinned) for r in rows} == {("toy/1", 4, 4), ("-", 4, 0)}
     assert commands.gc(cache=folder / "cache", runs=folder / "runs", dry_run=True) == 0
     printed = capsys.readouterr().out
     assert "would remove 9 artifacts" in printed
@@ -71,15 +96,30 @@ def test_a_pin_outlives_the_folder_of_its_run(two, capsys):
         "total": "1",
     }
     assert set(maintenance.artifacts(store)) == before, "it was only said"
+    sizes = {stage: [0, 0] for stage in ("numbers", "scale", "total")}
+    for stage, key in before:
+        if key not in pins.keys(store):
+            sizes[stage][0] += 1
+            sizes[stage][1] += (folder / "cache" / artifact_path(stage, key)).stat().st_size
+    assert maintenance.gc(store, pins.keys(store), dry_run=True).stages == sizes
     commands.gc(cache=folder / "cache", runs=folder / "runs", dry_run=False)
     assert {key for _, key in maintenance.artifacts(store)} == pins.keys(store)
     assert maintenance.verify(store, deep=True) == (9, [])
     with raises("RIL-563", "'2'", "toy/1"):
         pins.unpin(store, "2")
-    assert pins.unpin(store, "toy/1") == "toy/1"
+    assert pins.unpin(store, str(first)) == "toy/1"
     with raises("RIL-744", "no run is known"):
         commands.gc(cache=folder / "cache", runs=folder / "runs", dry_run=False)
     assert len(set(maintenance.artifacts(store))) == 9
+
+
+def test_pins_add_up_and_the_latest_of_a_sequence_goes_first(two):
+    folder, first, second = two
+    store = Store(folder / "cache")
+    assert pins.pin(store, first) == pins.pin(store, second) == 9
+    assert pins.keys(store) == lookup.used(first) | lookup.used(second)
+    assert [pins.unpin(store, name) for name in ("toy", "1")] == ["toy/2", "toy/1"]
+    assert pins.pins(store) == []
 
 
 def test_nothing_is_cleared_away_while_a_pin_cannot_be_read(two):

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import pytest
+from raising import raises
 from toys import chain
 
 from rille.pipeline.engine import events, scheduler
@@ -17,3 +19,20 @@ def test_a_run_is_complete_once_its_files_are_written(tmp_path):
     assert [line.split()[1] for line in lookup.describe([run])] == ["state", "interrupted"]
     events.add_facts(run / lookup.LEDGER, total=1.0)
     assert [line.split()[1] for line in lookup.describe([run])] == ["state", "complete"]
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_runs_are_found_by_the_names_that_users_type(tmp_path, linked):
+    """The latest of all is not the last by name; a link stands for a run that is there already."""
+    names = ("a/20260103", "b/20260101", "b/20260102")
+    every = [tmp_path / "runs" / name for name in names]
+    for run in every:
+        run.mkdir(parents=True)
+        (run / lookup.LEDGER).touch()
+    if linked:
+        (tmp_path / "runs/b/latest").symlink_to("20260102")
+    assert lookup.all_runs(tmp_path / "runs") == every
+    known = {"latest": 0, "a": 0, "b": 2, "20260101": 1, "b/20260101": 1, str(every[1]): 1}
+    assert {text: lookup.find(text, tmp_path / "runs") for text in known} == {t: every[k] for t, k in known.items()}
+    with raises("RIL-067", "20260103"):
+        lookup.find("20260104", tmp_path / "runs")

@@ -39,10 +39,13 @@ def collect(store: Store, runs: Path) -> int:
     return len(list(artifacts(store)))
 
 
-def test_clearing_up_from_elsewhere_keeps_what_known_runs_need(used, tmp_path):
+def test_clearing_up_from_elsewhere_keeps_what_known_runs_need(used, tmp_path, monkeypatch):
     assert collect(used, tmp_path / "elsewhere" / "runs") == 9
     roots.note(used, tmp_path / "work" / "runs")
     assert len(list((used.root / "roots").iterdir())) == 1, "noted once"
+    monkeypatch.setattr(roots.platform, "node", lambda: "another")
+    roots.note(used, tmp_path / "work" / "runs")
+    assert len(list((used.root / "roots").iterdir())) == 2, "by each machine: there, the folder may be another one"
 
 
 def test_where_no_run_is_known_nothing_is_cleared(used, tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from raising import raises
 
+from rille.stages.evaluation import dem_comparison
 from rille.stages.evaluation.dem_comparison import Grid, align, binned, cell_means, common, errors, figures, interpolate
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
@@ -150,6 +151,15 @@ def test_the_stated_deviations_are_those_of_least_squares() -> None:
     x, y = np.moveaxis(flat.centres(), -1, 0)
     spread = [x.size, ((y - y.mean()) ** 2).sum(), ((x - x.mean()) ** 2).sum()]
     np.testing.assert_allclose(found.sigma[2:5], 0.05 / np.sqrt(spread), rtol=0.1)
+
+
+def test_of_a_large_model_points_all_over_it_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dem_comparison, "MOST_POINTS", 1000)
+    whole = terrain()
+    found = align(Grid(whole.values + 0.1, whole.matrix), whole, "rigid")
+    assert 500 < found.points < 2000
+    assert found.centre[:2] == pytest.approx(whole.centres().mean(axis=(0, 1)), abs=3.0)
+    assert found.translation == pytest.approx([0.0, 0.0, -0.1], abs=1e-6)
 
 
 def test_a_motion_that_the_terrain_does_not_show_is_refused() -> None:

@@ -103,6 +103,15 @@ def test_places_against_a_look_at_every_wheel_and_part_of_the_belly() -> None:
             np.testing.assert_allclose([a[r, c] for a in found], expected, rtol=1e-4, atol=1e-6)
 
 
+def test_headings_go_once_round_half_a_turn() -> None:
+    at = Stance.of(MODEL, 0.0005).wheels.astype(float)
+    front, rear = at[:, :2].mean(axis=1), at[:, 2:].mean(axis=1)
+    ahead = (front - rear) @ [1j, 1.0]  # columns, and rows downwards
+    steps = np.degrees(np.angle(ahead[1:] / ahead[:-1]))
+    np.testing.assert_allclose(np.abs(steps.sum()), 180.0 * 7 / 8, atol=0.5)
+    np.testing.assert_allclose(steps, steps.mean(), atol=0.7)  # rounded to cells of half a millimetre
+
+
 def test_bilinear_weights_and_places() -> None:
     at = Stance.of(MODEL, CELL)
     np.testing.assert_allclose(at.weights.sum(axis=1), 1.0, rtol=1e-6)

@@ -120,7 +120,8 @@ def test_noise_does_not_hide_a_step() -> None:
 def test_a_single_wrong_cell_on_fine_ground_is_no_rock_but_a_coarse_post_is() -> None:
     z = np.zeros((100, 120))
     z[50, 60] = 0.05
-    assert (judge(z)["risk"] == HAZARDOUS).sum() == 0
+    for cell in (FINE, 0.003):  # five of which are a wheel's radius
+        assert (judge(z, cell)["risk"] == HAZARDOUS).sum() == 0
     z[50, 60] = 0.5
     assert (judge(z, cell=0.1, vehicle=DEFAULT_VEHICLE)["risk"] == HAZARDOUS).sum() >= 9
 

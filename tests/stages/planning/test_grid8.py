@@ -14,17 +14,17 @@ from scipy.sparse.csgraph import dijkstra
 from rille.stages.planning.grid8 import NEIGHBOURS, cost_to_go, parts, trace
 from rille.stages.planning.row_graph import UNREACHED
 
-UNIT = 5
+UNIT = 7
 
 
 def edges(height: np.ndarray, ways: np.ndarray, toll: np.ndarray) -> list[tuple[tuple[int, int], tuple[int, int], int]]:
-    """Every step that both its ends allow: length 5, or 7 on a diagonal, plus the climb or descent and the toll."""
+    """Every step that both its ends allow: length 7, or 10 on a diagonal, plus the climb or descent and the toll."""
     rows, cols = height.shape
     return [
         (
             (r, c),
             (r + dr, c + dc),
-            (UNIT if 0 in (dr, dc) else 7)
+            (UNIT if 0 in (dr, dc) else 10)
             + abs(int(height[r, c] - height[r + dr, c + dc]))
             + int(toll[r + dr, c + dc]),
         )
@@ -39,7 +39,8 @@ def edges(height: np.ndarray, ways: np.ndarray, toll: np.ndarray) -> list[tuple[
 @given(seed=st.integers(0, 9999), rows=st.integers(1, 11), cols=st.integers(1, 11), blocked=st.floats(0.0, 0.6))
 def test_costs_equal_networkx_and_scipy(seed: int, rows: int, cols: int, blocked: float) -> None:
     rng = np.random.default_rng(seed)
-    height, toll = rng.integers(0, 9, (rows, cols)), rng.integers(0, 3, (rows, cols))
+    # Of few different heights and tolls, so that many paths cost the same.
+    height, toll = (rng.integers(0, rng.integers(1, most), (rows, cols)) for most in (9, 3))
     ways = np.where(rng.random((rows, cols)) < blocked, 0, rng.integers(1, 16, (rows, cols))).astype(np.uint8)
     target = int(rng.integers(rows)), int(rng.integers(cols))
     cost, step = cost_to_go(height, ways, target, None, UNIT, toll)
@@ -55,10 +56,16 @@ def test_costs_equal_networkx_and_scipy(seed: int, rows: int, cols: int, blocked
         distance = dijkstra(csr_matrix((w, (i, j)), shape=(rows * cols,) * 2), indices=target[0] * cols + target[1])
         np.testing.assert_array_equal(np.where(cost < UNREACHED, cost, np.inf).ravel(), distance)
     weight = {(a, b): w for a, b, w in listed}
+    ahead: dict[tuple[int, int], list[tuple[int, tuple[int, int]]]] = {}
+    for a, b, w in listed:
+        if b in reached and reached[a] == reached[b] + w:
+            ahead.setdefault(a, []).append((reached[b], b))
     for start in reached:
         cells = [tuple(int(v) for v in cell) for cell in trace(step, start)]
         assert cells[-1] == target
         assert sum(weight[a, b] for a, b in pairwise(cells)) == cost[start]
+        if start != target:
+            assert cells[1] == min(ahead[start])[1], "of equals the one nearer to the target, then that of lower index"
 
 
 def test_the_search_ends_at_the_start_and_its_cost_is_the_same() -> None:
@@ -70,6 +77,24 @@ def test_the_search_ends_at_the_start_and_its_cost_is_the_same() -> None:
     assert part[48, 55] == whole[48, 55]
     assert (part == UNREACHED).sum() > 1000
     assert len(trace(step, (48, 55))) >= 6
+
+
+def test_costs_of_a_large_map_equal_scipy() -> None:
+    """So large that thousands of cells wait for their turn."""
+    n = 400
+    height, at = np.random.default_rng(6).integers(0, 30, (n, n)), np.arange(n * n).reshape(n, n)
+    cost, _ = cost_to_go(height, np.full((n, n), 15, np.uint8), (200, 200), None, UNIT, np.zeros_like(height))
+    graph = []
+    for length, here, there in (
+        (7, np.s_[1:], np.s_[:-1]),
+        (7, np.s_[:, 1:], np.s_[:, :-1]),
+        (10, np.s_[1:, 1:], np.s_[:-1, :-1]),
+        (10, np.s_[1:, :-1], np.s_[:-1, 1:]),
+    ):
+        weights = length + np.abs(height[here] - height[there])
+        graph.append(csr_matrix((weights.ravel(), (at[here].ravel(), at[there].ravel())), shape=(n * n, n * n)))
+    expected = dijkstra(sum(graph[1:], graph[0]), directed=False, indices=at[200, 200])
+    np.testing.assert_array_equal(cost.ravel(), expected)
 
 
 @settings(max_examples=20, deadline=None)
@@ -88,3 +113,11 @@ def test_connected_parts_equal_networkx(seed: int, rows: int, cols: int) -> None
     for k, cells in enumerate(expected):
         assert {(int(r), int(c)) for r, c in np.argwhere(number == k)} == cells
         assert spans[k].tolist() == [min(cells)[0], max(r for r, _ in cells)]
+
+
+def test_there_may_be_thousands_of_parts() -> None:
+    ways = np.zeros((90, 90), dtype=np.uint8)
+    ways[::2, ::2] = 15  # no cell beside another
+    number, spans = parts(ways)
+    np.testing.assert_array_equal(number[::2, ::2].ravel(), np.arange(45 * 45))
+    np.testing.assert_array_equal(spans, np.repeat(np.arange(0, 90, 2), 45)[:, None].repeat(2, axis=1))

@@ -73,17 +73,24 @@ def test_unknown_and_hazard_are_never_entered(seed: int, angle: float, planner: 
 
 
 @settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 999), margin=st.sampled_from([0.0, 0.01, 0.025]), planner=st.sampled_from(["rows", "grid8"]))
-def test_wheels_keep_the_margin_from_hazards(seed: int, margin: float, planner: str) -> None:
+@given(
+    seed=st.integers(0, 999),
+    margin=st.sampled_from([0.0, 0.01, 0.025]),
+    planner=st.sampled_from(["rows", "grid8"]),
+    bit=st.sampled_from(["step", "tilt"]),
+)
+def test_wheels_and_middle_keep_the_margin_from_hazards_to_them(
+    seed: int, margin: float, planner: str, bit: str
+) -> None:
     lattice = Lattice.at(-20, 30, CELL, 60, 56)
     risk, z = terrain(seed, lattice)
     vehicle = SHORT.model_copy(update={"margin": margin})
-    route = find_path(maps(risk, z), lattice, vehicle, params=PathParams(planner=planner))
+    route = find_path(maps(risk, z, bit), lattice, vehicle, params=PathParams(planner=planner))
     hazards = lattice.xy()[risk == HAZARDOUS]
     if len(route.xyz) < 2:
         return
-    wheels = wheels_of(route, vehicle)
-    nearest = np.hypot(*(wheels[:, None] - hazards[None]).transpose(2, 0, 1)).min()
+    places = wheels_of(route, vehicle) if bit == "step" else route.xyz[:, :2]
+    nearest = np.hypot(*(places[:, None] - hazards[None]).transpose(2, 0, 1)).min()
     # a wheel is put on the nearest cell: half a diagonal
     assert nearest >= margin - 0.71 * CELL
     assert margin == 0.0 or nearest > 0.3 * CELL
@@ -163,6 +170,17 @@ def test_ground_that_may_be_a_hazard_is_gone_round(chance: float, crossed: bool)
     route = find_path(given, lattice, SHORT, ends=ends, params=PathParams(uncertainty_cost=20.0))
     assert bool((given["p_hazard"][route.cells[:, 0], route.cells[:, 1]] == np.float32(chance)).all()) == crossed
     assert len(route.cells) > 30
+
+
+def test_the_dearest_ground_is_gone_round() -> None:
+    """A cell costs 45 000 steps of 0.2 mm, which 16 bits do not hold."""
+    lattice = Lattice.at(-30, 60, CELL, 61, 61)
+    given = maps(*level(lattice)) | {"p_hazard": np.zeros(lattice.shape, dtype=np.float32)}
+    given["p_hazard"][25:36, 24:37] = 0.9
+    prices = PathParams(uncertainty_cost=1000.0, p_certain_hazard=1.0)
+    route = find_path(given, lattice, SHORT, ends=((0.0, 0.1), (0.0, 0.5)), params=prices)
+    assert len(route.cells) > 30
+    assert given["p_hazard"][route.cells[:, 0], route.cells[:, 1]].max() == 0.0
 
 
 def test_ground_that_is_probably_a_hazard_closes_the_way() -> None:
@@ -255,6 +273,8 @@ def test_a_map_that_is_cut_is_crossed_on_its_longer_side() -> None:
     assert not describe(find_path(given, lattice, SHORT), given, lattice, SHORT)["found"]
     facts = describe(find_path(given, lattice, SHORT, stretch=True), given, lattice, SHORT)
     assert facts["planner"] == "grid8"
+    from_start = find_path(given, lattice, SHORT, ends=((0.0, -0.3), None), stretch=True)
+    assert not describe(from_start, given, lattice, SHORT)["found"], "a start that is given is not left out"
     before, beyond = facts["left_out_m"]
     assert 0.30 <= before <= 0.30 + 2 * SHORT.half_length
     assert beyond <= 2 * SHORT.half_length
@@ -315,6 +335,23 @@ def test_a_start_that_cannot_be_stood_on_is_refused_with_the_figure(kind: int, e
         find_path(given, lattice, SHORT, ends=((0.0, 0.06), None))
 
 
+@pytest.mark.parametrize(
+    ("bit", "band", "value", "words"),
+    [
+        ("tilt", "tilt", math.radians(25.0), "tilt 25 deg, vehicle.max_slope_deg 20"),
+        ("rise", "clearance", -0.01, f"rise under the belly {SHORT.clearance + 0.01:.3g} m, vehicle.clearance"),
+    ],
+)
+def test_a_measure_is_told_in_the_unit_of_its_limit(bit: str, band: str, value: float, words: str) -> None:
+    """Its raster holds radians, or what is left under the belly."""
+    lattice = Lattice.at(-20, 40, CELL, 41, 41)
+    risk, z = level(lattice)
+    risk[30:39, 15:26] = HAZARDOUS
+    given = maps(risk, z, bit) | {band: np.full(lattice.shape, value, dtype=np.float32)}
+    with raises("RIL-408", words):
+        find_path(given, lattice, SHORT, ends=((0.0, 0.06), None))
+
+
 def test_a_hazard_of_doubt_alone_is_said_to_be_one() -> None:
     """``step 0.008 m, vehicle.max_step 0.01`` reads as permitted ground."""
     lattice = Lattice.at(-20, 40, CELL, 41, 41)
@@ -350,6 +387,17 @@ def test_limits_that_leave_nothing_are_a_warning_of_the_whole_map_alone() -> Non
     assert "warnings" not in STAGE.run(PathParams(), {"use": "local"}, {"risk": source}).meta
 
 
+def test_going_down_is_no_climb() -> None:
+    lattice = Lattice.at(-10, 60, CELL, 50, 21)
+    risk, z = level(lattice)
+    rows = np.arange(50.0)[:, None]  # the target is in row 0
+    for height, top in ((0.002 * rows, 0.0), (0.002 * np.minimum(rows, 49.0 - rows), 0.002 * 24.0)):
+        given = maps(risk, z + height)
+        facts = describe(find_path(given, lattice, SHORT), given, lattice, SHORT)
+        assert facts["vertices"] > 30
+        assert facts["climb_m"] == pytest.approx(max(0.0, top - facts["start"][2]), abs=0.002)
+
+
 @pytest.mark.parametrize("blocked", [False, True])
 def test_the_stage(blocked: bool) -> None:
     lattice = Lattice.at(-10, 60, CELL, 50, 21)
@@ -383,7 +431,7 @@ def test_the_stage(blocked: bool) -> None:
     # a wheel's mean at the first and last row leans on what lies inside: half a cell of its three
     assert out.meta["climb_m"] == pytest.approx(0.1 * steps * CELL, abs=0.1 * CELL + 1e-6)
     assert out.meta["length_m"] == pytest.approx(steps * CELL * math.hypot(1, 0.1), rel=1e-3)
-    assert out["reachable"].any()
+    assert out["reachable"].sum() == out.meta["reachable_targets"] > 1
 
 
 @pytest.mark.parametrize(("col", "row"), [(0, 0), (0, -1), (-1, 0), (-1, -1)])

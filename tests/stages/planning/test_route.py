@@ -14,12 +14,22 @@ from rille.stages.planning.local_planner.route import (
     first_metres,
     last_metres,
     length_of,
+    pieces,
     straightened,
     through,
     turnable,
     vertices,
     within_turn,
 )  # fmt: skip
+from rille.stages.planning.local_planner.state_lattice import (
+    AHEAD,
+    BACK,
+    STEPS,
+    TO_LEFT,
+    TO_RIGHT,
+    PoseGraph,
+    PoseGrid,
+)
 
 STAIRS = [
     Piece((0.0, 0.0), (0.0, 0.1), 0.0, 1),
@@ -117,3 +127,31 @@ def test_what_rounding_leaves_over_is_no_piece() -> None:
     way = [Piece((0.0, 0.0), (0.0, 0.1), 0.0, 1), Piece((0.0, 0.1), (0.0, 0.2), 0.0, 1)]
     assert [piece.b for piece in first_metres(way, 0.1 + 1e-15)] == [(0.0, 0.1)]
     assert [piece.a for piece in last_metres(way, 0.1 - 1e-15)] == [(0.0, 0.1)]
+
+
+def graph_but(what: str, k: int) -> PoseGraph:
+    """Five places by five, all of which is known but the pose, step or turn ``k`` of the middle one."""
+    known = {name: np.ones((8, 5, 5), bool) for name in ("pose", "step", "turn")}
+    known.get(what, np.ones((8, 5, 5), bool))[k % 8, 2, 2] = False
+    price = np.ones((8, 5, 5))
+    grid = PoseGrid((0.0, 0.0), 0.0, 0.1, (5, 5), (2, 2))
+    return PoseGraph(grid, price, price, price, (known["pose"], known["step"], known["turn"]))
+
+
+@pytest.mark.parametrize("k", range(8))
+def test_a_stretch_is_unknown_whichever_way_it_is_driven(k: int) -> None:
+    a, b = (2, 2), (2 + int(STEPS[k][0]), 2 + int(STEPS[k][1]))
+    for heading, begin, move, end in ((k, a, AHEAD, b), (k, b, BACK, a), (k + 8, b, AHEAD, a), (k + 8, a, BACK, b)):
+        moves = [(heading, *begin, move), (heading, *end, -1)]
+        known = {what: [piece.known for piece in pieces(graph_but(what, k), moves)] for what in ("", "step", "pose")}
+        assert known == {"": [True], "step": [False], "pose": [False]}
+        assert pieces(graph_but("step", k + 1), moves)[0].known
+
+
+@pytest.mark.parametrize("k", [0, 6, 7, 15])
+def test_a_turn_over_unknown_ground_makes_what_follows_unknown(k: int) -> None:
+    for first, turn, then in ((k, TO_LEFT, k + 1), (k + 1, TO_RIGHT, k)):
+        dr, dc = (int(v) for v in STEPS[then % 16])
+        moves = [(first, 2, 2, turn), (then, 2, 2, AHEAD), (then, 2 + dr, 2 + dc, AHEAD), (then, 2, 2, -1)]
+        for what, known in (("", [True, True]), ("turn", [False, True])):
+            assert [piece.known for piece in pieces(graph_but(what, k), moves)] == known

@@ -11,7 +11,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from rille.stages.planning.configuration_space import ALL, LEFT, RIGHT, STRAIGHT
-from rille.stages.planning.row_graph import UNREACHED, Charges, leading, plan, sweep
+from rille.stages.planning.row_graph import UNREACHED, Charges, leading, nearest_middle, plan, sweep
 
 
 def edges(
@@ -149,17 +149,20 @@ def test_a_stray_cell_before_or_behind_does_not_block() -> None:
     assert plan(np.zeros((20, 15), dtype=np.int64), every_way(free), tolerance=0).blocking_row == 18
 
 
-def test_a_closed_row_of_a_small_map_is_not_excused_by_the_vehicles_length() -> None:
+@pytest.mark.parametrize("row", [3, 5, 8])
+def test_a_closed_row_of_a_small_map_is_not_excused_by_the_vehicles_length(row: int) -> None:
+    """A path may miss a quarter of 11 rows at either end."""
     free = np.ones((12, 9), dtype=bool)
-    free[5] = False
-    assert plan(np.zeros((12, 9), dtype=np.int64), every_way(free), tolerance=50).blocking_row == 5
+    free[row] = False
+    assert plan(np.zeros((12, 9), dtype=np.int64), every_way(free), tolerance=50).blocking_row == row
 
 
 def test_given_ends() -> None:
     flat, free = np.zeros((12, 12), dtype=np.int64), np.ones((12, 12), dtype=bool)
     found = plan(flat, every_way(free), ends=((10, 1), (2, 8)))
     np.testing.assert_array_equal(found.cells[[0, -1]], [[10, 1], [2, 8]])
-    assert "not ahead" in plan(flat, every_way(free), ends=((2, 1), (10, 1))).reason
+    for row in (2, 10):
+        assert "not ahead" in plan(flat, every_way(free), ends=((row, 1), (10, 8))).reason
     free[10, 1] = False
     refused = plan(flat, every_way(free), ends=((10, 1), None))
     assert (refused.blocking_row, refused.reason) == (10, "the start is not a free cell")
@@ -189,3 +192,13 @@ def test_a_toll_is_paid_on_entering() -> None:
     flat, free, toll = np.zeros((5, 7), dtype=np.int64), np.ones((5, 7), dtype=bool), np.zeros((5, 7), dtype=np.int64)
     toll[2, 3] = 2  # two moves aside cost two parts of a step of height
     assert plan(flat, every_way(free), charges=Charges(toll)).cells[2, 1] != 3
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 9999), rows=st.integers(1, 9), cols=st.integers(1, 9))
+def test_the_cell_nearest_to_the_middle_of_a_row_is_the_first_of_the_nearest(seed: int, rows: int, cols: int) -> None:
+    rng = np.random.default_rng(seed)
+    cells, row = rng.random((rows, cols)) < 0.3, int(rng.integers(rows))
+    cells[rng.integers(rows), rng.integers(cols)] = True
+    listed = [(int(r), int(c)) for r, c in np.argwhere(cells)]
+    assert nearest_middle(cells, row) == min(listed, key=lambda at: abs(at[0] - row) + abs(at[1] - 0.5 * (cols - 1)))

@@ -70,6 +70,28 @@ def test_costs_are_those_of_networkx(seed: int, rows: int, cols: int) -> None:
         assert sum(other.edges[e]["weight"] for e in edges) == pytest.approx(cost[0][origin])
 
 
+class Asked:
+    """A footing that gives back where it was asked."""
+
+    def gaps(self, x: np.ndarray, y: np.ndarray, heading: np.ndarray) -> tuple[np.ndarray, ...]:
+        return x, y, heading
+
+
+def test_prices_are_those_of_a_pose_of_half_a_step_ahead_and_of_half_a_turn_to_the_left() -> None:
+    grid = PoseGrid((0.3, -0.2), 0.4, 0.05, (4, 5), (2, 1))
+    x, y, heading = (
+        PoseGraph.of(Asked(), grid, lambda gaps, x, y, which=which: (x == x, gaps[which]))  # type: ignore[arg-type]
+        for which in range(3)
+    )
+    row, col = np.indices(grid.shape).astype(float)
+    for k in range(8):
+        half_turn = 0.5 * (math.remainder(ANGLES[k + 1] - ANGLES[k], 2 * math.pi))
+        for what, (dr, dc), turn in (("pose", (0, 0), 0.0), ("step", 0.5 * STEPS[k], 0.0), ("turn", (0, 0), half_turn)):
+            found = [getattr(graph, what)[k] for graph in (x, y, heading)]
+            np.testing.assert_allclose(found[:2], grid.xy(row + dr, col + dc), atol=1e-12)
+            np.testing.assert_allclose(found[2], 0.4 + ANGLES[k] + turn)
+
+
 def test_headings_go_once_round_to_the_left() -> None:
     assert np.diff(ANGLES).min() > math.radians(18)
     assert math.degrees(ANGLES[2]) == pytest.approx(45.0)

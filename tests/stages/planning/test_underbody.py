@@ -11,6 +11,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import SAFE, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.local_planner.clearance import Footing, Hazards
+from rille.stages.planning.local_planner.underbody import Straddle, clears
 from rille.stages.terrain.occlusion_bounds import Bounds
 
 ROVER = Vehicle(
@@ -90,3 +91,16 @@ def test_raising_what_may_be_there_never_opens_ground(seed: int, x: float, y: fl
         unknown(footing(hidden, u), x, y, heading) > 0 for u in (upper, more, np.full(LATTICE.shape, np.nan))
     )
     assert before >= after >= without
+
+
+def test_a_hollow_under_one_wheel_does_not_make_up_for_a_rise_at_another() -> None:
+    rng, clearance = np.random.default_rng(5), 0.02
+    weights, limits = rng.dirichlet(np.ones(4), 9), np.array([0.08, 0.1, clearance, 0.1])
+    met = set()
+    for point in np.arange(200) % 9:
+        top, heights = rng.uniform(-0.03, 0.06), rng.uniform(-0.05, 0.05, 4)
+        one = np.full((1, 1), top, np.float32)
+        expected = weights[point] @ np.maximum(0.0, top - heights) <= clearance
+        met.add(bool(expected))
+        assert clears(Straddle(one, one, np.stack([one, one]), weights, limits), point, 0, 0, heights) == expected
+    assert met == {True, False}

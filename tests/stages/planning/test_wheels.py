@@ -67,6 +67,18 @@ def test_a_stone_between_the_wheels_takes_clearance_and_no_step() -> None:
     assert (found.tilt, found.step) == (0.0, 0.0)
 
 
+def test_unknown_ground_under_the_belly_says_nothing_of_its_clearance() -> None:
+    z = np.where(np.hypot(X - 0.02, Y) < 0.008, 0.01, 0.0)
+    z[np.hypot(X + 0.015, Y) < 0.01] = np.nan
+    found = stand(ground(z), 0.0, 0.0, 0.0, ROVER)
+    assert found is not None
+    assert found.clearance == pytest.approx(0.025 - 0.01)
+    z[np.abs(X) < 0.037] = np.nan  # all that is between the wheels
+    found = stand(ground(z), 0.0, 0.0, 0.0, ROVER)
+    assert found is not None
+    assert math.isnan(found.clearance)
+
+
 def test_an_edge_under_a_wheel_is_a_step() -> None:
     found = stand(ground(np.where(Y > 0.05, 0.02, 0.0)), 0.0, 0.0, 0.0, ROVER)
     assert found is not None

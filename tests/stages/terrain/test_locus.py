@@ -255,6 +255,22 @@ def test_an_unusable_pixel_takes_the_cells_around_it_and_no_others() -> None:
     np.testing.assert_allclose(dem.elevation[kept], whole.elevation[kept], atol=1e-5)
 
 
+def test_a_search_that_begins_below_the_surface_finds_it_or_nothing() -> None:
+    """On the way up pixels are missing, so that many a cell has to go down again from where it began."""
+    column, row, usable = maps = disparity(RIG, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
+    there = usable & (np.random.default_rng(4).random(usable.shape) < 0.85)
+    task = locus_solve.PairArrays(
+        Matches(column, row, there), IMAGE, RIG, T_LOCAL_LEFT, (-1.0, -0.3), PARAMS.sigma_disparity, (0.5, 3.0)
+    )
+    dem = Dem(*np.full((4, *LATTICE.shape), np.nan, np.float32))
+    every = np.arange(LATTICE.rows), np.arange(LATTICE.cols)
+    task.cells(reference_plane(LATTICE), *every, -HEIGHT - 0.05, -HEIGHT - 0.01, dem)
+    found = np.isfinite(dem.elevation)
+    assert 0.05 < found.mean() < 0.9
+    truth = np.full(LATTICE.shape, -HEIGHT)
+    assert (np.abs(dem.elevation - truth) <= tolerance(maps, on_lattice(truth)))[found].all()
+
+
 def test_disparity_that_contradicts_the_calibration_is_left_out() -> None:
     column, row, usable = disparity(RIG, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
     off = solve((column, row + 0.3, usable), (-1.0, -0.3))
@@ -393,15 +409,20 @@ def test_stage_in_both_frames() -> None:
     assert lattice.cell == 0.01
     assert local.meta["defined"] > 0.3
     turn = RigidTransform(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([2.0, 3.0, 0.25]))
-    poses = np.stack([np.full((3, 4), np.nan), (turn @ T_LOCAL_LEFT).matrix34])
-    world = stage.STAGE.run(
-        LocusParams(cell_size=0.01),
-        {"pair": 3, "frame": "world", "row": 1},
-        inputs | {"trajectory": Bundle({"poses": poses}, {}), "local": local},
+    poses = {"poses": np.stack([np.full((3, 4), np.nan), (turn @ T_LOCAL_LEFT).matrix34])}
+    covariances = np.arange(72.0).reshape(2, 6, 6)
+    exact, world = (
+        stage.STAGE.run(
+            LocusParams(cell_size=0.01),
+            {"pair": 3, "frame": "world", "row": 1},
+            inputs | {"trajectory": Bundle(arrays, {}), "local": local},
+        )
+        for arrays in (poses, {**poses, "covariance": covariances})
     )
     check_outputs(stage.STAGE, world)
     json.dumps([local.meta, world.meta], allow_nan=False)
-    assert "pose_covariance" not in world.meta
+    assert world.meta.pop("pose_covariance") == list(range(36, 72))
+    assert world.meta == exact.meta
     assert "pose_covariance" not in local.meta
     # A quarter turn maps cells on cells: the same surface, computed anew, not resampled.
     rows, cols = np.nonzero(np.isfinite(local["elevation"]))

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from rille.stages.terrain.locus import kernel
 from rille.stages.terrain.locus.kernel import (
@@ -23,8 +27,10 @@ from rille.stages.terrain.locus.kernel import (
     START,
     STEPS,
     TOP,
+    BlockCells,
     LineSteps,
     Observed,
+    PairCameras,
     Z,
     climb,
     clip,
@@ -33,6 +39,7 @@ from rille.stages.terrain.locus.kernel import (
     pixels,
     raise_to,
     roots,
+    search,
     spans,
 )
 
@@ -162,3 +169,65 @@ def test_lines_end_where_an_image_does_and_steps_are_a_pixel_at_most() -> None:
         assert min(lanes[HIGH + k] + MARGIN * dz, top) - 1e-9 <= start <= top + 1e-9
         assert last <= 0.05 - MARGIN * dz
     assert short > n // 2
+
+
+def changes(s: np.ndarray, start: int, last: int) -> list[int]:
+    """Steps k with a change from free (k + 1) to behind (k), in the order in which the module says they are tried."""
+    found = []
+    if s[start] < 0.0:
+        above = next((k for k in range(start, len(s) - 1) if not s[k + 1] < 0.0), None)
+        found += [above] if above is not None and s[above + 1] >= 0.0 else []
+    for k in range(start - 1, -1, -1):
+        if s[k + 1] >= 0.0 and s[k] < 0.0:
+            found.append(k)
+        if k <= last and not s[k] >= 0.0:
+            break
+    return found
+
+
+def stands(at: Callable[[float], tuple[float, float]], below: float, dz: float, limit: float) -> tuple[float, str]:
+    """The root of the step above ``below``, and whether it stands: "yes", "no", or "unclear", too near to a gap or a
+    limit for another calculation to tell."""
+    inner = np.array([at(z)[0] for z in np.linspace(below, below + dz, 30)])
+    if not np.isfinite(inner).all() or (np.diff(np.sign(inner)) != 0).sum() != 1:
+        return np.nan, "unclear"
+    root = brentq(lambda z: at(z)[0], below, below + dz)
+    residual, slope = abs(at(root)[1]), float(np.fmin(at(root + dz)[0], -at(root - dz)[0]))
+    if abs(residual - limit) < 0.01 or abs(slope) < 0.01:
+        return root, "unclear"
+    return root, "yes" if residual < limit and slope > 0.0 else "no"
+
+
+def test_of_several_changes_the_one_is_taken_that_the_module_names() -> None:
+    """Wavy disparities with gaps; the row disparity refuses some of the roots."""
+    (feet, normals, lanes), n, rng = cells(LANES, 0.15), LANES, np.random.default_rng(7)
+    normals = -normals  # towards the camera
+    lanes[NORMAL : NORMAL + 3 * LANES] *= -1.0
+    lines(n, LEFT, RIGHT, lanes)
+    low, high = (rng.uniform(*ends, n).astype(np.float32) for ends in ((-3.0, -0.8), (-0.8, 0.3)))
+    low[::3] = high[::3] - np.float32(0.02)
+    lanes[LOW : LOW + n], lanes[HIGH : HIGH + n] = low, high
+    clip(n, SIZES, -4.0, 0.4, lanes)
+    spans(n, lanes)
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    waves = -4.5 + 2.5 * np.sin(1.5 * x + y), 0.5 + 0.7 * np.sin(0.7 * x - 0.4 * y)
+    disparity = np.stack(waves, axis=-1).astype(np.float32)
+    disparity[rng.random((HEIGHT, WIDTH)) < 0.01] = np.nan
+    plain, limit = np.ones((HEIGHT, WIDTH), np.float32), 0.45
+    seen = Observed(disparity.ravel(), plain, plain, np.array([limit, np.inf]), np.ones(2))
+    out = tuple(np.full((1, n), np.nan, np.float32) for _ in range(4))
+    block = BlockCells(feet[None], normals[None], low[None], high[None])
+    search(block, (-4.0, 0.4), PairCameras(LEFT, RIGHT, EPIPOLE, SIZES), seen, out)
+    met = []
+    for k, found in enumerate(out[0][0].astype(float)):
+        bottom, dz = lanes[BOTTOM + k], lanes[DZ + k]
+        count, start, last = (int(lanes[plane + k]) for plane in (COUNT, START, LAST))
+        at = partial(lambda k, z: mismatch(feet[k] + z * normals[k], disparity), k)
+        steps = changes(np.array([at(bottom + j * dz)[0] for j in range(count + 1)]), start, last)
+        verdicts = [stands(at, bottom + step * dz, dz, limit) for step in steps]
+        tried, (root, verdict) = next(((i, v) for i, v in enumerate(verdicts) if v[1] != "no"), (0, (np.nan, "no")))
+        met.append((verdict, min(tried, 1)))
+        if verdict != "unclear":
+            assert found == pytest.approx(root if verdict == "yes" else np.nan, abs=0.02 * dz, nan_ok=True)
+    assert min(met.count(case) for case in (("yes", 0), ("yes", 1), ("no", 0))) > 1
+    assert sum(verdict == "unclear" for verdict, _ in met) < n // 4

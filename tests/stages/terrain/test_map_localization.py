@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from raising import raises
+from scipy.interpolate import RegularGridInterpolator
 
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain.map_localization import MapLocalizationParams, fix, thin
@@ -61,6 +62,34 @@ def test_errors_are_of_the_size_that_the_covariance_claims() -> None:
     error = found.place - TRUE
     assert error @ np.linalg.solve(found.covariance, error) < 18.5  # chi2 of 4, 0.1 %
     assert math.sqrt(found.covariance[0, 0]) < 0.25 * CELL
+
+
+def test_the_covariance_is_that_of_least_squares_with_one_cell_a_correlation_length() -> None:
+    points, ground, whole = scene(hills, noise=0.002)
+    found = fix(points, ground, whole, PRIOR, SIGMA, MapLocalizationParams(correlation=3.0))
+    height = RegularGridInterpolator((whole.ys()[::-1], whole.xs()), ground[::-1])
+
+    def left(place: Floats) -> Floats:
+        c, s = math.cos(place[2]), math.sin(place[2])
+        x, y = place[0] + c * points[:, 0] - s * points[:, 1], place[1] + s * points[:, 0] + c * points[:, 1]
+        return np.asarray(points[:, 2] + place[3] - height((y, x)))
+
+    step = 1e-6
+    slopes = np.stack([(left(found.place + d) - left(found.place - d)) / (2 * step) for d in step * np.eye(4)], axis=1)
+    expected = np.linalg.inv(slopes.T @ slopes) * (left(found.place) ** 2).mean() * 3.0**2
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(found.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.02)
+
+
+def test_a_block_counts_from_three_tenths_of_its_cells_on() -> None:
+    lattice = Lattice.at(-10, 10, 0.01, 20, 20)
+    z, xy = np.full(lattice.shape, np.nan), lattice.xy()
+    for x, y, cells in ((0.0, 0.0, 5), (0.04, 0.0, 4)):
+        near = np.argwhere((np.abs(xy - (x, y)) < 0.0195).all(axis=-1))[:cells]
+        z[tuple(near.T)] = 10.0 * xy[tuple(near.T)][:, 0] + 1.0
+    ((x, y, height),) = thin(z, lattice, 0.04)
+    assert height == pytest.approx(10.0 * x + 1.0)
+    assert max(abs(x), abs(y)) < 0.02
 
 
 def test_ground_that_repeats_is_ambiguous() -> None:

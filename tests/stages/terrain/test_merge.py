@@ -359,3 +359,20 @@ def test_small_holes_are_closed_on_request_only_and_large_ones_stay() -> None:
     assert (closed.source[closed.filled == 1] == -1).all()
     known = np.isfinite(plain.elevation)
     assert np.array_equal(closed.elevation[known], plain.elevation[known])
+
+
+@pytest.mark.parametrize("max_hole", [1, 3, 6])
+@pytest.mark.parametrize("share", [0.2, 0.45])
+def test_closed_holes_do_not_depend_on_where_tiles_begin(max_hole: int, share: float) -> None:
+    rng = np.random.default_rng(max_hole)
+    whole, params = Lattice.at(0, 0, 0.1, 60, 70), MergeParams(max_hole=max_hole)
+    z = rng.normal(size=whole.shape)
+    block = np.ones((min(max_hole, 3),) * 2, bool)
+    z[np.kron(rng.random(whole.shape) < share, block)[:60, :70]] = np.nan
+    one = layer(0, z, std=rng.uniform(0.1, 0.2, whole.shape), lattice=whole)
+    merged = merge([one], whole, params)
+    assert merged.filled.any()
+    for i0, j0, rows, cols in ((0, 0, 60, 33), (33, 0, 60, 37), (20, -25, 12, 30), (5, -7, 3, 3)):
+        tile = Lattice.at(i0, j0, 0.1, rows, cols)
+        for part, values in zip(arrays(merge([one], tile, params)), arrays(merged), strict=True):
+            np.testing.assert_array_equal(part, values[whole.window(tile)])

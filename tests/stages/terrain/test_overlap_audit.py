@@ -13,7 +13,7 @@ from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain import overlap_audit as audit_stage
 from rille.stages.terrain import overlap_qa as seam_stage
-from rille.stages.terrain.overlap_audit import OverlapAuditParams
+from rille.stages.terrain.overlap_audit import OverlapAuditParams, contradictions
 
 PLANTED = 12
 
@@ -117,3 +117,12 @@ def test_the_map_holds_the_difference() -> None:
     assert np.nanmedian(drawn) == pytest.approx(0.3, abs=1e-4)
     x_min, x_max, _, _ = facts["map"]["bounds"]
     assert drawn.shape[1] == math.ceil((x_max - x_min) / facts["map"]["step"] - 1e-9)
+
+
+@pytest.mark.parametrize(("systematic", "chi2", "told"), [(2.1, 30.0, True), (1.9, 1000.0, False), (9.0, 10.0, False)])
+def test_a_model_contradicts_where_it_is_off_by_more_than_sigma_and_than_chance(
+    systematic: float, chi2: float, told: bool
+) -> None:
+    """Chi-square of three degrees of freedom exceeds 21.1 once in ten thousand."""
+    model = {"systematic": systematic, "expected": 1.0, "chi2": chi2}
+    assert contradictions([model], OverlapAuditParams()) == [model] * told
