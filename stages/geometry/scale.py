@@ -22,14 +22,14 @@ def alike(scale: float) -> bool:
     return max(scale, 1.0 / scale) <= ALIKE
 
 
-def counted(scale: float) -> float:
+def effective(scale: float) -> float:
     """The scale to count with: 1 where the images are alike."""
     return 1.0 if alike(scale) else scale
 
 
 def of_rig(rig: Rig) -> Floats:
     """Scale (2,) along columns and rows by the focal lengths; 1 where they are alike."""
-    return np.array([counted(rig.right.fx / rig.left.fx), counted(rig.right.fy / rig.left.fy)])
+    return np.array([effective(rig.right.fx / rig.left.fx), effective(rig.right.fy / rig.left.fy)])
 
 
 def coarser_focal(rig: Rig) -> float:

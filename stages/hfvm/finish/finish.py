@@ -15,7 +15,7 @@ import numpy as np
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.validity import Validity, mark
 from rille.stages.geometry import spline
-from rille.stages.geometry.scale import counted
+from rille.stages.geometry.scale import effective
 from rille.stages.hfvm.coarse_to_fine import hierarchy
 from rille.stages.hfvm.coarse_to_fine.hierarchy import Map, Prepared
 from rille.stages.hfvm.finish import guided, refine, textureless, uncertainty, variational_refinement
@@ -66,7 +66,7 @@ class Finish:
     @property
     def scale(self) -> float:
         """Pixels of the right image that one of the left image stands for; 1 where they are alike."""
-        return 1.0 if self.alignment is None else counted(plane.scale(self.alignment, self.shape))
+        return 1.0 if self.alignment is None else effective(plane.scale(self.alignment, self.shape))
 
     def fine(self, window: Window, a: Map) -> Results:
         """Map of a window of the left image with fractions of a pixel, means of like neighbours; feature distances.

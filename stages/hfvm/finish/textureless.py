@@ -145,7 +145,9 @@ def find(pair: Prepared, f: epipolar.Matrix, unmatched: AnyArray, along: AnyArra
             continue
         votes, step = found.distinct[y, x].astype(np.float64), found.best[y, x].astype(np.float64)
         g, error = _fit(x + window.x0, y + window.y0, step, votes)
-        more = excess(images, region, its_lines, window, g, found.least)
+        rows, cols = np.indices(region.shape)
+        on_plane = (g[0] + g[1] * (cols + window.x0) + g[2] * (rows + window.y0)).astype(np.float32)
+        more = excess(images, region, its_lines, (on_plane, window.x0, window.y0), found.least)
         inner = (steps[1] + 0.5 < step) & (step < steps[-2] - 0.5)
         agree = (error <= TOLERANCE) & inner & np.isfinite(more[y, x])
         if _sure(agree, votes, found.tried[y, x]):

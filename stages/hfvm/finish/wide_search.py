@@ -101,13 +101,14 @@ def _fraction(before: AnyArray, least: AnyArray, after: AnyArray) -> AnyArray:
 
 
 def excess(
-    images: Images, region: NDArray[np.bool_], lines: AnyArray, window: Window, g: AnyArray, least: AnyArray
+    images: Images, region: NDArray[np.bool_], lines: AnyArray, at: tuple[AnyArray, int, int], least: AnyArray
 ) -> AnyArray:
-    """By how much a pixel's distance, mean of the window, is greater at a plane of terms ``g`` than at ``least``, the
-    window's least sum; infinite where the plane leads out of the right image."""
-    y, x = np.indices(region.shape)
-    step = (g[0] + g[1] * (x + window.x0) + g[2] * (y + window.y0)).astype(np.float32)
-    sums = _sums(images, region, lines, (step, window.x0, window.y0))
+    """By how much a pixel's distance, mean of the window, exceeds that of the window's ``least`` sum at other steps.
+
+    ``at``: steps (row, col) float32, and column and row of the left window. Infinite where a step leads out of the
+    right image.
+    """
+    sums = _sums(images, region, lines, at)
     more = np.subtract(sums, least, out=np.full_like(sums, np.inf), where=np.isfinite(sums) & np.isfinite(least))
     return np.asarray(more / np.maximum(window_count(region, SIDE), 1))
 

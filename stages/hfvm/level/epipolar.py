@@ -82,7 +82,6 @@ def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float
     # y' = y: the baseline lies along the rows.
     prior[6] = -1.0
     precision = np.diag(PRIOR**-2.0)
-    pull = precision @ prior
     g, change = prior, math.inf
     spread = math.inf
     for step in range(ITERATIONS):
@@ -95,19 +94,18 @@ def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float
             break
         spread = wide
         normal, side = weighted_normal(terms, yr, 1.0 / (1.0 + (residual / spread) ** 2) / sigma**2)
-        new = np.linalg.solve(normal + precision, pull - side)
-        g, change = new, float((np.abs(new - g) / PRIOR).max())
+        new = np.linalg.solve(normal + precision, precision @ prior - side)
+        g, change = new, float(np.max(np.abs(new - g) / PRIOR))
     residual = residuals(terms, yr, g)
     cost = float(np.sum(np.log1p((residual / sigma) ** 2)) + np.sum(((g - prior) / PRIOR) ** 2))
     f = np.array([[g[1], g[2], g[0]], [g[3], g[4], 1.0], [g[5], g[6], g[7]]])
     return f, cost, typical(residual)
 
 
-@njit(cache=True, nogil=True)
-def typical(residual):  # type: ignore[no-untyped-def]
+def typical(residual: AnyArray) -> float:
     """Median magnitude (the upper one of two)."""
     size = np.abs(residual)
-    return np.partition(size, size.size // 2)[size.size // 2]
+    return float(np.partition(size, size.size // 2)[size.size // 2])
 
 
 @njit(cache=True, nogil=True)

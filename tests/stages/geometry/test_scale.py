@@ -20,12 +20,12 @@ def rig(fx: float, fy: float) -> Rig:
 
 @pytest.mark.parametrize("found", [1.0, 1.2, 1 / 1.2, 1.19])
 def test_a_fifth_is_no_other_scale(found: float) -> None:
-    assert scale.counted(found) == 1.0
+    assert scale.effective(found) == 1.0
 
 
 @pytest.mark.parametrize("found", [1.21, 0.8, 3.0])
 def test_more_is_counted_as_it_is(found: float) -> None:
-    assert scale.counted(found) == found
+    assert scale.effective(found) == found
 
 
 def test_of_a_rig_each_axis_counts_by_itself() -> None:
