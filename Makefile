@@ -4,7 +4,6 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
-TYPES  := $(VENV)/types/rille# the package as mypy finds it
 
 SEQ    ?= mockup
 FRAMES ?=
@@ -53,7 +52,6 @@ bench: $(STAMP) ## side-by-side measurements: every figure of the README; ONLY=m
 	@for b in $(or $(ONLY),$(BENCHMARKS)); do echo "== $$b"; $(BIN)/python benchmarks/record.py $$b $(ARGS) || exit 1; done
 
 lint: $(STAMP) ## ruff and mypy
-	@mkdir -p $(TYPES) && ln -sfn $(addprefix ../../../,rille/__init__.py rille/py.typed pipeline stages datasets) $(TYPES)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

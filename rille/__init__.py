@@ -6,7 +6,6 @@ sequence: ``reconstruct``, ``open_run`` (:mod:`rille.pipeline.api`).
 
 from importlib import import_module
 from importlib.metadata import version
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -29,10 +28,6 @@ __all__ = [
     "reconstruct",
     "terrain",
 ]
-
-_HERE = Path(__file__).resolve().parent
-if not (_HERE / "stages").is_dir():  # a checkout: the packages lie beside this folder; a wheel has them in it
-    __path__.append(str(_HERE.parent))
 
 
 def __dir__() -> list[str]:

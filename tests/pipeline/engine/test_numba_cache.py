@@ -115,7 +115,7 @@ def checkout(tmp_path):
             (stages / f"{file}.py").write_text(text)
         shutil.copytree(ROOT / "stages" / "core", stages / "core")
         for same in ("rille", "pipeline"):
-            shutil.copytree(ROOT / same, tmp_path / name / same)
+            shutil.copytree(ROOT / same, tmp_path / name / same, symlinks=True)
 
         def said():
             done = subprocess.run(
