@@ -81,7 +81,6 @@ class Results:
         Literal["auto", "bar", "plain", "json", "quiet"], Parameter(help="How progress is shown on stderr.")
     ] = "auto"
     quiet: Annotated[bool, flag("No progress; warnings and errors only.", "--quiet", "-q")] = False
-    live: Annotated[bool, flag("Keep progress as a page, too: live.html in the run's folder.")] = False
     verbose: Annotated[bool, flag("Say where to watch dask at work.", "--verbose", "-v")] = False
 
 
@@ -111,7 +110,6 @@ def options(
         cache=cache_folder(settings.cache),
         progress="quiet" if results.quiet else results.progress,
         memory_limit=memory_limit,
-        live=results.live,
         verbose=results.verbose,
     )
 

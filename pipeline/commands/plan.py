@@ -12,7 +12,7 @@ from collections.abc import Iterable
 
 from rille.datasets.text.count import count
 from rille.pipeline.engine import scheduler
-from rille.pipeline.engine.forecast import Kinds, kind, recall
+from rille.pipeline.engine.estimate import Earlier, recall
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.memory import cost_model, limits
 from rille.pipeline.engine.memory.admission import Account, Admission, account, forecast, largest
@@ -65,7 +65,7 @@ def plan(options: Options, *, verbose: bool = False) -> int:
     known = cost_model.recall(hints)
     limit = None if options.memory_limit is None else limits.parse(options.memory_limit)
     shares = account(known, limit, options.executor, jobs, largest(graph, known))
-    told = describe(graph, result, recall(hints) or {}, shares.workers, verbose=verbose)
+    told = describe(graph, result, recall(hints), shares.workers, verbose=verbose)
     for line in (*told, *needs(graph, known, shares)):
         print(line)
     # Last, so that the table stands above the refusal and shows which task it is.
@@ -99,7 +99,7 @@ def needs(graph: Graph, known: Costs, shares: Account) -> Iterable[str]:
         yield "the largest tasks will wait for one another: together they would exceed the limit"
 
 
-def describe(graph: Graph, result: Result, earlier: Kinds, workers: int, *, verbose: bool = False) -> Iterable[str]:
+def describe(graph: Graph, result: Result, earlier: Earlier, workers: int, *, verbose: bool = False) -> Iterable[str]:
     """Lines of the plan: a table by stage with reasons, totals, and what it rests on."""
     by_stage: dict[str, list[Handle]] = defaultdict(list)
     for handle in graph.nodes:
@@ -124,12 +124,12 @@ def _reasons(planned: list[Handle]) -> list[str]:
     return listed + ([f"an input is to be computed ({follow})"] if follow else [])
 
 
-def _totals(graph: Graph, result: Result, earlier: Kinds, workers: int) -> Iterable[str]:
+def _totals(graph: Graph, result: Result, earlier: Earlier, workers: int) -> Iterable[str]:
     planned = [h for h in graph.nodes if h.status == "planned"]
     cached = len(graph.nodes) - len(planned)
     line = f"{len(graph.nodes)} tasks known: {cached} cached, {len(planned)} to do"
-    untimed = sorted({h.stage for h in planned if kind(h.label) not in earlier})
-    work = sum(earlier.get(kind(h.label), (0.0, 0.0, 0.0))[1] for h in planned)
+    untimed = sorted({h.stage for h in planned if h.stage not in earlier})
+    work = sum(earlier.get(h.stage, (0.0, 0.0))[1] for h in planned)
     if planned and len(untimed) < len({h.stage for h in planned}):
         line += f", about {work / workers:.0f} s with {count(workers, 'worker')} by earlier runs"
         line += f" (never timed: {', '.join(untimed)})" if untimed else ""

@@ -1,6 +1,6 @@
 """Progress of a run on stderr: a bar with an estimate on a terminal, plain lines elsewhere, JSON lines, or nothing.
 
-The estimate of the time left is that of :mod:`rille.pipeline.engine.forecast`.
+The estimate of the time left is that of :mod:`rille.pipeline.engine.estimate`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any, TextIO
 
-from rille.pipeline.engine.forecast import Forecast, Kinds
+from rille.pipeline.engine.estimate import Earlier, Estimate
 from rille.pipeline.engine.plain import plain, raw
 from rille.stages.core.errors import ConfigError
 
@@ -47,14 +47,14 @@ class Progress:
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stderr
         self.graph: Graph | None = None
-        self.forecast = Forecast([], None, 1)
+        self.estimate = Estimate([], {}, 1)
         self.seen = 0
         self.done = 0
 
-    def open(self, graph: Graph, earlier: Kinds | None, jobs: int) -> None:
-        """The run begins: begin the forecast with the tasks that are laid out; the graph may still grow."""
+    def open(self, graph: Graph, earlier: Earlier, jobs: int) -> None:
+        """The run begins: begin the estimate with the tasks that are laid out; the graph may still grow."""
         self.graph, self.seen = graph, len(graph.nodes)
-        self.forecast = Forecast([h.label for h in graph.nodes], earlier, max(jobs, 1))
+        self.estimate = Estimate([h.stage for h in graph.nodes], earlier, max(jobs, 1))
 
     def detail(self, text: str) -> None:
         """A word for who asks for more of them."""
@@ -69,9 +69,9 @@ class Progress:
         self.done += 1
         if self.graph is not None:
             for added in self.graph.nodes[self.seen :]:
-                self.forecast.added(added.label)
+                self.estimate.added(added.stage)
             self.seen = len(self.graph.nodes)
-        self.forecast.ended(handle)
+        self.estimate.end(handle)
 
     def failed(self, label: str, error: BaseException) -> None:
         """A task or an expansion failed."""
@@ -87,7 +87,7 @@ class Progress:
 class Lines(Progress):
     """A line every few seconds, and one for each failure: for logs."""
 
-    def open(self, graph: Graph, earlier: Kinds | None, jobs: int) -> None:
+    def open(self, graph: Graph, earlier: Earlier, jobs: int) -> None:
         """Begin the clock."""
         super().open(graph, earlier, jobs)
         self.shown = time.monotonic()
@@ -98,7 +98,7 @@ class Lines(Progress):
         self._compiled(handle)
         if time.monotonic() - self.shown >= INTERVAL:
             self.shown = time.monotonic()
-            self._say(f"{self.done}/{self.total()} tasks, {handle.label} {handle.status}{to_go(self.forecast)}")
+            self._say(f"{self.done}/{self.total()} tasks, {handle.label} {handle.status}{to_go(self.estimate)}")
 
     def _compiled(self, handle: Handle) -> None:
         if handle.took.compiling >= SLOW_COMPILE:
@@ -133,7 +133,7 @@ class Json(Progress):
             seconds=round(handle.took.seconds, 4),
             done=self.done,
             total=self.total(),
-            left=self.forecast.left(),
+            left=self.estimate.left(),
         )
 
     def failed(self, label: str, error: BaseException) -> None:
@@ -151,7 +151,7 @@ class Json(Progress):
 class Bar(Lines):
     """A bar that moves with the estimated work done."""
 
-    def open(self, graph: Graph, earlier: Kinds | None, jobs: int) -> None:
+    def open(self, graph: Graph, earlier: Earlier, jobs: int) -> None:
         """Show the bar."""
         from rich.console import Console
         from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
@@ -180,14 +180,14 @@ class Bar(Lines):
         self._move(handle.label)
 
     def _move(self, label: str) -> None:
-        left = self.forecast.left()
+        left = self.estimate.left()
         gone = time.monotonic() - self.begin
         self.rich.update(
             self.task,
             completed=gone,
             total=None if left is None else gone + left,
             count=f"{self.done}/{self.total()}",
-            description=plain(label) + to_go(self.forecast),
+            description=plain(label) + to_go(self.estimate),
         )
 
     def close(self, result: Result) -> None:
@@ -210,9 +210,9 @@ def summary(result: Result) -> str:
     return f"{', '.join(parts)} in {result.seconds:.1f} s"
 
 
-def to_go(forecast: Forecast) -> str:
+def to_go(estimate: Estimate) -> str:
     """``, about 42 s left``; empty where nothing is known."""
-    left = forecast.left()
+    left = estimate.left()
     return "" if left is None else f", about {clock(left)} left"
 
 

@@ -32,7 +32,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from rille.pipeline.engine import forecast, provenance
+from rille.pipeline.engine import estimate, provenance
 from rille.pipeline.engine.events import Ledger
 from rille.pipeline.engine.executors.base import Executor, Failed, Given, NotBegun, Task, light, make
 from rille.pipeline.engine.executors.base import known as check
@@ -222,7 +222,7 @@ class _Run:
             self._close(kill=False)
             if not self.dry:
                 self.store.note(h.ref for h in self.graph.nodes if h.ref is not None)
-                forecast.remember(self.hints, self.progress.forecast)
+                estimate.remember(self.hints, self.progress.estimate)
                 cost_model.remember(self.hints, self.graph.nodes)
         finally:
             gc.unfreeze()
@@ -241,7 +241,7 @@ class _Run:
             self.executor.close(kill=kill)
 
     def _loop(self, interrupts: Interrupts) -> None:
-        self.progress.open(self.graph, forecast.recall(self.hints), self.options.jobs or cores())
+        self.progress.open(self.graph, estimate.recall(self.hints), self.options.jobs or cores())
         self.store.survey(_sequence(self.graph))
         while True:
             self._settle()

@@ -21,7 +21,6 @@ OUTPUTS = (
         "frames, handedness, quaternion order and units of every file; the frames' names",
         "any text editor",
     ),
-    Output("live.html", "progress while the run works, where --live asks for it", "any browser"),
     Output("config.toml", "every parameter in force; give it back with --config", "any text editor"),
     Output("ledger.jsonl", "what became of every task, a JSON object a line", "any text editor, jq"),
 )

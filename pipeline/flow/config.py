@@ -20,7 +20,6 @@ import tomli_w
 from pydantic import Field, ValidationError, create_model
 
 from rille.datasets.text import reading
-from rille.pipeline.flow import renamed
 from rille.stages.core.declare import Params, Stage
 from rille.stages.core.errors import ConfigError, told
 
@@ -225,9 +224,6 @@ def _complaint(kind: type[Params], prefix: tuple[str, ...], error: dict[str, Any
     loc = [str(part) for part in error["loc"]]
     key = ".".join((*prefix, *loc))
     if error["type"] == "extra_forbidden":
-        # Before the guess at a misspelling: a key that was once right is no slip.
-        if former := renamed.present(key, error["input"]):
-            return former
         near = difflib.get_close_matches(key, [".".join((*prefix, k)) for k in known_keys(kind)] + list(also), n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(_siblings(kind, loc))}"
         return f"unknown key {key!r} (value {error['input']!r}): {hint}"

@@ -12,8 +12,7 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -32,7 +31,6 @@ from rille.pipeline.flow import config as configuration
 from rille.stages.core.errors import ConfigError, RilleError
 
 if TYPE_CHECKING:
-    from rille.pipeline.engine.progress import Progress
     from rille.pipeline.engine.scheduler import Result
     from rille.pipeline.export.view import RunView
     from rille.pipeline.flow.closed_loop import Drive
@@ -60,7 +58,6 @@ class Options:
     progress: str = "auto"
     memory_limit: str | None = None
     verb: str = "reconstruct"
-    live: bool = False
     verbose: bool = False
     opened: Sequence | None = None
     """The sequence itself, where it is open already."""
@@ -243,10 +240,9 @@ def _reconstruct(options: Options) -> tuple[int, Path]:
     opened = _open(options)
     made: run_files.Made = {}
     opened.graph.last = lambda: run_files.lay_out(opened.graph, opened.late(), made)
-    with _progress(opened) as shown:
-        result = _compute(opened, shown)
-        remember()
-        missing = _write(opened, result, made)
+    result = _compute(opened)
+    remember()
+    missing = _write(opened, result, made)
     _point_latest(opened.folder)
     warn_of_results(opened.graph)
     arrived = _outcome(opened)
@@ -296,23 +292,9 @@ def _open(options: Options) -> _Opened:
     return _Opened(options, settled, view, folder, started, store, graph, drive)
 
 
-@contextmanager
-def _progress(opened: _Opened) -> Iterator[Progress]:
-    """Receiver of each step, as the user asks to see it."""
-    from rille.pipeline.engine import progress
-    from rille.pipeline.runs import live
-
-    options, page = opened.options, opened.folder / "live.html"
-    shown = progress.make(options.progress, verbose=options.verbose)
-    if options.live:
-        print(f"rille: progress is in {page}", file=sys.stderr)
-    with live.page(shown, page if options.live else None) as receiver:
-        yield receiver
-
-
-def _compute(opened: _Opened, shown: Progress) -> Result:
+def _compute(opened: _Opened) -> Result:
     """Bring every task to its artifact; raise the first failure unless the data are its cause and poses are there."""
-    from rille.pipeline.engine import scheduler
+    from rille.pipeline.engine import progress, scheduler
     from rille.pipeline.engine.memory import limits
     from rille.pipeline.runs import roots
 
@@ -327,7 +309,7 @@ def _compute(opened: _Opened, shown: Progress) -> Result:
             keep_going=options.keep_going,
             force=options.force,
             ledger=opened.folder / "ledger.jsonl",
-            progress=shown,
+            progress=progress.make(options.progress, verbose=options.verbose),
             memory_limit=None if options.memory_limit is None else limits.parse(options.memory_limit),
             survey=lambda: lay_out(view.sequence, view.config, view.frames),
         ),

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 from raising import raises
 
-from rille.pipeline.flow import config, renamed
+from rille.pipeline.flow import config
 
 
 def test_layers_win_in_order() -> None:
@@ -91,24 +90,3 @@ def test_unreadable_files(tmp_path: Path) -> None:
     bad.write_text("[select\nstride=1")
     with raises("RIL-026"):
         config.read_toml(bad)
-
-
-@pytest.mark.parametrize(
-    ("former", "present"),
-    [
-        ("leg.length=3", ("leg.length is local_planner.max_length",)),
-        ("select.stride=3", ("select.stride is keyframes.stride",)),
-        ("path.sure=0.2", ("path.sure", "write path.p_certain_hazard")),
-        ("refine.stereo=true", ("refine.stereo", "leave it out")),
-    ],
-)
-def test_keys_of_earlier_versions_are_refused_with_their_present_name(former: str, present: tuple[str, ...]) -> None:
-    with raises("RIL-027", *present):
-        config.build(config.parse_assignments([former]))
-
-
-def test_each_present_name_exists() -> None:
-    known = config.known_keys(config.model())
-    assert {renamed._renamed(key) for key in renamed.FIELDS} <= set(known)
-    assert set(renamed.SECTIONS.values()) <= set(known)
-    assert not set(renamed.SECTIONS) & set(known)
