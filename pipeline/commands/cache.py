@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import App
 
-from rille.pipeline.commands.options import COMPLETE, FAILED, RUNS, CacheFolder, Debug, Run, Runs, cache_folder, flag
+from rille.pipeline.commands.options import COMPLETE, FAILED, RUNS, CacheFolder, Debug, Runs, cache_folder, flag
 
 app = App(name="cache", help="Look after the cache of artifacts.")
 
@@ -50,21 +50,21 @@ def gc(
     dry_run: Annotated[bool, flag("List by stage what would be removed, and remove nothing.")] = False,
     debug: Debug = False,
 ) -> int:
-    """Remove artifacts that no kept and no pinned run refers to, and leftovers of interrupted runs.
+    """Remove artifacts that no kept run refers to, and leftovers of interrupted runs.
 
     What was made or used within a day stays: a run may be under way.
     """
     from rille.pipeline.engine.memory.limits import words
     from rille.pipeline.engine.store import maintenance
     from rille.pipeline.engine.store.base import Store
-    from rille.pipeline.runs import lookup, pins, roots
+    from rille.pipeline.runs import lookup, roots
     from rille.stages.core.errors import ConfigError
 
     store = Store(_there(cache))
     # Before any key is gathered: artifacts of runs that cannot be seen from here would count as unused.
     roots.check_all_seen(store)
     ledgers = [path for folder in roots.folders(store, runs) for path in folder.glob(f"*/*/{lookup.LEDGER}")]
-    kept = pins.keys(store).union(*(lookup.used(path.parent) for path in ledgers if path.is_file()))
+    kept = set[str]().union(*(lookup.used(path.parent) for path in ledgers if path.is_file()))
     if not kept:
         raise ConfigError(
             "RIL-744",
@@ -77,51 +77,4 @@ def gc(
             print(f"{stage:18s} {count:6d} {words(amount):>8s}")
     verb = "would remove" if dry_run else "removed"
     print(f"{verb} {cleared.artifacts} artifacts and {cleared.orphans} leftovers, {cleared.bytes / 2**20:.1f} MiB")
-    return COMPLETE
-
-
-@app.command
-def ls(
-    *,
-    as_json: Annotated[bool, flag("As JSON.", "--json")] = False,
-    cache: CacheFolder = None,
-    runs: Runs = RUNS,
-    debug: Debug = False,
-) -> int:
-    """List what the cache holds by sequence and stage: number, sizes, age, and the run that used it last."""
-    from rille.pipeline.runs import inventory
-
-    return inventory.ls(_there(cache), runs, as_json=as_json)
-
-
-@app.command
-def pin(
-    run: Run,
-    *,
-    cache: CacheFolder = None,
-    runs: Runs = RUNS,
-    debug: Debug = False,
-) -> int:
-    """Keep all artifacts of a run: gc leaves them alone, even if the run's folder is removed."""
-    from rille.pipeline.engine.store.base import Store
-    from rille.pipeline.runs import lookup, pins
-
-    folder = lookup.find(run, runs)
-    print(f"pinned {lookup.name(folder)}: {pins.pin(Store(_there(cache)), folder)} artifacts")
-    return COMPLETE
-
-
-@app.command
-def unpin(run: str, *, cache: CacheFolder = None, debug: Debug = False) -> int:
-    """Remove the pin of a run; its artifacts stay until the next gc.
-
-    Parameters
-    ----------
-    run
-        SEQUENCE (its latest pin), SEQUENCE/ID, or ID.
-    """
-    from rille.pipeline.engine.store.base import Store
-    from rille.pipeline.runs import pins
-
-    print(f"unpinned {pins.unpin(Store(_there(cache)), run)}")
     return COMPLETE

@@ -1,1 +1,1 @@
-"""A run: its folder, its pins, what it left."""
+"""A run: its folder, what it left."""

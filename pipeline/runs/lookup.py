@@ -157,14 +157,6 @@ def earlier(run: Path, *, of_any: bool = False) -> Iterator[Path]:
     yield from sorted(before, key=lambda r: r.name, reverse=True)
 
 
-def keys(folders: Iterable[Path]) -> dict[str, str]:
-    """Each key that any run in these folders of runs used, with the name of the last run (by time) that did."""
-    found: dict[str, str] = {}
-    for run in sorted((run for runs in folders for run in all_runs(runs)), key=lambda r: r.name):
-        found |= dict.fromkeys(used(run), name(run))
-    return found
-
-
 def used(run: Path) -> set[str]:
     """Keys of all artifacts that a run used.
 

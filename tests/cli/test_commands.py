@@ -351,21 +351,6 @@ def test_cache_verify_names_what_is_damaged(place: Place, tmp_path: Path) -> Non
     assert place.rille("cache", "verify", "--cache", copy).status == 0, "it was set aside"
 
 
-def test_cache_pin_and_unpin(place: Place, tmp_path: Path) -> None:
-    copy = tmp_path / "cache"
-    shutil.copytree(place.folder / ".rille/cache", copy)
-    run = f"other/{place.runs('other')[-1].name}"
-    for _ in range(2):
-        pinned = place.rille("cache", "pin", "other", "--cache", copy)
-        assert (pinned.status, pinned.err) == (0, "")
-        assert re.fullmatch(rf"pinned {run}: \d+ artifacts", pinned.last)
-    assert place.rille("cache", "ls", "--cache", copy).last == f"pinned: {run}"
-    assert place.rille("cache", "unpin", "other", "--cache", copy).last == f"unpinned {run}"
-    again = place.rille("cache", "unpin", run, "--cache", copy)
-    assert again.status == 2
-    assert again.complaint.startswith("rille: error RIL-563: ")
-
-
 def test_params(place: Place) -> None:
     first, second = place.rille("params", "locus"), place.rille("params", "locus")
     assert (first.status, first.err) == (0, "")

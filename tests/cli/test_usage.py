@@ -121,11 +121,8 @@ WRONG = {
         ("mockup-short other", "RIL-165"),
     ],
     "cache": [("no-such-command", "RIL-001")],
-    "cache ls": [("--no-such-option", "RIL-001")],
     "cache verify": [("--no-such-option", "RIL-001"), ("--cache no-such-folder", "RIL-589")],
     "cache gc": [("--no-such-option", "RIL-001"), ("--cache no-such-folder", "RIL-589")],
-    "cache pin": [("no-such-run", "RIL-067"), ("", "RIL-001"), ("other --cache no-such-folder", "RIL-589")],
-    "cache unpin": [("no-such-run", "RIL-563"), ("", "RIL-001"), ("other --cache no-such-folder", "RIL-589")],
 }
 
 

@@ -73,7 +73,7 @@ def test_runs_that_are_right_are_read(run: Path, capsys: pytest.CaptureFixture[s
         assert told(capsys, *words) == (0, [])
 
 
-@pytest.mark.parametrize("words", [("runs",), WHY, COMPARE, TIMING, GC, ("cache", "pin", "seq/2", "--cache", "cache")])
+@pytest.mark.parametrize("words", [("runs",), WHY, COMPARE, TIMING, GC])
 @pytest.mark.parametrize("line", ["5\n", '{"label": [1]}\n', '{"label": "a"}\n{"label": "b", "digest": "e"}\n'])
 def test_a_ledger_that_is_none(run: Path, words: tuple[str, ...], line: str, capsys: Any) -> None:
     (run / "ledger.jsonl").write_text(line)
@@ -254,16 +254,15 @@ def test_json_of_a_ledger_is_read_line_by_line(run: Path, capsys: Any) -> None:
     assert told(capsys, "runs") == (0, [])
 
 
-@pytest.mark.parametrize("name", ["roots/a.json", "pins/a.json"])
 @pytest.mark.parametrize("content", [DEEP, None])
-def test_notes_of_a_cache_that_are_none(run: Path, name: str, content: str | None, capsys: Any) -> None:
-    path = Path("cache") / name
+def test_notes_of_a_cache_that_are_none(run: Path, content: str | None, capsys: Any) -> None:
+    path = Path("cache/roots/a.json")
     path.parent.mkdir()
     if content is None:
         os.mkfifo(path)
     else:
         path.write_text(content)
-    assert told(capsys, *GC) == (1, ["RIL-742" if name.startswith("roots") else "RIL-564"])
+    assert told(capsys, *GC) == (1, ["RIL-742"])
 
 
 def test_pipes_in_a_cache_hold_nothing(tmp_path: Path) -> None:

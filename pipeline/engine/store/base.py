@@ -11,7 +11,6 @@ and on this machine (:func:`~rille.pipeline.engine.store.location.hints_folder`)
 
     hints/<sequence>/                       of its earlier runs, for explanations and estimates; never a matter
                                             of correctness
-    pins/<run>.json                         keys that clearing up leaves alone
     roots/<digest>.json                     folders of runs that use the cache
 
 The file of an artifact (:mod:`rille.pipeline.engine.store.manifest`) is its own commit: it is on the disk as a whole

@@ -18,7 +18,7 @@ from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.maintenance import artifacts
-from rille.pipeline.runs import pins, roots
+from rille.pipeline.runs import roots
 
 
 @pytest.fixture
@@ -62,12 +62,6 @@ def test_runs_of_another_machine_that_cannot_be_seen_stop_it(used, tmp_path):
     (used.root / "roots" / "other.json").write_text("{")
     with raises("RIL-742", "other.json"):
         collect(used, tmp_path / "work" / "runs")
-
-
-def test_a_pin_alone_is_enough_to_clear_the_rest(used, tmp_path):
-    pins.pin(used, tmp_path / "work" / "runs" / "toy" / "1")
-    shutil.rmtree(tmp_path / "work")
-    assert collect(used, tmp_path / "elsewhere") == 9
 
 
 def test_a_cache_that_may_only_be_read_is_used_without_a_note(used, tmp_path, monkeypatch):
