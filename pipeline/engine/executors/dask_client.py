@@ -328,16 +328,16 @@ class SetUp(WorkerPlugin):  # type: ignore[misc]
         _runs.pop(self.run, None)
 
     def transition(self, key: Any, start: str, finish: str, **more: Any) -> None:
-        """Send what a task of the run has left."""
-        if finish == "memory" and (event := _ended.pop(key, None)) is not None:
+        """Send what a task of the run has left; a task of another run is left to the plugin of that run."""
+        if finish == "memory" and (event := _ended.pop((self.run, key), None)) is not None:
             self._worker.log_event(self.run, event)
 
 
 _runs: dict[str, str] = {}
 """Runs that this worker serves, and in what it differs from what they need."""
 
-_ended: dict[str, bytes] = {}
-"""What became of tasks that have just ended on this worker, by their names."""
+_ended: dict[tuple[str, str], bytes] = {}
+"""What became of tasks that have just ended on this worker, by their runs and names."""
 
 
 def _halt(run: str) -> None:
@@ -365,7 +365,7 @@ def _work(run: str, pickled: bytes, *made: Ref | None) -> Ref | None:
         outcome = replace(outcome, took=replace(outcome.took, worker=str(worker.name)))
     name = worker.get_current_task()
     # Events travel as msgpack, which has no types of ours: bytes pass.
-    _ended[name] = pickle.dumps((task.number, name, outcome))
+    _ended[run, name] = pickle.dumps((task.number, name, outcome))
     # Never an exception: dask would state it as the failure of every task that waits for this one.
     return light(outcome.ref) if isinstance(outcome, Outcome) else None
 

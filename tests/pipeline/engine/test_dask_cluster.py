@@ -6,6 +6,8 @@ import os
 import pickle
 import queue
 import signal
+import threading
+import time
 from collections import Counter
 from contextlib import ExitStack
 from types import SimpleNamespace
@@ -22,6 +24,7 @@ from rille.pipeline.engine.executors import base, dask_client, dask_cluster
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.task import Outcome
+from rille.stages.core.declare import NoParams
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +46,28 @@ def run(cache, where="inline", jobs=2):
 def test_a_cluster_gives_what_one_process_gives(hands, tmp_path):
     assert run(tmp_path / "cluster", hands.address) == run(tmp_path / "inline")
     assert not list((tmp_path / "cluster").glob("*.tmp")), "probes are cleared away"
+
+
+def test_several_runs_at_once_on_one_client_all_end(hands, tmp_path):
+    """Each hears of its own tasks, also after the run that began first has failed and left."""
+    from distributed import Client
+
+    def run_one(number):
+        graph = Graph()
+        chain.build(graph, seed=number)
+        if number == 0:
+            graph.node("toys.mischief", "fails", NoParams(), {"what": "value"})
+        ended[number] = scheduler.run(graph, Store(tmp_path / "cache"), scheduler.RunOptions(executor=client)).ok
+
+    ended = {}
+    with Client(hands.address, set_as_default=False) as client:
+        threads = [threading.Thread(target=run_one, args=(number,), daemon=True) for number in range(4)]
+        for thread in threads:
+            thread.start()
+        deadline = time.monotonic() + 60
+        for thread in threads:
+            thread.join(max(0.0, deadline - time.monotonic()))
+    assert ended == {0: False, 1: True, 2: True, 3: True}
 
 
 @pytest.mark.parametrize("inside", [False, pytest.param(True, id="in-process")])
