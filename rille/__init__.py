@@ -4,11 +4,13 @@ One pair, step by step: ``open``, ``match``, ``terrain``, ``hazards``, ``path`` 
 sequence: ``reconstruct``, ``open_run`` (:mod:`rille.pipeline.api`).
 """
 
-from importlib import import_module
-from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from __future__ import annotations
 
+# No other module is imported here: until `rille.__main__` has begun, Ctrl-C prints a traceback.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from rille.pipeline.api import Run, open_run, reconstruct
     from rille.pipeline.steps import StereoPair, StereoSequence, hazards, match, open, path, terrain
     from rille.stages.core.errors import RilleError
@@ -35,8 +37,10 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> Any:
+    from importlib import import_module, metadata
+
     if name == "__version__":
-        return version("rille")
+        return metadata.version("rille")
     if name not in __all__:
         raise AttributeError(f"module {__name__} has no attribute {name}")
     # Loaded at first use: `import rille` must not import NumPy before threads are set.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -51,10 +52,17 @@ def raster(name: str, unit: str, long_name: str, dtype: str = "float32", nodata:
 
 @dataclass(frozen=True)
 class Bundle:
-    """Input or result of a stage: named arrays, and facts about them that can be written as JSON."""
+    """Input or result of a stage: named arrays, and facts about them that can be written as JSON.
+
+    A fact that is undefined (of a frame without a landmark, a model without a cell) is None: JSON has neither NaN nor
+    infinities, so these become None here, whoever made them, and readers of facts meet None alone.
+    """
 
     arrays: Mapping[str, AnyArray]
     meta: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "meta", _defined(self.meta))
 
     def __getitem__(self, name: str) -> AnyArray:
         return self.arrays[name]
@@ -70,6 +78,17 @@ class Bundle:
         """The array as something with ``shape`` that is read by window, ``raster[rows, columns]`` (slices)."""
         opened = getattr(self.arrays, "raster", None)
         return self.arrays[name] if opened is None else opened(name)
+
+
+def _defined(fact: Any) -> Any:
+    """The fact with None in place of each number that is not finite."""
+    if isinstance(fact, float):
+        return fact if math.isfinite(fact) else None
+    if isinstance(fact, dict):
+        return {name: _defined(item) for name, item in fact.items()}
+    if isinstance(fact, list | tuple):
+        return [_defined(item) for item in fact]
+    return fact
 
 
 Inputs = Mapping[str, Any]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Any, NoReturn
@@ -31,24 +31,45 @@ def held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+class OutsideImports:
+    """Handler of SIGINT that raises KeyboardInterrupt; in the midst of an import it calls ``leave``, which does not
+    return.
+
+    What libraries make of an exception in the midst of their import is anything: another one, a traceback, nothing.
+    """
+
+    def __init__(self, leave: Callable[[], Any]) -> None:
+        self._leave = leave
+
+    def __call__(self, number: int, frame: FrameType | None) -> NoReturn:
+        """Handle the signal."""
+        while frame is not None:
+            if frame.f_code.co_filename.startswith("<frozen importlib"):
+                self._leave()
+            frame = frame.f_back
+        raise KeyboardInterrupt
+
+
 class Interrupts:
     """Remembers interrupts while it is entered, on the main thread and where nobody else handles them."""
 
     def __init__(self) -> None:
         self.came = False
         self._hook: Any = None
+        self._before: Any = None
 
     def __enter__(self) -> Interrupts:
         main = threading.current_thread() is threading.main_thread()
         # A notebook or another program that has a handler of its own keeps it.
-        if main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            signal.signal(signal.SIGINT, self._interrupted)
+        before = signal.getsignal(signal.SIGINT)
+        if main and (before is signal.default_int_handler or isinstance(before, OutsideImports)):
+            self._before = signal.signal(signal.SIGINT, self._interrupted)
             self._hook, sys.unraisablehook = sys.unraisablehook, self._unraisable
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         if self._hook is not None:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGINT, self._before)
             sys.unraisablehook, self._hook = self._hook, None
 
     def check(self) -> None:

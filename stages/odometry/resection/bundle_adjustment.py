@@ -241,7 +241,7 @@ def _step(
     for A, B, d, ga, gd in parts:
         d = d * (1.0 + damping)
         # Schur's complement: depths are eliminated by a division, since no two of them share a measurement.
-        S = A + damping * np.diag(np.diag(A)) - (B / d) @ B.T
+        S = _determined(A + damping * np.diag(np.diag(A)) - (B / d) @ B.T)
         r = -(ga - B @ (gd / d))
         solved = np.linalg.solve(S[:-1, :-1], np.column_stack([S[:-1, -1], r[:-1]]))
         # The bias is all that segments share: each one eliminates its poses and leaves one equation for it.
@@ -254,6 +254,12 @@ def _step(
         pose = np.append(solved[:, 1] - common * solved[:, 0], common)
         steps.append((pose[:-1].reshape(-1, 6), -(gd + B.T @ pose) / d))
     return float(common), steps
+
+
+def _determined(S: Floats) -> Floats:
+    """Normal equations in which an unknown that no measurement touches (all its landmarks are behind) stays as is."""
+    S[np.diag_indices_from(S)] += np.diag(S) == 0.0
+    return S
 
 
 def scatter(views: SegmentTracks, state: SegmentState, bias: float, sigma: float) -> float:
@@ -323,7 +329,7 @@ def tilt_of(views: SegmentTracks, state: SegmentState, bias: float, params: Refi
     column = np.append(B @ g, g @ by_depth)
     A = np.column_stack([np.vstack([A, column[:-1]]), column])
     B = np.vstack([B, by_depth])
-    S = A - (B / d) @ B.T
+    S = _determined(A - (B / d) @ B.T)
     S[np.diag_indices_from(S)] *= 1.0 + 1e-9  # landmarks that hardly fix a pose say nothing, and stop nothing
     r = -(np.append(ga, g @ (gd - held * state.depth)) - B @ (gd / d))
     solved = np.linalg.solve(S[:-1, :-1], np.column_stack([S[:-1, -1], r[:-1]]))

@@ -30,6 +30,7 @@ from rille.stages.core.errors import ConfigError
 from rille.stages.geometry.epipolar import standing
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
+from rille.stages.geometry.projection import NEAREST
 from rille.stages.numeric.robust import huber_weight
 from rille.stages.odometry.resection.bundle_adjustment import (
     RefineParams,
@@ -43,7 +44,7 @@ from rille.stages.odometry.resection.bundle_adjustment import (
 )
 from rille.stages.odometry.resection.landmarks import Landmarks
 from rille.stages.odometry.resection.pnp import HUBER, Observations, Poses, back_projection, norms
-from rille.stages.odometry.resection.resect import SOURCES, ResectParams, coordinates, root, scatter_of_blocks
+from rille.stages.odometry.resection.resect import MINIMUM, SOURCES, ResectParams, coordinates, root, scatter_of_blocks
 
 
 class SegmentStart(NamedTuple):
@@ -80,7 +81,24 @@ def views_of(track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig) -
     # An exact disparity would have infinite information.
     held = np.maximum(known.sigma, 1e-3)
     views = SegmentTracks(known.position, known.per_pixel, held, pixels, seen, rig.left, tilt)
-    return SegmentStart(views, state, frames, which)
+    return _determined(SegmentStart(views, state, frames, which))
+
+
+def _determined(one: SegmentStart) -> SegmentStart | None:
+    """The segment without the frames that too few landmarks see to determine a pose; None if no frame is left."""
+    enough = one.views.seen.sum(1) >= MINIMUM
+    if enough.all():
+        return one
+    views = replace(one.views, pixels=one.views.pixels[enough], seen=one.views.seen[enough])
+    state = SegmentState(one.state.R[enough], one.state.t[enough], one.state.depth)
+    return SegmentStart(views, state, np.array(one.frames)[enough].tolist(), one.which) if enough.any() else None
+
+
+def _in_front(one: SegmentStart, state: SegmentState, bias: float) -> SegmentStart | None:
+    """The segment in its adjusted state; a landmark behind a camera agrees with no pose, and has no image there."""
+    x = one.views.position + (state.depth + bias)[:, None] * one.views.along
+    z = np.einsum("fj,nj->fn", state.R[:, 2], x) + state.t[:, 2:]
+    return _determined(one._replace(views=replace(one.views, seen=one.views.seen & (z >= NEAREST)), state=state))
 
 
 def _tilt_pattern(position: Floats, T_local_key: RigidTransform, rig: Rig) -> Floats:
@@ -201,7 +219,7 @@ def _anew(given: _Given, poses: Floats, tilt: float, resect: ResectParams) -> Se
     views, most = one.views.without_tilt(tilt), resect.threshold / resect.pixel_sigma
     for f in range(len(one.frames)):
         views.seen[f] &= norms(_frame(views, f, resect.pixel_sigma), _pose(one.state, f, 0.0))[0] <= most
-    return one._replace(views=views)
+    return _determined(one._replace(views=views))
 
 
 def _frame(views: SegmentTracks, f: int, pixel_sigma: float) -> Observations:
@@ -250,17 +268,21 @@ def claims(
 def _adjusted(
     found: Sequence[SegmentStart | None], out: Sequence[SegmentOut], params: RefineParams
 ) -> tuple[dict[str, float], dict[int, SegmentState]]:
-    """A window adjusted, ``out`` written to; facts of the adjustment, and the state of each segment."""
+    """A window adjusted, ``out`` written to; facts of the adjustment, and the state of each segment.
+
+    A frame that keeps too few landmarks keeps the pose of its resection.
+    """
     group = {k: one for k, one in enumerate(found) if one is not None}
-    starts = [(one.views, one.state) for one in group.values()]
-    states, bias, before, after = adjust(starts, params)
-    claimed = claims([(views, state) for (views, _), state in zip(starts, states, strict=True)], bias, params)
-    for (k, one), state, (covariance, shared) in zip(group.items(), states, claimed, strict=True):
-        for row, R, t in zip(one.frames, state.R, state.t, strict=True):
+    states, bias, before, after = adjust([(one.views, one.state) for one in group.values()], params)
+    ended = {k: _in_front(one, state, bias) for (k, one), state in zip(group.items(), states, strict=True)}
+    kept = {k: one for k, one in ended.items() if one is not None}
+    claimed = claims([(one.views, one.state) for one in kept.values()], bias, params)
+    for (k, one), (covariance, shared) in zip(kept.items(), claimed, strict=True):
+        for row, R, t in zip(one.frames, one.state.R, one.state.t, strict=True):
             out[k].poses[row] = RigidTransform(R, t).inverse().matrix34
         out[k].covariance[one.frames], out[k].shared[one.frames] = covariance, shared
         views = one.views
-        out[k].landmarks[one.which] = views.position + (state.depth + bias)[:, None] * views.along
+        out[k].landmarks[one.which] = views.position + (one.state.depth + bias)[:, None] * views.along
         out[k].inlier[:] = 0
         out[k].inlier[one.which, 0] = views.seen.any(0)
         out[k].inlier[np.ix_(one.which, np.array(one.frames))] = views.seen.T
