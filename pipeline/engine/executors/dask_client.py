@@ -40,8 +40,10 @@ from dask._task_spec import TaskRef
 from dask.utils import key_split
 from distributed import Client, KilledWorker, LocalCluster, WorkerPlugin, get_worker
 
+from rille.datasets.text.warning import warning
 from rille.pipeline.engine.executors import dask_cluster
 from rille.pipeline.engine.executors.base import Failed, Landed, NotBegun, Task, light
+from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime.environment import prepare_environment, worker_environment
 from rille.pipeline.engine.runtime.interrupts import held
 from rille.pipeline.engine.runtime.private import private_folder
@@ -138,6 +140,9 @@ class Dask:
         self._presence = dask_cluster.Presence(client, BIRTH if cluster else dask_cluster.NO_WORKERS)
         self._looked = time.monotonic()
         self._futures: dict[int, Any] = {}
+        self._labels: dict[int, str] = {}
+        self._told: set[str] = set()
+        """Silent workers that the user was told of."""
         self._gone: set[Any] = set()
         self._events: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._held: dict[int, Task] = {}
@@ -195,6 +200,7 @@ class Dask:
             with dask.annotate(priority=_priority):
                 futures = self._client.get(graph, list(nodes), sync=False)
             self._futures |= {task.number: future for task, future in zip(tasks, futures, strict=True)}
+            self._labels |= {task.number: task.spec.label for task in tasks}
 
     def wait(self) -> Landed:
         """Block until a task has ended; all that have ended meanwhile are given."""
@@ -228,6 +234,7 @@ class Dask:
             self._seen[number] = max(self._seen[number], *(_resident(pid) for pid in pids), 0)
         if time.monotonic() - self._looked > LOOK:
             threads = self._presence.threads()
+            self._tell_silent(self._presence.silent())
             if self._cluster is None:
                 self.slots = threads or self.slots
             else:
@@ -239,6 +246,22 @@ class Dask:
         # A task must not come back before the inputs that it had: it would wait for what is no more in flight.
         landed = self._hear(0) if lost else []
         return landed + [(n, self._lost(n, self._futures.pop(n), len(lost) == 1)) for n in lost if n in self._futures]
+
+    def _tell_silent(self, silent: set[str]) -> None:
+        """Warn once of each worker that is silent (stopped, or its machine is gone) in the midst of a task of ours."""
+        self._told &= silent
+        labels = {future.key: self._labels[number] for number, future in self._futures.items()}
+        nannies = getattr(self._cluster, "workers", {}).values()
+        processes = {nanny.worker_address: f", process {nanny.pid}," for nanny in nannies}
+        for address in silent - self._told:
+            with suppress(Exception):  # it has left meanwhile
+                given = [key for key in self._client.processing([address])[address] if key in labels]
+                if given:
+                    who = dask_cluster.worker_name(self._client, address) + processes.get(address, "")
+                    began = labels[max(given, key=_priority)]
+                    text = f"{who} has been silent for {dask_cluster.SILENCE:.0f} s at {began}"
+                    warn(warning("RIL-710", f"{text}: let it go on if it was stopped (kill -CONT), or end it"))
+                    self._told.add(address)
 
     def _revive(self) -> None:
         """Start a worker again that is gone for two looks: its nanny does not where it died just as it began."""

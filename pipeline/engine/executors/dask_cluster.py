@@ -39,7 +39,7 @@ NO_WORKERS = 30.0
 """Seconds that a scheduler may be without workers, at the beginning or later, before the run is given up."""
 
 SILENCE = 20.0
-"""Seconds without an answer of the scheduler before it counts as gone."""
+"""Seconds without an answer of the scheduler before it counts as gone, and of a worker before the user is told."""
 
 Identity = Mapping[str, str]
 
@@ -107,14 +107,14 @@ def examine(client: Any, cache: Location) -> None:
             if answer is not None:  # None is one that has left meanwhile
                 _judge(client, address, answer, ours, cache)
             if answer is not None and read_probe(store, f"{token}-{short}") is None:
-                raise _no_cache(_name(client, address), cache, "its probe is not seen here")
+                raise _no_cache(worker_name(client, address), cache, "its probe is not seen here")
     finally:
         with suppress(OSError, RilleError):
             store.place.delete(f"probe/{name}" for name in names)
 
 
 def _judge(client: Any, address: str, answer: Any, ours: Identity, cache: Location) -> None:
-    name = _name(client, address)
+    name = worker_name(client, address)
     if isinstance(answer, BaseException):
         raise ConfigError(
             "RIL-520",
@@ -135,9 +135,10 @@ def _judge(client: Any, address: str, answer: Any, ours: Identity, cache: Locati
         raise _no_cache(name, cache, answer["cache"])
 
 
-def _name(client: Any, address: str) -> str:
+def worker_name(client: Any, address: str) -> str:
+    """Name of a worker for messages."""
     known = client.scheduler_info(n_workers=-1)["workers"].get(address, {}).get("name", "")
-    return f"worker {known} ({address})" if known and known != address else f"worker {address}"
+    return f"worker {known} ({address})" if known not in ("", address) else f"worker {address}"
 
 
 def _no_cache(name: str, cache: Location, why: str) -> ConfigError:
@@ -151,6 +152,8 @@ class Presence:
     def __init__(self, client: Any, patience: float) -> None:
         self._client, self._address, self._patience = client, client.scheduler.address, patience
         self._answered = self._manned = time.monotonic()
+        self._heard: dict[str, tuple[float, float]] = {}
+        """Of each worker when the scheduler heard of it last, and since when we know that: clocks may differ."""
 
     def threads(self) -> int:
         """Threads of all workers now.
@@ -162,13 +165,18 @@ class Presence:
         """
         now = time.monotonic()
         try:
-            threads = sum(self._client.sync(self._client.scheduler.ncores, callback_timeout=SILENCE / 2).values())
+            within = {"n_workers": -1, "callback_timeout": SILENCE / 2}
+            workers = self._client.sync(self._client.scheduler.identity, **within)["workers"]
         except Exception as error:
             # One question without an answer is a busy scheduler; only a long silence is a lost one.
             if self._client.status in ("closing", "closed") or time.monotonic() - self._answered > SILENCE:
                 raise self.gone() from error
             return 0
         self._answered = now
+        heard = {address: worker["last_seen"] for address, worker in workers.items()}
+        known = {address: self._heard.get(address, (seen, now)) for address, seen in heard.items()}
+        self._heard = {a: known[a] if known[a][0] == seen else (seen, now) for a, seen in heard.items()}
+        threads = sum(worker["nthreads"] for worker in workers.values())
         if threads:
             self._manned = now
         elif now - self._manned > self._patience:
@@ -178,6 +186,10 @@ class Presence:
                 remedy="start workers, and run the same command: what is committed stays",
             )
         return int(threads)
+
+    def silent(self) -> set[str]:
+        """Addresses of the workers from which nothing was heard for long, by the last look."""
+        return {address for address, (_, since) in self._heard.items() if self._answered - since > SILENCE}
 
     def gone(self) -> ClusterError:
         """The scheduler is."""

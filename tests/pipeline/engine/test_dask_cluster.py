@@ -113,6 +113,7 @@ def test_a_task_does_not_come_back_before_the_inputs_that_it_had(monkeypatch):
     workers = object.__new__(dask_client.Dask)
     workers._cluster, workers._held, workers._refused, workers._deaths = None, {}, set(), Counter()
     workers._events, workers._looked = queue.SimpleQueue(), 0.0
+    workers._told, workers._labels = set(), {0: "input", 1: "next"}
 
     def threads():
         """While the scheduler is asked, the input ends, and the worker of the next task dies."""
@@ -120,12 +121,42 @@ def test_a_task_does_not_come_back_before_the_inputs_that_it_had(monkeypatch):
         workers._futures[1].status = "error"
         return 2
 
-    workers._presence = SimpleNamespace(threads=threads)
+    workers._presence = SimpleNamespace(threads=threads, silent=set)
     workers._futures = {
         number: SimpleNamespace(key=key, status="pending") for number, key in enumerate(["input", "next"])
     }
     monkeypatch.setattr(workers, "_lost", lambda *_: "not begun")
     assert workers.wait() == [(0, "made"), (1, "not begun")]
+
+
+def test_a_worker_that_falls_silent_is_named_once_with_its_task(monkeypatch, capsys):
+    """By what the scheduler heard of it, not by clocks; one that is heard again may fall silent again."""
+    now, seen = [0.0], {"tcp://a": 1.0, "tcp://b": 5e9}
+    monkeypatch.setattr(dask_cluster.time, "monotonic", lambda: now[0])
+    client = SimpleNamespace(
+        scheduler=SimpleNamespace(address="tcp://s", identity=None),
+        sync=lambda *_, **__: {"workers": {a: {"nthreads": 1, "last_seen": when} for a, when in seen.items()}},
+        scheduler_info=lambda n_workers: {"workers": {"tcp://a": {"name": "first"}}},
+        processing=lambda workers: {"tcp://a": ["numbers-run-7-3", "scale-run-8-4", "of-another-1-1"]},
+    )
+    workers = object.__new__(dask_client.Dask)
+    workers._client, workers._cluster, workers._told = client, None, set()
+    workers._futures = {3: SimpleNamespace(key="numbers-run-7-3"), 4: SimpleNamespace(key="scale-run-8-4")}
+    workers._labels = {3: "numbers/3", 4: "scale/3"}
+    presence = dask_cluster.Presence(client, 30.0)
+
+    def told_after(seconds, *heard):
+        now[0] += seconds
+        seen.update({address: seen[address] + seconds for address in heard})
+        assert presence.threads() == 2
+        workers._tell_silent(presence.silent())
+        return capsys.readouterr().err
+
+    line = "rille: warning RIL-710: worker first (tcp://a) has been silent for 20 s at numbers/3: "
+    assert told_after(0.0) == told_after(19.0, "tcp://b") == ""
+    assert told_after(2.0, "tcp://b").startswith(line)
+    assert told_after(2.0, "tcp://b") == told_after(2.0, "tcp://a", "tcp://b") == ""
+    assert told_after(21.0, "tcp://b").startswith(line)
 
 
 @pytest.mark.parametrize(("allowed", "died"), [(0, 3), (3, 12)])
