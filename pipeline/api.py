@@ -78,9 +78,10 @@ def reconstruct(
     /...computed..., cached 0, missing ...
     2 m
     """
-    from rille.pipeline.commands.options import cache_folder, prepare
+    from rille.pipeline.commands.options import cache_folder
+    from rille.pipeline.engine.runtime.environment import prepare_environment
 
-    prepare()
+    prepare_environment()
     from rille.pipeline.runs import session
 
     if not isinstance(seq, StereoSequence):

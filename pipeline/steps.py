@@ -30,7 +30,7 @@ import numpy as np
 
 from rille.datasets import registry
 from rille.datasets.protocol import Sequence
-from rille.pipeline.commands.options import prepare
+from rille.pipeline.engine.runtime.environment import prepare_environment
 from rille.stages.core.declare import Bundle, NoParams, Stage
 from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.geometry.geometry import Rig
@@ -205,7 +205,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     >>> [round(float(disparity[name].median()), 1) for name in ("column_disparity", "row_disparity")]
     [-7.0, 2.0]
     """
-    prepare()
+    prepare_environment()
     from rille.pipeline.flow import config, tiles
     from rille.stages.hfvm import stage as hfvm_stage
     from rille.stages.imaging import pyramid
@@ -383,7 +383,7 @@ def path(
 
 
 def _builder(pair: StereoPair | None, settings: Settings) -> Builder:
-    prepare()
+    prepare_environment()
     from rille.pipeline.engine.graph import Graph
     from rille.pipeline.flow import config
     from rille.pipeline.flow.builders import Builder

@@ -6,7 +6,8 @@ sequence: ``reconstruct``, ``open_run`` (:mod:`rille.pipeline.api`).
 
 from __future__ import annotations
 
-# No other module is imported here: until `rille.__main__` has begun, Ctrl-C prints a traceback.
+# No module is imported here: `python -m rille` looks for it in the current folder first, and until `rille.__main__` has
+# begun, Ctrl-C prints a traceback.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any

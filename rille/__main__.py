@@ -1,14 +1,35 @@
-"""``rille`` and ``python -m rille``: the command line, which Ctrl-C ends with exit code 130 and one line."""
+"""``rille`` and ``python -m rille``: the command line, which Ctrl-C ends with exit code 130 and one line.
+
+No module is imported from the current folder.
+"""
 
 from __future__ import annotations
 
 import os
-import signal
 import sys
 
-TYPE_CHECKING = False  # as in the package
+TYPE_CHECKING = False  # `typing` takes longer to load than all else here, and until then Ctrl-C prints a traceback
 if TYPE_CHECKING:
     from typing import Any
+
+
+def _leave_out_current_folder() -> None:
+    """Remove what Python has put before its library for the current folder, unless Rille itself lies there."""
+    try:
+        here = os.getcwd()
+    except FileNotFoundError:  # it was removed
+        return
+    entries = ("", *os.environ.get("PYTHONPATH", "").split(os.pathsep))
+    ours = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    there = {os.path.normpath(os.path.join(here, entry)) for entry in entries if not os.path.isabs(entry)} - {ours}
+    library = os.path.dirname(os.__file__)
+    before = sys.path.index(library) if library in sys.path else len(sys.path)
+    sys.path[:before] = [entry for entry in sys.path[:before] if entry not in there]
+
+
+_leave_out_current_folder()
+
+import signal  # noqa: E402  # only now: Python does not load it by itself
 
 
 def _leave(*_: Any) -> None:
@@ -24,7 +45,7 @@ def _unraisable(what: Any) -> None:
 
 
 def main() -> None:
-    """Entry point of ``rille``."""
+    """Run ``rille`` with the words of the command line."""
     # A shell lets what it starts in the background ignore Ctrl-C.
     heeded = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if heeded:

@@ -139,7 +139,10 @@ def check_output(path: Path, *endings: str) -> None:
 
 
 def prepare() -> None:
-    """One thread a library, and safe kernels, before NumPy and numba are imported."""
+    """One thread a library, safe kernels, and nothing of the current folder, before NumPy and numba are imported."""
+    from rille.pipeline.engine.runtime import apart
     from rille.pipeline.engine.runtime.environment import prepare_environment
 
     prepare_environment()
+    apart.APART.__enter__()
+    apart.ignore_settings()

@@ -214,7 +214,8 @@ def write_path_gpkg(
     import pyogrio
     from pyogrio.raw import write
 
-    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": GPKG_DATE})
+    # SpatiaLite, which nothing here needs, would look for PROJ's data in the current folder.
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": GPKG_DATE, "SPATIALITE_LOAD": "NO"})
     given = {"name": "path", "frame": FRAME, "axes": _axes(place), "unit": "m"} | dict(facts)
     kept = {name: value for name, value in given.items() if isinstance(value, str | int | float)}
     columns = [np.array([value], dtype=object if isinstance(value, str) else None) for value in kept.values()]

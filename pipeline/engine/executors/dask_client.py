@@ -44,6 +44,7 @@ from rille.datasets.text.warning import warning
 from rille.pipeline.engine.executors import dask_cluster
 from rille.pipeline.engine.executors.base import Failed, Landed, NotBegun, Task, light
 from rille.pipeline.engine.plain import warn
+from rille.pipeline.engine.runtime.apart import APART, ignore_settings
 from rille.pipeline.engine.runtime.environment import prepare_environment, worker_environment
 from rille.pipeline.engine.runtime.interrupts import held
 from rille.pipeline.engine.runtime.private import private_folder
@@ -81,6 +82,7 @@ class WorkerDiedError(RilleError):
 def here(jobs: int, cache: Location, memory: float) -> Dask:
     """Workers of this machine; they start while this process goes on."""
     _configure()
+    APART.__enter__()
     resource_tracker.ensure_running()  # it unblocks the signal in the thread that happens to start it
     with held(), warnings.catch_warnings():
         # A queue within this process is named by the machine's address, which it may not have.
@@ -324,12 +326,13 @@ class Dask:
             self._cluster.close(timeout=within)
         self._cluster._instances.discard(self._cluster)  # else it is closed once more at exit, for up to ten seconds
         _end([child.pid for child in psutil.Process().children() if "multiprocessing.spawn" in _command(child)])
+        APART.__exit__()
 
 
 class SetUp(WorkerPlugin):  # type: ignore[misc]
     """Prepares each worker, also one that joins later, and tells the client of ``run`` what became of its tasks.
 
-    ``ours`` is what the worker must be like, if that is to be examined. An event leaves together with the word of the
+    ``ours`` is what the worker must be like, if others have started it. An event leaves together with the word of the
     worker to the scheduler that the task is done: one message, not two.
     """
 
@@ -339,6 +342,8 @@ class SetUp(WorkerPlugin):  # type: ignore[misc]
     def setup(self, worker: Any) -> None:
         """Set the process up, and remember in what it differs."""
         prepare_environment()
+        if not self.ours:
+            ignore_settings()
         # Nearly all stages import them: the seconds of a worker's first task are then its own.
         for name in ("cv2", "numba"):
             import_module(name)

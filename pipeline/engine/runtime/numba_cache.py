@@ -20,8 +20,6 @@ import errno
 import fcntl
 import gc
 import hashlib
-import importlib.abc
-import importlib.util
 import os
 import pickle
 import sys
@@ -29,12 +27,12 @@ import threading
 import time
 from contextlib import suppress
 from functools import cache
-from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any
 
 from rille.pipeline.engine.code_digest import OWN, code_digest, package_of
+from rille.pipeline.engine.runtime.apart import Execute, hook
 from rille.pipeline.engine.runtime.private import private_folder
 
 DISPATCHER = "numba.core.dispatcher"
@@ -135,8 +133,8 @@ def guard() -> None:
     """Make the cache safe in this process, now or as soon as numba is imported; it is not imported for that."""
     if DISPATCHER in sys.modules:
         _patch(sys.modules[DISPATCHER])
-    elif not any(isinstance(finder, _Finder) for finder in sys.meta_path):
-        sys.meta_path.insert(0, _Finder())
+    else:
+        hook(DISPATCHER, _run_and_patch)
 
 
 def folder() -> Path:
@@ -153,24 +151,10 @@ def unused() -> list[Path]:
     return found
 
 
-class _Finder(importlib.abc.MetaPathFinder):
-    """Patches the module once it is there."""
-
-    def find_spec(self, name: str, path: Any, target: ModuleType | None = None) -> ModuleSpec | None:
-        if name != DISPATCHER:
-            return None
-        sys.meta_path.remove(self)
-        spec = importlib.util.find_spec(name)
-        if spec is not None and spec.loader is not None:
-            run = spec.loader.exec_module
-
-            # Patched right behind the import of the dispatcher, before the first decorator of numba can run.
-            def run_and_patch(module: ModuleType) -> None:
-                run(module)
-                _patch(module)
-
-            spec.loader.exec_module = run_and_patch  # type: ignore[method-assign]
-        return spec
+def _run_and_patch(execute: Execute, module: ModuleType) -> None:
+    """Patch right behind the import of the dispatcher, before the first decorator of numba can run."""
+    execute(module)
+    _patch(module)
 
 
 class _Locator:
