@@ -4,10 +4,8 @@ One pair, step by step: ``open``, ``match``, ``terrain``, ``hazards``, ``path`` 
 sequence: ``reconstruct``, ``open_run`` (:mod:`rille.pipeline.api`).
 """
 
-from __future__ import annotations
-
-# No module is imported here: `python -m rille` looks for it in the current folder first, and until `rille.__main__` has
-# begun, Ctrl-C prints a traceback.
+# Not even `__future__` is imported here: `python -m rille` looks for it in the current folder first, and until
+# `rille.__main__` has begun, Ctrl-C prints a traceback.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
@@ -37,7 +35,7 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})  # a notebook completes names that are not loaded yet
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     from importlib import import_module, metadata
 
     if name == "__version__":

@@ -3,8 +3,6 @@
 No module is imported from the current folder.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 
@@ -32,12 +30,12 @@ _leave_out_current_folder()
 import signal  # noqa: E402  # only now: Python does not load it by itself
 
 
-def _leave(*_: Any) -> None:
+def _leave(*_: "Any") -> None:
     os.write(2, b"rille: interrupted\n")
     os._exit(130)
 
 
-def _unraisable(what: Any) -> None:
+def _unraisable(what: "Any") -> None:
     # In a finaliser or a callback an exception is printed and forgotten.
     if issubclass(what.exc_type, KeyboardInterrupt):
         _leave()
