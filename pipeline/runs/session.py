@@ -174,12 +174,13 @@ def _unused_bits(sequence: Sequence, frames: tuple[int, ...]) -> dict[str, list[
     from rille.datasets.images import files, files16
     from rille.stages.imaging.image_quality import unused_bits
 
-    chosen = frames[:: max(1, -(-len(frames) // LOOKED_AT))]
+    there = [f for f in frames if f not in sequence.lost]
+    chosen = there[:: max(1, -(-len(there) // LOOKED_AT))]
     found: dict[str, list[int | None]] = {}
     for camera in ("left", "right"):
         bits = found.setdefault(camera, [])
         for frame in chosen:
-            # What cannot be read is told where its frame is lost; a drive has no images yet.
+            # What cannot be read is told where it is read; a drive has no images yet.
             with suppress(RilleError):
                 source = sequence.image(frame, camera)
                 deep = source.module == files16.__name__

@@ -95,7 +95,8 @@ def judge(
     """
     up, acceleration, odometry = readings
     # Motions are those of the vehicle's middle, as the wheels report them, not of the camera, which a turn swings.
-    key = RigidTransform.from_matrix(poses[0]) @ T_vehicle_left.inverse()
+    there = [bool(np.isfinite(pose).all()) for pose in poses]
+    key = RigidTransform.from_matrix(poses[0]) @ T_vehicle_left.inverse() if there[0] else RigidTransform.identity()
     steepest = params.max_tilt * float(vehicle["max_slope_deg"])
     sensors = (("attitude", "inclinometer"), ("acceleration", "accelerometer"), ("slip", "wheel odometry"))
     for k in range(1, len(poses)):
@@ -110,8 +111,9 @@ def judge(
         if acceleration[k] > params.max_acceleration:
             limit = f"{params.max_acceleration:g} permitted"
             return Verdict(k, "acceleration", f"peak of {acceleration[k]:.1f} m/s2 by the accelerometer, {limit}")
-        if inliers[k] < params.min_landmarks:
-            few = f"{inliers[k]} landmarks agree with the pose, {params.min_landmarks} are needed"
+        agree = inliers[k] if there[0] and there[k] else 0
+        if agree < params.min_landmarks:
+            few = f"{agree} landmarks agree with the pose, {params.min_landmarks} are needed"
             return Verdict(k, "lost", f"tracking is lost: {few}")
         moved = key.inverse() @ (RigidTransform.from_matrix(poses[k]) @ T_vehicle_left.inverse())
         found = _disagreement(odometry[k], moved, float(vehicle["wheel_base"]), params)

@@ -58,13 +58,15 @@ def localisation(estimate: Floats, truth: Floats, length: float) -> tuple[Floats
     error = np.linalg.norm(P[:, :3, 3] - (P[0] @ inverse(Q[0]) @ Q)[:, :3, 3], axis=1)
     # A drive that ends because tracking is lost has no pose at its last image.
     known = np.flatnonzero(np.isfinite(error))
-    last = float(error[known[-1]])
-    which = "last position" if known[-1] == len(error) - 1 else "last position that is known"
+    last = float(error[known[-1]]) if len(known) else math.nan
+    which = "last position" if len(known) and known[-1] == len(error) - 1 else "last position that is known"
     how = f"of the {which}, after making the first poses equal"
     return error, {
         "localisation_error": metric(last, "m", how),
         "localisation_share": metric(last / length if length > 0 else None, "1", f"{how}, over the length driven"),
-        "greatest_error": metric(float(np.nanmax(error)), "m", "of any position, after making the first poses equal"),
+        "greatest_error": metric(
+            float(np.fmax.reduce(error)), "m", "of any position, after making the first poses equal"
+        ),
     }
 
 

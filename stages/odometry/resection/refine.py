@@ -64,7 +64,8 @@ def views_of(track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig) -
     """
     poses = np.asarray(resection["poses"])
     frames = [j for j in range(1, len(poses)) if np.isfinite(poses[j]).all()]
-    inlier = np.asarray(resection["inlier"]) != 0
+    tracked = np.asarray(track["points"], dtype=np.float64)
+    inlier = (np.asarray(resection["inlier"]) != 0) & np.isfinite(tracked).all(-1)
     which = (
         np.flatnonzero(np.isfinite(landmarks.position).all(1) & inlier[:, frames].any(1))
         if frames
@@ -72,8 +73,7 @@ def views_of(track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig) -
     )
     if not len(which):
         return None
-    points = np.asarray(track["points"], dtype=np.float64)[which]
-    known, pixels = landmarks.take(which), np.ascontiguousarray(np.swapaxes(points[:, frames], 0, 1))
+    known, pixels = landmarks.take(which), np.ascontiguousarray(np.swapaxes(tracked[which][:, frames], 0, 1))
     T = [RigidTransform.from_matrix(poses[j]).inverse() for j in frames]
     state = SegmentState(np.array([p.rotation for p in T]), np.array([p.translation for p in T]), np.zeros(len(which)))
     seen = np.ascontiguousarray(inlier[which][:, frames].T)

@@ -38,7 +38,7 @@ def _run(params, args, inputs):
     if what == "sleep":
         time.sleep(args["seconds"])
     value = time.time_ns() if what == "random" else 1
-    return Bundle({"value": np.array([value], dtype=np.int64)}, {"undeclared": float("nan")} if what == "nan" else {})
+    return Bundle({"value": np.array([value], dtype=np.int64)}, {})
 
 
 STAGE = Stage(

@@ -1,11 +1,13 @@
 """Joint refinement: derivatives against differences, what it gains, that it never loses, and the stage's wiring."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from raising import raises
 
+from rille.pipeline.engine.store.output_digest import output_digest
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.odometry.resection import common_tilt as tilt_stage
@@ -424,6 +426,22 @@ def test_the_stage_gives_the_poses_of_the_last_segment_or_of_all(window):
     assert (np.linalg.eigvalsh(np.delete(out["covariance"], slice(0, None, 3), 0))[:, 0] > 0).all()
     with raises("RIL-416"):
         STAGE.run(RefineParams(), args | {"resect": ResectParams(landmarks="dem").model_dump(mode="json")}, inputs)
+
+
+def test_a_frame_that_keeps_no_landmark_keeps_its_pose_and_ends_nothing():
+    """All landmarks of frame 1 are behind its camera: no image, no error of it, and no part in the adjustment."""
+    given = bundles()
+    back = RigidTransform(rotation_exp([0.0, math.pi, 0.0]), [0.0, 0.0, 0.1]).matrix34
+    given["resections"][0].arrays["poses"][1] = back
+    args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
+    out = STAGE.run(PARAMS, args, given)
+    output_digest({}, out.meta)  # can be committed
+    np.testing.assert_array_equal(out["poses"][1], back)
+    assert np.isfinite(out["covariance"]).all()
+    assert not out["inlier"][:, 1].any()
+    rows = [(row["frame"], row["inliers"] > 12, row["rms_px"] < 0.01) for row in out.meta["per_frame"]]
+    assert rows == [(2, True, True)]
+    assert out["poses"][2, 2, 3] == pytest.approx(0.2, abs=3e-4)
 
 
 def test_a_lost_frame_stays_lost():
