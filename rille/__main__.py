@@ -20,8 +20,7 @@ def _leave_out_current_folder() -> None:
     entries = ("", *os.environ.get("PYTHONPATH", "").split(os.pathsep))
     ours = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
     there = {os.path.normpath(os.path.join(here, entry)) for entry in entries if not os.path.isabs(entry)} - {ours}
-    library = os.path.dirname(os.__file__)
-    before = sys.path.index(library) if library in sys.path else len(sys.path)
+    before = [*sys.path, library := os.path.dirname(os.__file__)].index(library)
     sys.path[:before] = [entry for entry in sys.path[:before] if entry not in there]
 
 

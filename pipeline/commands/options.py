@@ -144,5 +144,5 @@ def prepare() -> None:
     from rille.pipeline.engine.runtime.environment import prepare_environment
 
     prepare_environment()
-    apart.APART.__enter__()
+    apart.leave_out()
     apart.ignore_settings()

@@ -20,8 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.georeference import Georeference
-from rille.datasets.images.files import MOST_BYTES
-from rille.datasets.text.reading import open_regular
 from rille.pipeline.engine.plain import plain
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.foreign_raster import open_raster
@@ -363,8 +361,6 @@ def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.
 
     remedy = "give a TIFF with the bands column_disparity and row_disparity, as rille match writes"
     try:
-        # Pipes, devices and files that are too large are refused before GDAL opens them.
-        open_regular(path, "disparity", MOST_BYTES).close()
         with open_raster(path) as file:
             names = tuple(name for name in file.descriptions if name)
             if file.count != 2 or names not in ((), ("column_disparity", "row_disparity")):

@@ -44,7 +44,7 @@ from rille.datasets.text.warning import warning
 from rille.pipeline.engine.executors import dask_cluster
 from rille.pipeline.engine.executors.base import Failed, Landed, NotBegun, Task, light
 from rille.pipeline.engine.plain import warn
-from rille.pipeline.engine.runtime.apart import APART, ignore_settings
+from rille.pipeline.engine.runtime.apart import ignore_settings, leave_out, take_back
 from rille.pipeline.engine.runtime.environment import prepare_environment, worker_environment
 from rille.pipeline.engine.runtime.interrupts import held
 from rille.pipeline.engine.runtime.private import private_folder
@@ -82,7 +82,7 @@ class WorkerDiedError(RilleError):
 def here(jobs: int, cache: Location, memory: float) -> Dask:
     """Workers of this machine; they start while this process goes on."""
     _configure()
-    APART.__enter__()
+    interactive = leave_out()
     resource_tracker.ensure_running()  # it unblocks the signal in the thread that happens to start it
     with held(), warnings.catch_warnings():
         # A queue within this process is named by the machine's address, which it may not have.
@@ -106,6 +106,7 @@ def here(jobs: int, cache: Location, memory: float) -> Dask:
         # As the default client it would take over whatever else the calling program computes with dask.
         client = Client(within.contact_address, loop=cluster.loop, set_as_default=False)
         made = Dask(client, cache, jobs, cluster)
+        made.interactive = interactive
         cluster.scale(jobs)
     return made
 
@@ -134,7 +135,7 @@ def elsewhere(where: Any, cache: Location) -> Dask:
 class Dask:
     """An executor on ``slots`` threads of workers; ``cluster`` is one of our own, ``ours`` whether the client is."""
 
-    depth = DEPTH
+    depth, interactive = DEPTH, False
 
     def __init__(self, client: Any, cache: Location, slots: int, cluster: Any, *, ours: bool = True) -> None:
         self._client, self.slots, self._cluster, self._ours = client, slots, cluster, ours
@@ -326,7 +327,7 @@ class Dask:
             self._cluster.close(timeout=within)
         self._cluster._instances.discard(self._cluster)  # else it is closed once more at exit, for up to ten seconds
         _end([child.pid for child in psutil.Process().children() if "multiprocessing.spawn" in _command(child)])
-        APART.__exit__()
+        take_back(self.interactive)
 
 
 class SetUp(WorkerPlugin):  # type: ignore[misc]
@@ -406,6 +407,7 @@ def _configure() -> None:
     _quiet()
     memory = {f"distributed.worker.memory.{what}": False for what in ("target", "spill", "pause")}
     environment = worker_environment() | {
+        "PYTHONSAFEPATH": "1",
         "DASK_DISTRIBUTED__LOGGING__DISTRIBUTED": "critical",
         "MALLOC_ARENA_MAX": "1",  # tasks run on a second thread, whose own arena gives memory back and takes it anew
         # glibc keeps freed memory for the next task up to this, and takes arrays of 32 MiB (its limit) from it: fresh

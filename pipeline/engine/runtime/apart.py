@@ -10,7 +10,6 @@ from __future__ import annotations
 import importlib.abc
 import os
 import sys
-import threading
 from collections.abc import Callable
 from contextlib import ExitStack, chdir, suppress
 from importlib.machinery import ModuleSpec, PathFinder
@@ -26,47 +25,31 @@ SEARCH_PATHS = ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH")
 NUMBA_CONFIG = "numba.core.config"
 
 
-def environment() -> dict[str, str]:
-    """Variables of a process for which no search path depends on where it is started."""
-    found = {"PYTHONSAFEPATH": "1"}
-    for name in SEARCH_PATHS:
-        entries = os.environ.get(name, "").split(os.pathsep)
-        # Never empty: cv2 puts a folder of its own and a colon before LD_LIBRARY_PATH, and "" is the current folder.
-        found[name] = os.pathsep.join(filter(os.path.isabs, entries)) or os.devnull
-    return found
+def absolute_search_paths() -> dict[str, str]:
+    """Variables without entries that depend on where a process is started."""
+    entries = {name: filter(os.path.isabs, os.environ.get(name, "").split(os.pathsep)) for name in SEARCH_PATHS}
+    # Never empty: cv2 puts a folder of its own and a colon before LD_LIBRARY_PATH, and "" is the current folder.
+    return {name: os.pathsep.join(kept) or os.devnull for name, kept in entries.items()}
 
 
-class Apart:
-    """While entered, processes that are started look for no module, library or program in the current folder.
+def leave_out() -> bool:
+    """Have Python processes that are started look for no module in the current folder.
 
-    Variables and ``sys.path`` of this process are as before once nobody is in it any more: it may be a user's.
+    Returns
+    -------
+    Whether it was on ``sys.path`` of this process, an interactive Python; workers would take it over.
     """
-
-    def __init__(self) -> None:
-        self._lock, self._inside, self._empty = threading.Lock(), 0, 0
-        self._before: dict[str, str | None] = {}
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if not self._inside:
-                self._before = {name: os.environ.get(name) for name in environment()}
-                # Of an interactive Python; a worker would take it over as the folder in which this process was started.
-                self._empty = sys.path.count("")
-                sys.path[:] = filter(None, sys.path)
-            self._inside += 1
-            os.environ.update(environment())
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._inside -= 1
-            if not self._inside:
-                sys.path[:0] = [""] * self._empty
-                for name, value in self._before.items():
-                    os.environ.pop(name)
-                    os.environ |= {} if value is None else {name: value}
+    os.environ["PYTHONSAFEPATH"] = "1"
+    if interactive := "" in sys.path:
+        sys.path.remove("")
+    return interactive
 
 
-APART = Apart()
+def take_back(interactive: bool) -> None:
+    """Undo :func:`leave_out` so far as programs notice that this process, which may be a user's, starts otherwise."""
+    sys.path[:0] = [""] * interactive
+    if not sys.flags.safe_path:
+        os.environ.pop("PYTHONSAFEPATH", None)
 
 
 class Hook(importlib.abc.MetaPathFinder):

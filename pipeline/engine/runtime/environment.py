@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 
 from rille.pipeline.engine.code_digest import remember_in
+from rille.pipeline.engine.runtime.apart import absolute_search_paths
 from rille.pipeline.engine.runtime.numba_cache import guard
 from rille.pipeline.engine.runtime.private import private_folder
 
@@ -15,12 +16,13 @@ SINGLE = ("OMP", "OPENBLAS", "MKL", "NUMBA", "BLIS", "VECLIB_MAXIMUM", "NUMEXPR"
 
 
 def worker_environment() -> dict[str, str]:
-    """One thread a library."""
+    """One thread a library, and no search path that leads to the current folder."""
     return {f"{name}_NUM_THREADS": "1" for name in SINGLE} | {
         "OPENCV_FOR_THREADS_NUM": "1",
         "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1",  # numba colours a hundred thousand errors that nobody sees
         # a killed worker's semaphores are the tracker's business, not the user's
         "PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS") or "ignore:resource_tracker:UserWarning",
+        **absolute_search_paths(),
     }
 
 

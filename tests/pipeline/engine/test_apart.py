@@ -36,10 +36,9 @@ from pathlib import Path
 from rille.pipeline.engine.runtime.environment import prepare_environment
 prepare_environment()
 from rille.pipeline.engine.executors import dask_client
-from rille.pipeline.engine.runtime.apart import environment
 
 def now():
-    return sys.path[0], [os.environ.get(name) for name in environment()]
+    return sys.path[0], os.environ.get("PYTHONSAFEPATH")
 
 def look():
     import importlib.util, os, sys
