@@ -155,19 +155,26 @@ def expand(dotted: Mapping[str, Any]) -> dict[str, Any]:
     """``{"a.b": 1}`` to ``{"a": {"b": 1}}``."""
     nested: dict[str, Any] = {}
     for key, value in dotted.items():
-        *sections, last = key.split(".")
-        at = nested
-        for part in sections:
-            at = at.setdefault(part, {})
-        at[last] = value
+        for part in reversed(key.split(".")):
+            value = {part: value}
+        merge(nested, value)
     return nested
 
 
-def merge(into: dict[str, Any], layer: Mapping[str, Any]) -> dict[str, Any]:
-    """Lay a nested mapping over another one, in place."""
+def merge(into: dict[str, Any], layer: Mapping[str, Any], within: str = "") -> dict[str, Any]:
+    """Lay a nested mapping over another one, in place.
+
+    Raises
+    ------
+    ConfigError
+        A key is a value in one and a section in the other.
+    """
     for key, value in layer.items():
+        if key in into and isinstance(value, Mapping) is not isinstance(into[key], Mapping):
+            single = into[key] if isinstance(value, Mapping) else value
+            raise ConfigError("RIL-721", f"{within}{key} is a section and has a value", remedy=f"leave {single!r} out")
         if isinstance(value, Mapping) and isinstance(into.get(key), dict):
-            merge(into[key], value)
+            merge(into[key], value, f"{within}{key}.")
         else:
             into[key] = dict(value) if isinstance(value, Mapping) else value
     return into

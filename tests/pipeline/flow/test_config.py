@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from raising import raises
 
 from rille.pipeline.flow import config
@@ -90,3 +91,32 @@ def test_unreadable_files(tmp_path: Path) -> None:
     bad.write_text("[select\nstride=1")
     with raises("RIL-026"):
         config.read_toml(bad)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"locus": 1, "locus.cell_size": 0.1},
+        {"locus.cell_size": 0.1, "locus": 1},
+        {"locus.cell_size": 0.1, "locus.cell_size.x": 2},
+        {"a.b.c": 1, "a.b": [2]},
+        {"locus": "wide", "locus.cell_size": 0.1},
+    ],
+)
+def test_a_key_that_is_a_value_and_a_section_is_named(keys):
+    with raises("RIL-721"):
+        config.expand(keys)
+
+
+def test_so_where_they_stand_in_two_places():
+    for one, other in (({"locus": 1}, {"locus": {"both": True}}), ({"locus": {"both": True}}, {"locus": 1})):
+        with raises("RIL-721"):
+            config.build(one, other)
+    with raises("RIL-721"):
+        config.parse_assignments(["locus.both=true", "locus.both.x=1"])
+
+
+def test_a_section_and_dotted_keys_of_it_are_one():
+    assert config.expand({"locus": {"both": True}, "locus.cell_size": 0.1}) == {
+        "locus": {"both": True, "cell_size": 0.1}
+    }
