@@ -26,6 +26,12 @@ SMALL = 1_000_000
 TABLE = 100_000_000
 """Bytes of a table: an IMU at 200 Hz writes as much in three quarters of an hour."""
 
+MOST_LINES = 1_000_000
+"""Of a table; each becomes an object of some hundred bytes, and an IMU writes lines of a hundred characters."""
+
+LINE_ENDS = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"
+"""Where ``str.splitlines`` ends a line."""
+
 LONGEST_LINE = 10_000
 """Characters; a pose has 400. Parsers that look back take the square of it."""
 
@@ -98,8 +104,13 @@ def read_text(path: Path, what: str, most: int = SMALL) -> str:
 
 
 def read_lines(path: Path, what: str) -> list[str]:
-    """Lines of a table (see :func:`read_text`)."""
-    lines = read_text(path, what, TABLE).splitlines()
+    """Lines of a table (see :func:`read_text`), of which there are no more than ``MOST_LINES``."""
+    text = read_text(path, what, TABLE)
+    # Counted before there is a list of them: empty lines cost nothing in the file.
+    count = sum(map(text.count, LINE_ENDS))
+    if count > MOST_LINES:
+        raise InputError("RIL-722", f"{what} {path} has {count} lines, at most {MOST_LINES} are read", remedy="cut it")
+    lines = text.splitlines()
     _no_long_line(lines, path, what)
     return lines
 

@@ -26,6 +26,14 @@ def refused(code, call, *args):
     return str(caught.value)
 
 
+@pytest.mark.parametrize("end", ["\n", "\r", "\v", "\u2028", "1.5\n"])
+def test_a_table_of_more_lines_than_any_sensor_writes(tmp_path, end):
+    (tmp_path / "times.txt").write_text(end * (reading.MOST_LINES + 1), encoding="utf-8")
+    assert "1000001 lines" in refused("RIL-722", read_lines, tmp_path / "times.txt", "times")
+    (tmp_path / "times.txt").write_text(end * 1000, encoding="utf-8", newline="")
+    assert len(read_lines(tmp_path / "times.txt", "times")) == 1000
+
+
 # -- what is no small file ---------------------------------------------------------------------------------------------
 
 
