@@ -8,7 +8,9 @@ there were no index. Clearing up spares what an index names that is younger than
 
 from __future__ import annotations
 
+import gzip
 import hashlib
+import io
 import json
 import time
 import zlib
@@ -29,7 +31,9 @@ NEWEST = 4
 MOST = 256_000_000
 """Bytes that all of them may unpack to: a small object may unpack to any size."""
 
-PIECE = 1 << 20
+LONGEST = 64_000_000
+"""Bytes of a line: facts of one artifact."""
+
 KEY = 64
 """Digits of a key."""
 
@@ -104,24 +108,23 @@ def pack(lines: Iterable[str]) -> bytes:
 
 def _read(place: Place, item: Item, lines: dict[str, str], room: int) -> int:
     """Take lines in that are not known yet; gives the bytes of all. Raises ValueError where it is none of ours."""
-    data, unpacker, size = place.read(item.path), zlib.decompressobj(wbits=zlib.MAX_WBITS | 16), 0
+    size = 0
     found: dict[str, str] = {}
-    rest = b""
-    try:
-        while data and not unpacker.eof:
-            piece = unpacker.decompress(data, PIECE)
-            size, data = size + len(piece), unpacker.unconsumed_tail
-            # A small damaged or hostile file can unpack to any size.
-            if size > room:
-                raise ValueError(f"it unpacks to more than {room / 1e6:.0f} MB")
-            *whole, rest = (rest + piece).split(b"\n")
-            found |= {line[:KEY].decode("ascii"): line[KEY + 1 :].decode() for line in whole}
-    except zlib.error as error:
-        raise ValueError(f"it is damaged ({error})") from None
-    if not unpacker.eof or rest:
-        raise ValueError("it is cut short")
-    for key, line in found.items():
-        lines.setdefault(key, line)
+    with gzip.GzipFile(fileobj=io.BytesIO(place.read(item.path) or b"")) as file:
+        try:
+            while line := file.readline(min(LONGEST, room - size + 1)):
+                size += len(line)
+                # A small damaged or hostile file can unpack to any size, or to any number of lines.
+                if size > room:
+                    raise ValueError(f"it unpacks to more than {room / 1e6:.0f} MB")
+                if len(line) <= 2 * KEY or not line.endswith(b"\n"):
+                    raise ValueError("it has a line that is none of an index")
+                found[line[:KEY].decode("ascii")] = line[KEY + 1 : -1].decode()
+        except (zlib.error, OSError, EOFError) as error:
+            raise ValueError(f"it is damaged ({error})") from None
+    if not found:
+        raise ValueError("it is empty")
+    lines |= found | lines
     return size
 
 

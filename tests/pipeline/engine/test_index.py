@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import os
 import shutil
+import time
 import tracemalloc
 
 import pytest
@@ -179,6 +180,19 @@ def test_an_index_is_never_unpacked_beyond_its_bound(cache, monkeypatch, capsys)
     assert store._index.lines == {}
     told = "index/s/bomb in the cache is passed over: it unpacks to more than 1 MB"
     assert capsys.readouterr().err == f"rille: warning RIL-984: {told}\n"
+
+
+@pytest.mark.parametrize("line", [b"", b"\n", b"0" * 63 + b"\n"], ids=["one line", "empty lines", "short lines"])
+def test_an_index_of_what_no_run_writes_costs_little(cache, monkeypatch, capsys, line):
+    """An endless line is not joined again for each of its pieces, and lines of nothing are not counted out."""
+    (cache / "index/s").mkdir(parents=True)
+    (cache / "index/s/bomb").write_bytes(gzip.compress((line or b"0") * (300_000_000 // len(line or b"0")), 1))
+    began = time.process_time()
+    store = Store(cache)
+    store.survey("s")
+    assert time.process_time() - began < 3.0
+    assert store._index.lines == {}
+    assert capsys.readouterr().err.count("is passed over") == 1
 
 
 def test_an_index_is_compact(tmp_path):
