@@ -6,6 +6,7 @@ one whose files hold all that they show; and what may lie beside a file (``.msk`
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -15,7 +16,7 @@ from typing import Any
 import affine
 from affine import Affine
 
-from rille.datasets.text.reading import read_text
+from rille.datasets.text.reading import open_regular, read_text
 from rille.stages.core.errors import InputError
 
 GRID = ".asc"
@@ -35,10 +36,13 @@ def open_raster(path: Path, driver: str = "GTiff") -> Iterator[Any]:
     ------
     rasterio.errors.RasterioError
         It cannot be read by that driver.
+    InputError
+        It is a pipe or a device, on which GDAL would wait for ever.
     """
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning
 
+    open_regular(path, "raster", sys.maxsize).close()
     with warnings.catch_warnings():
         # Whoever needs a place refuses the file in a line of their own.
         warnings.simplefilter("ignore", NotGeoreferencedWarning)

@@ -12,15 +12,26 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
+from rille.datasets.text.reading import TABLE, Search, read_lines, read_text
 from rille.datasets.text.warning import warning
+from rille.pipeline.engine.memory.limits import free, words
 from rille.pipeline.export.foreign_raster import driver_of, open_raster, place_of
 from rille.stages.core.errors import InputError
 
 MOST_CELLS = 500_000_000
-"""Of an elevation model that is read whole: 4 GB; a file of some bytes may claim any number."""
+"""Of an elevation model, which is read whole."""
+
+CELL_BYTES = 100
+"""Memory that a cell takes until it is read, and compared or exported."""
+
+ALWAYS_CELLS, CELLS_PER_BYTE = 4_000_000, 50
+"""Cells that any file may have, and more of them if it has a byte for so many: a sparse file may claim any number."""
 
 LONGEST_AXIS = 10_000_000
 """Cells; coordinates are read whole even where nothing else is."""
+
+HIGHEST_WALL, HIGHEST_STEP = 1500.0, 300.0
+"""Metres and cells; nothing on Earth rises more upright over less than a cell."""
 
 METRE = ("m", "metre", "metres", "meter", "meters")
 
@@ -80,11 +91,37 @@ def read_elevation(path: Path) -> DemFile:
         found = _of_run(path)
     else:
         found = read_raster(path)
+    found = _without_marks(found)
     if not np.isfinite(found.values).any():
         raise InputError(
             "RIL-628", f"{path} has no known cell among {found.values.size}", remedy="give another elevation model"
         )
     return found
+
+
+def _without_marks(dem: DemFile) -> DemFile:
+    """The model without values that mark what is unknown although the file does not say so, each with a warning.
+
+    Such a value is the least or the greatest and lies apart: by more than all others between the two extend, and
+    further than ground can rise without a cell between. Seas, quarries and plateaus have slopes around, or are nearer.
+    """
+    values = dem.values
+    least, most = np.nanmin(values, initial=np.inf), np.nanmax(values, initial=-np.inf)
+    if least >= most:
+        return dem
+    between = values[(values > least) & (values < most)]
+    if not between.size:  # two values: the mark is the rarer one
+        between = np.nanmedian(values, keepdims=True)
+    low, high = between.min(), between.max()
+    gap, mark = max((low - least, least), (most - high, most))
+    marked = values == mark
+    step = HIGHEST_STEP * dem.cell if marked.sum() > 1 else math.inf
+    if gap <= max(high - low, min(HIGHEST_WALL, step)):
+        return dem
+    text = f"{dem.name}: {mark:.9g} in {marked.sum()} cells is no elevation, the others are {low:.6g} to {high:.6g} m"
+    line = warning("RIL-725", f"{text}: taken as unknown; state it in the file, as NODATA")
+    # There may be another such value.
+    return _without_marks(replace(dem, values=np.where(marked, np.nan, values), warnings=(*dem.warnings, line)))
 
 
 def read_raster(path: Path, *, length: bool = True) -> DemFile:
@@ -99,7 +136,7 @@ def read_raster(path: Path, *, length: bool = True) -> DemFile:
 
     try:
         with open_raster(path, driver_of(path)) as file:
-            _check_cells(path, file.height, file.width)
+            _check_cells(path, file.shape, path.stat().st_size)
             # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
             values = file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
             crs, transform, unit = file.crs, place_of(file, path), file.units[0]
@@ -131,11 +168,14 @@ def read_raster(path: Path, *, length: bool = True) -> DemFile:
     )
 
 
-def _check_cells(path: Path, rows: int, cols: int) -> None:
-    if rows * cols > MOST_CELLS:
+def _check_cells(path: Path, shape: tuple[int, ...], stored: int) -> None:
+    """Refuse more cells than there is memory for, or than so many ``stored`` bytes can hold."""
+    most = min(MOST_CELLS, free() // CELL_BYTES, max(ALWAYS_CELLS, CELLS_PER_BYTE * stored))
+    if math.prod(shape) > most:
+        size = " x ".join(map(str, shape))
         raise InputError(
             "RIL-981",
-            f"{path} has {rows} x {cols} cells, at most {MOST_CELLS / 1e6:g} million are read",
+            f"{path} has {size} cells in {words(stored)}, at most {most / 1e6:.3g} million are read",
             remedy="cut it, or resample it to larger cells",
         )
 
@@ -165,10 +205,13 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
     """Positions (n, 2) of the left camera in the CRS of the run's rasters."""
     from rille.datasets.georeference import Georeference
 
+    paths = run / "trajectory.kitti", run / "frames.json"
+    if not all(path.exists() for path in paths):
+        return None
+    lines, text = read_lines(paths[0], "trajectory"), read_text(paths[1], "frames.json", TABLE)
     try:
-        poses = np.loadtxt(run / "trajectory.kitti", ndmin=2)
-        facts = json.loads((run / "frames.json").read_text(encoding="utf-8")).get("georeference")
-    except (OSError, ValueError):
+        poses, facts = np.loadtxt(lines, ndmin=2), json.loads(text).get("georeference")
+    except ValueError:
         return None
     centres = poses[:, [3, 7, 11]][np.isfinite(poses[:, 3])]
     if facts is not None:
@@ -189,6 +232,7 @@ def open_group(path: Path) -> Any:
     import zarr
     from zarr.storage import LocalStore
 
+    _stored(path)
     group = zarr.open_group(store=LocalStore(path, read_only=True), mode="r")
     for name, array in group.arrays():
         if max(array.shape, default=0) > LONGEST_AXIS or math.prod(array.chunks) > MOST_CELLS:
@@ -199,10 +243,19 @@ def open_group(path: Path) -> Any:
     return group
 
 
+def _stored(group: Path) -> int:
+    """Bytes of all files of a zarr group; each is a regular one, because zarr would wait for a pipe for ever."""
+    search = Search()
+    entries = [entry for folder in search.folders(group) for entry in search.entries(folder)]
+    if other := next((e.path for e in entries if not (e.is_file() or e.is_dir())), ""):
+        raise InputError("RIL-723", f"{other} is no regular file", remedy="give terrain.zarr of a run")
+    return sum(entry.stat().st_size for entry in entries)
+
+
 def _of_zarr(path: Path) -> DemFile:
     try:
         group = open_group(path)
-        _check_cells(path, *group["elevation"].shape)
+        _check_cells(path, group["elevation"].shape, _stored(path))
         x, y, z = (np.asarray(group[name][...], np.float64) for name in ("x", "y", "elevation"))
         unit = str(group["elevation"].attrs.get("units", "m"))
         crs = str(group["spatial_ref"].attrs["crs_wkt"]) if "spatial_ref" in group else ""

@@ -16,12 +16,15 @@ import zarr
 from affine import Affine
 from pydantic import TypeAdapter
 from raising import raises
+from terrain_runs import finished
 
 from rille.pipeline.api import open_run
 from rille.pipeline.cli import main
 from rille.pipeline.engine.runtime.hints import read_hint
 from rille.pipeline.engine.store.folder import Folder
+from rille.pipeline.export import read_dem
 from rille.pipeline.export.output import place
+from rille.pipeline.export.programs import colmap
 from rille.pipeline.export.read_dem import read_elevation
 from rille.stages.core.declare import Bundle
 
@@ -190,6 +193,51 @@ def test_a_raster_that_claims_more_than_can_be_read(tmp_path: Path) -> None:
         pass
     with raises("RIL-981"):
         read_elevation(path)
+
+
+def test_a_small_file_does_not_take_more_than_it_can_hold(tmp_path: Path) -> None:
+    about = {"width": 3000, "dtype": "float32", "transform": Affine(0.1, 0, 0, 0, -0.1, 0)}
+    for name, rows in (("dem.tif", 2000), ("sparse.tif", 1000)):
+        with rasterio.open(tmp_path / name, "w", "GTiff", height=rows, count=1, SPARSE_OK=True, tiled=True, **about):
+            pass
+    with raises("RIL-981"):
+        read_elevation(tmp_path / "dem.tif")
+    assert read_elevation(tmp_path / "sparse.tif").values.shape == (1000, 3000)
+    huge(tmp_path / "terrain.zarr", 2001)
+    with raises("RIL-981"):
+        read_elevation(tmp_path / "terrain.zarr")
+
+
+def test_what_needs_more_memory_than_there_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with rasterio.open(
+        tmp_path / "dem.tif", "w", "GTiff", 100, 100, 1, dtype="float32", transform=Affine(0.1, 0, 0, 0, -0.1, 0)
+    ) as file:
+        file.write(np.ones((1, 100, 100), np.float32))
+    monkeypatch.setattr(read_dem, "free", lambda: 390_000)
+    with raises("RIL-981"):
+        read_elevation(tmp_path / "dem.tif")
+
+
+@pytest.mark.parametrize("name", ["frames.json", "trajectory.kitti", "terrain.zarr/elevation/0.0"])
+def test_a_pipe_in_a_run_is_not_waited_for(tmp_path: Path, name: str) -> None:
+    folder = finished(tmp_path / "run")
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    if name.startswith("terrain"):
+        huge(folder / "terrain.zarr", 10)
+    (folder / name).unlink(missing_ok=True)
+    os.mkfifo(folder / name)
+    with raises("RIL-723" if name.startswith("terrain") else "RIL-138"):
+        read_elevation(folder / name.split("/")[0] if name.startswith("terrain") else folder)
+    if name == "frames.json":
+        with raises("RIL-138"):
+            colmap._names(folder)
+
+
+@pytest.mark.parametrize("name", ["dem.tif", "dem.asc"])
+def test_a_pipe_for_a_raster_is_not_waited_for(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    with raises("RIL-138"):
+        read_elevation(tmp_path / name)
 
 
 def test_a_raster_that_names_other_files_is_not_followed(tmp_path: Path) -> None:

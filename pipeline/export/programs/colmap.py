@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.datasets.text.reading import TABLE, read_text
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts, check_new
@@ -251,6 +252,6 @@ def _rigid(pycolmap: Any, T: RigidTransform) -> Any:
 
 def _names(run: Path) -> dict[int, str]:
     """Image names by frame number, as the run wrote them down."""
-    facts = json.loads((run / "frames.json").read_text(encoding="utf-8"))
+    facts = json.loads(read_text(run / "frames.json", "frames.json", TABLE))
     rows = facts.get("frames", [])
     return {int(r["frame"]): str(r["name"]) for r in rows if isinstance(r, dict) and "name" in r}
