@@ -19,7 +19,7 @@ import numpy as np
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.geometry.epipolar import distances
-from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes, rotation_exp
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes, orthonormal, rotation_exp
 from rille.stages.geometry.lens import Lens
 
 MODELS: Mapping[str, tuple[str, ...]] = {
@@ -38,6 +38,9 @@ CORNER_SCALE = 0.5
 
 BAD_RATIO, BAD_PX = 4.0, 0.5
 """A view is bad if its RMS residual exceeds both four times the median of all views and half a pixel."""
+
+FOCAL_STARTS = 0.15 * 1.15 ** np.arange(20)
+"""Shares of an image's longer side that are tried as a fisheye's focal length: a diagonal of 220 to 25 degrees."""
 
 MOST_STEPS, SETTLED = 100, 1e-10
 """Largest number of steps of an adjustment, and the relative decrease of its cost at which it has converged."""
@@ -120,7 +123,8 @@ def calibrate_rig(
         raise ConfigError("RIL-308", f"distortion model {model!r} is unknown", remedy=f"one of {', '.join(MODELS)}")
     _enough(views)
     task = Adjustment(board, tuple(views), sizes, model)
-    x = task.solve(task.start(), robust=True)
+    # A bounded loss sees no way from far off, and a fisheye's start is some pixels off.
+    x = task.solve(task.solve(task.start()) if model == "fisheye" else task.start(), robust=True)
     first = task.residuals(x)
     # Half a pixel at least: where all views fit to a tenth, four tenths are still a good view.
     limit = max(BAD_PX, BAD_RATIO * float(np.median([r.worst for r in first])))
@@ -198,18 +202,16 @@ class Adjustment:
         return np.concatenate([left, right, *(_vector(T) for T in [middle, *left_poses])])
 
     def _alone(self, side: int, points: list[Floats]) -> tuple[Floats, list[RigidTransform]]:
+        if self.model == "fisheye":
+            return self._equidistant(side, points)
         boards = [self.board.astype(np.float32).reshape(1, -1, 3)] * len(points)
         flat = [p.astype(np.float32).reshape(1, -1, 2) for p in points]
         size, threads = self.sizes[side], cv2.getNumThreads()
         # Threads add up the views in any order: the last digits, and so the keys of all that uses the rig, would vary.
         cv2.setNumThreads(1)
         try:
-            if self.model == "fisheye":
-                flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
-                out = cv2.fisheye.calibrate(boards, flat, size, np.zeros((3, 3)), np.zeros(4), flags=flags)
-            else:
-                flags = {"rational": cv2.CALIB_RATIONAL_MODEL, "radtan4": cv2.CALIB_FIX_K3}.get(self.model, 0)
-                out = cv2.calibrateCamera(boards, flat, size, None, None, flags=flags)
+            flags = {"rational": cv2.CALIB_RATIONAL_MODEL, "radtan4": cv2.CALIB_FIX_K3}.get(self.model, 0)
+            out = cv2.calibrateCamera(boards, flat, size, None, None, flags=flags)
         except cv2.error as error:
             raise DegenerateError(
                 "RIL-311", UNDETERMINED, remedy=f"{MORE_VIEWS}, or a model with fewer coefficients"
@@ -221,6 +223,21 @@ class Adjustment:
         lens = np.concatenate([[k[0, 0], k[1, 1], k[0, 2], k[1, 2]], np.ravel(d)[:count]])
         both = zip(rotations, translations, strict=True)
         return lens, [RigidTransform(rotation_exp(np.ravel(r)), np.ravel(t)) for r, t in both]
+
+    def _equidistant(self, side: int, points: list[Floats]) -> tuple[Floats, list[RigidTransform]]:
+        """Start of a fisheye: no terms but the focal length for which half of the boards miss least.
+
+        OpenCV's own begins at one focal length, takes corners beyond 90 degrees off the axis then, and gives up.
+        """
+        width, height = self.sizes[side]
+        centre = np.array([width - 1, height - 1]) / 2
+
+        def poses(f: float) -> tuple[float, list[RigidTransform]]:
+            misses, found = zip(*(_flat_pose(self.board, (p - centre) / f) for p in points), strict=True)
+            return f * float(np.median(misses)), list(found)
+
+        f = min(max(width, height) * FOCAL_STARTS, key=lambda f: poses(f)[0])
+        return np.array([f, f, *centre, 0.0, 0.0, 0.0, 0.0]), poses(f)[1]
 
     def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
         """Residuals (4 n views,), found minus projected negative, pixels, left before right; and their Jacobian."""
@@ -344,6 +361,29 @@ class Adjustment:
         lens = ("fx", "fy", "cx", "cy", *MODELS[self.model])
         rig = [f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"]
         return [f"{side} {name}" for side in ("left", "right") for name in lens] + rig
+
+
+def _flat_pose(board: Floats, angles: Floats) -> tuple[float, RigidTransform]:
+    """Pose of a flat board, and the RMS angle (radians) by which it misses what a camera sees of it.
+
+    Parameters
+    ----------
+    board : (n, 3), z = 0.
+    angles : (n, 2) angle off the axis, in radians, along columns and rows. Directions are exact at any angle, where a
+        pinhole camera's coordinates become infinite.
+    """
+    off = np.hypot(angles[:, 0], angles[:, 1])
+    seen = np.column_stack([angles * np.sinc(off / np.pi)[:, None], np.cos(off)])
+    flat = np.column_stack([board[:, :2] / np.abs(board).max(), np.ones(len(board))])
+    # seen x (H flat) = 0, linear in H = [r1 r2 t] up to its scale (Zhang 2000).
+    cross = np.array([[[0, -z, y], [z, 0, -x], [-y, x, 0]] for x, y, z in seen])
+    h = np.linalg.svd(np.einsum("nij,nk->nijk", cross, flat).reshape(-1, 9), full_matrices=False)[2][-1].reshape(3, 3)
+    h *= np.sign((seen * (flat @ h.T)).sum()) / np.linalg.norm(h[:, :2], axis=0).mean()
+    turn = orthonormal(np.column_stack([h[:, 0], h[:, 1], np.cross(h[:, 0], h[:, 1])]))
+    there = flat @ np.column_stack([turn[:, :2], h[:, 2]]).T
+    there /= np.linalg.norm(there, axis=1, keepdims=True)
+    miss = float(np.sqrt(((there - seen) ** 2).sum(1).mean()))
+    return miss, RigidTransform(turn, h[:, 2] * np.abs(board).max())
 
 
 def _compose(first: Floats, second: Floats) -> tuple[Floats, Floats, Floats]:

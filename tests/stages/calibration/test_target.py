@@ -55,6 +55,38 @@ def test_exact_corners_give_the_rig_back(model):
     assert max(r.epipolar for r in found.residuals) < 1e-3
 
 
+@pytest.mark.parametrize("f", [150.0, 228.0])
+def test_wide_fisheyes_need_no_start(f):
+    """Boards in all parts of the images, corners up to 85 degrees off the axis: OpenCV's own start gives up on them."""
+    rng, size = np.random.default_rng(3), (960, 600)
+    lens = np.array([f, f, size[0] / 2 + 7, size[1] / 2 - 5, 0.02, -0.005, 0.002, -0.0005])
+    task = Adjustment(BOARD, (), (size, size), "fisheye")
+    views: list[BoardView] = []
+    while len(views) < 8:
+        # Facing the camera from a direction within the image, turned by up to 40 degrees.
+        off = rng.uniform(-0.5, 0.5, 2) * size / f
+        ray = np.array([*(off * np.sinc(np.hypot(*off) / np.pi)), np.cos(np.hypot(*off))])
+        x = np.cross([0, 1, 0], ray) / np.linalg.norm(np.cross([0, 1, 0], ray))
+        facing = RigidTransform(np.column_stack([x, np.cross(ray, x), ray]), rng.uniform(0.25, 0.7) * ray)
+        T = facing @ RigidTransform(rotation_exp(rng.uniform(-0.7, 0.7, 3)), np.zeros(3))
+        T = T @ RigidTransform(np.eye(3), -BOARD.mean(axis=0))
+        seen = [(pose.rotation @ BOARD.T).T + pose.translation for pose in (T, RIG @ T)]
+        if min((p[:, 2] / np.linalg.norm(p, axis=1)).min() for p in seen) < np.cos(np.radians(85)):
+            continue
+        corners = [
+            task._project(lens, np.r_[cv2.Rodrigues(pose.rotation)[0].ravel(), pose.translation], np.zeros((54, 2)))[0]
+            for pose in (T, RIG @ T)
+        ]
+        left, right = (c.reshape(-1, 2) + 0.1 * rng.standard_normal((54, 2)) for c in corners)
+        if min(left.min(), right.min()) > 0 and (np.maximum(left.max(0), right.max(0)) < size).all():
+            views.append(BoardView(str(len(views)), left, right))
+    found = calibrate_rig(BOARD, views, (size, size), "fisheye")
+    assert all(r.used for r in found.residuals)
+    assert found.rms < 0.16  # of 0.1 px along columns and rows
+    assert found.left.camera.fx == pytest.approx(f, rel=0.005)
+    np.testing.assert_allclose(found.T_right_left.translation, RIG.translation, atol=1e-3)
+
+
 def test_cameras_of_two_sizes_each_keep_their_own():
     found = calibrate_rig(BOARD, scene("radtan4"), ((640, 480), (1280, 720)), "radtan4")
     assert [(lens.camera.width, lens.camera.height) for lens in (found.left, found.right)] == [(640, 480), (1280, 720)]
