@@ -14,7 +14,7 @@ import tomllib
 from collections.abc import Iterator
 from contextlib import suppress
 from io import BufferedReader
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,16 @@ DEEPEST = 20
 
 MOST_ENTRIES = 300_000
 """Files and folders that are looked at in a search; a walk over them takes two or three seconds."""
+
+BETWEEN = re.compile(r'[\s;:=\[\]()"]+|,\s')
+COMMA, POINT = re.compile(r"[-+]?(\d+),(\d+)([eE][-+]?\d+)?"), re.compile(r"\d\.\d")
+"""What stands between numbers, and numbers with a decimal comma and with a point."""
+
+SAMPLE = 200
+"""Lines that show how a file writes its numbers."""
+
+MILLISECONDS = 10**12
+"""Stamps that are larger have no fraction."""
 
 WILD = re.compile(r"[*?\[]")
 
@@ -112,7 +122,32 @@ def read_lines(path: Path, what: str) -> list[str]:
         raise InputError("RIL-722", f"{what} {path} has {count} lines, at most {MOST_LINES} are read", remedy="cut it")
     lines = text.splitlines()
     _no_long_line(lines, path, what)
+    rows = [match for line in lines[:SAMPLE] if (match := COMMA.fullmatch(line.strip()))]
+    columns = [[int(row[k]) for row in rows] for k in (1, 2)]
+    # A comma in each line may part two columns of integers: stamps that never go back, and what goes with them.
+    if not rows or not (all(a < b for c in columns for a, b in pairwise(c)) or columns[0][0] > MILLISECONDS):
+        refuse_decimal_commas(lines, path)
     return lines
+
+
+def refuse_decimal_commas(lines: list[str], path: Path, cause: Exception | None = None) -> None:
+    """Refuse text of which more numbers have a decimal comma than a point, or one that ``cause`` complains of.
+
+    Raises
+    ------
+    InputError
+        It is so.
+    """
+    sample = enumerate((line[:LONGEST_LINE] for line in lines[:SAMPLE]), start=1)
+    words = [(k, word) for k, line in sample for word in BETWEEN.split(line)]
+    commas = [(k, word) for k, word in words if COMMA.fullmatch(word)]
+    points = sum(POINT.search(word) is not None for _, word in words)
+    if len(commas) > points or any(word in str(cause) for _, word in commas):
+        raise InputError(
+            "RIL-813",
+            f"{path}: decimal commas, such as {commas[0][1]} in line {commas[0][0]}, are not read",
+            remedy="write decimal points (LC_NUMERIC=C for the program that wrote them)",
+        ) from cause
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:

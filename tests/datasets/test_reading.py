@@ -60,6 +60,38 @@ def test_sizes_lines_and_content_are_bounded(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        "0,000000\n0,100000\n0,200000\n",
+        "0,5\n1,5\n2,5\n",
+        "1600000000,25 0,0 -0,0 1,5e-3\n",
+        "Zeit;X;Y\n0;0;0\n0,1;2,5;3,5\n",
+        '"0,1","2,5"\n"0,2","2,5"\n',
+        "a.png\t0,1\t5\n",
+    ],
+)
+def test_decimal_commas_are_called_so(tmp_path, text):
+    (tmp_path / "table").write_text(text)
+    assert "decimal commas" in refused("RIL-813", read_lines, tmp_path / "table", "table")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1,2,3\n4,5,6\n",
+        "0, 1, 2\n",
+        "0,1403636579763555584\n1,1403636579813555456\n",
+        "1403636579763555584,10000\n1403636579813555456,10000\n",
+        "# 1,5 m off\n0.1 0.2\n",
+        "0,100\n",
+    ],
+)
+def test_commas_between_numbers_are_no_decimal_commas(tmp_path, text):
+    (tmp_path / "table").write_text(text)
+    assert read_lines(tmp_path / "table", "table") == text.splitlines()
+
+
+@pytest.mark.parametrize(
     ("text", "code"),
     [
         ("x = " + "9" * 5000, "RIL-026"),
