@@ -10,7 +10,6 @@ predicts.
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ import numpy as np
 
 from rille.datasets.cameras import CalibratedCamera, opencv, rig_of
 from rille.datasets.cameras.fields import Fields
+from rille.datasets.cameras.model import RECTIFIED
 from rille.datasets.images import bag
 from rille.datasets.images.files import Digests, check_size
 from rille.datasets.images.headers import sizes_of
@@ -45,9 +45,6 @@ FORMS = (
 SUFFIXES = (".bag", ".mcap", ".db3")
 INFO, IMU, ODOMETRY = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
 FRAMES = "/tf_static"
-
-RECTIFIED = re.compile(r"(?<![a-z])rect")
-"""In a topic's name; not as in unrectified, corrected or direct."""
 
 LONGEST_GAP = 0.5
 """s; odometry is interpolated over no longer gap."""
@@ -228,7 +225,7 @@ def _camera(reader: Any, path: Path, topic: str) -> tuple[CalibratedCamera, np.n
     else:
         entries |= {"camera_matrix": given["k"], "rectification_matrix": given["r"]}
         entries |= {"distortion_model": message.distortion_model or "plumb_bob"}
-        entries |= {"distortion_coefficients": given["d"]} if len(given["d"]) else {}
+        entries |= {"distortion_coefficients": given["d"]}
     fields = Fields(entries, f"{path} {name}")
     turned = fields.rigid("R", np.reshape(given["r"], (3, 3)), np.zeros(3)).rotation if rectified else np.eye(3)
     return opencv.single(fields, path)[0], turned

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from rille.datasets.cameras import CalibratedCamera, read_cameras
+from rille.datasets.cameras.model import of_size
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import SIDES, SUFFIXES, ImagePair, common_headers, natural, pair_up, side_of
 from rille.datasets.poses import names_positions, read_positions
@@ -27,7 +28,7 @@ from rille.stages.geometry.geometry import Sizes
 DEPTH = 4
 """Folders below the given one that are looked into; more is another data set."""
 
-CALIBRATIONS = (".yaml", ".yml", ".xml", ".tsai", ".txt", ".toml", ".ini", ".cfg", ".json")
+CALIBRATIONS = (".yaml", ".yml", ".xml", ".tsai", ".txt", ".toml", ".ini", ".cfg", ".conf", ".json")
 TABLES = (".txt", ".csv", ".tum", ".dat")
 MOST_TEXTS = 200
 """Text files that are tried as calibration and as table; some data sets have one for each image."""
@@ -129,7 +130,7 @@ def inspect(folder: Path) -> Findings:
         try:
             kind = table_kind(path, found.views.pairs)
         except InputError as error:
-            found.unread.append(str(error))
+            found.unread += [] if str(error) in found.unread else [str(error)]
             continue
         if kind:
             found.tables.setdefault(kind, []).append(relative)
@@ -239,11 +240,13 @@ def _find_calibration(found: Findings, texts: list[Path]) -> None:
         try:
             cameras = read_cameras(path)
         except (RilleError, OSError, ValueError) as error:
-            if path.suffix.lower() == ".tsai" or "calib" in path.stem.lower():
+            # What is recognised, and refused for its lens or its numbers, or is called a calibration.
+            refused = re.match(r"RIL-(81\d|120|135)", getattr(error, "code", ""))
+            if refused or path.suffix.lower() == ".tsai" or "calib" in path.stem.lower():
                 found.unread.append(" ".join(str(error).split()))
             continue
         if cameras:
-            read[relative] = cameras
+            read[relative] = of_size(cameras, found.views.sizes)
     candidates = [_calibration((name,), cameras) for name, cameras in read.items() if len(cameras) == 2]
     for name, cameras in read.items():
         if len(cameras) > 2:
@@ -297,11 +300,13 @@ def table_kind(path: Path, pairs: int) -> str:
     Raises
     ------
     InputError
-        It is one of true positions, by the names of its columns, that cannot be read.
+        It is one of true positions, by the names of its columns, that cannot be read, or has decimal commas.
     """
     try:
         lines = [line.strip() for line in read_lines(path, "table") if line.strip()]
-    except InputError:
+    except InputError as error:
+        if error.code == "RIL-813":
+            raise
         return ""
     comments = [line for line in lines if not NUMBER.match(line)]
     rows = [line for line in lines if NUMBER.match(line)]

@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from rille.datasets.cameras import boofcv, colmap, kitti, middlebury, opencv, pds, slam, tsai
+from rille.datasets.cameras import boofcv, colmap, kitti, makers, middlebury, opencv, pds, slam, tsai
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from rille.datasets.cameras.pair import rig_of
 from rille.datasets.cameras.text import parse_nested
-from rille.datasets.text.reading import read_text
+from rille.datasets.text.reading import read_text, refuse_decimal_commas
 from rille.stages.core.errors import InputError
 
 __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 
 KNOWN = (
-    "OpenCV (YAML, XML), ROS camera_info, Kalibr, EuRoC sensor.yaml, ORB-SLAM, BoofCV, COLMAP, Middlebury calib.txt, "
-    "KITTI, ASP .tsai and PDS3 or VICAR labels (CAHV, CAHVOR, CAHVORE) are read"
+    "OpenCV (YAML, XML), ROS camera_info, Kalibr, EuRoC sensor.yaml, ORB-SLAM, camodocal and VINS, BoofCV, "
+    "ZED .conf, DepthAI, COLMAP, Middlebury calib.txt, KITTI, K.txt, ASP .tsai and PDS3 or VICAR labels (CAHV, CAHVOR, "
+    "CAHVORE) are read"
 )
 
 PLAIN: tuple[tuple[Callable[[str], bool], Callable[[str, Path], list[CalibratedCamera]]], ...] = (
@@ -26,6 +27,8 @@ PLAIN: tuple[tuple[Callable[[str], bool], Callable[[str, Path], list[CalibratedC
     (middlebury.is_middlebury, middlebury.middlebury),
     (colmap.is_colmap, colmap.colmap),
     (kitti.is_kitti, kitti.kitti),
+    (makers.is_zed, makers.zed),
+    (makers.is_matrix, makers.matrix),
 )
 """Text formats: how each is recognised, and its reader."""
 
@@ -34,6 +37,9 @@ NESTED: tuple[tuple[Callable[[Fields], bool], Callable[[Fields, Path], list[Cali
     (slam.is_orbslam, slam.orbslam),
     (slam.is_kalibr, slam.kalibr),
     (slam.is_sensor, slam.sensor),
+    (slam.is_camodocal, slam.camodocal),
+    (slam.is_vins, slam.vins),
+    (makers.is_depthai, makers.depthai),
     (boofcv.is_boofcv, boofcv.boofcv),
     (opencv.is_message, opencv.message),
     (opencv.is_single, opencv.single),
@@ -55,6 +61,14 @@ def read_cameras(path: Path) -> list[CalibratedCamera]:
     """
     # An image with its label in front is too large for a calibration and no text: of it, the label alone is read.
     text = pds.attached(path) or read_text(path, "calibration")
+    try:
+        return _read(text, path)
+    except InputError as error:
+        refuse_decimal_commas(text.splitlines(), path, error)
+        raise
+
+
+def _read(text: str, path: Path) -> list[CalibratedCamera]:
     # Before YAML, for which KITTI's `P0: 7.1 0 ...` is an entry, too: one word where twelve numbers belong.
     for recognises, read in PLAIN:
         if recognises(text):
@@ -62,5 +76,7 @@ def read_cameras(path: Path) -> list[CalibratedCamera]:
     fields = Fields(parse_nested(text, str(path)), str(path))
     for knows, read_fields in NESTED:
         if knows(fields):
-            return read_fields(fields, path)
+            found = read_fields(fields, path)
+            fields.check_lens()
+            return found
     raise InputError("RIL-100", f"{path} holds no camera that is known", remedy=KNOWN)

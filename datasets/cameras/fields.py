@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,32 +18,45 @@ from rille.stages.geometry.lens import Lens
 CORRECT = "correct the calibration file"
 
 MODELS: Mapping[str, str] = {
-    "none": "none",
-    "null": "none",
-    "radtan": "radtan",
-    "radial-tangential": "radtan",
-    "radialtangential": "radtan",
-    "plumb-bob": "radtan",
-    "brown": "radtan",
-    "opencv": "radtan",
-    "rational": "rational",
-    "rational-polynomial": "rational",
-    "equidistant": "fisheye",
-    "equi": "fisheye",
-    "fisheye": "fisheye",
-    "opencv-fisheye": "fisheye",
-    "kannalabrandt8": "fisheye",
-    "kannala-brandt": "fisheye",
-    "kb4": "fisheye",
+    name: model
+    for model, names in {
+        "": "pinhole perspective rectified",
+        "none": "none nodistortion",
+        "radtan": "radtan radialtangential plumbbob brown brownconrady opencv",
+        "rational": "rational rationalpolynomial fullopencv",
+        "fisheye": "equidistant equi fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8 kb kb4 kb8",
+        "unread": "omni omnidirectional mei ucm eucm ds doublesphere fov atan scaramuzza fisheye62 fisheye624",
+    }.items()
+    for name in names.split()
 }
-"""Names that programs have for the lens models of :mod:`rille.stages.geometry.lens`, in lower case with hyphens."""
+"""Names that programs have for the lens models of :mod:`rille.stages.geometry.lens`, in small letters and digits alone.
+
+Those of "" say nothing of distortion; those of "unread" are other models.
+"""
+
+LENS = re.compile(
+    r"dist(?!an[ct]|rib|inc)|fish|lens_?(model|type|dist|par|coef|$)|cam(era)?_?\d?[._]?(model|type)"
+    r"|proj(ection)?_?(model|type)|radial|tangential|prism|coef|(^|[._ ])d\d?$",
+    re.I,
+)
+"""Keys of what describes a lens: a word names its model, numbers are its coefficients."""
+
+COEFFICIENT = re.compile(r"(^|[._ ])(k\d|p[12]|s[1-4]|xi|tau_?[xy])$|distor|radial|tangential|coef", re.I)
+"""Keys of one number that is a coefficient: K1 and P1 may be matrices, and a single ``dist`` is a distance."""
+
+NOT_ZERO = re.compile(r"[-+]?[0.]*[1-9]")
+
+OTHER = re.compile(r"std|deviat|sigma|err|covar|uncert|mask|file|path|name|topic|frame|unit|comment", re.I)
+"""In keys that only look like those of a lens: they hold its errors, or the name of something."""
 
 
 class Fields:
     """Entries of a calibration file by key; ``file`` is its name for errors, ``at`` the way to a nested part."""
 
-    def __init__(self, values: Mapping[Any, Any], file: str, at: str = "") -> None:
+    def __init__(self, values: Mapping[Any, Any], file: str, at: str = "", used: set[str] | None = None) -> None:
         self.values, self.file, self.at = {str(k): v for k, v in values.items()}, file, at
+        self.used = set[str]() if used is None else used
+        """Full keys that a reader has taken, nested ones included."""
 
     def __contains__(self, key: str) -> bool:
         return self.values.get(key) is not None
@@ -55,6 +69,7 @@ class Fields:
         """An entry that must be there."""
         if key not in self:
             raise self.error("RIL-113", key, "is missing")
+        self.used.add(self.at + key)
         return self.values[key]
 
     def sub(self, key: str) -> Fields:
@@ -62,7 +77,7 @@ class Fields:
         value = self.get(key)
         if not isinstance(value, Mapping):
             raise self.error("RIL-114", key, f"is {_shown(value)}, it should hold entries of its own")
-        return Fields(value, self.file, f"{self.at}{key}.")
+        return Fields(value, self.file, f"{self.at}{key}.", self.used)
 
     def text(self, key: str, default: str | None = None) -> str:
         """A word; ``default`` where the key is missing."""
@@ -138,18 +153,39 @@ class Fields:
         except InputError as error:
             raise self.error(error.code, key, f"is wrong: {error.message}", error.remedy) from error
 
-    def model(self, key: str, default: str) -> str:
-        """Lens model of :mod:`rille.stages.geometry.lens` by the name that the file has for it."""
-        stated = self.text(key, default)
-        word = stated.lower().replace("_", "-").replace(" ", "-")
-        if word not in MODELS:
-            raise self.error(
-                "RIL-120",
-                key,
-                f"= {stated!r} is a lens model that is not read",
-                "calibrate as radial-tangential or equidistant",
-            )
-        return MODELS[word]
+    def model(self, coefficients: str) -> str:
+        """Lens model of :mod:`rille.stages.geometry.lens` that any key names; empty where none does.
+
+        Parameters
+        ----------
+        coefficients : key of their list, which must not be missing beside a model.
+
+        Raises
+        ------
+        InputError
+            The model is not read, two keys name two, or there are no coefficients.
+        """
+        named = {key: model for key, value in self.values.items() if (model := _named(key, value))}
+        self.used |= {self.at + key for key in named}
+        keys = {model: key for key, model in named.items()}
+        if "unread" in keys:
+            text = f"= {_shown(self.values[keys['unread']])} is a lens model that is not read"
+            raise self.error("RIL-120", keys["unread"], text, "calibrate as radial-tangential or equidistant")
+        if len(keys) > 1:
+            text = f"name two lens models, {' and '.join(keys)}"
+            raise self.error("RIL-811", " and ".join(keys.values()), text, "keep the one that was calibrated")
+        model = next(iter(keys), "")
+        if model not in ("", "none") and coefficients not in self:
+            remedy = "check its spelling, or give zeros where there is no distortion"
+            raise self.error("RIL-812", coefficients, f"is missing beside a {model} lens", remedy)
+        return model
+
+    def check_lens(self) -> None:
+        """Refuse what names a lens or its coefficients and was not taken: the images would be read by another lens."""
+        for key, value in _untaken(self.values, self.at, self.used):
+            text = f"= {_shown(value)} seems to describe the lens, and is not read there"
+            remedy = "state the lens by the keys of its format (e.g. distortion_model), or remove the entry"
+            raise InputError("RIL-810", f"{self.file}: {key} {text}", remedy=remedy)
 
     def _number(self, key: str, value: Any) -> float:
         try:
@@ -185,6 +221,33 @@ def by_count(coefficients: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
     if not k:
         return "none", k
     return ("radtan", k) if len(k) <= 5 else ("rational", k)
+
+
+def _named(key: str, value: Any) -> str:
+    """Lens model that an entry names; "unread" where it is another one, empty where it names none."""
+    if OTHER.search(key) or isinstance(value, Mapping | list) or value is None:
+        return ""
+    word = re.sub(r"[^a-z0-9]", "", str(value).lower())
+    if "fish" in key.lower() and word in ("1", "true", "yes"):
+        return "fisheye"
+    if word in ("", "false", "no") or word[0].isdigit():
+        return ""
+    # Kalibr's command line says pinhole-equi.
+    model, certain = MODELS.get(word.removeprefix("pinhole") or word, "unread"), LENS.search(key)
+    # Under any other key a word that stands for this only; short ones may stand for something else.
+    return model if certain or (word in MODELS and len(word) > 3 and model in ("fisheye", "unread")) else ""
+
+
+def _untaken(values: Mapping[Any, Any], at: str, used: set[str]) -> Iterator[tuple[str, Any]]:
+    """Full key and value of entries of a lens that no reader took, except coefficients that are zero."""
+    for key, value in ((str(k), v) for k, v in values.items()):
+        path, flat = at + key, _flat(value)
+        if isinstance(value, Mapping) and flat is None:
+            yield from _untaken(value, f"{path}.", used)
+        elif path not in used and not OTHER.search(path):
+            of_lens = (LENS if flat is not None and len(flat) > 1 else COEFFICIENT).search(key)
+            if _named(key, value) or (of_lens and any(NOT_ZERO.match(str(v)) for v in flat or [value])):
+                yield path, value
 
 
 def _flat(value: Any) -> list[Any] | None:

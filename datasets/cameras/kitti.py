@@ -59,6 +59,8 @@ def kitti(text: str, path: Path) -> list[CalibratedCamera]:
     if any(label.endswith("_roi") for label in labels):  # of the part that the images show
         labels = [label for label in labels if label.endswith("_roi")]
     if labels:
+        fields.used |= {f"D_{label[-2:]}" for label in labels}  # of the images before they were rectified
+        fields.check_lens()
         return [_rectified(fields, label) for label in labels]
     return [_raw(fields, label, label[-2:]) for label in sorted(fields.values) if RAW.fullmatch(label)]
 

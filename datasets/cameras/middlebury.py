@@ -24,4 +24,5 @@ def middlebury(text: str, path: Path) -> list[CalibratedCamera]:
     f = Fields(values, str(path))
     size = f.size("width", "height")
     left, right = (Lens(f.pinhole(key, size)) for key in ("cam0", "cam1"))
+    f.check_lens()
     return stereo_cameras(left, right, parallel(f.number("baseline") / 1000))

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
 
-from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.geometry import RigidTransform, Sizes
 from rille.stages.geometry.lens import Lens
 
 UNKNOWN_SIZE = (1, 1)
 """Width and height, pixels, of a camera whose file does not say how large its images are."""
+
+RECTIFIED = re.compile(r"(?<![a-z])rect(?!ang)|Rect|RECT")
+"""In the name of a topic or of a folder of rectified images; not as in unrectified, corrected or direct."""
 
 
 @dataclass(frozen=True)
@@ -24,17 +28,25 @@ class CalibratedCamera:
     T_camera_reference : maps the file's reference frame (first camera, body, world ...), the same for all cameras of
         one calibration, to the optical frame of this camera, in the file's unit of length (metres where the format
         fixes it); None where the file does not say where the camera stands.
+    rectified : the camera of its rectified images, where the file has that, too.
     """
 
     name: str
     lens: Lens
     T_camera_reference: RigidTransform | None = None
+    rectified: CalibratedCamera | None = None
 
     @property
     def size(self) -> tuple[int, int] | None:
         """Width and height of its images, pixels; None where the file does not say."""
         size = (self.lens.camera.width, self.lens.camera.height)
         return None if size == UNKNOWN_SIZE else size
+
+
+def of_size(cameras: list[CalibratedCamera], sizes: Sizes | None) -> list[CalibratedCamera]:
+    """The two of several cameras whose images have these sizes; all where they are not two."""
+    fit = [camera for camera in cameras if sizes is not None and camera.size in sizes]
+    return fit if len(fit) == 2 else cameras
 
 
 def parallel(baseline: float) -> RigidTransform:

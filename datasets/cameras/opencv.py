@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from rille.datasets.cameras.fields import Fields, by_count
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.datasets.cameras.text import parse_nested
 from rille.datasets.text.reading import read_text
+from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
 
@@ -58,7 +60,9 @@ def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
     else:
         T_right_left = _relative(f) or _beside(path)
         poses = (None if T_right_left is None else RigidTransform.identity()), T_right_left
-    return [CalibratedCamera(name, lens, T) for name, lens, T in zip(("left", "right"), lenses, poses, strict=True)]
+    found = [CalibratedCamera(name, lens, T) for name, lens, T in zip(("left", "right"), lenses, poses, strict=True)]
+    projections = ("LEFT.P", "RIGHT.P") if "RIGHT.P" in f else ("P1", "P2")
+    return [_with_rectified(camera, f, projection) for camera, projection in zip(found, projections, strict=True)]
 
 
 def is_message(f: Fields) -> bool:
@@ -68,8 +72,8 @@ def is_message(f: Fields) -> bool:
 
 def message(f: Fields, path: Path) -> list[CalibratedCamera]:
     """One camera of ROS' message camera_info as ``topic echo`` prints it."""
-    values = {MESSAGE.get(key.upper(), key): value for key, value in f.values.items()}
-    return single(Fields(values, f.file), path)
+    f.values = {MESSAGE.get(key.upper(), key): value for key, value in f.values.items()}
+    return single(f, path)
 
 
 def is_single(f: Fields) -> bool:
@@ -83,26 +87,24 @@ def single(f: Fields, path: Path) -> list[CalibratedCamera]:
     The pose of the latter refers to the rectified left camera: ``x_rectified = R x_camera``, and P holds the baseline.
     """
     matrix = next(key for key in SINGLE if key in f)
-    distortion = next((key for key in DISTORTION if key in f), "")
+    distortion = next((key for key in DISTORTION if key in f), DISTORTION[0])
     T = None
     if "projection_matrix" in f and "rectification_matrix" in f:
         T = _unrectified(f, "rectification_matrix", "projection_matrix")
     name = f.text("camera_name", path.stem)
-    return [CalibratedCamera(name, _lens(f, matrix, distortion, _size(f)), T)]
+    camera = CalibratedCamera(name, _lens(f, matrix, distortion, _size(f)), T)
+    return [_with_rectified(camera, f, "projection_matrix")]
 
 
 def _lens(f: Fields, matrix: str, distortion: str, size: tuple[int, int]) -> Lens:
     camera = f.pinhole(matrix, size)
     coefficients = f.numbers(distortion) if distortion in f else ()
     model, coefficients = by_count(coefficients)
-    if "distortion_model" in f:
-        stated = f.model("distortion_model", model)
-        # ROS writes five zeros for cameras without distortion, whatever the model
-        if stated == "fisheye" or any(coefficients):
-            model = stated
-    elif f.text("fisheye_model", "0") not in ("0", "False", "false"):
-        model = "fisheye"
-    return f.lens(distortion or matrix, camera, model, coefficients)
+    stated = f.model(distortion)
+    # ROS writes five zeros for cameras without distortion, whatever the model
+    if stated == "fisheye" or (stated and any(coefficients)):
+        model = stated
+    return f.lens(distortion, camera, model, coefficients)
 
 
 def _size(f: Fields, side: str = "") -> tuple[int, int]:
@@ -134,11 +136,25 @@ def _beside(path: Path) -> RigidTransform | None:
     return _relative(Fields(parse_nested(text, str(other)), str(other)))
 
 
+def _with_rectified(raw: CalibratedCamera, f: Fields, projection: str) -> CalibratedCamera:
+    """With the camera of its rectified images, whose axes are those of the rectified left camera."""
+    P = f.matrix(projection, 3, 4) if projection in f else np.zeros((3, 4))
+    if not P[0, 0] > 0:
+        return raw
+    values = (P[0, 0], P[1, 1], P[0, 2], P[1, 2])
+    camera = f.camera(projection, values, (raw.lens.camera.width, raw.lens.camera.height))
+    return replace(raw, rectified=CalibratedCamera(raw.name, Lens(camera), _baseline(P)))
+
+
+def _baseline(P: Floats) -> RigidTransform:
+    """T_camera_left of a rectified camera."""
+    # sensor_msgs/msg/CameraInfo: P[0, 3] is -fx' times the baseline, fx' = P[0, 0], and 0 of the left camera.
+    return RigidTransform(np.eye(3), np.array([P[0, 3] / P[0, 0], P[1, 3] / P[0, 0], 0.0]))
+
+
 def _unrectified(f: Fields, rotation: str, projection: str) -> RigidTransform:
     """T_camera_reference, where the reference is the rectified left camera."""
     R, P = f.matrix(rotation, 3, 3), f.matrix(projection, 3, 4)
     if not P[0, 0] > 0:
         raise f.error("RIL-125", projection, f"has the focal length {P[0, 0]:g}")
-    # sensor_msgs/msg/CameraInfo: P[0, 3] is -fx' times the baseline, fx' = P[0, 0], and 0 of the left camera.
-    T = RigidTransform(np.eye(3), np.array([P[0, 3] / P[0, 0], P[1, 3] / P[0, 0], 0.0]))
-    return f.rigid(rotation, R, np.zeros(3)).inverse() @ T
+    return f.rigid(rotation, R, np.zeros(3)).inverse() @ _baseline(P)

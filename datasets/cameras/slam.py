@@ -1,16 +1,28 @@
-"""Calibrations of visual-inertial programs: Kalibr's camchain, EuRoC's sensor.yaml, ORB-SLAM's settings."""
+"""Calibrations of visual-inertial programs: Kalibr's camchain, EuRoC's sensor.yaml, ORB-SLAM, camodocal and VINS."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import CalibratedCamera, parallel, stereo_cameras
+from rille.datasets.cameras.text import parse_nested
+from rille.datasets.text.reading import read_text
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
 
 CAMERA = re.compile(r"cam(\d+)")
+
+CAMODOCAL: Mapping[str, tuple[str, str, str]] = {
+    "PINHOLE": ("fx fy cx cy", "radtan", "k1 k2 p1 p2"),
+    "PINHOLE_FULL": ("fx fy cx cy", "rational", "k1 k2 p1 p2 k3 k4 k5 k6"),
+    "KANNALA_BRANDT": ("mu mv u0 v0", "fisheye", "k2 k3 k4 k5"),
+    "MEI": ("gamma1 gamma2 u0 v0", "radtan", "k1 k2 p1 p2"),
+}
+"""Its models: keys of the pinhole part, model of :mod:`rille.stages.geometry.lens`, keys of its coefficients."""
 
 
 def is_kalibr(f: Fields) -> bool:
@@ -19,21 +31,68 @@ def is_kalibr(f: Fields) -> bool:
 
 
 def kalibr(f: Fields, path: Path) -> list[CalibratedCamera]:
-    """Cameras of a chain: ``T_cn_cnm1`` maps camera n - 1 to camera n; else all ``T_cam_imu``. Lengths are metres."""
+    """Cameras of a chain: ``T_cn_cnm1`` maps camera n - 1 to camera n, metres.
+
+    Where not all have it, ``T_cam_imu`` or its inverse ``T_imu_cam`` (OpenVINS) says how they stand to the IMU.
+    """
     names = sorted((key for key in f.values if CAMERA.fullmatch(key)), key=lambda key: int(key[3:]))
     parts = [f.sub(name) for name in names]
-    poses: list[RigidTransform | None] = [None] * len(parts)
-    if len(parts) > 1 and all("T_cn_cnm1" in part for part in parts[1:]):
-        poses = [RigidTransform.identity()]
-        for part in parts[1:]:
-            # Each camera is stated from the one before, so that poses multiply along the chain.
-            poses.append(part.pose("T_cn_cnm1") @ (poses[-1] or RigidTransform.identity()))
-    elif all("T_cam_imu" in part for part in parts):
-        poses = [part.pose("T_cam_imu") for part in parts]
+    whole = len(parts) > 1 and all("T_cn_cnm1" in part for part in parts[1:])
+    poses = [RigidTransform.identity() if whole else _of_imu(parts[0])]
+    for part in parts[1:]:
+        T, before = (None if whole else _of_imu(part)), poses[-1]
+        # Each camera is stated from the one before, so that poses multiply along the chain.
+        poses.append(part.pose("T_cn_cnm1") @ before if T is None and before and "T_cn_cnm1" in part else T)
     return [
         CalibratedCamera(name, _pinhole_lens(part, "distortion_coeffs"), T)
         for name, part, T in zip(names, parts, poses, strict=True)
     ]
+
+
+def _of_imu(part: Fields) -> RigidTransform | None:
+    if "T_cam_imu" in part:
+        return part.pose("T_cam_imu")
+    return part.pose("T_imu_cam").inverse() if "T_imu_cam" in part else None
+
+
+def is_camodocal(f: Fields) -> bool:
+    """Whether these are the entries of a camera of camodocal."""
+    return "model_type" in f
+
+
+def camodocal(f: Fields, path: Path) -> list[CalibratedCamera]:
+    """The camera; ``extrinsicRotation`` and ``extrinsicTranslation`` map it to the body (VINS-Mono), metres."""
+    kind = f.text("model_type").upper()
+    # Without its mirror, Mei's unified model is a pinhole camera's.
+    xi = f.sub("mirror_parameters").number("xi") if kind == "MEI" else 0.0
+    if kind not in CAMODOCAL or xi:
+        text = f"= {kind} (xi = {xi:g}) is not read" if xi else f"= {kind} is not read"
+        raise f.error("RIL-814", "model_type", text, "calibrate as PINHOLE or KANNALA_BRANDT")
+    pinhole, model, coefficients = CAMODOCAL[kind]
+    p = f.sub("projection_parameters")
+    d = p if kind == "KANNALA_BRANDT" else f.sub("distortion_parameters")
+    fx, fy, cx, cy = (p.number(key) for key in pinhole.split())
+    camera = p.camera(pinhole, (fx, fy, cx, cy), f.size("image_width", "image_height"))
+    lens = d.lens(coefficients, camera, model, tuple(d.number(key) for key in coefficients.split()))
+    T = f.transform("extrinsicRotation", "extrinsicTranslation").inverse() if "extrinsicRotation" in f else None
+    return [CalibratedCamera(path.stem, lens, T)]
+
+
+def is_vins(f: Fields) -> bool:
+    """Whether these are the settings of VINS-Fusion with a file for each camera."""
+    return "cam0_calib" in f
+
+
+def vins(f: Fields, path: Path) -> list[CalibratedCamera]:
+    """Cameras of the files that ``cam0_calib`` ... name; ``body_T_cam0`` ... map each to the body, metres."""
+    cameras = []
+    for name in sorted(key[:4] for key in f.values if re.fullmatch(r"cam\d_calib", key)):
+        other = path.parent / f.text(f"{name}_calib")
+        part = Fields(parse_nested(read_text(other, "calibration"), str(other)), str(other))
+        T = f.pose(f"body_T_{name}").inverse() if f"body_T_{name}" in f else None
+        cameras += [replace(camera, name=name, T_camera_reference=T) for camera in camodocal(part, other)]
+        part.check_lens()
+    return cameras
 
 
 def is_sensor(f: Fields) -> bool:
@@ -57,8 +116,8 @@ def _pinhole_lens(f: Fields, distortion: str) -> Lens:
     fx, fy, cx, cy = f.numbers("intrinsics", 4)
     camera = f.camera("intrinsics", (fx, fy, cx, cy), f.pair_of_pixels("resolution"))
     coefficients = f.numbers(distortion) if distortion in f else ()
-    model = f.model("distortion_model", "radtan" if coefficients else "none")
-    return f.lens(distortion, camera, model, () if model == "none" else coefficients)
+    model = f.model(distortion) or ("radtan" if coefficients else "none")
+    return f.lens(distortion, camera, model, () if model == "none" and not any(coefficients) else coefficients)
 
 
 def is_orbslam(f: Fields) -> bool:
@@ -87,7 +146,7 @@ def orbslam(f: Fields, path: Path) -> list[CalibratedCamera]:
 def _orbslam_lens(f: Fields, name: str, size: tuple[int, int]) -> Lens:
     values = [f.number(f"{name}.{key}") for key in ("fx", "fy", "cx", "cy")]
     camera = f.camera(f"{name}.fx", (values[0], values[1], values[2], values[3]), size)
-    if f.text("Camera.type", "").lower() == "kannalabrandt8":
+    if f.model(f"{name}.k1") == "fisheye":
         keys = [f"{name}.k{n}" for n in (1, 2, 3, 4)]
         return f.lens(keys[0], camera, "fisheye", tuple(f.number(key) for key in keys))
     keys = [f"{name}.{key}" for key in ("k1", "k2", "p1", "p2", "k3")]

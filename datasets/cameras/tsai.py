@@ -45,7 +45,9 @@ def tsai(text: str, path: Path) -> list[CalibratedCamera]:
         )
     T_world_body = f.rigid("R", f.matrix("R", 3, 3), np.array(f.numbers("C", 3)))
     T_camera_body = f.rigid("u_direction", axes, np.zeros(3))
-    return [CalibratedCamera(path.stem, _lens(f, lens, camera), T_camera_body @ T_world_body.inverse())]
+    found = CalibratedCamera(path.stem, _lens(f, lens, camera), T_camera_body @ T_world_body.inverse())
+    f.check_lens()
+    return [found]
 
 
 def _entries(text: str, file: str) -> tuple[Fields, str]:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
-from rille.datasets.text.reading import read_lines, read_toml
+from rille.datasets.text.reading import read_text, read_toml
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import InputError, told
 from rille.stages.geometry.geometry import RigidTransform
@@ -44,6 +44,11 @@ class Images(Params):
         default="auto",
         description="how images are paired: by name (left/right aside), by the last number in the name, or by order; "
         "auto: by name, and by number where no names agree",
+    )
+    rectified: bool | None = Field(
+        default=None,
+        description="whether the images are rectified; by default they are where a word of their folders' or files' "
+        "names begins with rect",
     )
 
 
@@ -301,7 +306,7 @@ def _under_a_comment(error: Mapping[str, Any], path: Path) -> str:
     if error["type"] != "extra_forbidden":
         return ""
     header = ""
-    for line in read_lines(path, "manifest"):
+    for line in read_text(path, "manifest").splitlines():
         text = line.strip()
         bare = re.match(r"(#?)\s*\[([A-Za-z_.]+)\]", text)
         if bare:

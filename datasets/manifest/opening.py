@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rille.datasets.cameras.model import RECTIFIED
 from rille.datasets.georeference import georeference
 from rille.datasets.images import files
 from rille.datasets.images.headers import sizes_of
@@ -42,7 +43,7 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
     root = root_folder(manifest.root, path)
     pairs = find_pairs(manifest.images, root, name)
     headers = common_headers(pairs)
-    optics = read_optics(manifest, root, name, sizes_of(headers))
+    optics = read_optics(manifest, root, name, sizes_of(headers), _are_rectified(manifest.images, root, pairs[0]))
     motion = read_motion(manifest, root, name, pairs)
     up = motion.up
     if up is None and optics.up is not None:
@@ -84,6 +85,12 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
         notes=manifest.notes,
         warnings=(*(crossed(pairs) if manifest.images.pair == "order" else ()), *optics.warnings, *motion.warnings),
     )
+
+
+def _are_rectified(images: Images, root: Path, pair: ImagePair) -> bool:
+    """Whether the images are rectified, as stated or by the names of files and folders from the root on."""
+    names = (os.path.relpath(path, root.parent) for path in (pair.left, pair.right))
+    return all(map(RECTIFIED.search, names)) if images.rectified is None else images.rectified
 
 
 def default_name(path: Path) -> str:

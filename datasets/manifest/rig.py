@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from rille.datasets.cameras import CalibratedCamera, read_cameras, rig_of
-from rille.datasets.cameras.model import parallel
+from rille.datasets.cameras.model import of_size, parallel
 from rille.datasets.manifest.model import Cameras, Manifest, PinholeLens, RigSection
 from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
@@ -49,7 +49,7 @@ class Optics:
     warnings: tuple[str, ...]
 
 
-def read_optics(manifest: Manifest, root: Path, name: str, sizes: Sizes) -> Optics:
+def read_optics(manifest: Manifest, root: Path, name: str, sizes: Sizes, rectified: bool = False) -> Optics:
     """Rig and lenses of a manifest.
 
     Parameters
@@ -57,13 +57,15 @@ def read_optics(manifest: Manifest, root: Path, name: str, sizes: Sizes) -> Opti
     root : folder that calibration files are relative to.
     name : what to call the manifest in an error.
     sizes : of the images.
+    rectified : whether the images are; then their cameras are those that the calibration has for such images.
 
     Raises
     ------
     InputError
         The cameras or their relative pose are not stated, contradict the images, or cannot be.
     """
-    left, right = _cameras(manifest.cameras, root, name, sizes)
+    raw = _cameras(manifest.cameras, root, name, sizes)
+    left, right = (_rectified(camera, name) if rectified else camera for camera in raw)
     # Before anything compares lengths: the manifest's own are metres.
     left, right = (_scaled(camera, manifest.rig.unit) for camera in (left, right))
     up = _up(manifest, left, name)
@@ -73,6 +75,9 @@ def read_optics(manifest: Manifest, root: Path, name: str, sizes: Sizes) -> Opti
     except InputError as error:
         raise error.at(name) from error
     lines += _check_baseline(rig.baseline, manifest.rig, name)
+    if left.lens != raw[0].lens and manifest.images.rectified is None:
+        text = f"{name}: the images are rectified by their name: their camera is P, without the distortion"
+        lines.append(warning("RIL-817", f"{text} (images.rectified = false if they are raw)"))
     return Optics(rig, lenses, up, (*lines, *unusual_cameras((left, right), sizes)))
 
 
@@ -82,7 +87,7 @@ def _cameras(section: Cameras, root: Path, name: str, sizes: Sizes) -> tuple[Cal
         return tuple(_one(value, side, root, name, size) for side, value, size in stated)
     found: tuple[CalibratedCamera, ...] = ()
     if section.file is not None:
-        found = _of_file(section, root / section.file, name)
+        found = _of_file(section, root / section.file, name, sizes)
     elif section.stated:
         found = tuple(_one(section, side, root, name, sizes[0]) for side in ("left", "right"))
     if found and found[0].lens == found[1].lens and sizes[0] != sizes[1]:
@@ -99,6 +104,18 @@ def _cameras(section: Cameras, root: Path, name: str, sizes: Sizes) -> tuple[Cal
         f"{name}: the cameras are not known",
         remedy="give cameras.file, cameras.left and cameras.right, or cameras.fx, cx and cy (px)",
     )
+
+
+def _rectified(camera: CalibratedCamera, name: str) -> CalibratedCamera:
+    """The camera of rectified images; the one that there is where it has no distortion."""
+    if camera.rectified is None and not camera.lens.ideal:
+        raise InputError(
+            "RIL-816",
+            f"{name}: the images are rectified by their name, and the calibration of camera {camera.name} has a "
+            "distortion, which would be taken off twice",
+            remedy="give the calibration of the rectified images (P), or images.rectified = false if they are raw",
+        )
+    return camera.rectified or camera
 
 
 def _one(value: str | PinholeLens, side: str, root: Path, name: str, size: tuple[int, int]) -> CalibratedCamera:
@@ -123,9 +140,11 @@ def _one(value: str | PinholeLens, side: str, root: Path, name: str, size: tuple
         raise error.at(f"{name}: cameras") from error
 
 
-def _of_file(section: Cameras, path: Path, name: str) -> tuple[CalibratedCamera, ...]:
+def _of_file(section: Cameras, path: Path, name: str, sizes: Sizes) -> tuple[CalibratedCamera, ...]:
     """Left and right camera of one file; a single camera is taken for both."""
     found = read_cameras(path)
+    if section.names is None:
+        found = of_size(found, sizes)
     if section.names is not None:
         by_name = {camera.name: camera for camera in found}
         missing = [wanted for wanted in section.names if wanted not in by_name]

@@ -4,7 +4,7 @@ Models and the order of their coefficients are OpenCV's:
 
 * ``none``: no coefficients;
 * ``radtan`` (Brown 1966, Conrady 1919): k1 k2 p1 p2 [k3];
-* ``rational``: k1 k2 p1 p2 k3 k4 k5 k6 [s1 s2 s3 s4]; the last four are its thin prism;
+* ``rational``: k1 k2 p1 p2 k3 k4 k5 k6 [s1 s2 s3 s4 [tx ty]]: then its thin prism, and the tilt of the sensor;
 * ``fisheye`` (Kannala, Brandt 2006, doi:10.1109/TPAMI.2006.153): k1 k2 k3 k4; Kalibr calls it equidistant.
 
 One more is that of NASA's rovers, see :mod:`rille.stages.geometry.cahvore`:
@@ -35,7 +35,7 @@ from rille.stages.geometry.geometry import Camera
 COUNTS: Mapping[str, tuple[int, ...]] = {
     "none": (0,),
     "radtan": (4, 5),
-    "rational": (8, 12),
+    "rational": (8, 12, 14),
     "fisheye": (4,),
     "cahvore": (8,),
 }

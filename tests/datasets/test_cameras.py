@@ -1,3 +1,5 @@
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -176,6 +178,64 @@ def test_ros_models(tmp_path, model, values, kind):
     assert read_cameras(written(tmp_path, text))[0].lens.model == kind
 
 
+BENT = [0.0175653, -0.0031772, 0.0036, -0.0007]
+COEFFICIENTS = f"distortion_coefficients: {BENT}\n"
+PINHOLE = "camera_matrix: [500, 0, 320, 0, 501, 240, 0, 0, 1]\nimage_width: 640\nimage_height: 480\n"
+CAM0 = "cam0:\n  camera_model: pinhole\n  intrinsics: [190, 190, 250, 250]\n  resolution: [512, 512]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "model"),
+    [
+        (PINHOLE + COEFFICIENTS, "radtan"),
+        (PINHOLE + COEFFICIENTS + "camera_model: fisheye\n", "fisheye"),
+        (PINHOLE + COEFFICIENTS + "distorsion: equidistant\n", "fisheye"),
+        (PINHOLE + COEFFICIENTS + "dist_model: Kannala_Brandt4\n", "fisheye"),
+        (PINHOLE + COEFFICIENTS + "lens: equi\ncamera_model: pinhole\n", "fisheye"),
+        (PINHOLE + COEFFICIENTS + "type: fisheye\n", "fisheye"),
+        (PINHOLE + COEFFICIENTS + "is_fisheye: true\n", "fisheye"),
+        (PINHOLE + COEFFICIENTS + "fisheye_model: 0\ndistortion_model: plumb-bob\n", "radtan"),
+        (PINHOLE + COEFFICIENTS + "camera_model: fisheye\ndistortion_model: equidistant\n", "fisheye"),
+        (PINHOLE + COEFFICIENTS + "camera_model: pinhole-equi\n", "fisheye"),
+        # Not of the lens, or nothing of it.
+        (PINHOLE + COEFFICIENTS + "model: BFS-U3-31S4C\ncorner_dist: 0.1\nk3: 0.0\nsigmas: {left_k1: 0.1}\n", "radtan"),
+        (PINHOLE + "distortion_model: plumb_bob\ndistortion_coefficients: []\n", "none"),
+        (CAM0 + f"  distortion_coeffs: {BENT}\n  distorsion_model: equidistant\n", "fisheye"),
+        (CAM0 + f"  distortion_coeffs: {BENT}\n  distortion_model: RadTan\n", "radtan"),
+        ('{\n\t"K": [[500, 0, 320], [0, 501, 240], [0, 0, 1]],\n\t"D": [0.1, 0, 0, 0], "lens": "fisheye"}', "fisheye"),
+    ],
+)
+def test_a_lens_is_read_under_any_key_that_names_it(tmp_path, text, model):
+    assert read_cameras(written(tmp_path, text))[0].lens.model == model
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (PINHOLE + COEFFICIENTS + "distortion_model: fisheye62\n", ("RIL-120", "fisheye62")),
+        (PINHOLE + COEFFICIENTS + "lens_type: omni\n", ("RIL-120", "lens_type")),
+        (PINHOLE + COEFFICIENTS + "distortion_model: plumb_bob\ncamera_model: fisheye\n", ("RIL-811", "camera_model")),
+        (PINHOLE + "distortion_model: plumb_bob\n", ("RIL-812", "distortion_coefficients")),
+        (PINHOLE + f"distorsion_coefficients: {BENT}\n", ("RIL-810", "distorsion_coefficients")),
+        (PINHOLE + f"coeffs: {BENT}\n", ("RIL-810", "coeffs")),
+        (PINHOLE + "distortion: {k1: 0.1, k2: 0.2}\n", ("RIL-810", "distortion.k1")),
+        (PINHOLE + COEFFICIENTS + "lens: {type: fisheye}\n", ("RIL-810", "lens.type")),
+        (PINHOLE + COEFFICIENTS + "k5: 1e-3\n", ("RIL-810", "k5")),
+        (CAM0 + "  distortion_model: equidistant\n", ("RIL-812", "cam0.distortion_coeffs")),
+        (CAM0 + f"  dist_coeffs: {BENT}\n", ("RIL-810", "cam0.dist_coeffs")),
+        (CAM0 + f"  distortion_coeffs: {BENT}\ndistortion_model: equidistant\n", ("RIL-810", "distortion_model")),
+        ("P0: 707 0 601 0 0 707 183 0 0 0 1 0\nD: -0.3 0.1 0 0 0\n", ("RIL-810", "D =")),
+        ("cam0=[700 0 300; 0 700 200; 0 0 1]\ncam1=[700 0 300; 0 700 200; 0 0 1]\nbaseline=90\nk1=0.1\n", ("RIL-810",)),
+    ],
+)
+def test_what_would_be_another_lens_is_refused(tmp_path, text, expected):
+    path = written(tmp_path, text)
+    with raises(*expected) as error:
+        read_cameras(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
 def test_rectification_of_orbslam2_gives_the_raw_cameras(tmp_path):
     text = "%YAML:1.0\nCamera.fx: 435.2\nCamera.fy: 435.2\nCamera.cx: 367.4\nCamera.cy: 252.2\nCamera.bf: 47.9\n"
     a, b = rotation_exp([0.0, 0.01, 0.02]), rotation_exp([0.01, -0.03, 0.0])
@@ -237,6 +297,29 @@ def test_kalibr_by_the_imu(tmp_path):
     np.testing.assert_allclose(rig_of(left, right)[0].T_right_left.translation, SHIFT, atol=1e-12)
 
 
+def test_kalibr_by_the_imu_in_either_direction_or_both(tmp_path):
+    """OpenVINS states T_imu_cam; of a chain with both, links count where all have them."""
+    a, between = RigidTransform(ROTATION, [0.1, 0.2, 0.3]), RigidTransform(np.eye(3), SHIFT)
+    b = between @ a
+
+    def rig(*poses):
+        text = "".join(
+            f"cam{n}: {{intrinsics: [190, 190, 250, 250], resolution: [512, 512], {key}: "
+            f"{np.vstack([T.matrix34, [0, 0, 0, 1]]).tolist()}}}\n"
+            for n, (key, T) in enumerate(poses)
+        )
+        cameras = read_cameras(written(tmp_path, text))
+        return rig_of(cameras[0], cameras[-1])[0].T_right_left.matrix34
+
+    inverse = ("T_imu_cam", a.inverse()), ("T_imu_cam", b.inverse())
+    mixed = ("T_imu_cam", a.inverse()), ("T_cam_imu", b)
+    chained = ("T_cam_imu", b.inverse() @ a), ("T_imu_cam", a.inverse()), ("T_cn_cnm1", between)
+    np.testing.assert_allclose(rig(*inverse), between.matrix34, atol=1e-12)
+    np.testing.assert_allclose(rig(*mixed), between.matrix34, atol=1e-12)
+    expected = (b @ (b.inverse() @ a).inverse()).matrix34
+    np.testing.assert_allclose(rig(*chained), expected, atol=1e-12)
+
+
 def test_kalibr_of_one_camera(tmp_path):
     """It stands where the IMU says, or nowhere: in a chain of one camera no link is missing."""
     one = "cam0: {{intrinsics: [190, 190, 250, 250], resolution: [512, 512]{}}}\n"
@@ -275,6 +358,59 @@ def test_euroc_sensor_stands_in_the_body(tmp_path):
 
 
 ORB = "%YAML:1.0\n\n# notes\nCamera.fx: 969.0\nCamera.fy: 970\nCamera.cx: 635.1\nCamera.cy: 463.5\n"
+
+
+CAMODOCAL = """%YAML:1.0
+---
+model_type: {kind}
+camera_name: camera
+image_width: 752
+image_height: 480
+{mirror}distortion_parameters: {{k1: -0.29, k2: 0.1, p1: 0.001, p2: -0.002}}
+projection_parameters: {{{projection}}}
+"""
+USUAL = "fx: 460, fy: 461, cx: 363, cy: 248"
+
+
+@pytest.mark.parametrize(
+    ("kind", "mirror", "projection", "lens"),
+    [
+        ("PINHOLE", "", USUAL, ("radtan", (-0.29, 0.1, 0.001, -0.002))),
+        (
+            "MEI",
+            "mirror_parameters: {xi: 0}\n",
+            "gamma1: 460, gamma2: 461, u0: 363, v0: 248",
+            ("radtan", (-0.29, 0.1, 0.001, -0.002)),
+        ),
+        (
+            "KANNALA_BRANDT",
+            "",
+            "k2: 0.1, k3: 0.2, k4: 0.3, k5: 0.4, mu: 460, mv: 461, u0: 363, v0: 248",
+            ("fisheye", (0.1, 0.2, 0.3, 0.4)),
+        ),
+    ],
+)
+def test_camodocal(tmp_path, kind, mirror, projection, lens):
+    text = CAMODOCAL.format(kind=kind, mirror=mirror, projection=projection)
+    if kind == "KANNALA_BRANDT":
+        text = text.replace("distortion_parameters: {k1: -0.29, k2: 0.1, p1: 0.001, p2: -0.002}\n", "")
+    (camera,) = read_cameras(written(tmp_path, text))
+    assert camera.lens == Lens(Camera(460, 461, 363, 248, 752, 480), *lens)
+
+
+def test_vins_names_a_file_a_camera(tmp_path):
+    for n in (0, 1):
+        written(tmp_path, CAMODOCAL.format(kind="PINHOLE", mirror="", projection=USUAL), f"cam{n}_pinhole.yaml")
+    pose = "body_T_cam{n}: !!opencv-matrix\n  rows: 4\n  cols: 4\n  dt: d\n  data: {data}\n"
+    text = "%YAML:1.0\nimu: 1\nnum_of_cam: 2\n"
+    for n, x in ((0, -0.02), (1, 0.09)):
+        T = np.vstack([RigidTransform(ROTATION, [x, 0.0, 0.0]).matrix34, [0, 0, 0, 1]])
+        text += f"cam{n}_calib: cam{n}_pinhole.yaml\n" + pose.format(n=n, data=numbers(T))
+    left, right = read_cameras(written(tmp_path, text))
+    assert (left.name, right.name) == ("cam0", "cam1")
+    np.testing.assert_allclose(
+        centre(right.T_camera_reference) - centre(left.T_camera_reference), [0.11, 0, 0], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("bf", [226.746, -226.746])
@@ -440,6 +576,7 @@ def test_middlebury_is_in_millimetres(tmp_path):
         (BOOF.replace("skew: 0.0", "skew: 3.0"), ("RIL-104", "left.pinhole.skew")),
         (BOOF.replace("  z: -0.25\n", ""), ("RIL-113", "rightToLeft.z")),
         (STRAIGHT + "k1 = 1\n", ("RIL-113",)),
+        (STRAIGHT + "lens_model = fisheye\n", ("RIL-810", "lens_model")),
         (STRAIGHT.replace("C = 1 2 3", "C = 1 2"), ("RIL-116",)),
         (STRAIGHT + "pitch = 0\n" + BENT, ("RIL-146",)),
         ("1 OPENCV 640 480 500 501 320 240\n", ("RIL-109",)),
@@ -448,6 +585,8 @@ def test_middlebury_is_in_millimetres(tmp_path):
         (MONO.format(count=6, values=[0.1] * 6), ("RIL-370", "distortion_coefficients")),
         (MONO.format(count=4, values=[0.1] * 4).replace("[ 5.e+02, 0.,", "[ 5.e+02, 3.,"), ("RIL-119",)),
         (MONO.format(count=4, values=[0.1] * 4).replace("image_height: 480\n", ""), ("RIL-113", "image_height")),
+        (CAMODOCAL.format(kind="MEI", mirror="mirror_parameters: {xi: 1.9}\n", projection=USUAL), ("RIL-814", "MEI")),
+        (CAMODOCAL.format(kind="SCARAMUZZA", mirror="", projection=USUAL), ("RIL-814", "SCARAMUZZA")),
         ("sensor_type: imu\nrate_hz: 200\n", ("RIL-100",)),
         ("", ("RIL-100",)),
         ("just words\n", ("RIL-100",)),
@@ -463,6 +602,123 @@ def test_one_line_that_names_file_and_key(tmp_path, text, expected):
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
     assert error.value.remedy
+
+
+# -- as cameras come with them -----------------------------------------------------------------------------------------
+
+ZED = """[LEFT_CAM_{0}]
+fx={f}
+fy={f}
+cx=640
+cy=360
+k1=-0.17
+k2=0.02
+p1=0.001
+p2=0.002
+k3=0.003
+
+[RIGHT_CAM_{0}]
+fx={f}
+fy={f}
+cx=641
+cy=361
+{right}
+
+"""
+ZED_STEREO = "[STEREO]\nBaseline=120.5\nTY=0.1\nTZ=-0.2\nCV_HD=0.003\nRX_HD=0.001\nRZ_HD=-0.002\nCV_2K=0.004\n"
+
+
+def test_zed(tmp_path):
+    """All resolutions; lengths are millimetres; the rotation vector is RX, CV, RZ of each."""
+    text = ZED.format("2K", f=1400, right="") + ZED.format("HD", f=700, right="") + ZED_STEREO
+    text += "[RIGHT_DISTO]\nk4=0.1\np1=0\n"
+    cameras = read_cameras(written(tmp_path, text, "SN1.conf"))
+    assert [c.name for c in cameras] == ["left 2K", "right 2K", "left HD", "right HD"]
+    assert [c.size for c in cameras] == [(2208, 1242)] * 2 + [(1280, 720)] * 2
+    left, right = cameras[2:]
+    assert left.lens.coefficients == (-0.17, 0.02, 0.001, 0.002, 0.003, 0, 0, 0)
+    assert right.lens.coefficients == (0, 0, 0, 0, 0, 0.1, 0, 0)
+    T = rig_of(left, right)[0].T_right_left
+    np.testing.assert_allclose(T.rotation, rotation_exp([0.001, 0.003, -0.002]), atol=1e-12)
+    np.testing.assert_allclose(T.translation, [-0.1205, 1e-4, -2e-4])
+    np.testing.assert_allclose(cameras[1].T_camera_reference.rotation, rotation_exp([0, 0.004, 0]), atol=1e-12)
+
+
+def test_zed_of_one_resolution_is_that_of_the_images(tmp_path):
+    text = ZED.format("HD", f=700, right="k1=1\nk2=2\nk3=3\nk4=4") + ZED_STEREO
+    left, right = read_cameras(written(tmp_path, text, "a.conf"))
+    assert left.size is None
+    assert (right.lens.model, right.lens.coefficients) == ("fisheye", (1, 2, 3, 4))
+    with raises("RIL-113", "Baseline".lower()):
+        read_cameras(written(tmp_path, ZED.format("HD", f=700, right=""), "b.conf"))
+
+
+def oak(socket, to, shift, kind=0, coefficients=(0.0,) * 14):
+    return [
+        socket,
+        {
+            "cameraType": kind,
+            "distortionCoeff": list(coefficients),
+            "extrinsics": {
+                "rotationMatrix": np.eye(3).tolist(),
+                "translation": dict(zip("xyz", shift, strict=True)),
+                "specTranslation": {"x": 0, "y": 0, "z": 0},
+                "toCameraSocket": to,
+            },
+            "height": 800,
+            "intrinsicMatrix": [[790.0, 0, 640], [0, 790.0, 400], [0, 0, 1]],
+            "lensPosition": 130,
+            "width": 1280,
+        },
+    ]
+
+
+def test_depthai(tmp_path):
+    """Centimetres along the chain of sockets; which of them are left and right, the file says."""
+    bent = tuple(0.01 * k for k in range(1, 15))
+    rows = [oak(0, -1, (0, 0, 0)), oak(4, 0, (-3.75, 0, 0), coefficients=bent), oak(7, 4, (7.5, 0.1, 0), kind=1)]
+    text = {"cameraData": rows, "stereoRectificationData": {"leftCameraSocket": 4, "rightCameraSocket": 7}}
+    rows[2][1]["distortionCoeff"][:4] = [0.1, 0.2, 0.3, 0.4]
+    left, right = read_cameras(written(tmp_path, json.dumps(text, indent="\t"), "oak.json"))
+    assert (left.lens.model, left.lens.coefficients, left.size) == ("rational", bent, (1280, 800))
+    assert (right.lens.model, right.lens.coefficients) == ("fisheye", (0.1, 0.2, 0.3, 0.4))
+    np.testing.assert_allclose(rig_of(left, right)[0].T_right_left.translation, [-0.075, -0.001, 0], atol=1e-12)
+    rows[1][1]["extrinsics"]["toCameraSocket"] = -1
+    rows[2][1]["extrinsics"]["toCameraSocket"] = 0
+    assert read_cameras(written(tmp_path, json.dumps(text), "oak.json"))[1].T_camera_reference is None
+    with raises("RIL-113", "cameraData 7"):
+        read_cameras(written(tmp_path, json.dumps(text | {"cameraData": rows[:2]}), "oak.json"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["754.7 0.0 489.4 0.0 755.1 265.2 0.0 0.0 1.0\n{}\n", "[[754.7, 0, 489.4],\n[0, 755.1, 265.2],\n[0, 0, 1]]\n{}"],
+)
+def test_matrix_and_baseline(tmp_path, text):
+    left, right = read_cameras(written(tmp_path, text.format("0.063"), "K.txt"))
+    assert left.lens == Lens(Camera(754.7, 755.1, 489.4, 265.2, *UNKNOWN_SIZE))
+    np.testing.assert_allclose(right.T_camera_reference.translation, [-0.063, 0, 0])
+    assert len(read_cameras(written(tmp_path, text.format(""), "K.txt"))) == 1
+
+
+def test_a_rotation_alone_is_no_camera(tmp_path):
+    with raises("RIL-100"):
+        read_cameras(written(tmp_path, "1 0 0 0 1 0 0 0 1\n", "R.txt"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "P0: 707,0912 0 601,8873 0 0 707,0912 183,1104 0 0 0 1 0\nP1: 7,0 0 6,0 -3,8 0 7,0 1,8 0 0 0 1 0\n",
+        PINHOLE.replace("500, 0, 320, 0, 501, 240", "500,5, 0, 320,5, 0, 501,5, 240,5"),
+        ORB.replace(".", ",").replace("Camera,", "Camera.").replace("YAML:1,0", "YAML:1.0"),
+        ZED.format("HD", f="700,25", right="") + ZED_STEREO,
+        "754,7 0,0 489,4 0,0 755,1 265,2 0,0 0,0 1,0\n0,063\n",
+    ],
+)
+def test_decimal_commas_are_called_so(tmp_path, text):
+    with raises("RIL-813", "decimal commas"):
+        read_cameras(written(tmp_path, text))
 
 
 def test_files_that_are_no_text(tmp_path):

@@ -144,6 +144,30 @@ def test_true_positions_that_cannot_be_read_are_told(tmp_path):
     assert "truth.csv, line 3: 'nan'" in line
 
 
+def test_what_is_recognised_and_refused_is_told(tmp_path):
+    """A lens that is not read, and decimal commas of a calibration and of a table, once each."""
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    write_lines(tmp_path / "cam0.yaml", ["model_type: MEI", "mirror_parameters: {xi: 1.9}"])
+    write_lines(tmp_path / "P.txt", ["P0: 60,5 0 31,5 0 0 60,5 23,5 0 0 0 1 0"])
+    write_lines(tmp_path / "times.txt", ["0,00", "0,10"])
+    found = inspect(tmp_path)
+    assert not found.tables
+    assert [line.partition(": ")[0].rpartition("/")[2] for line in found.unread] == ["P.txt", "cam0.yaml", "times.txt"]
+    assert "MEI" in found.unread[1]
+    assert all("decimal commas" in found.unread[k] for k in (0, 2))
+
+
+def test_of_several_resolutions_that_of_the_images_is_taken(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]), (960, 600))
+    section = "[{side}_CAM_{name}]\nfx={f}\nfy={f}\ncx={f}\ncy={f}\n"
+    sections = [section.format(side=s, name=n, f=f) for n, f in (("SVGA", 240), ("HD", 640)) for s in ("LEFT", "RIGHT")]
+    (tmp_path / "SN1.conf").write_text("".join(sections) + "[STEREO]\nBaseline=120\n")
+    found = inspect(tmp_path)
+    assert found.calibration is not None
+    assert (found.calibration.files, found.calibration.cameras) == (("SN1.conf",), 2)
+    assert found.calibration.sizes == ((960, 600), (960, 600))
+
+
 def test_single_numbers_are_times_whatever_their_count_where_the_name_says_so(tmp_path):
     write_lines(tmp_path / "times.txt", ["0.0", "0.5", "1.0"])
     assert table_kind(tmp_path / "times.txt", 2) == "times"

@@ -113,6 +113,53 @@ def test_distortion_gives_lenses(tmp_path):
     )
 
 
+INFO = """image_width: 64
+image_height: 48
+camera_matrix: [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients: [-0.3, 0.1, 0, 0, 0]
+rectification_matrix: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+projection_matrix: [55, 0, 30, {shift}, 0, 55, 24, 0, 0, 0, 1, 0]
+"""
+
+
+@pytest.mark.parametrize(
+    ("places", "more", "rectified"),
+    [
+        ("{side}", "", False),
+        ("image_rect/{side}", "", True),
+        ("{side}_rectified", "", True),
+        ("{side}/imageRect", "", True),
+        ("unrectified/{side}", "", False),
+        ("{side}_corrected", "", False),
+        ("rectangle/{side}", "", False),
+        ("image_rect/{side}", "rectified = false", False),
+        ("{side}", "rectified = true", True),
+    ],
+)
+def test_distortion_is_not_taken_off_twice(tmp_path, places, more, rectified):
+    """A camera_info has both cameras: K and D are those of raw images, P is that of the rectified ones."""
+    for k, side in enumerate(("left", "right")):
+        folder = tmp_path / places.format(side=side)
+        folder.mkdir(parents=True)
+        cv2.imwrite(str(folder / "00.png"), np.full((48, 64), 9, np.uint8))
+        (tmp_path / f"{side}.yaml").write_text(INFO.format(shift=-5.5 * k))
+    left, right = (f"{places.format(side=side)}/*.png" for side in ("left", "right"))
+    lines = [f'images = {{ left = "{left}", right = "{right}"{f", {more}" if more else ""} }}']
+    (tmp_path / "m.toml").write_text("\n".join([*lines, 'cameras = { left = "left.yaml", right = "right.yaml" }']))
+    s = opened(tmp_path / "m.toml")
+    assert s.rig.baseline == pytest.approx(0.1)
+    assert (s.rig.left.fx, s.lenses is None) == ((55, True) if rectified else (60, False))
+    assert any("RIL-817" in line for line in s.warnings) == (rectified and not more)
+
+
+def test_a_distortion_without_projection_is_refused(tmp_path):
+    path = write_sequence(tmp_path, cameras=CAMERAS + "distortion = [-0.3, 0.1, 0, 0]\n")
+    path.write_text(path.read_text().replace("[images]", "[images]\nrectified = true"))
+    with raises("RIL-816", "rectified"):
+        opened(path)
+
+
 def test_cameras_may_differ(tmp_path):
     cameras = (
         "[cameras.left]\nfx = 60.0\ncx = 31.5\ncy = 23.5\n[cameras.right]\nfx = 61.0\nfy = 62.0\ncx = 30.0\ncy = 23.0\n"

@@ -17,6 +17,7 @@ LENSES = {
     "radtan of five": Lens(RAW, "radtan", (-0.266, -0.0386, 1.8e-3, -2.8e-4, 0.238)),
     "rational": Lens(RAW, "rational", (0.3, 0.02, 1e-4, 2e-4, 0.001, 0.6, 0.1, 0.005)),
     "thin prism": Lens(RAW, "rational", (0.3, 0.02, 1e-4, 2e-4, 0.0, 0.6, 0.1, 0.0, 1e-3, 2e-4, -1e-3, 1e-4)),
+    "tilted": Lens(RAW, "rational", (0.3, 0.02, 1e-4, 2e-4, 0.0, 0.6, 0.1, 0.0, 1e-3, 2e-4, -1e-3, 1e-4, 0.01, -0.02)),
     "fisheye": Lens(Camera(191.0, 190.5, 255.0, 257.0, 512, 512), "fisheye", (0.0035, 0.0007, -0.0021, 0.0002)),
 }
 

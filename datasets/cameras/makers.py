@@ -1,0 +1,142 @@
+"""Calibrations as stereo cameras come with them: ZED's ``.conf``, OAK's JSON (DepthAI), and ``K.txt`` of data sets."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from rille.datasets.cameras.fields import Fields, by_count
+from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera, parallel, stereo_cameras
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
+from rille.stages.geometry.lens import Lens
+
+SECTION = re.compile(r"^[ \t]*\[(\w{1,40})\]([^\[]*)", re.MULTILINE)
+ENTRY = re.compile(r"^[ \t]*(\w{1,40})[ \t]*=[ \t]*(\S+)", re.MULTILINE)
+"""Of a ``.conf``: a section with its text, and one of its entries."""
+
+ZED_SIZES = {
+    "VGA": (672, 376),
+    "SVGA": (960, 600),
+    "HD": (1280, 720),
+    "FHD": (1920, 1080),
+    "FHD1200": (1920, 1200),
+    "2K": (2208, 1242),
+    "QHDPLUS": (3200, 1800),
+    "4K": (3840, 2160),
+}
+"""Pixels of the resolutions that a ``.conf`` has a section for."""
+
+FOCAL, PIXEL, ZERO, ONE = r"(\d{2,6}\.?\d*)", r"(-?\d{1,6}\.?\d*)", r"-?0(?:\.0*)?(?:e[-+]?\d+)?", r"1(?:\.0*)?"
+NEXT = r"[\s,;\[\]]+"
+MATRIX = re.compile(
+    rf"[\s\[]*{NEXT.join((FOCAL, ZERO, PIXEL, ZERO, FOCAL, PIXEL, ZERO, ZERO, ONE))}(?:{NEXT}([^\s\]]+))?[\s\]]*"
+)
+"""Text of nine numbers fx 0 cx, 0 fy cy, 0 0 1, and perhaps a tenth."""
+
+
+def is_zed(text: str) -> bool:
+    """Whether this is the text of a ZED's calibration."""
+    return "[LEFT_CAM_" in text
+
+
+def zed(text: str, path: Path) -> list[CalibratedCamera]:
+    """Both cameras at each resolution. Lengths in the file are millimetres, here metres.
+
+    ``Baseline``, TY and TZ are the translation of ``x_right = R x_left + (-Baseline, TY, TZ)``, RX, CV and RZ the
+    rotation vector of R (``saveCalibZED`` of Stereolabs' calibration tool). Several resolutions tell their sizes; a
+    single one is taken for that of the images.
+    """
+    parts = {name.upper(): {k.lower(): v for k, v in ENTRY.findall(body)} for name, body in SECTION.findall(text)}
+    names = [name.removeprefix("LEFT_CAM_") for name in parts if name.startswith("LEFT_CAM_")]
+    stereo = Fields(parts.get("STEREO", {}), str(path), "STEREO ")
+    cameras = []
+    for name in names:
+        size = ZED_SIZES.get(name, UNKNOWN_SIZE) if len(names) > 1 else UNKNOWN_SIZE
+        # Newer files have the distortion once, for all resolutions.
+        left, right = (
+            _zed_lens(Fields(parts.get(f"{side}_DISTO", {}) | parts.get(at, {}), str(path), f"{at} "), size)
+            for side, at in (("LEFT", f"LEFT_CAM_{name}"), ("RIGHT", f"RIGHT_CAM_{name}"))
+        )
+        rx, cv, rz, ty, tz = (
+            stereo.number(f"{key}_{name.lower()}", stereo.number(key, 0.0)) for key in ("rx", "cv", "rz", "ty", "tz")
+        )
+        t = np.array([-stereo.number("baseline"), ty, tz]) / 1000
+        pair = stereo_cameras(left, right, RigidTransform(rotation_exp([rx, cv, rz]), t))
+        cameras += [replace(camera, name=f"{camera.name} {name}") for camera in pair]
+    return cameras
+
+
+def _zed_lens(f: Fields, size: tuple[int, int]) -> Lens:
+    fx, fy, cx, cy = (f.number(key) for key in ("fx", "fy", "cx", "cy"))
+    fisheye = "k4" in f and "p1" not in f
+    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    coefficients = tuple(f.number(key, 0.0) for key in keys)
+    f.check_lens()
+    return f.lens("k1", f.camera("fx", (fx, fy, cx, cy), size), "fisheye" if fisheye else "rational", coefficients)
+
+
+def is_depthai(f: Fields) -> bool:
+    """Whether these are the entries of an OAK's calibration."""
+    return "cameraData" in f
+
+
+def depthai(f: Fields, path: Path) -> list[CalibratedCamera]:
+    """The two cameras that the device rectifies for stereo. Lengths in the file are centimetres, here metres.
+
+    ``extrinsics`` map a camera to the one at ``toCameraSocket``; 14 coefficients are OpenCV's, of a fisheye four count.
+    """
+    rows = f.get("cameraData")
+    pairs = [row for row in rows if isinstance(row, list) and len(row) == 2] if isinstance(rows, list) else []
+    sockets = Fields({str(socket): camera for socket, camera in pairs}, f.file, "cameraData ")
+    stereo = f.sub("stereoRectificationData")
+    sides = [stereo.text(f"{side}CameraSocket") for side in ("left", "right")]
+    left, right = (_depthai_lens(sockets.sub(side)) for side in sides)
+    (root, T_root_left), (other, T_root_right) = (_to_root(sockets, side) for side in sides)
+    if root != other:
+        return [CalibratedCamera("left", left), CalibratedCamera("right", right)]
+    return stereo_cameras(left, right, T_root_right.inverse() @ T_root_left)
+
+
+def _depthai_lens(f: Fields) -> Lens:
+    camera = f.pinhole("intrinsicMatrix", f.size("width", "height"))
+    coefficients, kind = f.numbers("distortionCoeff"), f.text("cameraType", "0")
+    if kind == "1" and not any(coefficients[4:]):
+        return f.lens("distortionCoeff", camera, "fisheye", coefficients[:4])
+    if kind != "0":
+        raise f.error("RIL-815", "cameraType", f"= {kind} is not read", "0 (perspective) and 1 (fisheye) are")
+    return f.lens("distortionCoeff", camera, *by_count(coefficients))
+
+
+def _to_root(sockets: Fields, socket: str) -> tuple[str, RigidTransform]:
+    """The camera that all others are stated from, and T_root_socket in metres."""
+    T, seen = RigidTransform.identity(), set[str]()
+    while socket not in seen:
+        seen.add(socket)
+        e = sockets.sub(socket).sub("extrinsics")
+        other = e.text("toCameraSocket")
+        if other not in sockets:
+            break
+        shift = e.sub("translation")
+        t = np.array([shift.number(axis) for axis in "xyz"]) / 100
+        T, socket = e.rigid("rotationMatrix", e.matrix("rotationMatrix", 3, 3), t) @ T, other
+    return socket, T
+
+
+def is_matrix(text: str) -> bool:
+    """Whether the text is nine numbers K, or ten: K and the baseline."""
+    return MATRIX.fullmatch(text[:1000]) is not None
+
+
+def matrix(text: str, path: Path) -> list[CalibratedCamera]:
+    """Two parallel cameras alike, of ``K.txt`` with K row by row and a baseline in metres; without one, a camera."""
+    found = MATRIX.fullmatch(text[:1000])
+    assert found is not None
+    f = Fields(dict(zip(("fx", "cx", "fy", "cy", "baseline"), found.groups(), strict=True)), str(path))
+    fx, fy, cx, cy = (f.number(key) for key in ("fx", "fy", "cx", "cy"))
+    lens = Lens(f.camera("fx", (fx, fy, cx, cy), UNKNOWN_SIZE))
+    if "baseline" not in f:
+        return [CalibratedCamera(path.stem, lens)]
+    return stereo_cameras(lens, lens, parallel(f.number("baseline")))
