@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rille.datasets.cameras.fields import Fields, by_count
+from rille.datasets.cameras.kitti import LEAST_FOCAL
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera, parallel, stereo_cameras
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
@@ -29,10 +30,11 @@ ZED_SIZES = {
 }
 """Pixels of the resolutions that a ``.conf`` has a section for."""
 
-FOCAL, PIXEL, ZERO, ONE = r"(\d{2,6}\.?\d*)", r"(-?\d{1,6}\.?\d*)", r"-?0(?:\.0*)?(?:e[-+]?\d+)?", r"1(?:\.0*)?"
+NUMBER, ZERO, ONE = r"(-?\d{1,6}\.?\d*(?:e[-+]?\d+)?)", r"-?0(?:\.0*)?(?:e[-+]?\d+)?", r"1(?:\.0*)?(?:e[-+]?0+)?"
 NEXT = r"[\s,;\[\]]+"
 MATRIX = re.compile(
-    rf"[\s\[]*{NEXT.join((FOCAL, ZERO, PIXEL, ZERO, FOCAL, PIXEL, ZERO, ZERO, ONE))}(?:{NEXT}([^\s\]]+))?[\s\]]*"
+    rf"[\s\[]*{NEXT.join((NUMBER, ZERO, NUMBER, ZERO, NUMBER, NUMBER, ZERO, ZERO, ONE))}(?:{NEXT}([^\s\]]+))?[\s\]]*",
+    re.I,
 )
 """Text of nine numbers fx 0 cx, 0 fy cy, 0 0 1, and perhaps a tenth."""
 
@@ -127,7 +129,8 @@ def _to_root(sockets: Fields, socket: str) -> tuple[str, RigidTransform]:
 
 def is_matrix(text: str) -> bool:
     """Whether the text is nine numbers K, or ten: K and the baseline."""
-    return MATRIX.fullmatch(text[:1000]) is not None
+    found = MATRIX.fullmatch(text[:1000])
+    return found is not None and float(found[1]) > LEAST_FOCAL
 
 
 def matrix(text: str, path: Path) -> list[CalibratedCamera]:

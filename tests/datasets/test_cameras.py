@@ -692,7 +692,11 @@ def test_depthai(tmp_path):
 
 @pytest.mark.parametrize(
     "text",
-    ["754.7 0.0 489.4 0.0 755.1 265.2 0.0 0.0 1.0\n{}\n", "[[754.7, 0, 489.4],\n[0, 755.1, 265.2],\n[0, 0, 1]]\n{}"],
+    [
+        "754.7 0.0 489.4 0.0 755.1 265.2 0.0 0.0 1.0\n{}\n",
+        "[[754.7, 0, 489.4],\n[0, 755.1, 265.2],\n[0, 0, 1]]\n{}",
+        "7.547e+02 0.0e+00 4.894e+02\n0.0e+00 7.551e+02 2.652e+02\n0.0e+00 0.0e+00 1.0e+00\n{}\n",
+    ],
 )
 def test_matrix_and_baseline(tmp_path, text):
     left, right = read_cameras(written(tmp_path, text.format("0.063"), "K.txt"))
