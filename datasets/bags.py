@@ -1,6 +1,6 @@
 """ROS 1 and ROS 2 bags and mcap files with the images of two cameras and their ``camera_info``.
 
-Pairs are images of equal ``header.stamp``. Images of a topic with a word in its name that begins with ``rect`` are
+Pairs are images of nearest ``header.stamp``. Images of a topic with a word in its name that begins with ``rect`` are
 rectified: their camera is ``P``; of others it is ``K`` with the distortion ``D``, and ``R`` and ``P`` of both cameras
 say how they stand to each other (REP 104 and ``sensor_msgs/msg/CameraInfo``). An IMU and wheel odometry count where
 ``/tf_static`` says how their frame stands to the left camera's: the IMU gives the vertical and rotations, odometry
@@ -10,8 +10,8 @@ predicts.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,12 @@ from rille.datasets.cameras.model import RECTIFIED
 from rille.datasets.images import bag
 from rille.datasets.images.files import Digests, check_size
 from rille.datasets.images.headers import sizes_of
-from rille.datasets.images.pairing import side_of
+from rille.datasets.images.pairing import join, side_of
 from rille.datasets.imu import ImuRecord, Inertial, at_frames
+from rille.datasets.inspection import CALIBRATIONS, Findings, FoundImages, find_calibration
 from rille.datasets.kitti import CAR, STREET
-from rille.datasets.manifest.rig import unusual_cameras
+from rille.datasets.manifest.model import Cameras, Images, Manifest
+from rille.datasets.manifest.rig import Optics, read_optics, unusual_cameras
 from rille.datasets.poses import TimedPoses, interpolate
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.text.names import derived_name
@@ -34,7 +36,7 @@ from rille.datasets.text.times import seconds
 from rille.datasets.text.warning import warning
 from rille.stages.core.declare import NoParams
 from rille.stages.core.errors import InputError
-from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.geometry import RigidTransform, Sizes
 
 FORMS = (
     ("BAG", "ROS 1 or 2 bag or mcap (FILE.bag, FILE.mcap, folder with metadata.yaml): two image topics, camera_info"),
@@ -72,52 +74,58 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
     ------
     InputError
         The package that reads bags is missing, the bag cannot be read, holds no two image topics that belong together
-        or several, or lacks their ``camera_info``, or no two images have the same time.
+        or several, or no cameras are known, or no two images are of one time.
     """
     return open_bag(path.resolve(), number) if is_bag(path) else None
 
 
-def open_bag(path: Path, topics: str | None = None) -> Sequence:
-    """The sequence of a bag; ``topics`` are those of the left and right images, with a comma between them."""
+def open_bag(path: Path, topics: str | None = None, optics_of: Callable[[Sizes], Optics] | None = None) -> Sequence:
+    """The sequence of a bag.
+
+    Parameters
+    ----------
+    topics : those of the left and right images, with a comma between them.
+    optics_of : cameras before images of some sizes; by default those of ``camera_info``, or, where there is none, of a
+        calibration file beside the bag.
+    """
     with bag.opened(path) as reader:
         chosen = _topics(reader, path, topics)
-        taken = {c: _images(reader, path, topic) for c, topic in zip(CAMERAS, chosen, strict=True)}
-        cameras = [_camera(reader, path, topic) for topic in chosen]
-        stamps, warnings = _common(path, chosen, *taken.values())
-        left, right = (taken[camera][stamps[0]].size for camera in CAMERAS)
-        for camera, topic, size in zip(CAMERAS, chosen, (left, right), strict=True):
-            for stamp in stamps:
-                check_size(taken[camera][stamp].size, size, f"image {stamp} of {topic} in {path}")
+        there = [_images(reader, path, topic) for topic in chosen]
+        both, warnings = _joined(path, chosen, *there)
+        stamps = both[0]
+        taken = {c: [of[stamp] for stamp in k] for c, of, k in zip(CAMERAS, there, both, strict=True)}
+        sizes = sizes_of((taken["left"][0].size, taken["right"][0].size))
+        for camera, topic in zip(CAMERAS, chosen, strict=True):
+            for stamp, one in zip(stamps, taken[camera], strict=True):
+                check_size(one.size, taken[camera][0].size, f"image {stamp} of {topic} in {path}")
         times, more = seconds(stamps, str(path), unit="ns")
-        frame = taken["left"][stamps[0]].frame
-        inertial, odometry, unused = _movement(reader, path, times, frame, cameras[0][1])
-    pair, sizes = (cameras[0][0], cameras[1][0]), sizes_of((left, right))
-    rig, lenses = rig_of(*pair, sizes)
-    lines = unusual_cameras(pair, sizes)
+        frame = taken["left"][0].frame
+        optics, turned = (optics_of(sizes), np.eye(3)) if optics_of else _optics(reader, path, chosen, sizes)
+        inertial, odometry, unused = _movement(reader, path, times, frame, turned)
+    up = inertial.up if any(inertial.up) else None
 
     def image(number: int, camera: str) -> Source:
-        one = taken[camera][stamps[number]]
+        one = taken[camera][number]
         width, height, bits = one.size
         args = {"sha256": one.sha256, "camera": camera, "frame": number}
         args |= {"width": width, "height": height, "depth": bits}
-        module = "rille.datasets.images.bag16" if bits == 16 else "rille.datasets.images.bag"
-        topic = chosen[CAMERAS.index(camera)]
-        return Source(module, NoParams(), args, hints={"path": str(path), "topic": topic, "at": one.at})
+        hints = {"path": str(path), "topic": chosen[CAMERAS.index(camera)], "at": one.at}
+        return Source("rille.datasets.images.bag", NoParams(), args, hints=hints)
 
     return Sequence(
         name=derived_name(path.stem),
-        rig=rig,
+        rig=optics.rig,
         frames=len(stamps),
         image=image,
         frame_names=tuple(map(str, stamps)),
-        lenses=lenses,
+        lenses=optics.lenses,
         times=times,
-        up=inertial.up if any(inertial.up) else None,
+        up=up if optics.up is None else (optics.up,) * len(stamps),
         attitude=inertial.attitude if any(inertial.attitude) else None,
         odometry=odometry,
-        defaults=STREET if rig.baseline >= CAR else {},
+        defaults=STREET if optics.rig.baseline >= CAR else {},
         notes=inertial.notes,
-        warnings=(*warnings, *more, *lines, *unused, *inertial.warnings),
+        warnings=(*warnings, *more, *optics.warnings, *unused, *inertial.warnings),
     )
 
 
@@ -176,26 +184,44 @@ def _images(reader: Any, path: Path, topic: str) -> dict[int, TakenImage]:
     return found
 
 
-def _common(
+def _joined(
     path: Path, topics: tuple[str, str], left: Mapping[int, TakenImage], right: Mapping[int, TakenImage]
-) -> tuple[list[int], list[str]]:
-    """Stamps that both cameras have, in order, and what is left out."""
-    common = sorted(set(left) & set(right))
-    if not common:
-        # Only for the message, and quadratic: not of two cameras that ran for hours.
-        apart = min((abs(a - b) for a in left for b in right), default=None) if len(left) * len(right) < 10**7 else None
-        near = "" if apart is None else f"; the nearest are {apart / 1e6:.6g} ms apart"
+) -> tuple[tuple[list[int], list[int]], list[str]]:
+    """Stamps of the left and of the right images of all pairs, in order, and what is left out."""
+    stamps = sorted(left), sorted(right)
+    joined = join([stamp / 1e9 for stamp in stamps[0]], [stamp / 1e9 for stamp in stamps[1]])
+    if not joined.places:
         raise InputError(
             "RIL-947",
-            f"{path}: no image of {topics[0]} ({len(left)}) has the stamp of one of {topics[1]} ({len(right)}){near}",
+            f"{path}: no image of {topics[0]} ({len(left)}) has the stamp of one of {topics[1]} ({len(right)}); the "
+            f"nearest are {1e3 * joined.apart:.6g} ms apart, {1e3 * joined.allowed:.3g} ms are allowed",
             remedy="both images of a pair need the same header.stamp: synchronise the cameras",
         )
-    alone = len(left) + len(right) - 2 * len(common)
-    lines = [warning("RIL-948", f"{alone} images without a partner of the same stamp are left out")] if alone else []
-    return common, lines
+    both = [stamps[0][i] for i, _ in joined.places], [stamps[1][j] for _, j in joined.places]
+    return both, joined.lines("RIL-948")
 
 
 # -- cameras -----------------------------------------------------------------------------------------------------------
+
+
+def _optics(reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes) -> tuple[Optics, np.ndarray]:
+    """Cameras of the image topics, and the rotation from the left one's frame to its images'."""
+    if not any(c.msgtype == INFO for c in reader.connections):
+        found = Findings(path.parent, FoundImages("", "", 0, sizes, ""))
+        find_calibration(found, [p for p in sorted(path.parent.iterdir()) if p.suffix.lower() in CALIBRATIONS])
+        beside = found.calibration
+        if beside is not None and beside.baseline is not None:
+            stated = dict(zip(CAMERAS if beside.files[1:] else ("file",), beside.files, strict=True))
+            cameras = Cameras.model_validate({**stated, "names": beside.names})
+            manifest = Manifest(images=Images(left="", right=""), cameras=cameras)
+            line = warning(
+                "RIL-825", f"{path} has no camera_info: its cameras are those of {' and '.join(beside.files)}"
+            )
+            optics = read_optics(manifest, path.parent, str(path), sizes)
+            return replace(optics, warnings=(line, *optics.warnings)), np.eye(3)
+    (left, turned), (right, _) = (_camera(reader, path, topic) for topic in topics)
+    rig, lenses = rig_of(left, right, sizes)
+    return Optics(rig, lenses, None, unusual_cameras((left, right), sizes)), turned
 
 
 def _camera(reader: Any, path: Path, topic: str) -> tuple[CalibratedCamera, np.ndarray]:
@@ -208,7 +234,7 @@ def _camera(reader: Any, path: Path, topic: str) -> tuple[CalibratedCamera, np.n
         raise InputError(
             "RIL-949",
             f"{path} has no {name} for {topic} (camera_info: {', '.join(there) or 'none'})",
-            remedy="record the camera_info of both cameras beside their images",
+            remedy="record the camera_info of both cameras, put a calibration file beside the bag, or write a manifest",
         )
     # ROS 1 names the fields K, D, R and P, ROS 2 k, d, r and p.
     given = {key.lower(): getattr(message, key) for key in dir(message) if key.lower() in ("k", "d", "r", "p")}
@@ -218,6 +244,9 @@ def _camera(reader: Any, path: Path, topic: str) -> tuple[CalibratedCamera, np.n
         "image_height": message.height,
         "projection_matrix": given["p"],
         "camera_name": topic,
+        "binning_x": message.binning_x,
+        "binning_y": message.binning_y,
+        "roi": {key: getattr(message.roi, key) for key in ("x_offset", "y_offset", "width", "height")},
     }
     if rectified:
         # The images are rectified already: P alone is their camera, and R must not be applied again.

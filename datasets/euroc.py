@@ -162,7 +162,7 @@ def list_frames(layout: EurocLayout) -> Frames:
             "RIL-156",
             f"{layout.folder}: no time stamp of {len(taken['left'])} images in cam0 is also one of "
             f"{len(taken['right'])} in cam1",
-            remedy="give both cameras of one recording; stamps of a pair must be equal",
+            remedy="give both cameras of one recording, or a manifest: `rille init` pairs the nearest stamps",
         )
     if any(left_out):
         apart = f"{left_out[0]} of cam0, {left_out[1]} of cam1"

@@ -16,10 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.cameras import CalibratedCamera, read_cameras
+from rille.datasets.cameras import KNOWN, CalibratedCamera, read_cameras
 from rille.datasets.cameras.model import of_size
+from rille.datasets.images.files import SUFFIXES
 from rille.datasets.images.headers import sizes_of
-from rille.datasets.images.pairing import SIDES, SUFFIXES, ImagePair, common_headers, natural, pair_up, side_of
+from rille.datasets.images.kinds import unread
+from rille.datasets.images.pairing import SIDES, ImagePair, common_headers, natural, pair_up, side_of, stamp_of
 from rille.datasets.poses import names_positions, read_positions
 from rille.datasets.text.reading import Search, read_lines
 from rille.stages.core.errors import InputError, RilleError
@@ -32,9 +34,6 @@ CALIBRATIONS = (".yaml", ".yml", ".xml", ".tsai", ".txt", ".toml", ".ini", ".cfg
 TABLES = (".txt", ".csv", ".tum", ".dat")
 MOST_TEXTS = 200
 """Text files that are tried as calibration and as table; some data sets have one for each image."""
-
-STAMP = re.compile(r"(?<!\d)[1-9]\d{9,}")
-"""Seconds since 1970 have ten digits, their fractions more; frame numbers have fewer, or zeros in front."""
 
 UNWRITABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """In a name: control characters and line separators, which would end a comment, and bytes that are not UTF-8."""
@@ -56,6 +55,7 @@ class FoundImages:
     stamped : whether the file names are times since an epoch.
     sides : the words or letters in the names that mark left and right.
     absent : of the pairs that lack a file, what is missing; they are counted in ``pairs``.
+    lines : how the pairs are joined by the time stamps in their names, where these differ.
     """
 
     left: str
@@ -67,6 +67,7 @@ class FoundImages:
     stamped: bool = False
     sides: tuple[str, str] = ("left", "right")
     absent: tuple[str, ...] = ()
+    lines: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -112,16 +113,21 @@ def inspect(folder: Path) -> Findings:
     """
     if not folder.is_dir():
         raise InputError("RIL-193", f"{folder} is no folder", remedy="name a folder that holds images of two cameras")
-    paths = [p for p in _files(folder, Search()) if p.suffix.lower() in (*SUFFIXES, *CALIBRATIONS, *TABLES)]
+    there = list(_files(folder, Search()))
+    paths = [p for p in there if p.suffix.lower() in (*SUFFIXES, *CALIBRATIONS, *TABLES)]
     for path in paths:
         _writable(_relative(path, folder))
-    found = Findings(folder, find_views(folder, [p for p in paths if p.suffix.lower() in SUFFIXES]))
+    strange = [UNWRITABLE.sub("?", _relative(p, folder)) for p in there if p not in set(paths)]
+    try:
+        found = Findings(folder, find_views(folder, [p for p in paths if p.suffix.lower() in SUFFIXES]))
+    except InputError as error:
+        raise InputError(error.code, "; ".join([error.message, *unread(strange)]), remedy=error.remedy) from error
     texts = [p for p in paths if p.suffix.lower() in (*CALIBRATIONS, *TABLES)]
     # Each is tried as a calibration and as a table; thousands of them (one an image) would take minutes.
     if len(texts) > MOST_TEXTS:
         found.unread.append(f"of {len(texts)} text files only the first {MOST_TEXTS} were looked at")
         texts = texts[:MOST_TEXTS]
-    _find_calibration(found, [p for p in texts if p.suffix.lower() in CALIBRATIONS])
+    find_calibration(found, [p for p in texts if p.suffix.lower() in CALIBRATIONS])
     used = set(found.calibration.files if found.calibration else ()) | set(found.others)
     for path in texts:
         relative = _relative(path, folder)
@@ -134,6 +140,10 @@ def inspect(folder: Path) -> Findings:
             continue
         if kind:
             found.tables.setdefault(kind, []).append(relative)
+            used.add(relative)
+    told = " ".join(found.unread)
+    unknown = [_relative(p, folder) for p in texts if _relative(p, folder) not in used and str(p) not in told]
+    found.unread += unread(unknown + strange)
     return found
 
 
@@ -186,9 +196,9 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     # Most pairs first; of as many, the surest token (SIDES).
     key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0]))
     left, right = both[key]
-    sizes, trouble, matched = None, "", tuple[ImagePair, ...]()
+    sizes, trouble, matched, lines = None, "", tuple[ImagePair, ...](), list[str]()
     try:
-        matched = pair_up(left, right, gaps=True)  # as the manifest opens
+        matched = pair_up(left, right, gaps=True, warnings=lines)  # as the manifest opens
         sizes = sizes_of(common_headers(matched))
     except InputError as error:
         trouble = str(error)
@@ -200,9 +210,10 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         sizes,
         f"{len(left)} left and {len(right)} right images, told apart by {tokens[0]!r} and {tokens[1]!r}",
         trouble,
-        all(STAMP.search(path.stem) for path in left),
+        all(stamp_of(path.stem) for path in left),
         tokens,
         tuple(pair.absent for pair in matched if pair.absent),
+        tuple(lines),
     )
 
 
@@ -232,7 +243,7 @@ def _common_start(words: list[str]) -> str:
 # -- calibration -------------------------------------------------------------------------------------------------------
 
 
-def _find_calibration(found: Findings, texts: list[Path]) -> None:
+def find_calibration(found: Findings, texts: list[Path]) -> None:
     """Of all files that are calibrations, the one or the two that serve this rig best."""
     read: dict[str, list[CalibratedCamera]] = {}
     for path in texts:
@@ -240,9 +251,10 @@ def _find_calibration(found: Findings, texts: list[Path]) -> None:
         try:
             cameras = read_cameras(path)
         except (RilleError, OSError, ValueError) as error:
-            # What is recognised, and refused for its lens or its numbers, or is called a calibration.
+            # Most files of text are tables, or something else altogether; what is refused for its lens is neither.
+            other = path.suffix.lower() in TABLES or (isinstance(error, RilleError) and error.remedy == KNOWN)
             refused = re.match(r"RIL-(81\d|120|135)", getattr(error, "code", ""))
-            if refused or path.suffix.lower() == ".tsai" or "calib" in path.stem.lower():
+            if refused or "calib" in path.stem.lower() or not other:
                 found.unread.append(" ".join(str(error).split()))
             continue
         if cameras:
@@ -300,14 +312,9 @@ def table_kind(path: Path, pairs: int) -> str:
     Raises
     ------
     InputError
-        It is one of true positions, by the names of its columns, that cannot be read, or has decimal commas.
+        It cannot be read, as a file or as one of true positions, by the names of its columns, or has decimal commas.
     """
-    try:
-        lines = [line.strip() for line in read_lines(path, "table") if line.strip()]
-    except InputError as error:
-        if error.code == "RIL-813":
-            raise
-        return ""
+    lines = [line.strip() for line in read_lines(path, "table") if line.strip()]
     comments = [line for line in lines if not NUMBER.match(line)]
     rows = [line for line in lines if NUMBER.match(line)]
     if not rows:

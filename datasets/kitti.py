@@ -262,7 +262,7 @@ def list_pairs(layout: KittiLayout) -> Listing:
         raise InputError(
             "RIL-209",
             f"{ours[alone[0]]} has no partner in {layout.folder / side} (and {len(alone) - 1} more)",
-            remedy="add the missing images or remove these",
+            remedy="add the missing images or remove these; `rille init` pairs names by number or time stamp",
         )
     names = sorted(present, key=lambda name: (natural(name), name))
     if not names:

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from rille.datasets.images.files import Digests
 from rille.datasets.images.misalign import MisalignParams, misalign
+from rille.datasets.images.samples import examined
 from rille.datasets.manifest.opening import open_manifest
 from rille.datasets.mockup.loop import LOOP, mockup_loop
 from rille.datasets.mockup.params import RECORDED_ONLY, SHORT, MockupParams
@@ -95,7 +96,7 @@ def open_sequence(
         sequence = mockup(validated(MockupParams, "mockup", {**preset, **given}), name_or_path)
     else:
         _none_left(sections, name_or_path)
-        sequence = _of_files(name_or_path, Digests(memory))
+        sequence = examined(_of_files(name_or_path, Digests(memory)))
     return misalign(sequence, warp)
 
 
@@ -144,7 +145,7 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
 def hindrance(place: Path) -> RilleError | None:
     """Why a folder or a manifest does not open as it is; None where it does."""
     try:
-        _of_files(str(place), Digests(None))
+        examined(_of_files(str(place), Digests(None)))
     except RilleError as error:
         return error
     return None

@@ -10,7 +10,7 @@ import pytest
 from rille.pipeline.flow.config import modules, stage
 
 UNITS = {"1", "px", "m", "rad", "grey", "m^2, m rad, rad^2", "m, rad"}
-DATASET_STAGES = ("images.files", "images.files16", "mockup.scene", "mockup.render", "mockup.truth", "mockup.truth_dem")
+DATASET_STAGES = ("images.files", "mockup.scene", "mockup.render", "mockup.truth", "mockup.truth_dem")
 DRIVE_STAGES = ("mockup.rover", "mockup.sense", "mockup.site", "mockup.obstacle", "mockup.overview")
 TILE_STAGES = ("tile_stage", "join_stage")
 DECLARED = (

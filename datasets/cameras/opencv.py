@@ -92,8 +92,24 @@ def single(f: Fields, path: Path) -> list[CalibratedCamera]:
     if "projection_matrix" in f and "rectification_matrix" in f:
         T = _unrectified(f, "rectification_matrix", "projection_matrix")
     name = f.text("camera_name", path.stem)
-    camera = CalibratedCamera(name, _lens(f, matrix, distortion, _size(f)), T)
-    return [_with_rectified(camera, f, "projection_matrix")]
+    whole = _with_rectified(CalibratedCamera(name, _lens(f, matrix, distortion, _size(f)), T), f, "projection_matrix")
+    rectified = whole.rectified and replace(whole.rectified, lens=_read_out(f, whole.rectified.lens))
+    return [replace(whole, lens=_read_out(f, whole.lens), rectified=rectified)]
+
+
+def _read_out(f: Fields, lens: Lens) -> Lens:
+    """The lens before images of which ROS says that they are a part of the sensor, in pixels of several of its own.
+
+    ``sensor_msgs/msg/CameraInfo`` states the whole sensor's camera, the part in its pixels, and how many are combined.
+    """
+    x, y = (int(f.number(key, 1)) or 1 for key in ("binning_x", "binning_y"))
+    roi = f.sub("roi") if "roi" in f else Fields({}, f.file)
+    left, top, width, height = (int(roi.number(key, 0)) for key in ("x_offset", "y_offset", "width", "height"))
+    whole = lens.camera
+    size = max((width or whole.width) // x, 1), max((height or whole.height) // y, 1)
+    # The centre of a combined pixel lies amid those that it combines.
+    centre = (whole.cx - left) / x + (0.5 / x - 0.5), (whole.cy - top) / y + (0.5 / y - 0.5)
+    return replace(lens, camera=f.camera("roi", (whole.fx / x, whole.fy / y, *centre), size))
 
 
 def _lens(f: Fields, matrix: str, distortion: str, size: tuple[int, int]) -> Lens:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,8 +15,10 @@ import numpy as np
 
 from rille.datasets.images import files
 from rille.datasets.images.files import Grey
+from rille.datasets.text.reading import open_regular
 from rille.stages.core.declare import Bundle, Inputs, NoParams
 from rille.stages.core.errors import InputError, RilleError
+from rille.stages.imaging.levels import spread
 
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 IMAGE = "sensor_msgs/msg/Image"
@@ -30,10 +33,11 @@ LAYOUTS: Mapping[str, tuple[int, int, int | None]] = {
     "8UC3": (3, 8, cv2.COLOR_BGR2GRAY),
     "rgba8": (4, 8, cv2.COLOR_RGBA2GRAY),
     "bgra8": (4, 8, cv2.COLOR_BGRA2GRAY),
-    "bayer_rggb8": (1, 8, cv2.COLOR_BayerRGGB2GRAY),
-    "bayer_bggr8": (1, 8, cv2.COLOR_BayerBGGR2GRAY),
-    "bayer_gbrg8": (1, 8, cv2.COLOR_BayerGBRG2GRAY),
-    "bayer_grbg8": (1, 8, cv2.COLOR_BayerGRBG2GRAY),
+    **{
+        f"bayer_{filters}{bits}": (1, bits, getattr(cv2, f"COLOR_Bayer{filters.upper()}2GRAY"))
+        for filters in ("rggb", "bggr", "gbrg", "grbg")
+        for bits in (8, 16)
+    },
 }
 """Samples a pixel, bits a sample and OpenCV's conversion to grey, by the encoding of ``sensor_msgs/msg/Image``."""
 
@@ -54,6 +58,8 @@ def opened(path: Path) -> Iterator[Any]:
         raise InputError(
             "RIL-940", f"{path}: bags are read by the package rosbags", remedy="pip install 'rille[robots]'"
         ) from error
+    for file in path.iterdir() if path.is_dir() else (path,):
+        open_regular(file, "bag", sys.maxsize).close()
     try:
         # bags of ROS 2 before Iron hold no definitions of their messages
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
@@ -105,9 +111,9 @@ def grey_of(message: Any, name: str, wanted: tuple[int, int, int]) -> Grey:
         )
     pixels = np.ascontiguousarray(data[: rows * step].reshape(rows, step)[:, :width])
     if bits == 16:
-        return np.ascontiguousarray(pixels.view(">u2" if message.is_bigendian else "<u2"), dtype=np.uint16)
+        pixels = np.ascontiguousarray(pixels.view(">u2" if message.is_bigendian else "<u2"), dtype=np.uint16)
     image = pixels.reshape(rows, columns, samples) if samples > 1 else pixels
-    return image if conversion is None else np.asarray(cv2.cvtColor(image, conversion), np.uint8)
+    return image if conversion is None else cv2.cvtColor(image, conversion)
 
 
 def _layout(message: Any, name: str) -> tuple[int, int, int | None]:
@@ -131,7 +137,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
                 break
         else:
             raise InputError("RIL-944", f"{name} has changed since the run began", remedy="run the same command again")
-    image = grey_of(message, name, (args["width"], args["height"], args["depth"]))
+    image = spread(grey_of(message, name, (args["width"], args["height"], args["depth"])), args.get("levels"))
     meta = {"frame": args["frame"], "camera": args["camera"]}
     return Bundle({"image": image, "valid": np.ones(image.shape, np.uint8)}, meta)
 

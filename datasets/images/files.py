@@ -19,14 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.images.headers import PNG_SIGNATURE, Header, read_header
+from rille.datasets.images.kinds import KINDS, kind_of
 from rille.datasets.protocol import Source
 from rille.datasets.text.reading import open_regular, read_bytes
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.core.errors import InputError
+from rille.stages.imaging.levels import Levels, spread
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it says on stderr, an error says here
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".ppm", ".bmp")
+"""Kinds of image that are looked for where no pattern is given."""
+
 MOST_PIXELS = 160_000_000
 """Of one image: the largest sensors have 150 million."""
 
@@ -114,7 +118,9 @@ def decode(data: bytes, name: str, wanted: Header | None = None) -> Grey:
     return decode_colour(data, name, wanted)[0]
 
 
-def decode_colour(data: bytes, name: str, wanted: Header | None = None) -> tuple[Grey, NDArray[np.uint8] | None]:
+def decode_colour(
+    data: bytes, name: str, wanted: Header | None = None, levels: Levels | None = None
+) -> tuple[Grey, NDArray[np.uint8] | None]:
     """Grey image of an encoded file, and its colours where it has any.
 
     Colour becomes grey by ITU-R BT.601, 0.299 R + 0.587 G + 0.114 B; an alpha channel is dropped, an orientation tag
@@ -125,6 +131,7 @@ def decode_colour(data: bytes, name: str, wanted: Header | None = None) -> tuple
     data : the file's bytes.
     name : what to call it in an error.
     wanted : width, height and bits that it must have; the header is compared before anything is unpacked.
+    levels : how its samples are spread, of a sequence whose 16-bit images use a small part of their range.
 
     Returns
     -------
@@ -149,6 +156,7 @@ def decode_colour(data: bytes, name: str, wanted: Header | None = None) -> tuple
         raise InputError("RIL-192", f"{name} is damaged ({complaint})", remedy=COPY_AGAIN)
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError("RIL-172", f"{name} has samples of type {image.dtype}", remedy=FEWER_BITS)
+    image = spread(image, levels)
     colour: NDArray[np.uint8] | None = None
     if image.ndim == 3 and image.shape[2] >= 3:
         three = np.ascontiguousarray(image[:, :, :3])
@@ -169,8 +177,11 @@ def decode_colour(data: bytes, name: str, wanted: Header | None = None) -> tuple
 def _sound(header: Header | None, name: str) -> Header:
     """A header of an image that may be decoded."""
     if header is None:
+        kind = kind_of(name)
         raise InputError(
-            "RIL-171", f"{name} cannot be read as an image", remedy=f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM are read"
+            "RIL-171",
+            f"{name} cannot be read as an image",
+            remedy=f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM are read" if kind == "file" else KINDS[kind]["step"],
         )
     width, height, bits = header
     if bits > 16:
@@ -258,8 +269,7 @@ def image_source(path: Path, frame: int, camera: str, header: Header, digests: D
         "height": height,
         "depth": depth,
     }
-    module = "rille.datasets.images.files16" if depth == 16 else "rille.datasets.images.files"
-    return Source(module, NoParams(), args, hints={"path": str(path.resolve())})
+    return Source("rille.datasets.images.files", NoParams(), args, hints={"path": str(path.resolve())})
 
 
 def check_size(found: Header, wanted: Header, name: str) -> None:
@@ -279,7 +289,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     # The digest is in the key: a file that was replaced since must not be stored under the key of the former one.
     if hashlib.sha256(data).hexdigest() != args["sha256"]:
         raise InputError("RIL-177", f"{name} has changed since the run began", remedy="run the same command again")
-    image, colour = decode_colour(data, name, (args["width"], args["height"], args["depth"]))
+    image, colour = decode_colour(data, name, (args["width"], args["height"], args["depth"]), args.get("levels"))
     meta = {"frame": args["frame"], "camera": args["camera"]}
     arrays: dict[str, NDArray[Any]] = {"image": image, "valid": np.ones(image.shape, np.uint8)}
     # The right image's colours would colour nothing: an ortho image is made of left ones.
@@ -293,7 +303,7 @@ STAGE = Stage(
     params=NoParams,
     inputs=(),
     outputs=(
-        Array("image", ("row", "col"), "uint8", "grey", "image"),
+        Array("image", ("row", "col"), "uint8", "grey", "image", deep="uint16"),
         Array("valid", ("row", "col"), "uint8", "1", "1 = usable"),
         COLOUR,
     ),

@@ -6,7 +6,6 @@ turn is what stage ``rig`` should find (its corrections pitch, yaw, roll have th
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -19,7 +18,7 @@ from pydantic import Field
 from rille.datasets.images import files
 from rille.datasets.protocol import Sequence, Source
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import AnyArray, Bundle, Inputs, Params, Stage
 from rille.stages.geometry.geometry import rotation_exp
 from rille.stages.geometry.lens import Lens
 
@@ -71,7 +70,7 @@ def misalign(sequence: Sequence, params: MisalignParams) -> Sequence:
         if camera != "right":
             return source
         args = {"frame": frame, "camera": camera, "lens": lens.to_dict()}
-        return Source(_module(source), params, args, inputs={"image": source})
+        return Source("rille.datasets.images.misalign", params, args, inputs={"image": source})
 
     return replace(
         sequence,
@@ -80,13 +79,6 @@ def misalign(sequence: Sequence, params: MisalignParams) -> Sequence:
         notes=(*sequence.notes, params.words()),
         parameters={**sequence.parameters, "misalign": params},
     )
-
-
-def _module(source: Source) -> str:
-    """A stage declares one type for an array, so there is one for each depth of images."""
-    outputs: tuple[Array, ...] = importlib.import_module(source.module).STAGE.outputs
-    deep = next(a.dtype for a in outputs if a.name == "image") == "uint16"
-    return "rille.datasets.images.misalign16" if deep else "rille.datasets.images.misalign"
 
 
 def origins(lens: Lens, params: MisalignParams) -> tuple[Floats, Floats]:

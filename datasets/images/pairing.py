@@ -1,20 +1,30 @@
-"""Which left image belongs to which right one: by name, by number or by order; and the tokens that tell sides apart."""
+"""Which left image belongs to which right one: by name, number, time stamp or order; and the tokens of sides."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
 
 from rille.datasets.images import files
 from rille.datasets.images.headers import Headers
+from rille.datasets.text.count import count
+from rille.datasets.text.times import seconds
 from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
 
-SUFFIXES = (*files.SUFFIXES, ".ppm", ".bmp")
-"""Kinds of image that are looked for where no pattern is given."""
+STAMP = re.compile(r"(?<!\d)[1-9]\d{9}(?:[_-]\d{9}|\d*(?:\.\d+)?)(?!\d)")
+"""Seconds since 1970 have ten digits, their fractions more; frame numbers have fewer, or zeros in front."""
+
+SHARE, MOST_APART = 0.25, 0.01
+"""Share of the usual interval, and seconds, that the images of a pair are apart at most: at 10 m/s, 0.1 m."""
 
 SIDES: tuple[tuple[str, str], ...] = (
     ("left", "right"),
@@ -41,6 +51,62 @@ class ImagePair:
     left: Path
     right: Path
     absent: str = ""
+
+
+class Joined(NamedTuple):
+    """Images of two cameras that were taken together.
+
+    Attributes
+    ----------
+    places : of the left and of the right image of each pair, in order of time.
+    alone : images that have no partner.
+    apart : s; the longest time between the images of a pair; between the nearest ones where there is no pair.
+    allowed : s; how long it may be.
+    """
+
+    places: list[tuple[int, int]]
+    alone: int
+    apart: float
+    allowed: float
+
+    def lines(self, code: str) -> list[str]:
+        """A warning where images have no partner, or those of a pair are not of one time."""
+        text = f"images of a pair are up to {1e3 * self.apart:.3g} ms apart ({1e3 * self.allowed:.3g} ms are allowed)"
+        alone = f"; {count(self.alone, 'image')} without a partner of the same time are left out" if self.alone else ""
+        return [warning(code, text + alone)] if self.apart or alone else []
+
+
+def join(left: Sequence[float], right: Sequence[float], tolerance: float | None = None) -> Joined:
+    """Join the images of two cameras, each to the nearest of the other one in time.
+
+    Parameters
+    ----------
+    left, right : seconds, increasing.
+    tolerance : s; by default a quarter of the usual interval of the faster camera, at most ``MOST_APART``.
+    """
+    a, b = np.asarray(left), np.asarray(right)
+    intervals = [float(np.median(np.diff(times))) for times in (a, b) if len(times) > 1]
+    allowed = tolerance or min([MOST_APART, *(SHARE * interval for interval in intervals)])
+    ours, theirs = (np.searchsorted((t[1:] + t[:-1]) / 2, s) for t, s in ((b, a), (a, b)))
+    apart = np.abs(a - b[ours])
+    # Each must be the other's nearest, else one image would stand in two pairs.
+    there = np.flatnonzero((theirs[ours] == np.arange(len(a))) & (apart <= allowed))
+    longest = float(max(apart[there], default=apart.min()))
+    return Joined([(int(i), int(ours[i])) for i in there], len(a) + len(b) - 2 * len(there), longest, allowed)
+
+
+def stamp_of(name: str) -> str:
+    """The time since 1970 in a file's name, in whatever unit; empty where there is none."""
+    found = STAMP.search(name)
+    return re.sub("[_-]", ".", found[0]) if found else ""
+
+
+def _times(paths: Sequence[Path]) -> tuple[float, ...]:
+    """Times in the names of sorted files, s; none where not each has its own."""
+    stamps = [stamp for path in paths if (stamp := stamp_of(path.stem))]
+    with suppress(InputError):
+        return seconds(stamps, "the image names")[0] if len(stamps) == len(paths) else ()
+    return ()
 
 
 def natural(text: str) -> tuple[tuple[int, int | str], ...]:
@@ -84,24 +150,38 @@ def _number(stem: str) -> int | None:
 
 
 def pair_up(
-    left: Sequence[Path], right: Sequence[Path], rule: str = "auto", *, gaps: bool = False
+    left: Sequence[Path],
+    right: Sequence[Path],
+    rule: str = "auto",
+    *,
+    gaps: bool = False,
+    tolerance: float | None = None,
+    warnings: list[str] | None = None,
 ) -> tuple[ImagePair, ...]:
     """Pairs in the natural order of the left names.
 
     Parameters
     ----------
     left, right : image files of each camera.
-    rule : ``name`` (equal stems, sides' tokens aside), ``number`` (the last number in the stem), ``order`` (sorted
-        names), or ``auto``: name, and number where the names of the two cameras have nothing in common.
+    rule : ``name`` (equal stems, sides' tokens aside), ``number`` (the last number in the stem), ``nearest`` (time
+        stamps in the stems, see :func:`join`), ``order`` (sorted names), or ``auto``: name; nearest where time stamps
+        differ, and number where the names of the two cameras have nothing in common.
     gaps : images that are paired by name and have no partner make a pair of which a file is absent, as long as they
         are fewer than the whole pairs.
+    tolerance : s; how far the stamps of a pair may be apart; None: see :func:`join`.
+    warnings : takes lines on what is left out or apart.
 
     Raises
     ------
     InputError
-        An image has no partner, two images make the same pair, or the counts differ.
+        An image has no partner, two images make the same pair, the counts differ, or stamps of a pair are apart.
     """
-    left, right = (sorted(paths, key=lambda p: natural(p.name)) for paths in (left, right))
+    lines = [] if warnings is None else warnings
+    # Decimals of unlike number do not sort as numbers.
+    left, right = (
+        sorted(paths, key=lambda p: (Decimal(stamp_of(p.stem) or 0), natural(p.name))) for paths in (left, right)
+    )
+    times = _times(left), _times(right)
     # One image each is a pair, whatever the two are called.
     if rule == "order" or (rule == "auto" and len(left) == len(right) == 1):
         if len(left) != len(right):
@@ -111,7 +191,21 @@ def pair_up(
                 f"({ends([p.name for p in right])}) cannot be paired by order",
                 remedy="remove what is too many, or pair by name or number",
             )
-        return _named(list(zip(left, right, strict=True)))
+        pairs = _named(list(zip(left, right, strict=True)))
+        lines += [*crossed(pairs), *(_two_clocks(pairs, *times, tolerance) if all(times) and len(pairs) > 1 else ())]
+        return pairs
+    joined = join(*times, tolerance) if all(times) else None
+    if rule == "nearest" or (rule == "auto" and joined is not None and joined.apart):
+        if joined is None or not joined.places:
+            why = f"the nearest are {joined.apart:.4g} s apart" if joined else "not each has its own"
+            raise InputError(
+                "RIL-822",
+                f"left ({ends([p.name for p in left])}) and right images ({ends([p.name for p in right])}) make no "
+                f"pairs by the time stamps in their names: {why}",
+                remedy='state images.tolerance (s), or, of two clocks, images.pair = "order"',
+            )
+        lines += joined.lines("RIL-821")
+        return _named([(left[i], right[j]) for i, j in joined.places])
     keys = {"name": _names, "number": _numbers}
     if rule == "auto":
         rule = "name" if set(_names(left, 0)) & set(_names(right, 1)) else "number"
@@ -122,6 +216,31 @@ def pair_up(
         return _with_gaps(by_key)
     _all_partnered(by_key, rule, (left, right))
     return _named([(path, by_key[1][key]) for key, path in by_key[0].items()])
+
+
+def _two_clocks(
+    pairs: Sequence[ImagePair], left: Sequence[float], right: Sequence[float], most: float | None
+) -> list[str]:
+    """A line where the stamps of all pairs by order differ by a constant, as those of two clocks do.
+
+    Raises
+    ------
+    InputError
+        The stamps put the images of a pair farther apart: by ``most`` s, or by half the usual interval.
+    """
+    apart, most = np.subtract(right, left), most or float(np.median(np.diff(left))) / 2
+    # Where images have partners as they are, there is one clock, and a constant is that of lost images.
+    offset = float(np.median(apart)) if len(join(left, right).places) < 2 else 0.0
+    k = int(np.argmax(np.abs(apart - offset)))
+    if abs(apart[k] - offset) > most:
+        raise InputError(
+            "RIL-823",
+            f"by order {pairs[k].left.name} is paired with {pairs[k].right.name}, {apart[k]:+.4g} s off by their time "
+            f"stamps ({most:.3g} s are allowed): was an image lost?",
+            remedy='images.pair = "nearest" pairs by time stamp; or state images.tolerance (s)',
+        )
+    text = f"time stamps are of two clocks: those of the right images are {offset:.6g} s later in all pairs"
+    return [warning("RIL-824", text)] if abs(offset) > most else []
 
 
 def _with_gaps(by_key: list[dict[str, Path]]) -> tuple[ImagePair, ...]:

@@ -38,12 +38,20 @@ TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 class Images(Params):
     """``[images]``: which files are the pairs."""
 
-    left: str = Field(description="pattern of the left images below the root, e.g. left/*.png; ** is any folder")
-    right: str = Field(description="pattern of the right images")
-    pair: Literal["auto", "name", "number", "order"] = Field(
+    left: str = Field(
+        description="pattern of the left images below the root, e.g. left/*.png; ** is any folder; or BAG, or BAG:TOPIC"
+    )
+    right: str = Field(description="pattern of the right images, or the same bag")
+    pair: Literal["auto", "name", "number", "nearest", "order"] = Field(
         default="auto",
-        description="how images are paired: by name (left/right aside), by the last number in the name, or by order; "
-        "auto: by name, and by number where no names agree",
+        description="how images are paired: by name (left/right aside), by the last number in the name, by the nearest "
+        "time stamp in it, or by order; auto: by name, by time stamps where these differ, else by number",
+    )
+    tolerance: float | None = Field(
+        default=None,
+        gt=0,
+        description="s; time between the images of a pair at most, by the stamps in their names; by default a quarter "
+        "of the usual interval, at most 0.01",
     )
     rectified: bool | None = Field(
         default=None,

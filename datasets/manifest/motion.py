@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.images.pairing import ImagePair, ends
+from rille.datasets.images.pairing import ImagePair, ends, stamp_of
 from rille.datasets.imu import at_frames, read_imu
 from rille.datasets.manifest.model import Attitude, Imu, Manifest, PoseFile, Times, Truth
 from rille.datasets.manifest.rig import direction
@@ -41,15 +41,21 @@ class KnownMotion:
     warnings: tuple[str, ...] = ()
 
 
-def read_motion(manifest: Manifest, root: Path, name: str, pairs: Sequence[ImagePair]) -> KnownMotion:
+def read_motion(
+    manifest: Manifest, root: Path, name: str, pairs: Sequence[ImagePair], times: Seconds | None
+) -> KnownMotion:
     """Everything that the manifest's tables ``times``, ``truth``, ``odometry``, ``attitude`` and ``imu`` state.
+
+    Parameters
+    ----------
+    times : of the pairs, s, where the manifest states none.
 
     Raises
     ------
     InputError
         A file cannot be used, does not belong to these pairs, or needs times where the pairs have none.
     """
-    motion = KnownMotion(None)
+    motion = KnownMotion(times)
     if manifest.times is not None:
         motion.times, motion.warnings = pair_times(manifest.times, root, name, pairs)
     if manifest.truth is not None:
@@ -89,8 +95,8 @@ def pair_times(section: Times, root: Path, name: str, pairs: Sequence[ImagePair]
 
 
 def _stamp(pair: ImagePair, name: str) -> str:
-    """The time stamp in an image's name: its last number, with its decimals."""
-    found = re.findall(r"\d+(?:\.\d+)?", pair.left.stem)
+    """The time stamp in an image's name: one since 1970, or its last number, with its decimals."""
+    found = [stamp_of(pair.left.stem)] if stamp_of(pair.left.stem) else re.findall(r"\d+(?:\.\d+)?", pair.left.stem)
     if not found:
         raise InputError("RIL-227", f"{name}: times.names: {pair.left} has no number in its name", remedy=NEEDS_TIMES)
     return str(found[-1])

@@ -10,16 +10,18 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rille.datasets.bags import is_bag, open_bag
 from rille.datasets.cameras.model import RECTIFIED
 from rille.datasets.georeference import georeference
 from rille.datasets.images import files
 from rille.datasets.images.headers import sizes_of
-from rille.datasets.images.pairing import ImagePair, common_headers, crossed, pair_up
-from rille.datasets.manifest.model import Images, read_manifest
+from rille.datasets.images.pairing import ImagePair, common_headers, pair_up
+from rille.datasets.manifest.model import Cameras, Images, Manifest, RigSection, read_manifest
 from rille.datasets.manifest.motion import read_motion
 from rille.datasets.manifest.rig import read_optics
 from rille.datasets.protocol import Sequence, Source
@@ -41,19 +43,9 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
     """
     manifest, name = read_manifest(path), str(path)
     root = root_folder(manifest.root, path)
-    pairs = find_pairs(manifest.images, root, name)
-    headers = common_headers(pairs)
-    optics = read_optics(manifest, root, name, sizes_of(headers), _are_rectified(manifest.images, root, pairs[0]))
-    motion = read_motion(manifest, root, name, pairs)
-    up = motion.up
-    if up is None and optics.up is not None:
-        up = (optics.up,) * len(pairs)
-
-    def image(frame: int, camera: str) -> Source:
-        pair = pairs[frame]
-        path, header = (pair.left, headers[0]) if camera == "left" else (pair.right, headers[1])
-        return files.image_source(path, frame, camera, header, digests)
-
+    base, pairs = _of_bag(manifest, root, name) or _of_files(manifest, root, name, digests)
+    motion = read_motion(manifest, root, name, pairs, base.times)
+    up = motion.up or base.up
     world = manifest.world
     pitch = None if world.pitch_deg is None else math.radians(world.pitch_deg)
     vehicle = manifest.vehicle
@@ -63,34 +55,70 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
         # What the manifest states of the vertical goes before the robot's description.
         if pitch is None and up is None:
             pitch = robot.pitch
-    return Sequence(
+    return replace(
+        base,
         name=manifest.name or default_name(path),
-        rig=optics.rig,
-        frames=len(pairs),
-        image=image,
-        frame_names=tuple(pair.name for pair in pairs),
-        lenses=optics.lenses,
         times=motion.times,
         truth=motion.truth,
         truth_positions=motion.truth_positions,
         truth_source=motion.truth_source,
         up=up,
-        attitude=motion.attitude,
-        odometry=motion.odometry,
+        attitude=motion.attitude or base.attitude,
+        odometry=motion.odometry or base.odometry,
         pitch=pitch,
         georeference=georeference(world.crs, world.origin, world.azimuth_deg, name),
         vehicle=vehicle,
-        lost={k: pair.absent for k, pair in enumerate(pairs) if pair.absent},
-        defaults=dict(dotted(manifest.defaults)),
-        notes=manifest.notes,
-        warnings=(*(crossed(pairs) if manifest.images.pair == "order" else ()), *optics.warnings, *motion.warnings),
+        defaults={**base.defaults, **dict(dotted(manifest.defaults))},
+        notes=(*base.notes, *manifest.notes),
+        warnings=(*base.warnings, *motion.warnings),
     )
 
 
-def _are_rectified(images: Images, root: Path, pair: ImagePair) -> bool:
-    """Whether the images are rectified, as stated or by the names of files and folders from the root on."""
-    names = (os.path.relpath(path, root.parent) for path in (pair.left, pair.right))
+def _are_rectified(images: Images, names: Iterable[str]) -> bool:
+    """Whether the images are rectified, as stated or by the names of files and folders, or of topics."""
     return all(map(RECTIFIED.search, names)) if images.rectified is None else images.rectified
+
+
+def _of_files(
+    manifest: Manifest, root: Path, name: str, digests: files.Digests
+) -> tuple[Sequence, tuple[ImagePair, ...]]:
+    """Images and cameras of a manifest that names files."""
+    lines: list[str] = []
+    pairs = find_pairs(manifest.images, root, name, lines)
+    headers = common_headers(pairs)
+    names = (os.path.relpath(path, root.parent) for path in (pairs[0].left, pairs[0].right))
+    optics = read_optics(manifest, root, name, sizes_of(headers), _are_rectified(manifest.images, names))
+
+    def image(frame: int, camera: str) -> Source:
+        pair = pairs[frame]
+        path, header = (pair.left, headers[0]) if camera == "left" else (pair.right, headers[1])
+        return files.image_source(path, frame, camera, header, digests)
+
+    sequence = Sequence(
+        name="images",
+        rig=optics.rig,
+        frames=len(pairs),
+        image=image,
+        frame_names=tuple(pair.name for pair in pairs),
+        lenses=optics.lenses,
+        up=None if optics.up is None else (optics.up,) * len(pairs),
+        lost={k: pair.absent for k, pair in enumerate(pairs) if pair.absent},
+        warnings=(*lines, *optics.warnings),
+    )
+    return sequence, pairs
+
+
+def _of_bag(manifest: Manifest, root: Path, name: str) -> tuple[Sequence, tuple[ImagePair, ...]] | None:
+    """The same of one that names a bag, whose ``camera_info`` counts where the manifest states no cameras."""
+    (path, _, left), (other, _, right) = (text.partition(":") for text in (manifest.images.left, manifest.images.right))
+    if path != other or not is_bag(root / path):
+        return None
+    stated = manifest.cameras != Cameras() or manifest.rig != RigSection()
+    topics = f"{left},{right}" if left and right else None
+    rectified = _are_rectified(manifest.images, (left, right))
+    optics_of = (lambda sizes: read_optics(manifest, root, name, sizes, rectified)) if stated else None
+    sequence = open_bag((root / path).resolve(), topics, optics_of)
+    return sequence, tuple(ImagePair(stamp, Path(stamp), Path(stamp)) for stamp in sequence.frame_names)
 
 
 def default_name(path: Path) -> str:
@@ -125,8 +153,12 @@ def root_folder(text: str, path: Path) -> Path:
     return root
 
 
-def find_pairs(images: Images, root: Path, name: str) -> tuple[ImagePair, ...]:
+def find_pairs(images: Images, root: Path, name: str, lines: list[str]) -> tuple[ImagePair, ...]:
     """The pairs that the patterns find; where files are paired by name, some may lack one (``ImagePair.absent``).
+
+    Parameters
+    ----------
+    lines : takes warnings.
 
     Raises
     ------
@@ -152,7 +184,9 @@ def find_pairs(images: Images, root: Path, name: str) -> tuple[ImagePair, ...]:
             "RIL-218", f"{name}: images.left and images.right both find {both[0]}", remedy="narrow the patterns"
         )
     try:
-        return pair_up(found["left"], found["right"], images.pair, gaps=True)
+        return pair_up(
+            found["left"], found["right"], images.pair, gaps=True, tolerance=images.tolerance, warnings=lines
+        )
     except InputError as error:
         raise error.at(name) from error
 

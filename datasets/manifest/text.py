@@ -53,7 +53,10 @@ def _images(found: Findings) -> str:
     else:
         lines.append(f"# They make {pair_words(views)} of {size_words(views.sizes)} pixels.")
     lines.append(_pairs(left=views.left, right=views.right).rstrip())
-    lines.append('# pair = "auto"  # or "name", "number", "order"')
+    if views.lines:
+        lines += [f"# {line}" for line in views.lines] + ['pair = "nearest"', "# tolerance = 0.01  # s"]
+    else:
+        lines.append('# pair = "auto"  # or "name", "number", "nearest" (time stamps in the names), "order"')
     return "\n".join(lines) + "\n"
 
 

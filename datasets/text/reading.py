@@ -50,6 +50,8 @@ SAMPLE = 200
 
 MILLISECONDS = 10**12
 """Stamps that are larger have no fraction."""
+LFS = b"version https://git-lfs.github.com/spec/"
+"""How a file begins that Git LFS left in place of its content."""
 
 WILD = re.compile(r"[*?\[]")
 
@@ -64,7 +66,7 @@ def open_regular(path: Path, what: str, most: int) -> BufferedReader:
     Raises
     ------
     InputError
-        It cannot be opened, is a folder, a pipe or a device, or is larger.
+        It cannot be opened, is a folder, a pipe or a device, is larger, or is a pointer of Git LFS.
     """
     try:
         status = path.stat()
@@ -72,12 +74,18 @@ def open_regular(path: Path, what: str, most: int) -> BufferedReader:
             # Caught below, as the system's own refusals are: whatever the reason, it is one line.
             raise OSError(0, "it is a folder" if stat.S_ISDIR(status.st_mode) else "it is a pipe or a device")
         if status.st_size <= most:
-            return path.open("rb")
+            file = path.open("rb")
+            if not file.peek(len(LFS)).startswith(LFS):
+                return file
+            file.close()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error  # a path with a zero byte
         raise InputError(
             "RIL-138", f"{what} {path} cannot be read: {reason}", remedy="check the path and its rights"
         ) from error
+    if status.st_size <= most:
+        text = f"{what} {path} is a pointer of Git LFS; its content is elsewhere"
+        raise InputError("RIL-820", text, remedy="fetch it: git lfs pull")
     size = f"{status.st_size / 1e6:.1f} MB, at most {most / 1e6:g} MB are read"
     raise InputError("RIL-139", f"{what} {path} is too large: {size}", remedy="check that it is the right file")
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.images import chessboard, pairing
-from rille.datasets.images.files import read_grey
+from rille.datasets.images.files import SUFFIXES, read_grey
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE, check_output
 from rille.pipeline.engine.failures import reported
@@ -124,7 +124,7 @@ def _files(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
 def _images(place: Path) -> list[Path]:
     """Image files of a folder, a glob or a single path."""
     found = list(place.iterdir()) if place.is_dir() else [Path(p) for p in glob.glob(str(place.expanduser()))]
-    images = sorted(p for p in found if p.suffix.lower() in pairing.SUFFIXES)
+    images = sorted(p for p in found if p.suffix.lower() in SUFFIXES)
     if not images:
         raise InputError(
             "RIL-011", f"{place} names no images", remedy="give a folder, or a glob in quotes such as 'left*.jpg'"

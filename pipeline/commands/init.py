@@ -80,10 +80,12 @@ def _report(found: Findings, path: Path, needed: list[str]) -> list[str]:
     views, calibration = found.views, found.calibration
     size = f", {size_words(views.sizes)} pixels" if views.sizes else ""
     lines = [f"images       {pair_words(views)}{size}: {views.left} and {views.right}"]
+    lines += [f"pairs        {line}" for line in views.lines]
     if calibration is not None:
         baseline = f", baseline {calibration.baseline:.6g}" if calibration.baseline is not None else ""
         lines.append(f"calibration  {' and '.join(calibration.files)}{baseline}")
     lines += [f"{kind:12s} {', '.join(files)}" for kind, files in found.tables.items()]
+    lines += [f"not read     {line}" for line in found.unread]
     lines += [f"wrote        {path}"]
     lines += [f"needed       {line}" for line in needed]
     return lines + _next(path, edit=bool(needed))

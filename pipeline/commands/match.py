@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -18,7 +18,7 @@ from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import raw, warn
 from rille.pipeline.flow import config as configuration
 from rille.stages.core.errors import ConfigError, InputError
-from rille.stages.imaging.image_quality import FEW_BITS, unused_bits
+from rille.stages.imaging import levels
 
 if TYPE_CHECKING:
     from rille.stages.hfvm.stage import Disparity
@@ -84,6 +84,9 @@ def match_files(
         taken[path.resolve()] = name
     # Images and the prior are checked before the matcher is imported, which takes seconds.
     images = read_grey(left), read_grey(right)
+    found_levels = levels.levels_of(images)
+    levelled = [] if found_levels is None else [warning("RIL-705", levels.words(found_levels))]
+    images = levels.spread(images[0], found_levels), levels.spread(images[1], found_levels)
     given = _prior(prior, images[0].shape) if prior is not None else None
 
     from rille.pipeline.flow import tiles
@@ -103,7 +106,7 @@ def match_files(
     if confidence is not None:
         with _written(confidence):
             write_confidence(confidence, found.disparity_std, found.validity, found.backmatch_error, tags)
-    for line in (*_depths(images), *warnings(found, *images)):
+    for line in (*levelled, *warnings(found, *images)):
         warn(line)
     share = float(matched(found.validity).mean())
     typical = f", standard deviation {np.nanmedian(found.disparity_std):.2f} px (median)" if share else ""
@@ -114,15 +117,6 @@ def match_files(
 
 def _written(path: Path) -> AbstractContextManager[None]:
     return reported("RIL-991", f"{path} cannot be written", remedy="name another file", kind=InputError)
-
-
-def _depths(images: Iterable[NDArray[Any]]) -> list[str]:
-    # One of two cameras may give 8 bits.
-    unused = min((bits for bits in map(unused_bits, images) if bits is not None), default=0)
-    if unused < FEW_BITS:
-        return []
-    text = f"samples use {16 - unused} of their 16 bits, which costs contrast: multiply them by {2**unused}"
-    return [warning("RIL-705", text)]
 
 
 def warnings(found: Disparity, left: NDArray[Any], right: NDArray[Any]) -> list[str]:

@@ -20,7 +20,7 @@ from rille.datasets.protocol import Positions, Rows
 from rille.pipeline.runs.synchrony import best_shift
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.scale import alike
-from rille.stages.imaging.image_quality import FEW_BITS, Look
+from rille.stages.imaging.image_quality import Look
 
 Floats = NDArray[np.float64]
 Level = Literal["OK", "WARN", "FAIL"]
@@ -209,24 +209,7 @@ def judge_up(up: Sequence[tuple[float, float, float] | None] | None, frames: Seq
 def judge_looks(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Finding]:
     """Exposure and sharpness of all images, by camera and frame."""
     opened = {camera: of for camera, of in looks.items() if of}
-    return [*_uniform(opened, names), *_depth(opened), *_exposure(opened, names), *_sharpness(opened, names)]
-
-
-def _depth(looks: Mapping[str, Mapping[int, Look]]) -> list[Finding]:
-    return judge_bits({camera: [look.unused_bits for look in of.values()] for camera, of in looks.items()})
-
-
-def judge_bits(unused_bits: Mapping[str, Sequence[int | None]]) -> list[Finding]:
-    """Whether 16-bit samples hold fewer bits, by camera and image (None: samples of 8 bits)."""
-    found = [(bits, camera) for camera, of in unused_bits.items() for bits in of if bits is not None]
-    unused, _ = min(found, default=(0, ""))
-    if unused < FEW_BITS:
-        return []
-    # One of two cameras may give 8 bits.
-    deep = {camera for _, camera in found}
-    which = "all images" if len(deep) == len(unused_bits) else f"all {deep.pop()} images"
-    text = f"samples use {16 - unused} of their 16 bits: {which} are taken as {2**unused} times as dark as they are"
-    return [doubt("RIL-896", text, "images", remedy=f"multiply the samples by {2**unused}")]
+    return [*_uniform(opened, names), *_exposure(opened, names), *_sharpness(opened, names)]
 
 
 def _uniform(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Finding]:

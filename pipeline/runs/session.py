@@ -142,7 +142,7 @@ def settings_of_run(options: Options) -> Settled:
     from rille.pipeline.engine.executors.base import known
     from rille.pipeline.engine.memory import limits
     from rille.pipeline.flow import unread
-    from rille.pipeline.runs.input_checks import judge_bits, judge_rig
+    from rille.pipeline.runs.input_checks import judge_rig
 
     # Before anything is read or written.
     stages = configuration.stage_names() if options.force else set()
@@ -153,39 +153,14 @@ def settings_of_run(options: Options) -> Settled:
         limits.parse(options.memory_limit)
     settled = settings(options)
     unread.refuse_unreadable(settled.given, settled.config, settled.sequence)
-    sequence, doubts = settled.sequence, judge_bits(_unused_bits(settled.sequence, settled.frames))
+    sequence = settled.sequence
     rig = judge_rig(sequence.rig)
     # A manifest warns of its baseline itself, with the key to change.
     if rig.level != "OK" and not any("baseline" in line for line in sequence.warnings):
-        doubts.insert(0, rig)
-    more = (f"{doubt.code}: {doubt.text}: {doubt.remedy}" for doubt in doubts)
-    sequence = replace(sequence, warnings=(*sequence.warnings, *more))
+        sequence = replace(sequence, warnings=(*sequence.warnings, f"{rig.code}: {rig.text}: {rig.remedy}"))
     for line in sequence.warnings:
         warn(line)
     return replace(settled, sequence=sequence)
-
-
-LOOKED_AT = 3
-"""Frames that tell whether files of 16 bits hold fewer; `rille check` looks at all."""
-
-
-def _unused_bits(sequence: Sequence, frames: tuple[int, ...]) -> dict[str, list[int | None]]:
-    """By camera, the bits that no sample of some images uses; None of 8 bits, and of what is not read of such files."""
-    from rille.datasets.images import files, files16
-    from rille.stages.imaging.image_quality import unused_bits
-
-    there = [f for f in frames if f not in sequence.lost]
-    chosen = there[:: max(1, -(-len(there) // LOOKED_AT))]
-    found: dict[str, list[int | None]] = {}
-    for camera in ("left", "right"):
-        bits = found.setdefault(camera, [])
-        for frame in chosen:
-            # What cannot be read is told where it is read; a drive has no images yet.
-            with suppress(RilleError):
-                source = sequence.image(frame, camera)
-                deep = source.module == files16.__name__
-                bits.append(unused_bits(files.read_grey(Path(source.hints["path"]))) if deep else None)
-    return found
 
 
 def warn_of_results(graph: Graph) -> None:

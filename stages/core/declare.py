@@ -29,6 +29,7 @@ class Array:
     """One output array: what an artifact's reader needs to know.
 
     ``name`` may end in ``*`` for a family (``level_*``). ``nodata`` is ``"nan"``, a number as text or empty.
+    ``deep`` is another type that the array may have instead of ``dtype``.
     """
 
     name: str
@@ -39,6 +40,7 @@ class Array:
     nodata: str = ""
     frame: str = ""
     optional: bool = False
+    deep: str = ""
 
     def matches(self, name: str) -> bool:
         """Whether ``name`` is this array or one of its family."""
@@ -140,7 +142,7 @@ def check_outputs(stage: Stage, bundle: Bundle) -> None:
         spec = next((a for a in stage.outputs if a.matches(name)), None)
         if spec is None:
             raise TypeError(f"{stage.name}: array {name!r} is not declared")
-        if np.dtype(spec.dtype) != array.dtype or array.ndim != len(spec.dims):
+        if array.dtype not in (np.dtype(spec.dtype), np.dtype(spec.deep or spec.dtype)) or array.ndim != len(spec.dims):
             raise TypeError(f"{stage.name}: {name} is {array.dtype} {array.ndim}-D, declared {spec.dtype} {spec.dims}")
     missing = missing_outputs(stage, list(bundle.arrays))
     if missing:

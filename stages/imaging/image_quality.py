@@ -23,9 +23,6 @@ from rille.stages.imaging.pyramid import grey
 LOW, HIGH = 2.0, 253.0
 """Grey values at which an 8-bit image is taken as clipped."""
 
-FEW_BITS = 2
-"""Highest bits that no sample of 16-bit images has, from which on they may be those of a camera with 14 or fewer."""
-
 BANDS = (0.25, 0.5, 0.75)
 """Of the height: where the strips lie whose sharpness stands for the image's."""
 STRIP = 32
@@ -37,7 +34,7 @@ class Look:
     """One image in figures: mean grey 0..255, deviation, shares of dark and bright clipped pixels, sharpness.
 
     ``detail`` is what lies between two and four pixels, RMS over the deviation: where even that is gone, noise alone
-    decides on the sharpness. ``unused_bits``: see :func:`unused_bits`.
+    decides on the sharpness.
     """
 
     mean: float
@@ -46,15 +43,6 @@ class Look:
     bright: float
     sharpness: float
     detail: float = 0.0
-    unused_bits: int | None = None
-
-
-def unused_bits(image: NDArray[Any]) -> int | None:
-    """Highest bits of 16-bit samples that no pixel of an image has: the file may hold the 12 bits of a camera.
-
-    None of another depth.
-    """
-    return 16 - int(image.max(initial=0)).bit_length() if image.dtype == np.uint16 else None
 
 
 def look(image: NDArray[Any], valid: Bytes) -> Look:
@@ -64,8 +52,7 @@ def look(image: NDArray[Any], valid: Bytes) -> Look:
     if not values.size:
         return Look(math.nan, 0.0, 0.0, 0.0, math.nan)
     clipped = float((values <= LOW).mean()), float((values >= HIGH).mean())
-    found = *clipped, *texture(image, valid), unused_bits(image)
-    return Look(float(values.mean()), float(values.std()), *found)
+    return Look(float(values.mean()), float(values.std()), *clipped, *texture(image, valid))
 
 
 def texture(image: NDArray[Any], valid: Bytes) -> tuple[float, float]:

@@ -869,3 +869,27 @@ def test_projections_without_labels_are_kittis_and_poses_are_none(tmp_path):
     file.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
     with raises("RIL-100"):
         read_cameras(file)
+
+
+def test_a_part_of_the_sensor_in_a_printed_camera_info_is_applied(tmp_path):
+    text = """height: 480
+width: 640
+distortion_model: plumb_bob
+d: [0.0, 0.0, 0.0, 0.0, 0.0]
+k: [500.0, 0.0, 320.0, 0.0, 500.0, 240.0, 0.0, 0.0, 1.0]
+r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+p: [500.0, 0.0, 320.0, -50.0, 0.0, 500.0, 240.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+binning_x: {0}
+binning_y: {0}
+roi: {{x_offset: {1}, y_offset: 20, height: 400, width: 600, do_rectify: false}}
+"""
+    (whole,) = read_cameras(written(tmp_path, text.replace("roi", "other").format(0, 0), "a.yaml"))
+    assert (whole.lens.camera.cx, whole.size) == (320.0, (640, 480))
+    (part,) = read_cameras(written(tmp_path, text.format(1, 40), "b.yaml"))
+    assert (part.lens.camera.fx, part.lens.camera.cx, part.lens.camera.cy, part.size) == (500, 280, 220, (600, 400))
+    (half,) = read_cameras(written(tmp_path, text.format(2, 40), "c.yaml"))
+    assert (half.lens.camera.fx, half.lens.camera.cx, half.size) == (250, 139.75, (300, 200))
+    for camera in (part, half):
+        assert camera.T_camera_reference.translation == pytest.approx([-0.1, 0, 0])
+    with raises("RIL-329", "roi"):
+        read_cameras(written(tmp_path, text.format(-3, 40), "d.yaml"))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from rille.datasets.images import files, files16
+from rille.datasets.images import files
 from rille.datasets.images.files import Digests
 from rille.stages.core.declare import NoParams, check_outputs
 from rille.stages.core.errors import InputError
@@ -100,7 +100,7 @@ def test_a_few_bytes_of_padding_before_the_end_are_no_damage(capfd):
 
 
 def run(source):
-    stage = files16.STAGE if source.module.endswith("16") else files.STAGE
+    stage = files.STAGE
     bundle = stage.run(NoParams(), source.args | source.hints, {})
     check_outputs(stage, bundle)
     return bundle

@@ -333,3 +333,66 @@ def test_names_that_no_manifest_can_hold_are_refused(tmp_path, name):
     (tmp_path / name).write_text("")
     with raises("RIL-185"):
         inspect(tmp_path)
+
+
+def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    for name in ("a.mp4", "b.mp4", "x.svo2", "d.npy", "left/3.heic", "r.raw", "notes.md", "more.pdf", "drive.bag"):
+        (tmp_path / name).write_bytes(b"")
+    write_lines(tmp_path / "readme.txt", ["what this is"])
+    (tmp_path / "rig.yaml").write_text("camera_matrix: [1, 2\n")
+    found = inspect(tmp_path)
+    text = "\n".join(found.unread)
+    assert "2 videos (a.mp4 and 1 more): " in text
+    assert "ffmpeg -i" in text
+    for words in (
+        "1 ZED recording (x.svo2): ",
+        "1 array (d.npy): python -c",
+        "1 image (left/3.heic): ",
+        "1 bag (drive.bag)",
+    ):
+        assert words in text
+    assert "1 image without a header (r.raw): " in text
+    assert "3 files (readme.txt and 2 more): neither images nor" in text
+    assert "rig.yaml cannot be parsed" in text
+    assert len(found.unread) == 8
+    assert all(f"# Not readable: {line}" in manifest_text(found, ".") for line in found.unread)
+
+
+@pytest.mark.parametrize(
+    ("files", "step"),
+    [
+        (["left.mp4", "right.mp4"], "ffmpeg"),
+        (["left/1.npy", "right/1.npy"], "cv2.imwrite"),
+        (["left/1.webp", "right/1.webp"], "magick mogrify"),
+    ],
+)
+def test_a_folder_without_images_says_what_it_holds(tmp_path, files, step):
+    for name in files:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    with raises("RIL-194", step):
+        inspect(tmp_path)
+
+
+def test_a_pair_of_pointers_of_git_lfs_is_said(tmp_path):
+    for name in ("left/1.png", "right/1.png", "rig.yaml", "imu.csv"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 9\n")
+    found = inspect(tmp_path)
+    assert "git lfs pull" in found.views.trouble
+    assert [line.split(" is a pointer")[0].split("/")[-1] for line in found.unread] == ["rig.yaml", "imu.csv"]
+
+
+def test_pairing_by_time_stamps_is_proposed(tmp_path):
+    write_images(tmp_path, [f"left/16960598221{k}3456789.png" for k in range(4)])
+    write_images(tmp_path, [f"right/16960598221{k}4056789.png" for k in (0, 1, 3)])
+    (tmp_path / "rig.yaml").write_text(ORB_SETTINGS.format(*SIZE, bf=6.0))
+    text = manifest_text(inspect(tmp_path), ".")
+    assert tomllib.loads(text)["images"]["pair"] == "nearest"
+    path = tmp_path / "m.rille.toml"
+    path.write_text(text)
+    sequence = open_manifest(path, Digests())
+    assert sequence.frames == 3
+    assert sequence.times[2] - sequence.times[0] == pytest.approx(0.03, abs=1e-6)
+    assert any("1 image without a partner" in line for line in sequence.warnings)

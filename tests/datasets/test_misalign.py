@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 
 from rille.datasets.images import misalign as module
-from rille.datasets.images import misalign16
 from rille.datasets.images.misalign import MisalignParams, misalign, origins, warp
 from rille.datasets.mockup.params import SHORT, MockupParams
 from rille.datasets.mockup.sequence import mockup
-from rille.datasets.protocol import Source
-from rille.stages.core.declare import Bundle, NoParams, check_outputs
+from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.geometry.geometry import Camera, rotation_exp
 from rille.stages.geometry.lens import Lens
 
@@ -123,8 +121,9 @@ def test_real_optics_are_used_where_there_are_any():
     assert Lens.from_dict(misalign(plain, ALL).image(0, "right").args["lens"]) == lens
 
 
-@pytest.mark.parametrize(("dtype", "stage"), [(np.uint8, module.STAGE), (np.uint16, misalign16.STAGE)])
-def test_stage_keeps_the_depth(dtype, stage):
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_stage_keeps_the_depth(dtype):
+    stage = module.STAGE
     given = Bundle({"image": picture(dtype), "valid": np.ones((64, 96), np.uint8)}, {})
     args = {"frame": 2, "camera": "right", "lens": PINHOLE.to_dict()}
     out = stage.run(ALL, args, {"image": given})
@@ -132,11 +131,3 @@ def test_stage_keeps_the_depth(dtype, stage):
     assert out.meta == {"frame": 2, "camera": "right"}
     again = stage.run(ALL, args, {"image": given})
     assert again["image"].tobytes() == out["image"].tobytes()
-
-
-def test_deep_images_go_to_their_own_stage():
-    deep = replace(
-        mockup(MockupParams(**SHORT)),
-        image=lambda frame, camera: Source("rille.datasets.images.files16", NoParams(), {"frame": frame}),
-    )
-    assert misalign(deep, ALL).image(0, "right").module == "rille.datasets.images.misalign16"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from rille.datasets.images.pairing import common_headers, crossed, natural, pair_up, side_of
+from rille.datasets.images.pairing import common_headers, crossed, join, natural, pair_up, side_of, stamp_of
 
 
 def paths(*names: str) -> list[Path]:
@@ -145,3 +145,85 @@ def test_unequal_counts_name_both_ends():
         pair_up(left, right, "order")
     with raises("RIL-259", "000.png to 004.png", "000.png to 002.png"):
         pair_up(left, right, "name")
+
+
+# -- time stamps -------------------------------------------------------------------------------------------------------
+
+START = 1696059822_123456789
+
+
+def stamped(form, offsets_ms):
+    """Names of images at some times, ms after the start."""
+    return [Path(form.format(ns=START + round(t * 1e6), s=(START + round(t * 1e6)) / 1e9)) for t in offsets_ms]
+
+
+@pytest.mark.parametrize("form", ["{ns}.png", "cam_{ns}.png", "f{s:.6f}.png", "{ns}_left.png"])
+@pytest.mark.parametrize("rule", ["auto", "nearest"])
+def test_names_whose_stamps_differ_are_paired_by_the_nearest(form, rule):
+    left, right = stamped(form, [0, 100, 200, 300]), stamped(form, [0.8, 100 - 0.9, 200.5, 299.7])
+    lines: list[str] = []
+    pairs = pair_up(left[::-1], right, rule, warnings=lines)
+    assert [(p.left, p.right) for p in pairs] == list(zip(left, right, strict=True))
+    assert len(lines) == 1
+    assert "up to 0.9 ms apart (10 ms are allowed)" in lines[0]
+
+
+def test_seconds_and_nanoseconds_may_stand_apart():
+    assert stamp_of("left_1696059822_023456789") == "1696059822.023456789"
+    assert stamp_of("20231104_000012") == stamp_of("000048978") == ""
+    names = [
+        [Path(f"{side}_{1696059822 + k // 2}_{5 * (k % 2)}0{late}000000.png") for k in range(4)]
+        for side, late in ("a1", "b3")
+    ]
+    assert [(p.left, p.right) for p in pair_up(*names)] == list(zip(*names, strict=True))
+
+
+def test_an_image_that_was_lost_on_either_side_is_left_out():
+    left, right = stamped("{ns}.png", [0, 100, 200]), stamped("{ns}.png", [0.8, 200.5, 299.7])
+    lines: list[str] = []
+    assert [(p.left, p.right) for p in pair_up(left, right, warnings=lines)] == [
+        (left[0], right[0]),
+        (left[2], right[1]),
+    ]
+    assert "2 images without a partner of the same time are left out" in lines[0]
+
+
+def test_the_tolerance_follows_the_interval_and_is_stated():
+    left, right = stamped("{ns}.png", [0, 8, 16, 24]), stamped("{ns}.png", [3, 11, 19, 27])
+    with raises("RIL-822", "0.003 s apart"):  # a quarter of 8 ms is less
+        pair_up(left, right)
+    assert len(pair_up(left, right, tolerance=0.004)) == 4
+    assert join([0.0, 1.0, 2.0], [0.02, 1.0, 2.0]).places == [(1, 1), (2, 2)]  # never more than 10 ms
+    assert join([0.0, 0.1], [0.004, 0.006, 0.1]).places == [(0, 0), (1, 2)]  # no image in two pairs
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "expected"),
+    [
+        ([0, 100, 200], [0.8, 200.5, 299.7], ("RIL-823", "was an image lost?")),  # one left and one right lost
+        ([100, 200, 300, 400], [0, 100, 200, 300], ("RIL-823", "-0.1 s off")),  # all one frame apart, one clock
+        ([0, 100, 200, 300], [7e6, 7e6 + 100, 7e6 + 200, 7e6 + 400], ("RIL-823", "nearest")),
+    ],
+)
+def test_pairs_by_order_are_never_frames_apart(left, right, expected):
+    with raises(*expected):
+        pair_up(stamped("{ns}.png", left), stamped("{ns}.png", right), "order")
+
+
+def test_stamps_of_two_clocks_are_said():
+    left, right = stamped("{ns}.png", [0, 100, 200]), stamped("{ns}.png", [7e6 + 3, 7e6 + 101, 7e6 + 204])
+    with raises("RIL-822", "of two clocks"):
+        pair_up(left, right)
+    lines: list[str] = []
+    assert len(pair_up(left, right, "order", warnings=lines)) == 3
+    assert ["RIL-824" in line and "7000 s later" in line for line in lines] == [True]
+    jitter = stamped("{ns}.png", [20, 115, 230])  # no frame apart, though too far for "nearest"
+    assert len(pair_up(left, jitter, "order", warnings=lines)) == 3
+    assert len(lines) == 1
+
+
+def test_a_date_that_all_names_share_is_no_time_stamp():
+    left, right = ([Path(f"{side}_20231104101500_{k}.png") for k in range(3)] for side in ("a", "b"))
+    assert [(p.left, p.right) for p in pair_up(left, right)] == list(zip(left, right, strict=True))
+    with raises("RIL-822", "not each has its own"):
+        pair_up(left, right, "nearest")

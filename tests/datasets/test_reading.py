@@ -12,6 +12,7 @@ from fuzzing import LONGEST, within
 from rille.datasets.cameras import read_cameras
 from rille.datasets.images import files
 from rille.datasets.images.headers import read_header
+from rille.datasets.registry import open_sequence
 from rille.datasets.text import reading
 from rille.datasets.text.reading import Search, read_bytes, read_lines, read_toml
 from rille.stages.core.errors import InputError
@@ -185,6 +186,24 @@ def test_other_formats_reach_no_decoder(tmp_path, name, monkeypatch):
     cv2.imwrite(str(tmp_path / name), np.ones((9, 9, 3), np.float32 if name.endswith("hdr") else np.uint8))
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
     refused("RIL-171", files.read_grey, tmp_path / name)
+
+
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
+
+
+@pytest.mark.parametrize("name", ["a.png", "calib.yaml", "poses.txt", "drive.bag", "drive.mcap", "drive/d.mcap"])
+def test_pointers_of_git_lfs_are_named(tmp_path, name):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(POINTER)
+    read = {"png": files.read_grey, "yaml": read_cameras, "txt": lambda p: read_lines(p, "table")}.get(
+        name.split(".")[1]
+    )
+    if read is not None:
+        refused("RIL-820", read, path)
+        return
+    (path.parent / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+    refused("RIL-820", open_sequence, str(path.parent if "/" in name else path))
 
 
 # -- searches ----------------------------------------------------------------------------------------------------------

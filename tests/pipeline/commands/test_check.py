@@ -167,13 +167,13 @@ def test_a_doubtful_rig_is_one_finding(tmp_path):
 
 
 @pytest.mark.parametrize(("scale", "told"), [(16, True), (257, False)])
-def test_a_run_too_warns_of_samples_that_leave_bits_empty(tmp_path, scale, told):
+def test_a_run_says_that_it_spreads_samples_that_leave_bits_empty(tmp_path, scale, told):
     path = folder(tmp_path / "wall", frames=4)
     for image in path.glob("*/*.png"):
         cv2.imwrite(str(image), cv2.imread(str(image), cv2.IMREAD_GRAYSCALE).astype(np.uint16) * scale)
     options = session.Options(str(path), cache=tmp_path / "cache")
-    found = [line for line in session.settings_of_run(options).sequence.warnings if "RIL-896" in line]
-    assert ["of their 16 bits" in line for line in found] == [True] * told
+    found = [line for line in session.settings_of_run(options).sequence.warnings if "RIL-827" in line]
+    assert ["(sample - 0) x 8" in line for line in found] == [True] * told
     loop = session.Options("mockup-loop", cache=tmp_path / "cache", verb="drive")
     assert not session.settings_of_run(loop).sequence.warnings, "no image is there before the drive"
 

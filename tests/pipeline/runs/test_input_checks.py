@@ -147,21 +147,6 @@ def test_good_images_give_two_lines():
     assert levels(input_checks.judge_looks(looks([GOOD] * 5, [GOOD] * 5), NAMES)) == ["OK", "OK"]
 
 
-def test_samples_that_leave_bits_empty_are_told():
-    twelve = [changed(unused_bits=4)] * 4 + [changed(unused_bits=5)]
-    found = input_checks.judge_looks(looks(twelve, twelve), NAMES)
-    assert [(f.code, "12 of their 16 bits" in f.text, f.remedy) for f in found if f.level != "OK"] == [
-        ("RIL-896", True, "multiply the samples by 16")
-    ]
-    eight = [changed(unused_bits=None)] * 5
-    assert [f.text.split(": ")[1] for f in input_checks.judge_looks(looks(twelve, eight), NAMES) if f.code] == [
-        "all left images are taken as 16 times as dark as they are"
-    ]
-    # One bit is a matter of exposure.
-    dark = [changed(unused_bits=1)] * 5
-    assert levels(input_checks.judge_looks(looks(dark, dark), NAMES)) == ["OK", "OK"]
-
-
 @pytest.mark.parametrize(
     ("left", "right", "level", "words"),
     [

@@ -1,0 +1,54 @@
+"""Spread the grey values of 16-bit images that use a small part of their range, by one rule for a whole sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+
+from rille.stages.core.declare import AnyArray
+
+Levels = tuple[int, int]
+"""Black and gain: samples become ``(sample - black) * gain``; those beyond the range are clipped."""
+
+WHITE = 65535
+SHARE, FULL = 1 / 8, 1 / 4
+"""Shares of the range below which it is spread: from dark to bright; up to the brightest, as of a camera of 14 bits."""
+
+SMOOTH = 0.5
+"""Share of the deviation that means of 4 x 4 pixels keep at least; of noise alone they keep a quarter."""
+
+
+def levels_of(images: Iterable[AnyArray]) -> Levels | None:
+    """Levels for all images of a sequence by some of them; None where they use their range, or show nothing but noise.
+
+    The gain is a power of two that leaves the samples of these images half of the range, for others may be brighter.
+    """
+    deep = [image for image in images if image.dtype == np.uint16 and _shows(image)]
+    if not deep:
+        return None
+    dark, bright = (int(f(np.percentile(image, q) for image in deep)) for f, q in ((min, 0.5), (max, 99.5)))
+    span, top = max(bright - dark, 1), max(int(image.max()) for image in deep)
+    if span > SHARE * WHITE and top > FULL * WHITE:
+        return None
+    gain = 1 << (WHITE // (2 * span)).bit_length() - 1
+    # Their middle becomes that of the range, but black stays black.
+    return (max((dark + bright) // 2 - WHITE // (2 * gain), 0), gain) if gain > 1 else None
+
+
+def spread(image: AnyArray, levels: Levels | None) -> AnyArray:
+    """A uint16 image with its samples spread; any other one as it is."""
+    if levels is None or image.dtype != np.uint16:
+        return image
+    black, gain = levels
+    return np.clip((image.astype(np.int64) - black) * gain, 0, WHITE).astype(np.uint16)
+
+
+def words(levels: Levels) -> str:
+    """What is done to the images."""
+    return "16-bit samples use a small part of their range: (sample - {}) x {} is taken of all images".format(*levels)
+
+
+def _shows(image: AnyArray) -> bool:
+    return bool(cv2.blur(image.astype(np.float32), (4, 4)).std() > SMOOTH * image.std())

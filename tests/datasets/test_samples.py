@@ -1,0 +1,101 @@
+"""What some images of a sequence show when it is opened: mosaics of colours, unlike orientations, few bits."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from folders import write_sequence
+from PIL import Image
+from raising import raises
+
+from rille.datasets.images.samples import mosaic
+from rille.datasets.registry import open_sequence
+
+
+def coloured(seed=3, shape=(160, 192)):
+    """Colours (row, col, 3) that vary slowly, with texture."""
+    random = np.random.default_rng(seed)
+    slow = cv2.resize(random.random((5, 6, 3)).astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
+    return np.clip(200 * slow + 40 * random.random(shape)[..., None], 0, 255).astype(np.uint8)
+
+
+def filtered(image, pattern):
+    """What a sensor under colour filters takes of an image."""
+    out = np.empty(image.shape[:2], image.dtype)
+    for k, letter in enumerate(pattern):
+        out[k // 2 :: 2, k % 2 :: 2] = image[k // 2 :: 2, k % 2 :: 2, "rgb".index(letter)]
+    return out
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+@pytest.mark.parametrize("scale", [1, 16])
+def test_a_mosaic_of_colours_is_told_from_grey_images(pattern, scale):
+    image = coloured()
+    assert mosaic(filtered(image, pattern).astype(np.uint16 if scale > 1 else np.uint8) * scale)
+    assert not mosaic(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.random.default_rng(1).integers(0, 255, (200, 200)),
+        np.indices((200, 200)).sum(0) // 8 % 2 * 255,  # a board
+        np.repeat(np.repeat(np.random.default_rng(2).integers(0, 255, (100, 100)), 2, 0), 2, 1),  # enlarged
+        np.zeros((200, 200), int),
+        np.random.default_rng(1).integers(0, 255, (40, 40)),  # too few blocks to tell
+    ],
+)
+def test_noise_and_patterns_of_other_kinds_are_no_mosaic(image):
+    assert not mosaic(image.astype(np.uint8))
+
+
+def test_a_mosaic_is_said_when_it_is_opened(tmp_path):
+    path = write_sequence(tmp_path, frames=2)
+    for k, image in enumerate(sorted(tmp_path.glob("*/*.png"))):
+        cv2.imwrite(str(image), filtered(coloured(k), "rggb"))
+    assert sum("RIL-826" in line for line in open_sequence(str(path)).warnings) == 2
+
+
+def turned(folder, tags, ending="jpg"):
+    path = write_sequence(folder, frames=2)
+    path.write_text(path.read_text().replace(".png", f".{ending}"))
+    for side, tag in tags.items():
+        for k in range(2):
+            exif = Image.Exif()
+            if tag:
+                exif[0x0112] = tag
+            Image.new("L", (64, 48), 90 + k).save(folder / side / f"{k:02d}.{ending}", exif=exif)
+    return path
+
+
+@pytest.mark.parametrize("ending", ["jpg", "png", "tif"])
+@pytest.mark.parametrize("tags", [(1, 3), (None, 3), (6, 8), (1, 2)])
+def test_unlike_orientations_are_refused(tmp_path, tags, ending):
+    with raises("RIL-828", "auto-orient"):
+        open_sequence(str(turned(tmp_path, dict(zip(("left", "right"), tags, strict=True)), ending)))
+
+
+@pytest.mark.parametrize(("tag", "said"), [(None, 0), (1, 0), (3, 1), (6, 1)])
+def test_like_orientations_are_ignored_and_said(tmp_path, tag, said):
+    sequence = open_sequence(str(turned(tmp_path, {"left": tag, "right": tag})))
+    assert sum("RIL-829" in line for line in sequence.warnings) == said
+
+
+def test_images_of_few_bits_open_with_one_scale_for_both_cameras(tmp_path):
+    path = write_sequence(tmp_path, frames=4)
+    given = {}
+    for k, image in enumerate(sorted(tmp_path.glob("*/*.png"))):
+        given[image.parent.name, int(image.stem)] = (
+            cv2.GaussianBlur(coloured(k)[..., 0], (0, 0), 2).astype(np.uint16) + 29_000
+        )
+        cv2.imwrite(str(image), given[image.parent.name, int(image.stem)])
+    sequence = open_sequence(str(path))
+    assert sum("RIL-827" in line for line in sequence.warnings) == 1
+    sources = [sequence.image(k, camera) for k in range(4) for camera in ("left", "right")]
+    assert len({source.args["levels"] for source in sources}) == 1
+    black, gain = sources[0].args["levels"]
+    from rille.datasets.images.files import STAGE
+
+    out = STAGE.run(sources[3].params, {**sources[3].args, **sources[3].hints}, {})["image"]
+    np.testing.assert_array_equal(out, (given["right", 1].astype(int) - black) * gain)

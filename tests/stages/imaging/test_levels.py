@@ -1,0 +1,52 @@
+"""Samples of 16 bits that use a small part of their range: when they are spread, and how."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from rille.stages.imaging.levels import levels_of, spread
+
+
+def scene(low, high, seed=3):
+    """A textured image whose samples lie between two values."""
+    noise = np.random.default_rng(seed).random((64, 96)).astype(np.float32)
+    smooth = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 3), None, low, high, cv2.NORM_MINMAX)
+    return smooth.astype(np.uint16)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(0, 255), (0, 1023), (20, 4095), (29_000, 29_400), (29_000, 33_000), (64_000, 65_535)]
+)
+def test_a_small_part_of_the_range_is_spread_over_much_of_it(low, high):
+    image = scene(low, high)
+    levels = levels_of([image, scene(low, high, 4)])
+    assert levels is not None
+    out = spread(image, levels)
+    assert out.dtype == np.uint16
+    assert 0.2 * 65_535 < np.ptp(out.astype(int)) < 0.6 * 65_535
+    # Not one sample is clipped, nor are two made one.
+    assert len(np.unique(out)) == len(np.unique(image))
+
+
+@pytest.mark.parametrize(
+    "image", [scene(0, 65_535), scene(5000, 40_000), scene(12_000, 22_000), scene(0, 255).astype(np.uint8)]
+)
+def test_good_images_stay_as_they_are(image):
+    assert levels_of([image]) is None
+    assert spread(image, None) is image
+
+
+def test_noise_and_blank_images_are_not_blown_up():
+    noise = np.random.default_rng(0).normal(500, 5, (64, 96)).astype(np.uint16)
+    assert levels_of([noise, np.full((64, 96), 7, np.uint16), np.zeros((2, 2), np.uint16)]) is None
+    # Nor do they decide for others.
+    dropped = levels_of([scene(29_000, 29_400), np.zeros((64, 96), np.uint16)])
+    assert dropped == levels_of([scene(29_000, 29_400)])
+
+
+def test_one_scale_holds_for_dark_and_bright_images():
+    dark, bright = scene(100, 900), scene(100, 3600, 4)
+    levels = levels_of([dark, bright])
+    assert spread(dark, levels).max() < spread(bright, levels).max() / 2
