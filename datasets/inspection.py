@@ -11,6 +11,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -18,7 +19,7 @@ import numpy as np
 
 from rille.datasets.cameras import KNOWN, CalibratedCamera, read_cameras
 from rille.datasets.cameras.model import of_size
-from rille.datasets.images.files import SUFFIXES
+from rille.datasets.images.files import SUFFIXES, common_header
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import unread
 from rille.datasets.images.pairing import SIDES, ImagePair, common_headers, natural, pair_up, side_of, stamp_of
@@ -37,6 +38,8 @@ MOST_TEXTS = 200
 
 UNWRITABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """In a name: control characters and line separators, which would end a comment, and bytes that are not UTF-8."""
+
+SPLIT = "if each shows both views, split it: ffmpeg -i FILE -vf crop=iw/2:ih:0:0 left/FILE -vf crop=iw/2:ih:iw/2:0 right/FILE"
 
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
@@ -131,7 +134,7 @@ def inspect(folder: Path) -> Findings:
     used = set(found.calibration.files if found.calibration else ()) | set(found.others)
     for path in texts:
         relative = _relative(path, folder)
-        if path.suffix.lower() not in TABLES or relative in used:
+        if path.suffix.lower() not in TABLES or relative in used or any(str(path) in line for line in found.unread):
             continue
         try:
             kind = table_kind(path, found.views.pairs)
@@ -188,10 +191,15 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     both = {key: sides for key, sides in groups.items() if all(sides)}
     if not both:
         named = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
+        remedy = "name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand"
+        for path in images[:1]:
+            with suppress(InputError):
+                width, height, _ = common_header([path])
+                remedy = f"{SPLIT}; else {remedy}" if width >= 2 * height else remedy
         raise InputError(
             "RIL-194",
             f"{folder} holds {len(images)} images, {named[0]} named as left and {named[1]} as right: no pairs",
-            remedy="name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand",
+            remedy=remedy,
         )
     # Most pairs first; of as many, the surest token (SIDES).
     key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0]))

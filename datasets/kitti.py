@@ -11,6 +11,7 @@ maps the reference frame, in which the poses are given, to pixels; KITTI's have 
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from rille.datasets.cameras.kitti import decompose
 from rille.datasets.cameras.pair import check_focal
 from rille.datasets.images import files
 from rille.datasets.images.headers import sizes_of
+from rille.datasets.images.kinds import unread
 from rille.datasets.images.pairing import ends, natural
 from rille.datasets.manifest.rig import LONGEST_BASELINE, unusual
 from rille.datasets.poses import rounded_pose
@@ -266,10 +268,11 @@ def list_pairs(layout: KittiLayout) -> Listing:
         )
     names = sorted(present, key=lambda name: (natural(name), name))
     if not names:
+        folder = layout.folder / layout.pair[0]
         raise InputError(
             "RIL-210",
-            f"{layout.folder / layout.pair[0]} holds no images",
-            remedy=f"put files there: {', '.join(files.SUFFIXES)}",
+            f"{folder} holds no images",
+            remedy="; ".join([*unread(os.listdir(folder)), f"put files there: {', '.join(files.SUFFIXES)}"]),
         )
     names = _counted(names)
     lost, suffix = {}, next(iter({**left, **right}.values())).suffix

@@ -15,6 +15,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from rille.datasets.images.files import Digests
+from rille.datasets.images.kinds import unread
 from rille.datasets.images.misalign import MisalignParams, misalign
 from rille.datasets.images.samples import examined
 from rille.datasets.manifest.opening import open_manifest
@@ -129,6 +130,7 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
             return sequence
     if path.is_file():
         remedy = "give the folder, of a ROS 2 bag too, or a manifest (.toml); `rille init FOLDER` writes one"
+        remedy = "; ".join([*unread([name_or_path]), remedy])
         raise InputError("RIL-992", f"the file {name_or_path} is no sequence", remedy=remedy)
     if not path.is_dir():
         kind = "file" if path.suffix else "sequence"

@@ -239,8 +239,8 @@ def _two_clocks(
             f"stamps ({most:.3g} s are allowed): was an image lost?",
             remedy='images.pair = "nearest" pairs by time stamp; or state images.tolerance (s)',
         )
-    text = f"time stamps are of two clocks: those of the right images are {offset:.6g} s later in all pairs"
-    return [warning("RIL-824", text)] if abs(offset) > most else []
+    text = f"time stamps are of two clocks, or not of one time: in all pairs the right one is {offset:.6g} s later"
+    return [warning("RIL-824", text)] if abs(offset) > MOST_APART else []
 
 
 def _with_gaps(by_key: list[dict[str, Path]]) -> tuple[ImagePair, ...]:

@@ -14,6 +14,7 @@ from rille.datasets.inspection import find_views, inspect, pattern, table_kind
 from rille.datasets.manifest.opening import open_manifest
 from rille.datasets.manifest.text import manifest_text, needs
 from rille.datasets.text.names import derived_name
+from rille.stages.core.errors import InputError
 
 ORB_SETTINGS = """%YAML:1.0
 Camera.fx: 60.0
@@ -396,3 +397,13 @@ def test_pairing_by_time_stamps_is_proposed(tmp_path):
     assert sequence.frames == 3
     assert sequence.times[2] - sequence.times[0] == pytest.approx(0.03, abs=1e-6)
     assert any("1 image without a partner" in line for line in sequence.warnings)
+
+
+def test_images_that_may_show_both_views_say_how_they_are_split(tmp_path):
+    write_images(tmp_path / "wide", ["1.png", "2.png"], (128, 48))
+    with raises("RIL-194", "if each shows both views, split it: ffmpeg"):
+        inspect(tmp_path / "wide")
+    write_images(tmp_path / "one", ["1.png"])
+    with pytest.raises(InputError) as caught:
+        inspect(tmp_path / "one")
+    assert "both views" not in str(caught.value)

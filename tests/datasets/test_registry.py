@@ -181,3 +181,21 @@ def test_up_of_the_calibrations_frame_is_turned_into_the_cameras(data_dir, tmp_p
 @pytest.mark.parametrize("name", list(MANIFESTS))
 def test_defaults_of_the_programs_manifests_are_parameters(data_dir, name):
     configuration.build(configuration.expand(open_sequence(name).defaults))
+
+
+@pytest.mark.parametrize(
+    ("name", "step"), [("left.mp4", "ffmpeg"), ("drive.svo2", "ZED SDK"), ("left.npy", "cv2.imwrite")]
+)
+def test_a_file_that_is_no_sequence_says_what_to_do_with_it(tmp_path, name, step):
+    (tmp_path / name).write_bytes(b"x")
+    with raises("RIL-992", step):
+        open_sequence(str(tmp_path / name))
+
+
+def test_a_folder_of_images_that_are_not_read_says_so(tmp_path):
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        (tmp_path / side / "1.heic").write_bytes(b"x")
+    (tmp_path / "calib.txt").write_text("7 0 3 0 0 7 2 0 0 0 1 0\n7 0 3 -1 0 7 2 0 0 0 1 0\n")
+    with raises("RIL-210", "1 image (1.heic): convert them"):
+        open_sequence(str(tmp_path))
