@@ -10,7 +10,7 @@ predicts.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -79,7 +79,12 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
     return open_bag(path.resolve(), number) if is_bag(path) else None
 
 
-def open_bag(path: Path, topics: str | None = None, optics_of: Callable[[Sizes], Optics] | None = None) -> Sequence:
+def open_bag(
+    path: Path,
+    topics: str | None = None,
+    optics_of: Callable[[Sizes], Optics] | None = None,
+    tolerance: float | None = None,
+) -> Sequence:
     """The sequence of a bag.
 
     Parameters
@@ -87,11 +92,12 @@ def open_bag(path: Path, topics: str | None = None, optics_of: Callable[[Sizes],
     topics : those of the left and right images, with a comma between them.
     optics_of : cameras before images of some sizes; by default those of ``camera_info``, or, where there is none, of a
         calibration file beside the bag.
+    tolerance : s; how far the stamps of a pair may be apart; None: see :func:`rille.datasets.images.pairing.join`.
     """
     with bag.opened(path) as reader:
         chosen = _topics(reader, path, topics)
         there = [_images(reader, path, topic) for topic in chosen]
-        both, warnings = _joined(path, chosen, *there)
+        both, warnings = _joined(path, chosen, (there[0], there[1]), tolerance)
         stamps = both[0]
         taken = {c: [of[stamp] for stamp in k] for c, of, k in zip(CAMERAS, there, both, strict=True)}
         sizes = sizes_of((taken["left"][0].size, taken["right"][0].size))
@@ -185,19 +191,19 @@ def _images(reader: Any, path: Path, topic: str) -> dict[int, TakenImage]:
 
 
 def _joined(
-    path: Path, topics: tuple[str, str], left: Mapping[int, TakenImage], right: Mapping[int, TakenImage]
+    path: Path, topics: tuple[str, str], taken: tuple[Collection[int], Collection[int]], tolerance: float | None
 ) -> tuple[tuple[list[int], list[int]], list[str]]:
     """Stamps of the left and of the right images of all pairs, in order, and what is left out."""
-    stamps = sorted(left), sorted(right)
-    joined = join([stamp / 1e9 for stamp in stamps[0]], [stamp / 1e9 for stamp in stamps[1]])
+    left, right = sorted(taken[0]), sorted(taken[1])
+    joined = join([stamp / 1e9 for stamp in left], [stamp / 1e9 for stamp in right], tolerance)
     if not joined.places:
         raise InputError(
             "RIL-947",
             f"{path}: no image of {topics[0]} ({len(left)}) has the stamp of one of {topics[1]} ({len(right)}); the "
-            f"nearest are {1e3 * joined.apart:.6g} ms apart, {1e3 * joined.allowed:.3g} ms are allowed",
-            remedy="both images of a pair need the same header.stamp: synchronise the cameras",
+            f"nearest are {1e3 * joined.apart:.4g} ms apart, {1e3 * joined.allowed:.3g} ms are allowed",
+            remedy="synchronise the cameras, or state images.tolerance (s) in a manifest",
         )
-    both = [stamps[0][i] for i, _ in joined.places], [stamps[1][j] for _, j in joined.places]
+    both = [left[i] for i, _ in joined.places], [right[j] for _, j in joined.places]
     return both, joined.lines("RIL-948")
 
 

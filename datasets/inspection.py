@@ -39,7 +39,7 @@ MOST_TEXTS = 200
 UNWRITABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """In a name: control characters and line separators, which would end a comment, and bytes that are not UTF-8."""
 
-SPLIT = "if each shows both views, split it: ffmpeg -i FILE -vf crop=iw/2:ih:0:0 left/FILE -vf crop=iw/2:ih:iw/2:0 right/FILE"
+SPLIT = "if each shows both views: ffmpeg -i FILE -vf crop=iw/2:ih:0:0 left/FILE -vf crop=iw/2:ih:iw/2:0 right/FILE"
 
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 

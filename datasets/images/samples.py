@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
+from warnings import catch_warnings
 
 import numpy as np
 from PIL import Image
@@ -86,7 +87,7 @@ def mosaic(image: AnyArray) -> bool:
 def _orientations(sources: Mapping[str, list[Source]]) -> list[str]:
     """A line where all images are turned alike: they are taken as they are stored."""
     left, right = (sorted({_orientation(source) for source in of}) for of in sources.values())
-    if left == right == [1]:
+    if {*left, *right} <= {1}:
         return []
     words = f"EXIF orientations are {left} of left images and {right} of right ones"
     if left != right or len(left) > 1:
@@ -102,7 +103,8 @@ def _orientations(sources: Mapping[str, list[Source]]) -> list[str]:
 def _orientation(source: Source) -> int:
     """EXIF's orientation of an image file; 1 where it states none."""
     with (
-        suppress(OSError, ValueError, SyntaxError),
+        catch_warnings(action="ignore"),
+        suppress(Exception),  # of a damaged tag: whatever the parsers of three formats come upon
         Image.open(source.hints["path"], formats=("JPEG", "TIFF", "PNG")) as image,
     ):
         # Pillow decodes a whole PNG in search of what it does not have.

@@ -117,7 +117,7 @@ def _of_bag(manifest: Manifest, root: Path, name: str) -> tuple[Sequence, tuple[
     topics = f"{left},{right}" if left and right else None
     rectified = _are_rectified(manifest.images, (left, right))
     optics_of = (lambda sizes: read_optics(manifest, root, name, sizes, rectified)) if stated else None
-    sequence = open_bag((root / path).resolve(), topics, optics_of)
+    sequence = open_bag((root / path).resolve(), topics, optics_of, manifest.images.tolerance)
     return sequence, tuple(ImagePair(stamp, Path(stamp), Path(stamp)) for stamp in sequence.frame_names)
 
 

@@ -362,9 +362,12 @@ def test_a_manifest_takes_the_images_of_a_bag(tmp_path):
 
 
 def test_a_manifest_leaves_the_cameras_of_a_bag_as_they_are(tmp_path):
-    street("bag").write(tmp_path)
+    street("bag", lag=15_000_000).write(tmp_path)
     path = tmp_path / "m.rille.toml"
     path.write_text('[images]\nleft = "drive.bag"\nright = "drive.bag"\n')
+    with raises("RIL-947", "15 ms apart", "images.tolerance"):
+        open_sequence(str(path))
+    path.write_text(path.read_text() + "tolerance = 0.02\n")
     assert open_sequence(str(path)).rig.baseline == pytest.approx(0.5)
 
 

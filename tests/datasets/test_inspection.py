@@ -401,7 +401,7 @@ def test_pairing_by_time_stamps_is_proposed(tmp_path):
 
 def test_images_that_may_show_both_views_say_how_they_are_split(tmp_path):
     write_images(tmp_path / "wide", ["1.png", "2.png"], (128, 48))
-    with raises("RIL-194", "if each shows both views, split it: ffmpeg"):
+    with raises("RIL-194", "if each shows both views: ffmpeg"):
         inspect(tmp_path / "wide")
     write_images(tmp_path / "one", ["1.png"])
     with pytest.raises(InputError) as caught:

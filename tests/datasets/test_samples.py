@@ -76,6 +76,16 @@ def test_unlike_orientations_are_refused(tmp_path, tags, ending):
         open_sequence(str(turned(tmp_path, dict(zip(("left", "right"), tags, strict=True)), ending)))
 
 
+def test_a_damaged_tag_is_none(tmp_path):
+    path = turned(tmp_path, {"left": 3, "right": 3})
+    for image in tmp_path.glob("*/*.jpg"):
+        data = bytearray(image.read_bytes())
+        at = data.index(b"Exif")
+        data[at + 10 : at + 24] = b"\xff" * 14
+        image.write_bytes(data)
+    assert open_sequence(str(path)).frames == 2
+
+
 @pytest.mark.parametrize(("tag", "said"), [(None, 0), (1, 0), (3, 1), (6, 1)])
 def test_like_orientations_are_ignored_and_said(tmp_path, tag, said):
     sequence = open_sequence(str(turned(tmp_path, {"left": tag, "right": tag})))
