@@ -68,16 +68,23 @@ class Positions:
     positions : one row each, x, y or x, y, z, metres.
     times : seconds, increasing, of a clock that may be off by a constant; None: one row a frame.
     max_gap : seconds; between rows farther apart nothing is interpolated.
+    lever_arm : m, place of the antenna or prism in the left camera's frame; None: not known.
     """
 
     positions: tuple[tuple[float, ...], ...]
     times: tuple[float, ...] | None = None
     max_gap: float = 0.5
+    lever_arm: tuple[float, float, float] | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """JSON form."""
         times = None if self.times is None else list(self.times)
-        return {"positions": [list(row) for row in self.positions], "times": times, "max_gap": self.max_gap}
+        return {
+            "positions": [list(row) for row in self.positions],
+            "times": times,
+            "max_gap": self.max_gap,
+            "lever_arm": self.lever_arm,
+        }
 
 
 @dataclass(frozen=True)
@@ -135,6 +142,7 @@ class Sequence:
     truth : T_truth_left of each frame, in any world frame, metres; None where the truth has a gap.
     truth_positions : truth that is positions alone, where ``truth`` is None.
     truth_source : what the truth is, in words.
+    truth_mount : T_body_left, by which the poses of the truth's file were multiplied; None: they are the camera's.
     up : direction of "up" in each left camera frame (attitude); None where it is not known.
     attitude : R_reference_left of each frame from a sensor (gyroscope, compass); the reference is any inertial frame,
         the same for all frames, and only differences between frames are used. None where it is not known.
@@ -164,6 +172,7 @@ class Sequence:
     truth: tuple[RigidTransform | None, ...] | None = None
     truth_positions: Positions | None = None
     truth_source: str = ""
+    truth_mount: RigidTransform | None = None
     up: tuple[tuple[float, float, float] | None, ...] | None = None
     attitude: tuple[Rows | None, ...] | None = None
     odometry: tuple[RigidTransform | None, ...] | None = None

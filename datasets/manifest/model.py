@@ -166,6 +166,7 @@ class PoseFile(Params):
         default=None,
         description="rows of [R | t], m: from the left camera's frame to the body's whose poses the file has",
     )
+    unit: float = Field(default=1.0, gt=0, description="m; length of one unit of the file, 0.001 where it says mm")
     max_gap: float = Field(default=0.5, gt=0, description="s; poses are interpolated over no longer gap")
     time_offset: float = Field(
         default=0.0, description="s; added to the file's times so that they are those of the images"
@@ -180,6 +181,11 @@ class Truth(PoseFile):
         default={},
         description='names or numbers (from 1) of the columns of positions alone, e.g. { time = "gps s", x = "E", y = '
         '"N" }; x and y span the ground, y left of x seen from above, z is up; names that are clear need none',
+    )
+    lever_arm: Direction | None = Field(
+        default=None,
+        description="m; where the antenna or prism of positions alone is in the left camera's frame: x right, y down, "
+        "z ahead; none: fitted where turns show it, and the report says so",
     )
 
 

@@ -35,6 +35,7 @@ class KnownMotion:
     truth: Poses | None = None
     truth_positions: Positions | None = None
     truth_source: str = ""
+    truth_mount: RigidTransform | None = None
     odometry: Poses | None = None
     attitude: tuple[Rows | None, ...] | None = None
     up: Ups | None = None
@@ -133,6 +134,9 @@ def _poses(
     path = root / section.file
     timed = read_poses(path, section.format)
     motion.warnings += timed.warnings
+    if isinstance(section, PoseFile):
+        in_metres = (RigidTransform(pose.rotation, section.unit * pose.translation) for pose in timed.poses)
+        timed = replace(timed, poses=tuple(in_metres))
     poses: Poses = timed.poses
     if timed.times is None:
         if len(timed.poses) != count:
@@ -160,7 +164,14 @@ def _truth(section: Truth, root: Path, name: str, motion: KnownMotion, count: in
     alone = read_positions(root / section.file, section.format, {str(k): v for k, v in section.columns.items()})
     motion.truth_source = section.source or f"{'positions' if alone else 'poses'} of {section.file}, as recorded"
     if alone is None:
+        if section.lever_arm is not None:
+            raise InputError(
+                "RIL-782",
+                f"{name}: truth.lever_arm: {section.file} holds poses, not positions alone",
+                remedy="state where the camera is in their body as T_body_left",
+            )
         motion.truth = _poses(section, "truth", root, name, motion, count)
+        motion.truth_mount = None if section.T_body_left is None else RigidTransform.from_matrix(section.T_body_left)
         return
     if section.T_body_left is not None:
         raise InputError(
@@ -185,7 +196,8 @@ def _truth(section: Truth, root: Path, name: str, motion: KnownMotion, count: in
             f"{float(np.median(np.diff(times))):.4g} s apart: nothing would be compared",
             remedy="raise truth.max_gap, if straight lines between them are exact enough",
         )
-    motion.truth_positions = Positions(alone.positions, times, section.max_gap)
+    positions = tuple(tuple(section.unit * v for v in row) for row in alone.positions)
+    motion.truth_positions = Positions(positions, times, section.max_gap, section.lever_arm)
     motion.warnings += alone.warnings
 
 

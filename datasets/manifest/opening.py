@@ -62,6 +62,7 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
         truth=motion.truth,
         truth_positions=motion.truth_positions,
         truth_source=motion.truth_source,
+        truth_mount=motion.truth_mount,
         up=up,
         attitude=motion.attitude or base.attitude,
         odometry=motion.odometry or base.odometry,

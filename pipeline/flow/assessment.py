@@ -31,8 +31,8 @@ def of_trajectory(make: Builder, frames: Sequence[int]) -> Steps:
     if p.crosscheck is not None:
         p.agreement = make.node(agreement, "agreement", {}, trajectory=p.trajectory, crosscheck=p.crosscheck)
     if s.truth_positions is not None:
-        args = _positions(make, s.truth_positions, frames)
-        p.position_accuracy = make.node(position_accuracy, "position_accuracy", args, trajectory=p.trajectory)
+        given = _positions(make, s.truth_positions, frames)
+        p.position_accuracy = make.node(position_accuracy, "position_accuracy", given, trajectory=p.trajectory)
     true = [_truth(make, f) for f in frames]
     # No task for no truth: the report then says that there is none, not that it failed.
     if all(pose is None for pose in true):
@@ -45,7 +45,8 @@ def of_trajectory(make: Builder, frames: Sequence[int]) -> Steps:
     pieces, main = found.meta["pieces"], found.meta["main"]
     for number in range(len(pieces)):
         label = "accuracy" if number == main else f"accuracy/piece/{number + 1}"
-        args = {"piece": number} if len(pieces) > 1 else {}
+        args: dict[str, Any] = {"piece": number} if len(pieces) > 1 else {}
+        args |= {} if s.truth_mount is None else {"mount": s.truth_mount.to_list()}
         p.accuracy_pieces[number] = make.node(accuracy, label, args, trajectory=p.trajectory, truth=known)
     p.accuracy = p.accuracy_pieces.get(main)
 

@@ -8,8 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rille.datasets.text.count import count
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView
@@ -103,8 +101,7 @@ def find_warnings(scene: Scene) -> list[str]:
     ):
         bundle = view.bundle(handle)
         lines += (bundle.meta.get("warnings") or []) if bundle is not None else []
-    # Against the truth of another body no standard deviation can hold.
-    lines += (_turned_truth(view) or _sigma_warning(view)) + _displaced(view)
+    lines += _sigma_warning(view) + _displaced(view)
     compared = scene.comparison
     if compared is not None and compared.flagged.any():
         bad = [frame for frame, flagged in zip(view.frames, compared.flagged, strict=True) if flagged]
@@ -144,32 +141,6 @@ def _displaced(view: RunView) -> list[str]:
     ]
 
 
-TURNED = 0.3
-"""RMS error with the first poses made equal, over the RMS distance from the first position: that of a turn by 17
-degrees, far beyond what a first pose errs by."""
-
-SAME_SHAPE = 0.1
-"""Share of that error which the best rotation leaves, below which truth and trajectory have one shape."""
-
-
-def _turned_truth(view: RunView) -> list[str]:
-    """Truth of the trajectory's shape that looks elsewhere is that of another body than the left camera."""
-    accuracy = view.bundle(view.products.accuracy)
-    figures = {} if accuracy is None else accuracy.meta["metrics"]
-    best, first = (figures.get(name, {}).get("value") for name in ("ate_rmse", "ate_first_frame_rmse"))
-    if accuracy is None or first is None or best > SAME_SHAPE * first:
-        return []
-    true = np.asarray(accuracy["position_truth"])
-    true = true[np.isfinite(true).all(axis=1)]
-    if first <= TURNED * float(np.sqrt(((true - true[0]) ** 2).sum(axis=1).mean())):
-        return []
-    return [
-        f"the truth has the shape of the trajectory ({metres(best)} RMS by the best rotation) but leads elsewhere "
-        f"({metres(first)} RMS with the first poses made equal): its poses may be those of another body than the left "
-        "camera: a manifest states truth.T_body_left"
-    ]
-
-
 SIGMA_OFF = 3.0
 """Factor by which errors exceed their standard deviations from which on it is said."""
 
@@ -177,7 +148,10 @@ SIGMA_OFF = 3.0
 def _sigma_warning(view: RunView) -> list[str]:
     """The standard deviations of the positions are not to be weighed by, where truth says so."""
     accuracy = view.bundle(view.products.accuracy)
-    nees = None if accuracy is None else accuracy.meta["metrics"].get("nees", {}).get("value")
+    # Against truth that was misread no standard deviation can hold.
+    if accuracy is None or accuracy.meta.get("warnings"):
+        return []
+    nees = accuracy.meta["metrics"].get("nees", {}).get("value")
     if nees is None or nees <= SIGMA_OFF**2:
         return []
     return [

@@ -36,8 +36,11 @@ from rille.stages.evaluation.accuracy_parts import (
     relative_error,
     rms,
     square,
+    umeyama,
 )
+from rille.stages.evaluation.conventions import better_reading
 from rille.stages.evaluation.trajectory_error import against_claims, by_cause, by_shares, by_steps
+from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.odometry.resection.trajectory import world_poses
 
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
@@ -107,16 +110,6 @@ def _counts(has_pose: Bools, has_truth: Bools) -> dict[str, Metric]:
         "frames_without_truth": metric(int((~has_truth).sum()), "frames", "of them without truth, left out"),
         "frames_judged": metric(int((has_pose & has_truth).sum()), "frames", "of them with a pose and truth"),
     }
-
-
-def umeyama(source: Floats, target: Floats) -> tuple[Floats, Floats]:
-    """Rotation (3, 3) and translation (3,) that bring points (n, 3) nearest to others in the least-squares sense."""
-    a, b = source.mean(axis=0), target.mean(axis=0)
-    u, _, vt = np.linalg.svd((target - b).T @ (source - a))
-    # Else positions on a plane or a line may be fitted best by a reflection.
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    rotation = u @ sign @ vt
-    return rotation, b - rotation @ a
 
 
 def _absolute(P: Floats, Q: Floats, aligned: Floats) -> dict[str, Metric]:
@@ -239,13 +232,20 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     poses = world_poses(trajectory, int(args["piece"]) if "piece" in args else None)
     estimate, true = by_frame(poses, given, wanted), np.asarray(truth["poses"])
     has_pose, has_truth = posed(estimate), posed(true)
+    warnings: list[str] = []
     if len(estimate) == len(true) and not (has_pose & has_truth).any():
         arrays, metrics = _nothing(estimate), _counts(has_pose, has_truth)
     else:
         claims = "covariance" in trajectory.arrays
         claimed = by_frame(np.asarray(trajectory["covariance"]), given, wanted) if claims else None
         arrays, metrics = trajectory_accuracy(estimate, true, claimed)
-    return Bundle(arrays, {"metrics": metrics, "frames": wanted, "truth": truth.meta["source"]})
+        if claimed is not None:
+            both = has_pose & has_truth
+            sigma = float(np.sqrt(np.nanmean(np.trace(claimed[both, :3, :3], axis1=1, axis2=2))))
+            mount = RigidTransform.from_matrix(args["mount"]) if "mount" in args else RigidTransform.identity()
+            warnings = better_reading(estimate[both], true[both], mount, sigma)
+    facts = {"metrics": metrics, "frames": wanted, "truth": truth.meta["source"]}
+    return Bundle(arrays, facts | ({"warnings": warnings} if warnings else {}))
 
 
 STAGE = Stage(

@@ -75,3 +75,13 @@ def along(positions: Floats) -> tuple[Floats, str]:
     gaps = int((np.diff(rows) > 1).sum())
     bridged = f", straight over {gaps} gap{'s' if gaps > 1 else ''} of the truth" if gaps else ""
     return np.interp(np.arange(len(positions)), rows, way), bridged
+
+
+def umeyama(source: Floats, target: Floats) -> tuple[Floats, Floats]:
+    """Rotation (3, 3) and translation (3,) that bring points (n, 3) nearest to others in the least-squares sense."""
+    a, b = source.mean(axis=0), target.mean(axis=0)
+    u, _, vt = np.linalg.svd((target - b).T @ (source - a))
+    # Else positions on a plane or a line may be fitted best by a reflection.
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = u @ sign @ vt
+    return rotation, b - rotation @ a

@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from rille.stages.core.arrays import Floats
-from rille.stages.evaluation.accuracy import umeyama
-from rille.stages.evaluation.accuracy_parts import rms
+from rille.stages.evaluation.accuracy_parts import rms, umeyama
 
 REST_LEVER = 1.0
 """m, lever of a camera at rest: far beyond the millimetres of its positions."""

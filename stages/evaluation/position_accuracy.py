@@ -5,6 +5,10 @@ clock may be off by a constant. Truth is therefore moved rigidly in the plane (t
 height it is shifted alone) so that the squared distances are least, for each offset of its clock; the offset whose
 distances are least against the extent of both tracks is taken.
 
+Where the world's vertical was not measured and the truth has heights, it is moved rigidly in space. What was measured
+may stand off the camera: its lever arm ``l`` in the camera's frame (``P_i + R_i l`` is the antenna) is given, or fitted
+where turns show it. The error is that of the camera, ``P_i - (truth_i - R_i l)``.
+
 With positions as complex numbers, ``a_i`` estimated and ``b_i`` true about their means, the best turn is
 ``exp(i theta) = sum(conj(b_i) a_i) / |sum(conj(b_i) a_i)|``.
 
@@ -17,7 +21,7 @@ searched, or takes half of it, the offset is not determined, and that of the sta
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +30,8 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.evaluation.accuracy import by_frame
-from rille.stages.evaluation.accuracy_parts import Metric, along, metric, rms
+from rille.stages.evaluation.accuracy_parts import Metric, along, metric, rms, umeyama
+from rille.stages.evaluation.conventions import UNITS
 from rille.stages.odometry.resection.trajectory import world_poses
 
 LEAST = 4
@@ -52,19 +57,30 @@ MOST = 20000
 """Most offsets that are tried before the best one is refined."""
 
 ANOTHER = 0.5
-"""Share of the error: where the truth with other axes leaves less than this, a warning names those axes."""
+"""Share of the error: where other axes, another unit or a lever arm of the truth leave less than this, it is said."""
+
+# By which a lever arm is fitted: with turn, shift and clock it has up to ten unknowns.
+MIN_LEVER_FRAMES = 10
+# RMS way of the antenna about the camera over its lever arm, from which on turns show it: they are 6 degrees.
+MIN_SWING = 0.1
+# m, of a large vehicle; more is an error of the track.
+MAX_LEVER_ARM = 5.0
+# Sources of the vertical by which heights of truth and world have one direction; ground is not level.
+MEASURED = ("attitude", "initial pose")
 
 
 @dataclass(frozen=True)
 class TruePositions:
     """``positions`` (row, 2 or 3), m, x and y in the plane and z up; ``times`` (row,), s; rows are frames without.
 
-    Nothing is interpolated between rows that are more than ``max_gap`` s apart.
+    Nothing is interpolated between rows that are more than ``max_gap`` s apart. ``lever_arm`` (3,), m, is the place of
+    the antenna or prism in the left camera's frame (x right, y down, z ahead); None: not known.
     """
 
     positions: Floats
     times: Floats | None = None
     max_gap: float = 0.5
+    lever_arm: Floats | None = None
 
     def at(self, moments: Floats) -> Floats:
         """Positions (moment, 2 or 3) on the straight line between two rows; NaN in longer gaps and beyond the ends."""
@@ -103,21 +119,25 @@ class Offset(NamedTuple):
     determined: bool
 
 
-def fit_in_plane(estimate: Floats, truth: Floats) -> Fit:
-    """Truth (frame, 2 or 3) turned about the vertical and shifted to the estimated positions (frame, 3), m.
+def fit_rigid(estimate: Floats, truth: Floats, upright: bool = True) -> Fit:
+    """Truth (frame, 2 or 3) turned and shifted to the estimated positions (frame, 3), m.
 
-    Rows of NaN in either do not count, but are moved as well.
+    It is turned about the vertical alone where the world is ``upright``, i.e. its vertical was measured, and where the
+    truth has no heights. Rows of NaN in either do not count, but are moved as well.
     """
     width = truth.shape[1]
-    both = np.isfinite(estimate).all(axis=1) & np.isfinite(truth).all(axis=1)
+    both = _both(estimate, truth)
     if not both.any():
         return Fit(np.full_like(truth, np.nan), np.inf, np.inf)
     centre, origin = estimate[both, :width].mean(axis=0), truth[both].mean(axis=0)
     a, b = estimate[:, :width] - centre, truth - origin
-    # Its angle is the turn of least squares in the plane, see the module.
-    cross = np.sum(np.conj(_plane(b[both])) * _plane(a[both]))
-    turned = _plane(b) * (cross / abs(cross) if abs(cross) > 0 else 1.0)
-    b[:, 0], b[:, 1] = turned.real, turned.imag
+    if upright or width == 2:
+        # Its angle is the turn of least squares in the plane, see the module.
+        cross = np.sum(np.conj(_plane(b[both])) * _plane(a[both]))
+        turned = _plane(b) * (cross / abs(cross) if abs(cross) > 0 else 1.0)
+        b[:, 0], b[:, 1] = turned.real, turned.imag
+    else:
+        b = b @ umeyama(b[both], a[both])[0].T
     error = rms(a[both] - b[both])
     # Against the extent of both tracks: else the offset wins that compares the fewest, nearest frames.
     extent = np.sqrt(np.mean(np.sum(a[both] ** 2, axis=1) + np.sum(b[both] ** 2, axis=1)))
@@ -128,7 +148,7 @@ def _plane(points: Floats) -> NDArray[np.complex128]:
     return np.asarray(points[:, 0] + 1j * points[:, 1])
 
 
-def find_offset(moments: Floats, estimate: Floats, truth: TruePositions) -> Offset | None:
+def find_offset(moments: Floats, estimate: Floats, truth: TruePositions, upright: bool = True) -> Offset | None:
     """The constant offset of the truth's clock against that of the images.
 
     Parameters
@@ -149,7 +169,7 @@ def find_offset(moments: Floats, estimate: Floats, truth: TruePositions) -> Offs
 
     def error(offset: float) -> float:
         there = truth.at(moments - offset)
-        return fit_in_plane(estimate, there).relative if np.isfinite(there[:, 0]).sum() >= least else np.inf
+        return fit_rigid(estimate, there, upright).relative if np.isfinite(there[:, 0]).sum() >= least else np.inf
 
     errors = np.array([error(offset) for offset in tried])
     if not np.isfinite(errors).any():
@@ -197,8 +217,38 @@ def _end(error: Callable[[float], float], limit: float, start: float, outward: F
     return inside, False
 
 
+def fit_lever_arm(estimate: Floats, rotations: Floats, truth: Floats, upright: bool) -> tuple[Floats, int]:
+    """The lever arm ``l`` (3,), m, by which ``P_i + R_i l`` fits the true positions best, and how much of it shows.
+
+    Along directions that the turns do not show, such as the axis of all turns, it is 0; others are counted.
+
+    Parameters
+    ----------
+    estimate, rotations : (frame, 3) m and (frame, 3, 3), R_world_left.
+    truth : (frame, 2 or 3) m, of a frame of its own.
+    """
+    both, width, arm, shown = _both(estimate, truth), truth.shape[1], np.zeros(3), np.zeros(3, bool)
+    P, R = estimate[both], rotations[both]
+    for _ in range(20):
+        moved = fit_rigid(P + R @ arm, truth[both], upright).moved
+        # A shift of the truth takes the mean, its turns about one or three axes what looks like them.
+        centred = np.pad(moved - moved.mean(axis=0), ((0, 0), (0, 3 - width)))
+        axes = np.eye(3)[2 if upright or width == 2 else 0 :]
+        turns = np.stack([np.cross(axis, centred)[:, :width] for axis in axes], axis=2).reshape(-1, len(axes))
+        swings = (R - R.mean(axis=0))[:, :width].reshape(-1, 3)
+        off = centred[:, :width] - (P - P.mean(axis=0))[:, :width]
+        u, s, vt = np.linalg.svd(swings - turns @ np.linalg.pinv(turns) @ swings, full_matrices=False)
+        shown = s > MIN_SWING * np.sqrt(len(P))
+        arm = vt[shown].T @ ((u.T @ off.reshape(-1))[shown] / s[shown])
+    return arm, int(shown.sum())
+
+
 def position_accuracy(
-    estimate: Floats, truth: TruePositions, moments: Floats | None = None
+    estimate: Floats,
+    truth: TruePositions,
+    moments: Floats | None = None,
+    rotations: Floats | None = None,
+    upright: bool = True,
 ) -> tuple[Floats, dict[str, Metric], list[str]]:
     """Compare estimated positions with true ones.
 
@@ -207,16 +257,21 @@ def position_accuracy(
     estimate : (frame, 3) in the world, m; NaN where a frame has no pose.
     truth : positions of a clock and frame of their own; one row a frame where there are no times.
     moments : (frame,) s, of the images; None where either has no times.
+    rotations : (frame, 3, 3) R_world_left, by which a lever arm is fitted; None: it is known, and in ``estimate``.
+    upright : whether the world's vertical was measured; else truth with heights is fitted in space.
 
     Returns
     -------
-    True positions (frame, 2 or 3) in the world, NaN where there are none; metrics by name; warnings.
+    True positions (frame, 2 or 3) in the world, NaN where there are none, less the lever arm where one is fitted;
+    metrics by name; warnings.
     """
     offset, warnings = None, []
+    arm = np.zeros_like(estimate) if rotations is None or truth.lever_arm is None else rotations @ truth.lever_arm
+    antenna = estimate + arm
     if moments is None or truth.times is None:
         there, clock = truth.positions, "rows matched to frames one to one"
     else:
-        offset = find_offset(moments, estimate, truth)
+        offset = find_offset(moments, antenna, truth, upright)
         shift = 0.0 if offset is None else offset.value
         there = truth.at(moments - shift)
         clock = f"offset of {shift:.3f} s added to the times of the truth"
@@ -227,24 +282,43 @@ def position_accuracy(
                 f"offset in time of the truth: not determined{kept}; from {offset.low:.2f} to {offset.high:.2f} s the "
                 "tracks agree about as well: the motion changes too little"
             )
-    fit = fit_in_plane(estimate, there)
-    both = np.asarray(np.isfinite(estimate).all(axis=1) & np.isfinite(there).all(axis=1))
+    fit, both, width = fit_rigid(antenna, there, upright), _both(antenna, there), there.shape[1]
     if both.sum() >= LEAST:
-        others = {words: fit_in_plane(estimate, axes).error for words, axes in _other_axes(there).items()}
-        best = min(others, key=others.__getitem__)
-        if others[best] < ANOTHER * fit.error:
+        others = {words: fit_rigid(antenna, axes, upright) for words, axes in _otherwise(there).items()}
+        best = min(others, key=lambda words: others[words].error)
+        if others[best].error < ANOTHER * fit.error and others[best].relative < ANOTHER:
             warnings.append(f"true positions fit far better {best}")
-    how = f"positions only, after a rigid fit in the plane, {clock}"
-    metrics = _figures(estimate, fit.moved, both, how)
+    where = "in the plane" if upright or width == 2 else "in space, since the vertical was not measured"
+    # Of the camera, as the estimate is; where it has no pose, of the antenna.
+    moved = fit.moved - np.nan_to_num(arm[:, :width])
+    metrics = _figures(estimate, moved, both, f"positions only, after a rigid fit {where}, {clock}")
     if offset is not None:
         metrics |= _clock(offset)
-    return fit.moved, metrics, warnings
+    if rotations is None or truth.lever_arm is not None or both.sum() < MIN_LEVER_FRAMES:
+        return moved, metrics, warnings
+    lever, rank = fit_lever_arm(estimate, rotations, there, upright)
+    fitted = position_accuracy(estimate, replace(truth, lever_arm=lever), moments, rotations, upright)
+    before, after = (figures["position_rmse"]["value"] for figures in (metrics, fitted[1]))
+    if not rank or np.linalg.norm(lever) > MAX_LEVER_ARM or after is None or after > ANOTHER * before:
+        return moved, metrics, warnings
+    x, y, z = lever.round(3) + 0.0
+    said = (
+        f"lever arm fitted: the true positions lie {x:g} m right of, {y:g} m below and {z:g} m ahead of the left "
+        f"camera; error {after:.2g} m RMS, without it {before:.2g} m: state truth.lever_arm = [{x:g}, {y:g}, {z:g}], or as "
+        "measured; [0, 0, 0] is none" + ("" if rank == 3 else "; along the axis of its turns the images do not tell")
+    )
+    return fitted[0], fitted[1], [said, *fitted[2]]
 
 
-def _other_axes(truth: Floats) -> dict[str, Floats]:
-    """Truth (frame, 2 or 3) as it would be if its axes meant something else, by the words that say so."""
+def _both(estimate: Floats, truth: Floats) -> Bools:
+    return np.asarray(np.isfinite(estimate).all(axis=1) & np.isfinite(truth).all(axis=1))
+
+
+def _otherwise(truth: Floats) -> dict[str, Floats]:
+    """Truth (frame, 2 or 3) as it would be if its axes or its unit were others, by the words that say so."""
     mirrored = truth * np.array([1.0, -1.0, 1.0])[: truth.shape[1]]
     found = {"mirrored: x and y may be swapped; seen from above y lies left of x": mirrored}
+    found |= {f"in units of {unit:g} m: state truth.unit = {unit:g}": unit * truth for unit in UNITS}
     if truth.shape[1] == 3:
         # Cameras have x to the right, y down and z ahead; their positions are often given in the first one's frame.
         upright = truth[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
@@ -305,10 +379,13 @@ def _clock(offset: Offset) -> dict[str, Metric]:
 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     trajectory, frames = inputs["trajectory"], list(args["frames"])
-    estimate = by_frame(world_poses(trajectory), list(trajectory.meta["frames"]), frames)[:, :, 3]
+    poses = by_frame(world_poses(trajectory), list(trajectory.meta["frames"]), frames)
+    estimate, vertical = poses[:, :, 3], trajectory.meta["verticals"][trajectory.meta["main"]]
     given = np.array(args["positions"], dtype=np.float64)
     times, moments = (None if args[k] is None else np.array(args[k], dtype=np.float64) for k in ("times", "moments"))
-    there, metrics, warnings = position_accuracy(estimate, TruePositions(given, times, args["max_gap"]), moments)
+    arm = None if args.get("lever_arm") is None else np.array(args["lever_arm"])
+    truth = TruePositions(given, times, args["max_gap"], arm)
+    there, metrics, warnings = position_accuracy(estimate, truth, moments, poses[:, :, :3], vertical in MEASURED)
     whole = np.full((len(frames), 3), np.nan)
     whole[:, : there.shape[1]] = there
     facts = {"metrics": metrics, "frames": frames, "truth": args["source"], "warnings": warnings}

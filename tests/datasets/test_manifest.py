@@ -321,6 +321,22 @@ def test_truth_of_positions_alone(tmp_path, columns, header, times):
     assert s.truth_source == "positions of p.csv, as recorded"
 
 
+def test_unit_and_lever_arm_of_the_truth(tmp_path):
+    text = '[times]\nrate_hz = 1.0\n[truth]\nfile = "p.txt"\nunit = 0.001\n'
+    write_lines(tmp_path / "p.txt", [tum(0, 1500), tum(1, 2500), tum(2, 3500)])
+    mount = "T_body_left = [[1,0,0,0],[0,1,0,0],[0,0,1,2]]\n"
+    s = opened(write_sequence(tmp_path, text + mount))
+    assert [pose.translation.tolist() for pose in s.truth] == [[x, 0.0, 2.0] for x in (1.5, 2.5, 3.5)]
+    assert s.truth_mount.translation.tolist() == [0.0, 0.0, 2.0]
+    arm = "lever_arm = [0.1, -0.2, 0.3]\n"
+    with raises("RIL-782", "p.txt", "T_body_left"):
+        opened(write_sequence(tmp_path, text + arm))
+    write_lines(tmp_path / "p.txt", ["x y", "1000 0", "2000 0", "3000 0"])
+    found = opened(write_sequence(tmp_path, text + arm)).truth_positions
+    assert found.positions == ((1.0, 0.0), (2.0, 0.0), (3.0, 0.0))
+    assert found.to_dict()["lever_arm"] == (0.1, -0.2, 0.3)
+
+
 @pytest.mark.parametrize(
     ("more", "lines", "expected"),
     [

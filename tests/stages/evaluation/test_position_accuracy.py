@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
-from rille.stages.evaluation.position_accuracy import STAGE, TruePositions, find_offset, fit_in_plane, position_accuracy
+from rille.stages.evaluation.position_accuracy import STAGE, TruePositions, find_offset, fit_rigid, position_accuracy
 
 RATE = 10.0
 MOMENTS = np.arange(80) / RATE
@@ -110,8 +113,8 @@ def test_height_is_shifted_and_never_tilted():
     places = at(MOMENTS)
     tilted = places.copy()
     tilted[:, 2] += 0.1 * places[:, 0]
-    assert fit_in_plane(places, tilted).error > 0.5
-    assert fit_in_plane(places, places + np.array([0, 0, 7.0])).error < 1e-9
+    assert fit_rigid(places, tilted).error > 0.5
+    assert fit_rigid(places, places + np.array([0, 0, 7.0])).error < 1e-9
 
 
 def test_first_and_last_moments_may_miss_the_rows_by_a_rounding():
@@ -147,7 +150,11 @@ def test_stage():
         "frames": frames,
         "source": "gnss",
     }
-    out = STAGE.run(NoParams(), args, {"trajectory": Bundle({"poses": poses}, {"frames": frames})})
+    out = STAGE.run(
+        NoParams(),
+        args,
+        {"trajectory": Bundle({"poses": poses}, {"frames": frames, "verticals": ["attitude"], "main": 0})},
+    )
     check_outputs(STAGE, out)
     assert np.isnan(out["position_truth"][:, 2]).all()
     assert "positions only, after a rigid fit in the plane" in out.meta["metrics"]["position_rmse"]["how"]
@@ -179,3 +186,67 @@ def test_the_true_way_leads_on_where_poses_were_lost_and_straight_where_truth_is
     length = position_accuracy(half_circle, TruePositions(lost))[1]["path_length"]
     assert length["value"] < 2.4
     assert "straight over 1 gap of the truth" in length["how"]
+
+
+def test_truth_with_heights_is_fitted_in_space_where_the_vertical_was_not_measured():
+    """The world is that of a camera which looks down by 20 degrees."""
+    tilted = at(MOMENTS) @ Rotation.from_euler("x", 20, degrees=True).as_matrix().T
+    _, level, _ = position_accuracy(tilted, truth(3, 0.7), MOMENTS)
+    _, metrics, warnings = position_accuracy(tilted, truth(3, 0.7), MOMENTS, upright=False)
+    assert level["position_rmse"]["value"] > 0.5
+    assert metrics["position_rmse"]["value"] < 0.01
+    assert "in space" in metrics["position_rmse"]["how"]
+    assert warnings == []
+
+
+def test_positions_in_millimetres_are_said():
+    _, _, warnings = position_accuracy(at(MOMENTS), TruePositions(1e3 * at(MOMENTS)))
+    assert ["truth.unit = 0.001" in line for line in warnings] == [True]
+
+
+LEVER = np.array([0.1, -0.12, 0.08])
+
+
+def mounted(swing: float) -> tuple[np.ndarray, np.ndarray]:
+    """R_world_left (frame, 3, 3) of a camera that swings by ``swing`` rad about all axes, and its antenna's places."""
+    turns = swing * np.stack([np.sin(k * MOMENTS + k) for k in (1, 2, 3)], axis=1)
+    R = Rotation.from_rotvec(turns).as_matrix() @ [[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]
+    return R, at(MOMENTS) + R @ LEVER
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.7])
+def test_a_lever_arm_is_fitted_where_turns_show_it_and_said(offset):
+    R, antenna = mounted(0.6)
+    rows = TruePositions(elsewhere(antenna, 1.0), MOMENTS - offset, 0.2)
+    without = position_accuracy(at(MOMENTS), rows, MOMENTS)[1]
+    moved, metrics, warnings = position_accuracy(at(MOMENTS), rows, MOMENTS, R)
+    assert without["position_rmse"]["value"] > 0.05
+    assert metrics["position_rmse"]["value"] < 0.003
+    assert moved == pytest.approx(at(MOMENTS), abs=0.01)  # the camera's places, not the antenna's
+    (line,) = warnings
+    assert "lever arm fitted" in line
+    stated = np.array(json.loads(line[line.index("[") : line.index("]") + 1]))
+    assert stated == pytest.approx(LEVER, abs=0.004)
+
+
+def test_a_stated_lever_arm_is_used_and_none_is_fitted_without_turns_or_to_what_is_no_lever_arm():
+    R, antenna = mounted(0.6)
+    rows = TruePositions(elsewhere(antenna, 1.0), lever_arm=LEVER)
+    _, metrics, warnings = position_accuracy(at(MOMENTS), rows, None, R)
+    assert metrics["position_rmse"]["value"] < 1e-6
+    assert warnings == []
+    # An antenna on a camera that hardly turns is displaced, which the fit takes; a scale error is not an arm.
+    for swing, scale in ((0.02, 1.0), (0.6, 1.05)):
+        R, antenna = mounted(swing)
+        places = TruePositions(elsewhere(antenna if scale == 1.0 else scale * at(MOMENTS), 1.0))
+        _, metrics, warnings = position_accuracy(at(MOMENTS), places, None, R)
+        assert warnings == []
+        assert metrics["position_rmse"]["value"] > 1e-3
+
+
+def test_the_part_of_a_lever_arm_along_the_axis_of_all_turns_is_not_told():
+    R = Rotation.from_euler("z", np.sin(MOMENTS)[:, None]).as_matrix() @ [[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]
+    _, metrics, (line,) = position_accuracy(at(MOMENTS), TruePositions(at(MOMENTS) + R @ LEVER), None, R)
+    assert metrics["position_rmse"]["value"] < 1e-6
+    assert "[0.1, 0, 0.08]" in line
+    assert "along the axis of its turns" in line

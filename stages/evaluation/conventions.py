@@ -1,0 +1,143 @@
+"""Whether truth would fit the trajectory if its file were read by another convention; truth alone is doubted here.
+
+A pose of the file becomes another one by each reading (order of the quaternion, direction of the transform, a mirrored
+axis), by a unit of length, and by other axes of the body: a rotation B from the right, one of the 24 that exchange axes
+or the one that fits best. Readings are compared by what the best rotation and translation of the world leaves of
+positions and orientations together (:mod:`rille.stages.evaluation.pose_alignment`), over the extent of the trajectory.
+A drive that is straight or hardly turns is fitted by several readings alike: they are named together.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rille.stages.core.arrays import Floats
+from rille.stages.evaluation.accuracy_parts import angle, inverse, rms, square
+from rille.stages.evaluation.pose_alignment import align, moved, spread
+from rille.stages.geometry.geometry import RigidTransform, orthonormal
+
+MIN_FRAMES, MAX_FRAMES = 4, 50
+# Extent of a trajectory over the standard deviation of its positions, below which the camera is as good as at rest.
+MIN_EXTENT_SIGMAS = 5.0
+# Misfit over the extent, as read, up to which the estimate's own errors explain it; and the share of it that another
+# reading leaves at most.
+MIN_MISFIT, MAX_SHARE = 0.02, 0.4
+# Factor on the least misfit, and share of the extent beyond, up to which readings cannot be told apart; and the factor
+# up to which an estimate's own errors may favour one that changes more.
+ALIKE_FACTOR, ALIKE_SHARE, SIMPLE_FACTOR = 1.5, 0.005, 4.0
+# Least turn of a body against the camera, radians: an estimate's own errors look like smaller ones.
+MIN_TURN = 0.3
+# Factor of length from which on it is one of units, m: mm, cm, inches, feet, km.
+MIN_UNIT, UNITS = 2.0, (0.001, 0.01, 0.0254, 0.3048, 1000.0)
+AXES = Rotation.create_group("O").as_matrix()
+# Places, in (x, y, z, w) as read, of the true x, y, z and w.
+ORDERS = {
+    "": [0, 1, 2, 3],
+    "its quaternions begin with w: write x y z w, or state truth.format = 'euroc'": [1, 2, 3, 0],
+    "its quaternions end with w: write w x y z, or state truth.format = 'tum'": [3, 0, 1, 2],
+}
+DIRECTIONS = (
+    "",
+    "its poses lead from the world to the camera: invert each, [R | t] to [R' | -R' t]",
+    "its rotations lead from the world to the camera: negate qx, qy and qz, or transpose each R",
+)
+MIRRORS = {
+    "": np.eye(4),
+    "it is left-handed: negate x, qy and qz": np.diag([-1.0, 1.0, 1.0, 1.0]),
+    "it is left-handed: negate y, qx and qz": np.diag([1.0, -1.0, 1.0, 1.0]),
+    "it is left-handed: negate z, qx and qy": np.diag([1.0, 1.0, -1.0, 1.0]),
+}
+
+
+class Fit(NamedTuple):
+    """Misfit of a reading over the extent, at least and as it is stated; its number of changes; what to do."""
+
+    least: float
+    misfit: float
+    changes: int
+    words: str
+
+
+def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform, sigma: float) -> list[str]:
+    """Warn of conventions by which the truth fits far better than as it was read, and say what to do about the file.
+
+    Parameters
+    ----------
+    estimate : (frame, 3, 4) T_world_left, m, of the frames that have truth, too.
+    truth : (frame, 3, 4) T_truth_left as read.
+    T_body_left : by which the file's poses were multiplied.
+    sigma : m, of the estimated positions.
+    """
+    chosen = np.linspace(0, len(estimate) - 1, min(len(estimate), MAX_FRAMES)).astype(int)
+    P, Q, mount = estimate[chosen], truth[chosen], square(T_body_left.matrix34[None])[0]
+    if len(P) < MIN_FRAMES or spread(P) < max(MIN_EXTENT_SIGMAS * sigma, 1e-6) or spread(Q) < 1e-9:
+        return []
+    as_read, file = _misfit(P, Q, np.eye(3)), square(Q) @ inverse(mount)
+    if as_read < MIN_MISFIT:
+        return []
+    fits = []
+    for order, direction, mirror in product(ORDERS, DIRECTIONS, MIRRORS):
+        # A file that begins with the identity has its quaternions in the right order.
+        if not (order and angle(file[0]) < MIN_TURN):
+            poses, M = file.copy(), MIRRORS[mirror]
+            quaternion = Rotation.from_matrix(file[:, :3, :3]).as_quat()[:, ORDERS[order]]
+            poses[:, :3, :3] = Rotation.from_quat(quaternion).as_matrix()
+            # The whole pose is inverted, or its rotation alone; or nothing.
+            columns = slice((0, 4, 3)[DIRECTIONS.index(direction)])
+            poses[:, :3, columns] = inverse(poses)[:, :3, columns]
+            words = [word for word in (order, direction, mirror) if word]
+            fits += _fits(P, M @ poses @ M @ mount, mount, words)
+    best, least = min(fit.misfit for fit in fits), min(fit.least for fit in fits)
+    if best > MAX_SHARE * as_read:
+        return []
+    most = min(MAX_SHARE * as_read, SIMPLE_FACTOR * best + ALIKE_SHARE)
+    alike = [fit for fit in fits if fit.least <= ALIKE_FACTOR * least + ALIKE_SHARE and fit.misfit <= most]
+    simple = [fit for fit in alike if fit.changes == min(fit.changes for fit in alike)]
+    best = min(fit.misfit for fit in simple)
+    told = list(dict.fromkeys(fit.words for fit in simple if fit.misfit <= ALIKE_FACTOR * best + ALIKE_SHARE))
+    return [
+        f"the truth fits the trajectory far better by another convention ({100 * best:.2g} % of its extent are left, "
+        f"{100 * as_read:.2g} % as read): {'; or: '.join(told)}"
+        + ("; this drive cannot tell these apart" if len(told) > 1 else "")
+    ]
+
+
+def _fits(P: Floats, T: Floats, mount: Floats, words: list[str]) -> list[Fit]:
+    """Unit and axes of the body by which a reading T (n, 4, 4) of the truth fits."""
+    Q, ratio, fits = T[:, :3], spread(P) / max(spread(T[:, :3]), 1e-12), []
+    if not 1.0 / MIN_UNIT < ratio < MIN_UNIT:
+        unit = next((unit for unit in UNITS if abs(np.log(unit / ratio)) < 0.1), float(f"{ratio:.3g}"))
+        words = [*words, f"its unit of length is {unit:g} m: state truth.unit = {unit:g}"]
+        Q = np.concatenate([Q[:, :, :3], unit * Q[:, :, 3:]], axis=2)
+    for start in (np.eye(3), min(AXES, key=lambda B: _misfit(P, Q, B))):
+        turn = start
+        for _ in range(10):
+            # In turn: the world's rotation for this body, by the positions above all, and the body's for this world.
+            R_world_truth, _ = align(_turned(Q, turn), P, 0.1)
+            turn = orthonormal(np.einsum("nji,kj,nkl->il", Q[:, :, :3], R_world_truth, P[:, :, :3]))
+        # An estimate that errs by some degrees fits a little better if turned by them: that is no other convention.
+        axes = start if angle(start.T @ turn) < MIN_TURN else turn
+        said, other = words, bool(angle(axes) > MIN_TURN)
+        if other:
+            body = np.column_stack([mount[:3, :3] @ axes, mount[:3, 3]]).round(4) + 0.0
+            said = [*words, f"its poses are those of a body with other axes: state truth.T_body_left = {body.tolist()}"]
+        # Simple ones first: conventions of the file, then axes that are exchanged, then such as are turned.
+        changes = len(said) + other + (axes is turn)
+        fits.append(Fit(_misfit(P, Q, turn), _misfit(P, Q, axes), changes, " and ".join(said)))
+    return fits
+
+
+def _turned(Q: Floats, B: Floats) -> Floats:
+    """Poses (n, 3, 4) with the axes of the body turned by B (3, 3)."""
+    return np.concatenate([Q[:, :, :3] @ B, Q[:, :, 3:]], axis=2)
+
+
+def _misfit(P: Floats, Q: Floats, B: Floats) -> float:
+    """RMS misfit of poses Q (n, 3, 4), their bodies turned by B, after the best alignment with P, over P's extent."""
+    off = moved(_turned(Q, B), *align(_turned(Q, B), P, 1.0)) - P
+    # A rotation counts by its angle: beside the extent, a lever as long.
+    return float(np.hypot(rms(off[:, :, 3]) / spread(P), rms(off[:, :, :3].reshape(len(P), 9)) / np.sqrt(2.0)))
