@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rille.datasets.text.count import count
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView
@@ -16,6 +18,7 @@ from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.metrics import metrics
 from rille.pipeline.report.words import metres, number
+from rille.stages.odometry.resection.trajectory import world_poses
 
 FORMAT = 2
 """Raised when the meaning of a key of report.json changes."""
@@ -37,7 +40,7 @@ def gather(view: Any) -> dict[str, Any]:
         "frames": frames,
         "pairs": pairs,
         "vehicle": view.config.vehicle.model_dump(mode="json"),
-        "notes": list(view.sequence.notes),
+        "notes": [*view.sequence.notes, *given_numbers(view)],
         "compared": scene.comparison is not None,
     }
 
@@ -110,6 +113,37 @@ def find_warnings(scene: Scene) -> list[str]:
     lines += _unlike(view)
     # A name in the data may hold line feeds, and a warning is one line.
     return list(dict.fromkeys(" ".join(str(line).split()) for line in lines))
+
+
+def given_numbers(view: RunView) -> list[str]:
+    """What rests on the calibration's numbers alone, and what one per cent of each would do to this run.
+
+    With z = f b / d the whole path scales with the baseline b, its part along the optical axis with the focal length f:
+    of steps p (in the camera) by p_z^2 / |p|. A principal point that is off by e pixels turns all rays by e / f, and
+    with them the path as a whole and the ground in front.
+    """
+    trajectory, rig = view.bundle(view.products.trajectory), view.sequence.rig
+    levels = [view.bundle(handle) for handle in view.products.level.values()]
+    grounds = [level.meta["footprint"] for level in levels if level is not None and level.meta.get("footprint")]
+    poses = np.zeros((0, 3, 4)) if trajectory is None else world_poses(trajectory)
+    poses = poses[np.isfinite(poses).all(axis=(1, 2))]
+    steps = np.einsum("nji,nj->ni", poses[:-1, :, :3], np.diff(poses[:, :, 3], axis=0))
+    long = np.linalg.norm(steps, axis=1)
+    if not long.sum() > 0:
+        return []
+    ahead = float((steps[:, 2] ** 2 / np.maximum(long, 1e-12)).sum())
+    left, off = rig.left, float(np.linalg.norm(poses[-1, :, 3] - poses[0, :, 3]))
+    line = (
+        "Scale and heading rest on the calibration as given, whose errors a straight drive does not show. 1 % of the "
+        f"baseline ({metres(rig.baseline)}) is {metres(0.01 * long.sum())} of the path of {metres(long.sum())}; 1 % of "
+        f"the focal length ({left.fx:.4g} px) is {metres(0.01 * ahead)}; a principal point off by 1 % of the image's "
+        f"width ({0.01 * left.width:.2g} px) leads its end {metres(0.01 * left.width / left.fx * off)} aside"
+    )
+    if grounds:
+        far = float(np.median([0.5 * (box[2] + box[3]) for box in grounds]))
+        lift = metres(0.01 * left.height / left.fy * far)
+        line += f", off by 1 % of the height it lifts or lowers ground {metres(far)} ahead by {lift}"
+    return [line + "."]
 
 
 NOTHING_COMMON = 50.0

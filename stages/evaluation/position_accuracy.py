@@ -303,9 +303,9 @@ def position_accuracy(
         return moved, metrics, warnings
     x, y, z = lever.round(3) + 0.0
     said = (
-        f"lever arm fitted: the true positions lie {x:g} m right of, {y:g} m below and {z:g} m ahead of the left "
-        f"camera; error {after:.2g} m RMS, without it {before:.2g} m: state truth.lever_arm = [{x:g}, {y:g}, {z:g}], or as "
-        "measured; [0, 0, 0] is none" + ("" if rank == 3 else "; along the axis of its turns the images do not tell")
+        f"lever arm fitted: the true positions lie {x:g} m right of, {y:g} m below and {z:g} m ahead of the "
+        f"left camera; {after:.2g} m RMS, without it {before:.2g} m: state truth.lever_arm = [{x:g}, {y:g}, {z:g}]"
+        " ([0, 0, 0]: none)" + ("" if rank == 3 else "; along the axis of its turns the images do not tell")
     )
     return fitted[0], fitted[1], [said, *fitted[2]]
 

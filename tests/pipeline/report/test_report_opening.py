@@ -11,6 +11,7 @@ from rille.pipeline.report import checks, delivery, page, summary, tables, terra
 from rille.pipeline.report.canvas import Table
 from rille.pipeline.report.gather import Terrain
 from rille.stages.calibration.rig import RigParams
+from rille.stages.core.declare import Bundle
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import REASONS, RiskParams
 from rille.stages.hazard.vehicle import Vehicle
@@ -99,6 +100,42 @@ def test_standard_deviations_that_truth_contradicts_are_warned_of(nees, words):
     found = summary._sigma_warning(view)
     assert len(found) == len(words)
     assert all(word in line for word, line in zip(words, found, strict=True))
+
+
+def given(positions, rotation, footprint):
+    """A run with these positions (frame, 3), f = 350 px, 600 x 200 pixels, a baseline of .5 m."""
+    poses = np.concatenate([np.broadcast_to(rotation, (len(positions), 3, 3)), positions[:, :, None]], axis=2)
+    level = SimpleNamespace(meta={"footprint": footprint})
+    camera = SimpleNamespace(fx=350.0, fy=350.0, width=600, height=200)
+    return SimpleNamespace(
+        products=SimpleNamespace(trajectory=Bundle({"poses": poses}, {}), level={0: level, 4: None}),
+        sequence=SimpleNamespace(rig=SimpleNamespace(left=camera, baseline=0.5)),
+        bundle=lambda handle: handle,
+    )
+
+
+AHEAD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""R_world_left of a level camera that looks along y."""
+
+
+@pytest.mark.parametrize(
+    ("way", "by_focal_length"),
+    [([0.0, 1.0, 0.0], "0.120 m"), ([0.6, 0.8, 0.0], "76.8 mm"), ([1.0, 0.0, 0.0], "0 m")],
+)
+def test_what_rests_on_the_given_numbers_is_said_in_figures_of_the_run(way, by_focal_length):
+    """12 m ahead, aslant and aside: a focal length scales the part along the optical axis alone."""
+    positions = np.outer(np.arange(13.0), way)
+    positions[3] = np.nan
+    (line,) = summary.given_numbers(given(positions, AHEAD, [-3.0, 3.0, 4.0, 16.0]))
+    assert "baseline (0.500 m) is 0.120 m of the path of 12 m;" in line
+    assert f"focal length (350 px) is {by_focal_length};" in line
+    assert "(6 px) leads its end 0.206 m aside" in line
+    assert "ground 10 m ahead by 57.1 mm" in line
+
+
+def test_nothing_rests_on_the_given_numbers_of_a_camera_without_a_path():
+    assert summary.given_numbers(given(np.zeros((5, 3)), AHEAD, None)) == []
+    assert "ground" not in summary.given_numbers(given(np.eye(3), AHEAD, None))[0]
 
 
 def test_standard_deviations_are_not_judged_by_truth_that_was_misread():
