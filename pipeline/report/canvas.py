@@ -93,6 +93,7 @@ class Block:
     """One figure: panels side by side under a title, what one sees, a legend of ``(colour, words)`` and a table.
 
     ``strip``: the panels are narrow columns. ``data``: what the page's script draws in their place, as plain JSON.
+    ``how``: how to read it, folded below a caption that is short.
     """
 
     name: str
@@ -103,6 +104,7 @@ class Block:
     table: Table | None = None
     strip: bool = False
     data: Mapping[str, Any] | None = None
+    how: str = ""
 
     @property
     def anchor(self) -> str:

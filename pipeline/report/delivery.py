@@ -1,18 +1,21 @@
 """Delivered, absent (not asked for, or not possible with the data) and missing results, each from its facts.
 
-A path that was looked for and is not there is missing, though it is an answer: who reads "nothing is missing" takes it
-for granted. Truth that the data do not have and a comparison that is switched off are not missing.
+A path over the whole map that was looked for and is not there is missing, though it is an answer: who reads "nothing
+is missing" takes it for granted. A stop from which no safe ground leads lacks nothing: that is what it was asked. Truth
+that the data do not have and a comparison that is switched off are not missing.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from rille.datasets.text.count import count
 from rille.pipeline.engine.plain import some
-from rille.pipeline.export.view import UNSTATED, RunView
+from rille.pipeline.export.view import UNSTATED, RunView, TaskRow
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.words import metres, spans
@@ -35,14 +38,9 @@ def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
     The first in words; the others with ``kind``, ``what`` and ``why`` each; what is absent is no loss.
     """
     view = scene.view
-    missing = (
-        _poses(frames)
-        + _local_paths(pairs, merged=start_of_path(view) is not None)
-        + _path(view)
-        + _crosscheck_lost(scene)
-    )
+    missing = _poses(frames) + _path(view) + _crosscheck_lost(scene)
     found = {"delivered": _delivered(view, frames, pairs), "missing": missing}
-    return found | {"absent": _truth(view) + _crosscheck_off(view) + _vehicle(view)}
+    return found | {"absent": _local_paths(pairs) + _truth(view) + _crosscheck_off(view) + _vehicle(view)}
 
 
 def complete(found: Mapping[str, Any], view: RunView, figures: Sequence[Figure]) -> dict[str, Any]:
@@ -50,7 +48,11 @@ def complete(found: Mapping[str, Any], view: RunView, figures: Sequence[Figure])
     done = ["every task was done"] if view.tasks else []
     # A figure without its data is no loss of its own: they are listed, where they are one.
     undrawn = [figure for figure in figures if figure.why]
-    lost = [_item("figure" if figure.failed else "no figure", figure.title, figure.why) for figure in undrawn]
+    causes = dict.fromkeys(("figure" if figure.failed else "no figure", figure.why) for figure in undrawn)
+    lost = [
+        _item(kind, ", ".join(f.title for f in undrawn if f.why == why and f.failed == (kind == "figure")), why)
+        for kind, why in causes
+    ]
     missing = [*_failures(view), *found["missing"], *lost]
     absent = [item for item in found["absent"] if item["kind"] != "vehicle" or view.vehicle_source == UNSTATED]
     return {"delivered": [*done, *found["delivered"]], "absent": absent, "missing": missing}
@@ -69,12 +71,6 @@ def has_truth(view: RunView) -> list[bool]:
 def which(frames: list[int]) -> str:
     """``frames 1-3, 7``."""
     return f"frame{'s' if len(frames) > 1 else ''} {spans(frames)}"
-
-
-def _among(frames: list[int], stops: list[int]) -> str:
-    """The shorter of both lists: those that are meant, or all others."""
-    others = [stop for stop in stops if stop not in frames]
-    return which(frames) if len(frames) <= len(others) or not others else f"all stops but {which(others)}"
 
 
 def local_paths(pairs: Rows) -> tuple[int, int]:
@@ -110,12 +106,36 @@ def _delivered(view: RunView, frames: Rows, pairs: Rows) -> list[str]:
 
 
 def _failures(view: RunView) -> Items:
-    found = [_item("failed", t.label, t.reason) for t in view.tasks if t.status == "failed"]
-    skipped = [t for t in view.tasks if t.status not in ("computed", "cached", "failed")]
-    for reason in dict.fromkeys(t.reason for t in skipped):
-        labels = [t.label for t in skipped if t.reason == reason]
-        found.append(_item("skipped", some(labels, 6), reason or "something it depends on is missing"))
+    """Failed tasks by cause, with the number of tasks that depend on them; and what was left out for another reason."""
+    behind = {f"{t.label} {fate}": t for t in view.tasks for fate in ("failed", "was skipped")}
+    causes: dict[tuple[str, str], list[TaskRow]] = {}
+    for t in view.tasks:
+        root = t
+        while root.status == "skipped" and root.reason in behind:
+            root = behind[root.reason]
+        if root.status in ("failed", "skipped"):
+            # The figures in a message are those of one pair: the cause is the words.
+            kind = _kind(root.label) if root.status == "failed" else ""
+            causes.setdefault((kind, re.sub(r"[0-9][0-9.]*", "#", root.reason)), []).append(t)
+    found = []
+    for (kind, _), tasks in causes.items():
+        failed = [t for t in tasks if t.status == "failed"]
+        if not kind:
+            why = tasks[0].reason or "something it depends on is missing"
+            found.append(_item("skipped", some([t.label for t in tasks], 6), why))
+            continue
+        n, waiting = len(failed), len(tasks) - len(failed)
+        whole, names = sum(_kind(t.label) == kind for t in view.tasks), [t.label[len(kind) + 1 :] for t in failed]
+        what = f"{n} of {whole} tasks {kind} failed ({some(names, 12)})" if whole > 1 else f"{failed[0].label} failed"
+        if waiting:
+            what += f": {count(waiting, 'task')} depend{'s' * (waiting == 1)} on {'it' if n == 1 else 'them'}"
+        found.append(_item("failed", what, failed[0].reason))
     return found
+
+
+def _kind(label: str) -> str:
+    """A task's label without the number of its frame, pair or tile."""
+    return label.rpartition("/")[0] or label
 
 
 def _poses(frames: Rows) -> Items:
@@ -130,29 +150,13 @@ def _poses(frames: Rows) -> Items:
     return found
 
 
-def _local_paths(pairs: Rows, *, merged: bool) -> Items:
-    """Stops without a local path, each reason with its frames; ``merged``: there is a path over all models."""
+def _local_paths(pairs: Rows) -> Items:
+    """Stops without a local path, each reason with its frames."""
     found, asked = local_paths(pairs)
-    if found == asked:
-        return []
     without = [r for r in pairs if r["path"] not in (None, "found")]
-    stops = [r["frame"] for r in pairs if r["path"] is not None]
-    reasons = dict.fromkeys(r["path"] for r in without)
-    at = {reason: [r["frame"] for r in without if r["path"] == reason] for reason in reasons}
-    why = "; ".join(f"{reason} ({_among(frames, stops)}{_ahead(without, reason)})" for reason, frames in at.items())
-    if merged:
-        why += "; a path over the merged terrain was found all the same"
-        why += ": one stop sees what another does not" if asked > 1 else ""
-    return [_item("no path", f"{asked - found} of {asked} stops have no local path", why)]
-
-
-def _ahead(rows: Rows, reason: str) -> str:
-    """Where the ground is closed, of the stops with this reason."""
-    where = [r["blocked_m"] for r in rows if r["path"] == reason and r.get("blocked_m") is not None]
-    if not where:
-        return ""
-    low, high = min(where), max(where)
-    return f"; closed {metres(low)} ahead" if low == high else f"; closed {low:.3g} to {high:.3g} m ahead"
+    at = {reason: [r["frame"] for r in without if r["path"] == reason] for reason in [r["path"] for r in without]}
+    why = "; ".join(f"{reason} ({which(frames)})" for reason, frames in at.items())
+    return [_item("no local path", f"No local path from {asked - found} of {asked} stops", why)] if why else []
 
 
 def _path(view: RunView) -> Items:

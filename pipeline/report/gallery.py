@@ -112,53 +112,55 @@ def _map(scene: Scene) -> Block | None:
     found, world, risk = terrain_map.data(scene), scene.world, scene.risk
     if risk is None and (world is None or found is None):
         return None
-    words, shares, caption = "not judged", [], ""
+    words, shares, caption, how = "not judged", [], "", ""
     if risk is not None:
         classes, vehicle = risk.arrays["risk"], scene.view.config.vehicle
         shares = [float((classes == k).mean()) for k in range(4)]
         words = ", ".join(f"{number(100 * part, 2)}% {name}" for part, name in zip(shares, CLASSES, strict=True))
         panel = figures.risk_map(classes, scene.path, risk.extent, f"Risk map seen from above: {words}")
-        caption = (
-            f"Of all cells {words}; unknown ones may lie out of view. Limits of {vehicle.name}: slope and tilt "
-            f"{vehicle.max_slope_deg:g}°, step {length(vehicle.max_step)}, roughness {length(vehicle.max_roughness)}, "
-            f"clearance {length(vehicle.clearance)}. Hazard: a limit is exceeded once "
-            f"{scene.view.config.risk.sigmas:g} standard deviations of the measure are added to it; caution: it comes "
-            f"near one. {_path_words(scene)} "
+        path, path_how = _path_words(scene)
+        caption = f"{words} of all cells. {path}"
+        how = (
+            f"Unknown cells may lie out of view. Limits of {vehicle.name}: slope and tilt {vehicle.max_slope_deg:g}°, "
+            f"step {length(vehicle.max_step)}, "
+            f"roughness {length(vehicle.max_roughness)}, clearance {length(vehicle.clearance)}. Hazard: a limit is "
+            f"exceeded once {scene.view.config.risk.sigmas:g} standard deviations of the measure are added to it; "
+            f"caution: it comes near one. {path_how} "
         )
     else:
         assert world is not None
         panel = figures.elevation_with_path(world.arrays["elevation"], None, scene.path, world.extent, "Elevation")
     if found is not None:
-        caption += (
+        how += (
             "σ: standard deviation of the elevation as predicted from the disparity's error, the rig's geometry, how "
             "well both images agree and the poses' covariances; models: how many basic pairs saw a cell."
         )
     if found is not None and found["thinned"] > 1:
-        caption += f" The map shows one of {found['thinned']} cells along each axis; the GeoTIFFs have all."
-    return Block("Map", "Map", caption, (panel,), _legend(shares) if shares else (), data=found)
+        how += f" The map shows one of {found['thinned']} cells along each axis; the GeoTIFFs have all."
+    return Block("Map", "Map", caption, (panel,), _legend(shares) if shares else (), data=found, how=how)
 
 
-def _path_words(scene: Scene) -> str:
+def _path_words(scene: Scene) -> tuple[str, str]:
+    """What came of the path, and how to read it."""
     drive = scene.view.products.drive
     if drive is not None:
-        return (
-            f"{driving.outcome(drive)}; no path is planned over the whole map, what was driven is shown stop by stop. "
-            "Of a round patch at the start no camera saw anything: where the map has one, it is taken for flat ground, "
-            "since the rover stands on it."
+        return f"{driving.outcome(drive)}.", (
+            "No path is planned over the whole map, what was driven is shown stop by stop. Of a round patch at the "
+            "start no camera saw anything: where the map has one, it is taken for flat ground, since the rover stands "
+            "on it."
         )
     path, vehicle = scene.view.bundle(scene.view.products.world_path), scene.view.config.vehicle
     if path is None:
-        return "The path was not computed."
+        return "The path was not computed.", ""
     if scene.path is None:
-        return f"There is no path: {path.meta.get('reason')}."
+        return f"There is no path: {path.meta.get('reason')}.", ""
     before, beyond = path.meta.get("left_out_m") or (0.0, 0.0)
-    start = start_words(scene.view, " It ")
-    rest = f"{start}." if start else ""
+    start = start_words(scene.view, "It ")
     x, y = scene.path[-1, :2]
     aim = scene.view.config.path.target
     chosen = "the target" if aim else "no path.target is set, so that is the free place nearest to the far row's middle"
-    rest += (
-        f" It ends at x {x:.2f} m, y {y:.2f} m: {chosen}. Of all paths there it is the one that climbs and falls "
+    rest = (
+        f"{start}{'. ' if start else ''}It ends at {chosen}. Of all paths there it is the one that climbs and falls "
         "least, with caution ground and detours charged; not the shortest."
     )
     if max(before, beyond) > vehicle.wheel_base + vehicle.wheel_diameter:
@@ -171,9 +173,9 @@ def _path_words(scene: Scene) -> str:
         "wheels": "its wheels stay on known ground, its belly does not everywhere",
         "middle": "its middle stays on known ground, its wheels do not everywhere",
     }.get(path.meta.get("ground", ""), "unknown ground is not entered")
-    return (
-        "The path (black line; the vehicle stands at its start, a disk at its end) is that of the vehicle's middle; "
-        f"its wheels keep {length(vehicle.margin)} from hazards; {known}.{rest}"
+    return f"The path (black line) ends at x {x:.2f} m, y {y:.2f} m.", (
+        "The vehicle stands at the start of the path, a disk at its end; the line is that of the vehicle's middle; "
+        f"its wheels keep {length(vehicle.margin)} from hazards; {known}. {rest}"
     )
 
 
@@ -205,6 +207,8 @@ def _local(scene: Scene) -> Block | None:
         panels.append(figures.cost_to_go(cost, points, risk.extent, f"Cost of the best path to each cell from {name}"))
     outcome = (
         f"{targets} cells of the far row can be reached (blue dots); the path to the middle one is drawn"
+        if found and path.meta.get("planner") != "grid8"
+        else f"as no path crosses all rows, one in any direction is drawn, which ends at {path.meta.get('ended_by')}"
         if found
         else f"no path: {path.meta.get('reason') or 'the far row cannot be reached'}"
     )

@@ -409,7 +409,8 @@ def _hazards(scene: Scene) -> dict[str, Metric]:
 def _local_paths(pairs: Rows) -> dict[str, Metric]:
     found, asked = delivery.local_paths(pairs)
     every = f"{asked} of {len(pairs)} basic pairs"
-    return {"local_paths": _metric("Local paths found", found, "", "counted", every)} if asked else {}
+    how = "counted; a path leads at least the vehicle's length ahead, as far as the ground is known and safe"
+    return {"local_paths": _metric("Local paths found", found, "", how, every)} if asked else {}
 
 
 def _path(view: RunView) -> dict[str, Metric]:

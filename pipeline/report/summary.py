@@ -17,7 +17,7 @@ from rille.pipeline.report import delivery, seams, tables
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.metrics import metrics
-from rille.pipeline.report.words import metres, number
+from rille.pipeline.report.words import metres, number, quantity
 from rille.stages.odometry.resection.trajectory import world_poses
 
 FORMAT = 2
@@ -28,15 +28,15 @@ def gather(view: Any) -> dict[str, Any]:
     """Collect the part of ``report.json`` that depends on the artifacts alone, not on time and place of the run."""
     scene = Scene(view)
     frames, pairs = tables.frames(scene), tables.pairs(scene)
-    assessed = any(delivery.has_truth(view))
+    assessed, figures = any(delivery.has_truth(view)), metrics(scene, frames, pairs)
     return {
-        "verdict": _verdict(view, frames, pairs),
+        "verdict": _verdict(view, frames, pairs, figures),
         **delivery.account(scene, frames, pairs),
         "warnings": find_warnings(scene),
         "seams": seams.facts(scene),
         "sequence": _sequence(view),
         "truth": {"used": assessed, "source": view.sequence.truth_source if assessed else "no truth"},
-        "metrics": metrics(scene, frames, pairs),
+        "metrics": figures,
         "frames": frames,
         "pairs": pairs,
         "vehicle": view.config.vehicle.model_dump(mode="json"),
@@ -195,7 +195,11 @@ def _sigma_warning(view: RunView) -> list[str]:
     ]
 
 
-def _verdict(view: RunView, frames: list[dict[str, Any]], pairs: list[dict[str, Any]]) -> str:
+AGAINST_TRUTH = ("trajectory_drift", "trajectory_position_drift", "trajectory_ate_rmse", "dem_merged_rmse")
+"""The one figure against truth that the verdict gives: the first of these that has a value."""
+
+
+def _verdict(view: RunView, frames: delivery.Rows, pairs: delivery.Rows, figures: Mapping[str, Any]) -> str:
     """One line: what there is, of how much."""
     posed, placed = (sum(r[key] for r in frames) for key in ("posed", "in_world"))
     models = sum(r["modelled"] for r in pairs)
@@ -203,8 +207,14 @@ def _verdict(view: RunView, frames: list[dict[str, Any]], pairs: list[dict[str, 
     stops = delivery.local_paths(pairs)
     path = view.bundle(view.products.world_path)
     length = None if path is None else path.meta.get("length_m")
+    errors = [
+        f"{'drift' if name.endswith('drift') else 'RMSE'} {quantity(m['value'], m['unit'])} against truth"
+        for name in AGAINST_TRUTH
+        if (m := figures.get(name, {"value": None}))["value"] is not None
+    ]
     parts = [
         "one stereo pair" if len(frames) == 1 else f"{posed} of {len(frames)} frames posed{apart}",
+        *errors[:1],
         f"{models} of {len(pairs)} elevation models",
         *([f"{stops[0]} of {stops[1]} local paths"] if stops[1] else []),
         _way_words(view, length),

@@ -238,19 +238,12 @@ def level_rotation(up_in_camera: ArrayLike) -> Floats:
 
     Parameters
     ----------
-    up_in_camera : (3,) direction of "up" in the optical camera frame.
-
-    Raises
-    ------
-    InputError
-        The optical axis is vertical, so that it has no horizontal projection.
+    up_in_camera : (3,) direction of "up" in the optical camera frame; along the optical axis, which then has no
+        horizontal projection, the top of the image lies ahead.
     """
     z = np.asarray(up_in_camera, dtype=np.float64)
     z = z / np.linalg.norm(z)
-    forward = np.array([0.0, 0.0, 1.0])
+    forward = np.array([0.0, 0.0, 1.0] if float(np.hypot(z[0], z[1])) >= 1e-6 else [0.0, -1.0, 0.0])
     y = forward - z * float(z @ forward)
-    norm = float(np.linalg.norm(y))
-    if norm < 1e-6:
-        raise InputError("RIL-334", "the optical axis is vertical", remedy="give an attitude whose heading is defined")
-    y = y / norm
+    y = y / float(np.linalg.norm(y))
     return np.array([np.cross(y, z), y, z], dtype=np.float64)

@@ -21,10 +21,13 @@ the rows of a grid turned by a heading or by the line from start to target, fill
 
 An elevation model is fan-shaped and ragged: the first and last rows with a free cell hold a few, which may lead
 nowhere. So a start that is not given is, of the free cells within one vehicle length of the first row that lead on,
-the one nearest to that row's middle; the target likewise at the last row. A path counts as found when it comes within
-one vehicle length of the last row. A mission's map, on which the vehicle stands nowhere in particular, may be cut by
-ground that it cannot cross: then the connected ground over most rows (of that around the end that is given, if one is)
-is crossed, in any direction, and the length left out is reported (``left_out_m``).
+the one nearest to that row's middle; the target likewise at the last row.
+
+Where no path comes within one vehicle length of the last row, ``auto`` goes, in any direction, as far as connected
+ground leads from the first rows: that is a path if it leads at least one vehicle length ahead, and ``ended_by`` says
+what ends it. A mission's map, on which the vehicle stands nowhere in particular, may be cut by ground that it cannot
+cross: then the connected ground over most rows (of that around the end that is given, if one is) is crossed, and the
+length left out is reported (``left_out_m``).
 """
 
 from __future__ import annotations
@@ -45,7 +48,7 @@ from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN, check_size
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning import grid8
 from rille.stages.planning.path_ground import GROUNDS, Maps, PathMaps, PathPrices, Point, RowGrid
-from rille.stages.planning.path_words import Route, describe, hazard_words
+from rille.stages.planning.path_words import GOAL, Route, describe, ending, hazard_words
 from rille.stages.planning.row_graph import UNREACHED, Cell, Charges, Plan, nearest_middle, plan, row_span
 
 __all__ = ["STAGE", "PathParams", "Route", "describe", "find_path"]
@@ -68,7 +71,7 @@ class PathParams(Params):
     planner: Planner = Field(
         default="auto",
         description="rows: one step ahead in every row, as in the paper; grid8: any direction; auto: grid8 where rows"
-        " do not reach the target, or do not cross the map of a mission",
+        " do not reach the target, or do not cross the map",
     )
     height_step: float = Field(
         default=0.02, gt=0, le=1, description="smallest height difference that costs [share of max_step]"
@@ -120,7 +123,8 @@ def find_path(
     maps : arrays (row, col) of stage ``risk``: ``risk``, ``reason``, ``elevation``; the others serve messages.
     heading : driving direction (dx, dy) in the frame of the lattice; start and target together override it.
     ends : start and target, x, y, metres; None: see the module. Those of ``params`` are not looked at.
-    stretch : with no target, cross the connected ground over most rows where no path leads over all of them.
+    stretch : with no target, cross the connected ground over most rows where no path leads over all of them; else go
+        from the first rows as far as connected ground leads.
 
     Raises
     ------
@@ -139,8 +143,11 @@ def find_path(
     if start is not None and target is not None:
         heading = (target[0] - start[0], target[1] - start[1])
     found = _found(maps, lattice, vehicle, heading, ends, stretch, p)
+    if len(found.cells):
+        end = GOAL if target is not None else ending(found, maps, lattice, vehicle, p.p_certain_hazard)
+        return replace(found, ended_by=end)
     # A limit that closed nothing cannot be the reason.
-    if len(found.cells) or p.p_certain_hazard >= 1 or "p_hazard" not in maps:
+    if p.p_certain_hazard >= 1 or "p_hazard" not in maps:
         return found
     # Searched once more without the limit, only to name the figure that would open a way.
     other = _found(maps, lattice, vehicle, heading, ends, stretch, p.model_copy(update={"p_certain_hazard": 1.0}))
@@ -153,7 +160,7 @@ def find_path(
         f"ground with a p_hazard above path.p_certain_hazard {p.p_certain_hazard:g} closes every path; without it one "
         f"leads over ground of up to {chance:.3g}: raise path.p_certain_hazard to that to take it"
     )
-    return replace(found, plan=replace(found.plan, reason=reason), doubt=chance)
+    return replace(found, plan=replace(found.plan, reason=reason))
 
 
 def _found(
@@ -165,12 +172,15 @@ def _found(
     stretch: bool,
     p: PathParams,
 ) -> Route:
-    if p.planner == "grid8":
-        return _by_grid(maps, lattice, vehicle, ends, p, None)
-    found, target = _by_rows(maps, lattice, vehicle, heading, ends, p), ends[1]
-    if p.planner == "rows" or len(found.cells) or (target is None and not stretch):
-        return found
-    return _by_grid(maps, lattice, vehicle, ends, p, found)
+    before = None if p.planner == "grid8" else _by_rows(maps, lattice, vehicle, heading, ends, p)
+    if before is not None and (p.planner == "rows" or len(before.cells)):
+        return before
+    return _by_grid(maps, lattice, vehicle, ends, p, before, near=not stretch and ends[1] is None)
+
+
+def _length_cells(vehicle: Vehicle, lattice: Lattice) -> int:
+    """The vehicle's length from the front of the front wheels to the back of the rear ones, cells."""
+    return math.ceil(2.0 * vehicle.half_length / lattice.cell)
 
 
 def _ground(maps: Maps, lattice: Lattice, grid: RowGrid, vehicle: Vehicle, p: PathParams) -> PathMaps:
@@ -189,8 +199,6 @@ def _by_rows(
     ground = _ground(maps, lattice, RowGrid.over(lattice, heading), vehicle, p)
     grid = ground.grid
     first, last = (None if point is None else grid.nearest(point) for point in ends)
-    # One vehicle length, from the front of the front wheels to the back of the rear ones.
-    tolerance = math.ceil((vehicle.wheel_base + vehicle.wheel_diameter) / lattice.cell)
     span = row_span(~ground.closed)
     # A diagonal is longer than a row is wide; the rows themselves every path crosses.
     charges = Charges(ground.toll, round(p.detour_cost * (grid8.DIAGONAL - 1) * grid.cell / ground.unit))
@@ -198,7 +206,7 @@ def _by_rows(
         # How far one can go takes a sweep of its own, which only the last and most lenient try needs.
         explain = name == GROUNDS[-1]
         ways = ground.ways(name)
-        found = plan(ground.height, ways, tolerance, (first, last), span, charges, explain)
+        found = plan(ground.height, ways, _length_cells(vehicle, lattice), (first, last), span, charges, explain)
         if len(found.cells):
             break
     cost = ground.metres(found.cost, UNREACHED, grid.rows)
@@ -212,33 +220,42 @@ def _by_grid(
     ends: Ends,
     p: PathParams,
     before: Route | None,
+    *,
+    near: bool,
 ) -> Route:
-    ground = _ground(maps, lattice, RowGrid.over(lattice, (0.0, 1.0)), vehicle, p)
+    """``near``: from the first rows, or the start, on connected ground as far as that leads."""
+    grid = before.grid if near and before is not None else RowGrid.over(lattice, (0.0, 1.0))
+    ground = _ground(maps, lattice, grid, vehicle, p)
     # A step costs its length in units of height: else a path of no climb could be of any length.
-    grid, unit = ground.grid, max(1, round(lattice.cell / ground.unit))
+    unit = max(1, round(lattice.cell / ground.unit))
     given = tuple(None if point is None else grid.index(point) for point in ends)
+    length, span = _length_cells(vehicle, lattice), row_span(~ground.closed) or (0, 0)
+    if near and given[0] is None:
+        ground.first_row = max(span[1] - min(length, (span[1] - span[0]) // 4), 0)
     nothing = np.empty((0, 2), dtype=np.int64)
     cells, cost, name = nothing, np.full(ground.height.shape, UNREACHED), GROUNDS[0]
     # With a free end a stricter ground would always find some path, on however small a part.
     for name in GROUNDS if None not in given else ground.by_worth(given[0] or given[1]):
         ways = ground.ways(name)
-        first, last = _chosen(ground, name, *given)
+        first, last = _chosen(ground, name, *given, far=near)
         if first is None or last is None or not ways[first] or not ways[last]:
+            continue
+        if given == (None, None) and first[0] - last[0] < length:
             continue
         cost, step = grid8.cost_to_go(ground.height, ways, last, first, unit, ground.toll)
         if cost[first] < UNREACHED:
             cells = grid8.trace(step, first)
             break
-    reason = "" if len(cells) else "start and target are not connected by ground that the vehicle may cross"
+    free = "no ground that is known and safe leads a vehicle's length ahead"
+    reason = free if None in given else "start and target are not connected by ground that the vehicle may cross"
     # What rows found lies on their grid: where that is turned, its rows are none of this one.
     same = before is not None and before.grid == grid
     base = before.plan if before is not None and same else Plan(nothing, cost, np.zeros(grid.cols, dtype=bool), 0)
     found = replace(base, cells=cells, cost=cost, reachable=np.zeros(grid.cols, dtype=bool), reason=reason)
     if len(cells):
-        found = replace(found, target_row=int(cells[-1, 0]), blocking_row=None)
+        found = replace(found, target_row=int(cells[-1, 0]), blocking_row=None, reason="")
         found.reachable[cells[-1, 1]] = True
-    metres = ground.metres(cost, UNREACHED)
-    return Route(cells, ground.xyz(cells), found, grid, "grid8", name, metres, row_span(~ground.closed) or (0, 0))
+    return Route(cells, ground.xyz(cells), found, grid, "grid8", name, ground.metres(cost, UNREACHED), span)
 
 
 def _check_end(maps: Maps, lattice: Lattice, vehicle: Vehicle, name: str, point: Point) -> None:
@@ -271,9 +288,11 @@ def _away(cells: NDArray[np.intp], row: int, col: int, cell: float) -> float:
     return float(np.hypot(cells[:, 0] - row, cells[:, 1] - col).min()) * cell
 
 
-def _chosen(ground: PathMaps, below: str, start: Cell | None, target: Cell | None) -> tuple[Cell | None, Cell | None]:
+def _chosen(
+    ground: PathMaps, below: str, start: Cell | None, target: Cell | None, *, far: bool
+) -> tuple[Cell | None, Cell | None]:
     """Ends as given; else, of the connected ground over most rows (that of the end that is given), the cell nearest to
-    the middle of the first row, and the one nearest to that of the last.
+    the middle of the first row, and the one nearest to that of the last; ``far``: to that of its own last one, in it.
 
     Parameters
     ----------
@@ -285,10 +304,12 @@ def _chosen(ground: PathMaps, below: str, start: Cell | None, target: Cell | Non
     number, spans = ground.parts(below)
     given = start if start is not None else target
     part = int(number[given]) if given is not None else int(np.argmax(spans[:, 1] - spans[:, 0]))
-    if part < 0:
+    if part < 0 or not (number == part).any():
         return start, target
-    cells = number == part
-    return start or nearest_middle(cells, span[1]), target or nearest_middle(cells, span[0])
+    cells, row = number == part, int(spans[part, 0]) if far else span[0]
+    ahead, behind = (cells[: row + 1], ground.first_row) if far else (cells, 0)
+    r, c = nearest_middle(cells[behind:], span[1] - behind)
+    return start or (r + behind, c), target or nearest_middle(ahead, row)
 
 
 def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
@@ -304,10 +325,7 @@ def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         "cost_to_go": route.cost,
         "reachable": route.plan.reachable.astype(np.uint8),
     }
-    meta = describe(route, maps, lattice, vehicle) | {"frame": source.meta.get("frame", "local")}
-    if not local and not meta["found"] and (route.doubt is not None or not (maps["risk"] < HAZARDOUS).any()):
-        meta["warnings"] = [f"no path: {meta['reason']}"]
-    return Bundle(arrays, meta)
+    return Bundle(arrays, describe(route, maps, lattice, vehicle) | {"frame": source.meta.get("frame", "local")})
 
 
 STAGE = Stage(

@@ -160,7 +160,8 @@ class PathMaps:
 
     ``unit``: metres of height that cost one, the unit of the prices or a part of it; ``stand`` (row, col) float32 m,
     mean height under a wheel; ``height`` the same in units, 0 where closed; ``toll`` (row, col) units, of caution and
-    doubtful ground; ``closed`` (row, col): where the vehicle's middle may not be.
+    doubtful ground; ``closed`` (row, col): where the vehicle's middle may not be. ``first_row``: connected ground that
+    does not reach back to this row is left out.
     """
 
     def __init__(
@@ -204,6 +205,7 @@ class PathMaps:
         self._stand = FreePlaces(masks.wheels, masks.body, vehicle, grid.cell, masks.unknown, masks.closed)
         self._ways: dict[str, Bytes] = {}
         self._parts: dict[str, tuple[NDArray[np.int32], Ints]] = {}
+        self.first_row = 0
 
     def ways(self, below: str) -> Bytes:
         """Directions (row, col) as bits with ``below``, one of :data:`GROUNDS`, on the known."""
@@ -214,7 +216,10 @@ class PathMaps:
     def parts(self, below: str) -> tuple[NDArray[np.int32], Ints]:
         """Connected ground, see :func:`rille.stages.planning.grid8.parts`."""
         if below not in self._parts:
-            self._parts[below] = grid8.parts(self.ways(below))
+            number, spans = grid8.parts(self.ways(below))
+            ahead = spans[:, 1] < self.first_row
+            number[np.isin(number, np.flatnonzero(ahead))] = -1
+            self._parts[below] = number, np.where(ahead[:, None], 0, spans)
         return self._parts[below]
 
     def by_worth(self, at: tuple[int, int] | None = None) -> list[str]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.measures import MEASURES
-from rille.stages.hazard.risk import CAUTION, HAZARDOUS, UNKNOWN
+from rille.stages.hazard.risk import CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.path_ground import GROUNDS, Maps, RowGrid
 from rille.stages.planning.row_graph import Plan
@@ -27,8 +27,8 @@ class Route:
     ``cells`` (vertex, 2) on ``grid`` and ``xyz`` (vertex, 3) metres, z the mean height under a wheel, both empty where
     there is none; ``plan`` of the row graph, ``planner`` that gave the path, ``ground`` one of :data:`GROUNDS`;
     ``cost`` (row, col) metres: from the start by rows, to the target by grid8; NaN where not reached.
-    ``span``: farthest and nearest row of the grid that are free somewhere. ``doubt``: where there is none only because
-    ground is closed that is probably a hazard, greatest probability on a path that ignores it.
+    ``span``: farthest and nearest row of the grid that are free somewhere. ``ended_by``: why a path goes no
+    farther; None where there is none.
     """
 
     cells: Ints
@@ -39,7 +39,30 @@ class Route:
     ground: str
     cost: Floats32
     span: tuple[int, int]
-    doubt: float | None = None
+    ended_by: str | None = None
+
+
+GOAL = "the goal"
+ENDS = ("the edge of the map", "unknown ground", "ground too uncertain to be called safe", "a hazard")
+"""What a path does not go beyond."""
+
+
+def ending(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle, p_certain: float) -> str:
+    """The one of :data:`ENDS` that holds most of the cells beyond a path's end: as wide as the vehicle and its margin,
+    and as far ahead of its middle. Ground above the probability ``p_certain`` is uncertain, as is a hazard that
+    standard deviations alone make one."""
+    cell, (dx, dy) = lattice.cell, route.grid.ahead
+    far, wide = (math.ceil((half + vehicle.margin) / cell) for half in (vehicle.half_length, vehicle.half_width))
+    ahead, right = (v * cell for v in np.meshgrid(np.arange(1, far + 2), np.arange(-wide, wide + 1)))
+    points = route.xyz[-1, :2] + np.stack([ahead * dx + right * dy, ahead * dy - right * dx], axis=-1)
+    at = np.rint(lattice.index(points)).astype(np.int64)
+    inside = ((at >= 0) & (at < lattice.shape)).all(axis=-1)
+    here = tuple(at[inside].T)
+    risk, chance = maps["risk"][here], maps["p_hazard"][here] if "p_hazard" in maps else np.zeros(len(here[0]))
+    proven = (risk == HAZARDOUS) & (maps["reason"][here] & DOUBT_BIT == 0)
+    uncertain = ((risk == HAZARDOUS) & ~proven) | ((risk < HAZARDOUS) & (chance > p_certain))
+    counts = [np.count_nonzero(kind) for kind in (~inside, risk == UNKNOWN, uncertain, proven)]
+    return ENDS[int(np.argmax(counts))]
 
 
 def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> dict[str, Any]:
@@ -52,6 +75,7 @@ def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> di
         "reason": found.reason if len(xyz) else _why(found, maps, vehicle),
         "blocking_row": found.blocking_row,
         "blocking_y": None if found.blocking_row is None else (grid.j0 - found.blocking_row) * grid.cell,
+        "ended_by": route.ended_by,
         "beside_unknown": route.ground != GROUNDS[0],
         "target_row": found.target_row,
         "reachable_targets": int(found.reachable.sum()),

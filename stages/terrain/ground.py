@@ -60,7 +60,7 @@ def fit_plane(
         raise DegenerateError(
             "RIL-342",
             f"only {rays.shape[0]} sampled pixels are matched: left and right have no texture in common",
-            remedy="check exposure and focus, and that left and right show one scene; or lower hfvm.texture",
+            remedy="check exposure and focus, and that left and right show one scene",
         )
     # dh of height changes 1/Z by the share dh/h.
     tolerance = np.sqrt((2.0 * sigma) ** 2 + (relief * rho) ** 2)
@@ -80,12 +80,7 @@ def fit_plane(
         length = float(np.linalg.norm(theta))
         if share >= MIN_SHARE and bool(allowed(-theta[None] / length)[0]):
             return GroundPlane(-theta / length, 1.0 / length, share)
-    raise DegenerateError(
-        "RIL-343",
-        "the disparity shows no ground plane below the camera",
-        remedy="give the direction of up, the rig's pitch or an attitude, or check left/right order and the rig's "
-        "calibration",
-    )
+    raise DegenerateError("RIL-343", "the disparity shows no ground plane below the camera")
 
 
 MIN_POINTS = 100
@@ -165,10 +160,11 @@ class GroundView:
         """
         good = (self.along <= max_cells * cell) & (sigma_d <= max_sigma * self.slope)
         if np.count_nonzero(good) < 3:
+            enough = np.sort(np.maximum(self.along / max_cells, sigma_d / self.slope))[:3][-1]
             raise DegenerateError(
                 "RIL-344",
                 f"no ground is seen well enough for cells of {cell:g} m",
-                remedy="set locus.cell_size to a larger cell",
+                remedy=f"set locus.cell_size to {1.1 * enough:.2g} m or more",
             )
         low, high = self.xy[good].min(axis=0), self.xy[good].max(axis=0)
         return [float(low[0]), float(high[0]), float(low[1]), float(high[1])]

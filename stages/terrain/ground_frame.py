@@ -12,7 +12,7 @@ a surface); if nothing gives the vertical either, the local frame is that of the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,6 +43,7 @@ NEAR = 2.0  # pixels: distance to its epipolar line at which a match fits a rig
 NEAREST = 0.05  # share of the matches that may be nearer than what counts as nearest: gross mismatches
 UNSEEN = 20.0  # baselines; distance that stands for what is not seen at all
 
+DOMINANT = 0.3  # share of the matches from which a plane may be the ground, though its tilt is beyond the limits
 SWAPPED = 0.5  # share of such matches: nearly all where left and right are swapped
 
 
@@ -128,7 +129,8 @@ def level(
         ``tilt`` of the ground (rad); ``relief`` lowest and highest terrain against the plane (m); ``z_range`` (m);
         ``cell_size`` (m) that suits the rig; ``footprint`` x_min, x_max, y_min, y_max (m) for it; ``ground_share`` of
         the sampled pixels. All in the local frame. Where no ground is seen, ``no_ground`` says why, and the
-        values that describe it are None, except ``cell_size``.
+        values that describe it are None, except ``cell_size``; ``plane`` and ``relief`` are there where larger cells
+        may show it.
 
     Raises
     ------
@@ -137,23 +139,28 @@ def level(
     """
     rays, rho, sigma = _samples(np.asarray(column_disparity), np.asarray(row_disparity), usable, rig, params)
     known_up, source = _given_vertical(vertical or VerticalHint())
-    samples = rays, rho, sigma
+    samples, ground = (rays, rho, sigma), None
     try:
-        ground = _fitted(samples, known_up, params)
+        ground = _fitted(samples, lambda n: _allowed(n, known_up, params), params)
         R_local_left = level_rotation(ground.up if known_up is None else known_up)
         return {"source": source or "ground plane"} | _on_ground(ground, R_local_left, samples, rig, params)
     except DegenerateError as error:
-        why = error
+        why = _explained(error, samples, ground, params)
     up = np.array([0.0, -1.0, 0.0]) if known_up is None else known_up
     # No ground is seen: odometry, which needs none, still gets a frame.
     facts, R_local_left = {"source": source or NO_VERTICAL}, level_rotation(up)
     try:
         if params.reference_height is not None:
-            ground = GroundPlane(up, params.reference_height, 0.0)
-            return facts | _on_ground(ground, R_local_left, samples, rig, params)
+            stated = GroundPlane(up, params.reference_height, 0.0)
+            return facts | _on_ground(stated, R_local_left, samples, rig, params)
     except DegenerateError as error:
         why = error
-    nothing = dict.fromkeys(("ground_height", "plane", "tilt", "relief", "z_range", "footprint"))
+    nothing: dict[str, Any] = dict.fromkeys(("ground_height", "plane", "tilt", "relief", "z_range", "footprint"))
+    if ground is not None and why.code == "RIL-344" and ground.inliers >= DOMINANT:
+        # Larger cells than those that suit the rig may still make a map.
+        nothing["plane"], everywhere = _local_plane(ground, R_local_left), [-math.inf, math.inf] * 2
+        points = (rays[rho > 0] / rho[rho > 0, None]) @ R_local_left.T
+        nothing["relief"] = _relief(points, nothing["plane"], everywhere, ground.height, params)
     cell, T_local_left = _cell_without_ground(rho[rho > BEYOND * sigma], rig), RigidTransform(R_local_left, np.zeros(3))
     return (
         facts
@@ -162,10 +169,27 @@ def level(
     )
 
 
-def _fitted(samples: Samples, vertical: Floats | None, params: GroundFrameParams) -> GroundPlane:
-    """The ground plane that the samples show, under the limits of tilt."""
-    rng = np.random.default_rng(params.seed)
-    return fit_plane(*samples, lambda n: _allowed(n, vertical, params), params.relief, rng)
+def _fitted(samples: Samples, allowed: Callable[[Floats], Bools], params: GroundFrameParams) -> GroundPlane:
+    """The ground plane that the samples show, with a normal that is allowed."""
+    return fit_plane(*samples, allowed, params.relief, np.random.default_rng(params.seed))
+
+
+def _explained(
+    error: DegenerateError, samples: Samples, ground: GroundPlane | None, params: GroundFrameParams
+) -> DegenerateError:
+    """Why there is no ground, or none that is seen well enough, with the remedy of that cause."""
+    if error.code not in ("RIL-343", "RIL-344") or (ground is not None and ground.inliers >= DOMINANT):
+        return error
+    try:
+        seen = _fitted(samples, lambda n: np.ones(len(n), dtype=bool), params)
+    except DegenerateError:
+        seen = None
+    if seen is None or seen.inliers < DOMINANT:
+        remedy = "where the ground is a known surface, state its depth by ground_frame.reference_height"
+        return DegenerateError(error.code, error.message, remedy=remedy)
+    up = ", ".join(f"{v + 0.0:.2f}" for v in seen.up)
+    message = f"{error.message}; the plane that it shows has its normal at [{up}] in the camera's frame"
+    return DegenerateError(error.code, message, remedy="if that is the ground, state it as world.up in a manifest")
 
 
 def _on_ground(

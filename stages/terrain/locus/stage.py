@@ -268,12 +268,8 @@ def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
         T, lattice, z_range = _in_world(args, inputs, T_local_left)
     else:
         # One cell for the whole run: that which suits the first basic pair, where that pair is connected.
-        if level["plane"] is None:
-            raise DegenerateError(
-                "RIL-780",
-                f"no elevation model without ground: {level['no_ground']}",
-                remedy="or state a surface by ground_frame.reference_height",
-            )
+        if level["plane"] is None or ("no_ground" in level and params.cell_size is None):
+            raise DegenerateError("RIL-780", f"no elevation model without ground: {level['no_ground']}")
         cell = params.cell_size or inputs.get("reference", inputs["level"]).meta["cell_size"]
         T, lattice = T_local_left, local_lattice(rig, level, cell, params)
         z_range = plane_z_range(level["plane"], level["relief"], list(lattice.bounds))
@@ -335,7 +331,7 @@ def _size(params: LocusParams, args: Mapping[str, Any], metas: Mapping[str, Any]
     """Bytes of the surface's arrays, four of float32, and a half more for refining them."""
     if args["frame"] == "world":
         lattice = Lattice.from_dict(metas["local"]["lattice"])
-    elif metas["level"]["plane"] is None:
+    elif "no_ground" in metas["level"]:
         return 0.0
     else:
         cell = params.cell_size or metas.get("reference", metas["level"])["cell_size"]

@@ -40,8 +40,8 @@ def test_a_whole_run_has_every_figure_and_nothing_missing(whole: Written) -> Non
     assert facts["missing"] == []
     assert facts["complete"] is True
     assert facts["absent"] == []
-    said = "Complete: 6 of 6 frames posed, 2 of 2 elevation models, 2 of 2 local paths, a path of 0.49 m."
-    assert facts["verdict"] == said
+    said = "Complete: 6 of 6 frames posed, drift 0 % against truth, 2 of 2 elevation models, 2 of 2 local paths, a path"
+    assert facts["verdict"] == f"{said} of 0.49 m."
     everything = "every task was done, every frame has a pose, every stop has a local path, a path over the merged"
     assert f"Nothing is missing: {everything} terrain was found." in page_.text
     for anchor in (
@@ -164,7 +164,8 @@ def test_without_truth_it_says_so_and_shows_no_errors(tmp_path: Path) -> None:
     assert facts["missing"] == []
     assert [m["kind"] for m in facts["absent"]] == ["no truth"]
     assert 'class="note missing"' not in html, "what every user's own data have is no fault"
-    assert page_.text.index("Nothing is missing") < page_.text.index("Not asked for, or not available No truth")
+    answers = "Answers, and what was not asked for or is not available No truth"
+    assert page_.text.index("Nothing is missing") < page_.text.index(answers)
     assert all(metric["truth"] is None for metric in facts["metrics"].values())
     assert all(r["error_m"] is None for r in facts["frames"])
     assert "not assessed against truth" in page_.text
@@ -184,12 +185,11 @@ def test_what_is_missing_comes_first(tmp_path: Path) -> None:
     facts, page_, _, _ = written(tmp_path, view(made, tasks=tasks))
     assert facts["complete"] is False
     assert facts["verdict"].startswith(
-        "Incomplete: 0 of 6 frames posed, 1 of 2 elevation models, 2 of 2 local paths, no path"
+        "Incomplete: 0 of 6 frames posed, drift 0 % against truth, 1 of 2 elevation models, 2 of 2 local paths, no path"
     )
     kinds = [m["kind"] for m in facts["missing"]]
-    assert kinds[:4] == ["failed", "skipped", "no pose", "no path"]
-    skipped = facts["missing"][1]
-    assert skipped["what"] == "trajectory, risk/world"
+    assert kinds[:3] == ["failed", "no pose", "no path"]
+    assert facts["missing"][0]["what"].endswith("2 tasks depend on it")
     text = page_.text
     assert text.index("3 landmarks, 6 are needed") < text.index("Accuracy Quantity")
     assert page_.ids.index("missing-box") < page_.ids.index("trajectory")
@@ -236,13 +236,9 @@ def test_no_path_names_the_row_that_blocks(tmp_path: Path) -> None:
     assert facts["complete"] is True  # an answer, not a hole
     reason = "no way through"
     assert facts["missing"] == [
-        {
-            "kind": "no path",
-            "what": "2 of 2 stops have no local path",
-            "why": f"{reason} (frames 0, 4; closed 0.630 m ahead)",
-        },
         {"kind": "no path", "what": "No path", "why": f"{reason}; blocked at row 17, 0.63 m ahead"},
     ]
+    assert facts["absent"][0]["what"] == "No local path from 2 of 2 stops"
     assert facts["metrics"]["local_paths"]["value"] == 0
     assert facts["verdict"].startswith("Complete but for what is listed: 6 of 6 frames posed")
     assert "0 of 2 local paths, no path" in facts["verdict"]
@@ -252,17 +248,18 @@ def test_no_path_names_the_row_that_blocks(tmp_path: Path) -> None:
     assert "map" in page_.ids
 
 
-def test_one_stop_without_a_local_path_is_not_nothing_missing(tmp_path: Path) -> None:
+def test_a_stop_without_a_local_path_is_told_but_lacks_nothing(tmp_path: Path) -> None:
     made = bundles()
     meta = {**made["path"].meta, "found": False, "reason": "no free cell", "length_m": None}
     made["local_path4"] = Bundle({**made["path"].arrays, "path": np.empty((0, 3))}, meta)
-    facts, page_, _, _ = written(tmp_path, view(made))
-    (missing,) = facts["missing"]
-    assert missing["what"] == "1 of 2 stops have no local path"
-    assert missing["why"].startswith("no free cell (frame 4); a path over the merged terrain was found all the same")
-    assert "Nothing is missing" not in page_.text
+    facts, _, _, _ = written(tmp_path, view(made))
+    assert facts["missing"] == []
+    assert [(m["what"], m["why"]) for m in facts["absent"]] == [
+        ("No local path from 1 of 2 stops", "no free cell (frame 4)")
+    ]
+    assert facts["verdict"].startswith("Complete: ")
+    assert "1 of 2 local paths" in facts["verdict"]
     assert "every stop has a local path" not in facts["delivered"]
-    assert facts["complete"] is True  # it was looked for: that is an answer
 
 
 def test_a_path_says_where_it_starts_when_that_is_not_at_the_vehicle(tmp_path: Path) -> None:
@@ -289,7 +286,7 @@ def test_a_drive_that_arrived_does_not_say_that_there_is_no_path(tmp_path: Path,
     assert is_complete(of_drive) == (verdict == "goal")  # as the exit code says: the goal was asked for
     if verdict == "goal":
         assert "map-still" in page_.ids
-        assert "The goal was reached; no path is planned over the whole map" in page_.text
+        assert "The goal was reached. How to read this" in page_.text
         assert "the goal was reached" in facts["delivered"]
         assert missing == []
     else:

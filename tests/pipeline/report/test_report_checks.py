@@ -184,7 +184,8 @@ def test_a_single_pair_has_no_trajectory_and_lacks_none(tmp_path: Path) -> None:
     facts, page_, _, _ = written(tmp_path, view(made, products=one, frames=(0,)))
     assert facts["missing"] == []
     assert (
-        facts["verdict"] == "Complete: one stereo pair, 1 of 1 elevation models, 1 of 1 local paths, a path of 0.49 m."
+        facts["verdict"] == "Complete: one stereo pair, RMSE 0.400 mm against truth, 1 of 1 elevation models, "
+        "1 of 1 local paths, a path of 0.49 m."
     )
     assert not {"figure-8", "figure-9", "crosscheck", "overlap", "basic-pairs"} & set(page_.ids)
     assert "trajectory_drift" not in facts["metrics"]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from toys.finished import view, written
 
-from rille.pipeline.export.view import UNSTATED
+from rille.pipeline.export.view import UNSTATED, TaskRow
 from rille.pipeline.report import checks, delivery, page, summary, tables, terrain_map
-from rille.pipeline.report.canvas import Table
+from rille.pipeline.report.canvas import Figure, Table
 from rille.pipeline.report.gather import Terrain
 from rille.stages.calibration.rig import RigParams
 from rille.stages.core.declare import Bundle
@@ -67,30 +67,61 @@ def test_columns_of_pairs_without_anything_are_left_out():
     )
 
 
-def test_where_stops_are_closed():
-    two = [{"frame": k, "path": "closed", "blocked_m": m} for k, m in ((0, 4.0), (2, 12.345))]
-    (item,) = delivery._local_paths(two, merged=False)
-    assert item["why"] == "closed (frames 0, 2; closed 4 to 12.3 m ahead)"
-
-
 def rows(*paths):
     return [{"frame": 2 * k, "path": path} for k, path in enumerate(paths)]
 
 
-def test_a_missing_local_path_names_the_shorter_list_of_stops_and_whether_there_is_a_merged_path():
-    (few,) = delivery._local_paths(rows("found", "closed", "found", None, "found"), merged=False)
-    assert few["what"] == "1 of 4 stops have no local path"
-    assert few["why"] == "closed (frame 2)"
-    (most,) = delivery._local_paths(rows("closed", "closed", "found", "closed"), merged=True)
-    assert most["why"].startswith(
-        "closed (all stops but frame 4); a path over the merged terrain was found all the same"
-    )
-    (one,) = delivery._local_paths(rows("closed"), merged=True)
-    assert "one stop sees" in most["why"]
-    assert one["why"].endswith("found all the same")
-    (all_of_them,) = delivery._local_paths(rows("closed", "closed"), merged=False)
-    assert all_of_them["why"] == "closed (frames 0, 2)"
-    assert delivery._local_paths(rows("found", None), merged=True) == []
+def test_stops_without_a_local_path_are_told_with_the_reason_of_each():
+    (few,) = delivery._local_paths(rows("found", "closed", "found", None, "narrow", "closed"))
+    assert few["what"] == "No local path from 3 of 5 stops"
+    assert few["why"] == "closed (frames 2, 10); narrow (frame 8)"
+    assert delivery._local_paths(rows("found", None)) == []
+
+
+def failed(label, reason, behind=()):
+    return [TaskRow(label, "any", "failed", None, reason), *(TaskRow(b, "any", "skipped", None, r) for b, r in behind)]
+
+
+def test_failures_are_told_by_cause_with_the_tasks_that_depend_on_them():
+    tasks = [TaskRow(f"locus/local/{k}", "locus", "computed") for k in range(36)]
+    for k in (36, 40):
+        behind = [(f"risk/local/{k}", f"locus/local/{k} failed"), (f"path/local/{k}", f"risk/local/{k} was skipped")]
+        tasks += failed(f"locus/local/{k}", f"no ground within {k}.5 m: look down", behind)
+    tasks += failed("locus/local/44", "too dark: give light")
+    tasks += [TaskRow("merge", "merge", "skipped", None, "stopped after locus/local/44 failed")]
+    told = delivery._failures(SimpleNamespace(tasks=tasks))
+    assert [(m["kind"], m["what"], m["why"]) for m in told] == [
+        (
+            "failed",
+            "2 of 39 tasks locus/local failed (36, 40): 4 tasks depend on them",
+            "no ground within 36.5 m: look down",
+        ),
+        ("failed", "1 of 39 tasks locus/local failed (44)", "too dark: give light"),
+        ("skipped", "merge", "stopped after locus/local/44 failed"),
+    ]
+    (alone,) = delivery._failures(SimpleNamespace(tasks=failed("risk/world", "bad", [("x", "risk/world failed")])))
+    assert alone["what"] == "risk/world failed: 1 task depends on it"
+
+
+def test_figures_that_lack_the_same_are_one_line():
+    figures = [Figure("Map", why="not computed"), Figure("Seams", why="not computed"), Figure("Rig", why="no rig")]
+    nothing = SimpleNamespace(tasks=(), vehicle_source="")
+    told = delivery.complete({"missing": [], "absent": [], "delivered": []}, nothing, figures)["missing"]
+    assert [(m["what"], m["why"]) for m in told] == [("Map, Seams", "not computed"), ("Rig", "no rig")]
+
+
+@pytest.mark.parametrize(
+    ("figures", "words"),
+    [
+        ({"trajectory_drift": metric(0.84, "%"), "trajectory_ate_rmse": metric(0.1, "m")}, "drift 0.840 %"),
+        ({"trajectory_drift": metric(None, "%"), "trajectory_ate_rmse": metric(0.05, "m")}, "RMSE 50 mm"),
+        ({"trajectory_position_drift": metric(2.0, "%")}, "drift 2 %"),
+    ],
+)
+def test_the_verdict_gives_one_figure_against_truth(figures, words):
+    told = summary._verdict(view(), [], [], figures)
+    assert told.count("against truth") == 1
+    assert f"{words} against truth" in told
 
 
 @pytest.mark.parametrize(("nees", "words"), [(None, []), (8.9, []), (850.0, ["about 29 times too small"])])

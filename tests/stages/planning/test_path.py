@@ -13,7 +13,7 @@ from vehicles import SHORT
 
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.hazard.risk import BITS, CAUTION, HAZARDOUS, UNKNOWN
+from rille.stages.hazard.risk import BITS, CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.path import STAGE, PathParams, Route, describe, find_path
 
@@ -196,16 +196,16 @@ def test_ground_that_is_probably_a_hazard_closes_the_way() -> None:
     )
     assert len(find_path(given, lattice, SHORT, ends=ends, params=PathParams(p_certain_hazard=0.2)).cells) > 30
     given["risk"][30] = HAZARDOUS  # then it is not for what may be hazardous
-    assert find_path(given, lattice, SHORT, ends=ends).doubt is None
+    assert "p_certain_hazard" not in find_path(given, lattice, SHORT, ends=ends).plan.reason
 
 
-def test_ground_that_is_probably_a_hazard_everywhere_is_a_warning_with_the_figure() -> None:
+def test_ground_that_is_probably_a_hazard_everywhere_is_said_with_the_figure() -> None:
     lattice = Lattice.at(0, 40, CELL, 40, 30)
     arrays = maps(*level(lattice)) | {"p_hazard": np.full(lattice.shape, 0.15, dtype=np.float32)}
     source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": SHORT.model_dump()})
-    (line,) = STAGE.run(PathParams(), {}, {"risk": source}).meta["warnings"]
-    assert line.startswith("no path: ground with a p_hazard above path.p_certain_hazard 0.1 closes every path")
-    assert "up to 0.15" in line
+    reason = STAGE.run(PathParams(), {}, {"risk": source}).meta["reason"]
+    assert reason.startswith("ground with a p_hazard above path.p_certain_hazard 0.1 closes every path")
+    assert "up to 0.15" in reason
 
 
 def test_from_start_to_target_in_metres() -> None:
@@ -270,7 +270,6 @@ def test_a_map_that_is_cut_is_crossed_on_its_longer_side() -> None:
     risk, z = level(lattice)
     risk[70:74] = HAZARDOUS  # from edge to edge: 70 rows ahead of it, 26 before
     given = maps(risk, z)
-    assert not describe(find_path(given, lattice, SHORT), given, lattice, SHORT)["found"]
     facts = describe(find_path(given, lattice, SHORT, stretch=True), given, lattice, SHORT)
     assert facts["planner"] == "grid8"
     before, beyond = facts["left_out_m"]
@@ -286,7 +285,7 @@ def test_from_a_start_alone_a_mission_goes_round_as_well() -> None:
     risk, z = level(lattice)
     risk[20, 8:53] = risk[20:45, 8] = risk[20:45, 52] = HAZARDOUS  # a cup that opens to the near side
     ends = ((0.0, 0.25), None)
-    assert not len(find_path(maps(risk, z), lattice, SHORT, ends=ends).xyz)
+    assert not len(find_path(maps(risk, z), lattice, SHORT, ends=ends, params=PathParams(planner="rows")).xyz)
     route = find_path(maps(risk, z), lattice, SHORT, ends=ends, stretch=True)
     assert route.planner == "grid8"
     np.testing.assert_allclose(route.xyz[0, :2], [0.0, 0.25], atol=1e-9)
@@ -378,14 +377,62 @@ def test_limits_that_leave_nothing_to_drive_on_are_named() -> None:
     assert "all 1200 known cells are hazardous, 100 % of them by tilt: is vehicle.max_slope_deg 20" in facts["reason"]
 
 
-def test_limits_that_leave_nothing_are_a_warning_of_the_whole_map_alone() -> None:
-    lattice = Lattice.at(0, 40, CELL, 40, 30)
+WALLS = {
+    "unknown ground": {"risk": UNKNOWN},
+    "a hazard": {"risk": HAZARDOUS, "reason": BITS["step"]},
+    "ground too uncertain to be called safe": {"risk": HAZARDOUS, "reason": BITS["step"] | DOUBT_BIT},
+}
+
+
+@pytest.mark.parametrize("planner", ["auto", "grid8"])
+@pytest.mark.parametrize("words", [*WALLS, "p_hazard"])
+def test_a_local_path_leads_as_far_as_the_ground_is_known_and_safe_and_says_what_ends_it(
+    words: str, planner: str
+) -> None:
+    """A wall lies 60 rows ahead of the nearest one; beyond it is more ground than before it."""
+    lattice = Lattice.at(-20, 160, CELL, 160, 41)
     risk, z = level(lattice)
-    arrays = maps(np.full_like(risk, HAZARDOUS), z, "tilt")
-    source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": SHORT.model_dump()})
-    (line,) = STAGE.run(PathParams(), {}, {"risk": source}).meta["warnings"]
-    assert line.startswith("no path: all 1200 known cells are hazardous")
-    assert "warnings" not in STAGE.run(PathParams(), {"use": "local"}, {"risk": source}).meta
+    given = maps(risk, z) | {"p_hazard": np.zeros(lattice.shape, np.float32)}
+    for name, value in WALLS.get(words, {"p_hazard": 0.3}).items():
+        given[name][80:100] = value
+    facts = describe(find_path(given, lattice, SHORT, params=PathParams(planner=planner)), given, lattice, SHORT)
+    assert facts["found"]
+    assert facts["start"][1] <= lattice.ys()[-1] + 4 * SHORT.half_length, "where the vehicle stands"
+    assert lattice.ys()[99] - 4 * SHORT.half_length < facts["target"][1] < lattice.ys()[99]
+    assert facts["ended_by"] == (words if words in WALLS else "ground too uncertain to be called safe")
+
+
+def test_a_local_path_ends_at_the_edge_or_at_the_goal() -> None:
+    lattice = Lattice.at(-20, 60, CELL, 60, 41)
+    given = maps(*level(lattice))
+    for ends, words in (((None, None), "the edge of the map"), (((0.0, 0.1), (0.0, 0.4)), "the goal")):
+        assert describe(find_path(given, lattice, SHORT, ends=ends), given, lattice, SHORT)["ended_by"] == words
+
+
+@pytest.mark.parametrize("stretch", [False, True])
+@pytest.mark.parametrize("lengths", [0.5, 2.0])
+def test_no_path_is_what_does_not_lead_the_length_of_the_vehicle(lengths: float, stretch: bool) -> None:
+    lattice = Lattice.at(-20, 200, CELL, 200, 41)
+    risk, z = level(lattice)
+    risk[: 200 - round(lengths * 2 * SHORT.half_length / CELL)] = HAZARDOUS
+    risk[20:22] = 0  # too little ground elsewhere
+    on_middle = maps(risk, z, "tilt")  # keeps the middle off, not the wheels
+    facts = describe(find_path(on_middle, lattice, SHORT, stretch=stretch), on_middle, lattice, SHORT)
+    assert facts["found"] is (lengths > 1)
+    if lengths < 1:
+        assert facts["reason"] == "no ground that is known and safe leads a vehicle's length ahead"
+
+
+def test_a_local_path_goes_round_what_closes_the_rows() -> None:
+    lattice = Lattice.at(-30, 120, CELL, 120, 61)
+    risk, z = level(lattice)
+    risk[:10] = HAZARDOUS
+    risk[60, :50] = risk[60:90, 50] = HAZARDOUS  # a pocket ahead of the middle, open at the right of it
+    risk[100:, 50:] = HAZARDOUS
+    given = maps(risk, z)
+    facts = describe(find_path(given, lattice, SHORT), given, lattice, SHORT)
+    assert facts["found"]
+    assert facts["target"][1] > lattice.ys()[60]
 
 
 def test_going_down_is_no_climb() -> None:
@@ -416,11 +463,11 @@ def test_the_stage(blocked: bool) -> None:
     source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": SHORT.model_dump(), "frame": "local"})
     out = STAGE.run(PathParams(start=(9.0, 9.0)), {"use": "local"}, {"risk": source})
     check_outputs(STAGE, out)
-    assert out.meta["found"] is not blocked
+    assert out.meta["found"]
     if blocked:
-        # the front wheels stand half a wheel base ahead
-        assert out.meta["blocking_row"] in (20, 21, 22)
-        assert out["path"].shape == (0, 3)
+        # the front wheels stand half a wheel base before the row
+        assert lattice.ys()[24] < out.meta["target"][1] < lattice.ys()[20]
+        assert out.meta["ended_by"] == "a hazard"
         return
     outside = 2 * math.ceil(SHORT.half_length / CELL)  # rows at which the outline leaves the map
     assert 50 - outside <= out.meta["vertices"] <= 50

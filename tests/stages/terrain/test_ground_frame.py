@@ -16,6 +16,7 @@ from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.terrain import ground_frame as level_stage
 from rille.stages.terrain.ground import _singular_values, view_ground
 from rille.stages.terrain.ground_frame import GroundFrameParams, VerticalHint, level
+from rille.stages.terrain.locus.stage import LocusParams, local_lattice
 
 RIG = toed_in_rig()
 PARAMS = GroundFrameParams()
@@ -152,6 +153,37 @@ def test_without_ground_the_pair_is_levelled_all_the_same() -> None:
         noisy = far[0] + smooth_noise(far[0].shape, 0.2, np.random.default_rng(seed))
         assert level(noisy, far[1], patch, RIG, PARAMS)["plane"] is None
     assert "texture in common" in level(FLAT[0], FLAT[1], np.zeros_like(FLAT[2]), RIG, PARAMS)["no_ground"]
+
+
+@pytest.mark.parametrize("pitch", [83.0, 90.0])
+def test_a_camera_that_looks_down_is_told_to_state_the_vertical_and_sees_ground_with_it(pitch: float) -> None:
+    """The remedy is taken at its word."""
+    column, row, usable = disparity(RIG, pitched(pitch), plane(0.0, 0.0, -HEIGHT))
+    facts = level(column, row, usable, RIG, PARAMS)
+    assert facts["no_ground"].endswith("if that is the ground, state it as world.up in a manifest")
+    up = json.loads(facts["no_ground"].split("normal at ")[1].split(" in the")[0])
+    assert "no_ground" not in level(column, row, usable, RIG, PARAMS, VerticalHint(up=up))
+
+
+@pytest.mark.parametrize("up", [None, [0.0, -1.0, 0.0]])
+def test_where_no_plane_dominates_a_surface_may_be_stated(up: list[float] | None) -> None:
+    column, row, usable = disparity(RIG, pitched(0.0), box((-9.0, 1.0, -9.0), (9.0, 2.0, 9.0)))
+    column = column + np.random.default_rng(0).normal(0.0, 0.3 * abs(column[usable]).max(), column.shape)
+    facts = level(column, row, usable, RIG, PARAMS, VerticalHint(up=up))
+    assert facts["no_ground"].endswith("state its depth by ground_frame.reference_height")
+    assert "world.up" not in facts["no_ground"]
+
+
+def test_ground_that_is_seen_too_coarsely_says_which_cells_show_it() -> None:
+    """From 200 m with a baseline of 9 cm, as a drone; the remedy is taken at its word."""
+    column, row, usable = disparity(RIG, POSE, plane(0.0, 0.0, -200.0))
+    facts = level(column, row, usable, RIG, PARAMS.model_copy(update={"sigma_disparity": 0.01}))
+    assert "no ground is seen well enough" in facts["no_ground"]
+    cell = float(facts["no_ground"].split("locus.cell_size to ")[1].split()[0])
+    params = LocusParams(cell_size=cell, sigma_disparity=0.01)
+    assert local_lattice(RIG, facts, cell, params).rows > 0
+    with raises("RIL-344"):
+        local_lattice(RIG, facts, 0.5 * cell, params)
 
 
 def test_what_no_frame_can_be_posed_from_is_said_with_a_remedy() -> None:
