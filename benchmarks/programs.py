@@ -33,8 +33,8 @@ from evo.tools import file_interface
 from rosbags.highlevel import AnyReader
 
 import rille
+from rille.pipeline.commands.options import cache_folder
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.location import locate
 from rille.pipeline.export.programs import colmap as colmap_export
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "pipeline"))
@@ -106,7 +106,7 @@ class Opened:
     """A run with its exports, and what is right: the elevations of ``dem.tif`` as rasterio reads them."""
 
     def __init__(self, run: Path, exports: Path) -> None:
-        self.run, self.exports, self.cache = run, exports, locate(os.environ.get("RILLE_CACHE") or ".rille/cache")
+        self.run, self.exports, self.cache = run, exports, cache_folder(None)
         rille_command = Path(sys.executable).with_name("rille")
         for kind in EXPORTS:
             run_of(rille_command, "export", run, "--to", kind, "-o", exports / kind)

@@ -1,11 +1,11 @@
 """What the engine itself costs: a long sequence whose stages do nothing, laid out by the real dataflow.
 
-``python benchmarks/scale.py [--pairs 2000] [--jobs 2] [--bucket]``
+``python benchmarks/scale.py [--pairs 2000] [--jobs 2]``
 
 Every frame is basic, so that each has all the tasks of a pair. Each stage keeps its ports, arrays, parameters and code
 digest; only what it computes is replaced by a few zeros, committed as ever. Each size runs in a process of its own on
 an empty cache, then is planned by other processes, warm: at once, and on the next day, when files and index are old.
-With ``--bucket`` a small size follows with its cache in a bucket of moto's server. Printed are, a node or a task:
+Printed are, a node or a task:
 
 - plan: laying out and looking up when all is cached, as ``rille plan`` does
 - next day: a whole warm run a day later, which marks each artifact as used
@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import importlib
 import json
 import os
 import shutil
@@ -70,9 +69,6 @@ DAY = 86_400.0
 
 PLAN, OVERHEAD, MEMORY, FLAT = 0.2, 4.0, 1e9, 1.1
 """Limits: milliseconds a node, milliseconds a task, bytes of the client, memory at the end against the middle."""
-
-BUCKET_PAIRS = 100
-"""Pairs of the size whose cache is in a bucket: moto takes a hundred times as long for an artifact as the disk."""
 
 
 def _spent() -> float:
@@ -360,9 +356,8 @@ def figures(pairs: int, how: list[str], folder: Path, environment: Mapping[str, 
         warm = child(pairs, folder, how, what, environment)
         assert (warm["computed"], warm["nodes"]) == (0, cold["nodes"])
         yield planned(name, warm)
-    if not any(word.startswith("s3://") for word in how):
-        most, where = entries(folder)
-        yield f"  entries of the fullest folder: {most}, {where}"
+    most, where = entries(folder)
+    yield f"  entries of the fullest folder: {most}, {where}"
 
 
 def main() -> None:
@@ -373,7 +368,6 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="where to work (kept); a temporary one by default")
     parser.add_argument("--cache", default="", help="where artifacts are; in the folder by default")
     parser.add_argument("--flush", action="store_true", help="flush to the disk, as a real run does")
-    parser.add_argument("--bucket", action="store_true", help="also with the cache in a bucket")
     parser.add_argument("--what", choices=("all", "run", "plan", "later"), default="all", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.what != "all":
@@ -392,13 +386,6 @@ def main() -> None:
         for pairs in sorted({max(2, given.pairs // 4), given.pairs}):
             for line in figures(pairs, how, within / str(pairs), environment):
                 print(line, flush=True)
-        if given.bucket:
-            # Not imported by name: as source.py this file is a stage's own, whose imports must be packages.
-            with importlib.import_module("runs").bucket() as reached:
-                pairs, reached[UNFLUSHED] = min(BUCKET_PAIRS, given.pairs), "1"
-                print("with the cache in a bucket of moto's server:")
-                for line in figures(pairs, [*how, "--cache", "s3://bucket/cache"], within / "bucket", reached):
-                    print(line, flush=True)
 
 
 if __name__ == "__main__":

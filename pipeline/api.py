@@ -50,7 +50,7 @@ def reconstruct(
     runs
         Folder of the results.
     cache
-        Folder or bucket of the artifacts; ``RILLE_CACHE`` or ``.rille/cache`` by default.
+        Folder of the artifacts; ``RILLE_CACHE`` or ``.rille/cache`` by default.
     executor
         As ``--executor``, where there is no client.
     settings

@@ -13,14 +13,14 @@ from rille.pipeline.commands.options import COMPLETE, FAILED, RUNS, CacheFolder,
 app = App(name="cache", help="Look after the cache of artifacts.")
 
 
-def _there(cache: str | None) -> Path | str:
-    """The place of a cache; a folder that there is not was mistyped more often than it is empty."""
+def _there(cache: str | None) -> Path:
+    """The folder of a cache; one that there is not was mistyped more often than it is empty."""
     from rille.stages.core.errors import ConfigError
 
-    place = cache_folder(cache)
-    if isinstance(place, Path) and not place.is_dir():
-        raise ConfigError("RIL-589", f"there is no cache {place}", remedy="name it with --cache")
-    return place
+    folder = cache_folder(cache)
+    if not folder.is_dir():
+        raise ConfigError("RIL-589", f"there is no cache {folder}", remedy="name it with --cache")
+    return folder
 
 
 @app.command
@@ -68,7 +68,7 @@ def gc(
     if not kept:
         raise ConfigError(
             "RIL-744",
-            f"no run is known that uses the cache {store.location}: all of it would go",
+            f"no run is known that uses the cache {store.root}: all of it would go",
             remedy="give the folder of your runs with --runs, or remove the cache yourself",
         )
     cleared = maintenance.gc(store, kept, dry_run=dry_run)

@@ -23,7 +23,6 @@ from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.scheduler import Result
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.location import Location
 from rille.pipeline.flow.builders import Builder, name
 from rille.pipeline.runs import input_checks as judge
 from rille.pipeline.runs import synchrony
@@ -57,7 +56,7 @@ def check(
     *,
     output: Path | None = None,
     frames: tuple[int, ...],
-    cache: Location,
+    cache: Path,
 ) -> int:
     """Judge a sequence: prints a line for each finding, and draws the first pair's epipolar residuals.
 

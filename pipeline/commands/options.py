@@ -34,7 +34,7 @@ CacheFolder = Annotated[
     str | None,
     Parameter(
         name="--cache",
-        help="Folder of cached artifacts, or s3://bucket/prefix; RILLE_CACHE or .rille/cache by default.",
+        help="Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.",
     ),
 ]
 Debug = Annotated[bool, flag("Show tracebacks.")]
@@ -114,9 +114,9 @@ def options(
     )
 
 
-def cache_folder(given: str | Path | None) -> Path | str:
-    """Return the place of the artifact cache: ``--cache``, else ``RILLE_CACHE``, else ``.rille/cache`` here."""
-    from rille.pipeline.engine.store.location import locate
+def cache_folder(given: str | Path | None) -> Path:
+    """Return the folder of the artifact cache: ``--cache``, else ``RILLE_CACHE``, else ``.rille/cache`` here."""
+    from rille.pipeline.engine.store.folder import locate
 
     return locate(given or os.environ.get("RILLE_CACHE") or Path(".rille/cache"))
 

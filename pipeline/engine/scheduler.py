@@ -397,7 +397,7 @@ class _Run:
         for dependant in self.dependants.get(handle.index, ()):
             if dependant.status == "pending":
                 self._chain(dependant)
-        root, force = self.store.location, handle.stage in self.force
+        root, force = self.store.root, handle.stage in self.force
         return Task(handle.index, root, handle.spec, each(_given, handle.inputs), handle.key, force)
 
     def _arrive(self, handle: Handle, outcome: Outcome | Failed | NotBegun) -> None:
@@ -456,13 +456,13 @@ class _Run:
         amounts = {k: round(v) for k, v in vars(shares).items() if math.isfinite(v)}
         name = kind if isinstance(kind, str) else kind.scheduler.address
         self.ledger.run(executor=name, jobs=shares.workers, **amounts)
-        self.executor = make(kind, shares.workers, self.store.location, shares.limit)
+        self.executor = make(kind, shares.workers, self.store.root, shares.limit)
         self.result.executor_started = True
         if self.executor.pages:
             self.progress.detail(self.executor.pages)
 
     def _look_ahead(self) -> Graph:
-        """The graph laid out anew and looked up, by what this run's survey of the store has found."""
+        """The graph laid out anew and looked up, by the index that this run has read."""
         ahead = Graph() if self.options.survey is None else self.options.survey()
         # A run that looks up only, by the same code: what it foresees is what will be done.
         dry = _Run(ahead, self.store, RunOptions(force=self.force, dry=True))
@@ -506,7 +506,7 @@ class _Run:
             return False
         self.put_backs[handle.key] += 1
         self.to_compute.setdefault(handle.key, [handle])
-        # fresh: the survey from the start of the run still lists the artifact that has gone.
+        # fresh: the index vouches for a file that nobody wrote since, which the disk has damaged.
         absent = {h.key: h for h in handle.upstream() if self.store.lookup(h.stage, h.key, fresh=True) is None}
         for key, source in absent.items():
             source.reason = "its artifact was found damaged, or gone, when it was read"

@@ -26,7 +26,6 @@ from rille.pipeline.engine.packages import installed
 from rille.pipeline.engine.plain import plain, warn
 from rille.pipeline.engine.store.base import GoneError, Store
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
-from rille.pipeline.engine.store.location import Location, hints_folder, locate
 from rille.pipeline.flow import config as configuration
 from rille.stages.core.errors import ConfigError, RilleError
 
@@ -54,7 +53,7 @@ class Options:
     keep_going: bool = False
     force: frozenset[str] = frozenset()
     runs: Path = Path("runs")
-    cache: Location = Path(".rille/cache")
+    cache: Path = Path(".rille/cache")
     progress: str = "auto"
     memory_limit: str | None = None
     verb: str = "reconstruct"
@@ -119,7 +118,7 @@ def settings(options: Options) -> Settled:
     configuration.merge(read, configuration.parse_assignments(options.assignments))
     for_dataset, for_stages = configuration.split_dataset(read)
     if options.opened is None:
-        sequence = open_sequence(options.sequence, for_dataset, hints_folder(locate(options.cache)) / "files.json")
+        sequence = open_sequence(options.sequence, for_dataset, options.cache / "files.json")
     elif for_dataset:
         text = f"{next(iter(for_dataset))}: the sequence is open already"
         raise ConfigError("RIL-860", text, remedy="give its parameters to rille.open")

@@ -25,9 +25,8 @@ from rille.datasets.inspection import inspect
 from rille.datasets.manifest.opening import open_manifest
 from rille.datasets.registry import open_sequence
 from rille.pipeline.engine.store import manifest as stored
-from rille.pipeline.engine.store.folder import Folder
+from rille.pipeline.engine.store.folder import Folder, Item
 from rille.pipeline.engine.store.index import Index, pack
-from rille.pipeline.engine.store.place import Item
 from rille.pipeline.export.writers import read_disparity
 from rille.pipeline.flow import config
 from rille.stages.core.errors import RilleError

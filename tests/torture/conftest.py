@@ -118,26 +118,6 @@ def programs(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture(scope="session")
-def server():
-    """Port of an S3 server on loopback."""
-    import servers
-
-    with servers.s3() as port:
-        yield port
-
-
-@pytest.fixture
-def bucket(server: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A prefix of its own in a bucket, and the environment to reach it, which is this process's too."""
-    import servers
-
-    environment = servers.environment(server, tmp_path / "local")
-    for name, value in environment.items():
-        monkeypatch.setenv(name, value)
-    return f"s3://bucket/{tmp_path.name}", environment
-
-
-@pytest.fixture(scope="session")
 def calm(programs, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The undisturbed run: its cache, digests by key, and nodes by label."""
     import time

@@ -20,8 +20,7 @@ def together(programs, cache, runs, executors, grace, **options):
     *three, cleaner = programs(RUNS + 1)
     until = runs / "until"
     runs.mkdir(parents=True, exist_ok=True)
-    there = {"environment": options.get("environment") or {}}
-    cleaner.start(do="clear", cache=str(cache), runs=str(runs), until=str(until), grace=grace, **there)
+    cleaner.start(do="clear", cache=str(cache), runs=str(runs), until=str(until), grace=grace)
     for i, (program, executor) in enumerate(zip(three, executors, strict=True)):
         file = runs / "seq" / str(i) / "ledger.jsonl"
         program.start(cache=str(cache), executor=executor, ledger=str(file), **options)
@@ -53,26 +52,6 @@ def test_three_runs_on_one_cold_cache_with_clearing_beside(programs, calm, tmp_p
         shutil.rmtree(cache)
     expected = range(tries * total, RUNS * tries * total + 1)
     row("three runs on one cold cache, with gc", tries, lost, wrong, computed, expected, f"{sweeps} sweeps of gc")
-
-
-@pytest.mark.slow
-def test_three_runs_on_one_cold_bucket_with_clearing_beside(programs, calm, tmp_path, bucket, row):
-    prefix, environment = bucket
-    lost, wrong, computed, sweeps, total, tries = [], [], 0, 0, len(calm["digests"]), 3
-    for trial in range(tries):
-        cache = f"{prefix}/cache-{trial}"
-        options = {"grace": 3600, "environment": environment}
-        found, cleared = together(programs, cache, tmp_path / f"runs-{trial}", EXECUTORS, **options)
-        sweeps += cleared["times"]
-        assert cleared["removed"] == 0
-        for run in found:
-            assert run["ok"], [n["why"] for n in run["nodes"].values() if n["digest"] is None]
-            computed += sum(n["status"] == "computed" for n in run["nodes"].values())
-            wrong += look.wrong({n["key"]: n["digest"] for n in run["nodes"].values()}, calm["digests"])
-        wrong += look.wrong(look.decoded(cache), calm["digests"])
-        lost += sorted(set(calm["digests"]) ^ set(look.published(cache)))
-    expected = range(tries * total, RUNS * tries * total + 1)
-    row("three runs on one cold bucket, with gc", tries, lost, wrong, computed, expected, f"{sweeps} sweeps of gc")
 
 
 @pytest.mark.parametrize("tries", [1, pytest.param(12, marks=pytest.mark.slow)])

@@ -17,11 +17,11 @@ import traceback
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Protocol
 
 from rille.pipeline.engine.runtime.interrupts import held
 from rille.pipeline.engine.spec import Spec, flat
-from rille.pipeline.engine.store.location import Location
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import Outcome, ensure
 from rille.stages.core.errors import ConfigError
@@ -45,7 +45,7 @@ class Task:
     """
 
     number: int
-    root: Location
+    root: Path
     spec: Spec
     refs: Mapping[str, Given | list[Given]]
     key: str = ""
@@ -155,7 +155,7 @@ def known(kind: Any, jobs: int | None = None) -> None:
         raise ConfigError("RIL-540", f"{jobs} jobs are not permitted", remedy="give 1 or more")
 
 
-def make(kind: Any, jobs: int, cache: Location, memory: float) -> Executor:
+def make(kind: Any, jobs: int, cache: Path, memory: float) -> Executor:
     """``dask``, the address of a scheduler, a ``Client`` of dask, or ``inline``.
 
     ``jobs`` and ``memory`` are for workers of our own: how many, and bytes beyond which one that takes so many by

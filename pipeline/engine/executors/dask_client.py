@@ -30,6 +30,7 @@ from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
 from multiprocessing import resource_tracker
+from pathlib import Path
 from typing import Any
 
 import dask
@@ -48,7 +49,6 @@ from rille.pipeline.engine.runtime.apart import ignore_settings, leave_out, take
 from rille.pipeline.engine.runtime.environment import prepare_environment, worker_environment
 from rille.pipeline.engine.runtime.interrupts import held
 from rille.pipeline.engine.runtime.private import private_folder
-from rille.pipeline.engine.store.location import Location
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import CodeChangedError, Outcome
 from rille.stages.core.errors import ConfigError, RilleError
@@ -79,7 +79,7 @@ class WorkerDiedError(RilleError):
     """A task took several worker processes along: out of memory, or a crash in native code."""
 
 
-def here(jobs: int, cache: Location, memory: float) -> Dask:
+def here(jobs: int, cache: Path, memory: float) -> Dask:
     """Workers of this machine; they start while this process goes on."""
     _configure()
     interactive = leave_out()
@@ -111,7 +111,7 @@ def here(jobs: int, cache: Location, memory: float) -> Dask:
     return made
 
 
-def elsewhere(where: Any, cache: Location) -> Dask:
+def elsewhere(where: Any, cache: Path) -> Dask:
     """Workers of the scheduler at an address, or behind a ``Client``, if they are like this process."""
     client = where
     if isinstance(where, str):
@@ -137,7 +137,7 @@ class Dask:
 
     depth, interactive = DEPTH, False
 
-    def __init__(self, client: Any, cache: Location, slots: int, cluster: Any, *, ours: bool = True) -> None:
+    def __init__(self, client: Any, cache: Path, slots: int, cluster: Any, *, ours: bool = True) -> None:
         self._client, self.slots, self._cluster, self._ours = client, slots, cluster, ours
         self._run, self._submitted = f"rille-{uuid.uuid4().hex}", 0
         self._presence = dask_cluster.Presence(client, BIRTH if cluster else dask_cluster.NO_WORKERS)

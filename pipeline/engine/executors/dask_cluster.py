@@ -19,16 +19,16 @@ import uuid
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine.code_digest import OWN, tree_digest
 from rille.pipeline.engine.packages import version
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.location import Location
 from rille.stages.core.errors import ConfigError, RilleError
 
 PACKAGES = (
-    *("dask", "distributed", "google-crc32c", "llvmlite", "numba", "numcodecs", "numpy", "obstore", "pydantic", "zarr"),
+    *("dask", "distributed", "google-crc32c", "llvmlite", "numba", "numcodecs", "numpy", "pydantic", "zarr"),
     *("opencv-python-headless", "pycolmap", "pyogrio", "rasterio", "scipy"),
 )
 """Distributions whose version must be the client's, and the kind of processor that they work for."""
@@ -64,12 +64,12 @@ def unlike(theirs: Identity, ours: Identity) -> str:
     return ", ".join(f"{n} {theirs.get(n, 'none')} instead of {ours[n]}" for n in ours if theirs.get(n) != ours[n])
 
 
-def introduce(location: Location, token: str, name: str) -> dict[str, Any]:
+def introduce(cache: Path, token: str, name: str) -> dict[str, Any]:
     """Run on a worker: what it is, and whether it reads the client's probe and writes one of its own."""
     threads = [v for v in ONE_THREAD if os.environ.get(v) != "1"]
     facts: dict[str, Any] = {"identity": identity(), "threads": threads, "cache": ""}
     try:
-        store = Store(location)
+        store = Store(cache)
         if read_probe(store, token) != token.encode():
             facts["cache"] = "the client's probe is not there"
         write_probe(store, f"{token}-{name}")
@@ -80,15 +80,15 @@ def introduce(location: Location, token: str, name: str) -> dict[str, Any]:
 
 def write_probe(store: Store, name: str) -> None:
     """Leave a small file in the cache; clearing up takes what is forgotten."""
-    store.place.write(f"probe/{name}", name.encode())
+    store.folder.write(f"probe/{name}", name.encode())
 
 
 def read_probe(store: Store, name: str) -> bytes | None:
     """Read the probe that the client wrote; None if this machine cannot see it."""
-    return store.place.read(f"probe/{name}")
+    return store.folder.read(f"probe/{name}")
 
 
-def examine(client: Any, cache: Location) -> None:
+def examine(client: Any, cache: Path) -> None:
     """Refuse a cluster one of whose workers is not like this process, or does not share the cache.
 
     Raises
@@ -110,10 +110,10 @@ def examine(client: Any, cache: Location) -> None:
                 raise _no_cache(worker_name(client, address), cache, "its probe is not seen here")
     finally:
         with suppress(OSError, RilleError):
-            store.place.delete(f"probe/{name}" for name in names)
+            store.folder.delete(f"probe/{name}" for name in names)
 
 
-def _judge(client: Any, address: str, answer: Any, ours: Identity, cache: Location) -> None:
+def _judge(client: Any, address: str, answer: Any, ours: Identity, cache: Path) -> None:
     name = worker_name(client, address)
     if isinstance(answer, BaseException):
         raise ConfigError(
@@ -141,8 +141,8 @@ def worker_name(client: Any, address: str) -> str:
     return f"worker {known} ({address})" if known not in ("", address) else f"worker {address}"
 
 
-def _no_cache(name: str, cache: Location, why: str) -> ConfigError:
-    remedy = "give --cache a folder that all machines share, or s3://bucket/prefix"
+def _no_cache(name: str, cache: Path, why: str) -> ConfigError:
+    remedy = "give --cache a folder that all machines share"
     return ConfigError("RIL-523", f"{name} does not share the cache {cache}: {why}", remedy=remedy)
 
 

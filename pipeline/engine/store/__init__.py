@@ -1,1 +1,1 @@
-"""Artifacts: committed once, found by their keys, in a folder or a bucket."""
+"""Artifacts: committed once, found by their keys, in a folder."""

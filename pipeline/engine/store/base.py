@@ -1,24 +1,21 @@
-"""Content-addressed store of artifacts: look-up, commit, quarantine; the same in a folder and in a bucket.
+"""Content-addressed store of artifacts: look-up, commit, quarantine.
 
-Files, in the cache folder or below the prefix of a bucket::
+Files in the cache folder::
 
     artifacts/<stage>/<k>/<key>.zarr.zip    an artifact, one file; <k> are the key's first two digits
     quarantine/<stage>-<key>-<unique>.*     a damaged artifact, and the reason, set aside
     index/<sequence>/<digest>               what a run used (rille.pipeline.engine.store.index)
     rille.json                              the format
-
-and on this machine (:func:`~rille.pipeline.engine.store.location.hints_folder`)::
-
     hints/<sequence>/                       of its earlier runs, for explanations and estimates; never a matter
                                             of correctness
     roots/<digest>.json                     folders of runs that use the cache
 
 The file of an artifact (:mod:`rille.pipeline.engine.store.manifest`) is its own commit: it is on the disk as a whole
-before it gets its name, and gets it only if nobody has it (a link; in a bucket ``If-None-Match: *``). Killed at any
-instant, a run leaves a whole artifact or none. Of two that commit one key the second is compared and thrown away:
-another digest is a :class:`NonDeterministicError`. The size of the file is compared at each look-up, checksums of what
-is read on each reading, and all of them by :func:`rille.pipeline.engine.store.maintenance.verify`. What is damaged is
-set aside, counts as absent and is computed again.
+before it gets its name, and gets it only if nobody has it (a link). Killed at any instant, a run leaves a whole
+artifact or none. Of two that commit one key the second is compared and thrown away: another digest is a
+:class:`NonDeterministicError`. The size of the file is compared at each look-up, checksums of what is read on each
+reading, and all of them by :func:`rille.pipeline.engine.store.maintenance.verify`. What is damaged is set aside, counts
+as absent and is computed again.
 """
 
 from __future__ import annotations
@@ -32,10 +29,9 @@ from typing import Any
 
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
-from rille.pipeline.engine.store.folder import Folder, StoreError
-from rille.pipeline.engine.store.index import Index
+from rille.pipeline.engine.store.folder import Folder, StoreError, locate
+from rille.pipeline.engine.store.index import Index, folder_of
 from rille.pipeline.engine.store.lazy_arrays import LazyArrays
-from rille.pipeline.engine.store.location import Location, folder_of, hints_folder, locate
 from rille.pipeline.engine.store.manifest import (
     FIRST,
     Manifest,
@@ -48,7 +44,6 @@ from rille.pipeline.engine.store.manifest import (
     unframe,
 )
 from rille.pipeline.engine.store.output_digest import array_digests, output_digest
-from rille.pipeline.engine.store.place import Place
 from rille.pipeline.engine.store.zarr_group import encode
 from rille.stages.core.declare import Bundle, Stage
 from rille.stages.core.errors import RilleError
@@ -63,22 +58,17 @@ class GoneError(StoreError):
 
 
 class Store:
-    """Artifacts in a folder, or at ``s3://bucket/prefix``.
-
-    ``location`` is what another process opens the store by; ``root`` is the local folder of its hints, for a folder
-    the same.
+    """Artifacts in a folder, ``root``, by which another process opens the same store.
 
     Raises
     ------
-    RilleError
-        There is no such place, or it may not be used.
+    ConfigError
+        The cache is no folder but a URL.
     """
 
     def __init__(self, cache: Path | str) -> None:
-        where = locate(cache)
-        self.location: Location = where if isinstance(where, str) else where.absolute()
-        self.root = hints_folder(self.location).absolute()
-        self.place: Place = _place(self.location)
+        self.root = locate(cache).absolute()
+        self.folder = Folder(self.root)
         self._index: Index | None = None
 
     def hints(self, sequence: str) -> Path:
@@ -86,18 +76,17 @@ class Store:
         return self.root / "hints" / folder_of(sequence)
 
     def survey(self, sequence: str) -> None:
-        """Before many look-ups: find out at once what is there, with few requests or readings.
+        """Before many look-ups: read the index of earlier runs, which spares the manifests of what it names.
 
         ``sequence`` names what runs over the same images, whatever their parameters.
         """
-        if self.place.earlier():
-            text = f"artifacts of an earlier format in {self.location} are not read: 'rille cache gc' removes them"
+        if self.folder.earlier():
+            text = f"artifacts of an earlier format in {self.root} are not read: 'rille cache gc' removes them"
             warn(warning("RIL-985", text))
-        self.place.survey()
-        self._index = Index(self.place, sequence)
+        self._index = Index(self.folder, sequence)
 
     def note(self, refs: Iterable[Ref]) -> None:
-        """Record, at the end of a run, which artifacts it used: for later surveys and for ``gc``. Best effort."""
+        """Record, at the end of a run, which artifacts it used: for later look-ups and for ``gc``. Best effort."""
         if self._index is not None:
             with suppress(OSError, RilleError):  # it may permit reading alone
                 self._index.note({ref.key: ref for ref in refs})
@@ -110,18 +99,18 @@ class Store:
         StoreError
             The folder cannot be made, is full or may not be written.
         """
-        self.place.begin()
+        self.folder.begin()
 
     def lookup(self, stage: str, key: str, *, fresh: bool = False, use: bool = True) -> Ref | None:
         """The artifact of a key, the size of its file checked; a damaged one is set aside and counts as absent.
 
-        ``fresh`` does not rely on a survey. With ``use`` clearing up leaves it alone from now on.
+        ``fresh`` does not rely on the index. With ``use`` clearing up leaves it alone from now on.
         """
-        item = self.place.status(artifact_path(stage, key), fresh=fresh)
+        item = self.folder.status(artifact_path(stage, key))
         if item is None:
             return None
         known = None if fresh or self._index is None else self._index.get(stage, item, key)
-        touched = self.place.use(item) if use else item
+        touched = self.folder.use(item) if use else item
         if touched is None:
             return None
         if known is not None:
@@ -150,12 +139,12 @@ class Store:
     def _read_manifest(self, stage: str, key: str) -> Manifest | None:
         """Raises ValueError where the content is not what was written."""
         path = artifact_path(stage, key)
-        line = self.place.read(path, 0, FIRST)
+        line = self.folder.read(path, 0, FIRST)
         if line is None:
             return None
         size = length(line)
         if size > len(line):
-            line += self.place.read(path, len(line), size) or b""
+            line += self.folder.read(path, len(line), size) or b""
         manifest = unframe(line[:size])
         if (manifest["stage"], manifest["key"]) != (stage, key):
             raise ValueError("the manifest is that of another artifact")
@@ -163,7 +152,7 @@ class Store:
 
     def path(self, ref: Ref) -> str:
         """Return the address by which ``xarray.open_zarr`` opens an artifact."""
-        return self.place.url(ref.path)
+        return f"zip::{self.root / ref.path}"
 
     def open(self, ref: Ref) -> Bundle:
         """The bundle behind a reference; each array is read, and its chunks' checksums compared, at first access.
@@ -176,16 +165,16 @@ class Store:
         manifest = self.manifest(ref.stage, ref.key)
         if manifest is None or manifest["digest"] != ref.digest:
             raise GoneError(
-                "RIL-572", f"artifact {ref.stage} {ref.key[:12]} has gone from {self.location}", remedy="run again"
+                "RIL-572", f"artifact {ref.stage} {ref.key[:12]} has gone from {self.root}", remedy="run again"
             )
 
         def damaged(reason: str) -> bool:
             return self.set_aside(ref.stage, ref.key, manifest, reason)
 
         def read(start: int, stop: int) -> bytes | None:
-            return self.place.read(ref.path, start, stop)
+            return self.folder.read(ref.path, start, stop)
 
-        return Bundle(LazyArrays(read, manifest, damaged, slow=self.place.slow), manifest["meta"])
+        return Bundle(LazyArrays(read, manifest, damaged), manifest["meta"])
 
     def commit(
         self, stage: Stage, key: str, bundle: Bundle, *, label: str = "", provenance: Mapping[str, Any] | None = None
@@ -198,8 +187,6 @@ class Store:
             The key is there already, with another digest.
         StoreError
             The disk is full or may not be written.
-        BucketError
-            The server does not answer, or refuses.
         """
         digests = array_digests(bundle.arrays)
         digest = output_digest(digests, bundle.meta)
@@ -218,18 +205,16 @@ class Store:
         path = artifact_path(stage.name, key)
         # Another process may publish, damage or remove the same artifact between any two of these steps.
         for _ in range(3):
-            if self.place.create(path, pieces):
+            if self.folder.create(path, pieces):
                 return reference(manifest)
-            # fresh: the artifact that was in the way came after the survey.
+            # fresh: the index vouches for a file that nobody wrote since, which the disk may have damaged.
             there = self.lookup(stage.name, key, fresh=True)  # a damaged one is set aside
             if there is not None and there.digest == digest:
                 return there
             old = self.manifest(stage.name, key)
             if there is not None and old is not None:
                 raise NonDeterministicError("RIL-577", difference(label or key[:12], manifest, old))
-        raise StoreError(
-            "RIL-573", f"cannot publish {path} in {self.location}", remedy="remove that file and run again"
-        )
+        raise StoreError("RIL-573", f"cannot publish {path} in {self.root}", remedy="remove that file and run again")
 
     def set_aside(self, stage: str, key: str, manifest: Manifest | None, reason: str) -> bool:
         """Move a damaged artifact out of the way; False: it stays, for the cache may be read-only.
@@ -243,16 +228,8 @@ class Store:
                 # Compare attempts, not keys: a sound artifact of the same key may have replaced the damaged one.
                 if found is None or manifest is None or found["attempt"] != manifest["attempt"]:
                     return True
-            self.place.move(path, f"{aside}.zarr.zip")
+            self.folder.move(path, f"{aside}.zarr.zip")
             with suppress(OSError, RilleError):
-                self.place.write(f"{aside}.txt", f"{reason}\n".encode())
+                self.folder.write(f"{aside}.txt", f"{reason}\n".encode())
             return True
         return False
-
-
-def _place(location: Location) -> Place:
-    if isinstance(location, Path):
-        return Folder(location)
-    from rille.pipeline.engine.store.s3 import connect
-
-    return connect(location)

@@ -1,38 +1,75 @@
-"""A folder that holds the files of a store; see :class:`~rille.pipeline.engine.store.place.Place`."""
+"""The folder of a store, and its files; nothing here knows what an artifact is.
+
+Paths are relative to the folder, with ``/``.
+"""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import stat
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from rille.pipeline.engine.failures import CLOSED, FULL
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.engine.store.place import FORMAT, MARK, Item
-from rille.stages.core.errors import RilleError
+from rille.stages.core.errors import ConfigError, RilleError
+
+MARK, FORMAT = "rille.json", 2
+"""File that says in which format the artifacts are."""
+
+RACY = 0.1
+"""Seconds: a file that was changed so short a time ago might change again within one tick of the clock."""
+
+USED = 3600.0
+"""Seconds after which a look-up touches a file again, well below the grace of clearing up."""
 
 
 class StoreError(RilleError):
     """The cache cannot be read or written."""
 
 
-RACY = 0.1
-"""Seconds: a file that was changed so short a time ago might change again within one tick of the clock."""
+class Item(NamedTuple):
+    """A file; ``mark`` changes whenever its content does (empty: it might change and have the same one).
+
+    ``modified`` is in seconds since 1970.
+    """
+
+    path: str
+    size: int
+    mark: str
+    modified: float
 
 
-USED = 3600.0
-"""Seconds after which a look-up touches a file again, well below the grace of clearing up."""
+def locate(cache: Path | str) -> Path:
+    """Return the folder of a cache.
+
+    Raises
+    ------
+    ConfigError
+        It is a URL; the message does not repeat what may be a password.
+    """
+    text = str(cache)
+    # A Path has lost the second slash of a URL.
+    if "://" in text or (isinstance(cache, Path) and re.match(r"[a-z0-9]+:/", text)):
+        raise ConfigError(
+            "RIL-546",
+            f"a cache at {text.partition(':')[0]}:// is not supported",
+            remedy="give --cache a folder; machines share one by NFS, say",
+        )
+    return Path(cache)
 
 
 class Folder:
-    """Files below ``root``, which is made when the first one is written."""
+    """Files below ``root``, which is made when the first one is written.
 
-    slow = False
+    Where the disk refuses, a method raises a :class:`StoreError` in one line.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -49,14 +86,14 @@ class Folder:
                 atomic.write(self.root / MARK, json.dumps({"format": FORMAT}))
 
     def earlier(self) -> bool:
-        """Whether there are artifacts, and no mark."""
+        """Whether artifacts of an earlier format are here: there are some, and no mark."""
         return (self.root / "artifacts").is_dir() and not (self.root / MARK).exists()
 
-    def survey(self) -> None:
-        """A question takes microseconds."""
+    def status(self, path: str) -> Item | None:
+        """Return the status of a file, None if there is none.
 
-    def status(self, path: str, *, fresh: bool = False) -> Item | None:
-        """Return the status of a file. The mark has inode, size and times; no call can set the time of change."""
+        The mark has inode, size and times; no call can set the time of change.
+        """
         with self._clear_errors():
             try:
                 return _item(path, os.stat(f"{self.root}/{path}"))  # no Path: a plan asks tens of thousands of times
@@ -64,7 +101,7 @@ class Folder:
                 return None
 
     def use(self, item: Item) -> Item | None:
-        """Touch a file that nobody touched for :data:`USED`."""
+        """Touch a file that nobody touched for :data:`USED`: :meth:`clear` spares it. None if it has gone."""
         if item.modified > time.time() - USED:
             return item
         try:
@@ -76,7 +113,10 @@ class Folder:
         return self.status(item.path)
 
     def read(self, path: str, start: int = 0, stop: int | None = None) -> bytes | None:
-        """Read a part of a file; None where there is none, but a pipe or a device, say."""
+        """Return bytes ``start`` to ``stop`` (exclusive) of a file, fewer if it ends before; None if there is no file.
+
+        Without ``stop`` the whole file is returned. A pipe or a device is no file.
+        """
         with self._clear_errors():
             try:
                 with open(f"{self.root}/{path}", "rb", buffering=0, opener=_at_once) as file:
@@ -87,17 +127,17 @@ class Folder:
                 return None
 
     def write(self, path: str, data: bytes) -> None:
-        """Replace a file."""
+        """Replace a file, whole or not at all."""
         with self._clear_errors():
             atomic.write(self.root / path, data)
 
     def create(self, path: str, pieces: Iterable[bytes]) -> bool:
-        """Write a file unless there is one."""
+        """Write a file unless there is one, durably before it can be seen. False: there is one."""
         with self._clear_errors():
             return atomic.create(self.root / path, pieces)
 
     def list(self, area: str) -> Iterable[Item]:
-        """All files, in order of their names."""
+        """All files below a folder, in order of their names."""
         top = f"{self.root}/{area}".rstrip("/")
         found = []
         for folder, _, names in os.walk(top):
@@ -109,7 +149,7 @@ class Folder:
         return sorted(found)
 
     def move(self, path: str, to: str) -> None:
-        """Rename a file."""
+        """Rename a file; nothing where it has gone."""
         with self._clear_errors(), suppress(FileNotFoundError):
             target = self.root / to
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -147,10 +187,6 @@ class Folder:
         for above in list(Path(path).parents)[:-2]:  # the areas themselves stay
             # rmdir refuses a folder that is not empty; the callers suppress that error, and it ends the loop.
             (self.root / above).rmdir()
-
-    def url(self, path: str) -> str:
-        """Return the URL of an archive in fsspec's notation."""
-        return f"zip::{self.root / path}"
 
     @contextmanager
     def _clear_errors(self) -> Iterator[None]:

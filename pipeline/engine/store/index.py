@@ -1,7 +1,7 @@
 """What the runs of a sequence found in a store: manifests that nobody touched since need not be read again.
 
 A hint beside the artifacts, ``index/<sequence>/<name>``, written at the end of a run: a gzip of lines, one for each
-artifact that it used, with the mark of its file (:class:`~rille.pipeline.engine.store.place.Item`) and what the
+artifact that it used, with the mark of its file (:class:`~rille.pipeline.engine.store.folder.Item`) and what the
 manifest says of digest, sizes and facts. If the mark differs, or the index is damaged, the manifest is read as if
 there were no index. Clearing up spares what an index names that is younger than its grace.
 """
@@ -15,12 +15,12 @@ import json
 import time
 import zlib
 from collections.abc import Iterable, Mapping
+from urllib.parse import quote
 
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
-from rille.pipeline.engine.store.location import folder_of
+from rille.pipeline.engine.store.folder import Folder, Item
 from rille.pipeline.engine.store.manifest import Facts, Ref, parsed
-from rille.pipeline.engine.store.place import Item, Place
 from rille.stages.core.errors import RilleError
 
 AREA = "index"
@@ -29,7 +29,7 @@ NEWEST = 4
 """Indices read of a sequence."""
 
 MOST = 256_000_000
-"""Bytes that all of them may unpack to: a small object may unpack to any size."""
+"""Bytes that all of them may unpack to: a small file may unpack to any size."""
 
 LONGEST = 64_000_000
 """Bytes of a line: facts of one artifact."""
@@ -41,18 +41,23 @@ FRESH = 3600.0
 """Seconds after which a run writes again that it used the same artifacts."""
 
 
+def folder_of(sequence: str) -> str:
+    """Name of the folder of what is kept by sequence; no name leads out of where it lies."""
+    return quote(sequence, safe="").replace(".", "%2E") or "-"
+
+
 class Index:
     """Lines by key, of the newest indices of a sequence."""
 
-    def __init__(self, place: Place, sequence: str) -> None:
-        self._place = place
-        self._folder = f"{AREA}/{folder_of(sequence)}"
+    def __init__(self, folder: Folder, sequence: str) -> None:
+        self._folder = folder
+        self._area = f"{AREA}/{folder_of(sequence)}"
         self._written: dict[str, float] = {}
         self.lines: dict[str, str] = {}
         room = MOST
-        for item in sorted(place.list(self._folder), key=lambda i: -i.modified)[:NEWEST]:
+        for item in sorted(folder.list(self._area), key=lambda i: -i.modified)[:NEWEST]:
             try:
-                room -= _read(place, item, self.lines, room)
+                room -= _read(folder, item, self.lines, room)
                 self._written[item.path] = item.modified
             except ValueError as error:
                 warn(warning("RIL-984", f"{item.path} in the cache is passed over: {error}"))
@@ -76,22 +81,19 @@ class Index:
 
     def note(self, used: Mapping[str, Ref]) -> None:
         """Write what a run used, unless an index says so that is young."""
-        # Lines of the survey are still right: whatever was looked up through them had its mark compared.
+        # Lines that were read are still right: whatever was looked up through them had its mark compared.
         known = {key: self.lines[key] for key in used if key in self.lines}
-        if len(known) < len(used):
-            # The artifacts of this run came after the survey at its start.
-            self._place.survey()
-            for key in used.keys() - known.keys():
-                ref = used[key]
-                item = self._place.status(ref.path)
-                if item is not None and item.mark and item.size == ref.stored:
-                    known[key] = _line(item.mark, ref)
+        for key in used.keys() - known.keys():
+            ref = used[key]
+            item = self._folder.status(ref.path)
+            if item is not None and item.mark and item.size == ref.stored:
+                known[key] = _line(item.mark, ref)
         # named by what it says: of runs that use the same there is one
         lines = [f"{key} {known[key]}\n" for key in sorted(known)]
         name = hashlib.sha256("".join(lines).encode()).hexdigest()[:32]
-        path = f"{self._folder}/{name}"
+        path = f"{self._area}/{name}"
         if known and self._written.get(path, 0.0) < time.time() - FRESH:
-            self._place.write(path, pack(lines))
+            self._folder.write(path, pack(lines))
             self.lines |= known
 
 
@@ -106,11 +108,11 @@ def pack(lines: Iterable[str]) -> bytes:
     return b"".join([*(packer.compress(line.encode()) for line in lines), packer.flush()])
 
 
-def _read(place: Place, item: Item, lines: dict[str, str], room: int) -> int:
+def _read(folder: Folder, item: Item, lines: dict[str, str], room: int) -> int:
     """Take lines in that are not known yet; gives the bytes of all. Raises ValueError where it is none of ours."""
     size = 0
     found: dict[str, str] = {}
-    with gzip.GzipFile(fileobj=io.BytesIO(place.read(item.path) or b"")) as file:
+    with gzip.GzipFile(fileobj=io.BytesIO(folder.read(item.path) or b"")) as file:
         try:
             while line := file.readline(min(LONGEST, room - size + 1)):
                 size += len(line)
@@ -128,13 +130,13 @@ def _read(place: Place, item: Item, lines: dict[str, str], room: int) -> int:
     return size
 
 
-def used_since(place: Place, limit: float) -> set[str]:
+def used_since(folder: Folder, limit: float) -> set[str]:
     """Keys that indices name which were written after a time."""
     keys: dict[str, str] = {}
-    for item in place.list(AREA):
+    for item in folder.list(AREA):
         if item.modified > limit:
             try:
-                _read(place, item, keys, MOST)
+                _read(folder, item, keys, MOST)
             except (ValueError, RilleError):
                 continue
     return set(keys)

@@ -47,13 +47,10 @@ class LazyArrays(Mapping[str, AnyArray]):
     ``damaged(reason)`` is called before the error, and says whether the artifact is out of the way.
     """
 
-    def __init__(
-        self, read: Read, manifest: Mapping[str, Any], damaged: Callable[[str], bool], *, slow: bool = False
-    ) -> None:
+    def __init__(self, read: Read, manifest: Mapping[str, Any], damaged: Callable[[str], bool]) -> None:
         self._fetch = read
         self._manifest = manifest
         self._damaged = damaged
-        self._slow = slow
         self._loaded: dict[str, AnyArray] = {}
 
     def __iter__(self) -> Iterator[str]:
@@ -92,7 +89,7 @@ class LazyArrays(Mapping[str, AnyArray]):
             whole = self._one_chunk(name)
             if whole is not None:
                 return whole if window == (...,) else whole[window].copy()
-            store = _reading(lambda key: self._member(f"{name}/{key}"), self._slow)
+            store = _reading(lambda key: self._member(f"{name}/{key}"))
             array = zarr.open_array(store=store, mode="r")
             found = self._manifest["arrays"][name]
             # Its own description is the archive's, and may claim any size; that of the manifest was looked at.
@@ -156,16 +153,14 @@ class _WrongError(Exception):
     """What is wrong with a member, in words."""
 
 
-def _reading(member: Callable[[str], bytes | None], slow: bool) -> Any:
+def _reading(member: Callable[[str], bytes | None]) -> Any:
     """A store of zarr's that asks for each member when it is read: of a window, only the chunks that it touches."""
-    import asyncio
-
     from zarr.core.buffer import cpu
     from zarr.storage import MemoryStore
 
     class Reading(MemoryStore):
         async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
-            data = await asyncio.to_thread(member, key) if slow else member(key)
+            data = member(key)
             return None if data is None else cpu.Buffer.from_bytes(data)
 
     return Reading(read_only=True)

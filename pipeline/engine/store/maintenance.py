@@ -51,7 +51,7 @@ class Cleared:
 
 def artifacts(store: Store) -> Iterator[tuple[str, str]]:
     """Stage and key of everything committed; files of other names are not ours."""
-    for item in store.place.list("artifacts"):
+    for item in store.folder.list("artifacts"):
         if found := ARTIFACT.fullmatch(item.path):
             yield found[1], found[3]
 
@@ -66,7 +66,7 @@ def verify(store: Store, *, deep: bool = False) -> tuple[int, list[Damage]]:
     """
     sound, found = 0, []
     for stage, key in artifacts(store):
-        data = store.place.read(artifact_path(stage, key))
+        data = store.folder.read(artifact_path(stage, key))
         if data is None:
             continue  # cleared away, or set aside by a run, just now
         manifest = None
@@ -100,13 +100,13 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
 
     Only files that were neither made nor used within ``grace`` seconds are removed, since a run may be under way; the
     index of a run states what it used. ``keep`` are the keys of the kept runs
-    (:func:`rille.pipeline.engine.events.keys`). The age of an object in a bucket is this machine's clock minus the
+    (:func:`rille.pipeline.engine.events.keys`). In a shared folder the age of a file is this machine's clock minus the
     server's: keep ``grace`` well above the difference of the clocks.
     """
     limit, cleared, doomed = time.time() - grace, Cleared(), []
     # Of a run whose folder is gone, or of another machine, the index alone tells what it used.
-    kept = set(keep) | index.used_since(store.place, limit)
-    for item in store.place.list(""):
+    kept = set(keep) | index.used_since(store.folder, limit)
+    for item in store.folder.list(""):
         if item.modified > limit:
             continue
         if found := ARTIFACT.fullmatch(item.path):
@@ -126,5 +126,5 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
         if not dry_run:
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
     if not dry_run:
-        store.place.clear(doomed)
+        store.folder.clear(doomed)
     return cleared

@@ -3,7 +3,7 @@
 ``{"crc32c": "........", "bytes": .........., "manifest": {...}}`` on a line of its own, then the archive, whose
 members are stored as they are (zarr has compressed them) with a fixed time, so that equal arrays make equal archives.
 Any reader of zip files finds its directory at the end; we go by the manifest, which lists each member with offset (from
-the end of the line), size and crc32c: a part of an array is a few readings of a range, on a disk as in a bucket.
+the end of the line), size and crc32c: a part of an array is a few readings of a range.
 
 In memory a manifest's offsets count from the beginning of the file.
 """

@@ -15,9 +15,8 @@ from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store import folder, index, manifest
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.folder import Folder
+from rille.pipeline.engine.store.folder import Folder, Item
 from rille.pipeline.engine.store.manifest import Ref
-from rille.pipeline.engine.store.place import Item
 
 NODES = 9
 
@@ -198,18 +197,18 @@ def test_an_index_of_what_no_run_writes_costs_little(cache, monkeypatch, capsys,
 def test_an_index_is_compact(tmp_path):
     """Of an artifact: key, digest and mark, which cannot be compressed further, and what its facts need."""
 
-    class Place(Folder):
-        def status(self, path, *, fresh=False):
+    class Marked(Folder):
+        def status(self, path):
             return Item(path, 20_000, f"{hash(path) & (1 << 64) - 1:x}.4e20", 0.0)
 
-    place, refs = Place(tmp_path), {}
+    folder, refs = Marked(tmp_path), {}
     for k in range(5000):
         key, digest = (f"{hash((k, what)) & (1 << 256) - 1:064x}".replace("0000", f"{k:04x}") for what in "kd")
         refs[key] = Ref(key, "hfvm", digest, {"frame": k, "valid": k / 3}, 30_000 + k, 20_000)
-    made = index.Index(place, "s")
+    made = index.Index(folder, "s")
     made.note(refs)
     (path,) = indices(tmp_path)
     assert path.stat().st_size < 140 * len(refs)
-    again = index.Index(place, "s")
+    again = index.Index(folder, "s")
     key = next(iter(refs))
-    assert again.get("hfvm", place.status(refs[key].path), key) == refs[key]
+    assert again.get("hfvm", folder.status(refs[key].path), key) == refs[key]

@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import google_crc32c
 import numpy as np
 import pytest
 import xarray
@@ -22,6 +23,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 from raising import raises
 
+from rille.pipeline.commands.options import cache_folder
 from rille.pipeline.engine.store import folder, maintenance, manifest, zarr_group
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.output_digest import array_digests, output_digest
@@ -329,6 +331,39 @@ def test_a_forged_manifest_that_claims_what_no_archive_holds_is_a_miss(cache, ab
     assert Store(cache).lookup("toy", KEY) is None
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"stage": "scale"},
+        {"key": "j" * 64},
+        {"files": {"../../x": [0, 1, "00000000"]}},
+        {"files": {"flag/c.0.0": [0, "1", "00000000"]}},
+        {"files": {"flag/c.0.0": [0, 10**9, "00000000"]}},
+        {"files": {"flag/c.0.0": [-5, 5, "00000000"]}},
+        {"archive": None},
+        {"arrays": {"flag": {"dtype": "<f8", "shape": ["9" * 5000], "sha256": ""}}},
+        {"arrays": {"flag": {"dtype": "|O8", "shape": [1], "sha256": ""}}},
+        {"meta": None},
+        {"label": ["a"]},
+    ],
+)
+def test_a_manifest_that_is_wrong_by_intent_counts_as_damaged(cache, change):
+    """All but the change is right: offsets, size and checksum."""
+    commit(cache)
+    data = file_of(cache).read_bytes()
+    start = manifest.length(data)
+    file_of(cache).write_bytes(manifest.frame(json.loads(data[:start])["manifest"] | change) + data[start:])
+    assert Store(cache).lookup("toy", KEY) is None
+    assert files(cache) == [], "it was set aside"
+
+
+@pytest.mark.parametrize("text", [b"[" * 100_000, b'{"path": ' * 50_000, b"[]", b"1" * 5000])
+def test_a_manifest_that_is_no_object_is_damaged(text):
+    line = manifest._HEAD % (google_crc32c.value(text), len(text)) + text + b"}\n"
+    with pytest.raises(ValueError):  # noqa: PT011
+        manifest.unframe(line)
+
+
 def test_a_forged_archive_never_makes_an_array_of_another_size(cache, monkeypatch):
     ref = commit(cache)
     data, described = file_of(cache).read_bytes(), zarr_group.encode
@@ -402,6 +437,17 @@ def test_a_cache_that_may_not_be_written_is_one_line_and_still_read(cache, monke
     with raises("RIL-575") as caught:
         commit(cache)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("url", ["s3://key:hunter2@bucket/x", "gs://bucket/x?secret=hunter2", Path("s3://hunter2/x")])
+def test_a_cache_at_a_url_is_refused_in_a_line_that_does_not_repeat_it(tmp_path, monkeypatch, url):
+    monkeypatch.chdir(tmp_path)
+    with raises("RIL-546", "folder") as refused:
+        Store(url)
+    assert "hunter2" not in str(refused.value)
+    with raises("RIL-546"):
+        cache_folder(url)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_file_in_place_of_the_cache_is_said(tmp_path):
@@ -612,6 +658,27 @@ def test_an_array_of_one_chunk_is_what_zarr_reads(cache, monkeypatch, shape, dty
     assert found.part("values", window).base is None, "a window keeps no more than itself"
 
 
+def test_of_a_window_only_the_chunks_are_read_that_it_touches(cache, monkeypatch):
+    elevation = np.random.default_rng(0).random((2500, 1100), np.float32)
+    ref = Store(cache).commit(STAGE, KEY, Bundle({"elevation": elevation, "flag": np.zeros((2, 2), bool)}, {}))
+    members, opened, ranges = Store(cache).manifest("toy", KEY)["files"], Store(cache).open(ref).arrays, []
+    read = folder.Folder.read
+
+    def noted(self, path, start=0, stop=None):
+        ranges.append((start, stop))
+        return read(self, path, start, stop)
+
+    monkeypatch.setattr(folder.Folder, "read", noted)
+    part = opened.part("elevation", (slice(1000, 1040), slice(5, 9)))
+    np.testing.assert_array_equal(part, elevation[1000:1040, 5:9])
+    touched = [members[f"elevation/{name}"] for name in ("c.0.0", "c.1.0", "zarr.json")]
+    assert sorted(ranges) == sorted((start, start + size) for start, size, _ in touched)
+    np.testing.assert_array_equal(opened.raster("elevation")[2499:, 1024:], elevation[2499:, 1024:])
+    file_of(cache).unlink()
+    with raises("RIL-504", "missing"):
+        opened.part("elevation", (slice(2400, 2500), slice(1030, 1040)))
+
+
 def test_an_array_with_other_codecs_is_read_by_zarr(cache, monkeypatch):
     """As one would be that another version has written."""
     ref = commit(cache)
@@ -631,7 +698,7 @@ def test_chunks_of_nothing_are_members_too(cache):
 
 @pytest.mark.parametrize("name", ["locus", "mockup.scene"])
 def test_the_name_of_a_stage_may_have_a_point(cache, name):
-    """On disk and in a bucket: those of the simulator have one."""
+    """Those of the simulator have one."""
     Store(cache).commit(replace(STAGE, name=name), KEY, bundle(), label="here")
     assert Store(cache).lookup(name, KEY) is not None
     assert list(maintenance.artifacts(Store(cache))) == [(name, KEY)]

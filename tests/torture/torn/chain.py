@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import resource
 import sys
@@ -46,11 +45,10 @@ def build(graph, *, frames=FRAMES, size=150, shuffle=None, sleepers=0, sabotage=
         graph.node("toys.mischief", f"sleep/{i}", NoParams(), {"what": "sleep", "seconds": 60, "i": i})
 
 
-def run(cache, executor="inline", ledger=None, jobs=2, memory=None, environment=None, **options):
+def run(cache, executor="inline", ledger=None, jobs=2, memory=None, **options):
     """One run; what became of it, as plain values. ``memory`` is what all workers together may have, bytes."""
     if memory is not None:
         resource.setrlimit(resource.RLIMIT_RSS, (memory, memory))  # the engine heeds it, the kernel does not
-    os.environ.update(environment or {})
     from rille.pipeline.engine import scheduler
     from rille.pipeline.engine.graph import Graph
     from rille.pipeline.engine.store.base import Store
@@ -74,9 +72,8 @@ def run(cache, executor="inline", ledger=None, jobs=2, memory=None, environment=
     return {"ok": made.ok, "nodes": nodes}
 
 
-def clear(cache, runs, until, grace, environment=None):
+def clear(cache, runs, until, grace):
     """Clear the cache again and again beside the runs, as ``rille cache gc`` does; how often, and what went."""
-    os.environ.update(environment or {})
     from rille.pipeline.engine import events as ledger
     from rille.pipeline.engine.store import maintenance
     from rille.pipeline.engine.store.base import Store

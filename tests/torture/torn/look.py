@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -18,9 +17,9 @@ PLACES = [str(HERE), str(HERE.parent / "pipeline"), str(HERE.parent.parent)]
 
 def published(cache):
     """Digest by key of every artifact that is whole."""
-    place, found = Store(cache).place, {}
-    for stage, key in artifacts(Store(cache)):
-        data = place.read(artifact_path(stage, key))
+    store, found = Store(cache), {}
+    for stage, key in artifacts(store):
+        data = store.folder.read(artifact_path(stage, key))
         with suppress(ValueError):
             manifest = unframe(data[: length(data)])
             if not damage(manifest, data):
@@ -35,15 +34,6 @@ def span(data, kind, member):
         return (0, size) if kind == "manifest" else (data.rindex(b"PK\x01\x02"), len(data))
     start, length_, _ = unframe(data[:size])["files"][member]
     return start, start + length_
-
-
-def settled(cache):
-    """Wait until a server has carried out what a killed program still asked of it."""
-    if str(cache).startswith("s3://"):
-        place, before = Store(cache).place, None
-        while (now := sorted((e.path, e.mark) for e in place.list(""))) != before:
-            before = now
-            time.sleep(0.1)
 
 
 def manifests(cache):

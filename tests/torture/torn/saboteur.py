@@ -1,8 +1,8 @@
 """Kills the process that runs it: while it computes, in its commit, or by its memory; the first times only.
 
 ``what`` is ``task``, ``fsync:2``, ``link:1`` ... (the process dies before that call of the commit), ``linked:1`` (after
-it), ``create:1``, ``created:1`` (the same of a commit to a bucket), ``poison`` (each time), ``memory`` (it
-takes more than the worker may have), ``random`` (no death, but another result in each process, once two are there).
+it), ``poison`` (each time), ``memory`` (it takes more than the worker may have), ``random`` (no death, but another
+result in each process, once two are there).
 """
 
 import os
@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.pipeline.engine.store.s3 import Bucket
 from rille.stages.core.declare import Array, Bundle, NoParams, Stage
 
 
@@ -21,9 +20,8 @@ def _die():
 
 
 def _trap(name, count, after):
-    """Let the ``count``-th call of ``os.name``, or of the bucket's, be the last thing that this process does."""
-    place = os if hasattr(os, name) else Bucket
-    real, calls = getattr(place, name), []
+    """Let the ``count``-th call of ``os.name`` be the last thing that this process does."""
+    real, calls = getattr(os, name), []
 
     def trapped(*args, **kwargs):
         calls.append(1)
@@ -33,7 +31,7 @@ def _trap(name, count, after):
             real(*args, **kwargs)
         return _die()
 
-    setattr(place, name, trapped)
+    setattr(os, name, trapped)
 
 
 def _run(params, args, inputs):
@@ -55,8 +53,7 @@ def _run(params, args, inputs):
             time.sleep(0.001)
         return Bundle({"value": np.array([float(os.getpid())])}, {"what": what})
     elif first and count:
-        after = kind in ("linked", "created")
-        _trap({"linked": "link", "created": "create"}.get(kind, kind), int(count), after)
+        _trap("link" if kind == "linked" else kind, int(count), after=kind == "linked")
     return Bundle({"value": np.arange(50.0)}, {"what": what})
 
 
