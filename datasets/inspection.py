@@ -320,7 +320,7 @@ def table_kind(path: Path, pairs: int) -> str:
     Raises
     ------
     InputError
-        It cannot be read, as a file or as one of true positions, by the names of its columns, or has decimal commas.
+        It is no text, has decimal commas, or is one of true positions by its columns' names, and cannot be read.
     """
     lines = [line.strip() for line in read_lines(path, "table") if line.strip()]
     comments = [line for line in lines if not NUMBER.match(line)]
