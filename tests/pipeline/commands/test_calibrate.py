@@ -68,6 +68,54 @@ def test_file_says_how_it_was_found(results):
     assert file.getNode("square_size").real() == 0.025
 
 
+def drawn(lens: Lens, T: RigidTransform, square: float) -> np.ndarray:
+    """Picture of a board of 9 x 6 inner corners by an equidistant lens: each pixel the mean of four of its rays."""
+    camera = lens.camera
+    rows, columns = (np.indices((2 * camera.height, 2 * camera.width)) - 0.5) / 2
+    off = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy], axis=-1)
+    angle = np.hypot(off[..., 0], off[..., 1])
+    rays = np.concatenate([off * np.sinc(angle / np.pi)[..., None], np.cos(angle)[..., None]], axis=-1) @ T.rotation
+    origin = -T.rotation.T @ T.translation
+    far = -origin[2] / rays[..., 2]
+    place = (origin[:2] + far[..., None] * rays[..., :2]) / square + 1
+    paper = (far > 0) & ((place > -0.7) & (place < (10.7, 7.7))).all(axis=-1)
+    dark = ((place >= 0) & (place < (10, 7))).all(axis=-1) & (np.floor(place).sum(axis=-1) % 2 == 0)
+    fine = np.where(paper, np.where(dark, 20.0, 235.0), 110.0).reshape(camera.height, 2, camera.width, 2)
+    return cv2.GaussianBlur(fine.mean(axis=(1, 3)), (0, 0), 0.6).round().astype(np.uint8)
+
+
+def test_a_wide_fisheye_is_calibrated_from_its_pictures(tmp_path):
+    """An image of 240 degrees along its diagonal, and boards up to 60 degrees off the axis."""
+    lens = Lens(Camera(114.0, 114.0, 242.0, 147.0, 480, 300), "fisheye", (0.0, 0.0, 0.0, 0.0))
+    T_right_left = RigidTransform(cv2.Rodrigues(np.array([0.01, -0.02, 0.015]))[0], np.array([-0.1, 0.002, 0.003]))
+    centre = RigidTransform(np.eye(3), np.array([-0.12, -0.075, 0.0]))
+    # Direction and distance of the board, and its turn about its own axes.
+    for k, (across, down, away, *turn) in enumerate(
+        [
+            (0.0, 0.0, 0.25, 0.3, -0.4, 0.1),
+            (-0.9, 0.1, 0.3, -0.4, 0.2, 0.3),
+            (0.9, -0.1, 0.3, 0.4, -0.3, -0.2),
+            (0.2, 0.6, 0.3, -0.2, 0.5, 0.2),
+            (-0.2, -0.6, 0.3, 0.5, 0.4, -0.3),
+            (0.5, 0.4, 0.4, -0.5, -0.4, 0.0),
+            (-0.6, -0.3, 0.35, 0.2, 0.6, 0.4),
+        ]
+    ):
+        facing = cv2.Rodrigues(np.array([-down, across, 0.0]))[0]
+        pose = RigidTransform(facing @ cv2.Rodrigues(np.array(turn))[0], facing @ [0.0, 0.0, away])
+        for side, T in (("left", pose @ centre), ("right", T_right_left @ pose @ centre)):
+            cv2.imwrite(str(tmp_path / f"{side}{k}.png"), drawn(lens, T, 0.03))
+    out = tmp_path / "rig.yaml"
+    assert calibrate(tmp_path, tmp_path, square=0.03, corners="9x6", model="fisheye", output=out) == 0
+    left, right = read_cameras(out)
+    assert left.lens.model == "fisheye"
+    assert left.lens.camera.fx == pytest.approx(114, rel=0.01)
+    # Six views leave rotation and principal point to each other by some milliradians.
+    np.testing.assert_allclose(rig_of(left, right)[0].T_right_left.translation, T_right_left.translation, atol=1e-3)
+    file = cv2.FileStorage(str(out), cv2.FILE_STORAGE_READ)
+    assert file.getNode("avg_reprojection_error").real() < 0.3
+
+
 @pytest.mark.data
 def test_mispaired_view_and_stray_image_are_named(data_dir, tmp_path, capsys):
     for k in (1, 2, 3, 4, 5, 6, 7):
