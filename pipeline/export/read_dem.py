@@ -102,8 +102,9 @@ def read_elevation(path: Path) -> DemFile:
 def _without_marks(dem: DemFile) -> DemFile:
     """The model without values that mark what is unknown although the file does not say so, each with a warning.
 
-    Such a value is the least or the greatest and lies apart: by more than all others between the two extend, and
-    further than ground can rise without a cell between. Seas, quarries and plateaus have slopes around, or are nearer.
+    Such a value is the least or the greatest, and nothing lies between it and the others for more than ground can rise
+    within a cell: by a height that no wall has, or, of a value that several cells have, by as much as would be nearly
+    upright and more than all others extend. Seas, quarries and plateaus have slopes around, or are nearer.
     """
     values = dem.values
     least, most = np.nanmin(values, initial=np.inf), np.nanmax(values, initial=-np.inf)
@@ -115,8 +116,8 @@ def _without_marks(dem: DemFile) -> DemFile:
     low, high = between.min(), between.max()
     gap, mark = max((low - least, least), (most - high, most))
     marked = values == mark
-    step = HIGHEST_STEP * dem.cell if marked.sum() > 1 else math.inf
-    if gap <= max(high - low, min(HIGHEST_WALL, step)):
+    several, apart = marked.sum() > 1, gap > high - low
+    if not ((gap > HIGHEST_WALL and (several or apart)) or (gap > HIGHEST_STEP * dem.cell and several and apart)):
         return dem
     text = f"{dem.name}: {mark:.9g} in {marked.sum()} cells is no elevation, the others are {low:.6g} to {high:.6g} m"
     line = warning("RIL-725", f"{text}: taken as unknown; state it in the file, as NODATA")

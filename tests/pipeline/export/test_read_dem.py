@@ -50,6 +50,7 @@ HOLE = (slice(10, 20), slice(5, 50))
         (0.0, 2500.0, "float32"),
         (-999.0, 30.0, "float32"),
     ],
+    ids=str,
 )
 def test_a_value_that_marks_the_unknown_is_no_elevation(tmp_path, mark, base, kind):
     values = hills(base)
@@ -69,6 +70,12 @@ def test_so_in_an_ascii_grid_without_its_line_and_where_two_values_do(tmp_path):
     found = read_elevation(asc(tmp_path / "dem.asc", values))
     assert np.isnan(found.values).sum() == 450 + 80
     assert sum("RIL-725" in line for line in found.warnings) == 2
+
+
+def test_so_where_mountains_extend_further_than_the_value_is_off(tmp_path):
+    values = hills(2600.0, 1500.0)
+    values[HOLE] = -999.0
+    assert np.isnan(read_elevation(asc(tmp_path / "dem.asc", values)).values).sum() == 450
 
 
 def test_so_over_level_ground(tmp_path):
