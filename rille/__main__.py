@@ -6,10 +6,6 @@ No module is imported from the current folder.
 import os
 import sys
 
-TYPE_CHECKING = False  # `typing` takes longer to load than all else here, and until then Ctrl-C prints a traceback
-if TYPE_CHECKING:
-    from typing import Any
-
 
 def _leave_out_current_folder() -> None:
     """Remove what Python has put before its library for the current folder, unless Rille itself lies there."""
@@ -29,12 +25,12 @@ _leave_out_current_folder()
 import signal  # noqa: E402  # only now: Python does not load it by itself
 
 
-def _leave(*_: "Any") -> None:
+def _leave(*_: object) -> None:
     os.write(2, b"rille: interrupted\n")
     os._exit(130)
 
 
-def _unraisable(what: "Any") -> None:
+def _unraisable(what: "sys.UnraisableHookArgs") -> None:
     # In a finaliser or a callback an exception is printed and forgotten.
     if issubclass(what.exc_type, KeyboardInterrupt):
         _leave()
@@ -52,16 +48,15 @@ def main() -> None:
     from rille.pipeline.engine.runtime import interrupts
 
     try:
-        try:
-            if heeded:
-                sys.unraisablehook = _unraisable
-                signal.signal(signal.SIGINT, interrupts.OutsideImports(_leave))
-            cli.main()
-        finally:
-            if heeded:
-                signal.signal(signal.SIGINT, _leave)
+        if heeded:
+            sys.unraisablehook = _unraisable
+            signal.signal(signal.SIGINT, interrupts.OutsideImports(_leave))
+        cli.main()
     except KeyboardInterrupt:  # just before or behind the command
         _leave()
+    finally:
+        if heeded:
+            signal.signal(signal.SIGINT, _leave)
 
 
 if __name__ == "__main__":

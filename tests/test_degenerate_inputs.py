@@ -35,7 +35,7 @@ LOOP = (
 )
 RUNS = {
     "plain": ("mockup-short", "reconstruct", (*SHORT, "hfvm.preset=fast", "crosscheck.enabled=false")),
-    "tiles": ("mockup-short", "reconstruct", (*SHORT, "hfvm.preset=default", "tiling.tile=128", "crosscheck.window=2")),
+    "tiles": ("mockup-short", "reconstruct", (*SHORT, "hfvm.preset=default", "tiling.tile=128")),
     "drive": ("mockup-loop", "drive", (*LOOP, "hfvm.preset=fast")),
 }
 ELSEWHERE = {

@@ -60,13 +60,12 @@ def localisation(estimate: Floats, truth: Floats, length: float) -> tuple[Floats
     known = np.flatnonzero(np.isfinite(error))
     last = float(error[known[-1]]) if len(known) else math.nan
     which = "last position" if len(known) and known[-1] == len(error) - 1 else "last position that is known"
-    how = f"of the {which}, after making the first poses equal"
+    first = "after making the first poses equal"
+    how = f"of the {which}, {first}"
     return error, {
         "localisation_error": metric(last, "m", how),
         "localisation_share": metric(last / length if length > 0 else None, "1", f"{how}, over the length driven"),
-        "greatest_error": metric(
-            float(np.fmax.reduce(error)), "m", "of any position, after making the first poses equal"
-        ),
+        "greatest_error": metric(float(np.fmax.reduce(error)), "m", f"of any position, {first}"),
     }
 
 

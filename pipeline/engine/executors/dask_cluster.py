@@ -152,8 +152,8 @@ class Presence:
     def __init__(self, client: Any, patience: float) -> None:
         self._client, self._address, self._patience = client, client.scheduler.address, patience
         self._answered = self._manned = time.monotonic()
-        self._heard: dict[str, tuple[float, float]] = {}
-        """Of each worker when the scheduler heard of it last, and since when we know that: clocks may differ."""
+        self._heard: dict[tuple[str, float], float] = {}
+        """When the scheduler heard of each worker last, by its clock, and since when we know that, by ours."""
 
     def threads(self) -> int:
         """Threads of all workers now.
@@ -165,17 +165,16 @@ class Presence:
         """
         now = time.monotonic()
         try:
-            within = {"n_workers": -1, "callback_timeout": SILENCE / 2}
-            workers = self._client.sync(self._client.scheduler.identity, **within)["workers"]
+            identity = self._client.scheduler.identity
+            workers = self._client.sync(identity, n_workers=-1, callback_timeout=SILENCE / 2)["workers"]
         except Exception as error:
             # One question without an answer is a busy scheduler; only a long silence is a lost one.
             if self._client.status in ("closing", "closed") or time.monotonic() - self._answered > SILENCE:
                 raise self.gone() from error
             return 0
         self._answered = now
-        heard = {address: worker["last_seen"] for address, worker in workers.items()}
-        known = {address: self._heard.get(address, (seen, now)) for address, seen in heard.items()}
-        self._heard = {a: known[a] if known[a][0] == seen else (seen, now) for a, seen in heard.items()}
+        heard = [(address, worker["last_seen"]) for address, worker in workers.items()]
+        self._heard = {word: self._heard.get(word, now) for word in heard}
         threads = sum(worker["nthreads"] for worker in workers.values())
         if threads:
             self._manned = now
@@ -189,7 +188,7 @@ class Presence:
 
     def silent(self) -> set[str]:
         """Addresses of the workers from which nothing was heard for long, by the last look."""
-        return {address for address, (_, since) in self._heard.items() if self._answered - since > SILENCE}
+        return {address for (address, _), since in self._heard.items() if self._answered - since > SILENCE}
 
     def gone(self) -> ClusterError:
         """The scheduler is."""

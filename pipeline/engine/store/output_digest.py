@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rille.pipeline.engine.keys import digest, text
+from rille.pipeline.engine.keys import digest
 from rille.stages.core.declare import AnyArray
 
 
@@ -41,22 +41,6 @@ def output_digest(digests: Mapping[str, str], meta: Mapping[str, Any]) -> str:
     Raises
     ------
     TypeError
-        ``meta`` is not plain JSON (NaN and infinities are not either: use None).
+        ``meta`` is not plain JSON; a bundle's has None for NaN and infinities.
     """
-    _refuse_non_finite(meta, "meta")
-    return digest({"arrays": dict(digests), "meta": dict(meta)})
-
-
-def _refuse_non_finite(value: Any, where: str) -> None:
-    if isinstance(value, dict):
-        for key, item in value.items():
-            _refuse_non_finite(item, f"{where}.{key}")
-    elif isinstance(value, list | tuple):
-        for i, item in enumerate(value):
-            _refuse_non_finite(item, f"{where}[{i}]")
-    elif isinstance(value, set | frozenset):
-        raise TypeError(f"{where} is a set: give a sorted list")
-    elif isinstance(value, float) and not np.isfinite(value):
-        raise TypeError(f"{where} is {value}: metadata is JSON, use None for what is undefined")
-    else:
-        text(value, where)
+    return digest({"arrays": dict(digests), "meta": dict(meta)}, "result")

@@ -16,8 +16,7 @@ from rille.stages.geometry.pose_arrays import COVARIANCE, POSES
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     row, trajectory = int(args["row"]), inputs["trajectory"]
     if not np.isfinite(trajectory["poses"][row]).all():
-        where = f"frame {trajectory.meta['frames'][row]}"
-        raise DegenerateError("RIL-711", f"{where} has no pose", remedy="choose other frames, or drive more slowly")
+        raise DegenerateError("RIL-711", f"row {row} of the trajectory has no pose", remedy="choose other frames")
     kept = [name for name in ("poses", "covariance") if name in trajectory.arrays]
     return Bundle({name: np.asarray(trajectory[name])[row : row + 1].copy() for name in kept}, {})
 

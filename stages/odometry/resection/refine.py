@@ -87,8 +87,6 @@ def views_of(track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig) -
 def _determined(one: SegmentStart) -> SegmentStart | None:
     """The segment without the frames that too few landmarks see to determine a pose; None if no frame is left."""
     enough = one.views.seen.sum(1) >= MINIMUM
-    if enough.all():
-        return one
     views = replace(one.views, pixels=one.views.pixels[enough], seen=one.views.seen[enough])
     state = SegmentState(one.state.R[enough], one.state.t[enough], one.state.depth)
     return SegmentStart(views, state, np.array(one.frames)[enough].tolist(), one.which) if enough.any() else None

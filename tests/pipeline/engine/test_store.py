@@ -190,7 +190,7 @@ def test_only_numbers_are_stored():
     [{"a": {1: 2}}, {"a": np.float32(1)}, {"a": {1}}, {"a": frozenset()}],
 )
 def test_meta_must_be_json(cache, meta):
-    with pytest.raises(TypeError, match=r"meta\.a"):
+    with pytest.raises(TypeError, match=r"result\.meta\.a|type (frozen)?set is not JSON"):
         commit(cache, **meta)
     assert not cache.exists() or not files(cache)
 
