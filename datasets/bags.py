@@ -128,6 +128,7 @@ def open_bag(
         times=times,
         up=up if optics.up is None else (optics.up,) * len(stamps),
         attitude=inertial.attitude if any(inertial.attitude) else None,
+        imu_axes=inertial.axes,
         odometry=odometry,
         defaults=STREET if optics.rig.baseline >= CAR else {},
         notes=inertial.notes,

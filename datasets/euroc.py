@@ -136,6 +136,7 @@ def open_euroc(layout: EurocLayout, digests: files.Digests) -> Sequence:
         truth_source=known.truth_source,
         up=inertial.up if any(inertial.up) else None,
         attitude=inertial.attitude if any(inertial.attitude) else None,
+        imu_axes=inertial.axes,
         defaults=ROOM,
         notes=inertial.notes,
         warnings=(*frames.warnings, *unusual_cameras(cameras.values(), sizes_of(headers)), *known.warnings),

@@ -94,12 +94,14 @@ class Inertial:
     attitude : R_reference_left row by row, the reference being the sensor's frame at its first sample in use; None
         where the record does not reach or is cut off from the longest unbroken part by a gap.
     up : unit vector of up in the left camera's frame; None where the force is not gravity's reaction.
+    axes : R_imu_left, by which rates and forces came into the camera's frame.
     warnings : what is missing or suspicious, one line each.
     notes : what was assumed.
     """
 
     attitude: tuple[Rows | None, ...] = ()
     up: tuple[Up, ...] = ()
+    axes: Rows | None = None
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -253,7 +255,7 @@ def at_frames(imu: ImuRecord, at: Sequence[float], T_imu_left: RigidTransform) -
         attitude.append(None if R_reference_imu is None else rows_of(orthonormal(R_reference_imu @ R_imu_left)))
         up.append(None if force is None else _unit(R_imu_left.T @ force))
     warnings = coverage(attitude, at, f"attitude from {imu.name}")
-    return Inertial(tuple(attitude), tuple(up), warnings, notes)
+    return Inertial(tuple(attitude), tuple(up), rows_of(R_imu_left), warnings, notes)
 
 
 def stretches(imu: ImuRecord, bias: Floats | None, start: float, end: float) -> list[Stretch]:

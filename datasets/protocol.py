@@ -146,6 +146,7 @@ class Sequence:
     up : direction of "up" in each left camera frame (attitude); None where it is not known.
     attitude : R_reference_left of each frame from a sensor (gyroscope, compass); the reference is any inertial frame,
         the same for all frames, and only differences between frames are used. None where it is not known.
+    imu_axes : R_imu_left, where ``up`` and ``attitude`` are those of an IMU.
     odometry : T_odometry_left of each frame by dead reckoning, metres; predicts, and is never part of the result.
     pitch : downward pitch of the left camera's optical axis, radians, stated with the rig; roll 0.
     initial_pose : T_world_left of frame 0 handed in from outside.
@@ -175,6 +176,7 @@ class Sequence:
     truth_mount: RigidTransform | None = None
     up: tuple[tuple[float, float, float] | None, ...] | None = None
     attitude: tuple[Rows | None, ...] | None = None
+    imu_axes: Rows | None = None
     odometry: tuple[RigidTransform | None, ...] | None = None
     pitch: float | None = None
     initial_pose: RigidTransform | None = None

@@ -38,6 +38,7 @@ class KnownMotion:
     truth_mount: RigidTransform | None = None
     odometry: Poses | None = None
     attitude: tuple[Rows | None, ...] | None = None
+    imu_axes: Rows | None = None
     up: Ups | None = None
     warnings: tuple[str, ...] = ()
 
@@ -215,6 +216,6 @@ def _imu(section: Imu, root: Path, name: str, motion: KnownMotion) -> None:
     imu = read_imu(root / section.file)
     shifted = replace(imu, times=imu.times + section.time_offset)
     inertial = at_frames(shifted, motion.times, RigidTransform.from_matrix(section.T_imu_left))
-    motion.attitude = inertial.attitude
+    motion.attitude, motion.imu_axes = inertial.attitude, inertial.axes
     motion.up = inertial.up if any(up is not None for up in inertial.up) else None
     motion.warnings += (*imu.warnings, *inertial.warnings)

@@ -65,6 +65,7 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
         truth_mount=motion.truth_mount,
         up=up,
         attitude=motion.attitude or base.attitude,
+        imu_axes=motion.imu_axes,
         odometry=motion.odometry or base.odometry,
         pitch=pitch,
         georeference=georeference(world.crs, world.origin, world.azimuth_deg, name),

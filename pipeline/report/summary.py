@@ -18,6 +18,7 @@ from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.metrics import metrics
 from rille.pipeline.report.words import metres, number, quantity
+from rille.stages.evaluation import imu_check
 from rille.stages.odometry.resection.trajectory import world_poses
 
 FORMAT = 2
@@ -104,7 +105,7 @@ def find_warnings(scene: Scene) -> list[str]:
     ):
         bundle = view.bundle(handle)
         lines += (bundle.meta.get("warnings") or []) if bundle is not None else []
-    lines += _sigma_warning(view) + _displaced(view)
+    lines += _imu(view) + _sigma_warning(view) + _displaced(view)
     compared = scene.comparison
     if compared is not None and compared.flagged.any():
         bad = [frame for frame, flagged in zip(view.frames, compared.flagged, strict=True) if flagged]
@@ -173,6 +174,24 @@ def _displaced(view: RunView) -> list[str]:
         f"this run's world begins at frame {first}: rasters and path.gpkg are displaced on Earth, unless world.origin "
         f"and world.azimuth_deg are those of frame {first}"
     ]
+
+
+def _imu(view: RunView) -> list[str]:
+    """The IMU contradicts the images, by its rotations or by its gravity."""
+    s, trajectory, levels = view.sequence, view.bundle(view.products.trajectory), view.products.level
+    if s.imu_axes is None or s.attitude is None:
+        return []
+    axes, lines = np.array(s.imu_axes), []
+    if trajectory is not None and s.times is not None:
+        frames, unknown = trajectory.meta["frames"], np.full((3, 3), np.nan)
+        sensed = np.array([unknown if s.attitude[f] is None else s.attitude[f] for f in frames], dtype=float)
+        times = np.array([s.times[f] for f in frames])
+        lines += imu_check.of_rotations(world_poses(trajectory)[:, :, :3], sensed, times, axes)
+    for pair, level in ((pair, view.bundle(handle)) for pair, handle in levels.items()):
+        up = None if s.up is None else s.up[pair]
+        if level is not None and level.meta.get("seen_up") and up is not None:
+            return lines + imu_check.of_gravity(np.array(up), np.array(level.meta["seen_up"]), axes)
+    return lines
 
 
 SIGMA_OFF = 3.0
@@ -274,7 +293,7 @@ READS = (
 KNOWS = (
     "frames config.vehicle config.crosscheck.enabled sequence.name sequence.frames sequence.frame_names sequence.rig "
     "sequence.truth sequence.truth_source sequence.truth_positions sequence.warnings sequence.notes "
-    "sequence.evaluation_window sequence.georeference"
+    "sequence.evaluation_window sequence.georeference sequence.times sequence.up sequence.attitude sequence.imu_axes"
 )
 OUTPUTS = (Output("facts", "", "", _write, (), tuple(READS.split()), tuple(KNOWS.split())),)
 STAGE = stage("output.facts", "Figures and tables of the report in numbers", OUTPUTS)

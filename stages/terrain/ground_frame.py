@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -130,7 +131,8 @@ def level(
         ``cell_size`` (m) that suits the rig; ``footprint`` x_min, x_max, y_min, y_max (m) for it; ``ground_share`` of
         the sampled pixels. All in the local frame. Where no ground is seen, ``no_ground`` says why, and the
         values that describe it are None, except ``cell_size``; ``plane`` and ``relief`` are there where larger cells
-        may show it.
+        may show it; ``seen_up``, in the left camera's frame, is up by ground that is seen but contradicts the given
+        vertical.
 
     Raises
     ------
@@ -155,6 +157,10 @@ def level(
             return facts | _on_ground(stated, R_local_left, samples, rig, params)
     except DegenerateError as error:
         why = error
+    if known_up is not None:
+        with suppress(DegenerateError):
+            # The images may show ground where the given vertical has none: then one of the two is wrong.
+            facts |= {"seen_up": _fitted(samples, lambda n: _allowed(n, None, params), params).up.tolist()}
     nothing: dict[str, Any] = dict.fromkeys(("ground_height", "plane", "tilt", "relief", "z_range", "footprint"))
     if ground is not None and why.code == "RIL-344" and ground.inliers >= DOMINANT:
         # Larger cells than those that suit the rig may still make a map.

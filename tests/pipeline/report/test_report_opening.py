@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from toys.finished import view, written
 
 from rille.pipeline.export.view import UNSTATED, TaskRow
@@ -167,6 +168,23 @@ def test_what_rests_on_the_given_numbers_is_said_in_figures_of_the_run(way, by_f
 def test_nothing_rests_on_the_given_numbers_of_a_camera_without_a_path():
     assert summary.given_numbers(given(np.zeros((5, 3)), AHEAD, None)) == []
     assert "ground" not in summary.given_numbers(given(np.eye(3), AHEAD, None))[0]
+
+
+def test_an_imu_that_contradicts_the_images_is_warned_of():
+    """A camera at rest by its images; rates in degrees a second, and gravity off the ground that is seen."""
+    run = given(np.zeros((9, 3)), AHEAD, None)
+    run.products.trajectory.meta["frames"] = list(range(9))
+    spun = [Rotation.from_rotvec([0.0, 0.2 * k, 0.0]).as_matrix() for k in range(9)]
+    known = {"imu_axes": np.eye(3), "times": 0.05 * np.arange(9), "up": [(0.0, -1.0, 0.0)] * 9, "attitude": spun}
+    run.sequence.__dict__.update(known)
+    (rates,) = summary._imu(run)
+    assert "degrees a second" in rates
+    run.products.level[0].meta["seen_up"] = [0.0, 0.0, -1.0]
+    run.sequence.attitude = [np.eye(3)] * 9
+    (gravity,) = summary._imu(run)
+    assert "up is 90 degrees off" in gravity
+    run.sequence.up = None
+    assert summary._imu(run) == []
 
 
 def test_standard_deviations_are_not_judged_by_truth_that_was_misread():

@@ -52,6 +52,14 @@ def test_ground_plane_gives_attitude_and_height() -> None:
     assert facts["ground_share"] > 0.9
 
 
+def test_ground_that_contradicts_the_given_vertical_is_told() -> None:
+    """The vertical is stated near the optical axis: there is no ground below it, but there is some."""
+    facts = level(*FLAT, RIG, PARAMS, VerticalHint(up=[0.0, 0.3, -1.0]))
+    assert "no_ground" in facts
+    assert facts["seen_up"] == pytest.approx(POSE.rotation[2].tolist(), abs=0.01)
+    assert "seen_up" not in level(*FLAT, RIG, PARAMS, VerticalHint(up=POSE.rotation[2]))
+
+
 def test_each_source_and_their_order() -> None:
     slope = math.radians(8.0)
     maps = disparity(RIG, pitched(PITCH), plane(0.0, math.tan(slope), -HEIGHT))  # the ground rises ahead

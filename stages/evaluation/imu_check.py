@@ -1,0 +1,89 @@
+"""Whether an IMU contradicts the images: rates against the camera's rotations, gravity against ground that is seen.
+
+The sensor's rotation from frame to frame is that of the images in other axes: a signed exchange S of its axes, and the
+factor of degrees, are sought by which they agree. A camera at rest shows gravity alone, and that only where the ground
+is seen: several S then fit, and gravity along an axis tells nothing of the other two.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rille.stages.core.arrays import Floats
+
+MIN_STEPS = 5
+# Radians between frames, above which the two disagree; and the share of it that another reading leaves at most.
+MIN_DISAGREEMENT, MAX_SHARE = 0.035, 0.3
+# rad/s; the largest bias of a gyroscope, which a unit of degrees would make small, too.
+LARGEST_BIAS = 0.15
+# Of gravity against the normal of the ground: slopes are 15 degrees at most here.
+MIN_COSINE = np.cos(np.deg2rad(15.0))
+# The given axes come first.
+SIGNED_AXES = [np.eye(3), *(sign * turn for sign in (1.0, -1.0) for turn in Rotation.create_group("O").as_matrix())]
+
+
+def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) -> list[str]:
+    """Warn where the sensor turns otherwise than the images, and say what would fit.
+
+    Parameters
+    ----------
+    images, sensor : (frame, 3, 3) R_reference_left by the images and by the sensor; NaN where one has none.
+    times : (frame,) s.
+    axes : (3, 3) R_imu_left.
+    """
+    both = np.isfinite(images).all(axis=(1, 2)) & np.isfinite(sensor).all(axis=(1, 2))
+    if both.sum() <= MIN_STEPS:
+        return []
+    steps = (np.swapaxes(R[both][:-1], 1, 2) @ R[both][1:] for R in (images, sensor))
+    seen, sensed = (Rotation.from_matrix(step).as_rotvec() @ axes.T for step in steps)
+
+    def apart(S: Floats, factor: float) -> float:
+        return float(np.median(np.linalg.norm(factor * sensed @ S.T - seen, axis=1)))
+
+    # A bias turns the sensor, too, and degrees would make it small.
+    fast = np.median(np.linalg.norm(sensed, axis=1)) > MIN_DISAGREEMENT + LARGEST_BIAS * np.median(np.diff(times[both]))
+    readings = list(product((1.0, float(np.deg2rad(1.0))) if fast else (1.0,), SIGNED_AXES))
+    off = [float(np.median(np.linalg.norm(factor * sensed @ S.T - seen, axis=1))) for factor, S in readings]
+    if off[0] < MIN_DISAGREEMENT or min(off) > MAX_SHARE * off[0]:
+        return []
+    # A camera that hardly turns is fitted by all axes alike: those that are given come first.
+    given = [0.1 * off[0] * (S is SIGNED_AXES[0]) for _, S in readings]
+    best = int(np.argmin(np.subtract(off, given)))
+    factor, S = readings[best]
+    return [
+        f"the IMU contradicts the images: between frames it turns {np.degrees(off[0]):.2g} degrees otherwise (median); "
+        + ("" if factor == 1.0 else "its rates are in degrees a second: name its columns so, [deg/s]; ")
+        + (
+            ""
+            if np.allclose(S, np.eye(3))
+            else f"its x, y and z would have to be its {names(S)}: exchange its columns; "
+        )
+        + f"that leaves {np.degrees(off[best]):.2g} degrees"
+    ]
+
+
+def of_gravity(given: Floats, seen: Floats, axes: Floats) -> list[str]:
+    """Warn where gravity contradicts the ground that is seen, and name the axes that would fit.
+
+    Parameters
+    ----------
+    given, seen : (3,) up in the left camera's frame by the sensor, and by the ground.
+    axes : (3, 3) R_imu_left.
+    """
+    a, b = axes @ given, axes @ seen
+    fits = sorted((float(-b @ S @ a), k) for k, S in enumerate(SIGNED_AXES) if b @ S @ a > MIN_COSINE)
+    told = "; or ".join(dict.fromkeys(names(SIGNED_AXES[k]) for _, k in fits[:3]))
+    off = float(np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0))))
+    return [
+        f"the IMU contradicts the images: its up is {off:.0f} degrees off that of the ground which is seen; its x, y "
+        f"and z would have to be its {told or 'own, turned'} (gravity alone does not tell which): exchange its "
+        "columns, or correct T_imu_left"
+    ]
+
+
+def names(S: Floats) -> str:
+    """Signed axes (3, 3) in words: z, -y, x."""
+    return ", ".join(("-" if row.min() < -0.5 else "") + "xyz"[int(np.abs(row).argmax())] for row in S)

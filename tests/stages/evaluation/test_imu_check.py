@@ -1,0 +1,74 @@
+"""An IMU whose axes or unit are others than stated contradicts the images, and a right one never does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rille.stages.evaluation.imu_check import of_gravity, of_rotations
+
+AXES = Rotation.from_rotvec([0.02, 0.03, 1.55]).as_matrix()
+TIMES = 0.1 * np.arange(25)
+
+
+def attitudes(rates: np.ndarray) -> np.ndarray:
+    """R_reference_left of a sensor that reads ``rates`` (frame, 3), rad/s, in its own axes."""
+    R = [np.eye(3)]
+    for rate in rates[:-1]:
+        R.append(R[-1] @ AXES.T @ Rotation.from_rotvec(0.1 * rate).as_matrix() @ AXES)
+    return np.array(R)
+
+
+def turning(speed: float, seed: int) -> np.ndarray:
+    return speed * np.random.default_rng(seed).normal(size=(len(TIMES), 3))
+
+
+def noisy(R: np.ndarray) -> np.ndarray:
+    return R @ Rotation.from_rotvec(np.random.default_rng(9).normal(scale=1e-3, size=(len(R), 3))).as_matrix()
+
+
+@pytest.mark.parametrize(
+    ("read", "words"),
+    [
+        (lambda w: w[:, [2, 1, 0]], "its z, y, x:"),
+        (lambda w: w * [1, -1, 1], "its x, -y, z:"),
+        (lambda w: w[:, [1, 2, 0]], "its z, x, y:"),
+    ],
+)
+def test_the_axes_or_unit_that_fit_are_named(read, words):
+    rates = turning(1.0, 1)
+    (line,) = of_rotations(noisy(attitudes(rates)), attitudes(read(rates)), TIMES, AXES)
+    assert words in line
+
+
+def test_axes_about_which_it_hardly_turns_are_still_told():
+    rates = turning(1.0, 4) * [1.0, 0.07, 1.0]
+    (line,) = of_rotations(noisy(attitudes(rates)), attitudes(rates[:, [2, 1, 0]]), TIMES, AXES)
+    assert "its z, y, x:" in line
+
+
+def test_rates_in_degrees_of_a_camera_at_rest_are_named():
+    bias = np.tile([0.0, 0.02, 0.08], (len(TIMES), 1))
+    (line,) = of_rotations(noisy(attitudes(0 * bias)), attitudes(np.rad2deg(bias)), TIMES, AXES)
+    assert "degrees a second" in line
+    assert "exchange" not in line
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.02, 0.3, 2.0])
+def test_a_right_sensor_never_contradicts_not_even_with_its_bias(speed):
+    for seed in range(5):
+        rates = turning(speed, seed)
+        read = rates + np.array([0.0, 0.02, 0.12])
+        assert of_rotations(noisy(attitudes(rates)), attitudes(read), TIMES, AXES) == []
+    few = np.full((len(TIMES), 3, 3), np.nan)
+    assert of_rotations(few, attitudes(read), TIMES, AXES) == []
+
+
+def test_gravity_off_the_ground_names_the_axes_that_would_fit():
+    """As of a sensor whose x points up and z back, with x and z exchanged."""
+    up = np.array([0.926, 0.013, -0.377])
+    (line,) = of_gravity(AXES.T @ up[[2, 1, 0]], AXES.T @ up, AXES)
+    assert "its z, y, x" in line
+    assert "gravity alone does not tell" in line
+    assert "up is 134 degrees off" in line
