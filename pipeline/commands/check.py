@@ -25,7 +25,6 @@ from rille.pipeline.engine.scheduler import Result
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.flow.builders import Builder, name
 from rille.pipeline.runs import input_checks as judge
-from rille.pipeline.runs import synchrony
 from rille.pipeline.runs.input_checks import Finding, doubt, fault, fine
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.epipolar import beyond_infinity, inverse_depth
@@ -158,7 +157,10 @@ class Inspection:
             return
         yield from self._first_pair(whole[0])
         yield from self._motions()
-        yield from self._simultaneous()
+        if len(whole) > 1:
+            at = sorted({whole[int(k)] for k in np.linspace(0, len(whole) - 1, MOST_PAIRS).round()})
+            rows = yield self.make.synchrony("synchrony", at, whole)
+            self.say(judge.judge_synchrony(rows.meta))
 
     def _images(self) -> Steps:
         """Open every image: sizes, repetitions, exposure, sharpness."""
@@ -247,26 +249,6 @@ class Inspection:
             self.say(fault(error.code, error.message, "motion", remedy=error.remedy))
         motions = {step: task.ref.meta for step, task in tasks.items() if task.ref is not None}
         self.say(judge.judge_motion(motions, self.sequence.frame_names))
-
-    def _simultaneous(self) -> Steps:
-        """Rows of some pairs over the whole sequence, with the right images as named and shifted in time."""
-        looked_at = {*self.frames, *self.lost}
-        # Frames whose right images were looked at for every shift: else a shift would be judged by other frames.
-        inner = [k for k in self.frames if looked_at.issuperset(k + shift for shift in synchrony.SHIFTS)]
-        chosen = sorted({inner[int(k)] for k in np.linspace(0, len(inner) - 1, MOST_PAIRS).round()}) if inner else []
-        spreads: dict[int, list[float | None]] = {shift: [] for shift in synchrony.SHIFTS}
-        for frame in chosen:
-            left = yield from self._features(frame, "left")
-            for shift, values in spreads.items():
-                right = yield from self._features(frame + shift, "right")
-                values.append(synchrony.row_spread(self.sequence.rig, left, right))
-        self.say(judge.judge_synchrony(spreads))
-
-    def _features(self, frame: int, camera: str) -> Generator[Wait, Any, tuple[Any, Any] | None]:
-        if frame in self.lost or (frame, camera) in self.broken or frame not in self.frames:
-            return None
-        image = yield self.make.image(frame, camera)
-        return synchrony.features(np.asarray(self.store.open(image)["image"]))
 
 
 def _cause(handle: Handle) -> RilleError:

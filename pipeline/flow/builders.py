@@ -21,7 +21,7 @@ from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.flow import tiles
 from rille.pipeline.flow.products import Products
-from rille.stages.calibration import calibration, orientation, rig, swap_check
+from rille.stages.calibration import calibration, orientation, rig, swap_check, synchrony
 from rille.stages.core.declare import NoParams, Params
 from rille.stages.hazard import risk
 from rille.stages.hfvm import stage as hfvm
@@ -32,11 +32,15 @@ from rille.stages.terrain import ground_frame, merge
 from rille.stages.terrain.locus import stage as locus
 from rille.stages.terrain.tile_index import Box, tile_lattice
 
+Args = Mapping[str, Any]
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 NO_PARAMS = NoParams()
+
+AROUND = 3
+"""Frames before and behind a pair whose right images may be of its time."""
 """One object for all tasks without parameters: its canonical form is then made once."""
 
 
@@ -193,6 +197,13 @@ class Builder:
         ports = {camera: self.pyramid(frame, camera) for camera in ("left", "right")}
         return self.node(swap_check, f"swap_check/{frame}", args, **ports)
 
+    def synchrony(self, label: str, pairs: Series[int], frames: Series[int]) -> Handle:
+        """Which right images, of those of some frames about each pair, are of the time of the left ones."""
+        at = [frames.index(pair) for pair in pairs]
+        near = [f for k, f in enumerate(frames) if any(abs(k - place) <= AROUND for place in at)]
+        images = {"left": [self.pyramid(f, "left") for f in pairs], "right": [self.pyramid(f, "right") for f in near]}
+        return self.node(synchrony, label, {"pairs": list(pairs), "frames": near, "rig": self.given_rig}, **images)
+
     @once
     def disparity(self, pair: int) -> Handle:
         """Disparity of the left image of a pair."""
@@ -286,9 +297,12 @@ class Builder:
     # -- between pairs ------------------------------------------------------------------------------------------
 
     def segment(
-        self, frames: Series[int], key: Pair, prediction: Mapping[str, Any] | None = None, which: str = ""
+        self, frames: Series[int], key: Pair, more: Args | None = None, which: str = "", after: Pair | None = None
     ) -> Segment:
-        """Track and resect the left images that follow basic pair ``key``, which is the first of them."""
+        """Track and resect the left images that follow basic pair ``key``, which is the first of them.
+
+        ``more``: arguments of the resection; ``after``: the basic pair that the last image is of.
+        """
         args, which = {"frames": list(frames)}, which or f"{key.frame}"
         images = [self.pyramid(frame, "left") for frame in frames]
         motions = [self.motion(a, b) for a, b in pairwise(frames)]
@@ -296,7 +310,8 @@ class Builder:
         # landmarks come from the disparity, or (resect.landmarks = "dem") where rays meet the local elevation model
         surface = {"dem": key.dem} if self.config.resect.landmarks == "dem" else {}
         known = {"disparity": key.disparity, "level": key.level, "rig": key.rig, **surface}
-        posed = self.node(resect, f"resect/{which}", {**args, **(prediction or {})}, track=tracked, **known)
+        known |= {"after": after.disparity, "rig_after": after.rig} if after else {}
+        posed = self.node(resect, f"resect/{which}", {**args, **(more or {})}, track=tracked, **known)
         return Segment(tuple(frames), tracked, posed)
 
     # -- the world ----------------------------------------------------------------------------------------------

@@ -52,6 +52,7 @@ class Products:
     keyframes: Handle | None = None
     orientations: dict[int, Handle] = field(default_factory=dict)
     rigs: dict[int, Handle] = field(default_factory=dict)
+    contradictions: list[Handle] = field(default_factory=list)
     crosschecks: list[Handle] = field(default_factory=list)
     crosscheck: Handle | None = None
     agreement: Handle | None = None

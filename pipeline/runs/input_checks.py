@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.protocol import Positions, Rows
-from rille.pipeline.runs.synchrony import best_shift
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.scale import alike
 from rille.stages.imaging.image_quality import Look
@@ -336,25 +335,14 @@ def judge_epipolar(facts: Mapping[str, Any]) -> Finding:
     return fine("epipolar", words)
 
 
-def judge_synchrony(spreads: Mapping[int, list[float | None]]) -> Finding | None:
-    """Whether the right images are of the same moments; ``spreads`` [px] by shift, see
-    :mod:`rille.pipeline.runs.synchrony`."""
-    named = [value for value in spreads[0] if value is not None]
-    if not named:
+def judge_synchrony(facts: Mapping[str, Any]) -> Finding | None:
+    """Whether the right images are of the same moments: facts of :mod:`rille.stages.calibration.synchrony`."""
+    if "contradiction" in facts:
+        return fault("RIL-665", facts["contradiction"], "simultaneous", remedy="pair the images anew")
+    if not facts["rows"]:
         return None
-    found = best_shift(spreads)
-    words = f"rows of {len(named)} pairs over the sequence spread by {float(np.median(named)):.2f} px"
-    if found is None:
-        return fine("simultaneous", f"{words}; no shift in time explains them better")
-    shift, as_named, shifted = found
-    text = (
-        f"not simultaneous: left i with right i{shift:+d} spreads rows by {shifted:.2f} px, as named {as_named:.2f} px"
-    )
-    return fault("RIL-665", text, "simultaneous", remedy=f"pair each left image with the right one {_frames(shift)}")
-
-
-def _frames(shift: int) -> str:
-    return f"{abs(shift)} frame{'s' if abs(shift) > 1 else ''} {'before' if shift < 0 else 'after'} it"
+    words = f"rows of {len(facts['rows'])} pairs over the sequence spread by {float(np.median(facts['rows'])):.2f} px"
+    return fine("simultaneous", f"{words}; no right image of another time fits better")
 
 
 def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Sequence[str]) -> Finding:

@@ -39,6 +39,7 @@ from rille.stages.core.declare import Bundle, Inputs, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.epipolar import NAMES, corrected, distances
 from rille.stages.geometry.geometry import Rig
+from rille.stages.numeric.robust import mad_sigma
 
 MOST_MATCHES = 10_000
 """Most matches of all pairs together: with more, systematic errors dominate."""
@@ -49,7 +50,11 @@ LEAST_OF_A_BLOCK = 5
 """Fewest matches of a block whose median counts."""
 
 BAD_ROWS = 1.0
-"""RMS residual [pixels] after the repair from which on a warning names lens distortion or a wrong calibration."""
+"""Residual [pixels] after the repair from which on it is doubted: RMS of all pairs, lens distortion or a wrong
+calibration; spread of one, its images may be of two moments."""
+
+MOST_TURN = 5.0
+"""Largest correction [degrees] of each parameter: a mount that was knocked turns by less, and so does a baseline."""
 
 SWAPPED = 0.5
 """Share of matches beyond infinity from which on left and right are taken to be swapped."""
@@ -75,8 +80,11 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams) -> di
         ``changed``; ``parameters`` (name, value, asked, sigma, unit, observed, freed, why), ``held`` (name and reason
         in words); ``per_pair`` (pair, values and sigma by name, degrees, of what is observed);
         ``residual_before_px``, ``residual_after_px`` (RMS of inliers) and ``median_before_px``, ``median_after_px``,
-        of the same points; ``pairs``, ``matches``; ``warnings`` (lines). In mode ``fixed`` ``parameters`` say what
-        would be changed. Without a pair that can be used, there are only the first six and ``warnings``.
+        of the same points; ``pairs``, ``matches``; ``warnings`` (lines); only where there are any: ``suspects``,
+        pairs whose rows the rig does not explain, and lines: ``contradiction`` on a correction that no mount makes,
+        ``knocked`` on a rig that one calibration does not describe.
+        In mode ``fixed`` ``parameters`` say what would be changed. Without a pair that can be used, there are only the
+        first six and ``warnings``.
 
     Raises
     ------
@@ -110,7 +118,8 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams) -> di
 def _judged(given: Rig, pairs: list[PointPairs], params: RigParams) -> dict[str, Any]:
     """What the pairs say on the given rig, and the rig that follows."""
     decision = decide(given, pairs, params)
-    applied = params.mode != "fixed" and decision.changed
+    far = any(abs(math.degrees(p.value)) > MOST_TURN for p in decision.parameters)
+    applied = params.mode != "fixed" and decision.changed and not far
     rig = corrected(given, decision.correction) if applied else given
     per_pair = [_alone(given, m, one, decision, params) for m, one in zip(pairs, decision.start, strict=True)]
     share = impossible_share(rig, pairs, decision.fit)
@@ -122,9 +131,16 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams) -> dict[str,
             remedy="exchange the left and the right images, or the sign of the baseline",
         )
     residuals = _residuals(given, rig, pairs, decision)
-    warnings = _contradiction(given, pairs, decision, params.mode)
+    kept = "not repaired, for no mount moves that far" if far else "kept because rig.mode = fixed"
+    warnings = _contradiction(given, pairs, decision, "repaired" if applied else kept)
+    marks: dict[str, Any] = {"contradiction": warnings[0]} if far else {}
+    rows = [distances(rig, np.zeros(RIG), m.left, m.right)[0] for m in pairs]
+    suspects = [m.pair for m, d in zip(pairs, rows, strict=True) if far or mad_sigma(d) > BAD_ROWS]
+    marks |= {"suspects": suspects} if suspects else {}
     warnings += _doubts(share, residuals["residual_after_px"])
-    warnings += _drift(decision.start, per_pair, params)
+    moves, knocked = _drift(decision.start, per_pair, params)
+    warnings += moves
+    marks |= {"knocked": knocked} if knocked else {}
     return {
         "rig": rig.to_dict(),
         "source": _source(decision, applied, len(pairs)),
@@ -136,6 +152,7 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams) -> dict[str,
         "matches": sum(len(m.left) for m in pairs),
         "warnings": warnings,
         **residuals,
+        **marks,
     }
 
 
@@ -181,15 +198,14 @@ def _source(decision: Decision, applied: bool, pairs: int) -> str:
     return f"given calibration, {names} repaired from {pairs} pair{'s' if pairs > 1 else ''}"
 
 
-def _contradiction(given: Rig, pairs: Sequence[PointPairs], decision: Decision, mode: str) -> list[str]:
-    """What a user should know of a calibration that the images contradict."""
+def _contradiction(given: Rig, pairs: Sequence[PointPairs], decision: Decision, done: str) -> list[str]:
+    """What a user should know of a calibration that the images contradict; ``done``: what became of it."""
     if not decision.changed:
         return []
     signed = [distances(given, np.zeros(RIG), m.left, m.right)[0] for m in pairs]
     # The same points before and after: residuals of two sets of inliers say nothing about a repair.
     inlier = np.concatenate(decision.fit.weights) > 0
     words = misalignment(given, float(np.median(np.concatenate(signed)[inlier])), decision)
-    done = "kept because rig.mode = fixed" if mode == "fixed" else "repaired"
     lines = [f"the calibration contradicts the images: {words}; {done}"]
     hidden = [p for p in decision.parameters if not p.observed]
     if hidden:
@@ -214,8 +230,10 @@ def _doubts(share: float, residual: float) -> list[str]:
     return lines
 
 
-def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigParams) -> list[str]:
+def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigParams) -> tuple[list[str], str]:
     """Parameters that change from pair to pair by more than their errors, in pairs whose rows move enough to matter.
+
+    In words; also one line on what moves the rows most, where that is too far for any calibration, else nothing.
 
     Over one scene parameters stand in for each other (a pitch for a baseline across, over flat ground), so it counts by
     how much all that changed moves the rows together; and a rig that moves does so all over the image, mismatches on
@@ -228,17 +246,21 @@ def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigP
     usual = np.quantile(values, 0.5, axis=0, method="lower") if names else np.zeros(0)
     departure = values - usual
     moved = _shown(start, [NAMES.index(name) for name in names], np.radians(usual), np.radians(departure))
-    lines = []
+    lines, knocked, most = [], "", BAD_ROWS
     for k, name in enumerate(names):
         away = np.abs(departure[:, k])
         odd = (away > params.significance * sigma[:, k]) & (moved > params.least_rows)
         if odd.any():
-            worst = int(np.argmax(np.where(odd, away, 0.0)))
+            # Which of two states is the odd one does not tell when it changed.
+            change, degrees = per_pair[int(np.argmax(odd != odd[0]))]["pair"], away[odd].max()
+            if moved[odd].max() > most:
+                most = float(moved[odd].max())
+                knocked = f"the rig moved at pair {change}: {name.replace('_', ' ')} by {degrees:.2f} degrees"
             lines.append(
                 f"the rig moves: {name.replace('_', ' ')} of {int(odd.sum())} of {len(values)} pairs departs from the "
-                f"others', by {away[worst]:.2f} degrees at pair {per_pair[worst]['pair']}; try rig.mode = per_pair"
+                f"others', by {degrees:.2f} degrees, first at pair {change}; try rig.mode = per_pair"
             )
-    return lines
+    return lines, knocked
 
 
 def _shown(start: Sequence[Linear], columns: list[int], usual: Floats, departure: Floats) -> Floats:

@@ -95,8 +95,8 @@ def feature_homography(a: Pyramid, b: Pyramid) -> Floats | None:
     """Homography (3, 3) from level-0 pixels of frame a to those of frame b; None: too few features agree with one."""
     level = next((n for n, image in enumerate(a.images) if max(image.shape) <= LARGEST), a.levels - 1)
     level = min(level, b.levels - 1)
-    (p, first), (q, second) = (_features(frame, level) for frame in (a, b))
-    pairs = _matches(first, second)
+    (p, first), (q, second) = (features(frame, level) for frame in (a, b))
+    pairs = matches(first, second)
     if len(pairs) < LEAST_AGREEING:
         return None
     # Pixel centres of a level lie between those of the finer one: x0 = 2^n x + (2^n - 1) / 2.
@@ -112,10 +112,10 @@ def feature_homography(a: Pyramid, b: Pyramid) -> Floats | None:
     return homography / middle[2] if abs(middle[2]) > 1e-9 else None
 
 
-def _features(frame: Pyramid, level: int) -> tuple[Floats32, Floats32]:
+def features(frame: Pyramid, level: int, most: int = FEATURES) -> tuple[Floats32, Floats32]:
     """Positions (n, 2) column, row in pixels of the level, and RootSIFT descriptors (n, 128)."""
     image = np.clip(np.rint(np.nan_to_num(frame.images[level])), 0, 255).astype(np.uint8)
-    points, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(image, frame.valid[level])
+    points, descriptors = cv2.SIFT.create(most).detectAndCompute(image, frame.valid[level])
     if descriptors is None:
         return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32)
     # RootSIFT: Euclidean distances of the roots are Hellinger distances of the histograms, which few large bins do not
@@ -124,7 +124,7 @@ def _features(frame: Pyramid, level: int) -> tuple[Floats32, Floats32]:
     return np.array([k.pt for k in points], np.float32), root
 
 
-def _matches(a: Floats32, b: Floats32) -> NDArray[np.intp]:
+def matches(a: Floats32, b: Floats32) -> NDArray[np.intp]:
     """Numbers (k, 2) of the features that are each other's nearest, by far."""
     if min(len(a), len(b)) < 2:
         return np.zeros((0, 2), np.intp)

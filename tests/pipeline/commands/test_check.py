@@ -148,12 +148,14 @@ def test_frames_are_chosen_and_warnings_repeated(tmp_path, capsys):
     assert "from frame 001 to 003" in line(lines, "motion")
 
 
-def test_shifts_in_time_are_judged_where_they_were_looked_at(tmp_path, capsys):
+def test_moments_are_judged_over_the_frames_that_are_looked_at(tmp_path, capsys):
     path = folder(tmp_path / "wall", frames=9)
     _, lines = run(path, capsys)
-    assert "rows of 5 pairs" in line(lines, "simultaneous")
+    assert "rows of 6 pairs" in line(lines, "simultaneous")
     _, lines = run(path, capsys, frames=(0, 4, 8))
-    assert not [text for text in lines if "simultaneous" in text], "no frame has a neighbour among these"
+    assert "rows of 3 pairs" in line(lines, "simultaneous")
+    _, lines = run(path, capsys, frames=(4,))
+    assert not [text for text in lines if "simultaneous" in text], "there is no other moment"
 
 
 def test_a_doubtful_rig_is_one_finding(tmp_path):

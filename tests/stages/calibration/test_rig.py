@@ -186,7 +186,7 @@ def test_parameters_that_stand_in_for_each_other_do_not_move_the_rig():
             for k, row in enumerate(degrees)
         ]
         last = replace(start[-1], constant=start[-1].constant - design @ by) if shown else start[-1]
-        return _drift([*start[:-1], last], rows, RigParams())
+        return _drift([*start[:-1], last], rows, RigParams())[0]
 
     alone = 2.0 * np.where(np.arange(RIG) == strong, away, 0.0)
     assert told(away, shown=True) == []
@@ -246,3 +246,37 @@ def _image(source):
     import cv2
 
     return cv2.imread(source.hints["path"], cv2.IMREAD_GRAYSCALE)
+
+
+def test_a_correction_that_no_mount_makes_is_a_contradiction_and_no_repair():
+    """Right images one frame late on a straight drive: the baseline would point 60 degrees forward."""
+    given = street_rig()
+    centre = np.array([0.54, 0.0, -1.0])
+    late = Rig(given.left, given.right, RigidTransform(np.eye(3), -centre))
+    found = facts(given, [matches(late, street_depth, pair=k, samples=800) for k in range(4)])
+    assert not found["changed"]
+    assert found["rig"] == given.to_dict()
+    assert "baseline forward is off by" in found["contradiction"]
+    assert found["contradiction"].endswith("not repaired, for no mount moves that far")
+    assert found["suspects"] == [0, 1, 2, 3]
+    assert "contradiction" not in facts(given, street(roll_deg=2.0))
+
+
+def test_a_pair_whose_rows_no_rig_explains_is_a_suspect():
+    pairs = street(5)
+    rng = np.random.default_rng(1)
+    m = pairs[2]
+    pairs[2] = PointPairs(m.pair, m.left, m.right + np.outer(rng.normal(0, 2.0, len(m.left)), [0.0, 1.0]))
+    assert facts(street_rig(), pairs)["suspects"] == [m.pair]
+    assert "suspects" not in facts(street_rig(), street(5, roll_deg=0.5))
+
+
+@pytest.mark.parametrize("first", [2, 5, 8])
+def test_where_a_rig_was_knocked_too_far_for_one_calibration_is_told(first):
+    rig = street_rig()
+    after = knocked(rig, roll_deg=1.0)
+    pairs = [matches(after if k >= first else rig, street_depth, pair=10 + k, samples=800) for k in range(10)]
+    found = facts(rig, pairs)
+    assert found["knocked"].startswith(f"the rig moved at pair {10 + first}: roll by 1.0")
+    assert any(f"first at pair {10 + first}" in line for line in moves(found))
+    assert "knocked" not in facts(rig, street(5, roll_deg=1.0))

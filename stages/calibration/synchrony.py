@@ -1,0 +1,104 @@
+"""Test whether left and right images are simultaneous: of some right images, find the one that fits each left one.
+
+While the vehicle moves, matches of a right image of another time lie pixels off their epipolar lines; those of the
+simultaneous image do not. At rest all fit equally, and no finding results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
+from rille.stages.geometry.epipolar import distances
+from rille.stages.geometry.geometry import Rig
+from rille.stages.imaging.pyramid import Pyramid
+from rille.stages.numeric.robust import mad_sigma
+from rille.stages.odometry.roll_search import features, matches
+
+FEATURES = 1500
+"""Most features of an image."""
+
+REACH = 0.1
+"""Share of the right image's height that a match may depart from its line: what departs more is mismatched."""
+
+LEAST = 40
+"""Matches, below which a pair says nothing."""
+
+BETTER = 0.5
+"""Another right image explains the rows where their spread is below this share of the spread as named."""
+
+CLEAR = 1.0
+"""Pixels of spread as named, below which no other image is looked for; matches within are on their lines."""
+
+
+def row_offsets(rig: Rig, left: tuple[Floats32, Floats32], right: tuple[Floats32, Floats32]) -> Floats | None:
+    """Distances [px] of the matches from their epipolar lines, about their median; None of too few matches.
+
+    The median is that of a camera that is turned a little, which no shift in time explains.
+    """
+    rows = matches(left[1], right[1])
+    points = (side[0][rows[:, k]].astype(np.float64) for k, side in enumerate((left, right)))
+    apart, _ = distances(rig, np.zeros(5), *points)
+    # Before the spread is taken: far mismatches would hide what a shift does to the others.
+    apart = apart[np.abs(apart) < REACH * rig.right.height]
+    return np.asarray(apart - np.median(apart)) if len(apart) >= LEAST else None
+
+
+def best_partners(offsets: Mapping[int, Mapping[int, Floats | None]]) -> dict[str, Any]:
+    """Facts of the pairs, by whose frame, and of the right image's, ``offsets`` are those of :func:`row_offsets`.
+
+    ``rows``: spread [px] of each pair as named; ``partners``: pair and frame of its right image, where that is another;
+    ``contradiction``: one line where there is any.
+    """
+    rows, partners, better = [], dict[int, int](), []
+    for pair, by in offsets.items():
+        known = {frame: apart for frame, apart in by.items() if apart is not None}
+        if pair not in known:
+            continue
+        # Many on their lines, not a small spread: far away in time only things match that hardly move in the image.
+        fits = {frame: int((np.abs(apart) < CLEAR).sum()) for frame, apart in known.items()}
+        other = max(fits, key=fits.__getitem__)
+        named, fitted = mad_sigma(known[pair]), mad_sigma(known[other])
+        rows.append(named)
+        if named > CLEAR and fitted < BETTER * named:
+            partners[pair] = other
+            better.append((fitted, named))
+    facts: dict[str, Any] = {"rows": rows, "partners": [list(item) for item in partners.items()]}
+    if partners:
+        shifts = {other - pair for pair, other in partners.items()}
+        which = ", ".join(f"left {pair} with right {other}" for pair, other in partners.items())
+        if len(partners) > 2 and len(shifts) == 1:
+            which = f"left i with right i{shifts.pop():+d}"
+        fitted, named = np.median(better, axis=0)
+        facts["contradiction"] = (
+            f"left and right are not of one time: {which} spreads rows by {fitted:.2f} px, as named {named:.2f} px"
+        )
+        facts["warnings"] = [facts["contradiction"]]
+    return facts
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    rig, frames = Rig.from_dict(args["rig"]), [int(f) for f in args["frames"]]
+    ours, theirs = (
+        [features(Pyramid.from_bundle(one), 0, FEATURES) for one in inputs[side]] for side in ("left", "right")
+    )
+    offsets = {
+        int(pair): {f: row_offsets(rig, left, right) for f, right in zip(frames, theirs, strict=True)}
+        for pair, left in zip(args["pairs"], ours, strict=True)
+    }
+    return Bundle({}, best_partners(offsets))
+
+
+STAGE = Stage(
+    name="synchrony",
+    version=1,
+    summary="which right image is of the time of a left one, where the rows contradict their names",
+    params=NoParams,
+    inputs=("left*", "right*"),
+    outputs=(),
+    run=_run,
+)
