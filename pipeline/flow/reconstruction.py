@@ -21,7 +21,10 @@
     outputs: rasters, tracks, tables, figures: a task each; then report.html and report.json around them
 
 Frames that show no motion (black, of another scene, left and right exchanged) are lost: ``frame_screening`` finds them
-by their ``image_quality``, by motions and bridges over a lost frame, and by ``swap_check`` (left against right).
+by their ``image_quality``, by motions and bridges over a lost frame, and by ``swap_check`` (left against right). Pairs
+whose rows the rig does not explain go through ``synchrony`` (right images of other times): those of two times are not
+basic, and ``keyframes`` chooses anew. ``resect`` compares each basic pair with the one before: behind a rig that was
+knocked nothing is posed.
 
 A segment needs landmarks only relative to its own basic pair, so all segments are resected and refined in parallel (and
 refined again if ``common_tilt`` finds a tilt of all disparities). ``trajectory`` chains them. Locus then runs a second
@@ -43,6 +46,8 @@ from collections.abc import Sequence as Series
 from itertools import groupby, pairwise
 from typing import Any
 
+import numpy as np
+
 from rille.pipeline.engine.graph import Handle, Maybe, Wait
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow import assessment
@@ -51,7 +56,7 @@ from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.evaluation import crosscheck, crosscheck_join
 from rille.stages.imaging import image_quality
 from rille.stages.odometry import frame_screening, keyframes, step_table
-from rille.stages.odometry.resection import common_tilt, refine, trajectory
+from rille.stages.odometry.resection import common_tilt, refine, resect, trajectory
 from rille.stages.planning import path
 from rille.stages.terrain import overlap_audit, overlap_qa, radiometry, tile_index
 
@@ -63,6 +68,9 @@ RIG_PAIRS = 200
 
 SEAMS = 24
 """Earlier models that a model is compared with: enough to tell which is off, however often a place is seen again."""
+
+SUSPECTS = 12
+"""Pairs of doubtful rows that are compared with right images of other times at once."""
 
 TABLE_FRAMES = 100
 """Motions that one table of steps holds."""
@@ -103,23 +111,21 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     missing = [{"frame": f, "cause": why} for f, why in make.sequence.lost.items() if f in frames]
     lost = sorted([*missing, *found.meta["lost"]], key=lambda item: item["frame"])
     row = {frame: k for k, frame in enumerate(frames)}
-    marked = {
-        "unfit": [chain.index(f) for f in found.meta["unfit"]],
-        "behind": [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1],
-    }
-    marks = {name: at for name, at in marked.items() if at}
-    p.keyframes = make.node(keyframes, "keyframes", {"frames": len(chain)} | marks, steps=steps(make, chain))
-    chosen = yield p.keyframes
+    behind = [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1]
+    chosen, rigs = yield from simultaneous(make, chain, behind, found.meta["unfit"])
+    if chosen is None:
+        return
     basic = [chain[i] for i in chosen.meta["basic"]]
 
     # At each basic pair, the rover's stop: local elevation model, hazards and path.
-    pairs = basic_pairs(make, basic, frames[0])
+    pairs = basic_pairs(make, rigs, frames[0])
 
     # In between: tracks, poses in the frame of the segment's basic pair, and their product.
     segments = []
     for part in chosen.meta["segments"]:
         way = [chain[i] for i in part]
-        segments.append(make.segment(way, pairs[way[0]], dead_reckoning(make, way)))
+        segments.append(make.segment(way, pairs[way[0]], dead_reckoning(make, way), after=pairs.get(way[-1])))
+    segments, moved = yield from unmoved(make, pairs, segments)
     p.tracks, p.resections = [s.track for s in segments], [s.resection for s in segments]
     p.trajectory = make.node(
         trajectory,
@@ -135,7 +141,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     # The world is that of the largest unbroken piece: its models, straight on the world lattice.
     start, end = posed.meta["pieces"][posed.meta["main"]]
     # Pairs of other pieces have poses in frames of their own: nothing says where they lie in this world.
-    there = [k for k in basic if start <= k <= end and posed.meta["positions"][row[k]]]
+    there = [k for k in basic if start <= k <= end and posed.meta["positions"][row[k]] and k not in moved]
     for k in there:
         _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory)
     args = {"side": TILE_CELLS, "margin": make.config.merge.margin}
@@ -209,18 +215,54 @@ def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref]:
         turn += 1
 
 
-def basic_pairs(make: Builder, basic: list[int], first: int) -> dict[int, Pair]:
-    """Stereo pairs to local elevation models, risk maps and paths, with one rig for all pairs or one each."""
+def simultaneous(
+    make: Builder, chain: list[int], behind: list[int], unfit: list[int]
+) -> Generator[Wait, Any, tuple[Ref | None, dict[int, Handle]]]:
+    """Choose basic pairs whose images are of one time, and find their rigs: one for all pairs, or one each.
+
+    No choice where the images of most pairs contradict the rig, or each other: nothing is measured with these then.
+
+    Parameters
+    ----------
+    behind : places in the chain behind lost frames.
+    unfit : frames that may not be basic.
+    """
+    p, mode, unfit = make.products, make.config.rig.mode, list(unfit)
+    while True:
+        # Each contradiction leads to another choice.
+        which = f"/{len(p.contradictions)}" if p.contradictions else ""
+        marked = {"unfit": sorted(chain.index(f) for f in unfit), "behind": behind}
+        args = {"frames": len(chain)} | {name: at for name, at in marked.items() if at}
+        p.keyframes = make.node(keyframes, f"keyframes{which}", args, steps=steps(make, chain))
+        chosen: Ref = yield p.keyframes
+        basic = [chain[i] for i in chosen.meta["basic"]]
+        pooled = mode != "per_pair" and make.rig(spread(basic, RIG_PAIRS), which)
+        rigs = {k: pooled or make.rig([k], f"/{k}{which}") for k in basic}
+        p.rigs, known = ({k: one[side] for k, one in rigs.items()} for side in (0, 1))
+        judged: list[Ref] = yield list(dict.fromkeys(p.rigs.values()))
+        suspects = [pair for one in judged for pair in one.meta.get("suspects", ())]
+        if suspects:
+            p.contradictions.append(make.synchrony(f"synchrony{which}", spread(suspects, SUSPECTS), chain))
+            timed: Ref = yield p.contradictions[-1]
+            wrong = [pair for pair, _ in timed.meta["partners"]]
+            if 2 * len(suspects) > len(basic) and any("contradiction" in one.meta for one in (timed, *judged)):
+                return None, {}
+            if wrong:
+                unfit += wrong
+                continue
+        if not any("knocked" in one.meta for one in judged):
+            return chosen, known
+        p.contradictions.append(p.rigs[basic[0]])
+        # One calibration does not describe this rig: each pair has its own.
+        mode = "per_pair"
+
+
+def basic_pairs(make: Builder, rigs: dict[int, Handle], first: int) -> dict[int, Pair]:
+    """Stereo pairs to local elevation models, risk maps and paths, each with its rig."""
     p, pairs = make.products, dict[int, Pair]()
-    for k in basic:
+    for k, known in rigs.items():
         p.disparity[k], p.orientations[k] = make.disparity(k), make.orientation(k)
-    if make.config.rig.mode == "per_pair":
-        rigs = {k: make.rig([k], f"/{k}") for k in basic}
-    else:
-        rigs = dict.fromkeys(basic, make.rig(spread(basic, RIG_PAIRS)))
-    for k in basic:
-        p.rigs[k], known = rigs[k]
-        pair = pairs[k] = make.pair(k, vertical(make, k, k == first), known, pairs.get(basic[0]))
+        pair = pairs[k] = make.pair(k, vertical(make, k, k == first), known, pairs.get(next(iter(rigs))))
         p.level[k], p.local_dem[k] = pair.level, pair.dem
         p.local_risk[k] = make.hazards(f"risk/local/{k}", [pair.dem])
         p.local_path[k] = make.node(path, f"path/local/{k}", {"use": "local"}, risk=p.local_risk[k])
@@ -239,6 +281,29 @@ def vertical(make: Builder, pair: int, first: bool) -> dict[str, Any]:
     if s.pitch is not None:
         args["pitch"] = s.pitch
     return args
+
+
+def unmoved(
+    make: Builder, pairs: Mapping[int, Pair], segments: list[Segment]
+) -> Generator[Wait, Any, tuple[list[Segment], set[int]]]:
+    """Segments, those refused whose basic pair measures otherwise than the first: its rig was knocked; and such pairs.
+
+    The first pair stands for the calibration, which was made before the drive.
+    """
+    p, by, cause = make.products, np.zeros(2), ""
+    out, moved = [], set[int]()
+    judged = yield Maybe([s.resection for s in segments])
+    for s, one in zip(segments, judged, strict=True):
+        k, end = s.frames[0], s.frames[-1]
+        out.append(make.segment(s.frames, pairs[k], {"refused": cause}, f"{k}/refused") if k in moved else s)
+        if one is not None and "jump" in one.meta:
+            by, cause = by + one.meta["jump"], one.meta["knocked"]
+            p.contradictions.append(s.resection)
+        if end in pairs and np.linalg.norm(by) > resect.LEAST_JUMP:
+            moved.add(end)
+            for models in (p.local_dem, p.local_risk, p.local_path):
+                models.pop(end)
+    return out, moved
 
 
 def steps_of(make: Builder, chosen: Ref) -> list[list[float | None]]:

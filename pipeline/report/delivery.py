@@ -38,7 +38,8 @@ def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
     The first in words; the others with ``kind``, ``what`` and ``why`` each; what is absent is no loss.
     """
     view = scene.view
-    missing = _poses(frames) + _path(view) + _crosscheck_lost(scene)
+    contradicted = [_item("contradiction", line, "") for line in contradictions(view)]
+    missing = contradicted + _poses(frames) + _path(view) + _crosscheck_lost(scene)
     found = {"delivered": _delivered(view, frames, pairs), "missing": missing}
     return found | {"absent": _local_paths(pairs) + _truth(view) + _crosscheck_off(view) + _vehicle(view)}
 
@@ -103,6 +104,14 @@ def _delivered(view: RunView, frames: Rows, pairs: Rows) -> list[str]:
     words += ["the goal was reached"] if drive is not None and drive.verdict == "goal" else []
     words += [f"a path over the merged terrain was found{start_words(view)}"] if away is not None else []
     return words
+
+
+def contradictions(view: RunView) -> list[str]:
+    """List what the images contradict so that no figure may rest on it, one line each."""
+    p = view.products
+    found = [view.bundle(handle) for handle in (*p.contradictions, *p.rigs.values(), *p.resections)]
+    keys = ("contradiction", "knocked")
+    return list(dict.fromkeys(b.meta[key] for b in found if b is not None for key in keys if key in b.meta))
 
 
 def _failures(view: RunView) -> Items:

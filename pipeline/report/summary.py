@@ -93,6 +93,7 @@ def find_warnings(scene: Scene) -> list[str]:
     p = view.products
     for handle in (
         p.screening,
+        *p.contradictions,
         p.keyframes,
         p.common_tilt,
         *p.crosschecks,
@@ -239,7 +240,8 @@ def _verdict(view: RunView, frames: delivery.Rows, pairs: delivery.Rows, figures
         _way_words(view, length),
         *([] if any(delivery.has_truth(view)) else ["not assessed against truth"]),
     ]
-    return ", ".join(parts) + "."
+    first = "".join(f"{line}. " for line in delivery.contradictions(view)[:1])
+    return first + ", ".join(parts) + "."
 
 
 def _way_words(view: RunView, length: float | None) -> str:
@@ -287,7 +289,7 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
 
 READS = (
     "screening keyframes common_tilt crosschecks crosscheck agreement crosscheck_accuracy trajectory accuracy "
-    "position_accuracy overlap_audit disparity orientations rigs level local_dem local_risk local_path "
+    "position_accuracy overlap_audit disparity orientations rigs contradictions level local_dem local_risk local_path "
     "local_dem_accuracy resections refined world_dem world_tiles world_risk world_path dem_accuracy path_check drive"
 )
 KNOWS = (

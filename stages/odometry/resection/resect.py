@@ -39,7 +39,13 @@ from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
-from rille.stages.odometry.resection.landmarks import Landmarks, landmarks_from_dem, landmarks_from_disparity, relief
+from rille.stages.odometry.resection.landmarks import (
+    Landmarks,
+    landmarks_from_dem,
+    landmarks_from_disparity,
+    matches_at,
+    relief,
+)
 from rille.stages.odometry.resection.pnp import (
     Observations,
     Poses,
@@ -71,6 +77,21 @@ FALSE_ALARMS = 0.01
 """Expected number of poses that chance alone makes in a frame whose tracks are all wrong: one in a hundred frames."""
 SAMPLE = 4
 """Landmarks of one hypothesis: the fewest that fix a pose uniquely."""
+AWAY = 2.0
+"""Times the threshold from which on a landmark surely does not move as a pose says."""
+SECOND_SHARE = 0.2
+"""Share of the landmarks from which on a second motion puts the first in doubt: a vehicle ahead has less."""
+BODY_SHARE = 0.1
+"""The same where the landmarks that do not move in the image are all nearer, as the vehicle's own body is."""
+LEAST_JUMP = 1.0
+"""Median departure [pixels] of a basic pair's disparities from the pair's before from which on the rig was knocked;
+of sound rigs it stays below 0.2."""
+STILL = 0.5
+"""Median displacement [pixels] below which landmarks do not move in the image."""
+
+
+class AmbiguousError(DegenerateError):
+    """Two motions have large support: which is the camera's, the landmarks do not tell."""
 
 
 class ResectParams(Params):
@@ -182,15 +203,7 @@ def resect(
     """
     _enough(len(pixels), where, "have coordinates and were found", FEW)
     _not_collinear(landmarks.position, where)
-    obs = Observations(
-        landmarks.position[None],
-        landmarks.per_pixel[None],
-        landmarks.sigma[None],
-        pixels[None],
-        camera,
-        params.pixel_sigma,
-        params.bias_sigma,
-    )
+    obs = _observations(landmarks, pixels, camera, params)
     # The solver moves T_cam_local, callers speak of T_local_left.
     predictions = [Poses.of(T.inverse()) for T in starts]
     poses, near = _robust_start(obs, predictions, params, rng)
@@ -204,6 +217,71 @@ def resect(
     _not_by_chance(obs, poses, int(active.sum()), params, where)
     _not_collinear(landmarks.position[active], where)
     return _result(obs, poses, active, steps, params, where)
+
+
+def _observations(landmarks: Landmarks, pixels: Floats, camera: Camera, params: ResectParams) -> Observations:
+    known = landmarks.position[None], landmarks.per_pixel[None], landmarks.sigma[None]
+    return Observations(*known, pixels[None], camera, params.pixel_sigma, params.bias_sigma)
+
+
+def refuse_second_motion(
+    landmarks: Landmarks,
+    points: Floats32,
+    camera: Camera,
+    T_local_key: RigidTransform,
+    found: Resection,
+    params: ResectParams,
+    rng: np.random.Generator,
+) -> None:
+    """Refuse the pose of a frame where many of the landmarks that it leaves agree with another pose.
+
+    Either the camera moves and part of the view goes with it (the vehicle's own body), or it stands and part of the
+    view moves: the images are alike. Landmarks that fit both poses, as those at infinity, speak for neither.
+
+    Parameters
+    ----------
+    landmarks, points : all of the segment, and where they are (n, frames, 2) up to this frame, without the key; NaN
+        none.
+    found : by those that have both in this frame.
+
+    Raises
+    ------
+    AmbiguousError
+        Two motions have large support.
+    """
+    seen = np.asarray(np.isfinite(points).all(2))
+    seen[~np.isfinite(landmarks.position).all(1)] = False
+    # Of all that were seen: those at rest in the image stay in view while the others leave it.
+    total, use = int(seen.any(1).sum()), np.flatnonzero(seen[:, -1])
+    known, pixels = landmarks.take(use), points[use, -1].astype(np.float64)
+    norm = norms(_observations(known, pixels, camera, params), Poses.of(found.T_local_left.inverse()))[0]
+    left = np.flatnonzero(norm > AWAY * params.threshold / params.pixel_sigma)
+    if len(left) < max(MINIMUM, BODY_SHARE * total):
+        return
+    try:
+        # A part of the view that does not move in the image has the key's pose.
+        other = resect(known.take(left), pixels[left], camera, [found.T_local_left, T_local_key], params, rng)
+    except DegenerateError:
+        return
+    before = T_local_key.inverse().apply(known.position)
+    shift = np.sqrt(((camera.project(before) - pixels) ** 2).sum(1))
+    parts = [(np.flatnonzero(found.inlier), found), (left[other.inlier], other)]
+    (still, rest), (moving, motion) = sorted(parts, key=lambda part: float(np.median(shift[part[0]])))
+    stays = bool(np.median(shift[still]) < STILL)
+    body = stays and bool(np.quantile(before[still, 2], 0.9) < np.quantile(before[moving, 2], 0.1))
+    # The smaller part may be all that shows the motion only where the larger one is the vehicle itself.
+    if len(parts[1][0]) < (BODY_SHARE if body and rest is found else SECOND_SHARE) * total:
+        return
+    moved = [float(np.linalg.norm(one.T_local_left.translation - T_local_key.translation)) for one in (rest, motion)]
+    raise AmbiguousError(
+        "RIL-770",
+        f"two motions: {len(still)} of {total} landmarks ({len(still) / total:.0%}) "
+        f"{'do not move in the image' if stays else f'moved by {moved[0]:.3g} m'}, "
+        f"{len(moving)} ({len(moving) / total:.0%}) moved by {moved[1]:.3g} m",
+        remedy="the still ones are the nearest: cut the vehicle's own body off the images, or mask it"
+        if body
+        else "leave out frames in which the camera stood, or cut off or mask what moves with it",
+    )
 
 
 def _robust_start(
@@ -453,6 +531,7 @@ def resect_segment(
     )
     known = np.isfinite(landmarks.position).all(1)
     pose, together = T_local_key, list[float]()
+    doubt: AmbiguousError | None = None
     out.poses[0], out.covariance[0], out.shared[0] = pose.matrix34, 0.0, 0.0
     for j in range(count):
         use = np.flatnonzero(known & np.isfinite(points[:, j]).all(1))
@@ -461,11 +540,17 @@ def resect_segment(
             out.facts.append(_facts(frames[0], use.size, use.size, 0.0, None))
             continue
         try:
-            starts = [pose, *_reckoned(T_local_key, reckoned, j)]
-            found = _resect_one(landmarks, points[:, j], use, camera, starts, params, frames[j])
+            # What is in doubt stays so: later frames see fewer of the landmarks that told the motions apart.
+            if doubt:
+                raise doubt
+            starts = [T_local_key, pose, *_reckoned(T_local_key, reckoned, j)]
+            found = _resect_one(landmarks, points[:, 1 : j + 1], use, camera, starts, params, frames[j])
         except DegenerateError as error:
             cause = error.message.removeprefix(f"frame {frames[j]}: ")
             out.facts.append(_facts(frames[j], use.size, 0, None, None) | {"lost": cause})
+            if isinstance(error, AmbiguousError) and not doubt:
+                out.facts[-1]["contradiction"] = f"frame {frames[j]} shows {cause}: {error.remedy}"
+                doubt = AmbiguousError(error.code, f"two motions since frame {frames[j]}")
             continue
         pose = found.T_local_left
         out.poses[j], out.covariance[j], out.shared[j] = pose.matrix34, found.covariance, found.shared
@@ -494,15 +579,17 @@ def _resect_one(
     params: ResectParams,
     frame: int,
 ) -> Resection:
-    """One frame of a segment, by those of its points (n, 2) that are used."""
+    """The last frame of ``points`` (n, frames, 2), by those that are used; ``starts``: the key's pose, then others."""
     where = f"frame {frame}"
     if use.size < MINIMUM:
         what = f"of {len(points)} tracked points have coordinates and were found ({landmarks.summary()})"
         _enough(use.size, where, what, FEW)
     # Seeded by the frame: its pose does not depend on how many frames were posed before it.
     rng = np.random.default_rng([params.seed, frame])
-    pixels = points[use].astype(np.float64)
-    return resect(landmarks.take(use), pixels, camera, starts, params, rng, where=where)
+    pixels = points[use, -1].astype(np.float64)
+    found = resect(landmarks.take(use), pixels, camera, starts[1:], params, rng, where=where)
+    refuse_second_motion(landmarks, points, camera, starts[0], found, params, rng)
+    return found
 
 
 def _facts(frame: int, seen: int, inliers: int, rms: float | None, found: Resection | None) -> dict[str, Any]:
@@ -529,7 +616,12 @@ def _run(params: ResectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         reckoned = [None if T is None else RigidTransform.from_matrix(T) for T in args["prediction"]]
         if len(reckoned) != len(frames):
             raise InputError("RIL-423", f"{len(frames)} frames need {len(frames)} predicted poses, not {len(reckoned)}")
+    if "refused" in args:
+        # Of a rig that was knocked: what it measures is worth no pose.
+        points = np.where(np.arange(len(frames))[:, None] == 0, points, np.float32(np.nan))
     found = resect_segment(points, landmarks, rig.left, T_local_key, frames, params, reckoned)
+    for fact in found.facts[1:] if "refused" in args else ():
+        fact["lost"] = args["refused"]
     arrays: dict[str, AnyArray] = {
         "poses": found.poses,
         "covariance": found.covariance,
@@ -545,6 +637,10 @@ def _run(params: ResectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         "without_coordinates": landmarks.lost,
     }
     meta |= {"tracks": tracks, "moving_tracks": moving, "warnings": _moving_words(frames, tracks, moving)}
+    if "after" in inputs:
+        meta |= knocked(points[:, -1].astype(np.float64), found, landmarks, inputs)
+    for line in [fact["contradiction"] for fact in found.facts if "contradiction" in fact]:
+        meta |= {"contradiction": line, "warnings": [line]}
     return Bundle(arrays, meta)
 
 
@@ -561,6 +657,33 @@ def moving_tracks(points: Floats32, landmarks: Landmarks, found: SegmentPoses) -
     often = seen.sum(axis=1) >= 2
     agrees = (found.inlier != 0) & seen
     return int(often.sum()), int((often & ~agrees.any(axis=1)).sum())
+
+
+def knocked(points: Floats, found: SegmentPoses, landmarks: Landmarks, inputs: Inputs) -> dict[str, Any]:
+    """Facts where the basic pair at the segment's end measures otherwise than the landmarks say: the rig has moved.
+
+    A turn of a camera to the side shows in no row of one pair, but all its disparities jump by as much.
+
+    Parameters
+    ----------
+    points : (n, 2) column, row in that pair's left image; NaN lost.
+    """
+    rig, pose = Rig.from_dict(inputs["rig_after"].meta["rig"]), found.poses[-1]
+    names = ("column_disparity", "row_disparity", "validity")
+    disparity, matched = matches_at(points, *(np.asarray(inputs["after"][name]) for name in names))
+    use = matched & (found.inlier[:, -1] != 0)
+    if not np.isfinite(pose).all() or use.sum() < MINIMUM:
+        return {}
+    at = RigidTransform.from_matrix(pose).inverse().apply(landmarks.position[use])
+    expected = rig.right.project(rig.T_right_left.apply(at)) - rig.left.project(at)
+    jump = np.median(disparity[use] - expected, axis=0)
+    if np.linalg.norm(jump) <= LEAST_JUMP:
+        return {}
+    line = (
+        f"the rig moved at pair {found.facts[-1]['frame']}: its disparities depart by {jump[0]:+.1f} px in the column, "
+        f"{jump[1]:+.1f} px in the row from those of pair {found.facts[0]['frame']}"
+    )
+    return {"knocked": line, "jump": jump.tolist(), "warnings": [f"{line}: calibrate anew from there on"]}
 
 
 def _moving_words(frames: list[int], tracks: int, moving: int) -> list[str]:
@@ -603,7 +726,7 @@ STAGE = Stage(
     version=3,
     summary="poses of a segment's frames in the local frame of its basic pair",
     params=ResectParams,
-    inputs=("track", "dem?", "disparity?", "level", "rig"),
+    inputs=("track", "dem?", "disparity?", "level", "rig", "after?", "rig_after?"),
     outputs=(
         replace(POSES, frame="local"),
         replace(COVARIANCE, frame="local"),

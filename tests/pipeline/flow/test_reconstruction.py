@@ -26,9 +26,11 @@ def lay_out(
     chosen: dict[str, Any],
     trajectory: dict[str, Any],
     tilted: bool = False,
+    doubts: list[tuple[str, dict[str, Any]]] | None = None,
+    jumps: dict[str, dict[str, Any]] | None = None,
     **given: Any,
 ) -> tuple[Graph, Products]:
-    """The graph as it grows with these facts of the stages."""
+    """The graph as it grows with these facts of the stages; ``doubts`` are those behind the first choice, in order."""
     sequence = open_sequence("mockup-short", {"mockup": {"frames": FRAMES}})
     graph, settings = Graph(), config.build(config.expand(sequence.defaults), given)
     products, _ = dataflow(graph, sequence, settings, tuple(range(FRAMES)))
@@ -38,6 +40,13 @@ def lay_out(
     for meta in [*({"asks": asks} for asks in asked), nothing | answer, found]:
         deciding = [w for w in graph.expansions if w[0][0].stage in ("frame_screening", "keyframes")]
         deciding[-1][1](SimpleNamespace(meta=meta))
+    for stage, meta in doubts or [("rig", {})]:
+        handles, go_on, _ = [w for w in graph.expansions if w[0][0].stage == stage][-1]
+        facts = found | meta if stage == "keyframes" else meta
+        go_on(*(SimpleNamespace(meta=facts) for _ in handles))
+    for handles, go_on, _ in list(graph.expansions):
+        if handles[0].stage == "resect":
+            go_on(*(SimpleNamespace(meta=(jumps or {}).get(h.label, {})) for h in handles))
     for stage, meta in (("common_tilt", {"undone": tilted}), ("trajectory", trajectory)):
         for handles, go_on, _ in list(graph.expansions):
             if handles[0].label == stage:
@@ -154,3 +163,59 @@ def test_what_many_tasks_are_given_is_held_once() -> None:
         given = [h.spec.args[name] for h in graph.nodes if name in h.spec.args]
         assert len(given) >= least
         assert len({id(value) for value in given}) == 1, name
+
+
+WHOLE = {"chain": list(range(FRAMES)), "lost": [], "unfit": []}
+CHOICE = {"basic": [0, 3, 5, 6], "segments": [[0, 1, 2, 3], [3, 4, 5], [5, 6], [6, 7]]}
+POSED = {"frames": list(range(8)), "pieces": [[0, 7]], "main": 0, "positions": [[0, 0, k] for k in range(8)]}
+
+
+def test_a_pair_of_two_moments_is_no_basic_pair() -> None:
+    again = {"basic": [0, 2, 5, 6], "segments": [[0, 1, 2], [2, 3, 4, 5], [5, 6], [6, 7]]}
+    exchanged = ("synchrony", {"partners": [[3, 4]], "contradiction": "left 3 with right 4"})
+    doubts = [("rig", {"suspects": [3]}), exchanged, ("keyframes", again), ("rig", {})]
+    graph, products = lay_out([], WHOLE, CHOICE, POSED, doubts=doubts)
+    assert products.keyframes is not None
+    assert products.keyframes.spec.args["unfit"] == [3]
+    assert list(products.disparity) == [0, 2, 5, 6]
+    right = next(h for h in graph.nodes if h.stage == "synchrony").inputs["right"]
+    assert isinstance(right, list)
+    assert [h.label for h in right] == [f"pyramid/right/{k}" for k in range(7)]
+    assert list(products.world_dem) == [0, 2, 5, 6]
+
+
+@pytest.mark.parametrize("late", [True, False])
+def test_where_most_pairs_contradict_their_rig_nothing_is_measured(late: bool) -> None:
+    line = {"contradiction": "left i with right i+1"}
+    rig = {"suspects": [0, 3, 5, 6]} | ({} if late else line)
+    found = ("synchrony", {"partners": [[k, k + 1] for k in (0, 3, 5)] if late else []} | (line if late else {}))
+    graph, products = lay_out([], WHOLE, CHOICE, POSED, doubts=[("rig", rig), found])
+    assert products.trajectory is None
+    assert labels(graph, "resect") == labels(graph, "locus") == []
+
+
+def test_rows_that_no_other_moment_explains_change_nothing() -> None:
+    doubts = [("rig", {"suspects": [0, 3, 5, 6]}), ("synchrony", {"partners": []})]
+    _, products = lay_out([], WHOLE, CHOICE, POSED, doubts=doubts)
+    assert list(products.world_dem) == [0, 3, 5, 6]
+
+
+def test_each_pair_of_a_rig_that_moves_in_the_rows_has_its_own() -> None:
+    doubts = [("rig", {"knocked": "the rig moved at pair 5"}), ("keyframes", CHOICE), ("rig", {})]
+    _, products = lay_out([], WHOLE, CHOICE, POSED, doubts=doubts)
+    assert len({id(handle) for handle in products.rigs.values()}) == 4
+    assert products.contradictions[0].label == "rig"
+
+
+@pytest.mark.parametrize(
+    ("back", "refused", "world"), [(False, [5, 6], [0, 3]), (True, [5], [0, 3, 6])], ids=["knocked", "and back"]
+)
+def test_what_a_knocked_rig_measures_is_worth_no_pose(back: bool, refused: list[int], world: list[int]) -> None:
+    jumps = {"resect/3": {"jump": [3.0, 0.0], "knocked": "the rig moved at pair 5"}}
+    if back:
+        jumps["resect/5"] = {"jump": [-2.6, 0.1], "knocked": "the rig moved at pair 6"}
+    _, products = lay_out([], WHOLE, CHOICE, POSED, jumps=jumps)
+    said = [h.spec.args.get("refused") for h in products.resections]
+    assert [h.spec.args["frames"][0] for h, cause in zip(products.resections, said, strict=True) if cause] == refused
+    assert set(said) == {None, "the rig moved at pair 5"}
+    assert list(products.world_dem) == list(products.local_dem) == world

@@ -7,9 +7,12 @@ from raising import raises
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
+from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import DegenerateError
+from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import (
     Camera,
+    Rig,
     RigidTransform,
     rotation_exp,
 )
@@ -24,7 +27,7 @@ from rille.stages.odometry.resection.pnp import (
     normal_matrix,
     norms,
 )
-from rille.stages.odometry.resection.resect import ResectParams, moving_tracks, resect, resect_segment
+from rille.stages.odometry.resection.resect import ResectParams, knocked, moving_tracks, resect, resect_segment
 
 CAMERA = Camera(600.0, 610.0, 300.0, 250.0, 600, 500)
 PARAMS = ResectParams()
@@ -483,3 +486,68 @@ def test_a_landmark_that_the_camera_has_nearly_reached_agrees_with_nothing():
     assert not found.inlier[0]
     assert found.residual[found.inlier].max() < 1e-3
     np.testing.assert_allclose(found.T_local_left.translation, pose.translation, atol=1e-6)
+
+
+def carried(carried_near, carried_far, moved):
+    """Segment of two frames: so many landmarks carried along (near, or as far as the others), the others passed."""
+    rng = np.random.default_rng(29)
+    step = RigidTransform(rotation_exp([0, 0.01, 0]), np.array([0.0, 0, 0.6]))
+    landmarks = np.concatenate([scene(rng, carried_near, 1.0, 2.0), scene(rng, carried_far + moved)])
+    points = np.stack([seen(T, landmarks) for T in (RigidTransform.identity(), step)], 1).astype(np.float32)
+    points[: carried_near + carried_far, 1] = points[: carried_near + carried_far, 0]
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(len(landmarks)), {})
+    return resect_segment(points, known, CAMERA, RigidTransform.identity(), [4, 5], PARAMS), step
+
+
+@pytest.mark.parametrize(
+    ("near", "far", "moved", "words"),
+    [(60, 0, 40, "own body"), (0, 70, 30, "the camera stood"), (30, 0, 70, "own body"), (86, 0, 14, "own body")],
+)
+def test_of_two_motions_that_many_landmarks_show_none_is_taken(near, far, moved, words):
+    """A bonnet in view, or a camera that stands before a lorry: the images are alike."""
+    found, _ = carried(near, far, moved)
+    assert np.isnan(found.poses[1]).all()
+    assert "two motions" in found.facts[1]["lost"]
+    line = found.facts[1]["contradiction"]
+    assert f"{near + far} of 100 landmarks ({near + far}%) do not move in the image" in line
+    assert f"{moved} ({moved}%) moved by 0.6 m" in line
+    assert words in line
+
+
+@pytest.mark.parametrize(("near", "far", "moved"), [(0, 12, 88), (15, 0, 85), (0, 86, 14)])
+def test_a_vehicle_ahead_and_few_that_pass_leave_the_motion_as_it_is(near, far, moved):
+    found, step = carried(near, far, moved)
+    assert "contradiction" not in found.facts[1]
+    expected = step if moved > far else RigidTransform.identity()
+    np.testing.assert_allclose(found.poses[1], expected.matrix34, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("column", "row", "told"), [(3.0, 0.0, True), (-2.0, 0.0, True), (0.0, 1.5, True), (0.5, 0.2, False)]
+)
+def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told):
+    """The later pair measures disparities that all depart alike from those of the landmarks."""
+    rng = np.random.default_rng(31)
+    step = RigidTransform(rotation_exp([0, 0.01, 0]), np.array([0.0, 0, 0.4]))
+    rig = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), np.array([-0.3, 0.0, 0.0])))
+    landmarks = scene(rng, 80)
+    landmarks[:, 2] = 8.0  # a wall: one disparity at the key, and another one behind the step
+    points = np.stack([seen(T, landmarks) for T in (RigidTransform.identity(), step)], 1).astype(np.float32)
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {})
+    found = resect_segment(points, known, CAMERA, RigidTransform.identity(), [4, 7], PARAMS)
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    rays = CAMERA.rays(np.stack([u.ravel(), v.ravel()], 1).astype(float)) @ step.rotation.T
+    depth = (8.0 - step.translation[2]) / rays[:, 2]
+    shape = (CAMERA.height, CAMERA.width)
+    disparity = {
+        "column_disparity": (column - 0.3 * CAMERA.fx / depth).reshape(shape).astype(np.float32),
+        "row_disparity": np.full(shape, row, np.float32),
+        "validity": np.full(shape, Validity.MATCHED, np.uint8),
+    }
+    inputs = {"after": Bundle(disparity, {}), "rig_after": Bundle({}, {"rig": rig.to_dict()})}
+    facts = knocked(points[:, 1].astype(float), found, known, inputs)
+    assert bool(facts) == told
+    if told:
+        np.testing.assert_allclose(facts["jump"], [column, row], atol=0.05)
+        assert facts["knocked"].startswith("the rig moved at pair 7")
+        assert f"{(column or row):+.1f} px in the" in facts["knocked"]
