@@ -82,7 +82,8 @@ def recorded(names: list[str], folder: Path, *, outputs: bool = True) -> list[Ta
         scheduler.run(opened.graph, opened.store, scheduler.RunOptions(executor="inline")).check()
         for node in opened.graph.nodes:
             kind = node.spec.args.get("step", node.spec.args.get("file"))
-            if node.inputs and (node.spec.module, kind) not in found:
+            wanted = node.inputs or node.spec.module.startswith("rille.stages.")
+            if wanted and (node.spec.module, kind) not in found:
                 inputs = each(lambda h, store=opened.store: in_memory(store.open(h.ref)), node.inputs)
                 makers = each(lambda h: h.spec.stage, node.inputs)
                 found[node.spec.module, kind] = Task(node.label, node.spec, inputs, makers)
