@@ -482,11 +482,11 @@ EDITS: dict[str, tuple[str, str, str, set[str]]] = {
     "a helper of the seams": ("stages/terrain/overlap_qa.py", "", "\nMORE = 1\n", {"overlap_qa"}),
     "a stage that others hang on by its result": ("stages/terrain/tile_index.py", "", "\nMORE = 1\n", {"tile_index"}),
     "a helper's helper": ("stages/geometry/epipolar.py", "", "\nMORE = 1\n", {"orientation", "rig"}),
-    "a helper of two stages": (
+    "a helper of three stages": (
         "stages/evaluation/pose_alignment.py",
         "",
         "\nMORE = 1\n",
-        {"agreement", "crosscheck_join"},
+        {"accuracy", "agreement", "crosscheck_join"},
     ),
 }
 """File, what in it becomes what (at its end, if nothing), and the groups whose *own* code it is part of."""

@@ -181,7 +181,7 @@ def _sound(header: Header | None, name: str) -> Header:
         raise InputError(
             "RIL-171",
             f"{name} cannot be read as an image",
-            remedy=f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM are read" if kind == "file" else KINDS[kind]["step"],
+            remedy=f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM are read" if kind == "file" else KINDS[kind][1],
         )
     width, height, bits = header
     if bits > 16:

@@ -2,21 +2,42 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections import defaultdict
 from collections.abc import Iterable
-from pathlib import Path, PurePath
+from pathlib import PurePath
 
 from rille.datasets.text.count import count
 
-KINDS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+KINDS: dict[str, tuple[str, str]] = {
+    "video": (
+        ".mp4 .m4v .mov .avi .mkv .webm .mpg .mpeg .mjpeg .h264 .h265 .hevc",
+        "take its images out, a folder a camera: mkdir left; ffmpeg -i FILE left/%06d.png",
+    ),
+    "ZED recording": (".svo .svo2", "export left and right images with the ZED SDK (its sample svo_export)"),
+    "bag": (".bag .mcap .db3", "give it instead of the folder: rille check FILE (of ROS 2, its folder)"),
+    "array": (
+        ".npy",
+        "python -c \"import sys, cv2, numpy as n; [cv2.imwrite(f[:-3] + 'png', n.load(f)) for f in sys.argv[1:]]\""
+        " FILES",
+    ),
+    "image": (
+        ".webp .jp2 .j2k .exr .hdr .heic .heif .avif .jxl .gif .tga .dng .nef .cr2 .cr3 .arw .raf .orf .rw2",
+        "convert them: magick mogrify -format png FILES",
+    ),
+    "image without a header": (
+        ".raw .bin .yuv .bayer",
+        "state its size and bits: magick -size WIDTHxHEIGHT -depth 8 gray:FILE FILE.png",
+    ),
+    "archive": (".zip .tar .gz .tgz .bz2 .xz .7z .rar .zst .npz", "unpack it"),
+    "file": ("", "neither images nor a calibration or table that is known"),
+}
 """Endings and next step by the name of a kind; the kind ``file`` is any other."""
 
 
 def kind_of(name: str) -> str:
     """The kind of a file by its ending."""
     ending = PurePath(name).suffix.lower()
-    return next((kind for kind, of in KINDS.items() if ending in of["endings"]), "file")
+    return next((kind for kind, (endings, _) in KINDS.items() if ending in endings.split()), "file")
 
 
 def unread(names: Iterable[str]) -> list[str]:
@@ -25,4 +46,4 @@ def unread(names: Iterable[str]) -> list[str]:
     for name in names:
         groups[kind_of(name)].append(name)
     more = {kind: f" and {len(of) - 1} more" if of[1:] else "" for kind, of in groups.items()}
-    return [f"{count(len(of), kind)} ({of[0]}{more[kind]}): {KINDS[kind]['step']}" for kind, of in groups.items()]
+    return [f"{count(len(of), kind)} ({of[0]}{more[kind]}): {KINDS[kind][1]}" for kind, of in groups.items()]

@@ -21,6 +21,14 @@ from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.scale import of_rig
 
 
+class NoGroundError(DegenerateError):
+    """The disparity shows no ground."""
+
+
+class CoarseGroundError(NoGroundError):
+    """The disparity shows ground, and not well enough for cells of the size that is wanted."""
+
+
 @dataclass(frozen=True)
 class GroundPlane:
     """Plane of the left camera frame: ``up`` unit normal (3,), ``height`` of the camera above it in metres.
@@ -80,7 +88,7 @@ def fit_plane(
         length = float(np.linalg.norm(theta))
         if share >= MIN_SHARE and bool(allowed(-theta[None] / length)[0]):
             return GroundPlane(-theta / length, 1.0 / length, share)
-    raise DegenerateError("RIL-343", "the disparity shows no ground plane below the camera")
+    raise NoGroundError("RIL-343", "the disparity shows no ground plane below the camera")
 
 
 MIN_POINTS = 100
@@ -161,7 +169,7 @@ class GroundView:
         good = (self.along <= max_cells * cell) & (sigma_d <= max_sigma * self.slope)
         if np.count_nonzero(good) < 3:
             enough = np.sort(np.maximum(self.along / max_cells, sigma_d / self.slope))[:3][-1]
-            raise DegenerateError(
+            raise CoarseGroundError(
                 "RIL-344",
                 f"no ground is seen well enough for cells of {cell:g} m",
                 remedy=f"set locus.cell_size to {1.1 * enough:.2g} m or more",

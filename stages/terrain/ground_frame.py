@@ -28,7 +28,15 @@ from rille.stages.geometry.epipolar import exchanged, fits, inverse_depth
 from rille.stages.geometry.geometry import Rig, RigidTransform, level_rotation
 from rille.stages.geometry.pose_arrays import NO_VERTICAL
 from rille.stages.geometry.scale import coarser_focal
-from rille.stages.terrain.ground import MIN_POINTS, GroundPlane, fit_plane, rounded_cell, view_ground
+from rille.stages.terrain.ground import (
+    MIN_POINTS,
+    CoarseGroundError,
+    GroundPlane,
+    NoGroundError,
+    fit_plane,
+    rounded_cell,
+    view_ground,
+)
 
 Samples = tuple[Floats, Floats, Floats]
 """Rays (n, 3) with z = 1 of the left camera, inverse depths (n,) and their standard deviations, 1/m."""
@@ -162,7 +170,7 @@ def level(
             # The images may show ground where the given vertical has none: then one of the two is wrong.
             facts |= {"seen_up": _fitted(samples, lambda n: _allowed(n, None, params), params).up.tolist()}
     nothing: dict[str, Any] = dict.fromkeys(("ground_height", "plane", "tilt", "relief", "z_range", "footprint"))
-    if ground is not None and why.code == "RIL-344" and ground.inliers >= DOMINANT:
+    if ground is not None and isinstance(why, CoarseGroundError) and ground.inliers >= DOMINANT:
         # Larger cells than those that suit the rig may still make a map.
         nothing["plane"], everywhere = _local_plane(ground, R_local_left), [-math.inf, math.inf] * 2
         points = (rays[rho > 0] / rho[rho > 0, None]) @ R_local_left.T
@@ -184,7 +192,7 @@ def _explained(
     error: DegenerateError, samples: Samples, ground: GroundPlane | None, params: GroundFrameParams
 ) -> DegenerateError:
     """Why there is no ground, or none that is seen well enough, with the remedy of that cause."""
-    if error.code not in ("RIL-343", "RIL-344") or (ground is not None and ground.inliers >= DOMINANT):
+    if not isinstance(error, NoGroundError) or (ground is not None and ground.inliers >= DOMINANT):
         return error
     try:
         seen = _fitted(samples, lambda n: np.ones(len(n), dtype=bool), params)

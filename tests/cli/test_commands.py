@@ -315,16 +315,6 @@ def test_datasets(place: Place, tmp_path: Path) -> None:
     assert "earlier format" not in place.rille("plan", "mockup-short", "--cache", tmp_path / "new").err
 
 
-def test_cache_ls_names_each_sequence_and_its_run(place: Place) -> None:
-    done = place.rille("cache", "ls", "--json")
-    assert (done.status, done.err) == (0, "")
-    rows = {(row["sequence"], row["stage"]): row for row in json.loads(done.out)}
-    for sequence in ("mockup-short", "other", "mockup-loop"):
-        assert rows[sequence, "hfvm"]["last_run"] == f"{sequence}/{place.runs(sequence)[-1].name}"
-    total = sum(row["artifacts"] for row in rows.values())
-    assert re.fullmatch(rf"{total} artifacts, .* on disk", place.rille("cache", "ls").last)
-
-
 def test_cache_gc_removes_nothing_that_a_run_uses(place: Place) -> None:
     before = {str(p) for p in (place.folder / ".rille/cache").rglob("*")}
     for _ in range(2):

@@ -33,8 +33,9 @@ FACTS: dict[str, dict[str, Any]] = {
 }
 """What each stage would have found: enough that the graph grows to its end."""
 
-APART = {"trajectory": {"refined"}}
-"""Ports that one flow alone has, by stage: a drive goes on before there is anything to be adjusted jointly."""
+APART = {"trajectory": {"refined"}, "resect": {"after", "rig_after"}}
+"""Ports that one flow alone has, by stage: a drive goes on before there is anything to be adjusted jointly, or a pair
+after a segment to compare its rig with."""
 
 
 def grown(graph: Graph, failing: str = "") -> Graph:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from rille.datasets.protocol import Positions
-from rille.pipeline.runs import input_checks, session
+from rille.pipeline.runs import input_checks
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.imaging.image_quality import Look, look
 
@@ -23,18 +22,6 @@ def levels(found):
 
 def rig(x: float, right: Camera = CAMERA) -> Rig:
     return Rig(CAMERA, right, RigidTransform(np.eye(3), np.array([x, 0.0, 0.0])))
-
-
-def test_of_a_lost_frame_no_bits_are_looked_at():
-    """Of eight frames 0, 3 and 6 would be; there is no image of 3."""
-
-    def image(frame, camera):
-        read.append(frame)
-        return SimpleNamespace(module="", hints={"path": {0: "", 4: "", 7: ""}[frame]})
-
-    read: list[int] = []
-    session._unused_bits(SimpleNamespace(lost={3: "left/000003.png is missing"}, image=image), tuple(range(8)))
-    assert read == [0, 4, 7, 0, 4, 7]
 
 
 @pytest.mark.parametrize(
