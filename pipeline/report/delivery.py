@@ -54,7 +54,8 @@ def complete(found: Mapping[str, Any], view: RunView, figures: Sequence[Figure])
         _item(kind, ", ".join(f.title for f in undrawn if f.why == why and f.failed == (kind == "figure")), why)
         for kind, why in causes
     ]
-    missing = [*_failures(view), *found["missing"], *lost]
+    # What the images contradict comes first: it may be the cause of all that follows.
+    missing = sorted([*_failures(view), *found["missing"], *lost], key=lambda item: item["kind"] != "contradiction")
     absent = [item for item in found["absent"] if item["kind"] != "vehicle" or view.vehicle_source == UNSTATED]
     return {"delivered": [*done, *found["delivered"]], "absent": absent, "missing": missing}
 
@@ -125,7 +126,7 @@ def _failures(view: RunView) -> Items:
         if root.status in ("failed", "skipped"):
             # The figures in a message are those of one pair: the cause is the words.
             kind = _kind(root.label) if root.status == "failed" else ""
-            causes.setdefault((kind, re.sub(r"[0-9][0-9.]*", "#", root.reason)), []).append(t)
+            causes.setdefault((kind, re.sub(r"-?[0-9][0-9.]*", "#", root.reason)), []).append(t)
     found = []
     for (kind, _), tasks in causes.items():
         failed = [t for t in tasks if t.status == "failed"]

@@ -101,7 +101,7 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
     told = list(dict.fromkeys(fit.words for fit in simple if fit.misfit <= ALIKE_FACTOR * best + ALIKE_SHARE))
     return [
         f"the truth fits the trajectory far better by another convention ({100 * best:.2g} % of its extent are left, "
-        f"{100 * as_read:.2g} % as read): {'; or: '.join(told)}"
+        f"{100 * as_read:.3g} % as read): {'; or: '.join(told)}"
         + ("; this drive cannot tell these apart" if len(told) > 1 else "")
     ]
 

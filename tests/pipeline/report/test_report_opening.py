@@ -104,6 +104,14 @@ def test_failures_are_told_by_cause_with_the_tasks_that_depend_on_them():
     assert alone["what"] == "risk/world failed: 1 task depends on it"
 
 
+def test_what_the_images_contradict_is_told_before_what_failed():
+    view = SimpleNamespace(tasks=failed("locus/local/1", "no ground at -0.1"), vehicle_source="")
+    view.tasks += failed("locus/local/2", "no ground at 0.25")
+    found = {"missing": [{"kind": "contradiction", "what": "two motions", "why": ""}], "absent": [], "delivered": []}
+    told = delivery.complete(found, view, [])["missing"]
+    assert [m["what"] for m in told] == ["two motions", "2 of 2 tasks locus/local failed (1, 2)"]
+
+
 def test_figures_that_lack_the_same_are_one_line():
     figures = [Figure("Map", why="not computed"), Figure("Seams", why="not computed"), Figure("Rig", why="no rig")]
     nothing = SimpleNamespace(tasks=(), vehicle_source="")
