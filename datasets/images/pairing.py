@@ -53,7 +53,7 @@ class ImagePair:
     absent: str = ""
 
 
-class Joined(NamedTuple):
+class TimedPairs(NamedTuple):
     """Images of two cameras that were taken together.
 
     Attributes
@@ -76,7 +76,7 @@ class Joined(NamedTuple):
         return [warning(code, text + alone)] if self.apart or alone else []
 
 
-def join(left: Sequence[float], right: Sequence[float], tolerance: float | None = None) -> Joined:
+def join(left: Sequence[float], right: Sequence[float], tolerance: float | None = None) -> TimedPairs:
     """Join the images of two cameras, each to the nearest of the other one in time.
 
     Parameters
@@ -92,7 +92,7 @@ def join(left: Sequence[float], right: Sequence[float], tolerance: float | None 
     # Each must be the other's nearest, else one image would stand in two pairs.
     there = np.flatnonzero((theirs[ours] == np.arange(len(a))) & (apart <= allowed))
     longest = float(max(apart[there], default=apart.min()))
-    return Joined([(int(i), int(ours[i])) for i in there], len(a) + len(b) - 2 * len(there), longest, allowed)
+    return TimedPairs([(int(i), int(ours[i])) for i in there], len(a) + len(b) - 2 * len(there), longest, allowed)
 
 
 def stamp_of(name: str) -> str:

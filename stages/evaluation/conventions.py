@@ -53,7 +53,7 @@ MIRRORS = {
 }
 
 
-class Fit(NamedTuple):
+class ReadingFit(NamedTuple):
     """Misfit of a reading over the extent, at least and as it is stated; its number of changes; what to do."""
 
     least: float
@@ -106,7 +106,7 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
     ]
 
 
-def _fits(P: Floats, T: Floats, mount: Floats, words: list[str]) -> list[Fit]:
+def _fits(P: Floats, T: Floats, mount: Floats, words: list[str]) -> list[ReadingFit]:
     """Unit and axes of the body by which a reading T (n, 4, 4) of the truth fits."""
     Q, ratio, fits = T[:, :3], spread(P) / max(spread(T[:, :3]), 1e-12), []
     if not 1.0 / MIN_UNIT < ratio < MIN_UNIT:
@@ -127,7 +127,7 @@ def _fits(P: Floats, T: Floats, mount: Floats, words: list[str]) -> list[Fit]:
             said = [*words, f"its poses are those of a body with other axes: state truth.T_body_left = {body.tolist()}"]
         # Simple ones first: conventions of the file, then axes that are exchanged, then such as are turned.
         changes = len(said) + other + (axes is turn)
-        fits.append(Fit(_misfit(P, Q, turn), _misfit(P, Q, axes), changes, " and ".join(said)))
+        fits.append(ReadingFit(_misfit(P, Q, turn), _misfit(P, Q, axes), changes, " and ".join(said)))
     return fits
 
 
