@@ -232,7 +232,7 @@ def main() -> int:
                 line = f"{scene.name:12s} {kind:10s} {ended:8s} {shown:10s} {seconds:5.0f} s  {line[:160]}"
                 print(line, file=sys.stderr, flush=True)
     columns = ("0", "3", "2", "1", "trajectory", "internal", "hangs")
-    print(f"{'':12s}" + "".join(f"{name:>12s}" for name in columns))
+    print(f"{'damage':12s}" + "".join(f"{name:>12s}" for name in columns))
     for kind, counts in table.items():
         print(f"{kind:12s}" + "".join(f"{counts[name]:12d}" for name in columns))
     bad = sum(counts["internal"] + counts["hangs"] for counts in table.values())
