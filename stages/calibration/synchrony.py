@@ -19,19 +19,19 @@ from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.numeric.robust import mad_sigma
 from rille.stages.odometry.roll_search import features, matches
 
-FEATURES = 1500
+MAX_FEATURES = 1500
 """Most features of an image."""
 
-REACH = 0.1
+MAX_DISTANCE_SHARE = 0.1
 """Share of the right image's height that a match may depart from its line: what departs more is mismatched."""
 
-LEAST = 40
+MIN_MATCHES = 40
 """Matches, below which a pair says nothing."""
 
-BETTER = 0.5
+MAX_SPREAD_SHARE = 0.5
 """Another right image explains the rows where their spread is below this share of the spread as named."""
 
-CLEAR = 1.0
+MIN_SPREAD_PX = 1.0
 """Pixels of spread as named, below which no other image is looked for; matches within are on their lines."""
 
 
@@ -44,8 +44,8 @@ def row_offsets(rig: Rig, left: tuple[Floats32, Floats32], right: tuple[Floats32
     points = (side[0][rows[:, k]].astype(np.float64) for k, side in enumerate((left, right)))
     apart, _ = distances(rig, np.zeros(5), *points)
     # Before the spread is taken: far mismatches would hide what a shift does to the others.
-    apart = apart[np.abs(apart) < REACH * rig.right.height]
-    return np.asarray(apart - np.median(apart)) if len(apart) >= LEAST else None
+    apart = apart[np.abs(apart) < MAX_DISTANCE_SHARE * rig.right.height]
+    return np.asarray(apart - np.median(apart)) if len(apart) >= MIN_MATCHES else None
 
 
 def best_partners(offsets: Mapping[int, Mapping[int, Floats | None]]) -> dict[str, Any]:
@@ -60,11 +60,11 @@ def best_partners(offsets: Mapping[int, Mapping[int, Floats | None]]) -> dict[st
         if pair not in known:
             continue
         # Many on their lines, not a small spread: far away in time only things match that hardly move in the image.
-        fits = {frame: int((np.abs(apart) < CLEAR).sum()) for frame, apart in known.items()}
+        fits = {frame: int((np.abs(apart) < MIN_SPREAD_PX).sum()) for frame, apart in known.items()}
         other = max(fits, key=fits.__getitem__)
         named, fitted = mad_sigma(known[pair]), mad_sigma(known[other])
         rows.append(named)
-        if named > CLEAR and fitted < BETTER * named:
+        if named > MIN_SPREAD_PX and fitted < MAX_SPREAD_SHARE * named:
             partners[pair] = other
             better.append((fitted, named))
     facts: dict[str, Any] = {"rows": rows, "partners": [list(item) for item in partners.items()]}
@@ -84,7 +84,7 @@ def best_partners(offsets: Mapping[int, Mapping[int, Floats | None]]) -> dict[st
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     rig, frames = Rig.from_dict(args["rig"]), [int(f) for f in args["frames"]]
     ours, theirs = (
-        [features(Pyramid.from_bundle(one), 0, FEATURES) for one in inputs[side]] for side in ("left", "right")
+        [features(Pyramid.from_bundle(one), 0, MAX_FEATURES) for one in inputs[side]] for side in ("left", "right")
     )
     offsets = {
         int(pair): {f: row_offsets(rig, left, right) for f, right in zip(frames, theirs, strict=True)}
