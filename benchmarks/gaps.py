@@ -66,8 +66,8 @@ def spoil(good: Path, folder: Path, first: int, gap: int) -> int:
 def trajectory(folder: Path, frames: tuple[int, ...], cache: Path) -> Any:
     """The trajectory of some frames of a folder, without elevation models; None where there is none."""
     from rille.datasets.registry import open_sequence
-    from rille.pipeline.engine import scheduler
     from rille.pipeline.engine.graph import Graph, Handle
+    from rille.pipeline.engine.run import RunOptions, run
     from rille.pipeline.engine.store.base import Store
     from rille.pipeline.flow import config
     from rille.pipeline.flow.closed_loop import dataflow
@@ -86,7 +86,7 @@ def trajectory(folder: Path, frames: tuple[int, ...], cache: Path) -> Any:
     graph, store = Odometry(), Store(cache)
     settings = config.build({"crosscheck": {"enabled": False}})
     products, _ = dataflow(graph, open_sequence(str(folder)), settings, frames)
-    scheduler.run(graph, store, scheduler.RunOptions(executor="inline"))
+    run(graph, store, RunOptions(executor="inline"))
     handle = products.trajectory
     return None if handle is None or handle.ref is None else store.open(handle.ref)
 

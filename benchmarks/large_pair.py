@@ -114,9 +114,9 @@ def judge(store: Any, ref: Any, shape: tuple[int, int]) -> None:
 
 
 def run(graph: Any, store: Any, jobs: int) -> float:
-    from rille.pipeline.engine import scheduler
+    from rille.pipeline.engine.run import RunOptions, run
 
-    result = scheduler.run(graph, store, scheduler.RunOptions(jobs=jobs))
+    result = run(graph, store, RunOptions(jobs=jobs))
     result.check()
     return float(result.seconds)
 

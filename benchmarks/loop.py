@@ -48,8 +48,8 @@ def drive(settings: list[str]) -> dict[str, Any]:
     from driving.exact_bed import ExactBed
     from driving.limits import shortest_within_limits
 
-    from rille.pipeline.engine import scheduler
     from rille.pipeline.engine.graph import Graph
+    from rille.pipeline.engine.run import RunOptions, run
     from rille.pipeline.engine.store.base import Store
     from rille.pipeline.flow.closed_loop import Drive
 
@@ -65,7 +65,7 @@ def drive(settings: list[str]) -> dict[str, Any]:
         store = Store(folder)
         flow = Drive(graph, sequence, config_of([*layers, {"drive": {"goal": goal}}]))
         flow.build()
-        result = scheduler.run(graph, store, scheduler.RunOptions(executor="inline", keep_going=True))
+        result = run(graph, store, RunOptions(executor="inline", keep_going=True))
         found = figures(flow, store)
     finally:
         shutil.rmtree(folder, ignore_errors=True)

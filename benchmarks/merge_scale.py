@@ -62,8 +62,8 @@ def places(side: int, models: int, cells: int) -> list[tuple[int, int]]:
 
 def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, ledger: Path) -> dict[str, str]:
     """Run the merge of models at ``where``; label to digest of every tile."""
-    from rille.pipeline.engine import scheduler
     from rille.pipeline.engine.graph import Graph
+    from rille.pipeline.engine.run import RunOptions, run
     from rille.pipeline.engine.store.base import Store
     from rille.pipeline.flow.builders import merge_tiles
     from rille.pipeline.flow.reconstruction import TILE_CELLS
@@ -85,7 +85,7 @@ def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, led
 
     graph.flow(follow())
     begin = time.perf_counter()
-    result = scheduler.run(graph, Store(cache), scheduler.RunOptions(jobs=jobs, ledger=ledger))
+    result = run(graph, Store(cache), RunOptions(jobs=jobs, ledger=ledger))
     result.check()
     counts = {name: (c.computed, c.cached) for name, c in result.counts.items()}
     print(f"{time.perf_counter() - begin:.0f} s, computed and cached: {counts}", flush=True)

@@ -89,7 +89,7 @@ def _measured(ensure: Callable[..., Any]) -> Callable[..., Any]:
 
 
 if os.environ.get(UNFLUSHED) is not None and __name__ == "idle.source":  # in a worker, as it imports its first stage
-    from rille.pipeline.engine.executors import base
+    from rille.pipeline.engine import workers as base
 
     base.ensure = _measured(base.ensure)
     if os.environ[UNFLUSHED]:
@@ -260,8 +260,8 @@ class Watch(threading.Thread):
 
 def measure(pairs: int, cache: str, executor: str, jobs: int, what: str) -> dict[str, Any]:
     """One cold run, one plan of what is cached, or one warm run a day later, in this process."""
-    from rille.pipeline.engine import scheduler
     from rille.pipeline.engine.code_digest import tree_digest
+    from rille.pipeline.engine.run import RunOptions, run
     from rille.pipeline.engine.store.base import Store
 
     tree_digest()  # once a process, whatever its size: reading the sources, importing the flow and its stages
@@ -274,8 +274,8 @@ def measure(pairs: int, cache: str, executor: str, jobs: int, what: str) -> dict
     cpu, wall = time.process_time(), time.perf_counter()
     graph = graph_of(pairs)
     store, ledger = Store(cache), Path(tempfile.mkdtemp()) / "ledger.jsonl"
-    options = scheduler.RunOptions(executor=executor, jobs=jobs, ledger=ledger, dry=what == "plan")
-    result = scheduler.run(graph, store, options)
+    options = RunOptions(executor=executor, jobs=jobs, ledger=ledger, dry=what == "plan")
+    result = run(graph, store, options)
     result.check()
     spent, cpu = time.perf_counter() - wall, time.process_time() - cpu
     watch.stop()

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import rille
-from rille.pipeline.engine import scheduler
+from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.spec import Spec, each
 from rille.pipeline.engine.store.output_digest import array_digests, output_digest
 from rille.pipeline.runs import run_files, session
@@ -79,7 +79,7 @@ def recorded(names: list[str], folder: Path, *, outputs: bool = True) -> list[Ta
         opened = session._open(session.Options(sequence, given, verb=verb, executor="inline", **where))
         if outputs:
             opened.graph.last = lambda opened=opened: run_files.lay_out(opened.graph, opened.late(), {})
-        scheduler.run(opened.graph, opened.store, scheduler.RunOptions(executor="inline")).check()
+        driver.run(opened.graph, opened.store, driver.RunOptions(executor="inline")).check()
         for node in opened.graph.nodes:
             kind = node.spec.args.get("step", node.spec.args.get("file"))
             wanted = node.inputs or node.spec.module.startswith("rille.stages.")

@@ -23,7 +23,8 @@ from rille.datasets.images.misalign import MisalignParams
 from rille.datasets.mockup.params import SHORT, MockupParams
 from rille.datasets.protocol import Positions, Sequence
 from rille.datasets.registry import open_sequence
-from rille.pipeline.engine import code_digest, provenance, scheduler, spec
+from rille.pipeline.engine import code_digest, provenance, spec
+from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.store.base import Store
@@ -228,7 +229,7 @@ class Chain:
         graph = Graph()
         config = configuration.build(configuration.expand(self.sequence.defaults), given)
         dataflow(graph, self.sequence, config, FRAMES)
-        result = scheduler.run(graph, self.store, scheduler.RunOptions(dry=True))
+        result = driver.run(graph, self.store, driver.RunOptions(dry=True))
         assert not result.failures
         return graph
 

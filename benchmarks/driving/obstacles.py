@@ -27,8 +27,8 @@ def settings_of(k: int) -> list[str]:
 
 def trial(settings: list[str]) -> dict[str, Any]:
     """One leg with a stone on it; figures of the stone."""
-    from rille.pipeline.engine import scheduler
     from rille.pipeline.engine.graph import Graph
+    from rille.pipeline.engine.run import RunOptions, run
     from rille.pipeline.engine.store.base import Store
     from rille.pipeline.flow.closed_loop import Drive, EndedError, TrueStand
     from rille.pipeline.flow.products import Stop
@@ -46,7 +46,7 @@ def trial(settings: list[str]) -> dict[str, Any]:
         store = Store(folder)
         flow = OneLeg(graph, sequence, config_of(layers))
         flow.build()
-        result = scheduler.run(graph, store, scheduler.RunOptions(executor="inline", keep_going=True))
+        result = run(graph, store, RunOptions(executor="inline", keep_going=True))
         found = stone(flow, store)
     finally:
         shutil.rmtree(folder, ignore_errors=True)

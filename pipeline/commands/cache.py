@@ -54,7 +54,7 @@ def gc(
 
     What was made or used within a day stays: a run may be under way.
     """
-    from rille.pipeline.engine.memory.limits import words
+    from rille.pipeline.engine.memory import words
     from rille.pipeline.engine.store import maintenance
     from rille.pipeline.engine.store.base import Store
     from rille.pipeline.runs import lookup, roots

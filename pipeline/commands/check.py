@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from rille.datasets.protocol import CAMERAS, Sequence
 from rille.pipeline.commands.options import COMPLETE, FAILED, check_output
-from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
-from rille.pipeline.engine.scheduler import Result
+from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.flow.builders import Builder, name
 from rille.pipeline.runs import input_checks as judge
@@ -83,7 +82,7 @@ def check(
     inspection = Inspection(Builder(graph, sequence, config), frames, store)
     graph.flow(inspection.steps())
     # In this process: workers would take longer to start than most of this takes.
-    result = scheduler.run(graph, store, scheduler.RunOptions(executor="inline", keep_going=True))
+    result = run(graph, store, RunOptions(executor="inline", keep_going=True))
     # What a stage refuses is a finding, said by then; any other failure is one of the program.
     Result(failures=[f for f in result.failures if not (f.stage and isinstance(f.error, RilleError))]).check()
     found = inspection.found

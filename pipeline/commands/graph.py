@@ -10,8 +10,8 @@ from html import escape
 from pathlib import Path
 
 from rille.pipeline.commands.options import check_output
-from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.run import RunOptions, run
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.runs.session import Options, lay_out, settings
@@ -35,7 +35,7 @@ def graph(options: Options, output: Path, *, tasks: bool = False) -> int:
     draw = svg if output.suffix.lower() == ".svg" else dot
     settled = settings(options)
     laid_out = lay_out(settled.sequence, settled.config, settled.frames)
-    scheduler.run(laid_out, Store(options.cache), scheduler.RunOptions(dry=True)).check()
+    run(laid_out, Store(options.cache), RunOptions(dry=True)).check()
     names, edges = parts(laid_out, tasks=tasks)
     atomic.write(output, draw(names, edges))
     print(f"{output}  {len(laid_out.nodes)} tasks of {len({h.stage for h in laid_out.nodes})} stages")

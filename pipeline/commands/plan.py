@@ -9,18 +9,15 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable
+from itertools import chain
 
 from rille.datasets.text.count import count
-from rille.pipeline.engine import scheduler
+from rille.pipeline.engine import memory
 from rille.pipeline.engine.estimate import Earlier, recall
 from rille.pipeline.engine.graph import Graph, Handle
-from rille.pipeline.engine.memory import cost_model, limits
-from rille.pipeline.engine.memory.admission import Account, Admission, account, forecast, largest
-from rille.pipeline.engine.memory.cost_model import Costs, Foreseen
-from rille.pipeline.engine.memory.limits import words
+from rille.pipeline.engine.memory import words
 from rille.pipeline.engine.plain import brief, some
-from rille.pipeline.engine.runtime.environment import cores
-from rille.pipeline.engine.scheduler import Result
+from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
@@ -53,50 +50,38 @@ def plan(options: Options, *, verbose: bool = False) -> int:
         run_files.plan(graph, RunView("", *taken, products, (), config, vehicle_source=settled.vehicle_source))
 
     graph.last = outputs
-    result = scheduler.run(graph, store, scheduler.RunOptions(dry=True, force=options.force))
+    result = run(graph, store, RunOptions(dry=True, force=options.force))
     result.check()
     # A parameter may be read by tasks that are not known yet.
     lost = [] if result.unknown else unread.unread(settled.given, config, graph)
     if lost:
         text = f"{unread.values(lost, config)}: no task of this run reads it"
         raise ConfigError("RIL-733", text, remedy=unread.remedy(lost, config))
-    jobs = options.jobs or cores()
-    hints = store.hints(graph.sequence)
-    known = cost_model.recall(hints)
-    limit = None if options.memory_limit is None else limits.parse(options.memory_limit)
-    shares = account(known, limit, options.executor, jobs, largest(graph, known))
-    told = describe(graph, result, recall(hints), shares.workers, verbose=verbose)
-    for line in (*told, *needs(graph, known, shares)):
+    limit = None if options.memory_limit is None else memory.parse(options.memory_limit)
+    budget, jobs = memory.budget(options.executor, limit), memory.most_workers(options.executor, options.jobs)
+    largest = max((needs for _, needs in memory.Estimates().planned(graph)), default=0.0)
+    lines = describe(graph, result, recall(store.hints(graph.sequence)), budget.workers(jobs, largest), verbose=verbose)
+    # The refusal comes last, so that the table stands above it and shows which task it is.
+    for line in chain(lines, needs(graph, budget, jobs)):
         print(line)
-    # Last, so that the table stands above the refusal and shows which task it is.
-    Admission(known, shares, automatic=limit is None).check(graph)
     return 0
 
 
-def needs(graph: Graph, known: Costs, shares: Account) -> Iterable[str]:
-    """Lines on memory and bytes of what is to be computed; nothing where nothing is."""
-    foreseen = forecast(graph, known)
-    by_stage: dict[str, list[Foreseen]] = defaultdict(list)
-    for index, f in foreseen.items():
-        by_stage[graph.nodes[index].stage].append(f)
-    if not by_stage:
-        return
-    yield f"{'stage':19s} {'memory a task':>20s} {'results on disk':>16s}  how this is known"
-    for stage, tasks in by_stage.items():
-        most = max(tasks, key=lambda f: f.memory)
-        need = f"{words(most.memory)} +-{100 * most.spread:.0f} %"
-        sources = dict.fromkeys(f.source for f in tasks)
-        yield f"{stage:19s} {need:>20s} {words(sum(f.stored for f in tasks)):>16s}  {'; '.join(sources)}"
-    together = sorted((f.most for f in foreseen.values()), reverse=True)[: shares.workers]
-    # Admission never lets more begin: the greatest tasks wait for one another.
-    tasks_most = min(sum(together), shares.budget)
-    peak = shares.own + shares.workers * shares.rest + tasks_most
-    parts = [f"this process {words(shares.own)}", f"running tasks {words(tasks_most)}"]
-    parts += [f"{count(shares.workers, 'worker')} {words(shares.rest)} each"] if shares.rest else []
-    yield f"about {words(sum(f.stored for f in foreseen.values()))} will be added to the cache"
-    yield f"memory at most {words(peak)} of {words(shares.limit)}: {', '.join(parts)}"
-    if sum(together) > shares.budget:
-        yield "the largest tasks will wait for one another: together they would exceed the limit"
+def needs(graph: Graph, budget: memory.Budget, jobs: int) -> Iterable[str]:
+    """A line on the memory of what is to be computed; nothing where nothing is.
+
+    Raises
+    ------
+    MemoryRefusedError
+        A task does not fit even alone.
+    """
+    planned = memory.Estimates().planned(graph)
+    if planned:
+        handle, largest = max(planned, key=lambda task: task[1])
+        room = f"room for {count(budget.workers(jobs, largest), 'worker')} in {words(budget.limit)}"
+        yield f"memory: the largest task, {handle.label}, is estimated to need {words(largest)}; {room}"
+        if (refused := budget.refusal(handle, largest)) is not None:
+            raise refused.at(handle.label)
 
 
 def describe(graph: Graph, result: Result, earlier: Earlier, workers: int, *, verbose: bool = False) -> Iterable[str]:

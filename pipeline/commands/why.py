@@ -9,7 +9,7 @@ from typing import Any
 
 from rille.pipeline.engine import events, provenance
 from rille.pipeline.engine.keys import digest
-from rille.pipeline.engine.memory.limits import words
+from rille.pipeline.engine.memory import words
 from rille.pipeline.engine.plain import brief, some
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import artifact_path
@@ -51,9 +51,8 @@ def describe(run: Path, label: str, store: Store) -> Iterable[str]:
 
 def _fate(row: Mapping[str, Any], run: Path, made: Mapping[str, Any] | None) -> Iterable[str]:
     if row["status"] == "computed":
-        amount = "" if row.get("memory") is None else f", memory {words(row['memory'])} beyond the resting worker's"
         yield f"why           {row.get('reason', '')}"
-        yield f"took          {row['seconds']:.2f} s, of which the stage itself {row['kernel']:.2f} s{amount}"
+        yield f"took          {row['seconds']:.2f} s, of which the stage itself {row['kernel']:.2f} s"
     elif row["status"] == "cached":
         yield f"why           an artifact of the same key was there{_computed_by(row, run)}"
     else:

@@ -1,1 +1,1 @@
-"""Cached tasks: graph, keys, scheduler, events."""
+"""Cached tasks: graph, keys, run, workers, events."""

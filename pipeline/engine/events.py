@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from rille.pipeline.engine.graph import Handle
-from rille.pipeline.engine.memory.cost_model import input_bytes
 from rille.pipeline.engine.spec import each
 
 LONGEST = 100_000_000
@@ -80,12 +79,8 @@ def _took(handle: Handle) -> dict[str, Any]:
         "seconds": round(took.seconds, 4),
         "kernel": round(took.kernel, 4),
         "peak_rss": took.peak_rss,
-        "memory": took.memory,
-        "rest": took.rest,
-        "first": took.first,
         "compiling": round(took.compiling, 4),
         "worker": took.worker,
-        "input_bytes": round(input_bytes(handle)),
         "bytes": handle.ref.nbytes,
         "stored": handle.ref.stored,
     }

@@ -33,19 +33,14 @@ Expansion = Callable[..., None]
 class Took:
     """What a task took: ``seconds`` and peak memory [bytes] of the call, ``kernel`` seconds of the stage itself.
 
-    ``started`` is when the call began (seconds since 1970); ``memory`` and ``rest`` are a
-    :class:`~rille.pipeline.engine.memory.limits.Meter`'s figures, ``first`` says that the process had not run the stage
-    before (it imports, and compiles or loads kernels); ``compiling`` are the seconds for which it compiled; ``worker``
-    is the name of the dask worker that ran it.
+    ``started`` is when the call began (seconds since 1970); ``compiling`` are the seconds for which it compiled;
+    ``worker`` is the name of the dask worker that ran it.
     """
 
     seconds: float = 0.0
     peak_rss: int = 0
     started: float = 0.0
     kernel: float = 0.0
-    memory: int | None = None
-    rest: int | None = None
-    first: bool = False
     compiling: float = 0.0
     worker: str = ""
 

@@ -16,7 +16,7 @@ from rille.stages.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from rille.pipeline.engine.graph import Graph, Handle
-    from rille.pipeline.engine.scheduler import Result
+    from rille.pipeline.engine.run import Result
 
 INTERVAL = 5.0
 """Seconds between plain lines."""
@@ -40,7 +40,7 @@ def make(mode: str = "auto", stream: TextIO | None = None, *, verbose: bool = Fa
 
 
 class Progress:
-    """Receives the scheduler's progress, on its thread: keeps the account that others show, and says nothing."""
+    """Receives the run's progress: keeps the account that others show, and says nothing."""
 
     verbose = False
 

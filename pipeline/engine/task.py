@@ -14,10 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rille.pipeline.engine.graph import Took
-from rille.pipeline.engine.memory.cost_model import tells_more
-from rille.pipeline.engine.memory.limits import Meter
 from rille.pipeline.engine.runtime.numba_cache import COMPILING
-from rille.pipeline.engine.spec import Refs, Spec, each, flat, key_of, recipe
+from rille.pipeline.engine.spec import Refs, Spec, each, key_of, recipe
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import Ref
 from rille.stages.core.declare import Bundle, check_outputs
@@ -43,10 +41,6 @@ class Outcome:
     took: Took
 
 
-_run: set[str] = set()
-"""Modules of the stages that this process has run."""
-
-
 def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, force: bool = False) -> Outcome:
     """Give the artifact of a task, computing and committing it where it is absent (or ``force`` is set).
 
@@ -68,15 +62,11 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
             ref = None if force else store.lookup(spec.stage.name, own)
             if ref is not None:
                 return Outcome(ref, True, Took(time.perf_counter() - begin, _peak_rss(), started))
-            first = spec.module not in _run
             COMPILING.take()  # of what ran before in this process
-            size = sum(ref.nbytes for ref in flat(refs))
-            with Meter(measure=tells_more((spec.module, spec.canonical), size)) as meter:
-                ref, kernel = _compute(store, spec, refs, own)
-            seconds = time.perf_counter() - begin
-            _run.add(spec.module)
-            measured = (started, kernel, meter.memory, meter.rest, first, COMPILING.take())
-            return Outcome(ref, False, Took(seconds, _peak_rss(), *measured))
+            ref, kernel = _compute(store, spec, refs, own)
+            return Outcome(
+                ref, False, Took(time.perf_counter() - begin, _peak_rss(), started, kernel, COMPILING.take())
+            )
         except OSError as error:
             # A missing file does not appear by waiting; a network drive that stumbled recovers.
             if isinstance(error, PERMANENT) or trial == TRIES - 1:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rille.datasets.text.reading import TABLE, Search, read_lines, read_text
 from rille.datasets.text.warning import warning
-from rille.pipeline.engine.memory.limits import free, words
+from rille.pipeline.engine.memory import free, words
 from rille.pipeline.export.foreign_raster import driver_of, open_raster, place_of
 from rille.stages.core.errors import InputError
 

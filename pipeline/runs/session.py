@@ -30,7 +30,7 @@ from rille.pipeline.flow import config as configuration
 from rille.stages.core.errors import ConfigError, RilleError
 
 if TYPE_CHECKING:
-    from rille.pipeline.engine.scheduler import Result
+    from rille.pipeline.engine.run import Result
     from rille.pipeline.export.view import RunView
     from rille.pipeline.flow.closed_loop import Drive
     from rille.pipeline.report.delivery import Items
@@ -138,8 +138,8 @@ def settings(options: Options) -> Settled:
 
 def settings_of_run(options: Options) -> Settled:
     """The same for a run: what it cannot use is refused, what is suspicious but possible in the input is printed."""
-    from rille.pipeline.engine.executors.base import known
-    from rille.pipeline.engine.memory import limits
+    from rille.pipeline.engine import memory
+    from rille.pipeline.engine.workers import check
     from rille.pipeline.flow import unread
     from rille.pipeline.runs.input_checks import judge_rig
 
@@ -147,9 +147,9 @@ def settings_of_run(options: Options) -> Settled:
     stages = configuration.stage_names() if options.force else set()
     for name in sorted(options.force - stages):
         raise ConfigError("RIL-060", f"--force {name!r} is no stage", remedy=f"one of {', '.join(sorted(stages))}")
-    known(options.executor, options.jobs)
+    check(options.executor, options.jobs)
     if options.memory_limit is not None:
-        limits.parse(options.memory_limit)
+        memory.parse(options.memory_limit)
     settled = settings(options)
     unread.refuse_unreadable(settled.given, settled.config, settled.sequence)
     sequence = settled.sequence
@@ -269,23 +269,23 @@ def _open(options: Options) -> _Opened:
 
 def _compute(opened: _Opened) -> Result:
     """Bring every task to its artifact; raise the first failure unless the data are its cause and poses are there."""
-    from rille.pipeline.engine import progress, scheduler
-    from rille.pipeline.engine.memory import limits
+    from rille.pipeline.engine import memory, progress
+    from rille.pipeline.engine.run import RunOptions, run
     from rille.pipeline.runs import roots
 
     options, view = opened.options, opened.view
     roots.note(opened.store, options.runs)
-    result = scheduler.run(
+    result = run(
         opened.graph,
         opened.store,
-        scheduler.RunOptions(
+        RunOptions(
             executor=options.executor,
             jobs=options.jobs,
             keep_going=options.keep_going,
             force=options.force,
             ledger=opened.folder / "ledger.jsonl",
             progress=progress.make(options.progress, verbose=options.verbose),
-            memory_limit=None if options.memory_limit is None else limits.parse(options.memory_limit),
+            memory_limit=None if options.memory_limit is None else memory.parse(options.memory_limit),
             survey=lambda: lay_out(view.sequence, view.config, view.frames),
         ),
     )

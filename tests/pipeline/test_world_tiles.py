@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from toys import dem
 
-from rille.pipeline.engine import events, scheduler
+from rille.pipeline.engine import events
+from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.flow.builders import merge_tiles
@@ -46,9 +47,7 @@ def run(
         merge_tiles(node, [f.meta for f in found], dems, steps or {})
 
     graph.flow(follow())  # type: ignore[arg-type]
-    scheduler.run(
-        graph, Store(cache), scheduler.RunOptions(executor=executor, jobs=2, ledger=cache / "ledger.jsonl")
-    ).check()
+    driver.run(graph, Store(cache), driver.RunOptions(executor=executor, jobs=2, ledger=cache / "ledger.jsonl")).check()
     rows = events.read(cache / "ledger.jsonl")
     again = {r["label"] for r in rows if r["stage"] == "merge" and r["status"] == "computed"}
     return again, {r["label"]: r["digest"] for r in rows if r["stage"] == "merge"}, {h.label: h for h in graph.nodes}

@@ -15,7 +15,7 @@ import pytest
 from torn import chain, look
 from torn.faults import Faults
 
-from rille.pipeline.engine import scheduler
+from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store import folder, maintenance
 from rille.pipeline.engine.store.base import NonDeterministicError, Store
@@ -40,11 +40,10 @@ KINDS = {
     "directory": "",
     "label": "hints/-/keys-.json",
     "seconds": "hints/-/seconds.json",
-    "costs": "hints/-/costs.json",
     "index": "index/*/*",
 }
 """Members of an artifact's file, and what is beside the artifacts."""
-HINTS = ("label", "seconds", "costs", "index")
+HINTS = ("label", "seconds", "index")
 READ = ("manifest", "array", "chunk")
 """Kinds that a task which reads ``values`` sees."""
 
@@ -79,11 +78,9 @@ def run(cache, **options):
     force = options.pop("force", ())
     chain.build(graph, frames=SMALL, size=40, **options)
     try:
-        result = scheduler.run(
-            graph, Store(cache), scheduler.RunOptions(executor="inline", keep_going=True, force=force)
-        )
+        result = driver.run(graph, Store(cache), driver.RunOptions(executor="inline", keep_going=True, force=force))
     except StoreError as error:  # refused before anything is computed
-        result = scheduler.Result(failures=[scheduler.Failure("the cache", "", error, "")])
+        result = driver.Result(failures=[driver.Failure("the cache", "", error, "")])
     return graph, result
 
 
@@ -258,7 +255,7 @@ def test_shuffled_order(calm, tmp_path, row, seeds):
     for seed in range(seeds):
         graph = Graph()
         chain.build(graph, shuffle=seed)
-        result = scheduler.run(graph, Store(tmp_path / str(seed)), scheduler.RunOptions(executor="inline"))
+        result = driver.run(graph, Store(tmp_path / str(seed)), driver.RunOptions(executor="inline"))
         computed += result.total().computed
         wrong += [h.label for h in graph.nodes if h.ref.digest != calm["labels"][h.label]]
     row("shuffled order of tasks", seeds, [], wrong, computed, seeds * len(calm["digests"]), "inline")
@@ -273,7 +270,7 @@ def test_a_stage_that_is_not_deterministic_is_detected(tmp_path, row):
         graph = Graph()
         node = graph.node("toys.mischief", "random", NoParams(), {"what": "random"})
         graph.node("torn.reader", "reader", NoParams(), inputs={"values": node})
-        result = scheduler.run(graph, Store(cache), scheduler.RunOptions(executor="inline", keep_going=True, **options))
+        result = driver.run(graph, Store(cache), driver.RunOptions(executor="inline", keep_going=True, **options))
         caught += any(isinstance(f.error, NonDeterministicError) for f in result.failures)
         return graph, result
 

@@ -180,17 +180,17 @@ def test_workers_of_a_cluster_that_die(programs, calm, tmp_path, row):
 
 
 @pytest.mark.slow
-def test_poison_takes_three_workers_each_and_nothing_else_along(programs, calm, tmp_path, row):
+def test_poison_takes_a_few_workers_each_and_nothing_else_along(programs, calm, tmp_path, row):
     (program,) = programs(1)
     cache, tally = tmp_path / "cache", tmp_path / "tally"
     poison = ("poison#1", "poison#2", "poison#3")
     found = program.run(cache=str(cache), executor="dask", sabotage=poison, tally=str(tally))
     failed = {label: n["why"] for label, n in found["nodes"].items() if n["status"] == "failed"}
     assert set(failed) == {f"saboteur/{p}" for p in poison}
-    assert all(why.startswith("WorkerDiedError: 3 worker processes died") for why in failed.values())
+    assert all(why.startswith("WorkerDiedError: 2 worker processes died") for why in failed.values())
     deaths = {p.name: p.stat().st_size for p in tally.iterdir()}
     assert set(deaths) == set(poison)
-    assert set(deaths.values()) <= {3, 4}, "one that others were blamed for, too"
+    assert set(deaths.values()) <= {2, 3, 4}, "two once nothing else ran; before, dask counts deaths by others, too"
     wrong = [n for n, digest in calm["labels"].items() if found["nodes"][n]["digest"] != digest]
     computed = statuses(found, "computed")
     row(
@@ -214,7 +214,8 @@ def test_a_worker_out_of_memory_is_named_with_its_memory(programs, calm, tmp_pat
     )
     hog = found["nodes"]["saboteur/memory"]
     assert hog["status"] == "failed"
-    assert hog["why"].startswith("WorkerDiedError: 3 worker processes died")
+    assert "the last was ended at" in hog["why"]
+    assert hog["why"].startswith("WorkerDiedError: 2 worker processes died")
     wrong = [n for n, digest in calm["labels"].items() if found["nodes"][n]["digest"] != digest]
     computed = statuses(found, "computed")
     row(

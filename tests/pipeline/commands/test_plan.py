@@ -7,9 +7,9 @@ from toys.chain import build
 
 from rille.datasets.registry import open_sequence
 from rille.pipeline.commands import plan
-from rille.pipeline.engine import estimate, scheduler
+from rille.pipeline.engine import estimate
+from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
-from rille.pipeline.engine.memory import cost_model
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow.closed_loop import dataflow
@@ -21,7 +21,7 @@ SECONDS = {"numbers": (1.0, 2.0), "scale": (1.0, 3.0), "total": (1.0, 1.0)}
 def lines(cache, *, verbose=False, sequence="", choice="", **changed):
     graph = Graph(sequence, choice)
     build(graph, **changed)
-    result = scheduler.run(graph, Store(cache), scheduler.RunOptions(dry=True))
+    result = driver.run(graph, Store(cache), driver.RunOptions(dry=True))
     result.check()
     return list(plan.describe(graph, result, SECONDS, 2, verbose=verbose))
 
@@ -29,7 +29,7 @@ def lines(cache, *, verbose=False, sequence="", choice="", **changed):
 def compute(cache, *, sequence="", choice="", **kw):
     graph = Graph(sequence, choice)
     build(graph, **kw)
-    scheduler.run(graph, Store(cache), scheduler.RunOptions(executor="inline")).check()
+    driver.run(graph, Store(cache), driver.RunOptions(executor="inline")).check()
 
 
 def test_of_an_empty_cache_says_what_it_cannot_know(cache):
@@ -71,9 +71,8 @@ def test_hints_belong_to_their_sequence(cache):
     store = Store(cache)
     assert lines(cache, sequence="short", frames=3, seed=1)[1].endswith("never computed (3)")
     assert lines(cache, sequence="long", frames=6, seed=1)[1].endswith("params.seed 0 -> 1 (6)")
-    for recall, empty in ((estimate.recall, {}), (lambda hints: cost_model.recall(hints).groups, {})):
-        assert recall(store.hints("long"))
-        assert recall(store.hints("short")) == empty
+    assert estimate.recall(store.hints("long"))
+    assert estimate.recall(store.hints("short")) == {}
 
 
 def test_what_follows_is_laid_out_by_the_same_choice_of_frames_only(cache):
@@ -114,9 +113,9 @@ def test_an_earlier_result_that_does_not_fit_hides_what_follows(cache):
         graph.flow(fitting())
         return graph
 
-    scheduler.run(lay_out(0, 0), Store(cache), scheduler.RunOptions(executor="inline")).check()
-    result = scheduler.run(lay_out(1, 1), Store(cache), scheduler.RunOptions(dry=True))
+    driver.run(lay_out(0, 0), Store(cache), driver.RunOptions(executor="inline")).check()
+    result = driver.run(lay_out(1, 1), Store(cache), driver.RunOptions(dry=True))
     assert result.ok
     assert result.unknown == ["numbers/0"]
-    result = scheduler.run(lay_out(0, 1), Store(cache), scheduler.RunOptions(dry=True))
+    result = driver.run(lay_out(0, 1), Store(cache), driver.RunOptions(dry=True))
     assert [f.label for f in result.failures] == ["plan after numbers/0"], "by what is there it is a failure"

@@ -35,13 +35,15 @@ import sys, os
 from pathlib import Path
 from rille.pipeline.engine.runtime.environment import prepare_environment
 prepare_environment()
-from rille.pipeline.engine.executors import dask_client
+from rille.pipeline.engine import workers
 
 def now():
     return sys.path[0], os.environ.get("PYTHONSAFEPATH")
 
 def look():
     import importlib.util, os, sys
+    from rille.pipeline.engine import workers
+    workers._prepare(ours=True)  # as the first task of a worker does
     importlib.util.find_spec("matplotlib")  # asks for it alone, as xarray does
     import matplotlib, numba
     assert numba.njit(lambda x: x + 1)(1) == 2
@@ -53,7 +55,7 @@ if __name__ == "__main__":
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).write_text(text)
     before = now()
-    dask = dask_client.here(1, Path(sys.argv[2]), 2e9)
+    dask = workers.make("dask", 1, Path(sys.argv[2]), 2e9)
     print(dask._client.submit(look).result(60))
     dask.close()
     print(now() == before)

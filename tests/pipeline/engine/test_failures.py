@@ -14,7 +14,7 @@ import pytest
 from raising import raises
 
 from rille.pipeline.cli import main
-from rille.pipeline.engine import scheduler
+from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.failures import reported, translated
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
@@ -66,9 +66,9 @@ def test_a_cache_that_cannot_be_written_is_refused_before_anything_is_computed(t
 
     monkeypatch.setattr("rille.pipeline.engine.store.folder.tempfile.TemporaryFile", refuse)
     ended = []
-    monkeypatch.setattr(scheduler, "make", lambda *_: ended.append("an executor was started"))
+    monkeypatch.setattr(driver, "make", lambda *_: ended.append("an executor was started"))
     with raises("RIL-575", "may not be used"):
-        scheduler.run(graph, store)
+        driver.run(graph, store)
     assert not ended
     (tmp_path / "file").touch()
     with raises("RIL-576", "not a folder"):
@@ -82,14 +82,14 @@ SMALL = ["--frames", "0:2", "--set", "crosscheck.enabled=false", "--set", "hfvm.
 
 def test_a_run_whose_folder_is_removed_meanwhile_is_no_success(tmp_path, monkeypatch, capsys):
     folders = ["--cache", str(tmp_path / "cache"), "--runs", str(tmp_path / "runs"), "--executor", "inline"]
-    known = scheduler.run
+    known = driver.run
 
     def run(*args, **options):
         found = known(*args, **options)
         shutil.rmtree(tmp_path / "runs")
         return found
 
-    monkeypatch.setattr(scheduler, "run", run)
+    monkeypatch.setattr(driver, "run", run)
     with pytest.raises(SystemExit) as end:
         main(["reconstruct", "mockup-short", *SMALL, *folders, "--quiet"])
     assert end.value.code == 1

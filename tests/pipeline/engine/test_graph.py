@@ -7,7 +7,7 @@ from toys import mischief, numbers, scale, total
 from toys.numbers import NumbersParams
 from toys.scale import ScaleParams
 
-from rille.pipeline.engine import scheduler
+from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph, Maybe, MissingError
 from rille.pipeline.engine.store.base import Store
 from rille.stages.core.declare import NoParams
@@ -24,7 +24,7 @@ def broken(graph, what="degenerate"):
 
 
 def run(graph, tmp_path, **options):
-    return scheduler.run(graph, Store(tmp_path / "cache"), scheduler.RunOptions(executor="inline", **options))
+    return driver.run(graph, Store(tmp_path / "cache"), driver.RunOptions(executor="inline", **options))
 
 
 def test_a_flow_gets_what_it_yielded_and_several_run_side_by_side(tmp_path):

@@ -11,7 +11,7 @@ import tracemalloc
 import pytest
 from toys import chain
 
-from rille.pipeline.engine import scheduler
+from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store import folder, index, manifest
 from rille.pipeline.engine.store.base import Store
@@ -32,7 +32,7 @@ def run(cache, **options):
     chain.build(graph, **options)
     real = store._read_manifest
     store._read_manifest = lambda stage, key: read.append(key) or real(stage, key)
-    result = scheduler.run(graph, store, scheduler.RunOptions(executor="inline"))
+    result = driver.run(graph, store, driver.RunOptions(executor="inline"))
     return {h.label: (h.status, h.ref) for h in graph.nodes}, read, result
 
 

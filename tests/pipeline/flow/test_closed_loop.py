@@ -16,9 +16,9 @@ import pytest
 from raising import raises
 
 from rille.datasets.registry import open_sequence
-from rille.pipeline.engine import scheduler
+from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph, Handle
-from rille.pipeline.engine.scheduler import Result
+from rille.pipeline.engine.run import Result
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.flow import config, unread
 from rille.pipeline.flow.closed_loop import Drive
@@ -49,7 +49,7 @@ def drive(store: Path, *more: str) -> tuple[Drive, Result]:
     layers: list[dict[str, Any]] = [{"vehicle": sequence.vehicle.model_dump()}, config.expand(sequence.defaults)]
     flow = Drive(Graph(), sequence, config.build(*layers, for_stages))
     flow.build()
-    return flow, scheduler.run(flow.graph, Store(store), scheduler.RunOptions(executor="inline", keep_going=True))
+    return flow, driver.run(flow.graph, Store(store), driver.RunOptions(executor="inline", keep_going=True))
 
 
 @pytest.fixture(scope="module")
@@ -265,7 +265,7 @@ def test_the_vehicle_that_is_configured_is_the_one_that_stands_on_the_bed(store:
     flow = Drive(Graph(), sequence, config.build(given, config.expand(sequence.defaults), for_stages))
     flow.build()
     flow.graph.expansions.clear()
-    scheduler.run(flow.graph, Store(store), scheduler.RunOptions(executor="inline")).check()
+    driver.run(flow.graph, Store(store), driver.RunOptions(executor="inline")).check()
     assert flow.driven.place is not None
     assert flow.driven.place.ref is not None
     found = Store(store).open(flow.driven.place.ref)

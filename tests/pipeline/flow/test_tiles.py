@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rille.pipeline.engine import scheduler
+from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.flow import tiles
@@ -53,7 +53,7 @@ def disparity(store, images, params, side):
         node = graph.node("rille.stages.hfvm.stage", "hfvm", params, inputs=given)
     else:
         node = tiles.Tiles(graph, params, PyramidParams(), given, (SHAPE, SHAPE), side, "hfvm").build()
-    scheduler.run(graph, store, scheduler.RunOptions(executor="inline")).check()
+    driver.run(graph, store, driver.RunOptions(executor="inline")).check()
     return node.ref
 
 
@@ -79,7 +79,7 @@ def test_mockup_in_tiles_of_256_has_the_digest_of_the_whole(tmp_path, preset):
         found = settings(Options("mockup-short", (f"hfvm.preset={preset}", f"tiling.tile={side}")))
         graph = Graph()
         disparity = Builder(graph, found.sequence, found.config).disparity(0)
-        scheduler.run(graph, Store(tmp_path), scheduler.RunOptions(executor="inline")).check()
+        driver.run(graph, Store(tmp_path), driver.RunOptions(executor="inline")).check()
         digests.append(disparity.ref.digest)
     assert digests[0] == digests[1]
 
@@ -89,7 +89,7 @@ def test_wrong_size_of_the_camera_is_one_clear_line(tmp_path, images):
     given = pyramids(graph, images)
     less = (SHAPE[0] // 2, SHAPE[1] // 2)
     tiles.Tiles(graph, HfvmParams(), PyramidParams(), given, (less, less), 50, "hfvm").build()
-    result = scheduler.run(graph, Store(tmp_path), scheduler.RunOptions(executor="inline"))
+    result = driver.run(graph, Store(tmp_path), driver.RunOptions(executor="inline"))
     assert "does not have the size that its camera states" in str(result.failures[0].error)
 
 

@@ -13,7 +13,7 @@ from raising import raises
 from toys import chain
 
 from rille.pipeline.commands import cache
-from rille.pipeline.engine import scheduler
+from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
@@ -27,7 +27,7 @@ def used(tmp_path: Path) -> Store:
     store, folder, graph = Store(tmp_path / "cache"), tmp_path / "work" / "runs", Graph()
     (folder / "toy" / "1").mkdir(parents=True)
     chain.build(graph)
-    scheduler.run(graph, store, scheduler.RunOptions(executor="inline", ledger=folder / "toy" / "1" / "ledger.jsonl"))
+    driver.run(graph, store, driver.RunOptions(executor="inline", ledger=folder / "toy" / "1" / "ledger.jsonl"))
     roots.note(store, folder)
     for path in store.root.glob("artifacts/*/*/*.zip"):
         os.utime(path, (0, 0))
@@ -87,7 +87,7 @@ def test_what_may_not_be_removed_is_no_success(used, tmp_path, monkeypatch):
     graph, run = Graph(), tmp_path / "work" / "runs" / "toy" / "2"
     chain.build(graph, seed=1)
     run.mkdir()
-    scheduler.run(graph, used, scheduler.RunOptions(executor="inline", ledger=run / "ledger.jsonl"))
+    driver.run(graph, used, driver.RunOptions(executor="inline", ledger=run / "ledger.jsonl"))
     shutil.rmtree(run.parent / "1")
     shutil.rmtree(used.root / "index", ignore_errors=True)  # written where a run took long enough
     monkeypatch.setattr(atomic, "remove", refuse)

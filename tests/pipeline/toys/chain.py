@@ -30,15 +30,15 @@ def build(graph, frames=4, seed=0, size=40, offset=0.0):
 
 def run(folder, name, sequence="toy", **kw):
     """Run it in this process, with the ledger of a run of that name below ``folder / "runs"``; the run's folder."""
-    from rille.pipeline.engine import scheduler
+    from rille.pipeline.engine import run as driver
     from rille.pipeline.engine.graph import Graph
     from rille.pipeline.engine.store.base import Store
 
     graph = Graph(sequence)
     build(graph, **kw)
     at = folder / "runs" / sequence / name
-    options = scheduler.RunOptions(executor="inline", ledger=at / "ledger.jsonl")
-    scheduler.run(graph, Store(folder / "cache"), options).check()
+    options = driver.RunOptions(executor="inline", ledger=at / "ledger.jsonl")
+    driver.run(graph, Store(folder / "cache"), options).check()
     return at
 
 
@@ -47,7 +47,7 @@ def main(cache, executor="inline", what="", ledger=""):
     from rille.pipeline.engine.runtime.environment import prepare_environment
 
     prepare_environment()
-    from rille.pipeline.engine import scheduler
+    from rille.pipeline.engine import run as driver
     from rille.pipeline.engine.graph import Graph
     from rille.pipeline.engine.store.base import Store
     from rille.stages.core.declare import NoParams
@@ -58,11 +58,11 @@ def main(cache, executor="inline", what="", ledger=""):
         for i in range(3):
             graph.node("toys.mischief", f"sleep/{i}", NoParams(), {"what": "sleep", "seconds": 60, "i": i})
     print("begun", flush=True)
-    result = scheduler.run(
-        graph, Store(cache), scheduler.RunOptions(executor=executor, jobs=2, ledger=Path(ledger) if ledger else None)
+    result = driver.run(
+        graph, Store(cache), driver.RunOptions(executor=executor, jobs=2, ledger=Path(ledger) if ledger else None)
     )
     nodes = {h.label: [h.status, h.ref.digest if h.ref else None, h.reason] for h in graph.nodes}
-    print(json.dumps({"ok": result.ok, "workers": result.executor_started, "nodes": nodes}), flush=True)
+    print(json.dumps({"ok": result.ok, "workers": result.workers_started, "nodes": nodes}), flush=True)
 
 
 if __name__ == "__main__":

@@ -49,16 +49,16 @@ def run(cache, executor="inline", ledger=None, jobs=2, memory=None, **options):
     """One run; what became of it, as plain values. ``memory`` is what all workers together may have, bytes."""
     if memory is not None:
         resource.setrlimit(resource.RLIMIT_RSS, (memory, memory))  # the engine heeds it, the kernel does not
-    from rille.pipeline.engine import scheduler
+    from rille.pipeline.engine import run as driver
     from rille.pipeline.engine.graph import Graph
     from rille.pipeline.engine.store.base import Store
 
     graph = Graph()
     build(graph, **options)
-    made = scheduler.run(
+    made = driver.run(
         graph,
         Store(cache),
-        scheduler.RunOptions(executor=executor, jobs=jobs, keep_going=True, ledger=Path(ledger) if ledger else None),
+        driver.RunOptions(executor=executor, jobs=jobs, keep_going=True, ledger=Path(ledger) if ledger else None),
     )
     nodes = {
         h.label: {

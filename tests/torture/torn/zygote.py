@@ -19,7 +19,7 @@ import zarr.storage  # noqa: F401
 
 import rille.pipeline.engine.code_digest
 import rille.pipeline.engine.events
-import rille.pipeline.engine.scheduler
+import rille.pipeline.engine.run
 import rille.pipeline.engine.store.maintenance
 import torn.saboteur  # noqa: F401
 from torn import chain

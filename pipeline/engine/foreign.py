@@ -1,13 +1,8 @@
-"""Executor on a dask scheduler that others have started, and what its workers must be before they get a task.
+"""Schedulers and workers that others have started: what they must be, and whether they are still there.
 
 Every worker must have the source code, the Python and the packages of the client, use one thread a library, and see
 the same cache: a probe is written by each side and read by the other. One that differs is named with the difference,
-and the run does not begin. A worker that joins later is examined at its first task, which fails there.
-
-A worker that is lost in the midst of a task gives it back to the scheduler, which begins it elsewhere; after more
-deaths than its setting ``distributed.scheduler.allowed-failures`` (3) the task comes back to this process, which tries
-it alone, and fails it after the third time. What had been committed before the worker was lost is found there, not
-computed again.
+and the run does not begin. A worker that joins later is compared at its first task, which fails there.
 """
 
 from __future__ import annotations
@@ -18,11 +13,13 @@ import time
 import uuid
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine.code_digest import OWN, tree_digest
+from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.packages import version
 from rille.pipeline.engine.store.base import Store
 from rille.stages.core.errors import ConfigError, RilleError
@@ -35,11 +32,11 @@ PACKAGES = (
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
-NO_WORKERS = 30.0
-"""Seconds that a scheduler may be without workers, at the beginning or later, before the run is given up."""
+NO_WORKERS_SECONDS = 30.0
+"""Time that a scheduler may be without workers, at the beginning or later, before the run is given up."""
 
-SILENCE = 20.0
-"""Seconds without an answer of the scheduler before it counts as gone, and of a worker before the user is told."""
+SILENCE_SECONDS = 20.0
+"""Time without an answer of the scheduler before it counts as gone, and of a worker before the user is warned."""
 
 Identity = Mapping[str, str]
 
@@ -57,6 +54,12 @@ def identity() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             found[name] = "none"
     return found
+
+
+@cache
+def likeness() -> str:
+    """Digest of the facts that client and workers must share, as this process has them."""
+    return digest(identity())
 
 
 def unlike(theirs: Identity, ours: Identity) -> str:
@@ -166,10 +169,10 @@ class Presence:
         now = time.monotonic()
         try:
             identity = self._client.scheduler.identity
-            workers = self._client.sync(identity, n_workers=-1, callback_timeout=SILENCE / 2)["workers"]
+            workers = self._client.sync(identity, n_workers=-1, callback_timeout=SILENCE_SECONDS / 2)["workers"]
         except Exception as error:
             # One question without an answer is a busy scheduler; only a long silence is a lost one.
-            if self._client.status in ("closing", "closed") or time.monotonic() - self._answered > SILENCE:
+            if self._client.status in ("closing", "closed") or time.monotonic() - self._answered > SILENCE_SECONDS:
                 raise self.gone() from error
             return 0
         self._answered = now
@@ -188,7 +191,7 @@ class Presence:
 
     def silent(self) -> set[str]:
         """Addresses of the workers from which nothing was heard for long, by the last look."""
-        return {address for (address, _), since in self._heard.items() if self._answered - since > SILENCE}
+        return {address for (address, _), since in self._heard.items() if self._answered - since > SILENCE_SECONDS}
 
     def gone(self) -> ClusterError:
         """The scheduler is."""

@@ -15,8 +15,9 @@ from toys.numbers import NumbersParams
 from toys.scale import ScaleParams
 
 from rille.pipeline.engine import events as ledger
-from rille.pipeline.engine import packages, progress, scheduler
-from rille.pipeline.engine.executors import base
+from rille.pipeline.engine import packages, progress
+from rille.pipeline.engine import run as driver
+from rille.pipeline.engine import workers as base
 from rille.pipeline.engine.graph import Graph, Maybe
 from rille.pipeline.engine.spec import Spec, recipe
 from rille.pipeline.engine.store import maintenance
@@ -31,9 +32,7 @@ def run(cache, *, make=build, **options):
     graph = Graph()
     kwargs = {k: options.pop(k) for k in ("frames", "seed", "size", "offset") if k in options}
     make(graph, **kwargs)
-    result = scheduler.run(
-        graph, Store(cache), scheduler.RunOptions(executor=options.pop("executor", "inline"), **options)
-    )
+    result = driver.run(graph, Store(cache), driver.RunOptions(executor=options.pop("executor", "inline"), **options))
     return graph, result
 
 
@@ -71,11 +70,11 @@ def test_computes_what_numpy_computes(cache):
 
 def test_a_second_run_computes_nothing_and_starts_no_executor(cache, monkeypatch):
     first, _ = run(cache)
-    monkeypatch.setattr(scheduler, "make", lambda *_: pytest.fail("an executor was started"))
+    monkeypatch.setattr(driver, "make", lambda *_: pytest.fail("an executor was started"))
     second, result = run(cache, executor="dask")
     assert set(statuses(second).values()) == {"cached"}
     assert digests(second) == digests(first)
-    assert (result.total().cached, result.executor_started) == (9, False)
+    assert (result.total().cached, result.workers_started) == (9, False)
 
 
 @pytest.mark.parametrize(
@@ -168,7 +167,7 @@ def test_what_waits_for_healing_goes_on_if_another_worker_has_healed_it(cache, t
             return [(number, outcome)]
 
     earlier, _ = run(cache, make=in_a_row("first"))
-    monkeypatch.setattr(scheduler, "make", lambda *_: Dying())
+    monkeypatch.setattr(driver, "make", lambda *_: Dying())
     graph, result = run(
         cache,
         make=in_a_row("first", "last"),
@@ -184,7 +183,7 @@ def test_dry_run_computes_nothing_and_explains(cache):
     graph, result = run(cache, dry=True)
     assert statuses(graph) == {f"numbers/{i}": "planned" for i in range(4)}
     assert not cache.exists()
-    assert not result.executor_started
+    assert not result.workers_started
     run(cache)
     graph, _ = run(cache, dry=True, offset=0.5)
     assert {h.status for h in graph.nodes if h.stage == "scale"} == {"planned"}

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
-import queue
 import signal
 import threading
 import time
@@ -16,14 +14,11 @@ import pytest
 from hands import by_hand
 from raising import raises
 from toys import chain
-from toys.numbers import NumbersParams
-from toys.scale import ScaleParams
 
-from rille.pipeline.engine import events, scheduler
-from rille.pipeline.engine.executors import base, dask_client, dask_cluster
+from rille.pipeline.engine import events, foreign, workers
+from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.task import Outcome
 from rille.stages.core.declare import NoParams
 
 
@@ -39,7 +34,7 @@ def hands(tmp_path_factory):
 def run(cache, where="inline", jobs=2):
     graph = Graph()
     chain.build(graph)
-    scheduler.run(graph, Store(cache), scheduler.RunOptions(executor=where, jobs=jobs)).check()
+    driver.run(graph, Store(cache), driver.RunOptions(executor=where, jobs=jobs)).check()
     return {h.key: h.ref.digest for h in graph.nodes}
 
 
@@ -57,7 +52,7 @@ def test_several_runs_at_once_on_one_client_all_end(hands, tmp_path):
         chain.build(graph, seed=number)
         if number == 0:
             graph.node("toys.mischief", "fails", NoParams(), {"what": "value"})
-        ended[number] = scheduler.run(graph, Store(tmp_path / "cache"), scheduler.RunOptions(executor=client)).ok
+        ended[number] = driver.run(graph, Store(tmp_path / "cache"), driver.RunOptions(executor=client)).ok
 
     ended = {}
     with Client(hands.address, set_as_default=False) as client:
@@ -88,89 +83,32 @@ def test_a_client_handed_in_runs_the_tasks_on_its_workers_and_stays_open(hands, 
     assert made == run(tmp_path / "inline")
 
 
-def test_what_waits_for_a_suspect_of_the_same_batch_comes_back(hands, tmp_path):
-    from distributed import Client
-
-    graph = Graph()
-    first = graph.node("toys.numbers", "numbers/0", NumbersParams(size=5), {"frame": 0})
-    scaled = graph.node("toys.scale", "scale/0", ScaleParams(), inputs={"values": first})
-    tasks = [
-        base.Task(0, tmp_path, first.spec, {}),
-        base.Task(1, tmp_path, scaled.spec, {"values": 0}),
-        base.Task(2, tmp_path, scaled.spec, {"values": 1}),
-    ]
-    with Client(hands.address, set_as_default=False) as client:
-        workers = dask_client.Dask(client, tmp_path, 2, None, ours=False)
-        workers._deaths[0] = 1  # a worker died with it before
-        workers.submit(tasks)
-        back, (made,) = workers.wait(), workers.wait()
-        workers.close()
-    assert [(number, type(outcome)) for number, outcome in back] == [(1, base.NotBegun), (2, base.NotBegun)]
-    assert (made[0], type(made[1])) == (0, Outcome)
-
-
-def test_a_task_does_not_come_back_before_the_inputs_that_it_had(monkeypatch):
-    workers = object.__new__(dask_client.Dask)
-    workers._cluster, workers._held, workers._refused, workers._deaths = None, {}, set(), Counter()
-    workers._events, workers._looked = queue.SimpleQueue(), 0.0
-    workers._told, workers._labels = set(), {0: "input", 1: "next"}
-
-    def threads():
-        """While the scheduler is asked, the input ends, and the worker of the next task dies."""
-        workers._events.put(pickle.dumps((0, "input", "made")))
-        workers._futures[1].status = "error"
-        return 2
-
-    workers._presence = SimpleNamespace(threads=threads, silent=set)
-    workers._futures = {
-        number: SimpleNamespace(key=key, status="pending") for number, key in enumerate(["input", "next"])
-    }
-    monkeypatch.setattr(workers, "_lost", lambda *_: "not begun")
-    assert workers.wait() == [(0, "made"), (1, "not begun")]
-
-
 def test_a_worker_that_falls_silent_is_named_once_with_its_task(monkeypatch, capsys):
     """By what the scheduler heard of it, not by clocks; one that is heard again may fall silent again."""
     now, seen = [0.0], {"tcp://a": 1.0, "tcp://b": 5e9}
-    monkeypatch.setattr(dask_cluster.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(foreign.time, "monotonic", lambda: now[0])
     client = SimpleNamespace(
         scheduler=SimpleNamespace(address="tcp://s", identity=None),
         sync=lambda *_, **__: {"workers": {a: {"nthreads": 1, "last_seen": when} for a, when in seen.items()}},
         scheduler_info=lambda n_workers: {"workers": {"tcp://a": {"name": "first"}}},
-        processing=lambda workers: {"tcp://a": ["numbers-run-7-3", "scale-run-8-4", "of-another-1-1"]},
+        processing=lambda workers: {"tcp://a": ["numbers-run-7", "scale-run-8", "of-another-1"]},
     )
-    workers = object.__new__(dask_client.Dask)
-    workers._client, workers._cluster, workers._told = client, None, set()
-    workers._futures = {3: SimpleNamespace(key="numbers-run-7-3"), 4: SimpleNamespace(key="scale-run-8-4")}
-    workers._labels = {3: "numbers/3", 4: "scale/3"}
-    presence = dask_cluster.Presence(client, 30.0)
+    presence = foreign.Presence(client, 30.0)
+    crew = workers.Dask(client, presence)
+    crew._labels = {"numbers-run-7": "numbers/3", "scale-run-8": "scale/3"}
 
-    def told_after(seconds, *heard):
+    def warned_after(seconds, *heard):
         now[0] += seconds
         seen.update({address: seen[address] + seconds for address in heard})
         assert presence.threads() == 2
-        workers._tell_silent(presence.silent())
+        crew._warn_of_silent(presence.silent())
         return capsys.readouterr().err
 
     line = "rille: warning RIL-710: worker first (tcp://a) has been silent for 20 s at numbers/3: "
-    assert told_after(0.0) == told_after(19.0, "tcp://b") == ""
-    assert told_after(2.0, "tcp://b").startswith(line)
-    assert told_after(2.0, "tcp://b") == told_after(2.0, "tcp://a", "tcp://b") == ""
-    assert told_after(21.0, "tcp://b").startswith(line)
-
-
-@pytest.mark.parametrize(("allowed", "died"), [(0, 3), (3, 12)])
-def test_a_culprit_is_told_with_all_workers_that_it_took_along(allowed, died):
-    from distributed import KilledWorker
-
-    workers = object.__new__(dask_client.Dask)
-    workers._deaths, workers._tries, workers._seen, workers._beside = Counter(), Counter(), Counter(), set()
-    future = SimpleNamespace(
-        key="task", status="error", exception=lambda: KilledWorker("task", SimpleNamespace(address="w"), allowed)
-    )
-    first, second, third = (workers._lost(0, future, True) for _ in range(3))
-    assert (type(first), type(second)) == (base.NotBegun, base.NotBegun)
-    assert str(third.error).startswith(f"{died} worker processes died")
+    assert warned_after(0.0) == warned_after(19.0, "tcp://b") == ""
+    assert warned_after(2.0, "tcp://b").startswith(line)
+    assert warned_after(2.0, "tcp://b") == warned_after(2.0, "tcp://a", "tcp://b") == ""
+    assert warned_after(21.0, "tcp://b").startswith(line)
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -181,21 +119,21 @@ def test_a_cluster_of_this_machine_gives_what_one_process_gives(tmp_path, jobs):
 def test_the_ledger_of_a_default_run_names_the_dask_worker_of_each_task(tmp_path):
     graph, ledger = Graph(), tmp_path / "ledger.jsonl"
     chain.build(graph)
-    scheduler.run(graph, Store(tmp_path / "cache"), scheduler.RunOptions(jobs=2, ledger=ledger)).check()
+    driver.run(graph, Store(tmp_path / "cache"), driver.RunOptions(jobs=2, ledger=ledger)).check()
     rows = events.read(ledger)
     assert len(rows) == len(graph.nodes)
     assert {row["worker"] for row in rows} <= {"0", "1"}
 
 
 def test_a_cache_that_is_not_shared_is_refused(hands, tmp_path, monkeypatch):
-    monkeypatch.setattr(dask_cluster, "write_probe", lambda store, name: None)  # the workers see another folder
+    monkeypatch.setattr(foreign, "write_probe", lambda store, name: None)  # the workers see another folder
     with raises("RIL-523"):
         run(tmp_path / "cache", hands.address)
 
 
 def test_other_versions_are_refused_by_name(hands, tmp_path, monkeypatch):
-    ours = dask_cluster.identity()
-    monkeypatch.setattr(dask_cluster, "identity", lambda: {**ours, "numpy": "9.9", "source code": "feed"})
+    ours = foreign.identity()
+    monkeypatch.setattr(foreign, "identity", lambda: {**ours, "numpy": "9.9", "source code": "feed"})
     with raises("RIL-521") as wrong:
         run(tmp_path / "cache", hands.address)
     assert "worker first" in str(wrong.value) or "worker second" in str(wrong.value)
@@ -206,7 +144,7 @@ def test_other_versions_are_refused_by_name(hands, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "tcp://no-such-host.invalid:8786"])
 def test_no_scheduler(tmp_path, address, monkeypatch):
-    monkeypatch.setattr(dask_client, "CONNECT", 1.0)
+    monkeypatch.setattr(workers, "CONNECT_SECONDS", 1.0)
     with raises("RIL-541", "tcp://"):
         run(tmp_path / "cache", address)
 
@@ -214,13 +152,13 @@ def test_no_scheduler(tmp_path, address, monkeypatch):
 @pytest.mark.parametrize("kind", ["proceses", "tcp://", "tcp://host", "http://host:80", "tcp:host:80"])
 def test_unknown_executors(kind):
     with raises("RIL-539"):
-        base.known(kind)
+        workers.check(kind)
 
 
 def test_differences_in_words():
     ours = {"Python": "3.11.7", "numpy": "2.4.6", "zarr": "3.1.6"}
-    assert dask_cluster.unlike(ours, ours) == ""
-    assert dask_cluster.unlike({"Python": "3.11.7", "numpy": "2.4.5"}, ours) == (
+    assert foreign.unlike(ours, ours) == ""
+    assert foreign.unlike({"Python": "3.11.7", "numpy": "2.4.5"}, ours) == (
         "numpy 2.4.5 instead of 2.4.6, zarr none instead of 3.1.6"
     )
 
@@ -233,12 +171,12 @@ def test_threads_of_libraries_are_refused(tmp_path):
             return {"workers": {"tcp://a": {"name": "big"}}}
 
     with raises("RIL-522", "tcp://a"):
-        dask_cluster._judge(Client(), "tcp://a", told, {}, tmp_path)
+        foreign._judge(Client(), "tcp://a", told, {}, tmp_path)
 
 
 @pytest.mark.slow
 def test_no_workers_and_a_scheduler_that_leaves(tmp_path, monkeypatch):
-    monkeypatch.setattr(dask_cluster, "NO_WORKERS", 2.0)
+    monkeypatch.setattr(foreign, "NO_WORKERS_SECONDS", 2.0)
     with by_hand(tmp_path) as hands:
         with raises("RIL-525"):
             run(tmp_path / "cache", hands.address)
@@ -248,14 +186,14 @@ def test_no_workers_and_a_scheduler_that_leaves(tmp_path, monkeypatch):
         from rille.stages.core.declare import NoParams
 
         graph.node("toys.mischief", "sleep/0", NoParams(), {"what": "sleep", "seconds": 60, "i": 0})
-        monkeypatch.setattr(dask_cluster, "NO_WORKERS", 30.0)
-        begun = scheduler.make
+        monkeypatch.setattr(foreign, "NO_WORKERS_SECONDS", 30.0)
+        begun = driver.make
 
         def make(*given):
             made = begun(*given)
             os.killpg(hands.processes[0].pid, signal.SIGKILL)
             return made
 
-        monkeypatch.setattr(scheduler, "make", make)
+        monkeypatch.setattr(driver, "make", make)
         with raises("RIL-526"):
-            scheduler.run(graph, Store(tmp_path / "cache"), scheduler.RunOptions(executor=hands.address))
+            driver.run(graph, Store(tmp_path / "cache"), driver.RunOptions(executor=hands.address))

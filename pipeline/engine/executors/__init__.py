@@ -1,1 +1,0 @@
-"""Executors: dask workers, or this process."""

@@ -1,0 +1,169 @@
+"""Memory: how much a run may take here, what its tasks are estimated to need, and how many workers that permits.
+
+The limit is the free memory of the machine, or of the control group that this process is in. A task is estimated from
+its stage's declaration (:class:`~rille.stages.core.declare.Memory`) and the decoded bytes of its inputs; an input still
+to come counts as its stage declares, too. There are as many workers as the limit holds of the largest task; a task
+that does not fit even alone is refused, with the parameter that makes it smaller.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import psutil
+
+from rille.pipeline.engine.graph import Graph, Handle
+from rille.pipeline.engine.runtime.environment import cores
+from rille.pipeline.engine.spec import each
+from rille.stages.core.errors import ConfigError
+
+SHARE = 0.9
+"""Part of what is free that a run takes by itself: page cache for its files, and others that grow, need the rest."""
+
+WORKER_BYTES = 250e6
+"""Memory of a worker process between tasks: Python with NumPy, SciPy and numba."""
+
+UNITS = {"": 1, "k": 1e3, "m": 1e6, "g": 1e9, "t": 1e12, "ki": 2**10, "mi": 2**20, "gi": 2**30, "ti": 2**40}
+
+_WORDS = re.compile(r"([\d.]+)\s*([kmgt]?i?)b?", re.IGNORECASE)
+
+
+class MemoryRefusedError(ConfigError):
+    """A task needs more memory than the limit, all others aside."""
+
+
+def parse(text: str) -> int:
+    """Bytes of ``6GB``, ``800 MiB``, ``75%`` (of the machine or its control group).
+
+    Raises
+    ------
+    ConfigError
+        It is none of these.
+    """
+    words = text.strip()
+    # The pattern lets 1.2.3 pass, float() does not.
+    with suppress(ValueError):
+        if words.endswith("%") and 0 < float(words[:-1]) <= 100:
+            return int(float(words[:-1]) / 100 * total())
+        match = _WORDS.fullmatch(words)
+        if match and float(match[1]) > 0:
+            return int(float(match[1]) * UNITS[match[2].lower()])
+    raise ConfigError(
+        "RIL-553", f"--memory-limit {text!r} is no amount of memory", remedy="give e.g. 6GB, 800MB or 75%"
+    )
+
+
+def words(amount: float) -> str:
+    """``412 MB``, ``1.2 GB``, ``35 kB``."""
+    for limit, unit, digits in ((999.5e6, 1e9, 1), (99.5e3, 1e6, 0), (0, 1e3, 0)):
+        if amount >= limit:
+            name = {1e9: "GB", 1e6: "MB", 1e3: "kB"}[unit]
+            return f"{amount / unit:.{1 if unit == 1e6 and amount < 9.95e6 else digits}f} {name}"
+    return "0 kB"
+
+
+def total() -> int:
+    """Memory of the machine, or what its control groups and resource limits leave of it, bytes."""
+    from distributed.system import MEMORY_LIMIT
+
+    return int(MEMORY_LIMIT)
+
+
+def free() -> int:
+    """Memory that this process and its children may still take, bytes."""
+    machine = psutil.virtual_memory()
+    # Within a control group what its other processes hold is not known here: the limit counts without this process.
+    return max(0, min(int(machine.available), total() - resident()))
+
+
+def resident() -> int:
+    """Resident memory of this process, bytes."""
+    return int(psutil.Process().memory_info().rss)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Bytes that a run may take, ``limit``, of which this process holds ``own``."""
+
+    limit: float
+    own: float
+
+    @property
+    def alone(self) -> float:
+        """Memory for a task on the only worker, bytes."""
+        return max(0.0, self.limit - self.own - WORKER_BYTES)
+
+    def workers(self, jobs: int, largest: float) -> int:
+        """Number of workers, of ``jobs`` at most, each of which may run the ``largest`` task [bytes] at once."""
+        return int(max(1, min(jobs, (self.limit - self.own) // (WORKER_BYTES + largest))))
+
+    def refusal(self, handle: Handle, estimate: float) -> MemoryRefusedError | None:
+        """Why a task cannot run here at all, if so."""
+        if estimate <= self.alone:
+            return None
+        lower = handle.spec.stage.memory.lower
+        change = f"change {' or '.join(lower)}, or " if lower else ""
+        return MemoryRefusedError(
+            "RIL-500",
+            f"is estimated to need {words(estimate)}, and {words(self.alone)} are left for a task of the limit of "
+            f"{words(self.limit)} (the program itself and a worker hold {words(self.own + WORKER_BYTES)})",
+            remedy=f"{change}give more with --memory-limit",
+        )
+
+
+def budget(executor: Any, limit: float | None) -> Budget:
+    """What a run may take: ``limit`` bytes if given; on a cluster of others as much as it likes, else what is free."""
+    own = float(resident())
+    if limit is not None:
+        return Budget(float(limit), own)
+    return Budget(own + SHARE * free() if executor in ("dask", "inline") else math.inf, own)
+
+
+def most_workers(executor: Any, asked: int | None) -> int:
+    """Number of workers that memory may reduce: as many as asked for, or one a core; one within the program."""
+    return 1 if executor == "inline" else asked or cores()
+
+
+class Estimates:
+    """Estimates of the tasks of one graph, in the order of their creation."""
+
+    def __init__(self) -> None:
+        self._results: dict[int, float] = {}
+        """Decoded bytes of results still to come, by number of the node."""
+
+    def task(self, handle: Handle) -> float:
+        """Memory of a task beyond that of an idle worker, bytes."""
+        memory, size = handle.spec.stage.memory, input_bytes(handle, self._results)
+        inputs = [float(h.ref.nbytes) if h.ref else self._results.get(h.index, 0.0) for h in handle.upstream()]
+        # Guesses upon guesses would grow without end along a chain: no result is larger than the largest it came from.
+        most = max(*inputs, size - sum(inputs)) if inputs else math.inf
+        self._results[handle.index] = min(memory.result * size, most)
+        return memory.fixed + memory.factor * size
+
+    def planned(self, graph: Graph) -> list[tuple[Handle, float]]:
+        """Tasks of a dry run that are to be computed, each with its memory [bytes]."""
+        return [(handle, self.task(handle)) for handle in graph.nodes if handle.status == "planned"]
+
+
+def input_bytes(handle: Handle, expected: Mapping[int, float] | None = None) -> float:
+    """Bytes that a task works on: its inputs decoded, what it reads from outside, and what its stage adds.
+
+    ``expected`` are bytes of results still to come, by index of the node.
+    """
+    parts = (float(ref.nbytes) if (ref := h.ref) else (expected or {}).get(h.index, 0.0) for h in handle.upstream())
+    size = handle.expect + sum(parts)
+    more = handle.spec.stage.memory.size
+    if more is not None:
+        with suppress(Exception):  # an estimate only, and facts may be still to come
+            size += more(handle.spec.params, handle.spec.args, each(_meta, handle.inputs))
+    return size
+
+
+def _meta(handle: Handle) -> Any:
+    ref = handle.ref or handle.earlier
+    return ref.meta if ref is not None else {}

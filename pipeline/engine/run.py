@@ -1,0 +1,512 @@
+"""Runs a graph: looks up what is there, gives the rest to workers, goes on with flows as results arrive.
+
+>>> result = run(graph, Store("cache"), RunOptions(jobs=2, progress=progress.make("auto")))
+>>> result.check()                       # raises the first failure, with its stage and label
+>>> result.counts["locus"].cached
+8
+
+Nodes are taken in the order of their creation. One whose inputs are there has a key, and is looked up; one whose inputs
+are being computed is given to the workers as well, which chain it. A run that finds everything starts no worker. With
+``dry=True`` nothing is computed: ``status`` of the handles is ``cached`` or ``planned``, and ``reason`` says why
+(``rille plan``). What depends on results still to come is laid out by those of an earlier run where there was one
+(``Result.assumed``), else it is not known (``Result.unknown``).
+
+What a stage raises is not tried again (but for ``OSError``: :mod:`rille.pipeline.engine.task`), and what depends on it
+is skipped. Where the data do not determine an answer (:class:`~rille.stages.core.errors.DegenerateError`) everything
+else finishes: the run has a hole. After any other error nothing new is begun, unless with ``keep_going``. An artifact
+that is found damaged, or gone, when a task reads it is computed again, and the task after it. A task whose workers died
+is tried once more when nothing else runs. In every case the ledger has one line for each node that is missing, with the
+reason.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from rille.pipeline.engine import estimate, memory, provenance
+from rille.pipeline.engine.events import Ledger
+from rille.pipeline.engine.failures import translated
+from rille.pipeline.engine.graph import Expansion, Graph, Handle
+from rille.pipeline.engine.keys import digest
+from rille.pipeline.engine.plain import some
+from rille.pipeline.engine.progress import Progress
+from rille.pipeline.engine.runtime.interrupts import Interrupts
+from rille.pipeline.engine.spec import Refs, each, key_of, recipe
+from rille.pipeline.engine.store.base import GoneError, NonDeterministicError, Store
+from rille.pipeline.engine.store.lazy_arrays import DamagedError
+from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.task import CodeChangedError, Outcome
+from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, check, make
+from rille.stages.core.errors import DegenerateError, RilleError
+
+MAX_HEALS = 3
+"""Times that a task is begun again because an input was damaged or gone when it read it."""
+
+MISSING = ("failed", "skipped", "planned")
+"""Statuses of an input after which a task is not begun."""
+
+
+class TaskError(RilleError):
+    """A task failed; its own error is the cause (``__cause__``)."""
+
+
+class WorkerDiedError(RilleError):
+    """A task took several worker processes along: out of memory, or a crash in native code."""
+
+
+@dataclass
+class Counts:
+    """Number of nodes of one stage by outcome; ``seconds`` is the sum over those computed now."""
+
+    computed: int = 0
+    cached: int = 0
+    failed: int = 0
+    skipped: int = 0
+    planned: int = 0
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A task that failed: its label and stage, the original exception and the text of its traceback."""
+
+    label: str
+    stage: str
+    error: BaseException
+    traceback: str
+
+
+@dataclass
+class Result:
+    """Outcome of a run.
+
+    Of a dry run: ``assumed`` are labels whose earlier result served to lay out what follows, ``unknown`` those that
+    hide it.
+    """
+
+    counts: dict[str, Counts] = field(default_factory=dict)
+    failures: list[Failure] = field(default_factory=list)
+    assumed: list[str] = field(default_factory=list)
+    unknown: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+    workers_started: bool = False
+    interrupted: bool = False
+
+    @property
+    def ok(self) -> bool:
+        """Whether it came to its end, nothing failed and nothing was left out."""
+        return not self.interrupted and not self.failures and not any(c.skipped for c in self.counts.values())
+
+    def total(self) -> Counts:
+        """Counts over all stages."""
+        return Counts(**{f.name: sum(getattr(c, f.name) for c in self.counts.values()) for f in fields(Counts)})
+
+    def check(self, *, holes: bool = False) -> None:
+        """Raise the first failure as one line with its label: the original error of Rille, or what wraps another.
+
+        With ``holes`` failures that lie in the data are passed over.
+        """
+        failures = [f for f in self.failures if not (holes and is_hole(f.error))]
+        if failures:
+            first = failures[0]
+            error = first.error
+            if (known := translated(error)) is not None:
+                raise known.at(first.label) from error
+            raise TaskError(
+                "RIL-534", f"{first.label} (stage {first.stage}): {type(error).__name__}: {error}"
+            ) from error
+
+
+def is_hole(error: BaseException) -> bool:
+    """Whether a failure lies in the data, so that what does not depend on it is delivered all the same."""
+    return isinstance(error, DegenerateError)
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a graph is run.
+
+    Parameters
+    ----------
+    executor : ``dask`` (a cluster of this machine), the address of a running dask scheduler (``tcp://...``), a
+        ``Client`` of dask, or ``inline``.
+    jobs : worker processes; None is one a core.
+    keep_going : finish all tasks that do not depend on a failure, of whatever kind.
+    force : names of stages to compute again though they are there; the digests must agree.
+    dry : look up only.
+    ledger : file of JSON lines, one a node, written as they resolve.
+    progress : receives every step of the run.
+    memory_limit : bytes that this process and its workers may take together; None is what is free here.
+    survey : lays the same graph out anew, to look ahead: what cannot fit into memory is refused before anything runs.
+    """
+
+    executor: Any = "dask"
+    jobs: int | None = None
+    keep_going: bool = False
+    force: Collection[str] = ()
+    dry: bool = False
+    ledger: Path | None = None
+    progress: Progress = field(default_factory=Progress)
+    memory_limit: float | None = None
+    survey: Callable[[], Graph] | None = None
+
+
+_DEFAULTS = RunOptions()
+
+
+def run(graph: Graph, store: Store, options: RunOptions = _DEFAULTS) -> Result:
+    """Bring every node of a graph to an artifact in ``store``; its handles are filled in, flows may add nodes.
+
+    Raises
+    ------
+    MemoryRefusedError
+        A task that is known beforehand does not fit, even alone.
+    KeyboardInterrupt
+        Interrupted; running tasks are killed, committed artifacts stay.
+    """
+    return _Run(graph, store, options).go()
+
+
+class _Run:
+    def __init__(self, graph: Graph, store: Store, options: RunOptions) -> None:
+        self.graph, self.store, self.options = graph, store, options
+        self.dry, self.force, self.progress = options.dry, frozenset(options.force), options.progress
+        self.ledger, self.result = Ledger(options.ledger), Result()
+        self.workers: Workers | None = None
+        self.budget = memory.Budget(math.inf, 0.0)
+        self.estimates, self.largest = memory.Estimates(), 0.0
+        self.jobs = memory.most_workers(options.executor, options.jobs)
+        self.stopped = ""
+        self.taken = 0
+        """Nodes of the graph that were taken up, in order."""
+        self.again: list[int] = []
+        """Numbers of nodes to be taken up again, the least first."""
+        self.in_flight: dict[int, Handle] = {}
+        """With the workers."""
+        self.computing: dict[str, int] = {}
+        """Numbers of nodes in flight, by their keys so far as these are known."""
+        self.suspects: list[int] = []
+        """Numbers of nodes whose workers died; each is tried when nothing else runs, and is then in ``alone``."""
+        self.alone: set[int] = set()
+        self.heals: Counter[int] = Counter()
+        self.before: dict[int, str] = {}
+        """Digests of artifacts that are computed again because they were damaged or gone, by number of the node."""
+        hints = store.hints(graph.sequence)
+        self.hints, self.known = hints, provenance.Known(hints, graph.choice)
+
+    def go(self) -> Result:
+        begin = time.perf_counter()
+        try:
+            with Interrupts() as interrupts:
+                self._loop(interrupts)
+                self._leave_out()
+        except BaseException:
+            self.result.interrupted = True
+            self._close(kill=True)
+            raise
+        else:
+            self._close(kill=False)
+            if not self.dry:
+                self.store.note(h.ref for h in self.graph.nodes if h.ref is not None)
+                estimate.remember(self.hints, self.progress.estimate)
+        finally:
+            self._count()
+            if not self.dry:
+                self.known.save(self.graph.nodes)
+            self.result.seconds = time.perf_counter() - begin
+            # Without "ok" a ledger is that of a run which did not come to its end.
+            ended = {} if self.result.interrupted else {"ok": self.result.ok}
+            self.ledger.run(seconds=round(self.result.seconds, 3), **ended)
+            self.progress.close(self.result)
+            self.ledger.close()
+        return self.result
+
+    def _close(self, *, kill: bool) -> None:
+        if self.workers is not None:
+            self.workers.close(kill=kill)
+
+    def _loop(self, interrupts: Interrupts) -> None:
+        self.progress.open(self.graph, estimate.recall(self.hints), self.jobs)
+        self.store.survey(_sequence(self.graph))
+        while True:
+            while self._take() or self._go_on():
+                # An interrupt in a finaliser or a callback of a weak reference was remembered, not raised.
+                interrupts.check()
+            if not self.in_flight:
+                return
+            assert self.workers is not None
+            for number, ended in self.workers.wait():
+                interrupts.check()
+                if number in self.in_flight:  # not if the run was stopped by one before
+                    self._land(self.in_flight.pop(number), ended)
+
+    # -- what becomes of a node ---------------------------------------------------------------------------------
+
+    def _take(self) -> bool:
+        """Take up the next node; whether there was one for which the workers have room."""
+        if self.stopped or (self.workers is not None and len(self.in_flight) >= self.workers.room):
+            return False
+        if self.suspects or not self.alone.isdisjoint(self.in_flight):
+            if self.in_flight:
+                return False
+            number = heapq.heappop(self.suspects)
+            self.alone.add(number)
+            self._settle(self.graph.nodes[number])
+        elif self.again:
+            self._settle(self.graph.nodes[heapq.heappop(self.again)])
+        elif self.taken < len(self.graph.nodes):
+            self.taken += 1
+            self._settle(self.graph.nodes[self.taken - 1])
+        else:
+            return False
+        return True
+
+    def _settle(self, handle: Handle) -> None:
+        """Leave a node out, find it in the cache, or give it to the workers."""
+        upstream = handle.upstream()
+        missing = next((h for h in upstream if h.status in MISSING), None)
+        if missing is not None:
+            self._skip(handle, missing)
+            return
+        handle.key = ""
+        if all(h.done for h in upstream):
+            refs = handle.refs()
+            handle.key = key_of(handle.spec, refs)
+            if handle.stage not in self.force:
+                # fresh: the index vouches for a file that nobody wrote since, which the disk may have damaged.
+                fresh = handle.index in self.before
+                handle.ref = self.store.lookup(handle.stage, handle.key, fresh=fresh, use=not self.dry)
+                if handle.ref is not None:
+                    self._resolve(handle, "cached")
+                    return
+            if handle.index not in self.before:
+                self._explain(handle, refs)
+        if self.dry:
+            handle.earlier = self.known.latest(self.store, handle.stage, handle.label)
+            self._resolve(handle, "planned")
+        else:
+            self._submit(handle, upstream)
+
+    def _explain(self, handle: Handle, refs: Refs) -> None:
+        if handle.stage in self.force:
+            handle.reason = "forced"
+        else:
+            made = recipe(handle.spec, refs)
+            handle.reason = self.known.reason(self.store, handle.stage, handle.label, handle.key, made)
+
+    def _submit(self, handle: Handle, upstream: list[Handle]) -> None:
+        if self.workers is None:
+            self.workers = self._begin()
+        needs = self.estimates.task(handle)
+        if (refused := self.budget.refusal(handle, needs)) is not None and all(h.done for h in upstream):
+            self._fail(handle, Failed(refused))
+            return
+        if needs > self.largest:
+            self.largest = needs
+            self.workers.shrink(self.budget.workers(self.jobs, needs))
+        # A node of the same key (equal parameters and inputs) is found in the cache after the first.
+        after = (self.computing[handle.key],) if handle.key in self.computing else ()
+        if handle.key:
+            self.computing[handle.key] = handle.index
+        force = handle.stage in self.force
+        call = Call(handle.index, self.store.root, handle.spec, each(_given, handle.inputs), handle.key, force, after)
+        handle.status = "running"
+        self.in_flight[handle.index] = handle
+        self.workers.submit(call)
+        self.progress.running(handle)
+
+    def _begin(self) -> Workers:
+        """Look ahead, refuse what cannot fit, and start the workers that memory leaves room for."""
+        kind = self.options.executor
+        check(kind, self.options.jobs)
+        self.budget = memory.budget(kind, self.options.memory_limit)
+        ahead = self.options.survey() if self.options.survey is not None else Graph()
+        # A run that looks up only, by the same code: what it foresees is what will be done.
+        dry = _Run(ahead, self.store, RunOptions(force=self.force, dry=True))
+        while dry._take() or dry._go_on():
+            pass
+        for handle, needs in memory.Estimates().planned(ahead):
+            if (refused := self.budget.refusal(handle, needs)) is not None:
+                raise refused.at(handle.label)
+            self.largest = max(self.largest, needs)
+        # Before the workers start: a full or read-only disk should not cost that time.
+        self.store.writable()
+        jobs = self.budget.workers(self.jobs, self.largest)
+        name = kind if isinstance(kind, str) else kind.scheduler.address
+        self.ledger.run(executor=name, jobs=jobs)
+        workers = make(kind, jobs, self.store.root, self.budget.limit)
+        self.result.workers_started = True
+        if pages := getattr(workers, "pages", ""):
+            self.progress.detail(pages)
+        return workers
+
+    def _resolve(self, handle: Handle, status: str) -> None:
+        handle.status = status
+        self.ledger.write(handle)
+        if handle.index not in self.before:  # healed: it counts once, as what became of it last
+            self.progress.resolved(handle)
+
+    def _skip(self, handle: Handle, missing: Handle) -> None:
+        planned, handle.ref = missing.status == "planned", None
+        fate = "failed" if missing.status == "failed" else "was skipped"
+        handle.reason = f"input {missing.label} is to be computed" if planned else f"{missing.label} {fate}"
+        if planned:
+            handle.earlier = self.known.latest(self.store, handle.stage, handle.label)
+        self._resolve(handle, "planned" if planned else "skipped")
+
+    # -- what comes back ----------------------------------------------------------------------------------------
+
+    def _land(self, handle: Handle, ended: Ended) -> None:
+        """Take up what the workers give back."""
+        handle.status = "pending"
+        if self.computing.get(handle.key) == handle.index:
+            del self.computing[handle.key]
+        if isinstance(ended, Outcome):
+            self._succeed(handle, ended)
+        elif isinstance(ended, NotBegun):
+            heapq.heappush(self.again, handle.index)
+        elif isinstance(ended, Died) and handle.index not in self.alone:
+            heapq.heappush(self.suspects, handle.index)
+        elif isinstance(ended, Died):
+            self._fail(handle, Failed(self._culprit(handle, ended)))
+        elif not self._heal(handle, ended.error):
+            self._fail(handle, ended)
+
+    def _succeed(self, handle: Handle, outcome: Outcome) -> None:
+        chained = not handle.key
+        if chained and all(h.done for h in handle.upstream()):
+            refs = handle.refs()
+            handle.key = key_of(handle.spec, refs)
+            if not outcome.cached:
+                self._explain(handle, refs)
+        # The worker computed the key from its own source files: they were edited during the run, or differ there.
+        if handle.key not in ("", outcome.ref.key):
+            changed = CodeChangedError("RIL-870", "a worker's source code is not that of this process")
+            self._fail(handle, Failed(changed))
+            return
+        if self.before.get(handle.index, outcome.ref.digest) != outcome.ref.digest:
+            text = f"stage {handle.stage} is not deterministic: another digest when healed"
+            self._fail(handle, Failed(NonDeterministicError("RIL-535", text)))
+            return
+        # What is unpickled brings names of its own each time.
+        handle.took = replace(outcome.took, worker=sys.intern(outcome.took.worker))
+        handle.ref, handle.key = replace(outcome.ref, stage=handle.stage), outcome.ref.key
+        self._resolve(handle, "cached" if outcome.cached else "computed")
+
+    def _culprit(self, handle: Handle, died: Died) -> WorkerDiedError:
+        """The error of a task that ran alone as its workers died."""
+        at = f"; the last was ended at {died.memory}" if died.memory else ""
+        needs = memory.words(self.estimates.task(handle))
+        text = f"{died.workers} worker processes died while they ran it alone{at} (it is estimated to need {needs})"
+        lower = handle.spec.stage.memory.lower
+        change = f"change {' or '.join(lower)}, " if lower and died.memory else ""
+        remedy = f"{change}give it more memory with fewer --jobs, or run it with --executor inline to see the crash"
+        return WorkerDiedError("RIL-586", text, remedy=remedy)
+
+    def _heal(self, handle: Handle, error: BaseException) -> bool:
+        """Have inputs that were damaged or gone when a task read them computed again, and the task after them."""
+        if not isinstance(error, DamagedError | GoneError) or self.heals[handle.index] >= MAX_HEALS:
+            return False
+        self.heals[handle.index] += 1
+        for source in {h.index: h for h in handle.upstream()}.values():
+            if source.ref is not None and self.store.lookup(source.stage, source.key, fresh=True) is None:
+                self.before[source.index] = source.ref.digest
+                source.reason = "its artifact was found damaged, or gone, when it was read"
+                source.ref, source.status = None, "pending"
+                heapq.heappush(self.again, source.index)
+        heapq.heappush(self.again, handle.index)
+        return True
+
+    def _fail(self, handle: Handle, failed: Failed) -> None:
+        handle.error, handle.ref = failed.error, None
+        handle.reason = f"{type(failed.error).__name__}: {failed.error}"
+        self._resolve(handle, "failed")
+        self._failed(Failure(handle.label, handle.stage, failed.error, failed.traceback))
+
+    def _failed(self, failure: Failure) -> None:
+        self.result.failures.append(failure)
+        self.progress.failed(failure.label, failure.error)
+        if not self.options.keep_going and not is_hole(failure.error):
+            self.stopped = f"stopped after {failure.label} failed"
+            for handle in self.in_flight.values():
+                handle.status = "pending"
+            self.in_flight.clear()
+            if self.workers is not None:
+                self.workers.cancel()
+
+    # -- flows, and the end -------------------------------------------------------------------------------------
+
+    def _go_on(self) -> bool:
+        """Go on with the first flow whose handles are done, or lay out what comes last; whether there was such."""
+        if self.stopped or self.suspects:
+            return False
+        for i, (handles, flow, holes) in enumerate(self.graph.expansions):
+            if all(h.done or h.earlier or (holes and h.status in ("failed", "skipped")) for h in handles):
+                del self.graph.expansions[i]
+                self._expand(handles, flow)
+                return True
+        last = self.graph.last
+        if last is None or (self.graph.expansions and self.in_flight):
+            return False
+        self.graph.last = None
+        last()
+        return True
+
+    def _expand(self, handles: list[Handle], flow: Expansion) -> None:
+        assumed = [h.label for h in handles if h.earlier and not h.done]
+        self.result.assumed += assumed
+        before = len(self.graph.nodes)
+        try:
+            flow(*(h.ref or h.earlier for h in handles))
+        except Exception as error:
+            if assumed:  # what was found with other parameters or images does not fit: no more can be said
+                self.result.unknown += assumed
+            else:
+                self._failed(Failure(f"plan after {_labels(handles)}", "", error, Failed.of(error).traceback))
+        self.ledger.expansion([h.label for h in handles], [h.label for h in self.graph.nodes[before:]])
+
+    def _leave_out(self) -> None:
+        """Account for everything that was not even begun."""
+        for handle in self.graph.nodes:
+            if handle.status == "pending":
+                missing = next((h for h in handle.upstream() if h.status in MISSING), None)
+                if missing is not None:
+                    self._skip(handle, missing)
+                else:
+                    handle.reason = self.stopped
+                    self._resolve(handle, "skipped")
+        for handles, *_ in self.graph.expansions:
+            waits = [h for h in handles if not h.done]
+            self.result.unknown += [h.label for h in waits]
+            self.ledger.note(f"plan after {_labels(handles)}", "planned" if self.dry else "skipped", _labels(waits))
+
+    def _count(self) -> None:
+        for handle in self.graph.nodes:
+            counts = self.result.counts.setdefault(handle.stage, Counts())
+            if handle.status not in ("pending", "running"):
+                setattr(counts, handle.status, getattr(counts, handle.status) + 1)
+                counts.seconds += handle.took.seconds
+
+
+def _sequence(graph: Graph) -> str:
+    """Name of what the graph works on: its first task reads the first image, or what all images are made from."""
+    first = graph.nodes[0].spec if graph.nodes else None
+    return digest(None if first is None else [first.module, first.params, dict(first.args)])[:16]
+
+
+def _given(handle: Handle) -> Ref | int:
+    """An input as it is handed over: its artifact without the facts, which the task reads, or the number of the call
+    that makes it."""
+    return handle.index if handle.ref is None else replace(handle.ref, meta={})
+
+
+def _labels(handles: list[Handle]) -> str:
+    return some([h.label for h in handles], 3)

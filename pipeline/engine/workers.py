@@ -1,0 +1,533 @@
+"""Workers that run tasks: those of a dask cluster of this machine, of a scheduler that others have started, or inline.
+
+A task is a future that depends on the futures of the tasks that make its inputs: dask's scheduler chains them without
+asking this process, gives a task to another worker if its own dies, and ends a worker that takes too much memory. A
+task that comes back because its workers died is named ``Died``; the run tries it once more when nothing else runs, so
+that the culprit is known for certain (:mod:`rille.pipeline.engine.run`).
+
+On this machine workers are spawned, never forked; they never see Ctrl-C, end with this process, and speak TLS on the
+loopback with keys of this run alone, because whoever reaches a scheduler of dask can run code as its user.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import multiprocessing
+import pickle
+import queue
+import re
+import time
+import traceback
+import uuid
+import warnings
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.util import find_spec
+from multiprocessing import resource_tracker
+from pathlib import Path
+from typing import Any, Protocol
+
+import psutil
+
+from rille.datasets.text.warning import warning
+from rille.pipeline.engine import foreign
+from rille.pipeline.engine.plain import warn
+from rille.pipeline.engine.runtime.apart import ignore_settings, leave_out, take_back
+from rille.pipeline.engine.runtime.environment import prepare_environment, worker_environment
+from rille.pipeline.engine.runtime.interrupts import held
+from rille.pipeline.engine.runtime.private import private_folder
+from rille.pipeline.engine.spec import Spec, flat
+from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.task import CodeChangedError, Outcome, ensure
+from rille.stages.core.errors import ConfigError
+
+KINDS = ("dask", "inline")
+
+WATCH_SECONDS = 0.2
+"""Time until something else than an end of a task is looked after."""
+
+LOOK_SECONDS = 2.0
+"""Time between looks at the scheduler."""
+
+BIRTH_SECONDS = 120.0
+"""Time that workers of our own may take to start, on a machine that others use."""
+
+CONNECT_SECONDS = 10.0
+"""Time within which a scheduler must have answered."""
+
+LEAVE_SECONDS, HURRY_SECONDS = 2.0, 0.5
+"""Time to take leave of a scheduler at the end of a run, and of an interrupted one."""
+
+DEATHS = 1
+"""Deaths of its worker after which dask, on this machine, begins a task once more; at the next it gives it back."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """A call of :func:`~rille.pipeline.engine.task.ensure`: an input is an artifact, or the number of the call in
+    flight that makes it. ``key`` is empty while an input is still to come."""
+
+    number: int
+    root: Path
+    spec: Spec
+    refs: Mapping[str, Ref | int | list[Ref | int]]
+    key: str = ""
+    force: bool = False
+    after: tuple[int, ...] = ()
+    """Numbers of calls in flight that it waits for, and reads nothing of."""
+
+    def upstream(self) -> list[int]:
+        """Numbers of the calls in flight that it waits for, each once, in a fixed order."""
+        return list(dict.fromkeys([*(g for g in flat(self.refs) if isinstance(g, int)), *self.after]))
+
+    def run(self, made: Mapping[int, Ref]) -> Outcome | Failed:
+        """Run it here, with the artifacts of the calls that it waited for."""
+
+        def ref(given: Ref | int) -> Ref:
+            return made[given] if isinstance(given, int) else given
+
+        refs = {p: [ref(g) for g in given] if isinstance(given, list) else ref(given) for p, given in self.refs.items()}
+        try:
+            return ensure(self.root, self.spec, refs, key=self.key or None, force=self.force)
+        except Exception as error:
+            return Failed.of(error)
+
+
+@dataclass(frozen=True)
+class Failed:
+    """An exception that travels as a value, with the text of its traceback."""
+
+    error: BaseException
+    traceback: str = ""
+
+    @staticmethod
+    def of(error: BaseException) -> Failed:
+        """Wrap an exception; one that cannot be pickled is replaced by its words."""
+        text = "".join(traceback.format_exception(error))
+        try:
+            # Both ways: exceptions with arguments of their own often pickle, and fail when they are made anew.
+            pickle.loads(pickle.dumps(error))
+        except Exception:
+            error = RuntimeError(f"{type(error).__name__}: {error}")
+        return Failed(error, text)
+
+
+class NotBegun:
+    """In the place of an outcome: an input did not come."""
+
+
+@dataclass(frozen=True)
+class Died:
+    """In the place of an outcome: this many worker processes died while they had the task."""
+
+    workers: int
+    memory: str = ""
+    """Memory [bytes, in words] at which dask ended the last of them; empty if something else ended it."""
+
+
+Ended = Outcome | Failed | NotBegun | Died
+
+
+class Workers(Protocol):
+    """Run calls, each known by its number; the least number first."""
+
+    room: int
+    """Calls that they may have, those that wait for others among them."""
+
+    def submit(self, call: Call) -> None:
+        """Start a call after those in flight that it waits for."""
+
+    def wait(self) -> list[tuple[int, Ended]]:
+        """Block until at least one call has ended."""
+
+    def shrink(self, jobs: int) -> None:
+        """Keep no more than so many workers of our own."""
+
+    def cancel(self) -> None:
+        """Begin nothing that was submitted, and forget what is running."""
+
+    def close(self, *, kill: bool = False) -> None:
+        """Leave nothing behind; ``kill`` does not wait."""
+
+
+def check(kind: Any, jobs: int | None = None) -> None:
+    """Refuse an executor that there is not, before any work.
+
+    Raises
+    ------
+    ConfigError
+        It is neither one of the kinds nor an address nor an open ``Client`` of dask, or there are no ``jobs``; or this
+        process is a worker that imports its program.
+    """
+    if not isinstance(kind, str):
+        from distributed import Client
+
+        # A closed one has no scheduler; calls of an asynchronous one give coroutines.
+        if not isinstance(kind, Client) or kind.scheduler is None or kind.asynchronous:
+            text = f"{kind!r} is no open Client of dask, or an asynchronous one"
+            raise ConfigError("RIL-588", text, remedy="give Client(...) without asynchronous=True, or leave client out")
+    if isinstance(kind, str) and kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
+        raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
+    # A spawned worker imports the program's main module first: without a guard it would start workers of its own.
+    if kind == "dask" and getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise ConfigError(
+            "RIL-972",
+            "a worker that starts came to this call",
+            remedy='put what the program does under `if __name__ == "__main__":`',
+        )
+    if jobs is not None and jobs < 1:
+        raise ConfigError("RIL-540", f"{jobs} jobs are not permitted", remedy="give 1 or more")
+
+
+def make(kind: Any, jobs: int, cache: Path, memory: float) -> Workers:
+    """``inline``, or workers of dask: ``dask`` (of this machine), the address of a scheduler, or a ``Client``.
+
+    ``jobs`` and ``memory`` are for workers of our own: how many, and bytes beyond which one that takes so many by
+    itself is ended, before the system ends others.
+
+    Raises
+    ------
+    ConfigError
+        The cluster does not answer, or a worker of it is unlike this process.
+    """
+    if kind == "inline":
+        return Inline()
+    return _here(jobs, memory) if kind == "dask" else _elsewhere(kind, cache)
+
+
+class Inline:
+    """One call after the other in this process: for debugging, and where one core is all there is."""
+
+    room = 1
+
+    def __init__(self) -> None:
+        import zarr
+
+        self._call: Call | None = None
+        with held():  # zarr makes its event loop when it is first used
+            zarr.create_group(zarr.storage.MemoryStore())
+
+    def submit(self, call: Call) -> None:
+        """Remember the call; :meth:`wait` runs it."""
+        self._call = call
+
+    def wait(self) -> list[tuple[int, Ended]]:
+        """Run the call."""
+        assert self._call is not None
+        call, self._call = self._call, None
+        return [(call.number, call.run({}))]
+
+    def shrink(self, jobs: int) -> None:
+        """There is one worker."""
+
+    def cancel(self) -> None:
+        """Forget what was not run."""
+        self._call = None
+
+    def close(self, *, kill: bool = False) -> None:
+        """Nothing to leave."""
+        if kill:  # Python would warn at exit of each read or write of zarr's that was interrupted before it began
+            warnings.filterwarnings("ignore", message="coroutine .* was never awaited", category=RuntimeWarning)
+
+
+def _here(jobs: int, memory: float) -> Dask:
+    """Workers of this machine; they start while this process goes on."""
+    interactive = leave_out()  # before anything else is imported
+    from distributed import Client, LocalCluster
+
+    _configure()
+    resource_tracker.ensure_running()  # it unblocks the signal in the thread that happens to start it
+    with held():
+        cluster = LocalCluster(
+            # With workers LocalCluster would block until they run; scale() returns at once.
+            n_workers=0,
+            threads_per_worker=1,
+            security=True,
+            host="127.0.0.1",
+            # Port 0 is any free one: dask's own, 8787, may belong to another run.
+            dashboard_address="127.0.0.1:0",
+            worker_dashboard_address=None,
+            local_directory=str(private_folder() / "dask"),
+            memory_limit=int(memory) if math.isfinite(memory) else 0,
+            silence_logs=logging.CRITICAL,
+        )
+        # As the default client it would take over whatever else the calling program computes with dask.
+        client = Client(cluster, set_as_default=False)
+        made = Dask(client, foreign.Presence(client, BIRTH_SECONDS), cluster=cluster, interactive=interactive)
+        cluster.scale(jobs)
+    return made
+
+
+def _elsewhere(where: Any, cache: Path) -> Dask:
+    """Workers of the scheduler at an address, or behind a ``Client``, if they are like this process."""
+    from distributed import Client
+
+    client = where
+    if isinstance(where, str):
+        _quiet()
+        try:
+            client = Client(where, set_as_default=False, timeout=CONNECT_SECONDS)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise ConfigError("RIL-541", f"no dask scheduler answers at {where}", remedy="check the address") from error
+    presence = foreign.Presence(client, foreign.NO_WORKERS_SECONDS)
+    try:
+        while not presence.threads():
+            time.sleep(WATCH_SECONDS)
+        foreign.examine(client, cache)
+        return Dask(client, presence, ours=client is not where, likeness=foreign.likeness())
+    except BaseException:
+        if client is not where:
+            _leave(client, HURRY_SECONDS)
+        raise
+
+
+class Dask:
+    """Workers of dask; ``cluster`` is one of our own, ``ours`` whether the client is.
+
+    ``likeness`` is that of this process, if others have started the workers: one that joins later is compared.
+    """
+
+    room = 2000  # workers need not wait for this process, and the scheduler stays small
+
+    def __init__(
+        self,
+        client: Any,
+        presence: foreign.Presence,
+        *,
+        cluster: Any = None,
+        ours: bool = True,
+        interactive: bool = False,
+        likeness: str = "",
+    ) -> None:
+        self._client, self._presence, self._cluster, self._ours = client, presence, cluster, ours
+        self._interactive, self._likeness = interactive, likeness
+        self._run, self._submitted = uuid.uuid4().hex, 0
+        self._looked = time.monotonic()
+        self._futures: dict[int, Any] = {}
+        self._labels: dict[str, str] = {}
+        """Labels of tasks in flight, by the names that dask knows."""
+        self._ended: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()
+        self._named: set[str] = set()
+        """Silent workers that the user was warned of."""
+        self._gone: set[Any] = set()
+
+    @property
+    def pages(self) -> str:
+        """Sentence with the address of dask's dashboard, which exists if the scheduler's machine has bokeh."""
+        if self._cluster is not None and find_spec("bokeh") is None:
+            return "dask has pages to watch once bokeh is installed: pip install bokeh"
+        try:
+            return f"dask at work: {self._client.dashboard_link}"  # the address is asked of the scheduler
+        except OSError:
+            return ""  # it has gone; the first wait for a task says so
+
+    def submit(self, call: Call) -> None:
+        """Start a call after those in flight that it waits for."""
+        self._submitted += 1
+        # Dask takes equal names for equal results: a call that is tried again needs a new one.
+        name = f"{call.spec.stage.name}-{self._run}-{self._submitted}"
+        inputs = [self._futures[number] for number in call.upstream()]
+        future = self._client.submit(
+            work, call, self._likeness, *inputs, key=name, priority=-call.number, pure=False, retries=0
+        )
+        self._futures[call.number], self._labels[name] = future, call.spec.label
+        future.add_done_callback(lambda ended: self._ended.put((call.number, ended)))
+
+    def wait(self) -> list[tuple[int, Ended]]:
+        """Block until at least one call has ended; all that have ended meanwhile are given."""
+        while True:
+            batch = self._batch()
+            if batch:
+                return [(number, self._outcome(future)) for number, future in sorted(batch.items())]
+            # Not for ever: a scheduler that is lost, or workers that fall silent, end no call.
+            if time.monotonic() - self._looked > LOOK_SECONDS:
+                self._look()
+
+    def _batch(self) -> dict[int, Any]:
+        """Futures that have ended, by number; the first of them is waited for."""
+        batch: dict[int, Any] = {}
+        with suppress(queue.Empty):
+            while True:
+                number, future = self._ended.get(timeout=0 if batch else WATCH_SECONDS)
+                # A call that was cancelled has ended for dask, too.
+                if number in self._futures and self._futures[number] is future:
+                    del self._futures[number], self._labels[future.key]
+                    batch[number] = future
+        return batch
+
+    def _outcome(self, future: Any) -> Ended:
+        from distributed import KilledWorker
+        from distributed.client import FutureCancelledError
+
+        try:
+            outcome: Ended = future.result()
+        except FutureCancelledError:  # distributed cancels all futures when the connection to the scheduler is lost
+            raise self._presence.gone() from None
+        except KilledWorker as error:
+            # One that it waited for is named there by its own name.
+            return self._died(error) if str(error.task) == future.key else NotBegun()
+        except Exception as error:  # it could not even be unpickled there
+            return Failed.of(error)
+        return outcome
+
+    def _died(self, error: Any) -> Died:
+        address, memory = getattr(error.last_worker, "address", ""), ""
+        for _, event in self._client.get_events("worker-restart-memory"):
+            if event.get("worker") == address:
+                memory = f"{event['rss'] / 1e6:.0f} MB"
+        return Died(error.allowed_failures + 1, memory)
+
+    def _look(self) -> None:
+        """Look whether the scheduler is there and has workers, which of them are silent, and which are gone."""
+        self._presence.threads()
+        self._warn_of_silent(self._presence.silent())
+        if self._cluster is not None:
+            # A nanny does not start a worker again that died just as it began: after two looks we do.
+            gone = {nanny for nanny in self._cluster.workers.values() if not nanny.is_alive()}
+            for nanny in gone & self._gone:
+                # Nannies belong to the event loop of the client: their methods must run there.
+                self._client.loop.add_callback(nanny.instantiate)
+            self._gone = gone - self._gone
+        self._looked = time.monotonic()
+
+    def _warn_of_silent(self, silent: set[str]) -> None:
+        """Warn once of each worker that is silent (stopped, or its machine is gone) in the midst of a task of ours."""
+        self._named &= silent
+        nannies = getattr(self._cluster, "workers", {}).values()
+        processes = {nanny.worker_address: f", process {nanny.pid}," for nanny in nannies}
+        for address in silent - self._named:
+            with suppress(Exception):  # it has left meanwhile
+                given = [key for key in self._client.processing([address])[address] if key in self._labels]
+                if given:
+                    who = foreign.worker_name(self._client, address) + processes.get(address, "")
+                    text = f"{who} has been silent for {foreign.SILENCE_SECONDS:.0f} s at {self._labels[given[0]]}"
+                    warn(warning("RIL-710", f"{text}: let it go on if it was stopped (kill -CONT), or end it"))
+                    self._named.add(address)
+
+    def shrink(self, jobs: int) -> None:
+        """Keep no more than so many workers of our own; tasks of those that go are begun on others."""
+        if self._cluster is not None and jobs < len(self._cluster.worker_spec):
+            self._cluster.scale(jobs)
+
+    def cancel(self) -> None:
+        """Begin nothing that was submitted, and forget what is running."""
+        futures, self._futures = list(self._futures.values()), {}
+        self._labels.clear()
+        with suppress(Exception):
+            self._client.cancel(futures, force=True)
+
+    def close(self, *, kill: bool = False) -> None:
+        """End workers of our own, at once if ``kill``; leave others as they are."""
+        within = HURRY_SECONDS if kill else LEAVE_SECONDS
+        self.cancel()
+        if self._cluster is None:
+            if self._ours:
+                _leave(self._client, within)
+            return
+        nannies = list(self._cluster.workers.values())
+        processes = [nanny.pid for nanny in nannies if nanny.pid]
+        if kill:
+            for nanny in nannies:
+                nanny.auto_restart = False  # else it starts a worker again as soon as that is killed
+            _end(processes)
+        _leave(self._client, within)
+        with suppress(Exception):
+            self._cluster.close(timeout=within)
+        self._cluster.shutdown_on_close = False  # else it is closed once more at exit, for up to ten seconds
+        _end(processes)
+        take_back(self._interactive)
+
+
+def work(call: Call, likeness: str, *made: Outcome | Failed | NotBegun) -> Outcome | Failed | NotBegun:
+    """Run a call on a worker, unless an input did not come or the worker is unlike the client.
+
+    Never an exception: dask would state it as the failure of every call that waits for this one.
+    """
+    from distributed import get_worker
+
+    _prepare(ours=not likeness)
+    refs = {
+        number: given.ref for number, given in zip(call.upstream(), made, strict=True) if isinstance(given, Outcome)
+    }
+    if len(refs) < len(made):
+        return NotBegun()
+    name = str(get_worker().name)
+    if likeness and foreign.likeness() != likeness:
+        text = f"worker {name} has other source code or packages than this process"
+        return Failed(CodeChangedError("RIL-524", text, remedy="install the same there"))
+    outcome = call.run(refs)
+    if isinstance(outcome, Outcome):
+        outcome = replace(outcome, took=replace(outcome.took, worker=name))
+    return outcome
+
+
+@cache
+def _prepare(*, ours: bool) -> None:
+    """Set a worker process up, once."""
+    prepare_environment()
+    if ours:
+        ignore_settings()
+
+
+def _configure() -> None:
+    """Set dask up for workers of our own: no word in its logs, nothing at regular times that nobody looks at; no
+    spilling or pausing, because what travels is small."""
+    import dask
+
+    _quiet()
+    environment = worker_environment() | {
+        "PYTHONSAFEPATH": "1",
+        "DASK_DISTRIBUTED__LOGGING__DISTRIBUTED": "critical",
+        "MALLOC_ARENA_MAX": "1",  # tasks run on a second thread, whose own arena gives memory back and takes it anew
+        # glibc keeps freed memory for the next task up to this, and takes arrays of 32 MiB (its limit) from it: fresh
+        # pages took an eighth of a task's time.
+        "MALLOC_TRIM_THRESHOLD_": str(128 << 20),
+        "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
+    }
+    memory = {f"distributed.worker.memory.{what}": False for what in ("target", "spill", "pause")}
+    dask.config.set(
+        {
+            "distributed.scheduler.allowed-failures": DEATHS,
+            # A share of the limit: the bytes given are meant whole, by default dask ends a worker at 95 % of them.
+            "distributed.worker.memory.terminate": 1.0,
+            # Entries of each of dask's logs, which nobody reads; some keep whole messages, with all tasks in them.
+            "distributed.admin.low-level-log-length": 10,
+            "distributed.scheduler.active-memory-manager.start": False,
+            "distributed.worker.profile.enabled": False,
+            "distributed.worker.memory.monitor-interval": "500ms",
+            "distributed.scheduler.work-stealing-interval": "1s",
+            "distributed.admin.tick.interval": "5s",
+            "distributed.admin.system-monitor.interval": "5s",
+            "distributed.client.scheduler-info-interval": "10s",
+            "distributed.nanny.pre-spawn-environ": environment,
+            **memory,
+        }
+    )
+
+
+def _quiet() -> None:
+    """Silence distributed's log: what matters comes back as an exception, the rest is noise at shutdown."""
+    import dask
+
+    names = ("distributed", "distributed.client", "distributed.worker", "distributed.nanny", "distributed.scheduler")
+    dask.config.set({"distributed.logging": dict.fromkeys(names, "critical")})
+    for name in (*names, "tornado", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
+def _leave(client: Any, within: float) -> None:
+    with suppress(Exception):
+        client.close(timeout=within)
+
+
+def _end(processes: list[int]) -> None:
+    """Kill processes, and wait until they are gone."""
+    killed = []
+    for process in processes:
+        with suppress(psutil.Error):
+            killed.append(psutil.Process(process))
+            killed[-1].kill()
+    psutil.wait_procs(killed, timeout=LEAVE_SECONDS)
