@@ -8,9 +8,7 @@ and two processes that compile two signatures of one function at once may both t
   (:mod:`rille.pipeline.engine.code_digest`), so that an edit compiles anew what it can change, and nothing else;
 - each entry is a file of its own, named by its key; it holds the key and a checksum, against damage;
 - of processes that need the same kernel at once one compiles it, the others wait and load it;
-- a kernel has no wrapper for callers in C, and one that kernels call has none for callers in Python either: if Python
-  calls it, too, it is compiled anew with that wrapper;
-- a kernel that is called with a constant number is compiled for its type, not anew for each constant;
+- a kernel has no wrapper for callers in C;
 - all lie in :func:`rille.pipeline.engine.runtime.private.private_folder`, because loading one executes it.
 """
 
@@ -18,12 +16,10 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import gc
 import hashlib
 import os
 import pickle
 import sys
-import threading
 import time
 from contextlib import suppress
 from functools import cache
@@ -42,9 +38,6 @@ UNUSED_DAYS = 30
 """A kernel that was not loaded for so long is removed by ``rille cache gc``."""
 
 
-SELDOM = (100_000, 20, 100)
-"""Thresholds of Python's search for garbage while a kernel is compiled (usually 700, 10, 10)."""
-
 PATIENCE, PAUSE = 120.0, 0.02
 """Seconds that a process waits for another that compiles the same kernel, and between two looks."""
 
@@ -52,23 +45,18 @@ PATIENCE, PAUSE = 120.0, 0.02
 class Compiling:
     """Seconds for which kernels are compiled in this process, from the first that is not on disk to the last saved.
 
-    Waiting for another process that compiles the same kernel counts as compiling. Garbage is searched for seldom
-    meanwhile: numba makes millions of small objects that live until a kernel is done, and a ninth of its time would go
-    into looking at them.
+    Waiting for another process that compiles the same kernel counts as compiling.
     """
 
     def __init__(self) -> None:
         self.seconds = 0.0
         self.pending: set[str] = set()
         self.since = 0.0
-        self.usual = gc.get_threshold()
 
     def begin(self, key: str) -> None:
         """A kernel is not on disk: numba compiles it next, and whatever it calls in between."""
         if not self.pending:
             self.since = time.perf_counter()
-            self.usual = gc.get_threshold()
-            gc.set_threshold(*SELDOM)
         self.pending.add(key)
         _lock(key)
 
@@ -79,7 +67,6 @@ class Compiling:
         _unlock(key)
         if known and not self.pending:
             self.seconds += time.perf_counter() - self.since
-            gc.set_threshold(*self.usual)
 
     def take(self) -> float:
         """The seconds since this was last asked."""
@@ -88,7 +75,6 @@ class Compiling:
             for key in self.pending:
                 _unlock(key)
             self.pending.clear()
-            gc.set_threshold(*self.usual)
         return seconds
 
 
@@ -193,67 +179,6 @@ def _content(code: CodeType) -> tuple[object, ...]:
     return code.co_names, [_content(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
 
 
-class Calls(threading.local):
-    """Nesting depth, in this thread, of calls between kernels that numba compiles or loads; 0: Python calls the kernel.
-
-    Only a kernel that Python calls needs a wrapper for callers in Python.
-    """
-
-    depth = 0
-
-
-CALLS = Calls()
-
-
-def _patch_calls(module: Any) -> None:
-    """Compile what a kernel calls without a wrapper for Python, and once for all constants."""
-    from numba.core import sigutils, types
-    from numba.core.compiler_lock import global_compiler_lock
-
-    kind, compiler = module.Dispatcher, module._FunctionCompiler
-    template, add, compiled, flags_of = (
-        kind.get_call_template,
-        kind.add_overload,
-        kind.compile,
-        compiler._customize_flags,
-    )
-
-    def general(given: Any) -> Any:
-        return given.literal_type if isinstance(given, types.IntegerLiteral | types.BooleanLiteral) else given
-
-    def get_call_template(self: Any, args: Any, kws: Any) -> Any:  # a kernel calls it
-        if _is_own(self.py_func):
-            args, kws = [general(a) for a in args], {name: general(a) for name, a in dict(kws).items()}
-        CALLS.depth += 1
-        try:
-            return template(self, args, kws)
-        finally:
-            CALLS.depth -= 1
-
-    def customize_flags(self: Any, flags: Any) -> Any:
-        if CALLS.depth:
-            flags.no_cpython_wrapper = True
-        return flags_of(self, flags)
-
-    def add_overload(self: Any, made: Any) -> None:
-        if CALLS.depth:  # Python must not find what has no wrapper
-            self.overloads[tuple(made.signature.args)] = made
-            self.__dict__.setdefault("_unwrapped", set()).add(tuple(made.signature.args))
-        else:
-            add(self, made)
-
-    def compile_(self: Any, sig: Any) -> Any:
-        with global_compiler_lock:
-            args = tuple(sigutils.normalize_signature(sig)[0])
-            if not CALLS.depth and args in self.__dict__.get("_unwrapped", ()):
-                self._unwrapped.discard(args)
-                del self.overloads[args]
-            return compiled(self, sig)
-
-    kind.get_call_template, kind.add_overload, kind.compile = get_call_template, add_overload, compile_
-    compiler._customize_flags = customize_flags
-
-
 def _patch(module: Any) -> None:
     from numba.core import caching
 
@@ -269,10 +194,9 @@ def _patch(module: Any) -> None:
         cached(self)
 
     module.Dispatcher.enable_caching = enable_caching
-    _patch_calls(module)
 
     def path(self: Any, key: Any) -> Path:
-        content = (self._version, self._source_stamp, key, CALLS.depth > 0)
+        content = (self._version, self._source_stamp, key)
         name = hashlib.sha256(repr(content).encode()).hexdigest()[:24]
         return Path(self._data_path(f"{self._index_name.removesuffix('.nbi')}.{name}.nbc"))
 
