@@ -171,8 +171,9 @@ def check(kind: Any, jobs: int | None = None) -> None:
             raise ConfigError("RIL-588", text, remedy="give Client(...) without asynchronous=True, or leave client out")
     if isinstance(kind, str) and kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
         raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
-    # A spawned worker imports the program's main module first: without a guard it would start workers of its own.
-    if kind == "dask" and getattr(multiprocessing.current_process(), "_inheriting", False):
+    # A spawned worker imports the program's main module first, under this name: without a guard it would start workers.
+    modules = (frame.f_globals.get("__name__") for frame, _ in traceback.walk_stack(None))
+    if kind == "dask" and "__mp_main__" in modules and multiprocessing.parent_process() is not None:
         raise ConfigError(
             "RIL-972",
             "a worker that starts came to this call",
@@ -240,13 +241,17 @@ def _here(jobs: int, memory: float) -> Dask:
 
     _configure()
     resource_tracker.ensure_running()  # it unblocks the signal in the thread that happens to start it
-    with held():
+    with held(), warnings.catch_warnings():
+        # A queue within this process is named by the machine's address, which it may not have.
+        warnings.filterwarnings("ignore", "Couldn't detect a suitable IP address", RuntimeWarning)
         cluster = LocalCluster(
             # With workers LocalCluster would block until they run; scale() returns at once.
             n_workers=0,
             threads_per_worker=1,
             security=True,
             host="127.0.0.1",
+            # For the workers, and for the client: it shares the process, and needs no socket.
+            scheduler_kwargs={"host": ["127.0.0.1", None], "protocol": ["tls://", "inproc://"]},
             # Port 0 is any free one: dask's own, 8787, may belong to another run.
             dashboard_address="127.0.0.1:0",
             worker_dashboard_address=None,
@@ -254,8 +259,9 @@ def _here(jobs: int, memory: float) -> Dask:
             memory_limit=int(memory) if math.isfinite(memory) else 0,
             silence_logs=logging.CRITICAL,
         )
+        _, within = cluster.scheduler.listeners
         # As the default client it would take over whatever else the calling program computes with dask.
-        client = Client(cluster, set_as_default=False)
+        client = Client(within.contact_address, loop=cluster.loop, set_as_default=False)
         made = Dask(client, foreign.Presence(client, BIRTH_SECONDS), cluster=cluster, interactive=interactive)
         cluster.scale(jobs)
     return made
@@ -339,9 +345,9 @@ class Dask:
     def wait(self) -> list[tuple[int, Ended]]:
         """Block until at least one call has ended; all that have ended meanwhile are given."""
         while True:
-            batch = self._batch()
+            batch = dict(sorted(self._batch().items()))
             if batch:
-                return [(number, self._outcome(future)) for number, future in sorted(batch.items())]
+                return list(zip(batch, self._outcomes(list(batch.values())), strict=True))
             # Not for ever: a scheduler that is lost, or workers that fall silent, end no call.
             if time.monotonic() - self._looked > LOOK_SECONDS:
                 self._look()
@@ -357,6 +363,13 @@ class Dask:
                     del self._futures[number], self._labels[future.key]
                     batch[number] = future
         return batch
+
+    def _outcomes(self, futures: list[Any]) -> list[Ended]:
+        try:
+            # All at once: a question for each takes as long as the rest of what dask does for a task.
+            return list(self._client.gather(futures))
+        except Exception:  # one of them has failed, so each is asked
+            return [self._outcome(future) for future in futures]
 
     def _outcome(self, future: Any) -> Ended:
         from distributed import KilledWorker
