@@ -173,7 +173,7 @@ def check(kind: Any, jobs: int | None = None) -> None:
         raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
     # A spawned worker imports the program's main module first, under this name: without a guard it would start workers.
     modules = (frame.f_globals.get("__name__") for frame, _ in traceback.walk_stack(None))
-    if kind == "dask" and "__mp_main__" in modules and multiprocessing.parent_process() is not None:
+    if kind == "dask" and "__mp_main__" in modules and multiprocessing.parent_process() is None:  # not yet known
         raise ConfigError(
             "RIL-972",
             "a worker that starts came to this call",
