@@ -17,13 +17,13 @@ from rille.datasets.text.count import count
 from rille.pipeline.engine.plain import some
 from rille.pipeline.export.view import UNSTATED, RunView, TaskRow
 from rille.pipeline.report.canvas import Figure
-from rille.pipeline.report.gather import Scene
+from rille.pipeline.report.gather import Scene, facts_of, frames_of
 from rille.pipeline.report.words import metres, spans
 
 Rows = list[dict[str, Any]]
 Items = list[dict[str, str]]
 
-ANSWERS = ("no path", "crosscheck", "no figure")
+ANSWERS = ("no path", "crosscheck")
 """Kinds of what is missing that are answers, or lie outside of the reconstruction: the run is complete with them."""
 
 
@@ -47,15 +47,9 @@ def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
 def complete(found: Mapping[str, Any], view: RunView, figures: Sequence[Figure]) -> dict[str, Any]:
     """The lists of :func:`account` with what became of tasks and figures: all that a reader might take for granted."""
     done = ["every task was done"] if view.tasks else []
-    # A figure without its data is no loss of its own: they are listed, where they are one.
-    undrawn = [figure for figure in figures if figure.why]
-    causes = dict.fromkeys(("figure" if figure.failed else "no figure", figure.why) for figure in undrawn)
-    lost = [
-        _item(kind, ", ".join(f.title for f in undrawn if f.why == why and f.failed == (kind == "figure")), why)
-        for kind, why in causes
-    ]
+    undrawn = [_item("figure", figure.title, figure.why) for figure in figures if figure.why]
     # What the images contradict comes first: it may be the cause of all that follows.
-    missing = sorted([*_failures(view), *found["missing"], *lost], key=lambda item: item["kind"] != "contradiction")
+    missing = sorted([*_failures(view), *found["missing"], *undrawn], key=lambda item: item["kind"] != "contradiction")
     absent = [item for item in found["absent"] if item["kind"] != "vehicle" or view.vehicle_source == UNSTATED]
     return {"delivered": [*done, *found["delivered"]], "absent": absent, "missing": missing}
 
@@ -110,9 +104,8 @@ def _delivered(view: RunView, frames: Rows, pairs: Rows) -> list[str]:
 def contradictions(view: RunView) -> list[str]:
     """List what the images contradict so that no figure may rest on it, one line each."""
     p = view.products
-    found = [view.bundle(handle) for handle in (*p.contradictions, *p.rigs.values(), *p.resections)]
-    keys = ("contradiction", "knocked")
-    return list(dict.fromkeys(b.meta[key] for b in found if b is not None for key in keys if key in b.meta))
+    facts = [facts_of(view, handle) for handle in (*p.contradictions, *p.rigs.values(), *p.resections)]
+    return list(dict.fromkeys(f[key] for f in facts for key in ("contradiction", "knocked") if key in f))
 
 
 def _failures(view: RunView) -> Items:
@@ -220,13 +213,11 @@ def _crosscheck_off(view: RunView) -> Items:
 def _crosscheck_lost(scene: Scene) -> Items:
     """Frames that the other program was asked for and could not pose."""
     view, compared = scene.view, scene.comparison
-    if len(view.frames) < 2 or compared is None:
-        return []  # a task that failed or was skipped has its own line
-    lost = [frame for frame, there in zip(view.frames, compared.registered, strict=True) if not there]
+    # a task that failed or was skipped has its own line
+    lost = [] if compared is None or len(view.frames) < 2 else frames_of(view, ~compared.registered)
     if not lost:
         return []
-    joined = view.bundle(view.products.crosscheck)
-    meta = {} if joined is None else joined.meta
+    meta = facts_of(view, view.products.crosscheck)
     reasons = [f"COLMAP has no pose of {which(lost)}"]
     if len(meta.get("pieces") or ()) > 1:
         reasons.append(f"its trajectory falls into {len(meta['pieces'])} pieces, each laid on ours by itself")

@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.pipeline.export import ranges
-from rille.pipeline.export.artifacts import Floats, image, used_rig
+from rille.pipeline.export.artifacts import Floats, used_rig
+from rille.pipeline.export.artifacts import by_frame as rows
 from rille.pipeline.export.comparison import Comparison, compare
 from rille.pipeline.export.rasters import whole
 from rille.pipeline.export.view import RunView
-from rille.pipeline.report.canvas import Extent
+from rille.pipeline.flow.products import Stop
 from rille.stages.core.declare import Bundle
+from rille.stages.evaluation.accuracy import by_frame
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice, union
@@ -35,18 +37,9 @@ class Terrain:
     lattice: Lattice
     arrays: Mapping[str, Floats]
 
-    @property
-    def extent(self) -> Extent:
-        """x_min, x_max, y_min, y_max, metres."""
-        return self.lattice.bounds
-
-    def get(self, name: str) -> Floats | None:
-        """An array, None where there is none."""
-        return self.arrays.get(name)
-
     def at(self, name: str, xy: Floats) -> Floats:
         """Values (n,) of an array in the cells of points (n, 2), m; NaN outside, and where there is no such array."""
-        values, found = self.get(name), np.full(len(xy), np.nan)
+        values, found = self.arrays.get(name), np.full(len(xy), np.nan)
         if values is not None:
             row, col = np.rint(self.lattice.index(xy)).astype(int).T
             inside = (row >= 0) & (col >= 0) & (row < values.shape[0]) & (col < values.shape[1])
@@ -58,23 +51,21 @@ class Terrain:
 class Track:
     """The trajectory: positions (frame, 3) m in the world, one row a chosen frame, NaN without a pose there.
 
-    ``right`` (pair, 3): right cameras at basic pairs. ``truth`` (frame, 3): aligned by the first frame that has both,
-    NaN where the truth has a gap.
+    ``truth`` (frame, 3): aligned by the first frame that has both, NaN where the truth has a gap.
     ``sigma`` (frame,): standard deviation of the position, m. ``segment`` (frame,): which segment posed it, -1 none.
     ``piece`` (frame,): unbroken piece that it lies in, -1 without a pose; one of them is the world.
     """
 
     left: Floats
-    right: Floats
     truth: Floats | None
     sigma: Floats
     segment: NDArray[np.int64]
     piece: NDArray[np.int64]
 
     @property
-    def posed(self) -> NDArray[np.bool_]:
-        """Frames that have a pose, in the world or in another piece."""
-        return np.asarray(self.piece >= 0)
+    def error(self) -> Floats | None:
+        """Distance (frame,) from the truth, m, NaN where either has no position; None without truth."""
+        return None if self.truth is None else np.asarray(np.linalg.norm(self.left - self.truth, axis=1))
 
     @property
     def in_world(self) -> NDArray[np.bool_]:
@@ -84,18 +75,14 @@ class Track:
 
 @dataclass(frozen=True)
 class Difference:
-    """Elevation of the model of ``pair`` minus that of ``before``, in the world, over their common cells, m.
+    """Elevation of the model of ``pair`` minus that of the one before, in the world, over their common cells, m.
 
-    ``median``; ``deviation`` robust (1.4826 times the median absolute deviation); ``predicted`` median over the cells
-    of what both models' own standard deviations let expect, errors of pose left out.
+    ``median``; ``deviation`` robust (1.4826 times the median absolute deviation).
     """
 
-    before: int
     pair: int
-    cells: int
     median: float
     deviation: float
-    predicted: float
 
 
 @dataclass(frozen=True)
@@ -199,47 +186,47 @@ def terrain(bundle: Bundle | None, *names: str) -> Terrain | None:
 
 
 def trajectory(view: RunView) -> Track:
-    """Positions of all chosen frames, of the right cameras at basic pairs, and of the truth."""
-    n = len(view.frames)
-    row = {frame: i for i, frame in enumerate(view.frames)}
-    left, sigma = np.full((n, 3), np.nan), np.full(n, np.nan)
-    segment, piece = np.full(n, -1, dtype=np.int64), np.full(n, -1, dtype=np.int64)
-    right, posed = [], {}
-    bundle = view.bundle(view.products.trajectory)
-    if bundle is not None:
-        poses = world_poses(bundle)
-        for i, frame in enumerate(bundle.meta["frames"]):
-            if frame not in row:
-                continue
-            piece[row[frame]] = int(bundle["piece"][i])
-            if not np.isfinite(poses[i]).all():
-                continue
-            posed[frame] = pose = RigidTransform.from_matrix(poses[i])
-            left[row[frame]] = pose.translation
-            segment[row[frame]] = int(bundle["segment"][i])
-            sigma[row[frame]] = np.sqrt(max(float(np.trace(bundle["covariance"][i][:3, :3])), 0.0))
-            if frame in view.products.disparity:
-                right.append((pose @ used_rig(view, frame).T_right_left.inverse()).translation)
-    true = truth_in_world(view, posed)
-    at = None if true is None else np.array([[np.nan] * 3 if pose is None else pose.translation for pose in true])
-    return Track(left, np.array(right).reshape(-1, 3), at, sigma, segment, piece)
+    """Positions of all chosen frames, estimated and true."""
+    bundle, n = view.bundle(view.products.trajectory), len(view.frames)
+    nowhere, nothing = np.full((n, 3), np.nan), np.full(n, -1)
+    if bundle is None:
+        return Track(nowhere, None, nowhere[:, 0], nothing, nothing)
+    poses = by_frame(world_poses(bundle), list(bundle.meta["frames"]), list(view.frames))
+    there = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    variances = np.trace(rows(view, bundle, "covariance")[:, :3, :3], axis1=1, axis2=2)
+    segment, piece = (np.nan_to_num(rows(view, bundle, name), nan=-1).astype(int) for name in ("segment", "piece"))
+    return Track(
+        np.where(there[:, None], poses[:, :, 3], np.nan),
+        _truth_in_world(view, poses),
+        np.where(there, np.sqrt(np.maximum(variances, 0)), np.nan),
+        np.where(there, segment, -1),
+        piece,
+    )
 
 
-def truth_in_world(view: RunView, posed: Mapping[int, RigidTransform]) -> list[RigidTransform | None] | None:
-    """True poses of the left camera, one a chosen frame, brought to the world by the first frame that has both alone.
+def _truth_in_world(view: RunView, poses: Floats) -> Floats | None:
+    """True positions (frame, 3) of the left camera, brought to the world by the first frame that has both alone.
 
-    None in gaps, and instead of all where no frame has both.
+    NaN in gaps; None where no frame has both.
     """
-    truth = view.sequence.truth
-    if truth is None:
-        return None
-    true = [truth[frame] for frame in view.frames]
-    both = ((posed[f], pose) for f, pose in zip(view.frames, true, strict=True) if pose is not None and f in posed)
+    true = [None if view.sequence.truth is None else view.sequence.truth[frame] for frame in view.frames]
+    both = (
+        (RigidTransform.from_matrix(p), t)
+        for p, t in zip(poses, true, strict=True)
+        if t is not None and np.isfinite(p).all()
+    )
     estimate, first = next(both, (None, None))
     if estimate is None or first is None:
         return None
     T_world_truth = estimate @ first.inverse()
-    return [None if pose is None else T_world_truth @ pose for pose in true]
+    return np.array([[np.nan] * 3 if pose is None else (T_world_truth @ pose).translation for pose in true])
+
+
+def stops(view: RunView) -> list[Stop]:
+    """The stops of a drive that have a leg and a map; empty where nothing was driven."""
+    drive = view.products.drive
+    listed = [] if drive is None else drive.stops
+    return [stop for stop in listed if view.bundle(stop.leg) is not None and view.bundle(stop.risk) is not None]
 
 
 def frame_facts(view: RunView) -> dict[int, dict[str, Any]]:
@@ -248,43 +235,24 @@ def frame_facts(view: RunView) -> dict[int, dict[str, Any]]:
     Inliers and error are those of the joint refinement, where there was one: its poses are the trajectory's.
     """
     facts: dict[int, dict[str, Any]] = {}
-    for bundle in map(view.bundle, view.products.resections):
-        for item in bundle.meta.get("per_frame", ()) if bundle is not None else ():
+    for handle in view.products.resections:
+        for item in facts_of(view, handle).get("per_frame", ()):
             facts.setdefault(int(item["frame"]), dict(item))
-    for bundle in map(view.bundle, view.products.refined):
-        for item in bundle.meta["per_frame"] if bundle is not None else ():
+    for handle in view.products.refined:
+        for item in facts_of(view, handle).get("per_frame", ()):
             facts.setdefault(int(item["frame"]), {}).update(item)
     return facts
 
 
-def trails(view: RunView, frames: tuple[int, ...]) -> dict[int, tuple[list[Floats], list[bool]]]:
-    """Trails (n, 2) column, row of the landmarks up to each of ``frames``, and whether each is an inlier there."""
-    found: dict[int, tuple[list[Floats], list[bool]]] = {}
-    resections = list(view.products.resections) + [None] * len(view.products.tracks)
-    for handle, other in zip(view.products.tracks, resections, strict=False):
-        track, resection = view.bundle(handle), view.bundle(other)
-        if track is None:
-            continue
-        points, names = np.asarray(track["points"], dtype=np.float64), list(track.meta.get("frames", ()))
-        inlier = None if resection is None else np.asarray(resection["inlier"])
-        for at, frame in enumerate(names):
-            # A key frame ends one segment and begins the next: its trails are those that lead to it.
-            if frame not in frames or (frame in found and at == 0):
-                continue
-            alive = [i for i in range(len(points)) if np.isfinite(points[i, at]).all()]
-            lines = [_finite(points[i, : at + 1]) for i in alive]
-            good = [inlier is None or bool(inlier[i, at]) for i in alive]
-            found[frame] = (lines, good)
-    return found
+def facts_of(view: RunView, handle: Any) -> Mapping[str, Any]:
+    """Facts of an artifact; empty where there is none."""
+    bundle = view.bundle(handle)
+    return {} if bundle is None else bundle.meta
 
 
-def _finite(line: Floats) -> Floats:
-    return line[np.isfinite(line).all(axis=1)]
-
-
-def consecutive(view: RunView) -> tuple[int, ...]:
-    """The first four successive frames whose images are there (fewer where there are fewer)."""
-    return tuple(f for f in view.frames[:16] if image(view, f) is not None)[:4]
+def frames_of(view: RunView, chosen: NDArray[np.bool_]) -> list[int]:
+    """Numbers of the frames whose row in ``chosen`` is true."""
+    return [frame for frame, there in zip(view.frames, chosen, strict=True) if there]
 
 
 _NONE = (np.empty((0, 2)), np.empty(0), np.empty(0))
@@ -304,24 +272,17 @@ def _residuals(view: RunView, pair: int) -> tuple[Floats, Floats, Floats] | None
 
 
 def _difference(view: RunView, before: int, pair: int) -> Difference | None:
-    a, b = (view.bundle(view.products.world_dem[k]) for k in (before, pair))
-    if a is None or b is None or "lattice" not in a.meta or "lattice" not in b.meta:
+    models = [terrain(view.bundle(view.products.world_dem[k]), "elevation") for k in (before, pair)]
+    if models[0] is None or models[1] is None:
         return None
-    lattices = [Lattice.from_dict(m.meta["lattice"]) for m in (a, b)]
-    common = lattices[0].intersection(lattices[1])
+    common = models[0].lattice.intersection(models[1].lattice)
     if common is None:
         return None
-    windows = [lattice.window(common) for lattice in lattices]
-    z, sigma = (
-        [np.asarray(m[name][window], dtype=np.float64) for m, window in zip((a, b), windows, strict=True)]
-        for name in ("elevation", "elevation_std")
+    first, second = (
+        np.asarray(m.arrays["elevation"][m.lattice.window(common)], dtype=np.float64) for m in models if m is not None
     )
-    difference, expected = z[1] - z[0], np.hypot(*sigma)
-    cells = int(np.isfinite(difference).sum())
-    if cells < ranges.FEW:
+    known = np.isfinite(second - first)
+    if int(known.sum()) < ranges.FEW:
         return None
-    sampled = ranges.sample(difference)
-    median = float(np.median(sampled))
-    deviation = mad_sigma(sampled)
-    predicted = ranges.sample(np.where(np.isfinite(difference), expected, np.nan))
-    return Difference(before, pair, cells, median, deviation, float(np.median(predicted)))
+    sampled = ranges.sample(second - first)
+    return Difference(pair, float(np.median(sampled)), mad_sigma(sampled))

@@ -1,4 +1,4 @@
-"""``report.json``: the metrics with unit, truth and how each was obtained; what is missing; stages; versions."""
+"""``report.json``: all that the page says, as data: metrics, what is missing, warnings, rows, stages, versions."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ import numpy as np
 from rille.datasets.text.count import count
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView
-from rille.pipeline.report import delivery, seams, tables
+from rille.pipeline.flow.products import Products
+from rille.pipeline.report import delivery, tables
 from rille.pipeline.report.canvas import Figure
-from rille.pipeline.report.gather import Scene
-from rille.pipeline.report.metrics import metrics
+from rille.pipeline.report.gather import Scene, facts_of, frames_of
+from rille.pipeline.report.metrics import metric, metrics
+from rille.pipeline.report.reading import artifacts, known
 from rille.pipeline.report.words import metres, number, quantity
 from rille.stages.evaluation import imu_check
 from rille.stages.odometry.resection.trajectory import world_poses
@@ -33,8 +35,8 @@ def gather(view: Any) -> dict[str, Any]:
     return {
         "verdict": _verdict(view, frames, pairs, figures),
         **delivery.account(scene, frames, pairs),
-        "warnings": find_warnings(scene),
-        "seams": seams.facts(scene),
+        "warnings": find_warnings(scene, figures),
+        "seams": _seams(view),
         "sequence": _sequence(view),
         "truth": {"used": assessed, "source": view.sequence.truth_source if assessed else "no truth"},
         "metrics": figures,
@@ -42,7 +44,10 @@ def gather(view: Any) -> dict[str, Any]:
         "pairs": pairs,
         "vehicle": view.config.vehicle.model_dump(mode="json"),
         "notes": [*view.sequence.notes, *given_numbers(view)],
-        "compared": scene.comparison is not None,
+        "rig": _rig(scene),
+        "crosscheck": _crosscheck(scene),
+        "path": _path(scene),
+        "drive": _drive(scene),
     }
 
 
@@ -51,29 +56,19 @@ def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]
     found = delivery.complete(facts, view, figures)
     complete = delivery.is_complete(found["missing"])
     state = "Incomplete" if not complete else "Complete but for what is listed" if found["missing"] else "Complete"
-    rows, together = tables.table_2(view)
-    clock = {
-        "group": "Run",
-        "truth": None,
-        "label": "Time of this run's tasks",
-        "value": view.seconds,
-        "unit": "s",
-        "how": "wall clock, without writing the page; what is cached costs no time",
-        "completeness": None,
-        "key": False,
-    }
+    how = "wall clock, without writing the page; what is cached costs no time"
+    clock = {"group": "Run", "truth": None, **metric("Time of this run's tasks", view.seconds, "s", how)}
     return {
         "format": FORMAT,
         "run": view.run_id,
         "started": view.started,
         "command": view.command,
         "complete": complete,
-        **{key: value for key, value in facts.items() if key != "compared"},
+        **facts,
         "verdict": f"{state}: {facts['verdict']}",
         **found,
         "metrics": {**facts["metrics"], "wall_clock": clock},
         "stages": _stages(view),
-        "table_2": [vars(t) for t in (*rows, together)],
         "seconds": round(view.seconds, 3),
         "versions": dict(view.versions),
         "vehicle": {**facts["vehicle"], "source": view.vehicle_source},
@@ -85,34 +80,22 @@ def _write(path: Path, view: Any) -> None:
     path.write_text(json.dumps(gather(view), allow_nan=False), encoding="utf-8")
 
 
-def find_warnings(scene: Scene) -> list[str]:
+def find_warnings(scene: Scene, figures: Mapping[str, Any]) -> list[str]:
     """List warnings, one line each: on the input, the rig, the choice of pairs, the comparison."""
-    view = scene.view
+    view, p, compared = scene.view, scene.view.products, scene.comparison
     lines = list(view.sequence.warnings)
     lines += scene.calibration.collected("warnings") if scene.calibration is not None else []
-    p = view.products
-    for handle in (
-        p.screening,
-        *p.contradictions,
-        p.keyframes,
-        p.common_tilt,
-        *p.crosschecks,
-        p.crosscheck,
-        p.agreement,
-        p.trajectory,
-        p.accuracy,
-        p.position_accuracy,
-        p.overlap_audit,
-    ):
-        bundle = view.bundle(handle)
-        lines += (bundle.meta.get("warnings") or []) if bundle is not None else []
-    lines += _imu(view) + _sigma_warning(view) + _displaced(view)
-    compared = scene.comparison
+    early = [p.screening, *p.contradictions, p.keyframes, p.common_tilt, *p.crosschecks, p.crosscheck, p.agreement]
+    for handle in (*early, p.trajectory, p.accuracy, p.position_accuracy, p.overlap_audit):
+        lines += facts_of(view, handle).get("warnings") or []
+    # Against truth that was misread no standard deviation can hold.
+    misread = bool(facts_of(view, p.accuracy).get("warnings"))
+    lines += _imu(view) + ([] if misread else _small_sigma(figures)) + _displaced(view)
     if compared is not None and compared.flagged.any():
-        bad = [frame for frame, flagged in zip(view.frames, compared.flagged, strict=True) if flagged]
+        bad = frames_of(view, compared.flagged)
         share = f"{len(bad)} of {len(view.frames)} frames"
         lines.append(f"trajectory and COLMAP disagree more than elsewhere at {share}: {delivery.which(bad)}")
-    lines += _unlike(view)
+    lines += _unlike(figures)
     # A name in the data may hold line feeds, and a warning is one line.
     return list(dict.fromkeys(" ".join(str(line).split()) for line in lines))
 
@@ -153,22 +136,23 @@ NOTHING_COMMON = 50.0
 at rest, whose length is noise, it stays below."""
 
 
-def _unlike(view: RunView) -> list[str]:
+def _unlike(figures: Mapping[str, Any]) -> list[str]:
     """Trajectory and crosscheck are not alike anywhere: no frame then stands out."""
-    agreement = view.bundle(view.products.agreement)
-    figures = {} if agreement is None else agreement.meta.get("metrics", {})
-    rmse, length, share = (figures.get(name, {}).get("value") for name in ("rmse", "length", "share"))
-    if share is None or share <= NOTHING_COMMON:
+    if (_value(figures, "agreement_share") or 0.0) <= NOTHING_COMMON:
         return []
-    return [f"trajectory and COLMAP have nothing in common: {metres(rmse)} RMS over {metres(length)}; one is wrong"]
+    rmse, length = (metres(_value(figures, name)) for name in ("agreement_rmse", "agreement_length"))
+    return [f"trajectory and COLMAP have nothing in common: {rmse} RMS over {length}; one is wrong"]
+
+
+def _value(figures: Mapping[str, Any], name: str) -> Any:
+    """Value of a figure, None where there is none."""
+    return figures.get(name, {}).get("value")
 
 
 def _displaced(view: RunView) -> list[str]:
     """The place on Earth is that of a camera which is not the origin of this run's world."""
-    trajectory = view.bundle(view.products.trajectory)
-    if view.sequence.georeference is None or trajectory is None:
-        return []
-    first = trajectory.meta["pieces"][trajectory.meta["main"]][0]
+    facts = facts_of(view, view.products.trajectory)
+    first = facts["pieces"][facts["main"]][0] if facts and view.sequence.georeference is not None else 0
     if first == 0:
         return []
     return [
@@ -199,13 +183,9 @@ SIGMA_OFF = 3.0
 """Factor by which errors exceed their standard deviations from which on it is said."""
 
 
-def _sigma_warning(view: RunView) -> list[str]:
+def _small_sigma(figures: Mapping[str, Any]) -> list[str]:
     """The standard deviations of the positions are not to be weighed by, where truth says so."""
-    accuracy = view.bundle(view.products.accuracy)
-    # Against truth that was misread no standard deviation can hold.
-    if accuracy is None or accuracy.meta.get("warnings"):
-        return []
-    nees = accuracy.meta["metrics"].get("nees", {}).get("value")
+    nees = _value(figures, "trajectory_nees")
     if nees is None or nees <= SIGMA_OFF**2:
         return []
     return [
@@ -225,12 +205,12 @@ def _verdict(view: RunView, frames: delivery.Rows, pairs: delivery.Rows, figures
     models = sum(r["modelled"] for r in pairs)
     apart = f", {placed} of them in the world" if placed < posed else ""
     stops = delivery.local_paths(pairs)
-    path = view.bundle(view.products.world_path)
-    length = None if path is None else path.meta.get("length_m")
+    length = facts_of(view, view.products.world_path).get("length_m")
     errors = [
-        f"{'drift' if name.endswith('drift') else 'RMSE'} {quantity(m['value'], m['unit'])} against truth"
+        f"{'drift' if name.endswith('drift') else 'RMSE'} "
+        f"{quantity(_value(figures, name), figures[name]['unit'])} against truth"
         for name in AGAINST_TRUTH
-        if (m := figures.get(name, {"value": None}))["value"] is not None
+        if _value(figures, name) is not None
     ]
     parts = [
         "one stereo pair" if len(frames) == 1 else f"{posed} of {len(frames)} frames posed{apart}",
@@ -253,21 +233,74 @@ def _way_words(view: RunView, length: float | None) -> str:
     return "no path" if length is None else f"a path of {length:.3g} m{delivery.start_words(view)}"
 
 
+def _seams(view: RunView) -> dict[str, Any] | None:
+    """The audit of seams: variance factor, models, how many seams there are and the worst of them."""
+    audit = facts_of(view, view.products.overlap_audit)
+    names = ("variance_factor", "models", "seam_count", "seams")
+    return {name: audit[name] for name in names} if audit.get("seams") else None
+
+
+def _rig(scene: Scene) -> dict[str, Any] | None:
+    """The rig that was used, and what the images ask for; None if no task examined it."""
+    calibration = scene.calibration
+    if calibration is None:
+        return None
+    facts = {key: calibration.facts[0].get(key) for key in ("source", "residual_before_px", "residual_after_px")}
+    parameters = calibration.collected("parameters")
+    unsure = undecided(parameters, scene.view.config.rig.significance)
+    counts = {"rigs": len(calibration.facts), "changed": calibration.changed}
+    return counts | facts | {"parameters": parameters, "undecided": unsure}
+
+
+def undecided(parameters: Sequence[Mapping[str, Any]], significance: float) -> list[Mapping[str, Any]]:
+    """Parameters that the images ask for but cannot tell from a principal point that is off."""
+    held = [p for p in parameters if not p.get("freed") and not p.get("observed") and p.get("sigma")]
+    return [p for p in held if abs(p["asked"]) > significance * p["sigma"]]
+
+
+def _crosscheck(scene: Scene) -> dict[str, Any] | None:
+    """How the other program's trajectory was compared; None where it was not."""
+    compared = scene.comparison
+    if compared is None:
+        return None
+    facts = {key: compared.meta.get(key) for key in ("pieces", "rule", "flagged")}
+    return {**facts, "lost": frames_of(scene.view, ~compared.registered)}
+
+
+def _path(scene: Scene) -> dict[str, Any] | None:
+    """Where the path over the merged terrain ends, what it was to reach, and what it leaves out; None: not computed."""
+    view = scene.view
+    path = view.bundle(view.products.world_path)
+    if path is None:
+        return None
+    facts = {key: path.meta.get(key) for key in ("reason", "ground", "left_out_m")}
+    end = None if scene.path is None else scene.path[-1, :2].tolist()
+    return {**facts, "end": end, "start": delivery.start_words(view, "")}
+
+
+def _drive(scene: Scene) -> dict[str, Any] | None:
+    """How a drive ended, its stops, and its place in a global map; None where nothing was driven."""
+    drive = scene.view.products.drive
+    if drive is None:
+        return None
+    fix = scene.view.bundle(drive.fix)
+    place = {} if fix is None else {key: fix.meta[key] for key in ("source", "std", "other") if key in fix.meta}
+    if fix is not None:
+        place["xy"] = [fix.meta["T_global_local"][3], fix.meta["T_global_local"][7]]
+    return {"verdict": drive.verdict, "reason": drive.reason, "stops": tables.stops(scene), "place": place}
+
+
 def _sequence(view: RunView) -> dict[str, Any]:
-    s = view.sequence
-    left, right = s.rig.left, s.rig.right
+    s, cameras = view.sequence, {"": view.sequence.rig.left, "right_": view.sequence.rig.right}
     return {
         "name": s.name,
         "frames": len(view.frames),
         "frames_of_sequence": s.frames,
         "first": view.frames[0],
         "last": view.frames[-1],
-        "image_width_px": left.width,
-        "image_height_px": left.height,
-        "focal_length_px": left.fx,
-        "right_image_width_px": right.width,
-        "right_image_height_px": right.height,
-        "right_focal_length_px": right.fx,
+        **{f"{side}image_width_px": camera.width for side, camera in cameras.items()},
+        **{f"{side}image_height_px": camera.height for side, camera in cameras.items()},
+        **{f"{side}focal_length_px": camera.fx for side, camera in cameras.items()},
         "baseline_m": s.rig.baseline,
         "basic_pairs": sorted(view.products.disparity),
     }
@@ -287,15 +320,22 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
     return found
 
 
-READS = (
-    "screening keyframes common_tilt crosschecks crosscheck agreement crosscheck_accuracy trajectory accuracy "
-    "position_accuracy overlap_audit disparity orientations rigs contradictions level local_dem local_risk local_path "
-    "local_dem_accuracy resections refined world_dem world_tiles world_risk world_path dem_accuracy path_check drive"
-)
-KNOWS = (
-    "frames config.vehicle config.crosscheck.enabled sequence.name sequence.frames sequence.frame_names sequence.rig "
-    "sequence.truth sequence.truth_source sequence.truth_positions sequence.warnings sequence.notes "
-    "sequence.evaluation_window sequence.georeference sequence.times sequence.up sequence.attitude sequence.imu_axes"
-)
-OUTPUTS = (Output("facts", "", "", _write, (), tuple(READS.split()), tuple(KNOWS.split())),)
+def _reads(p: Products) -> tuple[object, ...]:
+    return (
+        *(p.contradictions, p.common_tilt, p.crosschecks, p.crosscheck, p.agreement, p.crosscheck_accuracy),
+        *(p.trajectory, p.accuracy, p.position_accuracy, p.overlap_audit, p.rigs, p.resections, p.refined),
+        *(p.world_tiles, p.world_risk, p.world_path, p.dem_accuracy, p.path_check, p.drive, *tables.of_pairs(p)),
+    )
+
+
+def _knows(run: RunView) -> tuple[object, ...]:
+    s, config = run.sequence, run.config
+    return (
+        *(config.vehicle, config.rig.significance, config.crosscheck.enabled),
+        *(s.name, s.frames, s.frame_names, s.rig, s.truth, s.truth_source, s.truth_positions, s.warnings, s.notes),
+        *(s.evaluation_window, s.georeference, s.times, s.up, s.attitude, s.imu_axes),
+    )
+
+
+OUTPUTS = (Output("facts", "", "", _write, (), artifacts(_reads), known(_knows)),)
 STAGE = stage("output.facts", "Figures and tables of the report in numbers", OUTPUTS)

@@ -2,7 +2,7 @@
 
 A picture has three bytes a pixel, kept without loss, and each is a plane of whole numbers: the script reads them back
 by a canvas. Heights take two bytes; standard deviations one, in steps of equal ratio, as their range is wide. Terrain
-of more than ``MOST_CELLS`` cells is thinned: the value shown is then that of one cell, not a mean, so that the map and
+of more than ``MAX_CELLS`` cells is thinned: the value shown is then that of one cell, not a mean, so that the map and
 the GeoTIFF never disagree.
 """
 
@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 
 from rille.pipeline.export import colour, ranges
 from rille.pipeline.export.artifacts import Floats
-from rille.pipeline.report import canvas
+from rille.pipeline.report import canvas, gather, strips
+from rille.pipeline.report.canvas import Block
 from rille.pipeline.report.gather import Scene, Terrain
+from rille.pipeline.report.strips import Line
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import mosaic
 from rille.stages.hazard.risk import REASONS, UNKNOWN
@@ -27,12 +29,24 @@ from rille.stages.terrain.shading import slope_deg
 
 Bytes = NDArray[np.uint8]
 
-MOST_CELLS = 350_000
+MAX_CELLS = 350_000
 """Cells of the map; three pictures of these and the ortho image are about 2 MB in the page."""
-STEPS = 65534
+HEIGHT_STEPS = 65534
 """Steps of a height; 0 is undefined."""
-FINE = 254
+BYTE_STEPS = 254
 """Steps of a value of one byte; 0 is undefined."""
+STILL_WIDTH_PIXELS = 800
+"""Of the picture that stands where no script runs."""
+
+
+def block(scene: Scene) -> Block | None:
+    """The layered map; without a script the page shows the hazards alone."""
+    layers, risk = data(scene), scene.risk
+    if risk is None and layers is None:
+        return None
+    lines = [] if scene.path is None else [Line(scene.path, canvas.MARK)]
+    still = [] if risk is None else [strips.risk_picture(risk, lines, STILL_WIDTH_PIXELS)]
+    return Block(tuple(strips.panel(picture, "Risk map seen from above") for picture in still), data=layers)
 
 
 def data(scene: Scene) -> dict[str, Any] | None:
@@ -41,26 +55,26 @@ def data(scene: Scene) -> dict[str, Any] | None:
     ``planes``: pictures with the bytes (height high, height low, sigma), (class and models, reason high, reason low),
     (p_hazard, slope, 0). ``track`` (frame): number, x, y, z, sigma, error or null. All lengths are metres, world frame.
     """
-    world = scene.world
-    if world is None or world.get("elevation") is None or not np.isfinite(world.arrays["elevation"]).any():
+    world, vehicle = scene.world, scene.view.config.vehicle
+    if world is None or world.arrays.get("elevation") is None or not np.isfinite(world.arrays["elevation"]).any():
         return None
-    step = max(1, math.ceil(math.sqrt(world.arrays["elevation"].size / MOST_CELLS)))
+    step = max(1, math.ceil(math.sqrt(world.arrays["elevation"].size / MAX_CELLS)))
     z = world.arrays["elevation"][::step, ::step]
     low, high = float(np.nanmin(z)), float(np.nanmax(z))
-    height = _steps(z, low, max(high - low, 1e-9), STEPS)
+    height = _steps(z, low, max(high - low, 1e-9), HEIGHT_STEPS)
     sigma, sigmas = _ratios(_plane(world, "elevation_std", step))
     risk, reason, p_hazard = (_of_risk(scene, name, missing)[::step, ::step] for name, missing in _RISK)
     # The class takes two bits of its byte: six are left for the number of models.
     count = np.minimum(np.nan_to_num(_plane(world, "count", step)), 63).astype(np.uint8)
-    slope = _steps(slope_deg(world.arrays["elevation"], world.lattice.cell)[::step, ::step], 0.0, 90.0, FINE)
+    slope = _steps(slope_deg(world.arrays["elevation"], world.lattice.cell)[::step, ::step], 0.0, 90.0, BYTE_STEPS)
     bits = np.asarray(reason, np.uint16)
     return {
         "planes": [
             _picture(height >> 8, height & 255, sigma),
             _picture(np.asarray(risk, np.uint8) | (count << 2), bits >> 8, bits & 255),
-            _picture(_steps(p_hazard, 0.0, 1.0, FINE), slope, np.zeros_like(slope)),
+            _picture(_steps(p_hazard, 0.0, 1.0, BYTE_STEPS), slope, np.zeros_like(slope)),
         ],
-        "ortho": _photo(_look(scene, world, step)),
+        "ortho": _ortho(scene, world, step),
         "rows": z.shape[0],
         "cols": z.shape[1],
         "x0": world.lattice.x0,
@@ -77,10 +91,9 @@ def data(scene: Scene) -> dict[str, Any] | None:
         "track": _track(scene),
         "frusta": _frusta(scene),
         "path": _path(scene),
-        "limit": scene.view.config.vehicle.max_slope_deg,
-        "vehicle": _vehicle(scene),
-        "legs": _legs(scene),
-        "goal": _goal(scene),
+        "limit": vehicle.max_slope_deg,
+        "vehicle": [vehicle.wheel_base + vehicle.wheel_diameter, vehicle.track],
+        **_drive(scene),
     }
 
 
@@ -88,7 +101,7 @@ _RISK = (("risk", UNKNOWN), ("reason", 0), ("p_hazard", np.nan))
 
 
 def _plane(world: Terrain, name: str, step: int) -> Floats:
-    values = world.get(name)
+    values = world.arrays.get(name)
     return np.full_like(world.arrays["elevation"], np.nan)[::step, ::step] if values is None else values[::step, ::step]
 
 
@@ -113,7 +126,7 @@ def _ratios(values: Floats) -> tuple[NDArray[np.int64], list[float]]:
         return np.zeros(values.shape, np.int64), [1.0, 1.0]
     low, span = float(there.min()), max(math.log(float(there.max()) / float(there.min())), 1e-9)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return _steps(np.log(np.where(values > 0, values, np.nan) / low), 0.0, span, FINE), [low, span]
+        return _steps(np.log(np.where(values > 0, values, np.nan) / low), 0.0, span, BYTE_STEPS), [low, span]
 
 
 def _picture(*planes: NDArray[Any]) -> str:
@@ -122,30 +135,25 @@ def _picture(*planes: NDArray[Any]) -> str:
 
     # No alpha: a canvas multiplies colours by it, and the bytes read back would be others.
     picture = Image.fromarray(np.stack([np.asarray(p, np.uint8) for p in planes], axis=-1))
-    return canvas.address(picture, "png", compress_level=9)
+    return canvas.compressed(picture, "png", compress_level=9)
 
 
-def _look(scene: Scene, world: Terrain, step: int) -> Floats:
-    """Grey values of the ortho image (row, col), or its colours (row, col, 3), NaN undefined."""
-    if {"ortho", "source"} <= world.arrays.keys() and colour.coloured(scene.view, world.arrays["source"]):
-        rgb = colour.ortho(scene.view, world.lattice, world.arrays)[::step, ::step].astype(np.float64)
-        return np.where(rgb > 0, rgb, np.nan)
-    return _plane(world, "ortho", step)
-
-
-def _photo(look: Floats) -> str:
+def _ortho(scene: Scene, world: Terrain, step: int) -> str:
+    """The ortho image, grey or coloured, as a picture with loss."""
     from PIL import Image
 
+    look = _plane(world, "ortho", step)
+    if {"ortho", "source"} <= world.arrays.keys() and colour.coloured(scene.view, world.arrays["source"]):
+        rgb = colour.ortho(scene.view, world.lattice, world.arrays)[::step, ::step].astype(np.float64)
+        look = np.where(rgb > 0, rgb, np.nan)
     low, high = ranges.limits(look, 0.5, 99.5)
     stretched = np.clip((np.nan_to_num(look, nan=low) - low) / (high - low) * 255, 0, 255)
-    return canvas.address(Image.fromarray(stretched.astype(np.uint8)), "jpeg", quality=82)
+    return canvas.compressed(Image.fromarray(stretched.astype(np.uint8)), "jpeg", quality=82)
 
 
 def _track(scene: Scene) -> list[list[Any]]:
     track = scene.track
-    error = np.full(len(track.left), np.nan)
-    if track.truth is not None:
-        error = np.linalg.norm(track.left - track.truth, axis=1)
+    error = np.full(len(track.left), np.nan) if track.error is None else track.error
     rows = np.column_stack([track.left, track.sigma, error])[track.in_world]
     frames = np.array(scene.view.frames)[track.in_world]
     return [
@@ -186,24 +194,13 @@ def _path(scene: Scene) -> list[list[float | None]]:
     ]
 
 
-def _legs(scene: Scene) -> dict[str, Any]:
-    """What was driven from each stop of a drive (vertex, 2) m, by the frame that it stands at."""
-    drive, found = scene.view.products.drive, {}
-    for stop in [] if drive is None else drive.stops:
+def _drive(scene: Scene) -> dict[str, Any]:
+    """What was driven from each stop of a drive (vertex, 2) m, by the frame that it stands at; x, y, m, of the goal."""
+    legs, goal = {}, None
+    for stop in gather.stops(scene.view):
         leg = scene.view.bundle(stop.leg)
-        if leg is not None and len(leg["path"]):
-            found[str(stop.frame)] = np.round(np.asarray(leg["path"])[:, :2], 4).tolist()
-    return found
-
-
-def _goal(scene: Scene) -> list[float] | None:
-    """x, y, m, of a drive's goal."""
-    drive = scene.view.products.drive
-    leg = scene.view.bundle(drive.stops[-1].leg) if drive is not None and drive.stops else None
-    return None if leg is None else [round(float(v), 4) for v in leg.meta["goal"][:2]]
-
-
-def _vehicle(scene: Scene) -> list[float]:
-    """Length and width of the vehicle over its wheels, m."""
-    vehicle = scene.view.config.vehicle
-    return [vehicle.wheel_base + vehicle.wheel_diameter, vehicle.track]
+        assert leg is not None
+        goal = [round(float(v), 4) for v in leg.meta["goal"][:2]]
+        if len(leg["path"]):
+            legs[str(stop.frame)] = np.round(np.asarray(leg["path"])[:, :2], 4).tolist()
+    return {"legs": legs, "goal": goal}

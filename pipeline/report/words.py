@@ -50,24 +50,6 @@ def metres(value: Any) -> str:
     return quantity(value, "m")
 
 
-def coordinate(value: Any) -> str:
-    """Coordinate in metres to a tenth of a millimetre."""
-    # -0.0 + 0.0 is 0.0: no minus stands before zero.
-    return "–" if value is None else f"{round(value, 4) + 0.0:.4f}".replace("-", "−")
-
-
-def share(value: Any) -> str:
-    """Share as per cent."""
-    return "–" if value is None else f"{100 * value:.0f} %"
-
-
-def seconds(value: Any) -> str:
-    """Seconds with two or three digits."""
-    if value is None:
-        return "–"
-    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
-
-
 def spread(values: Any) -> str:
     """``low to high`` of nearly all values, for alternative texts."""
     finite = ranges.sample(np.asarray(values))
@@ -75,11 +57,6 @@ def spread(values: Any) -> str:
         return "nothing defined"
     low, high = np.percentile(finite, [1, 99])
     return f"{low:.3g} to {high:.3g}"
-
-
-def length(metres: float) -> str:
-    """Metres, or millimetres where that reads better."""
-    return f"{metres * 1000:.4g} mm" if abs(metres) < 0.1 else f"{metres:.4g} m"
 
 
 def spans(numbers: list[int]) -> str:

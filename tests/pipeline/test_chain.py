@@ -162,16 +162,17 @@ def test_a_damaged_output_is_drawn_again(cold: Path, capsys: pytest.CaptureFixtu
 def test_a_figure_that_cannot_be_drawn_is_missing(
     cold: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    failed = FIGURE.dump_json(gallery._drawn("Seams", lambda _: 1 / 0, lambda _: True, None))  # type: ignore
+    drawing = gallery.Drawing("Pairs", lambda _: 1 / 0, lambda _: ())  # type: ignore[arg-type, return-value]
+    failed = FIGURE.dump_json(drawing.figure(None))
 
     def read(data: bytes) -> Figure:
         title = FIGURE.validate_json(data).title
-        return FIGURE.validate_json(failed) if title == "Seams" else Figure(title)
+        return FIGURE.validate_json(failed) if title == "Pairs" else Figure(title)
 
     monkeypatch.setattr(run_files, "FIGURE", SimpleNamespace(validate_json=read))
     assert session.reconstruct(options(cold)) == 3
     told = capsys.readouterr()
-    assert "rille: missing: Seams: drawing failed, ZeroDivisionError" in told.err
+    assert "rille: missing: Pairs: drawing failed, ZeroDivisionError" in told.err
     found = json.loads((latest(cold) / "report.json").read_text())
     assert not found["complete"]
     assert told.out.endswith(f"missing {len(found['missing'])}\n")
@@ -186,7 +187,7 @@ def test_one_risk_parameter_reruns_risk_path_and_what_reads_them(cold: Path) -> 
     assert {label.split("/")[0] for label in labels} == {"risk", "path", "path_check", "output"}
     drawn = {label.removeprefix("output/") for label in labels if label.startswith("output/")}
     assert {"risk.tif", "Map", "facts"} <= drawn
-    assert not drawn & {"dem.tif", "terrain.zarr", "trajectory.tum", "Figure 9. Trajectory", "Seams"}
+    assert not drawn & {"dem.tif", "terrain.zarr", "trajectory.tum", "Trajectory", "Disparity"}
 
 
 def test_one_vehicle_limit_reruns_the_same(cold: Path) -> None:

@@ -98,7 +98,7 @@ def test_a_task_makes_of_what_its_record_names_what_the_whole_run_would(
     assert unpack(found) == unpack(pack(tmp_path))
     if module is gallery:
         figure = FIGURE.validate_json(unpack(found)[output.name])
-        assert "failed" not in figure.why
+        assert figure.why == ""
 
 
 def test_what_a_record_does_not_name_is_out_of_reach() -> None:
@@ -117,6 +117,19 @@ def test_what_a_record_does_not_name_is_out_of_reach() -> None:
     from rille.pipeline.export.output import restore
 
     curious(Path(), restore(laid_out[0], [made[handle.ref] for handle in laid_out[1]]))
+
+
+def test_the_map_of_coloured_images_reads_what_it_needs() -> None:
+    whole, made = run()
+    for name in [name for name in made if name.startswith("image")]:
+        grey = made[name]["image"]
+        made[name] = Bundle({"image": grey, "colour": np.repeat(grey[..., None], 3, axis=2)}, made[name].meta)
+    laid_out = task(next(o for _, o in outputs() if o.name == "Map"), whole)
+    assert laid_out is not None
+    found = gallery.STAGE.run(
+        gallery.STAGE.params(), laid_out[0], {"read": [made[handle.ref] for handle in laid_out[1]]}
+    )
+    assert FIGURE.validate_json(unpack(found)["Map"]).why == ""
 
 
 def test_nothing_is_made_without_what_it_needs_and_holes_are_passed_on() -> None:

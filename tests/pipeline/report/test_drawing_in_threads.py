@@ -8,24 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from rille.pipeline.report import figures, gallery
+from rille.pipeline.report import figures
 from rille.pipeline.report.canvas import Block, Figure
-
-EXTENT = (0.0, 1.0, 0.0, 1.0)
+from rille.pipeline.report.gallery import Drawing
 
 
 def draw(seed: int) -> Figure:
     elevation = np.random.default_rng(seed).normal(size=(40, 40)).cumsum(axis=0)
 
     def maker(_: Any) -> Block:
-        panel = figures.elevation_with_path(elevation, None, None, EXTENT, "elevation")
-        return Block("", "", "", (panel,))
+        return Block((figures.raster(elevation, "elevation, m", "", extent=(0.0, 1.0, 0.0, 1.0)),))
 
-    return gallery._drawn("Elevation", maker, lambda _: True, SimpleNamespace())  # type: ignore[arg-type]
+    return Drawing("Elevation", maker, lambda p: ()).figure(SimpleNamespace())
 
 
 def test_threads_share_no_sheet_at_a_time() -> None:
     alone = [draw(seed) for seed in range(16)]
-    assert not [figure.why for figure in alone if figure.failed]
+    assert not [figure.why for figure in alone if figure.why]
     with ThreadPoolExecutor(8) as threads:
         assert list(threads.map(draw, range(16))) == alone

@@ -18,8 +18,7 @@ from rille.datasets.mockup.sequence import vehicle_at_scale
 from rille.pipeline.export import ranges
 from rille.pipeline.export.view import TaskRow
 from rille.pipeline.flow.products import Driven, Products
-from rille.pipeline.report import canvas, figures, gather, metrics, stops, summary, tables, words
-from rille.pipeline.report.canvas import Figure
+from rille.pipeline.report import canvas, figures, gather, metrics, strips, words
 from rille.pipeline.report.delivery import is_complete
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import RilleError
@@ -44,20 +43,9 @@ def test_a_whole_run_has_every_figure_and_nothing_missing(whole: Written) -> Non
     assert facts["verdict"] == f"{said} of 0.49 m."
     everything = "every task was done, every frame has a pose, every stop has a local path, a path over the merged"
     assert f"Nothing is missing: {everything} terrain was found." in page_.text
-    for anchor in (
-        "figure-6",
-        "stops",
-        "figure-7",
-        "map",
-        "map-view",
-        "figure-3",
-        "figure-8",
-        "figure-9",
-        "overlap",
-        "elevation-error",
-    ):
+    for anchor in ("map", "map-view", "trajectory", "elevation-error", "pairs", "stops", "disparity"):
         assert anchor in page_.ids
-    assert len(page_.images) == 1 + 4 + 2 + 2 + 4 + 2 + 2 + 1 + len(BASIC)
+    assert len(page_.images) == 6 + len(BASIC)
     assert facts["warnings"] == []
     assert "warnings-box" not in page_.ids
     assert all(image["alt"] for image in page_.images)
@@ -65,22 +53,21 @@ def test_a_whole_run_has_every_figure_and_nothing_missing(whole: Written) -> Non
     assert {p.name for p in folder.iterdir()} == {"report.html", "report.json"}
 
 
-def test_pictures_of_the_pairs_keep_to_their_budget(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene: Any = gather.Scene(view())
-    whole = stops.strip(scene)
+def test_pictures_of_the_pairs_keep_to_their_budget(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    whole = strips.pairs(gather.Scene(view()))
     assert whole is not None
     assert [p.frame for p in whole.panels] == list(BASIC)
-    size = sum(p.size for p in whole.panels)
-    assert size <= stops.BUDGET
-    monkeypatch.setattr(stops, "BUDGET", size // 2)
-    smaller = stops.strip(scene)
+    size = sum(len(p.uri) for p in whole.panels)
+    assert size <= strips.BUDGET_CHARACTERS
+    monkeypatch.setattr(strips, "BUDGET_CHARACTERS", size // 2)
+    smaller = strips.pairs(gather.Scene(view()))
     assert smaller is not None
     assert smaller.panels[0].width < whole.panels[0].width
-    monkeypatch.setattr(stops, "BUDGET", 3000)
-    fewer = stops.strip(scene)
+    monkeypatch.setattr(strips, "BUDGET_CHARACTERS", 3000)
+    fewer = strips.pairs(gather.Scene(view()))
     assert fewer is not None
     assert len(fewer.panels) == 1
-    assert "1 of 2 pairs are shown" in fewer.caption
+    assert "1 of 2 are shown" in written(tmp_path, view())[1].text
 
 
 def test_the_page_needs_nothing_but_itself(whole: Written) -> None:
@@ -129,7 +116,7 @@ def test_truth_is_aligned_by_the_first_frame_alone(whole: Written) -> None:
 
 
 def test_pairs_without_any_cell_have_no_error_but_a_completeness() -> None:
-    found = metrics._elevation(view(), [{"rmse_m": None, "completeness": 0.0, "tilt_deg": None}])
+    found = metrics._local_elevation(view(), [{"rmse_m": None, "completeness": 0.0}])
     assert found["dem_pairs_rmse_max"]["value"] is None
     assert found["dem_pairs_rmse_median"]["value"] is None
     assert found["dem_pairs_completeness_min"]["value"] == 0.0
@@ -192,8 +179,8 @@ def test_what_is_missing_comes_first(tmp_path: Path) -> None:
     assert facts["missing"][0]["what"].endswith("2 tasks depend on it")
     text = page_.text
     assert text.index("3 landmarks, 6 are needed") < text.index("Accuracy Quantity")
-    assert page_.ids.index("missing-box") < page_.ids.index("trajectory")
-    assert "figure-9" not in page_.ids
+    assert page_.ids.index("missing-box") < page_.ids.index("trajectories")
+    assert "trajectory" not in page_.ids
 
 
 def test_frames_without_a_pose_are_named(tmp_path: Path) -> None:
@@ -303,31 +290,14 @@ def test_nothing_at_all_still_makes_a_page(tmp_path: Path) -> None:
 
 def test_a_figure_that_cannot_be_drawn_is_admitted(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(figures, "disparity", lambda *a: 1 / 0)
+        patch.setattr(figures, "raster", lambda *a, **k: 1 / 0)
         facts, page_, _, _ = written(tmp_path, view(bundles()))
-    assert "figure-6" not in page_.ids
-    assert "figure-7" in page_.ids
-    assert any(m["kind"] == "figure" and "ZeroDivisionError" in m["why"] for m in facts["missing"])
-
-
-def test_table_2_sums_the_units_of_a_cycle() -> None:
-    rows, together = tables.table_2(view())
-    assert [t.in_1999 for t in rows] == [40, 20, 1, 1, 5, 5]
-    hfvm = rows[0]
-    assert (hfvm.unit, hfvm.total, hfvm.computed, hfvm.cached) == (3.0, 6.0, 1, 1)
-    assert rows[1].tasks == 2  # the world's Locus is not among the local ones
-    assert together.in_1999 == 72
-    assert together.unit == pytest.approx(3.0 + 1.0 + 0.1 + 0.1 + 0.3 + 0.2)
-    assert [t.name for t in tables.other_stages(view())] == ["locus/world", "pyramid"]
-
-
-def test_preparation_in_table_2_is_a_median_of_each_stage() -> None:
-    motions = [TaskRow(f"motion/{i}", "motion", "computed", seconds) for i, seconds in enumerate((4.0, 4.0, 40.0))]
-    qualities = [TaskRow(f"image_quality/{i}", "image_quality", "computed", 1.0) for i in range(4)]
-    tracks = [TaskRow(f"track/{i}", "track", "computed", 10.0) for i in range(2)]
-    rows, _ = tables.table_2(view(tasks=(*motions, *qualities, *tracks)))
-    assert rows[4].unit == pytest.approx(10.0 + (3 * 4.0 + 4 * 1.0) / 2)
-    assert rows[4].total == pytest.approx(20.0 + 48.0 + 4.0)
+    assert "disparity" not in page_.ids
+    assert "trajectory" in page_.ids
+    lost = [m for m in facts["missing"] if m["kind"] == "figure"]
+    assert {m["what"] for m in lost} == {"Disparity", "Elevation error"}
+    assert all("ZeroDivisionError" in m["why"] for m in lost)
+    assert not facts["complete"]
 
 
 def test_a_failed_write_leaves_the_old_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -365,24 +335,12 @@ def test_numbers_have_sensible_digits(value: Any, unit: str, text: str) -> None:
     assert words.quantity(value, unit) == text
 
 
-def test_shrinking_averages_what_is_defined() -> None:
-    a = np.array([[1.0, 3.0, np.nan, np.nan], [5.0, np.nan, np.nan, np.nan]], dtype=np.float32)
-    np.testing.assert_allclose(canvas.shrink(a, 2), [[3.0, np.nan]])
-    assert canvas.shrink(a, 4) is not None
-    assert canvas.shrink(np.ones((5, 9, 3)), 3).shape == (1, 3, 3)
-
-
 def test_limits_are_robust_and_never_empty() -> None:
     values = np.concatenate([np.linspace(0, 1, 1000), [1e6]])
     assert ranges.limits(values)[1] < 1.0
     for constant in (np.full(5, np.nan), np.zeros(5), np.full(5, 3.0)):
         low, high = ranges.limits(constant)
         assert high > low
-
-
-def test_measured_and_interpolated_are_told_apart() -> None:
-    bits = np.array([[1, 2, 2 | 4, 8, 0]], dtype=np.uint8)
-    np.testing.assert_array_equal(figures.validity_classes(bits), [[0, 1, 1, 2, 2]])
 
 
 def test_ground_limits_ignore_crowns() -> None:
@@ -416,25 +374,13 @@ def test_the_page_says_where_the_files_lie(tmp_path: Path) -> None:
     assert "not known" not in page_.text
 
 
-def test_a_figure_without_its_data_leaves_the_run_complete(tmp_path: Path) -> None:
-    """The reason is listed by itself: the other program's poses lie outside of the reconstruction."""
-    run = view(bundles())
-    facts = summary.summarise(run, summary.gather(run), [Figure("Crosscheck", why="what it shows was not computed")])
-    assert facts["complete"]
-    assert [m["kind"] for m in facts["missing"]] == ["no figure"]
-    facts = summary.summarise(run, summary.gather(run), [Figure("Seams", why="drawing failed", failed=True)])
-    assert not facts["complete"]
-
-
 def test_a_curve_of_many_frames_does_not_fill_the_page() -> None:
     def size(frames: int) -> int:
-        steps = np.random.default_rng(frames).normal(size=(frames, 3))
-        flagged = list(range(0, frames, 2))
-        few = figures.displacements(steps, None, range(frames), "x")
-        both = figures.basic_pairs(flagged, np.abs(steps[flagged, 0]), 0.7, range(frames), steps[:, 1], "x")
-        return len(few.uri) + len(both.uri)
+        values = np.random.default_rng(frames).normal(size=frames)
+        plot = figures.Plot("x", (figures.Curve("y", canvas.INK, values),))
+        return len(figures.curves(range(frames), [plot], "frame", "", marked=range(0, frames, 2)).uri)
 
-    assert size(4000) < 4 * size(400)
+    assert size(4000) < 10 * size(400)
 
 
 @pytest.mark.parametrize(
@@ -453,7 +399,7 @@ def test_near_points_have_the_smaller_disparity_along_the_baseline(
     rig = Rig(camera, camera, RigidTransform(np.eye(3), -np.array(centre)))
     points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 5.0]])
     near, far = camera.project(rig.T_right_left.apply(points)) - camera.project(points)
-    assert stops.depth_band(rig) == (band, sign)
+    assert strips.depth_band(rig) == (band, sign)
     axis = ("column_disparity", "row_disparity").index(band)
     assert sign * near[axis] < sign * far[axis]
 
@@ -470,13 +416,9 @@ def test_both_cameras_are_told_where_they_differ(tmp_path: Path) -> None:
         24,
         30.0,
     ]
-    assert page_.text.count("images of 64 × 48 pixels (right: 32 × 24 pixels)") == 2
+    assert "images of 64 × 48 pixels (right: 32 × 24 pixels)" in page_.text
     assert "focal length 60 px (right: 30 px)" in page_.text
 
 
-def test_a_model_that_failed_was_not_merged(tmp_path: Path) -> None:
-    made = bundles()
-    del made["world_dem4"], made["risk"]
-    _, page_, _, _ = written(tmp_path, view(made))
-    assert "ortho image merged from 1 basic pairs" in page_.text
-    assert "unknown cells are black" in page_.text
+def test_a_gap_is_a_dash_in_words() -> None:
+    assert [words.number(np.nan), words.metres(np.nan), words.metres(None)] == ["–"] * 3

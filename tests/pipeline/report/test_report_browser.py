@@ -119,7 +119,7 @@ def test_a_phone_in_the_dark_shows_no_page_wider_than_itself(chromium: str, page
         assert phone.run("document.documentElement.scrollWidth") <= 390
         assert phone.run("getComputedStyle(document.body).backgroundColor") == "rgb(21, 23, 27)"
         assert phone.run("document.querySelector('[data-at=flat]').clientHeight") > 200
-        phone.run("document.getElementById('figure-9').scrollIntoView()")
+        phone.run("document.getElementById('trajectory').scrollIntoView()")
         assert np.median(_pixels(phone.picture())) < 60  # a drawing's paper is dark too
     finally:
         phone.close()

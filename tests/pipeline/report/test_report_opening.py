@@ -5,13 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from toys.finished import view, written
+from toys.finished import Page, bundles, view, written
 
 from rille.pipeline.export.view import UNSTATED, TaskRow
-from rille.pipeline.report import checks, delivery, page, summary, tables, terrain_map
-from rille.pipeline.report.canvas import Figure, Table
+from rille.pipeline.report import delivery, page, summary, terrain_map, words
 from rille.pipeline.report.gather import Terrain
-from rille.stages.calibration.rig import RigParams
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import REASONS, RiskParams
@@ -20,7 +18,22 @@ from rille.stages.planning.path import PathParams
 
 
 def metric(value, unit, label="", truth=None, completeness=None):
-    return {"value": value, "unit": unit, "label": label, "truth": truth, "completeness": completeness}
+    return {
+        "value": value,
+        "unit": unit,
+        "label": label,
+        "truth": truth,
+        "completeness": completeness,
+        "how": "counted",
+    }
+
+
+def page_of(**changes):
+    """Text of the page of the toy's run, with other facts."""
+    run = view()
+    facts = summary.summarise(run, summary.gather(run), ()) | changes
+    facts["metrics"] = {name: {"group": "", **entry} for name, entry in facts["metrics"].items()}
+    return Page(page.render(run, facts, (), ())).text
 
 
 def test_tiles_say_what_stands_beside_their_figure():
@@ -34,11 +47,12 @@ def test_tiles_say_what_stands_beside_their_figure():
         "path_tilt": metric(None, "deg"),
         "mapped_area": metric(None, "m²", "Mapped area"),
     }
-    assert page._tiles(metrics, 20.0) == [
-        ("Frames with a pose", "9 of 10 frames", ""),
-        ("Drift at the end", "0.840 %", "0.500 m at the end; of 59.9 m driven; against truth; 9 of 10 frames"),
-        ("Path length", "66.6 m", "inclination up to 6.20° of 20°"),
-    ]
+    text = page_of(metrics=metrics)
+    limit = words.number(Vehicle().max_slope_deg)
+    assert (
+        "Frames with a pose 9 of 10 frames Drift at the end 0.840 % 0.500 m at the end; of 59.9 m driven; against "
+        f"truth; 9 of 10 frames Path length 66.6 m inclination up to 6.20° of {limit}° Nothing is missing"
+    ) in text
 
 
 def test_a_drive_names_the_limits_that_were_broken_and_how_near_the_others_came():
@@ -50,22 +64,23 @@ def test_a_drive_names_the_limits_that_were_broken_and_how_near_the_others_came(
         "drive_least_clearance": metric(0.0164, "m"),
         "drive_greatest_tilt": metric(21.0, "deg"),
     }
-    words = (
-        "judged at 273 placements; tilted beyond the limit at 2 placements; at least 16.4 mm of room under the belly"
-    )
-    assert page._tiles(metrics, 20.0) == [("Length driven", "1.08 m", f"{words}; tilt up to 21° of 20°; against truth")]
+    assert (
+        "Length driven 1.08 m judged at 273 placements; tilted beyond the limit at 2 placements; at least 16.4 mm of "
+        "room under the belly; tilt up to 21° of 20°; against truth"
+    ) in page_of(metrics=metrics)
 
 
 def test_every_reason_on_the_map_has_words():
-    assert dict(page.reasons()).keys() == REASONS.keys()
+    text = page_of()
+    listed = text[text.index("Reasons") :]
+    assert [name for name in REASONS if f"{name} :" not in listed] == []
 
 
 def test_columns_of_pairs_without_anything_are_left_out():
-    given = {name: None for _, name, _ in tables._PAIR_COLUMNS}
-    two = [given | {"frame": 0, "matched": 0.5}, given | {"frame": 4, "path": "found"}]
-    assert tables.pair_table(two) == Table(
-        ("Frame", "Matched", "Path"), (("0", "50 %", "–"), ("4", "–", "found")), (0, 1)
-    )
+    (first, *_) = summary.gather(view())["pairs"]
+    nothing = dict.fromkeys(first)
+    pairs = [nothing | {"frame": 0, "matched": 0.5}, nothing | {"frame": 4, "path": "found"}]
+    assert "local path Frame Matched Path 0 50 % – 4 – found Overlap:" in page_of(pairs=pairs)
 
 
 def rows(*paths):
@@ -112,34 +127,25 @@ def test_what_the_images_contradict_is_told_before_what_failed():
     assert [m["what"] for m in told] == ["two motions", "2 of 2 tasks locus/local failed (1, 2)"]
 
 
-def test_figures_that_lack_the_same_are_one_line():
-    figures = [Figure("Map", why="not computed"), Figure("Seams", why="not computed"), Figure("Rig", why="no rig")]
-    nothing = SimpleNamespace(tasks=(), vehicle_source="")
-    told = delivery.complete({"missing": [], "absent": [], "delivered": []}, nothing, figures)["missing"]
-    assert [(m["what"], m["why"]) for m in told] == [("Map, Seams", "not computed"), ("Rig", "no rig")]
-
-
 @pytest.mark.parametrize(
-    ("figures", "words"),
+    ("figures", "told"),
     [
         ({"trajectory_drift": metric(0.84, "%"), "trajectory_ate_rmse": metric(0.1, "m")}, "drift 0.840 %"),
         ({"trajectory_drift": metric(None, "%"), "trajectory_ate_rmse": metric(0.05, "m")}, "RMSE 50 mm"),
         ({"trajectory_position_drift": metric(2.0, "%")}, "drift 2 %"),
     ],
 )
-def test_the_verdict_gives_one_figure_against_truth(figures, words):
-    told = summary._verdict(view(), [], [], figures)
-    assert told.count("against truth") == 1
-    assert f"{words} against truth" in told
+def test_the_verdict_gives_one_figure_against_truth(figures, told):
+    verdict = summary._verdict(view(), [], [], figures)
+    assert verdict.count("against truth") == 1
+    assert f"{told} against truth" in verdict
 
 
-@pytest.mark.parametrize(("nees", "words"), [(None, []), (8.9, []), (850.0, ["about 29 times too small"])])
-def test_standard_deviations_that_truth_contradicts_are_warned_of(nees, words):
-    accuracy = SimpleNamespace(meta={"metrics": {"nees": {"value": nees}}})
-    view = SimpleNamespace(products=SimpleNamespace(accuracy=accuracy), bundle=lambda handle: handle)
-    found = summary._sigma_warning(view)
-    assert len(found) == len(words)
-    assert all(word in line for word, line in zip(words, found, strict=True))
+@pytest.mark.parametrize(("nees", "told"), [(None, []), (8.9, []), (850.0, ["about 29 times too small"])])
+def test_standard_deviations_that_truth_contradicts_are_warned_of(nees, told):
+    found = summary._small_sigma({"trajectory_nees": {"value": nees}})
+    assert len(found) == len(told)
+    assert all(word in line for word, line in zip(told, found, strict=True))
 
 
 def given(positions, rotation, footprint):
@@ -195,11 +201,13 @@ def test_an_imu_that_contradicts_the_images_is_warned_of():
     assert summary._imu(run) == []
 
 
-def test_standard_deviations_are_not_judged_by_truth_that_was_misread():
-    metrics = {"nees": {"value": 850.0}}
-    accuracy = SimpleNamespace(meta={"metrics": metrics, "warnings": ["the truth fits better by another convention"]})
-    view = SimpleNamespace(products=SimpleNamespace(accuracy=accuracy), bundle=lambda handle: handle)
-    assert summary._sigma_warning(view) == []
+@pytest.mark.parametrize(("warnings", "told"), [([], 1), (["the truth fits better by another convention"], 0)])
+def test_standard_deviations_are_not_judged_by_truth_that_was_misread(warnings, told):
+    made = bundles()
+    metrics = made["accuracy"].meta["metrics"] | {"nees": {"value": 850.0, "unit": "", "how": ""}}
+    made["accuracy"] = Bundle({}, {"metrics": metrics, "warnings": warnings})
+    lines = summary.gather(view(made))["warnings"]
+    assert sum("standard deviations of the poses" in line for line in lines) == told
 
 
 @pytest.mark.parametrize(("source", "told"), [(UNSTATED, True), ("user", False)])
@@ -211,25 +219,25 @@ def test_limits_that_nobody_stated_are_told(tmp_path, source, told):
 
 
 @pytest.mark.parametrize(
-    ("change", "scale", "words"),
-    [
-        ({"significance": 10.0}, None, None),
-        ({}, None, "compare a known length"),
-        ({}, -0.31, "with it that of depth, is off by 0.31 %"),
-        ({"asked": 0.1}, None, None),
-        ({"observed": True}, None, None),
-        ({"freed": True}, None, None),
-    ],
+    ("change", "told"), [({}, 1), ({"asked": 0.1}, 0), ({"observed": True}, 0), ({"freed": True}, 0)]
 )
-def test_a_turn_that_the_images_ask_for_but_cannot_tell_is_judged_by_the_truth(change, scale, words):
+def test_a_turn_that_the_images_ask_for_but_cannot_tell_is_undecided(change, told):
     yaw = {"name": "yaw", "freed": False, "observed": False, "asked": 0.4, "sigma": 0.05} | change
-    accuracy = None if scale is None else SimpleNamespace(meta={"metrics": {"scale_error": {"value": scale}}})
-    params = RigParams(significance=yaw.pop("significance", 4.0))
-    config, products = SimpleNamespace(rig=params), SimpleNamespace(accuracy=accuracy)
-    scene = SimpleNamespace(view=SimpleNamespace(config=config, products=products, bundle=lambda h: h))
-    found = " ".join(checks._untold(scene, SimpleNamespace(collected=lambda name: [yaw])))
-    assert words in found if words else found == ""
-    assert "yaw +0.4000°" in found or not words
+    assert summary.undecided([yaw], 4.0) == [yaw] * told
+    assert summary.undecided([yaw], 10.0) == []
+
+
+@pytest.mark.parametrize(
+    ("scale", "told"), [(None, "compare a known length"), (-0.31, "that of depth, is off by 0.31 %")]
+)
+def test_what_is_undecided_is_judged_by_the_truth(scale, told):
+    yaw = {"name": "yaw", "asked": 0.4, "sigma": 0.05}
+    rig = {"rigs": 1, "source": "given", "changed": False, "residual_before_px": 0.1, "residual_after_px": 0.1}
+    text = page_of(
+        rig=rig | {"parameters": [yaw], "undecided": [yaw]}, metrics={"trajectory_scale_error": metric(scale, "%")}
+    )
+    assert told in text
+    assert "yaw +0.4000°" in text
 
 
 def test_the_profile_shows_the_inclination_that_was_judged():

@@ -15,7 +15,7 @@ import pytest
 from rille.datasets.protocol import Sequence
 from rille.pipeline.export.view import RunView, TaskRow
 from rille.pipeline.flow.products import Products
-from rille.pipeline.report import canvas, gallery, gather, summary
+from rille.pipeline.report import canvas, gallery, summary
 from rille.pipeline.report.page import write_report
 from rille.stages.calibration.rig import RigParams
 from rille.stages.core.declare import Bundle
@@ -329,9 +329,7 @@ def _blank(fig: object, alt: str, *, photo: bool = False) -> canvas.Panel:
 
 def report(folder: Path, run: RunView) -> None:
     """Both files of the report, of artifacts as they are."""
-    scene = gather.Scene(run)
-    drawn = [gallery._drawn(*row[:3], scene) for row in gallery._FIGURES]
-    write_report(folder, run, summary.gather(run), drawn)
+    write_report(folder, run, summary.gather(run), [drawing.figure(run) for drawing in gallery.DRAWINGS])
 
 
 Written = tuple[dict[str, Any], Page, str, Path]

@@ -1,0 +1,212 @@
+"""A run as a strip of columns of small pictures: every basic pair, or every stop of a drive.
+
+The pictures are as large as ``BUDGET_CHARACTERS`` allows for all columns, so that the page stays small; where even the
+smallest ones are too many, every second column, or third, is shown, and the page says so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rille.pipeline.export import artifacts, ranges
+from rille.pipeline.report import canvas, gather
+from rille.pipeline.report.canvas import Block, Panel
+from rille.pipeline.report.gather import Scene, Terrain
+from rille.pipeline.report.words import metres
+from rille.stages.core.validity import matched
+from rille.stages.evaluation.crosscheck import grey_bytes
+from rille.stages.geometry.geometry import Rig
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+    from rille.pipeline.flow.products import Stop
+
+Floats = NDArray[Any]
+
+BUDGET_CHARACTERS = 900_000
+"""Of the pictures of a strip: the page has 5 MB at most."""
+PLANNED_SHARE = 0.75
+"""Of the budget: one column is not like the others."""
+MAX_WIDTH_PIXELS, MIN_WIDTH_PIXELS = 400, 140
+"""Of a column; 400 are twice what it takes on the screen."""
+MAX_HEIGHT_OVER_WIDTH = 1.2
+"""Of one picture of a column."""
+LEGEND = tuple(zip(canvas.RISK, canvas.CLASS_NAMES, strict=True))
+
+
+@dataclass(frozen=True)
+class Line:
+    """What is laid on a map: vertices (n, 2 or more), m, NaN gaps; colour; width in hundredths of the picture's."""
+
+    points: Floats
+    color: str
+    width: float = 1.0
+
+
+def pairs(scene: Scene) -> Block | None:
+    """Every basic pair; None where no pair was matched."""
+    view, disparity = scene.view, scene.view.products.disparity
+    matched_pairs = [pair for pair, handle in disparity.items() if view.bundle(handle) is not None]
+    if not matched_pairs:
+        return None
+    return Block(_fitting(matched_pairs, lambda pair, width: _pair(scene, pair, width)), LEGEND)
+
+
+def drive(scene: Scene) -> Block | None:
+    """Every stop of a drive; None where nothing was driven."""
+    stops = gather.stops(scene.view)
+    if not stops:
+        return None
+    legend = (*LEGEND, (canvas.ON_MAP, "estimated track"), (canvas.TRUE_ON_MAP, "true track"))
+    return Block(_fitting(stops, lambda stop, width: _stop(scene, stop, width)), legend)
+
+
+def depth_band(rig: Rig) -> tuple[str, int]:
+    """Component of the disparity along the baseline, and the sign by which it is the smaller the nearer a point is."""
+    right, below, _ = rig.T_right_left.inverse().translation
+    # Right minus left: a camera to the right (or below) sees what is near farther to the left (or above).
+    band, along = ("column_disparity", right) if abs(right) >= abs(below) else ("row_disparity", below)
+    return band, 1 if along >= 0 else -1
+
+
+def risk_picture(risk: Terrain, lines: Sequence[Line], width: int) -> Image:
+    """Classes of a risk map in their colours, and lines on them; ``width`` in pixels."""
+    from PIL import Image
+
+    picture = Image.fromarray(canvas.paint(risk.arrays["risk"], *canvas.RISK)).convert("RGBA")
+    return _with_lines(picture, risk, lines, width)
+
+
+def panel(picture: Image, alt: str, *, frame: int = -1, quality: int = 82) -> Panel:
+    """A picture as a panel, with two pixels to a CSS pixel."""
+    uri = canvas.compressed(picture, "webp", quality=quality, method=2)
+    return Panel(uri, alt, picture.width // 2, picture.height // 2, frame)
+
+
+def _fitting(items: Sequence[Any], draw: Callable[[Any, int], Panel]) -> tuple[Panel, ...]:
+    """Columns that fit the budget: narrower ones first, then fewer."""
+    cost = len(draw(items[len(items) // 2], MAX_WIDTH_PIXELS).uri) / MAX_WIDTH_PIXELS**2
+    step = math.ceil(len(items) * cost * MIN_WIDTH_PIXELS**2 / (PLANNED_SHARE * BUDGET_CHARACTERS))
+    shown = items[::step]
+    width = min(MAX_WIDTH_PIXELS, int(math.sqrt(PLANNED_SHARE * BUDGET_CHARACTERS / (len(shown) * cost))))
+    panels = [draw(item, width) for item in shown]
+    while len(panels) > 1 and sum(len(panel.uri) for panel in panels) > BUDGET_CHARACTERS:
+        panels = panels[::2]
+    return tuple(panels)
+
+
+def _pair(scene: Scene, pair: int, width: int) -> Panel:
+    view = scene.view
+    bundle, image = view.bundle(view.products.disparity[pair]), artifacts.image(view, pair)
+    assert bundle is not None
+    band, sign = depth_band(view.sequence.rig)
+    there = matched(np.asarray(bundle["validity"]))
+    seen = np.full(there.shape, 96, np.uint8) if image is None else grey_bytes(np.asarray(image["image"]))
+    pictures, words = [_photo(seen, width)], [f"{there.mean():.0%} matched"]
+    if seen.shape[:2] == there.shape:
+        pictures.append(_photo(_matches(seen, sign * np.asarray(bundle[band]), there), width))
+    dem = gather.terrain(view.bundle(view.products.local_dem.get(pair)), "elevation")
+    if dem is not None:
+        pictures.append(_elevations(dem, (), width))
+    risk = gather.terrain(view.bundle(view.products.local_risk.get(pair)), "risk")
+    if risk is not None:
+        path = gather.vertices(view.bundle(view.products.local_path.get(pair)))
+        pictures.append(risk_picture(risk, [] if path is None else [Line(path, canvas.MARK)], width))
+        words.append("no local path" if path is None else "with a local path")
+    return _column(pictures, f"Pair of frame {pair}: {', '.join(words)}", pair)
+
+
+def _stop(scene: Scene, stop: Stop, width: int) -> Panel:
+    view, track = scene.view, scene.track
+    leg, image = view.bundle(stop.leg), view.bundle(view.products.images.get(stop.frame))
+    assert leg is not None
+    risk = gather.terrain(view.bundle(stop.risk), "risk")
+    dem = gather.terrain(view.bundle(stop.risk if stop.far is None else stop.far), "elevation")
+    assert risk is not None
+    assert dem is not None
+    upto = view.frames.index(stop.frame) + 1
+    pictures = [] if image is None else [_photo(grey_bytes(np.asarray(image["image"])), width)]
+    legs = [Line(np.asarray(leg["way"]), canvas.MARK, 0.5), Line(np.asarray(leg["path"]), canvas.MARK, 1.5)]
+    pictures.append(risk_picture(risk, legs, width))
+    # Truth first and wider: where both agree it shows as a rim.
+    tracks = [] if track.truth is None else [Line(track.truth[:upto], canvas.TRUE_ON_MAP, 3)]
+    pictures.append(_elevations(dem, [*tracks, Line(track.left[:upto], canvas.ON_MAP, 1)], width))
+    words = f"{metres(leg.meta['left_m'])} from the goal: {leg.meta['verdict']}"
+    return _column(pictures, f"Stop {stop.index} at frame {stop.frame}, {words}", stop.frame)
+
+
+# -- pictures of a column
+
+
+def _column(pictures: Sequence[Image], alt: str, frame: int) -> Panel:
+    from PIL import Image
+
+    gap, width = 4, max(p.width for p in pictures)
+    whole, top = Image.new("RGBA", (width, sum(p.height + gap for p in pictures) - gap)), 0
+    for picture in pictures:
+        whole.paste(picture, ((width - picture.width) // 2, top))
+        top += picture.height + gap
+    return panel(whole, alt, frame=frame, quality=72)
+
+
+def _photo(pixels: NDArray[np.uint8], width: int) -> Image:
+    from PIL import Image
+
+    return _scaled(Image.fromarray(pixels).convert("RGBA"), width)
+
+
+def _scaled(picture: Image, width: int) -> Image:
+    """As wide as the column, or lower than ``MAX_HEIGHT_OVER_WIDTH`` allows."""
+    from PIL import Image
+
+    factor = min(width / picture.width, MAX_HEIGHT_OVER_WIDTH * width / picture.height)
+    size = (max(1, round(picture.width * factor)), max(1, round(picture.height * factor)))
+    return picture.resize(size, Image.Resampling.BOX if factor < 1 else Image.Resampling.NEAREST)
+
+
+def _matches(seen: NDArray[np.uint8], disparity: Floats, there: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Disparities in colour on the image; pixels that were not matched stay grey."""
+    low, high = ranges.limits(np.where(there, disparity, np.nan))
+    # The smaller the nearer a point is: turned round, so that blue is far.
+    colors = _colors((high - disparity) / max(high - low, 1e-9))
+    ground = seen if seen.ndim == 3 else np.repeat(seen[..., None], 3, axis=-1)
+    # Divided before multiplied: bytes would overflow the other way round.
+    return np.where(there[..., None], colors // 3 * 2 + ground // 3, ground)
+
+
+def _elevations(dem: Terrain, lines: Sequence[Line], width: int) -> Image:
+    from PIL import Image
+
+    elevation = dem.arrays["elevation"]
+    low, high = ranges.ground_limits(elevation)
+    alpha = np.where(np.isfinite(elevation), 255, 0).astype(np.uint8)
+    colors = _colors((elevation - low) / max(high - low, 1e-9))
+    return _with_lines(Image.fromarray(np.dstack([colors, alpha])), dem, lines, width)
+
+
+def _colors(share: Floats) -> NDArray[np.uint8]:
+    return np.asarray(canvas.ramp("viridis")[np.clip(np.nan_to_num(share) * 255, 0, 255).astype(np.uint8)])
+
+
+def _with_lines(picture: Image, ground: Terrain, lines: Sequence[Line], width: int) -> Image:
+    """A picture of all cells, scaled to ``width``, with lines that have a white casing."""
+    from PIL import ImageDraw
+
+    factor, picture = 1 / picture.width, _scaled(picture, width)
+    factor *= picture.width
+    pen = ImageDraw.Draw(picture)
+    for line in lines:
+        cols_rows = (ground.lattice.index(line.points[:, :2])[:, ::-1] + 0.5) * factor
+        points = [(float(u), float(v)) for u, v in cols_rows if np.isfinite(u)]
+        if len(points) > 1:
+            thick = max(1, round(line.width * picture.width / 100))
+            pen.line(points, fill="white", width=thick + 2)
+            pen.line(points, fill=line.color, width=thick)
+    return picture
