@@ -40,18 +40,20 @@ def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
     view = scene.view
     contradicted = [_item("contradiction", line, "") for line in contradictions(view)]
     missing = contradicted + _poses(frames) + _path(view) + _crosscheck_lost(scene)
-    found = {"delivered": _delivered(view, frames, pairs), "missing": missing}
-    return found | {"absent": _local_paths(pairs) + _truth(view) + _crosscheck_off(view) + _vehicle(view)}
+    absent = _local_paths(pairs) + _truth(view) + _crosscheck_off(view) + _vehicle(view)
+    return {"delivered": _delivered(view, frames, pairs), "missing": missing, "absent": absent}
 
 
-def complete(found: Mapping[str, Any], view: RunView, figures: Sequence[Figure]) -> dict[str, Any]:
+def complete(accounted: Mapping[str, Any], view: RunView, figures: Sequence[Figure]) -> dict[str, Any]:
     """The lists of :func:`account` with what became of tasks and figures: all that a reader might take for granted."""
     done = ["every task was done"] if view.tasks else []
     undrawn = [_item("figure", figure.title, figure.why) for figure in figures if figure.why]
     # What the images contradict comes first: it may be the cause of all that follows.
-    missing = sorted([*_failures(view), *found["missing"], *undrawn], key=lambda item: item["kind"] != "contradiction")
-    absent = [item for item in found["absent"] if item["kind"] != "vehicle" or view.vehicle_source == UNSTATED]
-    return {"delivered": [*done, *found["delivered"]], "absent": absent, "missing": missing}
+    missing = sorted(
+        [*_failures(view), *accounted["missing"], *undrawn], key=lambda item: item["kind"] != "contradiction"
+    )
+    absent = [item for item in accounted["absent"] if item["kind"] != "vehicle" or view.vehicle_source == UNSTATED]
+    return {"delivered": [*done, *accounted["delivered"]], "absent": absent, "missing": missing}
 
 
 def has_truth(view: RunView) -> list[bool]:
@@ -93,8 +95,8 @@ def start_words(view: RunView, lead: str = ", which ") -> str:
 
 def _delivered(view: RunView, frames: Rows, pairs: Rows) -> list[str]:
     words = ["every frame has a pose"] if len(frames) > 1 and all(r["in_world"] for r in frames) else []
-    found, asked = local_paths(pairs)
-    words += ["every stop has a local path"] if asked and found == asked else []
+    reached, asked = local_paths(pairs)
+    words += ["every stop has a local path"] if asked and reached == asked else []
     drive, away = view.products.drive, start_of_path(view)
     words += ["the goal was reached"] if drive is not None and drive.verdict == "goal" else []
     words += [f"a path over the merged terrain was found{start_words(view)}"] if away is not None else []
@@ -120,20 +122,20 @@ def _failures(view: RunView) -> Items:
             # The figures in a message are those of one pair: the cause is the words.
             kind = _kind(root.label) if root.status == "failed" else ""
             causes.setdefault((kind, re.sub(r"-?[0-9][0-9.]*", "#", root.reason)), []).append(t)
-    found = []
+    items = []
     for (kind, _), tasks in causes.items():
         failed = [t for t in tasks if t.status == "failed"]
         if not kind:
             why = tasks[0].reason or "something it depends on is missing"
-            found.append(_item("skipped", some([t.label for t in tasks], 6), why))
+            items.append(_item("skipped", some([t.label for t in tasks], 6), why))
             continue
         n, waiting = len(failed), len(tasks) - len(failed)
         whole, names = sum(_kind(t.label) == kind for t in view.tasks), [t.label[len(kind) + 1 :] for t in failed]
         what = f"{n} of {whole} tasks {kind} failed ({some(names, 12)})" if whole > 1 else f"{failed[0].label} failed"
         if waiting:
             what += f": {count(waiting, 'task')} depend{'s' * (waiting == 1)} on {'it' if n == 1 else 'them'}"
-        found.append(_item("failed", what, failed[0].reason))
-    return found
+        items.append(_item("failed", what, failed[0].reason))
+    return items
 
 
 def _kind(label: str) -> str:
@@ -142,24 +144,24 @@ def _kind(label: str) -> str:
 
 
 def _poses(frames: Rows) -> Items:
-    found = []
+    items = []
     lost = [r["frame"] for r in frames if not r["posed"]]
     if lost:
-        found.append(_item("no pose", f"{len(lost)} of {len(frames)} frames have no pose", which(lost)))
+        items.append(_item("no pose", f"{len(lost)} of {len(frames)} frames have no pose", which(lost)))
     apart = [r["frame"] for r in frames if r["posed"] and not r["in_world"]]
     if apart:
         what = f"{len(apart)} of {len(frames)} frames have a pose in another piece of the trajectory, not in the world"
-        found.append(_item("piece", what, which(apart)))
-    return found
+        items.append(_item("piece", what, which(apart)))
+    return items
 
 
 def _local_paths(pairs: Rows) -> Items:
     """Stops without a local path, each reason with its frames."""
-    found, asked = local_paths(pairs)
+    reached, asked = local_paths(pairs)
     without = [r for r in pairs if r["path"] not in (None, "found")]
     at = {reason: [r["frame"] for r in without if r["path"] == reason] for reason in [r["path"] for r in without]}
     why = "; ".join(f"{reason} ({which(frames)})" for reason, frames in at.items())
-    return [_item("no local path", f"No local path from {asked - found} of {asked} stops", why)] if why else []
+    return [_item("no local path", f"No local path from {asked - reached} of {asked} stops", why)] if why else []
 
 
 def _path(view: RunView) -> Items:

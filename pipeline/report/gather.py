@@ -39,12 +39,12 @@ class Terrain:
 
     def at(self, name: str, xy: Floats) -> Floats:
         """Values (n,) of an array in the cells of points (n, 2), m; NaN outside, and where there is no such array."""
-        values, found = self.arrays.get(name), np.full(len(xy), np.nan)
+        values, sampled = self.arrays.get(name), np.full(len(xy), np.nan)
         if values is not None:
             row, col = np.rint(self.lattice.index(xy)).astype(int).T
             inside = (row >= 0) & (col >= 0) & (row < values.shape[0]) & (col < values.shape[1])
-            found[inside] = values[row[inside], col[inside]]
-        return found
+            sampled[inside] = values[row[inside], col[inside]]
+        return sampled
 
 
 @dataclass(frozen=True)
@@ -154,8 +154,8 @@ class Scene:
         """Differences of successive elevation models that overlap, in the order of the pairs."""
         view = self.view
         present = [pair for pair, handle in view.products.world_dem.items() if view.bundle(handle) is not None]
-        found = (_difference(view, before, pair) for before, pair in itertools.pairwise(present))
-        return [one for one in found if one is not None]
+        differences = (_difference(view, before, pair) for before, pair in itertools.pairwise(present))
+        return [difference for difference in differences if difference is not None]
 
     @cached_property
     def calibration(self) -> Calibration | None:

@@ -99,10 +99,10 @@ def _against_truth(view: RunView, frames: Rows, pairs: Rows) -> dict[str, Metric
         ("trajectory_", p.accuracy or p.position_accuracy, "Trajectory against truth"),
         ("crosscheck_", p.crosscheck_accuracy, "COLMAP against truth"),
     ):
-        found = _assessed(view, handle, prefix, group, source) if len(frames) > 1 else {}
-        lost = found.get(f"{prefix}frames_missing", {}).get("value", len(frames) - posed)
+        figures = _assessed(view, handle, prefix, group, source) if len(frames) > 1 else {}
+        lost = figures.get(f"{prefix}frames_missing", {}).get("value", len(frames) - posed)
         share = f"{len(frames) - lost} of {len(frames)} frames{of_truth}"
-        by_name |= {name: {**entry, "completeness": share} for name, entry in found.items()}
+        by_name |= {name: {**entry, "completeness": share} for name, entry in figures.items()}
     group, truth = "Elevation against truth", "exact elevations of the scene"
     by_name |= {name: {"group": group, "truth": truth, **m} for name, m in _local_elevation(view, pairs).items()}
     merged = _assessed(view, p.dem_accuracy, "dem_merged_", group, truth)

@@ -53,9 +53,9 @@ def gather(view: Any) -> dict[str, Any]:
 
 def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]) -> dict[str, Any]:
     """Everything that ``report.json`` holds, with what this run alone knows; the page has the same numbers."""
-    found = delivery.complete(facts, view, figures)
-    complete = delivery.is_complete(found["missing"])
-    state = "Incomplete" if not complete else "Complete but for what is listed" if found["missing"] else "Complete"
+    outcome = delivery.complete(facts, view, figures)
+    complete = delivery.is_complete(outcome["missing"])
+    state = "Incomplete" if not complete else "Complete but for what is listed" if outcome["missing"] else "Complete"
     how = "wall clock, without writing the page; what is cached costs no time"
     clock = {"group": "Run", "truth": None, **metric("Time of this run's tasks", view.seconds, "s", how)}
     return {
@@ -66,7 +66,7 @@ def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]
         "complete": complete,
         **facts,
         "verdict": f"{state}: {facts['verdict']}",
-        **found,
+        **outcome,
         "metrics": {**facts["metrics"], "wall_clock": clock},
         "stages": _stages(view),
         "seconds": round(view.seconds, 3),

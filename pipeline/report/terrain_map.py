@@ -168,7 +168,7 @@ def _frusta(scene: Scene) -> list[Any]:
     bundle = view.bundle(view.products.trajectory)
     if bundle is None:
         return []
-    camera, found = view.sequence.rig.left, []
+    camera, frusta = view.sequence.rig.left, []
     far = 2.0 * view.sequence.rig.baseline
     # Pixel centres are whole numbers: the image begins half a pixel before the first.
     right, foot = camera.width - 0.5, camera.height - 0.5
@@ -177,8 +177,8 @@ def _frusta(scene: Scene) -> list[Any]:
     points = np.vstack([np.zeros(3), far * rays])
     for frame, pose in zip(bundle.meta["frames"], world_poses(bundle), strict=True):
         if frame in view.products.disparity and np.isfinite(pose).all():
-            found.append(np.round(RigidTransform.from_matrix(pose).apply(points), 4).tolist())
-    return found
+            frusta.append(np.round(RigidTransform.from_matrix(pose).apply(points), 4).tolist())
+    return frusta
 
 
 def _path(scene: Scene) -> list[list[float | None]]:
