@@ -11,6 +11,7 @@ loopback with keys of this run alone, because whoever reaches a scheduler of das
 
 from __future__ import annotations
 
+import inspect
 import logging
 import math
 import multiprocessing
@@ -171,9 +172,8 @@ def check(kind: Any, jobs: int | None = None) -> None:
             raise ConfigError("RIL-588", text, remedy="give Client(...) without asynchronous=True, or leave client out")
     if isinstance(kind, str) and kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
         raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
-    # A spawned worker imports the program's main module first, under this name: without a guard it would start workers.
-    modules = (frame.f_globals.get("__name__") for frame, _ in traceback.walk_stack(None))
-    if kind == "dask" and "__mp_main__" in modules and multiprocessing.parent_process() is None:  # not yet known
+    # A spawned worker imports the program's main module first: without a guard it would start workers of its own.
+    if kind == "dask" and multiprocessing.parent_process() is None and "__mp_main__" in _modules_at_work():
         raise ConfigError(
             "RIL-972",
             "a worker that starts came to this call",
@@ -181,6 +181,15 @@ def check(kind: Any, jobs: int | None = None) -> None:
         )
     if jobs is not None and jobs < 1:
         raise ConfigError("RIL-540", f"{jobs} jobs are not permitted", remedy="give 1 or more")
+
+
+def _modules_at_work() -> set[str]:
+    """Names of the modules whose code is being executed by this thread."""
+    names, frame = set(), inspect.currentframe()
+    while frame is not None:
+        names.add(frame.f_globals.get("__name__", ""))
+        frame = frame.f_back
+    return names
 
 
 def make(kind: Any, jobs: int, cache: Path, memory: float) -> Workers:
