@@ -26,9 +26,8 @@ from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import join, side_of
 from rille.datasets.imu import ImuRecord, Inertial, at_frames
 from rille.datasets.inspection import CALIBRATIONS, Findings, FoundImages, find_calibration
-from rille.datasets.kitti import CAR, STREET
 from rille.datasets.manifest.model import Cameras, Images, Manifest
-from rille.datasets.manifest.rig import Optics, read_optics, unusual_cameras
+from rille.datasets.manifest.rig import CAR, STREET, Optics, read_optics, unusual_cameras
 from rille.datasets.poses import TimedPoses, interpolate
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.text.names import derived_name

@@ -66,13 +66,13 @@ class TimedPoses:
     Attributes
     ----------
     times : seconds, increasing; None where the file has none, and rows are frames.
-    poses : T_reference_body, metres, one a row.
+    poses : T_reference_body, metres, one a row; None of a row of NaN.
     name : the file, for messages.
     warnings : what is suspicious, one line each.
     """
 
     times: tuple[float, ...] | None
-    poses: tuple[RigidTransform, ...]
+    poses: tuple[RigidTransform | None, ...]
     name: str = "poses"
     warnings: tuple[str, ...] = ()
 
@@ -273,7 +273,7 @@ def _quaternions(table: TextTable, columns: Mapping[str, int]) -> Floats:
     return np.asarray(Rotation.from_quat(q).as_matrix(), dtype=np.float64)
 
 
-def _matrices(table: TextTable) -> tuple[RigidTransform, ...]:
+def _matrices(table: TextTable) -> tuple[RigidTransform | None, ...]:
     """Poses of rows of [R | t]."""
     if table.columns not in (12, 16):
         raise InputError(
@@ -281,8 +281,11 @@ def _matrices(table: TextTable) -> tuple[RigidTransform, ...]:
             f"{table.name}, line {table.lines[0]}: {table.columns} numbers are no 3 x 4 pose",
             remedy="give 12 numbers a line, or state the format",
         )
-    values = table.numbers(range(table.columns)).reshape(len(table.rows), -1, 4)[:, :3]
-    return tuple(rounded_pose(m, f"{table.name}, line {line}") for m, line in zip(values, table.lines, strict=True))
+    values = table.numbers(range(table.columns), gaps=True).reshape(len(table.rows), -1, 4)[:, :3]
+    return tuple(
+        None if np.isnan(m).any() else rounded_pose(m, f"{table.name}, line {line}")
+        for m, line in zip(values, table.lines, strict=True)
+    )
 
 
 def rounded_pose(m: Floats, where: str) -> RigidTransform:
@@ -338,9 +341,10 @@ def interpolate(timed: TimedPoses, at: Sequence[float], max_gap: float) -> tuple
     known = inside & ((t[after] - t[before] <= max_gap) | (distance <= WITHIN))
     # By WITHIN at most: Slerp refuses any time beyond its ends.
     moment = np.clip(wanted, t[0], t[-1])
-    positions = np.array([p.translation for p in timed.poses])
-    rotations = Rotation.from_matrix([p.rotation for p in timed.poses])
-    turned = Slerp(t, rotations)(moment).as_matrix() if len(t) > 1 else [timed.poses[0].rotation] * len(wanted)
+    rows = [pose for pose in timed.poses if pose is not None]  # rows of NaN have no times
+    positions = np.array([p.translation for p in rows])
+    rotations = Rotation.from_matrix([p.rotation for p in rows])
+    turned = Slerp(t, rotations)(moment).as_matrix() if len(t) > 1 else [rows[0].rotation] * len(wanted)
     moved = np.stack([np.interp(moment, t, axis) for axis in positions.T], axis=1)
     return tuple(RigidTransform(turned[k], moved[k]) if known[k] else None for k in range(len(wanted)))
 

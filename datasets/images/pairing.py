@@ -244,17 +244,32 @@ def _two_clocks(
 
 
 def _with_gaps(by_key: list[dict[str, Path]]) -> tuple[ImagePair, ...]:
-    """Pairs of all keys; a file that is not there has the name that it would have."""
+    """Pairs of all keys and of numbers left out of a running count; an absent file has the name that it would have."""
     whole = next(key for key in by_key[0] if key in by_key[1])
-    keys = sorted({**by_key[0], **by_key[1]}, key=natural)
+    keys = counted(sorted({**by_key[0], **by_key[1]}, key=natural))
     paths = [[ours.get(key) or _called(ours[whole], whole, key) for ours in by_key] for key in keys]
     absent = [
         [p for p, ours in zip(both, by_key, strict=True) if key not in ours]
         for both, key in zip(paths, keys, strict=True)
     ]
     pairs = _named([(both[0], both[1]) for both in paths])
-    words = [f"{gone[0].parent.name}/{gone[0].name} is missing" if gone else "" for gone in absent]
+    names = [" and ".join(f"{path.parent.name}/{path.name}" for path in gone) for gone in absent]
+    words = [
+        "" if not gone else f"{name} {'are' if gone[1:] else 'is'} missing"
+        for gone, name in zip(absent, names, strict=True)
+    ]
     return tuple(replace(pair, absent=text) for pair, text in zip(pairs, words, strict=True))
+
+
+def counted(names: list[str]) -> list[str]:
+    """Names with the numbers that a running count leaves out; as they are where most do not count on by one."""
+    if len(names) < 3 or not all(name.isdecimal() for name in names):
+        return names
+    numbers = [int(name) for name in names]
+    if np.median(np.diff(numbers)) != 1 or numbers[-1] - numbers[0] + 1 > 2 * len(names):
+        return names
+    by_number = dict(zip(numbers, names, strict=True))
+    return [by_number.get(k, f"{k:0{len(names[0])}d}") for k in range(numbers[0], numbers[-1] + 1)]
 
 
 def _called(example: Path, key: str, wanted: str) -> Path:

@@ -276,6 +276,12 @@ class Manifest(Params):
     )
     notes: tuple[str, ...] = Field(default=(), description="facts that the report repeats")
 
+    @model_validator(mode="after")
+    def _one_rotation(self) -> Manifest:
+        if self.attitude is not None and self.imu is not None:
+            raise ValueError("[attitude] and [imu] both state the rotation: remove one of them")
+        return self
+
     @model_validator(mode="before")
     @classmethod
     def _notes_in_a_table(cls, value: Any) -> Any:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -22,16 +23,16 @@ from rille.stages.geometry.geometry import RigidTransform
 
 Poses = tuple[RigidTransform | None, ...]
 Ups = tuple[tuple[float, float, float] | None, ...]
-Seconds = tuple[float, ...]
+Row = TypeVar("Row")
 
 NEEDS_TIMES = "give [times] with file, names = true or rate_hz"
 
 
 @dataclass
-class KnownMotion:
+class Motion:
     """One entry a pair, as in :class:`rille.datasets.protocol.Sequence`; ``warnings`` collects what is suspicious."""
 
-    times: Seconds | None
+    times: tuple[float, ...] | None
     truth: Poses | None = None
     truth_positions: Positions | None = None
     truth_source: str = ""
@@ -40,182 +41,191 @@ class KnownMotion:
     attitude: tuple[Rows | None, ...] | None = None
     imu_axes: Rows | None = None
     up: Ups | None = None
+    notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
 
-def read_motion(
-    manifest: Manifest, root: Path, name: str, pairs: Sequence[ImagePair], times: Seconds | None
-) -> KnownMotion:
-    """Everything that the manifest's tables ``times``, ``truth``, ``odometry``, ``attitude`` and ``imu`` state.
+@dataclass
+class MotionReader:
+    """Reads the files of motion of one manifest.
 
-    Parameters
+    Attributes
     ----------
-    times : of the pairs, s, where the manifest states none.
-
-    Raises
-    ------
-    InputError
-        A file cannot be used, does not belong to these pairs, or needs times where the pairs have none.
+    root : folder that files are relative to.
+    name : the manifest's, for errors.
+    pairs : of images; of some a file may be absent.
+    motion : what has been read so far; times come first, by which the others are interpolated.
     """
-    motion = KnownMotion(times)
-    if manifest.times is not None:
-        motion.times, motion.warnings = pair_times(manifest.times, root, name, pairs)
-    if manifest.truth is not None:
-        _truth(manifest.truth, root, name, motion, len(pairs))
-    if manifest.odometry is not None:
-        motion.odometry = _poses(manifest.odometry, "odometry", root, name, motion, len(pairs))
-    if manifest.attitude is not None and manifest.imu is not None:
-        raise InputError(
-            "RIL-226", f"{name}: [attitude] and [imu] both state the rotation", remedy="remove one of them"
-        )
-    if manifest.attitude is not None:
-        _attitude(manifest.attitude, root, name, motion, len(pairs))
-    if manifest.imu is not None:
-        _imu(manifest.imu, root, name, motion)
-    return motion
 
+    root: Path
+    name: str
+    pairs: Sequence[ImagePair]
+    motion: Motion
 
-# -- times -------------------------------------------------------------------------------------------------------------
+    def read(self, manifest: Manifest) -> Motion:
+        """Everything that the tables ``times``, ``truth``, ``odometry``, ``attitude`` and ``imu`` state.
 
+        Raises
+        ------
+        InputError
+            A file cannot be used, does not belong to these pairs, or needs times where the pairs have none.
+        """
+        if manifest.times is not None:
+            self.motion.times = self.times(manifest.times)
+        if manifest.truth is not None:
+            self.truth(manifest.truth)
+        if manifest.odometry is not None:
+            self.motion.odometry = self.poses(manifest.odometry, "odometry")
+        if manifest.attitude is not None:
+            self.attitude(manifest.attitude)
+        if manifest.imu is not None:
+            self.imu(manifest.imu)
+        return self.motion
 
-def pair_times(section: Times, root: Path, name: str, pairs: Sequence[ImagePair]) -> tuple[Seconds, tuple[str, ...]]:
-    """Time of each pair, s, and warning lines.
+    def times(self, section: Times) -> tuple[float, ...]:
+        """Time of each pair, s; of one without a row of its own between its neighbours.
 
-    Raises
-    ------
-    InputError
-        The times do not parse, are not one a pair, do not increase, or mix units.
-    """
-    if section.rate_hz is not None:
-        return tuple(k / section.rate_hz for k in range(len(pairs))), ()
-    if section.names:
-        return seconds([_stamp(pair, name) for pair in pairs], "the image names", unit=section.unit)
-    assert section.file is not None
-    path = root / section.file
-    stamps, lines = _times_of_file(path, [pair.left.name for pair in pairs])
-    return seconds(stamps, str(path), unit=section.unit, lines=lines)
+        Raises
+        ------
+        InputError
+            The times do not parse, are not one a pair, do not increase, or mix units.
+        """
+        if section.rate_hz is not None:
+            return tuple(k / section.rate_hz for k in range(len(self.pairs)))
+        path = self.root / (section.file or "")
+        stamps = self.stamps_of_names() if section.names else self.stamps_of_file(path)
+        what = "the image names" if section.names else str(path)
+        known = [k for k, stamp in enumerate(stamps) if stamp is not None]
+        rows = [stamp for stamp in stamps if stamp is not None]
+        times, lines = seconds([t for t, _ in rows], what, unit=section.unit, lines=[line for _, line in rows])
+        self.motion.warnings += lines
+        return tuple(float(t) for t in np.interp(range(len(stamps)), known, times))
 
+    def stamps_of_names(self) -> list[tuple[str, int]]:
+        """The time stamp in each left image's name, one since 1970 or its last number, and the place of the pair."""
+        stamps = []
+        for k, pair in enumerate(self.pairs, start=1):
+            stem = pair.left.stem
+            numbers = [stamp_of(stem)] if stamp_of(stem) else re.findall(r"\d+(?:\.\d+)?", stem)
+            if not numbers:
+                text = f"{self.name}: times.names: {pair.left} has no number in its name"
+                raise InputError("RIL-227", text, remedy=NEEDS_TIMES)
+            stamps.append((str(numbers[-1]), k))
+        return stamps
 
-def _stamp(pair: ImagePair, name: str) -> str:
-    """The time stamp in an image's name: one since 1970, or its last number, with its decimals."""
-    found = [stamp_of(pair.left.stem)] if stamp_of(pair.left.stem) else re.findall(r"\d+(?:\.\d+)?", pair.left.stem)
-    if not found:
-        raise InputError("RIL-227", f"{name}: times.names: {pair.left} has no number in its name", remedy=NEEDS_TIMES)
-    return str(found[-1])
-
-
-def _times_of_file(path: Path, names: Sequence[str]) -> tuple[list[str], list[int]]:
-    """Time stamps as text, in the order of the pairs, and the lines that they stand in."""
-    text = read_lines(path, "times")
-    rows = [(k, re.split(r"[,;\s]+", line.strip().strip(","))) for k, line in enumerate(text, start=1)]
-    rows = [(k, words) for k, words in rows if words[0] and words[0][0] in "0123456789.+-"]
-    # Tables may list more images than there are pairs, in any order: names decide where all are found.
-    by_name = {Path(words[1]).stem: (words[0], k) for k, words in rows if len(words) > 1}
-    stems = [Path(n).stem for n in names]
-    if by_name and all(stem in by_name for stem in stems):
-        return [by_name[stem][0] for stem in stems], [by_name[stem][1] for stem in stems]
-    if len(rows) != len(names):
-        absent = next((n for n, stem in zip(names, stems, strict=True) if stem not in by_name), "")
-        raise InputError(
-            "RIL-229",
-            f"{path} has {len(rows)} times for {len(names)} pairs ({ends(names)})"
-            + (f", none of {absent}" if by_name else ""),
-            remedy="give one line a pair, or lines of time and file name",
-        )
-    return [words[0] for _, words in rows], [k for k, _ in rows]
-
-
-# -- poses -------------------------------------------------------------------------------------------------------------
-
-
-def _poses(
-    section: PoseFile | Attitude, table: str, root: Path, name: str, motion: KnownMotion, count: int
-) -> tuple[RigidTransform | None, ...]:
-    """T_reference_left of each pair from a file of poses of a body; warnings go to ``motion``."""
-    path = root / section.file
-    timed = read_poses(path, section.format)
-    motion.warnings += timed.warnings
-    if isinstance(section, PoseFile):
-        in_metres = (RigidTransform(pose.rotation, section.unit * pose.translation) for pose in timed.poses)
-        timed = replace(timed, poses=tuple(in_metres))
-    poses: Poses = timed.poses
-    if timed.times is None:
-        if len(timed.poses) != count:
+    def stamps_of_file(self, path: Path) -> Sequence[tuple[str, int] | None]:
+        """Time stamp of each pair as text, and the line that it stands in."""
+        text = enumerate(read_lines(path, "times"), start=1)
+        rows = [(k, re.split(r"[,;\s]+", line.strip().strip(","))) for k, line in text]
+        rows = [(k, words) for k, words in rows if words[0] and words[0][0] in "0123456789.+-"]
+        # Tables may list more images than there are pairs, in any order: names decide where all are found.
+        by_name = {Path(words[1]).stem: (words[0], k) for k, words in rows if len(words) > 1}
+        stems = [pair.left.stem for pair in self.pairs]
+        if by_name and all(stem in by_name for stem in stems):
+            return [by_name[stem] for stem in stems]
+        if len(rows) not in self.counts():
+            absent = next((stem for stem in stems if stem not in by_name), "")
+            more = f", none of {absent}" if by_name else ""
             raise InputError(
-                "RIL-230",
-                f"{name}: {table}.file: {path} has {len(timed.poses)} poses for {count} pairs",
-                remedy="give one a pair, or poses with times",
+                "RIL-229",
+                f"{path} has {len(rows)} times for {len(self.pairs)} pairs ({ends(stems)}){more}",
+                remedy="give one line a pair, or lines of time and file name",
             )
-    else:
-        if motion.times is None:
-            raise InputError(
-                "RIL-231", f"{name}: the poses of {path} have times, but the pairs have none", remedy=NEEDS_TIMES
-            )
-        moved = replace(timed, times=tuple(t + section.time_offset for t in timed.times))
-        poses = interpolate(moved, motion.times, section.max_gap)
-        motion.warnings += coverage(poses, motion.times, f"{table} ({path.name})")
-    if section.T_body_left is None:
-        return poses
-    T_body_left = RigidTransform.from_matrix(section.T_body_left)
-    return tuple(None if pose is None else pose @ T_body_left for pose in poses)
+        return self.a_pair([(words[0], k) for k, words in rows])
 
+    def counts(self) -> set[int]:
+        """Numbers of rows that a file may have: one a pair, or one for each pair with both images."""
+        return {len(self.pairs), sum(not pair.absent for pair in self.pairs)}
 
-def _truth(section: Truth, root: Path, name: str, motion: KnownMotion, count: int) -> None:
-    """Poses of each pair, or positions alone with their own times."""
-    alone = read_positions(root / section.file, section.format, {str(k): v for k, v in section.columns.items()})
-    motion.truth_source = section.source or f"{'positions' if alone else 'poses'} of {section.file}, as recorded"
-    if alone is None:
+    def a_pair(self, rows: Sequence[Row]) -> Sequence[Row | None]:
+        """One row a pair; where there are rows for whole pairs alone (:meth:`counts`), None for the others."""
+        remaining = iter(rows)
+        some = len(rows) < len(self.pairs)
+        return [None if some and pair.absent else next(remaining) for pair in self.pairs]
+
+    def poses(self, section: PoseFile | Attitude, table: str) -> Poses:
+        """T_reference_left of each pair from a file of poses of a body."""
+        path = self.root / section.file
+        timed = read_poses(path, section.format)
+        self.motion.warnings += timed.warnings
+        unit = section.unit if isinstance(section, PoseFile) else 1.0
+        poses: Poses = tuple(p and RigidTransform(p.rotation, unit * p.translation) for p in timed.poses)
+        if timed.times is not None:
+            if self.motion.times is None:
+                text = f"{self.name}: the poses of {path} have times, but the pairs have none"
+                raise InputError("RIL-231", text, remedy=NEEDS_TIMES)
+            moved = replace(timed, poses=poses, times=tuple(t + section.time_offset for t in timed.times))
+            poses = interpolate(moved, self.motion.times, section.max_gap)
+            self.motion.warnings += coverage(poses, self.motion.times, f"{table} ({path.name})")
+        elif len(poses) in self.counts():
+            poses = tuple(self.a_pair(poses))
+        else:
+            text = f"{self.name}: {table}.file: {path} has {len(poses)} poses for {len(self.pairs)} pairs"
+            raise InputError("RIL-230", text, remedy="give one a pair, or poses with times")
+        if section.T_body_left is None:
+            return poses
+        T_body_left = RigidTransform.from_matrix(section.T_body_left)
+        return tuple(pose and pose @ T_body_left for pose in poses)
+
+    def truth(self, section: Truth) -> None:
+        """Poses of each pair, or positions alone with their own times."""
+        columns = {str(meaning): column for meaning, column in section.columns.items()}
+        alone = read_positions(self.root / section.file, section.format, columns)
+        kind = "positions" if alone else "poses"
+        self.motion.truth_source = section.source or f"{kind} of {section.file}, as recorded"
+        if alone is not None:
+            self.motion.truth_positions = self.positions(section, alone.times, alone.positions)
+            self.motion.warnings += alone.warnings
+            return
         if section.lever_arm is not None:
             raise InputError(
                 "RIL-782",
-                f"{name}: truth.lever_arm: {section.file} holds poses, not positions alone",
+                f"{self.name}: truth.lever_arm: {section.file} holds poses, not positions alone",
                 remedy="state where the camera is in their body as T_body_left",
             )
-        motion.truth = _poses(section, "truth", root, name, motion, count)
-        motion.truth_mount = None if section.T_body_left is None else RigidTransform.from_matrix(section.T_body_left)
-        return
-    if section.T_body_left is not None:
-        raise InputError(
-            "RIL-802",
-            f"{name}: truth.T_body_left: the positions of {alone.name} have no rotations by which to move them",
-            remedy="remove T_body_left, or give poses",
-        )
-    times = None if alone.times is None else tuple(t + section.time_offset for t in alone.times)
-    if motion.times is None or times is None:
-        if len(alone.positions) != count:
-            raise InputError(
-                "RIL-803",
-                f"{name}: truth.file: {alone.name} has {len(alone.positions)} positions for {count} pairs, and "
-                f"{'the pairs have' if motion.times is None else 'it has'} no times to match them by",
-                remedy="give one a pair, or times of both ([times] of the pairs)",
-            )
-        times = None
-    elif len(times) > 1 and float(np.median(np.diff(times))) > section.max_gap:
-        raise InputError(
-            "RIL-804",
-            f"{name}: truth.max_gap = {section.max_gap:g} s, but the positions of {alone.name} are "
-            f"{float(np.median(np.diff(times))):.4g} s apart: nothing would be compared",
-            remedy="raise truth.max_gap, if straight lines between them are exact enough",
-        )
-    positions = tuple(tuple(section.unit * v for v in row) for row in alone.positions)
-    motion.truth_positions = Positions(positions, times, section.max_gap, section.lever_arm)
-    motion.warnings += alone.warnings
+        self.motion.truth = self.poses(section, "truth")
+        if section.T_body_left is not None:
+            self.motion.truth_mount = RigidTransform.from_matrix(section.T_body_left)
 
+    def positions(self, section: Truth, at: tuple[float, ...] | None, rows: tuple[tuple[float, ...], ...]) -> Positions:
+        """Positions of the truth in metres, at times (s) of the images' clock or one a pair."""
+        where = f"{self.name}: truth.{{}}: {section.file} "
+        if section.T_body_left is not None:
+            text = where.format("T_body_left") + "holds positions, which have no rotations by which to move them"
+            raise InputError("RIL-802", text, remedy="remove T_body_left, or give poses")
+        spacing = float(np.median(np.diff(at))) if at is not None and len(at) > 1 else 0.0
+        if self.motion.times is None or at is None:
+            if len(rows) != len(self.pairs):
+                text = f"has {len(rows)} positions for {len(self.pairs)} pairs, and not both have times"
+                remedy = "give one a pair, or times of both ([times] of the pairs)"
+                raise InputError("RIL-803", where.format("file") + text, remedy=remedy)
+            at = None
+        elif spacing > section.max_gap:
+            text = f"has positions {spacing:.4g} s apart, more than {section.max_gap:g} s: nothing would be compared"
+            remedy = "raise truth.max_gap, if straight lines between them are exact enough"
+            raise InputError("RIL-804", where.format("max_gap") + text, remedy=remedy)
+        times = None if at is None else tuple(t + section.time_offset for t in at)
+        scaled = tuple(tuple(section.unit * v for v in row) for row in rows)
+        return Positions(scaled, times, section.max_gap, section.lever_arm)
 
-def _attitude(section: Attitude, root: Path, name: str, motion: KnownMotion, count: int) -> None:
-    poses = _poses(section, "attitude", root, name, motion, count)
-    motion.attitude = tuple(None if pose is None else rows_of(pose.rotation) for pose in poses)
-    if section.up is not None:
-        what = f"{name}: attitude.up"
-        motion.up = tuple(None if p is None else direction(section.up, p.inverse(), what) for p in poses)
+    def attitude(self, section: Attitude) -> None:
+        """Rotations of a sensor, and the vertical where the file's reference is known to have one."""
+        poses = self.poses(section, "attitude")
+        self.motion.attitude = tuple(None if pose is None else rows_of(pose.rotation) for pose in poses)
+        if section.up is not None:
+            what = f"{self.name}: attitude.up"
+            self.motion.up = tuple(None if p is None else direction(section.up, p.inverse(), what) for p in poses)
 
-
-def _imu(section: Imu, root: Path, name: str, motion: KnownMotion) -> None:
-    if motion.times is None:
-        raise InputError("RIL-232", f"{name}: [imu] needs times, but the pairs have none", remedy=NEEDS_TIMES)
-    imu = read_imu(root / section.file)
-    shifted = replace(imu, times=imu.times + section.time_offset)
-    inertial = at_frames(shifted, motion.times, RigidTransform.from_matrix(section.T_imu_left))
-    motion.attitude, motion.imu_axes = inertial.attitude, inertial.axes
-    motion.up = inertial.up if any(up is not None for up in inertial.up) else None
-    motion.warnings += (*imu.warnings, *inertial.warnings)
+    def imu(self, section: Imu) -> None:
+        """Rotations and vertical by an IMU."""
+        if self.motion.times is None:
+            text = f"{self.name}: [imu] needs times, but the pairs have none"
+            raise InputError("RIL-232", text, remedy=NEEDS_TIMES)
+        imu = read_imu(self.root / section.file)
+        shifted = replace(imu, times=imu.times + section.time_offset)
+        inertial = at_frames(shifted, self.motion.times, RigidTransform.from_matrix(section.T_imu_left))
+        self.motion.attitude = inertial.attitude if any(inertial.attitude) else None
+        self.motion.up = inertial.up if any(inertial.up) else None
+        self.motion.imu_axes = inertial.axes
+        self.motion.notes += inertial.notes
+        self.motion.warnings += (*imu.warnings, *inertial.warnings)

@@ -22,7 +22,7 @@ from rille.datasets.images import files
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import ImagePair, common_headers, pair_up
 from rille.datasets.manifest.model import Cameras, Images, Manifest, RigSection, read_manifest
-from rille.datasets.manifest.motion import read_motion
+from rille.datasets.manifest.motion import Motion, MotionReader
 from rille.datasets.manifest.rig import read_optics
 from rille.datasets.protocol import Sequence, Source
 from rille.datasets.text.names import derived_name
@@ -41,10 +41,21 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
     InputError
         The manifest or a file that it names cannot be used; the message names the file and the key.
     """
-    manifest, name = read_manifest(path), str(path)
-    root = root_folder(manifest.root, path)
+    manifest = read_manifest(path)
+    named = manifest.model_copy(update={"name": manifest.name or default_name(path)})
+    return open_described(named, root_folder(manifest.root, path), str(path), digests)
+
+
+def open_described(manifest: Manifest, root: Path, name: str, digests: files.Digests) -> Sequence:
+    """The sequence of a manifest that a file, or a reader of one layout of folders, has stated.
+
+    Parameters
+    ----------
+    root : folder that the files are relative to.
+    name : the manifest's or the folder's, for errors.
+    """
     base, pairs = _of_bag(manifest, root, name) or _of_files(manifest, root, name, digests)
-    motion = read_motion(manifest, root, name, pairs, base.times)
+    motion = MotionReader(root, name, pairs, Motion(base.times)).read(manifest)
     up = motion.up or base.up
     world = manifest.world
     pitch = None if world.pitch_deg is None else math.radians(world.pitch_deg)
@@ -57,7 +68,7 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
             pitch = robot.pitch
     return replace(
         base,
-        name=manifest.name or default_name(path),
+        name=manifest.name,
         times=motion.times,
         truth=motion.truth,
         truth_positions=motion.truth_positions,
@@ -71,7 +82,7 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
         georeference=georeference(world.crs, world.origin, world.azimuth_deg, name),
         vehicle=vehicle,
         defaults={**base.defaults, **dict(dotted(manifest.defaults))},
-        notes=(*base.notes, *manifest.notes),
+        notes=(*base.notes, *motion.notes, *manifest.notes),
         warnings=(*base.warnings, *motion.warnings),
     )
 
@@ -173,6 +184,8 @@ def find_pairs(images: Images, root: Path, name: str, lines: list[str]) -> tuple
             paths = search.matching(root, pattern)
         except InputError as error:
             raise error.at(f"{name}: images.{side}") from error
+        if pattern.endswith("*"):  # of any kind: then what is no image may lie beside the images
+            paths = [path for path in paths if path.suffix.lower() in files.SUFFIXES] or paths
         if not paths:
             raise InputError(
                 "RIL-217",

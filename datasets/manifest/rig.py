@@ -32,6 +32,12 @@ OFF_CENTRE = 0.1
 USUAL_WIDTHS = (320, 512, 640, 672, 720, 752, 800, 848, 960, 1024, 1226, 1242, 1280, 1440, 1600, 1920, 2448, 2560, 3840)
 """px, of images as cameras give them."""
 
+STREET = {"locus.cell_size": 0.1}
+"""0.1 m resolves kerbs where the disparity does."""
+
+CAR = 0.3
+"""m, baseline from which a rig is taken for a car's: of a smaller one the cells follow from what its pixels resolve."""
+
 SAME = 0.01
 """Relative difference of two stated baselines that is no contradiction."""
 
@@ -249,7 +255,7 @@ def _check_baseline(baseline: float, section: RigSection, name: str) -> list[str
     from_files = section.baseline is None and section.T_right_left is None
     if baseline > LONGEST_BASELINE:
         unit = section.unit / 1000
-        hint = f"set rig.unit = {unit:g}, if the calibration is in millimetres" if from_files else "lengths are metres"
+        hint = f"a manifest's rig.unit = {unit:g} reads a calibration in millimetres" if from_files else "give metres"
         raise InputError(
             "RIL-244",
             f"{name}: the baseline is {baseline:g} m, which looks like millimetres",

@@ -40,32 +40,33 @@ class TextTable:
         """One column as it is written: exact, where a float would lose the last digits of a time stamp."""
         return [row[column] for row in self.rows]
 
-    def numbers(self, columns: Sequence[int]) -> NDArray[np.float64]:
-        """Columns as finite numbers, (rows, columns).
+    def numbers(self, columns: Sequence[int], gaps: bool = False) -> NDArray[np.float64]:
+        """Columns as finite numbers, (rows, columns); with ``gaps`` rows may be NaN as a whole.
 
         Raises
         ------
         InputError
             A cell is not a finite number; the message names the line.
         """
-        out = np.empty((len(self.rows), len(columns)))
-        for k, row in enumerate(self.rows):
-            for j, column in enumerate(columns):
-                out[k, j] = number(row[column], self.name, self.lines[k])
-        return out
+        values = np.array([[_number(row[column]) for column in columns] for row in self.rows])
+        wrong = ~np.isfinite(values) & ~(gaps & np.isnan(values).all(axis=1, keepdims=True))
+        if wrong.any():
+            row, column = np.argwhere(wrong)[0]
+            cell = self.rows[row][columns[column]]
+            raise InputError(
+                "RIL-284",
+                f"{self.name}, line {self.lines[row]}: {cell!r} is not a finite number",
+                remedy="correct or remove that line",
+            )
+        return values
 
 
-def number(cell: str, name: str, line: int) -> float:
-    """A finite number of a cell."""
+def _number(cell: str) -> float:
+    """Number of a cell; infinity where it is none."""
     try:
-        value = float(cell)
+        return float(cell)
     except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise InputError(
-            "RIL-284", f"{name}, line {line}: {cell!r} is not a finite number", remedy="correct or remove that line"
-        )
-    return value
+        return math.inf
 
 
 def read_table(path: Path, what: str) -> TextTable:

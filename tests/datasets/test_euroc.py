@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from rille.datasets.euroc import open_euroc, recognise
+from rille.datasets.euroc import open_layout
 from rille.datasets.images.files import Digests
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
@@ -89,9 +89,7 @@ def flight(tmp_path):
 
 
 def opened(folder):
-    layout = recognise(folder)
-    assert layout is not None
-    return open_euroc(layout, Digests())
+    return open_layout(folder, None, Digests())
 
 
 def test_a_whole_recording(flight, materialise):
@@ -108,8 +106,8 @@ def test_a_whole_recording(flight, materialise):
 
 
 def test_mav0_itself_is_recognised_and_others_are_not(flight, tmp_path):
-    assert recognise(flight / "mav0").name == "hall"
-    assert recognise(tmp_path) is None
+    assert opened(flight / "mav0").name == "hall"
+    assert opened(tmp_path) is None
 
 
 def test_truth_is_that_of_the_left_camera_at_the_image(flight):
@@ -125,7 +123,7 @@ def test_markers_stand_somewhere_in_the_body(flight):
     write(flight / "mav0" / "vicon0" / "data.csv", poses(T_BODY_MARKER, times))
     s = opened(flight)
     assert s.truth is None
-    assert "vicon0 does not say how its markers stand in the body" in s.warnings[0]
+    assert [line[:7] for line in s.warnings] == ["RIL-685"]
     write(flight / "mav0" / "vicon0" / "sensor.yaml", sensor(T_BODY_MARKER, camera=False))
     s = opened(flight)
     np.testing.assert_allclose(s.truth[3].matrix34, (body(0.15) @ T_BODY_LEFT).matrix34, atol=1e-6)
@@ -148,7 +146,7 @@ def test_truth_with_a_gap_is_said(flight):
     write(path, "\n".join(lines[:2] + lines[5:]) + "\n")
     s = opened(flight)
     assert [T is not None for T in s.truth] == [False, False, False, False, True]
-    assert "no truth in state_groundtruth_estimate0 for 4 of 5 frames" in " ".join(s.warnings)
+    assert "RIL-688" in [line[:7] for line in s.warnings]
 
 
 def test_images_without_a_partner_are_left_out_and_counted(flight):
@@ -157,8 +155,8 @@ def test_images_without_a_partner_are_left_out_and_counted(flight):
     assert s.frames == FRAMES - 1
     assert str(START + 2 * STEP) not in s.frame_names
     assert s.image(2, "right").hints["path"].endswith(f"{START + 3 * STEP}.png")
-    assert "1 of 5 images" in s.warnings[0]
-    assert s.warnings[1] == "RIL-680: images without a partner of the same time are left out: 1 of cam0, 0 of cam1"
+    assert [line[:7] for line in s.warnings] == ["RIL-821"]
+    assert "1 image " in s.warnings[0]
 
 
 def test_without_imu_truth_or_lists(flight):
@@ -176,28 +174,11 @@ def _no_calibration(m):
     (m / "cam1" / "sensor.yaml").unlink()
 
 
-def _shifted(m):
-    text = (m / "cam1" / "data.csv").read_text().splitlines()
-    rows = [text[0]] + [f"{int(line.split(',')[0]) + 1},{line.split(',')[1]}" for line in text[1:]]
-    (m / "cam1" / "data.csv").write_text("\n".join(rows))
-
-
 def _mixed(m):
     for name in ("cam0", "cam1"):
         text = (m / name / "data.csv").read_text().splitlines()
         text[3] = text[3][:16] + text[3][19:]
         (m / name / "data.csv").write_text("\n".join(text))
-
-
-def _twice(m):
-    with (m / "cam0" / "data.csv").open("a") as file:
-        file.write(f"{START},{START + STEP}.png\n")
-
-
-def _backwards(m):
-    for name in ("cam0", "cam1"):
-        text = (m / name / "data.csv").read_text().splitlines()
-        (m / name / "data.csv").write_text("\n".join([text[0], text[2], text[1], *text[3:]]))
 
 
 def _another_day(m):
@@ -222,23 +203,15 @@ def _empty(m):
         path.unlink()
 
 
-def _elsewhere(m):
-    (m / "cam0" / "data.csv").write_text("#t,filename\n1,a.png\n2,b.png\n")
-
-
 @pytest.mark.parametrize(
     ("spoil", "expected"),
     [
         (_no_calibration, ("RIL-161", "cam1/sensor.yaml", "cam1")),
-        (_shifted, ("RIL-156",)),
         (_mixed, ("RIL-292", "cam0/data.csv", "line 4")),
-        (_twice, ("RIL-159", "cam0/data.csv", "line 7")),
-        (_backwards, ("RIL-293", "cam0/data.csv", "line 3")),
         (_another_day, ("RIL-269", "1403")),
         (_swapped, ("RIL-130",)),
         (_size, ("RIL-176", "60 x 48", "64 x 48")),
-        (_empty, ("RIL-157", "cam0/data")),
-        (_elsewhere, ("RIL-160",)),
+        (_empty, ("RIL-217", "cam0/data")),
     ],
 )
 def test_what_is_wrong_is_one_line_with_a_remedy(flight, spoil, expected):

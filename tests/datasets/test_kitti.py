@@ -185,7 +185,7 @@ def _same_place(f):
 
 
 def _singular(f):
-    (f / "calib.txt").write_text(line(P_LEFT) + "\n" + line(np.zeros((3, 4))))
+    (f / "calib.txt").write_text(line(P_LEFT) + "\n" + line(np.diag([100.0, 0.0, 0.0])[:, [0, 1, 2, 2]]))
 
 
 def _no_rotation(f):
@@ -205,23 +205,23 @@ def _not_an_image(f):
 @pytest.mark.parametrize(
     ("spoil", "expected"),
     [
-        breaks(("right missing", _drop_right, ("RIL-209", "image_l/000001.png"))),
-        breaks(("left missing", _drop_left, ("RIL-209", "image_r/000001.png"))),
+        breaks(("right missing", _drop_right, ("RIL-259", "000001.png"))),
+        breaks(("left missing", _drop_left, ("RIL-259", "image_r/000001.png"))),
         breaks(("size", _resize, ("RIL-176", "image_r/000002.png", "60 x 48", "64 x 48"))),
         breaks(("depth", _deepen, ("RIL-176", "image_l/000001.png", "16 bits", "8 bits"))),
-        breaks(("pose count", _fewer_poses, ("RIL-211", "poses.txt"))),
-        breaks(("time count", _times, ("RIL-211", "times.txt"))),
+        breaks(("pose count", _fewer_poses, ("RIL-230", "poses.txt"))),
+        breaks(("time count", _times, ("RIL-229", "times.txt"))),
         breaks(("time goes back", _time_goes_back, ("RIL-293", "times.txt", "line 3", "0.1", "0.2"))),
         breaks(("time twice", _time_twice, ("RIL-293", "times.txt", "line 3", "0.1"))),
         breaks(("no calibration", _no_calib, ("RIL-278", "calib.txt"))),
-        breaks(("one camera", _one_row, ("RIL-202", "calib.txt", "image_l", "image_r"))),
-        breaks(("short row", _short_row, ("RIL-200", "calib.txt", "line 2"))),
-        breaks(("swapped", _swapped, ("RIL-207", "0.5"))),
-        breaks(("millimetres", _millimetres, ("RIL-206", "500", "0.5"))),
-        breaks(("one place", _same_place, ("RIL-205",))),
-        breaks(("singular", _singular, ("RIL-203", "image_r"))),
+        breaks(("one camera", _one_row, ("RIL-100", "calib.txt"))),
+        breaks(("short row", _short_row, ("RIL-100", "calib.txt"))),
+        breaks(("swapped", _swapped, ("RIL-130", "0.5"))),
+        breaks(("millimetres", _millimetres, ("RIL-244", "500", "0.5"))),
+        breaks(("one place", _same_place, ("RIL-129",))),
+        breaks(("singular", _singular, ("RIL-203", "calib.txt", "P1"))),
         breaks(("no rotation", _no_rotation, ("RIL-333", "poses.txt", "line 1"))),
-        breaks(("no images", _empty, ("RIL-210", "image_l"))),
+        breaks(("no images", _empty, ("RIL-217", "image_l"))),
         breaks(("empty file", _not_an_image, ("RIL-170", "image_l/000000.png"))),
     ],
 )

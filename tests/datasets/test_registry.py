@@ -197,5 +197,5 @@ def test_a_folder_of_images_that_are_not_read_says_so(tmp_path):
         (tmp_path / side).mkdir()
         (tmp_path / side / "1.heic").write_bytes(b"x")
     (tmp_path / "calib.txt").write_text("7 0 3 0 0 7 2 0 0 0 1 0\n7 0 3 -1 0 7 2 0 0 0 1 0\n")
-    with raises("RIL-210", "1 image (1.heic): convert them"):
+    with raises("RIL-171", "1.heic", "convert them"):
         open_sequence(str(tmp_path))
