@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rille.stages.core.errors import InputError
-
 
 @dataclass(frozen=True)
 class Georeference:
@@ -42,41 +40,18 @@ class Georeference:
         return {"crs": self.crs, "origin": list(self.origin), "azimuth": self.azimuth}
 
 
-def georeference(
-    crs: str | None, origin: tuple[float, float, float] | None, azimuth_deg: float | None, where: str
-) -> Georeference | None:
-    """The place that a manifest states; None where it states none.
-
-    Raises
-    ------
-    InputError
-        One of the three is missing, or the CRS is unknown, not projected or not in metres.
-    """
-    given = {"crs": crs, "origin": origin, "azimuth_deg": azimuth_deg}
-    missing = [name for name, value in given.items() if value is None]
-    if len(missing) == len(given):
-        return None
-    if crs is None or origin is None or azimuth_deg is None:
-        raise InputError(
-            "RIL-180",
-            f"{where}: world.{' and world.'.join(missing)} missing: a place needs crs, origin and azimuth_deg",
-            remedy='e.g. crs = "EPSG:32633", origin = [easting, northing, height], azimuth_deg = 90 for looking east',
-        )
-    _check_crs(crs, where)
-    return Georeference(crs, origin, math.radians(azimuth_deg))
-
-
-def _check_crs(text: str, where: str) -> None:
+def metric_crs(text: str) -> str:
+    """The CRS as it is written; ValueError where it is unknown, not projected or not in metres."""
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
 
-    remedy = 'give a projected one in metres, e.g. "EPSG:32633" (UTM zone 33 north)'
     try:
         crs = CRS.from_user_input(text)
     except CRSError as error:
-        raise InputError("RIL-181", f"{where}: world.crs = {text!r} is no known CRS", remedy=remedy) from error
+        raise ValueError("it is no known CRS: give e.g. EPSG:32633 (UTM zone 33 north)") from error
     if not crs.is_projected:
-        raise InputError("RIL-182", f"{where}: world.crs = {text!r} is not projected", remedy=remedy)
+        raise ValueError("it is not projected: give one in metres, e.g. EPSG:32633 (UTM zone 33 north)")
     unit, factor = crs.linear_units_factor
     if factor != 1.0:
-        raise InputError("RIL-183", f"{where}: world.crs = {text!r} is in {unit} of {factor:.6g} m", remedy=remedy)
+        raise ValueError(f"it is in {unit} of {factor:.6g} m: give one in metres")
+    return text

@@ -12,8 +12,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pydantic import ValidationError
-
 from rille.datasets.images.files import Digests
 from rille.datasets.images.kinds import unread
 from rille.datasets.images.misalign import MisalignParams, misalign
@@ -24,8 +22,8 @@ from rille.datasets.mockup.params import RECORDED_ONLY, SHORT, MockupParams
 from rille.datasets.mockup.rover import RoverParams
 from rille.datasets.mockup.sequence import mockup
 from rille.datasets.protocol import Sequence
-from rille.stages.core.declare import Params
-from rille.stages.core.errors import ConfigError, InputError, RilleError, told
+from rille.datasets.text.validation import Model, validated
+from rille.stages.core.errors import ConfigError, InputError, RilleError
 
 BUILT_IN: dict[str, tuple[str, Mapping[str, Any]]] = {
     "mockup": ("the paper's experiment, simulated: 40 pairs over a lunar bed at 1:10, with exact truth", {}),
@@ -90,11 +88,11 @@ def open_sequence(
     sections = dict(overrides or {})
     if name_or_path == "mockup-loop":
         return _loop(sections, name_or_path)
-    warp = validated(MisalignParams, "misalign", sections.pop("misalign", {}))
+    warp = _section("misalign", MisalignParams, sections.pop("misalign", {}))
     if name_or_path in BUILT_IN:
         preset, given = BUILT_IN[name_or_path][1], sections.pop("mockup", {})
         _none_left(sections, name_or_path)
-        sequence = mockup(validated(MockupParams, "mockup", {**preset, **given}), name_or_path)
+        sequence = mockup(_section("mockup", MockupParams, {**preset, **given}), name_or_path)
     else:
         _none_left(sections, name_or_path)
         sequence = examined(_of_files(name_or_path, Digests(memory)))
@@ -103,9 +101,9 @@ def open_sequence(
 
 def _loop(sections: dict[str, Mapping[str, Any]], name: str) -> Sequence:
     preset, given = BUILT_IN[name][1], sections.pop("mockup", {})
-    rover = validated(RoverParams, "rover", sections.pop("rover", {}))
+    rover = _section("rover", RoverParams, sections.pop("rover", {}))
     _none_left(sections, name)
-    params, default = (validated(MockupParams, "mockup", {**preset, **more}) for more in (given, {}))
+    params, default = (_section("mockup", MockupParams, {**preset, **more}) for more in (given, {}))
     for key in RECORDED_ONLY:
         if getattr(params, key) != getattr(default, key):
             raise ConfigError(
@@ -170,28 +168,8 @@ def folder_manifest(folder: Path) -> Path | None:
     return found[0] if found else None
 
 
-def validated(kind: type[Params], section: str, values: Mapping[str, Any]) -> Any:
-    """``kind(**values)`` with complaints as one line that names the dotted key.
-
-    Raises
-    ------
-    ConfigError
-        A key is unknown or a value not permitted.
-    """
-    try:
-        return kind.model_validate(dict(values))
-    except ValidationError as error:
-        what = told(error.errors(), lambda e: _complaint(kind, section, e))
-        raise ConfigError("RIL-280", what, remedy="") from error
-
-
-def _complaint(kind: type[Params], section: str, error: dict[str, Any]) -> str:
-    key = ".".join(str(part) for part in (section, *error["loc"]))
-    if error["type"] == "extra_forbidden":
-        near = difflib.get_close_matches(str(error["loc"][0]), list(kind.model_fields), n=1)
-        hint = f"did you mean '{section}.{near[0]}'?" if near else f"known: {', '.join(sorted(kind.model_fields))}"
-        return f"unknown key {key!r} (value {error['input']!r}): {hint}"
-    return f"{key} = {error['input']!r} is not permitted: {error['msg'][0].lower()}{error['msg'][1:]}"
+def _section(name: str, kind: type[Model], values: Mapping[str, Any]) -> Model:
+    return validated("RIL-280", kind, values, section=name)
 
 
 def _none_left(sections: Mapping[str, Any], name: str) -> None:

@@ -15,9 +15,9 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from pydantic import ValidationError
 
 from rille.datasets.text.reading import read_text
+from rille.datasets.text.validation import validated
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform
@@ -104,12 +104,8 @@ def read_urdf(path: Path, camera: str = "", stated: Vehicle | None = None) -> Ro
     found: dict[str, Any] = {name: round(float(value), 6) for name, value in sizes.items() if value > 1e-3}
     found |= {"name": robot.get("name")} if robot.get("name") else {}
     found |= {} if stated is None else stated.model_dump(exclude_unset=True)
-    try:
-        vehicle = Vehicle.model_validate(found)
-    except ValidationError as error:
-        raise _error(
-            path, f"gives no vehicle: {error.errors()[0]['msg']}", "state what differs in [vehicle]"
-        ) from error
+    remedy = "state what differs in [vehicle]"
+    vehicle = validated("RIL-959", Vehicle, found, file=f"URDF {path}", remedy=remedy)
     return Robot(vehicle, _pitch(camera, places, path) if camera else None)
 
 

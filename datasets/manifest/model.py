@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import difflib
-import re
-from collections.abc import Iterable, Mapping
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
-from rille.datasets.text.reading import read_text, read_toml
+from rille.datasets.georeference import Georeference, metric_crs
+from rille.datasets.text.reading import read_toml
+from rille.datasets.text.validation import TAG, validated
 from rille.stages.core.declare import Params
-from rille.stages.core.errors import InputError, told
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.hazard.vehicle import Vehicle
 
@@ -30,7 +29,18 @@ def _pose(value: Any) -> tuple[float, ...]:
 
 
 Pose = Annotated[tuple[float, ...], BeforeValidator(_pose)]
-Direction = tuple[float, float, float]
+
+
+def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    """A unit vector."""
+    length = math.hypot(*value)
+    if not length > 0:
+        raise ValueError("it has no direction: give e.g. [0, 0, 1] where z is up")
+    return value[0] / length, value[1] / length, value[2] / length
+
+
+Vector = tuple[float, float, float]
+Direction = Annotated[Vector, AfterValidator(_direction)]
 PoseFormat = Literal["auto", "kitti", "tum", "euroc", "csv"]
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
@@ -97,10 +107,11 @@ class PinholeLens(Params):
 
 
 def _kind(value: Any) -> str:
-    return "file" if isinstance(value, str) else "camera"
+    return FILE if isinstance(value, str) else FIGURES
 
 
-OneCamera = Annotated[Annotated[str, Tag("file")] | Annotated[PinholeLens, Tag("camera")], Discriminator(_kind)]
+FILE, FIGURES = f"{TAG}file)", f"{TAG}figures)"
+OneCamera = Annotated[Annotated[str, Tag(FILE)] | Annotated[PinholeLens, Tag(FIGURES)], Discriminator(_kind)]
 
 
 class Cameras(PinholeLens):
@@ -137,6 +148,15 @@ class RigSection(Params):
     unit: float = Field(
         default=1.0, gt=0, description="m; length of one unit of the calibration files, 0.001 where they say mm"
     )
+
+    @model_validator(mode="after")
+    def _one_baseline(self) -> RigSection:
+        if self.baseline is not None and self.T_right_left is not None:
+            raise ValueError("baseline and T_right_left both state the baseline: remove one of them")
+        if self.baseline is not None and self.baseline <= 0:
+            swapped = "where the right camera stands to the left, exchange images.left and images.right"
+            raise ValueError(f"baseline = {self.baseline:g} m is not positive: give the distance; {swapped}")
+        return self
 
 
 class Times(Params):
@@ -182,7 +202,7 @@ class Truth(PoseFile):
         description='names or numbers (from 1) of the columns of positions alone, e.g. { time = "gps s", x = "E", y = '
         '"N" }; x and y span the ground, y left of x seen from above, z is up; names that are clear need none',
     )
-    lever_arm: Direction | None = Field(
+    lever_arm: Vector | None = Field(
         default=None,
         description="m; where the antenna or prism of positions alone is in the left camera's frame: x right, y down, "
         "z ahead; none: fitted where turns show it, and the report says so",
@@ -230,11 +250,11 @@ class World(Params):
         description="direction of up in the reference frame of the calibration files (the left camera's where they "
         "state none), the same for all pairs",
     )
-    crs: str | None = Field(
+    crs: Annotated[str, AfterValidator(metric_crs)] | None = Field(
         default=None,
         description='projected CRS in metres of the results, e.g. "EPSG:32633"; with origin and azimuth_deg',
     )
-    origin: Direction | None = Field(
+    origin: Vector | None = Field(
         default=None, description="m; easting, northing and height of the first left camera's centre in that CRS"
     )
     azimuth_deg: float | None = Field(
@@ -244,6 +264,22 @@ class World(Params):
         description="degrees clockwise from grid north; heading of the first left camera's optical axis, which is the "
         "world's y axis",
     )
+
+    @model_validator(mode="after")
+    def _one_vertical_and_a_whole_place(self) -> World:
+        if self.up is not None and self.pitch_deg is not None:
+            raise ValueError("up and pitch_deg both state the vertical: remove one of them")
+        missing = [key for key in ("crs", "origin", "azimuth_deg") if getattr(self, key) is None]
+        if len(missing) in (1, 2):
+            raise ValueError(f"a place needs crs, origin and azimuth_deg: {' and '.join(missing)} missing")
+        return self
+
+    @property
+    def place(self) -> Georeference | None:
+        """Where the world frame lies; None where nothing is stated."""
+        if self.crs is None or self.origin is None or self.azimuth_deg is None:
+            return None
+        return Georeference(self.crs, self.origin, math.radians(self.azimuth_deg))
 
 
 class Urdf(Params):
@@ -299,66 +335,5 @@ def read_manifest(path: Path) -> Manifest:
     InputError
         It cannot be read, is not TOML, or a key is unknown, missing or not permitted; the message names the key.
     """
-    values = read_toml(path, "manifest")
-    try:
-        return Manifest.model_validate(values)
-    except ValidationError as error:
-        what = told(error.errors(), lambda e: _complaint(e) + _under_a_comment(e, path))
-        raise InputError("RIL-223", f"{path}: {what}", remedy="`rille init FOLDER` writes one to begin with") from error
-
-
-def _complaint(error: Mapping[str, Any]) -> str:
-    """One of pydantic's complaints as dotted key, value and reason."""
-    # pydantic names the member of a union (`file`, `camera`) as if it were a key.
-    loc = [str(part) for part in error["loc"] if part not in ("file", "camera") or part == error["loc"][-1]]
-    key = ".".join(loc)
-    if error["type"] == "extra_forbidden":
-        return f"unknown key {key!r} (value {error['input']!r}){_nearest(loc)}"
-    if error["type"] == "missing":
-        return f"{key} is missing"
-    reason = str(error.get("ctx", {}).get("error", error["msg"]))
-    value = "" if isinstance(error["input"], dict) else f" = {error['input']!r} is not permitted"
-    return f"{key or 'manifest'}{value}: {reason[0].lower() + reason[1:]}"
-
-
-def _under_a_comment(error: Mapping[str, Any], path: Path) -> str:
-    """Why a key of another table stands in this one: the header above it is still a comment."""
-    if error["type"] != "extra_forbidden":
-        return ""
-    header = ""
-    for line in read_text(path, "manifest").splitlines():
-        text = line.strip()
-        bare = re.match(r"(#?)\s*\[([A-Za-z_.]+)\]", text)
-        if bare:
-            header = bare[2] if bare[1] else ""
-        if header and re.match(rf"{re.escape(str(error['loc'][-1]))}\s*=", text):
-            return f"; it stands under the line '# [{header}]', which is a comment: remove its #, too"
-    return ""
-
-
-def _nearest(loc: list[str]) -> str:
-    """The key that may have been meant: of the same table, or of the same name in another one."""
-    known = list(known_keys())
-    key, last = ".".join(loc), loc[-1]
-    elsewhere = [k for k in known if k.rpartition(".")[2] == last]
-    near = elsewhere[:1] or difflib.get_close_matches(key, known, n=1)
-    if near:
-        return f": did you mean {near[0]!r}?"
-    table = key.rpartition(".")[0]
-    return f": known here are {', '.join(k.rpartition('.')[2] for k in known if k.rpartition('.')[0] == table)}"
-
-
-def known_keys(kind: type[Params] = Manifest, prefix: str = "") -> Iterable[str]:
-    """All dotted keys of a manifest, tables included."""
-    for name, field in kind.model_fields.items():
-        yield prefix + name
-        for table in tables(field.annotation):
-            yield from known_keys(table, f"{prefix}{name}.")
-
-
-def tables(annotation: Any) -> Iterable[type[Params]]:
-    """The models that a field's annotation allows."""
-    if isinstance(annotation, type):
-        return [annotation] if issubclass(annotation, Params) else []
-    found = [table for part in getattr(annotation, "__args__", ()) for table in tables(part)]
-    return list(dict.fromkeys(found))
+    remedy = "`rille init FOLDER` writes one to begin with"
+    return validated("RIL-223", Manifest, read_toml(path, "manifest"), file=str(path), remedy=remedy)

@@ -213,8 +213,7 @@ class MotionReader:
         poses = self.poses(section, "attitude")
         self.motion.attitude = tuple(None if pose is None else rows_of(pose.rotation) for pose in poses)
         if section.up is not None:
-            what = f"{self.name}: attitude.up"
-            self.motion.up = tuple(None if p is None else direction(section.up, p.inverse(), what) for p in poses)
+            self.motion.up = tuple(None if p is None else direction(section.up, p.inverse()) for p in poses)
 
     def imu(self, section: Imu) -> None:
         """Rotations and vertical by an IMU."""

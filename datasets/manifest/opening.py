@@ -17,7 +17,6 @@ from typing import Any
 
 from rille.datasets.bags import is_bag, open_bag
 from rille.datasets.cameras.model import RECTIFIED
-from rille.datasets.georeference import georeference
 from rille.datasets.images import files
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import ImagePair, common_headers, pair_up
@@ -79,7 +78,7 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
         imu_axes=motion.imu_axes,
         odometry=motion.odometry or base.odometry,
         pitch=pitch,
-        georeference=georeference(world.crs, world.origin, world.azimuth_deg, name),
+        georeference=world.place,
         vehicle=vehicle,
         defaults={**base.defaults, **dict(dotted(manifest.defaults))},
         notes=(*base.notes, *motion.notes, *manifest.notes),

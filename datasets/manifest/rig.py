@@ -74,7 +74,8 @@ def read_optics(manifest: Manifest, root: Path, name: str, sizes: Sizes, rectifi
     left, right = (_rectified(camera, name) if rectified else camera for camera in raw)
     # Before anything compares lengths: the manifest's own are metres.
     left, right = (_scaled(camera, manifest.rig.unit) for camera in (left, right))
-    up = _up(manifest, left, name)
+    stated = manifest.world.up
+    up = None if stated is None else direction(stated, left.T_camera_reference)
     left, right, lines = _placed(left, right, manifest.rig, name)
     try:
         rig, lenses = rig_of(left, right, sizes)
@@ -181,27 +182,11 @@ def _scaled(camera: CalibratedCamera, unit: float) -> CalibratedCamera:
     return replace(camera, T_camera_reference=RigidTransform(pose.rotation, pose.translation * unit))
 
 
-def _up(manifest: Manifest, left: CalibratedCamera, name: str) -> tuple[float, float, float] | None:
-    stated = manifest.world.up
-    if stated is None:
-        return None
-    if manifest.world.pitch_deg is not None:
-        raise InputError(
-            "RIL-239", f"{name}: world.up and world.pitch_deg both state the vertical", remedy="remove one of them"
-        )
-    return direction(stated, left.T_camera_reference, f"{name}: world.up")
-
-
 def direction(
-    stated: tuple[float, float, float], T_camera_reference: RigidTransform | None, what: str
+    stated: tuple[float, float, float], T_camera_reference: RigidTransform | None
 ) -> tuple[float, float, float]:
     """A unit direction of the reference frame in the camera's frame."""
-    length = math.hypot(*stated)
-    if not length > 0:
-        raise InputError("RIL-240", f"{what} = {list(stated)} has no direction", remedy="e.g. [0, 0, 1] where z is up")
-    turned = np.array(stated) / length
-    if T_camera_reference is not None:
-        turned = T_camera_reference.rotation @ turned
+    turned = np.array(stated) if T_camera_reference is None else T_camera_reference.rotation @ np.array(stated)
     x, y, z = (float(v) for v in turned)
     return x, y, z
 
@@ -213,7 +198,7 @@ def _placed(
     of_files = None
     if left.T_camera_reference is not None and right.T_camera_reference is not None:
         of_files = right.T_camera_reference @ left.T_camera_reference.inverse()
-    stated = _stated(section, name)
+    stated = _stated(section)
     if stated is None and of_files is None:
         raise InputError(
             "RIL-241",
@@ -231,23 +216,10 @@ def _placed(
     return placed, replace(right, T_camera_reference=chosen), lines
 
 
-def _stated(section: RigSection, name: str) -> RigidTransform | None:
-    if section.T_right_left is not None and section.baseline is not None:
-        raise InputError(
-            "RIL-242", f"{name}: rig.baseline and rig.T_right_left both state the baseline", remedy="remove one of them"
-        )
+def _stated(section: RigSection) -> RigidTransform | None:
     if section.T_right_left is not None:
         return RigidTransform.from_matrix(section.T_right_left)
-    if section.baseline is None:
-        return None
-    if section.baseline <= 0:
-        raise InputError(
-            "RIL-243",
-            f"{name}: rig.baseline = {section.baseline:g} m is not positive",
-            remedy="give the distance of the cameras; where the left one stands to the right, "
-            "they are swapped: exchange images.left and images.right",
-        )
-    return parallel(section.baseline)
+    return None if section.baseline is None else parallel(section.baseline)
 
 
 def _check_baseline(baseline: float, section: RigSection, name: str) -> list[str]:

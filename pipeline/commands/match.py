@@ -196,7 +196,7 @@ def matcher_params(preset: str | None, assignments: tuple[str, ...]) -> Any:
             f"--preset {preset} and --set hfvm.preset={values['preset']} contradict each other",
             remedy="leave one of them out",
         )
-    return configuration.validate(configuration.stage("hfvm").params, values, ("hfvm",))
+    return configuration.validate(configuration.stage("hfvm").params, values, "hfvm")
 
 
 @contextmanager

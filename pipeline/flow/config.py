@@ -6,7 +6,6 @@ Layers, later ones win: defaults of the code, what suits the sequence (``Sequenc
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import pkgutil
 import tomllib
@@ -17,11 +16,12 @@ from types import ModuleType
 from typing import Any, Literal
 
 import tomli_w
-from pydantic import Field, ValidationError, create_model
+from pydantic import Field, create_model
 
 from rille.datasets.text import reading
+from rille.datasets.text.validation import Model, validated
 from rille.stages.core.declare import Params, Stage
-from rille.stages.core.errors import ConfigError, told
+from rille.stages.core.errors import ConfigError
 
 ACCURATE_TERRAIN: dict[str, Any] = {
     "hfvm": {"preset": "accurate"},
@@ -205,8 +205,7 @@ def build(*layers: Mapping[str, Any]) -> Params:
                 nested = _beneath(nested, more)
     if _preset(nested, "keyframes") == "navigation":
         nested = _beneath(nested, NAVIGATION)
-    built: Params = validate(model(), nested, (), DATASET_SECTIONS)
-    return built
+    return validate(model(), nested, also=DATASET_SECTIONS)
 
 
 def _preset(nested: Mapping[str, Any], section: str) -> Any:
@@ -219,45 +218,9 @@ def _beneath(nested: Mapping[str, Any], preset: Mapping[str, Any]) -> dict[str, 
     return merge(merge({}, preset), nested)
 
 
-def validate(kind: type[Params], values: Mapping[str, Any], prefix: tuple[str, ...], also: Iterable[str] = ()) -> Any:
-    """``kind(**values)`` with pydantic's complaints turned into one :class:`ConfigError` line."""
-    try:
-        return kind.model_validate(dict(values))
-    except ValidationError as error:
-        raise ConfigError("RIL-027", told(error.errors(), lambda e: _complaint(kind, prefix, e, also))) from error
-
-
-def _complaint(kind: type[Params], prefix: tuple[str, ...], error: dict[str, Any], also: Iterable[str]) -> str:
-    loc = [str(part) for part in error["loc"]]
-    key = ".".join((*prefix, *loc))
-    if error["type"] == "extra_forbidden":
-        near = difflib.get_close_matches(key, [".".join((*prefix, k)) for k in known_keys(kind)] + list(also), n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(_siblings(kind, loc))}"
-        return f"unknown key {key!r} (value {error['input']!r}): {hint}"
-    context = error.get("ctx", {})
-    reason = context["error"] if "error" in context else error["msg"]
-    where = key or "configuration"
-    return f"{where} = {error['input']!r} is not permitted: {str(reason)[0].lower() + str(reason)[1:]}"
-
-
-def _siblings(kind: type[Params], loc: list[str]) -> list[str]:
-    at: Any = kind
-    for part in loc[:-1]:
-        field = at.model_fields.get(part)
-        if field is None or not hasattr(field.annotation, "model_fields"):
-            break
-        at = field.annotation
-    return sorted(at.model_fields)
-
-
-def known_keys(kind: type[Params], prefix: str = "") -> list[str]:
-    """All dotted keys of a model, sections included."""
-    keys = []
-    for name, field in kind.model_fields.items():
-        keys.append(prefix + name)
-        if hasattr(field.annotation, "model_fields"):
-            keys += known_keys(field.annotation, f"{prefix}{name}.")  # type: ignore[arg-type]
-    return keys
+def validate(kind: type[Model], values: Mapping[str, Any], section: str = "", also: Iterable[str] = ()) -> Model:
+    """``kind(**values)`` of a section, or of the whole configuration."""
+    return validated("RIL-027", kind, values, section=section, also=also)
 
 
 def to_toml(config: Params, extra: Mapping[str, Params] | None = None) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from raising import raises
 
+from rille.datasets.text.validation import known_keys
 from rille.pipeline.commands import params
 from rille.pipeline.flow import config
 
@@ -20,7 +21,7 @@ def test_the_page_in_the_documentation_is_current(capsys: pytest.CaptureFixture[
 
 def test_every_section_and_key_of_the_configuration_is_there() -> None:
     keys = {f"{name}.{row[0]}" for name, values in params.sections().items() for row in params.rows(values)}
-    assert {key for key in config.known_keys(config.model()) if "." in key} <= keys
+    assert {key for key in known_keys(config.model()) if "." in key} <= keys
 
 
 def test_choices_and_bounds_are_told(capsys: pytest.CaptureFixture[str]) -> None:

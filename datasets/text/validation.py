@@ -1,0 +1,89 @@
+"""Values of the user's against a model: pydantic's complaints become one line with the dotted key and its neighbour."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+
+from rille.stages.core.declare import Params
+from rille.stages.core.errors import ConfigError, InputError, RilleError, told
+
+Model = TypeVar("Model", bound=Params)
+
+TAG = "("
+"""Begins the name of a member of a union, which pydantic gives as if it were a key."""
+
+
+def validated(
+    code: str,
+    kind: type[Model],
+    values: Mapping[str, Any],
+    *,
+    section: str = "",
+    file: str = "",
+    remedy: str = "",
+    also: Iterable[str] = (),
+) -> Model:
+    """``kind(**values)``, or one line that names each key that is wrong.
+
+    Parameters
+    ----------
+    code : of the error, ``RIL-223``.
+    section : of the configuration, to which the keys belong.
+    file : that states the values, where a user wrote them into one.
+    also : sections that belong elsewhere, which a misspelt key may mean.
+
+    Raises
+    ------
+    InputError, ConfigError
+        A key is unknown or missing, or a value is not permitted, in a file or in a configuration.
+    """
+    section = section and f"{section}."
+    try:
+        return kind.model_validate(dict(values))
+    except ValidationError as wrong:
+        known = [section + key for key in known_keys(kind)] + list(also)
+        what = told(wrong.errors(), lambda one: _complaint(one, section, known))
+        error: type[RilleError] = InputError if file else ConfigError
+        raise error(code, f"{file}: {what}" if file else what, remedy=remedy) from wrong
+
+
+def _complaint(error: Mapping[str, Any], section: str, known: list[str]) -> str:
+    """One of pydantic's complaints as dotted key, value and reason."""
+    key = section + ".".join(str(part) for part in error["loc"] if not str(part).startswith(TAG))
+    if error["type"] == "extra_forbidden":
+        return f"unknown key {key!r} (value {error['input']!r}): {_nearest(key, known)}"
+    if error["type"] == "missing":
+        return f"{key} is missing"
+    reason = str(error.get("ctx", {}).get("error", error["msg"]))
+    value = "" if isinstance(error["input"], dict) else f" = {error['input']!r} is not permitted"
+    return f"{key or 'the whole'}{value}: {reason[0].lower() + reason[1:]}"
+
+
+def _nearest(key: str, known: list[str]) -> str:
+    """The key that may have been meant: of the same table, or of the same name in another one."""
+    table, _, last = key.rpartition(".")
+    beside = [k.rpartition(".")[2] for k in known if k.rpartition(".")[0] == table]
+    near = [f"{table}.{name}".lstrip(".") for name in difflib.get_close_matches(last, beside, n=1)]
+    elsewhere = [k for k in known if k.rpartition(".")[2] == last]
+    for meant in [*elsewhere, *near]:
+        return f"did you mean {meant!r}?"
+    return f"known here are {', '.join(sorted(beside))}"
+
+
+def known_keys(kind: type[Params], prefix: str = "") -> Iterable[str]:
+    """All dotted keys of a model, tables included."""
+    for name, field in kind.model_fields.items():
+        yield prefix + name
+        for table in tables(field.annotation):
+            yield from known_keys(table, f"{prefix}{name}.")
+
+
+def tables(annotation: Any) -> Iterable[type[Params]]:
+    """The models that a field's annotation allows."""
+    if isinstance(annotation, type):
+        return [annotation] if issubclass(annotation, Params) else []
+    return dict.fromkeys(table for part in getattr(annotation, "__args__", ()) for table in tables(part))
