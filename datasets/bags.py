@@ -103,7 +103,7 @@ def open_bag(
         for camera, topic in zip(CAMERAS, chosen, strict=True):
             for stamp, one in zip(stamps, taken[camera], strict=True):
                 check_size(one.size, taken[camera][0].size, f"image {stamp} of {topic} in {path}")
-        times, more = seconds(stamps, str(path), unit="ns")
+        times = seconds(stamps, str(path), unit="ns")
         frame = taken["left"][0].frame
         optics, turned = (optics_of(sizes), np.eye(3)) if optics_of else _optics(reader, path, chosen, sizes)
         inertial, odometry, unused = _movement(reader, path, times, frame, turned)
@@ -131,7 +131,7 @@ def open_bag(
         odometry=odometry,
         defaults=STREET if optics.rig.baseline >= CAR else {},
         notes=inertial.notes,
-        warnings=(*warnings, *more, *optics.warnings, *unused, *inertial.warnings),
+        warnings=(*warnings, *optics.warnings, *unused, *inertial.warnings),
     )
 
 
@@ -301,18 +301,16 @@ def _movement(
             np.array([[v.x, v.y, v.z] for v in (getattr(m, name) for m in messages)])
             for name in ("angular_velocity", "linear_acceleration")
         )
-        stamps, more = seconds([_stamp(m) for m in messages], f"{path} {topic}", unit="ns")
-        record = ImuRecord(np.array(stamps), rates, forces, topic, more)
+        stamps = seconds([_stamp(m) for m in messages], f"{path} {topic}", unit="ns")
+        record = ImuRecord(np.array(stamps), rates, forces, topic)
         inertial = at_frames(record, times, T_imu_left)
-        warnings += more
     found = placed(ODOMETRY, lambda m: m.child_frame_id)
     if found is not None:
         topic, messages, T_base_left = found
-        stamps, more = seconds([_stamp(m) for m in messages], f"{path} {topic}", unit="ns")
+        stamps = seconds([_stamp(m) for m in messages], f"{path} {topic}", unit="ns")
         timed = TimedPoses(stamps, tuple(_pose(m.pose.pose.position, m.pose.pose.orientation) for m in messages), topic)
         between = interpolate(timed, times, LONGEST_GAP)
         odometry = tuple(None if T is None else T @ T_base_left for T in between)
-        warnings += more
     return inertial, odometry, warnings
 
 

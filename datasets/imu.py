@@ -19,7 +19,6 @@ import numpy as np
 from rille.datasets.poses import coverage, times_of
 from rille.datasets.protocol import Rows, rows_of
 from rille.datasets.text.tables import TextTable, read_table
-from rille.datasets.text.times import GAP
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp
@@ -66,6 +65,9 @@ flight one frame in twenty passes, 0.6 degrees off in the median and 2 at most; 
 BRIDGE = 0.1
 """s; longest gap in the samples over which the rate is interpolated."""
 
+GAP = 2.5
+"""The same of a slow sensor, in median spacings: one missing sample (2) is common, more is not."""
+
 
 GYROSCOPE, ACCELEROMETER = ("gyr", "w_", "ang", "omega", "rate"), ("acc", "a_", "lin", "force")
 """How names of columns begin."""
@@ -82,7 +84,6 @@ class ImuRecord:
     rates: Floats
     forces: Floats
     name: str = "imu"
-    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -129,14 +130,14 @@ def read_imu(path: Path) -> ImuRecord:
             remedy="give time, three rates (rad/s) and three accelerations (m/s^2) a row",
         )
     gyro, accelerometer = _columns(table)
-    times, warnings = times_of(table, 0)
+    times = times_of(table, 0)
     rates, forces = table.numbers(gyro), table.numbers(accelerometer)
     if any("deg" in table.header[k] for k in gyro if table.header):
         rates = np.deg2rad(rates)
     _possible(rates, FASTEST, "rad/s", table)
     _possible(forces, HARDEST, "m/s^2", table)
     _plausible(rates, forces, table.name)
-    return ImuRecord(np.array(times), rates, forces, table.name, warnings)
+    return ImuRecord(np.array(times), rates, forces, table.name)
 
 
 def _columns(table: TextTable) -> tuple[list[int], list[int]]:

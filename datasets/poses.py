@@ -31,7 +31,6 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
 
-FORMATS = ("auto", "kitti", "tum", "euroc", "csv")
 QUATERNION, POSITION, ANGLES = ("qw", "qx", "qy", "qz"), ("x", "y", "z"), ("roll", "pitch", "yaw")
 ORDERED: Mapping[str, tuple[str, ...]] = {
     "tum": ("time", *POSITION, "qx", "qy", "qz", "qw"),
@@ -68,13 +67,11 @@ class TimedPoses:
     times : seconds, increasing; None where the file has none, and rows are frames.
     poses : T_reference_body, metres, one a row; None of a row of NaN.
     name : the file, for messages.
-    warnings : what is suspicious, one line each.
     """
 
     times: tuple[float, ...] | None
     poses: tuple[RigidTransform | None, ...]
     name: str = "poses"
-    warnings: tuple[str, ...] = ()
 
 
 def read_poses(path: Path, format: str = "auto") -> TimedPoses:
@@ -90,38 +87,17 @@ def read_poses(path: Path, format: str = "auto") -> TimedPoses:
     InputError
         The form is not recognised, or a row is not a time and a pose; the message names the line.
     """
-    from scipy.spatial.transform import Rotation
-
-    if format not in FORMATS:
-        raise InputError("RIL-262", f"format {format!r} of poses is unknown", remedy=f"one of {', '.join(FORMATS)}")
     table = read_table(path, "pose file")
-    if format == "kitti" or (format == "auto" and table.columns in (12, 16) and not _named(table)):
-        return TimedPoses(None, _matrices(table), table.name)
     meant = _meanings(table)
-    if format in ("auto", "csv") and not _complete(meant) and {"x", "y"} <= set(meant):
-        lacking = [q for q in QUATERNION if q not in meant]
-        raise InputError(
-            "RIL-801",
-            f"{table.name}: its columns {', '.join(table.header)} are positions without a whole rotation "
-            f"({', '.join(lacking)} missing), no poses",
-            remedy="add qw, qx, qy, qz or roll_deg, pitch_deg, yaw_deg; positions alone serve as [truth] only",
-        )
-    columns = _columns(table, format)
-    angles = None if "qw" in columns else _angle_unit(table, columns)
-    at = None
-    warnings: tuple[str, ...] = ()
-    if "time" in columns:
-        at, warnings = times_of(table, columns["time"])
-    if angles is None:
-        rotations = _quaternions(table, columns)
-    else:
-        values = table.numbers([columns[a] for a in ANGLES])
-        # Capitals turn about the axes as they are turned already: yaw first, then pitch, then roll.
-        rotations = Rotation.from_euler("ZYX", values[:, ::-1], degrees=angles == "deg").as_matrix()
-    with_position = all(axis in columns for axis in POSITION)
-    positions = table.numbers([columns[a] for a in POSITION]) if with_position else np.zeros((len(table.rows), 3))
+    if format == "kitti" or (format == "auto" and table.columns in (12, 16) and not _whole(meant)):
+        return TimedPoses(None, _matrices(table), table.name)
+    columns = _columns(table, format, meant)
+    times = times_of(table, columns["time"]) if "time" in columns else None
+    rotations = _quaternions(table, columns) if "qw" in columns else _angles(table, columns)
+    placed = [columns[axis] for axis in POSITION if axis in columns]
+    positions = table.numbers(placed) if len(placed) == 3 else np.zeros((len(table.rows), 3))
     poses = tuple(RigidTransform(R, t) for R, t in zip(rotations, positions, strict=True))
-    return TimedPoses(at, poses, table.name, warnings)
+    return TimedPoses(times, poses, table.name)
 
 
 @dataclass(frozen=True)
@@ -131,7 +107,6 @@ class TimedPositions:
     times: tuple[float, ...] | None
     positions: tuple[tuple[float, ...], ...]
     name: str
-    warnings: tuple[str, ...] = ()
 
 
 def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) -> TimedPositions | None:
@@ -150,29 +125,26 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
     if format not in ("auto", "csv"):
         return None
     table = read_table(path, "file of true positions" if columns else "pose file")
-    told = {meaning: _column(table, column) for meaning, column in columns.items()}
+    stated = {meaning: _column(table, column) for meaning, column in columns.items()}
     # A column that the user assigns to one axis is not another axis by its name: { x = "x", y = "z" } leaves no height.
-    meant = {meaning: k for meaning, k in _meanings(table).items() if k not in told.values()} | told
-    known = {meaning for meaning in ("x", "y") if meaning in meant}
-    if not columns and (_complete(meant) or (len(known) < 2 and table.columns >= len(ORDERED["tum"]))):
+    meant = {meaning: k for meaning, k in _meanings(table).items() if k not in stated.values()} | stated
+    known = {"x", "y"} & set(meant)
+    if not columns and (_whole(meant) or (len(known) < 2 and table.columns >= len(ORDERED["tum"]))):
         return None
-    if known != {"x", "y"}:
+    if len(known) < 2:
         names = ", ".join(table.header) or f"{table.columns} without names"
         raise InputError(
             "RIL-805",
             f"{table.name}: its columns ({names}) do not say which are x and y in metres",
             remedy='name them in the manifest: [truth] columns = { time = "NAME", x = "NAME", y = "NAME" }, or numbers',
         )
-    at: tuple[float, ...] | None = None
-    warnings: tuple[str, ...] = ()
-    if "time" in meant:
-        at, warnings = times_of(table, meant["time"])
+    times = times_of(table, meant["time"]) if "time" in meant else None
     rows = table.numbers([meant[axis] for axis in POSITION if axis in meant])
-    return TimedPositions(at, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings)
+    return TimedPositions(times, tuple(tuple(float(v) for v in row) for row in rows), table.name)
 
 
-def times_of(table: TextTable, column: int) -> tuple[tuple[float, ...], tuple[str, ...]]:
-    """Times of a column and warnings (:func:`rille.datasets.text.times.seconds`), in the unit that its name states."""
+def times_of(table: TextTable, column: int) -> tuple[float, ...]:
+    """Times of a column (:func:`rille.datasets.text.times.seconds`), in the unit that its name states."""
     said = TIME_UNIT.search(table.header[column]) if table.header else None
     return seconds(table.text(column), table.name, unit=said[1] if said else "auto", lines=table.lines)
 
@@ -185,75 +157,77 @@ def names_positions(path: Path) -> bool:
         return False
 
 
-def _column(table: TextTable, told: str | int) -> int:
+def _column(table: TextTable, stated: str | int) -> int:
     """Number from 0 of a column that the manifest names or numbers."""
-    if isinstance(told, str) and told.strip().lower() in table.header:
-        return table.header.index(told.strip().lower())
-    if isinstance(told, int) and 1 <= told <= table.columns:
-        return told - 1
+    if isinstance(stated, str) and stated.strip().lower() in table.header:
+        return table.header.index(stated.strip().lower())
+    if isinstance(stated, int) and 1 <= stated <= table.columns:
+        return stated - 1
     raise InputError(
         "RIL-806",
-        f"{table.name}: truth.columns: there is no column {told!r} of {', '.join(table.header) or table.columns}",
+        f"{table.name}: truth.columns: there is no column {stated!r} of {', '.join(table.header) or table.columns}",
         remedy="give a name of its first line, or a number from 1",
     )
 
 
-def _named(table: TextTable) -> dict[str, int]:
-    """Columns by what their names mean; a unit in brackets or at the end is no part of a name."""
-    found = _meanings(table)
-    return found if _complete(found) else {}
-
-
 def _meanings(table: TextTable) -> dict[str, int]:
-    found: dict[str, int] = {}
+    """Columns by what their names mean; a unit in brackets or at the end is no part of a name."""
+    columns: dict[str, int] = {}
     for k, name in enumerate(table.header):
         bare = re.sub(r"[\[(].*?[\])]|[_ ](deg|rad|m|s|ns|us|ms)$", "", name).strip()
-        for pattern, meaning in WORDS:
-            match = pattern.fullmatch(bare)
-            if match:
-                found.setdefault(meaning(match), k)
-                break
-    return found
+        matches = ((pattern.fullmatch(bare), meaning) for pattern, meaning in WORDS)
+        meant = next((meaning(match) for match, meaning in matches if match), None)
+        if meant is not None:
+            columns.setdefault(meant, k)
+    return columns
 
 
-def _complete(columns: Mapping[str, int]) -> bool:
-    return all(q in columns for q in QUATERNION) or all(a in columns for a in ANGLES)
+def _whole(columns: Mapping[str, int]) -> bool:
+    """Whether there is a rotation among the columns."""
+    return set(QUATERNION) <= set(columns) or set(ANGLES) <= set(columns)
 
 
-def _columns(table: TextTable, format: str) -> dict[str, int]:
-    named = _named(table)
-    if format == "csv" and not named:
-        raise InputError(
-            "RIL-263",
-            f"{table.name} does not name its columns",
-            remedy="begin with a line such as time,qw,qx,qy,qz or time,roll_deg,pitch_deg,yaw_deg",
-        )
-    if format == "csv" or (format == "auto" and named):
-        return named
-    chosen = format if format != "auto" else "euroc" if table.commas else "tum"
-    order = ORDERED[chosen]
-    if table.columns < len(order) or (chosen == "tum" and table.columns > len(order)):
+def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, int]:
+    """Columns of poses, by their names or in the order of the format."""
+    if format in ("auto", "csv"):
+        if _whole(meant):
+            return meant
+        if {"x", "y"} <= set(meant):
+            lacking = ", ".join(q for q in QUATERNION if q not in meant)
+            raise InputError(
+                "RIL-801",
+                f"{table.name}: its columns {', '.join(table.header)} are positions without a rotation ({lacking})",
+                remedy="add qw, qx, qy, qz or roll_deg, pitch_deg, yaw_deg; positions alone serve as [truth] only",
+            )
+    form = format if format != "auto" else "euroc" if table.commas else "tum"
+    order = ORDERED.get(form, ())
+    if not order or table.columns < len(order) or (form == "tum" and table.columns > len(order)):
         raise InputError(
             "RIL-264",
-            f"{table.name}, line {table.lines[0]}: {table.columns} numbers are no pose of format {chosen}",
-            remedy="3 x 4 numbers (kitti), time and 7 numbers (tum, euroc), or columns with names (csv)",
+            f"{table.name}, line {table.lines[0]}: {table.columns} numbers are no pose of format {form}",
+            remedy="3 x 4 numbers (kitti), time and 7 numbers (tum, euroc), or columns with names (csv), as "
+            "time,qw,qx,qy,qz or time,roll_deg,pitch_deg,yaw_deg",
         )
     return {name: k for k, name in enumerate(order)}
 
 
-def _angle_unit(table: TextTable, columns: Mapping[str, int]) -> str:
-    """``deg`` or ``rad``: as the names say, or degrees where the figures can be nothing else."""
-    said = {unit for a in ANGLES for unit in ("deg", "rad") if unit in table.header[columns[a]]}
-    if len(said) == 1:
-        return said.pop()
-    values = np.abs(table.numbers([columns[a] for a in ANGLES]))
-    if not said and values.max() > 2 * np.pi:
-        return "deg"
-    raise InputError(
-        "RIL-265",
-        f"{table.name}: roll, pitch and yaw have {'two units' if said else 'no unit'}",
-        remedy="name the columns roll_deg, pitch_deg, yaw_deg or roll_rad, pitch_rad, yaw_rad",
-    )
+def _angles(table: TextTable, columns: Mapping[str, int]) -> Floats:
+    """Rotation matrices (n, 3, 3) of roll, pitch and yaw, in the unit that the names say, or the figures alone."""
+    from scipy.spatial.transform import Rotation
+
+    values = table.numbers([columns[a] for a in ANGLES])
+    units = {unit for a in ANGLES for unit in ("deg", "rad") if unit in table.header[columns[a]]}
+    if not units and np.abs(values).max() > 2 * np.pi:
+        units = {"deg"}
+    if len(units) != 1:
+        raise InputError(
+            "RIL-265",
+            f"{table.name}: roll, pitch and yaw have {'two units' if units else 'no unit'}",
+            remedy="name the columns roll_deg, pitch_deg, yaw_deg or roll_rad, pitch_rad, yaw_rad",
+        )
+    # Capitals turn about the axes as they are turned already: yaw first, then pitch, then roll.
+    turns = Rotation.from_euler("ZYX", values[:, ::-1], degrees=units == {"deg"})
+    return np.asarray(turns.as_matrix(), dtype=np.float64)
 
 
 def _quaternions(table: TextTable, columns: Mapping[str, int]) -> Floats:

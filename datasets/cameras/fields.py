@@ -142,7 +142,8 @@ class Fields:
     def camera(self, key: str, values: tuple[float, float, float, float], size: tuple[int, int]) -> Camera:
         """Camera from fx, fy, cx, cy, pixels; ``key`` is where they stand."""
         try:
-            return Camera(values[0], values[1], values[2], values[3], size[0], size[1])
+            fx, fy, cx, cy = map(float, values)
+            return Camera(fx, fy, cx, cy, *size)
         except InputError as error:
             raise self.error(error.code, key, f"gives no camera: {error.message}", error.remedy) from error
 

@@ -105,7 +105,7 @@ def _times(paths: Sequence[Path]) -> tuple[float, ...]:
     """Times in the names of sorted files, s; none where not each has its own."""
     stamps = [stamp for path in paths if (stamp := stamp_of(path.stem))]
     with suppress(InputError):
-        return seconds(stamps, "the image names")[0] if len(stamps) == len(paths) else ()
+        return seconds(stamps, "the image names") if len(stamps) == len(paths) else ()
     return ()
 
 

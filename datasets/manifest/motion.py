@@ -97,8 +97,7 @@ class MotionReader:
         what = "the image names" if section.names else str(path)
         known = [k for k, stamp in enumerate(stamps) if stamp is not None]
         rows = [stamp for stamp in stamps if stamp is not None]
-        times, lines = seconds([t for t, _ in rows], what, unit=section.unit, lines=[line for _, line in rows])
-        self.motion.warnings += lines
+        times = seconds([t for t, _ in rows], what, unit=section.unit, lines=[line for _, line in rows])
         return tuple(float(t) for t in np.interp(range(len(stamps)), known, times))
 
     def stamps_of_names(self) -> list[tuple[str, int]]:
@@ -147,7 +146,6 @@ class MotionReader:
         """T_reference_left of each pair from a file of poses of a body."""
         path = self.root / section.file
         timed = read_poses(path, section.format)
-        self.motion.warnings += timed.warnings
         unit = section.unit if isinstance(section, PoseFile) else 1.0
         poses: Poses = tuple(p and RigidTransform(p.rotation, unit * p.translation) for p in timed.poses)
         if timed.times is not None:
@@ -175,7 +173,6 @@ class MotionReader:
         self.motion.truth_source = section.source or f"{kind} of {section.file}, as recorded"
         if alone is not None:
             self.motion.truth_positions = self.positions(section, alone.times, alone.positions)
-            self.motion.warnings += alone.warnings
             return
         if section.lever_arm is not None:
             raise InputError(
@@ -227,4 +224,4 @@ class MotionReader:
         self.motion.up = inertial.up if any(inertial.up) else None
         self.motion.imu_axes = inertial.axes
         self.motion.notes += inertial.notes
-        self.motion.warnings += (*imu.warnings, *inertial.warnings)
+        self.motion.warnings += inertial.warnings

@@ -20,9 +20,6 @@ from rille.stages.geometry.lens import Lens
 LONGEST_BASELINE = 20.0
 """m; no vehicle carries a longer one, but 97 (mm) is a common slip."""
 
-USUAL_BASELINE = (0.02, 2.0)
-"""m; from an endoscope's to a large vehicle's: beyond it a line says so."""
-
 USUAL_VIEW_DEG = (5.0, 175.0)
 """degrees; horizontal angle of view."""
 
@@ -81,7 +78,7 @@ def read_optics(manifest: Manifest, root: Path, name: str, sizes: Sizes, rectifi
         rig, lenses = rig_of(left, right, sizes)
     except InputError as error:
         raise error.at(name) from error
-    lines += _check_baseline(rig.baseline, manifest.rig, name)
+    _check_baseline(rig.baseline, manifest.rig, name)
     if left.lens != raw[0].lens and manifest.images.rectified is None:
         text = f"{name}: the images are rectified by their name: their camera is P, without the distortion"
         lines.append(warning("RIL-817", f"{text} (images.rectified = false if they are raw)"))
@@ -222,8 +219,8 @@ def _stated(section: RigSection) -> RigidTransform | None:
     return None if section.baseline is None else parallel(section.baseline)
 
 
-def _check_baseline(baseline: float, section: RigSection, name: str) -> list[str]:
-    """Refuse what cannot be metres; say what is unusual."""
+def _check_baseline(baseline: float, section: RigSection, name: str) -> None:
+    """Refuse what cannot be metres."""
     from_files = section.baseline is None and section.T_right_left is None
     if baseline > LONGEST_BASELINE:
         unit = section.unit / 1000
@@ -233,11 +230,6 @@ def _check_baseline(baseline: float, section: RigSection, name: str) -> list[str
             f"{name}: the baseline is {baseline:g} m, which looks like millimetres",
             remedy=f"did you mean {baseline / 1000:g}? {hint}",
         )
-    low, high = USUAL_BASELINE
-    if not low <= baseline <= high:
-        text = f"baseline {baseline:g} m is unusual ({low:g} to {high:g} m is common): lengths are in metres"
-        return [warning("RIL-692", text)]
-    return []
 
 
 def off_centre(camera: Camera, side: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Time stamps of images and sensors: their unit, their order, their gaps.
+"""Time stamps of images and sensors: their unit and their order.
 
 Stamps since 1970 tell their unit by magnitude: 1.4e9 are seconds, 1.4e12 milliseconds, 1.4e15 microseconds and 1.4e18
 nanoseconds. Smaller ones count from some other start; they are taken for seconds unless the unit is stated.
@@ -11,7 +11,6 @@ from decimal import Decimal, InvalidOperation
 
 import numpy as np
 
-from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
 
 UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
@@ -20,8 +19,8 @@ UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 UPPER = {"s": 1e11, "ms": 1e14, "us": 1e17}
 """Above it a value can no longer be in that unit: 1e11 s after 1970 is the year 5138."""
 
-GAP = 2.5
-"""Gap, in median spacings, from which a warning is given: one missing frame (2) is common, more is not."""
+SINCE_1970 = 1e8
+"""s; larger stamps of any unit are known by their magnitude: 1973 and later."""
 
 SLOW = 3600.0
 """s; pairs an hour apart are possible, but a wrong unit is likelier."""
@@ -41,7 +40,7 @@ def seconds(
     *,
     unit: str = "auto",
     lines: Sequence[int] | None = None,
-) -> tuple[tuple[float, ...], tuple[str, ...]]:
+) -> tuple[float, ...]:
     """Time stamps in seconds.
 
     Parameters
@@ -53,50 +52,33 @@ def seconds(
 
     Returns
     -------
-    times : seconds from the same start as the stamps; of stamps since 1970 a float64 keeps 0.24 microseconds.
-    warnings : a line on gaps, and one on stamps that are strangely far apart.
+    Seconds from the same start as the stamps; of stamps since 1970 a float64 keeps 0.24 microseconds.
 
     Raises
     ------
     InputError
-        A stamp is no number, two are equal or go back, units are mixed, or the unit is unknown.
+        A stamp is no number, two are equal or go back, units are mixed or unknown, or small stamps without a unit are
+        more than an hour apart.
     """
-    if unit != "auto" and unit not in UNITS:
-        raise InputError(
-            "RIL-290", f"{what}: unit {unit!r} of time is unknown", remedy=f"one of auto, {', '.join(UNITS)}"
-        )
     at = list(lines) if lines is not None else list(range(1, len(values) + 1))
     # Nanoseconds since 1970 have 19 digits; a float64 keeps 16, and would make stamps of successive samples equal.
     exact = [_decimal(v, what, k) for v, k in zip(values, at, strict=True)]
     if not exact:
-        return (), ()
-    unit = unit if unit != "auto" else _unit(exact, what, at)
-    _in_order(exact, what, at)
-    if len(exact) > 2:
-        _one_unit(exact, what, at)
-    times = tuple(float(v / UNITS[unit]) for v in exact)
-    return times, (*_unusual(times, unit, what), *gaps(times, what, at))
-
-
-def gaps(times: Sequence[float], what: str, lines: Sequence[int] | None = None) -> tuple[str, ...]:
-    """A line on spacings of more than 2.5 times the usual one; none where there are none.
-
-    Parameters
-    ----------
-    times : seconds, increasing.
-    """
-    if len(times) < 3:
         return ()
-    steps = np.diff(np.asarray(times))
-    usual = float(np.median(steps))
-    wide = np.flatnonzero(steps > GAP * usual)
-    if not wide.size:
-        return ()
-    longest = int(wide[np.argmax(steps[wide])])
-    where = f" after line {lines[longest]}" if lines is not None else ""
-    count = "1 gap" if wide.size == 1 else f"{wide.size} gaps, the longest"
-    text = f"times of {what}: {count} of {steps[longest]:.4g} s{where} where {usual:.4g} s is usual"
-    return (warning("RIL-686", text),)
+    in_order = zip(at[1:], exact, exact[1:], strict=False)
+    stated = unit if unit != "auto" else _unit(exact, what, at)
+    for line, before, now in in_order:
+        if now <= before:
+            words = "is there twice" if now == before else f"goes back from {before}"
+            raise InputError(
+                "RIL-293",
+                f"{what}, line {line}: time {now} {words}",
+                remedy="put the rows in order of time, each once, in one unit",
+            )
+    times = tuple(float(v / UNITS[stated]) for v in exact)
+    if unit == "auto" and times[0] < SINCE_1970:
+        _refuse_slow(times, what)
+    return times
 
 
 def _decimal(value: str | int | float, what: str, line: int) -> Decimal:
@@ -119,46 +101,20 @@ def _unit(exact: Sequence[Decimal], what: str, lines: Sequence[int]) -> str:
     units = [_magnitude(v) for v in exact]
     for k, unit in enumerate(units):
         if unit != units[0]:
-            raise _mixed(what, lines, exact, k, f"by magnitude {units[0]} and {unit}")
+            raise InputError(
+                "RIL-292",
+                f"{what}, line {lines[k]}: time {exact[k]} after {exact[k - 1]}: mixed units ({units[0]} and {unit})",
+                remedy="write all times in one unit, or state it where small stamps are not seconds",
+            )
     return units[0]
 
 
-def _mixed(what: str, lines: Sequence[int], exact: Sequence[Decimal], k: int, how: str) -> InputError:
-    return InputError(
-        "RIL-292",
-        f"{what}, line {lines[k]}: time {exact[k]} after {exact[k - 1]}: mixed units ({how})",
-        remedy="write all times in one unit, or state it where small stamps are not seconds",
-    )
-
-
-def _in_order(exact: Sequence[Decimal], what: str, lines: Sequence[int]) -> None:
-    for k in range(1, len(exact)):
-        if exact[k] <= exact[k - 1]:
-            words = "is there twice" if exact[k] == exact[k - 1] else f"goes back from {exact[k - 1]}"
-            raise InputError(
-                "RIL-293",
-                f"{what}, line {lines[k]}: time {exact[k]} {words}",
-                remedy="put the rows in order of time, each once, in one unit",
-            )
-
-
-def _one_unit(exact: Sequence[Decimal], what: str, lines: Sequence[int]) -> None:
-    """Refuse stamps that go on a thousand times larger and a thousand times wider apart: too small for magnitudes."""
-    for k in range(1, len(exact) - 1):
-        # The spacing before needs two stamps, and a ratio a positive one.
-        if k == 1 or exact[k - 1] <= 0:
-            continue
-        before, after = exact[k - 1] - exact[k - 2], exact[k + 1] - exact[k]
-        jump = exact[k] / exact[k - 1]
-        if any(Decimal("0.9") <= jump / f <= 3 and Decimal("0.5") <= after / before / f <= 2 for f in (1000, 10**6)):
-            raise _mixed(what, lines, exact, k, f"spacing {before}, then {after}")
-
-
-def _unusual(times: Sequence[float], unit: str, what: str) -> tuple[str, ...]:
-    if len(times) < 2:
-        return ()
-    usual = float(np.median(np.diff(np.asarray(times))))
-    if usual <= SLOW:
-        return ()
-    text = f"times of {what} are {usual:.4g} s apart, taken for {unit}: state the unit if they are not"
-    return (warning("RIL-687", text),)
+def _refuse_slow(times: Sequence[float], what: str) -> None:
+    """Refuse stamps that no unit by magnitude fits: small ones that are far apart for seconds."""
+    usual = float(np.median(np.diff(np.asarray(times)))) if len(times) > 1 else 0.0
+    if usual > SLOW:
+        raise InputError(
+            "RIL-687",
+            f"times of {what} are {usual:.4g} s apart, if they are seconds",
+            remedy='state their unit: times.unit = "ns" in the manifest, or time_ns as the name of the column',
+        )

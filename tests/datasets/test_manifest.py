@@ -490,7 +490,6 @@ def test_bad_patterns(tmp_path, line, expected):
 @pytest.mark.parametrize(
     ("parts", "line"),
     [
-        ({"rig": "[rig]\nbaseline = 5.4\n"}, r"baseline 5\.4 m is unusual \(0\.02 to 2 m is common\)"),
         ({"cameras": "[cameras]\nfx = 1.2\ncx = 31.5\ncy = 23.5\n"}, r"fx = 1\.2 px gives an angle of view of 176"),
         (
             {"cameras": "[cameras]\nfx = 60.0\ncx = 315.0\ncy = 23.5\n"},
