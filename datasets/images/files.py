@@ -5,20 +5,19 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-import struct
 import threading
-import zlib
 from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
+from warnings import catch_warnings
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.datasets.images.headers import PNG_SIGNATURE, Header, read_header
+from rille.datasets.images.headers import Header, read_header
 from rille.datasets.images.kinds import KINDS, kind_of
 from rille.datasets.protocol import Source
 from rille.datasets.text.reading import open_regular, read_bytes
@@ -40,7 +39,9 @@ MOST_BYTES = 2**29
 FEWER_BITS = "save it with 8 or 16 bits a sample"
 COPY_AGAIN = "copy the file again, or remove it"
 
-JPEG = b"\xff\xd8"
+PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+"""How files begin."""
+
 PADDING = 16
 """Bytes before a JPEG's end marker that are no damage: webcams pad their images."""
 
@@ -53,28 +54,20 @@ COLOUR = Array(
 Grey = NDArray[np.uint8] | NDArray[np.uint16]
 
 
-def _png_damage(data: bytes) -> str:
-    """What is wrong with the chunks of a PNG, or nothing: decoders may deliver a truncated one as partly black."""
-    at = len(PNG_SIGNATURE)
-    while at + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, at)
-        kind, end = data[at + 4 : at + 8], at + 12 + length
-        if end > len(data):
-            break
-        if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
-            return f"is damaged (checksum of chunk {kind.decode('latin-1')} at byte {at})"
-        if kind == b"IEND":
-            return ""
-        at = end
-    return f"is truncated (the PNG breaks off at byte {len(data)})"
-
-
 def _damage(data: bytes) -> str:
-    """Why a file cannot be whole, in words, or nothing."""
+    """Why a file cannot be whole, in words, or nothing: decoders may deliver a truncated one as partly black."""
+    from PIL import Image
+
     if not data:
         return "is empty"
-    if data.startswith(PNG_SIGNATURE):
-        return _png_damage(data)
+    if data.startswith(PNG):
+        try:
+            with catch_warnings(action="ignore"), Image.open(BytesIO(data), formats=("PNG",)) as image:
+                image.verify()
+        except Image.DecompressionBombError:
+            return ""  # said of its header
+        except Exception as error:  # whatever the parser of a damaged file comes upon
+            return f"is damaged or truncated ({' '.join(str(error).split())[:100]})"
     # the end marker may be followed by padding, but nothing else ends a JPEG
     if data.startswith(JPEG) and b"\xff\xd9" not in data[-4096:]:
         return f"is truncated (the JPEG breaks off at byte {len(data)})"
