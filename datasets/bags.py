@@ -146,11 +146,9 @@ def _topics(reader: Any, path: Path, wanted: str | None) -> tuple[str, str]:
     if wanted is not None:
         names = [name.strip() for name in wanted.split(",")]
         if len(names) != 2 or not set(names) <= set(images):
-            raise InputError(
-                "RIL-945",
-                f"{path} has not the image topics {wanted!r}",
-                remedy=f"name two with a comma between them, left first; there are {there}",
-            )
+            text = f"{path} has not the image topics {wanted!r}"
+            remedy = f"name two with a comma between them, left first; there are {there}"
+            raise InputError("RIL-945", text, remedy=remedy)
         return names[0], names[1]
     pairs: dict[tuple[bool, bool, int, str], dict[int, str]] = {}
     for topic in images:
@@ -161,11 +159,8 @@ def _topics(reader: Any, path: Path, wanted: str | None) -> tuple[str, str]:
     whole = {key: sides for key, sides in pairs.items() if len(sides) == 2}
     best = [sides for key, sides in whole.items() if key[:2] == min(whole)[:2]]
     if len(best) != 1:
-        raise InputError(
-            "RIL-946",
-            f"{path} has {len(best) or 'no'} image topics that are left and right by name (images: {there})",
-            remedy=f"name them: {path}:LEFT,RIGHT",
-        )
+        text = f"{path} has {len(best) or 'no'} image topics that are left and right by name (images: {there})"
+        raise InputError("RIL-946", text, remedy=f"name them: {path}:LEFT,RIGHT")
     return best[0][0], best[0][1]
 
 
@@ -237,11 +232,9 @@ def _camera(reader: Any, path: Path, topic: str) -> tuple[CalibratedCamera, np.n
     message = next((m for _, _, m in _messages(reader, name)), None)
     if message is None:
         there = sorted({c.topic for c in reader.connections if c.msgtype == INFO})
-        raise InputError(
-            "RIL-949",
-            f"{path} has no {name} for {topic} (camera_info: {', '.join(there) or 'none'})",
-            remedy="record the camera_info of both cameras, put a calibration file beside the bag, or write a manifest",
-        )
+        text = f"{path} has no {name} for {topic} (camera_info: {', '.join(there) or 'none'})"
+        remedy = "record the camera_info of both cameras, put a calibration file beside the bag, or write a manifest"
+        raise InputError("RIL-949", text, remedy=remedy)
     # ROS 1 names the fields K, D, R and P, ROS 2 k, d, r and p.
     given = {key.lower(): getattr(message, key) for key in dir(message) if key.lower() in ("k", "d", "r", "p")}
     rectified = RECTIFIED.search(topic) is not None

@@ -20,32 +20,8 @@ from rille.stages.geometry.geometry import Camera, RigidTransform, level_rotatio
 
 Materialise = Callable[[Source], Bundle]
 
-README = """{name}: {frames} stereo pairs, {size} pixels.
-{notes}
-Conventions
-  Pixel centres are at integer (column, row); (0, 0) is the centre of the top left pixel. Lengths are metres.
-  Camera frames are optical: x right, y down, z forward. T_a_b maps coordinates of frame b to frame a: x_a = R x_b + t.
-  World ("truth") frame: z up; {truth_source}.
-  The pairs are not rectified: the cameras may converge. No lens distortion.
-
-Files
-  left/, right/           grey images of 8 or 16 bits, one a frame, the same name left and right
-  valid/left, valid/right 255 = usable, 0 = background (only where something is masked)
-  rig.json                both cameras (fx, fy, cx, cy, width, height) and T_right_left (12 numbers, rows of [R | t]),
-                          as they are given to a reconstruction; a simulated
-                          calibration error is in it, while images and truth are those of the true cameras
-  calib.txt               the same as P = K [R | t], 3 x 4 row-major a line, left then right; the reference frame is the
-                          left camera's, so that the left one is K [I | 0] and the right one K [R_right_left | t]
-  poses.txt               T_truth_left, 3 x 4 row-major, a line a frame (KITTI's form); nan where it is not known
-  times.txt               seconds, a line a frame
-  disparity/NAME.npz      column, row: float32 (row, col) pixels, right minus left, NaN without surface; occluded:
-                          0 both cameras see the point, 1 hidden from the right one, 2 outside its image, 3 no surface;
-                          depth: metres along the left optical axis
-  dem/NAME.npz            elevation: float32 (row, col) metres, exact at the cell centres, in the local frame of that
-                          pair: origin at its left camera, z up, y the horizontal projection of its optical axis, x
-                          right; seen: 1 = both cameras of the pair see the cell; x0, y0, cell, rows, cols:
-                          cell centres at x = x0 + col * cell, y = y0 - row * cell; T_truth_local: 3 x 4
-"""
+README = "export_readme.txt"
+"""File beside this module: what the folder says of itself, with places for the sequence's name, size and notes."""
 
 
 def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs: Iterable[int] | None = None) -> Path:
@@ -66,11 +42,8 @@ def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs:
         are written have no place for.
     """
     if sequence.lenses:
-        raise InputError(
-            "RIL-184",
-            f"the images of {sequence.name} have lens distortion, which calib.txt cannot say",
-            remedy="export a sequence without; this one is plain files already",
-        )
+        text = f"the images of {sequence.name} have lens distortion, which calib.txt cannot say"
+        raise InputError("RIL-184", text, remedy="export a sequence without; this one is plain files already")
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise InputError("RIL-165", f"{directory} is not empty", remedy="name a folder that does not exist yet")
     chosen = tuple(
@@ -111,12 +84,17 @@ def _write(sequence: Sequence, folder: Path, materialise: Materialise, pairs: tu
         if sequence.truth_dem is not None and sequence.truth is not None and sequence.evaluation_window is not None:
             _write_dem(sequence, folder, frame, materialise)
     sizes = [f"{camera.width} x {camera.height}" for camera in (sequence.rig.left, sequence.rig.right)]
-    text = README.format(
-        name=sequence.name,
-        frames=len(frames),
-        size=sizes[0] if sizes[0] == sizes[1] else f"left {sizes[0]}, right {sizes[1]}",
-        notes="\n".join(sequence.notes),
-        truth_source=sequence.truth_source or "no truth is known",
+    text = (
+        Path(__file__)
+        .with_name(README)
+        .read_text(encoding="utf-8")
+        .format(
+            name=sequence.name,
+            frames=len(frames),
+            size=sizes[0] if sizes[0] == sizes[1] else f"left {sizes[0]}, right {sizes[1]}",
+            notes="\n".join(sequence.notes),
+            truth_source=sequence.truth_source or "no truth is known",
+        )
     )
     (folder / "README.txt").write_text(text, encoding="utf-8")
 

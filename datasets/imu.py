@@ -124,11 +124,8 @@ def read_imu(path: Path) -> ImuRecord:
     """
     table = read_table(path, "IMU record")
     if table.columns < 7:
-        raise InputError(
-            "RIL-186",
-            f"{path}, line {table.lines[0]}: {table.columns} columns are no IMU record",
-            remedy="give time, three rates (rad/s) and three accelerations (m/s^2) a row",
-        )
+        text = f"{path}, line {table.lines[0]}: {table.columns} columns are no IMU record"
+        raise InputError("RIL-186", text, remedy="give time, three rates (rad/s) and three accelerations (m/s^2) a row")
     gyro, accelerometer = _columns(table)
     times = times_of(table, 0)
     rates, forces = table.numbers(gyro), table.numbers(accelerometer)
@@ -146,11 +143,9 @@ def _columns(table: TextTable) -> tuple[list[int], list[int]]:
     named = [(columns, place) for columns, place in zip(found, ORDER, strict=True) if columns]
     # Names of one sensor alone: the other is in the usual order only if this one is.
     if len(named) == 1 and named[0][0] != named[0][1]:
-        raise InputError(
-            "RIL-191",
-            f"{table.name}: of its columns {', '.join(table.header)} only those of one sensor are recognised",
-            remedy="order the columns time, rates, accelerations, or name them gyro_x ... acc_x ...",
-        )
+        text = f"{table.name}: of its columns {', '.join(table.header)} only those of one sensor are recognised"
+        remedy = "order the columns time, rates, accelerations, or name them gyro_x ... acc_x ..."
+        raise InputError("RIL-191", text, remedy=remedy)
     gyro, accelerometer = (columns or place for columns, place in zip(found, ORDER, strict=True))
     return gyro, accelerometer
 
@@ -177,17 +172,12 @@ def _plausible(rates: Floats, forces: Floats, name: str) -> None:
     turn, force = (float(np.median(np.linalg.norm(v, axis=1))) for v in (rates, forces))
     # A force of gravity (9.8) among the rates, and rates of a vehicle where the force should be.
     if turn > 8 and force < 6:
-        raise InputError(
-            "RIL-187",
-            f"{name}: the rates are {turn:.3g} and the accelerations {force:.3g}: they look exchanged",
-            remedy="order the columns time, rates, accelerations, or name them gyro_x ... acc_x ...",
-        )
+        text = f"{name}: the rates are {turn:.3g} and the accelerations {force:.3g}: they look exchanged"
+        remedy = "order the columns time, rates, accelerations, or name them gyro_x ... acc_x ..."
+        raise InputError("RIL-187", text, remedy=remedy)
     if 0.8 < force < 1.2:
-        raise InputError(
-            "RIL-188",
-            f"{name}: accelerations of {force:.3g} look like multiples of gravity",
-            remedy="give them in m/s^2: 9.81 at rest",
-        )
+        text = f"{name}: accelerations of {force:.3g} look like multiples of gravity"
+        raise InputError("RIL-188", text, remedy="give them in m/s^2: 9.81 at rest")
 
 
 # -- frames ------------------------------------------------------------------------------------------------------------

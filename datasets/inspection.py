@@ -161,11 +161,8 @@ def _files(folder: Path, search: Search, depth: int = 0) -> Iterable[Path]:
 
 def _writable(name: str) -> None:
     if UNWRITABLE.search(name):
-        raise InputError(
-            "RIL-185",
-            f"the name {name!r} has a line break, or is not in UTF-8: no manifest holds it",
-            remedy="rename it",
-        )
+        text = f"the name {name!r} has a line break, or is not in UTF-8: no manifest holds it"
+        raise InputError("RIL-185", text, remedy="rename it")
 
 
 def _relative(path: Path, folder: Path) -> str:
@@ -196,11 +193,8 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
             with suppress(InputError):
                 width, height, _ = common_header([path])
                 remedy = f"{SPLIT}; else {remedy}" if width >= 2 * height else remedy
-        raise InputError(
-            "RIL-194",
-            f"{folder} holds {len(images)} images, {named[0]} named as left and {named[1]} as right: no pairs",
-            remedy=remedy,
-        )
+        text = f"{folder} holds {len(images)} images, {named[0]} named as left and {named[1]} as right: no pairs"
+        raise InputError("RIL-194", text, remedy=remedy)
     # Most pairs first; of as many, the surest token (SIDES).
     key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0]))
     left, right = both[key]

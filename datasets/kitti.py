@@ -63,11 +63,8 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
         return None
     folder = folder.resolve()
     if not (folder / "calib.txt").is_file():
-        raise InputError(
-            "RIL-278",
-            f"{path} has image folders {' and '.join(sides)}, but no calib.txt",
-            remedy=f"`rille init {path}` writes a manifest that says what is needed",
-        )
+        text = f"{path} has image folders {' and '.join(sides)}, but no calib.txt"
+        raise InputError("RIL-278", text, remedy=f"`rille init {path}` writes a manifest that says what is needed")
     sequence = open_described(manifest_of(folder, sides), folder, str(folder), digests)
     return replace(sequence, defaults=STREET if sequence.rig.baseline >= CAR else {})
 

@@ -133,11 +133,9 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
         return None
     if len(known) < 2:
         names = ", ".join(table.header) or f"{table.columns} without names"
-        raise InputError(
-            "RIL-805",
-            f"{table.name}: its columns ({names}) do not say which are x and y in metres",
-            remedy='name them in the manifest: [truth] columns = { time = "NAME", x = "NAME", y = "NAME" }, or numbers',
-        )
+        text = f"{table.name}: its columns ({names}) do not say which are x and y in metres"
+        remedy = 'name them in the manifest: [truth] columns = { time = "NAME", x = "NAME", y = "NAME" }, or numbers'
+        raise InputError("RIL-805", text, remedy=remedy)
     times = times_of(table, meant["time"]) if "time" in meant else None
     rows = table.numbers([meant[axis] for axis in POSITION if axis in meant])
     return TimedPositions(times, tuple(tuple(float(v) for v in row) for row in rows), table.name)
@@ -163,11 +161,8 @@ def _column(table: TextTable, stated: str | int) -> int:
         return table.header.index(stated.strip().lower())
     if isinstance(stated, int) and 1 <= stated <= table.columns:
         return stated - 1
-    raise InputError(
-        "RIL-806",
-        f"{table.name}: truth.columns: there is no column {stated!r} of {', '.join(table.header) or table.columns}",
-        remedy="give a name of its first line, or a number from 1",
-    )
+    text = f"{table.name}: truth.columns: there is no column {stated!r} of {', '.join(table.header) or table.columns}"
+    raise InputError("RIL-806", text, remedy="give a name of its first line, or a number from 1")
 
 
 def _meanings(table: TextTable) -> dict[str, int]:
@@ -194,11 +189,9 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
             return meant
         if {"x", "y"} <= set(meant):
             lacking = ", ".join(q for q in QUATERNION if q not in meant)
-            raise InputError(
-                "RIL-801",
-                f"{table.name}: its columns {', '.join(table.header)} are positions without a rotation ({lacking})",
-                remedy="add qw, qx, qy, qz or roll_deg, pitch_deg, yaw_deg; positions alone serve as [truth] only",
-            )
+            text = f"{table.name}: its columns {', '.join(table.header)} are positions without a rotation ({lacking})"
+            remedy = "add qw, qx, qy, qz or roll_deg, pitch_deg, yaw_deg; positions alone serve as [truth] only"
+            raise InputError("RIL-801", text, remedy=remedy)
     form = format if format != "auto" else "euroc" if table.commas else "tum"
     order = ORDERED.get(form, ())
     if not order or table.columns < len(order) or (form == "tum" and table.columns > len(order)):
@@ -220,11 +213,9 @@ def _angles(table: TextTable, columns: Mapping[str, int]) -> Floats:
     if not units and np.abs(values).max() > 2 * np.pi:
         units = {"deg"}
     if len(units) != 1:
-        raise InputError(
-            "RIL-265",
-            f"{table.name}: roll, pitch and yaw have {'two units' if units else 'no unit'}",
-            remedy="name the columns roll_deg, pitch_deg, yaw_deg or roll_rad, pitch_rad, yaw_rad",
-        )
+        text = f"{table.name}: roll, pitch and yaw have {'two units' if units else 'no unit'}"
+        remedy = "name the columns roll_deg, pitch_deg, yaw_deg or roll_rad, pitch_rad, yaw_rad"
+        raise InputError("RIL-265", text, remedy=remedy)
     # Capitals turn about the axes as they are turned already: yaw first, then pitch, then roll.
     turns = Rotation.from_euler("ZYX", values[:, ::-1], degrees=units == {"deg"})
     return np.asarray(turns.as_matrix(), dtype=np.float64)
@@ -239,22 +230,17 @@ def _quaternions(table: TextTable, columns: Mapping[str, int]) -> Floats:
     bad = np.flatnonzero(np.abs(norms - 1) > NORM)
     if bad.size:
         k = int(bad[0])
-        raise InputError(
-            "RIL-266",
-            f"{table.name}, line {table.lines[k]}: a quaternion of length {norms[k]:.4g}",
-            remedy="give unit quaternions, and the format whose order of columns the file has",
-        )
+        text = f"{table.name}, line {table.lines[k]}: a quaternion of length {norms[k]:.4g}"
+        remedy = "give unit quaternions, and the format whose order of columns the file has"
+        raise InputError("RIL-266", text, remedy=remedy)
     return np.asarray(Rotation.from_quat(q).as_matrix(), dtype=np.float64)
 
 
 def _matrices(table: TextTable) -> tuple[RigidTransform | None, ...]:
     """Poses of rows of [R | t]."""
     if table.columns not in (12, 16):
-        raise InputError(
-            "RIL-267",
-            f"{table.name}, line {table.lines[0]}: {table.columns} numbers are no 3 x 4 pose",
-            remedy="give 12 numbers a line, or state the format",
-        )
+        text = f"{table.name}, line {table.lines[0]}: {table.columns} numbers are no 3 x 4 pose"
+        raise InputError("RIL-267", text, remedy="give 12 numbers a line, or state the format")
     values = table.numbers(range(table.columns), gaps=True).reshape(len(table.rows), -1, 4)[:, :3]
     return tuple(
         None if np.isnan(m).any() else rounded_pose(m, f"{table.name}, line {line}")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Sequence_
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rille.datasets.georeference import Georeference
@@ -78,13 +78,7 @@ class Positions:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON form."""
-        times = None if self.times is None else list(self.times)
-        return {
-            "positions": [list(row) for row in self.positions],
-            "times": times,
-            "max_gap": self.max_gap,
-            "lever_arm": self.lever_arm,
-        }
+        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -201,8 +195,5 @@ class Sequence:
         for what in ("frame_names", "times", "truth", "up", "attitude", "odometry"):
             values = getattr(self, what)
             if values is not None and len(values) != self.frames:
-                raise InputError(
-                    "RIL-273",
-                    f"sequence {self.name}: {len(values)} {what.replace('_', ' ')} for {self.frames} frames",
-                    remedy=f"give one entry of {what.replace('_', ' ')} a frame",
-                )
+                text = f"sequence {self.name}: {len(values)} {what.replace('_', ' ')} for {self.frames} frames"
+                raise InputError("RIL-273", text, remedy=f"give one entry of {what.replace('_', ' ')} a frame")

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeAlias
 
 from rille.datasets.cameras import boofcv, colmap, kitti, makers, middlebury, opencv, pds, slam, tsai
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from rille.datasets.cameras.pair import rig_of
-from rille.datasets.cameras.text import parse_nested
+from rille.datasets.cameras.text import assignments, parse_nested
 from rille.datasets.text.reading import read_text, refuse_decimal_commas
 from rille.stages.core.errors import InputError
 
@@ -21,28 +23,42 @@ KNOWN = (
     "CAHVORE) are read"
 )
 
-PLAIN: tuple[tuple[Callable[[str], bool], Callable[[str, Path], list[CalibratedCamera]]], ...] = (
+Text: TypeAlias = Callable[[str], bool]
+Entries: TypeAlias = Callable[[Fields], bool]
+
+
+def states(*keys: str) -> Text:
+    """Whether a text has a line ``key = value`` with one of the keys."""
+    return lambda text: any(key in keys for key, _ in assignments(text))
+
+
+def has(*keys: str) -> Entries:
+    """Whether one of the keys is an entry."""
+    return lambda f: any(key in f for key in keys)
+
+
+PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = (
     (pds.is_label, pds.label),
-    (tsai.is_tsai, tsai.tsai),
-    (middlebury.is_middlebury, middlebury.middlebury),
+    (states("fu"), tsai.tsai),
+    (lambda text: re.search(r"^[ \t]*cam0[ \t]*=[ \t]*\[", text, re.MULTILINE) is not None, middlebury.middlebury),
     (colmap.is_colmap, colmap.colmap),
     (kitti.is_kitti, kitti.kitti),
-    (makers.is_zed, makers.zed),
+    (lambda text: "[LEFT_CAM_" in text, makers.zed),
     (makers.is_matrix, makers.matrix),
 )
 """Text formats: how each is recognised, and its reader."""
 
-NESTED: tuple[tuple[Callable[[Fields], bool], Callable[[Fields, Path], list[CalibratedCamera]]], ...] = (
-    (opencv.is_stereo, opencv.stereo),
-    (slam.is_orbslam, slam.orbslam),
-    (slam.is_kalibr, slam.kalibr),
-    (slam.is_sensor, slam.sensor),
-    (slam.is_camodocal, slam.camodocal),
-    (slam.is_vins, slam.vins),
-    (makers.is_depthai, makers.depthai),
-    (boofcv.is_boofcv, boofcv.boofcv),
+NESTED: tuple[tuple[Entries, Callable[[Fields, Path], list[CalibratedCamera]]], ...] = (
+    (lambda f: any(left[0] in f and right[0] in f for left, right in opencv.SIDES), opencv.stereo),
+    (has("Camera.fx", "Camera1.fx"), slam.orbslam),
+    (lambda f: any(isinstance(f.values[key], dict) for key in f.values if slam.CAMERA.fullmatch(key)), slam.kalibr),
+    (lambda f: "intrinsics" in f and has("T_BS", "distortion_coefficients")(f), slam.sensor),
+    (has("model_type"), slam.camodocal),
+    (has("cam0_calib"), slam.vins),
+    (has("cameraData"), makers.depthai),
+    (lambda f: "pinhole" in f or ("rightToLeft" in f and "left" in f), boofcv.boofcv),
     (opencv.is_message, opencv.message),
-    (opencv.is_single, opencv.single),
+    (has(*opencv.SINGLE), opencv.single),
 )
 """Formats of nested entries. ORB-SLAM2 files that also hold unrectified cameras are read as those: the images are."""
 

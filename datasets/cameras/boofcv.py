@@ -14,12 +14,8 @@ from rille.datasets.cameras.model import CalibratedCamera, stereo_cameras
 from rille.stages.geometry.lens import Lens
 
 MODELS = ("pinhole", "pinhole_radial_tangential")
-MOST_RADIAL = 3
-
-
-def is_boofcv(f: Fields) -> bool:
-    """Whether these are the entries of one of BoofCV's cameras."""
-    return "pinhole" in f or ("rightToLeft" in f and "left" in f)
+MAX_RADIAL = 3
+"""Radial coefficients that are read."""
 
 
 def boofcv(f: Fields, path: Path) -> list[CalibratedCamera]:
@@ -39,16 +35,14 @@ def _lens(f: Fields) -> Lens:
     p = f.sub("pinhole")
     if abs(p.number("skew", 0.0)) > 1e-6 * p.number("fx"):
         raise p.error("RIL-104", "skew", f"= {p.number('skew'):g} is not 0", "calibrate without skew")
-    values = (p.number("fx"), p.number("fy"), p.number("cx") - 0.5, p.number("cy") - 0.5)
-    camera = p.camera("fx", values, p.size("width", "height"))
+    camera = p.optics("fx fy cx cy", "none", "", p.size("width", "height"), corner=0.5).camera
     if "radial_tangential" not in f:
         return Lens(camera)
     bent = f.sub("radial_tangential")
     radial = bent.numbers("radial") if "radial" in bent else ()
-    if len(radial) > MOST_RADIAL:
-        raise bent.error(
-            "RIL-105", "radial", f"has {len(radial)} numbers, at most {MOST_RADIAL} are read", "calibrate with fewer"
-        )
-    k1, k2, k3 = (*radial, *(0.0,) * (MOST_RADIAL - len(radial)))
+    if len(radial) > MAX_RADIAL:
+        text = f"has {len(radial)} numbers, at most {MAX_RADIAL} are read"
+        raise bent.error("RIL-105", "radial", text, "calibrate with fewer")
+    k1, k2, k3 = (*radial, *(0.0,) * (MAX_RADIAL - len(radial)))
     coefficients = (k1, k2, bent.number("t1", 0.0), bent.number("t2", 0.0), k3)
     return bent.lens("radial", camera, "radtan", coefficients if k3 else coefficients[:4])

@@ -13,27 +13,22 @@ from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.datasets.text.reading import read_text
 from rille.stages.geometry.geometry import RigidTransform
-from rille.stages.geometry.lens import Lens
 
-PARAMETERS = {
-    "SIMPLE_PINHOLE": "f cx cy",
-    "PINHOLE": "fx fy cx cy",
-    "SIMPLE_RADIAL": "f cx cy k1",
-    "RADIAL": "f cx cy k1 k2",
-    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
-    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
-    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
-    "RADIAL_FISHEYE": "f cx cy k1 k2",
+MODELS = {
+    "SIMPLE_PINHOLE": ("f cx cy", "none"),
+    "PINHOLE": ("fx fy cx cy", "none"),
+    "SIMPLE_RADIAL": ("f cx cy k1", "radtan"),
+    "RADIAL": ("f cx cy k1 k2", "radtan"),
+    "OPENCV": ("fx fy cx cy k1 k2 p1 p2", "radtan"),
+    "FULL_OPENCV": ("fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "rational"),
+    "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "fisheye"),
+    "SIMPLE_RADIAL_FISHEYE": ("f cx cy k1", "fisheye"),
+    "RADIAL_FISHEYE": ("f cx cy k1 k2", "fisheye"),
 }
-"""Its camera models that are read, and the order of their parameters."""
+"""Its camera models that are read: the order of their parameters, and the lens (:mod:`rille.stages.geometry.lens`)."""
 
-ORDER = {
-    "none": (),
-    "radtan": ("k1", "k2", "p1", "p2"),
-    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    "fisheye": ("k1", "k2", "k3", "k4"),
-}
+COEFFICIENTS = {"none": "", "radtan": "k1 k2 p1 p2", "rational": "k1 k2 p1 p2 k3 k4 k5 k6", "fisheye": "k1 k2 k3 k4"}
+"""Keys in the order of each lens."""
 
 
 def is_colmap(text: str) -> bool:
@@ -47,30 +42,22 @@ def is_colmap(text: str) -> bool:
 def colmap(text: str, path: Path) -> list[CalibratedCamera]:
     """Cameras, named by their numbers; poses in the rig's frame where ``rigs.txt`` has exactly one rig."""
     poses = _rig(path.with_name("rigs.txt"))
-    found = []
+    cameras = []
     for number, model, width, height, *values in _lines(text):
-        at = f"camera {number} "
-        if model not in PARAMETERS:
-            raise Fields({}, str(path), at).error(
-                "RIL-108", "model", f"{model} is not read", f"one of {', '.join(PARAMETERS)}"
-            )
-        names = PARAMETERS[model].split()
+        f = Fields({}, str(path), f"camera {number} ")
+        if model not in MODELS:
+            raise f.error("RIL-108", "model", f"{model} is not read", f"one of {', '.join(MODELS)}")
+        names, lens = MODELS[model][0].split(), MODELS[model][1]
         if len(values) != len(names):
-            f = Fields({}, str(path), at)
-            raise f.error("RIL-109", "parameters", f"are {len(values)}, {model} takes {len(names)}: {' '.join(names)}")
-        f = Fields(dict(zip(names, values, strict=True)) | {"width": width, "height": height}, str(path), at)
-        found.append(CalibratedCamera(number, _lens(f, model), poses.get(number)))
-    return found
-
-
-def _lens(f: Fields, model: str) -> Lens:
-    fx, fy = (f.number("f"), f.number("f")) if "f" in f else (f.number("fx"), f.number("fy"))
-    values = (fx, fy, f.number("cx") - 0.5, f.number("cy") - 0.5)
-    camera = f.camera("fx" if "fx" in f else "f", values, f.size("width", "height"))
-    kind = "fisheye" if "FISHEYE" in model else "rational" if model == "FULL_OPENCV" else "radtan"
-    if "k1" not in f:
-        kind = "none"
-    return f.lens("k1", camera, kind, tuple(f.number(key, 0.0) for key in ORDER[kind]))
+            text = f"are {len(values)}, {model} takes {len(names)}: {' '.join(names)}"
+            raise f.error("RIL-109", "parameters", text)
+        zeros = dict.fromkeys(COEFFICIENTS[lens].split(), "0")
+        stated = dict(zip(names, values, strict=True)) | {"width": width, "height": height}
+        f = Fields(zeros | stated, str(path), f.at)
+        pinhole = "f f cx cy" if "f" in f else "fx fy cx cy"
+        optics = f.optics(pinhole, lens, COEFFICIENTS[lens], f.size("width", "height"), corner=0.5)
+        cameras.append(CalibratedCamera(number, optics, poses.get(number)))
+    return cameras
 
 
 def _rig(path: Path) -> dict[str, RigidTransform]:

@@ -154,6 +154,25 @@ class Fields:
         except InputError as error:
             raise self.error(error.code, key, f"is wrong: {error.message}", error.remedy) from error
 
+    def optics(self, pinhole: str, model: str, coefficients: str, size: tuple[int, int], corner: float = 0.0) -> Lens:
+        """Lens of numbers that stand each at a key of its own.
+
+        Parameters
+        ----------
+        pinhole : keys of fx, fy, cx and cy (``"f f cx cy"``), pixels.
+        model, coefficients : of :mod:`rille.stages.geometry.lens`, and their keys in its order; those that are missing
+            are 0 but for a fisheye's, and where all are, there is no distortion.
+        corner : pixels; where the first pixel's corner lies for the program: 0.5 left of its centre, or at 0.
+        """
+        keys = pinhole.split()
+        fx, fy, cx, cy = (self.number(key) for key in keys)
+        camera = self.camera(keys[0], (fx, fy, cx - corner, cy - corner), size)
+        keys = coefficients.split()
+        if not any(key in self for key in keys):
+            return Lens(camera)
+        values = tuple(self.number(key, None if model == "fisheye" else 0.0) for key in keys)
+        return self.lens(keys[0], camera, model, values[:4] if model == "radtan" and not any(values[4:]) else values)
+
     def model(self, coefficients: str) -> str:
         """Lens model of :mod:`rille.stages.geometry.lens` that any key names; empty where none does.
 

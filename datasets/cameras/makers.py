@@ -39,11 +39,6 @@ MATRIX = re.compile(
 """Text of nine numbers fx 0 cx, 0 fy cy, 0 0 1, and perhaps a tenth."""
 
 
-def is_zed(text: str) -> bool:
-    """Whether this is the text of a ZED's calibration."""
-    return "[LEFT_CAM_" in text
-
-
 def zed(text: str, path: Path) -> list[CalibratedCamera]:
     """Both cameras at each resolution. Lengths in the file are millimetres, here metres.
 
@@ -72,17 +67,11 @@ def zed(text: str, path: Path) -> list[CalibratedCamera]:
 
 
 def _zed_lens(f: Fields, size: tuple[int, int]) -> Lens:
-    fx, fy, cx, cy = (f.number(key) for key in ("fx", "fy", "cx", "cy"))
     fisheye = "k4" in f and "p1" not in f
-    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    coefficients = tuple(f.number(key, 0.0) for key in keys)
+    model, keys = ("fisheye", "k1 k2 k3 k4") if fisheye else ("rational", "k1 k2 p1 p2 k3 k4 k5 k6")
+    lens = f.optics("fx fy cx cy", model, keys, size)
     f.check_lens()
-    return f.lens("k1", f.camera("fx", (fx, fy, cx, cy), size), "fisheye" if fisheye else "rational", coefficients)
-
-
-def is_depthai(f: Fields) -> bool:
-    """Whether these are the entries of an OAK's calibration."""
-    return "cameraData" in f
+    return lens
 
 
 def depthai(f: Fields, path: Path) -> list[CalibratedCamera]:
@@ -138,8 +127,7 @@ def matrix(text: str, path: Path) -> list[CalibratedCamera]:
     found = MATRIX.fullmatch(text[:1000])
     assert found is not None
     f = Fields(dict(zip(("fx", "cx", "fy", "cy", "baseline"), found.groups(), strict=True)), str(path))
-    fx, fy, cx, cy = (f.number(key) for key in ("fx", "fy", "cx", "cy"))
-    lens = Lens(f.camera("fx", (fx, fy, cx, cy), UNKNOWN_SIZE))
+    lens = f.optics("fx fy cx cy", "none", "", UNKNOWN_SIZE)
     if "baseline" not in f:
         return [CalibratedCamera(path.stem, lens)]
     return stereo_cameras(lens, lens, parallel(f.number("baseline")))

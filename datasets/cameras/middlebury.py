@@ -10,11 +10,6 @@ from rille.datasets.cameras.text import assignments
 from rille.stages.geometry.lens import Lens
 
 
-def is_middlebury(text: str) -> bool:
-    """Whether this is the text of such a calibration."""
-    return any(key == "cam0" and value.startswith("[") for key, value in assignments(text))
-
-
 def middlebury(text: str, path: Path) -> list[CalibratedCamera]:
     """Both cameras; the file's baseline is in millimetres, here it is in metres."""
     values: dict[str, object] = {}

@@ -41,11 +41,6 @@ HEIGHTS = ("image_height", "image_Height", "height", "LEFT.height", "Camera.heig
 ROTATIONS, TRANSLATIONS = ("R", "rotation_matrix"), ("T", "translation_vector")
 
 
-def is_stereo(f: Fields) -> bool:
-    """Whether the entries hold two camera matrices."""
-    return any(left[0] in f and right[0] in f for left, right in SIDES)
-
-
 def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
     """Both cameras of OpenCV's stereo samples: M1 D1 M2 D2, R T with ``x_right = R x_left + T``.
 
@@ -74,11 +69,6 @@ def message(f: Fields, path: Path) -> list[CalibratedCamera]:
     """One camera of ROS' message camera_info as ``topic echo`` prints it."""
     f.values = {MESSAGE.get(key.upper(), key): value for key, value in f.values.items()}
     return single(f, path)
-
-
-def is_single(f: Fields) -> bool:
-    """Whether the entries hold one camera matrix."""
-    return any(key in f for key in SINGLE)
 
 
 def single(f: Fields, path: Path) -> list[CalibratedCamera]:

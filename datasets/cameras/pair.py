@@ -72,11 +72,8 @@ def rig_of(
     T_right_left = right.T_camera_reference @ left.T_camera_reference.inverse()
     rig = Rig(lenses["left"].ideal_camera(), lenses["right"].ideal_camera(), T_right_left)
     if rig.baseline < LEAST_BASELINE:
-        raise InputError(
-            "RIL-129",
-            f"cameras {left.name} and {right.name} stand in one place: the baseline is 0 m",
-            remedy="give the baseline in metres, or the calibration of both cameras",
-        )
+        text = f"cameras {left.name} and {right.name} stand in one place: the baseline is 0 m"
+        raise InputError("RIL-129", text, remedy="give the baseline in metres, or the calibration of both cameras")
     to_the_right = float(T_right_left.inverse().translation[0])
     if to_the_right < -SIDEWAYS * rig.baseline:
         raise InputError(
@@ -98,11 +95,8 @@ def _sized(camera: CalibratedCamera, size: tuple[int, int] | None) -> Lens:
             remedy="give the images as they were calibrated, or the calibration of images of this size",
         )
     if camera.size is None and size is None:
-        raise InputError(
-            "RIL-132",
-            f"the calibration of camera {camera.name} does not say how large its images are",
-            remedy="give the size of the images",
-        )
+        text = f"the calibration of camera {camera.name} does not say how large its images are"
+        raise InputError("RIL-132", text, remedy="give the size of the images")
     width, height = camera.size or size or (0, 0)
     lens = replace(camera.lens, camera=replace(camera.lens.camera, width=width, height=height))
     check_focal(lens.camera, camera.name)

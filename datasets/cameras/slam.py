@@ -25,11 +25,6 @@ CAMODOCAL: Mapping[str, tuple[str, str, str]] = {
 """Its models: keys of the pinhole part, model of :mod:`rille.stages.geometry.lens`, keys of its coefficients."""
 
 
-def is_kalibr(f: Fields) -> bool:
-    """Whether there is a ``cam0`` with entries of its own."""
-    return any(CAMERA.fullmatch(key) and isinstance(f.values[key], dict) for key in f.values)
-
-
 def kalibr(f: Fields, path: Path) -> list[CalibratedCamera]:
     """Cameras of a chain: ``T_cn_cnm1`` maps camera n - 1 to camera n, metres.
 
@@ -55,11 +50,6 @@ def _of_imu(part: Fields) -> RigidTransform | None:
     return part.pose("T_imu_cam").inverse() if "T_imu_cam" in part else None
 
 
-def is_camodocal(f: Fields) -> bool:
-    """Whether these are the entries of a camera of camodocal."""
-    return "model_type" in f
-
-
 def camodocal(f: Fields, path: Path) -> list[CalibratedCamera]:
     """The camera; ``extrinsicRotation`` and ``extrinsicTranslation`` map it to the body (VINS-Mono), metres."""
     kind = f.text("model_type").upper()
@@ -71,16 +61,10 @@ def camodocal(f: Fields, path: Path) -> list[CalibratedCamera]:
     pinhole, model, coefficients = CAMODOCAL[kind]
     p = f.sub("projection_parameters")
     d = p if kind == "KANNALA_BRANDT" else f.sub("distortion_parameters")
-    fx, fy, cx, cy = (p.number(key) for key in pinhole.split())
-    camera = p.camera(pinhole, (fx, fy, cx, cy), f.size("image_width", "image_height"))
+    camera = p.optics(pinhole, "none", "", f.size("image_width", "image_height")).camera
     lens = d.lens(coefficients, camera, model, tuple(d.number(key) for key in coefficients.split()))
     T = f.transform("extrinsicRotation", "extrinsicTranslation").inverse() if "extrinsicRotation" in f else None
     return [CalibratedCamera(path.stem, lens, T)]
-
-
-def is_vins(f: Fields) -> bool:
-    """Whether these are the settings of VINS-Fusion with a file for each camera."""
-    return "cam0_calib" in f
 
 
 def vins(f: Fields, path: Path) -> list[CalibratedCamera]:
@@ -93,11 +77,6 @@ def vins(f: Fields, path: Path) -> list[CalibratedCamera]:
         cameras += [replace(camera, name=name, T_camera_reference=T) for camera in camodocal(part, other)]
         part.check_lens()
     return cameras
-
-
-def is_sensor(f: Fields) -> bool:
-    """Whether these are the entries of one EuRoC camera."""
-    return "intrinsics" in f and ("T_BS" in f or "distortion_coefficients" in f)
 
 
 def sensor(f: Fields, path: Path) -> list[CalibratedCamera]:
@@ -120,11 +99,6 @@ def _pinhole_lens(f: Fields, distortion: str) -> Lens:
     return f.lens(distortion, camera, model, () if model == "none" and not any(coefficients) else coefficients)
 
 
-def is_orbslam(f: Fields) -> bool:
-    """Whether these are settings of ORB-SLAM 2 or 3."""
-    return "Camera.fx" in f or "Camera1.fx" in f
-
-
 def orbslam(f: Fields, path: Path) -> list[CalibratedCamera]:
     """Camera or cameras of ORB-SLAM's settings.
 
@@ -144,13 +118,7 @@ def orbslam(f: Fields, path: Path) -> list[CalibratedCamera]:
 
 
 def _orbslam_lens(f: Fields, name: str, size: tuple[int, int]) -> Lens:
-    values = [f.number(f"{name}.{key}") for key in ("fx", "fy", "cx", "cy")]
-    camera = f.camera(f"{name}.fx", (values[0], values[1], values[2], values[3]), size)
-    if f.model(f"{name}.k1") == "fisheye":
-        keys = [f"{name}.k{n}" for n in (1, 2, 3, 4)]
-        return f.lens(keys[0], camera, "fisheye", tuple(f.number(key) for key in keys))
-    keys = [f"{name}.{key}" for key in ("k1", "k2", "p1", "p2", "k3")]
-    if not any(key in f for key in keys):
-        return Lens(camera)
-    coefficients = tuple(f.number(key, 0.0) for key in keys)
-    return f.lens(keys[0], camera, "radtan", coefficients if coefficients[4] else coefficients[:4])
+    model = "fisheye" if f.model(f"{name}.k1") == "fisheye" else "radtan"
+    letters = ("k1", "k2", "k3", "k4") if model == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
+    pinhole, coefficients = (" ".join(f"{name}.{key}" for key in of) for of in (("fx", "fy", "cx", "cy"), letters))
+    return f.optics(pinhole, model, coefficients, size)

@@ -20,12 +20,10 @@ from rille.datasets.cameras.text import assignments
 from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import Lens
 
+LENSES = {"null": ("none", ""), "fisheye": ("fisheye", "k1 k2 k3 k4"), "tsai": ("radtan", "k1 k2 p1 p2")}
+"""Its lens models that are read: those of :mod:`rille.stages.geometry.lens`, and the keys of their coefficients."""
+
 HEADER = re.compile(r"(VERSION_\d+|PINHOLE)?")
-
-
-def is_tsai(text: str) -> bool:
-    """Whether this is the text of a pinhole camera."""
-    return any(key == "fu" for key, _ in assignments(text))
 
 
 def tsai(text: str, path: Path) -> list[CalibratedCamera]:
@@ -40,9 +38,8 @@ def tsai(text: str, path: Path) -> list[CalibratedCamera]:
     keys = ("u_direction", "v_direction", "w_direction")
     axes = np.array([f.numbers(key, 3) if key in f else row for key, row in zip(keys, np.eye(3), strict=True)])
     if np.linalg.det(axes) < 0:
-        raise f.error(
-            "RIL-147", "u_direction", "and the other two directions mirror the image", "give a model without mirroring"
-        )
+        text = "and the other two directions mirror the image"
+        raise f.error("RIL-147", "u_direction", text, "give a model without mirroring")
     T_world_body = f.rigid("R", f.matrix("R", 3, 3), np.array(f.numbers("C", 3)))
     T_camera_body = f.rigid("u_direction", axes, np.zeros(3))
     found = CalibratedCamera(path.stem, _lens(f, lens, camera), T_camera_body @ T_world_body.inverse())
@@ -64,17 +61,10 @@ def _entries(text: str, file: str) -> tuple[Fields, str]:
 
 
 def _lens(f: Fields, kind: str, camera: Camera) -> Lens:
-    name = kind.lower()
-    if name == "null" or (not name and "k1" not in f):
-        return Lens(camera)
-    if name == "fisheye":
-        return f.lens("k1", camera, "fisheye", tuple(f.number(key) for key in ("k1", "k2", "k3", "k4")))
-    if name not in ("", "tsai"):
-        raise f.error(
-            "RIL-148",
-            f"lens model {kind}",
-            "is not read",
-            "convert it by convert_pinhole_model --output-type TsaiLensDistortion",
-        )
-    k3 = (f.number("k3"),) if "k3" in f else ()
-    return f.lens("k1", camera, "radtan", (*(f.number(key) for key in ("k1", "k2", "p1", "p2")), *k3))
+    model = LENSES.get(kind.lower() or ("tsai" if "k1" in f else "null"))
+    if model is None:
+        remedy = "convert it by convert_pinhole_model --output-type TsaiLensDistortion"
+        raise f.error("RIL-148", f"lens model {kind}", "is not read", remedy)
+    name, keys = model
+    optional = ["k3"] if name == "radtan" and "k3" in f else []
+    return f.lens("k1", camera, name, tuple(f.number(key) for key in [*keys.split(), *optional]))

@@ -104,11 +104,8 @@ def grey_of(message: Any, name: str, wanted: tuple[int, int, int]) -> Grey:
     # Rows may be padded to `step` bytes (sensor_msgs/msg/Image), and the message may hold fewer than it states.
     data = np.frombuffer(bytes(message.data), np.uint8)
     if step < width or len(data) < rows * step:
-        raise InputError(
-            "RIL-942",
-            f"{name} has {len(data)} bytes in rows of {step}, {columns} x {rows} pixels need rows of {width}",
-            remedy=files.COPY_AGAIN,
-        )
+        text = f"{name} has {len(data)} bytes in rows of {step}, {columns} x {rows} pixels need rows of {width}"
+        raise InputError("RIL-942", text, remedy=files.COPY_AGAIN)
     pixels = np.ascontiguousarray(data[: rows * step].reshape(rows, step)[:, :width])
     if bits == 16:
         pixels = np.ascontiguousarray(pixels.view(">u2" if message.is_bigendian else "<u2"), dtype=np.uint16)
@@ -118,11 +115,8 @@ def grey_of(message: Any, name: str, wanted: tuple[int, int, int]) -> Grey:
 
 def _layout(message: Any, name: str) -> tuple[int, int, int | None]:
     if message.encoding not in LAYOUTS:
-        raise InputError(
-            "RIL-943",
-            f"{name} has the encoding {str(message.encoding)[:40]!r}",
-            remedy=f"record one of {', '.join(LAYOUTS)}, or compressed PNG or JPEG",
-        )
+        text = f"{name} has the encoding {str(message.encoding)[:40]!r}"
+        raise InputError("RIL-943", text, remedy=f"record one of {', '.join(LAYOUTS)}, or compressed PNG or JPEG")
     return LAYOUTS[message.encoding]
 
 

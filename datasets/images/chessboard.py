@@ -110,11 +110,9 @@ def find_size(images: Iterable[Grey]) -> tuple[int, int]:
             votes[max(pattern.shape), min(pattern.shape)] += 1
     agreed = {size: count for size, count in votes.items() if count > 1}
     if not agreed:
-        raise InputError(
-            "RIL-153",
-            "no chessboard of one size is found in the images",
-            remedy="give its inner corners, e.g. --corners 9x6, and check that all of it is in view and in focus",
-        )
+        text = "no chessboard of one size is found in the images"
+        remedy = "give its inner corners, e.g. --corners 9x6, and check that all of it is in view and in focus"
+        raise InputError("RIL-153", text, remedy=remedy)
     return max(agreed, key=lambda size: (agreed[size], size[0] * size[1]))
 
 

@@ -171,20 +171,15 @@ def _sound(header: Header | None, name: str) -> Header:
     """A header of an image that may be decoded."""
     if header is None:
         kind = kind_of(name)
-        raise InputError(
-            "RIL-171",
-            f"{name} cannot be read as an image",
-            remedy=f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM are read" if kind == "file" else KINDS[kind][1],
-        )
+        text = f"{name} cannot be read as an image"
+        remedy = f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM are read" if kind == "file" else KINDS[kind][1]
+        raise InputError("RIL-171", text, remedy=remedy)
     width, height, bits = header
     if bits > 16:
         raise InputError("RIL-761", f"{name} has samples of {bits} bits", remedy=FEWER_BITS)
     if not 0 < width * height <= MOST_PIXELS:
-        raise InputError(
-            "RIL-762",
-            f"{name} has {width} x {height} pixels, 1 to {MOST_PIXELS / 1e6:g} million are read",
-            remedy="leave its frame out, or give smaller images",
-        )
+        text = f"{name} has {width} x {height} pixels, 1 to {MOST_PIXELS / 1e6:g} million are read"
+        raise InputError("RIL-762", text, remedy="leave its frame out, or give smaller images")
     return header
 
 
@@ -269,11 +264,9 @@ def check_size(found: Header, wanted: Header, name: str) -> None:
     """Refuse an image whose width, height or depth differs from those of its camera's other images."""
     if found != wanted:
         words = [f"{w} x {h}, {d} bits" for w, h, d in (found, wanted)]
-        raise InputError(
-            "RIL-176",
-            f"{name} is {words[0]}; others of its camera are {words[1]}",
-            remedy="all images of a camera must have one size and depth; leave the frame out or convert it",
-        )
+        text = f"{name} is {words[0]}; others of its camera are {words[1]}"
+        remedy = "all images of a camera must have one size and depth; leave the frame out or convert it"
+        raise InputError("RIL-176", text, remedy=remedy)
 
 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

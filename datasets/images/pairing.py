@@ -192,7 +192,7 @@ def pair_up(
                 remedy="remove what is too many, or pair by name or number",
             )
         pairs = _named(list(zip(left, right, strict=True)))
-        lines += [*crossed(pairs), *(_two_clocks(pairs, *times, tolerance) if all(times) and len(pairs) > 1 else ())]
+        lines += _two_clocks(pairs, *times, tolerance) if all(times) and len(pairs) > 1 else []
         return pairs
     joined = join(*times, tolerance) if all(times) else None
     if rule == "nearest" or (rule == "auto" and joined is not None and joined.apart):
@@ -288,11 +288,9 @@ def _numbers(paths: Iterable[Path], side: int) -> list[str]:
     for path in paths:
         number = _number(path.stem)
         if number is None:
-            raise InputError(
-                "RIL-257",
-                f"{path} has no number in its name and no partner of its name",
-                remedy='say how images are paired: images.pair = "order", or narrow the patterns',
-            )
+            text = f"{path} has no number in its name and no partner of its name"
+            remedy = 'say how images are paired: images.pair = "order", or narrow the patterns'
+            raise InputError("RIL-257", text, remedy=remedy)
         found.append(str(number))
     return found
 
@@ -301,11 +299,8 @@ def _unique(keys: list[str], paths: Sequence[Path], rule: str) -> None:
     key, count = Counter(keys).most_common(1)[0]
     if count > 1:
         first, second = [p for k, p in zip(keys, paths, strict=True) if k == key][:2]
-        raise InputError(
-            "RIL-258",
-            f"{first} and {second.name} are the same frame by {rule}",
-            remedy="narrow the patterns, or choose another images.pair",
-        )
+        text = f"{first} and {second.name} are the same frame by {rule}"
+        raise InputError("RIL-258", text, remedy="narrow the patterns, or choose another images.pair")
 
 
 def _all_partnered(by_key: list[dict[str, Path]], rule: str, found: tuple[Sequence[Path], Sequence[Path]]) -> None:
@@ -330,21 +325,6 @@ def _named(pairs: list[tuple[Path, Path]]) -> tuple[ImagePair, ...]:
     if len(set(names)) < len(names):
         names = [str(k) for k in range(len(pairs))]
     return tuple(ImagePair(name, *pair) for name, pair in zip(names, pairs, strict=True))
-
-
-def crossed(pairs: Sequence[ImagePair]) -> list[str]:
-    """A warning where pairs by order part images of one number, while others join them: as after a lost image."""
-    numbers = [(_number(pair.left.stem), _number(pair.right.stem)) for pair in pairs]
-    there = {right for _, right in numbers} - {None}
-    parted = [k for k, (left, right) in enumerate(numbers) if left != right and left in there]
-    if not parted or not any(left == right for left, right in numbers):
-        return []
-    first = pairs[parted[0]]
-    text = (
-        f"by order {first.left.name} is paired with {first.right.name}, though there is a right image of its number; "
-        f"so are {len(parted)} of {len(pairs)} pairs: was an image lost? pair by number or name"
-    )
-    return [warning("RIL-990", text)]
 
 
 def common_headers(pairs: Sequence[ImagePair]) -> Headers:

@@ -175,11 +175,8 @@ class MotionReader:
             self.motion.truth_positions = self.positions(section, alone.times, alone.positions)
             return
         if section.lever_arm is not None:
-            raise InputError(
-                "RIL-782",
-                f"{self.name}: truth.lever_arm: {section.file} holds poses, not positions alone",
-                remedy="state where the camera is in their body as T_body_left",
-            )
+            text = f"{self.name}: truth.lever_arm: {section.file} holds poses, not positions alone"
+            raise InputError("RIL-782", text, remedy="state where the camera is in their body as T_body_left")
         self.motion.truth = self.poses(section, "truth")
         if section.T_body_left is not None:
             self.motion.truth_mount = RigidTransform.from_matrix(section.T_body_left)

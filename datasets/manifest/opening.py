@@ -186,11 +186,8 @@ def find_pairs(images: Images, root: Path, name: str, lines: list[str]) -> tuple
         if pattern.endswith("*"):  # of any kind: then what is no image may lie beside the images
             paths = [path for path in paths if path.suffix.lower() in files.SUFFIXES] or paths
         if not paths:
-            raise InputError(
-                "RIL-217",
-                f"{name}: images.{side} = {pattern!r} finds no file in {root}",
-                remedy="correct the pattern or root",
-            )
+            text = f"{name}: images.{side} = {pattern!r} finds no file in {root}"
+            raise InputError("RIL-217", text, remedy="correct the pattern or root")
         found[side] = paths
     both = sorted(set(found["left"]) & set(found["right"]))
     if both:

@@ -96,18 +96,13 @@ def _cameras(section: Cameras, root: Path, name: str, sizes: Sizes) -> tuple[Cal
         found = tuple(_one(section, side, root, name, sizes[0]) for side in ("left", "right"))
     if found and found[0].lens == found[1].lens and sizes[0] != sizes[1]:
         left, right = (f"{width} x {height}" for width, height in sizes)
-        raise InputError(
-            "RIL-960",
-            f"{name}: left images have {left} pixels, right ones {right}, and one camera is stated for both",
-            remedy="give cameras.left and cameras.right",
-        )
+        text = f"{name}: left images have {left} pixels, right ones {right}, and one camera is stated for both"
+        raise InputError("RIL-960", text, remedy="give cameras.left and cameras.right")
     if found:
         return found
-    raise InputError(
-        "RIL-235",
-        f"{name}: the cameras are not known",
-        remedy="give cameras.file, cameras.left and cameras.right, or cameras.fx, cx and cy (px)",
-    )
+    text = f"{name}: the cameras are not known"
+    remedy = "give cameras.file, cameras.left and cameras.right, or cameras.fx, cx and cy (px)"
+    raise InputError("RIL-235", text, remedy=remedy)
 
 
 def _rectified(camera: CalibratedCamera, name: str) -> CalibratedCamera:
@@ -127,11 +122,8 @@ def _one(value: str | PinholeLens, side: str, root: Path, name: str, size: tuple
     if isinstance(value, str):
         found = read_cameras(root / value)
         if len(found) != 1:
-            raise InputError(
-                "RIL-236",
-                f"{name}: cameras.{side}: {root / value} has {len(found)} cameras",
-                remedy="give it as cameras.file, and name the two by cameras.names",
-            )
+            text = f"{name}: cameras.{side}: {root / value} has {len(found)} cameras"
+            raise InputError("RIL-236", text, remedy="give it as cameras.file, and name the two by cameras.names")
         return found[0]
     assert value.fx is not None
     assert value.cx is not None
@@ -153,18 +145,12 @@ def _of_file(section: Cameras, path: Path, name: str, sizes: Sizes) -> tuple[Cal
         by_name = {camera.name: camera for camera in found}
         missing = [wanted for wanted in section.names if wanted not in by_name]
         if missing:
-            raise InputError(
-                "RIL-237",
-                f"{name}: cameras.names: {path} has no camera {missing[0]!r}",
-                remedy=f"it has {', '.join(by_name)}",
-            )
+            text = f"{name}: cameras.names: {path} has no camera {missing[0]!r}"
+            raise InputError("RIL-237", text, remedy=f"it has {', '.join(by_name)}")
         return tuple(by_name[wanted] for wanted in section.names)
     if len(found) > 2:
-        raise InputError(
-            "RIL-238",
-            f"{name}: {path} has {len(found)} cameras: {', '.join(camera.name for camera in found)}",
-            remedy="say which two by cameras.names = [left, right]",
-        )
+        text = f"{name}: {path} has {len(found)} cameras: {', '.join(camera.name for camera in found)}"
+        raise InputError("RIL-238", text, remedy="say which two by cameras.names = [left, right]")
     if len(found) == 1:
         # Its pose, if it has one, is that of one camera: where the other one stands the manifest has to say.
         return found[0], replace(found[0], name="right", T_camera_reference=None)
@@ -225,11 +211,8 @@ def _check_baseline(baseline: float, section: RigSection, name: str) -> None:
     if baseline > LONGEST_BASELINE:
         unit = section.unit / 1000
         hint = f"a manifest's rig.unit = {unit:g} reads a calibration in millimetres" if from_files else "give metres"
-        raise InputError(
-            "RIL-244",
-            f"{name}: the baseline is {baseline:g} m, which looks like millimetres",
-            remedy=f"did you mean {baseline / 1000:g}? {hint}",
-        )
+        text = f"{name}: the baseline is {baseline:g} m, which looks like millimetres"
+        raise InputError("RIL-244", text, remedy=f"did you mean {baseline / 1000:g}? {hint}")
 
 
 def off_centre(camera: Camera, side: str) -> list[str]:

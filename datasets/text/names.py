@@ -28,11 +28,9 @@ def check_name(name: str) -> None:
     """
     if not NAME.fullmatch(name) or name in RESERVED:
         shown = repr(name if len(name) <= LONGEST else f"{name[:LONGEST]}...")
-        raise InputError(
-            "RIL-764",
-            f"{shown} is not permitted as the name of a sequence",
-            remedy=f"at most {LONGEST} of A-Z a-z 0-9 _ . -, the first a letter, digit or _, and not {RESERVED[0]}",
-        )
+        text = f"{shown} is not permitted as the name of a sequence"
+        remedy = f"at most {LONGEST} of A-Z a-z 0-9 _ . -, the first a letter, digit or _, and not {RESERVED[0]}"
+        raise InputError("RIL-764", text, remedy=remedy)
 
 
 def derived_name(text: str) -> str:

@@ -151,11 +151,9 @@ def refuse_decimal_commas(lines: list[str], path: Path, cause: Exception | None 
     commas = [(k, word) for k, word in words if COMMA.fullmatch(word)]
     points = sum(POINT.search(word) is not None for _, word in words)
     if len(commas) > points or any(word in str(cause) for _, word in commas):
-        raise InputError(
-            "RIL-813",
-            f"{path}: decimal commas, such as {commas[0][1]} in line {commas[0][0]}, are not read",
-            remedy="write decimal points (LC_NUMERIC=C for the program that wrote them)",
-        ) from cause
+        text = f"{path}: decimal commas, such as {commas[0][1]} in line {commas[0][0]}, are not read"
+        remedy = "write decimal points (LC_NUMERIC=C for the program that wrote them)"
+        raise InputError("RIL-813", text, remedy=remedy) from cause
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
@@ -197,11 +195,8 @@ def _inner(value: Any) -> Iterator[Any]:
 def _no_long_line(lines: list[str], path: Path, what: str) -> None:
     for k, line in enumerate(lines, start=1):
         if len(line) > LONGEST_LINE:
-            raise InputError(
-                "RIL-757",
-                f"{what} {path}, line {k}: {len(line)} characters, at most {LONGEST_LINE} are read",
-                remedy="check that it is the right file",
-            )
+            text = f"{what} {path}, line {k}: {len(line)} characters, at most {LONGEST_LINE} are read"
+            raise InputError("RIL-757", text, remedy="check that it is the right file")
 
 
 class Search:
@@ -223,11 +218,8 @@ class Search:
             found = sorted(islice(there, MOST_ENTRIES - self._seen + 1), key=lambda entry: entry.name)
         self._seen += len(found)
         if self._seen > MOST_ENTRIES:
-            raise InputError(
-                "RIL-750",
-                f"more than {MOST_ENTRIES} files and folders to look at, so far as {folder}",
-                remedy="name the folder of the images, not one far above it",
-            )
+            text = f"more than {MOST_ENTRIES} files and folders to look at, so far as {folder}"
+            raise InputError("RIL-750", text, remedy="name the folder of the images, not one far above it")
         return found
 
     def folders(self, top: Path) -> list[Path]:

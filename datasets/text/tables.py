@@ -53,11 +53,8 @@ class TextTable:
         if wrong.any():
             row, column = np.argwhere(wrong)[0]
             cell = self.rows[row][columns[column]]
-            raise InputError(
-                "RIL-284",
-                f"{self.name}, line {self.lines[row]}: {cell!r} is not a finite number",
-                remedy="correct or remove that line",
-            )
+            text = f"{self.name}, line {self.lines[row]}: {cell!r} is not a finite number"
+            raise InputError("RIL-284", text, remedy="correct or remove that line")
         return values
 
 

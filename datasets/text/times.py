@@ -70,11 +70,8 @@ def seconds(
     for line, before, now in in_order:
         if now <= before:
             words = "is there twice" if now == before else f"goes back from {before}"
-            raise InputError(
-                "RIL-293",
-                f"{what}, line {line}: time {now} {words}",
-                remedy="put the rows in order of time, each once, in one unit",
-            )
+            text = f"{what}, line {line}: time {now} {words}"
+            raise InputError("RIL-293", text, remedy="put the rows in order of time, each once, in one unit")
     times = tuple(float(v / UNITS[stated]) for v in exact)
     if unit == "auto" and times[0] < SINCE_1970:
         _refuse_slow(times, what)
@@ -101,11 +98,9 @@ def _unit(exact: Sequence[Decimal], what: str, lines: Sequence[int]) -> str:
     units = [_magnitude(v) for v in exact]
     for k, unit in enumerate(units):
         if unit != units[0]:
-            raise InputError(
-                "RIL-292",
-                f"{what}, line {lines[k]}: time {exact[k]} after {exact[k - 1]}: mixed units ({units[0]} and {unit})",
-                remedy="write all times in one unit, or state it where small stamps are not seconds",
-            )
+            text = f"{what}, line {lines[k]}: time {exact[k]} after {exact[k - 1]}: mixed units ({units[0]} and {unit})"
+            remedy = "write all times in one unit, or state it where small stamps are not seconds"
+            raise InputError("RIL-292", text, remedy=remedy)
     return units[0]
 
 
@@ -113,8 +108,6 @@ def _refuse_slow(times: Sequence[float], what: str) -> None:
     """Refuse stamps that no unit by magnitude fits: small ones that are far apart for seconds."""
     usual = float(np.median(np.diff(np.asarray(times)))) if len(times) > 1 else 0.0
     if usual > SLOW:
-        raise InputError(
-            "RIL-687",
-            f"times of {what} are {usual:.4g} s apart, if they are seconds",
-            remedy='state their unit: times.unit = "ns" in the manifest, or time_ns as the name of the column',
-        )
+        text = f"times of {what} are {usual:.4g} s apart, if they are seconds"
+        remedy = 'state their unit: times.unit = "ns" in the manifest, or time_ns as the name of the column'
+        raise InputError("RIL-687", text, remedy=remedy)

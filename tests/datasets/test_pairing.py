@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from rille.datasets.images.pairing import common_headers, crossed, join, natural, pair_up, side_of, stamp_of
+from rille.datasets.images.pairing import common_headers, join, natural, pair_up, side_of, stamp_of
 
 
 def paths(*names: str) -> list[Path]:
@@ -77,22 +77,6 @@ def test_a_gap_is_a_pair_of_which_a_file_is_absent():
     assert [p.absent for p in pairs] == ["", "r/cam_right_10.png is missing", "l/cam_left_11.png is missing", "", ""]
     with raises("RIL-259"):
         pair_up(left, right, gaps=True)  # more is missing than whole
-
-
-@pytest.mark.parametrize(
-    ("left", "right", "crossed_pairs"),
-    [
-        ((0, 1, 2, 4), (0, 1, 3, 4), 0),  # 2 and 3 are one pair, neither has a partner
-        ((0, 1, 2, 4, 5), (0, 1, 2, 3, 4), 1),
-        ((0, 1, 2, 3), (1, 2, 3, 4), 0),  # cameras that count by themselves
-        ((10, 20, 31), (10, 21, 30), 0),  # times that jitter
-    ],
-)
-def test_pairs_by_order_that_a_lost_image_has_shifted_are_warned_of(left, right, crossed_pairs):
-    pairs = pair_up(paths(*(f"a{k}.png" for k in left)), paths(*(f"b{k}.png" for k in right)), "order")
-    lines = crossed(pairs)
-    assert len(lines) == (crossed_pairs > 0)
-    assert all(f"so are {crossed_pairs} of {len(left)} pairs" in line for line in lines)
 
 
 def test_numbers_in_names_sort_as_numbers():
