@@ -5,9 +5,11 @@ from __future__ import annotations
 import difflib
 import os
 import pkgutil
+import site
+import sysconfig
 from collections.abc import Mapping
 from functools import cache
-from importlib import import_module
+from importlib import import_module, metadata
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -43,9 +45,13 @@ MANIFEST_FORMS = (
 )
 
 
+ENTRY_POINTS = "rille.formats"
+"""Group of the modules by which installed packages add layouts of their own."""
+
+
 @cache
 def layouts() -> tuple[ModuleType, ...]:
-    """Modules beside this one that open folders or files of a certain layout, by name.
+    """Modules that open folders or files of a certain layout: those beside this one, then those of installed packages.
 
     Each has ``FORMS``, what a user may give and in words what that is, and ``open_layout(path, number, digests)``,
     which gives None where the folder is none of its own; ``number`` chooses one of several (``FOLDER:NUMBER``).
@@ -53,7 +59,18 @@ def layouts() -> tuple[ModuleType, ...]:
     # By listing, not by a table: a new layout is one new file, and the order by name is the same everywhere.
     names = [found.name for found in pkgutil.iter_modules([str(Path(__file__).parent)]) if not found.ispkg]
     modules = [import_module(f"rille.datasets.{name}") for name in sorted(names)]
-    return tuple(module for module in modules if hasattr(module, "open_layout"))
+    return (*(module for module in modules if hasattr(module, "open_layout")), *_installed())
+
+
+def _installed() -> list[ModuleType]:
+    """Modules of the entry points of packages that are installed for this Python, by name."""
+    # Of the folders of installed packages alone: `sys.path` may begin with the current folder.
+    folders = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
+    if site.ENABLE_USER_SITE:
+        folders.append(site.getusersitepackages())
+    distributions = metadata.distributions(path=list(dict.fromkeys(folders)))
+    points = (point for one in distributions for point in one.entry_points.select(group=ENTRY_POINTS))
+    return [point.load() for point in sorted(points, key=lambda point: (point.name, point.value))]
 
 
 def forms() -> list[tuple[str, str]]:

@@ -105,7 +105,7 @@ def read_urdf(path: Path, camera: str = "", stated: Vehicle | None = None) -> Ro
     found |= {"name": robot.get("name")} if robot.get("name") else {}
     found |= {} if stated is None else stated.model_dump(exclude_unset=True)
     remedy = "state what differs in [vehicle]"
-    vehicle = validated("RIL-959", Vehicle, found, file=f"URDF {path}", remedy=remedy)
+    vehicle = validated("RIL-963", Vehicle, found, file=f"URDF {path}", remedy=remedy)
     return Robot(vehicle, _pitch(camera, places, path) if camera else None)
 
 

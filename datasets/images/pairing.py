@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -114,9 +113,9 @@ def natural(text: str) -> tuple[tuple[int, int | str], ...]:
     return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", text) if part)
 
 
-def ends(names: Sequence[str]) -> str:
-    """``000000.png to 000050.png``: the first and the last of a list of names."""
-    return " to ".join(dict.fromkeys((names[0], names[-1]))) if names else "none"
+def ends(paths: Sequence[Path]) -> str:
+    """``000000.png to 000050.png``: the names of the first and the last of some files."""
+    return " to ".join(dict.fromkeys((paths[0].name, paths[-1].name))) if paths else "none"
 
 
 def _token(word: str) -> re.Pattern[str]:
@@ -142,11 +141,6 @@ def without_side(stem: str, side: int) -> str:
     """A file's stem without its side's token: ``cam_left_07`` and ``cam_right_07`` are both ``cam_*_07``."""
     found = side_of(stem)
     return found[2] if found is not None and found[1] == side else stem
-
-
-def _number(stem: str) -> int | None:
-    digits = re.findall(r"\d+", stem)
-    return int(digits[-1]) if digits else None
 
 
 def pair_up(
@@ -182,40 +176,54 @@ def pair_up(
         sorted(paths, key=lambda p: (Decimal(stamp_of(p.stem) or 0), natural(p.name))) for paths in (left, right)
     )
     times = _times(left), _times(right)
+    joined = join(*times, tolerance) if all(times) else None
+    both = " and ".join(f"{len(of)} {side} images ({ends(of)})" for side, of in (("left", left), ("right", right)))
     # One image each is a pair, whatever the two are called.
     if rule == "order" or (rule == "auto" and len(left) == len(right) == 1):
         if len(left) != len(right):
-            raise InputError(
-                "RIL-256",
-                f"{len(left)} left images ({ends([p.name for p in left])}) and {len(right)} right ones "
-                f"({ends([p.name for p in right])}) cannot be paired by order",
-                remedy="remove what is too many, or pair by name or number",
-            )
+            remedy = "remove what is too many, or pair by name or number"
+            raise InputError("RIL-256", f"{both} cannot be paired by order", remedy=remedy)
         pairs = _named(list(zip(left, right, strict=True)))
         lines += _two_clocks(pairs, *times, tolerance) if all(times) and len(pairs) > 1 else []
         return pairs
-    joined = join(*times, tolerance) if all(times) else None
     if rule == "nearest" or (rule == "auto" and joined is not None and joined.apart):
         if joined is None or not joined.places:
             why = f"the nearest are {joined.apart:.4g} s apart" if joined else "not each has its own"
-            raise InputError(
-                "RIL-822",
-                f"left ({ends([p.name for p in left])}) and right images ({ends([p.name for p in right])}) make no "
-                f"pairs by the time stamps in their names: {why}",
-                remedy='state images.tolerance (s), or, of two clocks, images.pair = "order"',
-            )
+            remedy = 'state images.tolerance (s), or, of two clocks, images.pair = "order"'
+            raise InputError("RIL-822", f"{both} make no pairs by the time stamps in their names: {why}", remedy=remedy)
         lines += joined.lines("RIL-821")
         return _named([(left[i], right[j]) for i, j in joined.places])
-    keys = {"name": _names, "number": _numbers}
     if rule == "auto":
-        rule = "name" if set(_names(left, 0)) & set(_names(right, 1)) else "number"
-    by_key = [dict(zip(keys[rule](paths, side), paths, strict=True)) for side, paths in enumerate((left, right))]
-    for side, paths in enumerate((left, right)):
-        _unique(keys[rule](paths, side), paths, rule)
-    if gaps and rule == "name" and 2 * len(set(by_key[0]) & set(by_key[1])) > len(set(by_key[0]) | set(by_key[1])):
+        shared = {without_side(path.stem, 0) for path in left} & {without_side(path.stem, 1) for path in right}
+        rule = "name" if shared else "number"
+    by_key = _by_key(left, 0, rule), _by_key(right, 1, rule)
+    shared, present = set(by_key[0]) & set(by_key[1]), set(by_key[0]) | set(by_key[1])
+    if gaps and rule == "name" and 2 * len(shared) > len(present):
         return _with_gaps(by_key)
-    _all_partnered(by_key, rule, (left, right))
+    alone = [path for ours in by_key for key, path in ours.items() if key not in shared]
+    if alone:
+        more = f" (and {len(alone) - 1} more)" if len(alone) > 1 else ""
+        text = f"{alone[0]} has no partner by {rule}{more}; {both}"
+        remedy = "add the missing image, narrow the patterns, or choose another images.pair"
+        raise InputError("RIL-259", text, remedy=remedy)
     return _named([(path, by_key[1][key]) for key, path in by_key[0].items()])
+
+
+def _by_key(paths: Sequence[Path], side: int, rule: str) -> dict[str, Path]:
+    """Images by what those of a pair share: their name without the side's token, or its last number."""
+    by_key: dict[str, Path] = {}
+    for path in paths:
+        numbers = re.findall(r"\d+", path.stem)
+        if rule == "number" and not numbers:
+            text = f"{path} has no number in its name and no partner of its name"
+            remedy = 'say how images are paired: images.pair = "order", or narrow the patterns'
+            raise InputError("RIL-257", text, remedy=remedy)
+        key = str(int(numbers[-1])) if rule == "number" else without_side(path.stem, side)
+        if key in by_key:
+            text = f"{by_key[key]} and {path.name} are the same frame by {rule}"
+            raise InputError("RIL-258", text, remedy="narrow the patterns, or choose another images.pair")
+        by_key[key] = path
+    return by_key
 
 
 def _two_clocks(
@@ -243,22 +251,17 @@ def _two_clocks(
     return [warning("RIL-824", text)] if abs(offset) > MOST_APART else []
 
 
-def _with_gaps(by_key: list[dict[str, Path]]) -> tuple[ImagePair, ...]:
+def _with_gaps(by_key: tuple[dict[str, Path], dict[str, Path]]) -> tuple[ImagePair, ...]:
     """Pairs of all keys and of numbers left out of a running count; an absent file has the name that it would have."""
     whole = next(key for key in by_key[0] if key in by_key[1])
     keys = counted(sorted({**by_key[0], **by_key[1]}, key=natural))
     paths = [[ours.get(key) or _called(ours[whole], whole, key) for ours in by_key] for key in keys]
-    absent = [
-        [p for p, ours in zip(both, by_key, strict=True) if key not in ours]
-        for both, key in zip(paths, keys, strict=True)
-    ]
-    pairs = _named([(both[0], both[1]) for both in paths])
-    names = [" and ".join(f"{path.parent.name}/{path.name}" for path in gone) for gone in absent]
-    words = [
-        "" if not gone else f"{name} {'are' if gone[1:] else 'is'} missing"
-        for gone, name in zip(absent, names, strict=True)
-    ]
-    return tuple(replace(pair, absent=text) for pair, text in zip(pairs, words, strict=True))
+    pairs = []
+    for key, pair in zip(keys, _named([(left, right) for left, right in paths]), strict=True):
+        gone = [path for path, ours in zip((pair.left, pair.right), by_key, strict=True) if key not in ours]
+        words = " and ".join(f"{path.parent.name}/{path.name}" for path in gone)
+        pairs.append(replace(pair, absent=f"{words} {'are' if gone[1:] else 'is'} missing" if gone else ""))
+    return tuple(pairs)
 
 
 def counted(names: list[str]) -> list[str]:
@@ -277,44 +280,6 @@ def _called(example: Path, key: str, wanted: str) -> Path:
     before, star, behind = key.partition("*")
     token = example.stem[len(before) : len(example.stem) - len(behind)] if star else ""
     return example.with_name(wanted.replace("*", token) + example.suffix)
-
-
-def _names(paths: Iterable[Path], side: int) -> list[str]:
-    return [without_side(path.stem, side) for path in paths]
-
-
-def _numbers(paths: Iterable[Path], side: int) -> list[str]:
-    found = []
-    for path in paths:
-        number = _number(path.stem)
-        if number is None:
-            text = f"{path} has no number in its name and no partner of its name"
-            remedy = 'say how images are paired: images.pair = "order", or narrow the patterns'
-            raise InputError("RIL-257", text, remedy=remedy)
-        found.append(str(number))
-    return found
-
-
-def _unique(keys: list[str], paths: Sequence[Path], rule: str) -> None:
-    key, count = Counter(keys).most_common(1)[0]
-    if count > 1:
-        first, second = [p for k, p in zip(keys, paths, strict=True) if k == key][:2]
-        text = f"{first} and {second.name} are the same frame by {rule}"
-        raise InputError("RIL-258", text, remedy="narrow the patterns, or choose another images.pair")
-
-
-def _all_partnered(by_key: list[dict[str, Path]], rule: str, found: tuple[Sequence[Path], Sequence[Path]]) -> None:
-    for ours, others, side in ((by_key[0], by_key[1], "right"), (by_key[1], by_key[0], "left")):
-        alone = [path for key, path in ours.items() if key not in others]
-        if alone:
-            more = f" (and {len(alone) - 1} more)" if len(alone) > 1 else ""
-            raise InputError(
-                "RIL-259",
-                f"{alone[0]} has no partner by {rule} among the {side} images{more}; "
-                f"{len(found[0])} left ({ends([p.name for p in found[0]])}), "
-                f"{len(found[1])} right ({ends([p.name for p in found[1]])})",
-                remedy="add the missing image, narrow the patterns, or choose another images.pair",
-            )
 
 
 def _named(pairs: list[tuple[Path, Path]]) -> tuple[ImagePair, ...]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from rille.datasets.georeference import Georeference, metric_crs
 from rille.datasets.text.reading import read_toml
@@ -45,52 +45,49 @@ PoseFormat = Literal["auto", "kitti", "tum", "euroc", "csv"]
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
 
-class Images(Params):
+class Table(Params):
+    """A table of the manifest; the text below each key is its description."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+
+class Images(Table):
     """``[images]``: which files are the pairs."""
 
-    left: str = Field(
-        description="pattern of the left images below the root, e.g. left/*.png; ** is any folder; or BAG, or BAG:TOPIC"
-    )
-    right: str = Field(description="pattern of the right images, or the same bag")
-    pair: Literal["auto", "name", "number", "nearest", "order"] = Field(
-        default="auto",
-        description="how images are paired: by name (left/right aside), by the last number in the name, by the nearest "
-        "time stamp in it, or by order; auto: by name, by time stamps where these differ, else by number",
-    )
-    tolerance: float | None = Field(
-        default=None,
-        gt=0,
-        description="s; time between the images of a pair at most, by the stamps in their names; by default a quarter "
-        "of the usual interval, at most 0.01",
-    )
-    rectified: bool | None = Field(
-        default=None,
-        description="whether the images are rectified; by default they are where a word of their folders' or files' "
-        "names begins with rect",
-    )
+    left: str
+    """pattern of the left images below the root, e.g. left/*.png; ** is any folder; or BAG, or BAG:TOPIC"""
+    right: str
+    """pattern of the right images, or the same bag"""
+    pair: Literal["auto", "name", "number", "nearest", "order"] = "auto"
+    """how images are paired: by name (left/right aside), by the last number in the name, by the nearest time stamp in
+    it, or by order; auto: by name, by time stamps where these differ, else by number"""
+    tolerance: float | None = Field(default=None, gt=0)
+    """s; time between the images of a pair at most, by the stamps in their names; by default a quarter of the usual
+    interval, at most 0.01"""
+    rectified: bool | None = None
+    """whether the images are rectified; by default they are where a word of their folders' or files' names begins with
+    rect"""
 
 
-class PinholeLens(Params):
+class PinholeLens(Table):
     """One camera stated in the manifest."""
 
-    fx: float | None = Field(default=None, gt=0, description="px, focal length in columns")
-    fy: float | None = Field(
-        default=None, gt=0, description="px, focal length in rows; that in columns where it is not given"
-    )
-    cx: float | None = Field(
-        default=None, description="px, column of the principal point; centre of the first pixel is 0"
-    )
-    cy: float | None = Field(default=None, description="px, row of the principal point")
-    width: int | None = Field(
-        default=None, ge=1, description="px, of the images that were calibrated; those given by default"
-    )
-    height: int | None = Field(default=None, ge=1, description="px, of the images that were calibrated")
-    model: Literal["none", "radtan", "rational", "fisheye"] | None = Field(
-        default=None, description="distortion model; radtan where there are coefficients"
-    )
-    distortion: tuple[float, ...] = Field(
-        default=(), description="coefficients in OpenCV's order, e.g. k1 k2 p1 p2 [k3]"
-    )
+    fx: float | None = Field(default=None, gt=0)
+    """px, focal length in columns"""
+    fy: float | None = Field(default=None, gt=0)
+    """px, focal length in rows; that in columns where it is not given"""
+    cx: float | None = None
+    """px, column of the principal point; centre of the first pixel is 0"""
+    cy: float | None = None
+    """px, row of the principal point"""
+    width: int | None = Field(default=None, ge=1)
+    """px, of the images that were calibrated; those given by default"""
+    height: int | None = Field(default=None, ge=1)
+    """px, of the images that were calibrated"""
+    model: Literal["none", "radtan", "rational", "fisheye"] | None = None
+    """distortion model; radtan where there are coefficients"""
+    distortion: tuple[float, ...] = ()
+    """coefficients in OpenCV's order, e.g. k1 k2 p1 p2 [k3]"""
 
     @model_validator(mode="after")
     def _whole(self) -> PinholeLens:
@@ -117,13 +114,14 @@ OneCamera = Annotated[Annotated[str, Tag(FILE)] | Annotated[PinholeLens, Tag(FIG
 class Cameras(PinholeLens):
     """``[cameras]``: one file, a file or a table each, or figures that hold for both cameras."""
 
-    file: str | None = Field(default=None, description="calibration file of both cameras")
-    left: OneCamera | None = Field(default=None, description="calibration file of the left camera, or its figures")
-    right: OneCamera | None = Field(default=None, description="calibration file of the right camera, or its figures")
-    names: tuple[str, str] | None = Field(
-        default=None,
-        description="names of the left and the right camera within the file, where it has more or other ones",
-    )
+    file: str | None = None
+    """calibration file of both cameras"""
+    left: OneCamera | None = None
+    """calibration file of the left camera, or its figures"""
+    right: OneCamera | None = None
+    """calibration file of the right camera, or its figures"""
+    names: tuple[str, str] | None = None
+    """names of the left and the right camera within the file, where it has more or other ones"""
 
     @model_validator(mode="after")
     def _one_form(self) -> Cameras:
@@ -138,16 +136,15 @@ class Cameras(PinholeLens):
         return self
 
 
-class RigSection(Params):
+class RigSection(Table):
     """``[rig]``: where the right camera stands, unless the calibration files say it."""
 
-    baseline: float | None = Field(
-        default=None, description="m; the right camera stands that far along the left one's x axis"
-    )
-    T_right_left: Pose | None = Field(default=None, description="rows of [R | t], m: x_right = R x_left + t")
-    unit: float = Field(
-        default=1.0, gt=0, description="m; length of one unit of the calibration files, 0.001 where they say mm"
-    )
+    baseline: float | None = None
+    """m; the right camera stands that far along the left one's x axis"""
+    T_right_left: Pose | None = None
+    """rows of [R | t], m: x_right = R x_left + t"""
+    unit: float = Field(default=1.0, gt=0)
+    """m; length of one unit of the calibration files, 0.001 where they say mm"""
 
     @model_validator(mode="after")
     def _one_baseline(self) -> RigSection:
@@ -159,15 +156,17 @@ class RigSection(Params):
         return self
 
 
-class Times(Params):
+class Times(Table):
     """``[times]``: when the pairs were taken."""
 
-    file: str | None = Field(
-        default=None, description="one time a line for each pair, or a table of time and file name"
-    )
-    names: bool = Field(default=False, description="the left images' names are time stamps")
-    rate_hz: float | None = Field(default=None, gt=0, description="1/s; pairs at a constant rate")
-    unit: TimeUnit = Field(default="auto", description="unit of file or names; auto: by magnitude")
+    file: str | None = None
+    """one time a line for each pair, or a table of time and file name"""
+    names: bool = False
+    """the left images' names are time stamps"""
+    rate_hz: float | None = Field(default=None, gt=0)
+    """1/s; pairs at a constant rate"""
+    unit: TimeUnit = "auto"
+    """unit of file or names; auto: by magnitude"""
 
     @model_validator(mode="after")
     def _one_source(self) -> Times:
@@ -177,93 +176,78 @@ class Times(Params):
         return self
 
 
-class PoseFile(Params):
+class PoseFile(Table):
     """``[odometry]``, and the base of ``[truth]``: poses of the left camera or of a body that carries it."""
 
-    file: str = Field(description="poses, one a pair, or with times")
-    format: PoseFormat = Field(default="auto", description="kitti 3 x 4, tum, euroc or csv")
-    T_body_left: Pose | None = Field(
-        default=None,
-        description="rows of [R | t], m: from the left camera's frame to the body's whose poses the file has",
-    )
-    unit: float = Field(default=1.0, gt=0, description="m; length of one unit of the file, 0.001 where it says mm")
-    max_gap: float = Field(default=0.5, gt=0, description="s; poses are interpolated over no longer gap")
-    time_offset: float = Field(
-        default=0.0, description="s; added to the file's times so that they are those of the images"
-    )
-    source: str = Field(default="", description="words: where the poses come from")
+    file: str
+    """poses, one a pair, or with times"""
+    format: PoseFormat = "auto"
+    """kitti 3 x 4, tum, euroc or csv"""
+    T_body_left: Pose | None = None
+    """rows of [R | t], m: from the left camera's frame to the body's whose poses the file has"""
+    unit: float = Field(default=1.0, gt=0)
+    """m; length of one unit of the file, 0.001 where it says mm"""
+    max_gap: float = Field(default=0.5, gt=0)
+    """s; poses are interpolated over no longer gap"""
+    time_offset: float = 0.0
+    """s; added to the file's times so that they are those of the images"""
+    source: str = ""
+    """words: where the poses come from"""
 
 
 class Truth(PoseFile):
     """``[truth]``: poses, or positions alone, which are compared after a rigid fit in the plane."""
 
-    columns: dict[Literal["time", "x", "y", "z"], str | int] = Field(
-        default={},
-        description='names or numbers (from 1) of the columns of positions alone, e.g. { time = "gps s", x = "E", y = '
-        '"N" }; x and y span the ground, y left of x seen from above, z is up; names that are clear need none',
-    )
-    lever_arm: Vector | None = Field(
-        default=None,
-        description="m; where the antenna or prism of positions alone is in the left camera's frame: x right, y down, "
-        "z ahead; none: fitted where turns show it, and the report says so",
-    )
+    columns: dict[Literal["time", "x", "y", "z"], str | int] = Field(default={})
+    """names or numbers (from 1) of the columns of positions alone, e.g. { time = "gps s", x = "E", y = "N" }; x and y
+    span the ground, y left of x seen from above, z is up; names that are clear need none"""
+    lever_arm: Vector | None = None
+    """m; where the antenna or prism of positions alone is in the left camera's frame: x right, y down, z ahead; none:
+    fitted where turns show it, and the report says so"""
 
 
-class Attitude(Params):
+class Attitude(Table):
     """``[attitude]``: rotation from a sensor."""
 
-    file: str = Field(description="table of time and roll, pitch, yaw or a quaternion; or poses, of which R is taken")
-    format: PoseFormat = Field(default="auto", description="as for poses")
-    T_body_left: Pose | None = Field(
-        default=None, description="rows of [R | t]: from the left camera's frame to the sensor's"
-    )
-    up: Direction | None = Field(
-        default=None, description="direction of up in the sensor's reference; none: not used as such"
-    )
-    max_gap: float = Field(default=0.5, gt=0, description="s; attitudes are interpolated over no longer gap")
-    time_offset: float = Field(
-        default=0.0, description="s; added to the file's times so that they are those of the images"
-    )
+    file: str
+    """table of time and roll, pitch, yaw or a quaternion; or poses, of which R is taken"""
+    format: PoseFormat = "auto"
+    """as for poses"""
+    T_body_left: Pose | None = None
+    """rows of [R | t]: from the left camera's frame to the sensor's"""
+    up: Direction | None = None
+    """direction of up in the sensor's reference; none: not used as such"""
+    max_gap: float = Field(default=0.5, gt=0)
+    """s; attitudes are interpolated over no longer gap"""
+    time_offset: float = 0.0
+    """s; added to the file's times so that they are those of the images"""
 
 
-class Imu(Params):
+class Imu(Table):
     """``[imu]``: angular rates and accelerations."""
 
-    file: str = Field(description="table of time, rates (rad/s) about x y z and accelerations (m/s2) along them")
-    T_imu_left: Pose = Field(description="rows of [R | t]: from the left camera's frame to the IMU's")
-    time_offset: float = Field(
-        default=0.0, description="s; added to the file's times so that they are those of the images"
-    )
+    file: str
+    """table of time, rates (rad/s) about x y z and accelerations (m/s2) along them"""
+    T_imu_left: Pose
+    """rows of [R | t]: from the left camera's frame to the IMU's"""
+    time_offset: float = 0.0
+    """s; added to the file's times so that they are those of the images"""
 
 
-class World(Params):
+class World(Table):
     """``[world]``: what is known of the vertical, and of the place."""
 
-    pitch_deg: float | None = Field(
-        default=None,
-        gt=-90,
-        lt=90,
-        description="degrees; downward pitch of the left camera's axis over the ground, roll 0",
-    )
-    up: Direction | None = Field(
-        default=None,
-        description="direction of up in the reference frame of the calibration files (the left camera's where they "
-        "state none), the same for all pairs",
-    )
-    crs: Annotated[str, AfterValidator(metric_crs)] | None = Field(
-        default=None,
-        description='projected CRS in metres of the results, e.g. "EPSG:32633"; with origin and azimuth_deg',
-    )
-    origin: Vector | None = Field(
-        default=None, description="m; easting, northing and height of the first left camera's centre in that CRS"
-    )
-    azimuth_deg: float | None = Field(
-        default=None,
-        ge=-360,
-        le=360,
-        description="degrees clockwise from grid north; heading of the first left camera's optical axis, which is the "
-        "world's y axis",
-    )
+    pitch_deg: float | None = Field(default=None, gt=-90, lt=90)
+    """degrees; downward pitch of the left camera's axis over the ground, roll 0"""
+    up: Direction | None = None
+    """direction of up in the reference frame of the calibration files (the left camera's where they state none), the
+    same for all pairs"""
+    crs: Annotated[str, AfterValidator(metric_crs)] | None = None
+    """projected CRS in metres of the results, e.g. "EPSG:32633"; with origin and azimuth_deg"""
+    origin: Vector | None = None
+    """m; easting, northing and height of the first left camera's centre in that CRS"""
+    azimuth_deg: float | None = Field(default=None, ge=-360, le=360)
+    """degrees clockwise from grid north; heading of the first left camera's optical axis, the world's y axis"""
 
     @model_validator(mode="after")
     def _one_vertical_and_a_whole_place(self) -> World:
@@ -282,20 +266,22 @@ class World(Params):
         return Georeference(self.crs, self.origin, math.radians(self.azimuth_deg))
 
 
-class Urdf(Params):
+class Urdf(Table):
     """A robot description that says how large the vehicle is and how its left camera is mounted."""
 
-    file: str = Field(
-        description="URDF; what [vehicle] does not state of the wheels and the clearance is taken from it"
-    )
-    left: str = Field(default="", description="optical link of the left camera; its pitch is taken, if none is stated")
+    file: str
+    """URDF; what [vehicle] does not state of the wheels and the clearance is taken from it"""
+    left: str = ""
+    """optical link of the left camera; its pitch is taken, if none is stated"""
 
 
-class Manifest(Params):
+class Manifest(Table):
     """A stereo sequence in a folder of any form."""
 
-    name: str = Field(default="", description="short name, used for folders; the manifest's folder by default")
-    root: str = Field(default=".", description="folder of all files, relative to the manifest; ${VARIABLE} is allowed")
+    name: str = ""
+    """short name, used for folders; the manifest's folder by default"""
+    root: str = "."
+    """folder of all files, relative to the manifest; ${VARIABLE} is allowed"""
     images: Images
     cameras: Cameras = Cameras()
     rig: RigSection = RigSection()
@@ -307,10 +293,10 @@ class Manifest(Params):
     world: World = World()
     vehicle: Vehicle | None = None
     urdf: Urdf | None = None
-    defaults: dict[str, Any] = Field(
-        default={}, description="parameters that suit the sequence, e.g. locus.cell_size = 0.05"
-    )
-    notes: tuple[str, ...] = Field(default=(), description="facts that the report repeats")
+    defaults: dict[str, Any] = Field(default={})
+    """parameters that suit the sequence, e.g. locus.cell_size = 0.05"""
+    notes: tuple[str, ...] = ()
+    """facts that the report repeats"""
 
     @model_validator(mode="after")
     def _one_rotation(self) -> Manifest:

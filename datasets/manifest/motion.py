@@ -125,11 +125,9 @@ class MotionReader:
         if len(rows) not in self.counts():
             absent = next((stem for stem in stems if stem not in by_name), "")
             more = f", none of {absent}" if by_name else ""
-            raise InputError(
-                "RIL-229",
-                f"{path} has {len(rows)} times for {len(self.pairs)} pairs ({ends(stems)}){more}",
-                remedy="give one line a pair, or lines of time and file name",
-            )
+            which = ends([pair.left for pair in self.pairs])
+            problem = f"{path} has {len(rows)} times for {len(self.pairs)} pairs ({which}){more}"
+            raise InputError("RIL-229", problem, remedy="give one line a pair, or lines of time and file name")
         return self.a_pair([(words[0], k) for k, words in rows])
 
     def counts(self) -> set[int]:

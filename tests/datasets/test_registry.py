@@ -7,6 +7,7 @@ import pytest
 from folders import write_lines, write_sequence
 from raising import raises
 
+from rille.datasets import registry
 from rille.datasets.registry import MANIFESTS, catalogue, open_sequence
 from rille.pipeline.flow import config as configuration
 
@@ -199,3 +200,36 @@ def test_a_folder_of_images_that_are_not_read_says_so(tmp_path):
     (tmp_path / "calib.txt").write_text("7 0 3 0 0 7 2 0 0 0 1 0\n7 0 3 -1 0 7 2 0 0 0 1 0\n")
     with raises("RIL-171", "1.heic", "convert them"):
         open_sequence(str(tmp_path))
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """A package that adds a layout, in a folder that takes the place of the installed packages'."""
+    write_lines(
+        tmp_path / "site" / "my_format.py",
+        [
+            "from rille.datasets.registry import open_sequence",
+            "FORMS = (('FOLDER', 'one with a file my.format'),)",
+            "def open_layout(path, number, digests):",
+            "    return open_sequence(str(path / 'inner')) if (path / 'my.format').is_file() else None",
+        ],
+    )
+    about = tmp_path / "site" / "my_format-1.dist-info"
+    write_lines(about / "METADATA", ["Metadata-Version: 2.1", "Name: my_format", "Version: 1"])
+    write_lines(about / "entry_points.txt", ["[rille.formats]", "mine = my_format"])
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    registry.layouts.cache_clear()
+    yield tmp_path / "site"
+    registry.layouts.cache_clear()
+
+
+def test_an_installed_package_adds_a_layout_and_the_current_folder_none(installed, tmp_path, monkeypatch):
+    write_sequence(tmp_path / "field" / "inner", head='name = "mine"')
+    write_lines(tmp_path / "field" / "my.format", [""])
+    monkeypatch.chdir(installed)
+    with raises("RIL-277"):
+        open_sequence(str(tmp_path / "field"))
+    registry.layouts.cache_clear()
+    monkeypatch.setattr(registry.sysconfig, "get_path", lambda name: str(installed))
+    assert open_sequence(str(tmp_path / "field")).name == "mine"
+    assert ("FOLDER", "one with a file my.format") in catalogue()
