@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.poses import coverage, times_of
+from rille.datasets.poses import coverage, refuse_apart, times_of
 from rille.datasets.protocol import Rows, rows_of
 from rille.datasets.text.tables import TextTable, read_table
 from rille.stages.core.arrays import Floats
@@ -231,7 +231,9 @@ def at_frames(imu: ImuRecord, at: Sequence[float], T_imu_left: RigidTransform) -
     InputError
         The record and the frames have no time in common, or the record has less than two samples.
     """
-    _overlap(imu, at)
+    if len(imu.times) < 2:
+        raise InputError("RIL-189", f"{imu.name} has one sample", remedy="give the whole record")
+    refuse_apart(imu.times, at, imu.name)
     bias, notes = resting_bias(imu, at[0], at[-1])
     parts = stretches(imu, bias, at[0] - HALF_WINDOW, at[-1] + HALF_WINDOW)
     part = [next((p for p, s in enumerate(parts) if s.holds(moment)), None) for moment in at]
@@ -319,19 +321,6 @@ def bins(values: Floats, times: Floats) -> Floats:
     size = max(1, round(BIN / float(np.median(np.diff(times)))))
     count = max(1, len(values) // size)
     return np.asarray(values[: count * size].reshape(count, -1, values.shape[1]).mean(axis=1), dtype=np.float64)
-
-
-def _overlap(imu: ImuRecord, at: Sequence[float]) -> None:
-    if len(imu.times) < 2:
-        raise InputError("RIL-189", f"{imu.name} has one sample", remedy="give the whole record")
-    first, last = float(imu.times[0]), float(imu.times[-1])
-    if at[-1] < first or at[0] > last:
-        raise InputError(
-            "RIL-190",
-            f"{imu.name} reaches from {first:.3f} to {last:.3f} s, the frames from {at[0]:.3f} to {at[-1]:.3f} s: "
-            "no common time",
-            remedy="check that both have the same clock and unit; a manifest states a constant offset as time_offset",
-        )
 
 
 def _unit(vector: Floats) -> Up:

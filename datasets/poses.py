@@ -287,13 +287,7 @@ def interpolate(timed: TimedPoses, at: Sequence[float], max_gap: float) -> tuple
         raise InputError("RIL-268", f"{timed.name} has no times", remedy="give one pose a frame, or a file with times")
     t, wanted = np.array(timed.times), np.asarray(at, dtype=np.float64)
     inside = (wanted >= t[0] - WITHIN) & (wanted <= t[-1] + WITHIN)
-    if not inside.any():
-        raise InputError(
-            "RIL-269",
-            f"{timed.name} reaches from {t[0]:.3f} to {t[-1]:.3f} s, the frames from {wanted[0]:.3f} to "
-            f"{wanted[-1]:.3f} s: no common time",
-            remedy="check that both have the same clock and unit; a manifest states a constant offset as time_offset",
-        )
+    refuse_apart(t, wanted, timed.name)
     before = np.clip(np.searchsorted(t, wanted, side="right") - 1, 0, max(len(t) - 2, 0))
     after = np.minimum(before + 1, len(t) - 1)
     distance = np.minimum(np.abs(wanted - t[before]), np.abs(wanted - t[after]))
@@ -307,6 +301,14 @@ def interpolate(timed: TimedPoses, at: Sequence[float], max_gap: float) -> tuple
     turned = Slerp(t, rotations)(moment).as_matrix() if len(t) > 1 else [rows[0].rotation] * len(wanted)
     moved = np.stack([np.interp(moment, t, axis) for axis in positions.T], axis=1)
     return tuple(RigidTransform(turned[k], moved[k]) if known[k] else None for k in range(len(wanted)))
+
+
+def refuse_apart(times: Sequence[float] | Floats, at: Sequence[float] | Floats, name: str) -> None:
+    """Refuse a record called ``name`` whose increasing times, s, have nothing in common with those of the frames."""
+    if at[-1] < times[0] - WITHIN or at[0] > times[-1] + WITHIN:
+        text = f"{name} reaches from {times[0]:.3f} to {times[-1]:.3f} s, the frames from {at[0]:.3f} to {at[-1]:.3f} s"
+        remedy = "check that both have the same clock and unit; a manifest states a constant offset as time_offset"
+        raise InputError("RIL-269", f"{text}: no common time", remedy=remedy)
 
 
 def coverage(found: Sequence[object | None], at: Sequence[float], what: str) -> tuple[str, ...]:

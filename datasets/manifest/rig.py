@@ -26,9 +26,6 @@ USUAL_VIEW_DEG = (5.0, 175.0)
 OFF_CENTRE = 0.1
 """Of the width: principal points lie nearer to the centre, unless images were scaled or cut after the calibration."""
 
-USUAL_WIDTHS = (320, 512, 640, 672, 720, 752, 800, 848, 960, 1024, 1226, 1242, 1280, 1440, 1600, 1920, 2448, 2560, 3840)
-"""px, of images as cameras give them."""
-
 STREET = {"locus.cell_size": 0.1}
 """0.1 m resolves kerbs where the disparity does."""
 
@@ -215,23 +212,6 @@ def _check_baseline(baseline: float, section: RigSection, name: str) -> None:
         raise InputError("RIL-244", text, remedy=f"did you mean {baseline / 1000:g}? {hint}")
 
 
-def off_centre(camera: Camera, side: str) -> list[str]:
-    """A line on a principal point more than a tenth of the width off the centre, with the size that it would fit."""
-
-    def off(width: float, height: float) -> float:
-        return max(abs(camera.cx - width / 2), abs(camera.cy - height / 2)) / width
-
-    size = camera.width, camera.height
-    if off(*size) <= OFF_CENTRE:
-        return []
-    scaled = [(width, round(width * size[1] / size[0])) for width in USUAL_WIDTHS if width != size[0]]
-    width, height = min(scaled, key=lambda s: off(*s))
-    fits = off(width, height) < OFF_CENTRE / 2
-    hint = f": it fits {width} x {height}, scale by {size[0] / width:.4g}" if fits else ""
-    place = f"({camera.cx:g}, {camera.cy:g}) px is far from the centre of {size[0]} x {size[1]} images"
-    return [warning("RIL-689", f"{side} camera: principal point {place}{hint}")]
-
-
 def unusual_cameras(cameras: Iterable[CalibratedCamera], sizes: Sizes) -> tuple[str, ...]:
     """Lines on a left and a right camera that are possible but strange, given images of these sizes."""
     # A calibration need not state the size.
@@ -246,7 +226,10 @@ def unusual(camera: Camera, side: str) -> list[str]:
     if not USUAL_VIEW_DEG[0] <= view <= USUAL_VIEW_DEG[1]:
         text = f"{side} camera: fx = {camera.fx:g} px gives an angle of view of {view:.3g} degrees; is it in pixels?"
         lines.append(warning("RIL-690", text))
-    lines += off_centre(camera, side)
+    off = max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2)) / camera.width
+    if off > OFF_CENTRE:
+        place = f"({camera.cx:g}, {camera.cy:g}) px is far from the centre of {camera.width} x {camera.height} images"
+        lines.append(warning("RIL-689", f"{side} camera: principal point {place}: were images scaled or cut?"))
     if not 0.8 < camera.fx / camera.fy < 1.25:
         text = f"{side} camera: fx = {camera.fx:g} and fy = {camera.fy:g} px differ much: no square pixels"
         lines.append(warning("RIL-691", text))

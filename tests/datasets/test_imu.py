@@ -189,7 +189,7 @@ def test_a_sensor_that_stops_or_starts_late():
 
 
 def test_no_common_time_names_both_ranges():
-    with raises("RIL-190", "0.000", "3.995", "100.000", "101.000"):
+    with raises("RIL-269", "0.000", "3.995", "100.000", "101.000"):
         at_frames(resting(4.0), [100.0, 101.0], IDENTITY)
 
 

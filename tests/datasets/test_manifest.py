@@ -16,10 +16,9 @@ from rille.datasets.georeference import Georeference
 from rille.datasets.images.files import Digests
 from rille.datasets.manifest.model import Manifest, read_manifest
 from rille.datasets.manifest.opening import dotted, open_manifest
-from rille.datasets.manifest.rig import off_centre
 from rille.datasets.protocol import Sequence
 from rille.datasets.text.validation import known_keys, tables
-from rille.stages.geometry.geometry import Camera, RigidTransform, rotation_exp
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 
 def opened(path: Path) -> Sequence:
@@ -524,19 +523,3 @@ def test_every_key_is_described():
 
 def test_nested_defaults_become_dotted():
     assert dotted({"a": {"b": {"c": 1}, "d": 2}, "e.f": 3}) == [("a.b.c", 1), ("a.d", 2), ("e.f", 3)]
-
-
-@pytest.mark.parametrize(
-    ("size", "centre", "expected"),
-    [
-        ((512, 288), (327.0, 176.0), "fits 640 x 360, scale by 0.8"),
-        ((512, 288), (250.0, 150.0), None),
-        ((1226, 370), (601.9, 183.1), None),
-        ((640, 480), (100.0, 240.0), "far from the centre"),
-    ],
-)
-def test_a_principal_point_off_the_centre_says_which_size_it_fits(size, centre, expected):
-    lines = off_centre(Camera(400.0, 400.0, *centre, *size), "left")
-    assert len(lines) == (expected is not None)
-    assert expected is None or expected in lines[0]
-    assert size != (640, 480) or "scale by" not in lines[0]

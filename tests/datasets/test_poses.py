@@ -94,7 +94,7 @@ def test_angles_beyond_a_turn_can_only_be_degrees(tmp_path):
         ("1 2 3 4\n", "auto", ("RIL-264",)),
         ("1 2 3 4\n", "kitti", ("RIL-267",)),
         ("1 2 3 4\n", "csv", ("RIL-264",)),
-        ("1 2 3 4\n", "bag", ("RIL-264", "'bag'")),
+        ("1 2 3 4\n", "bag", ("RIL-264", "bag")),
         (f"2 1 2 3 0 0 {H} {H}\n1 1 2 3 0 0 0 1\n", "auto", ("RIL-293", "line 2")),
     ],
 )
