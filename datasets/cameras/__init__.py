@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeAlias
 
-from rille.datasets.cameras import boofcv, colmap, kitti, makers, middlebury, opencv, pds, slam, tsai
+from rille.datasets.cameras import boofcv, colmap, kitti, makers, opencv, pds, slam, tsai
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from rille.datasets.cameras.pair import rig_of
@@ -40,7 +40,7 @@ def has(*keys: str) -> Entries:
 PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = (
     (pds.is_label, pds.label),
     (states("fu"), tsai.tsai),
-    (lambda text: re.search(r"^[ \t]*cam0[ \t]*=[ \t]*\[", text, re.MULTILINE) is not None, middlebury.middlebury),
+    (lambda text: re.search(r"^[ \t]*cam0[ \t]*=[ \t]*\[", text, re.MULTILINE) is not None, makers.middlebury),
     (colmap.is_colmap, colmap.colmap),
     (kitti.is_kitti, kitti.kitti),
     (lambda text: "[LEFT_CAM_" in text, makers.zed),

@@ -1,4 +1,7 @@
-"""Calibrations as stereo cameras come with them: ZED's ``.conf``, OAK's JSON (DepthAI), and ``K.txt`` of data sets."""
+"""Calibrations as stereo cameras and data sets come with them.
+
+ZED's ``.conf``, OAK's JSON (DepthAI), ``K.txt``, and Middlebury's rectified pairs (2014 and 2021).
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ import numpy as np
 from rille.datasets.cameras.fields import Fields, by_count
 from rille.datasets.cameras.kitti import LEAST_FOCAL
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera, parallel, stereo_cameras
+from rille.datasets.cameras.text import assignments
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 
@@ -131,3 +135,16 @@ def matrix(text: str, path: Path) -> list[CalibratedCamera]:
     if "baseline" not in f:
         return [CalibratedCamera(path.stem, lens)]
     return stereo_cameras(lens, lens, parallel(f.number("baseline")))
+
+
+def middlebury(text: str, path: Path) -> list[CalibratedCamera]:
+    """Both cameras; the file's baseline is in millimetres, here it is in metres."""
+    values: dict[str, object] = {}
+    for key, value in assignments(text):
+        matrix = value.startswith("[")
+        values[key] = value.strip("[]").replace(";", " ").split() if matrix else value
+    f = Fields(values, str(path))
+    size = f.size("width", "height")
+    left, right = (Lens(f.pinhole(key, size)) for key in ("cam0", "cam1"))
+    f.check_lens()
+    return stereo_cameras(left, right, parallel(f.number("baseline") / 1000))

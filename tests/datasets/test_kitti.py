@@ -133,22 +133,6 @@ def _drop_left(f):
         (f / "image_l" / f"{k:06d}.png").unlink()
 
 
-def _time_goes_back(f):
-    (f / "times.txt").write_text("0.0\n0.2\n0.1\n")
-
-
-def _time_twice(f):
-    (f / "times.txt").write_text("0.0\n0.1\n0.1\n")
-
-
-def _resize(f):
-    picture(f / "image_r" / "000002.png", (48, 60))
-
-
-def _deepen(f):
-    picture(f / "image_l" / "000001.png", dtype=np.uint16)
-
-
 def _fewer_poses(f):
     text = (f / "poses.txt").read_text().splitlines()
     (f / "poses.txt").write_text("\n".join(text[:2]))
@@ -170,18 +154,10 @@ def _short_row(f):
     (f / "calib.txt").write_text(line(P_LEFT) + "\n1 2 3\n")
 
 
-def _swapped(f):
-    (f / "calib.txt").write_text(line(P_RIGHT) + "\n" + line(P_LEFT))
-
-
 def _millimetres(f):
     right = P_RIGHT.copy()
     right[:, 3] *= 1000
     (f / "calib.txt").write_text(line(P_LEFT) + "\n" + line(right))
-
-
-def _same_place(f):
-    (f / "calib.txt").write_text(line(P_LEFT) + "\n" + line(P_LEFT))
 
 
 def _singular(f):
@@ -198,31 +174,20 @@ def _empty(f):
             path.unlink()
 
 
-def _not_an_image(f):
-    (f / "image_l" / "000000.png").write_bytes(b"")
-
-
 @pytest.mark.parametrize(
     ("spoil", "expected"),
     [
         breaks(("right missing", _drop_right, ("RIL-259", "000001.png"))),
         breaks(("left missing", _drop_left, ("RIL-259", "image_r/000001.png"))),
-        breaks(("size", _resize, ("RIL-176", "image_r/000002.png", "60 x 48", "64 x 48"))),
-        breaks(("depth", _deepen, ("RIL-176", "image_l/000001.png", "16 bits", "8 bits"))),
         breaks(("pose count", _fewer_poses, ("RIL-230", "poses.txt"))),
         breaks(("time count", _times, ("RIL-229", "times.txt"))),
-        breaks(("time goes back", _time_goes_back, ("RIL-293", "times.txt", "line 3", "0.1", "0.2"))),
-        breaks(("time twice", _time_twice, ("RIL-293", "times.txt", "line 3", "0.1"))),
         breaks(("no calibration", _no_calib, ("RIL-278", "calib.txt"))),
         breaks(("one camera", _one_row, ("RIL-100", "calib.txt"))),
         breaks(("short row", _short_row, ("RIL-100", "calib.txt"))),
-        breaks(("swapped", _swapped, ("RIL-130", "0.5"))),
         breaks(("millimetres", _millimetres, ("RIL-244", "500", "0.5"))),
-        breaks(("one place", _same_place, ("RIL-129",))),
         breaks(("singular", _singular, ("RIL-203", "calib.txt", "P1"))),
         breaks(("no rotation", _no_rotation, ("RIL-333", "poses.txt", "line 1"))),
         breaks(("no images", _empty, ("RIL-217", "image_l"))),
-        breaks(("empty file", _not_an_image, ("RIL-170", "image_l/000000.png"))),
     ],
 )
 def test_what_is_wrong_is_one_line_with_a_remedy(folder, spoil, expected):
