@@ -86,7 +86,7 @@ def manifest_of(folder: Path, sides: tuple[str, str]) -> Manifest:
     standard = folder.parent.name == "sequences"
     cameras = {camera.name: camera for camera in read_cameras(folder / "calib.txt")}
     names = camera_names(folder / "calib.txt", sides, set(cameras))
-    left = cameras.get(names[0]) if names else next(iter(cameras.values()))
+    left = cameras.get(names[0]) if names else next(iter(cameras.values()), None)
     places = [folder / "poses.txt", *([folder.parent.parent / "poses" / f"{folder.name}.txt"] if standard else [])]
     poses = next((place for place in places if place.is_file()), None)
     truth = None

@@ -73,14 +73,10 @@ def _installed() -> list[ModuleType]:
     return [point.load() for point in sorted(points, key=lambda point: (point.name, point.value))]
 
 
-def forms() -> list[tuple[str, str]]:
-    """Each form that a path may have, and in words what that is."""
-    return [*MANIFEST_FORMS, *(form for module in layouts() for form in module.FORMS)]
-
-
 def catalogue() -> list[tuple[str, str]]:
     """Name and description of each built-in sequence and each form that a path may have."""
-    return [(name, words) for name, (words, _) in BUILT_IN.items()] + [*MANIFESTS.items(), *forms()]
+    simulated = [(name, words) for name, (words, _) in BUILT_IN.items()]
+    return [*simulated, *MANIFESTS.items(), *MANIFEST_FORMS, *(form for one in layouts() for form in one.FORMS)]
 
 
 def open_sequence(

@@ -21,17 +21,15 @@ from rille.stages.geometry.geometry import RigidTransform, orthonormal
 from rille.stages.geometry.lens import Lens
 
 PROJECTION = re.compile(r"P(\d)(?:_roi)?|P_rect_(\d\d)")
-LINE = re.compile(r"^[ \t]*(P\d(?:_roi)?|P_rect_\d\d|K_\d\d)[ \t]*:[ \t]*[-+.\d]", re.MULTILINE)
+LINE = re.compile(r"^[ \t]*(P\d(?:_roi)?|P_rect_\d\d)[ \t]*:[ \t]*[-+.\d]", re.MULTILINE)
 """A label and its first number: the `P1` of OpenCV's YAML is a matrix, or a list in brackets."""
 
 LEAST_FOCAL = 2.0
 """Pixels; rows of a pose have the same twelve numbers, but the first three of them are at most 1."""
 
-RAW = re.compile(r"K_(\d\d)")
-
 
 def is_kitti(text: str) -> bool:
-    """Whether a line has the label of a projection or of a raw camera, or all are projections without labels."""
+    """Whether a line has the label of a projection, or all are projections without labels."""
     # The beginning is enough for any calibration. Other files pass here too: `rille init` tries every small text.
     return LINE.search(text[:100_000]) is not None or bool(_nameless(text))
 
@@ -51,18 +49,16 @@ def _nameless(text: str) -> dict[str, list[str]]:
 
 
 def kitti(text: str, path: Path) -> list[CalibratedCamera]:
-    """All cameras of the file, by the labels of their projections (or of K), in order."""
+    """All cameras of the file, by the labels of their projections, in order."""
     lines = (line.partition(":") for line in text.splitlines())
     labelled = {label.strip(): numbers.split() for label, _, numbers in lines if numbers.strip()}
     fields = Fields(labelled or _nameless(text), str(path))
     labels = sorted(label for label in fields.values if PROJECTION.fullmatch(label))
     if any(label.endswith("_roi") for label in labels):  # of the part that the images show
         labels = [label for label in labels if label.endswith("_roi")]
-    if labels:
-        fields.used |= {f"D_{label[-2:]}" for label in labels}  # of the images before they were rectified
-        fields.check_lens()
-        return [_rectified(fields, label) for label in labels]
-    return [_raw(fields, label, label[-2:]) for label in sorted(fields.values) if RAW.fullmatch(label)]
+    fields.used |= {f"D_{label[-2:]}" for label in labels}  # of the images before they were rectified
+    fields.check_lens()
+    return [_rectified(fields, label) for label in labels]
 
 
 def _rectified(fields: Fields, label: str) -> CalibratedCamera:
@@ -99,14 +95,3 @@ def decompose(projection: NDArray[np.float64], name: str) -> tuple[NDArray[np.fl
         )
     t = np.linalg.solve(k, projection[:, 3]) / scale * np.sign(np.linalg.det(m))
     return k, RigidTransform(orthonormal(r), t)
-
-
-def _raw(fields: Fields, label: str, number: str) -> CalibratedCamera:
-    camera = fields.pinhole(label, fields.pair_of_pixels(f"S_{number}"))
-    coefficients = fields.numbers(f"D_{number}") if f"D_{number}" in fields else ()
-    lens = fields.lens(f"D_{number}", camera, "radtan" if coefficients else "none", coefficients)
-    pose = None
-    if f"R_{number}" in fields and f"T_{number}" in fields:
-        R, t = fields.matrix(f"R_{number}", 3, 3), np.array(fields.numbers(f"T_{number}", 3))
-        pose = RigidTransform(orthonormal(R), t)  # seven digits in the files
-    return CalibratedCamera(label, lens, pose)
