@@ -11,7 +11,7 @@ from rille.datasets.cameras import boofcv, colmap, kitti, makers, opencv, pds, s
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from rille.datasets.cameras.pair import rig_of
-from rille.datasets.cameras.text import assignments, parse_nested
+from rille.datasets.cameras.text import parse_nested
 from rille.datasets.text.reading import read_text, refuse_decimal_commas
 from rille.stages.core.errors import InputError
 
@@ -27,9 +27,9 @@ Text: TypeAlias = Callable[[str], bool]
 Entries: TypeAlias = Callable[[Fields], bool]
 
 
-def states(*keys: str) -> Text:
-    """Whether a text has a line ``key = value`` with one of the keys."""
-    return lambda text: any(key in keys for key, _ in assignments(text))
+def states(entry: str) -> Text:
+    """Whether a line of a text begins with ``entry``, a pattern."""
+    return lambda text: re.search(rf"^[ \t]*{entry}", text, re.MULTILINE) is not None
 
 
 def has(*keys: str) -> Entries:
@@ -39,8 +39,8 @@ def has(*keys: str) -> Entries:
 
 PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = (
     (pds.is_label, pds.label),
-    (states("fu"), tsai.tsai),
-    (lambda text: re.search(r"^[ \t]*cam0[ \t]*=[ \t]*\[", text, re.MULTILINE) is not None, makers.middlebury),
+    (states(r"fu[ \t]*="), tsai.tsai),
+    (states(r"cam0[ \t]*=[ \t]*\["), makers.middlebury),
     (colmap.is_colmap, colmap.colmap),
     (kitti.is_kitti, kitti.kitti),
     (lambda text: "[LEFT_CAM_" in text, makers.zed),

@@ -11,13 +11,12 @@ from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
-from warnings import catch_warnings
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.datasets.images.headers import Header, read_header
+from rille.datasets.images.headers import Header, opened, read_header
 from rille.datasets.images.kinds import KINDS, kind_of
 from rille.datasets.protocol import Source
 from rille.datasets.text.reading import open_regular, read_bytes
@@ -56,16 +55,11 @@ Grey = NDArray[np.uint8] | NDArray[np.uint16]
 
 def _damage(data: bytes) -> str:
     """Why a file cannot be whole, in words, or nothing: decoders may deliver a truncated one as partly black."""
-    from PIL import Image
-
     if not data:
         return "is empty"
     if data.startswith(PNG):
         try:
-            with catch_warnings(action="ignore"), Image.open(BytesIO(data), formats=("PNG",)) as image:
-                image.verify()
-        except Image.DecompressionBombError:
-            return ""  # said of its header
+            opened(BytesIO(data)).verify()
         except Exception as error:  # whatever the parser of a damaged file comes upon
             return f"is damaged or truncated ({' '.join(str(error).split())[:100]})"
     # the end marker may be followed by padding, but nothing else ends a JPEG

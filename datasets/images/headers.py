@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from contextlib import suppress
 from typing import Any, BinaryIO
-from warnings import catch_warnings
 
 from rille.stages.geometry.geometry import Sizes
 
@@ -32,18 +31,25 @@ def sizes_of(headers: Headers) -> Sizes:
 
 def read_header(file: BinaryIO) -> Header | None:
     """Header of an image file, open at its beginning; None where the file is no PNG, JPEG, TIFF, PGM, PPM or BMP."""
+    # Of a damaged header whatever its parser comes upon: the decoder's refusal then says what is wrong.
+    with suppress(Exception):
+        image = opened(file)
+        if image is not None:
+            bits = _bits(image)
+            return image.width, image.height, 8 if bits <= 8 else 16 if bits <= 16 else bits
+    return None
+
+
+def opened(file: BinaryIO) -> Any:
+    """Pillow's image of a file of which the header alone is read, of any size; None where it is of another format."""
     from PIL import Image
 
-    # Of a damaged header whatever its parser comes upon: the decoder's refusal then says what is wrong. How many pixels
-    # are too many is decided by who asks.
-    with (
-        catch_warnings(action="ignore"),
-        suppress(Exception, Image.DecompressionBombError),
-        Image.open(file, formats=FORMATS) as image,
-    ):
-        bits = _bits(image)
-        return image.width, image.height, 8 if bits <= 8 else 16 if bits <= 16 else bits
-    return None
+    Image.init()
+    start = file.read(16)
+    file.seek(0)
+    # Not by `Image.open`, which refuses by a limit of its own how many pixels are too many.
+    fits = (Image.OPEN[name] for name in FORMATS)
+    return next((factory(file, "") for factory, accepts in fits if accepts is None or accepts(start)), None)
 
 
 def _bits(image: Any) -> int:

@@ -128,17 +128,17 @@ class MotionReader:
             which = ends([pair.left for pair in self.pairs])
             problem = f"{path} has {len(rows)} times for {len(self.pairs)} pairs ({which}){more}"
             raise InputError("RIL-229", problem, remedy="give one line a pair, or lines of time and file name")
-        return self.a_pair([(words[0], k) for k, words in rows])
+        return self.one_a_pair([(words[0], k) for k, words in rows])
 
     def counts(self) -> set[int]:
         """Numbers of rows that a file may have: one a pair, or one for each pair with both images."""
         return {len(self.pairs), sum(not pair.absent for pair in self.pairs)}
 
-    def a_pair(self, rows: Sequence[Row]) -> Sequence[Row | None]:
+    def one_a_pair(self, rows: Sequence[Row]) -> Sequence[Row | None]:
         """One row a pair; where there are rows for whole pairs alone (:meth:`counts`), None for the others."""
         remaining = iter(rows)
-        some = len(rows) < len(self.pairs)
-        return [None if some and pair.absent else next(remaining) for pair in self.pairs]
+        partly = len(rows) < len(self.pairs)
+        return [None if partly and pair.absent else next(remaining) for pair in self.pairs]
 
     def poses(self, section: PoseFile | Attitude, table: str) -> Poses:
         """T_reference_left of each pair from a file of poses of a body."""
@@ -154,7 +154,7 @@ class MotionReader:
             poses = interpolate(moved, self.motion.times, section.max_gap)
             self.motion.warnings += coverage(poses, self.motion.times, f"{table} ({path.name})")
         elif len(poses) in self.counts():
-            poses = tuple(self.a_pair(poses))
+            poses = tuple(self.one_a_pair(poses))
         else:
             text = f"{self.name}: {table}.file: {path} has {len(poses)} poses for {len(self.pairs)} pairs"
             raise InputError("RIL-230", text, remedy="give one a pair, or poses with times")

@@ -60,7 +60,7 @@ def _complaint(error: Mapping[str, Any], section: str, known: list[str]) -> str:
         return f"{key} is missing"
     reason = str(error.get("ctx", {}).get("error", error["msg"]))
     value = "" if isinstance(error["input"], dict) else f" = {error['input']!r} is not permitted"
-    return f"{key or 'the whole'}{value}: {reason[0].lower() + reason[1:]}"
+    return f"{key}{value}: {reason[0].lower() + reason[1:]}" if key else reason
 
 
 def _nearest(key: str, known: list[str]) -> str:
@@ -69,9 +69,8 @@ def _nearest(key: str, known: list[str]) -> str:
     beside = [k.rpartition(".")[2] for k in known if k.rpartition(".")[0] == table]
     near = [f"{table}.{name}".lstrip(".") for name in difflib.get_close_matches(last, beside, n=1)]
     elsewhere = [k for k in known if k.rpartition(".")[2] == last]
-    for meant in [*elsewhere, *near]:
-        return f"did you mean {meant!r}?"
-    return f"known here are {', '.join(sorted(beside))}"
+    meant = next(iter([*elsewhere, *near]), None)
+    return f"did you mean {meant!r}?" if meant else f"known here are {', '.join(sorted(beside))}"
 
 
 def known_keys(kind: type[Params], prefix: str = "") -> Iterable[str]:
