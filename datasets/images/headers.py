@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from typing import Any, BinaryIO
+from warnings import catch_warnings
 
 from rille.stages.geometry.geometry import Sizes
 
@@ -31,8 +32,8 @@ def sizes_of(headers: Headers) -> Sizes:
 
 def read_header(file: BinaryIO) -> Header | None:
     """Header of an image file, open at its beginning; None where the file is no PNG, JPEG, TIFF, PGM, PPM or BMP."""
-    # Of a damaged header whatever its parser comes upon: the decoder's refusal then says what is wrong.
-    with suppress(Exception):
+    # Of a damaged header whatever its parser warns of or comes upon: the decoder's refusal then says what is wrong.
+    with catch_warnings(action="ignore"), suppress(Exception):
         image = opened(file)
         if image is not None:
             bits = _bits(image)
