@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -24,22 +25,16 @@ def _there(cache: str | None) -> Path:
 
 
 @app.command
-def verify(
-    *,
-    deep: Annotated[bool, flag("Decode every chunk too, and compare the digests of the arrays.")] = False,
-    cache: CacheFolder = None,
-    debug: Debug = False,
-) -> int:
-    """Read every artifact and compare its checksums; damaged ones are named and recomputed by the next run."""
+def verify(*, cache: CacheFolder = None, debug: Debug = False) -> int:
+    """Read and decode every artifact, and compare its digest; damaged ones are named and recomputed by the next run."""
     from rille.pipeline.engine.store import maintenance
     from rille.pipeline.engine.store.base import Store
 
-    sound, damaged = maintenance.verify(Store(_there(cache)), deep=deep)
-    for found in damaged:
-        where = "set aside" if found.aside else "it stays, for the cache cannot be written"
-        print(f"rille: {found.label or found.key[:12]} ({found.stage}): {found.reason}; {where}", file=sys.stderr)
-    print(f"{sound} artifacts are sound, {len(damaged)} damaged")
-    return FAILED if damaged else COMPLETE
+    sound, damages = maintenance.verify(Store(_there(cache)))
+    for damage in damages:
+        print(f"rille: {damage}", file=sys.stderr)
+    print(f"{sound} artifacts are sound, {len(damages)} damaged")
+    return FAILED if damages else COMPLETE
 
 
 @app.command
@@ -50,19 +45,18 @@ def gc(
     dry_run: Annotated[bool, flag("List by stage what would be removed, and remove nothing.")] = False,
     debug: Debug = False,
 ) -> int:
-    """Remove artifacts that no kept run refers to, and leftovers of interrupted runs.
+    """Remove artifacts that no kept run refers to, leftovers of interrupted runs, and kernels that nothing uses.
 
     What was made or used within a day stays: a run may be under way.
     """
     from rille.pipeline.engine.memory import words
+    from rille.pipeline.engine.runtime import numba_cache
     from rille.pipeline.engine.store import maintenance
     from rille.pipeline.engine.store.base import Store
     from rille.pipeline.runs import lookup, roots
     from rille.stages.core.errors import ConfigError
 
     store = Store(_there(cache))
-    # Before any key is gathered: artifacts of runs that cannot be seen from here would count as unused.
-    roots.check_all_seen(store)
     ledgers = [path for folder in roots.folders(store, runs) for path in folder.glob(f"*/*/{lookup.LEDGER}")]
     kept = set[str]().union(*(lookup.used(path.parent) for path in ledgers if path.is_file()))
     if not kept:
@@ -72,9 +66,14 @@ def gc(
             remedy="give the folder of your runs with --runs, or remove the cache yourself",
         )
     cleared = maintenance.gc(store, kept, dry_run=dry_run)
+    leftovers = cleared.pop("", [])
     if dry_run:
-        for stage, (count, amount) in sorted(cleared.stages.items(), key=lambda item: -item[1][1]):
-            print(f"{stage:18s} {count:6d} {words(amount):>8s}")
-    verb = "would remove" if dry_run else "removed"
-    print(f"{verb} {cleared.artifacts} artifacts and {cleared.orphans} leftovers, {cleared.bytes / 2**20:.1f} MiB")
+        for stage, sizes in sorted(cleared.items(), key=lambda item: -sum(item[1])):
+            print(f"{stage:18s} {len(sizes):6d} {words(sum(sizes)):>8s}")
+    else:
+        for path in numba_cache.unused():
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+    verb, artifacts = "would remove" if dry_run else "removed", [size for sizes in cleared.values() for size in sizes]
+    size = sum(artifacts) + sum(leftovers)
+    print(f"{verb} {len(artifacts)} artifacts and {len(leftovers)} leftovers, {size / 2**20:.1f} MiB")
     return COMPLETE

@@ -21,6 +21,8 @@ from typing import Any
 from rille.pipeline.engine.code_digest import OWN, tree_digest
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.packages import version
+from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.stages.core.errors import ConfigError, RilleError
 
@@ -83,12 +85,13 @@ def introduce(cache: Path, token: str, name: str) -> dict[str, Any]:
 
 def write_probe(store: Store, name: str) -> None:
     """Leave a small file in the cache; clearing up takes what is forgotten."""
-    store.folder.write(f"probe/{name}", name.encode())
+    atomic.write(store.root / "probe" / name, name)
 
 
 def read_probe(store: Store, name: str) -> bytes | None:
     """Read the probe that the client wrote; None if this machine cannot see it."""
-    return store.folder.read(f"probe/{name}")
+    path = store.root / "probe" / name
+    return path.read_bytes() if path.is_file() else None
 
 
 def examine(client: Any, cache: Path) -> None:
@@ -112,8 +115,9 @@ def examine(client: Any, cache: Path) -> None:
             if answer is not None and read_probe(store, f"{token}-{short}") is None:
                 raise _no_cache(worker_name(client, address), cache, "its probe is not seen here")
     finally:
-        with suppress(OSError, RilleError):
-            store.folder.delete(f"probe/{name}" for name in names)
+        for name in names:
+            with suppress(OSError):
+                (store.root / "probe" / name).unlink()
 
 
 def _judge(client: Any, address: str, answer: Any, ours: Identity, cache: Path) -> None:

@@ -24,7 +24,7 @@ from rille.pipeline.engine.runtime.numba_cache import guard
 from rille.pipeline.engine.store.manifest import Ref
 from rille.stages.core.declare import Params, Stage
 
-FORMAT = 2
+FORMAT = 3
 """Enters every key: raise it when the meaning of keys or artifacts changes."""
 
 Refs = Mapping[str, Ref | list[Ref]]

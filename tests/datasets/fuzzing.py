@@ -6,17 +6,18 @@ takes long or much memory, is a fault of the reader.
 
 from __future__ import annotations
 
-import gzip
 import json
 import random
 import shutil
 import signal
+import sqlite3
+import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
 
-import google_crc32c
+import numpy as np
 from folders import CAMERAS, RIG, write_images
 
 from rille.datasets.cameras import read_cameras, rig_of
@@ -24,9 +25,11 @@ from rille.datasets.images import files
 from rille.datasets.inspection import inspect
 from rille.datasets.manifest.opening import open_manifest
 from rille.datasets.registry import open_sequence
-from rille.pipeline.engine.store import manifest as stored
-from rille.pipeline.engine.store.folder import Folder, Item
-from rille.pipeline.engine.store.index import Index, pack
+from rille.pipeline.engine.store.archive import pack
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.index import TABLE, Index
+from rille.pipeline.engine.store.manifest import artifact_path
+from rille.pipeline.engine.store.zarr_group import codec
 from rille.pipeline.export.writers import read_disparity
 from rille.pipeline.flow import config
 from rille.stages.core.errors import RilleError
@@ -103,35 +106,38 @@ def euroc(path: Path) -> None:
 
 
 def packed(path: Path) -> None:
-    _index(path, path.read_bytes())
-
-
-def index(path: Path) -> None:
-    """Content that is wrong behind a checksum that is right."""
-    _index(path, gzip.compress(path.read_bytes(), 1))
-
-
-def _index(path: Path, data: bytes) -> None:
-    apart = path.parent / "index" / "s"
-    apart.mkdir(parents=True, exist_ok=True)
-    (apart / "made").write_bytes(data)
-    known = Index(Folder(path.parent), "s")
-    for key, line in list(known.lines.items()):
-        known.get("numbers", Item("p", 1, line[2:].partition('"')[0], 0.0), key)
+    _lookup(path.parent / "cache", path.read_bytes())
 
 
 def artifact(path: Path) -> None:
-    data = path.read_bytes()
-    line = stored._HEAD % (google_crc32c.value(data), len(data)) + data + b"}\n"
-    _values_alone(lambda: stored.reference(stored.unframe(line[: stored.length(line)])))
+    """A manifest that is wrong behind a checksum that is right."""
+    _lookup(path.parent / "cache", bytes(pack({"manifest.json": path.read_bytes(), "values/c.0.0": CHUNK})))
 
 
-def _values_alone(read: Callable[[], object]) -> None:
-    """What the store's callers take for damage."""
-    try:
-        read()
-    except ValueError as error:
-        raise RilleError("RIL-000", str(error)) from error
+def _lookup(cache: Path, data: bytes) -> None:
+    """What damage there is counts as absent; what is taken is read."""
+    store = Store(cache)
+    place = cache / artifact_path("numbers", KEY)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.write_bytes(data)
+    ref = store.lookup("numbers", KEY)
+    if ref is None:
+        raise RilleError("RIL-000", "it is absent")
+    dict(store.open(ref).arrays)
+
+
+def database(path: Path) -> None:
+    (path.parent / "index.sqlite").write_bytes(path.read_bytes())
+    known = Index(path.parent, "s")
+    for key in list(known._rows):
+        known.get("numbers", key, "1.2.3")
+
+
+def index(path: Path) -> None:
+    """A row that is wrong behind a checksum that is right."""
+    known, stated = Index(path.parent, "s"), path.read_bytes().decode(errors="replace")
+    known._rows = {KEY: (stated, zlib.crc32(stated.encode()))}
+    known.get("numbers", KEY, "1.2.3")
 
 
 READERS: dict[str, Callable[[Path], None]] = {
@@ -147,34 +153,49 @@ READERS: dict[str, Callable[[Path], None]] = {
     "kitti": kitti,
     "euroc": euroc,
     "packed": packed,
-    "index": index,
     "artifact": artifact,
+    "database": database,
+    "index": index,
 }
 
 
 # -- seeds -------------------------------------------------------------------------------------------------------------
 
+KEY = "a" * 64
+VALUES = np.arange(12, dtype="<f4").reshape(3, 4)
+CHUNK = codec().encode(VALUES)
 MANIFEST = {
     "stage": "numbers",
     "label": "numbers/0",
-    "key": "a" * 64,
+    "key": KEY,
     "digest": "b" * 64,
-    "arrays": {"values": {"dtype": "<f4", "shape": [3, 4], "sha256": "c" * 64}},
+    "arrays": {"values": {"dtype": "<f4", "shape": [3, 4], "chunks": [3, 4], "sha256": "c" * 64}},
     "meta": {"frame": 0},
-    "attempt": "0" * 32,
-    "files": {"values/c.0.0": [44, 120, "0badcafe"], "zarr.json": [210, 300, "00000000"]},
-    "archive": [700, "0badcafe"],
     "provenance": {"reason": "new"},
 }
-ENTRY = ["1.2.3", "b" * 64, 48, 420, {"frame": 0}]
-LINES = [f"{k:064d} {json.dumps(ENTRY, separators=(',', ':'))}\n" for k in range(3)]
+STATED = [
+    "1.2.3",
+    {"key": KEY, "stage": "numbers", "digest": "b" * 64, "meta": {"frame": 0}, "nbytes": 48, "stored": 9},
+]
+
+
+def _database() -> bytes:
+    with closing(sqlite3.connect(":memory:")) as made:
+        made.execute(f"CREATE TABLE {TABLE}")
+        stated = json.dumps(STATED)
+        rows = [("s", f"{k:064d}", stated, zlib.crc32(stated.encode())) for k in range(3)]
+        made.executemany("INSERT INTO artifacts VALUES (?, ?, ?, ?)", rows)
+        made.commit()
+        return made.serialize()
+
 
 MADE: dict[str, bytes] = {
     "artifact/made": json.dumps(MANIFEST).encode(),
-    "index/made": "".join(LINES).encode(),
-    "packed/made": pack(LINES),
+    "packed/made": bytes(pack({"values/c.0.0": CHUNK, "manifest.json": json.dumps(MANIFEST).encode()})),
+    "index/made": json.dumps(STATED).encode(),
+    "database/made": _database(),
 }
-"""Seeds of what Rille itself writes, without the checksum in front."""
+"""Seeds of what Rille itself writes."""
 
 
 @cache

@@ -21,7 +21,6 @@ from terrain_runs import finished
 from rille.pipeline.api import open_run
 from rille.pipeline.cli import main
 from rille.pipeline.engine.runtime.hints import read_hint
-from rille.pipeline.engine.store.folder import Folder
 from rille.pipeline.export import read_dem
 from rille.pipeline.export.output import place
 from rille.pipeline.export.programs import colmap
@@ -313,8 +312,6 @@ def test_notes_of_a_cache_that_are_none(run: Path, content: str | None, capsys: 
     assert told(capsys, *GC) == (1, ["RIL-742"])
 
 
-def test_pipes_in_a_cache_hold_nothing(tmp_path: Path) -> None:
+def test_a_pipe_in_place_of_a_hint_holds_nothing(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "hint")
     assert read_hint(tmp_path / "hint", TypeAdapter(list[int])) is None
-    assert Folder(tmp_path).read("hint") is None
-    assert Folder(tmp_path).read("hint", 0, 10) is None

@@ -9,8 +9,8 @@ import errno
 import os
 import shutil
 import uuid
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 LEFTOVER = ".tmp-"
@@ -55,13 +55,14 @@ def write(path: Path, data: bytes | str) -> None:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
-def create(path: Path, pieces: Iterable[bytes]) -> bool:
+def create(path: Path, content: bytes | memoryview) -> bool:
     """Write a file unless there is one, and flush it to the disk before it can be seen; whether it was written."""
+    above = [folder for folder in list(path.parents)[1:4] if not path.parent.exists()]
+    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _beside(path)
-    made = _folder(path.parent, temporary)
     try:
         with temporary.open("wb") as file:
-            file.writelines(pieces)
+            file.write(content)
             file.flush()
             # Contents before name: without this, a power failure could leave the name of an artifact over empty blocks.
             os.fsync(file.fileno())
@@ -72,12 +73,15 @@ def create(path: Path, pieces: Iterable[bytes]) -> bool:
             return False
     finally:
         temporary.unlink(missing_ok=True)
-    try:
-        # The new name is an entry of its folder, and a new folder is one of the folder above: each needs a flush.
-        for folder in [path.parent, *made]:
-            _fsync(folder)
-    except OSError:
-        pass  # it is there: at worst a power failure takes it back as a whole
+    # The new name is an entry of its folder, and a new folder is one of the folder above: each needs a flush. The file
+    # is there in any case: at worst a power failure takes it back as a whole.
+    with suppress(OSError):
+        for folder in [path.parent, *above]:
+            handle = os.open(folder, os.O_RDONLY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
     return True
 
 
@@ -99,27 +103,5 @@ def remove(path: Path, modified: float) -> None:
         aside.unlink()
 
 
-def _folder(folder: Path, temporary: Path) -> list[Path]:
-    """Make a folder, and the temporary file in it, which keeps it; gives the folders above that have a new entry."""
-    for turn in range(100):
-        above = [parent for parent in list(folder.parents)[:3] if not folder.exists()]
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            temporary.touch()
-            return above
-        except FileNotFoundError:  # clearing up takes empty folders away just as they are made
-            if turn == 99:
-                raise
-    raise AssertionError
-
-
 def _beside(path: Path) -> Path:
     return path.with_name(f"{LEFTOVER}{uuid.uuid4().hex[:16]}")
-
-
-def _fsync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

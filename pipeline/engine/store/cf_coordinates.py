@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from rille.stages.core.declare import Stage
+from rille.stages.core.declare import AnyArray
 from rille.stages.geometry.lattice import Lattice
 
 DIMS = ["row", "col"]
+
+Variable = tuple[AnyArray, list[str], dict[str, str]]
+"""Values, names of the dimensions, and attributes."""
 
 
 def lattice_of(meta: Mapping[str, Any]) -> Lattice | None:
@@ -26,7 +26,7 @@ def lattice_of(meta: Mapping[str, Any]) -> Lattice | None:
     return Lattice.from_dict(stated) if isinstance(stated, Mapping) and keys <= stated.keys() else None
 
 
-def coordinates(lattice: Lattice, frame: str) -> dict[str, tuple[NDArray[np.float64], list[str], dict[str, str]]]:
+def coordinates(lattice: Lattice, frame: str) -> dict[str, Variable]:
     """Values, dimensions and attributes of the coordinates by name."""
     common = {"units": "m", "frame": frame}
     return {
@@ -35,18 +35,12 @@ def coordinates(lattice: Lattice, frame: str) -> dict[str, tuple[NDArray[np.floa
     }
 
 
-def attributes(
-    name: str, about: Mapping[str, Any], names: Mapping[str, Any], lattice: Lattice | None
-) -> dict[str, str]:
-    """Return the attributes of an array that name its coordinates and its standard deviation."""
-    found = {}
-    if lattice is not None and about["dims"] == DIMS and about["shape"] == list(lattice.shape):
-        found["coordinates"] = "x y"
-    if f"{name}_std" in names:
-        found["ancillary_variables"] = f"{name}_std"
-    return found
-
-
-def source(stage: Stage) -> str:
-    """Return the attribute ``source``: a sentence about the program that made the arrays."""
-    return f"Rille, stage {stage.name}, version {stage.version}: {stage.summary}"
+def located(variables: Mapping[str, Variable], meta: Mapping[str, Any]) -> dict[str, Variable]:
+    """The arrays of an artifact, which name their coordinates and standard deviations, and these coordinates."""
+    lattice, named = lattice_of(meta), dict[str, Variable]()
+    for name, (values, dims, attributes) in variables.items():
+        on_lattice = lattice is not None and dims == DIMS and values.shape == lattice.shape
+        names = {"coordinates": "x y"} if on_lattice else {}
+        names |= {"ancillary_variables": f"{name}_std"} if f"{name}_std" in variables else {}
+        named[name] = values, dims, {**attributes, **names}
+    return named | (coordinates(lattice, str(meta.get("frame", ""))) if lattice is not None and variables else {})

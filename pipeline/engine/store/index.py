@@ -1,142 +1,96 @@
-"""What the runs of a sequence found in a store: manifests that nobody touched since need not be read again.
+"""Index of a store: what the manifests of earlier runs' artifacts state, so that they need not be read again.
 
-A hint beside the artifacts, ``index/<sequence>/<name>``, written at the end of a run: a gzip of lines, one for each
-artifact that it used, with the mark of its file (:class:`~rille.pipeline.engine.store.folder.Item`) and what the
-manifest says of digest, sizes and facts. If the mark differs, or the index is damaged, the manifest is read as if
-there were no index. Clearing up spares what an index names that is younger than its grace.
+One table of a SQLite file beside the artifacts. A row has the mark of the artifact's file
+(:func:`rille.pipeline.engine.store.folder.mark`), and counts only while the file has the same one. The index is a hint:
+where it is missing or locked, manifests are read; one that is damaged or none of ours is set aside.
 """
 
 from __future__ import annotations
 
-import gzip
-import hashlib
-import io
-import json
-import time
+import os
+import sqlite3
+import stat
 import zlib
-from collections.abc import Iterable, Mapping
-from urllib.parse import quote
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from typing import Any
 
-from rille.datasets.text.warning import warning
-from rille.pipeline.engine.plain import warn
-from rille.pipeline.engine.store.folder import Folder, Item
-from rille.pipeline.engine.store.manifest import Facts, Ref, parsed
-from rille.stages.core.errors import RilleError
+from pydantic import TypeAdapter
 
-AREA = "index"
+from rille.pipeline.engine.store.folder import mark, quarantine
+from rille.pipeline.engine.store.manifest import Ref
 
-NEWEST = 4
-"""Indices read of a sequence."""
+NAME = "index.sqlite"
 
-MOST = 256_000_000
-"""Bytes that all of them may unpack to: a small file may unpack to any size."""
+TABLE = "artifacts (sequence, key, stated, checksum, PRIMARY KEY (sequence, key)) WITHOUT ROWID"
+"""``stated`` is JSON, of :data:`STATED`; ``checksum`` is its CRC-32: SQLite sees no flipped bit."""
 
-LONGEST = 64_000_000
-"""Bytes of a line: facts of one artifact."""
+STATED = TypeAdapter(tuple[str, Ref])
+"""Mark of the artifact's file, and the reference to it."""
 
-KEY = 64
-"""Digits of a key."""
+MAX_INDEX_BYTES = 500_000_000
+"""A greater index is set aside, and begun anew: some 350 000 artifacts."""
 
-FRESH = 3600.0
-"""Seconds after which a run writes again that it used the same artifacts."""
-
-
-def folder_of(sequence: str) -> str:
-    """Name of the folder of what is kept by sequence; no name leads out of where it lies."""
-    return quote(sequence, safe="").replace(".", "%2E") or "-"
+TIMEOUT_S = 5.0
+"""Seconds to wait for another process that writes."""
 
 
 class Index:
-    """Lines by key, of the newest indices of a sequence."""
+    """Rows of one sequence, that is, of what runs over the same images, read once."""
 
-    def __init__(self, folder: Folder, sequence: str) -> None:
-        self._folder = folder
-        self._area = f"{AREA}/{folder_of(sequence)}"
-        self._written: dict[str, float] = {}
-        self.lines: dict[str, str] = {}
-        room = MOST
-        for item in sorted(folder.list(self._area), key=lambda i: -i.modified)[:NEWEST]:
-            try:
-                room -= _read(folder, item, self.lines, room)
-                self._written[item.path] = item.modified
-            except ValueError as error:
-                warn(warning("RIL-984", f"{item.path} in the cache is passed over: {error}"))
-
-    def get(self, stage: str, item: Item, key: str) -> Ref | None:
-        """Return the reference to an artifact if its file is unchanged since it was entered, else None."""
-        line = self.lines.get(key, "")
-        if not line.startswith(f'["{item.mark}",'):
-            self.lines.pop(key, None)
-            return None
-        end = line.find(",{")
+    def __init__(self, root: Path, sequence: str) -> None:
+        self._root, self._sequence = root, sequence
+        self._rows: dict[str, tuple[Any, Any]] = {}
+        query = "SELECT key, stated, checksum FROM artifacts WHERE sequence = ?"
         try:
-            _, digest, nbytes, stored = parsed(f"{line[:end]}]")
-        except (ValueError, TypeError):
-            return None
-        return Ref(key, stage, digest, Facts(line, end + 1, -1), nbytes, stored)
+            with self._connected("ro") as database:
+                self._rows = {key: (stated, checksum) for key, stated, checksum in database.execute(query, [sequence])}
+        except (OSError, sqlite3.OperationalError):
+            pass  # there is none, or it is locked
+        except (sqlite3.Error, ValueError):
+            with suppress(OSError):
+                quarantine(root / NAME, root, NAME)
 
-    def forget(self, key: str) -> None:
-        """Drop a line whose mark has changed though the file has not: it is written anew at the end."""
-        self.lines.pop(key, None)
+    def get(self, stage: str, key: str, at: str) -> Ref | None:
+        """Reference to an artifact if its file has the same mark, ``at``, as when it was entered, else None."""
+        stated, checksum = self._rows.get(key, ("", None))
+        with suppress(ValueError):
+            if checksum == zlib.crc32(str(stated).encode()):
+                noted, ref = STATED.validate_json(stated)
+                if at and (noted, ref.stage, ref.key) == (at, stage, key):
+                    return ref
+        return None
 
-    def note(self, used: Mapping[str, Ref]) -> None:
-        """Write what a run used, unless an index says so that is young."""
-        # Lines that were read are still right: whatever was looked up through them had its mark compared.
-        known = {key: self.lines[key] for key in used if key in self.lines}
-        for key in used.keys() - known.keys():
-            ref = used[key]
-            item = self._folder.status(ref.path)
-            if item is not None and item.mark and item.size == ref.stored:
-                known[key] = _line(item.mark, ref)
-        # named by what it says: of runs that use the same there is one
-        lines = [f"{key} {known[key]}\n" for key in sorted(known)]
-        name = hashlib.sha256("".join(lines).encode()).hexdigest()[:32]
-        path = f"{self._area}/{name}"
-        if known and self._written.get(path, 0.0) < time.time() - FRESH:
-            self._folder.write(path, pack(lines))
-            self.lines |= known
+    def note(self, used: Iterable[Ref]) -> None:
+        """Enter artifacts that have no row, or another one. Best effort: it may be locked, or read-only."""
+        rows = [row for ref in used for row in self._row(ref) if self._rows.get(ref.key) != row[2:]]
+        with suppress(OSError, sqlite3.Error, ValueError):
+            if rows:
+                (self._root / NAME).touch()  # SQLite itself would deny a shared folder's group to write it
+                with self._connected("rw") as database, database:
+                    database.executemany("INSERT OR REPLACE INTO artifacts VALUES (?, ?, ?, ?)", rows)
 
+    def _row(self, ref: Ref) -> Iterator[tuple[str, str, str, int]]:
+        """Row of an artifact; none if its file has changed, or might have."""
+        with suppress(OSError):
+            status = os.stat(self._root / ref.path)
+            if mark(status) and status.st_size == ref.stored:
+                stated = STATED.dump_json((mark(status), ref)).decode()
+                yield self._sequence, ref.key, stated, zlib.crc32(stated.encode())
 
-def _line(mark: str, ref: Ref) -> str:
-    facts = ref.meta.text if isinstance(ref.meta, Facts) else json.dumps(dict(ref.meta), separators=(",", ":"))
-    return f"{json.dumps([mark, ref.digest, ref.nbytes, ref.stored], separators=(',', ':'))[:-1]},{facts}]"
-
-
-def pack(lines: Iterable[str]) -> bytes:
-    """Compress line by line."""
-    packer = zlib.compressobj(5, wbits=zlib.MAX_WBITS | 16)
-    return b"".join([*(packer.compress(line.encode()) for line in lines), packer.flush()])
-
-
-def _read(folder: Folder, item: Item, lines: dict[str, str], room: int) -> int:
-    """Take lines in that are not known yet; gives the bytes of all. Raises ValueError where it is none of ours."""
-    size = 0
-    found: dict[str, str] = {}
-    with gzip.GzipFile(fileobj=io.BytesIO(folder.read(item.path) or b"")) as file:
-        try:
-            while line := file.readline(min(LONGEST, room - size + 1)):
-                size += len(line)
-                # A small damaged or hostile file can unpack to any size, or to any number of lines.
-                if size > room:
-                    raise ValueError(f"it unpacks to more than {room / 1e6:.0f} MB")
-                if len(line) <= 2 * KEY or not line.endswith(b"\n"):
-                    raise ValueError("it has a line that is none of an index")
-                found[line[:KEY].decode("ascii")] = line[KEY + 1 : -1].decode()
-        except (zlib.error, OSError, EOFError) as error:
-            raise ValueError(f"it is damaged ({error})") from None
-    if not found:
-        raise ValueError("it is empty")
-    lines |= found | lines
-    return size
-
-
-def used_since(folder: Folder, limit: float) -> set[str]:
-    """Keys that indices name which were written after a time."""
-    keys: dict[str, str] = {}
-    for item in folder.list(AREA):
-        if item.modified > limit:
-            try:
-                _read(folder, item, keys, MOST)
-            except (ValueError, RilleError):
-                continue
-    return set(keys)
+    @contextmanager
+    def _connected(self, mode: str) -> Iterator[sqlite3.Connection]:
+        """The table, open. Raises ValueError where the file is none of ours."""
+        path = self._root / NAME
+        status = path.lstat()
+        if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_INDEX_BYTES:
+            raise ValueError(f"it is not a file of at most {MAX_INDEX_BYTES / 1e6:.0f} MB")
+        with closing(sqlite3.connect(f"{path.as_uri()}?mode={mode}", TIMEOUT_S, uri=True)) as database:
+            database.execute("PRAGMA trusted_schema = OFF")
+            if mode == "rw":
+                database.execute(f"CREATE TABLE IF NOT EXISTS {TABLE}")
+            # A view or a trigger of somebody else's would be a program.
+            if database.execute("SELECT sql FROM sqlite_master LIMIT 2").fetchall() != [(f"CREATE TABLE {TABLE}",)]:
+                raise ValueError("it has another table")
+            yield database

@@ -1,27 +1,29 @@
-"""Arrays of an artifact, each read at its first access.
-
-The crc32c of each member is in the manifest and is compared on every read.
-"""
+"""Arrays of an artifact, each read at its first access; the CRC-32 of each member is compared at every reading."""
 
 from __future__ import annotations
 
-import json
+import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping
-from copy import copy
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rille.pipeline.engine.store.manifest import checksum
-from rille.pipeline.engine.store.zarr_group import CHUNK, chunk_name, codec
+from rille.pipeline.engine.store.archive import Archive, BrokenError
+from rille.pipeline.engine.store.manifest import Manifest
+from rille.pipeline.engine.store.zarr_group import chunk_name, codec
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import RilleError
 
+if TYPE_CHECKING:
+    from rille.pipeline.engine.store.base import Store
+
+BLOSC_OVERHEAD_BYTES = 16
+
 
 class DamagedError(RilleError):
-    """Files of an artifact are missing or do not have the recorded size or checksum."""
+    """The file of an artifact is missing, or is not as it was written."""
 
 
 @dataclass(frozen=True)
@@ -37,20 +39,12 @@ class LazyRaster:
         return self.arrays.part(self.name, at)
 
 
-Read = Callable[[int, int], bytes | None]
-"""Bytes of an artifact's file from one offset to another; None if the file has gone."""
-
-
 class LazyArrays(Mapping[str, AnyArray]):
-    """Arrays of an artifact, each read at its first access.
+    """Arrays of an artifact, each read at its first access."""
 
-    ``damaged(reason)`` is called before the error, and says whether the artifact is out of the way.
-    """
-
-    def __init__(self, read: Read, manifest: Mapping[str, Any], damaged: Callable[[str], bool]) -> None:
-        self._fetch = read
+    def __init__(self, store: Store, manifest: Manifest) -> None:
+        self._store = store
         self._manifest = manifest
-        self._damaged = damaged
         self._loaded: dict[str, AnyArray] = {}
 
     def __iter__(self) -> Iterator[str]:
@@ -64,16 +58,14 @@ class LazyArrays(Mapping[str, AnyArray]):
 
     def __getitem__(self, name: str) -> AnyArray:
         if name not in self._loaded:
-            self._loaded[name] = self.part(name, (...,))
+            self._loaded[name] = self.part(name, ())
         return self._loaded[name]
 
-    def anew(self) -> LazyArrays:
-        """Return a copy that has read none of its arrays yet."""
-        other = copy(self)
-        other._loaded = {}
-        return other
+    def raster(self, name: str) -> LazyRaster:
+        """An array that is read by window, each time anew."""
+        return LazyRaster(self, name, tuple(self._manifest["arrays"][name]["shape"]))
 
-    def part(self, name: str, window: tuple[Any, ...]) -> AnyArray:
+    def part(self, name: str, window: tuple[slice, ...]) -> AnyArray:
         """Part of an array, which is not kept: only the chunks that hold it are read.
 
         Raises
@@ -81,86 +73,44 @@ class LazyArrays(Mapping[str, AnyArray]):
         DamagedError
             One of them is not as it was written; the artifact is set aside, if the cache can be written.
         """
-        if name not in self:
-            raise KeyError(f"{self._manifest['stage']} has no array {name!r}, only {', '.join(self) or 'metadata'}")
-        import zarr
-
+        stage, key, about = self._manifest["stage"], self._manifest["key"], self._manifest["arrays"][name]
         try:
-            whole = self._one_chunk(name)
-            if whole is not None:
-                return whole if window == (...,) else whole[window].copy()
-            store = _reading(lambda key: self._member(f"{name}/{key}"))
-            array = zarr.open_array(store=store, mode="r")
-            found = self._manifest["arrays"][name]
-            # Its own description is the archive's, and may claim any size; that of the manifest was looked at.
-            if [list(array.shape), array.dtype.str] != [found["shape"], found["dtype"]]:
-                raise _WrongError(f"{name} is described in two ways")
-            return np.asarray(array[window])
-        except _WrongError as error:
+            with self._store.opened(stage, key) as archive:
+                return _read(archive, name, about, window)
+        except FileNotFoundError:
+            wrong = "its file is missing"
+        except BrokenError as error:
             wrong = str(error)
-        aside = self._damaged(wrong)
-        found = "was set aside" if aside else "stays, for the cache cannot be written"
+        aside = self._store.set_aside(stage, key, wrong)
+        outcome = "was set aside" if aside else "stays, for the cache cannot be written"
         raise DamagedError(
             "RIL-504",
-            f"artifact {self._manifest['label']} ({self._manifest['stage']}) is damaged, {wrong}; it {found}",
+            f"artifact {self._manifest['label']} ({stage}) is damaged, {wrong}; it {outcome}",
             remedy="run again: it will be recomputed" if aside else "choose another folder with --cache",
         )
 
-    def raster(self, name: str) -> LazyRaster:
-        """An array that is read by window, each time anew."""
-        if name not in self:
-            raise KeyError(f"{self._manifest['stage']} has no array {name!r}")
-        return LazyRaster(self, name, tuple(self._manifest["arrays"][name]["shape"]))
 
-    def _one_chunk(self, name: str) -> AnyArray | None:
-        """An array that is one chunk, as most are; None: it is not, or has other codecs than we write.
+def _read(archive: Archive, name: str, about: Mapping[str, Any], window: tuple[slice, ...]) -> AnyArray:
+    """Window of an array (all of each axis that it does not name), from the chunks that it touches.
 
-        zarr hands every reading over to a thread of its own, twice, which takes ten times as long.
-        """
-        found = self._manifest["arrays"][name]
-        if math.prod(found["shape"]) > CHUNK**2:
-            return None
-        described = self._member(f"{name}/zarr.json")
-        about = json.loads(described) if described is not None else {"chunk_grid": None, "codecs": []}
-        grid = {"name": "regular", "configuration": {"chunk_shape": found["shape"]}}
-        if about["chunk_grid"] != grid or [step["name"] for step in about["codecs"]] != ["bytes", "blosc"]:
-            return None
-        data = self._member(chunk_name(name, (0,) * len(found["shape"])))
-        if data is None:
-            return None
-        array = np.empty(found["shape"], np.dtype(found["dtype"]))
-        if int.from_bytes(data[4:8], "little") != array.nbytes:  # header of blosc
-            raise _WrongError(f"{name} has another size")
-        codec().decode(data, array)
-        return array
-
-    def _member(self, name: str) -> bytes | None:
-        """Content of a member, compared with the manifest; None where zarr asks for one that there never was."""
-        if name not in self._manifest["files"]:
-            return None
-        start, size, crc = self._manifest["files"][name]
-        data = self._fetch(start, start + size)
-        if data is None:
-            raise _WrongError("its file is missing")
-        if len(data) != size:
-            raise _WrongError(f"{name} has {len(data)} bytes instead of {size}")
-        if checksum(data) != crc:
-            raise _WrongError(f"{name} has another checksum")
-        return data
-
-
-class _WrongError(Exception):
-    """What is wrong with a member, in words."""
-
-
-def _reading(member: Callable[[str], bytes | None]) -> Any:
-    """A store of zarr's that asks for each member when it is read: of a window, only the chunks that it touches."""
-    from zarr.core.buffer import cpu
-    from zarr.storage import MemoryStore
-
-    class Reading(MemoryStore):
-        async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
-            data = member(key)
-            return None if data is None else cpu.Buffer.from_bytes(data)
-
-    return Reading(read_only=True)
+    zarr would hand every reading over to a thread of its own, twice, which takes ten times as long.
+    """
+    edges, dtype = tuple(about["chunks"]), np.dtype(about["dtype"])
+    slices = [*window, *[slice(None)] * (len(edges) - len(window))]
+    spans = [range(n)[part] for n, part in zip(about["shape"], slices, strict=True)]
+    values = np.empty([len(span) for span in spans], dtype)
+    touched = [range(s.start // e, -(-s.stop // e) if s else 0) for s, e in zip(spans, edges, strict=True)]
+    for at in itertools.product(*touched):
+        data = archive.member(chunk_name(name, at), math.prod(edges) * dtype.itemsize + BLOSC_OVERHEAD_BYTES)
+        # First value of the window, counted from the first one of the chunk.
+        shifts = [s.start - i * e for s, i, e in zip(spans, at, edges, strict=True)]
+        exact = values.shape == edges and not any(shifts)
+        chunk = values if exact else np.empty(edges, dtype)
+        if int.from_bytes(data[4:8], "little") != chunk.nbytes:  # header of blosc
+            raise BrokenError(f"{name} has another size")
+        codec().decode(data, chunk)
+        if not exact:
+            target = tuple(slice(max(-d, 0), e - d) for d, e in zip(shifts, edges, strict=True))
+            source = tuple(slice(max(d, 0), d + n) for d, n in zip(shifts, values.shape, strict=True))
+            values[target] = chunk[source]
+    return values

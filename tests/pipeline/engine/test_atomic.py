@@ -46,8 +46,8 @@ def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path, monkeypatch):
 
 def test_of_two_that_create_a_file_one_does(tmp_path):
     path = tmp_path / "a" / "b"
-    assert atomic.create(path, [b"on", b"e"])
-    assert not atomic.create(path, [b"two"])
+    assert atomic.create(path, b"one")
+    assert not atomic.create(path, b"two")
     assert (path.read_bytes(), names(path.parent)) == (b"one", ["b"])
 
 

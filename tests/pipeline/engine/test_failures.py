@@ -64,16 +64,16 @@ def test_a_cache_that_cannot_be_written_is_refused_before_anything_is_computed(t
     def refuse(*_, **__):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    monkeypatch.setattr("rille.pipeline.engine.store.folder.tempfile.TemporaryFile", refuse)
+    monkeypatch.setattr("rille.pipeline.engine.store.base.tempfile.TemporaryFile", refuse)
     ended = []
     monkeypatch.setattr(driver, "make", lambda *_: ended.append("an executor was started"))
-    with raises("RIL-575", "may not be used"):
+    with raises("RIL-575", "Read-only file system"):
         driver.run(graph, store)
     assert not ended
     (tmp_path / "file").touch()
-    with raises("RIL-576", "not a folder"):
+    with raises("RIL-575", "Not a directory"):
         Store(tmp_path / "file" / "cache").writable()
-    with raises("RIL-576", "not a folder"):
+    with raises("RIL-575", "Not a directory"):
         Store(tmp_path / "file").writable()
 
 

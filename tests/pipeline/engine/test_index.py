@@ -2,85 +2,73 @@
 
 from __future__ import annotations
 
-import gzip
+import json
 import os
-import shutil
-import time
-import tracemalloc
+import sqlite3
+import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from toys import chain
 
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
-from rille.pipeline.engine.store import folder, index, manifest
+from rille.pipeline.engine.store import folder, index
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.folder import Folder, Item
-from rille.pipeline.engine.store.manifest import Ref
 
 NODES = 9
 
 
 @pytest.fixture(autouse=True)
 def _at_once(monkeypatch):
-    monkeypatch.setattr(folder, "RACY", 0.0)
+    monkeypatch.setattr(folder, "RACY_S", 0.0)
 
 
 def run(cache, **options):
     """Nodes of a run, and the manifests that its client read while it looked up."""
     graph, store, read = Graph(), Store(cache), []
     chain.build(graph, **options)
-    real = store._read_manifest
-    store._read_manifest = lambda stage, key: read.append(key) or real(stage, key)
+    real = store.read_manifest
+    store.read_manifest = lambda stage, key: read.append(key) or real(stage, key)
     result = driver.run(graph, store, driver.RunOptions(executor="inline"))
     return {h.label: (h.status, h.ref) for h in graph.nodes}, read, result
 
 
-def indices(cache):
-    return sorted(p for p in (cache / "index").rglob("*") if p.is_file())
+def refs(nodes):
+    return {label: ref for label, (_, ref) in nodes.items()}
+
+
+def rows(cache, query="SELECT * FROM artifacts", *values):
+    with sqlite3.connect(cache / index.NAME) as database:
+        return database.execute(query, values).fetchall()
 
 
 def test_a_second_run_reads_no_manifest_and_finds_the_same(cache):
     run(cache)
-    (path,) = indices(cache)
-    assert len(gzip.decompress(path.read_bytes()).splitlines()) == NODES
-    before = path.stat().st_mtime_ns
+    before = rows(cache)
+    assert len(before) == NODES
     with_index, read, result = run(cache)
     assert (read, result.total().cached) == ([], NODES)
-    assert [p.stat().st_mtime_ns for p in indices(cache)] == [before], "nothing new, nothing written"
-    shutil.rmtree(cache / "index")
+    assert rows(cache) == before
+    (cache / index.NAME).unlink()
     without, read, _ = run(cache)
     assert len(read) == NODES
     assert with_index == without
 
 
-def test_facts_of_what_is_found_are_read_only_where_somebody_asks(cache, monkeypatch):
+def test_parameters_of_one_sequence_share_its_rows(cache):
+    run(cache)
+    run(cache, offset=1.0)
+    assert run(cache)[1] == [], "going back and forth costs nothing"
+
+
+def test_a_run_over_old_artifacts_touches_them_and_notes_it(cache):
     nodes, _, _ = run(cache)
-    asked, real = [], index.parsed
-    for module in (index, manifest):
-        monkeypatch.setattr(module, "parsed", lambda text: asked.append(text) or real(text))
-    store, (label, (_, given)) = Store(cache), next(item for item in nodes.items() if item[1][1].meta)
-    asked.clear()
-    manifest._read.cache_clear()
-    run(cache)
-    assert not any(text.startswith("{") for text in asked), "the flow of these tasks asks for none"
-    store.survey(indices(cache)[0].parent.name)
-    asked.clear()
-    found = store.lookup(given.stage, given.key)
-    assert [text[0] for text in asked] == ["["]
-    assert found == given, label
-    assert [text[0] for text in asked] == ["[", "{", "{"], "each of the two once"
-    assert dict(found.meta) == given.meta
-    assert len(asked) == 3, "once"
-
-
-def test_a_run_says_anew_that_it_used_the_same(cache, monkeypatch):
-    run(cache)
-    (path,) = indices(cache)
-    before = path.stat().st_mtime_ns
-    monkeypatch.setattr(index, "FRESH", -1.0)
+    for ref in refs(nodes).values():
+        os.utime(cache / ref.path, (1.0, 1.0))
+    assert len(run(cache)[1]) == NODES
+    assert min((cache / ref.path).stat().st_mtime for ref in refs(nodes).values()) > 1e6
     assert run(cache)[1] == []
-    assert [p.stat().st_mtime_ns > before for p in indices(cache)] == [True]
 
 
 @pytest.mark.parametrize("way", ["touched", "rewritten", "replaced", "flipped"])
@@ -97,118 +85,141 @@ def test_a_file_that_was_changed_is_read_again(cache, way):
         path.with_name("copy").write_bytes(data)
         path.with_name("copy").replace(path)
     else:
-        path.write_bytes(data[:100] + bytes([data[100] ^ 1]) + data[101:])
+        path.write_bytes(data[:-200] + bytes([data[-200] ^ 1]) + data[-199:])
     os.utime(path, ns=times)  # whoever sets the times back is seen all the same
     again, read, result = run(cache)
     assert len(read) >= 1
     assert again["scale/1"][1].digest == ref.digest
     assert result.total().computed == (way == "flipped")
-    assert run(cache)[1] == [], "it has a line again"
+    assert run(cache)[1] == [], "it has a row again"
 
 
-def test_a_file_that_was_cut_short_is_seen_by_its_size(cache):
-    nodes, _, _ = run(cache)
-    ref = nodes["numbers/2"][1]
-    path = cache / ref.path
-    path.write_bytes(path.read_bytes()[:-1])
-    again, _, result = run(cache)
-    assert again["numbers/2"][0] == "computed"
-    assert again["numbers/2"][1].digest == ref.digest
-    assert "bytes instead of" in next((cache / "quarantine").glob("*.txt")).read_text()
-    assert result.total().computed == 1
-
-
-@pytest.mark.parametrize(
-    "damage", [lambda d: b"", lambda d: d[:-3], lambda d: d[:70] + bytes([d[70] ^ 1]) + d[71:], lambda d: b"\xff" * 99]
-)
-def test_a_damaged_index_counts_as_none(cache, damage, capsys):
-    nodes, _, _ = run(cache)
-    (path,) = indices(cache)
-    path.write_bytes(damage(path.read_bytes()))
-    again, read, _ = run(cache)
-    assert len(read) == NODES
-    assert capsys.readouterr().err.count("is passed over") == 1
-    assert {label: ref for label, (_, ref) in again.items()} == {label: ref for label, (_, ref) in nodes.items()}
-    assert run(cache)[1] == [], "it was written anew"
-
-
-def test_what_was_changed_a_moment_ago_is_not_entered(cache, monkeypatch):
-    monkeypatch.setattr(folder, "RACY", 3600.0)
+def test_what_was_changed_a_moment_ago_is_neither_entered_nor_believed(cache, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr(folder, "RACY_S", 3600.0)
+        run(cache)
+        assert not (cache / index.NAME).exists()
     run(cache)
-    assert not indices(cache)
-
-
-def test_what_was_changed_a_moment_ago_is_read_again(cache, monkeypatch):
-    run(cache)
-    monkeypatch.setattr(folder, "RACY", 3600.0)
+    monkeypatch.setattr(folder, "RACY_S", 3600.0)
     assert len(run(cache)[1]) == NODES
 
 
-def test_a_file_that_was_cut_short_during_the_run_is_not_entered(cache):
-    ref = run(cache)[0]["scale/1"][1]
-    shutil.rmtree(cache / "index")
-    store, again = Store(cache), Store(cache)
-    store.survey("s")
-    os.truncate(cache / ref.path, ref.stored - 1)
-    store.note([ref])
-    again.survey("s")
-    assert again.lookup(ref.stage, ref.key) is None
+def pipe(path):
+    path.unlink()
+    os.mkfifo(path)
 
 
-def test_sequences_have_an_index_each_and_parameters_share_one(cache):
+def of_gigabytes(path):
+    os.truncate(path, 3_000_000_000)
+
+
+def of_another_program(path):
+    path.unlink()
+    with sqlite3.connect(path) as database:
+        database.execute("CREATE TABLE places (url)")
+
+
+def a_program(path):
+    """A view that never ends."""
+    path.unlink()
+    with sqlite3.connect(path) as database:
+        database.execute(
+            "CREATE VIEW artifacts AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) "
+            "SELECT i AS sequence, i AS key, i AS stated, i AS checksum FROM n"
+        )
+
+
+def with_a_trigger(path):
+    with sqlite3.connect(path) as database:
+        database.execute("CREATE TRIGGER t AFTER INSERT ON artifacts BEGIN DELETE FROM artifacts; END")
+
+
+@pytest.mark.parametrize(
+    "way",
+    [
+        *(pipe, of_gigabytes, of_another_program, a_program, with_a_trigger),
+        lambda path: path.write_bytes(b"\xff" * 99),
+        lambda path: path.write_bytes(path.read_bytes()[:5000]),
+        lambda path: (path.unlink(), path.mkdir()),
+    ],
+)
+def test_an_index_that_is_none_of_ours_is_set_aside(cache, way):
+    nodes, _, _ = run(cache)
+    way(cache / index.NAME)
+    again, read, _ = run(cache)
+    assert len(read) == NODES
+    assert len(list((cache / "quarantine").iterdir())) == 1
+    assert refs(again) == refs(nodes)
+    assert run(cache)[1] == [], "it was written anew"
+
+
+def test_an_index_may_be_a_link_to_nothing_or_to_a_file_of_somebody_else(cache, tmp_path):
+    theirs = tmp_path / "theirs.sqlite"
     run(cache)
-    run(cache, offset=1.0)
-    assert len(list((cache / "index").iterdir())) == 1
-    assert run(cache)[1] == [], "going back and forth costs nothing"
-    run(cache, seed=5)
-    assert len(list((cache / "index").iterdir())) == 2
+    (cache / index.NAME).rename(theirs)
+    before = theirs.read_bytes()
+    for target in (theirs, tmp_path / "nothing"):
+        (cache / index.NAME).unlink(missing_ok=True)
+        (cache / index.NAME).symlink_to(target)
+        assert len(run(cache)[1]) == NODES
+    assert theirs.read_bytes() == before
+    assert not (tmp_path / "nothing").exists()
 
 
-def test_an_index_is_never_unpacked_beyond_its_bound(cache, monkeypatch, capsys):
-    """A hundred megabytes of nothing in a hundred kilobytes: one line, and no memory."""
-    bomb = gzip.compress(bytes(100_000_000))
-    assert len(bomb) < 100_000
-    (cache / "index/s").mkdir(parents=True)
-    (cache / "index/s/bomb").write_bytes(bomb)
-    monkeypatch.setattr(index, "MOST", 1_000_000)
-    store = Store(cache)
-    tracemalloc.start()
-    store.survey("s")
-    assert tracemalloc.get_traced_memory()[1] < 10_000_000
-    tracemalloc.stop()
-    assert store._index.lines == {}
-    told = "index/s/bomb in the cache is passed over: it unpacks to more than 1 MB"
-    assert capsys.readouterr().err == f"rille: warning RIL-984: {told}\n"
+@pytest.mark.parametrize(
+    ("stated", "right"),
+    [
+        ('["m", {}]', True),
+        ('["m", {"key": 1, "stage": [], "digest": "", "meta": []}]', True),
+        ("[" * 100_000, True),
+        (7, True),
+        (b"\xff", True),
+        (None, True),
+        ("flipped", False),
+    ],
+)
+def test_a_row_that_is_none_of_ours_is_not_believed(cache, stated, right):
+    nodes, _, _ = run(cache)
+    if stated == "flipped":
+        stated = rows(cache)[0][2].replace('"meta":{', '"meta":{"more":1,', 1)
+    checksum = zlib.crc32(str(stated).encode()) if right else 5
+    rows(cache, "UPDATE artifacts SET stated = ?, checksum = ?", stated, checksum)
+    again, read, _ = run(cache)
+    assert len(read) == NODES
+    assert refs(again) == refs(nodes)
 
 
-@pytest.mark.parametrize("line", [b"", b"\n", b"0" * 63 + b"\n"], ids=["one line", "empty lines", "short lines"])
-def test_an_index_of_what_no_run_writes_costs_little(cache, monkeypatch, capsys, line):
-    """An endless line is not joined again for each of its pieces, and lines of nothing are not counted out."""
-    (cache / "index/s").mkdir(parents=True)
-    (cache / "index/s/bomb").write_bytes(gzip.compress((line or b"0") * (300_000_000 // len(line or b"0")), 1))
-    began = time.process_time()
-    store = Store(cache)
-    store.survey("s")
-    assert time.process_time() - began < 3.0
-    assert store._index.lines == {}
-    assert capsys.readouterr().err.count("is passed over") == 1
+def test_a_locked_index_costs_a_bounded_wait(cache, monkeypatch):
+    nodes, _, _ = run(cache)
+    monkeypatch.setattr(index, "TIMEOUT_S", 0.05)
+    with sqlite3.connect(cache / index.NAME) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        again, read, _ = run(cache)
+    assert len(read) == NODES
+    assert refs(again) == refs(nodes)
+    assert run(cache)[1] == [], "it is as it was"
 
 
-def test_an_index_is_compact(tmp_path):
-    """Of an artifact: key, digest and mark, which cannot be compressed further, and what its facts need."""
+def test_several_runs_enter_what_they_used_at_once(cache):
+    nodes, _, _ = run(cache)
+    (cache / index.NAME).unlink()
+    stores = [Store(cache) for _ in nodes]
+    for k, store in enumerate(stores):
+        store.survey(f"s{k % 2}")
+    with ThreadPoolExecutor(NODES) as pool:
+        list(pool.map(lambda store, ref: store.note([ref]), stores, refs(nodes).values()))
+    assert sorted(row[1] for row in rows(cache)) == sorted(ref.key for ref in refs(nodes).values())
 
-    class Marked(Folder):
-        def status(self, path):
-            return Item(path, 20_000, f"{hash(path) & (1 << 64) - 1:x}.4e20", 0.0)
 
-    folder, refs = Marked(tmp_path), {}
-    for k in range(5000):
-        key, digest = (f"{hash((k, what)) & (1 << 256) - 1:064x}".replace("0000", f"{k:04x}") for what in "kd")
-        refs[key] = Ref(key, "hfvm", digest, {"frame": k, "valid": k / 3}, 30_000 + k, 20_000)
-    made = index.Index(folder, "s")
-    made.note(refs)
-    (path,) = indices(tmp_path)
-    assert path.stat().st_size < 140 * len(refs)
-    again = index.Index(folder, "s")
-    key = next(iter(refs))
-    assert again.get("hfvm", folder.status(refs[key].path), key) == refs[key]
+def test_a_row_holds_what_a_manifest_states(cache):
+    nodes, _, _ = run(cache)
+    ref = nodes["total"][1]
+    (stated,) = (row[2] for row in rows(cache) if row[1] == ref.key)
+    assert json.loads(stated)[1] == {
+        "key": ref.key,
+        "stage": "total",
+        "digest": ref.digest,
+        "meta": ref.meta,
+        "nbytes": ref.nbytes,
+        "stored": ref.stored,
+    }

@@ -65,15 +65,12 @@ def test_runs_of_another_machine_that_cannot_be_seen_stop_it(used, tmp_path):
 
 
 def test_a_cache_that_may_only_be_read_is_used_without_a_note(used, tmp_path, monkeypatch):
-    def fail(number: int) -> None:
-        raise OSError(number, os.strerror(number))
+    def refuse(*_) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    for refused in (errno.EACCES, errno.EROFS, errno.ENOTDIR):
-        monkeypatch.setattr(atomic, "write", lambda *_, number=refused: fail(number))
-        roots.note(used, tmp_path / "mine")
-    monkeypatch.setattr(atomic, "write", lambda *_: fail(errno.ENOSPC))
-    with raises("RIL-741", "No space left"):
-        roots.note(used, tmp_path / "mine")
+    monkeypatch.setattr(atomic, "write", refuse)
+    roots.note(used, tmp_path / "mine")
+    assert roots.folders(used, tmp_path) == sorted([tmp_path, tmp_path / "work" / "runs"])
 
 
 def test_what_may_not_be_removed_is_no_success(used, tmp_path, monkeypatch):
@@ -89,7 +86,6 @@ def test_what_may_not_be_removed_is_no_success(used, tmp_path, monkeypatch):
     run.mkdir()
     driver.run(graph, used, driver.RunOptions(executor="inline", ledger=run / "ledger.jsonl"))
     shutil.rmtree(run.parent / "1")
-    shutil.rmtree(used.root / "index", ignore_errors=True)  # written where a run took long enough
     monkeypatch.setattr(atomic, "remove", refuse)
     with raises("RIL-575", "Permission denied"):
         collect(used, run.parents[1])

@@ -83,7 +83,8 @@ def clear(cache, runs, until, grace):
         kept = set()
         for path in Path(runs).glob("*/*/ledger.jsonl"):
             kept |= ledger.keys(path)
-        removed += maintenance.gc(Store(cache), kept, grace=grace).artifacts
+        cleared = maintenance.gc(Store(cache), kept, grace=grace)
+        removed += sum(len(sizes) for stage, sizes in cleared.items() if stage)
         times += 1
         time.sleep(0.002)
     return {"times": times, "removed": removed}

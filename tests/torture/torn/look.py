@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
 from contextlib import suppress
 from pathlib import Path
 
+from rille.pipeline.engine.store.archive import BrokenError
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.maintenance import artifacts
-from rille.pipeline.engine.store.manifest import artifact_path, damage, length, unframe
 from rille.pipeline.engine.store.output_digest import array_digests, output_digest
 
 HERE = Path(__file__).parent.parent
@@ -19,21 +21,20 @@ def published(cache):
     """Digest by key of every artifact that is whole."""
     store, found = Store(cache), {}
     for stage, key in artifacts(store):
-        data = store.folder.read(artifact_path(stage, key))
-        with suppress(ValueError):
-            manifest = unframe(data[: length(data)])
-            if not damage(manifest, data):
-                found[manifest["key"]] = manifest["digest"]
+        with suppress(BrokenError), store.opened(stage, key) as archive:
+            for name in archive.namelist():
+                archive.member(name, archive.size)
+            found[key] = store.read_manifest(stage, key)["digest"]
     return found
 
 
-def span(data, kind, member):
-    """Where in an artifact's file a part lies: its manifest, a member, or the directory of the archive."""
-    size = length(data)
-    if kind in ("manifest", "directory"):
-        return (0, size) if kind == "manifest" else (data.rindex(b"PK\x01\x02"), len(data))
-    start, length_, _ = unframe(data[:size])["files"][member]
-    return start, start + length_
+def span(data, member):
+    """Where in an artifact's file a member lies, or the last record of its ``directory``."""
+    if member == "directory":
+        return data.rindex(b"PK\x01\x02"), len(data)
+    about = zipfile.ZipFile(io.BytesIO(data)).getinfo(member)
+    start = about.header_offset + len(about.FileHeader())
+    return start, start + about.file_size
 
 
 def manifests(cache):

@@ -7,7 +7,6 @@ import os
 import signal
 import sys
 
-import google_crc32c  # noqa: F401
 import numpy  # noqa: F401
 import toys.mischief
 import toys.numbers
