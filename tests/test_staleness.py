@@ -469,7 +469,7 @@ EDITS: dict[str, tuple[str, str, str, set[str]]] = {
         set(),
     ),
     "a docstring of a kernel": ("stages/hfvm/level/search.py", '"""', '"""Said otherwise. ', set()),
-    "the engine": ("pipeline/engine/scheduler.py", "MOST_PUT_BACKS = 3", "MOST_PUT_BACKS = 4", set()),
+    "the engine": ("pipeline/engine/run.py", "MAX_HEALS = 3", "MAX_HEALS = 4", set()),
     "the report": ("pipeline/report/words.py", "", "\nMORE = 1\n", set()),
     "a stage itself": ("stages/terrain/merge.py", "", "\nMORE = 1\n", {"merge"}),
     "a helper of one stage": ("stages/planning/path_words.py", "", "\nMORE = 1\n", {"path/local", "path/world"}),

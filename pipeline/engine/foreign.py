@@ -22,7 +22,6 @@ from rille.pipeline.engine.code_digest import OWN, tree_digest
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.packages import version
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.stages.core.errors import ConfigError, RilleError
 
