@@ -37,11 +37,11 @@ def terrain(rows: int, cols: int, cover: float) -> tuple[Any, Any]:
     """Elevation and its standard deviation (row, col), metres."""
     import numpy as np
 
-    from rille.datasets.mockup.params import MockupParams
+    from rille.datasets.mockup.params import MockupParams, SceneParams
     from rille.datasets.mockup.scene import build_scene
 
     bed = MockupParams(bed_width=(cols + 1) * CELL, bed_length=(rows + 1) * CELL, rock_cover=cover, seed=2)
-    z = build_scene(bed.scene())["height"][:rows, :cols].astype(np.float32)
+    z = build_scene(bed.part(SceneParams))["height"][:rows, :cols].astype(np.float32)
     rng = np.random.default_rng(0)
     for r, c in zip(rng.integers(0, rows, 300), rng.integers(0, cols, 300), strict=True):
         z[r : r + 8, c : c + 8] = np.nan

@@ -19,10 +19,9 @@ from rille.datasets.images.kinds import unread
 from rille.datasets.images.misalign import MisalignParams, misalign
 from rille.datasets.images.samples import examined
 from rille.datasets.manifest.opening import open_manifest
-from rille.datasets.mockup.loop import LOOP, mockup_loop
 from rille.datasets.mockup.params import RECORDED_ONLY, SHORT, MockupParams
 from rille.datasets.mockup.rover import RoverParams
-from rille.datasets.mockup.sequence import mockup
+from rille.datasets.mockup.sequence import LOOP, mockup, mockup_loop
 from rille.datasets.protocol import Sequence
 from rille.datasets.text.validation import Model, validated
 from rille.stages.core.errors import ConfigError, InputError, RilleError

@@ -11,7 +11,7 @@ from rille.pipeline.flow.config import modules, stage
 
 UNITS = {"1", "px", "m", "rad", "grey", "m^2, m rad, rad^2", "m, rad"}
 DATASET_STAGES = ("images.files", "mockup.scene", "mockup.render", "mockup.truth", "mockup.truth_dem")
-DRIVE_STAGES = ("mockup.rover", "mockup.sense", "mockup.site", "mockup.obstacle", "mockup.overview")
+DRIVE_STAGES = ("mockup.rover", "mockup.sense", "mockup.obstacle", "mockup.overview")
 TILE_STAGES = ("tile_stage", "join_stage")
 DECLARED = (
     {name: stage(name) for name in modules()}

@@ -159,8 +159,8 @@ RIGHT_IMAGE = (
 )
 
 SCENE = ("seed", "bed_width", "bed_length", "cell", "relief", "rocks", "rock_cover", "craters", "grain")
-SCENE += ("sun_elevation_deg", "sun_azimuth_deg", "sun_diameter_deg")
-RENDERED = ("blur", "sampling", "noise", "exposure", "exposure_jitter", "right_gain", "vignetting")
+SCENE += ("sun_elevation_deg", "sun_azimuth_deg")
+RENDERED = ("sampling", "noise", "exposure", "exposure_jitter")
 DRIVE = (
     "frames",
     "baseline",
@@ -169,7 +169,6 @@ DRIVE = (
     "camera_height",
     "forward",
     "sideways",
-    "turn_deg",
     "roll_deg",
 )
 DRIVE += ("roll_swing_deg", "jitter_deg")
@@ -186,9 +185,6 @@ SEQUENCE: dict[str, set[str]] = {
     "mockup.slope_deg": EVERYTHING,  # the cameras go along with the ground
     "mockup.up_noise_deg": LEVELLED,
     "mockup.attitude_noise_deg": {"motion", "step_table", "frame_screening", "keyframes", "track"} | LEVELLED,
-    "mockup.focal_error": {"undistort/left", "undistort/right", "image_quality"}
-    | PYRAMIDS
-    | COUNTERCHECK,  # by the ideal camera
     "mockup.rig_error_deg": GIVEN_RIG,
     **dict.fromkeys([f"misalign.{name}" for name in MisalignParams.model_fields], RIGHT_IMAGE),
 }

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.datasets.mockup import scene as bed
+from rille.datasets.mockup.params import SceneParams
 from rille.datasets.mockup.raycast import HeightField
-from rille.datasets.mockup.rover import bed_ground
+from rille.datasets.mockup.rover import START, bed_ground
+from rille.datasets.mockup.scene import build_scene, height_field
 from rille.datasets.mockup.sequence import true_rig
-from rille.datasets.mockup.site import prepare
 from rille.datasets.mockup.truth_dem import seen_by, true_dem
 from rille.pipeline.flow.closed_loop import arena
-from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import RigidTransform, from_above, level_rotation
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.vehicle import Vehicle
@@ -46,17 +45,15 @@ class ExactBed:
     def of(sequence: Any, config: Any, goal: tuple[float, float]) -> ExactBed:
         """The part of a bed that a drive to a goal maps."""
         mockup, rover = sequence.parameters["mockup"], sequence.parameters["rover"]
-        plain = bed.build_scene(mockup.scene())
-        scene = Bundle(prepare(plain, (*rover.start, rover.pad), None), plain.meta)
-        ground = bed_ground(scene, config.vehicle, rover.start, REACH)
-        found = stand(ground, *rover.start, math.radians(rover.heading_deg), config.vehicle)
+        scene = build_scene(mockup.part(SceneParams), pad=(*START[:2], rover.pad))
+        ground = bed_ground(scene, config.vehicle, START[:2], REACH)
+        found = stand(ground, *START, config.vehicle)
         assert found is not None
         T_bed_left = found.T_ground_vehicle @ sequence.simulation.T_vehicle_left
         T_world_left = RigidTransform(level_rotation(T_bed_left.rotation[2]), np.zeros(3))
         T_world_bed = T_world_left @ T_bed_left.inverse()
-        at = scene.meta["lattice"]
         lattice = arena(goal, config.drive.around, config.locus.cell_size)
-        field = HeightField.build(np.asarray(scene["height"]), at["x0"], at["y0"], at["cell"])
+        field = height_field(scene)
         z, points = true_dem(field, lattice.to_dict(), T_world_bed.inverse())
         T_world_vehicle = T_world_bed @ found.T_ground_vehicle
         return ExactBed(

@@ -11,10 +11,11 @@ import numpy as np
 from rille.datasets.mockup import scene as bed
 from rille.datasets.mockup import terrain
 from rille.datasets.mockup.params import SceneParams
-from rille.datasets.mockup.rover import RoverParams
-from rille.datasets.mockup.site import distance
+from rille.datasets.mockup.rover import RoverParams, true_and_believed
 from rille.stages.core.declare import Bundle, Inputs, Stage
-from rille.stages.geometry.geometry import RigidTransform, heading_of
+
+HEIGHT = 0.015
+"""m, of the stone; a wheel's radius."""
 
 
 def on_path(path: np.ndarray, way: float, aside: float) -> tuple[float, float]:
@@ -28,18 +29,18 @@ def on_path(path: np.ndarray, way: float, aside: float) -> tuple[float, float]:
     return float(point[0]), float(point[1])
 
 
-def lay(scene: Bundle, x: float, y: float, height: float) -> dict[str, Any]:
+def lay(scene: Bundle, x: float, y: float) -> dict[str, Any]:
     """Arrays of the scene with a round stone of profile 1 - q^4, whose radius is 1.2 times its height."""
     arrays: dict[str, Any] = {name: np.asarray(scene[name]) for name in scene.arrays}
-    z = np.array(arrays["height"])
-    q = distance(scene, x, y, z.shape, scene.meta["lattice"]["cell"]) / (1.2 * height)
+    z, lattice = np.array(arrays["height"]), scene.meta["lattice"]
+    q = bed.distance(lattice, z.shape, lattice["cell"], x, y) / (1.2 * HEIGHT)
     inside = q < 1.0
     ground = float(np.median(z[inside])) if inside.any() else 0.0
-    z[inside] = np.maximum(z[inside], ground + height * (1.0 - q[inside] ** 4))
-    arrays["height"] = z.astype(np.float32)
+    z[inside] = np.maximum(z[inside], ground + HEIGHT * (1.0 - q[inside] ** 4))
+    arrays["height"] = z
     arrays["tint"] = np.where(inside, np.uint8(120), arrays["tint"])
     # Shadows are part of the scene, not of the image: the stone casts one, and may stand in another.
-    arrays["sunlit"] = terrain.sunlit(arrays["height"], SceneParams(**scene.meta["scene"]))
+    arrays["sunlit"] = terrain.sunlit(z, SceneParams(**scene.meta["scene"]))
     return arrays
 
 
@@ -47,17 +48,14 @@ def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     scene, path = inputs["scene"], np.asarray(inputs["leg"]["path"])[:, :2]
     if len(path) < 2:
         return Bundle({name: np.asarray(scene[name]) for name in scene.arrays}, {**scene.meta, "obstacle": None})
-    T_left_vehicle = RigidTransform.from_matrix(args["T_vehicle_left"]).inverse()
-    true = RigidTransform.from_matrix(np.asarray(inputs["before"]["vehicle"])[int(args["row"])])
-    believed = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1]) @ T_left_vehicle
+    (true_x, true_y, true_heading), (x, y, heading) = true_and_believed(args, inputs)
     px, py = on_path(path, params.obstacle_ahead, params.obstacle_aside)
     # The path is in the frame of the rover's estimate: the stone is laid where it will really come by, so that errors
     # of the estimate do not carry it past.
-    turn = heading_of(true) - heading_of(believed)
-    dx, dy = px - believed.translation[0], py - believed.translation[1]
+    turn = true_heading - heading
     c, s = math.cos(turn), math.sin(turn)
-    x, y = float(true.translation[0] + c * dx - s * dy), float(true.translation[1] + s * dx + c * dy)
-    return Bundle(lay(scene, x, y, params.obstacle_height), {**scene.meta, "obstacle": [x, y]})
+    stone = true_x + c * (px - x) - s * (py - y), true_y + s * (px - x) + c * (py - y)
+    return Bundle(lay(scene, *stone), {**scene.meta, "obstacle": list(stone)})
 
 
 STAGE = Stage(

@@ -12,6 +12,9 @@ from rille.datasets.mockup.rover import RoverParams
 from rille.stages.core.declare import Array, Bundle, Inputs, Stage
 from rille.stages.geometry.lattice import Lattice
 
+SIGMA = 0.002
+"""m, of the map's elevations."""
+
 
 def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     at, z = inputs["scene"].meta["lattice"], np.asarray(inputs["scene"]["height"], dtype=np.float64)
@@ -22,12 +25,12 @@ def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     cols = math.floor((at["x0"] + at["cell"] * (at["cols"] - 1)) / cell - 0.5) - i0 + 1
     rows = j0 - math.ceil((at["y0"] - at["cell"] * (at["rows"] - 1)) / cell + 0.5) + 1
     lattice = Lattice.at(i0, j0, cell, rows, cols)
-    out = np.empty(lattice.shape)
-    for r, y in enumerate(lattice.ys()):
-        for c, x in enumerate(lattice.xs()):
-            row, col = (at["y0"] - y) / at["cell"] - 0.5 * (n - 1), (x - at["x0"]) / at["cell"] - 0.5 * (n - 1)
-            out[r, c] = z[round(row) : round(row) + n, round(col) : round(col) + n].mean()
-    out += params.map_sigma * np.random.default_rng([params.seed, 72]).standard_normal(out.shape)
+    row, col = (
+        np.round(far / at["cell"] - 0.5 * (n - 1)).astype(int)
+        for far in (at["y0"] - lattice.ys(), lattice.xs() - at["x0"])
+    )
+    out = np.lib.stride_tricks.sliding_window_view(z, (n, n))[np.ix_(row, col)].mean(axis=(2, 3))
+    out += SIGMA * np.random.default_rng([params.seed, 72]).standard_normal(out.shape)
     return Bundle({"elevation": out.astype(np.float32)}, {"lattice": lattice.to_dict(), "frame": "bed"})
 
 

@@ -5,9 +5,13 @@ The figures are the paper's (sections 3.2, 7.1-7.4) where it gives them.
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 from pydantic import Field
 
 from rille.stages.core.declare import Params
+
+Part = TypeVar("Part", bound=Params)
 
 
 class SceneParams(Params):
@@ -16,15 +20,10 @@ class SceneParams(Params):
     seed: int = Field(1, ge=0, description="seed of terrain, grain and sensor noise")
     bed_width: float = Field(1.6, ge=0.1, le=4.0, description="width of the bed [m]; the paper's bed is 1.6 x 2 m")
     bed_length: float = Field(2.0, ge=0.1, le=4.0, description="length of the bed along the drive [m]")
-    cell: float = Field(
-        0.001, ge=0.0005, le=0.01, description="spacing of the heights [m]; grain is drawn at half of it"
-    )
+    cell: float = Field(0.001, ge=0.0005, le=0.01, description="spacing of the heights [m]; of the grain, half of it")
     relief: float = Field(0.007, ge=0.0, le=0.03, description="RMS [m] of the longest octave (0.5 m) of the relief")
     rocks: float = Field(
-        30.0,
-        ge=0.0,
-        le=200.0,
-        description="rocks wider than 30 mm per square metre; the number of smaller ones follows D^-2",
+        30.0, ge=0.0, le=200.0, description="rocks wider than 30 mm a square metre; numbers follow D^-2"
     )
     rock_cover: float | None = Field(
         None,
@@ -34,33 +33,15 @@ class SceneParams(Params):
         " another; not set: mockup.rocks decides",
     )
     slope_deg: float = Field(
-        0.0,
-        ge=-25.0,
-        le=25.0,
-        description="slope of the bed [degrees], rising ahead; the body stands square on it",
+        0.0, ge=-25.0, le=25.0, description="slope of the bed ahead [degrees]; the body is square on it"
     )
     craters: float = Field(
-        8.0,
-        ge=0.0,
-        le=50.0,
-        description="craters wider than 100 mm per square metre; the number of others follows D^-2",
+        8.0, ge=0.0, le=50.0, description="craters wider than 0.1 m a square metre; numbers follow D^-2"
     )
     grain: float = Field(0.06, ge=0.0, le=0.3, description="relative RMS of each octave of the albedo grain")
-    sun_elevation_deg: float = Field(
-        20.0, ge=3.0, le=90.0, description="elevation of the light above the horizon [degrees]"
-    )
+    sun_elevation_deg: float = Field(20.0, ge=3.0, le=90.0, description="elevation of the light [degrees]")
     sun_azimuth_deg: float = Field(
-        -110.0,
-        ge=-360.0,
-        le=360.0,
-        description="direction from which the light comes [degrees clockwise from straight ahead]",
-    )
-    sun_diameter_deg: float = Field(
-        1.5,
-        ge=0.0,
-        le=10.0,
-        description="angular diameter of the light [degrees]; 1.5: a studio lamp some metres away, with soft "
-        "shadow edges",
+        -110.0, ge=-360.0, le=360.0, description="azimuth of the light [degrees], clockwise from ahead"
     )
 
 
@@ -68,19 +49,12 @@ class RenderParams(Params):
     """The camera as a sensor: optics, exposure and noise."""
 
     seed: int = Field(1, ge=0, description="seed of the sensor noise")
-    sampling: int = Field(
-        2, ge=1, le=4, description="rays per pixel along either axis; each averages the grain over its own width"
-    )
-    blur: float = Field(0.6, ge=0.0, le=5.0, description="standard deviation [px] of the optics' point spread")
+    sampling: int = Field(2, ge=1, le=4, description="rays a pixel along either axis; each averages its own width")
     noise: float = Field(1.5, ge=0.0, le=50.0, description="standard deviation [grey levels] of the sensor noise")
     exposure: float = Field(1.0, gt=0.0, le=10.0, description="factor on the grey values; 1: a mean of about 100")
     exposure_jitter: float = Field(
-        0.0, ge=0.0, le=0.5, description="relative standard deviation of the exposure from image to image"
+        0.0, ge=0.0, le=0.5, description="relative standard deviation of the images' exposures"
     )
-    right_gain: float = Field(
-        0.97, gt=0.0, le=2.0, description="sensitivity of the right camera over that of the left; no two are equal"
-    )
-    vignetting: float = Field(0.1, ge=0.0, le=0.9, description="relative loss of light in the image corners")
 
 
 class MockupParams(SceneParams, RenderParams):
@@ -89,31 +63,22 @@ class MockupParams(SceneParams, RenderParams):
     frames: int = Field(40, ge=1, le=2000, description="number of stereo pairs")
     image_width: int = Field(570, ge=16, le=4096, description="width of the images [px]")
     image_height: int = Field(520, ge=16, le=4096, description="height of the images [px]")
-    focal_length: float = Field(
-        600.0, gt=10.0, le=10000.0, description="focal length [px]; 600: 51 degrees across at 570 px"
-    )
+    focal_length: float = Field(600.0, gt=10.0, le=10000.0, description="focal length [px]; 600: 51 degrees at 570 px")
     baseline: float = Field(0.097, gt=0.0, le=1.0, description="distance between the cameras [m] (section 7.4)")
-    toe_in_deg: float = Field(
-        5.0, ge=-20.0, le=20.0, description="inward turn of each camera about the vertical [degrees]"
-    )
+    toe_in_deg: float = Field(5.0, ge=-20.0, le=20.0, description="inward turn of each camera [degrees]")
     pitch_deg: float = Field(
-        18.0, ge=0.0, le=60.0, description="downward pitch of the cameras [degrees]; the paper says 15-20"
+        18.0, ge=0.0, le=60.0, description="downward pitch of the cameras [degrees]; the paper: 15-20"
     )
     camera_height: float = Field(
         0.18, gt=0.05, le=1.0, description="height of the cameras above the mean of the bed [m]"
     )
-    forward: float = Field(
-        0.03, ge=-0.5, le=0.5, description="motion ahead per frame [m], along the heading (section 7.4)"
-    )
+    forward: float = Field(0.03, ge=-0.5, le=0.5, description="motion ahead per frame [m] (section 7.4)")
     sideways: float = Field(0.015, ge=-0.5, le=0.5, description="motion to the right per frame [m] (section 7.4)")
-    turn_deg: float = Field(0.0, ge=-45.0, le=45.0, description="turn to the right per frame [degrees]")
     roll_deg: float = Field(0.0, ge=-30.0, le=30.0, description="constant roll to the right [degrees]")
     roll_swing_deg: float = Field(
-        0.0, ge=0.0, le=60.0, description="roll from each frame to the next [degrees], to the right and back in turn"
+        0.0, ge=0.0, le=60.0, description="roll from frame to frame [degrees], right and left in turn"
     )
-    jitter_deg: float = Field(
-        0.0, ge=0.0, le=10.0, description="standard deviation of pitch, roll and heading from frame to frame [degrees]"
-    )
+    jitter_deg: float = Field(0.0, ge=0.0, le=10.0, description="standard deviation of each frame's angles [degrees]")
     up_noise_deg: float | None = Field(
         0.2,
         ge=0.0,
@@ -131,22 +96,15 @@ class MockupParams(SceneParams, RenderParams):
     rig_error_deg: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0), description="rotation errors of the given rig about the right camera's x, y, z [degrees]"
     )
-    focal_error: float = Field(0.0, ge=-0.2, le=0.2, description="relative error of the given focal length")
 
-    def scene(self) -> SceneParams:
-        """The bed's part."""
-        return SceneParams(**{name: getattr(self, name) for name in SceneParams.model_fields})
-
-    def render(self) -> RenderParams:
-        """The sensor's part."""
-        return RenderParams(**{name: getattr(self, name) for name in RenderParams.model_fields})
+    def part(self, kind: type[Part]) -> Part:
+        """The parameters of one half, bed or camera."""
+        return kind(**{name: getattr(self, name) for name in kind.model_fields})
 
 
 SHORT = {"frames": 9, "bed_width": 1.2, "bed_length": 1.2}
 """``mockup-short``: two segments and the pair that ends the second, on a smaller bed."""
 
-RECORDED_ONLY = (
-    *("frames", "forward", "sideways", "turn_deg", "roll_deg", "roll_swing_deg", "jitter_deg"),
-    *("up_noise_deg", "attitude_noise_deg"),
-)
+MOTION = ("frames", "forward", "sideways", "roll_deg", "roll_swing_deg", "jitter_deg")
+RECORDED_ONLY = (*MOTION, "up_noise_deg", "attitude_noise_deg")
 """Parameters of a recorded motion and of the vertical and attitude given with it; a rover has ``RoverParams``."""

@@ -22,8 +22,8 @@ NUDGE = 1e-7
 class HeightField:
     """Heights (row, col) float32, metres; node (row, col) lies at x = x0 + col * cell, y = y0 - row * cell.
 
-    ``maxima`` holds all levels of block maxima one after the other, level k at ``offsets[k]`` with ``shapes[k]``
-    (rows, cols); a block of level k spans 2^k x 2^k cells.
+    ``maxima`` holds all levels of block maxima one after the other, level k at ``offsets[k]`` with ``widths[k]``
+    columns; a block of level k spans 2^k x 2^k cells.
     """
 
     height: NDArray[np.float32]
@@ -32,30 +32,20 @@ class HeightField:
     cell: float
     maxima: NDArray[np.float32]
     offsets: NDArray[np.int64]
-    shapes: NDArray[np.int64]
+    widths: NDArray[np.int64]
 
     @staticmethod
     def build(height: NDArray[np.float32], x0: float, y0: float, cell: float) -> HeightField:
         """Height field with its pyramid of block maxima."""
-        h = np.ascontiguousarray(height, dtype=np.float32)
-        level = np.maximum(np.maximum(h[:-1, :-1], h[:-1, 1:]), np.maximum(h[1:, :-1], h[1:, 1:]))
-        levels = [level]
-        while max(level.shape) > 1:
-            level = np.pad(level, ((0, level.shape[0] % 2), (0, level.shape[1] % 2)), mode="edge")
-            level = np.maximum(
-                np.maximum(level[::2, ::2], level[::2, 1::2]), np.maximum(level[1::2, ::2], level[1::2, 1::2])
-            )
-            levels.append(level)
-        sizes = [a.size for a in levels]
-        return HeightField(
-            height=h,
-            x0=x0,
-            y0=y0,
-            cell=cell,
-            maxima=np.concatenate([a.ravel() for a in levels]),
-            offsets=np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64),
-            shapes=np.array([a.shape for a in levels], dtype=np.int64),
-        )
+        height = np.ascontiguousarray(height, dtype=np.float32)
+        levels = [_largest_of_four(height, 1)]
+        while max(levels[-1].shape) > 1:
+            rows, cols = levels[-1].shape
+            even = np.pad(levels[-1], ((0, rows % 2), (0, cols % 2)), mode="edge")
+            levels.append(_largest_of_four(even, 2))
+        maxima = np.concatenate([level.ravel() for level in levels])
+        offsets = np.cumsum([0, *(level.size for level in levels[:-1])])
+        return HeightField(height, x0, y0, cell, maxima, offsets, np.array([level.shape[1] for level in levels]))
 
     def cast(self, origins: Floats, directions: Floats) -> Floats:
         """Smallest t > 0 at which ``origin + t * direction`` meets the surface from above; NaN for none.
@@ -74,16 +64,16 @@ class HeightField:
 
     def contact(self, origins: Floats, directions: Floats) -> Floats:
         """As :meth:`cast`, but negative infinity where the ray enters through the side of the bed."""
-        return np.asarray(
-            _cast(
-                self.height,
-                self.maxima,
-                self.offsets,
-                self.shapes,
-                _to_grid(np.atleast_2d(origins), self.x0, self.y0, self.cell),
-                _to_grid(np.atleast_2d(directions), 0.0, 0.0, self.cell),
-            )
-        )
+        o = _to_grid(np.atleast_2d(origins), self.x0, self.y0, self.cell)
+        d = _to_grid(np.atleast_2d(directions), 0.0, 0.0, self.cell)
+        return np.asarray(_cast(self.height, (self.maxima, self.offsets, self.widths), o, d))
+
+
+def _largest_of_four(a: NDArray[np.float32], step: int) -> NDArray[np.float32]:
+    """Maxima of 2 x 2 values, a pair of rows and columns each ``step``."""
+    rows, cols = a.shape
+    corners = [a[i : rows - 1 + i : step, j : cols - 1 + j : step] for i in (0, 1) for j in (0, 1)]
+    return np.asarray(np.maximum.reduce(corners))
 
 
 def _to_grid(xyz: Floats, x0: float, y0: float, cell: float) -> Floats:
@@ -92,8 +82,9 @@ def _to_grid(xyz: Floats, x0: float, y0: float, cell: float) -> Floats:
 
 
 @njit(cache=True, nogil=True)
-def _cast(height, maxima, offsets, shapes, origins, directions):  # type: ignore[no-untyped-def]
+def _cast(height, pyramid, origins, directions):  # type: ignore[no-untyped-def]
     """Ray parameters (n,) in grid coordinates (column, row, metres), see :meth:`HeightField.contact`."""
+    maxima, offsets, widths = pyramid
     n = directions.shape[0]
     out = np.full(n, np.nan)
     top = offsets.shape[0] - 1
@@ -110,54 +101,35 @@ def _cast(height, maxima, offsets, shapes, origins, directions):  # type: ignore
             dr = 0.0
         inv_c = 1.0 / dc if dc != 0.0 else np.inf
         inv_r = 1.0 / dr if dr != 0.0 else np.inf
-        if (dc == 0.0 and not 0.0 <= oc <= edge_c) or (dr == 0.0 and not 0.0 <= orow <= edge_r):
-            continue
         # clip the ray to the outline and to what lies below the highest point
-        t, end = 0.0, np.inf
-        if dc != 0.0:
-            a, b = -oc * inv_c, (edge_c - oc) * inv_c
-            t, end = max(t, min(a, b)), min(end, max(a, b))
-        if dr != 0.0:
-            a, b = -orow * inv_r, (edge_r - orow) * inv_r
-            t, end = max(t, min(a, b)), min(end, max(a, b))
+        enter_c, leave_c = _within(oc, dc, inv_c, edge_c)
+        enter_r, leave_r = _within(orow, dr, inv_r, edge_r)
+        t, end = max(0.0, enter_c, enter_r), min(leave_c, leave_r)
         if oz + t * dz > highest:
             if dz >= 0.0:
                 continue
             t = max(t, (highest - oz) / dz)
         speed = max(abs(dc), abs(dr))
         eps = NUDGE / speed if speed > 0.0 else 0.0
-        level = top
-        first = True
-        while t - (0.0 if first else eps) <= end:
+        level, nudge = top, 0.0
+        # A vertical ray stays in its cell, and leaves it at infinity.
+        while t - nudge <= end and t < np.inf:
             c = min(max(oc + t * dc, 0.0), edge_c)
             r = min(max(orow + t * dr, 0.0), edge_r)
-            size = 1 << level
             ic = min(int(c), height.shape[1] - 2) >> level
             ir = min(int(r), height.shape[0] - 2) >> level
-            t_exit = end
-            if dc > 0.0:
-                t_exit = min(t_exit, ((ic + 1) * size - oc) * inv_c)
-            elif dc < 0.0:
-                t_exit = min(t_exit, (ic * size - oc) * inv_c)
-            if dr > 0.0:
-                t_exit = min(t_exit, ((ir + 1) * size - orow) * inv_r)
-            elif dr < 0.0:
-                t_exit = min(t_exit, (ir * size - orow) * inv_r)
+            t_exit = min(end, _leaves(oc, dc, inv_c, ic, level), _leaves(orow, dr, inv_r, ir, level))
             t_exit = max(t_exit, t)
             lowest = oz + (t_exit if dz < 0.0 else t) * dz
-            if lowest > maxima[offsets[level] + ir * shapes[level, 1] + ic]:
-                t = t_exit + eps
-                level = min(level + 1, top)
-                first = False
-                if eps == 0.0:
-                    break
+            if lowest > maxima[offsets[level] + ir * widths[level] + ic]:
+                t, nudge, level = t_exit + eps, eps, min(level + 1, top)
                 continue
             if level > 0:
                 level -= 1
                 continue
             # the bilinear patch: gap(s) = f0 + f1 s + f2 s^2 along the ray
             # (before the nudge that led here, lest a steep ray passes the surface within it)
-            at = t if first else t - eps
+            at = t - nudge
             u, v = oc + at * dc - ic, orow + at * dr - ir
             h00, h01 = np.float64(height[ir, ic]), np.float64(height[ir, ic + 1])
             h10, h11 = np.float64(height[ir + 1, ic]), np.float64(height[ir + 1, ic + 1])
@@ -165,21 +137,33 @@ def _cast(height, maxima, offsets, shapes, origins, directions):  # type: ignore
             f0 = oz + at * dz - (h00 + bc * u + br * v + bcr * u * v)
             # Below the surface already: the ray came in through the bed's side and meets nothing, or it is rounding.
             if f0 <= 0.0:
-                out[i] = at if not first or f0 > -1e-9 else -np.inf
+                out[i] = at if nudge > 0.0 or f0 > -1e-9 else -np.inf
                 break
             f1 = dz - bc * dc - br * dr - bcr * (u * dr + v * dc)
-            f2 = -bcr * dc * dr
-            s = _first_root(f0, f1, f2)
+            s = _first_root(f0, f1, -bcr * dc * dr)
             if s <= t_exit + eps - at:
                 out[i] = at + s
                 break
-            t = t_exit + eps
             # The next patch is mostly a neighbour: the pyramid is climbed again from below, not entered at the top.
-            level = min(1, top)
-            first = False
-            if eps == 0.0:
-                break
+            t, nudge, level = t_exit + eps, eps, min(1, top)
     return out
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _within(o, d, inv, edge):  # type: ignore[no-untyped-def]
+    """Ray parameters between which a ray is over the grid along one axis; ``inv`` = 1 / ``d``."""
+    if d == 0.0:
+        return (-np.inf, np.inf) if 0.0 <= o <= edge else (np.inf, -np.inf)
+    a, b = -o * inv, (edge - o) * inv
+    return min(a, b), max(a, b)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _leaves(o, d, inv, block, level):  # type: ignore[no-untyped-def]
+    """Ray parameter at which a ray leaves a block of the pyramid along one axis."""
+    if d == 0.0:
+        return np.inf
+    return (((block + 1 if d > 0.0 else block) << level) - o) * inv
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -192,8 +176,4 @@ def _first_root(f0, f1, f2):  # type: ignore[no-untyped-def]
     q = -0.5 * (f1 + (np.sqrt(disc) if f1 >= 0.0 else -np.sqrt(disc)))
     a = q / f2 if f2 != 0.0 else np.inf
     b = f0 / q if q != 0.0 else np.inf
-    if a <= 0.0:
-        a = np.inf
-    if b <= 0.0:
-        b = np.inf
-    return min(a, b)
+    return min(a if a > 0.0 else np.inf, b if b > 0.0 else np.inf)

@@ -19,19 +19,26 @@ from numpy.typing import NDArray
 from rille.datasets.mockup.params import RenderParams
 from rille.datasets.mockup.raycast import HeightField
 from rille.datasets.mockup.scene import MIPS, height_field
-from rille.datasets.mockup.terrain import EMISSION
+from rille.datasets.protocol import CAMERAS
 from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Stage
 from rille.stages.geometry.geometry import Camera, RigidTransform
 
 LUNAR = 0.6
 """McEwen's L near 70 degrees of phase angle, the usual one here."""
+EMISSION = 0.31
+"""Cosine of the emission angle for which the exposure is set: ground seen 18 degrees below the horizon."""
 AMBIENT = 0.05
 """Stray light of the room, relative to the lamp on a surface that faces it."""
 BACKGROUND = 9.0
 """Grey level of the dark room behind the bed."""
 LEVEL_GREY = 112.0
 """Grey level of sunlit level ground; shadows and vignetting bring the mean of a picture to about 100."""
-CAMERA_INDEX = {"left": 0, "right": 1}
+BLUR = 0.6
+"""Standard deviation of the optics' point spread, pixels."""
+RIGHT_GAIN = 0.97
+"""Sensitivity of the right camera over that of the left; no two are equal."""
+VIGNETTING = 0.1
+"""Relative loss of light in the image corners."""
 
 
 def camera_rays(camera: Camera, T_bed_camera: RigidTransform, sampling: int = 1) -> NDArray[np.float64]:
@@ -136,12 +143,6 @@ def _texel(albedo, level, r, c):  # type: ignore[no-untyped-def]
     return _bilinear(albedo[level], (r + 0.5) / size - 0.5, (c + 0.5) / size - 0.5)
 
 
-def sun_direction(elevation_deg: float, azimuth_deg: float) -> NDArray[np.float64]:
-    """Unit vector (3,) towards the sun in the bed frame; azimuth clockwise from +y."""
-    e, a = math.radians(elevation_deg), math.radians(azimuth_deg)
-    return np.array([math.cos(e) * math.sin(a), math.cos(e) * math.cos(a), math.sin(e)])
-
-
 def radiance(
     scene: Bundle, field: HeightField, camera: Camera, T_bed_camera: RigidTransform, sampling: int = 2
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -156,13 +157,14 @@ def radiance(
     # Copies, lest some levels are read-only and others not: one type for all.
     albedo = tuple(np.array(scene[f"albedo_{k}"][:], order="C") for k in range(MIPS))
     light = scene.meta["scene"]
+    e, a = math.radians(light["sun_elevation_deg"]), math.radians(light["sun_azimuth_deg"])
     bed = _Bed(
         field.height,
         np.ascontiguousarray(scene["sunlit"][:]),
         np.ascontiguousarray(scene["tint"][:]),
         (field.x0, field.y0, field.cell),
         math.tan(math.radians(light["slope_deg"])),
-        sun_direction(light["sun_elevation_deg"], light["sun_azimuth_deg"]),
+        np.array([math.cos(e) * math.sin(a), math.cos(e) * math.cos(a), math.sin(e)]),
     )
     values = _shade(bed, albedo, np.ascontiguousarray(origin), rays, distance, 1.0 / (sampling * camera.fx))
     blocks = values.reshape(camera.height, sampling, camera.width, sampling)
@@ -172,57 +174,25 @@ def radiance(
     return blocks, np.asarray(mask)
 
 
-def expose(blocks: NDArray[np.float32], p: RenderParams, flat: float, frame: int, camera: str) -> NDArray[np.uint8]:
-    """Grey image uint8 (row, col) from radiance samples (row, n, col, n); ``flat`` is the radiance of level ground."""
-    # A stream for each image: its noise depends neither on which others are rendered nor on their order.
-    rng = np.random.default_rng([p.seed, 50, frame, CAMERA_INDEX[camera]])
-    gain = LEVEL_GREY / flat * p.exposure * (1.0 + p.exposure_jitter * float(rng.standard_normal()))
-    gain *= p.right_gain if camera == "right" else 1.0
-    samples = np.where(np.isnan(blocks), np.float32(BACKGROUND), blocks * np.float32(gain))
-    grey = samples.astype(np.float64).mean(axis=(1, 3))
-    if p.blur > 0:
-        grey = scipy.ndimage.gaussian_filter(grey, p.blur, mode="nearest")
-    y, x = np.ogrid[-1.0 : 1.0 : grey.shape[0] * 1j, -1.0 : 1.0 : grey.shape[1] * 1j]
-    grey = grey * (1.0 - p.vignetting * (x * x + y * y) / 2.0)
-    # Noise arises in the sensor, behind the optics: it is neither blurred nor vignetted, and white.
-    noisy = grey + p.noise * rng.standard_normal(grey.shape)
-    return np.asarray(np.clip(np.rint(noisy), 0, 255), dtype=np.uint8)
-
-
-def flat_radiance(sun_elevation_deg: float) -> float:
-    """Radiance of level ground of mean albedo, seen as the camera's axis sees it."""
-    mu0 = math.sin(math.radians(sun_elevation_deg))
-    return 2.0 * LUNAR * mu0 / (mu0 + EMISSION) + (1.0 - LUNAR) * mu0 + AMBIENT
-
-
-def render(
-    scene: Bundle, camera: Camera, T_bed_camera: RigidTransform, params: RenderParams, frame: int, name: str
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Image uint8 (row, col) of a scene and its mask (1 = bed, 0 = background beyond it).
-
-    Parameters
-    ----------
-    scene : bundle of ``mockup.scene``.
-    camera, T_bed_camera : the true camera and its pose.
-    params : the sensor.
-    frame, name : number of the pair and ``"left"`` or ``"right"``; with the seed they fix the noise.
-    """
-    field = height_field(scene)
-    blocks, mask = radiance(scene, field, camera, T_bed_camera, params.sampling)
-    flat = flat_radiance(scene.meta["scene"]["sun_elevation_deg"])
-    return expose(blocks, params, flat, frame, name), mask.astype(np.uint8)
-
-
 def _run(params: RenderParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    image, valid = render(
-        inputs["scene"],
-        Camera.from_dict(args["geometry"]),
-        RigidTransform.from_matrix(args["T_bed_camera"]),
-        params,
-        args["frame"],
-        args["camera"],
-    )
-    return Bundle({"image": image, "valid": valid}, {"frame": args["frame"], "camera": args["camera"]})
+    scene, frame, side = inputs["scene"], args["frame"], args["camera"]
+    camera, T_bed_camera = Camera.from_dict(args["geometry"]), RigidTransform.from_matrix(args["T_bed_camera"])
+    blocks, mask = radiance(scene, height_field(scene), camera, T_bed_camera, params.sampling)
+    # A stream for each image: its noise depends neither on which others are rendered nor on their order.
+    rng = np.random.default_rng([params.seed, 50, frame, CAMERAS.index(side)])
+    mu0 = math.sin(math.radians(scene.meta["scene"]["sun_elevation_deg"]))
+    # Radiance of level ground of mean albedo, seen as the camera's axis sees it.
+    flat = 2.0 * LUNAR * mu0 / (mu0 + EMISSION) + (1.0 - LUNAR) * mu0 + AMBIENT
+    gain = LEVEL_GREY / flat * params.exposure * (1.0 + params.exposure_jitter * float(rng.standard_normal()))
+    gain *= RIGHT_GAIN if side == "right" else 1.0
+    samples = np.where(np.isnan(blocks), np.float32(BACKGROUND), blocks * np.float32(gain))
+    grey = scipy.ndimage.gaussian_filter(samples.astype(np.float64).mean(axis=(1, 3)), BLUR, mode="nearest")
+    y, x = np.ogrid[-1.0 : 1.0 : camera.height * 1j, -1.0 : 1.0 : camera.width * 1j]
+    grey = grey * (1.0 - VIGNETTING * (x * x + y * y) / 2.0)
+    # Noise arises in the sensor, behind the optics: it is neither blurred nor vignetted, and white.
+    noisy = grey + params.noise * rng.standard_normal(grey.shape)
+    image = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    return Bundle({"image": image, "valid": mask.astype(np.uint8)}, {"frame": frame, "camera": side})
 
 
 STAGE = Stage(

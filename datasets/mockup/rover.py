@@ -8,9 +8,9 @@ results of this stage; stage ``mockup.sense`` simulates the readings of its sens
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,47 +34,19 @@ class RoverParams(Params):
     """The simulated rover: where it starts and how well it drives. All of it is unknown to the estimates."""
 
     seed: int = Field(1, ge=0, description="seed of slip, heading errors and sensors; the bed has its own")
-    start: tuple[float, float] = Field(
-        (0.0, 0.3), description="x, y [m] of the centre of the wheels on the bed at the start"
-    )
-    heading_deg: float = Field(
-        0.0, ge=-180, le=180, description="heading at the start [degrees to the left of straight along the bed]"
-    )
     slip: float = Field(
-        0.05, ge=-0.5, lt=1, description="share of the wheels' rotation that yields no motion; sand: 0.05 to 0.2"
+        0.05, ge=-0.5, lt=1, description="share of the wheels' turning that yields no motion; sand: 0.05 to 0.2"
     )
     slip_sigma: float = Field(0.03, ge=0, lt=0.5, description="standard deviation of the slip from leg to leg")
     heading_sigma_deg: float = Field(
-        1.0, ge=0, le=20, description="standard deviation of the heading's drift over one leg [degrees]"
+        1.0, ge=0, le=20, description="standard deviation of the heading's drift on a leg [degrees]"
     )
-    turn_sigma: float = Field(
-        0.03, ge=0, le=0.5, description="relative standard deviation of the angle of a turn on the spot"
-    )
+    turn_sigma: float = Field(0.03, ge=0, le=0.5, description="relative standard deviation of turns on the spot")
     frame_step: float = Field(0.025, gt=0.001, description="longest distance between two images [m]")
-    frame_turn_deg: float = Field(
-        5.0, gt=0.5, le=15, description="largest turn on the spot between two images [degrees]"
-    )
-    speed: float = Field(0.05, gt=0, description="driving speed [m/s]; with it, bumps become accelerations")
-    odometry_sigma: float = Field(
-        0.01,
-        ge=0,
-        description="relative standard deviation of the distances and turns that the wheels report, as of their radius",
-    )
-    attitude_sigma_deg: float = Field(
-        0.2, ge=0, description="standard deviation of the inclinometer's error about each axis [degrees]"
-    )
-    acceleration_sigma: float = Field(0.05, ge=0, description="standard deviation [m/s2] of the accelerometer's noise")
-    camera_forward: float = Field(0.05, description="distance of the cameras ahead of the centre of the wheels [m]")
     pad: float = Field(
-        0.28,
-        ge=0,
-        description="radius [m] of the start area, which is plane, as steep as the bed, free of rocks, and known "
-        "to the rover",
+        0.28, ge=0, description="radius [m] of the start area: plane, as steep as the bed, known to the rover"
     )
-    map_cell: float | None = Field(
-        None, gt=0.004, description="cell [m] of a coarse map of the whole bed that the rover is given; not set: no map"
-    )
-    map_sigma: float = Field(0.002, ge=0, description="standard deviation of that map's elevations [m]")
+    map_cell: float | None = Field(None, gt=0.004, description="cell [m] of a coarse map of the bed; not set: no map")
     blank: tuple[float, float, float] | None = Field(
         None, description="x, y, radius [m] of a patch of the bed without any texture; not set: no such patch"
     )
@@ -82,38 +54,17 @@ class RoverParams(Params):
     obstacle_leg: int | None = Field(
         None, ge=0, description="leg on which an obstacle appears after its ground was mapped; not set: no obstacle"
     )
-    obstacle_ahead: float = Field(
-        0.2, gt=0, description="distance of the obstacle along the leg from the centre of the wheels [m]"
-    )
+    obstacle_ahead: float = Field(0.2, gt=0, description="distance [m] of the obstacle along the leg")
     obstacle_aside: float = Field(0.0, description="distance of the obstacle to the right of the leg [m]")
-    obstacle_height: float = Field(0.015, gt=0, description="height of the obstacle [m]; 0.015: a wheel's radius")
 
 
-@dataclass
-class _Drive:
-    """The true motion in the making: where it is, how it stood on the way, and what its wheels did."""
+Pose = tuple[float, float, float]
+"""x, y (m) of the centre of the wheels, and heading (rad) to the left of y."""
 
-    ground: HeightGrid
-    vehicle: Vehicle
-    x: float
-    y: float
-    heading: float
-    trail: list[Stand]
-    wheels: list[tuple[float, float, float]]
-
-    def advance(self, distance: float, turn: float, rolled: float, turned: float) -> bool:
-        """Move on; whether the vehicle still stands on the bed."""
-        self.heading += turn
-        self.x -= distance * math.sin(self.heading)
-        self.y += distance * math.cos(self.heading)
-        found = stand(self.ground, self.x, self.y, self.heading, self.vehicle)
-        if found is None:
-            return False
-        self.trail.append(found)
-        x, y, h = self.wheels[-1]
-        h += turned
-        self.wheels.append((x - rolled * math.sin(h), y + rolled * math.cos(h), h))
-        return True
+START: Pose = (0.0, 0.3, 0.0)
+"""On the bed; the rover looks straight along it."""
+FRAME_TURN = math.radians(5.0)
+"""Largest turn on the spot between two images."""
 
 
 class SentLeg(NamedTuple):
@@ -125,56 +76,79 @@ class SentLeg(NamedTuple):
     turn: float
 
 
-def drive_leg(
-    ground: HeightGrid,
-    vehicle: Vehicle,
-    before: tuple[float, float, float],
-    believed: tuple[float, float, float],
-    sent: SentLeg,
-    p: RoverParams,
-    rng: np.random.Generator,
-) -> _Drive:
-    """True motion along a path.
+class _Step(NamedTuple):
+    """True motion ahead, m, and turn, rad; and those of the wheels, ``rolled`` and ``turned``."""
 
-    Parameters
-    ----------
-    before : true x, y (m) and heading (rad) on the bed.
-    believed : estimated x, y (m) and heading (rad) in the frame of the path.
-    """
-    path, gear, turn = sent
+    distance: float
+    turn: float
+    rolled: float
+    turned: float
+
+
+class DrivenLeg(NamedTuple):
+    """``trail``, how the vehicle stood on the way; ``wheels``, its x, y (m) and heading (rad) as they turned."""
+
+    trail: list[Stand]
+    wheels: list[Pose]
+
+
+def _steps(believed: Pose, sent: SentLeg, p: RoverParams, rng: np.random.Generator) -> Iterator[_Step]:
+    """Steps of a leg, with the rover's errors."""
     slip = p.slip + p.slip_sigma * float(rng.standard_normal())
-    length = way_length(path)
-    drift = math.radians(p.heading_sigma_deg) * float(rng.standard_normal()) / max(length, STEP)
+    drift = math.radians(p.heading_sigma_deg) * float(rng.standard_normal()) / max(way_length(sent.path), STEP)
     spin = 1.0 + p.turn_sigma * float(rng.standard_normal())
-    first = stand(ground, *before, vehicle)
-    if first is None:
-        raise InputError(
-            "RIL-250",
-            "the rover stands beside the bed",
-            remedy="set rover.start within the bed, a larger bed or a smaller vehicle",
-        )
-    d = _Drive(ground, vehicle, *before, [first], [(0.0, 0.0, 0.0)])
     x, y, heading = believed
 
-    def rotate(by: float) -> bool:
+    def rotate(by: float) -> Iterator[_Step]:
         n = math.ceil(abs(by) / STEP_TURN)
-        return all(d.advance(0.0, spin * by / n, 0.0, by / n) for _ in range(n))
+        return itertools.repeat(_Step(0.0, spin * by / n, 0.0, by / n), n) if n else iter(())
 
-    for vertex, sign in zip(path[1:], gear, strict=True):
+    for vertex, sign in zip(sent.path[1:], sent.gear, strict=True):
         dx, dy = sign * (vertex[0] - x), sign * (vertex[1] - y)
         way, towards = math.hypot(dx, dy), math.atan2(-dx, dy)
         n = max(1, math.ceil(way / STEP))
         rolled = sign * way / n
         # remainder() gives the shorter way round, -pi to pi.
-        there = rotate(math.remainder(towards - heading, 2 * math.pi)) and all(
-            d.advance((1.0 - slip) * rolled, drift * way / n, rolled, 0.0) for _ in range(n)
-        )
-        if not there:
-            break
+        yield from rotate(math.remainder(towards - heading, 2 * math.pi))
+        yield from itertools.repeat(_Step((1.0 - slip) * rolled, drift * way / n, rolled, 0.0), n)
         x, y, heading = float(vertex[0]), float(vertex[1]), towards
-    else:
-        rotate(turn)
-    return d
+    yield from rotate(sent.turn)
+
+
+def drive_leg(
+    ground: HeightGrid,
+    vehicle: Vehicle,
+    before: Pose,
+    believed: Pose,
+    sent: SentLeg,
+    p: RoverParams,
+    rng: np.random.Generator,
+) -> DrivenLeg:
+    """True motion along a path, as far as the bed reaches.
+
+    Parameters
+    ----------
+    before : true pose on the bed.
+    believed : estimated pose in the frame of the path.
+    """
+    first = stand(ground, *before, vehicle)
+    if first is None:
+        remedy = "set a larger bed (mockup.bed_width, mockup.bed_length) or a smaller vehicle"
+        raise InputError("RIL-250", "the rover stands beside the bed", remedy=remedy)
+    x, y, heading = before
+    leg = DrivenLeg([first], [(0.0, 0.0, 0.0)])
+    for step in _steps(believed, sent, p, rng):
+        heading += step.turn
+        x -= step.distance * math.sin(heading)
+        y += step.distance * math.cos(heading)
+        placed = stand(ground, x, y, heading, vehicle)
+        if placed is None:
+            break
+        leg.trail.append(placed)
+        u, v, h = leg.wheels[-1]
+        h += step.turned
+        leg.wheels.append((u - step.rolled * math.sin(h), v + step.rolled * math.cos(h), h))
+    return leg
 
 
 def images_at(wheels: Floats, p: RoverParams) -> list[int]:
@@ -185,7 +159,7 @@ def images_at(wheels: Floats, p: RoverParams) -> list[int]:
         dx, dy, dh = wheels[k] - wheels[k - 1]
         way, turn = way + math.hypot(dx, dy), turn + abs(dh)
         # Steps add up with rounding: without the tolerance an image would come one step late.
-        if way > p.frame_step - 1e-9 or turn > math.radians(p.frame_turn_deg) - 1e-9 or k == len(wheels) - 1:
+        if way > p.frame_step - 1e-9 or turn > FRAME_TURN - 1e-9 or k == len(wheels) - 1:
             at.append(k)
             way, turn = 0.0, 0.0
     return at
@@ -206,40 +180,39 @@ def bed_ground(scene: Bundle, vehicle: Vehicle, at: tuple[float, float], reach: 
     )
 
 
-def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    scene, vehicle = inputs["scene"], Vehicle.model_validate(args["vehicle"])
+def true_and_believed(args: Mapping[str, Any], inputs: Inputs) -> tuple[Pose, Pose]:
+    """True pose of the vehicle on the bed before a leg, and its estimate in the frame of the reconstruction."""
     T_left_vehicle = RigidTransform.from_matrix(args["T_vehicle_left"]).inverse()
+    true = RigidTransform.from_matrix(np.asarray(inputs["before"]["vehicle"])[int(args["row"])])
+    estimate = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1]) @ T_left_vehicle
+    return from_above(true), from_above(estimate)
+
+
+def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    vehicle = Vehicle.model_validate(args["vehicle"])
+    T_left_vehicle = RigidTransform.from_matrix(args["T_vehicle_left"]).inverse()
+    before, believed, sent = START, (0.0, 0.0, 0.0), SentLeg(np.zeros((1, 2)), [], 0.0)
+    if "before" in inputs:
+        before, believed = true_and_believed(args, inputs)
+        leg = inputs["leg"]
+        sent = SentLeg(np.asarray(leg["path"])[:, :2], np.asarray(leg["gear"]).tolist(), float(leg.meta["turn"]))
+    ground = bed_ground(inputs["scene"], vehicle, before[:2], way_length(sent.path) + REACH)
     # The placement at the start is leg -1, and a seed must not be negative.
     rng = np.random.default_rng([params.seed, 70, 1 + int(args["leg"])])
-    if "before" in inputs:
-        before = from_above(RigidTransform.from_matrix(np.asarray(inputs["before"]["vehicle"])[int(args["row"])]))
-        start = from_above(RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1]) @ T_left_vehicle)
-        path, gear = np.asarray(inputs["leg"]["path"])[:, :2], np.asarray(inputs["leg"]["gear"]).tolist()
-        turn = float(inputs["leg"].meta["turn"])
-    else:
-        before = *params.start, math.radians(params.heading_deg)
-        path, gear, start, turn = np.zeros((1, 2)), [], (0.0, 0.0, 0.0), 0.0
-    ground = bed_ground(scene, vehicle, before[:2], way_length(path) + REACH)
-    d = drive_leg(ground, vehicle, before, start, SentLeg(path, gear, turn), params, rng)
-    wheels = np.array(d.wheels)
+    trail, turned = drive_leg(ground, vehicle, before, believed, sent, params, rng)
+    wheels = np.array(turned)
     frames = images_at(wheels, params)
-    vehicles = np.stack([s.T_ground_vehicle.matrix34 for s in d.trail])
-    lefts = np.stack([(d.trail[i].T_ground_vehicle @ T_left_vehicle.inverse()).matrix34 for i in frames])
+    vehicles = np.stack([s.T_ground_vehicle.matrix34 for s in trail])
+    lefts = np.stack([(trail[i].T_ground_vehicle @ T_left_vehicle.inverse()).matrix34 for i in frames])
     arrays: dict[str, AnyArray] = {
         "poses": lefts,
         "vehicle": vehicles[frames],
         "trail": vehicles,
         "frame_at": np.array(frames, dtype=np.int32),
         "wheels": wheels,
-        "tilt": np.array([s.tilt for s in d.trail]),
-        "clearance": np.array([s.clearance for s in d.trail]),
-        "step": np.array([s.step for s in d.trail]),
     }
+    arrays |= {name: np.array([getattr(s, name) for s in trail]) for name in ("tilt", "clearance", "step")}
     return Bundle(arrays, {"leg": args["leg"], "frames": len(frames), "poses": [m.reshape(-1).tolist() for m in lefts]})
-
-
-def _trail(name: str, unit: str, long_name: str) -> Array:
-    return Array(name, ("position",), "float64", unit, long_name)
 
 
 STAGE = Stage(
@@ -254,9 +227,9 @@ STAGE = Stage(
         Array("trail", ("position", "row", "col"), "float64", "m", "true pose of the vehicle, finely", frame="bed"),
         Array("frame_at", ("frame",), "int32", "1", "position of the trail at which the image is taken"),
         Array("wheels", ("position", "xyh"), "float64", "1", "x, y (m), heading (rad) as the wheels turned"),
-        _trail("tilt", "rad", "angle of the vehicle to the horizontal"),
-        _trail("clearance", "m", "least distance of the belly to the ground"),
-        _trail("step", "m", "edge under the worst wheel"),
+        Array("tilt", ("position",), "float64", "rad", "angle of the vehicle to the horizontal"),
+        Array("clearance", ("position",), "float64", "m", "least distance of the belly to the ground"),
+        Array("step", ("position",), "float64", "m", "edge under the worst wheel"),
     ),
     run=_run,
 )

@@ -1,4 +1,7 @@
-"""Stage ``mockup.scene``: the whole bed as one artifact, which every image and every truth reads."""
+"""Stage ``mockup.scene``: the whole bed as one artifact, which every image and every truth reads.
+
+For a drive it has a smooth pad to start from, and may have a patch without texture.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rille.datasets.mockup import terrain
 from rille.datasets.mockup.params import SceneParams
@@ -16,8 +20,23 @@ MIPS = 7
 """Levels of the albedo: 0.5 mm texels up to 32 mm, more than any footprint on the bed."""
 
 
-def build_scene(p: SceneParams) -> Bundle:
+Disk = tuple[float, float, float]
+"""x, y and radius of a disk on the bed, metres."""
+
+EDGE = 0.06
+"""m; over which the pad passes into the ground around it."""
+
+
+def build_scene(p: SceneParams, pad: Disk | None = None, blank: Disk | None = None) -> Bundle:
     """Heights, light and albedo of a bed.
+
+    Parameters
+    ----------
+    pad : a smooth start area for a rover.
+    blank : a smooth patch without texture.
+
+    Both are planes as steep as the bed is (``slope_deg``), at the median height of the ground that they replace: on a
+    slope a level pad would be a pit with a wall before it.
 
     Returns
     -------
@@ -27,25 +46,52 @@ def build_scene(p: SceneParams) -> Bundle:
         ``albedo_0`` uint8 on a grid twice as fine with the same first node, ``albedo_1`` ... its 2 x 2 means.
     """
     rows, cols = round(p.bed_length / p.cell) + 1, round(p.bed_width / p.cell) + 1
+    lattice = {"x0": -0.5 * (cols - 1) * p.cell, "y0": (rows - 1) * p.cell, "cell": p.cell, "rows": rows, "cols": cols}
     height = terrain.relief(p, (rows, cols))
     terrain.add_craters(height, p)
     # Before the rocks: the cameras' height counts from the mean of the bare ground.
     height -= np.float32(height.mean(dtype=np.float64))
-    if p.slope_deg:
-        rise = np.tan(np.deg2rad(p.slope_deg)) * p.cell * np.arange(rows - 1, -1, -1)
-        height += rise[:, None].astype(np.float32)
-    tint = terrain.add_rocks(height, p)
-    arrays: dict[str, Any] = {
-        "height": height,
-        "sunlit": terrain.sunlit(height, p),
-        "tint": np.clip(100.0 * tint, 0, 255).astype(np.uint8),
-    }
+    slope = (np.tan(np.deg2rad(p.slope_deg)) * p.cell * np.arange(rows - 1, -1, -1)).astype(np.float32)[:, None]
+    height += slope
+    tint = np.clip(100.0 * terrain.add_rocks(height, p), 0, 255).astype(np.uint8)
     texture = terrain.albedo(p, height.shape)
-    for level in range(MIPS):
-        arrays[f"albedo_{level}"] = texture
+    bare = None
+    for disk in (pad, blank):
+        if disk is None:
+            continue
+        x, y, radius = disk
+        far = distance(lattice, height.shape, p.cell, x, y)
+        if not (far <= radius).any():  # beside the bed, or less than a cell: no ground has a height to take
+            continue
+        weight = np.clip((radius + EDGE - far) / EDGE, 0.0, 1.0)
+        # Smoothstep: the slope has no kink at either end of the edge.
+        weight = weight * weight * (3.0 - 2.0 * weight)
+        level = np.median((height - slope)[far <= radius])
+        height = (height + weight * (slope + level - height)).astype(np.float32)
+        tint = np.where(weight > 0.5, np.uint8(100), tint)
+        if disk is blank:
+            bare = x, y + level, radius  # the grain is draped: what lies at a height has that of as much farther ahead
+    arrays: dict[str, Any] = {"height": height, "sunlit": terrain.sunlit(height, p), "tint": tint}
+    for k in range(MIPS):
+        arrays[f"albedo_{k}"] = texture
+        if bare is not None:
+            x, y, radius = bare
+            # A texel of a coarser level lies in the middle of those that it is the mean of, half of them behind the
+            # first one.
+            middle = 0.25 * p.cell * (2**k - 1)
+            far = distance(lattice, texture.shape, 0.5 * p.cell * 2**k, x - middle, y + middle)
+            arrays[f"albedo_{k}"] = np.where(far <= radius, np.uint8(128), texture)
         texture = terrain.halve(texture)
-    lattice = {"x0": -0.5 * (cols - 1) * p.cell, "y0": (rows - 1) * p.cell, "cell": p.cell, "rows": rows, "cols": cols}
     return Bundle(arrays=arrays, meta={"lattice": lattice, "scene": p.model_dump()})
+
+
+def distance(
+    lattice: Mapping[str, Any], shape: tuple[int, ...], spacing: float, x: float, y: float
+) -> NDArray[np.float64]:
+    """Distance (row, col), metres, of the nodes of a grid of the bed from a point of it."""
+    dx = lattice["x0"] + spacing * np.arange(shape[1]) - x
+    dy = lattice["y0"] - spacing * np.arange(shape[0]) - y
+    return np.asarray(np.hypot(dx[None, :], dy[:, None]))
 
 
 def height_field(scene: Bundle) -> HeightField:
@@ -55,7 +101,7 @@ def height_field(scene: Bundle) -> HeightField:
 
 
 def _run(params: SceneParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    return build_scene(params)
+    return build_scene(params, args.get("pad"), args.get("blank"))
 
 
 STAGE = Stage(

@@ -1,4 +1,6 @@
-"""The simulated experiment as a sequence: where the cameras stand, what is given and what is known.
+"""The simulated experiment as a sequence, recorded or driven: where the cameras stand, what is given and known.
+
+A driven rover moves by what the chain makes of its images.
 
 Frames: the bed frame (truth) has z up, y ahead, x right and its origin in the middle of the bed's near edge at mean
 height. The body frame moves with the rig: y ahead, x along the baseline to the right, z up, origin between the
@@ -9,23 +11,59 @@ own horizontal axis, so that with a level body both cameras have exactly that pi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from rille.datasets.mockup.params import MockupParams
-from rille.datasets.protocol import CAMERAS, Rows, Sequence, Source, rows_of
+from rille.datasets.mockup.params import MockupParams, RenderParams, SceneParams
+from rille.datasets.mockup.rover import START, RoverParams
+from rille.datasets.protocol import CAMERAS, Rows, Sequence, Simulation, Source, rows_of
 from rille.stages.core.declare import NoParams
-from rille.stages.core.errors import ConfigError
+from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.hazard.vehicle import Vehicle
 
-START = -0.1
+FIRST_Y = -0.1
 """m, y of the first position in the bed frame: the near edge of the bed lies below the first images."""
+
+TRUTH_SOURCE = "the simulator's own poses: exact"
+
+CAMERA_FORWARD = 0.05
+"""m; distance of a driven rover's cameras ahead of the centre of its wheels."""
 
 WINDOW = (-0.3, 0.4, 0.3, 0.7)
 """m, evaluation window of a basic pair: 600 x 300 mm about where the optical axes cross (0.55 m ahead)."""
+
+
+LOOP: Mapping[str, Any] = {
+    "frames": 1,
+    "image_width": 320,
+    "image_height": 240,
+    "focal_length": 180.0,
+    "toe_in_deg": 3.0,
+    "pitch_deg": 32.0,
+    "sampling": 1,
+    "bed_width": 1.6,
+    "bed_length": 2.0,
+    "cell": 0.002,
+    "rocks": 12.0,
+    "craters": 4.0,
+}
+"""``mockup-loop``: small images of wide-angle cameras, which see the ground from 0.08 m before them to the horizon;
+one ray a pixel, since a drive takes a hundred of them."""
+
+LOOP_DEFAULTS: Mapping[str, Any] = {
+    "terrain.preset": "accurate",
+    "track.points": 400,
+    "locus.cell_size": 0.004,
+    "crosscheck.enabled": False,
+    "drive.goal": (0.0, 1.0),
+}
+"""Accurate terrain, since what a map smooths away is met by a wheel: of the cells with an edge above ``max_step`` (six
+beds, three stops each) half as many have a probability below 0.3, none below 0.06 (0.5 %), and a tenth fewer cells are
+false hazards. It takes a quarter more time a stop. Poses need no more points than by default."""
 
 
 def mount(p: MockupParams, camera: str) -> RigidTransform:
@@ -40,60 +78,46 @@ def mount(p: MockupParams, camera: str) -> RigidTransform:
 
 
 def body_poses(p: MockupParams) -> list[RigidTransform]:
-    """T_bed_body of every frame: steps along the body's own heading on the mean plane, then roll and jitter."""
-    rng = np.random.default_rng([p.seed, 60])
-    headings = -np.deg2rad(p.turn_deg) * np.arange(p.frames)
-    offsets = np.zeros((p.frames, 2))
-    for k in range(1, p.frames):
-        c, s = math.cos(headings[k - 1]), math.sin(headings[k - 1])
-        offsets[k] = offsets[k - 1] + [p.sideways * c - p.forward * s, p.sideways * s + p.forward * c]
+    """T_bed_body of every frame: equal steps on the mean plane, with roll and jitter."""
+    steps = np.full((p.frames, 2), [p.sideways, p.forward])
+    steps[0] = 0.0
+    offsets = np.cumsum(steps, axis=0)
     # The drive is centred across the bed, whichever way it drifts.
     offsets[:, 0] -= 0.5 * (offsets[:, 0].min() + offsets[:, 0].max())
-    offsets[:, 1] += START - min(offsets[:, 1].min(), 0.0)
-    shakes = np.deg2rad(p.jitter_deg) * rng.standard_normal((p.frames, 3))
-    poses = []
+    offsets[:, 1] += FIRST_Y - min(offsets[:, 1].min(), 0.0)
+    shakes = np.deg2rad(p.jitter_deg) * np.random.default_rng([p.seed, 60]).standard_normal((p.frames, 3))
     swings = np.deg2rad(p.roll_swing_deg) * (np.arange(p.frames) % 2 - 0.5)
-    for heading, offset, shake, swing in zip(headings, offsets, shakes, swings, strict=True):
-        roll = math.radians(p.roll_deg) + shake[1] + swing
+    T_bed_plane = RigidTransform(rotation_exp([np.deg2rad(p.slope_deg), 0.0, 0.0]), np.zeros(3))
+    poses = []
+    for (x, y), (pitch, roll, heading), swing in zip(offsets, shakes, swings, strict=True):
         rotation = (
-            rotation_exp([0.0, 0.0, heading + shake[2]])
-            @ rotation_exp([shake[0], 0.0, 0.0])
-            @ rotation_exp([0.0, roll, 0.0])
+            rotation_exp([0.0, 0.0, heading])
+            @ rotation_exp([pitch, 0.0, 0.0])
+            @ rotation_exp([0.0, math.radians(p.roll_deg) + roll + swing, 0.0])
         )
-        poses.append(RigidTransform(rotation, np.array([offset[0], offset[1], p.camera_height])))
-    if p.slope_deg:
-        T_bed_plane = RigidTransform(rotation_exp([np.deg2rad(p.slope_deg), 0.0, 0.0]), np.zeros(3))
-        poses = [T_bed_plane @ pose for pose in poses]
+        poses.append(T_bed_plane @ RigidTransform(rotation, np.array([x, y, p.camera_height])))
     return poses
 
 
 def true_rig(p: MockupParams) -> Rig:
     """The rig that takes the images."""
-    camera = Camera(
-        p.focal_length,
-        p.focal_length,
-        0.5 * (p.image_width - 1),
-        0.5 * (p.image_height - 1),
-        p.image_width,
-        p.image_height,
-    )
+    f, width, height = p.focal_length, p.image_width, p.image_height
+    camera = Camera(f, f, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
     return Rig(camera, camera, mount(p, "right").inverse() @ mount(p, "left"))
 
 
 def given_rig(p: MockupParams) -> Rig:
-    """The rig as it is handed to the reconstruction: the true one with the stated errors."""
+    """The rig as it is handed to the reconstruction: the true one with the stated error."""
     rig = true_rig(p)
-    f = p.focal_length * (1.0 + p.focal_error)
-    camera = Camera(f, f, rig.left.cx, rig.left.cy, rig.left.width, rig.left.height)
     error = RigidTransform(rotation_exp(np.deg2rad(p.rig_error_deg)), np.zeros(3))
-    return Rig(camera, camera, error @ rig.T_right_left)
+    return Rig(rig.left, rig.right, error @ rig.T_right_left)
 
 
 def _check_on_bed(p: MockupParams, poses: list[RigidTransform]) -> None:
     """Refuse a drive that leaves the bed."""
     for k, pose in enumerate(poses):
         x, y, _ = pose.translation
-        # Not y < 0: a drive begins before the near edge (START).
+        # Not y < 0: a drive begins before the near edge (FIRST_Y).
         if abs(x) > 0.5 * p.bed_width or y > p.bed_length:
             raise ConfigError(
                 "RIL-253",
@@ -107,13 +131,9 @@ def _attitude(p: MockupParams, truth: list[RigidTransform]) -> tuple[Rows, ...] 
     """R_bed_left of each frame, as a sensor with the stated error gives it."""
     if p.attitude_noise_deg is None:
         return None
-    rng = np.random.default_rng([p.seed, 61])
-    out = []
-    for pose in truth:
-        error = rotation_exp(np.deg2rad(p.attitude_noise_deg) * rng.standard_normal(3))
-        # The sensor errs about the camera's axes: the error stands before R_left_bed, the transposed rotation.
-        out.append(rows_of((error @ pose.rotation.T).T))
-    return tuple(out)
+    errors = np.deg2rad(p.attitude_noise_deg) * np.random.default_rng([p.seed, 61]).standard_normal((p.frames, 3))
+    # The sensor errs about the camera's axes: the error stands before R_left_bed, the transposed rotation.
+    return tuple(rows_of((rotation_exp(e) @ T.rotation.T).T) for e, T in zip(errors, truth, strict=True))
 
 
 def _up(p: MockupParams, truth: list[RigidTransform]) -> tuple[tuple[float, float, float], ...] | None:
@@ -129,53 +149,63 @@ def _up(p: MockupParams, truth: list[RigidTransform]) -> tuple[tuple[float, floa
     return tuple(out)
 
 
+@dataclass(frozen=True)
+class Sources:
+    """Sources of images and truth of an experiment; ``inputs``: the scene, where it is the same for all of them."""
+
+    p: MockupParams
+    rig: Rig
+    inputs: Mapping[str, Source]
+
+    def image(self, frame: int, camera: str, T_bed_camera: RigidTransform, sensor: RenderParams) -> Source:
+        """Image of a true camera."""
+        geometry = self.rig.left if camera == "left" else self.rig.right
+        args = {
+            "frame": frame,
+            "camera": camera,
+            "geometry": geometry.to_dict(),
+            "T_bed_camera": T_bed_camera.to_list(),
+        }
+        return Source("rille.datasets.mockup.render", sensor, args, inputs=self.inputs)
+
+    def disparity(self, frame: int, T_bed_left: RigidTransform) -> Source:
+        """True disparity of a pair."""
+        args = {"frame": frame, "rig": self.rig.to_dict(), "T_bed_left": T_bed_left.to_list()}
+        return Source("rille.datasets.mockup.truth", NoParams(), args, inputs=self.inputs)
+
+    def dem(self, lattice: Mapping[str, Any], T_bed_world: RigidTransform, lefts: Iterable[RigidTransform]) -> Source:
+        """True elevations, and which of them the pairs at some places see."""
+        args = {"lattice": dict(lattice), "T_bed_world": T_bed_world.to_list(), "rig": self.rig.to_dict()}
+        args["pairs"] = [T.to_list() for T in lefts]
+        return Source("rille.datasets.mockup.truth_dem", NoParams(), args, inputs=self.inputs)
+
+
 def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
     """The simulated sequence."""
     bodies = body_poses(p)
     _check_on_bed(p, bodies)
-    rig = true_rig(p)
-    cameras = {"left": rig.left, "right": rig.right}
     poses = {c: [body @ mount(p, c) for body in bodies] for c in CAMERAS}
-    scene = Source("rille.datasets.mockup.scene", p.scene())
-
-    def image(frame: int, camera: str) -> Source:
-        args = {
-            "frame": frame,
-            "camera": camera,
-            "geometry": cameras[camera].to_dict(),
-            "T_bed_camera": poses[camera][frame].to_list(),
-        }
-        return Source("rille.datasets.mockup.render", p.render(), args, inputs={"scene": scene})
-
-    def disparity(frame: int) -> Source:
-        args = {"frame": frame, "rig": rig.to_dict(), "T_bed_left": poses["left"][frame].to_list()}
-        return Source("rille.datasets.mockup.truth", NoParams(), args, inputs={"scene": scene})
+    lefts = poses["left"]
+    sources = Sources(p, true_rig(p), {"scene": Source("rille.datasets.mockup.scene", p.part(SceneParams))})
 
     def dem(lattice: Mapping[str, Any], T_truth_world: RigidTransform, pairs: tuple[int, ...] = ()) -> Source:
-        args = {
-            "lattice": dict(lattice),
-            "T_bed_world": T_truth_world.to_list(),
-            "rig": rig.to_dict(),
-            "pairs": [poses["left"][k].to_list() for k in pairs],
-        }
-        return Source("rille.datasets.mockup.truth_dem", NoParams(), args, inputs={"scene": scene})
+        return sources.dem(lattice, T_truth_world, [lefts[k] for k in pairs])
 
-    attitude = _attitude(p, poses["left"])
-    up = _up(p, poses["left"]) if attitude is None else tuple(rows[2] for rows in attitude)
+    attitude = _attitude(p, lefts)
     return Sequence(
         name=name,
         rig=given_rig(p),
         frames=p.frames,
-        image=image,
+        image=lambda frame, camera: sources.image(frame, camera, poses[camera][frame], p.part(RenderParams)),
         frame_names=tuple(f"{k:06d}" for k in range(p.frames)),
         times=tuple(float(k) for k in range(p.frames)),
-        truth=tuple(poses["left"]),
-        truth_source="the simulator's own poses: exact",
-        up=up,
+        truth=tuple(lefts),
+        truth_source=TRUTH_SOURCE,
+        up=_up(p, lefts) if attitude is None else tuple(rows[2] for rows in attitude),
         attitude=attitude,
         vehicle=vehicle_at_scale(),
         truth_dem=dem,
-        truth_disparity=disparity,
+        truth_disparity=lambda frame: sources.disparity(frame, lefts[frame]),
         evaluation_window=WINDOW,
         defaults={"keyframes.rule": "stride", "keyframes.stride": 4, "locus.cell_size": 0.001},
         notes=(
@@ -198,4 +228,61 @@ def vehicle_at_scale() -> Vehicle:
         max_step=0.012,
         max_roughness=0.004,
         margin=0.01,
+    )
+
+
+def mockup_loop(p: MockupParams, rover: RoverParams, name: str = "mockup-loop") -> Sequence:
+    """The sequence of a rover that is driven: one pair at the start, the others come about on the way."""
+    sources = Sources(p, true_rig(p), {})
+    T_vehicle_body = RigidTransform(np.eye(3), np.array([0.0, CAMERA_FORWARD, p.camera_height]))
+    T_vehicle_left = T_vehicle_body @ mount(p, "left")
+    T_left_right = sources.rig.T_right_left.inverse()
+    mounted = {"T_vehicle_left": T_vehicle_left.to_list()}
+
+    def leg(body: Vehicle, number: int, row: int | None = None) -> Source:
+        args = {"leg": number, "row": row, "vehicle": body.model_dump(mode="json"), **mounted}
+        return Source("rille.datasets.mockup.rover", rover, args)
+
+    def image(frame: int, camera: str, T_bed_left: RigidTransform) -> Source:
+        T_bed_camera = T_bed_left if camera == "left" else T_bed_left @ T_left_right
+        # Black but for the sensor's noise, as with a closed shutter.
+        lost = {"exposure": 1e-3} if frame in rover.lost_frames else {}
+        return sources.image(frame, camera, T_bed_camera, p.part(RenderParams).model_copy(update=lost))
+
+    def change(number: int, row: int) -> Source | None:
+        if number != rover.obstacle_leg:
+            return None
+        return Source("rille.datasets.mockup.obstacle", rover, {"leg": number, "row": row, **mounted})
+
+    def nothing(frame: int, camera: str) -> Source:
+        raise InputError("RIL-247", "images of a drive come about on the way", remedy=f"rille drive {name}")
+
+    site = {"pad": [*START[:2], rover.pad] if rover.pad > 0 else None, "blank": rover.blank}
+    overview = Source("rille.datasets.mockup.overview", rover, {"cell": rover.map_cell})
+    return Sequence(
+        name=name,
+        rig=given_rig(p),
+        frames=1,
+        image=nothing,
+        frame_names=("000000",),
+        truth_source=TRUTH_SOURCE,
+        vehicle=vehicle_at_scale(),
+        defaults=LOOP_DEFAULTS,
+        notes=(
+            f"simulated at 1:10, bed of seed {p.seed}, rover of seed {rover.seed}; lengths are those of the model",
+            "a closed loop: each image was rendered where the rover had driven to by what was made of those before",
+        ),
+        parameters={"mockup": p, "rover": rover},
+        simulation=Simulation(
+            scene=Source("rille.datasets.mockup.scene", p.part(SceneParams), site),
+            place=lambda body: leg(body, -1),
+            drive=leg,
+            sense=lambda number: Source("rille.datasets.mockup.sense", rover, {"leg": number}),
+            change=change,
+            image=image,
+            truth_dem=sources.dem,
+            T_vehicle_left=T_vehicle_left,
+            pad=rover.pad,
+            overview=None if rover.map_cell is None else overview,
+        ),
     )

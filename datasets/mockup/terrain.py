@@ -6,12 +6,14 @@ its own stream of the seed, so that changing one leaves the others as they were.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
+
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.datasets.mockup.params import SceneParams
-from rille.stages.core.arrays import Floats32
+from rille.stages.core.arrays import Floats, Floats32
 
 OCTAVES = (0.5, 0.25, 0.125, 0.0625, 0.03125, 0.015625, 0.0078125, 0.00390625)
 """Spacings of the relief's octaves, metres. Finer relief is drawn as grain: no camera resolves its shape."""
@@ -22,16 +24,18 @@ HURST = 0.85
 SPLINE_RMS = 0.479
 """RMS of unit white noise after smoothing with the two-dimensional cubic B-spline."""
 
-WIDEST_ROCK = 0.11
-WIDEST_CRATER = 0.35
-LEAST_COVER_ROCK, WIDEST_COVER_ROCK = 0.004, 0.15
-"""Rocks of a stated cover, metres: what a camera resolves, and 1.5 m at full scale."""
+LEAST_ROCK, WIDEST_ROCK = 0.004, 0.11
+LEAST_CRATER, WIDEST_CRATER = 0.025, 0.35
+SUN_DIAMETER_DEG = 1.5
+"""Of a studio lamp some metres away, with soft edges of its shadows."""
+SUNLIT = -1e9
+"""Metres: the ceiling of the shade where there is none."""
+WIDEST_COVER_ROCK = 0.15
+"""Widest rock of a stated cover, metres: 1.5 m at full scale."""
 FULL_SCALE = 10.0
 """Metres of Mars or Moon to a metre of the bed, for the law of the rocks' sizes."""
 TRIES = 300
 """Places tried for one rock; at a cover of 0.3 one in a thousand finds none."""
-EMISSION = 0.31
-"""Cosine of the emission angle for which the exposure is set: ground seen 18 degrees below the horizon."""
 
 
 def stream(seed: int, part: int) -> np.random.Generator:
@@ -41,43 +45,36 @@ def stream(seed: int, part: int) -> np.random.Generator:
     return np.random.default_rng([seed, part])
 
 
-@njit(cache=True, nogil=True)
-def _add_octave(out, grid, spacing, amplitude):  # type: ignore[no-untyped-def]
-    """Add ``amplitude`` times the cubic B-spline with coefficients ``grid``, one every ``spacing`` nodes."""
-    rows, cols = out.shape
-    line = np.empty(grid.shape[1])
-    w = np.empty((cols, 4))
-    at = np.empty(cols, np.int64)
-    for c in range(cols):
-        at[c] = int(c / spacing)
-        _spline_weights(c / spacing - at[c], w[c])
-    wr = np.empty(4)
-    for r in range(rows):
-        i = int(r / spacing)
-        _spline_weights(r / spacing - i, wr)
-        for j in range(grid.shape[1]):
-            line[j] = wr[0] * grid[i, j] + wr[1] * grid[i + 1, j] + wr[2] * grid[i + 2, j] + wr[3] * grid[i + 3, j]
-        for c in range(cols):
-            j = at[c]
-            value = w[c, 0] * line[j] + w[c, 1] * line[j + 1] + w[c, 2] * line[j + 2] + w[c, 3] * line[j + 3]
-            out[r, c] += amplitude * value
-
-
-@njit(cache=True, nogil=True)
-def _spline_weights(f, w):  # type: ignore[no-untyped-def]
-    """Weights of the uniform cubic B-spline at fraction f."""
-    g = 1.0 - f
-    w[0] = g * g * g / 6.0
-    w[1] = (3.0 * f * f * f - 6.0 * f * f + 4.0) / 6.0
-    w[2] = (3.0 * g * g * g - 6.0 * g * g + 4.0) / 6.0
-    w[3] = f * f * f / 6.0
-
-
 def add_octave(out: Floats32, spacing: float, amplitude: float, rng: np.random.Generator) -> None:
-    """Add smooth noise of RMS ``amplitude`` with one random value every ``spacing`` nodes."""
-    shape = (int(out.shape[0] / spacing) + 5, int(out.shape[1] / spacing) + 5)
-    grid = rng.standard_normal(shape, dtype=np.float32)
-    _add_octave(out, grid, float(spacing), float(amplitude / SPLINE_RMS))
+    """Add smooth noise of RMS ``amplitude`` to ``out``: a cubic B-spline, one random value each ``spacing`` nodes."""
+    grid = rng.standard_normal([int(n / spacing) + 5 for n in out.shape], dtype=np.float32)
+    first_row, first_col = (np.floor(np.arange(n) / spacing).astype(int) for n in out.shape)
+    row_weights, col_weights = (_spline_weights(np.arange(n) / spacing) for n in out.shape)
+    scale = amplitude / SPLINE_RMS
+    # Row by row: a bed's albedo is large. Sums are written out, not as matrix products: the same bits from any BLAS.
+    for row, i in enumerate(first_row):
+        line = _weighted(row_weights[:, row], grid[i : i + 4])
+        out[row] += scale * _weighted(col_weights, [line[first_col + k] for k in range(4)])
+
+
+def _spline_weights(x: Floats) -> Floats:
+    """Weights (4, n) of the uniform cubic B-spline's coefficients from floor(x) on, at places x (n,)."""
+    f = x - np.floor(x)
+    g = 1.0 - f
+    return np.stack(
+        [
+            g * g * g / 6.0,
+            (3.0 * f * f * f - 6.0 * f * f + 4.0) / 6.0,
+            (3.0 * g * g * g - 6.0 * g * g + 4.0) / 6.0,
+            f * f * f / 6.0,
+        ]
+    )
+
+
+def _weighted(weights: Floats, values: Any) -> Floats:
+    """Sum (n,) of four values (4, n), each times its weight (4,) or (4, n)."""
+    w, v = weights, values
+    return np.asarray(w[0] * v[0] + w[1] * v[1] + w[2] * v[2] + w[3] * v[3])
 
 
 def relief(p: SceneParams, shape: tuple[int, int]) -> Floats32:
@@ -99,13 +96,16 @@ def _sizes(rng: np.random.Generator, count: float, least: float, most: float) ->
 
 
 def _patch(
-    shape: tuple[int, int], cell: float, x: float, y: float, reach: float
-) -> tuple[tuple[slice, slice], NDArray[np.float64], NDArray[np.float64]] | None:
-    """Window of the nodes within ``reach`` of (x, y) from the upper left node, and their offsets in metres."""
-    c0, c1 = max(int((x - reach) / cell), 0), min(int((x + reach) / cell) + 2, shape[1])
-    r0, r1 = max(int((y - reach) / cell), 0), min(int((y + reach) / cell) + 2, shape[0])
-    if c0 >= c1 or r0 >= r1:
-        return None
+    height: Floats32, cell: float, place: Sequence[float] | Floats, reach: float
+) -> tuple[tuple[slice, slice], NDArray[np.float64], NDArray[np.float64]]:
+    """Window of the nodes within ``reach`` metres of a place, and their offsets from it, metres.
+
+    ``place``: x and y from the upper left node, as shares of the bed's width and length.
+    """
+    rows, cols = height.shape
+    x, y = place[0] * cols * cell, place[1] * rows * cell
+    c0, c1 = max(int((x - reach) / cell), 0), min(int((x + reach) / cell) + 2, cols)
+    r0, r1 = max(int((y - reach) / cell), 0), min(int((y + reach) / cell) + 2, rows)
     dx = np.arange(c0, c1, dtype=np.float64) * cell - x
     dy = np.arange(r0, r1, dtype=np.float64) * cell - y
     return (slice(r0, r1), slice(c0, c1)), dx[None, :], dy[:, None]
@@ -115,14 +115,11 @@ def add_craters(height: Floats32, p: SceneParams) -> None:
     """Bowls with raised rims; the older a crater, the shallower. Ejecta fall off with distance^-3."""
     rng = stream(p.seed, 1)
     area = (height.shape[0] * p.cell) * (height.shape[1] * p.cell)
-    least = 0.025
     # The parameter counts those above 0.1 m: by D^-2 the number above the least one is larger by this factor.
-    for diameter in _sizes(rng, p.craters * area * (0.1 / least) ** 2, least, WIDEST_CRATER):
-        x, y, age = rng.random(3)
-        patch = _patch(height.shape, p.cell, x * height.shape[1] * p.cell, y * height.shape[0] * p.cell, 1.5 * diameter)
-        if patch is None:
-            continue
-        window, dx, dy = patch
+    count = p.craters * area * (0.1 / LEAST_CRATER) ** 2
+    for diameter in _sizes(rng, count, LEAST_CRATER, WIDEST_CRATER):
+        *place, age = rng.random(3)
+        window, dx, dy = _patch(height, p.cell, place, 1.5 * diameter)
         # Age 0 is the oldest crater, which is the shallowest.
         depth = diameter * (0.05 + 0.13 * age)
         rim = 0.22 * depth
@@ -135,59 +132,55 @@ def add_craters(height: Floats32, p: SceneParams) -> None:
         height[window] += np.where(q < 3.0, bowl, 0.0).astype(np.float32)
 
 
+class _Rock(NamedTuple):
+    """``diameter`` m of the long axis; ``aspect``, short over long; ``draws`` (5,) in 0..1 turn, break and tint it;
+    ``places``: shares of the bed's width and length, tried one after the other."""
+
+    diameter: float
+    aspect: float
+    draws: Floats
+    places: Iterable[Floats]
+
+
 def add_rocks(height: Floats32, p: SceneParams) -> Floats32:
     """Put rocks of profile 1 - q^4 (bounded slopes) on the ground; returns their tint, the albedo relative to it."""
-    if p.rock_cover is not None:
-        return _add_rock_cover(height, p, p.rock_cover)
-    rng = stream(p.seed, 2)
     area = (height.shape[0] * p.cell) * (height.shape[1] * p.cell)
-    least = 0.004
-    stones, rough = np.zeros_like(height), _rough_faces(height, p)
-    tint = np.ones_like(height)
-    for diameter in _sizes(rng, p.rocks * area * (0.03 / least) ** 2, least, WIDEST_ROCK):
-        x, y, a, b, c, e, g, s = rng.random(8)
-        patch = _patch(height.shape, p.cell, x * height.shape[1] * p.cell, y * height.shape[0] * p.cell, 0.8 * diameter)
-        if patch is None:
-            continue
-        window, dx, dy = patch
-        stone = _stone(dx, dy, diameter, 0.65 + 0.35 * b, (a, c, e, g, s), rough[window])
-        over = stone > stones[window]
-        tint[window] = np.where(over, np.float32(0.75 + 0.6 * e), tint[window])
-        stones[window] = np.maximum(stones[window], stone)
-    height += stones
-    return tint
-
-
-def _rough_faces(height: Floats32, p: SceneParams) -> Floats32:
-    """Relief of the rocks' faces relative to their height."""
-    rough = np.zeros_like(height)
+    rough = np.zeros_like(height)  # relief of the rocks' faces relative to their height
     for k, wave in enumerate((0.016, 0.008, 0.004)):
         add_octave(rough, max(wave / p.cell, 1.0), 0.5**k, stream(p.seed, 20 + k))
-    return rough
-
-
-def _add_rock_cover(height: Floats32, p: SceneParams, cover: float) -> Floats32:
-    """Rocks beside each other, the largest first, until they cover the stated share; returns their tint."""
-    rng = stream(p.seed, 3)
-    length, width = height.shape[0] * p.cell, height.shape[1] * p.cell
-    stones, rough, tint = np.zeros_like(height), _rough_faces(height, p), np.ones_like(height)
-    for diameter in cover_sizes(rng, cover, length * width):
-        b, *draws = (float(v) for v in rng.random(6))
-        aspect = 0.65 + 0.35 * b
-        long_axis = diameter / np.sqrt(aspect)  # the ellipse has the area of a circle of that diameter
-        for _ in range(TRIES):
-            x, y = rng.random(2)
-            patch = _patch(height.shape, p.cell, x * width, y * length, 0.6 * long_axis)
-            if patch is None:
+    stones, tint = np.zeros_like(height), np.ones_like(height)
+    for rock in _scattered(p, area) if p.rock_cover is None else _beside_each_other(p, p.rock_cover, area):
+        for place in rock.places:
+            window, dx, dy = _patch(height, p.cell, place, 0.8 * rock.diameter)
+            stone = _stone(dx, dy, rock, rough[window])
+            if p.rock_cover is not None and (stones[window][stone > 0] > 0).any():
                 continue
-            window, dx, dy = patch
-            stone = _stone(dx, dy, long_axis, aspect, tuple(draws), rough[window])
-            if not (stones[window][stone > 0] > 0).any():
-                stones[window] = np.maximum(stones[window], stone)
-                tint[window] = np.where(stone > 0, np.float32(0.75 + 0.6 * draws[2]), tint[window])
-                break
+            brightness = np.float32(0.75 + 0.6 * rock.draws[2])
+            tint[window] = np.where(stone > stones[window], brightness, tint[window])
+            stones[window] = np.maximum(stones[window], stone)
+            break
     height += stones
     return tint
+
+
+def _scattered(p: SceneParams, area: float) -> Iterator[_Rock]:
+    """Rocks anywhere, so many to a square metre; they may lie over each other."""
+    rng = stream(p.seed, 2)
+    # The parameter counts those above 30 mm.
+    for diameter in _sizes(rng, p.rocks * area * (0.03 / LEAST_ROCK) ** 2, LEAST_ROCK, WIDEST_ROCK):
+        x, y, turn, b, *others = rng.random(8)
+        yield _Rock(diameter, 0.65 + 0.35 * b, np.array([turn, *others]), [np.array([x, y])])
+
+
+def _beside_each_other(p: SceneParams, cover: float, area: float) -> Iterator[_Rock]:
+    """Rocks, the largest first, that cover a share of the bed."""
+    rng = stream(p.seed, 3)
+    for diameter in cover_sizes(rng, cover, area):
+        b, *draws = rng.random(6)
+        aspect = 0.65 + 0.35 * b
+        # The ellipse has the area of a circle of that diameter.
+        places = (rng.random(2) for _ in range(TRIES))
+        yield _Rock(diameter / np.sqrt(aspect), aspect, np.array(draws), places)
 
 
 def cover_sizes(rng: np.random.Generator, cover: float, area: float) -> NDArray[np.float64]:
@@ -197,7 +190,7 @@ def cover_sizes(rng: np.random.Generator, cover: float, area: float) -> NDArray[
     with exp(-q D), q = 1.79 + 0.152 / cover, at full scale. Sizes are drawn one from each equal part of the numbers.
     """
     q = (1.79 + 0.152 / cover) * FULL_SCALE
-    d = np.geomspace(LEAST_COVER_ROCK, WIDEST_COVER_ROCK, 2000)
+    d = np.geomspace(LEAST_ROCK, WIDEST_COVER_ROCK, 2000)
     covered = np.exp(-q * d[0]) - np.exp(-q * d)
     middle = np.sqrt(d[1:] * d[:-1])
     number = np.concatenate([[0.0], np.cumsum(np.diff(covered) / (0.25 * np.pi * middle**2))])
@@ -206,22 +199,13 @@ def cover_sizes(rng: np.random.Generator, cover: float, area: float) -> NDArray[
     return np.asarray(np.interp(u * number[-1], number, d)[::-1], dtype=np.float64)
 
 
-def _stone(
-    dx: NDArray[np.float64],
-    dy: NDArray[np.float64],
-    diameter: float,
-    aspect: float,
-    draws: tuple[float, ...],
-    rough: Floats32,
-) -> Floats32:
-    """Heights (row, col) of one rock at offsets (dx, dy) from its middle, metres; 0 beside it.
-
-    ``diameter`` is that of the long axis, ``aspect`` short over long; ``draws`` (5,) in 0..1 turn and break it.
-    """
-    a, c, e, g, s = draws
+def _stone(dx: NDArray[np.float64], dy: NDArray[np.float64], rock: _Rock, rough: Floats32) -> Floats32:
+    """Heights (row, col) of one rock at offsets (dx, dy) from its middle, metres; 0 beside it."""
+    a, c, e, g, s = rock.draws
+    diameter = rock.diameter
     turn = 2.0 * np.pi * a
     u, v = np.cos(turn) * dx + np.sin(turn) * dy, -np.sin(turn) * dx + np.cos(turn) * dy
-    v = v / aspect
+    v = v / rock.aspect
     bearing = np.arctan2(v, u)
     outline = 1.0 + 0.10 * np.cos(3.0 * bearing + 6.3 * c) + 0.06 * np.cos(5.0 * bearing + 6.3 * e)
     q = np.sqrt(u**2 + v**2) / (0.5 * diameter * outline)
@@ -259,36 +243,6 @@ def halve(a: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return ((total + 2) >> 2).astype(np.uint8)
 
 
-@njit(cache=True, nogil=True)
-def _lit(height, out, step_r, step_c, phase, drop):  # type: ignore[no-untyped-def]
-    """Add one to ``out`` where light arrives that travels by (step_r, step_c) nodes and falls by ``drop`` metres.
-
-    One of the steps is +-1. The ceiling of the shade is swept along it, S(p) = max(h(q), S(q)) - drop at the node's
-    predecessor q; along the other axis the line is rounded to nodes, since interpolation would wear narrow shadows off.
-    """
-    rows, cols = height.shape
-    by_row = abs(step_r) == 1.0
-    lines, width = (rows, cols) if by_row else (cols, rows)
-    main, side = (step_r, step_c) if by_row else (step_c, step_r)
-    shade = np.full(width, -1e9)
-    before = np.empty(width)
-    for k in range(lines):
-        line = k if main > 0 else lines - 1 - k
-        shift = int(np.floor(k * side + phase)) - int(np.floor((k - 1) * side + phase))
-        for j in range(width):
-            before[j] = shade[j]
-        for j in range(width):
-            value = before[j - shift] - drop if 0 <= j - shift < width else -1e9
-            h = height[line, j] if by_row else height[j, line]
-            if h >= value:
-                if by_row:
-                    out[line, j] += 1
-                else:
-                    out[j, line] += 1
-                value = h
-            shade[j] = value
-
-
 def sunlit(height: Floats32, p: SceneParams) -> NDArray[np.uint8]:
     """Share of the sun's disc that each node sees, 0..255 (cast shadows only, not the slope's own).
 
@@ -298,15 +252,38 @@ def sunlit(height: Floats32, p: SceneParams) -> NDArray[np.uint8]:
     count = np.zeros(height.shape, np.uint8)
     for k in range(points):
         # Square roots and the golden angle (Vogel's spiral) spread the points evenly over the disc.
-        radius, angle = 0.5 * p.sun_diameter_deg * np.sqrt((k + 0.5) / points), k * 2.39996323
+        radius, angle = 0.5 * SUN_DIAMETER_DEG * np.sqrt((k + 0.5) / points), k * 2.39996323
         # Off the horizon and the zenith: there tan() is 0, or has no end.
         elevation = np.deg2rad(np.clip(p.sun_elevation_deg + radius * np.sin(angle), 0.5, 89.5))
         # An angle on the sky spans more azimuth the higher it stands.
         azimuth = np.deg2rad(p.sun_azimuth_deg) + np.deg2rad(radius * np.cos(angle)) / np.cos(elevation)
         # travel of the light in nodes: away from the sun; rows grow towards the viewer
-        step_c, step_r = -np.sin(azimuth), np.cos(azimuth)
+        step_r, step_c = np.cos(azimuth), -np.sin(azimuth)
         longer = max(abs(step_c), abs(step_r))
-        step_c, step_r = step_c / longer, step_r / longer
+        step_r, step_c = step_r / longer, step_c / longer
         drop = float(np.hypot(step_c, step_r)) * p.cell * float(np.tan(elevation))
-        _lit(height, count, float(step_r), float(step_c), (k + 0.5) / points, drop)
+        # Views whose rows the light crosses one after the other.
+        if abs(step_r) == 1.0:
+            lines, lit, along, across = height, count, step_r, step_c
+        else:
+            lines, lit, along, across = height.T, count.T, step_c, step_r
+        order = 1 if along > 0 else -1
+        _count_lit(lines[::order], lit[::order], float(across), (k + 0.5) / points, drop)
     return np.asarray(count.astype(np.uint16) * 255 // points, dtype=np.uint8)
+
+
+def _count_lit(height: Floats32, out: NDArray[np.uint8], across: float, phase: float, drop: float) -> None:
+    """Add one to ``out`` where light arrives that moves on by (1, ``across``) nodes and falls by ``drop`` metres.
+
+    The ceiling of the shade is swept along the rows, S(p) = max(h(q), S(q)) - drop at the node's predecessor q; along
+    a row the line is rounded to nodes, since interpolation would wear narrow shadows off.
+    """
+    width = height.shape[1]
+    shade = np.full(width, SUNLIT)
+    for k, line in enumerate(height):
+        shift = int(np.floor(k * across + phase)) - int(np.floor((k - 1) * across + phase))
+        ceiling = np.full(width, SUNLIT)
+        ceiling[max(shift, 0) : width + min(shift, 0)] = shade[max(-shift, 0) : width + min(-shift, 0)] - drop
+        arrives = line >= ceiling
+        out[k] += arrives
+        shade = np.where(arrives, line, ceiling)

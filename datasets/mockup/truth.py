@@ -48,15 +48,13 @@ def visible(
     return pixels, inside, free
 
 
-def true_disparity(
-    field: HeightField, rig: Rig, T_bed_left: RigidTransform
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]:
+def true_disparity(field: HeightField, rig: Rig, T_bed_left: RigidTransform) -> dict[str, AnyArray]:
     """Disparity of each left pixel's central ray.
 
     Returns
     -------
-    column, row : float32 (row, col), pixels, right minus left; NaN where the left camera sees no bed. Given for points
-        that the right camera does not see, too.
+    column_disparity, row_disparity : float32 (row, col), pixels, right minus left; NaN where the left camera sees no
+        bed. Given for points that the right camera does not see, too.
     occluded : uint8; 0 both cameras see the point, 1 hidden from the right one, 2 outside its image, 3 no bed.
     depth : float32, metres along the left optical axis, NaN without bed.
     """
@@ -65,31 +63,24 @@ def true_disparity(
     points = T_bed_left.translation + depth[:, None] * rays
     pixels, inside, free = visible(field, rig.right, T_bed_left @ rig.T_right_left.inverse(), points)
     shape = (rig.left.height, rig.left.width)
-    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    rows, columns = np.indices(shape)
     occluded = np.full(len(rays), SEEN, np.uint8)
     # Later lines win: what is outside of the right image was never tested for being hidden, and without bed nothing is.
     occluded[~free] = HIDDEN
     occluded[~inside] = OUTSIDE
     occluded[np.isnan(depth)] = NO_BED
-    return (
-        (pixels[:, 0].reshape(shape) - columns).astype(np.float32),
-        (pixels[:, 1].reshape(shape) - rows).astype(np.float32),
-        occluded.reshape(shape),
-        depth.reshape(shape).astype(np.float32),
-    )
+    return {
+        "column_disparity": (pixels[:, 0].reshape(shape) - columns).astype(np.float32),
+        "row_disparity": (pixels[:, 1].reshape(shape) - rows).astype(np.float32),
+        "occluded": occluded.reshape(shape),
+        "depth": depth.reshape(shape).astype(np.float32),
+    }
 
 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    column, row, occluded, depth = true_disparity(
-        height_field(inputs["scene"]), Rig.from_dict(args["rig"]), RigidTransform.from_matrix(args["T_bed_left"])
-    )
-    arrays: dict[str, AnyArray] = {
-        "column_disparity": column,
-        "row_disparity": row,
-        "occluded": occluded,
-        "depth": depth,
-    }
-    return Bundle(arrays, {"frame": args["frame"], "seen": int((occluded == SEEN).sum())})
+    field, T_bed_left = height_field(inputs["scene"]), RigidTransform.from_matrix(args["T_bed_left"])
+    arrays = true_disparity(field, Rig.from_dict(args["rig"]), T_bed_left)
+    return Bundle(arrays, {"frame": args["frame"], "seen": int((arrays["occluded"] == SEEN).sum())})
 
 
 STAGE = Stage(

@@ -10,7 +10,7 @@ import pytest
 from raising import raises
 
 from rille.datasets.mockup.obstacle import on_path
-from rille.datasets.mockup.rover import RoverParams, SentLeg, bed_ground, drive_leg, images_at
+from rille.datasets.mockup.rover import FRAME_TURN, RoverParams, SentLeg, bed_ground, drive_leg, images_at
 from rille.datasets.mockup.sequence import vehicle_at_scale
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import heading_of
@@ -69,7 +69,7 @@ def test_images_are_taken_by_way_and_turn() -> None:
         way = np.hypot(*np.diff(wheels[a : b + 1, :2], axis=0).T).sum()
         turn = np.abs(np.diff(wheels[a : b + 1, 2])).sum()
         assert way <= EXACT.frame_step + 0.005
-        assert turn <= math.radians(EXACT.frame_turn_deg + 2.5)
+        assert turn <= FRAME_TURN + math.radians(2.5)
 
 
 def test_a_piece_that_is_driven_back_is_driven_back() -> None:
