@@ -6,11 +6,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyogrio
 import rasterio
 from matplotlib import pyplot as plt
 from matplotlib.colors import LightSource
@@ -42,8 +42,8 @@ def main() -> None:
     filled = np.where(np.isnan(z), np.nanmedian(z), z)
     shade = LightSource(315, 45).hillshade(filled, vert_exag=1.5, dx=cell, dy=cell)
     colour = RISK[risk] * np.where(risk == 3, 1.0, 0.35 + 0.65 * shade)[..., None]
-    features = json.loads((run / "path.geojson").read_text(encoding="utf-8"))["features"]
-    line = next(f["geometry"]["coordinates"] for f in features if f["geometry"]["type"] == "LineString")
+    _, _, (line, *_), _ = pyogrio.raw.read(run / "path.gpkg", layer="path")
+    path = np.frombuffer(line[9:], "<f8").reshape(-1, 3)  # behind the head of well-known binary: x, y, z
 
     figure, axes = plt.subplots(1, 5, figsize=(16, 4.3), width_ratios=(1.1, 1.1, 1.1, 1, 1), layout="constrained")
     for ax, image, title in zip(axes[:2], (pair.left, pair.right), ("left image", "right image"), strict=True):
@@ -55,7 +55,7 @@ def main() -> None:
     axes[3].imshow(np.where(np.isnan(z)[..., None], 1.0, relief * (0.35 + 0.65 * shade)[..., None]), extent=extent)
     axes[3].set_title("terrain, ten pairs merged")
     axes[4].imshow(colour, extent=extent)
-    axes[4].plot(*np.array(line).T[:2], color="black", linewidth=2)
+    axes[4].plot(*path.T[:2], color="black", linewidth=2)
     axes[4].set_title("safe, caution, hazard; path")
     for ax in axes:
         ax.axis("off")

@@ -8,10 +8,9 @@ Five pairs are merged into one terrain. The ground is judged for a vehicle, and 
 # %%
 # Reconstruct a short sequence. The vehicle's limits are in metres and degrees.
 
-import json
-
 import matplotlib.pyplot as plt
 import numpy as np
+import pyogrio
 import rasterio
 
 import rille
@@ -44,12 +43,9 @@ with rasterio.open(run.folder / "risk.tif") as source:
     classes, box = source.read(1), source.bounds
 with rasterio.open(run.folder / "hazard.tif") as source:
     p_hazard = source.read(source.descriptions.index("p_hazard") + 1)
-features = json.loads((run.folder / "path.geojson").read_text())["features"]
-lines = [
-    np.array(f["geometry"]["coordinates"])
-    for f in features
-    if f["geometry"]["type"] == "LineString"
-]
+_, _, lines, _ = pyogrio.raw.read(run.folder / "path.gpkg", layer="path")
+# Well-known binary: nine bytes of head, then x, y and z of each vertex.
+lines = [np.frombuffer(line[9:], "<f8").reshape(-1, 3) for line in lines if line]
 
 colours = np.array(
     [(0.45, 0.72, 0.42), (0.96, 0.80, 0.32), (0.80, 0.25, 0.20), (0.88, 0.88, 0.88)]

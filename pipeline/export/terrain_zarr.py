@@ -22,6 +22,7 @@ from typing import Any
 import numcodecs
 import numpy as np
 import pyproj
+import xarray
 from numpy.typing import NDArray
 
 from rille.datasets.georeference import Georeference
@@ -56,77 +57,66 @@ def write_terrain(
     place : of the world frame, where it is known.
     facts : attributes of the whole group, e.g. ``title``, ``source``.
     """
-    import zarr
-    from zarr.storage import LocalStore
-
-    attributes = {"Conventions": CONVENTIONS, **facts, "frame": FRAME, "cell_size_m": lattice.cell}
+    data = xarray.Dataset(
+        {name: _variable(name, arrays, place) for name in arrays},
+        _coordinates(lattice, place),
+        {"Conventions": CONVENTIONS, **facts, "frame": FRAME, "cell_size_m": lattice.cell},
+    )
     if place is not None:
-        attributes |= {f"georeference_{name}": value for name, value in place.to_dict().items()}
-    with atomic.replacing(path) as folder:
-        group = zarr.create_group(store=LocalStore(folder), zarr_format=2, attributes=attributes)
-        _coordinates(group, lattice, place)
-        coordinates = {"coordinates": "spatial_ref"}
-        if place is not None:
-            coordinates = {"coordinates": "spatial_ref easting northing", "grid_mapping": "crs: easting northing"}
-        for name, (spec, values) in arrays.items():
-            about: dict[str, Any] = {
-                "units": UNITS.get(spec.unit, spec.unit),
-                "long_name": spec.long_name,
-                "frame": spec.frame or "world",
-                # GDAL's own attribute for the system of a zarr array.
-                "_CRS": {"wkt": ENGINEERING_CRS},
-                **coordinates,
-            }
-            if name == "elevation":
-                others = (n for n in arrays if n not in (name, "ortho", SLOPE.name))
-                about |= {"positive": "up", "ancillary_variables": " ".join(others)}
-            if spec.unit in UNITS:
-                about["quantity"] = spec.unit
-            _array(group, name, values, ("y", "x"), about, spec.nodata)
-        # zarr says that readers of other languages may not know consolidated metadata.
-        with warnings.catch_warnings(action="ignore"):
-            zarr.consolidate_metadata(LocalStore(folder))
+        data.attrs |= {f"georeference_{name}": value for name, value in place.to_dict().items()}
+        data["crs"] = ((), np.int32(0), pyproj.CRS(place.crs).to_cf() | {"long_name": place.crs})
+    for variable in data.variables.values():
+        variable.encoding["chunks"] = tuple(min(n, CHUNK) for n in variable.shape) or None
+        # Of the compressors, zlib is in every build of GDAL.
+        variable.encoding["compressors"] = [numcodecs.Zlib(level=1)]
+    # zarr says that readers of other languages may not know consolidated metadata.
+    with atomic.replacing(path) as folder, warnings.catch_warnings(action="ignore"):
+        data.to_zarr(folder, mode="w", zarr_format=2, consolidated=True, write_empty_chunks=True)
 
 
-def _coordinates(group: Any, lattice: Lattice, place: Georeference | None) -> None:
-    for axis, values, words in (("x", lattice.xs(), "right"), ("y", lattice.ys(), "ahead")):
-        about = {"units": "m", "axis": axis.upper()}
-        about["long_name"] = f"{axis} of the cell centre, world frame, {words}"
-        _array(group, axis, values, (axis,), about)
-    name = "Rille world frame (local metres)"
-    # crs_wkt is the name by CF, spatial_ref that by GDAL: readers look for either.
-    reference = {"crs_wkt": ENGINEERING_CRS, "spatial_ref": ENGINEERING_CRS, "long_name": name}
+def _variable(
+    name: str, arrays: Mapping[str, tuple[Array, NDArray[Any]]], place: Georeference | None
+) -> xarray.Variable:
+    spec, values = arrays[name]
+    about: dict[str, Any] = {
+        "units": UNITS.get(spec.unit, spec.unit),
+        "long_name": spec.long_name,
+        "frame": spec.frame or "world",
+        # GDAL's own attribute for the system of a zarr array.
+        "_CRS": {"wkt": ENGINEERING_CRS},
+    }
+    if place is not None:
+        about["grid_mapping"] = "crs: easting northing"
+    if name == "elevation":
+        others = (n for n in arrays if n not in (name, "ortho", SLOPE.name))
+        about |= {"positive": "up", "ancillary_variables": " ".join(others)}
+    if spec.unit in UNITS:
+        about["quantity"] = spec.unit
+    unknown = np.nan if values.dtype.kind == "f" else int(spec.nodata) if spec.nodata else None
+    return xarray.Variable(("y", "x"), values, about, {"_FillValue": unknown})
+
+
+def _coordinates(lattice: Lattice, place: Georeference | None) -> dict[str, xarray.Variable]:
     half = 0.5 * lattice.cell
     # In GDAL's order, which is not that of affine.
     corner = lattice.x0 - half, lattice.cell, 0.0, lattice.y0 + half, 0.0, -lattice.cell
-    reference["GeoTransform"] = " ".join(f"{v:.17g}" for v in corner)
-    _array(group, "spatial_ref", np.array(0, np.int32), (), reference)
+    reference = {
+        # crs_wkt is the name by CF, spatial_ref that by GDAL: readers look for either.
+        "crs_wkt": ENGINEERING_CRS,
+        "spatial_ref": ENGINEERING_CRS,
+        "long_name": "Rille world frame (local metres)",
+        "GeoTransform": " ".join(f"{v:.17g}" for v in corner),
+    }
+    found = {"spatial_ref": xarray.Variable((), np.int32(0), reference)}
+    for axis, values, words in (("x", lattice.xs(), "right"), ("y", lattice.ys(), "ahead")):
+        about = {"units": "m", "axis": axis.upper(), "long_name": f"{axis} of the cell centre, world frame, {words}"}
+        found[axis] = xarray.Variable((axis,), values, about, {"_FillValue": None})
     if place is not None:
         there = place.apply(np.concatenate([lattice.xy(), np.zeros((*lattice.shape, 1))], axis=-1))
-        _array(group, "crs", np.array(0, np.int32), (), pyproj.CRS(place.crs).to_cf() | {"long_name": place.crs})
         for k, (name, axis) in enumerate((("easting", "x"), ("northing", "y"))):
             about = {"units": "m", "long_name": name, "standard_name": f"projection_{axis}_coordinate"}
-            _array(group, name, there[..., k], ("y", "x"), about)
-
-
-def _array(
-    group: Any, name: str, values: NDArray[Any], dims: tuple[str, ...], attributes: Mapping[str, Any], nodata: str = ""
-) -> None:
-    # What zarr 2 calls the fill value is CF's _FillValue: unknown cells.
-    fill: float | int | None = np.nan if values.dtype.kind == "f" else int(nodata) if nodata else None
-    written = group.create_array(
-        name,
-        shape=values.shape,
-        dtype=values.dtype,
-        chunks=tuple(min(n, CHUNK) for n in values.shape) or (),
-        fill_value=fill,
-        # Of the compressors, zlib is in every build of GDAL.
-        compressors=numcodecs.Zlib(level=1),
-        # zarr 2 has no names of dimensions: xarray reads and writes them as this attribute.
-        attributes=dict(attributes) | {"_ARRAY_DIMENSIONS": list(dims)},
-        config={"write_empty_chunks": True},
-    )
-    written[...] = values
+            found[name] = xarray.Variable(("y", "x"), there[..., k], about, {"_FillValue": None})
+    return found
 
 
 SLOPE = Array("slope", ("row", "col"), "float32", "degree", "inclination of the terrain", "nan", "world")

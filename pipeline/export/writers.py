@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 import struct
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from rille.pipeline.engine.plain import plain
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.foreign_raster import open_raster
 from rille.stages.core.errors import InputError
+from rille.stages.core.validity import Validity
 from rille.stages.geometry.lattice import Lattice
 
 FRAME = (
@@ -70,6 +70,10 @@ class Meaning:
     tags: Mapping[str, str] = field(default_factory=dict)
     colours: Sequence[str] = ()
 
+    def units(self, bands: Iterable[str]) -> list[str]:
+        """Unit of each band."""
+        return [self.unit if isinstance(self.unit, str) else self.unit[name] for name in bands]
+
 
 def write_raster(
     path: Path,
@@ -92,21 +96,13 @@ def write_raster(
     InputError
         An array does not fit the lattice.
     """
-    import rasterio
-
     for name, values in bands.items():
         if values.shape != lattice.shape:
             raise InputError("RIL-621", f"band {name} of {values.shape} cells does not fit its lattice {lattice.shape}")
     profile = {
         "driver": "COG",
-        "height": lattice.rows,
-        "width": lattice.cols,
-        "count": len(bands),
-        "dtype": next(iter(bands.values())).dtype.name,
-        "crs": rasterio.crs.CRS.from_user_input(ENGINEERING_CRS if place is None else place.crs),
+        "crs": ENGINEERING_CRS if place is None else place.crs,
         "transform": raster_transform(lattice, place),
-        "nodata": meaning.nodata,
-        "compress": "deflate",
         "level": 1,
         "num_threads": "all_cpus",
         # COG chooses by the dtype: differences of whole numbers (2) or of floats (3).
@@ -114,37 +110,38 @@ def write_raster(
         "blocksize": 256,
         "overview_resampling": "mode" if meaning.nodata is None else "average",
     }
-    unit = meaning.unit
-    units = [unit if isinstance(unit, str) else unit[name] for name in bands]
-    facts = {
-        "FRAME": FRAME,
-        "AXES": _axes(place),
-        "UNIT": ", ".join(dict.fromkeys(units)),
-        "CELL_SIZE_M": f"{lattice.cell:.12g}",
-    }
-    with _gdal_file(path, profile) as file:
-        for number, (name, values) in enumerate(bands.items(), start=1):
-            file.write(np.asarray(values), number)
-            file.set_band_description(number, name)
-        if list(bands) == ["red", "green", "blue"]:
-            file.colorinterp = [rasterio.enums.ColorInterp[name] for name in bands]
-        if meaning.colours:
-            file.write_colormap(1, {k: tuple(bytes.fromhex(c[1:])) for k, c in enumerate(meaning.colours)})
-        file.units = tuple("metre" if u == "m" else u for u in units)
-        file.update_tags(**facts, **{key.upper(): value for key, value in meaning.tags.items()})
+    facts = {"FRAME": FRAME, "AXES": _axes(place), "CELL_SIZE_M": f"{lattice.cell:.12g}"}
+    facts["UNIT"] = ", ".join(dict.fromkeys(meaning.units(bands)))
+    _write_bands(path, bands, meaning, profile, facts)
 
 
-@contextmanager
-def _gdal_file(path: Path, profile: Mapping[str, Any]) -> Iterator[Any]:
-    """A raster of ``profile`` to write to, which becomes the file ``path`` at the end.
+def _write_bands(
+    path: Path,
+    bands: Mapping[str, NDArray[Any]],
+    meaning: Meaning,
+    profile: Mapping[str, Any],
+    facts: Mapping[str, str],
+) -> None:
+    """Write bands of one shape and dtype by GDAL; ``profile``: driver, place and packing of the file.
 
-    It is made in memory: where the disk is full GDAL says nothing, and leaves a file that nobody can read.
+    The file is made in memory: where the disk is full GDAL says nothing, and leaves a file that nobody can read.
     """
+    from rasterio.enums import ColorInterp
     from rasterio.io import MemoryFile
 
+    first = next(iter(bands.values()))
+    about = {"height": first.shape[0], "width": first.shape[1], "count": len(bands), "dtype": first.dtype.name}
     with MemoryFile() as memory:
-        with memory.open(**profile) as file:
-            yield file
+        with memory.open(**profile, **about, nodata=meaning.nodata, compress="deflate") as file:
+            for number, (name, values) in enumerate(bands.items(), start=1):
+                file.write(values, number)
+                file.set_band_description(number, name)
+            if list(bands) == ["red", "green", "blue"]:
+                file.colorinterp = [ColorInterp[name] for name in bands]
+            if meaning.colours:
+                file.write_colormap(1, {k: tuple(bytes.fromhex(c[1:])) for k, c in enumerate(meaning.colours)})
+            file.units = tuple("metre" if u == "m" else u for u in meaning.units(bands))
+            file.update_tags(**facts, **{key.upper(): value for key, value in meaning.tags.items()})
         # The driver COG writes as it closes.
         atomic.write(path, bytes(memory.getbuffer()))
 
@@ -169,32 +166,6 @@ def _axes(place: Georeference | None) -> str:
         f"easting = {e:.3f} + x cos a + y sin a, northing = {n:.3f} - x sin a + y cos a, height = {h:.3f} + z with x, "
         f"y, z of the frame and a = {np.degrees(place.azimuth):.6g} degrees, clockwise from grid north"
     )
-
-
-def write_path_geojson(path: Path, vertices: NDArray[np.float64], facts: Mapping[str, Any]) -> None:
-    """Write the path as GeoJSON: a line, its start and its target; a feature without geometry where none was found.
-
-    RFC 7946 knows WGS 84 only. The coordinates here are local metres, which the properties say; a program that
-    overlooks it draws the path near latitude 0.
-
-    Parameters
-    ----------
-    vertices : (vertex, xyz) metres, world frame; empty where no path was found.
-    facts : JSON-able properties of the line.
-    """
-    common = {"crs_name": "local metres (not WGS 84)", "frame": FRAME, "unit": "m"}
-    coordinates = [[round(float(v), 6) for v in vertex] for vertex in vertices]
-    # RFC 7946: a LineString has two positions or more, and a feature without geometry has null.
-    line = {"type": "LineString", "coordinates": coordinates} if len(coordinates) > 1 else None
-    features = [_feature(line, {"name": "path"} | dict(facts) | common)]
-    if coordinates:
-        for name, at in (("start", 0), ("target", -1)):
-            features.append(_feature({"type": "Point", "coordinates": coordinates[at]}, {"name": name} | common))
-    atomic.write(path, json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n")
-
-
-def _feature(geometry: Mapping[str, Any] | None, properties: Mapping[str, Any]) -> dict[str, Any]:
-    return {"type": "Feature", "geometry": geometry, "properties": dict(properties)}
 
 
 def write_path_gpkg(
@@ -299,11 +270,11 @@ def write_disparity(path: Path, column: NDArray[Any], row: NDArray[Any], tags: M
 
     Parameters
     ----------
-    column, row : (row, col) float32 pixels on the left image, right minus left, NaN undefined.
+    column, row : (row, col) pixels on the left image, right minus left, NaN undefined.
     tags : more metadata.
     """
-    bands = {"column_disparity": (column, "pixel"), "row_disparity": (row, "pixel")}
-    _write_image(path, bands, {"CONVENTION": "right minus left, pixels of the left image, NaN undefined"} | dict(tags))
+    facts = {"CONVENTION": "right minus left, pixels of the left image, NaN undefined"}
+    _write_image(path, {"column_disparity": column, "row_disparity": row}, Meaning("pixel", tags=tags), facts)
 
 
 def write_confidence(
@@ -313,36 +284,26 @@ def write_confidence(
 
     Parameters
     ----------
-    std, backmatch_error : (row, col) float32 pixels, NaN undefined.
+    std, backmatch_error : (row, col) pixels, NaN undefined.
     validity : (row, col) uint8, bits of :class:`rille.stages.core.validity.Validity`; written as whole numbers, and as
         the tag ``VALIDITY`` says.
     tags : more metadata.
     """
-    from rille.stages.core.validity import Validity
-
     bits = ", ".join(f"{bit.value} {str(bit.name).lower()}" for bit in Validity)
-    bands = {"disparity_std": (std, "pixel"), "validity": (validity, ""), "backmatch_error": (backmatch_error, "pixel")}
-    _write_image(path, bands, {"VALIDITY": f"sum of {bits}"} | dict(tags))
+    units = {"disparity_std": "pixel", "validity": "", "backmatch_error": "pixel"}
+    bands = dict(zip(units, (std, validity, backmatch_error), strict=True))
+    _write_image(path, bands, Meaning(units, tags=tags), {"VALIDITY": f"sum of {bits}"})
 
 
-def _write_image(path: Path, bands: Mapping[str, tuple[NDArray[Any], str]], tags: Mapping[str, str]) -> None:
-    """Write arrays (row, col) on image pixels, with their units, as bands of a float32 TIFF, NaN undefined."""
-    import warnings
-
+def _write_image(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning, facts: Mapping[str, str]) -> None:
+    """Write arrays (row, col) on image pixels as bands of a float32 TIFF, NaN undefined."""
     from rasterio.errors import NotGeoreferencedWarning
 
-    height, width = next(iter(bands.values()))[0].shape
-    profile = {"driver": "GTiff", "height": height, "width": width, "count": len(bands), "dtype": "float32"}
-    # 3 is TIFF's predictor of floats; GTiff does not choose by itself, as COG does.
-    profile |= {"nodata": float("nan"), "compress": "deflate", "predictor": 3}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)  # an image has no place on the ground
-        with _gdal_file(path, profile) as file:
-            for number, (name, (values, _)) in enumerate(bands.items(), start=1):
-                file.write(np.asarray(values, dtype=np.float32), number)
-                file.set_band_description(number, name)
-            file.units = tuple(unit for _, unit in bands.values())
-            file.update_tags(**dict(tags))
+        # 3 is TIFF's predictor of floats; GTiff does not choose by itself, as COG does.
+        profile = {"driver": "GTiff", "predictor": 3}
+        _write_bands(path, {n: np.asarray(v, np.float32) for n, v in bands.items()}, meaning, profile, facts)
 
 
 def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

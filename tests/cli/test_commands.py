@@ -22,7 +22,6 @@ RECONSTRUCTED |= {
     "risk.tif",
     "hazard.tif",
     "reason.tif",
-    "path.geojson",
     "terrain.zarr",
 }
 SAME_IN_EACH_RUN = ("trajectory.tum", "trajectory.kitti", "dem.tif", "dem_sigma.tif", "ortho.tif", "risk.tif")

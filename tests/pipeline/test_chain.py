@@ -73,7 +73,7 @@ def test_outputs_are_all_there_and_sound(cold: Path) -> None:
     wanted |= {"reason.tif", "risk.tif.aux.xml"}
     wanted |= {"path.gpkg", "frames.json", "dem.qml", "risk.qml", "crosscheck.tum", "agreement.csv"}
     wanted |= {"slope.tif", "hillshade.tif", "terrain.zarr"}
-    wanted |= {"path.geojson", "config.toml", "report.json", "report.html", "ledger.jsonl"}
+    wanted |= {"config.toml", "report.json", "report.html", "ledger.jsonl"}
     assert wanted <= {p.name for p in folder.iterdir()}
     assert np.loadtxt(folder / "trajectory.kitti").shape == (5, 12)
     with rasterio.open(folder / "dem.tif") as dem, rasterio.open(folder / "risk.tif") as risk:

@@ -234,7 +234,6 @@ def test_all_files_of_a_run_state_one_system(georeference: Georeference | None, 
         }
     else:
         assert {crs.to_epsg() for crs in found.values()} == {32633}
-        assert "crs" not in json.loads((tmp_path / "path.geojson").read_text())
 
 
 def table() -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import json
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -21,7 +20,6 @@ from rille.pipeline.export.frames_json import describe
 from rille.pipeline.export.rasters import dem_style, risk_style, rounded
 from rille.pipeline.export.writers import (
     Meaning,
-    write_path_geojson,
     write_path_gpkg,
     write_raster,
     write_table,
@@ -126,25 +124,6 @@ def test_a_raster_that_does_not_fit_is_refused(tmp_path: Path) -> None:
         write_raster(tmp_path / "a.tif", {"a": np.zeros((2, 2), np.uint8)}, LATTICE, Meaning("1", nodata=None))
 
 
-def test_the_path_says_that_it_is_not_wgs84(tmp_path: Path) -> None:
-    vertices = np.array([[0.1, 0.2, -0.18], [0.1, 0.3, -0.181], [0.11, 0.4, -0.18]])
-    write_path_geojson(tmp_path / "path.geojson", vertices, {"found": True, "length_m": 0.2})
-    data = json.loads((tmp_path / "path.geojson").read_text())
-    line, start, target = data["features"]
-    assert line["geometry"] == {"type": "LineString", "coordinates": vertices.tolist()}
-    assert line["properties"]["length_m"] == 0.2
-    assert "not WGS 84" in line["properties"]["crs_name"]
-    assert start["geometry"]["coordinates"] == vertices[0].tolist()
-    assert target["geometry"]["coordinates"] == vertices[-1].tolist()
-
-
-def test_no_path_has_no_geometry_but_a_reason(tmp_path: Path) -> None:
-    write_path_geojson(tmp_path / "p.geojson", np.empty((0, 3)), {"found": False, "blocking_row": 7})
-    (feature,) = json.loads((tmp_path / "p.geojson").read_text())["features"]
-    assert feature["geometry"] is None
-    assert feature["properties"]["blocking_row"] == 7
-
-
 def test_evo_reads_the_trajectories(tmp_path: Path) -> None:
     P = poses(7)
     write_trajectory_kitti(tmp_path / "trajectory.kitti", P)
@@ -236,9 +215,9 @@ def test_only_what_was_written_is_described() -> None:
     assert facts["units"]["time"] == "s"
     assert facts["georeference"] is None
     place = Georeference("EPSG:32633", (1.0, 2.0, 3.0), 0.5)
-    placed = describe(["dem.tif", "path.geojson"], [3], ["left003"], [0.5], clock=True, place=place)
+    placed = describe(["dem.tif", "trajectory.tum"], [3], ["left003"], [0.5], clock=True, place=place)
     assert placed["files"]["dem.tif"]["frame"] == "georeference"
-    assert placed["files"]["path.geojson"]["frame"] == "world"
+    assert placed["files"]["trajectory.tum"]["frame"] == "world"
     assert facts["files"]["dem.tif"]["raster"].endswith("north is y")
     assert "north" not in placed["files"]["dem.tif"]["raster"], "the raster is turned by the azimuth"
     assert placed["georeference"]["origin"] == [1.0, 2.0, 3.0]
