@@ -276,7 +276,7 @@ def nav2(o: Opened) -> tuple[str, str]:
         classes, p, corner = risk.read(1), hazard.read(hazard.descriptions.index("p_hazard") + 1), risk.bounds
     wanted = np.select([classes == 2, classes == 3], [100, -1], np.rint(100.0 * np.nan_to_num(p)))
     masks = {"keepout": np.where(classes >= 2, 100, 0), "speed": np.where(classes == 1, 50, 0)}
-    for name, values in {"map": wanted, "map_scale": wanted, **masks}.items():
+    for name, values in {"map": wanted, **masks}.items():
         grid = map_server.load(o.exports / "nav2" / f"{name}.yaml")
         assert np.allclose(grid.origin, (corner.left, corner.bottom), atol=1e-6), grid.origin
         np.testing.assert_array_equal(grid.data[::-1] < 0, values < 0)
@@ -285,7 +285,7 @@ def nav2(o: Opened) -> tuple[str, str]:
     poses = yaml.safe_load((o.exports / "nav2" / "path.yaml").read_text())["poses"]
     return (
         "as documented",
-        f"map raw and scale, keepout and speed mask of {classes.size} cells, path of {len(poses)} poses",
+        f"map, keepout and speed mask of {classes.size} cells, path of {len(poses)} poses",
     )
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -125,48 +127,53 @@ def _without_marks(dem: DemFile) -> DemFile:
     return _without_marks(replace(dem, values=np.where(marked, np.nan, values), warnings=(*dem.warnings, line)))
 
 
-def read_raster(path: Path, *, length: bool = True) -> DemFile:
-    """First band of a GeoTIFF, or an ESRI ASCII grid; ``length``: it holds metres.
+@contextmanager
+def opened_raster(path: Path) -> Iterator[Any]:
+    """A GeoTIFF or ESRI ASCII grid, open for reading, with no more cells than can be read.
 
     Raises
     ------
     InputError
-        It cannot be read, has no geotransform, or has another unit.
+        It cannot be read, or has too many cells.
     """
     from rasterio.errors import RasterioError
 
     try:
         with open_raster(path, driver_of(path)) as file:
             _check_cells(path, file.shape, path.stat().st_size)
-            # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
-            values = file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
-            crs, transform, unit = file.crs, place_of(file, path), file.units[0]
+            yield file
     except RasterioError as error:
-        raise InputError(
-            "RIL-629", f"{path} cannot be read as a raster ({error})", remedy="give a GeoTIFF, or an ESRI ASCII grid"
-        ) from error
+        text, remedy = f"{path} cannot be read as a raster ({error})", "give a GeoTIFF, or an ESRI ASCII grid"
+        raise InputError("RIL-629", text, remedy=remedy) from error
+
+
+def read_raster(path: Path) -> DemFile:
+    """First band of a GeoTIFF, or an ESRI ASCII grid.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, has no geotransform, or has another unit.
+    """
+    with opened_raster(path) as file:
+        # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
+        values = file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
+        crs, transform, unit = file.crs, place_of(file, path), file.units[0]
     if transform == Affine.identity():
         raise InputError("RIL-630", f"{path} has no geotransform", remedy="give a raster that says where its cells are")
     # Lengths of the cell's sides, not a and e: a raster may be turned.
     across, down = np.hypot(transform.a, transform.d), np.hypot(transform.b, transform.e)
     if not (0.0 < abs(transform.determinant) < math.inf and np.isclose(across, down, rtol=1e-6, atol=0.0)):
-        raise InputError(
-            "RIL-631",
-            f"{path} has cells of {across:g} x {down:g}",
-            remedy="resample it to square cells, e.g. with gdalwarp -tr",
-        )
-    doubts = []
-    if crs is not None and length:
+        remedy = "resample it to square cells, e.g. with gdalwarp -tr"
+        raise InputError("RIL-631", f"{path} has cells of {across:g} x {down:g}", remedy=remedy)
+    if crs is not None:
         _metric_crs(path, crs)
-    if length and unit and unit.lower() not in METRE:
-        raise InputError(
-            "RIL-632", f"{path} has elevations in {unit!r}, not in metres", remedy="convert it, e.g. with gdal_calc"
-        )
-    if length and not unit:
-        doubts.append(warning("RIL-962", f"{path} states no unit of its elevations: taken as metres"))
-    return DemFile(
-        str(path), values, transform, "" if crs is None else crs.to_wkt(version="WKT2_2019"), None, tuple(doubts)
-    )
+    if unit and unit.lower() not in METRE:
+        remedy = "convert it, e.g. with gdal_calc"
+        raise InputError("RIL-632", f"{path} has elevations in {unit!r}, not in metres", remedy=remedy)
+    doubt = warning("RIL-962", f"{path} states no unit of its elevations: taken as metres")
+    wkt = "" if crs is None else crs.to_wkt(version="WKT2_2019")
+    return DemFile(str(path), values, transform, wkt, warnings=() if unit else (doubt,))
 
 
 def _check_cells(path: Path, shape: tuple[int, ...], stored: int) -> None:

@@ -148,12 +148,13 @@ def build(
     body.add_ref_sensor(cameras[0].sensor_id)
     body.add_sensor(cameras[1].sensor_id, _rigid(pycolmap, rig.T_right_left))
     model.add_rig(body)
+    # Before images are made: each point adds its pixels to the views that see it.
     views = {}
     for number, frame in enumerate(poses):
         name = names.get(frame, f"{frame:06d}.png")
         views[frame] = [_View(2 * number + 1 + k, f"{side}/{name}") for k, side in enumerate(("left", "right"))]
     # Before images are made: each point adds its pixels to the views that see it.
-    points = [point for segment in segments for point in _points(segment, poses, views, images or {})]
+    points = [point for segment in segments for point in _points(segment, rig, poses, views, images or {})]
     for number, (frame, T_world_left) in enumerate(poses.items()):
         ours = pycolmap.Frame(frame_id=number + 1, rig_id=1)
         for view, camera in zip(views[frame], cameras, strict=True):
@@ -174,24 +175,8 @@ def build(
         model.add_point3D(position, track, np.full(3, colour, dtype=np.uint8))
     for number in range(len(poses)):
         model.register_frame(number + 1)
-    _leave_out(model)
     model.update_point_3d_errors()
     return model
-
-
-def _leave_out(model: Any) -> None:
-    """Take back the observations that lie farther than :data:`FARTHEST` from their points."""
-    far = []
-    for point in model.points3D.values():
-        for element in point.track.elements:
-            image = model.images[element.image_id]
-            miss = image.project_point(point.xyz) - image.points2D[element.point2D_idx].xy
-            # Not ">": a distance that is NaN must count as far.
-            if not np.hypot(*miss) <= FARTHEST:
-                far.append((element.image_id, element.point2D_idx))
-    for image_id, index in far:
-        if model.images[image_id].points2D[index].has_point3D():  # a point goes with the last but one
-            model.delete_observation(image_id, index)
 
 
 def _ends(track: Bundle) -> list[int]:
@@ -202,6 +187,7 @@ def _ends(track: Bundle) -> list[int]:
 
 def _points(
     segment: MatchedSegment,
+    rig: Rig,
     poses: Mapping[int, RigidTransform],
     views: Mapping[int, list[_View]],
     images: Mapping[int, Bundle],
@@ -213,32 +199,36 @@ def _points(
         return
     T_local_key = RigidTransform.from_matrix(np.asarray(segment.resection["poses"])[0])
     world = (poses[key] @ T_local_key.inverse()).apply(segment.landmarks)
-    pixels = np.asarray(segment.track["points"], dtype=np.float64)
-    agrees = (segment.inlier != 0) & np.array([f in poses for f in frames])
-    disparity = np.full(pixels.shape, np.nan)
+    # Pixels (point, frame, camera, 2) of left and right cameras, and which of them are observations.
+    pixels = np.repeat(np.asarray(segment.track["points"], dtype=np.float64)[:, :, None], 2, axis=2)
+    seen = np.zeros(pixels.shape[:3], bool)
     for j, frame in enumerate(frames):
+        if frame not in poses:
+            continue
+        in_left, left = poses[frame].inverse().apply(world), pixels[:, j, 0]
+        agrees = segment.inlier[:, j] != 0
+        seen[:, j, 0] = agrees & _near(rig.left, in_left, left)
         if (found := segment.matches.get(frame)) is not None:
-            vectors, matched = matches_at(
-                pixels[:, j], *(np.asarray(found[n]) for n in ("column_disparity", "row_disparity", "validity"))
-            )
-            disparity[:, j] = np.where((matched & agrees[:, j])[:, None], vectors, np.nan)
-    twice = np.isfinite(disparity[..., 0])
+            disparity = (np.asarray(found[n]) for n in ("column_disparity", "row_disparity", "validity"))
+            vectors, matched = matches_at(left, *disparity)
+            pixels[:, j, 1] += vectors
+            seen[:, j, 1] = agrees & matched & _near(rig.right, rig.T_right_left.apply(in_left), pixels[:, j, 1])
     grey = np.asarray(images[key]["image"]) if key in images else np.zeros((1, 1), np.uint8)
     columns, rows = (
-        np.clip(np.nan_to_num(pixels[:, 0, k]).astype(int), 0, n - 1) for k, n in enumerate(grey.shape[::-1])
+        np.clip(np.nan_to_num(pixels[:, 0, 0, k]).astype(int), 0, n - 1) for k, n in enumerate(grey.shape[::-1])
     )
     values = grey[rows, columns]
     # COLMAP's colours have 8 bits: of 16 the high byte. Undistorted images are floats of 0..255.
     values = np.rint(values) if values.dtype.kind == "f" else values >> (8 * (values.itemsize - 1))
     # A point seen once would slide along its ray in any adjustment of the model.
-    for k in map(int, np.flatnonzero(np.isfinite(world).all(1) & (agrees.sum(1) + twice.sum(1) > 1))):
-        elements = []
-        for j in map(int, np.flatnonzero(agrees[k])):
-            left_view, right_view = views[frames[j]]
-            elements.append(left_view.element(pixels[k, j]))
-            if twice[k, j]:
-                elements.append(right_view.element(pixels[k, j] + disparity[k, j]))
+    for k in np.flatnonzero(np.isfinite(world).all(1) & (seen.sum(axis=(1, 2)) > 1)):
+        elements = [views[frames[j]][side].element(pixels[k, j, side]) for j, side in np.argwhere(seen[k])]
         yield world[k], elements, int(values[k])
+
+
+def _near(camera: Camera, points: Floats, pixels: Floats) -> NDArray[np.bool_]:
+    """Whether points (n, 3) of the camera frame, metres, project to within :data:`FARTHEST` of pixels (n, 2)."""
+    return np.asarray(np.hypot(*(camera.project(points) - pixels).T) <= FARTHEST)
 
 
 def _camera(pycolmap: Any, number: int, camera: Camera) -> Any:

@@ -8,13 +8,12 @@ stored by columns (``grid_map_core``, ``GridMapMath``; ``grid_map_ros``, ``GridM
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
@@ -55,15 +54,6 @@ def export_run(run: Path, target: Path, store: Store) -> str:
     return f"{target}: {TOPIC} of {risk['risk'].size} cells; ros2 bag play {target}"
 
 
-def layers(risk: Bundle, tiles: Sequence[Bundle]) -> dict[str, NDArray[np.float32]]:
-    """Layers (row, col) on the lattice of the risk map: m, m, class 0 safe to 2 hazard, probability; NaN unknown."""
-    lattice = Lattice.from_dict(risk.meta["lattice"])
-    found = {"elevation": whole(tiles, "elevation", lattice)[1], "sigma": whole(tiles, "elevation_std", lattice)[1]}
-    classes = np.asarray(risk["risk"], np.float32)
-    found |= {"risk": np.where(classes == UNKNOWN, np.nan, classes), "p_hazard": np.asarray(risk["p_hazard"])}
-    return {name: np.asarray(values, np.float32) for name, values in found.items()}
-
-
 def write(folder: Path, risk: Bundle, tiles: Sequence[Bundle]) -> None:
     """Write a bag of a risk map and of the tiles of the merged terrain; ``folder`` must not exist."""
     try:
@@ -76,26 +66,22 @@ def write(folder: Path, risk: Bundle, tiles: Sequence[Bundle]) -> None:
     types = get_typestore(Stores.ROS2_HUMBLE)
     for kind, text in DEFINITIONS.items():
         types.register(get_types_from_msg(text, kind))
-    message = _message(types.types, Lattice.from_dict(risk.meta["lattice"]), layers(risk, tiles))
-    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        topic = writer.add_connection(TOPIC, MESSAGE, typestore=types)
-        writer.write(topic, 0, types.serialize_cdr(message, MESSAGE))
 
-
-def _message(types: Mapping[str, Any], lattice: Lattice, found: Mapping[str, NDArray[np.float32]]) -> Any:
     def make(kind: str, *values: Any) -> Any:
-        return types[kind](*values)
+        return types.types[kind](*values)
 
+    lattice, classes = Lattice.from_dict(risk.meta["lattice"]), np.asarray(risk["risk"], np.float32)
+    layers = {
+        "elevation": whole(tiles, "elevation", lattice)[1],
+        "sigma": whole(tiles, "elevation_std", lattice)[1],
+        "risk": np.where(classes == UNKNOWN, np.float32(np.nan), classes),
+        "p_hazard": np.asarray(risk["p_hazard"], np.float32),
+    }
     # The pose of a grid map is its centre (GridMapInfo), not a corner.
-    x = lattice.x0 + 0.5 * (lattice.cols - 1) * lattice.cell
-    y = lattice.y0 - 0.5 * (lattice.rows - 1) * lattice.cell
-    pose = make(
-        "geometry_msgs/msg/Pose",
-        make("geometry_msgs/msg/Point", x, y, 0.0),
-        make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
-    )
-    sizes = lattice.cols * lattice.cell, lattice.rows * lattice.cell
-    info = make("grid_map_msgs/msg/GridMapInfo", lattice.cell, *sizes, pose)
+    left, right, bottom, top = lattice.bounds
+    middle = make("geometry_msgs/msg/Point", 0.5 * (left + right), 0.5 * (bottom + top), 0.0)
+    pose = make("geometry_msgs/msg/Pose", middle, make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0))
+    info = make("grid_map_msgs/msg/GridMapInfo", lattice.cell, right - left, top - bottom, pose)
     # By these labels grid_map_ros knows storage by columns: the outer dimension must be called column_index.
     dimensions = [
         make("std_msgs/msg/MultiArrayDimension", "column_index", lattice.rows, lattice.rows * lattice.cols),
@@ -103,7 +89,10 @@ def _message(types: Mapping[str, Any], lattice: Lattice, found: Mapping[str, NDA
     ]
     layout = make("std_msgs/msg/MultiArrayLayout", dimensions, 0)
     # a column of a grid map is one row of a raster, from the greatest x
-    data = [make("std_msgs/msg/Float32MultiArray", layout, values[:, ::-1].ravel()) for values in found.values()]
+    data = [make("std_msgs/msg/Float32MultiArray", layout, values[:, ::-1].ravel()) for values in layers.values()]
     header = make("std_msgs/msg/Header", make("builtin_interfaces/msg/Time", 0, 0), FRAME)
     # Basic layers decide which cells are valid (GridMap::isValid): one with elevation but without risk is.
-    return make(MESSAGE, header, info, list(found), ["elevation"], data, 0, 0)
+    message = make(MESSAGE, header, info, list(layers), ["elevation"], data, 0, 0)
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topic = writer.add_connection(TOPIC, MESSAGE, typestore=types)
+        writer.write(topic, 0, types.serialize_cdr(message, MESSAGE))

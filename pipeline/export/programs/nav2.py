@@ -5,7 +5,6 @@ Nav2's documentation states for ``map_server`` (map_io) and for the costmap filt
 
 - ``map.yaml``, ``map.pgm``: mode ``raw``, a pixel is the occupancy itself: 100 times the probability of a hazard, 100
   where the class is hazard, 255 (unknown) where the ground is unknown.
-- ``map_scale.yaml``, ``map_scale.png``: the same in mode ``scale``: black is occupied, white free, transparent unknown.
 - ``keepout.yaml``, ``keepout.pgm``: mask of the keepout filter: 100 where the class is hazard or unknown, else 0.
 - ``speed.yaml``, ``speed.pgm``: mask of the speed filter in percent of the greatest speed: :data:`SLOW` on caution,
   else 0, which means no limit.
@@ -16,12 +15,12 @@ The first row of an image is the map's greatest y; ``origin`` is the lower left 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from rille.pipeline.engine.runtime import atomic
@@ -31,7 +30,6 @@ from rille.stages.core.declare import Bundle
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.classification import CAUTION, HAZARDOUS, UNKNOWN
 
-FRAME = "map"
 OCCUPIED, NOT_KNOWN = 100, 255
 """Values of a pixel of mode raw."""
 
@@ -40,9 +38,6 @@ SLOW = 50
 
 CHORD = 10
 """Vertices to either side between which a pose's yaw is taken: cells next to each other make steps of 45 degrees."""
-
-FREE_THRESHOLD, OCCUPIED_THRESHOLD = 0.0, 1.0
-"""Of mode scale: between them occupancy grows with darkness, here from 0 to 100."""
 
 
 def export_run(run: Path, target: Path, store: Store) -> str:
@@ -70,71 +65,46 @@ def export_run(run: Path, target: Path, store: Store) -> str:
 def write(folder: Path, risk: Bundle, path: Bundle | None) -> None:
     """Write the files of a risk map and a path into an empty folder."""
     lattice, classes = Lattice.from_dict(risk.meta["lattice"]), np.asarray(risk["risk"])
-    maps = occupancy(classes, np.asarray(risk["p_hazard"]))
-    closed = (classes == HAZARDOUS) | (classes == UNKNOWN)
-    masks = {
-        "map": maps,
-        "keepout": np.where(closed, OCCUPIED, 0),
+    hazardous, unknown = classes == HAZARDOUS, classes == UNKNOWN
+    percent = np.rint(100.0 * np.nan_to_num(np.clip(risk["p_hazard"], 0.0, 1.0)))
+    maps = {
+        "map": np.select([hazardous, unknown], [OCCUPIED, NOT_KNOWN], percent),
+        "keepout": np.where(hazardous | unknown, OCCUPIED, 0),
         "speed": np.where(classes == CAUTION, SLOW, 0),
     }
-    for name, values in masks.items():
-        _image(folder / f"{name}.pgm", values.astype(np.uint8))
-        (folder / f"{name}.yaml").write_text(_yaml(f"{name}.pgm", "raw", lattice), encoding="utf-8")
-    _image(folder / "map_scale.png", scaled(maps))
-    (folder / "map_scale.yaml").write_text(_yaml("map_scale.png", "scale", lattice), encoding="utf-8")
+    left, _, bottom, _ = (round(v, 9) for v in lattice.bounds)
+    # map_server demands both thresholds in every mode, also in raw, which has no use for them.
+    about = {"mode": "raw", "resolution": lattice.cell, "negate": 0, "occupied_thresh": 1.0, "free_thresh": 0.0}
+    for name, values in maps.items():
+        _, image = cv2.imencode(".pgm", values.astype(np.uint8))
+        (folder / f"{name}.pgm").write_bytes(image.tobytes())
+        _write_yaml(folder / f"{name}.yaml", {"image": f"{name}.pgm", **about, "origin": [left, bottom, 0.0]})
     if path is not None and len(path["path"]):
-        (folder / "path.yaml").write_text(path_message(np.asarray(path["path"])), encoding="utf-8")
+        _write_yaml(folder / "path.yaml", path_message(np.asarray(path["path"])))
 
 
-def occupancy(classes: NDArray[Any], p_hazard: NDArray[Any]) -> NDArray[np.uint8]:
-    """Occupancy 0..100 of every cell (row, col), 255 unknown."""
-    percent = np.rint(100.0 * np.nan_to_num(np.clip(p_hazard, 0.0, 1.0)))
-    percent[classes == HAZARDOUS] = OCCUPIED
-    percent[classes == UNKNOWN] = NOT_KNOWN
-    return np.asarray(percent, np.uint8)
-
-
-def scaled(maps: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Image (row, col, BGRA) for mode ``scale`` of occupancies."""
-    known = maps != NOT_KNOWN
-    # 205 is the grey by which map_saver shows unknown ground; map_server goes by alpha alone.
-    grey = np.where(known, np.rint(255.0 * (1.0 - np.minimum(maps, OCCUPIED) / OCCUPIED)), 205.0).astype(np.uint8)
-    return np.dstack([grey, grey, grey, np.where(known, 255, 0).astype(np.uint8)])
-
-
-def path_message(xyz: NDArray[np.float64]) -> str:
-    """Vertices (n, 3), metres, as ``nav_msgs/msg/Path`` in YAML."""
+def path_message(xyz: NDArray[np.float64]) -> dict[str, Any]:
+    """Vertices (n, 3), metres, as ``nav_msgs/msg/Path``."""
     number = np.arange(len(xyz))
     ahead = xyz[np.minimum(number + CHORD, len(xyz) - 1)] - xyz[np.maximum(number - CHORD, 0)]
-    yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
-    stamp = "stamp: {sec: 0, nanosec: 0}"
-    lines = ["header:", f"  {stamp}", f"  frame_id: {FRAME}", "poses:"]
-    for (x, y, z), angle in zip(xyz, yaw, strict=True):
-        turn = f"{{x: 0.0, y: 0.0, z: {np.sin(0.5 * angle):.9f}, w: {np.cos(0.5 * angle):.9f}}}"
-        lines += [
-            f"- header: {{{stamp}, frame_id: {FRAME}}}",
-            f"  pose: {{position: {{x: {x:.6f}, y: {y:.6f}, z: {z:.6f}}}, orientation: {turn}}}",
-        ]
-    return "\n".join(lines) + "\n"
+    half_yaw = 0.5 * np.arctan2(ahead[:, 1], ahead[:, 0])
+    turns = np.column_stack([np.zeros((len(xyz), 2)), np.sin(half_yaw), np.cos(half_yaw)])
+    poses = [
+        {
+            "header": _header(),
+            "pose": {
+                "position": dict(zip("xyz", place, strict=True)),
+                "orientation": dict(zip("xyzw", turn, strict=True)),
+            },
+        }
+        for place, turn in zip(np.round(xyz, 6).tolist(), np.round(turns, 9).tolist(), strict=True)
+    ]
+    return {"header": _header(), "poses": poses}
 
 
-def _yaml(image: str, mode: str, lattice: Lattice) -> str:
-    half = 0.5 * lattice.cell
-    left, bottom = lattice.x0 - half, lattice.y0 - (lattice.rows - 1) * lattice.cell - half
-    facts: Mapping[str, Any] = {
-        "image": image,
-        "mode": mode,
-        "resolution": f"{lattice.cell:.9g}",
-        "origin": f"[{left:.9g}, {bottom:.9g}, 0.0]",
-        "negate": 0,
-        # map_server demands both thresholds in every mode, also in raw, which has no use for them.
-        "occupied_thresh": OCCUPIED_THRESHOLD,
-        "free_thresh": FREE_THRESHOLD,
-    }
-    return "".join(f"{name}: {value}\n" for name, value in facts.items())
+def _header() -> dict[str, Any]:
+    return {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "map"}
 
 
-def _image(path: Path, values: NDArray[np.uint8]) -> None:
-    done, data = cv2.imencode(path.suffix, values)
-    assert done
-    path.write_bytes(data.tobytes())
+def _write_yaml(path: Path, facts: dict[str, Any]) -> None:
+    path.write_text(yaml.safe_dump(facts, sort_keys=False), encoding="utf-8")

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.colour import LUMA
-from rille.pipeline.export.foreign_raster import open_raster
-from rille.pipeline.export.read_dem import DemFile, read_elevation, read_raster
+from rille.pipeline.export.foreign_raster import place_of
+from rille.pipeline.export.read_dem import DemFile, opened_raster, read_elevation
 from rille.stages.core.errors import InputError
 
 MADE = date(2000, 1, 1)
@@ -64,14 +64,23 @@ def _beside(run: Path, name: str, terrain: DemFile) -> Layer:
     path = run / f"{name}.tif"
     if not path.is_file():
         return None
-    found = read_raster(path, length=False)
-    if found.values.shape != terrain.values.shape or found.transform != terrain.transform:
-        raise InputError("RIL-602", f"{path} and dem.tif have other cells", remedy="make the run again")
-    with open_raster(path) as raster:
-        if raster.count == 1:
-            return found.values
-        bands = raster.read(out_dtype="float64", masked=True).filled(np.nan)
-        return np.asarray(np.moveaxis(bands, 0, 2), np.float64)
+    with opened_raster(path) as raster:
+        if raster.shape != terrain.values.shape or place_of(raster, path) != terrain.transform:
+            raise InputError("RIL-602", f"{path} and dem.tif have other cells", remedy="make the run again")
+        bands = raster.read([1, 2, 3] if raster.count == 3 else [1], out_dtype="float64", masked=True).filled(np.nan)
+    return np.asarray(np.moveaxis(bands, 0, 2) if len(bands) == 3 else bands[0], np.float64)
+
+
+def _points(terrain: DemFile, ortho: Layer, sigma: Layer) -> dict[str, NDArray[Any]]:
+    """Columns (n,) of the known cells: x, y, z, and red, green, blue and ``sigma`` of z (m) where there are any."""
+    row, col = np.nonzero(np.isfinite(terrain.values))
+    x, y = terrain.transform @ (col + 0.5, row + 0.5)
+    columns = {"x": x, "y": y, "z": terrain.values[row, col]}
+    if ortho is not None:
+        columns |= zip(("red", "green", "blue"), _colours(ortho)[row, col].T, strict=True)
+    if sigma is not None:
+        columns["sigma"] = sigma[row, col].astype(np.float32)
+    return columns
 
 
 def write_laz(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
@@ -83,33 +92,30 @@ def write_laz(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
     import laspy
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
-    row, col = np.nonzero(np.isfinite(terrain.values))
-    x, y = terrain.transform @ (col + 0.5, row + 0.5)
+    points = _points(terrain, ortho, sigma)
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.creation_date, header.generating_software, header.system_identifier = MADE, "Rille", "stereo"
     # LAS has coordinates of 32 bits: without offsets eastings would overflow at steps as fine as these.
-    header.offsets = [float(np.floor(v.min())) for v in (x, y, terrain.values[row, col])]
+    header.offsets = [float(np.floor(points[axis].min())) for axis in "xyz"]
     header.scales = np.full(3, 10.0 ** np.floor(np.log10(terrain.cell / STEPS)))
     if terrain.crs:
         # LAS 1.4 allows only WKT with point formats 6 to 10, wants this bit set, and knows the first version alone.
         header.vlrs.append(WktCoordinateSystemVlr(pyproj.CRS(terrain.crs).to_wkt("WKT1_GDAL")))
         header.global_encoding.wkt = True
-    if sigma is not None:
+    if "sigma" in points:
         about = laspy.ExtraBytesParams("sigma", type=np.float32, description="standard deviation of z, m")
         header.add_extra_dim(about)
     cloud = laspy.LasData(header)
-    cloud.x, cloud.y, cloud.z = x, y, terrain.values[row, col]
+    for name, values in points.items():
+        # LAS has colours of 16 bits.
+        setattr(cloud, name, values.astype(np.uint16) * np.uint16(257) if values.dtype == np.uint8 else values)
     # LAS counts returns from 1: 0 of 0, which laspy leaves, is not valid.
     cloud.return_number[:] = cloud.number_of_returns[:] = 1
     if ortho is not None:
-        look = _colours(ortho)[row, col].astype(np.uint16) * np.uint16(257)  # LAS has colours of 16 bits
-        cloud.intensity = np.rint(look @ LUMA).astype(np.uint16)
-        cloud.red, cloud.green, cloud.blue = look.T
-    if sigma is not None:
-        cloud.sigma = sigma[row, col].astype(np.float32)
+        cloud.intensity = np.rint(np.column_stack([cloud.red, cloud.green, cloud.blue]) @ LUMA).astype(np.uint16)
     with atomic.replacing(path) as temporary:
         cloud.write(str(temporary), do_compress=True)
-    return f"{row.size} points"
+    return f"{len(points['x'])} points"
 
 
 def write_ply(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
@@ -117,24 +123,19 @@ def write_ply(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
 
     Coordinates are 64-bit floats: eastings of 32 bits would jump by decimetres. A comment states the CRS as WKT.
     """
-    row, col = np.nonzero(np.isfinite(terrain.values))
-    x, y = terrain.transform @ (col + 0.5, row + 0.5)
-    columns = {"x": x, "y": y, "z": terrain.values[row, col]}
-    if ortho is not None:
-        columns["red"], columns["green"], columns["blue"] = _colours(ortho)[row, col].T
-    if sigma is not None:
-        columns["sigma"] = sigma[row, col].astype(np.float32)
-    points = np.empty(row.size, [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
+    columns = _points(terrain, ortho, sigma)
+    count = len(columns["x"])
+    points = np.empty(count, [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
     for name, values in columns.items():
         points[name] = values
     # One line: a line feed would end the comment, and its rest would be read as a line of the header.
     crs = [f"comment crs {' '.join(terrain.crs.split())}"] if terrain.crs else []
     properties = [f"property {PLY_TYPES[values.dtype.name]} {name}" for name, values in columns.items()]
     lines = ["ply", "format binary_little_endian 1.0", *crs, "comment metres; sigma: standard deviation of z"]
-    lines += [f"element vertex {row.size}", *properties, "end_header"]
+    lines += [f"element vertex {count}", *properties, "end_header"]
     with atomic.replacing(path) as temporary:
         temporary.write_bytes("".join(f"{line}\n" for line in lines).encode() + points.tobytes())
-    return f"{row.size} points"
+    return f"{count} points"
 
 
 def write_glb(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:

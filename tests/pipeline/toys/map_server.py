@@ -29,16 +29,8 @@ def load(path: Path) -> OccupancyGrid:
     """Read a map by its YAML file."""
     about = yaml.safe_load(path.read_text(encoding="utf-8"))
     image = cv2.imread(str(path.parent / about["image"]), cv2.IMREAD_UNCHANGED)
-    image = image[..., None] if image.ndim == 2 else image
-    shade = image[..., :3].mean(axis=-1) / 255.0
-    if about["mode"] == "raw":
-        value = np.rint(255.0 * shade)
-        data = np.where(value <= 100, value, -1)
-    else:
-        assert (about["mode"], about["negate"]) == ("scale", 0)
-        low, high, occupied = about["free_thresh"], about["occupied_thresh"], 1.0 - shade
-        data = np.rint(np.clip((occupied - low) / (high - low), 0.0, 1.0) * 100.0)
-        data = np.where(image[..., 3] < 255, -1, data) if image.shape[-1] == 4 else data
+    assert (about["mode"], about["negate"]) == ("raw", 0)
+    data = np.where(image <= 100, image.astype(np.int64), -1)
     x, y, turn = about["origin"]
     assert turn == 0.0
-    return OccupancyGrid(data[::-1].astype(np.int64), about["resolution"], (x, y))
+    return OccupancyGrid(data[::-1], about["resolution"], (x, y))

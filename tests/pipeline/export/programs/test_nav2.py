@@ -24,14 +24,13 @@ def risk():
 def test_every_cell_has_its_class_at_its_place(tmp_path):
     bundle = risk()
     nav2.write(tmp_path, bundle, None)
-    grids = {name: load(tmp_path / f"{name}.yaml") for name in ("map", "map_scale", "keepout", "speed")}
+    grids = {name: load(tmp_path / f"{name}.yaml") for name in ("map", "keepout", "speed")}
     places, classes, p = LATTICE.xy(), bundle["risk"], bundle["p_hazard"]
     for row, col in np.random.default_rng(1).integers(0, (30, 20), (60, 2)):
         x, y = places[row, col]
         kind = classes[row, col]
         expected = {2: 100, 3: -1}.get(int(kind), round(100 * float(p[row, col])))
         assert grids["map"].at(x, y) == expected
-        assert grids["map_scale"].at(x, y) == pytest.approx(expected, abs=0.6)
         assert grids["keepout"].at(x, y) == (100 if kind >= 2 else 0)
         assert grids["speed"].at(x, y) == (nav2.SLOW if kind == 1 else 0)
     assert not (tmp_path / "path.yaml").exists()
@@ -52,7 +51,7 @@ def test_the_path_is_a_message_whose_poses_look_ahead(tmp_path):
 
 
 def test_a_path_of_one_pose_and_of_none(tmp_path):
-    assert "poses" in yaml.safe_load(nav2.path_message(np.zeros((1, 3))))
+    assert len(nav2.path_message(np.zeros((1, 3)))["poses"]) == 1
     nav2.write(tmp_path, risk(), Bundle({"path": np.empty((0, 3))}, {}))
     assert not (tmp_path / "path.yaml").exists()
 
