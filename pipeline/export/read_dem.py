@@ -35,6 +35,8 @@ LONGEST_AXIS = 10_000_000
 HIGHEST_WALL, HIGHEST_STEP = 1500.0, 300.0
 """Metres and cells; nothing on Earth rises more upright over less than a cell."""
 
+OURS = "give terrain.zarr of a run"
+
 METRE = ("m", "metre", "metres", "meter", "meters")
 
 
@@ -82,23 +84,15 @@ def read_elevation(path: Path) -> DemFile:
         There is nothing, it is none of these, its unit is not the metre, or it has no known cell.
     """
     if not path.exists():
-        raise InputError(
-            "RIL-627",
-            f"{path} does not exist",
-            remedy="give a GeoTIFF or ESRI ASCII grid, the folder of a run, or a zarr group",
-        )
-    if any((path / name).is_file() for name in ("zarr.json", ".zgroup")):
-        found = _of_zarr(path)
-    elif path.is_dir():
-        found = _of_run(path)
-    else:
-        found = read_raster(path)
-    found = _without_marks(found)
-    if not np.isfinite(found.values).any():
-        raise InputError(
-            "RIL-628", f"{path} has no known cell among {found.values.size}", remedy="give another elevation model"
-        )
-    return found
+        remedy = "give a GeoTIFF or ESRI ASCII grid, the folder of a run, or a zarr group"
+        raise InputError("RIL-627", f"{path} does not exist", remedy=remedy)
+    is_group = any((path / name).is_file() for name in ("zarr.json", ".zgroup"))
+    read = _of_zarr if is_group else _of_run if path.is_dir() else read_raster
+    dem = _without_marks(read(path))
+    if not np.isfinite(dem.values).any():
+        text = f"{path} has no known cell among {dem.values.size}"
+        raise InputError("RIL-628", text, remedy="give another elevation model")
+    return dem
 
 
 def _without_marks(dem: DemFile) -> DemFile:
@@ -180,19 +174,15 @@ def _check_cells(path: Path, shape: tuple[int, ...], stored: int) -> None:
     """Refuse more cells than there is memory for, or than so many ``stored`` bytes can hold."""
     most = min(MOST_CELLS, free() // CELL_BYTES, max(ALWAYS_CELLS, CELLS_PER_BYTE * stored))
     if math.prod(shape) > most:
-        size = " x ".join(map(str, shape))
-        raise InputError(
-            "RIL-981",
-            f"{path} has {size} cells in {words(stored)}, at most {most / 1e6:.3g} million are read",
-            remedy="cut it, or resample it to larger cells",
-        )
+        size = f"{' x '.join(map(str, shape))} cells in {words(stored)}"
+        text = f"{path} has {size}, at most {most / 1e6:.3g} million are read"
+        raise InputError("RIL-981", text, remedy="cut it, or resample it to larger cells")
 
 
 def _metric_crs(path: Path, crs: Any) -> None:
     if crs.is_geographic:
-        raise InputError(
-            "RIL-633", f"{path} is in degrees ({crs.to_string()})", remedy="project it, e.g. with gdalwarp -t_srs"
-        )
+        remedy = "project it, e.g. with gdalwarp -t_srs"
+        raise InputError("RIL-633", f"{path} is in degrees ({crs.to_string()})", remedy=remedy)
     # rasterio knows the unit of projected systems alone; an engineering one is taken as metric.
     unit, factor = crs.linear_units_factor if crs.is_projected else ("metre", 1.0)
     if factor != 1.0:
@@ -201,11 +191,8 @@ def _metric_crs(path: Path, crs: Any) -> None:
 
 def _of_run(path: Path) -> DemFile:
     if not (path / "dem.tif").is_file():
-        raise InputError(
-            "RIL-635",
-            f"{path} has no dem.tif",
-            remedy="give the folder of a finished run, RUNS/sequence/latest, or a GeoTIFF",
-        )
+        remedy = "give the folder of a finished run, RUNS/sequence/latest, or a GeoTIFF"
+        raise InputError("RIL-635", f"{path} has no dem.tif", remedy=remedy)
     return replace(read_raster(path / "dem.tif"), name=str(path), viewpoints=_cameras(path))
 
 
@@ -245,9 +232,7 @@ def open_group(path: Path) -> Any:
     for name, array in group.arrays():
         if max(array.shape, default=0) > LONGEST_AXIS or math.prod(array.chunks) > MOST_CELLS:
             size = " x ".join(map(str, array.shape))
-            raise InputError(
-                "RIL-982", f"{path}: {name} has {size} values, too many to be read", remedy="give terrain.zarr of a run"
-            )
+            raise InputError("RIL-982", f"{path}: {name} has {size} values, too many to be read", remedy=OURS)
     return group
 
 
@@ -256,7 +241,7 @@ def _stored(group: Path) -> int:
     search = Search()
     entries = [entry for folder in search.folders(group) for entry in search.entries(folder)]
     if other := next((e.path for e in entries if not (e.is_file() or e.is_dir())), ""):
-        raise InputError("RIL-723", f"{other} is no regular file", remedy="give terrain.zarr of a run")
+        raise InputError("RIL-723", f"{other} is no regular file", remedy=OURS)
     return sum(entry.stat().st_size for entry in entries)
 
 
@@ -270,23 +255,18 @@ def _of_zarr(path: Path) -> DemFile:
     except InputError:
         raise
     except (KeyError, ValueError, OSError, TypeError, RuntimeError) as error:
-        raise InputError(
-            "RIL-636",
-            f"{path} has no elevation with coordinates x and y ({error})",
-            remedy="give terrain.zarr of a run",
-        ) from error
+        text = f"{path} has no elevation with coordinates x and y ({error})"
+        raise InputError("RIL-636", text, remedy=OURS) from error
     if unit not in METRE:
         raise InputError("RIL-637", f"{path} has elevations in {unit!r}, not in metres", remedy="give one in metres")
     if z.shape != (y.size, x.size) or min(z.shape) < 2:
-        raise InputError(
-            "RIL-638", f"{path}: elevation is {z.shape}, its coordinates {(y.size, x.size)}", remedy="give another one"
-        )
+        text = f"{path}: elevation is {z.shape}, its coordinates {(y.size, x.size)}"
+        raise InputError("RIL-638", text, remedy=OURS)
     steps = np.concatenate([np.diff(x), -np.diff(y)])
     cell = float(np.median(steps))
     if not cell > 0 or np.abs(steps - cell).max() > 1e-3 * cell:
-        raise InputError(
-            "RIL-639", f"{path}: cells are {steps.min():g} to {steps.max():g} m wide", remedy="give a regular one"
-        )
+        text = f"{path}: cells are {steps.min():g} to {steps.max():g} m wide"
+        raise InputError("RIL-639", text, remedy="give a regular one")
     # Coordinates of CF name the middles of cells, an affine transform their corners.
     corner = Affine(cell, 0.0, x[0] - 0.5 * cell, 0.0, -cell, y[0] + 0.5 * cell)
     return DemFile(str(path), z, corner, crs, None)

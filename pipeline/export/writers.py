@@ -237,7 +237,7 @@ def write_trajectory_kitti(path: Path, poses: NDArray[np.float64]) -> None:
     ----------
     poses : (frame, 3, 4) T_world_left, metres; optical axes x right, y down, z forward.
     """
-    atomic.write(path, "".join(_line(pose.reshape(-1)) for pose in poses))
+    _write_rows(path, poses.reshape(len(poses), 12))
 
 
 def write_trajectory_tum(path: Path, poses: NDArray[np.float64], times: Sequence[float], world: str = FRAME) -> None:
@@ -251,18 +251,17 @@ def write_trajectory_tum(path: Path, poses: NDArray[np.float64], times: Sequence
     """
     from scipy.spatial.transform import Rotation
 
-    head = f"# time x y z qx qy qz qw; world from left camera (x right, y down, z forward); world {world}\n"
-    lines = [
-        # Two quaternions mean one rotation: w >= 0 makes the file unique, as frames.json says.
-        _line([time, *pose[:, 3], *Rotation.from_matrix(pose[:, :3]).as_quat(canonical=True)])
-        for time, pose in zip(times, poses, strict=True)
-        if np.isfinite(pose).all()
-    ]
-    atomic.write(path, head + "".join(lines))
+    posed = np.isfinite(poses).all(axis=(1, 2))
+    # Two quaternions mean one rotation: w >= 0 makes the file unique, as frames.json says.
+    turns = Rotation.from_matrix(poses[posed, :, :3]).as_quat(canonical=True)
+    head = f"time x y z qx qy qz qw; world from left camera (x right, y down, z forward); world {world}"
+    _write_rows(path, np.column_stack([np.asarray(times)[posed], poses[posed, :, 3], turns]), head)
 
 
-def _line(values: Sequence[float] | NDArray[np.float64]) -> str:
-    return " ".join(f"{value:.15g}" for value in values) + "\n"
+def _write_rows(path: Path, rows: NDArray[np.float64], head: str = "") -> None:
+    out = io.StringIO()
+    np.savetxt(out, rows, "%.15g", header=head)
+    atomic.write(path, out.getvalue())
 
 
 def write_disparity(path: Path, column: NDArray[Any], row: NDArray[Any], tags: Mapping[str, str]) -> None:
