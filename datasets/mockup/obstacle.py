@@ -14,8 +14,7 @@ from rille.datasets.mockup.params import SceneParams
 from rille.datasets.mockup.rover import RoverParams, true_and_believed
 from rille.stages.core.declare import Bundle, Inputs, Stage
 
-HEIGHT = 0.015
-"""m, of the stone; a wheel's radius."""
+HEIGHT = 0.015  # m, of the stone; a wheel's radius
 
 
 def on_path(path: np.ndarray, way: float, aside: float) -> tuple[float, float]:

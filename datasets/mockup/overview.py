@@ -12,8 +12,7 @@ from rille.datasets.mockup.rover import RoverParams
 from rille.stages.core.declare import Array, Bundle, Inputs, Stage
 from rille.stages.geometry.lattice import Lattice
 
-SIGMA = 0.002
-"""m, of the map's elevations."""
+SIGMA = 0.002  # m, of the map's elevations
 
 
 def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

@@ -33,12 +33,9 @@ BACKGROUND = 9.0
 """Grey level of the dark room behind the bed."""
 LEVEL_GREY = 112.0
 """Grey level of sunlit level ground; shadows and vignetting bring the mean of a picture to about 100."""
-BLUR = 0.6
-"""Standard deviation of the optics' point spread, pixels."""
-RIGHT_GAIN = 0.97
-"""Sensitivity of the right camera over that of the left; no two are equal."""
-VIGNETTING = 0.1
-"""Relative loss of light in the image corners."""
+BLUR = 0.6  # standard deviation of the optics' point spread, pixels
+RIGHT_GAIN = 0.97  # sensitivity of the right camera over that of the left; no two are equal
+VIGNETTING = 0.1  # relative loss of light in the image corners
 
 
 def camera_rays(camera: Camera, T_bed_camera: RigidTransform, sampling: int = 1) -> NDArray[np.float64]:

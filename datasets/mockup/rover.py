@@ -63,8 +63,7 @@ Pose = tuple[float, float, float]
 
 START: Pose = (0.0, 0.3, 0.0)
 """On the bed; the rover looks straight along it."""
-FRAME_TURN = math.radians(5.0)
-"""Largest turn on the spot between two images."""
+FRAME_TURN = math.radians(5.0)  # largest turn on the spot between two images
 
 
 class SentLeg(NamedTuple):

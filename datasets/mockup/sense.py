@@ -16,14 +16,10 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, Inputs, Stage
 from rille.stages.geometry.geometry import rotation_exp
 
-SPEED = 0.05
-"""m/s; with it, bumps become accelerations."""
-ODOMETRY_SIGMA = 0.01
-"""Relative, of distances and turns by the wheels, as of their radius."""
-ATTITUDE_SIGMA_DEG = 0.2
-"""Of the inclinometer about each axis."""
-ACCELERATION_SIGMA = 0.05
-"""m/s2, of the accelerometer's noise."""
+SPEED = 0.05  # m/s; with it, bumps become accelerations
+ODOMETRY_SIGMA = 0.01  # relative, of distances and turns by the wheels, as of their radius
+ATTITUDE_SIGMA_DEG = 0.2  # of the inclinometer about each axis
+ACCELERATION_SIGMA = 0.05  # m/s2, of the accelerometer
 
 
 def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

@@ -153,7 +153,6 @@ def _up(p: MockupParams, truth: list[RigidTransform]) -> tuple[tuple[float, floa
 class Sources:
     """Sources of images and truth of an experiment; ``inputs``: the scene, where it is the same for all of them."""
 
-    p: MockupParams
     rig: Rig
     inputs: Mapping[str, Source]
 
@@ -186,7 +185,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
     _check_on_bed(p, bodies)
     poses = {c: [body @ mount(p, c) for body in bodies] for c in CAMERAS}
     lefts = poses["left"]
-    sources = Sources(p, true_rig(p), {"scene": Source("rille.datasets.mockup.scene", p.part(SceneParams))})
+    sources = Sources(true_rig(p), {"scene": Source("rille.datasets.mockup.scene", p.part(SceneParams))})
 
     def dem(lattice: Mapping[str, Any], T_truth_world: RigidTransform, pairs: tuple[int, ...] = ()) -> Source:
         return sources.dem(lattice, T_truth_world, [lefts[k] for k in pairs])
@@ -233,7 +232,7 @@ def vehicle_at_scale() -> Vehicle:
 
 def mockup_loop(p: MockupParams, rover: RoverParams, name: str = "mockup-loop") -> Sequence:
     """The sequence of a rover that is driven: one pair at the start, the others come about on the way."""
-    sources = Sources(p, true_rig(p), {})
+    sources = Sources(true_rig(p), {})
     T_vehicle_body = RigidTransform(np.eye(3), np.array([0.0, CAMERA_FORWARD, p.camera_height]))
     T_vehicle_left = T_vehicle_body @ mount(p, "left")
     T_left_right = sources.rig.T_right_left.inverse()

@@ -26,10 +26,8 @@ SPLINE_RMS = 0.479
 
 LEAST_ROCK, WIDEST_ROCK = 0.004, 0.11
 LEAST_CRATER, WIDEST_CRATER = 0.025, 0.35
-SUN_DIAMETER_DEG = 1.5
-"""Of a studio lamp some metres away, with soft edges of its shadows."""
-SUNLIT = -1e9
-"""Metres: the ceiling of the shade where there is none."""
+SUN_DIAMETER_DEG = 1.5  # of a studio lamp some metres away, with soft edges of its shadows
+SUNLIT = -1e9  # m: the ceiling of the shade where there is none
 WIDEST_COVER_ROCK = 0.15
 """Widest rock of a stated cover, metres: 1.5 m at full scale."""
 FULL_SCALE = 10.0
