@@ -123,7 +123,7 @@ def _check_on_bed(p: MockupParams, poses: list[RigidTransform]) -> None:
                 "RIL-253",
                 f"mockup: frame {k} stands at x = {x:.2f} m, y = {y:.2f} m, outside the bed of "
                 f"{p.bed_width:g} x {p.bed_length:g} m",
-                remedy="take fewer frames, smaller steps or turns, or a larger bed",
+                remedy="take fewer frames, smaller steps, or a larger bed",
             )
 
 

@@ -137,8 +137,8 @@ def opened_raster(path: Path) -> Iterator[Any]:
             _check_cells(path, file.shape, path.stat().st_size)
             yield file
     except RasterioError as error:
-        text, remedy = f"{path} cannot be read as a raster ({error})", "give a GeoTIFF, or an ESRI ASCII grid"
-        raise InputError("RIL-629", text, remedy=remedy) from error
+        remedy = "give a GeoTIFF, or an ESRI ASCII grid"
+        raise InputError("RIL-629", f"{path} cannot be read as a raster ({error})", remedy=remedy) from error
 
 
 def read_raster(path: Path) -> DemFile:
