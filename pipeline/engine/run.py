@@ -44,7 +44,7 @@ from rille.pipeline.engine.store.base import GoneError, NonDeterministicError, S
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import CodeChangedError, Outcome
-from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, check, make
+from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, check, light, make
 from rille.stages.core.errors import DegenerateError, RilleError
 
 MAX_HEALS = 3
@@ -505,7 +505,7 @@ def _sequence(graph: Graph) -> str:
 def _given(handle: Handle) -> Ref | int:
     """An input as it is handed over: its artifact without the facts, which the task reads, or the number of the call
     that makes it."""
-    return handle.index if handle.ref is None else replace(handle.ref, meta={})
+    return handle.index if handle.ref is None else light(handle.ref)
 
 
 def _labels(handles: list[Handle]) -> str:

@@ -1,9 +1,9 @@
 """Workers that run tasks: those of a dask cluster of this machine, of a scheduler that others have started, or inline.
 
 A task is a future that depends on the futures of the tasks that make its inputs: dask's scheduler chains them without
-asking this process, gives a task to another worker if its own dies, and ends a worker that takes too much memory. A
-task that comes back because its workers died is named ``Died``; the run tries it once more when nothing else runs, so
-that the culprit is known for certain (:mod:`rille.pipeline.engine.run`).
+asking this process, gives a task to another worker if its own dies, and ends a worker that takes too much memory. What
+became of a task comes back as an event. A task that comes back because its workers died is named ``Died``; the run
+tries it once more when nothing else runs, so that the culprit is known for certain (:mod:`rille.pipeline.engine.run`).
 
 On this machine workers are spawned, never forked; they never see Ctrl-C, end with this process, and speak TLS on the
 loopback with keys of this run alone, because whoever reaches a scheduler of dask can run code as its user.
@@ -319,15 +319,18 @@ class Dask:
     ) -> None:
         self._client, self._presence, self._cluster, self._ours = client, presence, cluster, ours
         self._interactive, self._likeness = interactive, likeness
-        self._run, self._submitted = uuid.uuid4().hex, 0
+        self._run, self._submitted = f"rille-{uuid.uuid4().hex}", 0
         self._looked = time.monotonic()
         self._futures: dict[int, Any] = {}
+        self._leaving: list[Any] = []
         self._labels: dict[str, str] = {}
         """Labels of tasks in flight, by the names that dask knows."""
-        self._ended: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()
+        self._events: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._named: set[str] = set()
         """Silent workers that the user was warned of."""
         self._gone: set[Any] = set()
+        # The handler runs on the client's event loop: it only hands over what came.
+        client.subscribe_topic(self._run, lambda event: self._events.put(event[1]))
 
     @property
     def pages(self) -> str:
@@ -345,55 +348,56 @@ class Dask:
         # Dask takes equal names for equal results: a call that is tried again needs a new one.
         name = f"{call.spec.stage.name}-{self._run}-{self._submitted}"
         inputs = [self._futures[number] for number in call.upstream()]
-        future = self._client.submit(
-            work, call, self._likeness, *inputs, key=name, priority=-call.number, pure=False, retries=0
+        self._futures[call.number] = self._client.submit(
+            work, call, self._run, self._likeness, *inputs, key=name, priority=-call.number, pure=False, retries=0
         )
-        self._futures[call.number], self._labels[name] = future, call.spec.label
-        future.add_done_callback(lambda ended: self._ended.put((call.number, ended)))
+        self._labels[name] = call.spec.label
 
     def wait(self) -> list[tuple[int, Ended]]:
         """Block until at least one call has ended; all that have ended meanwhile are given."""
-        while True:
-            batch = dict(sorted(self._batch().items()))
-            if batch:
-                return list(zip(batch, self._outcomes(list(batch.values())), strict=True))
-            # Not for ever: a scheduler that is lost, or workers that fall silent, end no call.
+        ended: list[tuple[int, Ended]] = []
+        while not ended:
+            # Not for ever: a call whose worker died, a scheduler that is lost, and silent workers send no event.
+            ended = self._events_of(WATCH_SECONDS)
             if time.monotonic() - self._looked > LOOK_SECONDS:
                 self._look()
+            lost = [n for n, future in self._futures.items() if future.status not in ("pending", "finished")]
+            # A call must not come back before the inputs that it had.
+            ended += self._events_of(0) if lost else []
+            ended += [(n, self._why(self._release(n))) for n in lost if n in self._futures]
+        return ended
 
-    def _batch(self) -> dict[int, Any]:
-        """Futures that have ended, by number; the first of them is waited for."""
-        batch: dict[int, Any] = {}
+    def _events_of(self, timeout: float) -> list[tuple[int, Ended]]:
+        """What has ended by its own word; the first of it is waited for."""
+        ended: list[tuple[int, Ended]] = []
         with suppress(queue.Empty):
             while True:
-                number, future = self._ended.get(timeout=0 if batch else WATCH_SECONDS)
-                # A call that was cancelled has ended for dask, too.
-                if number in self._futures and self._futures[number] is future:
-                    del self._futures[number], self._labels[future.key]
-                    batch[number] = future
-        return batch
+                number, name, outcome = pickle.loads(self._events.get(timeout=0 if ended else timeout))
+                # Of another name: it ran again because its worker died after it had said so.
+                if number in self._futures and self._futures[number].key == name:
+                    # Dask has not heard of the end yet: a future that is dropped now would count as cancelled.
+                    self._leaving.append(self._release(number))
+                    ended.append((number, outcome))
+        self._leaving = [future for future in self._leaving if future.status == "pending"]
+        return ended
 
-    def _outcomes(self, futures: list[Any]) -> list[Ended]:
-        try:
-            # All at once: a question for each takes as long as the rest of what dask does for a task.
-            return list(self._client.gather(futures))
-        except Exception:  # one of them has failed, so each is asked
-            return [self._outcome(future) for future in futures]
+    def _release(self, number: int) -> Any:
+        """The future of a call, which is no longer in flight."""
+        future = self._futures.pop(number)
+        del self._labels[future.key]
+        return future
 
-    def _outcome(self, future: Any) -> Ended:
+    def _why(self, future: Any) -> Ended:
+        """Why a call ended without a word."""
         from distributed import KilledWorker
-        from distributed.client import FutureCancelledError
 
-        try:
-            outcome: Ended = future.result()
-        except FutureCancelledError:  # distributed cancels all futures when the connection to the scheduler is lost
-            raise self._presence.gone() from None
-        except KilledWorker as error:
-            # One that it waited for is named there by its own name.
-            return self._died(error) if str(error.task) == future.key else NotBegun()
-        except Exception as error:  # it could not even be unpickled there
+        if future.status != "error":  # distributed cancels all futures when the connection to the scheduler is lost
+            raise self._presence.gone()
+        error = future.exception()
+        if not isinstance(error, KilledWorker):  # it could not even be unpickled there
             return Failed.of(error)
-        return outcome
+        # One that it waited for is named there by its own name.
+        return self._died(error) if str(error.task) == future.key else NotBegun()
 
     def _died(self, error: Any) -> Died:
         address, memory = getattr(error.last_worker, "address", ""), ""
@@ -443,9 +447,14 @@ class Dask:
 
     def close(self, *, kill: bool = False) -> None:
         """End workers of our own, at once if ``kill``; leave others as they are."""
+        from distributed import wait
+
         within = HURRY_SECONDS if kill else LEAVE_SECONDS
         self.cancel()
         if self._cluster is None:
+            with suppress(Exception):
+                self._client.unsubscribe_topic(self._run)
+                wait(self._leaving, timeout=within)
             if self._ours:
                 _leave(self._client, within)
             return
@@ -454,36 +463,42 @@ class Dask:
         if kill:
             for nanny in nannies:
                 nanny.auto_restart = False  # else it starts a worker again as soon as that is killed
-            _end(processes)
+            _kill(processes)
         _leave(self._client, within)
         with suppress(Exception):
             self._cluster.close(timeout=within)
         self._cluster.shutdown_on_close = False  # else it is closed once more at exit, for up to ten seconds
-        _end(processes)
+        _kill(processes)
         take_back(self._interactive)
 
 
-def work(call: Call, likeness: str, *made: Outcome | Failed | NotBegun) -> Outcome | Failed | NotBegun:
-    """Run a call on a worker, unless an input did not come or the worker is unlike the client.
+def work(call: Call, run: str, likeness: str, *made: Ref | None) -> Ref | None:
+    """Run a call on a worker, unless an input did not come or the worker is unlike the client; give its artifact to
+    the calls that wait for it.
 
-    Never an exception: dask would state it as the failure of every call that waits for this one.
+    What became of it leaves as an event of dask for the client of ``run``, which costs half of what fetching a result
+    does. Never an exception: dask would state it as the failure of every call that waits for this one.
     """
     from distributed import get_worker
 
     _prepare(ours=not likeness)
-    refs = {
-        number: given.ref for number, given in zip(call.upstream(), made, strict=True) if isinstance(given, Outcome)
-    }
-    if len(refs) < len(made):
-        return NotBegun()
-    name = str(get_worker().name)
+    worker, outcome = get_worker(), NotBegun()  # type: tuple[Any, Ended]
+    refs = {number: ref for number, ref in zip(call.upstream(), made, strict=True) if ref is not None}
     if likeness and foreign.likeness() != likeness:
-        text = f"worker {name} has other source code or packages than this process"
-        return Failed(CodeChangedError("RIL-524", text, remedy="install the same there"))
-    outcome = call.run(refs)
+        text = f"worker {worker.name} has other source code or packages than this process"
+        outcome = Failed(CodeChangedError("RIL-524", text, remedy="install the same there"))
+    elif len(refs) == len(made):
+        outcome = call.run(refs)
     if isinstance(outcome, Outcome):
-        outcome = replace(outcome, took=replace(outcome.took, worker=name))
-    return outcome
+        outcome = replace(outcome, took=replace(outcome.took, worker=str(worker.name)))
+    # Events travel as msgpack, which has no types of ours: bytes pass.
+    worker.log_event(run, pickle.dumps((call.number, worker.get_current_task(), outcome)))
+    return light(outcome.ref) if isinstance(outcome, Outcome) else None
+
+
+def light(ref: Ref) -> Ref:
+    """Return a reference without its facts: a task reads them from the store, and those of a trajectory are large."""
+    return replace(ref, meta={})
 
 
 @cache
@@ -545,7 +560,7 @@ def _leave(client: Any, within: float) -> None:
         client.close(timeout=within)
 
 
-def _end(processes: list[int]) -> None:
+def _kill(processes: list[int]) -> None:
     """Kill processes, and wait until they are gone."""
     killed = []
     for process in processes:

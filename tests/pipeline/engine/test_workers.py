@@ -89,6 +89,7 @@ def test_a_worker_that_falls_silent_is_named_once_with_its_task(monkeypatch, cap
     monkeypatch.setattr(foreign.time, "monotonic", lambda: now[0])
     client = SimpleNamespace(
         scheduler=SimpleNamespace(address="tcp://s", identity=None),
+        subscribe_topic=lambda *_: None,
         sync=lambda *_, **__: {"workers": {a: {"nthreads": 1, "last_seen": when} for a, when in seen.items()}},
         scheduler_info=lambda n_workers: {"workers": {"tcp://a": {"name": "first"}}},
         processing=lambda workers: {"tcp://a": ["numbers-run-7", "scale-run-8", "of-another-1"]},
