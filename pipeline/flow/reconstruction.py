@@ -333,13 +333,15 @@ def refined(
         return {}
     params, count = config.refine, config.refine.window or len(segments)
     windows = [segments[max(0, k - count) : k] for k in (range(1, len(segments) + 1) if params.window else [count])]
+    lenses = {side: lens.to_dict() for side, lens in (make.sequence.lenses or {}).items()}
 
     def adjusted(label: str, window: list[Segment], **tilt: Handle) -> Handle:
         keys = [pairs[s.frames[0]] for s in window]
         return make.node(
             refine,
             f"{label}/{keys[-1].frame}",
-            {"pairs": [pair.frame for pair in keys], "resect": make.given_resect},
+            {"pairs": [pair.frame for pair in keys], "resect": make.given_resect}
+            | ({"lenses": lenses} if lenses and not tilt else {}),
             tracks=[s.track for s in window],
             resections=[s.resection for s in window],
             levels=[pair.level for pair in keys],
@@ -354,7 +356,10 @@ def refined(
         tilt = p.common_tilt = make.node(
             common_tilt, "common_tilt", args, segments=found, rig=pairs[segments[0].frames[0]].rig
         )
-        if (yield tilt).meta["undone"]:
+        shared: Ref = yield tilt
+        if "contradiction" in shared.meta:
+            p.contradictions.append(tilt)
+        if shared.meta["undone"]:
             found = [adjusted("refine/untilted", window, tilt=tilt) for window in windows]
     p.refined = found
     return {"refined": found}

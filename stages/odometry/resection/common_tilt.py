@@ -20,6 +20,7 @@ from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
 from rille.stages.geometry.epipolar import standing
 from rille.stages.geometry.geometry import Rig
 from rille.stages.numeric.robust import huber_weight, mad_sigma
+from rille.stages.odometry.resection import intrinsics
 
 
 def common_tilt(parts: Floats, prior_sigma: float) -> tuple[float, float]:
@@ -58,8 +59,15 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         return Bundle({}, {"undone": False})
     undone = abs(tilt) > args["significance"] * sigma
     rig = Rig.from_dict(inputs["rig"].meta["rig"])
-    warnings = {"warnings": [_words(tilt, sigma, rig)]} if undone else {}
-    return Bundle({}, {"tilt_rad": tilt, "sigma_rad": sigma, "undone": undone, **warnings})
+    facts: dict[str, Any] = {"tilt_rad": tilt, "sigma_rad": sigma, "undone": undone}
+    lines = [_words(tilt, sigma, rig)] if undone else []
+    parts = np.array([one for segment in inputs["segments"] for one in segment.meta["intrinsics"]])
+    # No prior: a file holds any number.
+    errors = [common_tilt(parts[:, k], 1.0) for k in range(len(intrinsics.NAMES))]
+    facts["intrinsics"] = dict(zip(intrinsics.NAMES, errors, strict=True))
+    if line := intrinsics.contradiction(errors, rig.left.fx):
+        lines, facts["contradiction"] = [line, *lines], line
+    return Bundle({}, facts | ({"warnings": lines} if lines else {}))
 
 
 def _words(tilt: float, sigma: float, rig: Rig) -> str:
@@ -74,7 +82,7 @@ def _words(tilt: float, sigma: float, rig: Rig) -> str:
 STAGE = Stage(
     name="common_tilt",
     version=1,
-    summary="tilt that the disparities of all segments share",
+    summary="tilt and intrinsics that the disparities of all segments share",
     params=NoParams,
     inputs=("segments*", "rig"),
     outputs=(),

@@ -82,6 +82,15 @@ def landmarks_from_disparity(
     return _landmarks(rays, np.where(meets, depth, np.nan), rig, T_local_left, disparity_sigma, max_depth_ratio, lost)
 
 
+def triangulated(
+    points: Floats, right: Floats, rig: Rig, T_local_left: RigidTransform, disparity_sigma: Floats
+) -> Landmarks:
+    """Landmarks of matches (n, 2) in both images; NaN where the rays do not meet in front of the cameras."""
+    rays = rig.left.rays(points)
+    depth = _triangulate(rays, right, rig)
+    return _landmarks(rays, np.where(depth > 0, depth, np.nan), rig, T_local_left, disparity_sigma, np.inf, {})
+
+
 def matches_at(points: Floats, column: Floats32, row: Floats32, validity: Bytes) -> tuple[Floats, Bools]:
     """Disparity vectors (n, 2) by bilinear interpolation, and whether the four neighbours are matched and agree."""
     rows, cols = column.shape

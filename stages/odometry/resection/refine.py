@@ -29,6 +29,7 @@ from rille.stages.core.declare import Array, Bundle, Inputs, Stage
 from rille.stages.core.errors import ConfigError
 from rille.stages.geometry.epipolar import standing
 from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
 from rille.stages.geometry.projection import NEAREST
 from rille.stages.numeric.robust import huber_weight
@@ -42,6 +43,7 @@ from rille.stages.odometry.resection.bundle_adjustment import (
     scatter,
     tilt_of,
 )
+from rille.stages.odometry.resection.intrinsics import SegmentCameras, contribution
 from rille.stages.odometry.resection.landmarks import Landmarks
 from rille.stages.odometry.resection.pnp import HUBER, Observations, Poses, back_projection, norms
 from rille.stages.odometry.resection.resect import MINIMUM, SOURCES, ResectParams, coordinates, root, scatter_of_blocks
@@ -77,11 +79,15 @@ def views_of(track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig) -
     T = [RigidTransform.from_matrix(poses[j]).inverse() for j in frames]
     state = SegmentState(np.array([p.rotation for p in T]), np.array([p.translation for p in T]), np.zeros(len(which)))
     seen = np.ascontiguousarray(inlier[which][:, frames].T)
-    tilt = _tilt_pattern(known.position, RigidTransform.from_matrix(poses[0]), rig)
+    tilt = _tilt_pattern(known.position, _key_pose(resection), rig)
     # An exact disparity would have infinite information.
     held = np.maximum(known.sigma, 1e-3)
     views = SegmentTracks(known.position, known.per_pixel, held, pixels, seen, rig.left, tilt)
     return _determined(SegmentStart(views, state, frames, which))
+
+
+def _key_pose(resection: Bundle) -> RigidTransform:
+    return RigidTransform.from_matrix(np.asarray(resection["poses"])[0])
 
 
 def _determined(one: SegmentStart) -> SegmentStart | None:
@@ -139,9 +145,12 @@ def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         judged = [_anew(one, new.poses, tilt, resect) for one, new in zip(given, out, strict=True)]
         facts, _ = _adjusted(judged, out, params)
     elif params.tilt_sigma_deg > 0:
-        of = [(one.views, states[k]) for k, one in list(enumerate(found))[kept] if one is not None]
-        told = [tilt_of(views, state, facts["bias_px"], params) for views, state in of]
+        of = [(given[k], one.views, states[k]) for k, one in list(enumerate(found))[kept] if one is not None]
+        told = [tilt_of(views, state, facts["bias_px"], params) for _, views, state in of]
         meta["tilt"] = [list(pair) for pair in told if np.isfinite(pair).all()]
+        lenses = {side: Lens.from_dict(lens) for side, lens in args.get("lenses", {}).items()}
+        cameras = [SegmentCameras(one.rig, lenses, _key_pose(one.resection)) for one, _, _ in of]
+        meta["intrinsics"] = [contribution(*one[1:], at, params) for one, at in zip(of, cameras, strict=True)]
     per_frame = [item for one, of in zip(given[kept], out[kept], strict=True) for item in _per_frame(one, of)]
     meta |= {"frames": [len(one.poses) for one in out[kept]], "points": [len(one.landmarks) for one in out[kept]]}
     meta |= {"adjustment": facts, "per_frame": per_frame}

@@ -1,0 +1,101 @@
+"""Error of the intrinsics that both cameras share, from the contributions of all adjusted segments.
+
+A wrong focal length stretches what a stereo pair sees along the optical axis, a wrong principal point shears it. A
+straight drive shows neither. Where the camera turns, it sees the same points stretched along another axis, which no
+motion explains. Each segment gives the change of its adjustment's cost with each number, its landmarks triangulated and
+its tracks undistorted anew; all segments together give the error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from rille.stages.core.arrays import Floats
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.lens import Lens
+from rille.stages.odometry.resection.bundle_adjustment import RefineParams, SegmentState, SegmentTracks, adjust
+from rille.stages.odometry.resection.landmarks import triangulated
+
+NAMES = ("focal length", "principal point's column", "principal point's row")
+
+STEP = 0.01
+"""Change of each number by which the cost is differentiated, over the focal length, as all errors here."""
+
+MIN_ERROR = 0.015
+"""Error over the focal length up to which calibrations pass for good: what remains of lens distortion looks like it."""
+
+MIN_SIGMAS = 5.0
+"""Standard deviations from which on an error is stated."""
+
+
+class SegmentCameras(NamedTuple):
+    """Rig of a segment, its key's pose, and by the camera's name the lenses of images that were undistorted."""
+
+    rig: Rig
+    lenses: Mapping[str, Lens]
+    T_local_key: RigidTransform
+
+
+def changed(camera: Camera, name: str, by: float) -> Camera:
+    """Camera with another focal length or principal point, by a share of the focal length."""
+    if name == NAMES[0]:
+        return replace(camera, fx=camera.fx * (1.0 + by), fy=camera.fy * (1.0 + by))
+    if name == NAMES[1]:
+        return replace(camera, cx=camera.cx + by * camera.fx)
+    return replace(camera, cy=camera.cy + by * camera.fy)
+
+
+def with_change(views: SegmentTracks, cameras: SegmentCameras, name: str, by: float) -> SegmentTracks:
+    """Measurements as they would be if both cameras had another number."""
+    rig, T_local_key = cameras.rig, cameras.T_local_key
+    other = replace(rig, left=changed(rig.left, name, by), right=changed(rig.right, name, by))
+
+    def undistorted_anew(pixels: Floats, side: str, given: Camera, ideal: Camera) -> Floats:
+        if (lens := cameras.lenses.get(side)) is None:
+            return pixels
+        raw = lens.distort(np.nan_to_num(pixels).reshape(-1, 2), given)
+        again = replace(lens, camera=changed(lens.camera, name, by))
+        return again.undistort(raw, ideal).reshape(pixels.shape)
+
+    key = T_local_key.inverse().apply(views.position)
+    left = undistorted_anew(rig.left.project(key), "left", rig.left, other.left)
+    right = undistorted_anew(rig.right.project(rig.T_right_left.apply(key)), "right", rig.right, other.right)
+    at = triangulated(left, right, other, T_local_key, views.sigma)
+    pixels = undistorted_anew(views.pixels, "left", rig.left, other.left)
+    return replace(views, position=at.position, along=at.per_pixel, pixels=pixels, camera=other.left)
+
+
+def contribution(
+    views: SegmentTracks, state: SegmentState, cameras: SegmentCameras, params: RefineParams
+) -> list[tuple[float, float]]:
+    """Information and pull of the error of each of :data:`NAMES` by an adjusted segment, all its unknowns free."""
+    parts = []
+    for name in NAMES:
+        three = [with_change(views, cameras, name, by) for by in (-STEP, 0.0, STEP)]
+        finite = [np.isfinite(v.position).all(1) & np.isfinite(v.pixels).all(2) for v in three]
+        seen = views.seen & np.all(finite, axis=0)
+        below, at, above = (adjust([(replace(v, seen=seen), state)], params)[3] for v in three)
+        parts.append(((below - 2.0 * at + above) / STEP**2, (below - above) / (2.0 * STEP)))
+    return parts
+
+
+def contradiction(errors: Sequence[tuple[float, float]], focal: float) -> str:
+    """One line on the number of :data:`NAMES` that the tracks contradict most; empty where they contradict none.
+
+    Parameters
+    ----------
+    errors : of each, with its standard deviation, over the focal length.
+    focal : focal length, pixels.
+    """
+    name, (error, sigma) = max(zip(NAMES, errors, strict=True), key=lambda item: abs(item[1][0]) / item[1][1])
+    if abs(error) < max(MIN_ERROR, MIN_SIGMAS * sigma):
+        return ""
+    scale, unit = (100.0, "%") if name == NAMES[0] else (focal, "px")
+    return (
+        f"the tracks contradict the {name} of both cameras: where the camera turns they ask for one that differs by "
+        f"some {scale * error:+.2g} +- {scale * sigma:.1g} {unit}; scale and heading are wrong: calibrate anew"
+    )
