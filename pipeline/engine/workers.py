@@ -245,7 +245,7 @@ class Inline:
 
 def _here(jobs: int, memory: float) -> Dask:
     """Workers of this machine; they start while this process goes on."""
-    interactive = leave_out()  # before anything else is imported
+    leave_out()  # before anything else is imported
     from distributed import Client, LocalCluster
 
     _configure()
@@ -271,7 +271,7 @@ def _here(jobs: int, memory: float) -> Dask:
         _, within = cluster.scheduler.listeners
         # As the default client it would take over whatever else the calling program computes with dask.
         client = Client(within.contact_address, loop=cluster.loop, set_as_default=False)
-        made = Dask(client, foreign.Presence(client, BIRTH_SECONDS), cluster=cluster, interactive=interactive)
+        made = Dask(client, foreign.Presence(client, BIRTH_SECONDS), cluster=cluster)
         cluster.scale(jobs)
     return made
 
@@ -314,11 +314,10 @@ class Dask:
         *,
         cluster: Any = None,
         ours: bool = True,
-        interactive: bool = False,
         likeness: str = "",
     ) -> None:
         self._client, self._presence, self._cluster, self._ours = client, presence, cluster, ours
-        self._interactive, self._likeness = interactive, likeness
+        self._likeness = likeness
         self._run, self._submitted = f"rille-{uuid.uuid4().hex}", 0
         self._looked = time.monotonic()
         self._futures: dict[int, Any] = {}
@@ -469,7 +468,7 @@ class Dask:
             self._cluster.close(timeout=within)
         self._cluster.shutdown_on_close = False  # else it is closed once more at exit, for up to ten seconds
         _kill(processes)
-        take_back(self._interactive)
+        take_back()
 
 
 def work(call: Call, run: str, likeness: str, *made: Ref | None) -> Ref | None:

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable
 from contextlib import ExitStack, chdir, suppress
 from importlib.machinery import ModuleSpec, PathFinder
+from threading import Lock
 from types import ModuleType
 from typing import Any
 
@@ -24,6 +25,8 @@ SEARCH_PATHS = ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH")
 
 NUMBA_CONFIG = "numba.core.config"
 
+_lock, _was_on_path = Lock(), list[bool]()
+
 
 def absolute_search_paths() -> dict[str, str]:
     """Variables without entries that depend on where a process is started."""
@@ -32,24 +35,26 @@ def absolute_search_paths() -> dict[str, str]:
     return {name: os.pathsep.join(kept) or os.devnull for name, kept in entries.items()}
 
 
-def leave_out() -> bool:
-    """Have Python processes that are started look for no module in the current folder.
+def leave_out() -> None:
+    """Have Python processes that are started look for no module in the current folder, until :func:`take_back`.
 
-    Returns
-    -------
-    Whether it was on ``sys.path`` of this process, an interactive Python; workers would take it over.
+    Workers would take over an empty entry of ``sys.path``, as an interactive Python has it. Runs in one process may
+    overlap: the last that ends takes back what the first has done.
     """
-    os.environ["PYTHONSAFEPATH"] = "1"
-    if interactive := "" in sys.path:
-        sys.path.remove("")
-    return interactive
+    with _lock:
+        os.environ["PYTHONSAFEPATH"] = "1"
+        _was_on_path.append("" in sys.path)
+        if _was_on_path[-1]:
+            sys.path.remove("")
 
 
-def take_back(interactive: bool) -> None:
-    """Undo :func:`leave_out` so far as programs notice that this process, which may be a user's, starts otherwise."""
-    sys.path[:0] = [""] * interactive
-    if not sys.flags.safe_path:
-        os.environ.pop("PYTHONSAFEPATH", None)
+def take_back() -> None:
+    """Undo one :func:`leave_out`, so that a program that uses this process notices nothing of it."""
+    with _lock:
+        if _was_on_path.pop():
+            sys.path.insert(0, "")
+        if not _was_on_path and not sys.flags.safe_path:
+            os.environ.pop("PYTHONSAFEPATH", None)
 
 
 class Hook(importlib.abc.MetaPathFinder):

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from rille.pipeline.engine.runtime.apart import leave_out, take_back
+
 RILLE = str(Path(sysconfig.get_path("scripts")) / "rille")
 
 MODULES = ("pickle", "socket", "numba", "yaml", "json", "csv", "zipfile", "typing", "pathlib", "matplotlib", "tornado")
@@ -116,6 +118,19 @@ PLAN = ("plan", "mockup-short", "--frames", "0:1")
 def test_the_client_leaves_the_current_folder_out(folder, command, path):
     lay(folder, traps(python=not path))
     assert "never computed" in start(folder, *command, *PLAN, PYTHONPATH=path)
+
+
+def test_the_last_of_two_runs_in_one_interactive_python_takes_the_path_back(monkeypatch):
+    monkeypatch.setattr(sys, "path", ["", *sys.path])
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    leave_out()
+    leave_out()
+    take_back()
+    assert "" not in sys.path
+    assert "PYTHONSAFEPATH" in os.environ
+    take_back()
+    assert sys.path[0] == ""
+    assert "PYTHONSAFEPATH" not in os.environ
 
 
 def test_workers_and_their_tracker_leave_it_out_of_the_path_of_an_interactive_python(folder, tmp_path):
