@@ -54,30 +54,24 @@ def best_partners(offsets: Mapping[int, Mapping[int, Floats | None]]) -> dict[st
     ``rows``: spread [px] of each pair as named; ``partners``: pair and frame of its right image, where that is another;
     ``contradiction``: one line where there is any.
     """
-    rows, partners, better = [], dict[int, int](), []
+    rows, partners = list[float](), dict[int, int]()
     for pair, by in offsets.items():
         known = {frame: apart for frame, apart in by.items() if apart is not None}
         if pair not in known:
             continue
         # Many on their lines, not a small spread: far away in time only things match that hardly move in the image.
-        fits = {frame: int((np.abs(apart) < MIN_SPREAD_PX).sum()) for frame, apart in known.items()}
-        other = max(fits, key=fits.__getitem__)
-        named, fitted = mad_sigma(known[pair]), mad_sigma(known[other])
-        rows.append(named)
-        if named > MIN_SPREAD_PX and fitted < MAX_SPREAD_SHARE * named:
+        other = max(known, key=lambda frame: int((np.abs(known[frame]) < MIN_SPREAD_PX).sum()))
+        rows.append(mad_sigma(known[pair]))
+        if rows[-1] > MIN_SPREAD_PX and mad_sigma(known[other]) < MAX_SPREAD_SHARE * rows[-1]:
             partners[pair] = other
-            better.append((fitted, named))
     facts: dict[str, Any] = {"rows": rows, "partners": [list(item) for item in partners.items()]}
     if partners:
         shifts = {other - pair for pair, other in partners.items()}
         which = ", ".join(f"left {pair} with right {other}" for pair, other in partners.items())
         if len(partners) > 2 and len(shifts) == 1:
             which = f"left i with right i{shifts.pop():+d}"
-        fitted, named = np.median(better, axis=0)
-        facts["contradiction"] = (
-            f"left and right are not of one time: {which} spreads rows by {fitted:.2f} px, as named {named:.2f} px"
-        )
-        facts["warnings"] = [facts["contradiction"]]
+        line = f"left and right are not of one time: by its rows, {which} is simultaneous"
+        facts |= {"contradiction": line, "warnings": [line]}
     return facts
 
 
