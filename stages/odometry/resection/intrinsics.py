@@ -8,11 +8,13 @@ its tracks undistorted anew; all segments together give the error.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
@@ -25,7 +27,10 @@ NAMES = ("focal length", "principal point's column", "principal point's row")
 STEP = 0.01
 """Change of each number by which the cost is differentiated, over the focal length, as all errors here."""
 
-MIN_ERROR = 0.015
+MIN_TURN_DEG = 4.0
+"""Turn of a segment from which on it counts: errors that all tracks share hide what smaller ones show."""
+
+MIN_ERROR = 0.0175
 """Error over the focal length up to which calibrations pass for good: what remains of lens distortion looks like it."""
 
 MIN_SIGMAS = 5.0
@@ -72,7 +77,13 @@ def with_change(views: SegmentTracks, cameras: SegmentCameras, name: str, by: fl
 def contribution(
     views: SegmentTracks, state: SegmentState, cameras: SegmentCameras, params: RefineParams
 ) -> list[tuple[float, float]]:
-    """Information and pull of the error of each of :data:`NAMES` by an adjusted segment, all its unknowns free."""
+    """Information and pull of the error of each of :data:`NAMES` by an adjusted segment, all its unknowns free.
+
+    0 where the segment turns too little.
+    """
+    turns = Rotation.from_matrix(state.R @ cameras.T_local_key.rotation).magnitude()
+    if turns.max() < math.radians(MIN_TURN_DEG):
+        return [(0.0, 0.0)] * len(NAMES)
     parts = []
     for name in NAMES:
         three = [with_change(views, cameras, name, by) for by in (-STEP, 0.0, STEP)]
@@ -84,18 +95,23 @@ def contribution(
 
 
 def contradiction(errors: Sequence[tuple[float, float]], focal: float) -> str:
-    """One line on the number of :data:`NAMES` that the tracks contradict most; empty where they contradict none.
+    """One line on the numbers of :data:`NAMES` that the tracks contradict; empty where they contradict none.
+
+    Where the camera turns about one axis, one wrong number looks like another one: all that it may be are named.
 
     Parameters
     ----------
     errors : of each, with its standard deviation, over the focal length.
     focal : focal length, pixels.
     """
-    name, (error, sigma) = max(zip(NAMES, errors, strict=True), key=lambda item: abs(item[1][0]) / item[1][1])
-    if abs(error) < max(MIN_ERROR, MIN_SIGMAS * sigma):
+    wrong = []
+    for name, (error, sigma) in zip(NAMES, errors, strict=True):
+        if abs(error) > max(MIN_ERROR, MIN_SIGMAS * sigma):
+            scale, unit = (100.0, "%") if name == NAMES[0] else (focal, "px")
+            wrong.append(f"the {name} by some {scale * error:+.2g} +- {scale * sigma:.1g} {unit}")
+    if not wrong:
         return ""
-    scale, unit = (100.0, "%") if name == NAMES[0] else (focal, "px")
     return (
-        f"the tracks contradict the {name} of both cameras: where the camera turns they ask for one that differs by "
-        f"some {scale * error:+.2g} +- {scale * sigma:.1g} {unit}; scale and heading are wrong: calibrate anew"
+        "the tracks contradict the calibration of both cameras: where the camera turns they ask for another one, "
+        f"{' or '.join(wrong)}; scale and heading are wrong: calibrate anew"
     )
