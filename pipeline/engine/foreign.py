@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine.code_digest import OWN, tree_digest
+from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.packages import version
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.engine.store.base import Store
 from rille.stages.core.errors import ConfigError, RilleError
 
 PACKAGES = (
@@ -38,6 +38,8 @@ NO_WORKERS_SECONDS = 30.0
 
 SILENCE_SECONDS = 20.0
 """Time without an answer of the scheduler before it counts as gone, and of a worker before the user is warned."""
+
+SHARE = "give --cache a folder that all machines share"
 
 Identity = Mapping[str, str]
 
@@ -63,34 +65,27 @@ def likeness() -> str:
     return digest(identity())
 
 
-def unlike(theirs: Identity, ours: Identity) -> str:
-    """In what a worker differs, in words; empty if in nothing."""
-    return ", ".join(f"{n} {theirs.get(n, 'none')} instead of {ours[n]}" for n in ours if theirs.get(n) != ours[n])
+def compare(ours: Identity, cache: Path, token: str) -> str:
+    """Run on a worker: name of the probe that it has left in the cache, if it is like the client.
 
-
-def introduce(cache: Path, token: str, name: str) -> dict[str, Any]:
-    """Run on a worker: what it is, and whether it reads the client's probe and writes one of its own."""
-    threads = [v for v in ONE_THREAD if os.environ.get(v) != "1"]
-    facts: dict[str, Any] = {"identity": identity(), "threads": threads, "cache": ""}
-    try:
-        store = Store(cache)
-        if read_probe(store, token) != token.encode():
-            facts["cache"] = "the client's probe is not there"
-        write_probe(store, f"{token}-{name}")
-    except (OSError, RilleError) as error:
-        facts["cache"] = " ".join(str(error).split())
-    return facts
-
-
-def write_probe(store: Store, name: str) -> None:
-    """Leave a small file in the cache; clearing up takes what is forgotten."""
-    atomic.write(store.root / "probe" / name, name)
-
-
-def read_probe(store: Store, name: str) -> bytes | None:
-    """Read the probe that the client wrote; None if this machine cannot see it."""
-    path = store.root / "probe" / name
-    return path.read_bytes() if path.is_file() else None
+    Raises
+    ------
+    ConfigError
+        It differs, may use several threads a library, or does not share the cache.
+    """
+    theirs = identity()
+    differs = [f"{n} {theirs.get(n, 'none')} instead of {ours[n]}" for n in ours if theirs.get(n) != ours[n]]
+    if differs:
+        remedy = "install the same there, and start it again"
+        raise ConfigError("RIL-521", f"differs: {', '.join(differs)}", remedy=remedy)
+    if threads := [name for name in ONE_THREAD if os.environ.get(name) != "1"]:
+        text = f"may use several threads a library ({threads[0]} is not 1)"
+        raise ConfigError("RIL-522", text, remedy="start it with OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1")
+    probe = cache / "probe" / f"{token}-{uuid.uuid4().hex}"
+    with reported("RIL-523", f"does not share the cache {cache}", remedy=SHARE, kind=ConfigError):
+        (cache / "probe" / token).read_bytes()
+        atomic.write(probe, "")
+    return probe.name
 
 
 def examine(client: Any, cache: Path) -> None:
@@ -101,55 +96,32 @@ def examine(client: Any, cache: Path) -> None:
     ConfigError
         The first such worker, with the difference.
     """
-    store, token, ours = Store(cache), uuid.uuid4().hex, identity()
-    workers = {address: f"w{k}" for k, address in enumerate(sorted(client.nthreads()))}
-    names = [token, *(f"{token}-{short}" for short in workers.values())]
+    probes, token = cache / "probe", uuid.uuid4().hex
     try:
-        write_probe(store, token)
-        # One at a time, so that a refusal names the worker.
-        for address, short in workers.items():
-            answer = client.run(introduce, cache, token, short, workers=[address], on_error="return").get(address)
-            if answer is not None:  # None is one that has left meanwhile
-                _judge(client, address, answer, ours, cache)
-            if answer is not None and read_probe(store, f"{token}-{short}") is None:
-                raise _no_cache(worker_name(client, address), cache, "its probe is not seen here")
+        atomic.write(probes / token, "")
+        answers = client.run(compare, identity(), cache, token, on_error="return")
+        for address, answer in sorted(answers.items()):
+            name = worker_name(client, address)
+            if isinstance(answer, ConfigError):
+                raise answer.at(name)
+            if isinstance(answer, BaseException):
+                text = f"{name} cannot run Rille: {type(answer).__name__}: {' '.join(str(answer).split())[:200]}"
+                raise ConfigError(
+                    "RIL-520", text, remedy="install the same version there, and start the workers with it"
+                )
+            if not (probes / answer).is_file():
+                text = f"{name} does not share the cache {cache}: its probe is not seen here"
+                raise ConfigError("RIL-523", text, remedy=SHARE)
     finally:
-        for name in names:
+        for probe in probes.glob(f"{token}*"):
             with suppress(OSError):
-                (store.root / "probe" / name).unlink()
-
-
-def _judge(client: Any, address: str, answer: Any, ours: Identity, cache: Path) -> None:
-    name = worker_name(client, address)
-    if isinstance(answer, BaseException):
-        raise ConfigError(
-            "RIL-520",
-            f"{name} cannot run Rille: {type(answer).__name__}: {' '.join(str(answer).split())[:200]}",
-            remedy="install the same version there, and start the workers with it",
-        )
-    if difference := unlike(answer["identity"], ours):
-        raise ConfigError(
-            "RIL-521", f"{name} differs: {difference}", remedy="install the same there, and start it again"
-        )
-    if answer["threads"]:
-        raise ConfigError(
-            "RIL-522",
-            f"{name} may use several threads a library ({answer['threads'][0]} is not 1)",
-            remedy="start it with OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1",
-        )
-    if answer["cache"]:
-        raise _no_cache(name, cache, answer["cache"])
+                probe.unlink()
 
 
 def worker_name(client: Any, address: str) -> str:
     """Name of a worker for messages."""
     known = client.scheduler_info(n_workers=-1)["workers"].get(address, {}).get("name", "")
     return f"worker {known} ({address})" if known not in ("", address) else f"worker {address}"
-
-
-def _no_cache(name: str, cache: Path, why: str) -> ConfigError:
-    remedy = "give --cache a folder that all machines share"
-    return ConfigError("RIL-523", f"{name} does not share the cache {cache}: {why}", remedy=remedy)
 
 
 class Presence:

@@ -127,7 +127,8 @@ def test_the_ledger_of_a_default_run_names_the_dask_worker_of_each_task(tmp_path
 
 
 def test_a_cache_that_is_not_shared_is_refused(hands, tmp_path, monkeypatch):
-    monkeypatch.setattr(foreign, "write_probe", lambda store, name: None)  # the workers see another folder
+    write = foreign.atomic.write
+    monkeypatch.setattr(foreign.atomic, "write", lambda path, text: write(tmp_path / "elsewhere" / path.name, text))
     with raises("RIL-523"):
         run(tmp_path / "cache", hands.address)
 
@@ -156,23 +157,10 @@ def test_unknown_executors(kind):
         workers.check(kind)
 
 
-def test_differences_in_words():
-    ours = {"Python": "3.11.7", "numpy": "2.4.6", "zarr": "3.1.6"}
-    assert foreign.unlike(ours, ours) == ""
-    assert foreign.unlike({"Python": "3.11.7", "numpy": "2.4.5"}, ours) == (
-        "numpy 2.4.5 instead of 2.4.6, zarr none instead of 3.1.6"
-    )
-
-
-def test_threads_of_libraries_are_refused(tmp_path):
-    told = {"identity": {}, "threads": ["OMP_NUM_THREADS"], "cache": ""}
-
-    class Client:
-        def scheduler_info(self, n_workers):
-            return {"workers": {"tcp://a": {"name": "big"}}}
-
-    with raises("RIL-522", "tcp://a"):
-        foreign._judge(Client(), "tcp://a", told, {}, tmp_path)
+def test_threads_of_libraries_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "4")
+    with raises("RIL-522", "OMP_NUM_THREADS"):
+        foreign.compare(foreign.identity(), tmp_path, "token")
 
 
 @pytest.mark.slow
