@@ -348,7 +348,16 @@ class Dask:
         name = f"{call.spec.stage.name}-{self._run}-{self._submitted}"
         inputs = [self._futures[number] for number in call.upstream()]
         self._futures[call.number] = self._client.submit(
-            work, call, self._run, self._likeness, *inputs, key=name, priority=-call.number, pure=False, retries=0
+            work,
+            # Bytes: dask would unpickle a call, and import its stage, on the thread on which a worker hears of others.
+            pickle.dumps(call),
+            self._run,
+            self._likeness,
+            *inputs,
+            key=name,
+            priority=-call.number,
+            pure=False,
+            retries=0,
         )
         self._labels[name] = call.spec.label
 
@@ -471,7 +480,7 @@ class Dask:
         take_back()
 
 
-def work(call: Call, run: str, likeness: str, *made: Ref | None) -> Ref | None:
+def work(pickled: bytes, run: str, likeness: str, *made: Ref | None) -> Ref | None:
     """Run a call on a worker, unless an input did not come or the worker is unlike the client; give its artifact to
     the calls that wait for it.
 
@@ -481,6 +490,7 @@ def work(call: Call, run: str, likeness: str, *made: Ref | None) -> Ref | None:
     from distributed import get_worker
 
     _prepare(ours=not likeness)
+    call: Call = pickle.loads(pickled)
     worker, outcome = get_worker(), NotBegun()  # type: tuple[Any, Ended]
     refs = {number: ref for number, ref in zip(call.upstream(), made, strict=True) if ref is not None}
     if likeness and foreign.likeness() != likeness:
