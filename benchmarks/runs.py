@@ -3,8 +3,8 @@
 ``python benchmarks/runs.py [--sequence mockup] [--warm 5]``
 
 A cold run starts with an empty cache and no compiled kernels; warm runs follow, with nothing to compute. Printed are
-wall and processor time, and the bound ``1.15 x max(seconds of stages / cores, longest chain) + 5 s`` of the cold run
-with ``rille timing``'s account.
+wall and processor time, and the bound ``1.15 x seconds of stages / workers + 5 s`` of the cold run with ``rille
+timing``'s account.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ def measure(sequence: str, folder: Path, warm: int) -> None:
     print(f"cold   {wall:7.2f} s by the clock, {used:7.2f} s of processors: {text.split('  ')[-1].strip()}")
     _, _, account = rille("timing", sequence, "--runs", str(folder / "runs"), environment=environment)
     print("       " + account.strip().replace("\n", "\n       "))
-    bound = float(next(iter(re.findall(r"limit of a good run ([\d.]+) s", account))))
+    workers, seconds = re.findall(r" with (\d+) worker", account)[0], account.splitlines()[-1].split()[1]
+    bound = 1.15 * float(seconds) / int(workers) + 5.0
     print(f"       command to prompt {wall:.1f} s, bound {bound:.1f} s: {'kept' if wall <= bound else 'NOT KEPT'}")
     runs = [rille("reconstruct", sequence, *where, environment=environment) for _ in range(warm)]
     if any("computed 0," not in text for *_, text in runs):

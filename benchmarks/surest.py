@@ -116,7 +116,7 @@ def main() -> None:
     from rille.pipeline.runs.session import Options, reconstruct
 
     cache = cache_folder(given.cache)
-    if given.run is None and reconstruct(Options(SEQUENCE, (PRESET,), runs=given.runs, cache=cache)):
+    if given.run is None and reconstruct(Options(SEQUENCE, (PRESET,), runs=given.runs, cache=str(cache))):
         sys.exit("the run is not complete")
     folder = lookup.find(given.run or SEQUENCE, given.runs)
     rows = {row["label"]: row for row in events.read(folder / lookup.LEDGER)}

@@ -78,22 +78,22 @@ def reconstruct(
     /...computed..., cached 0, missing ...
     2 m
     """
-    from rille.pipeline.commands.options import cache_folder
     from rille.pipeline.engine.runtime.environment import prepare_environment
 
     prepare_environment()
+    from rille.pipeline.commands.options import Options
     from rille.pipeline.runs import session
 
     if not isinstance(seq, StereoSequence):
         check_place(seq)
     opened = seq.source if isinstance(seq, StereoSequence) else None
-    options = session.Options(
+    options = Options(
         str(seq) if opened is None else opened.name,
         assignments=tuple(assignments(settings)),
         frames=frames,
         executor=executor if client is None else client,
         runs=Path(runs),
-        cache=cache_folder(cache),
+        cache=None if cache is None else str(cache),
         opened=opened,
     )
     # Absolute: the program may change its folder, or send the run to another.

@@ -31,6 +31,7 @@ FLOORS = (
     "rille.pipeline.flow",
     "rille.pipeline.export",
     "rille.pipeline.report",
+    "rille.pipeline.commands.options",
     "rille.pipeline.runs",
     "rille.pipeline.commands",
     "rille.pipeline",

@@ -84,7 +84,7 @@ def test_resting_drone(data_dir: Path, tmp_path: Path) -> None:
 @pytest.mark.data
 def test_flying_drone(data_dir: Path, tmp_path: Path) -> None:
     manifest = tmp_path / "flight.toml"
-    assert init(data_dir / "euroc_moving", manifest) == 0
+    assert init(data_dir / "euroc_moving", output=manifest) == 0
     sensor = (data_dir / "euroc_moving" / "cam0_sensor.yaml").read_text().split("\n", 1)[1]  # behind %YAML:1.0
     mount = np.array(yaml.safe_load(sensor)["T_BS"]["data"]).reshape(4, 4)[:3]
     text = manifest.read_text()

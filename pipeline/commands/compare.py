@@ -6,38 +6,47 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from rille.datasets.text.reading import TABLE, read_lines, read_text, read_toml
 from rille.pipeline.commands import compare_dem
-from rille.pipeline.commands.options import check_output
+from rille.pipeline.commands.options import COMPLETE, RUNS, Debug, Output, Run, Runs, check_output
 from rille.pipeline.engine import events
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.export.read_dem import read_elevation
 from rille.pipeline.report.words import metres, quantity
 from rille.pipeline.runs import lookup
+from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import ConfigError, InputError
 
 
-def compare(a: Path, b: Path, output: Path) -> int:
-    """Print what differs between two runs, and draw the difference of their elevations; gives the exit code.
+def compare(
+    a: Run,
+    b: Run,
+    *,
+    output: Annotated[Path, Output] = Path("comparison.png"),
+    runs: Runs = RUNS,
+    debug: Debug = False,
+) -> int:
+    """Compare two runs: which parameters, tasks, figures, positions and elevations differ.
 
-    Raises
-    ------
-    ConfigError
-        One of the runs did not come to its end, or the picture cannot be written.
+    Parameters
+    ----------
+    output
+        Picture of the difference of the elevations, A minus B, to write.
     """
+    one, other = both = lookup.find(a, runs), lookup.find(b, runs)
     # All before anything is printed: where something cannot be read or written there is no half of a comparison.
     check_output(output, ".png", ".pdf", ".svg")
-    with lookup.reading(a, b):
-        reports = [_report(run) for run in (a, b)]
-        settings = [_flat(read_toml(run / "config.toml", "configuration")) for run in (a, b)]
-        lines = [*_parameters(*settings), *_tasks(a, b), *_figures(*reports), _positions(a, b)]
-    terrain = _elevations(a, b, output)
-    print("\n".join([f"A {lookup.name(a)}", f"B {lookup.name(b)}", *lines, terrain]))
-    return 0
+    with lookup.reading(*both):
+        reports = [_report(run) for run in both]
+        settings = [_flat(read_toml(run / "config.toml", "configuration")) for run in both]
+        lines = [*_parameters(*settings), *_tasks(*both), *_figures(*reports), _positions(*both)]
+    terrain = _elevations(*both, output)
+    print("\n".join([f"A {lookup.name(one)}", f"B {lookup.name(other)}", *lines, terrain]))
+    return COMPLETE
 
 
 def _report(run: Path) -> dict[str, Any]:
@@ -46,16 +55,15 @@ def _report(run: Path) -> dict[str, Any]:
         raise ConfigError(
             "RIL-890", f"run {lookup.name(run)} did not come to its end", remedy="run the same command again"
         )
-    found: dict[str, Any] = json.loads(read_text(path, "report", TABLE))
-    return found
+    return dict(json.loads(read_text(path, "report", TABLE)))
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Values of nested tables by dotted names."""
-    found: dict[str, Any] = {}
+    flat: dict[str, Any] = {}
     for name, value in table.items():
-        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
-    return found
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return flat
 
 
 def _parameters(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
@@ -68,68 +76,61 @@ def _parameters(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
 
 def _tasks(a: Path, b: Path) -> Iterator[str]:
     """Counts by stage: tasks with another result, and those of which one run alone or neither has a result."""
-    every = [{row["label"]: row for row in events.read(run / lookup.LEDGER)} for run in (a, b)]
+    ledgers = [{row["label"]: row for row in events.read(run / lookup.LEDGER)} for run in (a, b)]
     # A task that failed or was left out has no digest.
-    one, other = ({label: row for label, row in rows.items() if row.get("digest")} for rows in every)
-    common = [label for label in one if label in other]
-    changed = [label for label in common if one[label]["digest"] != other[label]["digest"]]
-    neither = [label for label in every[0] if label in every[1] and label not in one and label not in other]
-    yield f"tasks         {len(common) - len(changed)} with the same result, {len(changed)} with another"
-    for words, rows, labels in (
-        ("another result", one, changed),
-        ("in A alone", one, [label for label in one if label not in other]),
-        ("in B alone", other, [label for label in other if label not in one]),
-        ("without a result in both", every[0], neither),
-    ):
-        for stage, count in Counter(rows[label]["stage"] for label in labels).items():
-            yield f"  {stage}: {count} {words}"
+    digests = {label: tuple(rows.get(label, {}).get("digest") for rows in ledgers) for label in ledgers[0] | ledgers[1]}
+    fates = {label: _fate(*pair) for label, pair in digests.items()}
+    total = Counter(fates.values())
+    yield f"tasks         {total['the same result']} with the same result, {total['another result']} with another"
+    stages = Counter((fate, (ledgers[1] | ledgers[0])[label]["stage"]) for label, fate in fates.items())
+    yield from (f"  {stage}: {n} {fate}" for (fate, stage), n in stages.items() if fate != "the same result")
+
+
+def _fate(a: str | None, b: str | None) -> str:
+    if a and b:
+        return "the same result" if a == b else "another result"
+    return "in A alone" if a else "in B alone" if b else "without a result in both"
 
 
 def _figures(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
     """Figures of the report that differ or that one run alone has; times are no results."""
-    one, other = a["metrics"], b["metrics"]
-    both = [name for name in one if name in other and name != "wall_clock"]
-    differ = [name for name in both if one[name]["value"] != other[name]["value"]]
-    shown = {name: [quantity(m[name]["value"], m[name]["unit"]) for m in (one, other)] for name in differ}
-    # What differs only beyond the digits shown would read as "12.3 -> 12.3".
-    seen = [name for name, (before, after) in shown.items() if before != after]
-    equal = f"{len(both) - len(differ)} equal, {len(differ) - len(seen)} equal to three digits"
-    yield f"figures       {equal}, {len(seen)} differ"
-    yield from (f"  {one[name]['label']}: {' -> '.join(shown[name])}" for name in seen)
-    for words, metrics, without in (("in A alone", one, other), ("in B alone", other, one)):
-        alone = [name for name in metrics if name not in without and name != "wall_clock"]
-        yield from (
-            f"  {metrics[n]['label']}: {quantity(metrics[n]['value'], metrics[n]['unit'])} {words}" for n in alone
-        )
+    one, other = ({k: m for k, m in report["metrics"].items() if k != "wall_clock"} for report in (a, b))
+    both = [name for name in one if name in other]
+    words = {n: tuple(quantity(m[n]["value"], m[n]["unit"]) for m in (one, other)) for n in both}
+    # Compared in words, of three digits: what differs only beyond would read as "12.3 -> 12.3".
+    differ = [name for name, (before, after) in words.items() if before != after]
+    yield f"figures       {len(both) - len(differ)} equal to three digits, {len(differ)} differ"
+    yield from (f"  {one[name]['label']}: {' -> '.join(words[name])}" for name in differ)
+    for where, metrics, without in (("in A alone", one, other), ("in B alone", other, one)):
+        alone = [metric for name, metric in metrics.items() if name not in without]
+        yield from (f"  {m['label']}: {quantity(m['value'], m['unit'])} {where}" for m in alone)
 
 
 def _positions(a: Path, b: Path) -> str:
     paths = [run / "trajectory.tum" for run in (a, b)]
     if not all(path.exists() for path in paths):
         return "positions     not both runs have a trajectory"
-    rows = (np.loadtxt(read_lines(path, "trajectory"), ndmin=2) for path in paths)
-    one, other = ({row[0]: row[1:4] for row in found} for found in rows)
-    common = [time for time in one if time in other]
-    if not common:
+    tables = (np.loadtxt(read_lines(path, "trajectory"), ndmin=2) for path in paths)
+    one, other = ({row[0]: row[1:4] for row in table} for table in tables)
+    apart = [float(np.linalg.norm(one[time] - other[time])) for time in one if time in other]
+    if not apart:
         return "positions     no frame has a pose in both"
-    apart = np.array([np.linalg.norm(one[time] - other[time]) for time in common])
-    rms = float(np.sqrt(np.mean(apart**2)))
-    return f"positions     of {len(common)} frames: RMS {metres(rms)}, at most {metres(float(apart.max()))} apart"
+    return f"positions     of {len(apart)} frames: {_size(np.array(apart))} apart"
+
+
+def _size(differences: Floats) -> str:
+    rms = float(np.sqrt(np.mean(np.square(differences))))
+    return f"RMS {metres(rms)}, at most {metres(float(np.abs(differences).max(initial=0.0)))}"
 
 
 def _elevations(a: Path, b: Path, output: Path) -> str:
     try:
-        models = [read_elevation(run) for run in (a, b)]
-        compare_dem.check(*models)
-        found, error, slope, distance = compare_dem.measure(models[0], models[1])
+        one, other = read_elevation(a), read_elevation(b)
+        compare_dem.check(one, other)
+        figures, error = compare_dem.measure(one, other)
     except InputError as problem:
         return f"elevations    not compared: {problem}"
     with reported("RIL-892", f"{output} cannot be written", remedy="name another with -o", kind=ConfigError):
-        compare_dem.draw(output, found, error, slope, distance)
-    known = np.isfinite(error)
-    moved, most = int(np.count_nonzero(error[known])), float(np.abs(error[known]).max(initial=0.0))
-    rms = float(np.sqrt(np.mean(np.square(error[known]))))
-    return (
-        f"elevations    {moved} of {int(known.sum())} common cells differ: RMS {metres(rms)}, at most {metres(most)}\n"
-        f"{output}"
-    )
+        compare_dem.draw(output, figures, error)
+    known = error[np.isfinite(error)]
+    return f"elevations    {np.count_nonzero(known)} of {known.size} common cells differ: {_size(known)}\n{output}"

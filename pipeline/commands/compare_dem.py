@@ -4,52 +4,72 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
+from rasterio.crs import CRS
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from rille.datasets.text.warning import warning
+from rille.pipeline.commands.options import COMPLETE, RUNS, Debug, Output, Runs
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import DemFile, read_elevation
 from rille.pipeline.export.writers import ENGINEERING_CRS
+from rille.pipeline.runs import lookup
 from rille.stages.core.errors import InputError
-from rille.stages.evaluation.dem_comparison import FREE, Alignment, Grid, align, binned, common, errors, figures
+from rille.stages.evaluation import dem_comparison as evaluation
+from rille.stages.evaluation.dem_comparison import Grid
 
 Floats = NDArray[np.float64]
 SLOPES_DEG = np.array([0.0, 2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0])
-RANGES = 8
-"""Bins of range, of equal width."""
+RANGE_BINS = 8
 WORDS = {"rmse": "RMSE", "nmad": "NMAD", "p95": "95 %", "bias": "bias", "median": "median"}
 
 
-def compare(path_a: Path, path_b: Path, *, align: str = "none", output: Path = Path("dem_comparison")) -> int:
-    """Compare A with the reference B; gives the exit code.
+def compare_dem(
+    a: str,
+    b: str,
+    *,
+    align: Literal["none", "shift", "tilt", "rigid"] = "none",
+    output: Annotated[Path, Output] = Path("dem_comparison"),
+    runs: Runs = RUNS,
+    debug: Debug = False,
+) -> int:
+    """Compare elevation model A with reference B: errors, completeness, error against range and slope.
 
-    Raises
-    ------
-    InputError
-        One of them cannot be read, or they are in different systems or do not overlap.
-    DegenerateError
-        The alignment that was asked for is not determined.
+    The finer one is brought to the coarser one's cells (means of the known cells inside, or bilinear between four known
+    ones); only cells that both know are compared. Prints the figures; writes OUTPUT.png and OUTPUT.json.
+
+    Parameters
+    ----------
+    a
+        GeoTIFF, ESRI ASCII grid (.asc), zarr group with elevation, x and y, or a run: its folder or name (mockup,
+        latest).
+    b
+        Reference, likewise.
+    align
+        Move A onto B first: shift (x, y, z), tilt (z and two inclinations) or rigid (all six); the motion is printed.
+    output
+        Files to write, without ending.
     """
-    a, b = read_elevation(path_a), read_elevation(path_b)
-    check(a, b)
-    for line in (*a.warnings, *b.warnings):
+    one, other = (read_elevation(lookup.elevation(text, runs)) for text in (a, b))
+    check(one, other)
+    figures, error = measure(one, other, align)
+    for line in figures["warnings"]:
         warn(line)
-    found, error, slope, distance = measure(a, b, align)
-    _print(found)
+    _print(figures)
     # Either ending is understood as the name of both files.
     target = output.with_name(output.name.removesuffix(".png").removesuffix(".json"))
     with reported("RIL-614", f"{target} cannot be written", remedy="name others with -o", kind=InputError):
-        atomic.write(target.with_name(target.name + ".json"), json.dumps(found, indent=1, allow_nan=False) + "\n")
-        draw(target.with_name(target.name + ".png"), found, error, slope, distance)
+        atomic.write(target.with_name(target.name + ".json"), json.dumps(figures, indent=1, allow_nan=False) + "\n")
+        draw(target.with_name(target.name + ".png"), figures, error)
     print(f"{target}.png  {target}.json")
-    return 0
+    return COMPLETE
 
 
 def check(a: DemFile, b: DemFile) -> None:
@@ -78,8 +98,6 @@ def check(a: DemFile, b: DemFile) -> None:
 
 
 def _same_crs(a: str, b: str) -> bool:
-    from rasterio.crs import CRS
-
     return a == b or CRS.from_wkt(a) == CRS.from_wkt(b) or {_crs_name(a), _crs_name(b)} == {_crs_name(ENGINEERING_CRS)}
 
 
@@ -93,44 +111,53 @@ def _grid(raster: DemFile) -> Grid:
     return Grid(raster.values, np.array([[t.a, t.b, t.c], [t.d, t.e, t.f]]))
 
 
-def measure(a: DemFile, b: DemFile, kind: str = "none") -> tuple[dict[str, Any], Floats, Floats, Floats | None]:
-    """All figures (JSON-able); error, slope of B in degrees and range (rows, cols) of the common cells."""
-    on_a, on_b, how = common(_grid(a), _grid(b))
-    found: dict[str, Any] = {
+def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any], Floats]:
+    """All figures of A against the reference B (JSON-able), and the error, m, of the common cells (rows, cols).
+
+    Raises
+    ------
+    InputError
+        No cell is left that both know.
+    DegenerateError
+        The alignment that was asked for is not determined.
+    """
+    on_a, on_b, how = evaluation.common(_grid(a), _grid(b))
+    missing_crs = [warning("RIL-694", f"{r.name} states no CRS: taken as the other's") for r in (a, b) if not r.crs]
+    figures: dict[str, Any] = {
         "a": _about(a),
         "b": _about(b),
         "error": "A minus B, m",
         "resampling": how,
-        "warnings": _missing_crs(a, b),
+        "warnings": [*missing_crs, *a.warnings, *b.warnings],
     }
     alignment = None
-    if kind != "none":
-        found["before_alignment"] = figures(errors(on_a, on_b))
-        alignment = align(on_a, on_b, kind)  # type: ignore[arg-type]
-        found["alignment"] = _alignment(alignment, kind)
-    error = errors(on_a, on_b, alignment)
-    known, inside = np.isfinite(on_b.values), _within(on_b, a)
-    found["figures"] = figures(error)
-    given = int(np.isfinite(error).sum())
-    if not given:
-        raise InputError(
-            "RIL-617", "no cell is left that both know", remedy="leave --align out, or compare other models"
-        )
-    found["completeness"] = {
-        "of_b": min(given / known.sum(), 1.0),
-        "of_b_within_a": min(given / max(int((known & inside).sum()), 1), 1.0),
-        "how": f"{given} cells compared, of {int(known.sum())} that B knows, {int((known & inside).sum())} of these "
+    if align != "none":
+        figures["before_alignment"] = evaluation.figures(evaluation.errors(on_a, on_b))
+        alignment = evaluation.align(on_a, on_b, align)  # type: ignore[arg-type]
+        figures["alignment"] = _alignment(alignment, align)
+    error = evaluation.errors(on_a, on_b, alignment)
+    figures["figures"] = evaluation.figures(error)
+    compared, known = int(np.isfinite(error).sum()), np.isfinite(on_b.values)
+    if not compared:
+        text = "no cell is left that both know"
+        raise InputError("RIL-617", text, remedy="leave --align out, or compare other models")
+    within = int((known & _within(on_b, a)).sum())
+    figures["completeness"] = {
+        "of_b": min(compared / known.sum(), 1.0),
+        "of_b_within_a": min(compared / max(within, 1), 1.0),
+        "how": f"{compared} cells compared, of {int(known.sum())} that B knows, {within} of these "
         "within the outline of A",
     }
     slope = np.degrees(np.arctan(np.hypot(*on_b.slopes())))
-    found["by_slope"] = {"unit": "degrees of B", "bins": binned(error, slope, SLOPES_DEG)}
-    distance = _range(on_b, a, b, found)
+    figures["by_slope"] = {"unit": "degrees of B", "bins": evaluation.binned(error, slope, SLOPES_DEG)}
+    distance, unit = _range(on_b, a, b)
+    bins = []
     if distance is not None:
         far = float(np.nanmax(np.where(np.isfinite(error), distance, np.nan)))
         # Bins are open at their upper end: a hair more keeps the farthest cell in the last one.
-        edges = np.linspace(0.0, far * (1.0 + 1e-9), RANGES + 1)
-        found["by_range"] |= {"bins": binned(error, distance, edges)}
-    return found, error, slope, distance
+        bins = evaluation.binned(error, distance, np.linspace(0.0, far * (1.0 + 1e-9), RANGE_BINS + 1))
+    figures["by_range"] = {"unit": unit, "bins": bins}
+    return figures, error
 
 
 def _about(raster: DemFile) -> dict[str, Any]:
@@ -138,67 +165,53 @@ def _about(raster: DemFile) -> dict[str, Any]:
     return {"path": raster.name, "rows": rows, "cols": cols, "cell_m": raster.cell, "crs": _crs_name(raster.crs)}
 
 
-def _missing_crs(a: DemFile, b: DemFile) -> list[str]:
-    lines = [warning("RIL-694", f"{r.name} states no CRS: taken as the other's") for r in (a, b) if not r.crs]
-    for line in lines:
-        warn(line)
-    return [*lines, *a.warnings, *b.warnings]
-
-
-def _alignment(found: Alignment, kind: str) -> dict[str, Any]:
-    from scipy.spatial.transform import Rotation
-
-    angles = np.degrees(Rotation.from_matrix(found.rotation).as_rotvec())
+def _alignment(alignment: evaluation.Alignment, kind: str) -> dict[str, Any]:
+    turn = np.degrees(Rotation.from_matrix(alignment.rotation).as_rotvec())
     names = ("x_m", "y_m", "z_m", "about_x_deg", "about_y_deg", "about_z_deg")
-    values = [*found.translation, *angles]
-    sigma = [*found.sigma[:3], *np.degrees(found.sigma[3:])]
+    values, sigma = [*alignment.translation, *turn], [*alignment.sigma[:3], *np.degrees(alignment.sigma[3:])]
     return {
         "kind": kind,
-        "motion_of_a": {names[k]: float(values[k]) for k in FREE[kind]},
-        "sigma": {names[k]: float(sigma[k]) for k in FREE[kind]},
-        "centre_m": found.centre.tolist(),
+        "motion_of_a": {names[k]: float(values[k]) for k in evaluation.FREE[kind]},
+        "sigma": {names[k]: float(sigma[k]) for k in evaluation.FREE[kind]},
+        "centre_m": alignment.centre.tolist(),
         "how": "x_b = R (x_a - centre) + centre + t; least squares of the elevation differences, Tukey's biweight",
-        "iterations": found.iterations,
-        "points": found.points,
+        "iterations": alignment.iterations,
+        "points": alignment.points,
     }
 
 
 def _within(target: Grid, a: DemFile) -> NDArray[np.bool_]:
     """Target cells (rows, cols) whose centres lie in the outline of A."""
-    rows, cols = a.values.shape
     index = _grid(a).index(target.centres())
-    return np.asarray(((index >= -0.5) & (index <= np.array([rows, cols]) - 0.5)).all(axis=-1))
+    return np.asarray(((index >= -0.5) & (index <= np.array(a.values.shape) - 0.5)).all(axis=-1))
 
 
-def _range(target: Grid, a: DemFile, b: DemFile, found: dict[str, Any]) -> Floats | None:
-    """Horizontal distance (rows, cols) from the nearest camera; None (and why) where no camera is known."""
+def _range(target: Grid, a: DemFile, b: DemFile) -> tuple[Floats | None, str]:
+    """Horizontal distance (rows, cols) from the nearest camera, and its unit; None (and why) where none is known."""
     cameras = a.viewpoints if a.viewpoints is not None else b.viewpoints
     unit = "m, from the nearest position of the left camera"
-    if cameras is None and ENGINEERING_CRS.split('"')[1] in (_crs_name(a.crs), _crs_name(b.crs)):
+    if cameras is None and _crs_name(ENGINEERING_CRS) in (_crs_name(a.crs), _crs_name(b.crs)):
         cameras, unit = np.zeros((1, 2)), "m, from the frame's origin (the first left camera)"
     if cameras is None or not len(cameras):
-        found["by_range"] = {"unit": "no camera is known: give the folder of a run for A or B", "bins": []}
-        return None
-    found["by_range"] = {"unit": unit}
-    centres = target.centres()
-    return np.asarray(cKDTree(cameras).query(centres.reshape(-1, 2))[0], np.float64).reshape(centres.shape[:2])
+        return None, "no camera is known: give the folder of a run for A or B"
+    return np.asarray(cKDTree(cameras).query(target.centres())[0], np.float64), unit
 
 
-def _print(found: dict[str, Any]) -> None:
-    print(f"A  {found['a']['path']}  {found['a']['cell_m']:g} m cells")
-    print(f"B  {found['b']['path']}  {found['b']['cell_m']:g} m cells, the reference")
-    print(f"cells: {found['resampling']}; errors are A minus B")
-    if "alignment" in found:
-        aligned = found["alignment"]
+def _print(figures: dict[str, Any]) -> None:
+    print(f"A  {figures['a']['path']}  {figures['a']['cell_m']:g} m cells")
+    print(f"B  {figures['b']['path']}  {figures['b']['cell_m']:g} m cells, the reference")
+    print(f"cells: {figures['resampling']}; errors are A minus B")
+    if "alignment" in figures:
+        aligned = figures["alignment"]
         moved = ", ".join(f"{k} {v:.6g} (sigma {aligned['sigma'][k]:.2g})" for k, v in aligned["motion_of_a"].items())
         print(f"aligned ({aligned['kind']}): A was moved by {moved}")
-        print("before  " + _line(found["before_alignment"]))
-    print(("after   " if "alignment" in found else "") + _line(found["figures"]))
-    share = found["completeness"]
+        print("before  " + _line(figures["before_alignment"]))
+    print(("after   " if "alignment" in figures else "") + _line(figures["figures"]))
+    share = figures["completeness"]
     print(f"complete {share['of_b']:.3f}; {share['of_b_within_a']:.3f} within A's outline ({share['how']})")
     for name, words in (("by_range", "range"), ("by_slope", "slope")):
-        print(f"\n{words} ({found[name]['unit']})")
-        for f in found[name]["bins"]:
+        print(f"\n{words} ({figures[name]['unit']})")
+        for f in figures[name]["bins"]:
             print(f"{f['from']:8.3g} .. {f['to']:<8.3g} {_line(f)}  {f['cells']:.0f} cells")
 
 
@@ -206,28 +219,26 @@ def _line(f: dict[str, float]) -> str:
     return "  ".join(f"{words} {1e3 * f[k]:.3g} mm" for k, words in WORDS.items() if k in f)
 
 
-def draw(path: Path, found: dict[str, Any], error: Floats, slope: Floats, distance: Floats | None) -> None:
+def draw(path: Path, figures: dict[str, Any], error: Floats) -> None:
     """Picture of the errors: map, histogram, and against range and slope."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 8.5))
-    axes = figure.subplots(2, 2, gridspec_kw={"left": 0.07, "right": 0.97, "bottom": 0.07, "top": 0.95, "hspace": 0.25})
-    f = found["figures"]
-    most = 1e3 * max(f["p95"], 1e-9)
-    shown = axes[0, 0].imshow(1e3 * error, cmap="RdBu_r", vmin=-most, vmax=most, interpolation="nearest")
-    figure.colorbar(shown, ax=axes[0, 0], label="A - B, mm")
-    axes[0, 0].set(title="error (columns and rows of the common cells)", facecolor="0.85")
-    e = 1e3 * error[np.isfinite(error)]
-    axes[0, 1].hist(np.clip(e, -2 * most, 2 * most), bins=121, color="0.4")
-    axes[0, 1].set(title=_line(f).replace("  ", ", "), xlabel="A - B, mm (the ends hold all beyond)", ylabel="cells")
-    axes[0, 1].title.set_fontsize(8)
-    for axis, name, words in ((axes[1, 0], "by_range", "range, m"), (axes[1, 1], "by_slope", "slope of B, degrees")):
-        bins = found[name]["bins"]
+    figure = Figure(figsize=(11, 8.5), layout="constrained")
+    ((field, histogram), (by_range, by_slope)) = figure.subplots(2, 2)
+    most = 1e3 * max(figures["figures"]["p95"], 1e-9)
+    shown = field.imshow(1e3 * error, cmap="RdBu_r", vmin=-most, vmax=most, interpolation="nearest")
+    figure.colorbar(shown, ax=field, label="A - B, mm")
+    field.set(title="error (columns and rows of the common cells)", facecolor="0.85")
+    known = 1e3 * error[np.isfinite(error)]
+    histogram.hist(np.clip(known, -2 * most, 2 * most), bins=121, color="0.4")
+    histogram.set(xlabel="A - B, mm (the ends hold all beyond)", ylabel="cells")
+    histogram.set_title(_line(figures["figures"]).replace("  ", ", "), fontsize=8)
+    for axis, name, words in ((by_range, "by_range", "range, m"), (by_slope, "by_slope", "slope of B, degrees")):
+        bins = figures[name]["bins"]
         middle = [0.5 * (k["from"] + k["to"]) for k in bins]
-        for figure_name in ("rmse", "nmad", "p95"):
-            axis.plot(middle, [1e3 * k[figure_name] for k in bins], "o-", label=WORDS[figure_name])
-        axis.plot(middle, [1e3 * k["bias"] for k in bins], "s--", color="0.5", label="bias")
-        axis.set(xlabel=words, ylabel="mm", title=f"{found[name]['unit']}" if not bins else "")
+        for key in ("rmse", "nmad", "p95", "bias"):
+            axis.plot(middle, [1e3 * k[key] for k in bins], "o-", label=WORDS[key])
+        axis.set(xlabel=words, ylabel="mm", title="" if bins else figures[name]["unit"])
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8)
     with atomic.replacing(path) as temporary:

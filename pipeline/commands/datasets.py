@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from cyclopts import App
 
-from rille.pipeline.commands.options import COMPLETE, Assignments, CacheFolder, Debug, cache_folder, prepare
-
-if TYPE_CHECKING:
-    from rille.datasets.protocol import Source
-    from rille.pipeline.engine.store.manifest import Ref
+from rille.datasets import registry
+from rille.datasets.export import export
+from rille.datasets.protocol import Source
+from rille.pipeline.commands.options import COMPLETE, Assignments, CacheFolder, Debug, cache_folder
+from rille.pipeline.engine.spec import Spec
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.task import ensure
+from rille.pipeline.flow import config
+from rille.stages.core.errors import ConfigError
 
 app = App(name="datasets", help="Sequences that Rille knows: list them, or export one for other tools.")
 
@@ -20,9 +24,7 @@ app = App(name="datasets", help="Sequences that Rille knows: list them, or expor
 @app.command(name="list")
 def list_datasets() -> int:
     """List the built-in sequences and the folder layouts that are recognised."""
-    from rille.datasets.registry import catalogue
-
-    for name, words in catalogue():
+    for name, words in registry.catalogue():
         print(f"{name:16s} {words}")
     return COMPLETE
 
@@ -32,7 +34,7 @@ def export_dataset(
     seq: str,
     directory: Path,
     *,
-    assignments: Assignments = None,
+    assignments: Assignments = (),
     cache: CacheFolder = None,
     debug: Debug = False,
 ) -> int:
@@ -45,16 +47,7 @@ def export_dataset(
     directory
         Folder to make; it must not exist yet or be empty.
     """
-    prepare()
-    from rille.datasets.export import export
-    from rille.datasets.registry import open_sequence
-    from rille.pipeline.engine.spec import Spec
-    from rille.pipeline.engine.store.base import Store
-    from rille.pipeline.engine.task import ensure
-    from rille.pipeline.flow import config
-    from rille.stages.core.errors import ConfigError
-
-    for_dataset, others = config.split_dataset(config.parse_assignments(assignments or ()))
+    for_dataset, others = config.split_dataset(config.parse_assignments(assignments))
     if others:
         raise ConfigError(
             "RIL-063", f"--set {next(iter(others))}: not a section of a sequence", remedy="set mockup.key=value"
@@ -69,5 +62,6 @@ def export_dataset(
         label = source.module.rsplit(".", 1)[-1]
         return ensure(place, Spec(source.module, label, source.params, source.args, source.hints), refs).ref
 
-    print(export(open_sequence(seq, for_dataset), directory, lambda source: store.open(artifact(source))))
+    sequence = registry.open_sequence(seq, for_dataset)
+    print(export(sequence, directory, lambda source: store.open(artifact(source))))
     return COMPLETE

@@ -1,89 +1,63 @@
-"""``rille graph``: the tasks of a run and what each reads, drawn by stage or by task as SVG, or as text for Graphviz.
+"""``rille graph``: the tasks of a run and what each reads, by stage or by task, as text for Graphviz.
 
 What depends on results that are still to come is drawn as the last run had it, where there was one.
 """
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from html import escape
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
-from rille.pipeline.commands.options import check_output
+from rille.pipeline.commands.options import COMPLETE, Output, Settings, cache_folder, check_output, flag
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.run import RunOptions, run
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.runs.session import Options, lay_out, settings
+from rille.pipeline.runs.session import lay_out, settings
 
-BOX, GAP = (150, 22), (20, 48)
-"""Width and height of a box, and of the space between two, pixels."""
-
-Names = Counter[str]
-Edges = Counter[tuple[str, str]]
+_SETTINGS = Settings()
 
 
-def graph(options: Options, output: Path, *, tasks: bool = False) -> int:
-    """Draw the graph of a run into a file; gives the exit code.
+def graph(
+    seq: str = "mockup",
+    *,
+    output: Annotated[Path | None, Output] = None,
+    options: Settings = _SETTINGS,
+    tasks: Annotated[bool, flag("Each task, not each stage.")] = False,
+) -> int:
+    """Draw the tasks of a run and what each reads, by stage.
 
-    Raises
-    ------
-    ConfigError
-        The file's name ends neither in ``.svg`` nor in ``.dot``.
+    Prints text for Graphviz: rille graph SEQ | dot -Tsvg > graph.svg.
+
+    Parameters
+    ----------
+    seq
+        As for reconstruct.
+    output
+        File to write instead, .dot.
     """
-    check_output(output, ".svg", ".dot")
-    draw = svg if output.suffix.lower() == ".svg" else dot
-    settled = settings(options)
+    if output is not None:
+        check_output(output, ".dot")
+    settled = settings(replace(options, sequence=seq))
     laid_out = lay_out(settled.sequence, settled.config, settled.frames)
-    run(laid_out, Store(options.cache), RunOptions(dry=True)).check()
-    names, edges = parts(laid_out, tasks=tasks)
-    atomic.write(output, draw(names, edges))
-    print(f"{output}  {len(laid_out.nodes)} tasks of {len({h.stage for h in laid_out.nodes})} stages")
-    return 0
+    run(laid_out, Store(cache_folder(options.cache)), RunOptions(dry=True)).check()
+    text = dot(laid_out, tasks=tasks)
+    if output is None:
+        print(text)
+    else:
+        atomic.write(output, f"{text}\n")
+        print(f"{output}  {len(laid_out.nodes)} tasks of {len({h.stage for h in laid_out.nodes})} stages")
+    return COMPLETE
 
 
-def parts(graph: Graph, *, tasks: bool = False) -> tuple[Names, Edges]:
-    """How many tasks stand behind each name, and how many reads behind each arrow; names in order of creation."""
-    names, edges = Counter[str](), Counter[tuple[str, str]]()
+def dot(graph: Graph, *, tasks: bool = False) -> str:
+    """Return a box for each name with the number of its tasks, and an arrow for each that one reads."""
+    names, arrows = Counter[str](), dict[tuple[str, str], None]()
     for handle in graph.nodes:
         name = handle.label if tasks else handle.stage
         names[name] += 1
-        edges.update((source.label if tasks else source.stage, name) for source in handle.upstream())
-    return names, Counter({edge: count for edge, count in edges.items() if edge[0] != edge[1]})
-
-
-def dot(names: Names, edges: Edges) -> str:
-    """Text for ``dot`` of Graphviz."""
-    boxes = [f'  "{name}" [label="{_label(name, count)}"];' for name, count in names.items()]
-    return "\n".join(["digraph {", *boxes, *(f'  "{a}" -> "{b}";' for a, b in edges), "}", ""])
-
-
-def svg(names: Names, edges: Edges) -> str:
-    """A drawing: each name in the row behind all that it reads and that was created before it."""
-    rows: dict[str, int] = {}
-    read = defaultdict[str, list[str]](list)
-    for a, b in edges:
-        read[b].append(a)
-    for name in names:
-        # A stage that reads itself through others (`locus` by `pose`) stays where it was first created: its loop is
-        # drawn upwards.
-        rows[name] = 1 + max((rows[a] for a in read[name] if a in rows), default=-1)
-    filled, places = Counter[int](), {}
-    for name, row in rows.items():
-        places[name] = (filled[row] * (BOX[0] + GAP[0]), row * (BOX[1] + GAP[1]))
-        filled[row] += 1
-    size = (max(filled.values(), default=1) * (BOX[0] + GAP[0]), len(filled) * (BOX[1] + GAP[1]))
-    lines = [f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="-5 -5 {size[0]} {size[1]}" font-family="sans-serif">']
-    for a, b in edges:
-        (x, y), (u, v) = places[a], places[b]
-        half = BOX[0] // 2
-        lines.append(f'<path d="M{x + half} {y + BOX[1]} L{u + half} {v}" stroke="#888" stroke-opacity="0.6"/>')
-    for name, (x, y) in places.items():
-        lines.append(f'<rect x="{x}" y="{y}" width="{BOX[0]}" height="{BOX[1]}" rx="4" fill="#eef" stroke="#446"/>')
-        label = escape(_label(name, names[name]))
-        lines.append(f'<text x="{x + BOX[0] // 2}" y="{y + 15}" font-size="11" text-anchor="middle">{label}</text>')
-    return "\n".join([*lines, "</svg>", ""])
-
-
-def _label(name: str, count: int) -> str:
-    return name if count == 1 else f"{name} x {count}"
+        arrows |= dict.fromkeys((source.label if tasks else source.stage, name) for source in handle.upstream())
+    boxes = [f'  "{name}"' + (f' [label="{name} x {n}"];' if n > 1 else ";") for name, n in names.items()]
+    return "\n".join(["digraph {", *boxes, *(f'  "{a}" -> "{b}";' for a, b in arrows if a != b), "}"])

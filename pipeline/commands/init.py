@@ -5,32 +5,33 @@ from __future__ import annotations
 import os
 import shlex
 from pathlib import Path
+from typing import Annotated
 
 from rille.datasets.bags import is_bag
 from rille.datasets.inspection import Findings, inspect
 from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_words
 from rille.datasets.registry import hindrance
 from rille.datasets.text.names import derived_name
-from rille.pipeline.commands.options import COMPLETE
+from rille.pipeline.commands.options import COMPLETE, Debug, Output, flag
 from rille.pipeline.engine.failures import reported
 from rille.stages.core.errors import ConfigError, InputError
 
 
-def init(directory: Path, output: Path | None = None, force: bool = False) -> int:
-    """Write a manifest for a folder and say what it still needs; a folder that opens as it is gets none unasked.
+def init(
+    directory: Path,
+    *,
+    output: Annotated[Path | None, Output] = None,
+    force: Annotated[bool, flag("Replace a manifest that is there.")] = False,
+    debug: Debug = False,
+) -> int:
+    """Write a commented manifest of a folder of stereo images: what was found, and what is still needed.
 
     Parameters
     ----------
-    directory : folder that holds the images, in it or below.
-    output : file to write; ``NAME.rille.toml`` in the present folder by default (data are often read-only).
-    force : whether an existing file may be overwritten.
-
-    Raises
-    ------
-    ConfigError
-        The file exists and ``force`` is not given.
-    InputError
-        The folder holds no stereo images, or the file cannot be written.
+    directory
+        Folder with the images, and with whatever is known of the cameras.
+    output
+        Manifest to write; by default DIRECTORY's name with .rille.toml, in the present folder.
     """
     hindered = hindrance(directory.absolute())  # never a built-in sequence of the same name
     if output is None and not force and (directory.is_dir() or is_bag(directory)) and hindered is None:
@@ -39,20 +40,15 @@ def init(directory: Path, output: Path | None = None, force: bool = False) -> in
         print("\n".join(_next(directory)))
         return COMPLETE
     if is_bag(directory):
-        raise hindered or ConfigError(
-            "RIL-938",
-            f"no manifest is written for the bag {directory}: it opens as it is",
-            remedy="rille check opens it",
-        )
+        text = f"no manifest is written for the bag {directory}: it opens as it is"
+        raise hindered or ConfigError("RIL-938", text, remedy="rille check opens it")
     name = f"{derived_name(directory.resolve().name)}.rille.toml"
     found = inspect(directory)
     path = output if output is not None else Path(name)
     if path.suffix != ".toml":
         raise ConfigError("RIL-037", f"--output {path} is no .toml file", remedy=f"e.g. {name}")
     if path.exists() and not force:
-        raise ConfigError(
-            "RIL-038", f"{path} exists", remedy="name another file by --output, or overwrite it by --force"
-        )
+        raise ConfigError("RIL-038", f"{path} exists", remedy="give another --output, or overwrite it by --force")
     # Written whether complete or not: what is missing stands in it as comments, at its place.
     text = manifest_text(found, _root(directory, path))
     remedy = f"name another file, e.g. --output {name}"

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-if TYPE_CHECKING:
-    from rille.pipeline.runs.session import Options
+from rille.pipeline.engine.plain import plain
 
 COMPLETE, FAILED, USAGE, HOLES, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -24,58 +24,81 @@ def flag(words: str, *names: str) -> Parameter:
 
 def several(words: str, *names: str) -> Parameter:
     """An option that may be repeated, one value each time."""
-    return Parameter(name=list(names) or None, negative="", consume_multiple=False, help=f"{words}; may be repeated.")
+    help_text = f"{words}; may be repeated."
+    return Parameter(name=list(names) or None, negative="", consume_multiple=False, show_default=False, help=help_text)
 
 
 Assignments = Annotated[
-    list[str] | None, several("A parameter, section.key=value, for example locus.cell_size=0.002", "--set", "-s")
+    tuple[str, ...], several("A parameter, section.key=value, for example locus.cell_size=0.002", "--set", "-s")
 ]
 CacheFolder = Annotated[
     str | None,
-    Parameter(
-        name="--cache",
-        help="Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.",
-    ),
+    Parameter(name="--cache", help="Folder of cached artifacts; RILLE_CACHE or .rille/cache by default."),
 ]
 Debug = Annotated[bool, flag("Show tracebacks.")]
-Executor = Annotated[
-    str,
-    Parameter(
-        help="Where tasks run: dask (a cluster of this machine), inline, or a dask scheduler's address, tcp://host:port."
-    ),
-]
-Frames = Annotated[str | None, Parameter(help="Frame range START:STOP[:STEP], as in Python; all by default.")]
-MemoryLimit = Annotated[
-    str | None,
-    Parameter(help="Memory that a run may use in total, for example 6GB or 75%; by default 90 % of what is free."),
-]
 Output = Parameter(name=["--output", "-o"])
 Run = Annotated[
     str, Parameter(help="A run by name: SEQUENCE (its latest), SEQUENCE/ID, ID, latest (of all); or its folder.")
 ]
 Runs = Annotated[Path, Parameter(help="Folder of results; each run makes RUNS/sequence/run-id.")]
+Unparsed = Parameter(parse=False)
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Settings:
-    """Options that choose the computation and its cache."""
+    """Options that choose what is computed, and the cache; ``sequence`` is the word or path that names the sequence."""
 
-    assignments: Assignments = None
+    sequence: Annotated[str, Unparsed] = ""
+    assignments: Assignments = ()
     config: Annotated[
         Path | None, Parameter(help="TOML file of parameters; every run writes one with all defaults filled.")
     ] = None
-    jobs: Annotated[int | None, Parameter(help="Worker processes; the number of cores by default.")] = None
-    force: Annotated[list[str] | None, several("A stage to compute again although it is cached")] = None
+    frames: Annotated[str | None, Parameter(help="Frame range START:STOP[:STEP], as in Python; all by default.")] = None
     cache: CacheFolder = None
     debug: Debug = False
+    verb: Annotated[str, Unparsed] = "reconstruct"
+    opened: Annotated[Any, Unparsed] = None
+    """The :class:`~rille.datasets.protocol.Sequence` itself, where it is open already."""
+
+    def command(self) -> str:
+        """The command line that repeats this run, as a shell takes it, in one line."""
+        words = ["rille", self.verb, self.sequence]
+        words += ["--config", str(self.config)] if self.config else []
+        words += ["--frames", self.frames] if self.frames else []
+        words += [word for a in self.assignments for word in ("--set", a)]
+        # A line feed within a list of TOML is as good as a space; in `config.toml` this is a comment of one line.
+        return plain(shlex.join(words).replace("\n", " "))
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Results:
-    """Options of the folder of results and of the messages during a run."""
+class Work(Settings):
+    """Those, and options that choose where tasks run; ``executor`` may also be a ``Client`` of dask."""
 
+    jobs: Annotated[int | None, Parameter(help="Worker processes; the number of cores by default.")] = None
+    force: Annotated[frozenset[str], several("A stage to compute again although it is cached")] = frozenset()
+    executor: Annotated[
+        Any,
+        Parameter(
+            help="Where tasks run: dask (a cluster of this machine), inline, or a dask scheduler's address, "
+            "tcp://host:port."
+        ),
+    ] = "dask"
+    memory_limit: Annotated[
+        str | None,
+        Parameter(help="Memory that a run may use in total, for example 6GB or 75%; by default 90 % of what is free."),
+    ] = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Options(Work):
+    """Those, and options of the folder of results and of the messages during a run."""
+
+    keep_going: Annotated[
+        bool, flag("After a failure, finish all tasks that do not depend on it; the exit status is then 3.")
+    ] = False
     runs: Runs = RUNS
     progress: Annotated[
         Literal["auto", "bar", "plain", "json", "quiet"], Parameter(help="How progress is shown on stderr.")
@@ -84,34 +107,12 @@ class Results:
     verbose: Annotated[bool, flag("Say where to watch dask at work.", "--verbose", "-v")] = False
 
 
-def options(
-    seq: str,
-    settings: Settings,
-    results: Results,
-    *,
-    executor: str = "dask",
-    frames: str | None = None,
-    keep_going: bool = False,
-    memory_limit: str | None = None,
-) -> Options:
-    """Collect the options of the command line for :mod:`rille.pipeline.runs.session`."""
-    from rille.pipeline.runs.session import Options
+@Parameter(name="*")
+@dataclass(frozen=True)
+class DriveOptions(Options):
+    """Options of a drive, which takes its frames itself."""
 
-    return Options(
-        sequence=seq,
-        assignments=tuple(settings.assignments or ()),
-        config=settings.config,
-        frames=frames,
-        jobs=settings.jobs,
-        executor=executor,
-        keep_going=keep_going,
-        force=frozenset(settings.force or ()),
-        runs=results.runs,
-        cache=cache_folder(settings.cache),
-        progress="quiet" if results.quiet else results.progress,
-        memory_limit=memory_limit,
-        verbose=results.verbose,
-    )
+    frames: Annotated[None, Unparsed] = None
 
 
 def cache_folder(given: str | Path | None) -> Path:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import difflib
 import textwrap
-from collections.abc import Iterator
-from typing import Literal, get_args, get_origin
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Literal, get_args, get_origin
 
 import tomli_w
 from pydantic.fields import FieldInfo
 
+from rille.datasets.images.misalign import MisalignParams
+from rille.datasets.mockup.params import MockupParams
+from rille.datasets.mockup.rover import RoverParams
+from rille.pipeline.commands.options import COMPLETE, Debug, flag
 from rille.pipeline.flow import config
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import ConfigError
@@ -18,39 +22,35 @@ WIDTH = 100
 SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 
-def sections() -> dict[str, Params]:
-    """Every section of the configuration with its defaults: stages in the order of the flow, then sequences."""
-    from rille.datasets.images.misalign import MisalignParams
-    from rille.datasets.mockup.params import MockupParams
-    from rille.datasets.mockup.rover import RoverParams
+def params(
+    section: str = "", *, markdown: Annotated[bool, flag("As tables of Markdown.")] = False, debug: Debug = False
+) -> int:
+    """Print all parameters, or those of one section: default, what is permitted, and meaning.
 
-    known = config.build()
-    return {name: getattr(known, name) for name in type(known).model_fields} | {
-        "mockup": MockupParams.model_validate({}),
-        "rover": RoverParams.model_validate({}),
-        "misalign": MisalignParams.model_validate({}),
-    }
-
-
-def show(name: str = "", *, markdown: bool = False) -> int:
-    """Print one section, or all of them.
-
-    Raises
-    ------
-    ConfigError
-        There is no such section.
+    Parameters
+    ----------
+    section
+        Such as locus; all by default.
     """
     known = sections()
-    if name and name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
+    if section and section not in known:
+        near = difflib.get_close_matches(section, known, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"one of {', '.join(sorted(known))}"
-        raise ConfigError("RIL-920", f"there is no section {name!r}", remedy=hint)
-    chosen = {name: known[name]} if name else known
+        raise ConfigError("RIL-920", f"there is no section {section!r}", remedy=hint)
+    chosen = {section: known[section]} if section else known
     print("\n".join(page(chosen) if markdown else plain(chosen)))
-    return 0
+    return COMPLETE
 
 
-def plain(chosen: dict[str, Params]) -> Iterator[str]:
+def sections() -> dict[str, Params]:
+    """Every section of the configuration with its defaults: stages in the order of the flow, then sequences."""
+    known = config.build()
+    of_sequences: dict[str, type[Params]] = {"mockup": MockupParams, "rover": RoverParams, "misalign": MisalignParams}
+    of_stages = {name: getattr(known, name) for name in type(known).model_fields}
+    return of_stages | {name: kind.model_validate({}) for name, kind in of_sequences.items()}
+
+
+def plain(chosen: Mapping[str, Params]) -> Iterator[str]:
     """Lines for a terminal."""
     for name, values in chosen.items():
         for key, default, permitted, words in rows(values):
@@ -59,7 +59,7 @@ def plain(chosen: dict[str, Params]) -> Iterator[str]:
         yield ""
 
 
-def page(chosen: dict[str, Params]) -> Iterator[str]:
+def page(chosen: Mapping[str, Params]) -> Iterator[str]:
     """Lines of Markdown: a table a section."""
     yield "# Parameters\n\nSet one by `--set section.key=value`, or in a TOML file given by `--config`.\n"
     for name, values in chosen.items():
@@ -83,10 +83,5 @@ def _permitted(field: FieldInfo) -> str:
     # The union of a choice with None has its Literal one level down.
     kinds = (field.annotation, *get_args(field.annotation))
     choices = [repr(c) for kind in kinds for c in get_args(kind) if get_origin(kind) is Literal]
-    bounds = [
-        f"{sign} {getattr(limit, name):g}"
-        for limit in field.metadata
-        for name, sign in SIGNS.items()
-        if hasattr(limit, name)
-    ]
-    return ", ".join([*choices, *bounds])
+    signs = [(sign, getattr(limit, name, None)) for limit in field.metadata for name, sign in SIGNS.items()]
+    return ", ".join([*choices, *(f"{sign} {bound:g}" for sign, bound in signs if bound is not None)])

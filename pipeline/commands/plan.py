@@ -9,9 +9,12 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import chain
+from typing import Annotated
 
 from rille.datasets.text.count import count
+from rille.pipeline.commands.options import COMPLETE, Work, cache_folder, flag
 from rille.pipeline.engine import memory
 from rille.pipeline.engine.estimate import Earlier, recall
 from rille.pipeline.engine.graph import Graph, Handle
@@ -22,12 +25,11 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
-from rille.pipeline.runs import run_files
-from rille.pipeline.runs.session import Options, settings_of_run
+from rille.pipeline.runs.session import memory_limit, settings_of_run
 from rille.stages.core.errors import ConfigError
 
-REASONS = 3
-"""Different reasons told a stage; ``verbose`` tells each task's."""
+MAX_REASONS = 3
+"""Different reasons of a stage that are printed; ``verbose`` prints each task's."""
 
 WIDTH = 80
 """Characters of a reason in the table."""
@@ -35,15 +37,30 @@ WIDTH = 80
 BEHIND = "input "
 """Begin of the reason of a task that only follows from another one."""
 
+_WORK = Work()
 
-def plan(options: Options, *, verbose: bool = False) -> int:
-    """Print what ``reconstruct`` with the same options would do; gives the exit code."""
-    settled = settings_of_run(options)
+
+def plan(
+    seq: str = "mockup",
+    *,
+    options: Work = _WORK,
+    verbose: Annotated[bool, flag("Each task with its reason.", "--verbose", "-v")] = False,
+) -> int:
+    """Show what `reconstruct` would compute and why, and what is cached; nothing is computed.
+
+    Parameters
+    ----------
+    seq
+        As for reconstruct.
+    """
+    settled = settings_of_run(replace(options, sequence=seq))
     sequence, frames, config = settled.sequence, settled.frames, settled.config
-    graph, store = Graph(), Store(options.cache)
+    graph, store = Graph(), Store(cache_folder(options.cache))
     products, drive = dataflow(graph, sequence, config, frames)
 
     def outputs() -> None:
+        from rille.pipeline.runs import run_files  # it imports matplotlib
+
         if graph.unfinished:  # what they would read is not all known: they belong to the tasks that follow
             return
         taken = (sequence, frames) if drive is None else drive.taken()
@@ -57,14 +74,14 @@ def plan(options: Options, *, verbose: bool = False) -> int:
     if lost:
         text = f"{unread.values(lost, config)}: no task of this run reads it"
         raise ConfigError("RIL-733", text, remedy=unread.remedy(lost, config))
-    limit = None if options.memory_limit is None else memory.parse(options.memory_limit)
-    budget, jobs = memory.budget(options.executor, limit), memory.most_workers(options.executor, options.jobs)
+    budget = memory.budget(options.executor, memory_limit(options))
+    jobs = memory.most_workers(options.executor, options.jobs)
     largest = max((needs for _, needs in memory.Estimates().planned(graph)), default=0.0)
     lines = describe(graph, result, recall(store.hints(graph.sequence)), budget.workers(jobs, largest), verbose=verbose)
     # The refusal comes last, so that the table stands above it and shows which task it is.
     for line in chain(lines, needs(graph, budget, jobs)):
         print(line)
-    return 0
+    return COMPLETE
 
 
 def needs(graph: Graph, budget: memory.Budget, jobs: int) -> Iterable[str]:
@@ -102,9 +119,9 @@ def describe(graph: Graph, result: Result, earlier: Earlier, workers: int, *, ve
 def _reasons(planned: list[Handle]) -> list[str]:
     """The reasons of a stage's tasks, own ones first, the most frequent first, with their number."""
     own = Counter(h.reason for h in planned if not h.reason.startswith(BEHIND))
-    listed = [f"{brief(reason, WIDTH)} ({n})" for reason, n in own.most_common(REASONS)]
-    if len(own) > REASONS:
-        listed.append(f"{len(own) - REASONS} other reasons")
+    listed = [f"{brief(reason, WIDTH)} ({n})" for reason, n in own.most_common(MAX_REASONS)]
+    if len(own) > MAX_REASONS:
+        listed.append(f"{len(own) - MAX_REASONS} other reasons")
     follow = len(planned) - own.total()
     return listed + ([f"an input is to be computed ({follow})"] if follow else [])
 

@@ -1,9 +1,8 @@
-"""Runs by the names that users type, the list of all runs, and tasks of a run by their labels."""
+"""Runs by the names that users type, and tasks of a run by their labels."""
 
 from __future__ import annotations
 
 import difflib
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -74,7 +73,7 @@ def find(text: str, runs: Path) -> Path:
     started = [run for run in known if run.parent.name == text]
     if started:  # none of them came to its end
         return started[-1]
-    names = [n for run in known for n in (name(run), run.parent.name, run.name)]
+    names = [word for run in known for word in (name(run), run.parent.name, run.name)]
     where = f"there are {some(sorted({run.parent.name for run in known}), 4)}" if known else f"{runs} holds none"
     raise ConfigError("RIL-067", f"no run {text!r}", remedy=_near(text, names) or where)
 
@@ -88,43 +87,6 @@ def elevation(text: str, runs: Path) -> Path:
         return find(text, runs)
     except ConfigError:
         return path  # what reads it says what it may be
-
-
-def describe(chosen: Iterable[Path]) -> Iterator[str]:
-    """Lines of the table of runs, the latest last."""
-    yield f"{'run':44s} {'state':12s} {'computed':>8s} {'cached':>8s} {'seconds':>8s}"
-    for run in sorted(chosen, key=lambda r: r.name):
-        with reading(run):
-            yield _line(run)
-
-
-def _line(run: Path) -> str:
-    ended = Counter(row["status"] for row in events.read(run / LEDGER))
-    facts = events.facts(run / LEDGER)
-    seconds = facts.get("total", facts.get("seconds"))
-    missing = ended["failed"] + ended["skipped"]
-    # "ok": all tasks have ended; "total": the files and the report are written, too.
-    whole = "complete" if "total" in facts else "interrupted"
-    state = "interrupted" if "ok" not in facts else f"{missing} missing" if missing else whole
-    took = "" if seconds is None else f"{seconds:.1f}"
-    return f"{name(run):44s} {state:12s} {ended['computed']:8d} {ended['cached']:8d} {took:>8s}"
-
-
-def show(sequence: str, runs: Path) -> int:
-    """Print the runs of a sequence, or all of them.
-
-    Raises
-    ------
-    ConfigError
-        There is none.
-    """
-    chosen = [run for run in all_runs(runs) if sequence in ("", run.parent.name)]
-    if not chosen:
-        raise ConfigError(
-            "RIL-880", f"{runs} holds no run{f' of {sequence}' if sequence else ''}", remedy="check --runs"
-        )
-    print("\n".join(describe(chosen)))
-    return 0
 
 
 def row(rows: Iterable[dict[str, Any]], label: str, run: Path) -> dict[str, Any]:
@@ -146,9 +108,8 @@ def row(rows: Iterable[dict[str, Any]], label: str, run: Path) -> dict[str, Any]
 
 def _near(text: str, names: Iterable[str]) -> str:
     known = list(dict.fromkeys(names))
-    within = [n for n in known if text and text in n]
-    found = difflib.get_close_matches(text, known, n=3, cutoff=0.5) or within[:3]
-    return f"did you mean {' or '.join(found)}?" if found else ""
+    near = difflib.get_close_matches(text, known, n=3, cutoff=0.5) or [n for n in known if text and text in n][:3]
+    return f"did you mean {' or '.join(near)}?" if near else ""
 
 
 def earlier(run: Path, *, of_any: bool = False) -> Iterator[Path]:

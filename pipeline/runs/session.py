@@ -9,66 +9,39 @@ from __future__ import annotations
 
 import hashlib
 import os
-import shlex
 import shutil
 import sys
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rille.datasets.protocol import Sequence
+from rille.datasets.registry import open_sequence
+from rille.pipeline.commands.options import COMPLETE, HOLES, Options, Settings, Work, cache_folder
+from rille.pipeline.engine import events, memory, progress
+from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.code_digest import remember
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.packages import installed
-from rille.pipeline.engine.plain import plain, warn
+from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.store.base import GoneError, Store
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
+from rille.pipeline.engine.workers import check
+from rille.pipeline.export.view import UNSTATED, RunView
 from rille.pipeline.flow import config as configuration
+from rille.pipeline.flow import unread
+from rille.pipeline.flow.closed_loop import Drive, dataflow
+from rille.pipeline.runs import roots
+from rille.pipeline.runs.input_checks import judge_rig
 from rille.stages.core.errors import ConfigError, RilleError
 
 if TYPE_CHECKING:
-    from rille.pipeline.engine.run import Result
-    from rille.pipeline.export.view import RunView
-    from rille.pipeline.flow.closed_loop import Drive
     from rille.pipeline.report.delivery import Items
     from rille.pipeline.runs import run_files
-
-COMPLETE, HOLES = 0, 3
-
-
-@dataclass(frozen=True)
-class Options:
-    """Options of a run, as the command line gives them."""
-
-    sequence: str
-    assignments: tuple[str, ...] = ()
-    config: Path | None = None
-    frames: str | None = None
-    jobs: int | None = None
-    executor: Any = "dask"
-    """A kind, the address of a dask scheduler, or a ``Client`` of dask."""
-    keep_going: bool = False
-    force: frozenset[str] = frozenset()
-    runs: Path = Path("runs")
-    cache: Path = Path(".rille/cache")
-    progress: str = "auto"
-    memory_limit: str | None = None
-    verb: str = "reconstruct"
-    verbose: bool = False
-    opened: Sequence | None = None
-    """The sequence itself, where it is open already."""
-
-    def command(self) -> str:
-        """The command line that repeats this run, as a shell takes it, in one line."""
-        words = ["rille", self.verb, self.sequence]
-        words += ["--config", str(self.config)] if self.config else []
-        words += ["--frames", self.frames] if self.frames else []
-        words += [word for a in self.assignments for word in ("--set", a)]
-        # A line feed within a list of TOML is as good as a space; in `config.toml` this is a comment of one line.
-        return plain(shlex.join(words).replace("\n", " "))
 
 
 def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
@@ -79,15 +52,13 @@ def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
     ConfigError
         The range is no range, empty, or reaches beyond the sequence.
     """
-    if text is None:
-        return tuple(range(count))
     remedy = f"give START:STOP[:STEP] within 0:{count}"
     try:
-        parts = [int(p) if p else None for p in text.split(":")]
+        parts = [int(p) if p else None for p in (":" if text is None else text).split(":")]
+        if not 2 <= len(parts) <= 3 or any(p is not None and p < 0 for p in parts) or parts[2:] == [0]:
+            raise ValueError(text)
     except (ValueError, AttributeError):  # from Python it may be no text
         raise ConfigError("RIL-055", f"--frames {text!r} is not a range", remedy=remedy) from None
-    if not 2 <= len(parts) <= 3 or any(p is not None and p < 0 for p in parts) or parts[2:] == [0]:
-        raise ConfigError("RIL-056", f"--frames {text!r} is not a range", remedy=remedy)
     if (parts[1] or 0) > count or (parts[0] or 0) >= count:
         raise ConfigError("RIL-057", f"--frames {text!r} reaches beyond the sequence's {count} frames", remedy=remedy)
     chosen = tuple(range(count)[slice(*parts)])
@@ -107,18 +78,14 @@ class Settled:
     given: tuple[str, ...]
 
 
-def settings(options: Options) -> Settled:
+def settings(options: Settings) -> Settled:
     """Open a sequence and determine its configuration: defaults, presets, file and options of the user."""
-    from rille.datasets.registry import open_sequence
-    from rille.pipeline.export.view import UNSTATED
-    from rille.pipeline.flow import unread
-
     read = configuration.read_toml(options.config) if options.config else {}
     # Over the file: --set is said now, --config may be old.
     configuration.merge(read, configuration.parse_assignments(options.assignments))
     for_dataset, for_stages = configuration.split_dataset(read)
     if options.opened is None:
-        sequence = open_sequence(options.sequence, for_dataset, options.cache / "files.json")
+        sequence = open_sequence(options.sequence, for_dataset, cache_folder(options.cache) / "files.json")
     elif for_dataset:
         text = f"{next(iter(for_dataset))}: the sequence is open already"
         raise ConfigError("RIL-860", text, remedy="give its parameters to rille.open")
@@ -136,20 +103,14 @@ def settings(options: Options) -> Settled:
     return Settled(sequence, choose_frames(options.frames, sequence.frames), config, source, given)
 
 
-def settings_of_run(options: Options) -> Settled:
+def settings_of_run(options: Work) -> Settled:
     """The same for a run: what it cannot use is refused, what is suspicious but possible in the input is printed."""
-    from rille.pipeline.engine import memory
-    from rille.pipeline.engine.workers import check
-    from rille.pipeline.flow import unread
-    from rille.pipeline.runs.input_checks import judge_rig
-
     # Before anything is read or written.
     stages = configuration.stage_names() if options.force else set()
     for name in sorted(options.force - stages):
         raise ConfigError("RIL-060", f"--force {name!r} is no stage", remedy=f"one of {', '.join(sorted(stages))}")
     check(options.executor, options.jobs)
-    if options.memory_limit is not None:
-        memory.parse(options.memory_limit)
+    memory_limit(options)
     settled = settings(options)
     unread.refuse_unreadable(settled.given, settled.config, settled.sequence)
     sequence = settled.sequence
@@ -162,10 +123,9 @@ def settings_of_run(options: Options) -> Settled:
     return replace(settled, sequence=sequence)
 
 
-def warn_of_results(graph: Graph) -> None:
-    """Print what stages found suspicious, each thing once."""
-    for line in dict.fromkeys(w for h in graph.nodes if h.ref is not None for w in h.ref.meta.get("warnings", ())):
-        warn(line)
+def memory_limit(options: Work) -> int | None:
+    """Bytes that a run may use in total; None: what is free."""
+    return None if options.memory_limit is None else memory.parse(options.memory_limit)
 
 
 def reconstruct(options: Options) -> int:
@@ -209,6 +169,7 @@ class _Opened:
 
 
 def _reconstruct(options: Options) -> tuple[int, Path]:
+    # They import matplotlib, which a wrong option should not have to wait for.
     from rille.pipeline.report.delivery import is_complete
     from rille.pipeline.runs import run_files
 
@@ -219,7 +180,9 @@ def _reconstruct(options: Options) -> tuple[int, Path]:
     remember()
     missing = _write(opened, result, made)
     _point_latest(opened.folder)
-    warn_of_results(opened.graph)
+    suspicious = (line for h in opened.graph.nodes if h.ref is not None for line in h.ref.meta.get("warnings", ()))
+    for line in dict.fromkeys(suspicious):
+        warn(line)
     arrived = _outcome(opened)
     total = result.total()
     for item in missing:
@@ -236,9 +199,6 @@ def _reconstruct(options: Options) -> tuple[int, Path]:
 
 def _open(options: Options) -> _Opened:
     """Read the input and lay the run out."""
-    from rille.pipeline.export.view import RunView
-    from rille.pipeline.flow.closed_loop import dataflow
-
     started = datetime.now(UTC)
     settled = settings_of_run(options)
     sequence, frames, config = settled.sequence, settled.frames, settled.config
@@ -248,7 +208,7 @@ def _open(options: Options) -> _Opened:
     text = header + configuration.to_toml(config, sequence.parameters)
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
     (folder / "config.toml").write_text(text, encoding="utf-8")
-    graph, store = Graph(), Store(options.cache)
+    graph, store = Graph(), Store(cache_folder(options.cache))
     products, drive = dataflow(graph, sequence, config, frames)
     view = RunView(
         run_id=folder.name,
@@ -267,25 +227,21 @@ def _open(options: Options) -> _Opened:
     return _Opened(options, settled, view, folder, started, store, graph, drive)
 
 
-def _compute(opened: _Opened) -> Result:
+def _compute(opened: _Opened) -> driver.Result:
     """Bring every task to its artifact; raise the first failure unless the data are its cause and poses are there."""
-    from rille.pipeline.engine import memory, progress
-    from rille.pipeline.engine.run import RunOptions, run
-    from rille.pipeline.runs import roots
-
     options, view = opened.options, opened.view
     roots.note(opened.store, options.runs)
-    result = run(
+    result = driver.run(
         opened.graph,
         opened.store,
-        RunOptions(
+        driver.RunOptions(
             executor=options.executor,
             jobs=options.jobs,
             keep_going=options.keep_going,
             force=options.force,
             ledger=opened.folder / "ledger.jsonl",
-            progress=progress.make(options.progress, verbose=options.verbose),
-            memory_limit=None if options.memory_limit is None else memory.parse(options.memory_limit),
+            progress=progress.make("quiet" if options.quiet else options.progress, verbose=options.verbose),
+            memory_limit=memory_limit(options),
             survey=lambda: lay_out(view.sequence, view.config, view.frames),
         ),
     )
@@ -295,9 +251,8 @@ def _compute(opened: _Opened) -> Result:
     return result
 
 
-def _write(opened: _Opened, result: Result, made: run_files.Made) -> Items:
+def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> Items:
     """Write everything that the run leaves, nothing of it where an artifact was found damaged; give what is missing."""
-    from rille.pipeline.engine import events
     from rille.pipeline.runs import run_files
 
     # The folder may go while a run of hours is under way; writing would make one without its first files.
@@ -321,8 +276,6 @@ def _write(opened: _Opened, result: Result, made: run_files.Made) -> Items:
 
 def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Graph:
     """The graph of a reconstruction as far as it is known beforehand."""
-    from rille.pipeline.flow.closed_loop import dataflow
-
     graph = Graph()
     dataflow(graph, sequence, config, frames)
     return graph
@@ -339,8 +292,6 @@ def _outcome(opened: _Opened) -> int:
 
 def _all_read(opened: _Opened, arrived: int) -> int:
     """Exit code of a run that came to its end: a parameter that no task of it read is an error, and named."""
-    from rille.pipeline.flow import unread
-
     # A drive that ended early did not come to the tasks that would have read it.
     if arrived != COMPLETE:
         return COMPLETE
@@ -364,13 +315,13 @@ def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
         )
     name = f"{started:%Y%m%dT%H%M%SZ}-{hashlib.sha256(plan.encode()).hexdigest()[:8]}"
     # Two runs of one plan within a second: mkdir decides which of them has the name.
-    for suffix in ["", *(f"-{i}" for i in range(2, 100))]:
+    for suffix in chain([""], (f"-{number}" for number in count(2))):
         folder = parent / (name + suffix)
         reported_as = reported("RIL-061", f"cannot make {folder}", remedy="choose another --runs folder")
         with reported_as, suppress(FileExistsError):
             folder.mkdir(parents=True)
-            return folder
-    raise RilleError("RIL-062", f"too many runs named {name}", remedy="remove some, or wait a second")
+            break
+    return folder
 
 
 def _point_latest(folder: Path) -> None:

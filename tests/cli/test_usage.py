@@ -42,7 +42,7 @@ WRONG = {
         ("no-such-sequence", "RIL-276"),
         ("--no-such-option", "RIL-001"),
         ("other --frames 7:9", "RIL-057"),
-        ("other --executor cloud", "RIL-001"),
+        ("other --executor cloud", "RIL-539"),
         ("other --jobs 0", "RIL-540"),
         ("other --jobs -2", "RIL-540"),
         ("other --force no-such-stage", "RIL-060"),

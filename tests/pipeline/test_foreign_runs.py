@@ -88,8 +88,7 @@ def test_a_ledger_that_is_none(run: Path, words: tuple[str, ...], line: str, cap
         ('{"run": 5}\n', ("runs",)),
         ('{"run": {"ok": true, "total": "x"}}\n', ("runs",)),
         (ROW.replace('"key"', '"inputs": {"x": 5}, "key"'), WHY),
-        (ROW + ROW.replace('"a"', '"b"').replace('"key"', '"inputs": {"x": "b"}, "key"'), TIMING),
-        (ROW + '{"run": {"jobs": 0, "total": 1.0}}\n', TIMING),
+        (ROW + '{"run": {"jobs": "x"}}\n', TIMING),
     ],
 )
 def test_a_ledger_with_lines_of_another_form(run: Path, line: str, words: tuple[str, ...], capsys: Any) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import affine
 import numpy as np
@@ -15,9 +16,12 @@ from terrain_runs import LATTICE, PLACE, elevation, finished, hills
 
 from rille.pipeline import cli
 from rille.pipeline.commands import compare_dem
-from rille.pipeline.commands.compare_dem import compare
 from rille.pipeline.export.terrain_zarr import write_terrain
 from rille.stages.terrain import merge
+
+
+def compare(a: Path, b: Path, **options: Any) -> int:
+    return compare_dem.compare_dem(str(a), str(b), **options)
 
 
 def tiff(path: Path, values: np.ndarray, cell: float, x0: float, y0: float, **more: object) -> Path:

@@ -72,7 +72,7 @@ def test_what_is_needed_is_printed(drive, capsys):
 
 
 def test_next_steps_are_as_a_shell_takes_them(drive, tmp_path, capsys):
-    init(drive, tmp_path / "here" / "my drive.toml")
+    init(drive, output=tmp_path / "here" / "my drive.toml")
     assert f"rille check '{tmp_path}/here/my drive.toml'" in capsys.readouterr().out
 
 
@@ -81,7 +81,7 @@ def test_elsewhere_the_manifest_still_finds_its_folder(drive, tmp_path, place, r
     (drive / "calibration.yaml").write_text(SETTINGS)
     (tmp_path / place).mkdir(parents=True, exist_ok=True)
     path = tmp_path / place / "m.toml"
-    init(drive, path)
+    init(drive, output=path)
     assert f'root = "{root or drive}"' in path.read_text()
     assert open_manifest(path, Digests()).frames == 2
 
@@ -90,9 +90,9 @@ def test_nothing_is_overwritten_without_force(drive):
     path = drive / "m.toml"
     path.write_text("mine")
     with raises("RIL-038", "m.toml"):
-        init(drive, path)
+        init(drive, output=path)
     assert path.read_text() == "mine"
-    init(drive, path, force=True)
+    init(drive, output=path, force=True)
     assert path.read_text() != "mine"
     init(drive)
     with raises("RIL-038", "drive.rille.toml"):
@@ -108,7 +108,7 @@ def test_a_folder_that_opens_as_it_is_gets_no_manifest_unasked(drive, tmp_path, 
     assert f"{drive} opens as it is" in printed
     assert f"rille reconstruct {drive}\n" in printed
     assert not list(drive.glob("*.toml"))
-    init(drive, tmp_path / "m.toml")
+    init(drive, output=tmp_path / "m.toml")
     assert (tmp_path / "m.toml").is_file()
 
 
@@ -149,8 +149,8 @@ def test_image_folders_of_raw_recordings_open_with_their_calibration(drive, caps
 
 def test_places_that_cannot_be_written(drive, tmp_path):
     with raises("RIL-039", "m.toml"):
-        init(drive, tmp_path / "nowhere" / "m.toml")
+        init(drive, output=tmp_path / "nowhere" / "m.toml")
     with raises("RIL-037", "m.yaml"):
-        init(drive, tmp_path / "m.yaml")
+        init(drive, output=tmp_path / "m.yaml")
     with raises("RIL-193"):
         init(tmp_path / "nothing")

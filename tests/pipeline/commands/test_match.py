@@ -32,8 +32,9 @@ def folder(tmp_path):
 
 
 def run(folder, left="left.png", right="right.png", preset=None, assignments=(), dense=False, **options):
-    params = command.matcher_params(preset, assignments)
-    return command.match_files(folder / left, folder / right, folder / "out.tif", params, dense=dense, **options)
+    matcher = command.Matcher(preset, options.pop("prior", None), assignments)
+    options.setdefault("output", folder / "out.tif")
+    return command.match(folder / left, folder / right, matcher=matcher, dense=dense, **options)
 
 
 def test_writes_two_named_bands_and_says_what_it_found(folder, capsys):
@@ -72,28 +73,17 @@ def test_confidence_has_three_bands_that_fit_the_disparity(folder):
 def test_an_output_that_cannot_be_written_is_named(folder, name):
     (folder / "file").write_text("")
     out = {"--output": "out.tif", "--confidence": "sure.tif"} | {name: "file/here.tif"}
-    params = command.matcher_params(None, ())
     with raises("RIL-991", "file/here.tif cannot be written"):
-        command.match_files(
-            folder / "left.png",
-            folder / "right.png",
-            folder / out["--output"],
-            params,
-            confidence=folder / out["--confidence"],
-            dense=False,
-        )
+        run(folder, output=folder / out["--output"], confidence=folder / out["--confidence"])
 
 
 def test_outputs_that_cannot_be_are_refused_before_matching(folder):
-    params = command.matcher_params(None, ())
     (folder / "results.tif").mkdir()
     before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
 
     def refused(code, *words, output="out.tif", **options):
         with raises(code, *words):
-            command.match_files(
-                folder / "left.png", folder / "right.png", folder / output, params, dense=False, **options
-            )
+            run(folder, output=folder / output, **options)
 
     refused("RIL-043", "--confidence and --output", confidence=folder / "out.tif")
     refused("RIL-047", "results.tif is a folder", output="results.tif")
@@ -102,7 +92,7 @@ def test_outputs_that_cannot_be_are_refused_before_matching(folder):
     refused("RIL-871", ".tif or .tiff", output="out.npy")
     (folder / "left.png").rename(folder / "left.tif")
     with raises("RIL-043", "an image"):
-        command.match_files(folder / "left.tif", folder / "right.png", folder / "left.tif", params, dense=False)
+        run(folder, "left.tif", output=folder / "left.tif")
     (folder / "left.tif").rename(folder / "left.png")
     assert {path.name: path.stat().st_mtime_ns for path in folder.iterdir()} == before
 
@@ -242,22 +232,14 @@ def test_command_line_has_it_all(folder, capsys):
     assert "gone.png" in capsys.readouterr().err
 
 
-def test_progress_is_for_large_pairs_only(monkeypatch):
+def test_progress_is_a_bar_on_a_terminal_for_large_pairs(monkeypatch):
     stream = io.StringIO()
-    with command._progress(command.LARGE - 1, stream) as tell:
+    monkeypatch.setattr(command.sys, "stderr", stream)
+    with command._progress(command.LARGE) as tell:
         assert tell is None
-    clock = iter([0.0, 1.0, 6.0, 6.0, 7.0])
-    monkeypatch.setattr(command.time, "monotonic", lambda: next(clock))
-    with command._progress(command.LARGE, stream) as tell:
-        tell(0.1, "features")
-        tell(0.4, "level 0")
-        tell(0.5, "refinement")
-    assert stream.getvalue() == "rille: level 0, 40 %\n"
-
-
-def test_progress_is_a_bar_on_a_terminal(monkeypatch):
-    stream = io.StringIO()
     monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
-    with command._progress(command.LARGE, stream) as tell:
+    with command._progress(command.LARGE - 1) as tell:
+        assert tell is None
+    with command._progress(command.LARGE) as tell:
         tell(0.5, "level 0")
     assert "level 0" in stream.getvalue()

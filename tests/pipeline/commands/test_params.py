@@ -15,7 +15,7 @@ PAGE = Path(__file__).resolve().parents[3] / "docs" / "parameters.md"
 
 
 def test_the_page_in_the_documentation_is_current(capsys: pytest.CaptureFixture[str]) -> None:
-    assert params.show(markdown=True) == 0
+    assert params.params(markdown=True) == 0
     assert PAGE.read_text(encoding="utf-8") == capsys.readouterr().out, "make pages"
 
 
@@ -25,11 +25,11 @@ def test_every_section_and_key_of_the_configuration_is_there() -> None:
 
 
 def test_choices_and_bounds_are_told(capsys: pytest.CaptureFixture[str]) -> None:
-    params.show("hfvm")
+    params.params("hfvm")
     told = capsys.readouterr().out
     assert 'hfvm.preset = "default"    [\'' in told
     assert "merge." not in told
     with raises("RIL-920", "'nope'"):
-        params.show("nope")
+        params.params("nope")
     with raises("RIL-920", "did you mean 'locus'?"):
-        params.show("locs")
+        params.params("locs")

@@ -41,7 +41,8 @@ def test_of_an_empty_cache_says_what_it_cannot_know(cache):
 
 def test_the_time_is_that_of_the_workers_that_there_will_be(cache, monkeypatch, capsys):
     monkeypatch.setattr(plan, "recall", lambda hints: {"mockup.scene": (1.0, 1.4)})
-    plan.plan(session.Options("mockup-short", ("mockup.frames=2",), jobs=2, executor="inline", cache=cache))
+    options = session.Work(assignments=("mockup.frames=2",), jobs=2, executor="inline", cache=cache)
+    plan.plan("mockup-short", options=options)
     assert "s with 1 worker by earlier runs" in capsys.readouterr().out
 
 

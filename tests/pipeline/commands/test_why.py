@@ -60,7 +60,7 @@ def test_it_may_be_a_run_of_another_sequence(tmp_path):
 def test_many_inputs_are_counted_and_an_artifact_that_has_gone_is_said(tmp_path):
     at = run(tmp_path, "1", frames=11)
     lines = told(tmp_path, at, "total")
-    assert sum(line.startswith("input ") for line in lines) == why.INPUTS + 1
+    assert sum(line.startswith("input ") for line in lines) == why.MAX_INPUTS + 1
     assert "input         parts        and 3 more, computed" in lines
     shutil.rmtree(tmp_path / "cache" / "artifacts" / "total")
     assert re.search(r"has gone from .*, or the run used another cache \(--cache\)", told(tmp_path, at, "total")[-1])

@@ -163,10 +163,10 @@ def facts(before: float, after: float, offset: float = 0.0):
     ("given", "level", "words"),
     [
         (facts(0.3, 0.3), "OK", "roll +0.100"),
-        (facts(3.2, 0.4, 3.1), "WARN", "repairs"),
-        (facts(0.7, 0.4, -0.6), "WARN", "repairs"),
-        (facts(2.5, 2.0), "WARN", "distortion"),
-        (facts(40.0, 20.0), "FAIL", "no rig explains"),
+        (facts(3.2, 0.4, 3.1), "WARN", "RIL-664"),
+        (facts(0.7, 0.4, -0.6), "WARN", "RIL-664"),
+        (facts(2.5, 2.0), "WARN", "RIL-663"),
+        (facts(40.0, 20.0), "FAIL", "RIL-662"),
         ({"words": "not checked: 3 matches"}, "WARN", "3 matches"),
     ],
 )

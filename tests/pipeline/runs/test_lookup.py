@@ -4,6 +4,7 @@ import pytest
 from raising import raises
 from toys import chain
 
+from rille.pipeline.commands import runs
 from rille.pipeline.engine import events
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
@@ -17,9 +18,9 @@ def test_a_run_is_complete_once_its_files_are_written(tmp_path):
     chain.build(graph)
     options = driver.RunOptions(executor="inline", ledger=run / lookup.LEDGER)
     driver.run(graph, Store(tmp_path / "cache"), options)
-    assert [line.split()[1] for line in lookup.describe([run])] == ["state", "interrupted"]
+    assert [line.split()[1] for line in runs.describe([run])] == ["state", "interrupted"]
     events.add_facts(run / lookup.LEDGER, total=1.0)
-    assert [line.split()[1] for line in lookup.describe([run])] == ["state", "complete"]
+    assert [line.split()[1] for line in runs.describe([run])] == ["state", "complete"]
 
 
 @pytest.mark.parametrize("linked", [False, True])

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
+from rille.pipeline.commands import compile as compilation
 from rille.pipeline.engine.runtime import numba_cache
-from rille.pipeline.runs import compilation
 from rille.stages.core.errors import RilleError
 
 

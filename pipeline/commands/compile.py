@@ -1,4 +1,4 @@
-"""Compile the kernels of every stage before the first run asks for them.
+"""``rille compile``: the kernels of every stage, compiled before the first run asks for them.
 
 Numba compiles a kernel for the types that it is called with, so the kernels are called: by a small reconstruction and a
 small drive of simulated sequences, in a temporary folder. What they compile stays in the folder of this user's kernels.
@@ -13,8 +13,9 @@ import time
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
+from rille.pipeline.commands.options import COMPLETE, Debug, Options
 from rille.pipeline.engine.runtime import numba_cache
-from rille.pipeline.runs.session import Options, perform
+from rille.pipeline.runs.session import perform
 
 SMALL = (
     "mockup.frames=5",
@@ -31,25 +32,20 @@ SHORT = ("drive.max_stops=3",)
 """A drive that ends, far from its goal, when all kernels of driving were called."""
 
 
-def compile_kernels() -> int:
-    """Compile the kernels that are not compiled yet, and print their number; gives the exit code."""
+def compile_kernels(*, debug: Debug = False) -> int:
+    """Compile the numerical kernels for this user and machine, so that the first run need not.
+
+    Runs two small simulated sequences in a temporary folder. What is compiled stays: again, nothing is left to compile.
+    """
     print("rille: compiling kernels; from nothing this takes one to two minutes", file=sys.stderr)
     began, before = time.perf_counter(), _kernels()
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-        for verb, sequence, assignments in (("reconstruct", "mockup-short", SMALL), ("drive", "mockup-loop", SHORT)):
-            perform(
-                Options(
-                    sequence,
-                    assignments,
-                    runs=Path(folder) / "runs",
-                    cache=Path(folder) / "cache",
-                    progress="quiet",
-                    verb=verb,
-                )
-            )
+        runs, cache = Path(folder) / "runs", f"{folder}/cache"
+        perform(Options("mockup-short", SMALL, runs=runs, cache=cache, progress="quiet"))
+        perform(Options("mockup-loop", SHORT, runs=runs, cache=cache, progress="quiet", verb="drive"))
     made, seconds = len(_kernels() - before), time.perf_counter() - began
     print(f"{numba_cache.folder()}  kernels compiled: {made}, in {seconds:.0f} s")
-    return 0
+    return COMPLETE
 
 
 def _kernels() -> set[str]:
