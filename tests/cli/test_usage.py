@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import re
 import subprocess
+import sys
 
 import pytest
 from cyclopts import App
 from place import RILLE, Place
 
-from rille.pipeline.cli import app
+from rille.pipeline.cli import COMMANDS, app
 
 WRONG = {
     "": [("no-such-command", "RIL-001"), ("--no-such-option", "RIL-001")],
@@ -157,6 +158,19 @@ def test_help(place: Place, command: str) -> None:
     done = place.here(*command.split(), "--help")
     assert (done.status, done.err) == (0, "")
     assert done.lines[0].startswith(f"Usage: rille {command}".strip())
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_list_says_of_a_command_what_its_own_help_begins_with(command: str) -> None:
+    _, words = COMMANDS[command]
+    assert app[command].help.startswith(words)
+
+
+def test_the_list_of_commands_imports_none_of_them() -> None:
+    program = "import sys; from rille.pipeline.cli import main; main(['--help'])"
+    loaded = f"import atexit, sys; atexit.register(lambda: print('numpy' in sys.modules)); {program}"
+    done = subprocess.run([sys.executable, "-c", loaded], check=True, capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1] == "False"
 
 
 def test_a_word_too_many_is_named(place: Place) -> None:
