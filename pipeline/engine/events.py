@@ -6,7 +6,6 @@ Each line is written as soon as the outcome is known, so a killed run leaves the
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -49,10 +48,6 @@ class Ledger:
     def note(self, label: str, status: str, reason: str) -> None:
         """A line for what is no node: an expansion that could not be made."""
         self._line({"label": label, "stage": "", "status": status, "reason": reason})
-
-    def expansion(self, after: Sequence[str], nodes: Sequence[str]) -> None:
-        """A line for nodes that could be laid out only after the results of others."""
-        self._line({"expansion": {"after": list(after), "nodes": list(nodes)}})
 
     def run(self, **facts: Any) -> None:
         """A line of facts about the run as a whole."""
@@ -106,11 +101,6 @@ def add_facts(path: Path, **facts: Any) -> None:
     """Add a line about the run as a whole to a ledger that is closed."""
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps({"run": facts}) + "\n")
-
-
-def expansions(path: Path) -> list[tuple[list[str], list[str]]]:
-    """Labels of the nodes that were waited for, and of those laid out then."""
-    return [(e["after"], e["nodes"]) for row in _lines(path) if (e := row.get("expansion"))]
 
 
 def _lines(path: Path) -> list[dict[str, Any]]:

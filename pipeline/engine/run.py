@@ -463,7 +463,6 @@ class _Run:
     def _expand(self, handles: list[Handle], flow: Expansion) -> None:
         assumed = [h.label for h in handles if h.earlier and not h.done]
         self.result.assumed += assumed
-        before = len(self.graph.nodes)
         try:
             flow(*(h.ref or h.earlier for h in handles))
         except Exception as error:
@@ -471,7 +470,6 @@ class _Run:
                 self.result.unknown += assumed
             else:
                 self._failed(Failure(f"plan after {_labels(handles)}", "", error, Failed.of(error).traceback))
-        self.ledger.expansion([h.label for h in handles], [h.label for h in self.graph.nodes[before:]])
 
     def _leave_out(self) -> None:
         """Account for everything that was not even begun."""
