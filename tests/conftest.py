@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections import Counter
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import pytest
 
@@ -35,3 +36,16 @@ def missing(what: str, required: str) -> NoReturn:
     if os.environ.get(required) == "1":
         pytest.fail(what)
     pytest.skip(what)
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Print the seconds of the tests of each folder, setups too, where ``--durations`` is given."""
+    if terminalreporter.config.getoption("durations") is None:
+        return
+    seconds = Counter[str]()
+    for report in (report for reports in terminalreporter.stats.values() for report in reports):
+        if hasattr(report, "duration") and hasattr(report, "nodeid"):
+            seconds[report.nodeid.partition("::")[0].rpartition("/")[0]] += report.duration
+    terminalreporter.section("seconds by folder")
+    for folder, total in seconds.most_common():
+        terminalreporter.write_line(f"{total:8.1f} {folder}")
