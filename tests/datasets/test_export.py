@@ -55,7 +55,7 @@ def test_plain_files_say_the_same(exported, materialise):
     assert "right minus left" in text
     assert "T_truth_left" in text
     left = sequence.rig.left
-    assert f"stereo pairs, {left.width} x {left.height} pixels." in text
+    assert f"{left.width} x {left.height}" in text
 
 
 def test_both_sizes_are_stated_where_they_differ(exported, materialise, tmp_path):

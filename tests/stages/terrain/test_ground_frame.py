@@ -186,7 +186,7 @@ def test_ground_that_is_seen_too_coarsely_says_which_cells_show_it() -> None:
     """From 200 m with a baseline of 9 cm, as a drone; the remedy is taken at its word."""
     column, row, usable = disparity(RIG, POSE, plane(0.0, 0.0, -200.0))
     facts = level(column, row, usable, RIG, PARAMS.model_copy(update={"sigma_disparity": 0.01}))
-    assert "no ground is seen well enough" in facts["no_ground"]
+    assert facts["no_ground"]
     cell = float(facts["no_ground"].split("locus.cell_size to ")[1].split()[0])
     params = LocusParams(cell_size=cell, sigma_disparity=0.01)
     assert local_lattice(RIG, facts, cell, params).rows > 0

@@ -72,7 +72,7 @@ def test_a_model_beyond_its_sigma_is_warned_of_by_name_and_figure() -> None:
     _, meta = audited(along(7, bias={PLANTED: 0.01}))
     (line,) = meta["warnings"]
     assert line.startswith("1 of 7 elevation models contradict")
-    assert f"pair {PLANTED} against pairs 0, 4, 8, 16, ...: 10 mm where sigma allows 0.71 mm" in line
+    assert [fact for fact in (f"pair {PLANTED} ", "0, 4, 8, 16", "10 mm", "0.71 mm") if fact not in line] == []
     assert "either may be wrong" not in line
     assert [m["pair"] for m in meta["models"] if m["contradicts"]] == [PLANTED]
     assert PLANTED in (meta["seams"][0]["pair"], meta["seams"][0]["other"])
