@@ -15,24 +15,27 @@ import scipy
 from numpy.typing import NDArray
 
 from rille.pipeline.export import artifacts
+from rille.pipeline.export.view import RunView
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 
 LUMA = np.array([0.299, 0.587, 0.114])
 """Grey of red, green and blue, as the images were made grey (ITU-R BT.601)."""
 
-READS = ("images", "undistorted", "trajectory", "screening", "rigs")
-KNOWS = ("frames", "sequence.rig")
-"""What an output needs besides the merged tiles, see :class:`rille.pipeline.export.output.Output`."""
+
+def reads(run: RunView) -> tuple[object, ...]:
+    """What the colours take of a run, besides its merged terrain."""
+    p = run.products
+    return p.images, p.undistorted, p.trajectory, p.rigs, run.sequence.rig
 
 
-def coloured(view: Any, source: NDArray[Any]) -> bool:
+def coloured(view: RunView, source: NDArray[Any]) -> bool:
     """Whether a left image of the pairs in ``source`` has colours; one that is dark has none, whatever the others."""
     images = (artifacts.image(view, int(pair)) for pair in np.unique(source))
     return any(image is not None and "colour" in image.arrays for image in images)
 
 
-def ortho(view: Any, lattice: Lattice, merged: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
+def ortho(view: RunView, lattice: Lattice, merged: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
     """Red, green and blue (row, col, 3) of the merged cells, 1..255; 0 where nothing is known.
 
     Parameters
@@ -40,7 +43,7 @@ def ortho(view: Any, lattice: Lattice, merged: Mapping[str, NDArray[Any]]) -> ND
     merged : arrays ``ortho``, ``elevation`` and ``source`` on ``lattice``.
     """
     grey, known = merged["ortho"], np.isfinite(merged["ortho"])
-    found = np.repeat(np.nan_to_num(grey)[..., None], 3, axis=2).astype(np.float64)
+    colours = np.repeat(np.nan_to_num(grey)[..., None], 3, axis=2).astype(np.float64)
     trajectory = view.bundle(view.products.trajectory)
     poses = (
         {} if trajectory is None else dict(zip(view.frames, artifacts.by_frame(view, trajectory, "poses"), strict=True))
@@ -56,6 +59,6 @@ def ortho(view: Any, lattice: Lattice, merged: Mapping[str, NDArray[Any]]) -> ND
         x, y = camera.project(RigidTransform.from_matrix(pose).inverse().apply(world)).T
         bands = np.moveaxis(image["colour"], 2, 0)
         colour = np.stack([scipy.ndimage.map_coordinates(b, (y, x), float, 1, mode="nearest") for b in bands], axis=1)
-        found[here] += colour - (colour @ LUMA)[:, None]
+        colours[here] += colour - (colour @ LUMA)[:, None]
     # 0 means unknown in the file: a black that was seen becomes 1.
-    return np.where(known[..., None], np.clip(np.rint(found), 1, 255), 0).astype(np.uint8)
+    return np.where(known[..., None], np.clip(np.rint(colours), 1, 255), 0).astype(np.uint8)

@@ -58,23 +58,20 @@ class Comparison:
         return {name: values.tolist() for name, values in found.items()}
 
 
-def compare(view: RunView) -> Comparison | None:
-    """Frame by frame against the crosscheck; None where there is no comparison."""
-    bundle = view.bundle(view.products.agreement)
-    if bundle is None:
-        return None
+def compare(view: RunView, agreement: Bundle) -> Comparison:
+    """Frame by frame against the crosscheck, of its agreement with the trajectory."""
     names = ("poses", "distance", "angle", "step_distance", "step_angle")
-    found = {name: by_frame(view, bundle, name) for name in names}
+    found = {name: by_frame(view, agreement, name) for name in names}
     registered = np.asarray(np.isfinite(found["poses"]).all(axis=(1, 2)))
     trajectory = view.bundle(view.products.trajectory)
     if trajectory is not None:  # other pieces lie in frames of their own, and so do the frames lost behind them
         piece = np.nan_to_num(by_frame(view, trajectory, "piece"), nan=-1).astype(np.int64)
         found["poses"][carried(piece) != trajectory.meta["main"]] = np.nan
-    flagged = np.nan_to_num(by_frame(view, bundle, "flagged")) > 0
+    flagged = np.nan_to_num(by_frame(view, agreement, "flagged")) > 0
     p = view.products
     error, theirs = (_error(view, view.bundle(handle)) for handle in (p.accuracy, p.crosscheck_accuracy))
     judged = {**found, "registered": registered, "flagged": flagged, "error": error, "error_crosscheck": theirs}
-    return Comparison(view.frames, **judged, meta=bundle.meta)
+    return Comparison(view.frames, **judged, meta=agreement.meta)
 
 
 def _error(view: RunView, accuracy: Bundle | None) -> Floats:

@@ -1,30 +1,32 @@
-"""Outputs: every file of a run by one record, and the task that makes it of artifacts.
+"""Outputs: every file of a run by one row, and the task that makes it of artifacts.
 
-A record says what the file is called, what writes it and of what, in which frame and unit its values are, and what
-opens it. Writer, report, ``frames.json`` and the table in the docs read nothing else.
+A row says what the file is called, what writes it and of what, in which frame and unit its values are, and what opens
+it. Writer, report, ``frames.json`` and the table in the docs read nothing else.
 
-A file is a cached task like all others: its artifact holds its bytes, keyed by the artifacts and facts that the record
-names and by the code of the module that declares it. A run's folder gets a copy: what a user does to it cannot damage
+A file is a cached task like all others: its artifact holds its bytes, keyed by the artifacts and facts that its writer
+takes and by the code of the module that declares it. A run's folder gets a copy: what a user does to it cannot damage
 the cache, also where both are on one disk. What no input determines (times, what was computed anew) is in none of
 these files: the page and ``report.json`` are rendered by each run around what is cached.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
-from functools import lru_cache
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, is_dataclass
+from inspect import Parameter, signature
+from operator import methodcaller
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
-from types import SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
 
 from rille.datasets.georeference import Georeference
+from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.runtime import atomic
-from rille.stages.core.declare import Array, Bundle, Memory, NoParams, Stage
+from rille.pipeline.export.view import Part, RunView
+from rille.stages.core.declare import AnyArray, Array, Bundle, Memory, NoParams, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.hazard.vehicle import Vehicle
@@ -33,16 +35,6 @@ BLOCK = 1024
 """Bytes a row of the array that holds a file: a chunk of an artifact is 1024 x 1024 then."""
 
 CONTENT = Array("content", ("block", "byte"), "uint8", "1", "bytes of the files, one behind another")
-
-RESTORE: Mapping[str, Callable[[Any], Any]] = {
-    "frames": tuple,
-    "sequence.rig": Rig.from_dict,
-    "sequence.simulation.T_vehicle_left": RigidTransform.from_matrix,
-    "sequence.georeference": lambda d: Georeference(d["crs"], tuple(d["origin"]), d["azimuth"]),
-    "sequence.truth": lambda poses: [None if pose is None else RigidTransform.from_matrix(pose) for pose in poses],
-    "config.vehicle": Vehicle.model_validate,
-}
-"""How facts of a view come back from their plain form; others are plain."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +46,11 @@ class Output:
     name : of the file.
     what : what it is, in words.
     opens : free programs that open it.
-    write : ``write(path, view)`` writes it; None for what each run renders. It may write nothing, or for a name with
-        a ``*`` several files beside ``path``.
-    needs : fields of :class:`rille.pipeline.flow.products.Products` whose artifacts must all be there.
-    reads : further ones, which may lack some.
-    knows : facts of the view that it uses, such as ``sequence.georeference``; others it cannot reach.
+    write : ``write(path, **inputs)`` writes it; None for what each run renders. It may write nothing, or for a name
+        with a ``*`` several files beside ``path``.
+    inputs : what ``write`` takes of a run, by name: products, which it gets as artifacts, and plain facts. Where one
+        that has no default in ``write`` is not there as a whole, the file is not made; of others (a list, a
+        dictionary, a :class:`rille.pipeline.export.view.Part`) what is missing is None.
     frame : frame of reference of its values, a key of :data:`rille.pipeline.export.frames_json.FRAMES`; empty: none.
     facts : what else a program has to know to read it, for ``frames.json``: units, columns, what is missing.
     """
@@ -66,133 +58,137 @@ class Output:
     name: str
     what: str
     opens: str
-    write: Callable[[Path, Any], None] | None = None
-    needs: tuple[str, ...] = ()
-    reads: tuple[str, ...] = ()
-    knows: tuple[str, ...] = ()
+    write: Callable[..., None] | None = None
+    inputs: Callable[[RunView], Mapping[str, Any]] = lambda _: {}
     frame: str = ""
     facts: Mapping[str, str] = field(default_factory=dict)
 
 
 def stage(name: str, summary: str, outputs: Sequence[Output]) -> Stage:
     """Declare the stage behind outputs: its module declares it as ``STAGE``, so that the module's code is its own."""
-    by_name = {output.name: output for output in outputs}
+    writers = {output.name: output.write for output in outputs}
 
     def run(params: NoParams, args: Mapping[str, Any], inputs: Mapping[str, Any]) -> Bundle:
-        write = by_name[args["file"]].write
+        write, bundles = writers[args["file"]], [Bundle(_Unkept(b), b.meta) for b in inputs["read"]]
         assert write is not None
         with TemporaryDirectory() as folder:
-            write(Path(folder) / args["file"], restore(args, inputs["read"]))
+            taken = {name: _restored(form, bundles) for name, form in args["inputs"].items()}
+            write(Path(folder) / args["file"], **taken)
             return pack(Path(folder))
 
-    # artifacts are opened one by one, and only a few at once are held
     return Stage(name, 1, summary, NoParams, ("read*",), (CONTENT,), run, Memory(fixed=300e6, factor=1.0, result=0.1))
 
 
-# -- a view of a run as arguments and inputs of a task ----------------------------------------------------------
+class _Unkept(Mapping[str, AnyArray]):
+    """Arrays of an artifact, each read whenever it is asked for: a figure of all pairs could not hold all of them."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self._bundle = bundle
+
+    def __getitem__(self, name: str) -> AnyArray:
+        return self._bundle.part(name, ())
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._bundle.arrays
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._bundle.arrays)
+
+    def __len__(self) -> int:
+        return len(self._bundle.arrays)
 
 
-def handles(output: Output, products: Any) -> list[Any]:
-    """Handles of all artifacts that an output reads, each once."""
-    there: There = {}
-    for name in (*output.needs, *output.reads):
-        _layout(getattr(products, name), there, lambda _: True)
-    return [handle for _, handle in there.values()]
+def handles(output: Output, run: RunView) -> list[Handle]:
+    """Handles of all artifacts that an output takes, each once."""
+    return _handles(dict(output.inputs(run)))
 
 
-def task(output: Output, view: Any) -> tuple[dict[str, Any], list[Any]] | None:
-    """Arguments and inputs of the task that makes an output; None where what it needs is not there."""
-    for name in output.needs:
-        needed = handles(Output(name, "", "", needs=(name,)), view.products)
-        if not needed or not all(map(_due, needed)):
-            return None
-    there: There = {}
-    # Sorted: the arguments enter the task's key, and a set's order differs from process to process.
-    names = sorted({*output.needs, *output.reads})
-    layout = {name: _layout(getattr(view.products, name), there, _due) for name in names}
-    facts = {name: plain(_get(view, name)) for name in output.knows}
-    return {"file": output.name, "products": layout, "facts": facts}, [handle for _, handle in there.values()]
+def add(graph: Graph, module: ModuleType, output: Output, run: RunView) -> Handle | None:
+    """Add the task that makes an output of ``module``; None where something that it needs is not there."""
+    assert output.write is not None
+    taken = output.inputs(run)
+    parameters = signature(output.write).parameters
+    if not all(_whole(value) for name, value in taken.items() if parameters[name].default is Parameter.empty):
+        return None
+    there: dict[Handle, int] = {}
+    forms = {name: _form(value, there, _due) for name, value in taken.items()}
+    args = {"file": output.name, "inputs": forms}
+    return graph.node(module, f"output/{output.name}", NoParams(), args, {}, {"read": list(there)})
 
 
-def _due(handle: Any) -> bool:
+def _due(handle: Handle) -> bool:
     """Whether there is an artifact; a plan counts on those that are to be computed."""
     return handle.ref is not None or handle.status == "planned"
 
 
-def restore(args: Mapping[str, Any], bundles: Sequence[Bundle]) -> Any:
-    """The view of :func:`task`, with bundles for handles; what was not named is no attribute of it."""
-
-    @lru_cache(maxsize=16)
-    def opened(at: int) -> Bundle:
-        # A lazy artifact keeps what was read of it: a copy's is freed when this cache drops the copy.
-        anew = getattr(bundles[at].arrays, "anew", None)
-        return bundles[at] if anew is None else Bundle(anew(), bundles[at].meta)
-
-    place = {id(bundle): at for at, bundle in enumerate(bundles)}
-    products = SimpleNamespace(**{name: _filled(layout, bundles) for name, layout in args["products"].items()})
-    view = SimpleNamespace(products=products, bundle=lambda b: None if b is None else opened(place[id(b)]), tasks=())
-    for name, value in args["facts"].items():
-        *path, last = name.split(".")
-        at = view
-        for part in path:
-            at.__dict__.setdefault(part, SimpleNamespace())
-            at = getattr(at, part)
-        setattr(at, last, None if value is None else RESTORE.get(name, lambda given: given)(value))
-    return view
+def _whole(value: Any) -> bool:
+    """Whether an input is there, with all its artifacts; a part of a run may have holes."""
+    empty = value is None or (isinstance(value, list | dict) and not value)
+    return isinstance(value, Part) or (not empty and all(map(_due, _handles(value))))
 
 
-def _get(view: Any, name: str) -> Any:
-    for part in name.split("."):
-        view = getattr(view, part, None)
-    return view
+def _handles(value: Any) -> list[Handle]:
+    there: dict[Handle, int] = {}
+    _form(value, there, lambda _: True)
+    return list(there)
 
 
-def plain(value: Any) -> Any:
-    """JSON form of a fact."""
-    for method in ("to_dict", "to_list"):
-        if hasattr(value, method):
-            return getattr(value, method)()
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json")
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    return value
+# -- inputs of a writer as arguments of a task, and back ----------------------------------------------------------
 
 
-There = dict[int, tuple[int, Any]]
-"""Handles with their numbers, by their ids."""
+@dataclass(frozen=True)
+class Form:
+    """How values of a class are written as plain JSON, and read back."""
+
+    kind: type
+    write: Callable[[Any], Any]
+    read: Callable[[Any], Any]
 
 
-def _layout(value: Any, there: There, wanted: Callable[[Any], bool]) -> Any:
-    """Plain form of what holds handles; wanted ones are collected in ``there`` and replaced by their number.
+FORMS = {
+    form.kind.__name__: form
+    for form in (
+        Form(Rig, Rig.to_dict, Rig.from_dict),
+        Form(RigidTransform, RigidTransform.to_list, RigidTransform.from_matrix),
+        Form(Georeference, Georeference.to_dict, lambda d: Georeference(**d | {"origin": tuple(d["origin"])})),
+        Form(Vehicle, methodcaller("model_dump", mode="json"), Vehicle.model_validate),
+    )
+}
+"""Facts that are not plain, by the names of their classes."""
+
+
+def _form(value: Any, there: dict[Handle, int], wanted: Callable[[Handle], bool]) -> Any:
+    """Plain form of an input; wanted handles are collected in ``there`` and replaced by their number, others by None.
 
     A dictionary is sorted: tasks are laid out in the order in which results come, which is not always the same.
     """
-    if hasattr(value, "spec") and hasattr(value, "ref"):
-        if not wanted(value):
-            return None
-        return {"read": there.setdefault(id(value), (len(there), value))[0]}
+    if isinstance(value, Handle):
+        return {"artifact": there.setdefault(value, len(there))} if wanted(value) else None
+    if (form := FORMS.get(type(value).__name__)) is not None:
+        return {type(value).__name__: form.write(value)}
     if isinstance(value, Mapping):
-        return {"by": [[key, _layout(value[key], there, wanted)] for key in sorted(value)]}
+        return {"by": [[key, _form(value[key], there, wanted)] for key in sorted(value)]}
     if isinstance(value, list | tuple):
-        return [_layout(item, there, wanted) for item in value]
-    if is_dataclass(value):
-        return {"of": {f.name: _layout(getattr(value, f.name), there, wanted) for f in fields(value)}}
+        return [_form(item, there, wanted) for item in value]
+    if isinstance(value, Part) or is_dataclass(value):
+        return {"part": {name: _form(item, there, wanted) for name, item in vars(value).items()}}
     return value
 
 
-def _filled(layout: Any, bundles: Sequence[Bundle]) -> Any:
-    if isinstance(layout, list):
-        return [_filled(item, bundles) for item in layout]
-    if not isinstance(layout, dict):
-        return layout
-    if "read" in layout:
-        return bundles[layout["read"]]
-    if "by" in layout:
-        return {key: _filled(item, bundles) for key, item in layout["by"]}
-    return SimpleNamespace(**{name: _filled(item, bundles) for name, item in layout["of"].items()})
+def _restored(form: Any, bundles: Sequence[Bundle]) -> Any:
+    """The input of a plain form, with artifacts for handles."""
+    if isinstance(form, list):
+        return tuple(_restored(item, bundles) for item in form)
+    if not isinstance(form, dict):
+        return form
+    ((kind, content),) = form.items()
+    if kind == "artifact":
+        return bundles[content]
+    if kind == "by":
+        return {key: _restored(item, bundles) for key, item in content}
+    if kind == "part":
+        return Part(**{name: _restored(item, bundles) for name, item in content.items()})
+    return FORMS[kind].read(content)
 
 
 # -- files as an artifact ---------------------------------------------------------------------------------------

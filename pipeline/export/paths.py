@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from rille.datasets.georeference import Georeference
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.writers import write_path_gpkg
+from rille.stages.core.declare import Bundle
 
 
-def _write_gpkg(path: Path, view: Any) -> None:
-    planned = view.bundle(view.products.world_path)
-    write_path_gpkg(path, np.asarray(planned["path"]), planned.meta, view.sequence.georeference)
+def _write_gpkg(path: Path, planned: Bundle, place: Georeference | None = None) -> None:
+    write_path_gpkg(path, np.asarray(planned["path"]), planned.meta, place)
 
 
 OUTPUTS = (
@@ -22,10 +22,9 @@ OUTPUTS = (
         "path over the merged terrain, its start and target, with their coordinate system",
         "QGIS, GDAL",
         _write_gpkg,
-        ("world_path",),
-        knows=("sequence.georeference",),
-        frame="world",
-        facts={"crs": "engineering CRS, metres", "coordinates": "x y z, m"},
+        lambda run: {"planned": run.products.world_path, "place": run.sequence.georeference},
+        "world",
+        {"crs": "engineering CRS, metres", "coordinates": "x y z, m"},
     ),
 )
 STAGE = stage("output.paths", "The path as a file", OUTPUTS)

@@ -5,15 +5,18 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export import colour, ranges
 from rille.pipeline.export.output import Output, stage
+from rille.pipeline.export.view import RunView, part
 from rille.pipeline.export.writers import Meaning, write_raster
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.lattice import Lattice, mosaic, union
@@ -42,60 +45,59 @@ def whole(tiles: Sequence[Bundle], name: str, lattice: Lattice | None = None) ->
     return target, mosaic(parts, NODATA[name], target)
 
 
-def _height(view: Any) -> tuple[Lattice, NDArray[Any]]:
+Tiles = Sequence[Bundle]
+"""World tiles of the merged terrain."""
+Place = Georeference | None
+
+
+def _height(tiles: Tiles, place: Place) -> tuple[Lattice, NDArray[Any]]:
     """Elevations, or heights where the sequence has a place, m."""
-    lattice, elevation = whole(list(map(view.bundle, view.products.world_tiles)), "elevation")
-    place = view.sequence.georeference
+    lattice, elevation = whole(tiles, "elevation")
     return lattice, elevation if place is None else elevation.astype(np.float64) + place.origin[2]
 
 
-Values = Callable[[Any], tuple[Lattice, NDArray[Any]]]
-"""Values of a raster, and the lattice they are on, of a view."""
+def _slope(tiles: Tiles, place: Place) -> tuple[Lattice, NDArray[Any]]:
+    lattice, elevation = whole(tiles, "elevation")
+    return lattice, slope_deg(elevation, lattice.cell)
 
 
-def _raster(band: str, unit: str, values: Values) -> Callable[..., None]:
-    """Writer of a raster of one band."""
+def _sigma(tiles: Tiles, place: Place) -> tuple[Lattice, NDArray[Any]]:
+    return whole(tiles, "elevation_std")
 
-    def write(path: Path, view: Any) -> None:
-        lattice, found = values(view)
-        bands = {band: np.asarray(found, np.float32)}
-        write_raster(path, bands, lattice, Meaning(unit), view.sequence.georeference)
+
+def _raster(
+    band: str, unit: str, values: Callable[[Tiles, Place], tuple[Lattice, NDArray[Any]]]
+) -> Callable[..., None]:
+    """Writer of a raster of one band: ``values`` gives its lattice and its values."""
+
+    def write(path: Path, tiles: Tiles, place: Place = None) -> None:
+        lattice, cells = values(tiles, place)
+        write_raster(path, {band: np.asarray(cells, np.float32)}, lattice, Meaning(unit), place)
 
     return write
 
 
-def _merged(name: str) -> Values:
-    return lambda view: whole(list(map(view.bundle, view.products.world_tiles)), name)
-
-
-def _slope(view: Any) -> tuple[Lattice, NDArray[Any]]:
-    lattice, elevation = _merged("elevation")(view)
-    return lattice, slope_deg(elevation, lattice.cell)
-
-
-def _write_hillshade(path: Path, view: Any) -> None:
-    lattice, elevation = _merged("elevation")(view)
-    place = view.sequence.georeference
+def _write_hillshade(path: Path, tiles: Tiles, place: Place = None) -> None:
+    lattice, elevation = whole(tiles, "elevation")
     # The raster is turned by the azimuth where it has a place: there the light has to come from the map's upper left.
     bands = {"hillshade": hillshade(elevation, lattice.cell, 0.0 if place is None else place.azimuth)}
     write_raster(path, bands, lattice, Meaning(nodata=0, tags=LIGHT), place)
 
 
-def _write_ortho(path: Path, view: Any) -> None:
-    """Write grey values as they are, or red, green and blue where the images have colours."""
-    lattice, grey = _merged("ortho")(view)
-    place = view.sequence.georeference
-    source = _merged("source")(view)[1]
-    if not colour.coloured(view, source):
+def write_ortho(path: Path, tiles: Tiles, run: RunView, place: Place = None) -> None:
+    """Write grey values as they are, or red, green and blue where the images of ``run`` have colours."""
+    lattice, grey = whole(tiles, "ortho")
+    source = whole(tiles, "source")[1]
+    if not colour.coloured(run, source):
         write_raster(path, {"ortho": np.asarray(grey, np.float32)}, lattice, Meaning(), place)
         return
-    merged = {"ortho": grey, "elevation": _merged("elevation")(view)[1], "source": source}
-    bands = dict(zip(("red", "green", "blue"), np.moveaxis(colour.ortho(view, lattice, merged), 2, 0), strict=True))
+    merged = {"ortho": grey, "elevation": whole(tiles, "elevation")[1], "source": source}
+    bands = dict(zip(("red", "green", "blue"), np.moveaxis(colour.ortho(run, lattice, merged), 2, 0), strict=True))
     write_raster(path, bands, lattice, Meaning(nodata=0), place)
 
 
-def _write_dem_style(path: Path, view: Any) -> None:
-    low, high = ranges.ground_limits(_height(view)[1])
+def _write_dem_style(path: Path, tiles: Tiles, place: Place = None) -> None:
+    low, high = ranges.ground_limits(_height(tiles, place)[1])
     atomic.write(path, dem_style(low, high))
 
 
@@ -110,42 +112,37 @@ BITS = 12
 """Significant bits of a written measure: 0.02 %, finer than any is known."""
 
 
-def _write_risk(path: Path, view: Any) -> None:
+def _write_risk(path: Path, risk: Bundle, place: Place = None) -> None:
     """Write the class of each cell as a byte, with its colour and, beside it, its name."""
-    risk = view.bundle(view.products.world_risk)
     tags = {"classes": ", ".join(f"{k} {name}" for k, name in enumerate(CLASSES))} | _vehicle(risk)
-    lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
     # No nodata: class 3, unknown, is to be seen and counted like the others.
     meaning = Meaning(nodata=None, tags=tags, colours=list(CLASSES.values()))
-    write_raster(path, {"class": np.asarray(risk["risk"], np.uint8)}, lattice, meaning, place)
+    bands = {"class": np.asarray(risk["risk"], np.uint8)}
+    write_raster(path, bands, Lattice.from_dict(risk.meta["lattice"]), meaning, place)
 
 
-def _write_class_names(path: Path, view: Any) -> None:
+def _write_class_names(path: Path, risk: Bundle) -> None:
     # GeoTIFF has no names of classes: GDAL reads them from this file beside it (PAM).
     names = "".join(f"<Category>{name}</Category>" for name in CLASSES)
     text = f'<PAMDataset><PAMRasterBand band="1"><CategoryNames>{names}</CategoryNames></PAMRasterBand></PAMDataset>'
     atomic.write(path, text)
 
 
-def _write_reasons(path: Path, view: Any) -> None:
-    risk = view.bundle(view.products.world_risk)
-    bands = {"reason": np.asarray(risk["reason"], np.uint16), "filled": np.asarray(risk["filled"], np.uint16)}
+def _write_reasons(path: Path, risk: Bundle, place: Place = None) -> None:
+    bands = {name: np.asarray(risk[name], np.uint16) for name in ("reason", "filled")}
     tags = {"reason_bits": ", ".join(f"{bit} {name}" for name, bit in REASONS.items())}
-    lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
-    write_raster(path, bands, lattice, Meaning(nodata=None, tags=tags), place)
+    write_raster(path, bands, Lattice.from_dict(risk.meta["lattice"]), Meaning(nodata=None, tags=tags), place)
 
 
-def _write_hazard(path: Path, view: Any) -> None:
+def _write_hazard(path: Path, risk: Bundle, place: Place = None) -> None:
     """Write the probability of a hazard and the measures, in metres and degrees."""
-    risk = view.bundle(view.products.world_risk)
     bands, units = {"p_hazard": risk["p_hazard"]}, {"p_hazard": ""}
     for a in RISK.outputs:
         if a.unit in ("m", "rad") and a.name != "elevation":
             bands[a.name] = np.degrees(risk[a.name]) if a.unit == "rad" else risk[a.name]
             units[a.name] = "degree" if a.unit == "rad" else a.unit
     given = {name: rounded(np.asarray(values, dtype=np.float32), BITS) for name, values in bands.items()}
-    lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
-    write_raster(path, given, lattice, Meaning(units, tags=_vehicle(risk)), place)
+    write_raster(path, given, Lattice.from_dict(risk.meta["lattice"]), Meaning(units, tags=_vehicle(risk)), place)
 
 
 def _vehicle(risk: Bundle) -> dict[str, str]:
@@ -160,7 +157,7 @@ def rounded(values: NDArray[np.float32], bits: int) -> NDArray[np.float32]:
     return np.asarray(np.ldexp(np.rint(mantissa * scale) / scale, exponent), dtype=np.float32)
 
 
-def _write_risk_style(path: Path, view: Any) -> None:
+def _write_risk_style(path: Path, risk: Bundle) -> None:
     atomic.write(path, risk_style())
 
 
@@ -201,17 +198,33 @@ def _style(kind: str, content: str) -> str:
     )
 
 
-def _of_terrain(name: str, what: str, write: Callable[..., None], values: str, missing: str = "nan") -> Output:
-    """Record of a raster of the merged terrain: a hole in the run must not look like unknown terrain."""
-    facts = {**CRS, "values": values, "missing": missing}
-    return Output(name, what, GIS, write, ("world_tiles",), (), ("sequence.georeference",), "world", facts)
+def _terrain(run: RunView) -> dict[str, Any]:
+    """Merged terrain and its place: a hole in the run must not look like unknown terrain."""
+    return {"tiles": run.products.world_tiles, "place": run.sequence.georeference}
+
+
+def _coloured(run: RunView) -> dict[str, Any]:
+    """The same, and what the colours of the images take."""
+    return _terrain(run) | {"run": part(run, colour.reads)}
+
+
+def _hazards(run: RunView) -> dict[str, Any]:
+    return {"risk": run.products.world_risk, "place": run.sequence.georeference}
+
+
+def _risk(run: RunView) -> dict[str, Any]:
+    return {"risk": run.products.world_risk}
+
+
+def _of_terrain(name: str, what: str, write: Callable[..., None], values: str = "", missing: str = "nan") -> Output:
+    """Row of a raster of the merged terrain; ``values``: in more words than ``what``."""
+    facts = {**CRS, "values": values or what, "missing": missing}
+    return Output(name, what, GIS, write, _terrain, "world", facts)
 
 
 def _of_risk(name: str, what: str, write: Callable[..., None]) -> Output:
-    """Record of a raster of the hazards."""
-    return Output(
-        name, what, GIS, write, ("world_risk",), (), ("sequence.georeference",), "world", {**CRS, "values": what}
-    )
+    """Row of a raster of the hazards."""
+    return Output(name, what, GIS, write, _hazards, "world", {**CRS, "values": what})
 
 
 OUTPUTS = (
@@ -221,26 +234,9 @@ OUTPUTS = (
         _raster("elevation", "m", _height),
         "elevation z of the cell centre, m; where the sequence has a place on Earth, its height there",
     ),
-    Output(
-        "dem.qml",
-        "colours of dem.tif, which QGIS applies by itself",
-        "QGIS",
-        _write_dem_style,
-        ("world_tiles",),
-        knows=("sequence.georeference",),
-    ),
-    _of_terrain(
-        "dem_sigma.tif",
-        "standard deviation of the elevation, m",
-        _raster("elevation_std", "m", _merged("elevation_std")),
-        "standard deviation of the elevation, m",
-    ),
-    _of_terrain(
-        "slope.tif",
-        "inclination of the terrain, degrees",
-        _raster("slope", "degree", _slope),
-        "inclination of the terrain, degrees",
-    ),
+    Output("dem.qml", "colours of dem.tif, which QGIS applies by itself", "QGIS", _write_dem_style, _terrain),
+    _of_terrain("dem_sigma.tif", "standard deviation of the elevation, m", _raster("elevation_std", "m", _sigma)),
+    _of_terrain("slope.tif", "inclination of the terrain, degrees", _raster("slope", "degree", _slope)),
     _of_terrain(
         "hillshade.tif",
         "shaded relief of the terrain",
@@ -248,19 +244,18 @@ OUTPUTS = (
         "shaded relief 1..255, light from the upper left",
         "0",
     ),
-    Output(
-        "ortho.tif",
-        "merged ortho image, grey 0..255, or red, green and blue where the images have colours",
-        GIS,
-        _write_ortho,
-        ("world_tiles",),
-        colour.READS,
-        ("sequence.georeference", *colour.KNOWS),
-        "world",
-        {**CRS, "values": "grey value 0..255, or red, green, blue 1..255", "missing": "nan; of colours 0"},
+    replace(
+        _of_terrain(
+            "ortho.tif",
+            "merged ortho image, grey 0..255, or red, green and blue where the images have colours",
+            write_ortho,
+            "grey value 0..255, or red, green, blue 1..255",
+            "nan; of colours 0",
+        ),
+        inputs=_coloured,
     ),
     _of_risk("risk.tif", "risk map: class 0 safe, 1 caution, 2 hazard, 3 unknown, with colours", _write_risk),
-    Output("risk.tif.aux.xml", "names of the classes of risk.tif", GIS, _write_class_names, ("world_risk",)),
+    Output("risk.tif.aux.xml", "names of the classes of risk.tif", GIS, _write_class_names, _risk),
     _of_risk("hazard.tif", "probability of a hazard, and the measures in metres and degrees", _write_hazard),
     _of_risk("reason.tif", "bits of the limits that a cell breaks; whether it was filled", _write_reasons),
     Output(
@@ -268,7 +263,7 @@ OUTPUTS = (
         "colours and names of the classes of risk.tif, which QGIS applies by itself",
         "QGIS",
         _write_risk_style,
-        ("world_risk",),
+        _risk,
     ),
 )
 STAGE = stage("output.rasters", "Rasters of the terrain and its hazards", OUTPUTS)

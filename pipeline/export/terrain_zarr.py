@@ -15,7 +15,7 @@ and ground; those above the first camera have none.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.rasters import whole
 from rille.pipeline.export.writers import ENGINEERING_CRS, FRAME
-from rille.stages.core.declare import Array
+from rille.stages.core.declare import Array, Bundle
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain import merge
 from rille.stages.terrain.shading import slope_deg
@@ -122,19 +122,19 @@ def _coordinates(lattice: Lattice, place: Georeference | None) -> dict[str, xarr
 SLOPE = Array("slope", ("row", "col"), "float32", "degree", "inclination of the terrain", "nan", "world")
 
 
-def _write_output(path: Path, view: Any) -> None:
+def _write_output(path: Path, tiles: Sequence[Bundle], sequence: str, place: Georeference | None = None) -> None:
     """All merged arrays, put together of the world tiles, and the slope."""
-    tiles, arrays = list(map(view.bundle, view.products.world_tiles)), {}
+    arrays = {}
     for spec in merge.STAGE.outputs:
         if spec.dims == ("row", "col") and all(spec.name in tile.arrays for tile in tiles):
             lattice, values = whole(tiles, spec.name)
             arrays[spec.name] = (spec, values)
     arrays["slope"] = (SLOPE, slope_deg(arrays["elevation"][1], lattice.cell))
     about = {
-        "title": f"Merged terrain of the sequence {view.sequence.name}",
+        "title": f"Merged terrain of the sequence {sequence}",
         "source": "stereo images: disparity by HFVM, elevation models by Locus, merged; Rille",
     }
-    write_terrain(path, arrays, lattice, view.sequence.georeference, about)
+    write_terrain(path, arrays, lattice, place, about)
 
 
 OUTPUTS = (
@@ -143,10 +143,13 @@ OUTPUTS = (
         "all merged arrays with units and coordinates",
         "xarray.open_zarr, GDAL",
         _write_output,
-        ("world_tiles",),
-        knows=("sequence.georeference", "sequence.name"),
-        frame="world",
-        facts={
+        lambda run: {
+            "tiles": run.products.world_tiles,
+            "sequence": run.sequence.name,
+            "place": run.sequence.georeference,
+        },
+        "world",
+        {
             "crs": "engineering CRS, metres; easting and northing beside x and y where the sequence has a place on "
             "Earth",
             "values": "all merged arrays as one zarr 2 group, by the CF conventions; units with each",

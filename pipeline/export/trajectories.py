@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence as Series
 from pathlib import Path
 from typing import Any
 
 from rille.pipeline.export import writers
 from rille.pipeline.export.comparison import compare
 from rille.pipeline.export.output import Output, stage
+from rille.pipeline.export.view import RunView, part
 from rille.pipeline.export.writers import write_table, write_trajectory_kitti, write_trajectory_tum
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.pose_arrays import NO_VERTICAL
@@ -20,13 +22,11 @@ TUM = {
     "quaternion": "x y z w (scalar last), Hamilton, w >= 0, rotates from the left camera to the world",
     "missing": "frames without a pose have no line",
 }
-WHEN = ("frames", "sequence.times")
 
 
-def stamps(view: Any) -> list[float]:
-    """Time of each chosen frame, seconds; its number where there is no clock."""
-    times = view.sequence.times
-    return [float(f) if times is None else times[f] for f in view.frames]
+def stamps(frames: Series[int], times: Series[float] | None) -> list[float]:
+    """Time of each frame, seconds; its number where there is no clock."""
+    return [float(f) if times is None else times[f] for f in frames]
 
 
 def _world(trajectory: Bundle, piece: int) -> str:
@@ -34,36 +34,34 @@ def _world(trajectory: Bundle, piece: int) -> str:
     return writers.UNLEVELLED if trajectory.meta["verticals"][piece] == NO_VERTICAL else writers.FRAME
 
 
-def _write_kitti(path: Path, view: Any) -> None:
-    write_trajectory_kitti(path, world_poses(view.bundle(view.products.trajectory)))
+def _write_kitti(path: Path, trajectory: Bundle) -> None:
+    write_trajectory_kitti(path, world_poses(trajectory))
 
 
-def _write_tum(path: Path, view: Any) -> None:
-    trajectory = view.bundle(view.products.trajectory)
-    write_trajectory_tum(path, world_poses(trajectory), stamps(view), _world(trajectory, trajectory.meta["main"]))
+def _write_tum(path: Path, trajectory: Bundle, frames: Series[int], times: Series[float] | None = None) -> None:
+    world = _world(trajectory, trajectory.meta["main"])
+    write_trajectory_tum(path, world_poses(trajectory), stamps(frames, times), world)
 
 
-def _write_pieces(path: Path, view: Any) -> None:
-    trajectory = view.bundle(view.products.trajectory)
+def _write_pieces(path: Path, trajectory: Bundle, frames: Series[int], times: Series[float] | None = None) -> None:
     for number in range(len(trajectory.meta["verticals"])):
         if number != trajectory.meta["main"]:
             piece, world = path.with_name(path.name.replace("*", str(number + 1))), _world(trajectory, number)
-            write_trajectory_tum(piece, world_poses(trajectory, number), stamps(view), world)
+            write_trajectory_tum(piece, world_poses(trajectory, number), stamps(frames, times), world)
 
 
-def _write_crosscheck(path: Path, view: Any) -> None:
-    compared, trajectory = compare(view), view.bundle(view.products.trajectory)
-    assert compared is not None
-    write_trajectory_tum(path, compared.poses, stamps(view), _world(trajectory, trajectory.meta["main"]))
+def _write_crosscheck(path: Path, agreement: Bundle, run: RunView) -> None:
+    trajectory = run.bundle(run.products.trajectory)
+    world = writers.FRAME if trajectory is None else _world(trajectory, trajectory.meta["main"])
+    write_trajectory_tum(path, compare(run, agreement).poses, stamps(run.frames, run.sequence.times), world)
 
 
-def _write_agreement(path: Path, view: Any) -> None:
-    compared, trajectory = compare(view), view.bundle(view.products.trajectory)
-    assert compared is not None
-    names = [view.sequence.frame_names[f] for f in view.frames]
-    columns: dict[str, list[Any]] = {"frame": list(view.frames), "name": names}
-    if view.sequence.times is not None:
-        columns["time_s"] = stamps(view)
+def _write_agreement(path: Path, agreement: Bundle, run: RunView) -> None:
+    compared, trajectory = compare(run, agreement), run.bundle(run.products.trajectory)
+    names = [run.sequence.frame_names[f] for f in run.frames]
+    columns: dict[str, list[Any]] = {"frame": list(run.frames), "name": names}
+    if run.sequence.times is not None:
+        columns["time_s"] = stamps(run.frames, run.sequence.times)
     if trajectory is not None:
         positions = world_poses(trajectory)[:, :, 3]
         columns |= {f"{a}_m": positions[:, k].tolist() for k, a in enumerate("xyz")}
@@ -71,16 +69,27 @@ def _write_agreement(path: Path, view: Any) -> None:
     write_table(path, columns | compared.columns())
 
 
-COMPARED = ("trajectory", "accuracy", "crosscheck_accuracy")
+def _posed(run: RunView) -> dict[str, Any]:
+    return {"trajectory": run.products.trajectory, "frames": run.frames, "times": run.sequence.times}
+
+
+def _compared(run: RunView) -> dict[str, Any]:
+    def reads(run: RunView) -> tuple[object, ...]:
+        p, s = run.products, run.sequence
+        return p.trajectory, p.accuracy, p.crosscheck_accuracy, s.times, s.frame_names
+
+    return {"agreement": run.products.agreement, "run": part(run, reads)}
+
+
 OUTPUTS = (
     Output(
         "trajectory.kitti",
         "pose of each left camera, a 3 x 4 matrix a line, world from camera, m",
         "evo (evo_traj kitti), any text editor",
         _write_kitti,
-        ("trajectory",),
-        frame="world",
-        facts={
+        lambda run: {"trajectory": run.products.trajectory},
+        "world",
+        {
             **POSES,
             "columns": "3 x 4 matrix [R | t], row by row",
             "lines": "one a frame, in the order of `frames` here",
@@ -92,27 +101,23 @@ OUTPUTS = (
         "the same as time, position and quaternion x y z w",
         "evo (evo_traj tum), CloudCompare",
         _write_tum,
-        ("trajectory",),
-        knows=WHEN,
-        frame="world",
-        facts=TUM,
+        _posed,
+        "world",
+        TUM,
     ),
     Output(
         "trajectory.piece*.tum",
         "another unbroken piece of the trajectory, in a frame of its own",
         "evo (evo_traj tum), CloudCompare",
         _write_pieces,
-        ("trajectory",),
-        knows=WHEN,
+        _posed,
     ),
     Output(
         "crosscheck.tum",
         "the trajectory by COLMAP in the same form, laid on ours without a change of scale",
         "evo (evo_ape tum trajectory.tum crosscheck.tum)",
         _write_crosscheck,
-        ("agreement",),
-        COMPARED,
-        WHEN,
+        _compared,
         "world",
         {
             **TUM,
@@ -125,9 +130,7 @@ OUTPUTS = (
         "each frame: our position, COLMAP's, their disagreement, whether it is flagged, errors where there is truth",
         "LibreOffice Calc, any text editor",
         _write_agreement,
-        ("agreement",),
-        COMPARED,
-        (*WHEN, "sequence.frame_names"),
+        _compared,
         "world",
         {
             "columns": "frame number, name, time where the sequence has a clock; positions of both trajectories; "

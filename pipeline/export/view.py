@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from rille.stages.core.declare import Bundle
 
@@ -74,3 +75,40 @@ class RunView:
     vehicle_source: str = ""
     started: str = ""
     notes: tuple[str, ...] = ()
+
+
+class Part(SimpleNamespace):
+    """A part of a run, by the same attributes; where an output is made of it, artifacts stand for handles."""
+
+    def bundle(self, artifact: Bundle | None) -> Bundle | None:
+        """The artifact itself."""
+        return artifact
+
+
+def part(run: RunView, reads: Callable[[RunView], tuple[object, ...]]) -> RunView:
+    """The part of a run that ``reads`` names, such as ``(run.products.trajectory, run.sequence.rig)``, and its frames.
+
+    Nothing else is within reach of who gets it.
+    """
+    named = Part(frames=run.frames)
+    for name in map(str, reads(cast(RunView, _Name()))):
+        *path, last = name.split(".")
+        source: Any = run
+        target: Any = named
+        for step in path:
+            source, target = getattr(source, step, None), vars(target).setdefault(step, Part())
+        setattr(target, last, getattr(source, last, None))
+    return cast(RunView, named)
+
+
+class _Name:
+    """The dotted name of an attribute, made by reading it: type checkers follow what a quoted name would hide."""
+
+    def __init__(self, name: str = "") -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> _Name:
+        return _Name(f"{self._name}.{name}".lstrip("."))
+
+    def __str__(self) -> str:
+        return self._name

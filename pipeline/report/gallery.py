@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from rille.pipeline.export import ranges
+from rille.pipeline.export import colour, ranges
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import RunView
-from rille.pipeline.flow.products import Products
+from rille.pipeline.export.view import RunView, part
 from rille.pipeline.report import canvas, figures, gather, strips, tables, terrain_map
 from rille.pipeline.report.canvas import FIGURE, Block, Figure
 from rille.pipeline.report.figures import Curve, Plot
 from rille.pipeline.report.gather import Scene
-from rille.pipeline.report.reading import Used, artifacts, known
 from rille.pipeline.report.words import spread
 from rille.stages.core.errors import RilleError
 
@@ -125,10 +122,9 @@ class Drawing:
 
     title: str
     maker: Callable[[Scene], Block | None]
-    reads: Callable[[Products], Used]
-    knows: Callable[[RunView], Used] = lambda run: ()
+    reads: Callable[[RunView], tuple[object, ...]]
 
-    def figure(self, view: Any) -> Figure:
+    def figure(self, view: RunView) -> Figure:
         """Draw it; none where the run does not have what it shows."""
         try:
             return Figure(self.title, self.maker(Scene(view)))
@@ -138,41 +134,51 @@ class Drawing:
             return Figure(self.title, why=f"drawing failed, {type(error).__name__}: {error}")
 
     def output(self) -> Output:
-        """Its record as an output: a part of the page, kept as JSON."""
+        """Its row as an output: a part of the page, kept as JSON."""
 
-        def write(path: Path, view: Any) -> None:
-            path.write_bytes(FIGURE.dump_json(self.figure(view)))
+        def write(path: Path, run: RunView) -> None:
+            path.write_bytes(FIGURE.dump_json(self.figure(run)))
 
-        return Output(self.title, "", "", write, (), artifacts(self.reads), known(self.knows))
+        return Output(self.title, "", "", write, lambda run: {"run": part(run, self.reads)})
+
+
+def _of_map(run: RunView) -> tuple[object, ...]:
+    p, s = run.products, run.sequence
+    return (
+        p.world_tiles,
+        p.world_risk,
+        p.world_path,
+        p.drive,
+        p.disparity,
+        *colour.reads(run),
+        s.truth,
+        run.config.vehicle,
+    )
+
+
+def _of_stops(run: RunView) -> tuple[object, ...]:
+    p = run.products
+    return p.disparity, p.images, p.undistorted, p.local_dem, p.local_risk, p.local_path, run.sequence.rig
+
+
+def _of_trajectory(run: RunView) -> tuple[object, ...]:
+    p = run.products
+    return p.trajectory, p.agreement, p.accuracy, p.crosscheck_accuracy, run.sequence.truth
 
 
 DRAWINGS = (
+    Drawing("Map", terrain_map.block, _of_map),
     Drawing(
-        "Map",
-        terrain_map.block,
-        lambda p: (
-            *(p.world_tiles, p.world_risk, p.world_path, p.drive, p.trajectory),
-            *(p.disparity, p.rigs, p.images, p.undistorted, p.screening),
-        ),
-        lambda run: (run.config.vehicle, run.sequence.rig, run.sequence.truth),
+        "Drive",
+        strips.drive,
+        lambda run: (run.products.drive, run.products.images, run.products.trajectory, run.sequence.truth),
     ),
-    Drawing("Drive", strips.drive, lambda p: (p.drive, p.images, p.trajectory), lambda run: (run.sequence.truth,)),
-    Drawing("Disparity", _disparity, lambda p: (p.disparity,), lambda run: (run.sequence.rig,)),
-    Drawing(
-        "Stops",
-        strips.pairs,
-        lambda p: (p.disparity, p.images, p.undistorted, p.local_dem, p.local_risk, p.local_path),
-        lambda run: (run.sequence.rig,),
-    ),
-    Drawing("Rig", _rig, lambda p: (p.rigs, p.orientations), lambda run: (run.sequence.rig,)),
-    Drawing(
-        "Trajectory",
-        _trajectory,
-        lambda p: (p.trajectory, p.agreement, p.accuracy, p.crosscheck_accuracy),
-        lambda run: (run.sequence.truth,),
-    ),
-    Drawing("Pairs", _pairs, tables.of_pairs),
-    Drawing("Elevation error", _elevation_error, lambda p: (p.dem_accuracy,)),
+    Drawing("Disparity", _disparity, lambda run: (run.products.disparity, run.sequence.rig)),
+    Drawing("Stops", strips.pairs, _of_stops),
+    Drawing("Rig", _rig, lambda run: (run.products.rigs, run.products.orientations, run.sequence.rig)),
+    Drawing("Trajectory", _trajectory, _of_trajectory),
+    Drawing("Pairs", _pairs, lambda run: tables.of_pairs(run.products)),
+    Drawing("Elevation error", _elevation_error, lambda run: (run.products.dem_accuracy,)),
 )
 """All figures of the page; the template places them."""
 

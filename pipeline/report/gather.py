@@ -146,8 +146,9 @@ class Scene:
 
     @cached_property
     def comparison(self) -> Comparison | None:
-        """The trajectory against that of another program."""
-        return compare(self.view)
+        """The trajectory against that of another program; None where there is no comparison."""
+        agreement = self.view.bundle(self.view.products.agreement)
+        return None if agreement is None else compare(self.view, agreement)
 
     @cached_property
     def differences(self) -> list[Difference]:

@@ -12,13 +12,11 @@ import numpy as np
 
 from rille.datasets.text.count import count
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import RunView
-from rille.pipeline.flow.products import Products
+from rille.pipeline.export.view import RunView, part
 from rille.pipeline.report import delivery, tables
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene, facts_of, frames_of
 from rille.pipeline.report.metrics import metric, metrics
-from rille.pipeline.report.reading import artifacts, known
 from rille.pipeline.report.words import metres, number, quantity
 from rille.stages.evaluation import imu_check
 from rille.stages.odometry.resection.trajectory import world_poses
@@ -27,7 +25,7 @@ FORMAT = 2
 """Raised when the meaning of a key of report.json changes."""
 
 
-def gather(view: Any) -> dict[str, Any]:
+def gather(view: RunView) -> dict[str, Any]:
     """Collect the part of ``report.json`` that depends on the artifacts alone, not on time and place of the run."""
     scene = Scene(view)
     frames, pairs = tables.frames(scene), tables.pairs(scene)
@@ -76,8 +74,8 @@ def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]
     }
 
 
-def _write(path: Path, view: Any) -> None:
-    path.write_text(json.dumps(gather(view), allow_nan=False), encoding="utf-8")
+def _write(path: Path, run: RunView) -> None:
+    path.write_text(json.dumps(gather(run), allow_nan=False), encoding="utf-8")
 
 
 def find_warnings(scene: Scene, figures: Mapping[str, Any]) -> list[str]:
@@ -320,22 +318,17 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _reads(p: Products) -> tuple[object, ...]:
+def _reads(run: RunView) -> tuple[object, ...]:
+    p, s, config = run.products, run.sequence, run.config
     return (
         *(p.contradictions, p.common_tilt, p.crosschecks, p.crosscheck, p.agreement, p.crosscheck_accuracy),
         *(p.trajectory, p.accuracy, p.position_accuracy, p.overlap_audit, p.rigs, p.resections, p.refined),
         *(p.world_tiles, p.world_risk, p.world_path, p.dem_accuracy, p.path_check, p.drive, *tables.of_pairs(p)),
-    )
-
-
-def _knows(run: RunView) -> tuple[object, ...]:
-    s, config = run.sequence, run.config
-    return (
         *(config.vehicle, config.rig.significance, config.crosscheck.enabled),
         *(s.name, s.frames, s.frame_names, s.rig, s.truth, s.truth_source, s.truth_positions, s.warnings, s.notes),
         *(s.evaluation_window, s.georeference, s.times, s.up, s.attitude, s.imu_axes),
     )
 
 
-OUTPUTS = (Output("facts", "", "", _write, (), artifacts(_reads), known(_knows)),)
+OUTPUTS = (Output("facts", "", "", _write, lambda run: {"run": part(run, _reads)}),)
 STAGE = stage("output.facts", "Figures and tables of the report in numbers", OUTPUTS)

@@ -13,14 +13,13 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export import catalogue
 from rille.pipeline.export.frames_json import describe
-from rille.pipeline.export.output import Output, handles, place, task, unpack
+from rille.pipeline.export.output import Output, add, handles, place, unpack
 from rille.pipeline.export.trajectories import stamps
 from rille.pipeline.export.view import RunView, TaskRow
 from rille.pipeline.report import gallery, summary
 from rille.pipeline.report.canvas import FIGURE
 from rille.pipeline.report.delivery import Items
 from rille.pipeline.report.page import write_report
-from rille.stages.core.declare import NoParams
 
 MODULES = (*catalogue.MADE, gallery, summary)
 Made = dict[str, Handle]
@@ -42,20 +41,15 @@ def plan(graph: Graph, view: RunView) -> None:
     """Add the task of each output that a run would make; ``view`` holds what is known without computing anything."""
     for module in MODULES:
         for output in module.OUTPUTS:
-            _add(graph, view, module, output, {})
+            add(graph, module, output, view)
 
 
 def _make(graph: Graph, view: RunView, module: ModuleType, output: Output, made: Made) -> Generator[Wait, Any, None]:
     # what was laid out last is there last: looked at first, it spares looking at all others
-    yield Maybe(handles(output, view.products)[::-1])
-    _add(graph, view, module, output, made)
-
-
-def _add(graph: Graph, view: RunView, module: ModuleType, output: Output, made: Made) -> None:
-    found = task(output, view)
-    if found is not None:
-        args, inputs = found
-        made[output.name] = graph.node(module, f"output/{output.name}", NoParams(), args, {}, {"read": inputs})
+    yield Maybe(handles(output, view)[::-1])
+    node = add(graph, module, output, view)
+    if node is not None:
+        made[output.name] = node
 
 
 def task_rows(graph: Graph, store: Store) -> tuple[TaskRow, ...]:
@@ -94,7 +88,7 @@ def _frames(folder: Path, view: RunView) -> dict[str, Any]:
         [file.name for file in folder.iterdir()],
         view.frames,
         [names[f] for f in view.frames],
-        stamps(view),
+        stamps(view.frames, times),
         clock=times is not None,
         place=view.sequence.georeference,
         vertical="" if meta is None else meta["verticals"][meta["main"]],

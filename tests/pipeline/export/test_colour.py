@@ -8,7 +8,7 @@ from test_output import run
 
 from rille.datasets.images.files import decode_colour
 from rille.pipeline.export import colour
-from rille.pipeline.export.rasters import _write_ortho
+from rille.pipeline.export.rasters import write_ortho
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
@@ -63,9 +63,9 @@ def test_each_cell_takes_the_colour_of_its_pair_and_keeps_the_merged_grey():
 
 
 def test_grey_sequences_write_grey_ortho_images(tmp_path):
-    view, _ = run()
+    view, made = run()
     assert not colour.coloured(view, np.zeros((1, 1), int))
-    _write_ortho(tmp_path / "ortho.tif", view)
+    write_ortho(tmp_path / "ortho.tif", [made["tile"]], view)
     with rasterio.open(tmp_path / "ortho.tif") as found:
         assert (found.count, found.dtypes[0]) == (1, "float32")
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import laspy
 import numpy as np
@@ -21,12 +21,14 @@ from evo.tools import file_interface
 from toys.finished import FRAMES, bundles, checked, checks, sequence, view
 
 from rille.datasets.georeference import Georeference
+from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.export import catalogue
 from rille.pipeline.export.frames_json import FRAMES as REFERENCES
 from rille.pipeline.export.frames_json import describe
-from rille.pipeline.export.output import Output, handles, pack, place, task, unpack
+from rille.pipeline.export.output import Output, add, handles, pack, place, unpack
 from rille.pipeline.export.programs import point_cloud
+from rille.pipeline.export.view import Part, part
 from rille.pipeline.report import canvas, gallery
 from rille.pipeline.report.canvas import FIGURE
 from rille.pipeline.runs import run_files
@@ -38,24 +40,45 @@ PLACE = Georeference("EPSG:32633", (1.0, 2.0, 3.0), 0.5)
 BEGIN, END = "<!-- table -->\n", "<!-- end of table -->\n"
 
 
-@dataclass(eq=False)
-class Handle:
-    """What stands for an artifact in a graph."""
+class Made(Handle):
+    """A handle of an artifact that is known by its name."""
 
-    name: str
-    ref: str | None
-    spec: str = ""
-    status: str = "computed"
+    def __init__(self, name: str, *, there: bool) -> None:
+        super().__init__(0, cast(Any, None), {}, "computed", cast(Any, name if there else None))
+        self.name = name
+
+
+def laid_out(name: str, whole: Any) -> Handle | None:
+    """The task that makes an output of a run."""
+    return next(add(Graph(), module, output, whole) for module, output in outputs() if output.name == name)
+
+
+def made_by(task: Handle | None, made: dict[str, Bundle]) -> Bundle:
+    """The artifact of a task, of arguments that went through JSON."""
+    assert task is not None
+    digest(task.spec.args)  # they are part of a key
+    args, stage = json.loads(json.dumps(task.spec.args)), task.spec.stage
+    return stage.run(stage.params(), args, {"read": [made[handle.name] for handle in read(task)]})
+
+
+def read(task: Handle) -> list[Any]:
+    """What a task reads."""
+    return cast(list[Any], task.inputs["read"])
+
+
+def write(output: Output, folder: Path, whole: Any, made: dict[str, Bundle]) -> None:
+    """The files of an output in a folder, by its task."""
+    place(made_by(add(Graph(), next(m for m, o in outputs() if o is output), output, whole), made), folder)
 
 
 def run(place: Georeference | None = None) -> Any:
     """A finished run whose products are handles, and their bundles by reference."""
     made = bundles() | checks()
-    known: dict[str, Handle] = {}
+    known: dict[str, Made] = {}
 
     def handle(value: Any) -> Any:
         if isinstance(value, str):
-            return known.setdefault(value, Handle(value, value if value in made else None))
+            return known.setdefault(value, Made(value, there=value in made))
         if isinstance(value, dict):
             return {k: handle(v) for k, v in value.items()}
         return [handle(v) for v in value] if isinstance(value, list) else value
@@ -82,41 +105,37 @@ def _unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("georeference", [None, PLACE], ids=["local", "placed"])
-@pytest.mark.parametrize(("module", "output"), list(outputs()), ids=lambda value: getattr(value, "name", ""))
-def test_a_task_makes_of_what_its_record_names_what_the_whole_run_would(
-    module: Any, output: Output, georeference: Georeference | None, tmp_path: Path
+@pytest.mark.parametrize("output", [output for _, output in outputs()], ids=lambda output: output.name)
+def test_a_task_makes_of_what_its_row_names_what_the_whole_run_would(
+    output: Output, georeference: Georeference | None, tmp_path: Path
 ) -> None:
     whole, made = run(georeference)
     assert output.write is not None
-    output.write(tmp_path / output.name, whole)
-    laid_out = task(output, whole)
-    assert laid_out is not None
-    args, inputs = laid_out
-    digest(args)  # it is part of a key
-    given = json.loads(json.dumps(args))
-    found = module.STAGE.run(module.STAGE.params(), given, {"read": [made[handle.ref] for handle in inputs]})
-    assert unpack(found) == unpack(pack(tmp_path))
-    if module is gallery:
-        figure = FIGURE.validate_json(unpack(found)[output.name])
-        assert figure.why == ""
+    # In place of a part the whole run, in place of handles their artifacts.
+    output.write(tmp_path / output.name, **{name: opened(value, whole) for name, value in output.inputs(whole).items()})
+    found = unpack(made_by(laid_out(output.name, whole), made))
+    assert found == unpack(pack(tmp_path))
+    if output in gallery.OUTPUTS:
+        assert FIGURE.validate_json(found[output.name]).why == ""
 
 
-def test_what_a_record_does_not_name_is_out_of_reach() -> None:
-    whole, made = run()
+def opened(value: Any, whole: Any) -> Any:
+    """An input as a writer gets it."""
+    if isinstance(value, list):
+        return [opened(item, whole) for item in value]
+    if isinstance(value, Part):
+        return whole
+    return whole.bundle(value) if isinstance(value, Handle) else value
 
-    def curious(folder: Path, given: Any) -> None:
-        assert given.bundle(given.products.world_risk) is made["risk"]
+
+def test_nothing_but_what_is_named_of_a_run_is_within_reach() -> None:
+    whole, _ = run()
+    named = part(whole, lambda run: (run.products.world_risk, run.sequence.name))
+    assert named.products.world_risk is whole.products.world_risk
+    assert (named.sequence.name, named.frames) == ("bed", FRAMES)
+    for lost in (lambda run: run.products.world_path, lambda run: run.sequence.truth):
         with pytest.raises(AttributeError):
-            given.products.world_path  # noqa: B018
-        with pytest.raises(AttributeError):
-            given.sequence.truth  # noqa: B018
-
-    output = Output("a", "", "", curious, ("world_risk",), (), ("sequence.name",))
-    laid_out = task(output, whole)
-    assert laid_out is not None
-    from rille.pipeline.export.output import restore
-
-    curious(Path(), restore(laid_out[0], [made[handle.ref] for handle in laid_out[1]]))
+            lost(named)
 
 
 def test_the_map_of_coloured_images_reads_what_it_needs() -> None:
@@ -124,11 +143,7 @@ def test_the_map_of_coloured_images_reads_what_it_needs() -> None:
     for name in [name for name in made if name.startswith("image")]:
         grey = made[name]["image"]
         made[name] = Bundle({"image": grey, "colour": np.repeat(grey[..., None], 3, axis=2)}, made[name].meta)
-    laid_out = task(next(o for _, o in outputs() if o.name == "Map"), whole)
-    assert laid_out is not None
-    found = gallery.STAGE.run(
-        gallery.STAGE.params(), laid_out[0], {"read": [made[handle.ref] for handle in laid_out[1]]}
-    )
+    found = made_by(laid_out("Map", whole), made)
     assert FIGURE.validate_json(unpack(found)["Map"]).why == ""
 
 
@@ -136,16 +151,15 @@ def test_nothing_is_made_without_what_it_needs_and_holes_are_passed_on() -> None
     whole, _ = run()
     whole.products.world_path.ref = None
     path = next(o for _, o in outputs() if o.name == "path.gpkg")
-    assert [handle.name for handle in handles(path, whole.products)] == ["path"]
-    assert task(path, whole) is None
-    risk = next(o for _, o in outputs() if o.name == "Map")
-    laid_out = task(risk, whole)
-    assert laid_out is not None
-    assert laid_out[0]["products"]["world_path"] is None
-    named = [handle.name for handle in laid_out[1]]
-    assert [name for name in named if not name.startswith(("image", "undistorted", "screening"))] == [
-        *("disparity0", "disparity4", "rig", "trajectory", "risk", "tile")
-    ]
+    assert [cast(Any, handle).name for handle in handles(path, whole)] == ["path"]
+    assert laid_out("path.gpkg", whole) is None
+    drawn = laid_out("Map", whole)
+    assert drawn is not None
+    assert drawn.spec.args["inputs"]["run"]["part"]["products"]["part"]["world_path"] is None
+    assert {handle.name for handle in read(drawn)} == {
+        *("disparity0", "disparity4", "rig", "trajectory", "risk", "tile"),
+        *(f"image{frame}" for frame in FRAMES),
+    }
 
 
 def test_files_come_out_of_an_artifact_as_they_went_in(tmp_path: Path) -> None:
@@ -160,10 +174,10 @@ def test_files_come_out_of_an_artifact_as_they_went_in(tmp_path: Path) -> None:
 
 
 def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
-    whole, _ = run()
+    whole, made = run()
     for module in catalogue.MADE:
         for output in module.OUTPUTS:
-            output.write(tmp_path / output.name, whole)
+            write(output, tmp_path, whole, made)
     names = [p.name for p in tmp_path.iterdir()]
     facts = describe(names, FRAMES, [f"left{f:03d}" for f in FRAMES], [float(f) for f in FRAMES], clock=False)
     described = [o.name for o in catalogue.OUTPUTS if o.frame]
@@ -194,8 +208,7 @@ def test_both_trajectories_state_one_frame_where_the_vertical_is_not_known(tmp_p
     heads = []
     for name in ("trajectory.tum", "crosscheck.tum"):
         output = next(o for _, o in outputs() if o.name == name)
-        assert output.write is not None
-        output.write(tmp_path / name, whole)
+        write(output, tmp_path, whole, made)
         heads.append((tmp_path / name).read_text().splitlines()[0])
     assert heads[0] == heads[1]
     assert "nothing tells of the vertical" in heads[0]
@@ -203,10 +216,10 @@ def test_both_trajectories_state_one_frame_where_the_vertical_is_not_known(tmp_p
 
 @pytest.mark.parametrize("georeference", [None, PLACE], ids=["local", "placed"])
 def test_all_files_of_a_run_state_one_system(georeference: Georeference | None, tmp_path: Path) -> None:
-    whole, _ = run(georeference)
+    whole, made = run(georeference)
     for module in catalogue.MADE:
         for output in module.OUTPUTS:
-            output.write(tmp_path / output.name, whole)
+            write(output, tmp_path, whole, made)
     point_cloud.export(tmp_path, "laz", None)
     found = {}
     for path in tmp_path.glob("*.tif"):
