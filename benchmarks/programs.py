@@ -36,6 +36,7 @@ import rille
 from rille.pipeline.commands.options import cache_folder
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs import colmap as colmap_export
+from rille.pipeline.export.programs.run_artifacts import export_run
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "pipeline"))
 from toys import map_server
@@ -211,7 +212,7 @@ def back_projection(o: Opened) -> tuple[float, float]:
     rows = {r["name"]: r for r in json.loads((o.run / "report.json").read_text())["frames"] if r["rms_px"] is not None}
     with tempfile.TemporaryDirectory() as folder:
         limit, colmap_export.FARTHEST = colmap_export.FARTHEST, np.inf
-        colmap_export.export_run(o.run, Path(folder) / "all", Store(o.cache))
+        export_run("colmap", o.run, Path(folder) / "all", Store(o.cache))
         colmap_export.FARTHEST = limit
         model = pycolmap.Reconstruction(f"{folder}/all")
     found = []

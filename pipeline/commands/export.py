@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -61,7 +60,8 @@ def export(
             path, words = point_cloud.export(folder, form, output)
             print(f"{path}  {words}")
         else:
-            program = import_module(f"rille.pipeline.export.programs.{form}")
+            from rille.pipeline.export.programs.run_artifacts import export_run
+
             with lookup.reading(folder):
-                print(program.export_run(folder, output or folder / form, Store(cache_folder(cache))))
+                print(export_run(form, folder, output or folder / form, Store(cache_folder(cache))))
     return COMPLETE

@@ -16,9 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.text.reading import TABLE, read_text
-from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.engine.store.base import Store
-from rille.pipeline.export.programs.run_artifacts import RunArtifacts, check_new
+from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.stages.core.declare import Bundle
 from rille.stages.evaluation.crosscheck import PIXEL_CENTRE
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
@@ -64,26 +62,18 @@ class _View:
         return self.image_id, len(self.pixels) - 1
 
 
-def export_run(run: Path, target: Path, store: Store) -> str:
-    """Write the model of a run folder as COLMAP's text files; the line to print.
-
-    Raises
-    ------
-    InputError
-        The folder holds no finished run, its artifacts are gone from the cache, or the target is not empty.
-    """
-    check_new(target)
-    bundles = RunArtifacts(run, store)
-    rig = Rig.from_dict(bundles.one("calibration").meta["rig"])
-    segments = _segments(bundles)
-    images = {key: found for s in segments if (found := _image(bundles, key := _ends(s.track)[0])) is not None}
+def write_run(folder: Path, run: RunArtifacts) -> str:
+    """Write the model of a run as COLMAP's text files into a new folder; what was written, in words."""
+    rig = Rig.from_dict(run.one("calibration").meta["rig"])
+    segments = _segments(run)
+    keys = [_ends(segment.track)[0] for segment in segments]
+    images = {key: image for key in keys if (image := _image(run, key)) is not None}
     # A drive has a trajectory at each stop: the last one is all of it.
-    model = build(rig, bundles.one("trajectory", last=True), _names(run), segments, images)
-    with atomic.replacing(target) as folder:
-        folder.mkdir()
-        model.write_text(str(folder))
+    model = build(rig, run.one("trajectory", last=True), _names(run.run), segments, images)
+    folder.mkdir()
+    model.write_text(str(folder))
     return (
-        f"{target}: {model.num_reg_frames()} frames of 2 images, {model.num_points3D()} points, "
+        f"{model.num_reg_frames()} frames of 2 images, {model.num_points3D()} points, "
         f"{model.compute_mean_reprojection_error():.2f} px; open it with colmap gui --import_path"
     )
 
@@ -97,7 +87,8 @@ def _image(bundles: RunArtifacts, frame: int) -> Bundle | None:
 def _segments(bundles: RunArtifacts) -> list[MatchedSegment]:
     """The segments of a run in their order."""
     # A leg of a drive that was stopped is tracked once more, up to there: the later one counts.
-    of_key = {_ends(pair[0])[0]: pair for pair in bundles.pairs("track", "resect")}
+    tracks, resections = bundles.all("track"), bundles.all("resect")
+    of_key = {_ends(track)[0]: (track, resections[part]) for part, track in tracks.items() if part in resections}
     keys = sorted(of_key)
     tracked = [of_key[key] for key in keys]
     points = [(np.asarray(resection["landmarks"]), np.asarray(resection["inlier"])) for _, resection in tracked]

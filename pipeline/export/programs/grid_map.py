@@ -15,9 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.engine.store.base import Store
-from rille.pipeline.export.programs.run_artifacts import RunArtifacts, check_new
+from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.rasters import whole
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
@@ -36,22 +34,20 @@ DEFINITIONS = {
 """Of ROS 2, where the header stands in the map."""
 
 
-def export_run(run: Path, target: Path, store: Store) -> str:
-    """Write the bag of a run folder; the line to print.
+def write_run(folder: Path, run: RunArtifacts) -> str:
+    """Write the bag of a run's terrain as a new folder; what was written, in words.
 
     Raises
     ------
     InputError
-        The folder holds no run with a risk map, its artifacts are gone from the cache, the target is not
-        empty, or the package that writes bags is missing.
+        The package that writes bags is missing.
     """
-    check_new(target)
-    risk, tiles, _ = RunArtifacts(run, store).world()
-    with atomic.replacing(target) as folder, TemporaryDirectory(dir=folder.parent) as aside:
-        bag = Path(aside) / target.name  # a bag's files have the name of its folder
+    risk, tiles, _ = run.world()
+    with TemporaryDirectory(dir=folder.parent) as aside:
+        bag = Path(aside) / "grid_map"  # a bag's files have the name of its folder
         write(bag, risk, tiles)
         bag.rename(folder)
-    return f"{target}: {TOPIC} of {risk['risk'].size} cells; ros2 bag play {target}"
+    return f"{TOPIC} of {risk['risk'].size} cells, for ros2 bag play"
 
 
 def write(folder: Path, risk: Bundle, tiles: Sequence[Bundle]) -> None:

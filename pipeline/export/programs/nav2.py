@@ -23,9 +23,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.engine.store.base import Store
-from rille.pipeline.export.programs.run_artifacts import RunArtifacts, check_new
+from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.classification import CAUTION, HAZARDOUS, UNKNOWN
@@ -40,26 +38,13 @@ CHORD = 10
 """Vertices to either side between which a pose's yaw is taken: cells next to each other make steps of 45 degrees."""
 
 
-def export_run(run: Path, target: Path, store: Store) -> str:
-    """Write the maps, masks and path of a run as files for Nav2 into a new or empty folder.
-
-    Returns
-    -------
-    The line to print: number of cells, and of poses of the path.
-
-    Raises
-    ------
-    InputError
-        ``run`` is not the folder of a run with a risk map, its artifacts are not in the cache, or ``target``
-        is not empty.
-    """
-    check_new(target)
-    risk, _, path = RunArtifacts(run, store).world()
-    with atomic.replacing(target) as folder:
-        folder.mkdir()
-        write(folder, risk, path)
+def write_run(folder: Path, run: RunArtifacts) -> str:
+    """Write maps, masks and path of a run into a new folder; what was written, in words."""
+    risk, _, path = run.world()
+    folder.mkdir()
+    write(folder, risk, path)
     way = "no path" if path is None or len(path["path"]) == 0 else f"a path of {len(path['path'])} poses"
-    return f"{target}: map, keepout and speed masks of {risk['risk'].size} cells, {way}"
+    return f"map, keepout and speed masks of {risk['risk'].size} cells, {way}"
 
 
 def write(folder: Path, risk: Bundle, path: Bundle | None) -> None:

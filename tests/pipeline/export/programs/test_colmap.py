@@ -10,7 +10,8 @@ from toys.artifacts import recorded
 
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs import colmap
-from rille.pipeline.export.programs.colmap import MatchedSegment, build, export_run
+from rille.pipeline.export.programs.colmap import MatchedSegment, build
+from rille.pipeline.export.programs.run_artifacts import export_run
 from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
@@ -126,7 +127,7 @@ def driven(folder):
 
 
 def test_a_drive_gives_its_whole_trajectory_and_each_point_once(tmp_path):
-    export_run(tmp_path, tmp_path / "model", driven(tmp_path))
+    export_run("colmap", tmp_path, tmp_path / "model", driven(tmp_path))
     model = pycolmap.Reconstruction(str(tmp_path / "model"))
     assert model.num_reg_frames() == 2
     assert model.num_points3D() == 40
@@ -141,13 +142,13 @@ def test_a_model_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
 
     monkeypatch.setattr(colmap, "build", lambda *_: Full())
     with pytest.raises(OSError, match="No space"):
-        export_run(tmp_path, tmp_path / "model", driven(tmp_path))
+        export_run("colmap", tmp_path, tmp_path / "model", driven(tmp_path))
     assert {p.name for p in tmp_path.iterdir()} == {"ledger.jsonl", "frames.json"}
 
 
 def test_what_is_no_run_or_has_content_is_said(tmp_path):
     with raises("RIL-608"):
-        export_run(tmp_path, tmp_path / "model", Store(tmp_path / "cache"))
+        export_run("colmap", tmp_path, tmp_path / "model", Store(tmp_path / "cache"))
     (tmp_path / "x").touch()
     with raises("RIL-607"):
-        export_run(tmp_path, tmp_path, Store(tmp_path / "cache"))
+        export_run("colmap", tmp_path, tmp_path, Store(tmp_path / "cache"))

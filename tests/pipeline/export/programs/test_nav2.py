@@ -8,6 +8,7 @@ from toys.artifacts import recorded
 from toys.map_server import load
 
 from rille.pipeline.export.programs import nav2
+from rille.pipeline.export.programs.run_artifacts import export_run
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.lattice import Lattice
 
@@ -60,11 +61,11 @@ def test_of_a_drive_the_map_of_its_last_stop_is_written(tmp_path):
     last, other = risk(), Bundle({}, {})
     made = {f"risk/{k}{kind}": other for k in range(11) for kind in ("/near", "")} | {"risk/truth": other}
     store = recorded(tmp_path, made | {"risk/10": last} | {f"merge/{k}": other for k in range(11)})
-    assert nav2.export_run(tmp_path, tmp_path / "nav2", store).endswith("600 cells, no path")
+    assert export_run("nav2", tmp_path, tmp_path / "nav2", store).endswith("600 cells, no path")
     assert load(tmp_path / "nav2/keepout.yaml").at(*LATTICE.xy()[0, 0]) == (100 if last["risk"][0, 0] >= 2 else 0)
 
 
 def test_a_run_without_a_map_is_told_how_to_get_one(tmp_path):
     with raises("RIL-609", "run the same command again"):
-        nav2.export_run(tmp_path, tmp_path / "nav2", recorded(tmp_path, {"calibration": Bundle({}, {})}))
+        export_run("nav2", tmp_path, tmp_path / "nav2", recorded(tmp_path, {"calibration": Bundle({}, {})}))
     assert not (tmp_path / "nav2").exists()
