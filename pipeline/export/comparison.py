@@ -38,45 +38,44 @@ class Comparison:
     error_crosscheck: Floats
     meta: Mapping[str, Any]
 
-    def reasons(self) -> list[str]:
-        """Why each frame is flagged, in words; empty where it is not."""
-        why = {int(f["frame"]): "; ".join(f["why"]) for f in self.meta.get("flagged") or ()}
-        return [why.get(frame, "") for frame in self.frames]
-
     def columns(self) -> dict[str, list[Any]]:
         """Columns of ``agreement.csv`` behind the positions; distances from the truth where there is any."""
-        found = {
-            "disagreement_m": self.distance,
-            "disagreement_deg": np.degrees(self.angle),
-            "step_disagreement_m": self.step_distance,
-            "step_disagreement_deg": np.degrees(self.step_angle),
-            "flagged": self.flagged.astype(np.int64),
-            "flagged_for": np.array(self.reasons(), dtype=object),
-        }
+        why = {int(flag["frame"]): "; ".join(flag["why"]) for flag in self.meta.get("flagged") or ()}
         errors = {"error_m": self.error, "crosscheck_error_m": self.error_crosscheck}
-        found |= {name: values for name, values in errors.items() if np.isfinite(values).any()}
-        return {name: values.tolist() for name, values in found.items()}
+        return {
+            "disagreement_m": self.distance.tolist(),
+            "disagreement_deg": np.degrees(self.angle).tolist(),
+            "step_disagreement_m": self.step_distance.tolist(),
+            "step_disagreement_deg": np.degrees(self.step_angle).tolist(),
+            "flagged": self.flagged.astype(np.int64).tolist(),
+            "flagged_for": [why.get(frame, "") for frame in self.frames],
+            **{name: values.tolist() for name, values in errors.items() if np.isfinite(values).any()},
+        }
 
 
 def compare(view: RunView, agreement: Bundle) -> Comparison:
     """Frame by frame against the crosscheck, of its agreement with the trajectory."""
-    names = ("poses", "distance", "angle", "step_distance", "step_angle")
-    found = {name: by_frame(view, agreement, name) for name in names}
-    registered = np.asarray(np.isfinite(found["poses"]).all(axis=(1, 2)))
+    poses = by_frame(view, agreement, "poses")
+    registered = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     trajectory = view.bundle(view.products.trajectory)
     if trajectory is not None:  # other pieces lie in frames of their own, and so do the frames lost behind them
         piece = np.nan_to_num(by_frame(view, trajectory, "piece"), nan=-1).astype(np.int64)
-        found["poses"][carried(piece) != trajectory.meta["main"]] = np.nan
-    flagged = np.nan_to_num(by_frame(view, agreement, "flagged")) > 0
-    p = view.products
-    error, theirs = (_error(view, view.bundle(handle)) for handle in (p.accuracy, p.crosscheck_accuracy))
-    judged = {**found, "registered": registered, "flagged": flagged, "error": error, "error_crosscheck": theirs}
-    return Comparison(view.frames, **judged, meta=agreement.meta)
+        poses[carried(piece) != trajectory.meta["main"]] = np.nan
+    return Comparison(
+        frames=view.frames,
+        poses=poses,
+        registered=registered,
+        flagged=np.nan_to_num(by_frame(view, agreement, "flagged")) > 0,
+        error=_error(view, view.bundle(view.products.accuracy)),
+        error_crosscheck=_error(view, view.bundle(view.products.crosscheck_accuracy)),
+        meta=agreement.meta,
+        **{name: by_frame(view, agreement, name) for name in ("distance", "angle", "step_distance", "step_angle")},
+    )
 
 
 def _error(view: RunView, accuracy: Bundle | None) -> Floats:
     """Distance (frame,) from the truth, m, first poses equal."""
     if accuracy is None or "position_truth" not in accuracy.arrays:
         return np.full(len(view.frames), np.nan)
-    found, true = (by_frame(view, accuracy, name) for name in ("position", "position_truth"))
-    return np.asarray(np.linalg.norm(found - true, axis=1))
+    ours, true = (by_frame(view, accuracy, name) for name in ("position", "position_truth"))
+    return np.asarray(np.linalg.norm(ours - true, axis=1))

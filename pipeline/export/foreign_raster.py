@@ -50,11 +50,6 @@ def open_raster(path: Path, driver: str = "GTiff") -> Iterator[Any]:
             yield file
 
 
-def driver_of(path: Path) -> str:
-    """The driver that reads an elevation model, by the ending of its name."""
-    return "AAIGrid" if path.suffix.lower() == GRID else "GTiff"
-
-
 def place_of(file: Any, path: Path) -> Affine:
     """Corners of cells (column, row) to the CRS: as the raster or the world file beside it says, else the identity."""
     # GDAL gives the identity where a file states no geotransform.

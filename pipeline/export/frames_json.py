@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rille.datasets.georeference import Georeference
 from rille.pipeline.export.catalogue import OUTPUTS
+from rille.pipeline.export.trajectories import stamps
+from rille.pipeline.export.view import RunView
 from rille.pipeline.export.writers import FRAME, UNLEVELLED
 from rille.stages.geometry.pose_arrays import NO_VERTICAL
 
@@ -40,26 +41,15 @@ IN_PLACE = {
 """By their endings, the files whose coordinates are those of the sequence's CRS where it has one: what is then said."""
 
 
-def describe(
-    written: Sequence[str],
-    frames: Sequence[int],
-    names: Sequence[str],
-    stamps: Sequence[float],
-    *,
-    clock: bool,
-    place: Georeference | None = None,
-    vertical: str = "",
-) -> dict[str, Any]:
+def describe(written: Sequence[str], run: RunView, vertical: str = "") -> dict[str, Any]:
     """Return the content of ``frames.json``.
 
     Parameters
     ----------
     written : names of the files that the run has written; only these are described.
-    frames, names, stamps : number, name and time stamp (as in the trajectory files) of each frame.
-    clock : the stamps are seconds; otherwise they are the frames' numbers.
-    place : of the world frame, where it is known; rasters and ``path.gpkg`` are then in its CRS.
     vertical : source of the world's vertical, "none" if there is none; empty without a trajectory.
     """
+    times, place, names = run.sequence.times, run.sequence.georeference, run.sequence.frame_names
     world = FRAMES["world"] | ({"vertical": vertical} if vertical else {})
     if vertical == NO_VERTICAL:
         world |= {"axes": {"x": "right", "y": "optical axis of the first camera", "z": "that camera's up"}}
@@ -69,12 +59,12 @@ def describe(
         known = {name: facts | IN_PLACE.get(Path(name).suffix, {}) for name, facts in known.items()}
     return {
         "format": FORMAT,
-        "units": {"length": "m", "angle": "rad, deg where the name says so", "time": "s" if clock else "frame number"},
+        "units": {"length": "m", "angle": "rad, deg where the name says so", "time": "s" if times else "frame number"},
         "frames_of_reference": FRAMES | {"world": world},
         "files": known,
         "georeference": None if place is None else place.to_dict(),
         "frames": [
-            {"frame": frame, "name": name, "time": stamp}
-            for frame, name, stamp in zip(frames, names, stamps, strict=True)
+            {"frame": frame, "name": names[frame], "time": stamp}
+            for frame, stamp in zip(run.frames, stamps(run.frames, times), strict=True)
         ],
     }

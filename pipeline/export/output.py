@@ -212,13 +212,13 @@ def unpack(bundle: Bundle) -> dict[str, bytes]:
     InputError
         It holds no such files, or a name leads out of the folder of the run: others may write to a shared cache.
     """
-    data, at, found = np.asarray(bundle["content"]).tobytes(), 0, {}
+    data, at, files = np.asarray(bundle["content"]).tobytes(), 0, {}
     try:
         for name, size in bundle.meta["files"]:
             path = PurePath(name)
             if path.is_absolute() or ".." in path.parts:
                 raise ValueError(f"{name!r} lies outside of a run")
-            found[name] = data[at : at + size]
+            files[name] = data[at : at + size]
             at += size
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(
@@ -226,7 +226,7 @@ def unpack(bundle: Bundle) -> dict[str, bytes]:
             f"an artifact of the cache holds no files of a run ({error})",
             remedy="somebody forged it: use another cache",
         ) from error
-    return found
+    return files
 
 
 def place(bundle: Bundle, folder: Path) -> None:

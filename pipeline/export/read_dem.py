@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rille.datasets.text.reading import TABLE, Search, read_lines, read_text
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.memory import free, words
-from rille.pipeline.export.foreign_raster import driver_of, open_raster, place_of
+from rille.pipeline.export.foreign_raster import GRID, open_raster, place_of
 from rille.stages.core.errors import InputError
 
 MOST_CELLS = 500_000_000
@@ -133,7 +133,7 @@ def opened_raster(path: Path) -> Iterator[Any]:
     from rasterio.errors import RasterioError
 
     try:
-        with open_raster(path, driver_of(path)) as file:
+        with open_raster(path, "AAIGrid" if path.suffix.lower() == GRID else "GTiff") as file:
             _check_cells(path, file.shape, path.stat().st_size)
             yield file
     except RasterioError as error:

@@ -107,16 +107,16 @@ def _coordinates(lattice: Lattice, place: Georeference | None) -> dict[str, xarr
         "long_name": "Rille world frame (local metres)",
         "GeoTransform": " ".join(f"{v:.17g}" for v in corner),
     }
-    found = {"spatial_ref": xarray.Variable((), np.int32(0), reference)}
+    coordinates = {"spatial_ref": xarray.Variable((), np.int32(0), reference)}
     for axis, values, words in (("x", lattice.xs(), "right"), ("y", lattice.ys(), "ahead")):
         about = {"units": "m", "axis": axis.upper(), "long_name": f"{axis} of the cell centre, world frame, {words}"}
-        found[axis] = xarray.Variable((axis,), values, about, {"_FillValue": None})
+        coordinates[axis] = xarray.Variable((axis,), values, about, {"_FillValue": None})
     if place is not None:
         there = place.apply(np.concatenate([lattice.xy(), np.zeros((*lattice.shape, 1))], axis=-1))
         for k, (name, axis) in enumerate((("easting", "x"), ("northing", "y"))):
             about = {"units": "m", "long_name": name, "standard_name": f"projection_{axis}_coordinate"}
-            found[name] = xarray.Variable(("y", "x"), there[..., k], about, {"_FillValue": None})
-    return found
+            coordinates[name] = xarray.Variable(("y", "x"), there[..., k], about, {"_FillValue": None})
+    return coordinates
 
 
 SLOPE = Array("slope", ("row", "col"), "float32", "degree", "inclination of the terrain", "nan", "world")

@@ -324,8 +324,8 @@ def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.
         with open_raster(path) as file:
             names = tuple(name for name in file.descriptions if name)
             if file.count != 2 or names not in ((), ("column_disparity", "row_disparity")):
-                found = ", ".join(names) or "without names"
-                raise InputError("RIL-622", f"{path} has {file.count} bands ({found}), no disparity", remedy=remedy)
+                listed = ", ".join(names) or "without names"
+                raise InputError("RIL-622", f"{path} has {file.count} bands ({listed}), no disparity", remedy=remedy)
             if shape and file.shape != shape:
                 raise InputError(
                     "RIL-044",

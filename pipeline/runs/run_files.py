@@ -14,7 +14,6 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export import catalogue
 from rille.pipeline.export.frames_json import describe
 from rille.pipeline.export.output import Output, add, handles, place, unpack
-from rille.pipeline.export.trajectories import stamps
 from rille.pipeline.export.view import RunView, TaskRow
 from rille.pipeline.report import gallery, summary
 from rille.pipeline.report.canvas import FIGURE
@@ -72,27 +71,15 @@ def write(folder: Path, view: RunView, made: Made, store: Store) -> Items:
         ref = made[output.name].ref if output.name in made else None
         if ref is not None:
             place(store.open(ref), folder)
-    atomic.write(folder / "frames.json", json.dumps(_frames(folder, view), indent=1) + "\n")
+    trajectory = view.products.trajectory
+    meta = None if trajectory is None or trajectory.ref is None else trajectory.ref.meta
+    frames = describe([p.name for p in folder.iterdir()], view, "" if meta is None else meta["verticals"][meta["main"]])
+    atomic.write(folder / "frames.json", json.dumps(frames, indent=1) + "\n")
     facts = json.loads(_content(made["facts"], store))
     figures = [
         FIGURE.validate_json(_content(made[o.name], store)) for o in gallery.OUTPUTS if made[o.name].ref is not None
     ]
     return write_report(folder, view, facts, figures)
-
-
-def _frames(folder: Path, view: RunView) -> dict[str, Any]:
-    """What the frames of all files are."""
-    names, times, trajectory = view.sequence.frame_names, view.sequence.times, view.products.trajectory
-    meta = None if trajectory is None or trajectory.ref is None else trajectory.ref.meta
-    return describe(
-        [file.name for file in folder.iterdir()],
-        view.frames,
-        [names[f] for f in view.frames],
-        stamps(view.frames, times),
-        clock=times is not None,
-        place=view.sequence.georeference,
-        vertical="" if meta is None else meta["verticals"][meta["main"]],
-    )
 
 
 def _content(handle: Handle, store: Store) -> bytes:

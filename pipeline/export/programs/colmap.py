@@ -94,9 +94,9 @@ def _segments(bundles: RunArtifacts) -> list[MatchedSegment]:
     points = [(np.asarray(resection["landmarks"]), np.asarray(resection["inlier"])) for _, resection in tracked]
     # Where disparities were tilted, the adjustment without the tilt is the one whose poses count.
     for label in ("refine/untilted", "refine"):
-        found = [part for k in keys if (b := bundles.find(f"{label}/{k}")) is not None for part in refine.parts(b)]
-        if len(found) == len(points):
-            points = found
+        adjusted = [part for k in keys if (b := bundles.find(f"{label}/{k}")) is not None for part in refine.parts(b)]
+        if len(adjusted) == len(points):
+            points = adjusted
             break
     return [
         MatchedSegment(
@@ -199,8 +199,8 @@ def _points(
         in_left, left = poses[frame].inverse().apply(world), pixels[:, j, 0]
         agrees = segment.inlier[:, j] != 0
         seen[:, j, 0] = agrees & _near(rig.left, in_left, left)
-        if (found := segment.matches.get(frame)) is not None:
-            disparity = (np.asarray(found[n]) for n in ("column_disparity", "row_disparity", "validity"))
+        if (pair := segment.matches.get(frame)) is not None:
+            disparity = (np.asarray(pair[n]) for n in ("column_disparity", "row_disparity", "validity"))
             vectors, matched = matches_at(left, *disparity)
             pixels[:, j, 1] += vectors
             seen[:, j, 1] = agrees & matched & _near(rig.right, rig.T_right_left.apply(in_left), pixels[:, j, 1])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,6 +15,7 @@ import pytest
 import rasterio
 from evo.tools import file_interface
 from raising import raises
+from toys.finished import FRAMES, sequence, view
 
 from rille.datasets.georeference import Georeference
 from rille.pipeline.export.frames_json import describe
@@ -210,12 +212,14 @@ def test_times_since_1970_keep_their_microseconds(tmp_path: Path) -> None:
 
 
 def test_only_what_was_written_is_described() -> None:
-    facts = describe(["dem.tif", "notes.txt"], [3], ["left003"], [0.5], clock=True)
+    timed = replace(sequence(truth=False), times=tuple(0.5 * frame for frame in FRAMES))
+    facts = describe(["dem.tif", "notes.txt"], view(sequence=timed))
     assert list(facts["files"]) == ["dem.tif"]
     assert facts["units"]["time"] == "s"
+    assert facts["frames"][3] == {"frame": 3, "name": "left003", "time": 1.5}
     assert facts["georeference"] is None
     place = Georeference("EPSG:32633", (1.0, 2.0, 3.0), 0.5)
-    placed = describe(["dem.tif", "trajectory.tum"], [3], ["left003"], [0.5], clock=True, place=place)
+    placed = describe(["dem.tif", "trajectory.tum"], view(sequence=replace(timed, georeference=place)))
     assert placed["files"]["dem.tif"]["frame"] == "georeference"
     assert placed["files"]["trajectory.tum"]["frame"] == "world"
     assert facts["files"]["dem.tif"]["raster"].endswith("north is y")
