@@ -13,7 +13,8 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export import catalogue
 from rille.pipeline.export.frames_json import describe
-from rille.pipeline.export.output import Output, add, handles, place, unpack
+from rille.pipeline.export.output import Output, place, unpack
+from rille.pipeline.export.output_task import add, handles
 from rille.pipeline.export.view import RunView, TaskRow
 from rille.pipeline.report import gallery, summary
 from rille.pipeline.report.canvas import FIGURE

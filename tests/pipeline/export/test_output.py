@@ -26,7 +26,8 @@ from rille.pipeline.engine.keys import digest
 from rille.pipeline.export import catalogue
 from rille.pipeline.export.frames_json import FRAMES as REFERENCES
 from rille.pipeline.export.frames_json import describe
-from rille.pipeline.export.output import Output, add, handles, pack, place, unpack
+from rille.pipeline.export.output import Output, pack, place, unpack
+from rille.pipeline.export.output_task import add, handles
 from rille.pipeline.export.programs import point_cloud
 from rille.pipeline.export.view import Part, part
 from rille.pipeline.report import canvas, gallery
