@@ -1,4 +1,4 @@
-"""All files that a run can have, each by its record, in the order in which the report lists them."""
+"""All files that a run can have, each by its row, in the order in which the report lists them."""
 
 from __future__ import annotations
 

@@ -65,6 +65,6 @@ def describe(written: Sequence[str], run: RunView, vertical: str = "") -> dict[s
         "georeference": None if place is None else place.to_dict(),
         "frames": [
             {"frame": frame, "name": names[frame], "time": stamp}
-            for frame, stamp in zip(run.frames, stamps(run.frames, times), strict=True)
+            for frame, stamp in zip(run.frames, stamps(run), strict=True)
         ],
     }

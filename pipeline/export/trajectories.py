@@ -24,9 +24,10 @@ TUM = {
 }
 
 
-def stamps(frames: Series[int], times: Series[float] | None) -> list[float]:
-    """Time of each frame, seconds; its number where there is no clock."""
-    return [float(f) if times is None else times[f] for f in frames]
+def stamps(run: RunView) -> list[float]:
+    """Time of each chosen frame, seconds; its number where there is no clock."""
+    times = run.sequence.times
+    return [float(f) if times is None else times[f] for f in run.frames]
 
 
 def _world(trajectory: Bundle, piece: int) -> str:
@@ -38,39 +39,38 @@ def _write_kitti(path: Path, trajectory: Bundle) -> None:
     write_trajectory_kitti(path, world_poses(trajectory))
 
 
-def _write_tum(path: Path, trajectory: Bundle, frames: Series[int], times: Series[float] | None = None) -> None:
-    world = _world(trajectory, trajectory.meta["main"])
-    write_trajectory_tum(path, world_poses(trajectory), stamps(frames, times), world)
+def _write_tum(path: Path, trajectory: Bundle, times: Series[float]) -> None:
+    write_trajectory_tum(path, world_poses(trajectory), times, _world(trajectory, trajectory.meta["main"]))
 
 
-def _write_pieces(path: Path, trajectory: Bundle, frames: Series[int], times: Series[float] | None = None) -> None:
+def _write_pieces(path: Path, trajectory: Bundle, times: Series[float]) -> None:
     for number in range(len(trajectory.meta["verticals"])):
         if number != trajectory.meta["main"]:
-            piece, world = path.with_name(path.name.replace("*", str(number + 1))), _world(trajectory, number)
-            write_trajectory_tum(piece, world_poses(trajectory, number), stamps(frames, times), world)
+            piece = path.with_name(path.name.replace("*", str(number + 1)))
+            write_trajectory_tum(piece, world_poses(trajectory, number), times, _world(trajectory, number))
 
 
 def _write_crosscheck(path: Path, agreement: Bundle, run: RunView) -> None:
     trajectory = run.bundle(run.products.trajectory)
-    world = writers.FRAME if trajectory is None else _world(trajectory, trajectory.meta["main"])
-    write_trajectory_tum(path, compare(run, agreement).poses, stamps(run.frames, run.sequence.times), world)
+    assert trajectory is not None  # the agreement is with it
+    world = _world(trajectory, trajectory.meta["main"])
+    write_trajectory_tum(path, compare(run, agreement).poses, stamps(run), world)
 
 
 def _write_agreement(path: Path, agreement: Bundle, run: RunView) -> None:
     compared, trajectory = compare(run, agreement), run.bundle(run.products.trajectory)
+    assert trajectory is not None
     names = [run.sequence.frame_names[f] for f in run.frames]
     columns: dict[str, list[Any]] = {"frame": list(run.frames), "name": names}
     if run.sequence.times is not None:
-        columns["time_s"] = stamps(run.frames, run.sequence.times)
-    if trajectory is not None:
-        positions = world_poses(trajectory)[:, :, 3]
-        columns |= {f"{a}_m": positions[:, k].tolist() for k, a in enumerate("xyz")}
-    columns |= {f"crosscheck_{a}_m": compared.poses[:, k, 3].tolist() for k, a in enumerate("xyz")}
+        columns["time_s"] = stamps(run)
+    for prefix, poses in (("", world_poses(trajectory)), ("crosscheck_", compared.poses)):
+        columns |= {f"{prefix}{axis}_m": poses[:, k, 3].tolist() for k, axis in enumerate("xyz")}
     write_table(path, columns | compared.columns())
 
 
 def _posed(run: RunView) -> dict[str, Any]:
-    return {"trajectory": run.products.trajectory, "frames": run.frames, "times": run.sequence.times}
+    return {"trajectory": run.products.trajectory, "times": stamps(run)}
 
 
 def _compared(run: RunView) -> dict[str, Any]:
