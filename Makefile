@@ -4,6 +4,9 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
+PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+# Requirements of a dependency group, one a line: `pip install --group` needs a newer pip than venv brings.
+GROUP  := $(BIN)/python -c 'import sys, tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["dependency-groups"][sys.argv[1]], sep="\n")'
 
 SEQ    ?= mockup
 FRAMES ?=
@@ -26,7 +29,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "rille needs Python 3.11 or newer; say which with PYTHON=..." >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(PIP) -r <($(GROUP) dev)
 	@$(BIN)/python -m compileall -q rille pipeline stages datasets
 	@touch $@
 
@@ -69,7 +72,7 @@ docs-fast: ## the same without executing anything
 	@RILLE_DOCS_FAST=1 $(MAKE) --no-print-directory docs
 
 $(VENV)/.docs: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,docs]'
+	$(PIP) -r <($(GROUP) dev) -r <($(GROUP) docs)
 	@touch $@
 
 clean: ## remove caches of tools and build leftovers; keeps .venv, runs and artifacts

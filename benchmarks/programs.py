@@ -1,7 +1,7 @@
 """Which programs open the files of a run, and whether they read what Rille wrote: a row a program, with its version.
 
 ``python benchmarks/programs.py [RUN_FOLDER]``; the run is the latest of `mockup-short` by default. Fails if a program
-reads something else. Python packages come with `pip install -e '.[dev]'`; three.js comes with trimesh and runs in
+reads something else. Python packages come with `make install`; three.js comes with trimesh and runs in
 ``chromium``. Others are asked where they are installed: ``gdalinfo`` and ``pdal`` on the path, QGIS's module of
 ``/usr/bin/python3``, ``rio-cogeo`` of the environment that ``COGEO`` names (a folder with ``bin/rio``), Khronos'
 validator in the ``node_modules`` that ``GLTF_VALIDATOR`` names.

@@ -23,7 +23,7 @@ FENCE = re.compile(r"^```.*?^```", re.M | re.S)
 INLINE = re.compile(r"(`)([\w/]+\.py)`")
 EXAMPLES = frozenset[str]()
 """Modules that a page names though they do not exist: those that its reader is to write."""
-needs_sphinx = pytest.mark.skipif(find_spec("sphinx_gallery") is None, reason="needs pip install -e '.[docs]'")
+needs_sphinx = pytest.mark.skipif(find_spec("sphinx_gallery") is None, reason="needs `make docs-fast` once")
 
 
 class Block(NamedTuple):

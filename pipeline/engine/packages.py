@@ -91,7 +91,7 @@ def _kind(distribution: str) -> str:
         import numpy as np
 
         config = np.show_config(mode="dicts")
-        found = config["SIMD Extensions"] if isinstance(config, dict) else {}
+        found = config["SIMD Extensions"]
         return " ".join([*found.get("baseline", ()), *found.get("found", ()), _blas("numpy")]).strip()
     if distribution == "scipy":
         return _blas("scipy")
