@@ -204,3 +204,12 @@ def test_tests_expect_codes_not_words() -> None:
     tests = {path: ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "tests").rglob("*.py")}
     bad = [f"{p.relative_to(ROOT)}:{line}" for p, tree in tests.items() for line in matched_by_words(tree, CLASSES)]
     assert not bad, f'use `with raises("RIL-123", "facts")` of tests/raising.py: {bad}'
+
+
+def test_commits_are_checked_by_the_formatter_that_the_tests_use() -> None:
+    """The hooks of pre-commit name a revision of ruff, and the development tools a version."""
+    hooks = (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8")
+    revision = re.search(r"ruff-pre-commit\n +rev: v(\S+)", hooks)
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["dependency-groups"]["dev"]
+    assert revision is not None
+    assert f"ruff=={revision[1]}" in tools
