@@ -53,7 +53,7 @@ def describe(run: Path, label: str, store: Store) -> Iterable[str]:
     row = lookup.row(rows, label, run)
     made = store.manifest(row["stage"], row["key"]) if "key" in row else None
     yield f"{label}: stage {row['stage']}, {row['status']} in run {lookup.name(run)}"
-    yield from _fate(row, run, made)
+    yield from _fate(row, run, made, store)
     yield from _inputs(row, {r["label"]: r for r in rows})
     if made is None:
         if "key" in row and row["status"] in ("computed", "cached"):
@@ -64,7 +64,7 @@ def describe(run: Path, label: str, store: Store) -> Iterable[str]:
     yield from _since(run, row, made, store)
 
 
-def _fate(row: Mapping[str, Any], run: Path, made: Mapping[str, Any] | None) -> Iterable[str]:
+def _fate(row: Mapping[str, Any], run: Path, made: Mapping[str, Any] | None, store: Store) -> Iterable[str]:
     reason = f"an artifact of the same key was there{_computed_by(row, run)}"
     yield f"why           {reason if row['status'] == 'cached' else row.get('reason', '')}"
     if row["status"] == "computed":
@@ -75,7 +75,8 @@ def _fate(row: Mapping[str, Any], run: Path, made: Mapping[str, Any] | None) -> 
         facts = ""
         if made is not None:
             path = artifact_path(made["stage"], made["key"])
-            facts = f", {words(made['size'])} in {path}: {', '.join(made['arrays']) or 'metadata only'}"
+            size = words((store.root / path).stat().st_size)
+            facts = f", {size} in {path}: {', '.join(made['arrays']) or 'metadata only'}"
         yield f"result        digest {row['digest'][:SHORT_DIGITS]}{facts}"
 
 

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine.code_digest import OWN, tree_digest
-from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.packages import version
 from rille.pipeline.engine.runtime import atomic
@@ -38,8 +37,6 @@ NO_WORKERS_SECONDS = 30.0
 
 SILENCE_SECONDS = 20.0
 """Time without an answer of the scheduler before it counts as gone, and of a worker before the user is warned."""
-
-SHARE = "give --cache a folder that all machines share"
 
 Identity = Mapping[str, str]
 
@@ -82,10 +79,17 @@ def compare(ours: Identity, cache: Path, token: str) -> str:
         text = f"may use several threads a library ({threads[0]} is not 1)"
         raise ConfigError("RIL-522", text, remedy="start it with OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1")
     probe = cache / "probe" / f"{token}-{uuid.uuid4().hex}"
-    with reported("RIL-523", f"does not share the cache {cache}", remedy=SHARE, kind=ConfigError):
+    try:
         (cache / "probe" / token).read_bytes()
         atomic.write(probe, "")
+    except (OSError, RilleError) as error:
+        raise _not_shared(cache, " ".join(str(error).split())) from error
     return probe.name
+
+
+def _not_shared(cache: Path, why: str) -> ConfigError:
+    remedy = "give --cache a folder that all machines share"
+    return ConfigError("RIL-523", f"does not share the cache {cache}: {why}", remedy=remedy)
 
 
 def examine(client: Any, cache: Path) -> None:
@@ -110,8 +114,7 @@ def examine(client: Any, cache: Path) -> None:
                     "RIL-520", text, remedy="install the same version there, and start the workers with it"
                 )
             if not (probes / answer).is_file():
-                text = f"{name} does not share the cache {cache}: its probe is not seen here"
-                raise ConfigError("RIL-523", text, remedy=SHARE)
+                raise _not_shared(cache, "its probe is not seen here").at(name)
     finally:
         for probe in probes.glob(f"{token}*"):
             with suppress(OSError):

@@ -203,7 +203,7 @@ def test_check_fails_where_an_image_is_truncated(place: Place, tmp_path: Path) -
     done = place.rille("check", "torn", folder=tmp_path)
     assert done.status == 1
     assert re.fullmatch(r"torn: [1-9] fail, \d+ to look at, \d+ fine", done.last)
-    assert "000001.png is truncated" in next(line for line in done.lines if line.startswith("FAIL"))
+    assert "000001.png is damaged or truncated" in next(line for line in done.lines if line.startswith("FAIL"))
 
 
 def test_init_writes_a_manifest_and_replaces_none(place: Place, tmp_path: Path) -> None:

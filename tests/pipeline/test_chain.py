@@ -123,7 +123,7 @@ def test_the_same_again_computes_nothing(cold: Path, monkeypatch: pytest.MonkeyP
     def no_worker(*args: object, **kw: object) -> None:
         raise AssertionError("a worker was started")
 
-    monkeypatch.setattr("rille.pipeline.engine.driver.make", no_worker)
+    monkeypatch.setattr("rille.pipeline.engine.run.make", no_worker)
     before = digests(cold)
     assert session.reconstruct(options(cold, executor="dask")) == 0
     assert computed(cold) == set()

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from rille.pipeline.engine.runtime import apart
 from rille.pipeline.engine.runtime.apart import leave_out, take_back
 
 RILLE = str(Path(sysconfig.get_path("scripts")) / "rille")
@@ -121,6 +122,7 @@ def test_the_client_leaves_the_current_folder_out(folder, command, path):
 
 
 def test_the_last_of_two_runs_in_one_interactive_python_takes_the_path_back(monkeypatch):
+    monkeypatch.setattr(apart, "_was_on_path", [])  # without other runs of this process
     monkeypatch.setattr(sys, "path", ["", *sys.path])
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
     leave_out()

@@ -19,6 +19,7 @@ class Faults:
         self._lock = threading.Lock()
         for name, place in (("mkdir", 0), ("link", 1), ("replace", 1), ("rename", 1), ("utime", 0)):
             monkeypatch.setattr(os, name, self._around(getattr(os, name), name, place))
+        monkeypatch.setattr(Path, "touch", self._around(Path.touch, "touch", 0))
         monkeypatch.setattr(os, "fsync", self._fsync(os.fsync))
         monkeypatch.setattr(io, "open", self._open(io.open))
         monkeypatch.setattr(sqlite3, "connect", self._connect(sqlite3.connect))
