@@ -455,14 +455,14 @@ class Dask:
 
     def close(self, *, kill: bool = False) -> None:
         """End workers of our own, at once if ``kill``; leave others as they are."""
-        from distributed import wait
-
         within = HURRY_SECONDS if kill else LEAVE_SECONDS
         self.cancel()
         if self._cluster is None:
             with suppress(Exception):
                 self._client.unsubscribe_topic(self._run)
-                wait(self._leaving, timeout=within)
+            until = time.monotonic() + within
+            while any(future.status == "pending" for future in self._leaving) and time.monotonic() < until:
+                time.sleep(0.01)
             if self._ours:
                 _leave(self._client, within)
             return
