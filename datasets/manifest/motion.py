@@ -29,7 +29,7 @@ NEEDS_TIMES = "give [times] with file, names = true or rate_hz"
 
 
 @dataclass
-class Motion:
+class StatedMotion:
     """One entry a pair, as in :class:`rille.datasets.protocol.Sequence`; ``warnings`` collects what is suspicious."""
 
     times: tuple[float, ...] | None
@@ -60,9 +60,9 @@ class MotionReader:
     root: Path
     name: str
     pairs: Sequence[ImagePair]
-    motion: Motion
+    motion: StatedMotion
 
-    def read(self, manifest: Manifest) -> Motion:
+    def read(self, manifest: Manifest) -> StatedMotion:
         """Everything that the tables ``times``, ``truth``, ``odometry``, ``attitude`` and ``imu`` state.
 
         Raises

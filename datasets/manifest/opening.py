@@ -21,7 +21,7 @@ from rille.datasets.images import files
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import ImagePair, common_headers, pair_up
 from rille.datasets.manifest.model import Cameras, Images, Manifest, RigSection, read_manifest
-from rille.datasets.manifest.motion import Motion, MotionReader
+from rille.datasets.manifest.motion import MotionReader, StatedMotion
 from rille.datasets.manifest.rig import read_optics
 from rille.datasets.protocol import Sequence, Source
 from rille.datasets.text.names import derived_name
@@ -54,7 +54,7 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
     name : the manifest's or the folder's, for errors.
     """
     base, pairs = _of_bag(manifest, root, name) or _of_files(manifest, root, name, digests)
-    motion = MotionReader(root, name, pairs, Motion(base.times)).read(manifest)
+    motion = MotionReader(root, name, pairs, StatedMotion(base.times)).read(manifest)
     up = motion.up or base.up
     world = manifest.world
     pitch = None if world.pitch_deg is None else math.radians(world.pitch_deg)

@@ -42,7 +42,7 @@ LEGEND = tuple(zip(canvas.RISK, canvas.CLASS_NAMES, strict=True))
 
 
 @dataclass(frozen=True)
-class Line:
+class StripLine:
     """What is laid on a map: vertices (n, 2 or more), m, NaN gaps; colour; width in hundredths of the picture's."""
 
     points: Floats
@@ -76,7 +76,7 @@ def depth_band(rig: Rig) -> tuple[str, int]:
     return band, 1 if along >= 0 else -1
 
 
-def risk_picture(risk: Terrain, lines: Sequence[Line], width: int) -> Image:
+def risk_picture(risk: Terrain, lines: Sequence[StripLine], width: int) -> Image:
     """Classes of a risk map in their colours, and lines on them; ``width`` in pixels."""
     from PIL import Image
 
@@ -118,7 +118,7 @@ def _pair(scene: Scene, pair: int, width: int) -> Panel:
     risk = gather.terrain(view.bundle(view.products.local_risk.get(pair)), "risk")
     if risk is not None:
         path = gather.vertices(view.bundle(view.products.local_path.get(pair)))
-        pictures.append(risk_picture(risk, [] if path is None else [Line(path, canvas.MARK)], width))
+        pictures.append(risk_picture(risk, [] if path is None else [StripLine(path, canvas.MARK)], width))
         words.append("no local path" if path is None else "with a local path")
     return _column(pictures, f"Pair of frame {pair}: {', '.join(words)}", pair)
 
@@ -133,11 +133,11 @@ def _stop(scene: Scene, stop: Stop, width: int) -> Panel:
     assert dem is not None
     upto = view.frames.index(stop.frame) + 1
     pictures = [] if image is None else [_photo(grey_bytes(np.asarray(image["image"])), width)]
-    legs = [Line(np.asarray(leg["way"]), canvas.MARK, 0.5), Line(np.asarray(leg["path"]), canvas.MARK, 1.5)]
+    legs = [StripLine(np.asarray(leg["way"]), canvas.MARK, 0.5), StripLine(np.asarray(leg["path"]), canvas.MARK, 1.5)]
     pictures.append(risk_picture(risk, legs, width))
     # Truth first and wider: where both agree it shows as a rim.
-    tracks = [] if track.truth is None else [Line(track.truth[:upto], canvas.TRUE_ON_MAP, 3)]
-    pictures.append(_elevations(dem, [*tracks, Line(track.left[:upto], canvas.ON_MAP, 1)], width))
+    tracks = [] if track.truth is None else [StripLine(track.truth[:upto], canvas.TRUE_ON_MAP, 3)]
+    pictures.append(_elevations(dem, [*tracks, StripLine(track.left[:upto], canvas.ON_MAP, 1)], width))
     words = f"{metres(leg.meta['left_m'])} from the goal: {leg.meta['verdict']}"
     return _column(pictures, f"Stop {stop.index} at frame {stop.frame}, {words}", stop.frame)
 
@@ -181,7 +181,7 @@ def _matches(seen: NDArray[np.uint8], disparity: Floats, there: NDArray[np.bool_
     return np.where(there[..., None], colors // 3 * 2 + ground // 3, ground)
 
 
-def _elevations(dem: Terrain, lines: Sequence[Line], width: int) -> Image:
+def _elevations(dem: Terrain, lines: Sequence[StripLine], width: int) -> Image:
     from PIL import Image
 
     elevation = dem.arrays["elevation"]
@@ -195,7 +195,7 @@ def _colors(share: Floats) -> NDArray[np.uint8]:
     return np.asarray(canvas.ramp("viridis")[np.clip(np.nan_to_num(share) * 255, 0, 255).astype(np.uint8)])
 
 
-def _with_lines(picture: Image, ground: Terrain, lines: Sequence[Line], width: int) -> Image:
+def _with_lines(picture: Image, ground: Terrain, lines: Sequence[StripLine], width: int) -> Image:
     """A picture of all cells, scaled to ``width``, with lines that have a white casing."""
     from PIL import ImageDraw
 

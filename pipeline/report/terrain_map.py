@@ -20,7 +20,7 @@ from rille.pipeline.export.artifacts import Floats
 from rille.pipeline.report import canvas, gather, strips
 from rille.pipeline.report.canvas import Block
 from rille.pipeline.report.gather import Scene, Terrain
-from rille.pipeline.report.strips import Line
+from rille.pipeline.report.strips import StripLine
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import mosaic
 from rille.stages.hazard.risk import REASONS, UNKNOWN
@@ -44,7 +44,7 @@ def block(scene: Scene) -> Block | None:
     layers, risk = data(scene), scene.risk
     if risk is None and layers is None:
         return None
-    lines = [] if scene.path is None else [Line(scene.path, canvas.MARK)]
+    lines = [] if scene.path is None else [StripLine(scene.path, canvas.MARK)]
     still = [] if risk is None else [strips.risk_picture(risk, lines, STILL_WIDTH_PIXELS)]
     return Block(tuple(strips.panel(picture, "Risk map seen from above") for picture in still), data=layers)
 

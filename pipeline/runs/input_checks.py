@@ -30,7 +30,7 @@ GAP = 2.5  # median steps of time above which a step is a gap
 
 
 @dataclass(frozen=True)
-class Limit:
+class InputLimit:
     """A finding has this code and remedy where the figure lies below ``least`` or above ``most``."""
 
     code: str
@@ -41,7 +41,7 @@ class Limit:
     level: ClassVar[Level] = "WARN"
 
 
-class Fault(Limit):
+class Fault(InputLimit):
     """A limit beyond which a reconstruction is useless or impossible."""
 
     level = "FAIL"
@@ -51,56 +51,60 @@ LIMITS = {
     "rig": (
         Fault("RIL-640", "baselines to the left", most=0.5, remedy="swap left and right"),  # of the right camera
         # Outside, lengths in another unit are likelier than such a rig.
-        Limit("RIL-641", "baseline, m", least=0.01, most=5.0, remedy="is the baseline in metres?"),
-        Limit("RIL-642", "ratio of the focal lengths", most=ALIKE, remedy="two different lenses?"),
+        InputLimit("RIL-641", "baseline, m", least=0.01, most=5.0, remedy="is the baseline in metres?"),
+        InputLimit("RIL-642", "ratio of the focal lengths", most=ALIKE, remedy="two different lenses?"),
     ),
     "times": (
         Fault("RIL-643", "steps back", most=0, remedy="correct the times"),
-        Limit("RIL-644", "gaps", most=0, remedy="frames may be missing; is the overlap kept there?"),
+        InputLimit("RIL-644", "gaps", most=0, remedy="frames may be missing; is the overlap kept there?"),
     ),
-    "truth": (Limit("RIL-645", "without", most=0, remedy="frames without truth are left out of the accuracy"),),
+    "truth": (InputLimit("RIL-645", "without", most=0, remedy="frames without truth are left out of the accuracy"),),
     "attitude": (
         Fault("RIL-646", "degrees off", most=2.0, remedy="check T_body_left, the axes and degrees or radians"),
-        Limit("RIL-647", "without", most=0, remedy="the other frames are matched without it"),
+        InputLimit("RIL-647", "without", most=0, remedy="the other frames are matched without it"),
     ),
     "up": (
-        Limit("RIL-648", "known", least=1, remedy="the ground is levelled by its own plane"),
+        InputLimit("RIL-648", "known", least=1, remedy="the ground is levelled by its own plane"),
         # Camera frames have y downwards: up has a negative y where a camera is held upright.
-        Limit("RIL-649", "y in the images", most=0.0, remedy="held upside down, or a wrong sign?"),
+        InputLimit("RIL-649", "y in the images", most=0.0, remedy="held upside down, or a wrong sign?"),
     ),
     "images": (
         Fault("RIL-650", "blank", most=0, remedy="leave these frames out with --frames"),
-        Limit("RIL-668", "lost", most=0, remedy="it gets no pose; its neighbours are joined across it"),
+        InputLimit("RIL-668", "lost", most=0, remedy="it gets no pose; its neighbours are joined across it"),
         Fault("RIL-670", "unusable", most=0),
         Fault("RIL-671", "left and right are one", most=0, remedy="give the right camera's images"),
-        Limit("RIL-672", "repeated", most=0, remedy="was a frame copied, or did the camera hang?"),
+        InputLimit("RIL-672", "repeated", most=0, remedy="was a frame copied, or did the camera hang?"),
     ),
     "exposure": (
         # A white sky takes less than this; more means clipped ground.
-        Limit("RIL-651", "clipped", most=0.2, remedy="such areas cannot be matched; mask them or expose anew"),
+        InputLimit("RIL-651", "clipped", most=0.2, remedy="such areas cannot be matched; mask them or expose anew"),
         # The matcher removes the mean, but not the noise.
-        Limit("RIL-652", "change", most=1.5, remedy="it is levelled, but black and white is lost: fix the exposure"),
-        Limit("RIL-653", "right over left", least=1 / 1.5, most=1.5, remedy="couple the exposure of both cameras"),
+        InputLimit(
+            "RIL-652", "change", most=1.5, remedy="it is levelled, but black and white is lost: fix the exposure"
+        ),
+        InputLimit("RIL-653", "right over left", least=1 / 1.5, most=1.5, remedy="couple the exposure of both cameras"),
     ),
     "sharpness": (
-        Limit("RIL-654", "blurred", most=0, remedy="leave them out, or expect a weak pose there"),
-        Limit("RIL-655", "right over left", least=0.7, most=1 / 0.7, remedy="out of focus, or a dirty lens?"),
+        InputLimit("RIL-654", "blurred", most=0, remedy="leave them out, or expect a weak pose there"),
+        InputLimit("RIL-655", "right over left", least=0.7, most=1 / 0.7, remedy="out of focus, or a dirty lens?"),
     ),
     "matching": (
         Fault("RIL-669", "whole pairs", least=1),
         Fault("RIL-656", "matched", least=0.02, remedy="do both images show one scene, taken at one time, and sharp?"),
-        Limit("RIL-657", "matched", least=0.3, remedy="little texture, or little overlap of left and right"),
-        Limit("RIL-658", "baselines away", most=200, remedy="depth is a guess there; is the baseline right?"),
+        InputLimit("RIL-657", "matched", least=0.3, remedy="little texture, or little overlap of left and right"),
+        InputLimit("RIL-658", "baselines away", most=200, remedy="depth is a guess there; is the baseline right?"),
     ),
     "sides": (
         Fault("RIL-659", "beyond", most=0.5, remedy="left and right are swapped, or the baseline has the wrong sign"),
-        Limit("RIL-660", "beyond", most=0.1, remedy="the calibration's toe-in, or its principal points, are wrong"),
+        InputLimit(
+            "RIL-660", "beyond", most=0.1, remedy="the calibration's toe-in, or its principal points, are wrong"
+        ),
     ),
     "epipolar": (
-        Limit("RIL-661", "known", least=1, remedy="see the matching"),
+        InputLimit("RIL-661", "known", least=1, remedy="see the matching"),
         Fault("RIL-662", "adjusted, px", most=5.0, remedy="wrong calibration file, or lens distortion left in"),
-        Limit("RIL-663", "adjusted, px", most=1.0, remedy="is lens distortion left in, or the wrong file given?"),
-        Limit(
+        InputLimit("RIL-663", "adjusted, px", most=1.0, remedy="is lens distortion left in, or the wrong file given?"),
+        InputLimit(
             "RIL-664",
             "residual or row offset",  # px, half px
             most=1.0,
@@ -110,7 +114,7 @@ LIMITS = {
     "simultaneous": (Fault("RIL-665", "contradictions", most=0, remedy="pair the images anew"),),
     "motion": (  # tracking needs most of a left image in the next one
         Fault("RIL-666", "overlap", least=0.1, remedy="the trajectory breaks there; add frames between, or split it"),
-        Limit("RIL-667", "overlap", least=0.4, remedy="take every frame, or expect weak poses there"),
+        InputLimit("RIL-667", "overlap", least=0.4, remedy="take every frame, or expect weak poses there"),
     ),
 }
 """Limits of the figures of each subject, the worst first."""

@@ -21,7 +21,7 @@ MAX_READ_BYTES = 4_000_000
 """Bound of one reading, and so of the archive's directory, which is read at once: some 40 000 members."""
 
 MALFORMED = (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, OverflowError, struct.error)
-"""Errors by which zipfile, json and the codec refuse content that nobody wrote so."""
+"""Errors of zipfile (NotImplementedError: a method that it does not know), json and the codec about what they read."""
 
 
 class BrokenError(ValueError):
