@@ -43,11 +43,12 @@ STAGE_MODULE = '''"""Ports and arrays of {real}, and no work."""
 
 from dataclasses import replace
 
-from {real} import STAGE as REAL
+import {real} as real
+from rille.stages.core.declare import declared
 
 from idle.source import nothing
 
-STAGE = replace(REAL, run=nothing("{name}"))
+STAGE = replace(declared(real), run=nothing("{name}"))
 '''
 
 IMAGE_MODULE = '''"""An image of a few pixels."""
@@ -126,9 +127,9 @@ def _of(args: Any, inputs: Any) -> str:
 
 
 def _real(name: str) -> Any:
-    from rille.pipeline.flow.config import stage
+    from rille.pipeline.flow.config import stages
 
-    return stage(name)
+    return stages()[name]
 
 
 def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
@@ -187,15 +188,15 @@ def image_stage() -> Any:
 
 def write_stages(folder: Path) -> None:
     """The package ``idle`` of stages that do nothing."""
-    from rille.pipeline.flow.config import modules
+    from rille.pipeline.flow.config import stages
 
     package = folder / "idle"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text('"""Stages that do nothing."""\n')
     shutil.copyfile(__file__, package / "source.py")  # a stage's own modules lie in its package
     (package / "image.py").write_text(IMAGE_MODULE)
-    for name, real in modules().items():
-        (package / f"{name}.py").write_text(STAGE_MODULE.format(real=real.__name__, name=name))
+    for name, real in stages().items():
+        (package / f"{name}.py").write_text(STAGE_MODULE.format(real=real.module, name=name))
 
 
 def graph_of(pairs: int) -> Any:
@@ -211,7 +212,7 @@ def graph_of(pairs: int) -> Any:
         """Takes for each stage the one that does nothing."""
 
         def node(self, stage: Any, *args: Any, **more: Any) -> Handle:
-            return super().node(stage if isinstance(stage, str) else f"idle.{stage.STAGE.name}", *args, **more)
+            return super().node(stage if isinstance(stage, str) else f"idle.{stage.name}", *args, **more)
 
     none = NoParams()
     camera = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)

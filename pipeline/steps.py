@@ -279,7 +279,7 @@ def terrain(disparity: xarray.Dataset, pair: StereoPair, **locus: Any) -> xarray
     _, known = make.rig([pair.frame])
     model = make.pair(pair.frame, vertical(make, pair.frame, pair.frame == 0), known, None)
     found = _computed(model.dem, {model.disparity: given}, pair.sequence.drawn)
-    return _dataset(locus_stage.STAGE, found, settings)
+    return _dataset(locus_stage.locus_stage, found, settings)
 
 
 def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, **risk: Any) -> xarray.Dataset:
@@ -324,7 +324,7 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
     settings = _merged(dem, {"vehicle": limits, "risk": risk})
     make, given = _builder(None, settings), _placeholder("dem")
     found = _computed(
-        make.hazards("risk", [given]), {given: _bundle(dem, locus_stage.STAGE, "elevation", "rille.terrain")}, {}
+        make.hazards("risk", [given]), {given: _bundle(dem, locus_stage.locus_stage, "elevation", "rille.terrain")}, {}
     )
     return _dataset(risk_stage.STAGE, found, settings)
 
@@ -374,7 +374,7 @@ def path(
     ends = {name: list(end) for name, end in (("target", goal), ("start", start)) if end is not None}
     settings = _merged(hazards, {"path": {**path, **ends}})
     make, given = _builder(None, settings), _placeholder("risk")
-    planned = make.node(path_stage, "path", {} if ends else {"use": "local"}, risk=given)
+    planned = make.node(path_stage.STAGE, "path", risk=given, use=None if ends else "local")
     found = _computed(planned, {given: _bundle(hazards, risk_stage.STAGE, "risk", "rille.hazards")}, {})
     return _dataset(path_stage.STAGE, found, settings)
 

@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("stages", "datasets", "pipeline")
 FLOORS = (
     "rille.stages.core",
+    "rille.stages.facts",
     "rille.stages.geometry rille.stages.numeric",
     "rille.stages.imaging rille.stages.hazard rille.stages.terrain",
     "rille.stages.hfvm.level rille.stages.terrain.locus rille.stages.planning rille.stages.driving",

@@ -7,23 +7,24 @@ import importlib
 import numpy as np
 import pytest
 
-from rille.pipeline.flow.config import modules, stage
+from rille.pipeline.flow.config import stages
+from rille.stages.core.declare import declared
 
 UNITS = {"1", "px", "m", "rad", "grey", "m^2, m rad, rad^2", "m, rad"}
 DATASET_STAGES = ("images.files", "mockup.scene", "mockup.render", "mockup.truth", "mockup.truth_dem")
 DRIVE_STAGES = ("mockup.rover", "mockup.sense", "mockup.obstacle", "mockup.overview")
 TILE_STAGES = ("tile_stage", "join_stage")
 DECLARED = (
-    {name: stage(name) for name in modules()}
-    | {name: importlib.import_module(f"rille.stages.hfvm.{name}").STAGE for name in TILE_STAGES}
-    | {name: importlib.import_module(f"rille.datasets.{name}").STAGE for name in (*DATASET_STAGES, *DRIVE_STAGES)}
+    stages()
+    | {name: declared(importlib.import_module(f"rille.stages.hfvm.{name}")) for name in TILE_STAGES}
+    | {name: declared(importlib.import_module(f"rille.datasets.{name}")) for name in (*DATASET_STAGES, *DRIVE_STAGES)}
 )
 
 
 @pytest.mark.parametrize("name", DECLARED)
 def test_declaration(name: str) -> None:
     s = DECLARED[name]
-    assert name not in modules() or s.name == name
+    assert name not in stages() or s.name == name
     assert s.version >= 1
     assert s.summary
     assert len(set(s.inputs)) == len(s.inputs)

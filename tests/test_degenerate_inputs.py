@@ -164,7 +164,7 @@ def test_every_stage_bears_that_little_is_usable(tmp_path: Path) -> None:
     declared = {
         path.relative_to(sources).with_suffix("").as_posix().replace("/", ".")
         for path in sources.glob("stages/**/*.py")
-        if re.search(r"^STAGE = ", path.read_text(encoding="utf-8"), re.MULTILINE)
+        if re.search(r"^(STAGE = |@stage\()", path.read_text(encoding="utf-8"), re.MULTILINE)
     }
     met = {task.spec.module.removeprefix("rille.") for task in tasks}
     assert declared - met == {f"stages.{name}" for name in ELSEWHERE}

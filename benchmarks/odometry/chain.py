@@ -18,7 +18,7 @@ import numpy as np
 
 from rille.datasets.protocol import Sequence, Source
 from rille.pipeline.flow import config as configuration
-from rille.stages.core.declare import Bundle, NoParams
+from rille.stages.core.declare import Bundle, NoParams, declared
 from rille.stages.odometry.resection.trajectory import world_poses
 
 MATCHING = ("hfvm", "orientation", "rig", "calibration", "ground_frame")
@@ -58,7 +58,7 @@ class Images:
         if shared in self._made:
             return self._made[shared]
         inputs = {port: self._take(upstream) for port, upstream in source.inputs.items()}
-        stage = importlib.import_module(source.module).STAGE
+        stage = declared(importlib.import_module(source.module))
         found: Bundle = stage.run(source.params, {**source.args, **source.hints}, inputs)
         if shared is not None:
             self._made[shared] = found

@@ -6,17 +6,17 @@ import hashlib
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from rille.datasets.facts import ImageFacts
 from rille.datasets.images import files
 from rille.datasets.images.files import Grey
 from rille.datasets.text.reading import open_regular
-from rille.stages.core.declare import Bundle, Inputs, NoParams
+from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.core.errors import InputError, RilleError
 from rille.stages.imaging.levels import spread
 
@@ -120,20 +120,30 @@ def _layout(message: Any, name: str) -> tuple[int, int, int | None]:
     return LAYOUTS[message.encoding]
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    name = f"frame {args['frame']}, {args['camera']} image of {args['path']}"
-    with opened(Path(args["path"])) as reader:
-        there = [c for c in reader.connections if c.topic == args["topic"]]
-        at = int(args["at"])
+@stage("image", version=2, outputs=files.image_stage.outputs)
+def bag_image_stage(
+    params: NoParams,
+    *,
+    frame: int,
+    camera: str,
+    path: str,
+    topic: str,
+    at: int,
+    sha256: str,
+    width: int,
+    height: int,
+    depth: int,
+    levels: tuple[int, int] | None = None,
+) -> Bundle[ImageFacts]:
+    """One image of a bag, checked and grey."""
+    name = f"frame {frame}, {camera} image of {path}"
+    with opened(Path(path)) as reader:
+        there = [c for c in reader.connections if c.topic == topic]
         for connection, _, data in reader.messages(there, start=at, stop=at + 1) if there else ():
-            if hashlib.sha256(data).hexdigest() == args["sha256"]:
+            if hashlib.sha256(data).hexdigest() == sha256:
                 message = reader.deserialize(data, connection.msgtype)
                 break
         else:
             raise InputError("RIL-944", f"{name} has changed since the run began", remedy="run the same command again")
-    image = spread(grey_of(message, name, (args["width"], args["height"], args["depth"])), args.get("levels"))
-    meta = {"frame": args["frame"], "camera": args["camera"]}
-    return Bundle({"image": image, "valid": np.ones(image.shape, np.uint8)}, meta)
-
-
-STAGE = replace(files.STAGE, summary="one image of a bag, checked and grey", run=_run)
+    image = spread(grey_of(message, name, (width, height, depth)), levels)
+    return Bundle({"image": image, "valid": np.ones(image.shape, np.uint8)}, {"frame": frame, "camera": camera})

@@ -6,7 +6,7 @@ import hashlib
 import os
 import re
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -16,11 +16,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.datasets.facts import ImageFacts
 from rille.datasets.images.headers import Header, opened, read_header
 from rille.datasets.images.kinds import KINDS, kind_of
 from rille.datasets.protocol import Source
 from rille.datasets.text.reading import open_regular, read_bytes
-from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
 from rille.stages.imaging.levels import Levels, spread
 
@@ -263,29 +264,35 @@ def check_size(found: Header, wanted: Header, name: str) -> None:
         raise InputError("RIL-176", text, remedy=remedy)
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    name = f"frame {args['frame']}, {args['camera']} image {args['path']}"
-    data = read_bytes(Path(args["path"]), "image", MOST_BYTES)
-    # The digest is in the key: a file that was replaced since must not be stored under the key of the former one.
-    if hashlib.sha256(data).hexdigest() != args["sha256"]:
-        raise InputError("RIL-177", f"{name} has changed since the run began", remedy="run the same command again")
-    image, colour = decode_colour(data, name, (args["width"], args["height"], args["depth"]), args.get("levels"))
-    meta = {"frame": args["frame"], "camera": args["camera"]}
-    arrays: dict[str, NDArray[Any]] = {"image": image, "valid": np.ones(image.shape, np.uint8)}
-    # The right image's colours would colour nothing: an ortho image is made of left ones.
-    return Bundle(arrays if colour is None or args["camera"] != "left" else arrays | {"colour": colour}, meta)
-
-
-STAGE = Stage(
-    name="image",
+@stage(
+    "image",
     version=2,
-    summary="one image file, checked and grey",
-    params=NoParams,
-    inputs=(),
-    outputs=(
+    outputs=[
         Array("image", ("row", "col"), "uint8", "grey", "image", deep="uint16"),
         Array("valid", ("row", "col"), "uint8", "1", "1 = usable"),
         COLOUR,
-    ),
-    run=_run,
+    ],
 )
+def image_stage(
+    params: NoParams,
+    *,
+    frame: int,
+    camera: str,
+    path: str,
+    sha256: str,
+    width: int,
+    height: int,
+    depth: int,
+    levels: tuple[int, int] | None = None,
+) -> Bundle[ImageFacts]:
+    """One image file, checked and grey."""
+    name = f"frame {frame}, {camera} image {path}"
+    data = read_bytes(Path(path), "image", MOST_BYTES)
+    # The digest is in the key: a file that was replaced since must not be stored under the key of the former one.
+    if hashlib.sha256(data).hexdigest() != sha256:
+        raise InputError("RIL-177", f"{name} has changed since the run began", remedy="run the same command again")
+    image, colour = decode_colour(data, name, (width, height, depth), levels)
+    meta: ImageFacts = {"frame": frame, "camera": camera}
+    arrays: dict[str, NDArray[Any]] = {"image": image, "valid": np.ones(image.shape, np.uint8)}
+    # The right image's colours would colour nothing: an ortho image is made of left ones.
+    return Bundle(arrays if colour is None or camera != "left" else arrays | {"colour": colour}, meta)

@@ -6,19 +6,18 @@ turn is what stage ``rig`` should find (its corrections pitch, yaw, roll have th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
 import scipy
 from pydantic import Field
 
+from rille.datasets.facts import ImageFacts
 from rille.datasets.images import files
 from rille.datasets.protocol import Sequence, Source
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import AnyArray, Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import AnyArray, Bundle, Params, stage
 from rille.stages.geometry.geometry import rotation_exp
 from rille.stages.geometry.lens import Lens
 
@@ -120,19 +119,10 @@ def warp(image: AnyArray, valid: AnyArray, lens: Lens, params: MisalignParams) -
     return np.where(mask != 0, values, 0).astype(image.dtype), mask
 
 
-def _run(params: MisalignParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    source = inputs["image"]
-    lens = Lens.from_dict(args["lens"])
-    image, valid = warp(np.asarray(source["image"]), np.asarray(source["valid"]), lens, params)
-    return Bundle({"image": image, "valid": valid}, {"frame": args["frame"], "camera": args["camera"]})
-
-
-STAGE = Stage(
-    name="misalign",
-    version=1,
-    summary="right image as a knocked camera would have taken it",
-    params=MisalignParams,
-    inputs=("image",),
-    outputs=files.STAGE.outputs[:2],
-    run=_run,
-)
+@stage("misalign", outputs=files.image_stage.outputs[:2])
+def misalign_stage(
+    params: MisalignParams, image: Bundle[ImageFacts], *, frame: int, camera: str, lens: Lens
+) -> Bundle[ImageFacts]:
+    """Right image as a knocked camera would have taken it."""
+    turned, valid = warp(np.asarray(image["image"]), np.asarray(image["valid"]), lens, params)
+    return Bundle({"image": turned, "valid": valid}, {"frame": frame, "camera": camera})

@@ -13,7 +13,7 @@ from PIL import Image
 
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.text.warning import warning
-from rille.stages.core.declare import AnyArray
+from rille.stages.core.declare import AnyArray, declared
 from rille.stages.core.errors import InputError, RilleError
 from rille.stages.imaging import levels
 
@@ -62,7 +62,8 @@ def examined(sequence: Sequence) -> Sequence:
 def _images(source: Source) -> list[AnyArray]:
     """The grey image (row, col); none of one that cannot be read, which its own task says."""
     with suppress(RilleError):
-        stage = import_module(source.module).STAGE
+        stage = declared(import_module(source.module))
+        assert stage is not None
         return [np.asarray(stage.run(source.params, {**source.args, **source.hints}, {})["image"])]
     return []
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from rille.datasets.mockup import scene as bed
 from rille.datasets.mockup import terrain
+from rille.datasets.mockup.facts import LegFacts, SceneFacts
 from rille.datasets.mockup.params import SceneParams
 from rille.datasets.mockup.rover import RoverParams, true_and_believed
-from rille.stages.core.declare import Bundle, Inputs, Stage
+from rille.stages.core.declare import Bundle, stage
+from rille.stages.geometry.geometry import RigidTransform
 
 HEIGHT = 0.015  # m, of the stone; a wheel's radius
 
@@ -43,11 +44,22 @@ def lay(scene: Bundle, x: float, y: float) -> dict[str, Any]:
     return arrays
 
 
-def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    scene, path = inputs["scene"], np.asarray(inputs["leg"]["path"])[:, :2]
+@stage("mockup.obstacle", outputs=bed.scene_stage.outputs)
+def obstacle_stage(
+    params: RoverParams,
+    scene: Bundle[SceneFacts],
+    before: Bundle[LegFacts],
+    pose: Bundle,
+    leg: Bundle,
+    *,
+    T_vehicle_left: RigidTransform,
+    row: int,
+) -> Bundle[SceneFacts]:
+    """The simulated bed with a stone laid on the rover's way."""
+    path = np.asarray(leg["path"])[:, :2]
     if len(path) < 2:
         return Bundle({name: np.asarray(scene[name]) for name in scene.arrays}, {**scene.meta, "obstacle": None})
-    (true_x, true_y, true_heading), (x, y, heading) = true_and_believed(args, inputs)
+    (true_x, true_y, true_heading), (x, y, heading) = true_and_believed(before, row, pose, T_vehicle_left)
     px, py = on_path(path, params.obstacle_ahead, params.obstacle_aside)
     # The path is in the frame of the rover's estimate: the stone is laid where it will really come by, so that errors
     # of the estimate do not carry it past.
@@ -55,14 +67,3 @@ def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     c, s = math.cos(turn), math.sin(turn)
     stone = true_x + c * (px - x) - s * (py - y), true_y + s * (px - x) + c * (py - y)
     return Bundle(lay(scene, *stone), {**scene.meta, "obstacle": list(stone)})
-
-
-STAGE = Stage(
-    name="mockup.obstacle",
-    version=1,
-    summary="the simulated bed with a stone laid on the rover's way",
-    params=RoverParams,
-    inputs=("scene", "before", "pose", "leg"),
-    outputs=bed.STAGE.outputs,
-    run=_run,
-)

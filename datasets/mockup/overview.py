@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
+from rille.datasets.mockup.facts import ElevationFacts, SceneFacts
 from rille.datasets.mockup.rover import RoverParams
-from rille.stages.core.declare import Array, Bundle, Inputs, Stage
+from rille.stages.core.declare import Array, Bundle, stage
 from rille.stages.geometry.lattice import Lattice
 
 SIGMA = 0.002  # m, of the map's elevations
 
 
-def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    at, z = inputs["scene"].meta["lattice"], np.asarray(inputs["scene"]["height"], dtype=np.float64)
-    cell = float(args["cell"])
+@stage(
+    "mockup.overview",
+    outputs=[Array("elevation", ("row", "col"), "float32", "m", "mean elevation of the cell", "nan", "bed")],
+)
+def overview_stage(params: RoverParams, scene: Bundle[SceneFacts], *, cell: float) -> Bundle[ElevationFacts]:
+    """A coarse elevation model of the whole simulated bed."""
+    at, z = scene.meta["lattice"], np.asarray(scene["height"], dtype=np.float64)
     n = max(1, round(cell / at["cell"]))
     # Cells at multiples of their size, those alone that lie wholly within the bed.
     i0, j0 = math.ceil(at["x0"] / cell + 0.5), math.floor(at["y0"] / cell - 0.5)
@@ -31,14 +34,3 @@ def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     out = np.lib.stride_tricks.sliding_window_view(z, (n, n))[np.ix_(row, col)].mean(axis=(2, 3))
     out += SIGMA * np.random.default_rng([params.seed, 72]).standard_normal(out.shape)
     return Bundle({"elevation": out.astype(np.float32)}, {"lattice": lattice.to_dict(), "frame": "bed"})
-
-
-STAGE = Stage(
-    name="mockup.overview",
-    version=1,
-    summary="a coarse elevation model of the whole simulated bed",
-    params=RoverParams,
-    inputs=("scene",),
-    outputs=(Array("elevation", ("row", "col"), "float32", "m", "mean elevation of the cell", "nan", "bed"),),
-    run=_run,
-)

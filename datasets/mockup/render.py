@@ -8,19 +8,20 @@ vignetting, exposure, noise and quantisation.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.datasets.facts import ImageFacts
+from rille.datasets.mockup.facts import SceneFacts
 from rille.datasets.mockup.params import RenderParams
 from rille.datasets.mockup.raycast import HeightField
 from rille.datasets.mockup.scene import MIPS, height_field
 from rille.datasets.protocol import CAMERAS
-from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Stage
+from rille.stages.core.declare import Array, Bundle, Memory, stage
 from rille.stages.geometry.geometry import Camera, RigidTransform
 
 LUNAR = 0.6
@@ -171,37 +172,37 @@ def radiance(
     return blocks, np.asarray(mask)
 
 
-def _run(params: RenderParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    scene, frame, side = inputs["scene"], args["frame"], args["camera"]
-    camera, T_bed_camera = Camera.from_dict(args["geometry"]), RigidTransform.from_matrix(args["T_bed_camera"])
-    blocks, mask = radiance(scene, height_field(scene), camera, T_bed_camera, params.sampling)
+@stage(
+    "mockup.render",
+    outputs=[
+        Array("image", ("row", "col"), "uint8", "grey", "image"),
+        Array("valid", ("row", "col"), "uint8", "1", "1 = usable, 0 = background beyond the bed"),
+    ],
+    memory=Memory(result=0.02),
+)
+def render_stage(
+    params: RenderParams,
+    scene: Bundle[SceneFacts],
+    *,
+    frame: int,
+    camera: str,
+    geometry: Camera,
+    T_bed_camera: RigidTransform,
+) -> Bundle[ImageFacts]:
+    """One image of the simulated bed."""
+    blocks, mask = radiance(scene, height_field(scene), geometry, T_bed_camera, params.sampling)
     # A stream for each image: its noise depends neither on which others are rendered nor on their order.
-    rng = np.random.default_rng([params.seed, 50, frame, CAMERAS.index(side)])
+    rng = np.random.default_rng([params.seed, 50, frame, CAMERAS.index(camera)])
     mu0 = math.sin(math.radians(scene.meta["scene"]["sun_elevation_deg"]))
     # Radiance of level ground of mean albedo, seen as the camera's axis sees it.
     flat = 2.0 * LUNAR * mu0 / (mu0 + EMISSION) + (1.0 - LUNAR) * mu0 + AMBIENT
     gain = LEVEL_GREY / flat * params.exposure * (1.0 + params.exposure_jitter * float(rng.standard_normal()))
-    gain *= RIGHT_GAIN if side == "right" else 1.0
+    gain *= RIGHT_GAIN if camera == "right" else 1.0
     samples = np.where(np.isnan(blocks), np.float32(BACKGROUND), blocks * np.float32(gain))
     grey = scipy.ndimage.gaussian_filter(samples.astype(np.float64).mean(axis=(1, 3)), BLUR, mode="nearest")
-    y, x = np.ogrid[-1.0 : 1.0 : camera.height * 1j, -1.0 : 1.0 : camera.width * 1j]
+    y, x = np.ogrid[-1.0 : 1.0 : geometry.height * 1j, -1.0 : 1.0 : geometry.width * 1j]
     grey = grey * (1.0 - VIGNETTING * (x * x + y * y) / 2.0)
     # Noise arises in the sensor, behind the optics: it is neither blurred nor vignetted, and white.
     noisy = grey + params.noise * rng.standard_normal(grey.shape)
     image = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
-    return Bundle({"image": image, "valid": mask.astype(np.uint8)}, {"frame": frame, "camera": side})
-
-
-STAGE = Stage(
-    name="mockup.render",
-    version=1,
-    summary="one image of the simulated bed",
-    params=RenderParams,
-    inputs=("scene",),
-    outputs=(
-        Array("image", ("row", "col"), "uint8", "grey", "image"),
-        Array("valid", ("row", "col"), "uint8", "1", "1 = usable, 0 = background beyond the bed"),
-    ),
-    run=_run,
-    memory=Memory(result=0.02),  # an image has a fiftieth of the scene's bytes
-)
+    return Bundle({"image": image, "valid": mask.astype(np.uint8)}, {"frame": frame, "camera": camera})

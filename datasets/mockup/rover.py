@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
 
+from rille.datasets.mockup.facts import LegFacts, SceneFacts
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import AnyArray, Array, Bundle, Params, stage
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, from_above, way_length
 from rille.stages.hazard.vehicle import Vehicle
@@ -179,48 +180,19 @@ def bed_ground(scene: Bundle, vehicle: Vehicle, at: tuple[float, float], reach: 
     )
 
 
-def true_and_believed(args: Mapping[str, Any], inputs: Inputs) -> tuple[Pose, Pose]:
+def true_and_believed(
+    before: Bundle[LegFacts], row: int, pose: Bundle, T_vehicle_left: RigidTransform
+) -> tuple[Pose, Pose]:
     """True pose of the vehicle on the bed before a leg, and its estimate in the frame of the reconstruction."""
-    T_left_vehicle = RigidTransform.from_matrix(args["T_vehicle_left"]).inverse()
-    true = RigidTransform.from_matrix(np.asarray(inputs["before"]["vehicle"])[int(args["row"])])
-    estimate = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1]) @ T_left_vehicle
+    true = RigidTransform.from_matrix(np.asarray(before["vehicle"])[row])
+    estimate = RigidTransform.from_matrix(np.asarray(pose["poses"])[-1]) @ T_vehicle_left.inverse()
     return from_above(true), from_above(estimate)
 
 
-def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    vehicle = Vehicle.model_validate(args["vehicle"])
-    T_left_vehicle = RigidTransform.from_matrix(args["T_vehicle_left"]).inverse()
-    before, believed, sent = START, (0.0, 0.0, 0.0), SentLeg(np.zeros((1, 2)), [], 0.0)
-    if "before" in inputs:
-        before, believed = true_and_believed(args, inputs)
-        leg = inputs["leg"]
-        sent = SentLeg(np.asarray(leg["path"])[:, :2], np.asarray(leg["gear"]).tolist(), float(leg.meta["turn"]))
-    ground = bed_ground(inputs["scene"], vehicle, before[:2], way_length(sent.path) + REACH)
-    # The placement at the start is leg -1, and a seed must not be negative.
-    rng = np.random.default_rng([params.seed, 70, 1 + int(args["leg"])])
-    trail, turned = drive_leg(ground, vehicle, before, believed, sent, params, rng)
-    wheels = np.array(turned)
-    frames = images_at(wheels, params)
-    vehicles = np.stack([s.T_ground_vehicle.matrix34 for s in trail])
-    lefts = np.stack([(trail[i].T_ground_vehicle @ T_left_vehicle.inverse()).matrix34 for i in frames])
-    arrays: dict[str, AnyArray] = {
-        "poses": lefts,
-        "vehicle": vehicles[frames],
-        "trail": vehicles,
-        "frame_at": np.array(frames, dtype=np.int32),
-        "wheels": wheels,
-    }
-    arrays |= {name: np.array([getattr(s, name) for s in trail]) for name in ("tilt", "clearance", "step")}
-    return Bundle(arrays, {"leg": args["leg"], "frames": len(frames), "poses": [m.reshape(-1).tolist() for m in lefts]})
-
-
-STAGE = Stage(
-    name="mockup.drive",
+@stage(
+    "mockup.drive",
     version=3,
-    summary="true motion of the simulated rover along one leg",
-    params=RoverParams,
-    inputs=("scene", "before?", "pose?", "leg?"),
-    outputs=(
+    outputs=[
         Array("poses", ("frame", "row", "col"), "float64", "m", "true pose [R | t] of the left camera", frame="bed"),
         Array("vehicle", ("frame", "row", "col"), "float64", "m", "true pose of the vehicle", frame="bed"),
         Array("trail", ("position", "row", "col"), "float64", "m", "true pose of the vehicle, finely", frame="bed"),
@@ -229,6 +201,39 @@ STAGE = Stage(
         Array("tilt", ("position",), "float64", "rad", "angle of the vehicle to the horizontal"),
         Array("clearance", ("position",), "float64", "m", "least distance of the belly to the ground"),
         Array("step", ("position",), "float64", "m", "edge under the worst wheel"),
-    ),
-    run=_run,
+    ],
 )
+def drive_stage(
+    params: RoverParams,
+    scene: Bundle[SceneFacts],
+    before: Bundle[LegFacts] | None = None,
+    pose: Bundle | None = None,
+    plan: Bundle | None = None,
+    *,
+    vehicle: Vehicle,
+    T_vehicle_left: RigidTransform,
+    leg: int,
+    row: int = 0,
+) -> Bundle[LegFacts]:
+    """True motion of the simulated rover along one leg."""
+    start, believed, sent = START, (0.0, 0.0, 0.0), SentLeg(np.zeros((1, 2)), [], 0.0)
+    if before is not None and pose is not None and plan is not None:
+        start, believed = true_and_believed(before, row, pose, T_vehicle_left)
+        sent = SentLeg(np.asarray(plan["path"])[:, :2], np.asarray(plan["gear"]).tolist(), float(plan.meta["turn"]))
+    ground = bed_ground(scene, vehicle, start[:2], way_length(sent.path) + REACH)
+    # The placement at the start is leg -1, and a seed must not be negative.
+    rng = np.random.default_rng([params.seed, 70, 1 + leg])
+    trail, turned = drive_leg(ground, vehicle, start, believed, sent, params, rng)
+    wheels = np.array(turned)
+    frames = images_at(wheels, params)
+    vehicles = np.stack([s.T_ground_vehicle.matrix34 for s in trail])
+    lefts = np.stack([(trail[i].T_ground_vehicle @ T_vehicle_left).matrix34 for i in frames])
+    arrays: dict[str, AnyArray] = {
+        "poses": lefts,
+        "vehicle": vehicles[frames],
+        "trail": vehicles,
+        "frame_at": np.array(frames, dtype=np.int32),
+        "wheels": wheels,
+    }
+    arrays |= {name: np.array([getattr(s, name) for s in trail]) for name in ("tilt", "clearance", "step")}
+    return Bundle(arrays, {"leg": leg, "frames": len(frames), "poses": [m.reshape(-1).tolist() for m in lefts]})

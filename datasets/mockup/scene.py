@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.mockup import terrain
+from rille.datasets.mockup.facts import SceneFacts
 from rille.datasets.mockup.params import SceneParams
 from rille.datasets.mockup.raycast import HeightField
-from rille.stages.core.declare import Array, Bundle, Inputs, Stage
+from rille.stages.core.declare import Array, Bundle, stage
 
 MIPS = 7
 """Levels of the albedo: 0.5 mm texels up to 32 mm, more than any footprint on the bed."""
@@ -27,7 +28,7 @@ EDGE = 0.06
 """m; over which the pad passes into the ground around it."""
 
 
-def build_scene(p: SceneParams, pad: Disk | None = None, blank: Disk | None = None) -> Bundle:
+def build_scene(p: SceneParams, pad: Disk | None = None, blank: Disk | None = None) -> Bundle[SceneFacts]:
     """Heights, light and albedo of a bed.
 
     Parameters
@@ -100,17 +101,9 @@ def height_field(scene: Bundle) -> HeightField:
     return HeightField.build(np.asarray(scene["height"][:]), lattice["x0"], lattice["y0"], lattice["cell"])
 
 
-def _run(params: SceneParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    return build_scene(params, args.get("pad"), args.get("blank"))
-
-
-STAGE = Stage(
-    name="mockup.scene",
-    version=1,
-    summary="terrain, albedo and shadows of the simulated bed",
-    params=SceneParams,
-    inputs=(),
-    outputs=(
+@stage(
+    "mockup.scene",
+    outputs=[
         Array("height", ("row", "col"), "float32", "m", "height of the bed", frame="bed"),
         Array("sunlit", ("row", "col"), "uint8", "1", "share of the sun's disc in view, 255 = all", frame="bed"),
         Array("tint", ("row", "col"), "uint8", "1", "brightness of rocks relative to the ground, 100 = 1", frame="bed"),
@@ -122,6 +115,8 @@ STAGE = Stage(
             "relative albedo, 128 = mean, level 0 at half the cell",
             frame="bed",
         ),
-    ),
-    run=_run,
+    ],
 )
+def scene_stage(params: SceneParams, *, pad: Disk | None = None, blank: Disk | None = None) -> Bundle[SceneFacts]:
+    """Terrain, albedo and shadows of the simulated bed."""
+    return build_scene(params, pad, blank)

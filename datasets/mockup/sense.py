@@ -6,38 +6,19 @@ This, and the images, is all that the estimates ever learn of a drive.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
+from rille.datasets.mockup.facts import LegFacts, SensedFacts
 from rille.datasets.mockup.rover import RoverParams
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import Array, Bundle, Inputs, Stage
+from rille.stages.core.declare import Array, Bundle, stage
 from rille.stages.geometry.geometry import rotation_exp
 
 SPEED = 0.05  # m/s; with it, bumps become accelerations
 ODOMETRY_SIGMA = 0.01  # relative, of distances and turns by the wheels, as of their radius
 ATTITUDE_SIGMA_DEG = 0.2  # of the inclinometer about each axis
 ACCELERATION_SIGMA = 0.05  # m/s2, of the accelerometer
-
-
-def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    drive = inputs["drive"]
-    rng = np.random.default_rng([params.seed, 71, 1 + int(args["leg"])])
-    at = np.asarray(drive["frame_at"])
-    wheels, poses = np.asarray(drive["wheels"])[at], np.asarray(drive["poses"])
-    # One error for the whole leg: it does not average out over the leg's images.
-    odometry = wheels * (1.0 + ODOMETRY_SIGMA * float(rng.standard_normal()))
-    sigma = math.radians(ATTITUDE_SIGMA_DEG)
-    # The third row of R_bed_left is the bed's z axis, in axes of the camera.
-    up = np.stack([rotation_exp(sigma * rng.standard_normal(3)) @ pose[2, :3] for pose in poses])
-    peak = _peaks(np.asarray(drive["trail"])[:, 2, 3], np.asarray(drive["wheels"]))
-    acceleration = [float(peak[a + 1 : b + 1].max(initial=0.0)) for a, b in zip([0, *at[:-1]], at, strict=True)]
-    noise = ACCELERATION_SIGMA * rng.standard_normal(len(at))
-    arrays = {"odometry": odometry, "up": up, "acceleration": np.abs(np.array(acceleration) + noise)}
-    facts = {"up": up.tolist(), "odometry": odometry.tolist()}
-    return Bundle(arrays, {"leg": args["leg"], **facts})
 
 
 def _peaks(z: Floats, wheels: Floats) -> Floats:
@@ -50,16 +31,26 @@ def _peaks(z: Floats, wheels: Floats) -> Floats:
     return out
 
 
-STAGE = Stage(
-    name="mockup.sense",
-    version=1,
-    summary="what the simulated rover's sensors report of a leg",
-    params=RoverParams,
-    inputs=("drive",),
-    outputs=(
+@stage(
+    "mockup.sense",
+    outputs=[
         Array("odometry", ("frame", "xyh"), "float64", "1", "x, y (m), heading (rad) since the leg began, by wheels"),
         Array("up", ("frame", "xyz"), "float64", "1", "direction of up in the left camera, by inclinometer"),
         Array("acceleration", ("frame",), "float64", "1", "peak of vertical acceleration since the last image, m/s2"),
-    ),
-    run=_run,
+    ],
 )
+def sense_stage(params: RoverParams, drive: Bundle[LegFacts], *, leg: int) -> Bundle[SensedFacts]:
+    """What the simulated rover's sensors report of a leg."""
+    rng = np.random.default_rng([params.seed, 71, 1 + leg])
+    at = np.asarray(drive["frame_at"])
+    wheels, poses = np.asarray(drive["wheels"])[at], np.asarray(drive["poses"])
+    # One error for the whole leg: it does not average out over the leg's images.
+    odometry = wheels * (1.0 + ODOMETRY_SIGMA * float(rng.standard_normal()))
+    sigma = math.radians(ATTITUDE_SIGMA_DEG)
+    # The third row of R_bed_left is the bed's z axis, in axes of the camera.
+    up = np.stack([rotation_exp(sigma * rng.standard_normal(3)) @ pose[2, :3] for pose in poses])
+    peak = _peaks(np.asarray(drive["trail"])[:, 2, 3], np.asarray(drive["wheels"]))
+    acceleration = [float(peak[a + 1 : b + 1].max(initial=0.0)) for a, b in zip([0, *at[:-1]], at, strict=True)]
+    noise = ACCELERATION_SIGMA * rng.standard_normal(len(at))
+    arrays = {"odometry": odometry, "up": up, "acceleration": np.abs(np.array(acceleration) + noise)}
+    return Bundle(arrays, {"leg": leg, "up": up.tolist(), "odometry": odometry.tolist()})

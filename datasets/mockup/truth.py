@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.datasets.mockup.facts import SceneFacts, TruthFacts
 from rille.datasets.mockup.raycast import HeightField
 from rille.datasets.mockup.render import camera_rays, transform
 from rille.datasets.mockup.scene import height_field
-from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 
 TOLERANCE = 1e-5
@@ -77,23 +75,18 @@ def true_disparity(field: HeightField, rig: Rig, T_bed_left: RigidTransform) -> 
     }
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    field, T_bed_left = height_field(inputs["scene"]), RigidTransform.from_matrix(args["T_bed_left"])
-    arrays = true_disparity(field, Rig.from_dict(args["rig"]), T_bed_left)
-    return Bundle(arrays, {"frame": args["frame"], "seen": int((arrays["occluded"] == SEEN).sum())})
-
-
-STAGE = Stage(
-    name="mockup.truth",
-    version=1,
-    summary="exact disparity of a simulated pair",
-    params=NoParams,
-    inputs=("scene",),
-    outputs=(
+@stage(
+    "mockup.truth",
+    outputs=[
         Array("column_disparity", ("row", "col"), "float32", "px", "exact column disparity", nodata="nan"),
         Array("row_disparity", ("row", "col"), "float32", "px", "exact row disparity", nodata="nan"),
         Array("occluded", ("row", "col"), "uint8", "1", "0 seen, 1 hidden, 2 outside the right image, 3 no bed"),
         Array("depth", ("row", "col"), "float32", "m", "depth along the left optical axis", nodata="nan"),
-    ),
-    run=_run,
+    ],
 )
+def truth_stage(
+    params: NoParams, scene: Bundle[SceneFacts], *, T_bed_left: RigidTransform, rig: Rig, frame: int
+) -> Bundle[TruthFacts]:
+    """Exact disparity of a simulated pair."""
+    arrays = true_disparity(height_field(scene), rig, T_bed_left)
+    return Bundle(arrays, {"frame": frame, "seen": int((arrays["occluded"] == SEEN).sum())})

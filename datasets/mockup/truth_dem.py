@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.datasets.mockup.facts import ElevationFacts, SceneFacts
 from rille.datasets.mockup.raycast import HeightField
 from rille.datasets.mockup.render import transform
 from rille.datasets.mockup.scene import height_field
 from rille.datasets.mockup.truth import visible
-from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.geometry.geometry import Rig, RigidTransform
 
 
@@ -57,25 +58,27 @@ def seen_by(
     return seen
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    field = height_field(inputs["scene"])
-    elevation, points = true_dem(field, args["lattice"], RigidTransform.from_matrix(args["T_bed_world"]))
-    lefts = [RigidTransform.from_matrix(m) for m in args["pairs"]]
-    seen = seen_by(field, Rig.from_dict(args["rig"]), lefts, points).reshape(elevation.shape).astype(np.uint8)
-    # Rounding may lift the cosine of a level frame above 1.
-    tilt = math.degrees(math.acos(min(1.0, RigidTransform.from_matrix(args["T_bed_world"]).rotation[2, 2])))
-    return Bundle({"elevation": elevation, "seen": seen}, {"lattice": dict(args["lattice"]), "tilt_deg": tilt})
-
-
-STAGE = Stage(
-    name="mockup.truth_dem",
-    version=1,
-    summary="exact elevations of the simulated bed on a lattice, and how far its frame is off the vertical",
-    params=NoParams,
-    inputs=("scene",),
-    outputs=(
+@stage(
+    "mockup.truth_dem",
+    outputs=[
         Array("elevation", ("row", "col"), "float32", "m", "exact elevation", nodata="nan", frame="world"),
         Array("seen", ("row", "col"), "uint8", "1", "1 = both cameras of a listed pair see the cell", frame="world"),
-    ),
-    run=_run,
+    ],
 )
+def truth_dem_stage(
+    params: NoParams,
+    scene: Bundle[SceneFacts],
+    *,
+    lattice: Mapping[str, Any],
+    T_bed_world: RigidTransform,
+    pairs: Sequence[Sequence[float]],
+    rig: Rig,
+) -> Bundle[ElevationFacts]:
+    """Exact elevations of the simulated bed on a lattice, and how far its frame is off the vertical."""
+    field = height_field(scene)
+    elevation, points = true_dem(field, lattice, T_bed_world)
+    lefts = [RigidTransform.from_matrix(m) for m in pairs]
+    seen = seen_by(field, rig, lefts, points).reshape(elevation.shape).astype(np.uint8)
+    # Rounding may lift the cosine of a level frame above 1.
+    tilt = math.degrees(math.acos(min(1.0, T_bed_world.rotation[2, 2])))
+    return Bundle({"elevation": elevation, "seen": seen}, {"lattice": dict(lattice), "tilt_deg": tilt})

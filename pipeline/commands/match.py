@@ -79,7 +79,7 @@ class Matcher:
         if self.preset is not None and values.setdefault("preset", self.preset) != self.preset:
             text = f"--preset {self.preset} and --set hfvm.preset={values['preset']} contradict each other"
             raise ConfigError("RIL-986", text, remedy="leave one of them out")
-        return configuration.validate(configuration.stage("hfvm").params, values, "hfvm")
+        return configuration.validate(configuration.stages()["hfvm"].params, values, "hfvm")
 
     def prior(self, shape: tuple[int, ...]) -> tuple[NDArray[Any], NDArray[Any]] | None:
         """Prior disparities (rows, cols) of columns and rows, pixels, for a left image of this shape.

@@ -14,7 +14,7 @@ from rille.pipeline.engine.memory import words
 from rille.pipeline.engine.plain import brief, some
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import artifact_path
-from rille.pipeline.flow.config import modules, stage
+from rille.pipeline.flow.config import stages
 from rille.pipeline.runs import lookup
 
 SHORT_DIGITS = 12
@@ -104,7 +104,7 @@ def _inputs(row: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]]) -> It
 def _recipe(made: Mapping[str, Any]) -> Iterable[str]:
     """Parameters, arguments, code and environment of an artifact."""
     past, name = made["provenance"], made["stage"]
-    defaults = stage(name).params().model_dump(mode="json") if name in modules() else {}
+    defaults = stages()[name].params().model_dump(mode="json") if name in stages() else {}
     for name, value in past["params"].items():
         differs = name in defaults and defaults[name] != value
         note = f"   (default: {brief(defaults[name], WIDTH)})" if differs else ""

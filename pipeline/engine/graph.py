@@ -19,12 +19,11 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from types import ModuleType
-from typing import Any
+from typing import Any, Generic
 
 from rille.pipeline.engine.spec import Refs, Spec, each, flat
 from rille.pipeline.engine.store.manifest import Ref
-from rille.stages.core.declare import Params
+from rille.stages.core.declare import F, Params, Stage
 
 Expansion = Callable[..., None]
 
@@ -49,7 +48,7 @@ NOTHING = Took()
 
 
 @dataclass(eq=False, slots=True)
-class Handle:
+class Handle(Generic[F]):
     """A node of the graph and what became of it.
 
     ``status`` is ``pending``, ``running``, ``computed``, ``cached``, ``failed``, ``skipped`` or, when dry, ``planned``.
@@ -62,8 +61,8 @@ class Handle:
     spec: Spec
     inputs: dict[str, Handle | list[Handle]]
     status: str = "pending"
-    ref: Ref | None = None
-    earlier: Ref | None = None
+    ref: Ref[F] | None = None
+    earlier: Ref[F] | None = None
     reason: str = ""
     key: str = ""
     expect: float = 0.0
@@ -113,6 +112,12 @@ Wait = Handle | Maybe | Sequence[Handle]
 """What a flow may yield."""
 
 
+def done(handle: Handle[F]) -> Generator[Wait, Any, Ref[F]]:
+    """In a flow, ``ref = yield from done(handle)``: wait for a handle; its facts are typed."""
+    ref: Ref[F] = yield handle
+    return ref
+
+
 @dataclass
 class Graph:
     """Nodes in order of creation, and expansions that wait for some of them."""
@@ -130,17 +135,17 @@ class Graph:
 
     def node(
         self,
-        stage: ModuleType | str,
+        stage: Stage[Any, F] | str,
         label: str,
         params: Params,
         args: Mapping[str, Any] | None = None,
         hints: Mapping[str, Any] | None = None,
         inputs: Mapping[str, Handle | Sequence[Handle]] | None = None,
         expect: float = 0.0,
-    ) -> Handle:
+    ) -> Handle[F]:
         """Add a task and give its handle.
 
-        ``stage`` is the module that declares it, or its dotted name. ``inputs`` maps each port of the stage to a
+        ``stage`` may be the dotted name of its module. ``inputs`` maps each port of the stage to a
         handle, or to a list of them for a port declared ``name*``; ``expect`` are decoded bytes that it works on and no
         input has, as what it reads from outside, for estimates.
 
@@ -153,11 +158,11 @@ class Graph:
         """
         if label in self._labels:
             raise ValueError(f"the label {label!r} is taken: labels of nodes are unique")
-        module = stage if isinstance(stage, str) else stage.__name__
+        module = stage if isinstance(stage, str) else stage.module
         spec = Spec(module, label, params, dict(args) if args else _NONE, dict(hints) if hints else _NONE)
         given = {p: h if isinstance(h, Handle) else list(h) for p, h in (inputs or {}).items()}
         _check_ports(spec, given)
-        handle = Handle(len(self.nodes), spec, given, expect=expect)
+        handle: Handle[F] = Handle(len(self.nodes), spec, given, expect=expect)
         self._labels.add(label)
         self.nodes.append(handle)
         return handle

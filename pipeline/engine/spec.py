@@ -1,6 +1,6 @@
 """What a task computes, and its key.
 
-A :class:`Spec` names a stage module (its ``STAGE`` is taken), validated parameters, the arguments that
+A :class:`Spec` names a stage by its module, validated parameters, the arguments that
 identify the task, and hints (paths) that cannot change the result. The key is the digest of all of it but the hints
 and the label, of the code and packages behind the stage, and of the *output digests* of the inputs. Parameters that
 many tasks share are put into canonical form, and pickled, only once.
@@ -22,7 +22,7 @@ from rille.pipeline.engine.keys import text
 from rille.pipeline.engine.packages import versions
 from rille.pipeline.engine.runtime.numba_cache import guard
 from rille.pipeline.engine.store.manifest import Ref
-from rille.stages.core.declare import Params, Stage
+from rille.stages.core.declare import Params, Stage, declared
 
 FORMAT = 3
 """Enters every key: raise it when the meaning of keys or artifacts changes."""
@@ -94,15 +94,15 @@ _forms_by_id: dict[int, _Forms] = {}
 
 @cache
 def resolve(module: str) -> Stage:
-    """``STAGE`` of a module; its source is digested just before the import, so that both see the same files."""
+    """The stage of a module; its source is digested just before the import, so that both see the same files."""
     module_digests(module)
     guard()
-    stage = importlib.import_module(module).STAGE
+    stage = declared(importlib.import_module(module))
     if "cv2" in sys.modules:
         # OpenCV takes a thread a core by default, and there is a worker for each core already.
         sys.modules["cv2"].setNumThreads(1)
-    if not isinstance(stage, Stage):
-        raise TypeError(f"{module}.STAGE is a {type(stage).__name__}, not a Stage")
+    if stage is None:
+        raise TypeError(f"{module} declares no stage")
     return stage
 
 

@@ -32,7 +32,7 @@ def add(graph: Graph, module: ModuleType, output: Output, run: RunView) -> Handl
     there: dict[Handle, int] = {}
     forms = {name: _form(value, there, _due) for name, value in taken.items()}
     args = {"file": output.name, "inputs": forms}
-    return graph.node(module, f"output/{output.name}", NoParams(), args, {}, {"read": list(there)})
+    return graph.node(module.__name__, f"output/{output.name}", NoParams(), args, {}, {"read": list(there)})
 
 
 def _due(handle: Handle) -> bool:

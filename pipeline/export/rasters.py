@@ -33,7 +33,7 @@ CRS = {
 GIS = "QGIS, GDAL"
 
 
-NODATA = {array.name: float(array.nodata or 0) for array in merge.STAGE.outputs}
+NODATA = {array.name: float(array.nodata or 0) for array in merge.merge_stage.outputs}
 """Of the arrays of merged terrain."""
 
 

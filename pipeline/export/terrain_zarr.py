@@ -125,7 +125,7 @@ SLOPE = Array("slope", ("row", "col"), "float32", "degree", "inclination of the 
 def _write_output(path: Path, tiles: Sequence[Bundle], sequence: str, place: Georeference | None = None) -> None:
     """All merged arrays, put together of the world tiles, and the slope."""
     arrays = {}
-    for spec in merge.STAGE.outputs:
+    for spec in merge.merge_stage.outputs:
         if spec.dims == ("row", "col") and all(spec.name in tile.arrays for tile in tiles):
             lattice, values = whole(tiles, spec.name)
             arrays[spec.name] = (spec, values)

@@ -14,10 +14,17 @@ from collections.abc import Generator, Sequence
 from typing import Any
 
 from rille.datasets.protocol import Positions
-from rille.pipeline.engine.graph import Handle, Wait
+from rille.pipeline.engine.graph import Handle, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow.builders import Builder, Pair
-from rille.stages.evaluation import accuracy, agreement, dem_accuracy, path_check, position_accuracy, truth
+from rille.stages.evaluation.accuracy import accuracy_stage
+from rille.stages.evaluation.agreement import agreement_stage
+from rille.stages.evaluation.dem_accuracy import dem_accuracy_stage
+from rille.stages.evaluation.path_check import path_check_stage
+from rille.stages.evaluation.position_accuracy import position_accuracy_stage
+from rille.stages.evaluation.truth import truth_stage
+from rille.stages.facts.evaluation import JoinFacts, TruthFacts
+from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice, union
 
@@ -29,36 +36,41 @@ def of_trajectory(make: Builder, frames: Sequence[int]) -> Steps:
     p, s = make.products, make.sequence
     assert p.trajectory is not None
     if p.crosscheck is not None:
-        p.agreement = make.node(agreement, "agreement", {}, trajectory=p.trajectory, crosscheck=p.crosscheck)
+        p.agreement = make.node(agreement_stage, "agreement", trajectory=p.trajectory, crosscheck=p.crosscheck)
     if s.truth_positions is not None:
         given = _positions(make, s.truth_positions, frames)
-        p.position_accuracy = make.node(position_accuracy, "position_accuracy", given, trajectory=p.trajectory)
+        p.position_accuracy = make.node(position_accuracy_stage, "position_accuracy", trajectory=p.trajectory, **given)
     true = [_truth(make, f) for f in frames]
     # No task for no truth: the report then says that there is none, not that it failed.
     if all(pose is None for pose in true):
         return
     poses = [None if pose is None else pose.to_list() for pose in true]
-    known = make.node(truth, "truth", {"poses": poses, "source": s.truth_source, "frames": list(frames)})
+    known = make.node(truth_stage, "truth", poses=poses, source=s.truth_source, frames=list(frames))
     if p.crosscheck is not None:
         make.graph.flow(_of_crosscheck(make, p.crosscheck, known))
-    found = yield p.trajectory
+    found = yield from done(p.trajectory)
     pieces, main = found.meta["pieces"], found.meta["main"]
     for number in range(len(pieces)):
         label = "accuracy" if number == main else f"accuracy/piece/{number + 1}"
-        args: dict[str, Any] = {"piece": number} if len(pieces) > 1 else {}
-        args |= {} if s.truth_mount is None else {"mount": s.truth_mount.to_list()}
-        p.accuracy_pieces[number] = make.node(accuracy, label, args, trajectory=p.trajectory, truth=known)
+        p.accuracy_pieces[number] = make.node(
+            accuracy_stage,
+            label,
+            trajectory=p.trajectory,
+            truth=known,
+            piece=number if len(pieces) > 1 else None,
+            mount=s.truth_mount and s.truth_mount.to_list(),
+        )
     p.accuracy = p.accuracy_pieces.get(main)
 
 
-def _of_crosscheck(make: Builder, joined: Handle, known: Handle) -> Steps:
+def _of_crosscheck(make: Builder, joined: Handle[JoinFacts], known: Handle[TruthFacts]) -> Steps:
     """The other program's trajectory against truth, where it has one there."""
-    found = yield joined
+    found = yield from done(joined)
     posed = [f for f, position in zip(found.meta["frames"], found.meta["positions"], strict=True) if position]
     if any(_truth(make, frame) is not None for frame in posed):
-        args = {"piece": found.meta["longest"]} if len(found.meta["pieces"]) > 1 else {}
+        piece = found.meta["longest"] if len(found.meta["pieces"]) > 1 else None
         make.products.crosscheck_accuracy = make.node(
-            accuracy, "accuracy/crosscheck", args, trajectory=joined, truth=known
+            accuracy_stage, "accuracy/crosscheck", trajectory=joined, truth=known, piece=piece
         )
 
 
@@ -66,13 +78,15 @@ def of_pair(make: Builder, pair: Pair) -> Steps:
     """The local elevation model of a pair."""
     if make.sequence.truth_dem is None or _truth(make, pair.frame) is None:
         return
-    level, dem = yield [pair.level, pair.dem]
+    level, dem = (yield from done(pair.level)), (yield from done(pair.dem))
     exact = _truth_dem(make, Lattice.from_dict(dem.meta["lattice"]), pair.frame, level, (pair.frame,), "local")
-    args: dict[str, Any] = {"pair": pair.frame}
-    if make.sequence.evaluation_window is not None:
-        args["window"] = list(make.sequence.evaluation_window)
+    window = make.sequence.evaluation_window
     make.products.local_dem_accuracy[pair.frame] = make.node(
-        dem_accuracy, f"dem_accuracy/local/{pair.frame}", args, dem=[pair.dem], truth=exact
+        dem_accuracy_stage,
+        f"dem_accuracy/local/{pair.frame}",
+        dem=[pair.dem],
+        truth=exact,
+        window=None if window is None else list(window),
     )
 
 
@@ -82,12 +96,12 @@ def of_world(make: Builder, pairs: Sequence[Pair]) -> Steps:
     if make.sequence.truth_dem is None or _truth(make, first.frame) is None:
         return
     assert p.world_path is not None
-    level = yield first.level
+    level = yield from done(first.level)
     whole = union(Lattice.from_dict(tile.spec.args["lattice"]) for tile in p.world_tiles)
     exact = _truth_dem(make, whole, first.frame, level, tuple(pair.frame for pair in pairs), "world")
-    p.dem_accuracy = make.node(dem_accuracy, "dem_accuracy/world", {}, dem=p.world_tiles, truth=exact)
+    p.dem_accuracy = make.node(dem_accuracy_stage, "dem_accuracy/world", dem=p.world_tiles, truth=exact)
     p.truth_risk = make.hazards("risk/truth", [exact])
-    p.path_check = make.node(path_check, "path_check", {}, path=p.world_path, risk=p.truth_risk)
+    p.path_check = make.node(path_check_stage, "path_check", path=p.world_path, risk=p.truth_risk)
 
 
 def _truth(make: Builder, frame: int) -> RigidTransform | None:
@@ -105,7 +119,9 @@ def _positions(make: Builder, true: Positions, frames: Sequence[int]) -> dict[st
     return args | {"moments": moments, "frames": list(frames), "source": s.truth_source}
 
 
-def _truth_dem(make: Builder, lattice: Lattice, pair: int, level: Ref, seen_by: tuple[int, ...], scope: str) -> Handle:
+def _truth_dem(
+    make: Builder, lattice: Lattice, pair: int, level: Ref[GroundFacts], seen_by: tuple[int, ...], scope: str
+) -> Handle:
     """Exact elevations in the levelled frame of ``pair`` (for the first pair: the world)."""
     T_truth_left, exact = _truth(make, pair), make.sequence.truth_dem
     assert T_truth_left is not None

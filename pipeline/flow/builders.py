@@ -11,7 +11,6 @@ from collections.abc import Sequence as Series
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from types import ModuleType
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
@@ -21,15 +20,27 @@ from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.flow import tiles
 from rille.pipeline.flow.products import Products
-from rille.stages.calibration import calibration, orientation, rig, swap_check, synchrony
-from rille.stages.core.declare import NoParams, Params
+from rille.stages.calibration.calibration import calibration_stage
+from rille.stages.calibration.orientation import orientation_stage
+from rille.stages.calibration.rig import rig_stage
+from rille.stages.calibration.swap_check import swap_check_stage
+from rille.stages.calibration.synchrony import synchrony_stage
+from rille.stages.core.declare import F, NoParams, Params, Stage
+from rille.stages.facts.calibration import CalibrationFacts, OrientationFacts, RigFacts, SwapFacts, SynchronyFacts
+from rille.stages.facts.imaging import PyramidFacts
+from rille.stages.facts.odometry import MotionFacts, ResectFacts, TrackFacts, TrajectoryFacts
+from rille.stages.facts.terrain import DemFacts, GroundFacts, MergeFacts, TileIndexFacts
 from rille.stages.hazard import risk
 from rille.stages.hfvm import stage as hfvm
-from rille.stages.imaging import pyramid, undistort
-from rille.stages.odometry import motion, track
-from rille.stages.odometry.resection import pose, resect
-from rille.stages.terrain import ground_frame, merge
-from rille.stages.terrain.locus import stage as locus
+from rille.stages.imaging.pyramid import pyramid_stage
+from rille.stages.imaging.undistort import undistort_stage
+from rille.stages.odometry.motion import motion_stage
+from rille.stages.odometry.resection.pose import pose_stage
+from rille.stages.odometry.resection.resect import resect_stage
+from rille.stages.odometry.track import track_stage
+from rille.stages.terrain.ground_frame import ground_frame_stage
+from rille.stages.terrain.locus.stage import locus_stage
+from rille.stages.terrain.merge import merge_stage
 from rille.stages.terrain.tile_index import Box, tile_lattice
 
 Args = Mapping[str, Any]
@@ -54,9 +65,9 @@ class Pair:
 
     frame: int
     disparity: Handle
-    rig: Handle
-    level: Handle
-    dem: Handle
+    rig: Handle[CalibrationFacts]
+    level: Handle[GroundFacts]
+    dem: Handle[DemFacts]
 
 
 @dataclass(frozen=True)
@@ -64,8 +75,8 @@ class Segment:
     """Left images from one basic pair on: their frames, tracks, and poses in the frame of that pair."""
 
     frames: tuple[int, ...]
-    track: Handle
-    resection: Handle
+    track: Handle[TrackFacts]
+    resection: Handle[ResectFacts]
 
 
 def once(make: Callable[Concatenate[Builder, P], T]) -> Callable[Concatenate[Builder, P], T]:
@@ -118,11 +129,16 @@ class Builder:
         found: dict[str, Any] = self.config.resect.model_dump(mode="json")
         return found
 
-    def node(self, stage: ModuleType, label: str, args: Mapping[str, Any], **inputs: Handle | list[Handle]) -> Handle:
-        """One task of the stage that a module declares, with the parameters that it has in the configuration."""
+    def node(self, stage: Stage[Any, F], label: str, params: Any = None, /, **given: Any) -> Handle[F]:
+        """One task of a stage, with the parameters that it has in the configuration, or with others.
+
+        ``given`` are its inputs (handles) and arguments; None stands for one that is absent.
+        """
         # A section is named as its stage; a stage without parameters has none.
-        params: Params = getattr(self.config, stage.STAGE.name, NO_PARAMS)
-        return self.graph.node(stage, label, params, args, {}, inputs)
+        chosen: Params = params or getattr(self.config, stage.name, NO_PARAMS)
+        there = {name: value for name, value in given.items() if value is not None}
+        inputs = {name: there.pop(name) for name in stage.ports() if name in there}
+        return self.graph.node(stage, label, chosen, there, {}, inputs)
 
     # -- images -------------------------------------------------------------------------------------------------
 
@@ -163,46 +179,51 @@ class Builder:
         if lens is None:
             return image
         ideal = self.sequence.rig.left if camera == "left" else self.sequence.rig.right
-        args = {"lens": lens.to_dict(), "camera": ideal.to_dict(), "frame": frame, "camera_name": camera}
-        image = self.node(undistort, f"undistort/{camera}/{frame}", args, image=image)
+        image = self.node(
+            undistort_stage,
+            f"undistort/{camera}/{frame}",
+            image=image,
+            lens=lens.to_dict(),
+            camera=ideal.to_dict(),
+            frame=frame,
+            camera_name=camera,
+        )
         if camera == "left":
             self.products.undistorted[frame] = image
         return image
 
     @once
-    def pyramid(self, frame: int, camera: str) -> Handle:
+    def pyramid(self, frame: int, camera: str) -> Handle[PyramidFacts]:
         """Image pyramid."""
-        return self.node(pyramid, f"pyramid/{camera}/{frame}", {}, image=self.image(frame, camera))
+        return self.node(pyramid_stage, f"pyramid/{camera}/{frame}", image=self.image(frame, camera))
 
     # -- what two images show -----------------------------------------------------------------------------------
 
     @once
-    def motion(self, a: int, b: int) -> Handle:
+    def motion(self, a: int, b: int) -> Handle[MotionFacts]:
         """Displacements from one left image to another."""
-        ports = {"a": self.pyramid(a, "left"), "b": self.pyramid(b, "left")}
-        return self.node(motion, f"motion/{a}-{b}", self._turn(a, b), **ports)
+        images = {"a": self.pyramid(a, "left"), "b": self.pyramid(b, "left")}
+        return self.node(motion_stage, f"motion/{a}-{b}", **images, **self._turn(a, b))
 
     def _turn(self, a: int, b: int) -> dict[str, Any]:
         """What is known of the rotation of the left camera from frame to frame."""
-        args: dict[str, Any] = {"frames": [a, b]}
         before, after = (None if self.sequence.attitude is None else self.sequence.attitude[f] for f in (a, b))
         if before is None or after is None:
-            return args
+            return {}
         rotation = np.array(after).T @ np.array(before)
-        return args | {"rotation": rotation.tolist(), "camera": self.sequence.rig.left.to_dict()}
+        return {"rotation": rotation.tolist(), "camera": self.sequence.rig.left.to_dict()}
 
-    def sides(self, frame: int) -> Handle:
+    def sides(self, frame: int) -> Handle[SwapFacts]:
         """Whether the images of a pair are exchanged."""
-        args = {"frame": frame, "rig": self.given_rig}
-        ports = {camera: self.pyramid(frame, camera) for camera in ("left", "right")}
-        return self.node(swap_check, f"swap_check/{frame}", args, **ports)
+        images = {camera: self.pyramid(frame, camera) for camera in ("left", "right")}
+        return self.node(swap_check_stage, f"swap_check/{frame}", **images, frame=frame, rig=self.given_rig)
 
-    def synchrony(self, label: str, pairs: Series[int], frames: Series[int]) -> Handle:
+    def synchrony(self, label: str, pairs: Series[int], frames: Series[int]) -> Handle[SynchronyFacts]:
         """Which right images, of those of some frames about each pair, are of the time of the left ones."""
         at = [frames.index(pair) for pair in pairs]
         near = [f for k, f in enumerate(frames) if any(abs(k - place) <= AROUND for place in at)]
         images = {"left": [self.pyramid(f, "left") for f in pairs], "right": [self.pyramid(f, "right") for f in near]}
-        return self.node(synchrony, label, {"pairs": list(pairs), "frames": near, "rig": self.given_rig}, **images)
+        return self.node(synchrony_stage, label, **images, pairs=list(pairs), frames=near, rig=self.given_rig)
 
     @once
     def disparity(self, pair: int) -> Handle:
@@ -216,83 +237,78 @@ class Builder:
 
     def _matched(self, label: str, pair: int, camera: str, other: str) -> Handle:
         """One task, or for a large pair tasks per level and tile that give the same artifact."""
-        ports = {"left": self.pyramid(pair, camera), "right": self.pyramid(pair, other)}
+        ports: dict[str, Handle] = {"left": self.pyramid(pair, camera), "right": self.pyramid(pair, other)}
         cameras = {"left": self.sequence.rig.left, "right": self.sequence.rig.right}
         first, second = ((cameras[name].height, cameras[name].width) for name in (camera, other))
         side = tiles.side(self.config.tiling, self.config.hfvm, self.config.pyramid, (first, second))
         if side is None:
             # A smaller right image may be aligned to the left one, and is then as large.
             more = PYRAMID_BYTES * max(math.prod(first) - math.prod(second), 0)
-            return self.graph.node(hfvm, label, self.config.hfvm, {"pair": pair}, {}, ports, more)
+            return self.graph.node(hfvm.STAGE, label, self.config.hfvm, {"pair": pair}, {}, ports, more)
         given = self.config.hfvm, self.config.pyramid, ports, (first, second), side
         return tiles.Tiles(self.graph, *given, label).build()
 
     # -- a stereo pair ------------------------------------------------------------------------------------------
 
     @once
-    def orientation(self, pair: int) -> Handle:
+    def orientation(self, pair: int) -> Handle[OrientationFacts]:
         """Relative orientation that the disparity of a pair asks for."""
-        args = {"pair": pair, "rig": self.given_rig}
-        return self.node(orientation, f"orientation/{pair}", args, disparity=self.disparity(pair))
+        known = {"disparity": self.disparity(pair), "rig": self.given_rig}
+        return self.node(orientation_stage, f"orientation/{pair}", **known, pair=pair)
 
-    def rig(self, pairs: Series[int], which: str = "") -> tuple[Handle, Handle]:
+    def rig(self, pairs: Series[int], which: str = "") -> tuple[Handle[RigFacts], Handle[CalibrationFacts]]:
         """The rig that the orientations of these pairs agree on, and what of it other stages read."""
         orientations = [self.orientation(pair) for pair in pairs]
-        found = self.node(rig, f"rig{which}", {"rig": self.given_rig}, orientations=orientations)
-        return found, self.node(calibration, f"calibration{which}", {}, rig=found)
+        found = self.node(rig_stage, f"rig{which}", orientations=orientations, rig=self.given_rig)
+        return found, self.node(calibration_stage, f"calibration{which}", rig=found)
 
-    def pair(self, frame: int, vertical: Mapping[str, Any], known: Handle, first: Pair | None) -> Pair:
+    def pair(
+        self, frame: int, vertical: Mapping[str, Any], known: Handle[CalibrationFacts], first: Pair | None
+    ) -> Pair:
         """Vertical and local elevation model of a pair; ``known`` is its rig.
 
         Cells and extent of the ``first`` pair (None: this one) serve all, so that they merge.
         """
         disparity = self.disparity(frame)
-        level = self.node(
-            ground_frame, f"ground_frame/{frame}", {"pair": frame, **vertical}, disparity=disparity, rig=known
-        )
+        level = self.node(ground_frame_stage, f"ground_frame/{frame}", disparity=disparity, rig=known, **vertical)
         reference = level if first is None else first.level
-        args = {"pair": frame, "frame": "local"}
-        dem = self._elevations(f"locus/local/{frame}", args, disparity, known, level, reference)
+        seen = self._seen(frame)
+        dem = self.node(
+            locus_stage,
+            f"locus/local/{frame}",
+            **seen,
+            rig=known,
+            level=level,
+            reference=reference,
+            pair=frame,
+            frame="local",
+        )
         return Pair(frame, disparity, known, level, dem)
 
-    def world_model(self, pair: Pair, first: Pair, row: int, trajectory: Handle) -> tuple[Handle, Handle]:
+    def world_model(
+        self, pair: Pair, first: Pair, row: int, trajectory: Handle[TrajectoryFacts]
+    ) -> tuple[Handle, Handle[DemFacts]]:
         """Pose and elevations of a pair straight on the world lattice: the pose in this row of the trajectory.
 
         The frame of pair ``first`` is the world.
         """
-        at = self.node(pose, f"pose/{pair.frame}", {"row": row}, trajectory=trajectory)
+        at = self.node(pose_stage, f"pose/{pair.frame}", trajectory=trajectory, row=row)
         # Row 0 of the artifact of `pose`, which holds one: so an elevation model depends on its own pose alone, and
         # stays in the cache when only other poses move.
-        args = {"pair": pair.frame, "frame": "world", "row": 0}
-        known = pair.disparity, pair.rig, pair.level, first.level
-        return at, self._elevations(f"locus/world/{pair.frame}", args, *known, trajectory=at, local=pair.dem)
-
-    def _elevations(
-        self,
-        label: str,
-        args: Mapping[str, Any],
-        disparity: Handle,
-        known: Handle,
-        level: Handle,
-        reference: Handle,
-        **where: Handle,
-    ) -> Handle:
-        """Locus: what the images of the pair ``args["pair"]`` show, from both disparities where that is wanted."""
-        frame = args["pair"]
-        back = {"back": self.backward(frame)} if self.config.locus.both else {}
-        images = {camera: self.pyramid(frame, camera) for camera in ("left", "right")}
-        return self.node(
-            locus,
-            label,
-            args,
-            disparity=disparity,
-            rig=known,
-            **images,
-            **back,
-            level=level,
-            reference=reference,
-            **where,
+        known = {"rig": pair.rig, "level": pair.level, "reference": first.level, "trajectory": at, "local": pair.dem}
+        label = f"locus/world/{pair.frame}"
+        return at, self.node(
+            locus_stage, label, **self._seen(pair.frame), **known, pair=pair.frame, frame="world", row=0
         )
+
+    def _seen(self, frame: int) -> dict[str, Handle | None]:
+        """Images and disparity of a pair, and the disparity of its right image where that is wanted."""
+        return {
+            "disparity": self.disparity(frame),
+            "left": self.pyramid(frame, "left"),
+            "right": self.pyramid(frame, "right"),
+            "back": self.backward(frame) if self.config.locus.both else None,
+        }
 
     # -- between pairs ------------------------------------------------------------------------------------------
 
@@ -303,36 +319,43 @@ class Builder:
 
         ``more``: arguments of the resection; ``after``: the basic pair that the last image is of.
         """
-        args, which = {"frames": list(frames)}, which or f"{key.frame}"
+        which = which or f"{key.frame}"
         images = [self.pyramid(frame, "left") for frame in frames]
         motions = [self.motion(a, b) for a, b in pairwise(frames)]
-        tracked = self.node(track, f"track/{which}", args, frames=images, motions=motions)
-        # landmarks come from the disparity, or (resect.landmarks = "dem") where rays meet the local elevation model
-        surface = {"dem": key.dem} if self.config.resect.landmarks == "dem" else {}
-        known = {"disparity": key.disparity, "level": key.level, "rig": key.rig, **surface}
-        known |= {"after": after.disparity, "rig_after": after.rig} if after else {}
-        posed = self.node(resect, f"resect/{which}", {**args, **(more or {})}, track=tracked, **known)
+        tracked = self.node(track_stage, f"track/{which}", pyramids=images, motions=motions, frames=list(frames))
+        posed = self.node(
+            resect_stage,
+            f"resect/{which}",
+            track=tracked,
+            level=key.level,
+            rig=key.rig,
+            disparity=key.disparity,
+            # Landmarks come from the disparity, or from where rays meet the local elevation model.
+            dem=key.dem if self.config.resect.landmarks == "dem" else None,
+            after=after and after.disparity,
+            rig_after=after and after.rig,
+            **(more or {}),
+        )
         return Segment(tuple(frames), tracked, posed)
 
     # -- the world ----------------------------------------------------------------------------------------------
 
-    def hazards(self, label: str, dems: list[Handle]) -> Handle:
+    def hazards(self, label: str, dems: Series[Handle]) -> Handle:
         """Add the task that judges hazards on the tiles of an elevation model."""
-        args = {"vehicle": self.given_vehicle}
-        return self.node(risk, label, args, dem=dems)
+        return self.node(risk.STAGE, label, dem=list(dems), vehicle=self.given_vehicle)
 
 
 def merge_tiles(
-    node: Callable[..., Handle],
-    footprints: Series[Mapping[str, Any]],
-    dems: Mapping[int, Handle],
+    node: Callable[..., Handle[Any]],
+    footprints: Series[TileIndexFacts],
+    dems: Mapping[int, Handle[DemFacts]],
     steps: Mapping[str, int],
-) -> list[Handle]:
+) -> list[Handle[MergeFacts]]:
     """Add one task for each world tile that a model touches; it reads these models and nothing else.
 
     Parameters
     ----------
-    node : ``node(stage, label, args, **inputs)`` adds a task, as :meth:`Builder.node` does.
+    node : adds a task, as :meth:`Builder.node` does.
     footprints : facts of stage ``tile_index``, one a model.
     dems : world models by pair.
     steps : exposure of the pairs whose grey values are levelled, as stage ``radiometry`` gives them.
@@ -341,16 +364,16 @@ def merge_tiles(
     for meta in footprints:
         for tx, ty, *box in meta["tiles"]:
             touching.setdefault((ty, tx), []).append((meta["pair"], (box[0], box[1], box[2], box[3])))
-    tiles = []
+    merged: list[Handle[MergeFacts]] = []
     for (ty, tx), here in sorted(touching.items()):
         # In order of the pairs: merging must not depend on the order in which results arrived.
         here.sort()
-        args: dict[str, Any] = {"lattice": tile_lattice([box for _, box in here], footprints[0]["cell"]).to_dict()}
+        lattice = tile_lattice([box for _, box in here], footprints[0]["cell"]).to_dict()
         # Of this tile's pairs alone: a level that changes elsewhere leaves the tile in the cache.
         exposure = {str(pair): steps[str(pair)] for pair, _ in here if str(pair) in steps}
-        args |= {"exposure": exposure} if exposure else {}
-        tiles.append(node(merge, f"merge/{tx}_{ty}", args, dems=[dems[pair] for pair, _ in here]))
-    return tiles
+        there = [dems[pair] for pair, _ in here]
+        merged.append(node(merge_stage, f"merge/{tx}_{ty}", dems=there, lattice=lattice, exposure=exposure or None))
+    return merged
 
 
 def centre(box: Mapping[str, Any]) -> list[float]:

@@ -41,7 +41,7 @@ from pydantic import Field
 
 from rille.datasets.protocol import Sequence, Simulation
 from rille.datasets.text.count import count
-from rille.pipeline.engine.graph import Graph, Handle, MissingError, Wait
+from rille.pipeline.engine.graph import Graph, Handle, MissingError, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow.builders import Builder, Pair, Segment, name
 from rille.pipeline.flow.products import Driven, Products, Stop
@@ -49,14 +49,22 @@ from rille.pipeline.flow.reconstruction import reconstruction
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import ConfigError, DegenerateError
 from rille.stages.driving import fault_monitor, obstacle_monitor
-from rille.stages.evaluation import accuracy, dem_accuracy, drive_check, truth
+from rille.stages.evaluation.accuracy import accuracy_stage
+from rille.stages.evaluation.dem_accuracy import dem_accuracy_stage
+from rille.stages.evaluation.drive_check import drive_check_stage
+from rille.stages.evaluation.truth import truth_stage
+from rille.stages.facts.odometry import TrajectoryFacts
+from rille.stages.facts.terrain import MapFixFacts, MergeFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.odometry import motion
-from rille.stages.odometry.resection import trajectory
+from rille.stages.odometry.motion import motion_stage
+from rille.stages.odometry.resection.trajectory import trajectory_stage
 from rille.stages.planning.local_planner import stage as local_planner
 from rille.stages.planning.local_planner.look import PlannerMemory
-from rille.stages.terrain import map_localization, merge, occlusion_bounds, start_area
+from rille.stages.terrain.map_localization import map_localization_stage
+from rille.stages.terrain.merge import merge_stage
+from rille.stages.terrain.occlusion_bounds import occlusion_bounds_stage
+from rille.stages.terrain.start_area import start_area_stage
 
 Sigma = Annotated[float, Field(ge=0)]
 
@@ -218,7 +226,7 @@ class Drive:
         while True:
             stop = self._look(at)
             if stop.index == 0 and self.config.drive.frame == "map":
-                self._on_the_map((yield self._fix()))
+                self._on_the_map((yield from done(self._fix())))
             self._map(stop)
             yield from self._think(stop)
             way = yield from self._drive(stop, at)
@@ -243,24 +251,23 @@ class Drive:
         self.pairs.append(pair)
         return stop
 
-    def _fix(self) -> Handle:
+    def _fix(self) -> Handle[MapFixFacts]:
         """Where the first pair is in the global map: handed in, or found by its elevation model."""
-        d, inputs = self.config.drive, dict[str, Handle]()
-        args: dict[str, Any] = {}
+        d, given = self.config.drive, dict[str, Any]()
         if d.pose is not None:
-            args["pose"] = [*d.pose[:3], math.radians(d.pose[3])]
+            given["pose"] = [*d.pose[:3], math.radians(d.pose[3])]
         else:
             # Checked before the drive began.
             assert d.prior is not None
             assert self.simulation.overview is not None
             overview = self.make.source(self.simulation.overview, "overview", {"scene": self.scene})
-            inputs = {"dem": self.pairs[0].dem, "map": overview}
-            args["prior"] = [*d.prior[:2], math.radians(d.prior[2])]
-            args["prior_sigma"] = [d.prior_sigma[0], math.radians(d.prior_sigma[1])]
-        self.driven.fix = self.make.node(map_localization, "map_localization", args, **inputs)
+            given["dem"], given["global_map"] = self.pairs[0].dem, overview
+            given["prior"] = [*d.prior[:2], math.radians(d.prior[2])]
+            given["prior_sigma"] = [d.prior_sigma[0], math.radians(d.prior_sigma[1])]
+        self.driven.fix = self.make.node(map_localization_stage, "map_localization", **given)
         return self.driven.fix
 
-    def _on_the_map(self, fixed: Ref) -> None:
+    def _on_the_map(self, fixed: Ref[MapFixFacts]) -> None:
         """The goal in the world frame, which is the local frame of the first pair."""
         T_world_map = RigidTransform.from_matrix(fixed.meta["T_global_local"]).inverse()
         x, y, _ = T_world_map.apply([*self.config.drive.goal, fixed.meta["T_global_local"][11]])
@@ -273,9 +280,16 @@ class Drive:
         pose, p.world_dem[stop.frame] = make.world_model(self.pairs[k], self.pairs[0], len(self.posed) - 1, found)
         self.poses.append(pose)
         if k == 0 and self.simulation.pad > 0:  # the ground under the vehicle, which no camera sees
-            args = {"radius": self.simulation.pad, "wheel_diameter": self.config.vehicle.wheel_diameter}
-            like = p.world_dem[stop.frame]
-            self.pads = [make.node(start_area, "start_area", args | self.mounting, pose=pose, like=like)]
+            pad = make.node(
+                start_area_stage,
+                "start_area",
+                pose=pose,
+                like=p.world_dem[stop.frame],
+                radius=self.simulation.pad,
+                wheel_diameter=self.config.vehicle.wheel_diameter,
+                **self.mounting,
+            )
+            self.pads = [pad]
         # Two maps: of all that was seen, to plan far ahead, and of what was seen finely enough to drive on.
         stop.merged = self._merged(f"merge/{k}", None)
         p.world_tiles = [stop.merged]
@@ -288,31 +302,30 @@ class Drive:
             stop.risk = make.hazards(f"risk/{k}/near", [near])
         stop.ceiling = self._ceiling(f"occlusion_bounds/{k}", near, finest)
 
-    def _located(self, legs: int) -> Handle:
+    def _located(self, legs: int) -> Handle[TrajectoryFacts]:
         """The trajectory over so many legs, which is that of the drive from now on."""
         p = self.products
         levels = [pair.level for pair in self.pairs]
         found = p.trajectory = self.make.node(
-            trajectory,
+            trajectory_stage,
             f"trajectory/{legs}",
-            {"frames": list(self.posed)},
+            frames=list(self.posed),
             segments=list(p.resections),
             levels=levels[:legs] or levels[:1],
         )
         return found
 
-    def _merged(self, label: str, finest: float | None) -> Handle:
+    def _merged(self, label: str, finest: float | None) -> Handle[MergeFacts]:
         """All that was seen so far, or what of it a pixel covers ``finest`` metres of at most."""
         params = self.config.merge.model_copy(update={} if finest is None else {"max_footprint": finest})
-        args = {"lattice": self.arena().to_dict()}
         dems = [*self.pads, *self.products.world_dem.values()]
-        return self.graph.node(merge, label, params, args, {}, {"dems": dems})
+        return self.make.node(merge_stage, label, params, dems=dems, lattice=self.arena().to_dict())
 
     def _ceiling(self, label: str, merged: Handle, finest: float | None) -> Handle:
         """How high the ground may be, also where it was not seen."""
         params = self.config.occlusion_bounds.model_copy(update={} if finest is None else {"max_footprint": finest})
-        inputs: dict[str, Any] = {"merged": merged, "dems": list(self.products.world_dem.values())}
-        return self.graph.node(occlusion_bounds, label, params, {}, {}, inputs)
+        dems = list(self.products.world_dem.values())
+        return self.make.node(occlusion_bounds_stage, label, params, merged=merged, dems=dems)
 
     def arena(self) -> Lattice:
         """The part of the world that is mapped."""
@@ -342,7 +355,7 @@ class Drive:
     def _leg(self, label: str, memory: PlannerMemory, more: dict[str, Any], **inputs: Handle) -> Handle:
         args: dict[str, Any] = {"goal": list(self.goal), "looks": memory.looks, **self.mounting}
         args |= {"closed": [list(p) for p in memory.closed], "stands": [list(p) for p in memory.stands]}
-        return self.make.node(local_planner, label, args | more, rig=self.pairs[0].rig, **inputs)
+        return self.make.node(local_planner.STAGE, label, rig=self.pairs[0].rig, **args, **more, **inputs)
 
     # -- a leg --------------------------------------------------------------------------------------------------
 
@@ -350,7 +363,7 @@ class Drive:
         """The true motion, what the sensors say of it, and the images on the way that are not lost."""
         k, s, make = stop.index, self.simulation, self.make
         assert stop.leg is not None
-        given = {"scene": self.scene, "before": at.before, "pose": self.poses[-1], "leg": stop.leg}
+        given = {"scene": self.scene, "before": at.before, "pose": self.poses[-1], "plan": stop.leg}
         change = s.change(k, at.row)
         if change is not None:
             given["scene"] = self.scene = make.source(change, f"obstacle/{k}", given)
@@ -394,10 +407,16 @@ class Drive:
         frames, rows, key = way.frames, way.rows, self.pairs[-1]
         segment = self.make.segment(frames, key)
         self.products.tracks.append(segment.track)
-        args = {"rows": [rows[f] for f in frames], "vehicle": self.make.given_vehicle}
         assert stop.sense is not None
-        given = {"sense": stop.sense, "resect": segment.resection}
-        stop.safety = self.make.node(fault_monitor, f"fault_monitor/{stop.index}", args | self.mounting, **given)
+        stop.safety = self.make.node(
+            fault_monitor.STAGE,
+            f"fault_monitor/{stop.index}",
+            sense=stop.sense,
+            resect=segment.resection,
+            rows=[rows[f] for f in frames],
+            vehicle=self.make.given_vehicle,
+            **self.mounting,
+        )
         judges = [stop.safety]
         if self.config.obstacle_monitor.enabled:
             stop.obstacle = self._obstacles(stop, way, segment, key)
@@ -439,11 +458,19 @@ class Drive:
         params = self.config.motion.model_copy(update={"level": p.level})
         motions = []
         for a, b in ((frames[i], frames[j]) for i, j in compared):
-            inputs = {"a": self.make.pyramid(a, "left"), "b": self.make.pyramid(b, "left")}
-            motions.append(self.graph.node(motion, f"motion/way/{a}-{b}", params, {"frames": [a, b]}, {}, inputs))
-        args = {"pairs": [list(c) for c in compared], "vehicle": self.make.given_vehicle, **self.mounting}
-        known = {"dem": key.dem, "resect": segment.resection, "rig": key.rig}
-        return self.make.node(obstacle_monitor, f"obstacle_monitor/{stop.index}", args, **known, motions=motions)
+            images = {"a": self.make.pyramid(a, "left"), "b": self.make.pyramid(b, "left")}
+            motions.append(self.make.node(motion_stage, f"motion/way/{a}-{b}", params, **images))
+        return self.make.node(
+            obstacle_monitor.STAGE,
+            f"obstacle_monitor/{stop.index}",
+            dem=key.dem,
+            resect=segment.resection,
+            rig=key.rig,
+            motions=motions,
+            pairs=[list(c) for c in compared],
+            vehicle=self.make.given_vehicle,
+            **self.mounting,
+        )
 
     # -- the end ------------------------------------------------------------------------------------------------
 
@@ -455,16 +482,15 @@ class Drive:
             self._check({})
             return
         poses = [list(self.true[f]) for f in self.posed]
-        args = {"poses": poses, "source": self.sequence.truth_source, "frames": list(self.posed)}
-        true = make.node(truth, "truth", args)
-        p.accuracy = make.node(accuracy, "accuracy", {}, trajectory=p.trajectory, truth=true)
-        level = yield self.pairs[0].level
+        true = make.node(truth_stage, "truth", poses=poses, source=self.sequence.truth_source, frames=list(self.posed))
+        p.accuracy = make.node(accuracy_stage, "accuracy", trajectory=p.trajectory, truth=true)
+        level = yield from done(self.pairs[0].level)
         T_left_local = RigidTransform.from_matrix(level.meta["T_local_left"]).inverse()
         T_truth_world = RigidTransform.from_matrix(self.true[0]) @ T_left_local
         stops = [RigidTransform.from_matrix(self.true[stop.frame]) for stop in self.driven.stops]
         source = self.simulation.truth_dem(self.arena().to_dict(), T_truth_world, stops)
         exact = make.source(source, "truth_dem", {"scene": self.scene})
-        p.dem_accuracy = make.node(dem_accuracy, "dem_accuracy/world", {}, dem=p.world_tiles, truth=exact)
+        p.dem_accuracy = make.node(dem_accuracy_stage, "dem_accuracy/world", dem=p.world_tiles, truth=exact)
         p.truth_risk = make.hazards("risk/truth", [exact])
         best = self._leg("leg/truth", PlannerMemory(), {"whole": True}, risk=p.truth_risk, pose=self.poses[0])
         self._check({"trajectory": p.trajectory, "truth": true, "best": best})
@@ -479,9 +505,14 @@ class Drive:
         d = self.driven
         legs = [(s.row, s.drive) for s in d.stops if s.drive is not None and not _failed(s.drive)]
         assert d.place is not None
-        args = {"rows": [0, *(row for row, _ in legs)], "vehicle": self.make.given_vehicle}
-        drives = [d.place, *(drive for _, drive in legs)]
-        d.check = self.make.node(drive_check, "drive_check", args, drives=drives, **known)
+        d.check = self.make.node(
+            drive_check_stage,
+            "drive_check",
+            drives=[d.place, *(drive for _, drive in legs)],
+            rows=[0, *(row for row, _ in legs)],
+            vehicle=self.make.given_vehicle,
+            **known,
+        )
 
     def outcome(self) -> tuple[str, str]:
         """Verdict and reason, once the graph has run: of the last stop, or of what failed on the way."""

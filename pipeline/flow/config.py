@@ -20,7 +20,7 @@ from pydantic import Field, create_model
 
 from rille.datasets.text import reading
 from rille.datasets.text.validation import Model, validated
-from rille.stages.core.declare import Params, Stage
+from rille.stages.core.declare import Params, Stage, declared
 from rille.stages.core.errors import ConfigError
 
 ACCURATE_TERRAIN: dict[str, Any] = {
@@ -73,21 +73,16 @@ DATASET_SECTIONS = ("mockup", "misalign", "rover")
 
 
 @cache
-def modules(*flows: str) -> dict[str, ModuleType]:
-    """The stage modules that the flows import (all flows by default), by the stage's name.
+def stages(*flows: str) -> dict[str, Stage]:
+    """The stages that the flows import (all flows by default), by name.
 
     Each stage with parameters has a section.
     """
     every = "builders", "reconstruction", "closed_loop", "assessment"
     found = [vars(importlib.import_module(f"rille.pipeline.flow.{flow}")).values() for flow in flows or every]
-    used = [module for names in found for module in names if isinstance(module, ModuleType)]
-    return {module.STAGE.name: module for module in used if hasattr(module, "STAGE")}
-
-
-def stage(name: str) -> Stage:
-    """Declaration of a stage by its name."""
-    found: Stage = modules()[name].STAGE
-    return found
+    used = [value for values in found for value in values]
+    listed = [v if isinstance(v, Stage) else declared(v) for v in used if isinstance(v, Stage | ModuleType)]
+    return {stage.name: stage for stage in listed if stage is not None}
 
 
 def stage_names() -> set[str]:
@@ -99,7 +94,7 @@ def stage_names() -> set[str]:
         for package in (stages, datasets)
         for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
     ]
-    return {module.STAGE.name for module in modules if hasattr(module, "STAGE")}
+    return {stage.name for stage in map(declared, modules) if stage is not None}
 
 
 @cache
@@ -110,7 +105,7 @@ def model() -> type[Params]:
     from rille.stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
 
     fields: dict[str, Any] = {
-        name: (stage(name).params, stage(name).params()) for name in modules() if stage(name).params.model_fields
+        name: (stage.params, stage.params()) for name, stage in stages().items() if stage.params.model_fields
     }
     fields["terrain"] = (TerrainParams, TerrainParams())
     fields["tiling"] = (Tiling, Tiling())

@@ -5,6 +5,26 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from rille.pipeline.engine.graph import Handle
+from rille.stages.facts.calibration import OrientationFacts, RigFacts
+from rille.stages.facts.evaluation import (
+    AccuracyFacts,
+    AgreementFacts,
+    DemAccuracyFacts,
+    DriveCheckFacts,
+    JoinFacts,
+    MetricsFacts,
+    WindowFacts,
+)
+from rille.stages.facts.odometry import (
+    KeyframesFacts,
+    RefineFacts,
+    ResectFacts,
+    ScreeningFacts,
+    TiltFacts,
+    TrackFacts,
+    TrajectoryFacts,
+)
+from rille.stages.facts.terrain import AuditFacts, DemFacts, GroundFacts, MapFixFacts, MergeFacts, OverlapFacts
 
 
 @dataclass
@@ -13,11 +33,11 @@ class Stop:
 
     index: int
     frame: int
-    merged: Handle | None = None
+    merged: Handle[MergeFacts] | None = None
     risk: Handle | None = None
     far: Handle | None = None
     ceiling: Handle | None = None
-    trajectory: Handle | None = None
+    trajectory: Handle[TrajectoryFacts] | None = None
     leg: Handle | None = None
     drive: Handle | None = None
     sense: Handle | None = None
@@ -38,8 +58,8 @@ class Driven:
     verdict: str = ""
     reason: str = ""
     place: Handle | None = None
-    fix: Handle | None = None
-    check: Handle | None = None
+    fix: Handle[MapFixFacts] | None = None
+    check: Handle[DriveCheckFacts] | None = None
 
 
 @dataclass
@@ -48,36 +68,36 @@ class Products:
 
     images: dict[int, Handle] = field(default_factory=dict)
     undistorted: dict[int, Handle] = field(default_factory=dict)
-    screening: Handle | None = None
-    keyframes: Handle | None = None
-    orientations: dict[int, Handle] = field(default_factory=dict)
-    rigs: dict[int, Handle] = field(default_factory=dict)
+    screening: Handle[ScreeningFacts] | None = None
+    keyframes: Handle[KeyframesFacts] | None = None
+    orientations: dict[int, Handle[OrientationFacts]] = field(default_factory=dict)
+    rigs: dict[int, Handle[RigFacts]] = field(default_factory=dict)
     contradictions: list[Handle] = field(default_factory=list)
-    crosschecks: list[Handle] = field(default_factory=list)
-    crosscheck: Handle | None = None
-    agreement: Handle | None = None
-    crosscheck_accuracy: Handle | None = None
+    crosschecks: list[Handle[WindowFacts]] = field(default_factory=list)
+    crosscheck: Handle[JoinFacts] | None = None
+    agreement: Handle[AgreementFacts] | None = None
+    crosscheck_accuracy: Handle[AccuracyFacts] | None = None
     disparity: dict[int, Handle] = field(default_factory=dict)
-    level: dict[int, Handle] = field(default_factory=dict)
-    local_dem: dict[int, Handle] = field(default_factory=dict)
+    level: dict[int, Handle[GroundFacts]] = field(default_factory=dict)
+    local_dem: dict[int, Handle[DemFacts]] = field(default_factory=dict)
     local_risk: dict[int, Handle] = field(default_factory=dict)
     local_path: dict[int, Handle] = field(default_factory=dict)
-    tracks: list[Handle] = field(default_factory=list)
-    resections: list[Handle] = field(default_factory=list)
-    refined: list[Handle] = field(default_factory=list)
-    common_tilt: Handle | None = None
-    world_dem: dict[int, Handle] = field(default_factory=dict)
-    seams: dict[int, Handle] = field(default_factory=dict)
-    overlap_audit: Handle | None = None
-    world_tiles: list[Handle] = field(default_factory=list)
-    trajectory: Handle | None = None
+    tracks: list[Handle[TrackFacts]] = field(default_factory=list)
+    resections: list[Handle[ResectFacts]] = field(default_factory=list)
+    refined: list[Handle[RefineFacts]] = field(default_factory=list)
+    common_tilt: Handle[TiltFacts] | None = None
+    world_dem: dict[int, Handle[DemFacts]] = field(default_factory=dict)
+    seams: dict[int, Handle[OverlapFacts]] = field(default_factory=dict)
+    overlap_audit: Handle[AuditFacts] | None = None
+    world_tiles: list[Handle[MergeFacts]] = field(default_factory=list)
+    trajectory: Handle[TrajectoryFacts] | None = None
     world_risk: Handle | None = None
     world_path: Handle | None = None
-    accuracy: Handle | None = None
-    position_accuracy: Handle | None = None
-    accuracy_pieces: dict[int, Handle] = field(default_factory=dict)
-    local_dem_accuracy: dict[int, Handle] = field(default_factory=dict)
-    dem_accuracy: Handle | None = None
+    accuracy: Handle[AccuracyFacts] | None = None
+    position_accuracy: Handle[AccuracyFacts] | None = None
+    accuracy_pieces: dict[int, Handle[AccuracyFacts]] = field(default_factory=dict)
+    local_dem_accuracy: dict[int, Handle[DemAccuracyFacts]] = field(default_factory=dict)
+    dem_accuracy: Handle[DemAccuracyFacts] | None = None
     truth_risk: Handle | None = None
-    path_check: Handle | None = None
+    path_check: Handle[MetricsFacts] | None = None
     drive: Driven | None = None

@@ -48,17 +48,37 @@ from typing import Any
 
 import numpy as np
 
-from rille.pipeline.engine.graph import Handle, Maybe, Wait
+from rille.pipeline.engine.graph import Handle, Maybe, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow import assessment
 from rille.pipeline.flow.builders import Builder, Pair, Segment, centre, merge_tiles
 from rille.stages.core.errors import DegenerateError, InputError
-from rille.stages.evaluation import crosscheck, crosscheck_join
-from rille.stages.imaging import image_quality
-from rille.stages.odometry import frame_screening, keyframes, step_table
-from rille.stages.odometry.resection import common_tilt, refine, resect, trajectory
+from rille.stages.evaluation.crosscheck import crosscheck_stage, windows
+from rille.stages.evaluation.crosscheck_join import crosscheck_join_stage
+from rille.stages.facts.calibration import CalibrationFacts, RigFacts
+from rille.stages.facts.evaluation import JoinFacts
+from rille.stages.facts.odometry import (
+    KeyframesFacts,
+    RefineFacts,
+    ScreeningFacts,
+    StepTableFacts,
+    TiltFacts,
+    TrajectoryFacts,
+)
+from rille.stages.facts.terrain import OverlapFacts, TileIndexFacts
+from rille.stages.imaging.image_quality import image_quality_stage
+from rille.stages.odometry.frame_screening import frame_screening_stage
+from rille.stages.odometry.keyframes import keyframes_stage
+from rille.stages.odometry.resection.common_tilt import common_tilt_stage
+from rille.stages.odometry.resection.refine import refine_stage
+from rille.stages.odometry.resection.resect import LEAST_JUMP
+from rille.stages.odometry.resection.trajectory import trajectory_stage
+from rille.stages.odometry.step_table import step_table_stage
 from rille.stages.planning import path
-from rille.stages.terrain import overlap_audit, overlap_qa, radiometry, tile_index
+from rille.stages.terrain.overlap_audit import overlap_audit_stage
+from rille.stages.terrain.overlap_qa import overlap_qa_stage
+from rille.stages.terrain.radiometry import radiometry_stage
+from rille.stages.terrain.tile_index import tile_index_stage
 
 TILE_CELLS = 512
 """Side of a world tile, cells: 512 x 512 float32 is 1 MiB an array, small enough to recompute alone."""
@@ -127,16 +147,19 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         segments.append(make.segment(way, pairs[way[0]], dead_reckoning(make, way), after=pairs.get(way[-1])))
     segments, moved = yield from unmoved(make, pairs, segments)
     p.tracks, p.resections = [s.track for s in segments], [s.resection for s in segments]
+    p.refined = yield from refined(make, pairs, segments)
     p.trajectory = make.node(
-        trajectory,
+        trajectory_stage,
         "trajectory",
-        {"frames": list(frames), "steps": steps_of(make, chosen)} | ({"lost": lost} if lost else {}),
         segments=p.resections,
         levels=[pairs[s.frames[0]].level for s in segments] or [pairs[basic[0]].level],
-        **(yield from refined(make, pairs, segments)),
+        refined=p.refined or None,
+        frames=list(frames),
+        steps=steps_of(make, chosen),
+        lost=lost or None,
     )
     flow(assessment.of_trajectory(make, frames))
-    posed = yield p.trajectory
+    posed = yield from done(p.trajectory)
 
     # The world is that of the largest unbroken piece: its models, straight on the world lattice.
     start, end = posed.meta["pieces"][posed.meta["main"]]
@@ -144,8 +167,8 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     there = [k for k in basic if start <= k <= end and posed.meta["positions"][row[k]] and k not in moved]
     for k in there:
         _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory)
-    args = {"side": TILE_CELLS, "margin": make.config.merge.margin}
-    prints = [make.node(tile_index, f"tile_index/{k}", args, dem=dem) for k, dem in p.world_dem.items()]
+    size = {"side": TILE_CELLS, "margin": make.config.merge.margin}
+    prints = [make.node(tile_index_stage, f"tile_index/{k}", dem=dem, **size) for k, dem in p.world_dem.items()]
     # A pair whose model failed is left out of the world: the others make a map with a hole.
     laid = yield Maybe(prints)
     footprints = [ref.meta for ref in laid if ref is not None and ref.meta["tiles"]]
@@ -156,38 +179,47 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
 
     # Seams are audited, exposures levelled, models merged in world tiles; then hazards and the path over all of it.
     p.seams = overlaps(make, footprints)
-    centres = {"centres": {str(f["pair"]): centre(f["box"]) for f in footprints}}
-    p.overlap_audit = make.node(overlap_audit, "overlap_audit", centres, seams=list(p.seams.values()))
-    levelled = yield make.node(radiometry, "radiometry", centres, seams=list(p.seams.values()))
+    known = {
+        "seams": list(p.seams.values()),
+        "centres": {str(f["pair"]): centre(f["box"]) for f in footprints if f["box"] is not None},
+    }
+    p.overlap_audit = make.node(overlap_audit_stage, "overlap_audit", **known)
+    levelled = yield from done(make.node(radiometry_stage, "radiometry", **known))
     p.world_tiles = merge_tiles(make.node, footprints, p.world_dem, levelled.meta["steps"])
     p.world_risk = make.hazards("risk/world", p.world_tiles)
-    p.world_path = make.node(path, "path/world", {"use": "world", "heading": heading(posed.meta)}, risk=p.world_risk)
+    p.world_path = make.node(path.STAGE, "path/world", risk=p.world_risk, use="world", heading=heading(posed.meta))
     yield from assessment.of_world(make, [pairs[k] for k in there])
 
 
-def steps(make: Builder, frames: list[int]) -> list[Handle]:
+def steps(make: Builder, frames: list[int]) -> list[Handle[StepTableFacts]]:
     """Motions along some frames in tables, cut by frame numbers: where a frame is left out, the other tables stay."""
-    made: dict[tuple[int, ...], list[Handle]] = make.made.setdefault("steps", {})
+    made: dict[tuple[int, ...], list[Handle[StepTableFacts]]] = make.made.setdefault("steps", {})
     if tuple(frames) not in made:
         taken = "step_table/bridged" if made else "step_table"
         parts = [list(part) for _, part in groupby(pairwise(frames), lambda step: step[0] // TABLE_FRAMES)]
         # A step is judged by the one before it, also across the border of two tables.
-        last = [{}, *({"before": make.motion(*part[-1])} for part in parts)]
+        last = [None, *(make.motion(*part[-1]) for part in parts)]
         made[tuple(frames)] = [
-            make.node(step_table, f"{taken}/{part[0][0]}", {}, motions=[make.motion(*step) for step in part], **before)
+            make.node(
+                step_table_stage,
+                f"{taken}/{part[0][0]}",
+                motions=[make.motion(*step) for step in part],
+                before=before,
+            )
             for part, before in zip(parts, last, strict=False)
         ]
     return made[tuple(frames)]
 
 
-def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref]:
+def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref[ScreeningFacts]]:
     """Ask which frames are lost; while more is to be known for the answer, find that and ask again."""
     qualities = [
         make.node(
-            image_quality,
+            image_quality_stage,
             f"image_quality/{frame}",
-            {"frame": frame},
-            **{camera: make.image(frame, camera) for camera in ("left", "right")},
+            left=make.image(frame, "left"),
+            right=make.image(frame, "right"),
+            frame=frame,
         )
         for frame in whole
     ]
@@ -197,15 +229,16 @@ def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref]:
     turn = 0
     while True:
         asked = make.node(
-            frame_screening,
+            frame_screening_stage,
             f"frame_screening/{turn}" if turn else "frame_screening",
-            {"frames": whole} | ({"bridges": list(bridges)} if bridges else {}),
+            frames=whole,
+            bridged=list(bridges) or None,
             qualities=qualities,
             steps=along,
             bridges=list(bridges.values()),
             sides=list(sides.values()),
         )
-        found: Ref = yield asked
+        found = yield from done(asked)
         asks = found.meta["asks"]
         if not any(asks.values()):
             make.products.screening = asked
@@ -217,7 +250,7 @@ def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref]:
 
 def simultaneous(
     make: Builder, chain: list[int], behind: list[int], unfit: list[int]
-) -> Generator[Wait, Any, tuple[Ref | None, dict[int, Handle]]]:
+) -> Generator[Wait, Any, tuple[Ref[KeyframesFacts] | None, dict[int, Handle[CalibrationFacts]]]]:
     """Choose basic pairs whose images are of one time, and find their rigs: one for all pairs, or one each.
 
     No choice where the images of most pairs contradict the rig, or each other: nothing is measured with these then.
@@ -231,21 +264,29 @@ def simultaneous(
     while True:
         # Each contradiction leads to another choice.
         which = f"/{len(p.contradictions)}" if p.contradictions else ""
-        marked = {"unfit": sorted(chain.index(f) for f in unfit), "behind": behind}
-        args = {"frames": len(chain)} | {name: at for name, at in marked.items() if at}
-        p.keyframes = make.node(keyframes, f"keyframes{which}", args, steps=steps(make, chain))
-        chosen: Ref = yield p.keyframes
+        p.keyframes = make.node(
+            keyframes_stage,
+            f"keyframes{which}",
+            steps=steps(make, chain),
+            frames=len(chain),
+            unfit=sorted(chain.index(f) for f in unfit) or None,
+            behind=behind or None,
+        )
+        chosen = yield from done(p.keyframes)
         basic = [chain[i] for i in chosen.meta["basic"]]
         pooled = mode != "per_pair" and make.rig(spread(basic, RIG_PAIRS), which)
         rigs = {k: pooled or make.rig([k], f"/{k}{which}") for k in basic}
-        p.rigs, known = ({k: one[side] for k, one in rigs.items()} for side in (0, 1))
-        judged: list[Ref] = yield list(dict.fromkeys(p.rigs.values()))
+        p.rigs, known = {k: one[0] for k, one in rigs.items()}, {k: one[1] for k, one in rigs.items()}
+        judged: list[Ref[RigFacts]] = yield list(dict.fromkeys(p.rigs.values()))
         suspects = [pair for one in judged for pair in one.meta.get("suspects", ())]
         if suspects:
-            p.contradictions.append(make.synchrony(f"synchrony{which}", spread(suspects, SUSPECTS), chain))
-            timed: Ref = yield p.contradictions[-1]
+            asked = make.synchrony(f"synchrony{which}", spread(suspects, SUSPECTS), chain)
+            p.contradictions.append(asked)
+            timed = yield from done(asked)
             wrong = [pair for pair, _ in timed.meta["partners"]]
-            if 2 * len(suspects) > len(basic) and any("contradiction" in one.meta for one in (timed, *judged)):
+            if 2 * len(suspects) > len(basic) and (
+                "contradiction" in timed.meta or any("contradiction" in one.meta for one in judged)
+            ):
                 return None, {}
             if wrong:
                 unfit += wrong
@@ -257,7 +298,7 @@ def simultaneous(
         mode = "per_pair"
 
 
-def basic_pairs(make: Builder, rigs: dict[int, Handle], first: int) -> dict[int, Pair]:
+def basic_pairs(make: Builder, rigs: dict[int, Handle[CalibrationFacts]], first: int) -> dict[int, Pair]:
     """Stereo pairs to local elevation models, risk maps and paths, each with its rig."""
     p, pairs = make.products, dict[int, Pair]()
     for k, known in rigs.items():
@@ -265,7 +306,7 @@ def basic_pairs(make: Builder, rigs: dict[int, Handle], first: int) -> dict[int,
         pair = pairs[k] = make.pair(k, vertical(make, k, k == first), known, pairs.get(next(iter(rigs))))
         p.level[k], p.local_dem[k] = pair.level, pair.dem
         p.local_risk[k] = make.hazards(f"risk/local/{k}", [pair.dem])
-        p.local_path[k] = make.node(path, f"path/local/{k}", {"use": "local"}, risk=p.local_risk[k])
+        p.local_path[k] = make.node(path.STAGE, f"path/local/{k}", risk=p.local_risk[k], use="local")
         make.graph.flow(assessment.of_pair(make, pair))
     return pairs
 
@@ -299,14 +340,14 @@ def unmoved(
         if one is not None and "jump" in one.meta:
             by, cause = by + one.meta["jump"], one.meta["knocked"]
             p.contradictions.append(s.resection)
-        if end in pairs and np.linalg.norm(by) > resect.LEAST_JUMP:
+        if end in pairs and np.linalg.norm(by) > LEAST_JUMP:
             moved.add(end)
             for models in (p.local_dem, p.local_risk, p.local_path):
                 models.pop(end)
     return out, moved
 
 
-def steps_of(make: Builder, chosen: Ref) -> list[list[float | None]]:
+def steps_of(make: Builder, chosen: Ref[KeyframesFacts]) -> list[list[float | None]]:
     """Return, for each step to the next frame, the displacement as an angle (radians; None: not known) and the share of
     matching pixels."""
     lengths, focal = chosen.meta["displacement"], make.sequence.rig.left.fx
@@ -326,64 +367,69 @@ def dead_reckoning(make: Builder, segment: list[int]) -> dict[str, Any]:
 
 def refined(
     make: Builder, pairs: Mapping[int, Pair], segments: list[Segment]
-) -> Generator[Wait, Any, dict[str, list[Handle]]]:
+) -> Generator[Wait, Any, list[Handle[RefineFacts]]]:
     """Segments adjusted with their landmarks in windows, where that is wanted; again if disparities are tilted."""
     p, config = make.products, make.config
     if not (config.refine.enabled and segments and config.resect.landmarks == "disparity"):
-        return {}
+        return []
     params, count = config.refine, config.refine.window or len(segments)
     windows = [segments[max(0, k - count) : k] for k in (range(1, len(segments) + 1) if params.window else [count])]
     lenses = {side: lens.to_dict() for side, lens in (make.sequence.lenses or {}).items()}
 
-    def adjusted(label: str, window: list[Segment], **tilt: Handle) -> Handle:
+    def adjusted(label: str, window: list[Segment], tilt: Handle[TiltFacts] | None = None) -> Handle[RefineFacts]:
         keys = [pairs[s.frames[0]] for s in window]
         return make.node(
-            refine,
+            refine_stage,
             f"{label}/{keys[-1].frame}",
-            {"pairs": [pair.frame for pair in keys], "resect": make.given_resect}
-            | ({"lenses": lenses} if lenses and not tilt else {}),
+            pairs=[pair.frame for pair in keys],
+            resect=make.given_resect,
+            lenses=lenses if lenses and tilt is None else None,
             tracks=[s.track for s in window],
             resections=[s.resection for s in window],
             levels=[pair.level for pair in keys],
             disparities=[pair.disparity for pair in keys],
             rigs=[pair.rig for pair in keys],
-            **tilt,
+            tilt=tilt,
         )
 
     found = [adjusted("refine", window) for window in windows]
     if params.tilt_sigma_deg > 0:
-        args = {"sigma_deg": params.tilt_sigma_deg, "significance": params.tilt_significance}
         tilt = p.common_tilt = make.node(
-            common_tilt, "common_tilt", args, segments=found, rig=pairs[segments[0].frames[0]].rig
+            common_tilt_stage,
+            "common_tilt",
+            segments=found,
+            rig=pairs[segments[0].frames[0]].rig,
+            sigma_deg=params.tilt_sigma_deg,
+            significance=params.tilt_significance,
         )
-        shared: Ref = yield tilt
+        shared = yield from done(tilt)
         if "contradiction" in shared.meta:
             p.contradictions.append(tilt)
         if shared.meta["undone"]:
-            found = [adjusted("refine/untilted", window, tilt=tilt) for window in windows]
-    p.refined = found
-    return {"refined": found}
+            found = [adjusted("refine/untilted", window, tilt) for window in windows]
+    return found
 
 
-def another_program(make: Builder, whole: list[int]) -> Handle:
+def another_program(make: Builder, whole: list[int]) -> Handle[JoinFacts]:
     """Structure from motion by another program, in windows; it knows nothing of our trajectory, nor we of its."""
     parts = [
         make.node(
-            crosscheck,
+            crosscheck_stage,
             f"crosscheck/{window[0]}-{window[-1]}",
-            {"frames": window, "rig": make.given_rig},
+            frames=window,
+            rig=make.given_rig,
             left=[make.image(f, "left") for f in window],
             right=[make.image(f, "right") for f in window],
         )
-        for window in crosscheck.windows(whole, make.config.crosscheck)
+        for window in windows(whole, make.config.crosscheck)
     ]
     make.products.crosschecks = parts
-    return make.node(crosscheck_join, "crosscheck_join", {"frames": whole}, windows=parts)
+    return make.node(crosscheck_join_stage, "crosscheck_join", windows=parts, frames=whole)
 
 
-def overlaps(make: Builder, footprints: list[Facts]) -> dict[int, Handle]:
+def overlaps(make: Builder, footprints: list[TileIndexFacts]) -> dict[int, Handle[OverlapFacts]]:
     """Each model against the earlier ones with which it shares a tile, of many those with most ground in common."""
-    models, seams = make.products.world_dem, dict[int, Handle]()
+    models, seams = make.products.world_dem, dict[int, Handle[OverlapFacts]]()
     present: dict[tuple[int, int], list[tuple[int, list[int]]]] = {}
     for meta in footprints:
         pair, shared = meta["pair"], Counter[int]()
@@ -395,7 +441,7 @@ def overlaps(make: Builder, footprints: list[Facts]) -> dict[int, Handle]:
         if shared:
             nearest = sorted(shared, key=lambda other: (-shared[other], -other))[:SEAMS]
             others = [models[other] for other in sorted(nearest)]
-            seams[pair] = make.node(overlap_qa, f"overlap_qa/{pair}", {}, dem=models[pair], others=others)
+            seams[pair] = make.node(overlap_qa_stage, f"overlap_qa/{pair}", dem=models[pair], others=others)
     return seams
 
 
@@ -411,10 +457,10 @@ def spread(pairs: list[int], most: int) -> list[int]:
     return pairs[:: -(-len(pairs) // most)]
 
 
-def heading(trajectory: Mapping[str, Any]) -> list[float]:
+def heading(trajectory: TrajectoryFacts) -> list[float]:
     """Mean driving direction (dx, dy) in the world: from the first to the last position; ahead where it rests."""
-    first, last = trajectory["pieces"][trajectory["main"]]
-    at = [trajectory["positions"][trajectory["frames"].index(frame)] for frame in (first, last)]
-    (x0, y0, _), (x1, y1, _) = at
+    ends = trajectory["pieces"][trajectory["main"]]
+    at = [trajectory["positions"][trajectory["frames"].index(frame)] for frame in ends]
+    (x0, y0, _), (x1, y1, _) = (position for position in at if position is not None)
     dx, dy = x1 - x0, y1 - y0
     return [dx, dy] if dx * dx + dy * dy > 0 else [0.0, 1.0]

@@ -117,7 +117,7 @@ class Tiles:
         final = self._tiles("final", "final", {}, fine=fine, checked=checked, refined=refined, patches=patches, **facts)
         args = {"side": self.side}
         given: dict[str, Handle | list[Handle]] = {**self.images, "coarse": self.coarse, "tiles": final}
-        return self.graph.node(join_stage, self.label, self.params, args, {}, given)
+        return self.graph.node(join_stage.STAGE, self.label, self.params, args, {}, given)
 
     def _tiles(self, step: str, label: str, args: dict[str, Any], **inputs: Handle | list[Handle]) -> list[Handle]:
         count = self._count(args.get("level", 0), args.get("way", "left"))
@@ -131,4 +131,6 @@ class Tiles:
 
     def _node(self, step: str, label: str, args: dict[str, object], **inputs: Handle | list[Handle]) -> Handle:
         args = {"step": step, "side": self.side, **args}
-        return self.graph.node(tile_stage, f"{self.label}/{label}", self.params, args, {}, {**self.images, **inputs})
+        return self.graph.node(
+            tile_stage.STAGE, f"{self.label}/{label}", self.params, args, {}, {**self.images, **inputs}
+        )

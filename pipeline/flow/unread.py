@@ -19,7 +19,7 @@ from typing import Any
 
 from rille.datasets.protocol import Sequence
 from rille.pipeline.engine.graph import Graph
-from rille.pipeline.flow.config import modules
+from rille.pipeline.flow.config import stages
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import ConfigError
 
@@ -27,15 +27,15 @@ from rille.stages.core.errors import ConfigError
 @cache
 def recorded() -> frozenset[str]:
     """Stages, and so sections, that only a reconstruction has."""
-    of_both = {*modules("builders"), *modules("closed_loop")} - {"undistort"}
-    return frozenset({*modules("builders", "reconstruction", "assessment")} - of_both)
+    of_both = {*stages("builders"), *stages("closed_loop")} - {"undistort"}
+    return frozenset({*stages("builders", "reconstruction", "assessment")} - of_both)
 
 
 @cache
 def driven() -> frozenset[str]:
     """Stages, and so sections, that only a drive has."""
-    of_both = modules("builders", "reconstruction", "assessment")
-    return frozenset({"drive", *modules("closed_loop")} - {*of_both})
+    of_both = stages("builders", "reconstruction", "assessment")
+    return frozenset({"drive", *stages("closed_loop")} - {*of_both})
 
 
 CHECKED = frozenset(("undistort", "pyramid", "motion", "hfvm", "tiling", "orientation"))

@@ -239,8 +239,8 @@ def frame_facts(view: RunView) -> dict[int, dict[str, Any]]:
     for handle in view.products.resections:
         for item in facts_of(view, handle).get("per_frame", ()):
             facts.setdefault(int(item["frame"]), dict(item))
-    for handle in view.products.refined:
-        for item in facts_of(view, handle).get("per_frame", ()):
+    for adjusted in view.products.refined:
+        for item in facts_of(view, adjusted).get("per_frame", ()):
             facts.setdefault(int(item["frame"]), {}).update(item)
     return facts
 

@@ -7,24 +7,13 @@ bit, everything behind it stays cached.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Bundle, NoParams, stage
+from rille.stages.facts.calibration import CalibrationFacts, RigFacts
 from rille.stages.geometry.geometry import Rig
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    rig = Rig.from_dict(inputs["rig"].meta["rig"])
-    return Bundle({}, {"rig": rig.to_dict(), "baseline": rig.baseline})
-
-
-STAGE = Stage(
-    name="calibration",
-    version=1,
-    summary="the rig that is computed with",
-    params=NoParams,
-    inputs=("rig",),
-    outputs=(),
-    run=_run,
-)
+@stage("calibration")
+def calibration_stage(params: NoParams, rig: Bundle[RigFacts]) -> Bundle[CalibrationFacts]:
+    """The rig that is computed with."""
+    used = Rig.from_dict(rig.meta["rig"])
+    return Bundle({}, {"rig": used.to_dict(), "baseline": used.baseline})

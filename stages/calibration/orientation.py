@@ -9,8 +9,7 @@ stage ``rig``, which decides for the sequence.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numba import njit
@@ -20,9 +19,10 @@ from pydantic import Field
 from rille.stages.calibration.parameter_selection import Decision, RelativeParams, decide
 from rille.stages.calibration.relative_orientation import LEAST_MATCHES, RIG, PointPairs, rms
 from rille.stages.core.arrays import Bools, Floats
-from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Stage
+from rille.stages.core.declare import AnyArray, Array, Bundle, stage
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import matched_back
+from rille.stages.facts.calibration import OrientationFacts
 from rille.stages.geometry.epipolar import corrected, distances, standing
 from rille.stages.geometry.geometry import Rig
 
@@ -138,8 +138,21 @@ def _arrays(before: Floats, after: Floats, weight: Floats) -> dict[str, AnyArray
     return {name: values.astype(np.float32) for name, values in named.items()}
 
 
-def _run(params: OrientationParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    rig, disparity = Rig.from_dict(args["rig"]), inputs["disparity"]
+_MATCH = ("match",)
+
+
+@stage(
+    "orientation",
+    outputs=[
+        Array("left", ("match", "axis"), "float32", "px", "column and row in the left image", "", "left image"),
+        Array("right", ("match", "axis"), "float32", "px", "column and row in the right image", "", "right image"),
+        Array("residual_before", _MATCH, "float32", "px", "signed distance from the epipolar line, given rig"),
+        Array("residual_after", _MATCH, "float32", "px", "the same, rig adjusted to this pair"),
+        Array("weight", _MATCH, "float32", "1", "robust weight in the adjustment, 0 = outlier"),
+    ],
+)
+def orientation_stage(params: OrientationParams, disparity: Bundle, *, rig: Rig, pair: int) -> Bundle[OrientationFacts]:
+    """Relative orientation of the right camera from one pair's disparity."""
     if not rig.baseline > 0:
         raise InputError(
             "RIL-402", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
@@ -157,25 +170,6 @@ def _run(params: OrientationParams, args: Mapping[str, Any], inputs: Inputs) -> 
     )
     # what the stage rig will read, to the last bit
     points = {"left": left.astype(np.float32), "right": right.astype(np.float32)}
-    pair = int(args["pair"])
     matches = PointPairs(pair, points["left"].astype(np.float64), points["right"].astype(np.float64))
     arrays, facts = orient(rig, matches, params)
-    return Bundle(points | arrays, {"pair": pair} | facts)
-
-
-_MATCH = ("match",)
-STAGE = Stage(
-    name="orientation",
-    version=1,
-    summary="relative orientation of the right camera from one pair's disparity",
-    params=OrientationParams,
-    inputs=("disparity",),
-    outputs=(
-        Array("left", ("match", "axis"), "float32", "px", "column and row in the left image", "", "left image"),
-        Array("right", ("match", "axis"), "float32", "px", "column and row in the right image", "", "right image"),
-        Array("residual_before", _MATCH, "float32", "px", "signed distance from the epipolar line, given rig"),
-        Array("residual_after", _MATCH, "float32", "px", "the same, rig adjusted to this pair"),
-        Array("weight", _MATCH, "float32", "1", "robust weight in the adjustment, 0 = outlier"),
-    ),
-    run=_run,
-)
+    return Bundle(points | arrays, cast(OrientationFacts, {"pair": pair} | facts))

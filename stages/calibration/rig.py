@@ -9,8 +9,8 @@ contradict, or would change by too little to matter stays as given, to the last 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Sequence
+from typing import Any, Literal, cast
 
 import numpy as np
 from pydantic import Field
@@ -35,8 +35,9 @@ from rille.stages.calibration.relative_orientation import (
     solution,
 )
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import Bundle, Inputs, Stage
+from rille.stages.core.declare import Bundle, stage
 from rille.stages.core.errors import InputError
+from rille.stages.facts.calibration import OrientationFacts, RigFacts
 from rille.stages.geometry.epipolar import NAMES, corrected, distances
 from rille.stages.geometry.geometry import Rig
 from rille.stages.numeric.robust import mad_sigma
@@ -70,21 +71,8 @@ class RigParams(RelativeParams):
     )
 
 
-def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams) -> dict[str, Any]:
-    """Facts of the rig to be used.
-
-    Returns
-    -------
-    dict
-        ``rig`` (:meth:`Rig.to_dict`) to be used, ``given``; ``mode``; ``baseline`` (m); ``source`` in words;
-        ``changed``; ``parameters`` (name, value, asked, sigma, unit, observed, freed, why), ``held`` (name and reason
-        in words); ``per_pair`` (pair, values and sigma by name, degrees, of what is observed);
-        ``residual_before_px``, ``residual_after_px`` (RMS of inliers) and ``median_before_px``, ``median_after_px``,
-        of the same points; ``pairs``, ``matches``; ``warnings`` (lines); only where there are any: ``suspects``,
-        pairs whose rows the rig does not explain, and lines: ``contradiction`` on a correction that no mount makes,
-        ``knocked`` on a rig that one calibration does not describe.
-        In mode ``fixed`` ``parameters`` say what would be changed. Without a pair that can be used, there are only the
-        first six and ``warnings``.
+def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams) -> RigFacts:
+    """Facts of the rig to be used; without a pair that can be used, only the first six and ``warnings``.
 
     Raises
     ------
@@ -95,7 +83,7 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams) -> di
         raise InputError(
             "RIL-427", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
         )
-    facts: dict[str, Any] = {
+    facts: RigFacts = {
         "rig": given.to_dict(),
         "given": given.to_dict(),
         "mode": params.mode,
@@ -106,7 +94,7 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams) -> di
     }
     usable = [m for m in pairs if len(m.left) >= LEAST_MATCHES]
     if usable:
-        facts |= _judged(given, _share(usable), params)
+        facts |= cast(RigFacts, _judged(given, _share(usable), params))
         if len(usable) < len(pairs):
             few = len(pairs) - len(usable)
             facts["warnings"].insert(0, f"{few} of {len(pairs)} pairs have too few matches for the rig")
@@ -293,24 +281,17 @@ def _shown(start: Sequence[Linear], columns: list[int], usual: Floats, departure
     return moved
 
 
-def _run(params: RigParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+@stage("rig", version=3)
+def rig_stage(
+    params: RigParams, orientations: Sequence[Bundle[OrientationFacts]] = (), *, rig: Rig
+) -> Bundle[RigFacts]:
+    """The rig: the given calibration, repaired where the images contradict it."""
     pairs = [
         PointPairs(
-            int(found.meta["pair"]),
+            found.meta["pair"],
             np.asarray(found["left"], dtype=np.float64),
             np.asarray(found["right"], dtype=np.float64),
         )
-        for found in inputs.get("orientations", [])
+        for found in orientations
     ]
-    return Bundle({}, orient_rig(Rig.from_dict(args["rig"]), pairs, params))
-
-
-STAGE = Stage(
-    name="rig",
-    version=3,
-    summary="the rig: the given calibration, repaired where the images contradict it",
-    params=RigParams,
-    inputs=("orientations*?",),
-    outputs=(),
-    run=_run,
-)
+    return Bundle({}, orient_rig(rig, pairs, params))

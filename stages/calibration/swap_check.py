@@ -11,14 +11,13 @@ exchanged images.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.core.validity import matched
+from rille.stages.facts.calibration import SwapFacts
 from rille.stages.geometry.epipolar import exchanged, fits
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.scale import of_rig
@@ -48,30 +47,20 @@ def _matches(left: Pyramid, right: Pyramid, finer: int) -> tuple[Floats, Floats,
     return one, other, scale * 2.0 ** down[1]
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    rig = Rig.from_dict(args["rig"])
-    images = Pyramid.from_bundle(inputs["left"]), Pyramid.from_bundle(inputs["right"])
+@stage("swap_check")
+def swap_check_stage(params: NoParams, left: Bundle, right: Bundle, *, frame: int, rig: Rig) -> Bundle[SwapFacts]:
+    """Whether left and right of a pair are exchanged."""
+    images = Pyramid.from_bundle(left), Pyramid.from_bundle(right)
     finer = round(math.log2(of_rig(rig)[0]))
     given = _matches(*images, finer)
     other = _matches(*images, -finer) if finer else given
     most = max(len(given[0]), len(other[0]))
-    facts: dict[str, Any] = {"frame": int(args["frame"]), "matches": most, "swapped": False}
+    facts: SwapFacts = {"frame": frame, "matches": most, "swapped": False}
     if most >= LEAST:
         # The tolerance is one coarse pixel: coarse matches are no more exact. Too few matches fit nothing.
-        left, right, scale = given
-        as_given = fits(rig, left, right, scale) if len(left) >= LEAST else 0.0
-        left, right, scale = other
-        other_way = fits(rig, right, left, scale) if len(left) >= LEAST else 0.0
+        a, b, scale = given
+        as_given = fits(rig, a, b, scale) if len(a) >= LEAST else 0.0
+        a, b, scale = other
+        other_way = fits(rig, b, a, scale) if len(a) >= LEAST else 0.0
         facts |= {"as_given": as_given, "exchanged": other_way, "swapped": exchanged(as_given, other_way)}
     return Bundle({}, facts)
-
-
-STAGE = Stage(
-    name="swap_check",
-    version=1,
-    summary="whether left and right of a pair are exchanged",
-    params=NoParams,
-    inputs=("left", "right"),
-    outputs=(),
-    run=_run,
-)

@@ -6,13 +6,13 @@ simultaneous image do not. At rest all fit equally, and no finding results.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from rille.stages.core.arrays import Floats, Floats32
-from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Bundle, NoParams, stage
+from rille.stages.facts.calibration import SynchronyFacts
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.pyramid import Pyramid
@@ -48,7 +48,7 @@ def row_offsets(rig: Rig, left: tuple[Floats32, Floats32], right: tuple[Floats32
     return np.asarray(apart - np.median(apart)) if len(apart) >= MIN_MATCHES else None
 
 
-def best_partners(offsets: Mapping[int, Mapping[int, Floats | None]]) -> dict[str, Any]:
+def best_partners(offsets: Mapping[int, Mapping[int, Floats | None]]) -> SynchronyFacts:
     """Facts of the pairs, by whose frame, and of the right image's, ``offsets`` are those of :func:`row_offsets`.
 
     ``rows``: spread [px] of each pair as named; ``partners``: pair and frame of its right image, where that is another;
@@ -64,35 +64,31 @@ def best_partners(offsets: Mapping[int, Mapping[int, Floats | None]]) -> dict[st
         rows.append(mad_sigma(known[pair]))
         if rows[-1] > MIN_SPREAD_PX and mad_sigma(known[other]) < MAX_SPREAD_SHARE * rows[-1]:
             partners[pair] = other
-    facts: dict[str, Any] = {"rows": rows, "partners": [list(item) for item in partners.items()]}
+    facts: SynchronyFacts = {"rows": rows, "partners": [list(item) for item in partners.items()]}
     if partners:
         shifts = {other - pair for pair, other in partners.items()}
         which = ", ".join(f"left {pair} with right {other}" for pair, other in partners.items())
         if len(partners) > 2 and len(shifts) == 1:
             which = f"left i with right i{shifts.pop():+d}"
         line = f"left and right are not of one time: by its rows, {which} is simultaneous"
-        facts |= {"contradiction": line, "warnings": [line]}
+        facts["contradiction"], facts["warnings"] = line, [line]
     return facts
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    rig, frames = Rig.from_dict(args["rig"]), [int(f) for f in args["frames"]]
-    ours, theirs = (
-        [features(Pyramid.from_bundle(one), 0, MAX_FEATURES) for one in inputs[side]] for side in ("left", "right")
-    )
+@stage("synchrony")
+def synchrony_stage(
+    params: NoParams,
+    left: Sequence[Bundle],
+    right: Sequence[Bundle],
+    *,
+    rig: Rig,
+    frames: Sequence[int],
+    pairs: Sequence[int],
+) -> Bundle[SynchronyFacts]:
+    """Which right image is of the time of a left one, where the rows contradict their names."""
+    ours, theirs = ([features(Pyramid.from_bundle(one), 0, MAX_FEATURES) for one in side] for side in (left, right))
     offsets = {
-        int(pair): {f: row_offsets(rig, left, right) for f, right in zip(frames, theirs, strict=True)}
-        for pair, left in zip(args["pairs"], ours, strict=True)
+        pair: {f: row_offsets(rig, left, right) for f, right in zip(frames, theirs, strict=True)}
+        for pair, left in zip(pairs, ours, strict=True)
     }
     return Bundle({}, best_partners(offsets))
-
-
-STAGE = Stage(
-    name="synchrony",
-    version=1,
-    summary="which right image is of the time of a left one, where the rows contradict their names",
-    params=NoParams,
-    inputs=("left*", "right*"),
-    outputs=(),
-    run=_run,
-)

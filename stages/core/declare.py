@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Concatenate, Generic, ParamSpec, TypedDict, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
+from typing_extensions import TypeVar
 
 AnyArray = NDArray[Any]
+
+
+class Facts(TypedDict, total=False):
+    """Base of the facts that a stage declares: names and types of what its results' ``meta`` holds.
+
+    A module of facts does without ``from __future__ import annotations``, by which ``NotRequired`` would not count.
+    """
+
+    warnings: list[str]
+
+
+F = TypeVar("F", bound=Mapping[str, Any], default=Mapping[str, Any], covariant=True)
+P = ParamSpec("P")
+M = TypeVar("M", bound="Params")
 
 
 class Params(BaseModel):
@@ -53,15 +69,17 @@ def raster(name: str, unit: str, long_name: str, dtype: str = "float32", nodata:
 
 
 @dataclass(frozen=True)
-class Bundle:
+class Bundle(Generic[F]):
     """Input or result of a stage: named arrays, and facts about them that can be written as JSON.
+
+    ``Bundle[MergeFacts]`` has the facts that a stage declares by that type.
 
     A fact that is undefined (of a frame without a landmark, a model without a cell) is None: JSON has neither NaN nor
     infinities, so these become None here, whoever made them, and readers of facts meet None alone.
     """
 
     arrays: Mapping[str, AnyArray]
-    meta: Mapping[str, Any]
+    meta: F
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "meta", _defined(self.meta))
@@ -118,22 +136,113 @@ class Memory:
 
 
 @dataclass(frozen=True)
-class Stage:
-    """Declaration of one stage; every stage module holds one as ``STAGE``.
+class Stage(Generic[M, F]):
+    """Declaration of one stage, made by :func:`stage` of a function; a module holds one.
 
-    ``run(params, args, inputs)`` gets the tunable parameters, what identifies this task (JSON-able: frame numbers,
-    a rig ...), and the upstream bundles by port. A port ``name*`` takes a list, ``name?`` may be absent.
-    ``memory`` never enters a key by itself: it serves the plan and the admission of tasks.
+    Called, it is that function. ``run(params, args, inputs)`` calls it with the tunable parameters, with what
+    identifies the task (JSON-able: frame numbers, a rig ...) by keyword, and with the upstream bundles by port.
+    ``inputs`` are the ports: ``name*`` takes a list, ``name?`` may be absent. ``facts`` are the names that ``meta`` of
+    a result must have, and those it may have. ``memory`` never enters a key: it serves the plan and the number of
+    workers.
     """
 
     name: str
     version: int
     summary: str
-    params: type[Params]
+    params: type[M]
     inputs: tuple[str, ...]
     outputs: tuple[Array, ...]
-    run: Callable[[Any, Mapping[str, Any], Inputs], Bundle]
+    run: Callable[[Any, Mapping[str, Any], Inputs], Bundle[F]]
     memory: Memory = Memory()
+    facts: tuple[frozenset[str], frozenset[str]] | None = None
+    function: Callable[..., Bundle[F]] | None = None
+
+    @property
+    def module(self) -> str:
+        """Dotted name of the module that declares it."""
+        return (self.function or self.run).__module__
+
+    def ports(self) -> tuple[str, ...]:
+        """Names of the ports."""
+        return tuple(port.rstrip("*?") for port in self.inputs)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Bundle[F]:
+        """Call the function that was declared."""
+        assert self.function is not None
+        return self.function(*args, **kwargs)
+
+
+def stage(
+    name: str, *, version: int = 1, outputs: Sequence[Array] = (), memory: Memory = Memory()
+) -> Callable[[Callable[Concatenate[M, P], Bundle[F]]], Stage[M, F]]:
+    """Declare a function as a stage: its signature says the parameters, the ports, the arguments and the facts.
+
+    >>> class DoubleFacts(Facts):
+    ...     pair: int
+    >>> @stage("double", outputs=[raster("elevation", "m", "twice the elevation")])
+    ... def double(params: NoParams, dem: Bundle, masks: Sequence[Bundle] = (), *, pair: int) -> Bundle[DoubleFacts]:
+    ...     "An elevation model, doubled."
+    ...     return Bundle({"elevation": 2 * dem["elevation"]}, {"pair": pair})
+    >>> double.inputs, double.summary
+    (('dem', 'masks*?'), 'an elevation model, doubled')
+
+    First come the parameters (a :class:`Params`), then the ports (a bundle, or a list of bundles; one with a default
+    may be absent), then by keyword the arguments that identify a task, which travel as JSON: one that is annotated
+    with a class that has ``from_dict``, ``from_matrix`` or is a model of pydantic arrives as such an object. The
+    docstring's first line is the summary.
+    ``version`` is raised when results change although the code of the module does not.
+    """
+
+    def declare(function: Callable[Concatenate[M, P], Bundle[F]]) -> Stage[M, F]:
+        types = get_type_hints(function)
+        first, *rest = inspect.signature(function).parameters.values()
+        ports = [p for p in rest if p.kind is p.POSITIONAL_OR_KEYWORD]
+        several = {p.name for p in ports if get_origin(types[p.name]) is cast(Any, Sequence)}
+        inputs = tuple(
+            p.name + "*" * (p.name in several) + "?" * (p.default is not inspect.Parameter.empty) for p in ports
+        )
+        facts = get_args(types["return"])
+
+        readers = {p.name: read for p in rest if (read := _reader(types[p.name])) is not None}
+
+        def run(params: M, args: Mapping[str, Any], inputs: Inputs) -> Bundle[F]:
+            typed = {n: readers[n](v) if n in readers and v is not None else v for n, v in args.items()}
+            return cast(Callable[..., Bundle[F]], function)(params, **inputs, **typed)
+
+        line = (function.__doc__ or "").strip().split("\n")[0].removesuffix(".")
+        summary = line[:1].lower() + line[1:] if line[1:2].islower() or line[1:2] == " " else line
+        return Stage(
+            name,
+            version,
+            summary,
+            types[first.name],
+            inputs,
+            tuple(outputs),
+            run,
+            memory,
+            (facts[0].__required_keys__, facts[0].__optional_keys__) if facts else None,
+            function,
+        )
+
+    return declare
+
+
+def _reader(annotation: Any) -> Callable[[Any], Any] | None:
+    """How an argument of this type (or of it or None) is made of JSON; None for one that is JSON itself."""
+    for kind in (annotation, *get_args(annotation)):
+        for name in ("from_dict", "from_matrix", "model_validate"):
+            if isinstance(kind, type) and hasattr(kind, name):
+                reader: Callable[[Any], Any] = getattr(kind, name)
+                return reader
+    return None
+
+
+def declared(module: Any) -> Stage[Any, Any] | None:
+    """The stage that a module declares, if it does."""
+    named = vars(module).get("STAGE")
+    if isinstance(named, Stage):
+        return named
+    return next((v for v in vars(module).values() if isinstance(v, Stage) and v.module == module.__name__), None)
 
 
 def check_outputs(stage: Stage, bundle: Bundle) -> None:
@@ -147,6 +256,11 @@ def check_outputs(stage: Stage, bundle: Bundle) -> None:
     missing = missing_outputs(stage, list(bundle.arrays))
     if missing:
         raise TypeError(f"{stage.name}: declared arrays are missing: {', '.join(missing)}")
+    if stage.facts is not None:
+        required, optional = stage.facts
+        if not required <= bundle.meta.keys() <= required | optional:
+            missing, unknown = sorted(required - bundle.meta.keys()), sorted(bundle.meta.keys() - required - optional)
+            raise TypeError(f"{stage.name}: facts that are missing: {missing}, that are not declared: {unknown}")
 
 
 def missing_outputs(stage: Stage, names: Sequence[str]) -> list[str]:

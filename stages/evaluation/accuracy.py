@@ -17,17 +17,14 @@ Relative errors over longer stretches, their causes and the claimed covariances:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
-from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation.accuracy_parts import (
-    Metric,
     along,
     angle,
     inverse,
@@ -40,6 +37,8 @@ from rille.stages.evaluation.accuracy_parts import (
 )
 from rille.stages.evaluation.conventions import better_reading
 from rille.stages.evaluation.trajectory_error import against_claims, by_cause, by_shares, by_steps
+from rille.stages.facts.evaluation import AccuracyFacts, Metric, TruthFacts
+from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.odometry.resection.trajectory import world_poses
 
@@ -225,11 +224,28 @@ def _nothing(estimate: Floats) -> dict[str, Floats]:
     return arrays | {"displacement": np.diff(position, axis=0), "displacement_truth": none[1:].copy()}
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    trajectory, truth = inputs["trajectory"], inputs["truth"]
+@stage(
+    "accuracy",
+    version=4,
+    outputs=[
+        Array("position", ("frame", "xyz"), "float64", "m", "estimated position", "nan", "world"),
+        Array("position_truth", ("frame", "xyz"), "float64", "m", "true position, first poses equal", "nan", "world"),
+        Array("displacement", ("step", "xyz"), "float64", "m", "estimated displacement per frame", "nan", "world"),
+        Array("displacement_truth", ("step", "xyz"), "float64", "m", "true displacement per frame", "nan", "world"),
+    ],
+)
+def accuracy_stage(
+    params: NoParams,
+    trajectory: Bundle[TrajectoryFacts],
+    truth: Bundle[TruthFacts],
+    *,
+    piece: int | None = None,
+    mount: RigidTransform | None = None,
+) -> Bundle[AccuracyFacts]:
+    """Trajectory against truth: ATE, RPE, displacements, drift, KITTI."""
     given = list(trajectory.meta["frames"])
     wanted = given if truth.meta["frames"] is None else list(truth.meta["frames"])
-    poses = world_poses(trajectory, int(args["piece"]) if "piece" in args else None)
+    poses = world_poses(trajectory, piece)
     estimate, true = by_frame(poses, given, wanted), np.asarray(truth["poses"])
     has_pose, has_truth = posed(estimate), posed(true)
     warnings: list[str] = []
@@ -242,23 +258,8 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         if claimed is not None:
             both = has_pose & has_truth
             sigma = float(np.sqrt(np.nanmean(np.trace(claimed[both, :3, :3], axis1=1, axis2=2))))
-            mount = RigidTransform.from_matrix(args["mount"]) if "mount" in args else RigidTransform.identity()
-            warnings = better_reading(estimate[both], true[both], mount, sigma)
-    facts = {"metrics": metrics, "frames": wanted, "truth": truth.meta["source"]}
-    return Bundle(arrays, facts | ({"warnings": warnings} if warnings else {}))
-
-
-STAGE = Stage(
-    name="accuracy",
-    version=4,
-    summary="trajectory against truth: ATE, RPE, displacements, drift, KITTI",
-    params=NoParams,
-    inputs=("trajectory", "truth"),
-    outputs=(
-        Array("position", ("frame", "xyz"), "float64", "m", "estimated position", "nan", "world"),
-        Array("position_truth", ("frame", "xyz"), "float64", "m", "true position, first poses equal", "nan", "world"),
-        Array("displacement", ("step", "xyz"), "float64", "m", "estimated displacement per frame", "nan", "world"),
-        Array("displacement_truth", ("step", "xyz"), "float64", "m", "true displacement per frame", "nan", "world"),
-    ),
-    run=_run,
-)
+            warnings = better_reading(estimate[both], true[both], mount or RigidTransform.identity(), sigma)
+    facts: AccuracyFacts = {"metrics": metrics, "frames": wanted, "truth": truth.meta["source"]}
+    if warnings:
+        facts["warnings"] = warnings
+    return Bundle(arrays, facts)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats
-
-Metric = dict[str, Any]
+from rille.stages.facts.evaluation import Metric
 
 
 def metric(value: float | int | None, unit: str, how: str) -> Metric:

@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.core.arrays import Bytes, Floats
-from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import AnyArray, Array, Bundle, Params, stage
 from rille.stages.evaluation.accuracy import angles_between, by_frame
-from rille.stages.evaluation.accuracy_parts import Metric, metric, posed, rms
+from rille.stages.evaluation.accuracy_parts import metric, posed, rms
 from rille.stages.evaluation.pose_alignment import align, moved, spread
+from rille.stages.facts.evaluation import AgreementFacts, JoinFacts, Metric
+from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.numeric.robust import mad_sigma
 
 ORIENTATION_SHARE = 0.1
@@ -182,11 +184,27 @@ def _metrics(arrays: Mapping[str, Floats], facts: Mapping[str, Any], length: flo
     }
 
 
-def _run(params: AgreementParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    trajectory, other = inputs["trajectory"], inputs["crosscheck"]
-    frames, given = [int(f) for f in trajectory.meta["frames"]], [int(f) for f in other.meta["frames"]]
-    ours, theirs = np.asarray(trajectory["poses"]), by_frame(np.asarray(other["piece_poses"]), given, frames)
-    number = dict(zip(given, np.asarray(other["piece"]).tolist(), strict=True))
+@stage(
+    "agreement",
+    version=2,
+    outputs=[
+        Array("poses", ("frame", "row", "col"), "float64", "m", "crosscheck's poses in the world", "nan", "world"),
+        Array("position", ("frame", "xyz"), "float64", "m", "position, ours", "nan", "world"),
+        Array("position_crosscheck", ("frame", "xyz"), "float64", "m", "position, crosscheck", "nan", "world"),
+        Array("distance", ("frame",), "float64", "m", "disagreement in position", "nan"),
+        Array("angle", ("frame",), "float64", "rad", "disagreement in rotation", "nan"),
+        Array("step_distance", ("frame",), "float64", "m", "disagreement in the motion since the frame before", "nan"),
+        Array("step_angle", ("frame",), "float64", "rad", "the same, rotation", "nan"),
+        Array("flagged", ("frame",), "uint8", "1", "bits: 1 position, 2 rotation, 4 motion, 8 rotation of a step"),
+    ],
+)
+def agreement_stage(
+    params: AgreementParams, trajectory: Bundle[TrajectoryFacts], crosscheck: Bundle[JoinFacts]
+) -> Bundle[AgreementFacts]:
+    """Trajectory against the crosscheck's."""
+    frames, given = trajectory.meta["frames"], crosscheck.meta["frames"]
+    ours, theirs = np.asarray(trajectory["poses"]), by_frame(np.asarray(crosscheck["piece_poses"]), given, frames)
+    number = dict(zip(given, np.asarray(crosscheck["piece"]).tolist(), strict=True))
     piece = np.array([number.get(f, -1) for f in frames], dtype=np.int64)
     own = np.zeros(len(frames), dtype=np.int64)
     if "piece" in trajectory.arrays:
@@ -198,11 +216,11 @@ def _run(params: AgreementParams, args: Mapping[str, Any], inputs: Inputs) -> Bu
     # Our pieces lie in frames of their own: from one to the next there is no way.
     there = np.diff(own[compared]) == 0
     length = float(np.linalg.norm(np.diff(ours[compared, :, 3], axis=0), axis=1)[there].sum())
-    meta = {
+    meta: AgreementFacts = {
         "frames": frames,
         "compared": int(compared.sum()),
         "not_compared": [f for f, ok in zip(frames, compared, strict=True) if not ok],
-        "pieces": len(other.meta["pieces"]),
+        "pieces": len(crosscheck.meta["pieces"]),
         "metrics": _metrics(arrays, facts, length),
         "rule": f"disagreement above the median by more than {params.threshold:g} robust standard deviations "
         f"(1.4826 MAD), and above {params.least_ratio:g} medians; in position, rotation (from "
@@ -214,6 +232,8 @@ def _run(params: AgreementParams, args: Mapping[str, Any], inputs: Inputs) -> Bu
             for f, bits in zip(frames, flags.tolist(), strict=True)
             if bits
         ],
+        "scale_ratio": facts["scale_ratio"],
+        "rmse_scaled_m": facts["rmse_scaled_m"],
     }
     out: dict[str, AnyArray] = {
         **arrays,
@@ -221,24 +241,4 @@ def _run(params: AgreementParams, args: Mapping[str, Any], inputs: Inputs) -> Bu
         "position_crosscheck": arrays["poses"][:, :, 3].copy(),
         "flagged": flags,
     }
-    return Bundle(out, meta | facts)
-
-
-STAGE = Stage(
-    name="agreement",
-    version=2,
-    summary="trajectory against the crosscheck's",
-    params=AgreementParams,
-    inputs=("trajectory", "crosscheck"),
-    outputs=(
-        Array("poses", ("frame", "row", "col"), "float64", "m", "crosscheck's poses in the world", "nan", "world"),
-        Array("position", ("frame", "xyz"), "float64", "m", "position, ours", "nan", "world"),
-        Array("position_crosscheck", ("frame", "xyz"), "float64", "m", "position, crosscheck", "nan", "world"),
-        Array("distance", ("frame",), "float64", "m", "disagreement in position", "nan"),
-        Array("angle", ("frame",), "float64", "rad", "disagreement in rotation", "nan"),
-        Array("step_distance", ("frame",), "float64", "m", "disagreement in the motion since the frame before", "nan"),
-        Array("step_angle", ("frame",), "float64", "rad", "the same, rotation", "nan"),
-        Array("flagged", ("frame",), "uint8", "1", "bits: 1 position, 2 rotation, 4 motion, 8 rotation of a step"),
-    ),
-    run=_run,
-)
+    return Bundle(out, meta)

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
-from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from rille.stages.core.declare import Array, Bundle, Memory, Params, stage
 from rille.stages.evaluation.accuracy_parts import posed
+from rille.stages.facts.evaluation import WindowFacts
 from rille.stages.geometry.geometry import Camera, Rig
 
 PIXEL_CENTRE = 0.5
@@ -201,42 +202,6 @@ def image_pairs(frames: int, span: int) -> list[tuple[int, int]]:
     return pairs
 
 
-def _run(params: CrosscheckParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    import pycolmap
-
-    frames, rig = [int(f) for f in args["frames"]], Rig.from_dict(args["rig"])
-    pycolmap.logging.minloglevel = 3  # fatal: what goes wrong is said by the result
-    bundles = itertools.chain.from_iterable(zip(inputs["left"], inputs["right"], strict=True))
-    features = [extract(np.asarray(b["image"]), np.asarray(b["valid"]), params) for b in bundles]
-    with pycolmap.Database.open(":memory:") as database:
-        cameras = _write_rig(database, rig)
-        verified = _write_frames(database, cameras, features, params)
-        models = _models(database, params, verified)
-    poses, observations = np.full((len(frames), 3, 4), np.nan), np.zeros(len(frames), np.int32)
-    meta: dict[str, Any] = {
-        "frames": frames,
-        "features": float(np.median([len(f.points) for f in features])),
-        "pairs": len(image_pairs(len(frames), params.span)),
-        "pairs_verified": len(verified),
-        "models": len(models),
-        "points": 0,
-        "observations": 0,
-        "reprojection_px": None,
-    }
-    if models:
-        # Models of one window do not share a frame of reference; what the others hold is left to the neighbouring
-        # windows.
-        best = max(models, key=lambda m: m.num_reg_frames())
-        _read(best, poses, observations)
-        meta["points"], meta["observations"] = int(best.num_points3D()), int(observations.sum())
-        meta["reprojection_px"] = float(best.compute_mean_reprojection_error())
-    registered = posed(poses)
-    meta["registered"] = int(registered.sum())
-    meta["unregistered"] = [f for f, ok in zip(frames, registered, strict=True) if not ok]
-    meta["reason"] = "" if models else _why(meta)
-    return Bundle({"poses": poses, "registered": registered.astype(np.uint8), "observations": observations}, meta)
-
-
 def _why(meta: Mapping[str, Any]) -> str:
     if meta["pairs_verified"] == 0:
         return f"no two images match (median {meta['features']:.0f} features an image)"
@@ -355,17 +320,49 @@ def _read(model: Any, poses: Floats, observations: NDArray[np.int32]) -> None:
         observations[number - 1] = sum(int(model.image(i).num_points3D) for i in images if model.exists_image(i))
 
 
-STAGE = Stage(
-    name="crosscheck",
-    version=1,
-    summary="poses of a window of frames by COLMAP, for comparison",
-    params=CrosscheckParams,
-    inputs=("left*", "right*"),
-    outputs=(
+@stage(
+    "crosscheck",
+    outputs=[
         Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan", "window"),
         Array("registered", ("frame",), "uint8", "1", "1 = the frame has a pose"),
         Array("observations", ("frame",), "int32", "1", "adjusted image points of the frame, both cameras"),
-    ),
-    run=_run,
+    ],
     memory=Memory(factor=10.0, result=0.0, lower=("crosscheck.window", "crosscheck.max_image_size")),
 )
+def crosscheck_stage(
+    params: CrosscheckParams, left: Sequence[Bundle], right: Sequence[Bundle], *, frames: Sequence[int], rig: Rig
+) -> Bundle[WindowFacts]:
+    """Poses of a window of frames by COLMAP, for comparison."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 3  # fatal: what goes wrong is said by the result
+    bundles = itertools.chain.from_iterable(zip(left, right, strict=True))
+    features = [extract(np.asarray(b["image"]), np.asarray(b["valid"]), params) for b in bundles]
+    with pycolmap.Database.open(":memory:") as database:
+        cameras = _write_rig(database, rig)
+        verified = _write_frames(database, cameras, features, params)
+        models = _models(database, params, verified)
+    poses, observations = np.full((len(frames), 3, 4), np.nan), np.zeros(len(frames), np.int32)
+    best = None
+    if models:
+        # Models of one window do not share a frame of reference; what the others hold is left to the neighbouring
+        # windows.
+        best = max(models, key=lambda m: m.num_reg_frames())
+        _read(best, poses, observations)
+    registered = posed(poses)
+    meta: WindowFacts = {
+        "frames": list(frames),
+        "features": float(np.median([len(f.points) for f in features])),
+        "pairs": len(image_pairs(len(frames), params.span)),
+        "pairs_verified": len(verified),
+        "models": len(models),
+        "points": 0 if best is None else int(best.num_points3D()),
+        "observations": int(observations.sum()),
+        "reprojection_px": None if best is None else float(best.compute_mean_reprojection_error()),
+        "registered": int(registered.sum()),
+        "unregistered": [f for f, ok in zip(frames, registered, strict=True) if not ok],
+        "reason": "",
+    }
+    if best is None:
+        meta["reason"] = _why(meta)
+    return Bundle({"poses": poses, "registered": registered.astype(np.uint8), "observations": observations}, meta)

@@ -7,17 +7,18 @@ keeps a frame of its own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.evaluation.accuracy import angles_between
 from rille.stages.evaluation.accuracy_parts import posed, rms
 from rille.stages.evaluation.pose_alignment import align, moved
+from rille.stages.facts.evaluation import JoinFacts, WindowFacts
 from rille.stages.geometry.geometry import orthonormal
 
 ORIENTATION_SHARE = 1.0
@@ -85,39 +86,39 @@ def _tie(frames: list[int], a: Floats, b: Floats) -> dict[str, Any]:
     }
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    frames = [int(f) for f in args["frames"]]
-    parts = [(list(b.meta["frames"]), np.asarray(b["poses"])) for b in inputs["windows"]]
+_POSES = ("frame", "row", "col")
+
+
+_OF_A_WINDOW: tuple[Literal["frames", "registered", "points", "reason"], ...]
+_OF_A_WINDOW = ("frames", "registered", "points", "reason")
+
+
+@stage(
+    "crosscheck_join",
+    outputs=[
+        Array("poses", _POSES, "float64", "m", "pose [R | t] of the left camera, longest piece", "nan", "crosscheck"),
+        Array("piece_poses", _POSES, "float64", "m", "the same of all pieces", "nan", "crosscheck piece"),
+        Array("piece", ("frame",), "int16", "1", "unbroken piece that the frame belongs to", "-1"),
+    ],
+)
+def crosscheck_join_stage(
+    params: NoParams, windows: Sequence[Bundle[WindowFacts]], *, frames: Sequence[int]
+) -> Bundle[JoinFacts]:
+    """Windows of the crosscheck to one trajectory."""
+    parts = [(list(b.meta["frames"]), np.asarray(b["poses"])) for b in windows]
     chained, piece, ties = join(frames, parts)
     lengths = np.bincount(piece[piece >= 0])
     longest = int(lengths.argmax()) if lengths.size else -1
     poses = np.where((piece == longest)[:, None, None] & (longest >= 0), chained, np.nan)
-    facts = [{k: b.meta[k] for k in ("frames", "registered", "points", "reason")} for b in inputs["windows"]]
-    meta = {
-        "frames": frames,
+    meta: JoinFacts = {
+        "frames": list(frames),
         "registered": int((piece >= 0).sum()),
         "unregistered": [f for f, p in zip(frames, piece, strict=True) if p < 0],
         "longest": longest,
         "pieces": [[f for f, p in zip(frames, piece, strict=True) if p == k] for k in range(len(lengths))],
         "ties": ties,
-        "points": sum(int(f["points"]) for f in facts),
-        "windows": facts,
+        "points": sum(b.meta["points"] for b in windows),
+        "windows": [{k: b.meta[k] for k in _OF_A_WINDOW} for b in windows],
         "positions": [None if not np.isfinite(p).all() else [float(v) for v in p[:, 3]] for p in poses],
     }
     return Bundle({"poses": poses, "piece_poses": chained, "piece": piece}, meta)
-
-
-_POSES = ("frame", "row", "col")
-STAGE = Stage(
-    name="crosscheck_join",
-    version=1,
-    summary="windows of the crosscheck to one trajectory",
-    params=NoParams,
-    inputs=("windows*",),
-    outputs=(
-        Array("poses", _POSES, "float64", "m", "pose [R | t] of the left camera, longest piece", "nan", "crosscheck"),
-        Array("piece_poses", _POSES, "float64", "m", "the same of all pieces", "nan", "crosscheck piece"),
-        Array("piece", ("frame",), "int16", "1", "unbroken piece that the frame belongs to", "-1"),
-    ),
-    run=_run,
-)

@@ -8,16 +8,16 @@ doi:10.1016/j.isprsjprs.2009.02.003).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats32
-from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage, raster
+from rille.stages.core.declare import Bundle, NoParams, raster, stage
 from rille.stages.core.errors import InputError
-from rille.stages.evaluation.accuracy_parts import Metric, metric
+from rille.stages.evaluation.accuracy_parts import metric
 from rille.stages.evaluation.dem_comparison import figures
+from rille.stages.facts.evaluation import DemAccuracyFacts, Metric
 from rille.stages.geometry.lattice import Lattice, mosaic
 
 
@@ -57,15 +57,18 @@ def in_window(lattice: Lattice, window: Sequence[float] | None) -> Bools:
     return inside_y[:, None] & inside_x[None]
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    truth: Bundle = inputs["truth"]
+@stage("dem_accuracy", version=2, outputs=[raster("error", "m", "elevation minus truth")])
+def dem_accuracy_stage(
+    params: NoParams, dem: Sequence[Bundle], truth: Bundle, *, window: list[float] | None = None
+) -> Bundle[DemAccuracyFacts]:
+    """Elevation model against truth: RMSE, NMAD, 95 %, bias and completeness."""
     lattice = Lattice.from_dict(truth.meta["lattice"])
-    parts = [(Lattice.from_dict(dem.meta["lattice"]), np.asarray(dem["elevation"])) for dem in inputs["dem"]]
+    parts = [(Lattice.from_dict(one.meta["lattice"]), np.asarray(one["elevation"])) for one in dem]
     if not parts:
         raise InputError("RIL-320", "no elevation model to compare with truth")
     elevation = mosaic(parts, np.nan, lattice)
     true = np.asarray(truth["elevation"])
-    seen, inside = np.asarray(truth["seen"]) != 0, in_window(lattice, args.get("window"))
+    seen, inside = np.asarray(truth["seen"]) != 0, in_window(lattice, window)
     error = (elevation - true).astype(np.float32)
     metrics = dem_accuracy(elevation, true, seen & inside)
     unseen = np.isfinite(elevation) & ~seen & inside
@@ -73,16 +76,5 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     if "tilt_deg" in truth.meta:
         how = "between the vertical of the model and the true one; the errors of elevation are against the tilted truth"
         metrics["tilt"] = metric(float(truth.meta["tilt_deg"]), "deg", how)
-    meta = {"lattice": lattice.to_dict(), "window": args.get("window"), "metrics": metrics}
+    meta: DemAccuracyFacts = {"lattice": lattice.to_dict(), "window": window, "metrics": metrics}
     return Bundle({"error": error}, meta)
-
-
-STAGE = Stage(
-    name="dem_accuracy",
-    version=2,
-    summary="elevation model against truth: RMSE, NMAD, 95 %, bias and completeness",
-    params=NoParams,
-    inputs=("dem*", "truth"),
-    outputs=(raster("error", "m", "elevation minus truth"),),
-    run=_run,
-)

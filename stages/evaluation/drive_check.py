@@ -17,12 +17,14 @@ from typing import Any
 import numpy as np
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
-from rille.stages.evaluation.accuracy_parts import Metric, inverse, metric, square
+from rille.stages.core.declare import Array, Bundle, NoParams, stage
+from rille.stages.evaluation.accuracy_parts import inverse, metric, square
+from rille.stages.facts.evaluation import DriveCheckFacts, Metric, TruthFacts
+from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry.geometry import way_length
 
 
-def judged(drive: Mapping[str, Any], row: int) -> dict[str, Floats]:
+def judged(drive: Bundle, row: int) -> dict[str, Floats]:
     """Select the placements of a drive up to the image of this row (-1: the last one)."""
     # What lies behind the last image that was taken was driven, but nothing was known of it.
     end = int(np.asarray(drive["frame_at"])[row]) + 1
@@ -69,36 +71,40 @@ def localisation(estimate: Floats, truth: Floats, length: float) -> tuple[Floats
     }
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    parts = [judged(drive, int(row)) for drive, row in zip(inputs["drives"], args["rows"], strict=True)]
+@stage(
+    "drive_check",
+    version=3,
+    outputs=[
+        Array("error", ("frame",), "float64", "m", "distance of the estimated from the true position", "nan"),
+        Array("way", ("position", "xyz"), "float64", "m", "true position of the vehicle on the ground", frame="truth"),
+    ],
+)
+def drive_check_stage(
+    params: NoParams,
+    drives: Sequence[Bundle],
+    trajectory: Bundle[TrajectoryFacts] | None = None,
+    truth: Bundle[TruthFacts] | None = None,
+    best: Bundle | None = None,
+    *,
+    rows: Sequence[int],
+    vehicle: Mapping[str, Any],
+) -> Bundle[DriveCheckFacts]:
+    """A drive against the truth: placements, localisation, length."""
+    parts = [judged(drive, row) for drive, row in zip(drives, rows, strict=True)]
     length, error = way(parts), np.zeros(0)
-    metrics = placements(parts, args["vehicle"])
+    metrics = placements(parts, vehicle)
     metrics["path_length"] = metric(length, "m", "true path of the vehicle, seen from above")
-    facts: dict[str, Any] = {"metrics": metrics, "stops": len(parts), "path_exists": None, "with_margin": None}
-    if "trajectory" in inputs:
-        estimate, truth = (np.asarray(inputs[port]["poses"]) for port in ("trajectory", "truth"))
-        error, found = localisation(estimate, truth, length)
+    facts: DriveCheckFacts = {"metrics": metrics, "stops": len(parts), "path_exists": None, "with_margin": None}
+    if trajectory is not None and truth is not None:
+        estimate, true = (np.asarray(one["poses"]) for one in (trajectory, truth))
+        error, found = localisation(estimate, true, length)
         metrics |= found
-    if "best" in inputs:
-        best = inputs["best"].meta
-        shortest, margin = best["shortest_m"], best["shortest_margin_m"]
+    if best is not None:
+        shortest, margin = best.meta["shortest_m"], best.meta["shortest_margin_m"]
         room = "with the vehicle's margin" if margin else "within its limits, but without its margin"
         how = f"from start to goal over the risk map of the exact elevations, {room}"
         metrics["shortest_length"] = metric(shortest, "m", how)
-        facts |= {"path_exists": shortest is not None, "with_margin": bool(shortest is not None and margin > 0)}
+        facts["path_exists"] = shortest is not None
+        facts["with_margin"] = bool(shortest is not None and margin > 0)
     T = np.concatenate([p["trail"] for p in parts])
     return Bundle({"error": error, "way": T[:, :, 3].copy()}, facts)
-
-
-STAGE = Stage(
-    name="drive_check",
-    version=3,
-    summary="a drive against the truth: placements, localisation, length",
-    params=NoParams,
-    inputs=("drives*", "trajectory?", "truth?", "best?"),
-    outputs=(
-        Array("error", ("frame",), "float64", "m", "distance of the estimated from the true position", "nan"),
-        Array("way", ("position", "xyz"), "float64", "m", "true position of the vehicle on the ground", frame="truth"),
-    ),
-    run=_run,
-)

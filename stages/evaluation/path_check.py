@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes, Floats
-from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
-from rille.stages.evaluation.accuracy_parts import Metric, metric
+from rille.stages.core.declare import Array, Bundle, NoParams, stage
+from rille.stages.evaluation.accuracy_parts import metric
+from rille.stages.facts.evaluation import Metric, MetricsFacts
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
@@ -112,21 +110,15 @@ def _shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> f
     return float(cost[first]) / UNIT * lattice.cell if cost[first] < UNREACHED else None
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    path, risk = inputs["path"], inputs["risk"]
+@stage(
+    "path_check",
+    version=2,
+    outputs=[Array("hazard_cell", ("cell", "rowcol"), "int32", "1", "crossed cells that are truly hazardous")],
+)
+def path_check_stage(params: NoParams, path: Bundle, risk: Bundle) -> Bundle[MetricsFacts]:
+    """Planned path against the risk map of the exact elevations."""
     lattice = Lattice.from_dict(risk.meta["lattice"])
     vertices, maps = np.asarray(path["path"]), {name: np.asarray(risk[name]) for name in risk.arrays}
     hit, metrics = path_check(vertices, maps["risk"], lattice)
     metrics |= shortest(vertices, maps, lattice, Vehicle.model_validate(risk.meta["vehicle"]))
     return Bundle({"hazard_cell": hit.astype(np.int32)}, {"metrics": metrics})
-
-
-STAGE = Stage(
-    name="path_check",
-    version=2,
-    summary="planned path against the risk map of the exact elevations",
-    params=NoParams,
-    inputs=("path", "risk"),
-    outputs=(Array("hazard_cell", ("cell", "rowcol"), "int32", "1", "crossed cells that are truly hazardous"),),
-    run=_run,
-)

@@ -20,7 +20,7 @@ searched, or takes half of it, the offset is not determined, and that of the sta
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -28,10 +28,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
-from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.evaluation.accuracy import by_frame
-from rille.stages.evaluation.accuracy_parts import Metric, along, metric, rms, umeyama
+from rille.stages.evaluation.accuracy_parts import along, metric, rms, umeyama
 from rille.stages.evaluation.conventions import UNITS
+from rille.stages.facts.evaluation import AccuracyFacts, Metric
+from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.odometry.resection.trajectory import world_poses
 
 LEAST = 4
@@ -377,30 +379,34 @@ def _clock(offset: Offset) -> dict[str, Metric]:
     }
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    trajectory, frames = inputs["trajectory"], list(args["frames"])
-    poses = by_frame(world_poses(trajectory), list(trajectory.meta["frames"]), frames)
-    estimate, vertical = poses[:, :, 3], trajectory.meta["verticals"][trajectory.meta["main"]]
-    given = np.array(args["positions"], dtype=np.float64)
-    times, moments = (None if args[k] is None else np.array(args[k], dtype=np.float64) for k in ("times", "moments"))
-    arm = None if args.get("lever_arm") is None else np.array(args["lever_arm"])
-    truth = TruePositions(given, times, args["max_gap"], arm)
-    there, metrics, warnings = position_accuracy(estimate, truth, moments, poses[:, :, :3], vertical in MEASURED)
-    whole = np.full((len(frames), 3), np.nan)
-    whole[:, : there.shape[1]] = there
-    facts = {"metrics": metrics, "frames": frames, "truth": args["source"], "warnings": warnings}
-    return Bundle({"position": estimate.copy(), "position_truth": whole}, facts)
-
-
-STAGE = Stage(
-    name="position_accuracy",
-    version=1,
-    summary="trajectory against positions without rotation, of a frame and a clock of their own",
-    params=NoParams,
-    inputs=("trajectory",),
-    outputs=(
+@stage(
+    "position_accuracy",
+    outputs=[
         Array("position", ("frame", "xyz"), "float64", "m", "estimated position", "nan", "world"),
         Array("position_truth", ("frame", "xyz"), "float64", "m", "true position, moved in the plane", "nan", "world"),
-    ),
-    run=_run,
+    ],
 )
+def position_accuracy_stage(
+    params: NoParams,
+    trajectory: Bundle[TrajectoryFacts],
+    *,
+    frames: list[int],
+    positions: Sequence[Any],
+    times: Sequence[float] | None,
+    moments: Sequence[float | None] | None,
+    max_gap: float,
+    source: str,
+    lever_arm: Sequence[float] | None = None,
+) -> Bundle[AccuracyFacts]:
+    """Trajectory against positions without rotation, of a frame and a clock of their own."""
+    poses = by_frame(world_poses(trajectory), trajectory.meta["frames"], frames)
+    estimate, vertical = poses[:, :, 3], trajectory.meta["verticals"][trajectory.meta["main"]]
+    given = np.array(positions, dtype=np.float64)
+    clock, at = (None if t is None else np.array(t, dtype=np.float64) for t in (times, moments))
+    arm = None if lever_arm is None else np.array(lever_arm)
+    truth = TruePositions(given, clock, max_gap, arm)
+    there, metrics, warnings = position_accuracy(estimate, truth, at, poses[:, :, :3], vertical in MEASURED)
+    whole = np.full((len(frames), 3), np.nan)
+    whole[:, : there.shape[1]] = there
+    facts: AccuracyFacts = {"metrics": metrics, "frames": frames, "truth": source, "warnings": warnings}
+    return Bundle({"position": estimate.copy(), "position_truth": whole}, facts)

@@ -12,7 +12,8 @@ import math
 import numpy as np
 
 from rille.stages.core.arrays import Floats
-from rille.stages.evaluation.accuracy_parts import Metric, along, angle, inverse, metric, posed, relative_error, rms
+from rille.stages.evaluation.accuracy_parts import along, angle, inverse, metric, posed, relative_error, rms
+from rille.stages.facts.evaluation import Metric
 from rille.stages.geometry.geometry import cross_matrix, rotation_log
 
 STEPS = (2, 5, 10, 20, 50)

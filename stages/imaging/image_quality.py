@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes
-from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Bundle, NoParams, stage
+from rille.stages.facts.imaging import QualityFacts
 from rille.stages.imaging.pyramid import grey
 
 LOW, HIGH = 2.0, 253.0
@@ -97,21 +97,8 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
     }
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    facts = {
-        side: glance(np.asarray(inputs[side]["image"]), np.asarray(inputs[side]["valid"]))
-        for side in ("left", "right")
-        if side in inputs
-    }
-    return Bundle({}, {"frame": int(args["frame"])} | facts)
-
-
-STAGE = Stage(
-    name="image_quality",
-    version=1,
-    summary="grey values and sharpness of a pair, before anything is matched",
-    params=NoParams,
-    inputs=("left", "right"),
-    outputs=(),
-    run=_run,
-)
+@stage("image_quality")
+def image_quality_stage(params: NoParams, left: Bundle, right: Bundle, *, frame: int) -> Bundle[QualityFacts]:
+    """Grey values and sharpness of a pair, before anything is matched."""
+    seen = [glance(np.asarray(one["image"]), np.asarray(one["valid"])) for one in (left, right)]
+    return Bundle({}, {"frame": frame, "left": seen[0], "right": seen[1]})

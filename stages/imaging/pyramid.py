@@ -8,7 +8,7 @@ are completed by repeating the last row or column. A coarse pixel is valid if at
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, overload
@@ -19,9 +19,10 @@ from numba import njit
 from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats32
-from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import AnyArray, Array, Bundle, Params, stage
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Mask
+from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.imaging import noise
 
 
@@ -253,23 +254,17 @@ def filled_from(above: Floats32, image: Floats32, mask: Bools, y: int = 0, x: in
     return image
 
 
-def _run(params: PyramidParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    bundle: Bundle = inputs["image"]
-    pyramid = build(bundle["image"], params, bundle["valid"])
-    arrays: dict[str, AnyArray] = {f"level_{n}": image for n, image in enumerate(pyramid.images)}
-    arrays |= {f"valid_{n}": mask for n, mask in enumerate(pyramid.valid)}
-    return Bundle(arrays, {"levels": pyramid.levels, "noise": pyramid.noise})
-
-
-STAGE = Stage(
-    name="pyramid",
+@stage(
+    "pyramid",
     version=2,
-    summary="grey image pyramid by means of 2 x 2 pixels",
-    params=PyramidParams,
-    inputs=("image",),
-    outputs=(
+    outputs=[
         Array("level_*", ("row", "col"), "float32", "1", "grey value 0..255, 0 where masked"),
         Array("valid_*", ("row", "col"), "uint8", "1", "1 = usable"),
-    ),
-    run=_run,
+    ],
 )
+def pyramid_stage(params: PyramidParams, image: Bundle) -> Bundle[PyramidFacts]:
+    """Grey image pyramid by means of 2 x 2 pixels."""
+    pyramid = build(image["image"], params, image["valid"])
+    arrays: dict[str, AnyArray] = {f"level_{n}": level for n, level in enumerate(pyramid.images)}
+    arrays |= {f"valid_{n}": mask for n, mask in enumerate(pyramid.valid)}
+    return Bundle(arrays, {"levels": pyramid.levels, "noise": pyramid.noise})

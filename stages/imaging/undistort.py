@@ -11,15 +11,16 @@ doi:10.1109/TASSP.1981.1163711, the six-point kernel of fourth order.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numba import njit
 from pydantic import Field
 
 from rille.stages.core.arrays import Bytes, Floats, Floats32
-from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import AnyArray, Array, Bundle, Params, stage
 from rille.stages.core.errors import InputError
+from rille.stages.facts.imaging import UndistortedFacts
 from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import Lens
 from rille.stages.imaging.pyramid import grey
@@ -146,35 +147,30 @@ def _resample(image, usable, whole, maps, table, out, out_valid):  # type: ignor
             out[i, j], out_valid[i, j] = value, 1
 
 
-def _run(params: UndistortParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    bundle: Bundle = inputs["image"]
-    lens, camera = Lens.from_dict(args["lens"]), Camera.from_dict(args["camera"])
-    try:
-        image, valid = undistort(bundle["image"], lens, camera, params, bundle["valid"])
-    except InputError as error:
-        raise error.at(f"frame {args['frame']}, {args['camera_name']} camera") from error
-    meta = {
-        "frame": args["frame"],
-        "camera": args["camera_name"],
-        "usable": float(np.count_nonzero(valid) / valid.size),
-    }
-    arrays: dict[str, AnyArray] = {"image": image, "valid": valid}
-    if "colour" in bundle.arrays:
-        bands = [undistort(band, lens, camera, params)[0] for band in np.moveaxis(bundle["colour"], 2, 0)]
-        arrays["colour"] = np.rint(np.stack(bands, axis=2)).astype(np.uint8)
-    return Bundle(arrays, meta)
-
-
-STAGE = Stage(
-    name="undistort",
+@stage(
+    "undistort",
     version=2,
-    summary="one image with its lens distortion removed",
-    params=UndistortParams,
-    inputs=("image",),
-    outputs=(
+    outputs=[
         Array("image", ("row", "col"), "float32", "grey", "image of an ideal camera, 0..255, 0 where masked"),
         Array("valid", ("row", "col"), "uint8", "1", "1 = usable"),
         Array("colour", ("row", "col", "band"), "uint8", "grey", "red, green and blue of it", optional=True),
-    ),
-    run=_run,
+    ],
 )
+def undistort_stage(
+    params: UndistortParams, image: Bundle, *, lens: Lens, camera: Camera, frame: int, camera_name: str
+) -> Bundle[UndistortedFacts]:
+    """One image with its lens distortion removed."""
+    try:
+        ideal, valid = undistort(image["image"], lens, camera, params, image["valid"])
+    except InputError as error:
+        raise error.at(f"frame {frame}, {camera_name} camera") from error
+    meta: UndistortedFacts = {
+        "frame": frame,
+        "camera": camera_name,
+        "usable": float(np.count_nonzero(valid) / valid.size),
+    }
+    arrays: dict[str, AnyArray] = {"image": ideal, "valid": valid}
+    if "colour" in image.arrays:
+        bands = [undistort(band, lens, camera, params)[0] for band in np.moveaxis(image["colour"], 2, 0)]
+        arrays["colour"] = np.rint(np.stack(bands, axis=2)).astype(np.uint8)
+    return Bundle(arrays, meta)

@@ -23,8 +23,11 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from rille.stages.core.declare import Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.core.errors import DegenerateError, InputError
+from rille.stages.facts.calibration import SwapFacts
+from rille.stages.facts.imaging import QualityFacts
+from rille.stages.facts.odometry import MotionFacts, ScreeningFacts
 from rille.stages.imaging.image_quality import HIGH, LOW
 from rille.stages.odometry.covisibility import Step
 from rille.stages.odometry.keyframes import LEAST_BLOCKS
@@ -220,26 +223,36 @@ def _jumps(frames: Sequence[int], changes: Sequence[float], params: FrameScreeni
     return [f for f in frames if f in found]
 
 
-def _run(params: FrameScreeningParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    frames = [int(f) for f in args["frames"]]
-    along, bridges = steps_of(inputs["steps"]), list(inputs.get("bridges") or [])
-    if len(along) != len(frames) - 1 or len(inputs["qualities"]) != len(frames):
+@stage("frame_screening")
+def frame_screening_stage(
+    params: FrameScreeningParams,
+    qualities: Sequence[Bundle[QualityFacts]],
+    steps: Sequence[Bundle],
+    bridges: Sequence[Bundle[MotionFacts]],
+    sides: Sequence[Bundle[SwapFacts]],
+    *,
+    frames: Sequence[int],
+    bridged: Sequence[Sequence[int]] = (),
+) -> Bundle[ScreeningFacts]:
+    """Which frames are lost, and which may not be basic."""
+    along = steps_of(steps)
+    if len(along) != len(frames) - 1 or len(qualities) != len(frames):
         raise InputError("RIL-317", f"{len(frames)} frames need as many image qualities and {len(frames) - 1} steps")
-    qualities = {f: s.meta for f, s in zip(frames, inputs["qualities"], strict=True)}
-    steps = {s: share(step) for s, step in zip(pairwise(frames), along, strict=True)}
-    changes = changes_of(inputs["steps"])
-    spanned = [(int(a), int(b)) for a, b in args.get("bridges", ())]
-    steps |= {s: share(Step.from_bundle(m)) for s, m in zip(spanned, bridges, strict=True)}
-    sides = {int(s.meta["frame"]): s.meta for s in inputs.get("sides") or []}
-    found = judge(frames, qualities, steps, _jumps(frames, changes, params), sides, params)
+    seen = {f: s.meta for f, s in zip(frames, qualities, strict=True)}
+    shares = {s: share(step) for s, step in zip(pairwise(frames), along, strict=True)}
+    changes = changes_of(steps)
+    spanned = [(a, b) for a, b in bridged]
+    shares |= {s: share(Step.from_bundle(m)) for s, m in zip(spanned, bridges, strict=True)}
+    tested = {s.meta["frame"]: s.meta for s in sides}
+    found = judge(list(frames), seen, shares, _jumps(list(frames), changes, params), tested, params)
     chain = [f for f in frames if f not in found.lost]
     unfit = {f: why for f, why in found.unfit.items() if f in chain}
-    meta: dict[str, Any] = {
+    meta: ScreeningFacts = {
         "asks": {"bridges": [list(s) for s in found.asks["bridges"]], "sides": found.asks["sides"]},
         "chain": chain,
         "lost": [{"frame": f, "cause": found.lost[f]} for f in frames if f in found.lost],
         "unfit": [f for f in chain if f in unfit],
-        "match_rate": [steps[s] for s in pairwise(frames)],
+        "match_rate": [shares[s] for s in pairwise(frames)],
     }
     if not any(found.asks.values()):
         meta["warnings"] = [
@@ -247,14 +260,3 @@ def _run(params: FrameScreeningParams, args: Mapping[str, Any], inputs: Inputs) 
             *(f"frame {f} is not used as basic pair: {unfit[f]}" for f in chain if f in unfit),
         ]
     return Bundle({}, meta)
-
-
-STAGE = Stage(
-    name="frame_screening",
-    version=1,
-    summary="which frames are lost, and which may not be basic",
-    params=FrameScreeningParams,
-    inputs=("qualities*", "steps*", "bridges*", "sides*"),
-    outputs=(),
-    run=_run,
-)

@@ -19,8 +19,9 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from rille.stages.core.declare import Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.core.errors import ConfigError, InputError
+from rille.stages.facts.odometry import KeyframesFacts
 from rille.stages.odometry.covisibility import Covisibility, Step
 from rille.stages.odometry.step_table import steps_of
 
@@ -119,11 +120,10 @@ class Marked:
     behind: frozenset[int] = frozenset()
 
     @classmethod
-    def of(cls, args: Mapping[str, Any], frames: int) -> Marked:
-        """Build from the arguments of the stage; after a gap the first position that is not unfit is basic."""
-        unfit = frozenset(args.get("unfit", ()))
+    def of(cls, frames: int, unfit: Sequence[int], behind: Sequence[int]) -> Marked:
+        """Build for a number of frames; after a gap the first position that is not unfit is basic."""
         fit = [k for k in range(frames) if k not in unfit]
-        return cls(unfit, frozenset(n for k in args.get("behind", ()) for n in [n for n in fit if n >= k][:1]))
+        return cls(frozenset(unfit), frozenset(n for k in behind for n in [n for n in fit if n >= k][:1]))
 
 
 UNMARKED = Marked()
@@ -202,29 +202,6 @@ def segments(basic: list[int], frames: int) -> list[list[int]]:
     return [list(range(a, b + 1)) for a, b in zip(basic, ends, strict=True) if b > a]
 
 
-def _run(params: KeyframesParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    frames = int(args["frames"])
-    if frames < 1:
-        raise ConfigError("RIL-437", "no frame is chosen", remedy="choose at least one with --frames")
-    steps = steps_of(inputs["steps"])
-    if len(steps) != frames - 1:
-        raise InputError("RIL-438", f"{frames} frames need {frames - 1} steps, not {len(steps)}")
-    stride = params.rule == "stride"
-    marked = Marked.of(args, frames)
-    choice = (by_stride if stride else by_overlap)(steps, params, marked)
-    meta = {
-        "basic": choice.basic,
-        "segments": segments(choice.basic, frames),
-        "rule": f"every {params.stride}" if stride else f"overlap {params.overlap:g}",
-        "overlap": choice.overlap,
-        "why": choice.why,
-        "displacement": [step.displacement for step in steps],
-        "match_rate": [step.match_rate for step in steps],
-        "warnings": _warnings(steps, choice.overlap, params),
-    }
-    return Bundle({}, meta)
-
-
 def _warnings(steps: Sequence[Step], overlap: Sequence[float | None], params: KeyframesParams) -> list[str]:
     """What the choice could not give."""
     lines = []
@@ -245,12 +222,32 @@ def _warnings(steps: Sequence[Step], overlap: Sequence[float | None], params: Ke
     return lines
 
 
-STAGE = Stage(
-    name="keyframes",
-    version=3,
-    summary="which stereo pairs become elevation models, and the segments between them",
-    params=KeyframesParams,
-    inputs=("steps*",),
-    outputs=(),
-    run=_run,
-)
+@stage("keyframes", version=3)
+def keyframes_stage(
+    params: KeyframesParams,
+    steps: Sequence[Bundle],
+    *,
+    frames: int,
+    unfit: Sequence[int] = (),
+    behind: Sequence[int] = (),
+) -> Bundle[KeyframesFacts]:
+    """Which stereo pairs become elevation models, and the segments between them."""
+    if frames < 1:
+        raise ConfigError("RIL-437", "no frame is chosen", remedy="choose at least one with --frames")
+    moves = steps_of(steps)
+    if len(moves) != frames - 1:
+        raise InputError("RIL-438", f"{frames} frames need {frames - 1} steps, not {len(moves)}")
+    stride = params.rule == "stride"
+    marked = Marked.of(frames, unfit, behind)
+    choice = (by_stride if stride else by_overlap)(moves, params, marked)
+    meta: KeyframesFacts = {
+        "basic": choice.basic,
+        "segments": segments(choice.basic, frames),
+        "rule": f"every {params.stride}" if stride else f"overlap {params.overlap:g}",
+        "overlap": choice.overlap,
+        "why": choice.why,
+        "displacement": [step.displacement for step in moves],
+        "match_rate": [step.match_rate for step in moves],
+        "warnings": _warnings(moves, choice.overlap, params),
+    }
+    return Bundle({}, meta)

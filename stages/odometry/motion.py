@@ -11,16 +11,17 @@ in-plane rotation that is looked for, is undone, as is one that the matches show
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from pydantic import Field
 
 from rille.stages.core.arrays import Floats, Floats32
-from rille.stages.core.declare import AnyArray, Bundle, Inputs, Params, Stage, raster
+from rille.stages.core.declare import AnyArray, Bundle, Params, raster, stage
 from rille.stages.core.validity import Mask, Validity, defined, mark, matched, matched_share
+from rille.stages.facts.imaging import PyramidFacts
+from rille.stages.facts.odometry import MotionFacts
 from rille.stages.geometry.geometry import Camera
 from rille.stages.hfvm.coarse_to_fine import hierarchy
 from rille.stages.hfvm.images.params import HfvmParams
@@ -180,24 +181,43 @@ def matched_texture(found: Motion) -> bool:
     return int(np.count_nonzero((found.validity & np.uint8(Validity.NO_TEXTURE)) == 0)) >= roll_search.LEAST
 
 
-def known_turn(args: Mapping[str, Any], level: int) -> Derotation | None:
-    """The rotation among a task's arguments, where there is one and it moves the image noticeably.
+def known_turn(rotation: Sequence[Sequence[float]] | None, camera: Camera | None, level: int) -> Derotation | None:
+    """The known rotation of a step, where there is one and it moves the image noticeably.
 
     Parameters
     ----------
-    args : ``rotation`` (3 x 3 rows of R_b_a) and ``camera``, both or neither.
+    rotation, camera : 3 x 3 rows of R_b_a, and the camera that turned: both or neither.
     """
-    if "rotation" not in args:
+    if rotation is None or camera is None:
         return None
-    turn = Derotation.of(args["rotation"], Camera.from_dict(args["camera"]))
+    turn = Derotation.of(rotation, camera)
     return turn if turn.reach > STILL * 2.0**level else None
 
 
-def _run(params: MotionParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    turn = known_turn(args, params.level)
-    a, b = Pyramid.from_bundle(inputs["a"]), Pyramid.from_bundle(inputs["b"])
-    found = coarse_motion(a, b, params, turn)
-    rolled = _rolled(a, b, found, params, turn)
+_GRID = "coarse level of a"
+
+
+@stage(
+    "motion",
+    outputs=[
+        raster("column_disparity", "px", "level-0 columns, frame b minus a", frame=_GRID),
+        raster("row_disparity", "px", "level-0 rows, frame b minus a", frame=_GRID),
+        raster("validity", "1", "bit mask, see stages.core.validity", "uint8", "", _GRID),
+    ],
+)
+def motion_stage(
+    params: MotionParams,
+    a: Bundle[PyramidFacts],
+    b: Bundle[PyramidFacts],
+    *,
+    rotation: Sequence[Sequence[float]] | None = None,
+    camera: Camera | None = None,
+) -> Bundle[MotionFacts]:
+    """Coarse displacements of all points from one left frame to the next."""
+    turn = known_turn(rotation, camera, params.level)
+    before, after = Pyramid.from_bundle(a), Pyramid.from_bundle(b)
+    found = coarse_motion(before, after, params, turn)
+    rolled = _rolled(before, after, found, params, turn)
     roll_deg = 0.0
     if rolled is not None:
         found, turn, roll_deg = rolled
@@ -209,7 +229,7 @@ def _run(params: MotionParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     seen = ok & (xb >= 0) & (xb <= cols - 1) & (yb >= 0) & (yb <= rows - 1)
     u, v = found.column_disparity[ok], found.row_disparity[ok]
     usable = int(np.count_nonzero(found.validity & np.uint8(Validity.OUT_OF_IMAGE) == 0))
-    meta = {
+    meta: MotionFacts = {
         "level": found.level,
         "median_column": float(np.median(u)) if u.size else None,
         "median_row": float(np.median(v)) if u.size else None,
@@ -225,19 +245,3 @@ def _run(params: MotionParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         "validity": found.validity,
     }
     return Bundle(arrays, meta)
-
-
-_GRID = "coarse level of a"
-STAGE = Stage(
-    name="motion",
-    version=1,
-    summary="coarse displacements of all points from one left frame to the next",
-    params=MotionParams,
-    inputs=("a", "b"),
-    outputs=(
-        raster("column_disparity", "px", "level-0 columns, frame b minus a", frame=_GRID),
-        raster("row_disparity", "px", "level-0 rows, frame b minus a", frame=_GRID),
-        raster("validity", "1", "bit mask, see stages.core.validity", "uint8", "", _GRID),
-    ),
-    run=_run,
-)

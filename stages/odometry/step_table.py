@@ -6,15 +6,15 @@ displacements, not the maps: read from tables, a sequence of thousands of frames
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain, pairwise
-from typing import Any
 
 import numpy as np
 
-from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import matched
+from rille.stages.facts.odometry import MotionFacts, StepTableFacts
 from rille.stages.odometry.covisibility import Step
 
 
@@ -44,8 +44,19 @@ def _rows(table: Bundle) -> Iterator[Step]:
         yield Step(blocks, float(table.meta["side"]), shift[k], (width, height), float(rate))
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    motions = list(inputs["motions"])
+@stage(
+    "step_table",
+    outputs=[
+        Array("blocks", ("block", "uv"), "float64", "px", "column and row of the centre of each block"),
+        Array("shift", ("step", "block", "uv"), "float64", "px", "displacement of each block", "nan"),
+        Array("match_rate", ("step",), "float64", "1", "share of the pixels with texture that have a displacement"),
+        Array("change", ("step",), "float64", "px", "median change of the displacements since the step before"),
+    ],
+)
+def step_table_stage(
+    params: NoParams, motions: Sequence[Bundle[MotionFacts]], before: Bundle[MotionFacts] | None = None
+) -> Bundle[StepTableFacts]:
+    """Displacements of the blocks of the image from frame to frame, of many motions."""
     steps = [Step.from_bundle(motion) for motion in motions]
     first = steps[0]
     if any(not np.array_equal(step.blocks, first.blocks) for step in steps):
@@ -53,30 +64,14 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
             "RIL-895", "motions of one table have different grids", remedy="give images of one size to a sequence"
         )
     # A change needs two steps: the first of a table that has one before it is measured against that one's last.
-    before = [inputs["before"]] if "before" in inputs else []
-    changes = [change(a, b) for a, b in pairwise([*before, *motions])]
+    earlier = [] if before is None else [before]
+    changes = [change(a, b) for a, b in pairwise([*earlier, *motions])]
     return Bundle(
         {
             "blocks": first.blocks,
             "shift": np.array([step.shift for step in steps]),
             "match_rate": np.array([step.match_rate for step in steps]),
-            "change": np.array(changes if before else [0.0, *changes]),
+            "change": np.array(changes if earlier else [0.0, *changes]),
         },
         {"side": first.side, "size": list(first.size)},
     )
-
-
-STAGE = Stage(
-    name="step_table",
-    version=1,
-    summary="displacements of the blocks of the image from frame to frame, of many motions",
-    params=NoParams,
-    inputs=("motions*", "before?"),
-    outputs=(
-        Array("blocks", ("block", "uv"), "float64", "px", "column and row of the centre of each block"),
-        Array("shift", ("step", "block", "uv"), "float64", "px", "displacement of each block", "nan"),
-        Array("match_rate", ("step",), "float64", "1", "share of the pixels with texture that have a displacement"),
-        Array("change", ("step",), "float64", "px", "median change of the displacements since the step before"),
-    ),
-    run=_run,
-)

@@ -15,17 +15,18 @@ known, and dropped if it is not found there. Where the exposure changes, it is u
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
-from rille.stages.core.declare import Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import Array, Bundle, Params, stage
 from rille.stages.core.errors import InputError
+from rille.stages.facts.imaging import PyramidFacts
+from rille.stages.facts.odometry import MotionFacts, TrackFacts
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.odometry.affine_lk import HALF, Templates, align
 from rille.stages.odometry.affinity import NEIGHBOURS, fit_affinity, known
@@ -199,29 +200,28 @@ def _align(
     return np.where(good[:, None], place, np.nan), np.where(good, error, np.nan)
 
 
-def _run(params: TrackParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    frames = [Pyramid.from_bundle(b) for b in inputs["frames"]]
-    motions = [
-        LevelDisplacements(np.asarray(b["column_disparity"]), np.asarray(b["row_disparity"]), int(b.meta["level"]))
-        for b in inputs["motions"]
-    ]
-    found = track(frames, motions, params)
-    return Bundle(
-        {"points": found.points, "birth": found.birth, "distance": found.distance},
-        {"frames": list(args["frames"]), "tracked": [int(v) for v in np.isfinite(found.distance).sum(0)]},
-    )
-
-
-STAGE = Stage(
-    name="track",
-    version=1,
-    summary="interest points followed through the left frames of a segment",
-    params=TrackParams,
-    inputs=("frames*", "motions*"),
-    outputs=(
+@stage(
+    "track",
+    outputs=[
         Array("points", ("point", "frame", "uv"), "float32", "px", "column and row of the point", nodata="nan"),
         Array("birth", ("point",), "int16", "1", "index of the frame that the template is from"),
         Array("distance", ("point", "frame"), "float32", "grey", "rms difference to the template", nodata="nan"),
-    ),
-    run=_run,
+    ],
 )
+def track_stage(
+    params: TrackParams,
+    pyramids: Sequence[Bundle[PyramidFacts]],
+    motions: Sequence[Bundle[MotionFacts]],
+    *,
+    frames: Sequence[int],
+) -> Bundle[TrackFacts]:
+    """Interest points followed through the left frames of a segment."""
+    moves = [
+        LevelDisplacements(np.asarray(b["column_disparity"]), np.asarray(b["row_disparity"]), b.meta["level"])
+        for b in motions
+    ]
+    found = track([Pyramid.from_bundle(b) for b in pyramids], moves, params)
+    return Bundle(
+        {"points": found.points, "birth": found.birth, "distance": found.distance},
+        {"frames": list(frames), "tracked": [int(v) for v in np.isfinite(found.distance).sum(0)]},
+    )

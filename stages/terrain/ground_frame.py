@@ -12,7 +12,7 @@ a surface); if nothing gives the vertical either, the local frame is that of the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -21,9 +21,11 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats
-from rille.stages.core.declare import Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.core.validity import matched_back
+from rille.stages.facts.calibration import CalibrationFacts
+from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.epipolar import exchanged, fits, inverse_depth
 from rille.stages.geometry.geometry import Rig, RigidTransform, level_rotation
 from rille.stages.geometry.pose_arrays import NO_VERTICAL
@@ -121,7 +123,7 @@ def level(
     rig: Rig,
     params: GroundFrameParams,
     vertical: VerticalHint | None = None,
-) -> dict[str, Any]:
+) -> GroundFacts:
     """Local frame and ground of one pair.
 
     Parameters
@@ -129,18 +131,6 @@ def level(
     column_disparity, row_disparity : (rows, cols) right minus left, pixels, of the left image.
     usable : (rows, cols) pixels with a measured disparity.
     vertical : None: it is that of the ground.
-
-    Returns
-    -------
-    dict
-        ``T_local_left`` (12 numbers), ``source`` of the vertical (``none``: unknown, z is the camera's own up);
-        ``ground_height`` z of the ground below the camera (m, negative); ``plane`` (a, b, c) of z = c + a x + b y;
-        ``tilt`` of the ground (rad); ``relief`` lowest and highest terrain against the plane (m); ``z_range`` (m);
-        ``cell_size`` (m) that suits the rig; ``footprint`` x_min, x_max, y_min, y_max (m) for it; ``ground_share`` of
-        the sampled pixels. All in the local frame. Where no ground is seen, ``no_ground`` says why, and the
-        values that describe it are None, except ``cell_size``; ``plane`` and ``relief`` are there where larger cells
-        may show it; ``seen_up``, in the left camera's frame, is up by ground that is seen but contradicts the given
-        vertical.
 
     Raises
     ------
@@ -153,34 +143,41 @@ def level(
     try:
         ground = _fitted(samples, lambda n: _allowed(n, known_up, params), params)
         R_local_left = level_rotation(ground.up if known_up is None else known_up)
-        return {"source": source or "ground plane"} | _on_ground(ground, R_local_left, samples, rig, params)
+        return _on_ground(ground, R_local_left, samples, rig, params, source or "ground plane")
     except DegenerateError as error:
         why = _explained(error, samples, ground, params)
     up = np.array([0.0, -1.0, 0.0]) if known_up is None else known_up
     # No ground is seen: odometry, which needs none, still gets a frame.
-    facts, R_local_left = {"source": source or NO_VERTICAL}, level_rotation(up)
+    source, R_local_left = source or NO_VERTICAL, level_rotation(up)
     try:
         if params.reference_height is not None:
             stated = GroundPlane(up, params.reference_height, 0.0)
-            return facts | _on_ground(stated, R_local_left, samples, rig, params)
+            return _on_ground(stated, R_local_left, samples, rig, params, source)
     except DegenerateError as error:
         why = error
+    facts: GroundFacts = {
+        "T_local_left": RigidTransform(R_local_left, np.zeros(3)).to_list(),
+        "source": source,
+        "ground_height": None,
+        "plane": None,
+        "tilt": None,
+        "relief": None,
+        "z_range": None,
+        "cell_size": _cell_without_ground(rho[rho > BEYOND * sigma], rig),
+        "footprint": None,
+        "ground_share": 0.0,
+        "no_ground": str(why),
+    }
     if known_up is not None:
         with suppress(DegenerateError):
             # The images may show ground where the given vertical has none: then one of the two is wrong.
-            facts |= {"seen_up": _fitted(samples, lambda n: _allowed(n, None, params), params).up.tolist()}
-    nothing: dict[str, Any] = dict.fromkeys(("ground_height", "plane", "tilt", "relief", "z_range", "footprint"))
+            facts["seen_up"] = _fitted(samples, lambda n: _allowed(n, None, params), params).up.tolist()
     if ground is not None and isinstance(why, CoarseGroundError) and ground.inliers >= DOMINANT:
         # Larger cells than those that suit the rig may still make a map.
-        nothing["plane"], everywhere = _local_plane(ground, R_local_left), [-math.inf, math.inf] * 2
+        plane, everywhere = _local_plane(ground, R_local_left), [-math.inf, math.inf] * 2
         points = (rays[rho > 0] / rho[rho > 0, None]) @ R_local_left.T
-        nothing["relief"] = _relief(points, nothing["plane"], everywhere, ground.height, params)
-    cell, T_local_left = _cell_without_ground(rho[rho > BEYOND * sigma], rig), RigidTransform(R_local_left, np.zeros(3))
-    return (
-        facts
-        | nothing
-        | {"T_local_left": T_local_left.to_list(), "cell_size": cell, "ground_share": 0.0, "no_ground": str(why)}
-    )
+        facts["plane"], facts["relief"] = plane, _relief(points, plane, everywhere, ground.height, params)
+    return facts
 
 
 def _fitted(samples: Samples, allowed: Callable[[Floats], Bools], params: GroundFrameParams) -> GroundPlane:
@@ -207,8 +204,8 @@ def _explained(
 
 
 def _on_ground(
-    ground: GroundPlane, R_local_left: Floats, samples: Samples, rig: Rig, params: GroundFrameParams
-) -> dict[str, Any]:
+    ground: GroundPlane, R_local_left: Floats, samples: Samples, rig: Rig, params: GroundFrameParams, source: str
+) -> GroundFacts:
     """What :func:`level` says of a pair whose ground plane is known."""
     rays, rho, _ = samples
     plane = _local_plane(ground, R_local_left)
@@ -219,6 +216,7 @@ def _on_ground(
     relief = _relief(points[rho > 0], plane, footprint, ground.height, params)
     return {
         "T_local_left": RigidTransform(R_local_left, np.zeros(3)).to_list(),
+        "source": source,
         "ground_height": plane[2],
         "plane": plane,
         "tilt": math.atan(math.hypot(plane[0], plane[1])),
@@ -326,25 +324,23 @@ def _relief(
     return [max(low - margin, -height), min(high + margin, (1.0 + params.ceiling) * height)]
 
 
-def _run(params: GroundFrameParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    disparity = inputs["disparity"]
+@stage("ground_frame")
+def ground_frame_stage(
+    params: GroundFrameParams,
+    disparity: Bundle,
+    rig: Bundle[CalibrationFacts],
+    *,
+    up: Sequence[float] | None = None,
+    initial_up: Sequence[float] | None = None,
+    pitch: float | None = None,
+) -> Bundle[GroundFacts]:
+    """Vertical and ground plane of a basic pair."""
     facts = level(
         disparity["column_disparity"],
         disparity["row_disparity"],
         matched_back(np.asarray(disparity["validity"]), np.asarray(disparity["backmatch_error"])),
-        Rig.from_dict(inputs["rig"].meta["rig"]),
+        Rig.from_dict(rig.meta["rig"]),
         params,
-        VerticalHint(args.get("up"), args.get("initial_up"), args.get("pitch")),
+        VerticalHint(up, initial_up, pitch),
     )
     return Bundle({}, facts)
-
-
-STAGE = Stage(
-    name="ground_frame",
-    version=1,
-    summary="vertical and ground plane of a basic pair",
-    params=GroundFrameParams,
-    inputs=("disparity", "rig"),
-    outputs=(),
-    run=_run,
-)

@@ -11,9 +11,8 @@ else."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy
@@ -22,8 +21,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.core.errors import DegenerateError, InputError
+from rille.stages.facts.terrain import DemFacts, MapFixFacts
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.numeric.robust import huber_weight
@@ -268,18 +268,30 @@ def _transform(x: float, y: float, heading: float, z: float) -> list[float]:
     return RigidTransform(rotation_exp([0.0, 0.0, heading]), np.array([x, y, z])).to_list()
 
 
-def _run(params: MapLocalizationParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    if "pose" in args:
-        x, y, z, heading = (float(v) for v in args["pose"])
+@stage("map_localization")
+def map_localization_stage(
+    params: MapLocalizationParams,
+    dem: Bundle[DemFacts] | None = None,
+    global_map: Bundle | None = None,
+    *,
+    pose: Sequence[float] | None = None,
+    prior: Sequence[float] = (),
+    prior_sigma: Sequence[float] = (),
+) -> Bundle[MapFixFacts]:
+    """First pose in a global map, by aligning the first elevation model or as handed in."""
+    if pose is not None:
+        x, y, z, heading = pose
         return Bundle({}, {"T_global_local": _transform(x, y, heading, z), "source": "handed in"})
-    dem, given = inputs["dem"], inputs["map"]
-    lattice = Lattice.from_dict(given.meta["lattice"])
+    assert dem is not None
+    assert global_map is not None
+    lattice = Lattice.from_dict(global_map.meta["lattice"])
     points = thin(np.asarray(dem["elevation"]), Lattice.from_dict(dem.meta["lattice"]), lattice.cell)
-    x, y, heading = (float(v) for v in args["prior"])
-    sigma = (float(args["prior_sigma"][0]), float(args["prior_sigma"][1]))
-    found = fix(points, np.asarray(given["elevation"]), lattice, (x, y, heading), sigma, params)
+    x, y, heading = prior
+    found = fix(
+        points, np.asarray(global_map["elevation"]), lattice, (x, y, heading), (prior_sigma[0], prior_sigma[1]), params
+    )
     std = np.sqrt(np.diag(found.covariance))
-    meta: dict[str, Any] = {
+    meta: MapFixFacts = {
         "T_global_local": _transform(*found.place),
         "source": "aligned to the global map",
         "std": [float(v) for v in std],
@@ -299,14 +311,3 @@ def _run(params: MapLocalizationParams, args: Mapping[str, Any], inputs: Inputs)
             f"{params.min_chi2_gap:g} wanted)"
         ]
     return Bundle({}, meta)
-
-
-STAGE = Stage(
-    name="map_localization",
-    version=1,
-    summary="first pose in a global map, by aligning the first elevation model or as handed in",
-    params=MapLocalizationParams,
-    inputs=("dem?", "map?"),
-    outputs=(),
-    run=_run,
-)

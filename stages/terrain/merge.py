@@ -34,8 +34,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.core.arrays import Bytes, Floats, Floats32
-from rille.stages.core.declare import Bundle, Inputs, Memory, Params, Stage, raster
+from rille.stages.core.declare import Bundle, Memory, Params, raster, stage
 from rille.stages.core.errors import InputError
+from rille.stages.facts.terrain import DemFacts, MergeFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice, Window
 from rille.stages.numeric.holes import close_holes
@@ -273,34 +274,10 @@ def _fine(dem: Bundle, lattice: Lattice, most: float) -> Callable[[str, Window],
     return part
 
 
-def _run(params: MergeParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    tile = Lattice.from_dict(args["lattice"])
-    steps = args.get("exposure", {})
-    layers = []
-    for dem in inputs["dems"]:
-        pair = int(dem.meta["pair"])
-        gain = math.exp(STEP * int(steps.get(str(pair), 0)))
-        lattice = Lattice.from_dict(dem.meta["lattice"])
-        part = dem.part if params.max_footprint is None else _fine(dem, lattice, params.max_footprint)
-        layers.append(Layer(pair, lattice, part, gain, Placed.of(dem.meta)))
-    merged = merge(layers, tile, params)
-    meta = {
-        "lattice": tile.to_dict(),
-        "frame": "world",
-        "pairs": sorted(layer.pair for layer in layers),
-        "defined": float(np.mean(merged.count > 0)),
-        "filled": int(merged.filled.sum()),
-    }
-    return Bundle(vars(merged), meta)
-
-
-STAGE = Stage(
-    name="merge",
+@stage(
+    "merge",
     version=3,
-    summary="merged elevation model and ortho image of one tile of the world",
-    params=MergeParams,
-    inputs=("dems*",),
-    outputs=(
+    outputs=[
         raster("elevation", "m", "elevation of the cell centre", "float32", "nan", "world"),
         raster("elevation_std", "m", "standard deviation of the elevation, poses included", "float32", "nan", "world"),
         raster("spread", "m", "standard deviation of the merged models about the elevation", "float32", "nan", "world"),
@@ -309,7 +286,30 @@ STAGE = Stage(
         raster("ortho", "grey", "grey value, 0..255", "float32", "nan", "world"),
         raster("relief_std", "m", "standard deviation of the elevation against that around", "float32", "nan", "world"),
         raster("filled", "1", "1 where a small hole was closed by interpolation", "uint8", "", "world"),
-    ),
-    run=_run,
+    ],
     memory=Memory(lower=("locus.cell_size",)),
 )
+def merge_stage(
+    params: MergeParams,
+    dems: Sequence[Bundle[DemFacts]],
+    *,
+    lattice: Lattice,
+    exposure: Mapping[str, int] | None = None,
+) -> Bundle[MergeFacts]:
+    """Merged elevation model and ortho image of one tile of the world."""
+    steps = exposure or {}
+    layers = []
+    for dem in dems:
+        pair, own = dem.meta["pair"], Lattice.from_dict(dem.meta["lattice"])
+        gain = math.exp(STEP * steps.get(str(pair), 0))
+        part = dem.part if params.max_footprint is None else _fine(dem, own, params.max_footprint)
+        layers.append(Layer(pair, own, part, gain, Placed.of(dem.meta)))
+    merged = merge(layers, lattice, params)
+    meta: MergeFacts = {
+        "lattice": lattice.to_dict(),
+        "frame": "world",
+        "pairs": sorted(layer.pair for layer in layers),
+        "defined": float(np.mean(merged.count > 0)),
+        "filled": int(merged.filled.sum()),
+    }
+    return Bundle(vars(merged), meta)

@@ -13,16 +13,16 @@ it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numba import njit
 from pydantic import Field
 
 from rille.stages.core.arrays import Floats, Floats32
-from rille.stages.core.declare import Bundle, Inputs, Params, Stage, raster
+from rille.stages.core.declare import Bundle, Params, raster, stage
+from rille.stages.facts.terrain import BoundsFacts, DemFacts, MergeFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain.merge import footprint
@@ -100,13 +100,22 @@ def _below(z, row, col, height, out):  # type: ignore[no-untyped-def]
                 out[i, j] = min(out[i, j], np.float32(height + (z[r, c] - height) * min(share, 1.0)))
 
 
-def _run(params: OcclusionBoundsParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    merged = inputs["merged"]
+@stage(
+    "occlusion_bounds",
+    outputs=[
+        raster("upper", "m", "height that the ground does not exceed", frame="world"),
+        raster("lower", "m", "height that it does not fall below, where it was seen", frame="world"),
+    ],
+)
+def occlusion_bounds_stage(
+    params: OcclusionBoundsParams, merged: Bundle[MergeFacts], dems: Sequence[Bundle[DemFacts]]
+) -> Bundle[BoundsFacts]:
+    """Between which heights the ground lies: where it was not seen, below the lines of sight over it."""
     lattice = Lattice.from_dict(merged.meta["lattice"])
     z, s = (np.asarray(merged[name], dtype=np.float32) for name in ("elevation", "relief_std"))
     k = np.float32(params.sigmas)
     least = np.full(lattice.shape, np.nan, dtype=np.float32)
-    for dem in inputs["dems"]:
+    for dem in dems:
         own = Lattice.from_dict(dem.meta["lattice"])
         centre = RigidTransform.from_matrix(dem.meta["T_frame_left"]).translation
         seen, std = (np.asarray(dem[name], dtype=np.float32) for name in ("elevation", "elevation_std"))
@@ -121,19 +130,5 @@ def _run(params: OcclusionBoundsParams, args: Mapping[str, Any], inputs: Inputs)
         least[here] = np.fmin(least[here], found)
     bounds, unknown = Bounds.of(z, k * s, least), np.isnan(z)
     shares = {"unknown": float(unknown.mean()), "bounded": float((unknown & np.isfinite(least)).mean())}
-    meta = {"lattice": lattice.to_dict(), "frame": "world", "shares": shares}
+    meta: BoundsFacts = {"lattice": lattice.to_dict(), "frame": "world", "shares": shares}
     return Bundle({"upper": bounds.upper, "lower": bounds.lower}, meta)
-
-
-STAGE = Stage(
-    name="occlusion_bounds",
-    version=1,
-    summary="between which heights the ground lies: where it was not seen, below the lines of sight over it",
-    params=OcclusionBoundsParams,
-    inputs=("merged", "dems*"),
-    outputs=(
-        raster("upper", "m", "height that the ground does not exceed", frame="world"),
-        raster("lower", "m", "height that it does not fall below, where it was seen", frame="world"),
-    ),
-    run=_run,
-)

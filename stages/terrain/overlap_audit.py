@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats
-from rille.stages.core.declare import Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import Bundle, Params, stage
+from rille.stages.facts.terrain import AuditFacts, OverlapFacts
 
 Facts = Mapping[str, Any]
 
@@ -173,10 +174,13 @@ def describe(model: Facts) -> str:
     return words + (", either may be wrong" if model["either"] else "")
 
 
-def _run(params: OverlapAuditParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    seams = [s for bundle in inputs["seams"] for s in bundle.meta["seams"]]
-    centres = {int(pair): centre for pair, centre in args["centres"].items()}
-    factor, models = audit(seams, centres)
+@stage("overlap_audit", version=2)
+def overlap_audit_stage(
+    params: OverlapAuditParams, seams: Sequence[Bundle[OverlapFacts]], *, centres: Mapping[str, Sequence[float]]
+) -> Bundle[AuditFacts]:
+    """Which elevation models contradict their neighbours, in bias and tilt, the worst first."""
+    every = [s for bundle in seams for s in bundle.meta["seams"]]
+    factor, models = audit(every, {int(pair): centre for pair, centre in centres.items()})
     bad = contradictions(models, params)
     for model in models:
         model["contradicts"] = model in bad
@@ -186,7 +190,7 @@ def _run(params: OverlapAuditParams, args: Mapping[str, Any], inputs: Inputs) ->
         more = f"; and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
         count = f"{len(bad)} of {len(centres)} elevation models"
         warnings.append(f"{count} contradict their neighbours by more than their sigma allows: {told}{more}")
-    ranked = sorted(seams, key=lambda s: (-s["systematic"] / max(s["expected"], 1e-12), s["pair"], s["other"]))
+    ranked = sorted(every, key=lambda s: (-s["systematic"] / max(s["expected"], 1e-12), s["pair"], s["other"]))
     kept = ("pair", "other", "cells", "bias", "tilt", "covariance", "noise", "structure", "systematic", "expected")
     return Bundle(
         {},
@@ -198,14 +202,3 @@ def _run(params: OverlapAuditParams, args: Mapping[str, Any], inputs: Inputs) ->
             "warnings": warnings,
         },
     )
-
-
-STAGE = Stage(
-    name="overlap_audit",
-    version=2,
-    summary="which elevation models contradict their neighbours, in bias and tilt, the worst first",
-    params=OverlapAuditParams,
-    inputs=("seams*",),
-    outputs=(),
-    run=_run,
-)

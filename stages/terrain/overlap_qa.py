@@ -17,14 +17,15 @@ with a triangular kernel k over the distance of two blocks (Conley 1999, doi:10.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
-from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Array, Bundle, NoParams, stage
+from rille.stages.facts.terrain import DemFacts, OverlapFacts
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
 
@@ -263,24 +264,9 @@ def _coarse(difference: Floats) -> tuple[Floats32, int]:
     return np.where(count > 0, mean, np.nan).astype(np.float32), step
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    dem = inputs["dem"]
-    arrays, facts = {}, []
-    for other in sorted(inputs["others"], key=lambda b: int(b.meta["pair"])):
-        found = seam(dem, other)
-        if found is not None:
-            facts.append(found[0])
-            arrays[f"difference_{found[0]['other']}"] = found[1]
-    return Bundle(arrays, {"pair": int(dem.meta["pair"]), "seams": facts})
-
-
-STAGE = Stage(
-    name="overlap_qa",
-    version=1,
-    summary="difference of an elevation model from earlier ones that overlap: bias, tilt and noise apart",
-    params=NoParams,
-    inputs=("dem", "others*"),
-    outputs=(
+@stage(
+    "overlap_qa",
+    outputs=[
         Array(
             "difference_*",
             ("row", "col"),
@@ -291,6 +277,16 @@ STAGE = Stage(
             "world",
             optional=True,
         ),
-    ),
-    run=_run,
+    ],
 )
+def overlap_qa_stage(
+    params: NoParams, dem: Bundle[DemFacts], others: Sequence[Bundle[DemFacts]]
+) -> Bundle[OverlapFacts]:
+    """Difference of an elevation model from earlier ones that overlap: bias, tilt and noise apart."""
+    arrays, facts = {}, []
+    for other in sorted(others, key=lambda b: int(b.meta["pair"])):
+        found = seam(dem, other)
+        if found is not None:
+            facts.append(found[0])
+            arrays[f"difference_{found[0]['other']}"] = found[1]
+    return Bundle(arrays, {"pair": int(dem.meta["pair"]), "seams": facts})

@@ -14,12 +14,12 @@ little then leaves those of the others as they are, to the bit, and with them ev
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from pydantic import Field
 
-from rille.stages.core.declare import Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import Bundle, Params, stage
+from rille.stages.facts.terrain import OverlapFacts, RadiometryFacts
 
 STEP = 0.01
 """Step of log g: half a step is 0.6 of 128 grey values."""
@@ -66,25 +66,17 @@ def level(centres: Mapping[int, Sequence[float]], ratios: Sequence[tuple[int, in
     return {pair: int(steps[i]) for pair, i in at.items() if steps[i]}
 
 
-def _run(params: RadiometryParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+@stage("radiometry")
+def radiometry_stage(
+    params: RadiometryParams, seams: Sequence[Bundle[OverlapFacts]], *, centres: Mapping[str, Sequence[float]]
+) -> Bundle[RadiometryFacts]:
+    """Factors that level the exposures of overlapping elevation models' grey values."""
     ratios = [
         (int(seam["other"]), int(seam["pair"]), float(seam["log_ratio"]))
-        for bundle in inputs["seams"]
+        for bundle in seams
         for seam in bundle.meta["seams"]
         if seam["log_ratio"] is not None
     ]
-    centres = {int(pair): centre for pair, centre in args["centres"].items()}
-    steps = level(centres, ratios) if params.level else {}
+    steps = level({int(pair): centre for pair, centre in centres.items()}, ratios) if params.level else {}
     found = {str(pair): n for pair, n in sorted(steps.items())}
     return Bundle({}, {"step": STEP, "steps": found, "seams": len(ratios)})
-
-
-STAGE = Stage(
-    name="radiometry",
-    version=1,
-    summary="factors that level the exposures of overlapping elevation models' grey values",
-    params=RadiometryParams,
-    inputs=("seams*",),
-    outputs=(),
-    run=_run,
-)

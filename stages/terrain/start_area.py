@@ -7,13 +7,11 @@ that what the cameras see of the disk outweighs it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 from pydantic import Field
 
-from rille.stages.core.declare import Bundle, Inputs, Params, Stage, raster
+from rille.stages.core.declare import Bundle, Params, raster, stage
+from rille.stages.facts.terrain import DemFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 
@@ -41,12 +39,30 @@ def pad(T_world_vehicle: RigidTransform, radius: float, cell: float) -> tuple[La
     return lattice, np.where(np.hypot(dx, dy) <= radius, plane, np.nan).astype(np.float32)
 
 
-def _run(params: StartAreaParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    T_world_left = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1])
-    T_world_vehicle = T_world_left @ RigidTransform.from_matrix(args["T_vehicle_left"]).inverse()
-    lattice, elevation = pad(T_world_vehicle, float(args["radius"]), float(inputs["like"].meta["lattice"]["cell"]))
+@stage(
+    "start_area",
+    outputs=[
+        raster("elevation", "m", "elevation of the cell centre", frame="world"),
+        raster("elevation_std", "m", "standard deviation of the elevation", frame="world"),
+        raster("residual", "px", "none: not measured", frame="world"),
+        raster("ortho", "grey", "none: not seen", frame="world"),
+    ],
+)
+def start_area_stage(
+    params: StartAreaParams,
+    pose: Bundle,
+    like: Bundle[DemFacts],
+    *,
+    T_vehicle_left: RigidTransform,
+    radius: float,
+    wheel_diameter: float,
+) -> Bundle[DemFacts]:
+    """The ground that the vehicle stands on at the start, as the operator vouches for it."""
+    T_world_left = RigidTransform.from_matrix(np.asarray(pose["poses"])[-1])
+    T_world_vehicle = T_world_left @ T_vehicle_left.inverse()
+    lattice, elevation = pad(T_world_vehicle, radius, float(like.meta["lattice"]["cell"]))
     known = np.isfinite(elevation)
-    sigma = np.float32(params.sigma * float(args["wheel_diameter"]))
+    sigma = np.float32(params.sigma * wheel_diameter)
     arrays = {
         "elevation": elevation,
         "elevation_std": np.where(known, sigma, np.float32(np.nan)),
@@ -54,19 +70,3 @@ def _run(params: StartAreaParams, args: Mapping[str, Any], inputs: Inputs) -> Bu
         "ortho": np.full(elevation.shape, np.nan, np.float32),
     }
     return Bundle(arrays, {"lattice": lattice.to_dict(), "frame": "world", "pair": NOBODY})
-
-
-STAGE = Stage(
-    name="start_area",
-    version=1,
-    summary="the ground that the vehicle stands on at the start, as the operator vouches for it",
-    params=StartAreaParams,
-    inputs=("pose", "like"),
-    outputs=(
-        raster("elevation", "m", "elevation of the cell centre", frame="world"),
-        raster("elevation_std", "m", "standard deviation of the elevation", frame="world"),
-        raster("residual", "px", "none: not measured", frame="world"),
-        raster("ortho", "grey", "none: not seen", frame="world"),
-    ),
-    run=_run,
-)

@@ -7,14 +7,14 @@ same one whatever models there are, and depends on those alone that have a defin
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools
-from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Bundle, NoParams, stage
+from rille.stages.facts.terrain import DemFacts, TileIndexFacts
 from rille.stages.geometry.lattice import Lattice
 
 Tile = tuple[int, int]
@@ -67,11 +67,12 @@ def tile_lattice(boxes: Iterable[Box], cell: float) -> Lattice:
     return Lattice.at(left, -top, cell, foot - top, right - left)
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    dem = inputs["dem"]
+@stage("tile_index")
+def tile_index_stage(params: NoParams, dem: Bundle[DemFacts], *, side: int, margin: int) -> Bundle[TileIndexFacts]:
+    """Tiles of the world that an elevation model touches."""
     lattice = Lattice.from_dict(dem.meta["lattice"])
     defined = np.isfinite(dem["elevation"])
-    tiles = footprint(defined, lattice, int(args["side"]), int(args["margin"]))
+    tiles = footprint(defined, lattice, side, margin)
     rows, cols = (np.flatnonzero(defined.any(axis=axis)) for axis in (1, 0))
     box = None
     if rows.size:
@@ -79,14 +80,3 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         box = Lattice.at(lattice.i0 + int(cols[0]), lattice.j0 - int(rows[0]), lattice.cell, *shape).to_dict()
     listed = [[*tile, *tiles[tile]] for tile in sorted(tiles)]
     return Bundle({}, {"pair": dem.meta["pair"], "cell": lattice.cell, "box": box, "tiles": listed})
-
-
-STAGE = Stage(
-    name="tile_index",
-    version=1,
-    summary="tiles of the world that an elevation model touches",
-    params=NoParams,
-    inputs=("dem",),
-    outputs=(),
-    run=_run,
-)

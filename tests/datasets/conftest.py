@@ -9,7 +9,7 @@ import pytest
 
 from rille.datasets.mockup.params import MockupParams
 from rille.datasets.protocol import Source
-from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.core.declare import Bundle, check_outputs, declared
 
 TINY = {
     "frames": 3,
@@ -32,7 +32,7 @@ class Materialiser:
         args = json.loads(json.dumps(dict(source.args)))
         key = f"{source.module} {source.params!r} {json.dumps(args, sort_keys=True)} {sorted(source.inputs)}"
         if key not in self.kept:
-            stage = importlib.import_module(source.module).STAGE
+            stage = declared(importlib.import_module(source.module))
             inputs = {port: self(upstream) for port, upstream in source.inputs.items()}
             bundle = stage.run(source.params, args | dict(source.hints), inputs)
             check_outputs(stage, bundle)

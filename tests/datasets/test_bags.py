@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 import rille
 from rille.datasets.registry import open_sequence
 from rille.pipeline.cli import main
+from rille.stages.core.declare import declared
 from rille.stages.geometry.geometry import RigidTransform
 
 START, STEP = 1_700_000_000_000_000_000, 100_000_000
@@ -115,7 +116,7 @@ def street(form="mcap-file", frames=3, lag=0, infos=True, dtype=np.uint8):
 
 def pixels(sequence, frame, camera):
     source = sequence.image(frame, camera)
-    stage = import_module(source.module).STAGE
+    stage = declared(import_module(source.module))
     return np.asarray(stage.run(source.params, {**source.args, **source.hints}, {})["image"])
 
 

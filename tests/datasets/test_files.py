@@ -100,7 +100,7 @@ def test_a_few_bytes_of_padding_before_the_end_are_no_damage(capfd):
 
 
 def run(source):
-    stage = files.STAGE
+    stage = files.image_stage
     bundle = stage.run(NoParams(), source.args | source.hints, {})
     check_outputs(stage, bundle)
     return bundle

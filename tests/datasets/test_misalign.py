@@ -123,7 +123,7 @@ def test_real_optics_are_used_where_there_are_any():
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_stage_keeps_the_depth(dtype):
-    stage = module.STAGE
+    stage = module.misalign_stage
     given = Bundle({"image": picture(dtype), "valid": np.ones((64, 96), np.uint8)}, {})
     args = {"frame": 2, "camera": "right", "lens": PINHOLE.to_dict()}
     out = stage.run(ALL, args, {"image": given})

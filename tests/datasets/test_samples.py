@@ -105,7 +105,7 @@ def test_images_of_few_bits_open_with_one_scale_for_both_cameras(tmp_path):
     sources = [sequence.image(k, camera) for k in range(4) for camera in ("left", "right")]
     assert len({source.args["levels"] for source in sources}) == 1
     black, gain = sources[0].args["levels"]
-    from rille.datasets.images.files import STAGE
+    from rille.datasets.images.files import image_stage
 
-    out = STAGE.run(sources[3].params, {**sources[3].args, **sources[3].hints}, {})["image"]
+    out = image_stage.run(sources[3].params, {**sources[3].args, **sources[3].hints}, {})["image"]
     np.testing.assert_array_equal(out, (given["right", 1].astype(int) - black) * gain)

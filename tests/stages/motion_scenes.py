@@ -82,7 +82,7 @@ def tables(motions, rows=3):
     """Tables of steps of so many motions each, as the flow cuts them."""
     cuts = range(0, len(motions), rows)
     return [
-        step_table.STAGE.run(
+        step_table.step_table_stage.run(
             NoParams(), {}, {"motions": motions[k : k + rows]} | ({"before": motions[k - 1]} if k else {})
         )
         for k in cuts

@@ -6,11 +6,12 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Generic
 
 from pydantic import BaseModel, Field, NonNegativeInt, PositiveInt
 
 from rille.pipeline.engine.store.archive import MANIFEST, Archive, BrokenError
+from rille.stages.core.declare import F
 
 Manifest = dict[str, Any]
 
@@ -45,7 +46,7 @@ class _Manifest(BaseModel, strict=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Ref:
+class Ref(Generic[F]):
     """A committed artifact: all that travels between tasks.
 
     ``nbytes`` are bytes of the decoded arrays, ``stored`` those of the file.
@@ -54,7 +55,7 @@ class Ref:
     key: str
     stage: str
     digest: str
-    meta: Mapping[str, Any]
+    meta: F
     nbytes: int = 0
     stored: int = 0
 

@@ -10,13 +10,14 @@ the tilt (:func:`rille.stages.odometry.resection.bundle_adjustment.tilt_of`).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Bundle, NoParams, stage
+from rille.stages.facts.calibration import CalibrationFacts
+from rille.stages.facts.odometry import RefineFacts, TiltFacts
 from rille.stages.geometry.epipolar import standing
 from rille.stages.geometry.geometry import Rig
 from rille.stages.numeric.robust import huber_weight, mad_sigma
@@ -52,24 +53,6 @@ def common_tilt(parts: Floats, prior_sigma: float) -> tuple[float, float]:
     return tilt * total / (total + prior), (total + prior) ** -0.5
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    told = [pair for segment in inputs["segments"] for pair in segment.meta["tilt"]]
-    tilt, sigma = common_tilt(np.array(told).reshape(-1, 2), math.radians(args["sigma_deg"]))
-    if not math.isfinite(sigma):
-        return Bundle({}, {"undone": False})
-    undone = abs(tilt) > args["significance"] * sigma
-    rig = Rig.from_dict(inputs["rig"].meta["rig"])
-    facts: dict[str, Any] = {"tilt_rad": tilt, "sigma_rad": sigma, "undone": undone}
-    lines = [_words(tilt, sigma, rig)] if undone else []
-    parts = np.array([one for segment in inputs["segments"] for one in segment.meta["intrinsics"]])
-    # No prior: a file holds any number.
-    errors = [common_tilt(parts[:, k], 1.0) for k in range(len(intrinsics.NAMES))]
-    facts["intrinsics"] = dict(zip(intrinsics.NAMES, errors, strict=True))
-    if line := intrinsics.contradiction(errors, rig.left.fx):
-        lines, facts["contradiction"] = [line, *lines], line
-    return Bundle({}, facts | ({"warnings": lines} if lines else {}))
-
-
 def _words(tilt: float, sigma: float, rig: Rig) -> str:
     angle, focal, lines = ("yaw", rig.right.fx, "columns") if standing(rig) else ("pitch", rig.right.fy, "rows")
     return (
@@ -79,12 +62,30 @@ def _words(tilt: float, sigma: float, rig: Rig) -> str:
     )
 
 
-STAGE = Stage(
-    name="common_tilt",
-    version=1,
-    summary="tilt and intrinsics that the disparities of all segments share",
-    params=NoParams,
-    inputs=("segments*", "rig"),
-    outputs=(),
-    run=_run,
-)
+@stage("common_tilt")
+def common_tilt_stage(
+    params: NoParams,
+    segments: Sequence[Bundle[RefineFacts]],
+    rig: Bundle[CalibrationFacts],
+    *,
+    sigma_deg: float,
+    significance: float,
+) -> Bundle[TiltFacts]:
+    """Tilt and intrinsics that the disparities of all segments share."""
+    told = [pair for segment in segments for pair in segment.meta["tilt"]]
+    tilt, sigma = common_tilt(np.array(told).reshape(-1, 2), math.radians(sigma_deg))
+    if not math.isfinite(sigma):
+        return Bundle({}, {"undone": False})
+    undone = abs(tilt) > significance * sigma
+    used = Rig.from_dict(rig.meta["rig"])
+    facts: TiltFacts = {"tilt_rad": tilt, "sigma_rad": sigma, "undone": undone}
+    lines = [_words(tilt, sigma, used)] if undone else []
+    parts = np.array([one for segment in segments for one in segment.meta["intrinsics"]])
+    # No prior: a file holds any number.
+    errors = [common_tilt(parts[:, k], 1.0) for k in range(len(intrinsics.NAMES))]
+    facts["intrinsics"] = dict(zip(intrinsics.NAMES, errors, strict=True))
+    if line := intrinsics.contradiction(errors, used.left.fx):
+        lines, facts["contradiction"] = [line, *lines], line
+    if lines:
+        facts["warnings"] = lines
+    return Bundle({}, facts)

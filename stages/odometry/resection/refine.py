@@ -25,8 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import Array, Bundle, Inputs, Stage
+from rille.stages.core.declare import Array, Bundle, stage
 from rille.stages.core.errors import ConfigError
+from rille.stages.facts.calibration import CalibrationFacts
+from rille.stages.facts.odometry import RefineFacts, ResectFacts, TiltFacts, TrackFacts
+from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.epipolar import standing
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lens import Lens
@@ -112,55 +115,6 @@ def _tilt_pattern(position: Floats, T_local_key: RigidTransform, rig: Rig) -> Fl
     return np.asarray(np.where(z > 0, focal * x * y / np.where(z > 0, z, 1.0) ** 2, 0.0))
 
 
-def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    resect = ResectParams.model_validate(args["resect"])
-    if resect.landmarks != "disparity":
-        raise ConfigError(
-            "RIL-416",
-            "refine needs landmarks of the disparity",
-            remedy="set resect.landmarks=disparity or refine.enabled=false",
-        )
-    disparity = {int(k): b for k, b in zip(args["pairs"], inputs["disparities"], strict=True)}
-    rigs = {int(k): Rig.from_dict(b.meta["rig"]) for k, b in zip(args["pairs"], inputs["rigs"], strict=True)}
-    given: list[_Given] = []
-    out: list[SegmentOut] = []
-    for track, resection, level in zip(inputs["tracks"], inputs["resections"], inputs["levels"], strict=True):
-        frames = [int(f) for f in track.meta["frames"]]
-        rig, T = rigs[frames[0]], RigidTransform.from_matrix(level.meta["T_local_left"])
-        points = np.asarray(track["points"])[:, 0].astype(np.float64)
-        landmarks = coordinates(points, {"disparity": disparity[frames[0]]}, rig, T, resect)
-        given.append(_Given(track, resection, landmarks, rig))
-        out.append(SegmentOut.of(resection))
-    kept = slice(0, None) if params.window == 0 else slice(-1, None)
-    found = [views_of(g.track, g.resection, g.landmarks, g.rig) for g in given]
-    facts, states = _adjusted(found, out, params)
-    meta: dict[str, Any] = {}
-    if "tilt" in inputs:
-        tilt = float(inputs["tilt"].meta["tilt_rad"])
-        again = [
-            None if one is None else one._replace(views=one.views.without_tilt(tilt), state=states[k])
-            for k, one in enumerate(found)
-        ]
-        _adjusted(again, out, params)
-        judged = [_anew(one, new.poses, tilt, resect) for one, new in zip(given, out, strict=True)]
-        facts, _ = _adjusted(judged, out, params)
-    elif params.tilt_sigma_deg > 0:
-        of = [(given[k], one.views, states[k]) for k, one in list(enumerate(found))[kept] if one is not None]
-        told = [tilt_of(views, state, facts["bias_px"], params) for _, views, state in of]
-        meta["tilt"] = [list(pair) for pair in told if np.isfinite(pair).all()]
-        lenses = {side: Lens.from_dict(lens) for side, lens in args.get("lenses", {}).items()}
-        cameras = [SegmentCameras(one.rig, lenses, _key_pose(one.resection)) for one, _, _ in of]
-        meta["intrinsics"] = [contribution(*one[1:], at, params) for one, at in zip(of, cameras, strict=True)]
-    per_frame = [item for one, of in zip(given[kept], out[kept], strict=True) for item in _per_frame(one, of)]
-    meta |= {"frames": [len(one.poses) for one in out[kept]], "points": [len(one.landmarks) for one in out[kept]]}
-    meta |= {"adjustment": facts, "per_frame": per_frame}
-    names = ("poses", "covariance", "shared", "landmarks")
-    arrays = {name: np.concatenate([getattr(one, name) for one in out[kept]]) for name in names}
-    most = max(meta["frames"])
-    arrays["inlier"] = np.concatenate([np.pad(o.inlier, ((0, 0), (0, most - len(o.poses)))) for o in out[kept]])
-    return Bundle(arrays, meta)
-
-
 def _per_frame(given: _Given, of: SegmentOut) -> list[dict[str, Any]]:
     """Number, inliers and RMS back-projection error [pixels] of each posed frame behind the key."""
     frames, rows = given.track.meta["frames"], []
@@ -219,7 +173,7 @@ def _anew(given: _Given, poses: Floats, tilt: float, resect: ResectParams) -> Se
     """A segment without the tilt, its landmarks judged once more by poses: the tilt had made good ones inconsistent."""
     tracked = np.isfinite(np.asarray(given.track["points"])).all(-1)
     # All tracks stand trial again, not only those that agreed under the tilt.
-    resection = Bundle({"poses": poses, "inlier": tracked.astype(np.uint8)}, {})
+    resection: Bundle = Bundle({"poses": poses, "inlier": tracked.astype(np.uint8)}, {})
     one = views_of(given.track, resection, given.landmarks, given.rig)
     if one is None:
         return None
@@ -297,18 +251,78 @@ def _adjusted(
     return facts, dict(zip(group, states, strict=True))
 
 
-STAGE = Stage(
-    name="refine",
+@stage(
+    "refine",
     version=4,
-    summary="poses of a segment adjusted jointly with its landmarks",
-    params=RefineParams,
-    inputs=("tracks*", "resections*", "levels*", "disparities*", "rigs*", "tilt?"),
-    outputs=(
+    outputs=[
         replace(POSES, long_name="poses of a segment, of several one after the other", frame="local"),
         replace(COVARIANCE, frame="local"),
         replace(SHARED, frame="local"),
         Array("landmarks", ("point", "xyz"), "float64", "m", "landmarks after the adjustment", "nan", "local"),
         Array("inlier", ("point", "frame"), "uint8", "1", "landmark agrees with the pose", nodata="0"),
-    ),
-    run=_run,
+    ],
 )
+def refine_stage(
+    params: RefineParams,
+    tracks: Sequence[Bundle[TrackFacts]],
+    resections: Sequence[Bundle[ResectFacts]],
+    levels: Sequence[Bundle[GroundFacts]],
+    disparities: Sequence[Bundle],
+    rigs: Sequence[Bundle[CalibrationFacts]],
+    tilt: Bundle[TiltFacts] | None = None,
+    *,
+    resect: ResectParams,
+    pairs: Sequence[int],
+    lenses: Mapping[str, Any] | None = None,
+) -> Bundle[RefineFacts]:
+    """Poses of a segment adjusted jointly with its landmarks."""
+    if resect.landmarks != "disparity":
+        raise ConfigError(
+            "RIL-416",
+            "refine needs landmarks of the disparity",
+            remedy="set resect.landmarks=disparity or refine.enabled=false",
+        )
+    disparity = dict(zip(pairs, disparities, strict=True))
+    rig_of = {k: Rig.from_dict(b.meta["rig"]) for k, b in zip(pairs, rigs, strict=True)}
+    given: list[_Given] = []
+    out: list[SegmentOut] = []
+    for track, resection, level in zip(tracks, resections, levels, strict=True):
+        key = track.meta["frames"][0]
+        rig, T = rig_of[key], RigidTransform.from_matrix(level.meta["T_local_left"])
+        points = np.asarray(track["points"])[:, 0].astype(np.float64)
+        landmarks = coordinates(points, rig, T, resect, disparity=disparity[key])
+        given.append(_Given(track, resection, landmarks, rig))
+        out.append(SegmentOut.of(resection))
+    kept = slice(0, None) if params.window == 0 else slice(-1, None)
+    found = [views_of(g.track, g.resection, g.landmarks, g.rig) for g in given]
+    facts, states = _adjusted(found, out, params)
+    shared: dict[str, Any] = {}
+    if tilt is not None:
+        angle = tilt.meta["tilt_rad"]
+        again = [
+            None if one is None else one._replace(views=one.views.without_tilt(angle), state=states[k])
+            for k, one in enumerate(found)
+        ]
+        _adjusted(again, out, params)
+        judged = [_anew(one, new.poses, angle, resect) for one, new in zip(given, out, strict=True)]
+        facts, _ = _adjusted(judged, out, params)
+    elif params.tilt_sigma_deg > 0:
+        of = [(given[k], one.views, states[k]) for k, one in list(enumerate(found))[kept] if one is not None]
+        told = [tilt_of(views, state, facts["bias_px"], params) for _, views, state in of]
+        shared["tilt"] = [list(pair) for pair in told if np.isfinite(pair).all()]
+        lenses = {side: Lens.from_dict(lens) for side, lens in (lenses or {}).items()}
+        cameras = [SegmentCameras(one.rig, lenses, _key_pose(one.resection)) for one, _, _ in of]
+        shared["intrinsics"] = [contribution(*one[1:], at, params) for one, at in zip(of, cameras, strict=True)]
+    per_frame = [item for one, of in zip(given[kept], out[kept], strict=True) for item in _per_frame(one, of)]
+    meta: RefineFacts = {
+        "frames": [len(one.poses) for one in out[kept]],
+        "points": [len(one.landmarks) for one in out[kept]],
+        "adjustment": facts,
+        "per_frame": per_frame,
+        **shared,  # type: ignore[typeddict-item]
+    }
+    names = ("poses", "covariance", "shared", "landmarks")
+    arrays = {name: np.concatenate([getattr(one, name) for one in out[kept]]) for name in names}
+    most = max(meta["frames"])
+    arrays["inlier"] = np.concatenate([np.pad(o.inlier, ((0, 0), (0, most - len(o.poses)))) for o in out[kept]])
+    return Bundle(arrays, meta)

@@ -24,7 +24,7 @@ parts:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -34,8 +34,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
-from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import AnyArray, Array, Bundle, Params, stage
 from rille.stages.core.errors import DegenerateError, InputError
+from rille.stages.facts.calibration import CalibrationFacts
+from rille.stages.facts.odometry import ResectFacts, TrackFacts
+from rille.stages.facts.terrain import DemFacts, GroundFacts
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
@@ -605,45 +608,6 @@ def _facts(frame: int, seen: int, inliers: int, rms: float | None, found: Resect
     }
 
 
-def _run(params: ResectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    track, rig = inputs["track"], Rig.from_dict(inputs["rig"].meta["rig"])
-    T_local_key = RigidTransform.from_matrix(inputs["level"].meta["T_local_left"])
-    points = np.asarray(track["points"])
-    landmarks = coordinates(points[:, 0].astype(np.float64), inputs, rig, T_local_key, params)
-    frames = [int(f) for f in track.meta["frames"]]
-    reckoned = None
-    if "prediction" in args:
-        reckoned = [None if T is None else RigidTransform.from_matrix(T) for T in args["prediction"]]
-        if len(reckoned) != len(frames):
-            raise InputError("RIL-423", f"{len(frames)} frames need {len(frames)} predicted poses, not {len(reckoned)}")
-    if "refused" in args:
-        # Of a rig that was knocked: what it measures is worth no pose.
-        points = np.where(np.arange(len(frames))[:, None] == 0, points, np.float32(np.nan))
-    found = resect_segment(points, landmarks, rig.left, T_local_key, frames, params, reckoned)
-    for fact in found.facts[1:] if "refused" in args else ():
-        fact["lost"] = args["refused"]
-    arrays: dict[str, AnyArray] = {
-        "poses": found.poses,
-        "covariance": found.covariance,
-        "shared": found.shared,
-        "inlier": found.inlier,
-        "landmarks": landmarks.position,
-        "residual": found.residual,
-    }
-    tracks, moving = moving_tracks(points, landmarks, found)
-    meta: dict[str, Any] = {
-        "per_frame": found.facts,
-        "landmark_source": params.landmarks,
-        "without_coordinates": landmarks.lost,
-    }
-    meta |= {"tracks": tracks, "moving_tracks": moving, "warnings": _moving_words(frames, tracks, moving)}
-    if "after" in inputs:
-        meta |= knocked(points[:, -1].astype(np.float64), found, landmarks, inputs)
-    for line in [fact["contradiction"] for fact in found.facts if "contradiction" in fact]:
-        meta |= {"contradiction": line, "warnings": [line]}
-    return Bundle(arrays, meta)
-
-
 def moving_tracks(points: Floats32, landmarks: Landmarks, found: SegmentPoses) -> tuple[int, int]:
     """Count the landmarks that were found in two or more frames with a pose, and those of them that fit no pose.
 
@@ -659,31 +623,34 @@ def moving_tracks(points: Floats32, landmarks: Landmarks, found: SegmentPoses) -
     return int(often.sum()), int((often & ~agrees.any(axis=1)).sum())
 
 
-def knocked(points: Floats, found: SegmentPoses, landmarks: Landmarks, inputs: Inputs) -> dict[str, Any]:
-    """Facts where the basic pair at the segment's end measures otherwise than the landmarks say: the rig has moved.
+def knocked(
+    points: Floats, found: SegmentPoses, landmarks: Landmarks, after: Bundle, rig: Rig
+) -> tuple[str, list[float]] | None:
+    """A line and a jump, px, where the basic pair at the segment's end contradicts the landmarks: the rig has moved.
 
     A turn of a camera to the side shows in no row of one pair, but all its disparities jump by as much.
 
     Parameters
     ----------
     points : (n, 2) column, row in that pair's left image; NaN lost.
+    after, rig : disparity and rig of that pair.
     """
-    rig, pose = Rig.from_dict(inputs["rig_after"].meta["rig"]), found.poses[-1]
+    pose = found.poses[-1]
     names = ("column_disparity", "row_disparity", "validity")
-    disparity, matched = matches_at(points, *(np.asarray(inputs["after"][name]) for name in names))
+    disparity, matched = matches_at(points, *(np.asarray(after[name]) for name in names))
     use = matched & (found.inlier[:, -1] != 0)
     if not np.isfinite(pose).all() or use.sum() < MINIMUM:
-        return {}
+        return None
     at = RigidTransform.from_matrix(pose).inverse().apply(landmarks.position[use])
     expected = rig.right.project(rig.T_right_left.apply(at)) - rig.left.project(at)
     jump = np.median(disparity[use] - expected, axis=0)
     if np.linalg.norm(jump) <= LEAST_JUMP:
-        return {}
+        return None
     line = (
         f"the rig moved at pair {found.facts[-1]['frame']}: its disparities depart by {jump[0]:+.1f} px in the column, "
         f"{jump[1]:+.1f} px in the row from those of pair {found.facts[0]['frame']}"
     )
-    return {"knocked": line, "jump": jump.tolist(), "warnings": [f"{line}: calibrate anew from there on"]}
+    return line, jump.tolist()
 
 
 def _moving_words(frames: list[int], tracks: int, moving: int) -> list[str]:
@@ -696,10 +663,16 @@ def _moving_words(frames: list[int], tracks: int, moving: int) -> list[str]:
 
 
 def coordinates(
-    points: Floats, inputs: Inputs, rig: Rig, T_local_key: RigidTransform, params: ResectParams
+    points: Floats,
+    rig: Rig,
+    T_local_key: RigidTransform,
+    params: ResectParams,
+    *,
+    disparity: Bundle | None,
+    dem: Bundle[DemFacts] | None = None,
 ) -> Landmarks:
     """Landmarks of the key frame's points from the source that the parameters name."""
-    source, disparity = inputs.get(params.landmarks), inputs.get("disparity")
+    source = disparity if params.landmarks == "disparity" else dem
     if source is None:
         raise InputError(
             "RIL-424",
@@ -721,19 +694,70 @@ def coordinates(
     )
 
 
-STAGE = Stage(
-    name="resect",
+@stage(
+    "resect",
     version=3,
-    summary="poses of a segment's frames in the local frame of its basic pair",
-    params=ResectParams,
-    inputs=("track", "dem?", "disparity?", "level", "rig", "after?", "rig_after?"),
-    outputs=(
+    outputs=[
         replace(POSES, frame="local"),
         replace(COVARIANCE, frame="local"),
         replace(SHARED, frame="local"),
         Array("inlier", ("point", "frame"), "uint8", "1", "landmark agrees with the pose", nodata="0"),
         Array("landmarks", ("point", "xyz"), "float64", "m", "coordinates of the landmarks", "nan", "local"),
         Array("residual", ("point", "frame"), "float32", "px", "back-projection error", nodata="nan"),
-    ),
-    run=_run,
+    ],
 )
+def resect_stage(
+    params: ResectParams,
+    track: Bundle[TrackFacts],
+    level: Bundle[GroundFacts],
+    rig: Bundle[CalibrationFacts],
+    dem: Bundle[DemFacts] | None = None,
+    disparity: Bundle | None = None,
+    after: Bundle | None = None,
+    rig_after: Bundle[CalibrationFacts] | None = None,
+    *,
+    prediction: Sequence[Sequence[float] | None] | None = None,
+    refused: str | None = None,
+) -> Bundle[ResectFacts]:
+    """Poses of a segment's frames in the local frame of its basic pair."""
+    own = Rig.from_dict(rig.meta["rig"])
+    T_local_key = RigidTransform.from_matrix(level.meta["T_local_left"])
+    points = np.asarray(track["points"])
+    landmarks = coordinates(points[:, 0].astype(np.float64), own, T_local_key, params, disparity=disparity, dem=dem)
+    frames = track.meta["frames"]
+    reckoned = None
+    if prediction is not None:
+        reckoned = [None if T is None else RigidTransform.from_matrix(T) for T in prediction]
+        if len(reckoned) != len(frames):
+            raise InputError("RIL-423", f"{len(frames)} frames need {len(frames)} predicted poses, not {len(reckoned)}")
+    if refused is not None:
+        # Of a rig that was knocked: what it measures is worth no pose.
+        points = np.where(np.arange(len(frames))[:, None] == 0, points, np.float32(np.nan))
+    found = resect_segment(points, landmarks, own.left, T_local_key, frames, params, reckoned)
+    for fact in found.facts[1:] if refused is not None else ():
+        fact["lost"] = refused
+    arrays: dict[str, AnyArray] = {
+        "poses": found.poses,
+        "covariance": found.covariance,
+        "shared": found.shared,
+        "inlier": found.inlier,
+        "landmarks": landmarks.position,
+        "residual": found.residual,
+    }
+    tracks, moving = moving_tracks(points, landmarks, found)
+    meta: ResectFacts = {
+        "per_frame": found.facts,
+        "landmark_source": params.landmarks,
+        "without_coordinates": landmarks.lost,
+        "tracks": tracks,
+        "moving_tracks": moving,
+        "warnings": _moving_words(frames, tracks, moving),
+    }
+    if after is not None and rig_after is not None:
+        theirs = Rig.from_dict(rig_after.meta["rig"])
+        if (jumped := knocked(points[:, -1].astype(np.float64), found, landmarks, after, theirs)) is not None:
+            meta["knocked"], meta["jump"] = jumped
+            meta["warnings"] = [f"{jumped[0]}: calibrate anew from there on"]
+    for line in [fact["contradiction"] for fact in found.facts if "contradiction" in fact]:
+        meta["contradiction"], meta["warnings"] = line, [line]
+    return Bundle(arrays, meta)

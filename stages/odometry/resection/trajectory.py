@@ -30,8 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
+from rille.stages.facts.odometry import RefineFacts, ResectFacts, TrajectoryFacts
+from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform, cross_matrix, level_rotation, orthonormal
 from rille.stages.geometry.pose_arrays import COVARIANCE, NO_VERTICAL, POSES
 
@@ -253,53 +255,60 @@ def _facts(segments: Sequence[Bundle]) -> list[dict[str, Any]]:
     return facts
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    levels = [RigidTransform.from_matrix(b.meta["T_local_left"]) for b in inputs["levels"]]
-    names = ("poses", "covariance", "shared")
-    posed = inputs.get("refined", inputs["segments"])
-    ends = np.cumsum([len(b.meta["per_frame"]) for b in inputs["segments"]])[:-1]
-    parts = [np.split(np.concatenate([b[name] for b in posed]), ends) for name in names] if posed else [[]] * 3
-    segments = list(zip(*parts, strict=True))
-    frames = [int(f) for f in args["frames"]]
-    facts = _facts(inputs["segments"]) or [{"frame": frames[0], "inliers": 0}]
-    causes = {int(f["frame"]): str(f["cause"]) for f in args.get("lost", ())}
-    causes |= {int(f["frame"]): str(f["lost"]) for f in facts if "lost" in f}
-    if "steps" in args:
-        through = [f for f in frames if f not in {int(lost["frame"]) for lost in args.get("lost", ())}]
-        moved = _moved(through, args["steps"])
-        causes = {f: "; ".join([cause, *moved.get(f, ())]) for f, cause in causes.items()}
-    row = {frame: k for k, frame in enumerate(frames)}
-    at = np.array([row[int(f["frame"])] for f in facts], dtype=np.intp)
-    found = _spread(chain(segments, levels), at, len(frames))
-    keys = [row[int(b.meta["per_frame"][0]["frame"])] for b in inputs["segments"]] or [int(at[0])]
-    found, verticals = _with_verticals(found, keys, inputs["levels"])
-    account = _account(frames, found.piece, causes)
-    account["warnings"] += _without_vertical(account["pieces"], verticals)
-    inliers = {int(f["frame"]): int(f["inliers"]) for f in facts}
-    return Bundle(
-        {"poses": found.poses, "covariance": found.covariance, "segment": found.segment, "piece": found.piece},
-        {
-            "frames": frames,
-            "inliers": [inliers.get(f, 0) for f in frames],
-            # Metadata are JSON, which has no NaN.
-            "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in found.poses],
-            "verticals": verticals,
-        }
-        | account,
-    )
-
-
-STAGE = Stage(
-    name="trajectory",
+@stage(
+    "trajectory",
     version=3,
-    summary="poses of all left frames in the world frame",
-    params=NoParams,
-    inputs=("segments*", "levels*", "refined*?"),
-    outputs=(
+    outputs=[
         replace(POSES, frame="world"),
         replace(COVARIANCE, frame="world"),
         Array("segment", ("frame",), "int16", "1", "segment that posed the frame, -1: lost", "-1"),
         Array("piece", ("frame",), "int16", "1", "unbroken piece, each in its own frame; -1: lost", "-1"),
-    ),
-    run=_run,
+    ],
 )
+def trajectory_stage(
+    params: NoParams,
+    segments: Sequence[Bundle[ResectFacts]],
+    levels: Sequence[Bundle[GroundFacts]],
+    refined: Sequence[Bundle[RefineFacts]] = (),
+    *,
+    frames: list[int],
+    lost: Sequence[Mapping[str, Any]] = (),
+    steps: Sequence[tuple[float | None, float]] | None = None,
+) -> Bundle[TrajectoryFacts]:
+    """Poses of all left frames in the world frame."""
+    level = [RigidTransform.from_matrix(b.meta["T_local_left"]) for b in levels]
+    names = ("poses", "covariance", "shared")
+    posed: Sequence[Bundle] = refined or segments
+    ends = np.cumsum([len(b.meta["per_frame"]) for b in segments])[:-1]
+    parts = [np.split(np.concatenate([b[name] for b in posed]), ends) for name in names] if posed else [[]] * 3
+    chained = list(zip(*parts, strict=True))
+    facts = _facts(segments) or [{"frame": frames[0], "inliers": 0}]
+    causes = {int(f["frame"]): str(f["cause"]) for f in lost}
+    causes |= {int(f["frame"]): str(f["lost"]) for f in facts if "lost" in f}
+    if steps is not None:
+        through = [f for f in frames if f not in {int(one["frame"]) for one in lost}]
+        moved = _moved(through, steps)
+        causes = {f: "; ".join([cause, *moved.get(f, ())]) for f, cause in causes.items()}
+    row = {frame: k for k, frame in enumerate(frames)}
+    at = np.array([row[int(f["frame"])] for f in facts], dtype=np.intp)
+    found = _spread(chain(chained, level), at, len(frames))
+    keys = [row[int(b.meta["per_frame"][0]["frame"])] for b in segments] or [int(at[0])]
+    found, verticals = _with_verticals(found, keys, levels)
+    account = _account(frames, found.piece, causes)
+    account["warnings"] += _without_vertical(account["pieces"], verticals)
+    inliers = {int(f["frame"]): int(f["inliers"]) for f in facts}
+    meta: TrajectoryFacts = {
+        "frames": frames,
+        "inliers": [inliers.get(f, 0) for f in frames],
+        # Facts are JSON, which has no NaN.
+        "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in found.poses],
+        "verticals": verticals,
+        **account,  # type: ignore[typeddict-item]
+    }
+    arrays: dict[str, AnyArray] = {
+        "poses": found.poses,
+        "covariance": found.covariance,
+        "segment": found.segment,
+        "piece": found.piece,
+    }
+    return Bundle(arrays, meta)

@@ -22,9 +22,13 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
-from rille.stages.core.declare import Bundle, Inputs, Memory, Params, Stage, raster
+from rille.stages.core.declare import Bundle, Memory, Params, raster, stage
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.core.validity import matched
+from rille.stages.facts.calibration import CalibrationFacts
+from rille.stages.facts.imaging import PyramidFacts
+from rille.stages.facts.odometry import TrajectoryFacts
+from rille.stages.facts.terrain import DemFacts, GroundFacts
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.scale import coarser_focal
@@ -260,48 +264,6 @@ def world_lattice(elevation: Floats32, lattice: Lattice, T_world_local: RigidTra
     return Lattice.snap(bounds, lattice.cell), [float(low[2] - margin), float(high[2] + margin)]
 
 
-def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    rig = Rig.from_dict(inputs["rig"].meta["rig"])
-    level = inputs["level"].meta
-    T_local_left = RigidTransform.from_matrix(level["T_local_left"])
-    if args["frame"] == "world":
-        T, lattice, z_range = _in_world(args, inputs, T_local_left)
-    else:
-        # One cell for the whole run: that which suits the first basic pair, where that pair is connected.
-        if level["plane"] is None or ("no_ground" in level and params.cell_size is None):
-            raise DegenerateError("RIL-780", f"no elevation model without ground: {level['no_ground']}")
-        cell = params.cell_size or inputs.get("reference", inputs["level"]).meta["cell_size"]
-        T, lattice = T_local_left, local_lattice(rig, level, cell, params)
-        z_range = plane_z_range(level["plane"], level["relief"], list(lattice.bounds))
-    if params.max_sigma is None:
-        params = params.model_copy(update={"max_sigma": lattice.cell})
-    disparity = inputs["disparity"]
-    good = usable(disparity["validity"], disparity["backmatch_error"], params)
-    pair = MatchedPair(
-        inputs["left"]["level_0"],
-        Matches(disparity["column_disparity"], disparity["row_disparity"], good, disparity.arrays.get("disparity_std")),
-        inputs["right"]["level_0"] if "right" in inputs else None,
-        _backward(inputs["back"], params) if "back" in inputs else None,
-    )
-    dem = reconstruct(pair, rig, T, plane(lattice), (z_range[0], z_range[1]), params)
-    if not np.isfinite(dem.elevation).any():
-        raise explain(rig, T, plane(lattice), (z_range[0], z_range[1]), good)
-    meta = {
-        "lattice": lattice.to_dict(),
-        "frame": args["frame"],
-        "pair": args["pair"],
-        "z_range": z_range,
-        "T_frame_left": T.to_list(),
-        "pixel_rad": 1.0 / coarser_focal(rig),
-        "defined": float(np.mean(np.isfinite(dem.elevation))),
-        "median_residual": _median(dem.residual),
-        "median_elevation_std": _median(dem.elevation_std),
-    }
-    if args["frame"] == "world" and "covariance" in inputs["trajectory"].arrays:
-        meta["pose_covariance"] = np.asarray(inputs["trajectory"]["covariance"])[int(args["row"])].ravel().tolist()
-    return Bundle(vars(dem), meta)
-
-
 def usable(validity: ArrayLike, backmatch_error: ArrayLike, params: LocusParams) -> Bools:
     """Pixels that were measured, not filled, and match back to within ``max_backmatch`` pixels."""
     with np.errstate(invalid="ignore"):
@@ -312,19 +274,6 @@ def _backward(disparity: Bundle, params: LocusParams) -> Matches:
     good = usable(disparity["validity"], disparity["backmatch_error"], params)
     maps = np.asarray(disparity["column_disparity"]), np.asarray(disparity["row_disparity"])
     return Matches(*maps, good, disparity.arrays.get("disparity_std"))
-
-
-def _in_world(
-    args: Mapping[str, Any], inputs: Inputs, T_local_left: RigidTransform
-) -> tuple[RigidTransform, Lattice, list[float]]:
-    poses = np.asarray(inputs["trajectory"]["poses"])
-    T_world_left = RigidTransform.from_matrix(poses[int(args["row"])])
-    local = inputs["local"]
-    T_world_local = T_world_left @ T_local_left.inverse()
-    lattice, z_range = world_lattice(
-        np.asarray(local["elevation"]), Lattice.from_dict(local.meta["lattice"]), T_world_local
-    )
-    return T_world_left, lattice, z_range
 
 
 def _size(params: LocusParams, args: Mapping[str, Any], metas: Mapping[str, Any]) -> float:
@@ -345,18 +294,75 @@ def _median(array: Floats32) -> float | None:
 
 
 _FRAME = "local or world (meta: frame)"
-STAGE = Stage(
-    name="locus",
+
+
+@stage(
+    "locus",
     version=5,
-    summary="elevation model and ortho image of a basic pair",
-    params=LocusParams,
-    inputs=("disparity", "rig", "left", "right?", "back?", "level", "reference?", "trajectory?", "local?"),
-    outputs=(
+    outputs=[
         raster("elevation", "m", "elevation of the cell centre", frame=_FRAME),
         raster("elevation_std", "m", "standard deviation of the elevation", frame=_FRAME),
         raster("residual", "px", "mismatch of disparity and calibration at the elevation", frame=_FRAME),
         raster("ortho", "grey", "grey value of the left image, 0..255", frame=_FRAME),
-    ),
-    run=_run,
+    ],
     memory=Memory(lower=("locus.cell_size", "locus.extent"), size=_size),
 )
+def locus_stage(
+    params: LocusParams,
+    disparity: Bundle,
+    rig: Bundle[CalibrationFacts],
+    left: Bundle[PyramidFacts],
+    level: Bundle[GroundFacts],
+    right: Bundle[PyramidFacts] | None = None,
+    back: Bundle | None = None,
+    reference: Bundle[GroundFacts] | None = None,
+    trajectory: Bundle[TrajectoryFacts] | None = None,
+    local: Bundle[DemFacts] | None = None,
+    *,
+    frame: str,
+    pair: int,
+    row: int = 0,
+) -> Bundle[DemFacts]:
+    """Elevation model and ortho image of a basic pair."""
+    used, ground = Rig.from_dict(rig.meta["rig"]), level.meta
+    T_local_left = RigidTransform.from_matrix(ground["T_local_left"])
+    if frame == "world":
+        assert trajectory is not None
+        assert local is not None
+        T = RigidTransform.from_matrix(np.asarray(trajectory["poses"])[row])
+        lattice, z_range = world_lattice(
+            np.asarray(local["elevation"]), Lattice.from_dict(local.meta["lattice"]), T @ T_local_left.inverse()
+        )
+    else:
+        # One cell for the whole run: that which suits the first basic pair, where that pair is connected.
+        if ground["plane"] is None or ground["relief"] is None or ("no_ground" in ground and params.cell_size is None):
+            raise DegenerateError("RIL-780", f"no elevation model without ground: {ground['no_ground']}")
+        cell = params.cell_size or (reference or level).meta["cell_size"]
+        T, lattice = T_local_left, local_lattice(used, ground, cell, params)
+        z_range = plane_z_range(ground["plane"], ground["relief"], list(lattice.bounds))
+    if params.max_sigma is None:
+        params = params.model_copy(update={"max_sigma": lattice.cell})
+    good = usable(disparity["validity"], disparity["backmatch_error"], params)
+    matched = MatchedPair(
+        left["level_0"],
+        Matches(disparity["column_disparity"], disparity["row_disparity"], good, disparity.arrays.get("disparity_std")),
+        right["level_0"] if right is not None else None,
+        _backward(back, params) if back is not None else None,
+    )
+    dem = reconstruct(matched, used, T, plane(lattice), (z_range[0], z_range[1]), params)
+    if not np.isfinite(dem.elevation).any():
+        raise explain(used, T, plane(lattice), (z_range[0], z_range[1]), good)
+    meta: DemFacts = {
+        "lattice": lattice.to_dict(),
+        "frame": frame,
+        "pair": pair,
+        "z_range": z_range,
+        "T_frame_left": T.to_list(),
+        "pixel_rad": 1.0 / coarser_focal(used),
+        "defined": float(np.mean(np.isfinite(dem.elevation))),
+        "median_residual": _median(dem.residual),
+        "median_elevation_std": _median(dem.elevation_std),
+    }
+    if trajectory is not None and "covariance" in trajectory.arrays:
+        meta["pose_covariance"] = np.asarray(trajectory["covariance"])[row].ravel().tolist()
+    return Bundle(vars(dem), meta)

@@ -36,7 +36,7 @@ def tiff(path: Path, values: np.ndarray, cell: float, x0: float, y0: float, **mo
 
 def test_a_lifted_run_against_its_own_zarr(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = finished(tmp_path / "run", lift=0.25)
-    specs = {spec.name: spec for spec in merge.STAGE.outputs}
+    specs = {spec.name: spec for spec in merge.merge_stage.outputs}
     write_terrain(tmp_path / "b.zarr", {"elevation": (specs["elevation"], elevation())}, LATTICE, None, {})
     assert compare(run, tmp_path / "b.zarr", output=tmp_path / "out") == 0
     found = json.loads((tmp_path / "out.json").read_text())

@@ -67,12 +67,12 @@ def test_many_inputs_are_counted_and_an_artifact_that_has_gone_is_said(tmp_path)
 
 
 def test_differences_from_the_programs_defaults_are_marked():
-    from rille.pipeline.flow.config import stage
+    from rille.pipeline.flow.config import stages
 
     made = {
         "stage": "locus",
         "provenance": {
-            "params": stage("locus").params(max_residual=0.7).model_dump(mode="json"),
+            "params": stages()["locus"].params(max_residual=0.7).model_dump(mode="json"),
             "args": {"pair": 3},
             "code": {"rille.stages.terrain.locus.stage": "0"},
             "env": {},

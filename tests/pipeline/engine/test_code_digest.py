@@ -144,7 +144,7 @@ def test_no_stage_loads_code_or_tables_that_its_digest_does_not_see():
     reached = {
         module
         for name, text in modules().items()
-        if re.search(r"^STAGE = ", text, re.MULTILINE)
+        if re.search(r"^(STAGE = |@stage\()", text, re.MULTILINE)
         for module in code_digest.module_digests(name)
     }
     found = {name for name, text in modules().items() if name in reached and hidden.search(text)}

@@ -15,6 +15,7 @@ from raising import raises
 
 from rille import datasets, stages
 from rille.pipeline.engine import code_digest, packages
+from rille.stages.core.declare import declared
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -24,7 +25,7 @@ def stage_modules() -> list[str]:
     found = []
     for package in (stages, datasets):
         for info in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            if "STAGE" in vars(importlib.import_module(info.name)):
+            if declared(importlib.import_module(info.name)) is not None:
                 found.append(info.name)
     return found
 

@@ -30,12 +30,12 @@ def arrays() -> dict:
     model["ortho"] = np.full_like(z, 90)
     layer = Layer(4, LATTICE, lambda name, window: model[name][window])
     found = vars(merge.merge([layer], LATTICE, MergeParams()))
-    return {spec.name: (spec, found[spec.name]) for spec in merge.STAGE.outputs if spec.name in found}
+    return {spec.name: (spec, found[spec.name]) for spec in merge.merge_stage.outputs if spec.name in found}
 
 
 def write(path: Path, bundle: Bundle) -> str:
     store = Store(path)
-    return store.path(store.commit(merge.STAGE, "a" * 64, bundle))
+    return store.path(store.commit(merge.merge_stage, "a" * 64, bundle))
 
 
 def opened(path: Path | str) -> xarray.Dataset:

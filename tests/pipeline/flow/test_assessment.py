@@ -22,8 +22,8 @@ def test_the_other_program_s_longest_piece_is_judged(split: int) -> None:
         Bundle({"poses": poses[a:b]}, {"frames": frames[a:b], "registered": b - a, "points": 1, "reason": ""})
         for a, b in ((0, split), (split, 12))
     ]
-    joined = crosscheck_join.STAGE.run(NoParams(), {"frames": frames}, {"windows": windows})
-    known = truth.STAGE.run(NoParams(), {"poses": poses.reshape(12, 12).tolist(), "frames": frames}, {})
+    joined = crosscheck_join.crosscheck_join_stage.run(NoParams(), {"frames": frames}, {"windows": windows})
+    known = truth.truth_stage.run(NoParams(), {"poses": poses.reshape(12, 12).tolist(), "frames": frames}, {})
     given: list[dict[str, Any]] = []
     make: Any = SimpleNamespace(
         node=lambda stage, label, args, **inputs: given.append(args),
@@ -34,6 +34,6 @@ def test_the_other_program_s_longest_piece_is_judged(split: int) -> None:
     next(steps)
     with pytest.raises(StopIteration):
         steps.send(joined)
-    metrics = accuracy.STAGE.run(NoParams(), given[0], {"trajectory": joined, "truth": known}).meta["metrics"]
+    metrics = accuracy.accuracy_stage.run(NoParams(), given[0], {"trajectory": joined, "truth": known}).meta["metrics"]
     assert metrics["frames_judged"]["value"] == max(split, 12 - split)
     assert metrics["drift"]["value"] == pytest.approx(0.0, abs=1e-9)

@@ -85,13 +85,15 @@ def scene(true: Rig):
 
 
 def run(rig: Rig, found: Bundle, **params):
-    return orientation.STAGE.run(OrientationParams(**params), {"pair": 7, "rig": rig.to_dict()}, {"disparity": found})
+    return orientation.orientation_stage.run(
+        OrientationParams(**params), {"pair": 7, "rig": rig.to_dict()}, {"disparity": found}
+    )
 
 
 def test_stage_on_a_dense_disparity():
     rig = toed_in_rig()
     out = run(rig, scene(knocked(rig, pitch_deg=0.4, roll_deg=-0.5)))
-    check_outputs(orientation.STAGE, out)
+    check_outputs(orientation.orientation_stage, out)
     json.dumps(out.meta, allow_nan=False)
     values = {p["name"]: p["value"] for p in out.meta["parameters"]}
     # 0.02 degrees are a tenth of a pixel of rows
@@ -127,7 +129,7 @@ def test_nothing_matched_is_no_failure():
     found = scene(rig)
     none = Bundle({**found.arrays, "validity": np.zeros_like(found["validity"])}, {})
     out = run(rig, none)
-    check_outputs(orientation.STAGE, out)
+    check_outputs(orientation.orientation_stage, out)
     assert out.meta["matches"] == 0
 
 

@@ -37,7 +37,7 @@ def street(count=4, noise=0.2, **knock):
 @pytest.mark.parametrize("inputs", [{}, {"orientations": []}])
 def test_without_pairs_the_given_rig_passes_through(inputs):
     rig = toed_in_rig()
-    meta = rig_stage.STAGE.run(RigParams(), {"rig": rig.to_dict()}, inputs).meta
+    meta = rig_stage.rig_stage.run(RigParams(), {"rig": rig.to_dict()}, inputs).meta
     assert meta["rig"] == rig.to_dict()
     assert (meta["changed"], meta["warnings"], meta["mode"]) == (False, [], "pooled")
     assert meta["baseline"] == pytest.approx((0.1**2 + 0.004**2 + 0.003**2) ** 0.5)
@@ -55,7 +55,7 @@ def test_stage_reads_what_orientation_writes():
         Bundle({"left": m.left.astype(np.float32), "right": m.right.astype(np.float32)}, {"pair": m.pair})
         for m in street(pitch_deg=0.3)
     ]
-    meta = rig_stage.STAGE.run(RigParams(), {"rig": rig.to_dict()}, {"orientations": bundles}).meta
+    meta = rig_stage.rig_stage.run(RigParams(), {"rig": rig.to_dict()}, {"orientations": bundles}).meta
     assert meta["changed"]
     assert [p["pair"] for p in meta["per_pair"]] == [0, 10, 20, 30]
 

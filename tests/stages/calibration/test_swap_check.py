@@ -58,5 +58,5 @@ def test_exchanged_images_are_told_at_any_scale_of_the_right_camera(scale, swap)
         arrays = {f"level_{n}": level for n, level in enumerate(built.images)}
         arrays |= {f"valid_{n}": mask for n, mask in enumerate(built.valid)}
         inputs[side] = Bundle(arrays, {"levels": built.levels, "noise": built.noise})
-    found = swap_check.STAGE.run(NoParams(), {"frame": 0, "rig": Rig(left, right, T).to_dict()}, inputs).meta
+    found = swap_check.swap_check_stage.run(NoParams(), {"frame": 0, "rig": Rig(left, right, T).to_dict()}, inputs).meta
     assert found["swapped"] == swap, found

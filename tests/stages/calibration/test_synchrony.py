@@ -31,7 +31,7 @@ def test_the_right_image_of_each_pair_is_found(data_dir, rights, partners, words
         files = sorted((street / folder).iterdir())
         read = [cv2.imread(str(files[k]), cv2.IMREAD_REDUCED_GRAYSCALE_2) for k in frames]
         taken = [Bundle({"image": image, "valid": np.ones(image.shape, np.uint8)}, {}) for image in read]
-        return [pyramid.STAGE.run(pyramid.PyramidParams(), {}, {"image": image}) for image in taken]
+        return [pyramid.pyramid_stage.run(pyramid.PyramidParams(), {}, {"image": image}) for image in taken]
 
     rig = open_sequence(str(street)).rig
     half = [
@@ -40,7 +40,7 @@ def test_the_right_image_of_each_pair_is_found(data_dir, rights, partners, words
     ]
     args = {"pairs": [10, 11, 12], "frames": [9, 10, 11, 12, 13], "rig": Rig(*half, rig.T_right_left).to_dict()}
     ports = {"left": pyramids("image_l", [10, 11, 12]), "right": pyramids("image_r", rights)}
-    facts = synchrony.STAGE.run(NoParams(), args, ports).meta
+    facts = synchrony.synchrony_stage.run(NoParams(), args, ports).meta
     assert facts["partners"] == partners
     assert words in facts.get("contradiction", "")
     assert judge_synchrony(facts).level == ("FAIL" if partners else "OK")

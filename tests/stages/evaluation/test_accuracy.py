@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.evaluation import truth
-from rille.stages.evaluation.accuracy import STAGE, by_frame, trajectory_accuracy
+from rille.stages.evaluation.accuracy import accuracy_stage, by_frame, trajectory_accuracy
 from rille.stages.geometry.geometry import rotation_exp
 
 
@@ -187,11 +187,13 @@ def test_a_camera_at_rest_has_no_drift_figure() -> None:
 
 def test_the_stage_matches_frames_by_number() -> None:
     true = walk(3, 6)
-    source = truth.STAGE.run(NoParams(), {"poses": true.reshape(6, 12).tolist(), "frames": [4, 5, 6, 7, 8, 9]}, {})
-    check_outputs(truth.STAGE, source)
+    source = truth.truth_stage.run(
+        NoParams(), {"poses": true.reshape(6, 12).tolist(), "frames": [4, 5, 6, 7, 8, 9]}, {}
+    )
+    check_outputs(truth.truth_stage, source)
     trajectory = Bundle({"poses": true[[0, 1, 2, 4]]}, {"frames": [4, 5, 6, 8]})
-    out = STAGE.run(NoParams(), {}, {"trajectory": trajectory, "truth": source})
-    check_outputs(STAGE, out)
+    out = accuracy_stage.run(NoParams(), {}, {"trajectory": trajectory, "truth": source})
+    check_outputs(accuracy_stage, out)
     assert out.meta["metrics"]["frames_missing"]["value"] == 2
     assert out.meta["metrics"]["ate_rmse"]["value"] == pytest.approx(0.0, abs=1e-9)
     assert np.isnan(by_frame(true, [0, 1, 2, 3, 4, 5], [5, 6])[1]).all()
@@ -258,13 +260,13 @@ def test_a_kitti_section_has_truth_from_its_first_to_its_last_frame(lost: int) -
 def test_truth_with_gaps_and_a_trajectory_without_poses_as_artifacts() -> None:
     true = walk(3, 4)
     poses = [None if k == 2 else p.reshape(12).tolist() for k, p in enumerate(true)]
-    source = truth.STAGE.run(NoParams(), {"poses": poses, "frames": [4, 5, 6, 7]}, {})
-    check_outputs(truth.STAGE, source)
+    source = truth.truth_stage.run(NoParams(), {"poses": poses, "frames": [4, 5, 6, 7]}, {})
+    check_outputs(truth.truth_stage, source)
     assert source.meta["without_truth"] == [6]
     assert np.isnan(source["poses"][2]).all()
     nothing = Bundle({"poses": np.full((4, 3, 4), np.nan)}, {"frames": [4, 5, 6, 7]})
-    out = STAGE.run(NoParams(), {}, {"trajectory": nothing, "truth": source})
-    check_outputs(STAGE, out)
+    out = accuracy_stage.run(NoParams(), {}, {"trajectory": nothing, "truth": source})
+    check_outputs(accuracy_stage, out)
     value = {name: m["value"] for name, m in out.meta["metrics"].items()}
     assert value == {"frames": 4, "frames_missing": 4, "frames_without_truth": 1, "frames_judged": 0}
 

@@ -10,7 +10,7 @@ from evo.core import metrics as evo_metrics
 from evo.core.trajectory import PosePath3D
 
 from rille.stages.core.declare import Bundle, check_outputs
-from rille.stages.evaluation.agreement import STAGE, AgreementParams, _at_rest, compare, flag
+from rille.stages.evaluation.agreement import AgreementParams, _at_rest, agreement_stage, compare, flag
 from rille.stages.evaluation.pose_alignment import moved
 from rille.stages.geometry.geometry import rotation_exp
 
@@ -41,10 +41,10 @@ def run(ours: np.ndarray, theirs: np.ndarray, piece: np.ndarray | None = None) -
     frames = list(range(10, 10 + len(ours)))
     pieces = [[f for f, p in zip(frames, piece, strict=True) if p == k] for k in range(int(piece.max()) + 1)]
     other = Bundle({"piece_poses": theirs, "piece": piece.astype(np.int16)}, {"frames": frames, "pieces": pieces})
-    out = STAGE.run(
+    out = agreement_stage.run(
         AgreementParams(), {}, {"trajectory": Bundle({"poses": ours}, {"frames": frames}), "crosscheck": other}
     )
-    check_outputs(STAGE, out)
+    check_outputs(agreement_stage, out)
     return out
 
 
@@ -197,6 +197,6 @@ def test_from_one_of_our_pieces_to_the_next_there_is_no_way() -> None:
     frames = list(range(20))
     given = Bundle({"poses": ours, "piece": np.repeat([0, 1], 10).astype(np.int16)}, {"frames": frames})
     other = Bundle({"piece_poses": true, "piece": np.zeros(20, np.int16)}, {"frames": frames, "pieces": [frames]})
-    metrics = STAGE.run(AgreementParams(), {}, {"trajectory": given, "crosscheck": other}).meta["metrics"]
+    metrics = agreement_stage.run(AgreementParams(), {}, {"trajectory": given, "crosscheck": other}).meta["metrics"]
     assert metrics["rmse"]["value"] == pytest.approx(0.0, abs=1e-9)
     assert metrics["length"]["value"] == pytest.approx(18.0)

@@ -16,11 +16,11 @@ from pydantic import ValidationError
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.evaluation.accuracy import angles_between, posed
 from rille.stages.evaluation.crosscheck import (
-    STAGE,
     CrosscheckParams,
     Features,
     _camera,
     _extractor,
+    crosscheck_stage,
     extract,
     grey_bytes,
     image_pairs,
@@ -80,8 +80,8 @@ def scene() -> tuple[list[RigidTransform], dict[str, list[Bundle]]]:
 
 
 def run(inputs: Any, frames: list[int], params: CrosscheckParams = PARAMS) -> Bundle:
-    out = STAGE.run(params, {"frames": frames, "rig": RIG.to_dict()}, inputs)
-    check_outputs(STAGE, out)
+    out = crosscheck_stage.run(params, {"frames": frames, "rig": RIG.to_dict()}, inputs)
+    check_outputs(crosscheck_stage, out)
     return out
 
 
@@ -107,7 +107,7 @@ def test_a_wrong_rig_is_held_not_repaired(scene: Any) -> None:
     inputs = {side: bundles[:3] for side, bundles in scene[1].items()}
     wrong = Rig(CAMERA, CAMERA, RigidTransform(rotation_exp([0.0, 0.0, 0.009]), np.zeros(3)) @ RIG.T_right_left)
     good, bad = (
-        STAGE.run(PARAMS, {"frames": [0, 1, 2], "rig": rig.to_dict()}, inputs).meta["reprojection_px"]
+        crosscheck_stage.run(PARAMS, {"frames": [0, 1, 2], "rig": rig.to_dict()}, inputs).meta["reprojection_px"]
         for rig in (RIG, wrong)
     )
     assert good < 0.5
@@ -254,5 +254,5 @@ def test_devon_island_is_registered_throughout(data_dir: Any) -> None:
         files = sorted((data_dir / "devon_island" / side).iterdir())
         inputs[side] = [bundle(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in files]
     n = len(inputs["left"])
-    out = STAGE.run(PARAMS, {"frames": list(range(n)), "rig": rig.to_dict()}, inputs)
+    out = crosscheck_stage.run(PARAMS, {"frames": list(range(n)), "rig": rig.to_dict()}, inputs)
     assert (n, out.meta["unregistered"]) == (10, [])

@@ -7,7 +7,7 @@ import pytest
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.evaluation.accuracy import posed
-from rille.stages.evaluation.crosscheck_join import STAGE, join
+from rille.stages.evaluation.crosscheck_join import crosscheck_join_stage, join
 from rille.stages.evaluation.pose_alignment import moved
 from rille.stages.geometry.geometry import rotation_exp
 
@@ -65,8 +65,10 @@ def test_a_broken_chain_names_its_pieces_and_keeps_the_longest() -> None:
     )
     second[1][:2] = np.nan  # shares no posed frame with the first
     third[1][2] = np.nan
-    out = STAGE.run(NoParams(), {"frames": list(range(12))}, {"windows": [bundle(p) for p in (first, second, third)]})
-    check_outputs(STAGE, out)
+    out = crosscheck_join_stage.run(
+        NoParams(), {"frames": list(range(12))}, {"windows": [bundle(p) for p in (first, second, third)]}
+    )
+    check_outputs(crosscheck_join_stage, out)
     assert out.meta["pieces"] == [[0, 1, 2, 3], [4, 5, 6, 8, 9, 10, 11]]
     assert out.meta["longest"] == 1
     assert out.meta["unregistered"] == [7]
@@ -80,8 +82,8 @@ def test_a_broken_chain_names_its_pieces_and_keeps_the_longest() -> None:
 
 def test_no_window_with_a_model_is_a_fact() -> None:
     nothing = ([0, 1, 2], np.full((3, 3, 4), np.nan))
-    out = STAGE.run(NoParams(), {"frames": [0, 1, 2]}, {"windows": [bundle(nothing)]})
-    check_outputs(STAGE, out)
+    out = crosscheck_join_stage.run(NoParams(), {"frames": [0, 1, 2]}, {"windows": [bundle(nothing)]})
+    check_outputs(crosscheck_join_stage, out)
     assert out.meta["pieces"] == []
     assert out.meta["registered"] == 0
     assert out.meta["unregistered"] == [0, 1, 2]

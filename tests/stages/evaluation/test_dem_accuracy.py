@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
-from rille.stages.evaluation.dem_accuracy import STAGE, dem_accuracy, in_window
+from rille.stages.evaluation.dem_accuracy import dem_accuracy, dem_accuracy_stage, in_window
 from rille.stages.geometry.lattice import Lattice
 
 CELL = 0.5
@@ -59,11 +59,11 @@ def test_the_stage_lays_tiles_on_the_lattice_of_truth() -> None:
     truth = Bundle({"elevation": z, "seen": np.ones((6, 8), dtype=np.uint8)}, {"lattice": whole.to_dict()})
     part = Lattice.at(0, 10, CELL, 6, 4)
     tile = Bundle({"elevation": z[:, :4] + np.float32(0.25)}, {"lattice": part.to_dict()})
-    out = STAGE.run(NoParams(), {}, {"dem": [tile], "truth": truth})
-    check_outputs(STAGE, out)
+    out = dem_accuracy_stage.run(NoParams(), {}, {"dem": [tile], "truth": truth})
+    check_outputs(dem_accuracy_stage, out)
     assert (out["error"][:, :4] == 0.25).all()
     assert np.isnan(out["error"][:, 4:]).all()
     assert out.meta["metrics"]["completeness"]["value"] == 0.5
     assert out.meta["metrics"]["unseen"]["value"] == 0
-    window = STAGE.run(NoParams(), {"window": [0.0, 4.5, 1.5, 5.0]}, {"dem": [tile], "truth": truth})
+    window = dem_accuracy_stage.run(NoParams(), {"window": [0.0, 4.5, 1.5, 5.0]}, {"dem": [tile], "truth": truth})
     assert window.meta["metrics"]["completeness"]["value"] == 1.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rille.stages.core.declare import Bundle, NoParams
-from rille.stages.evaluation.drive_check import STAGE, localisation
+from rille.stages.evaluation.drive_check import drive_check_stage, localisation
 from rille.stages.hazard.vehicle import Vehicle
 
 VEHICLE = Vehicle(wheel_diameter=0.03, track=0.08, wheel_base=0.1, clearance=0.025, max_step=0.012, max_slope_deg=20.0)
@@ -23,7 +23,7 @@ def leg(steps: list[float], frame_at: list[int]) -> Bundle:
 def test_a_drive_that_failed_is_judged_by_all_that_it_drove() -> None:
     start, last = leg([0.001], [0]), leg([0.001, 0.013, 0.002], [0, 2])
     args = {"rows": [0, -1], "vehicle": VEHICLE.model_dump(mode="json")}
-    found = STAGE.run(NoParams(), args, {"drives": [start, last]})
+    found = drive_check_stage.run(NoParams(), args, {"drives": [start, last]})
     metrics = found.meta["metrics"]
     assert metrics["placements"]["value"] == 4
     assert metrics["step_violations"]["value"] == 1
@@ -34,7 +34,7 @@ def test_a_drive_that_failed_is_judged_by_all_that_it_drove() -> None:
 
 def test_a_leg_that_was_cut_short_counts_up_to_there() -> None:
     cut = {"rows": [0], "vehicle": VEHICLE.model_dump(mode="json")}
-    found = STAGE.run(NoParams(), cut, {"drives": [leg([0.001, 0.013, 0.002], [0, 2])]})
+    found = drive_check_stage.run(NoParams(), cut, {"drives": [leg([0.001, 0.013, 0.002], [0, 2])]})
     assert found.meta["metrics"]["placements"]["value"] == 1
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
-from rille.stages.evaluation.path_check import STAGE, crossed_cells, path_check, shortest
+from rille.stages.evaluation.path_check import crossed_cells, path_check, path_check_stage, shortest
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.measures import BITS
 from rille.stages.hazard.risk import HAZARDOUS
@@ -85,8 +85,8 @@ def test_where_the_margin_closes_every_way_the_shortest_is_without_it_or_none() 
 def test_the_stage_without_a_path() -> None:
     meta = {"lattice": LATTICE.to_dict(), "vehicle": ROVER.model_dump()}
     risk = Bundle(maps(np.zeros((10, 10), bool)), meta)
-    out = STAGE.run(NoParams(), {}, {"path": Bundle({"path": np.empty((0, 3))}, {}), "risk": risk})
-    check_outputs(STAGE, out)
+    out = path_check_stage.run(NoParams(), {}, {"path": Bundle({"path": np.empty((0, 3))}, {}), "risk": risk})
+    check_outputs(path_check_stage, out)
     assert out.meta["metrics"]["hazard_cells"]["value"] is None
     assert out.meta["metrics"]["length_ratio"]["value"] is None
     assert "no path" in out.meta["metrics"]["hazard_cells"]["how"]

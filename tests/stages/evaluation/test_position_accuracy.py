@@ -9,7 +9,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
-from rille.stages.evaluation.position_accuracy import STAGE, TruePositions, find_offset, fit_rigid, position_accuracy
+from rille.stages.evaluation.position_accuracy import (
+    TruePositions,
+    find_offset,
+    fit_rigid,
+    position_accuracy,
+    position_accuracy_stage,
+)
 
 RATE = 10.0
 MOMENTS = np.arange(80) / RATE
@@ -150,12 +156,12 @@ def test_stage():
         "frames": frames,
         "source": "gnss",
     }
-    out = STAGE.run(
+    out = position_accuracy_stage.run(
         NoParams(),
         args,
         {"trajectory": Bundle({"poses": poses}, {"frames": frames, "verticals": ["attitude"], "main": 0})},
     )
-    check_outputs(STAGE, out)
+    check_outputs(position_accuracy_stage, out)
     assert np.isnan(out["position_truth"][:, 2]).all()
     assert "positions only" in out.meta["metrics"]["position_rmse"]["how"]
 

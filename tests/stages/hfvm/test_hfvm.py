@@ -283,7 +283,7 @@ def test_stage_gives_what_it_declares():
     left, right, *_ = pair(lambda x, y: (-8.0, 1.0))
     valid = np.ones(left.shape, np.uint8)
     bundles = [
-        pyramid.STAGE.run(PyramidParams(), {}, {"image": Bundle({"image": a, "valid": valid}, {})})
+        pyramid.pyramid_stage.run(PyramidParams(), {}, {"image": Bundle({"image": a, "valid": valid}, {})})
         for a in (left, right)
     ]
     out = hfvm.STAGE.run(HfvmParams(), {}, {"left": bundles[0], "right": bundles[1]})

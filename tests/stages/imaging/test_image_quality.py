@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
-from rille.stages.imaging.image_quality import STAGE, glance
+from rille.stages.imaging.image_quality import glance, image_quality_stage
 
 
 def picture(seed=1, shape=(200, 300)):
@@ -30,8 +30,8 @@ def test_a_black_image_deviates_by_nothing_and_equal_images_have_one_digest():
     image = picture()
     both = {"left": Bundle({"image": 0 * image, "valid": np.ones_like(image)}, {})}
     both["right"] = Bundle({"image": image, "valid": np.ones_like(image)}, {})
-    out = STAGE.run(NoParams(), {"frame": 4}, both)
-    check_outputs(STAGE, out)
+    out = image_quality_stage.run(NoParams(), {"frame": 4}, both)
+    check_outputs(image_quality_stage, out)
     assert out.meta["frame"] == 4
     assert out.meta["left"]["deviation"] == out.meta["left"]["mean"] == 0.0
     assert out.meta["right"]["digest"] == glance(image.copy(), np.ones_like(image))["digest"]

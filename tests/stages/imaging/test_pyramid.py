@@ -147,10 +147,10 @@ def test_refuses_a_mask_of_another_size():
 
 def test_stage_gives_what_it_declares_and_reads_it_back():
     image = np.random.default_rng(0).integers(0, 255, (40, 50)).astype(np.uint8)
-    bundle = pyramid.STAGE.run(
+    bundle = pyramid.pyramid_stage.run(
         PyramidParams(), {}, {"image": Bundle({"image": image, "valid": np.ones((40, 50), np.uint8)}, {})}
     )
-    check_outputs(pyramid.STAGE, bundle)
+    check_outputs(pyramid.pyramid_stage, bundle)
     found = Pyramid.from_bundle(bundle)
     assert found.levels == 3
     np.testing.assert_array_equal(found.images[0], image)

@@ -155,12 +155,12 @@ def test_sixteen_bits_are_the_same_grey():
 def run(image, lens, camera):
     inputs = {"image": Bundle({"image": image, "valid": np.ones(image.shape, np.uint8)}, {})}
     args = {"lens": lens.to_dict(), "camera": camera.to_dict(), "frame": 7, "camera_name": "right"}
-    return undistort.STAGE.run(UndistortParams(), args, inputs)
+    return undistort.undistort_stage.run(UndistortParams(), args, inputs)
 
 
 def test_stage():
     out = run(np.full((240, 376), 90, np.uint8), LENSES["radtan"], RAW)
-    check_outputs(undistort.STAGE, out)
+    check_outputs(undistort.undistort_stage, out)
     assert out["image"].shape == (240, 376)
     assert out.meta["usable"] == pytest.approx(1.0, abs=0.05)
     assert (out.meta["frame"], out.meta["camera"]) == (7, "right")

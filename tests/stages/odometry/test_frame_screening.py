@@ -10,7 +10,7 @@ from motion_scenes import motion, shift, tables
 from raising import raises
 
 from rille.stages.core.declare import Bundle, check_outputs
-from rille.stages.odometry.frame_screening import STAGE, FrameScreeningParams, judge
+from rille.stages.odometry.frame_screening import FrameScreeningParams, frame_screening_stage, judge
 
 PARAMS = FrameScreeningParams()
 
@@ -118,11 +118,11 @@ def test_the_stage_asks_then_answers():
     motions = [motion(shift(9.0)), blind, blind, motion(shift(9.0))]
     qualities = [Bundle({}, {"frame": k} | sight(k)) for k in frames]
     inputs = {"qualities": qualities, "steps": tables(motions), "bridges": [], "sides": []}
-    first = STAGE.run(PARAMS, {"frames": frames}, inputs)
-    check_outputs(STAGE, first)
+    first = frame_screening_stage.run(PARAMS, {"frames": frames}, inputs)
+    check_outputs(frame_screening_stage, first)
     assert first.meta["asks"]["bridges"] == [[1, 3]]
-    args = {"frames": frames, "bridges": [[1, 3]]}
-    last = STAGE.run(PARAMS, args, inputs | {"bridges": [motion(shift(18.0))]})
+    args = {"frames": frames, "bridged": [[1, 3]]}
+    last = frame_screening_stage.run(PARAMS, args, inputs | {"bridges": [motion(shift(18.0))]})
     assert last.meta["chain"] == [0, 1, 3, 4]
     assert [item["frame"] for item in last.meta["lost"]] == [2]
     assert not any(last.meta["asks"].values())
@@ -132,9 +132,11 @@ def test_the_stage_looks_at_the_sides_where_displacements_jump():
     steps = [motion(shift(u)) for u in (9.0, 9.5, 9.0, 60.0, -42.0, 9.0)]
     qualities = [Bundle({}, {"frame": k} | sight(k)) for k in range(7)]
     inputs = {"qualities": qualities, "steps": tables(steps), "bridges": [], "sides": []}
-    asks = STAGE.run(PARAMS, {"frames": list(range(7))}, inputs).meta["asks"]
+    asks = frame_screening_stage.run(PARAMS, {"frames": list(range(7))}, inputs).meta["asks"]
     assert 4 in asks["sides"]
     assert 0 not in asks["sides"]
-    still = STAGE.run(PARAMS, {"frames": list(range(7))}, inputs | {"steps": tables([motion(shift(9.0))] * 6)}).meta
+    still = frame_screening_stage.run(
+        PARAMS, {"frames": list(range(7))}, inputs | {"steps": tables([motion(shift(9.0))] * 6)}
+    ).meta
     assert not still["asks"]["sides"]
     assert still["match_rate"] == pytest.approx([np.mean(still["match_rate"])] * 6)

@@ -15,15 +15,15 @@ from rille.stages.geometry.geometry import rotation_exp
 from rille.stages.imaging.pyramid import PyramidParams, build
 from rille.stages.odometry import keyframes
 from rille.stages.odometry.keyframes import KeyframesParams, segments
-from rille.stages.odometry.motion import STAGE as MOTION
 from rille.stages.odometry.motion import MotionParams
+from rille.stages.odometry.motion import motion_stage as motion_task
 
 
 def run(motions, frames=None, **params):
     """Meta of the stage for motions between successive frames."""
     args = {"frames": len(motions) + 1 if frames is None else frames}
-    out = keyframes.STAGE.run(KeyframesParams(**params), args, {"steps": tables(motions)})
-    check_outputs(keyframes.STAGE, out)
+    out = keyframes.keyframes_stage.run(KeyframesParams(**params), args, {"steps": tables(motions)})
+    check_outputs(keyframes.keyframes_stage, out)
     return out.meta
 
 
@@ -137,7 +137,7 @@ def test_a_stride_has_a_basic_pair_behind_a_step_with_few_matches():
 def test_behind_a_gap_is_a_basic_pair_so_that_a_refused_bridge_begins_a_piece(rule):
     args = {"frames": 9, "behind": [3, 6], "unfit": [6]}
     steps = {"steps": tables([motion(shift(2.0))] * 8)}
-    meta = keyframes.STAGE.run(KeyframesParams(rule=rule, stride=16), args, steps).meta
+    meta = keyframes.keyframes_stage.run(KeyframesParams(rule=rule, stride=16), args, steps).meta
     assert meta["basic"] == [0, 3, 7]
     assert meta["why"] == ["first frame", "behind a gap", "behind a gap"]
 
@@ -182,7 +182,7 @@ def test_street_at_ten_frames_a_second_gets_about_every_second_pair(data_dir):
         p = build(cv2.imread(str(folder / f"{n:06d}.png"), 0), PyramidParams())
         arrays = {f"level_{i}": a for i, a in enumerate(p.images)} | {f"valid_{i}": a for i, a in enumerate(p.valid)}
         bundles.append(Bundle(arrays, {"levels": p.levels}))
-    motions = [MOTION.run(MotionParams(), {}, {"a": a, "b": b}) for a, b in itertools.pairwise(bundles)]
+    motions = [motion_task.run(MotionParams(), {}, {"a": a, "b": b}) for a, b in itertools.pairwise(bundles)]
     meta = run(motions)
     assert set(np.diff(meta["basic"])) <= {1, 2, 3}
     assert 1.5 < np.mean(np.diff(meta["basic"])) < 3

@@ -56,8 +56,8 @@ def run(a, b, *, args=None, **params):
         p = build(image, PyramidParams())
         arrays = {f"level_{n}": i for n, i in enumerate(p.images)} | {f"valid_{n}": i for n, i in enumerate(p.valid)}
         bundles.append(Bundle(arrays, {"levels": p.levels}))
-    out = motion.STAGE.run(MotionParams(**params), args or {}, {"a": bundles[0], "b": bundles[1]})
-    check_outputs(motion.STAGE, out)
+    out = motion.motion_stage.run(MotionParams(**params), args or {}, {"a": bundles[0], "b": bundles[1]})
+    check_outputs(motion.motion_stage, out)
     return out
 
 

@@ -10,13 +10,13 @@ from rille.stages.terrain import merge
 def test_one_pose_with_its_covariance() -> None:
     rng = np.random.default_rng(1)
     trajectory = Bundle({"poses": rng.normal(size=(3, 3, 4)), "covariance": rng.normal(size=(3, 6, 6))}, {})
-    found = pose.STAGE.run(NoParams(), {"row": 1}, {"trajectory": trajectory})
-    check_outputs(pose.STAGE, found)
+    found = pose.pose_stage.run(NoParams(), {"row": 1}, {"trajectory": trajectory})
+    check_outputs(pose.pose_stage, found)
     for name in ("poses", "covariance"):
         np.testing.assert_array_equal(found[name], trajectory[name][1:2])
     alone = Bundle({"poses": trajectory["poses"]}, {})
-    found = pose.STAGE.run(NoParams(), {"row": 2}, {"trajectory": alone})
-    check_outputs(pose.STAGE, found)
+    found = pose.pose_stage.run(NoParams(), {"row": 2}, {"trajectory": alone})
+    check_outputs(pose.pose_stage, found)
     assert set(found.arrays) == {"poses"}
 
 

@@ -26,13 +26,13 @@ from rille.stages.odometry.resection.bundle_adjustment import (
 from rille.stages.odometry.resection.common_tilt import common_tilt
 from rille.stages.odometry.resection.landmarks import landmarks_from_disparity
 from rille.stages.odometry.resection.refine import (
-    STAGE,
     SegmentOut,
     SegmentStart,
     _adjusted,
     _tilt_pattern,
     claims,
     parts,
+    refine_stage,
     views_of,
 )
 from rille.stages.odometry.resection.resect import ResectParams
@@ -334,11 +334,11 @@ def test_the_stage_undoes_a_tilt_and_says_so():
             points = np.asarray(one["tracks"][0]["points"]) + 0.1 * rng.standard_normal((80, 3, 2))
             many.append(one | {"tracks": [Bundle({"points": points.astype(np.float32)}, {"frames": [0, 1, 2]})]})
         args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
-        found = [STAGE.run(RefineParams(), args, given) for given in many]
+        found = [refine_stage.run(RefineParams(), args, given) for given in many]
         how = {"sigma_deg": PARAMS.tilt_sigma_deg, "significance": PARAMS.tilt_significance}
-        common = tilt_stage.STAGE.run(NoParams(), how, {"segments": found, "rig": one["rigs"][0]})
+        common = tilt_stage.common_tilt_stage.run(NoParams(), how, {"segments": found, "rig": one["rigs"][0]})
         if common.meta["undone"]:
-            found = [STAGE.run(RefineParams(), args, given | {"tilt": common}) for given in many]
+            found = [refine_stage.run(RefineParams(), args, given | {"tilt": common}) for given in many]
         return common.meta, found
 
     plain, bent = stage(0.0), stage(0.006)
@@ -408,8 +408,8 @@ def test_the_stage_gives_the_poses_of_the_last_segment_or_of_all(window):
     one = bundles()
     inputs = {port: given * (1 if port in ("disparities", "rigs") else 2) for port, given in one.items()}
     args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
-    out = STAGE.run(RefineParams(window=window), args, inputs)
-    check_outputs(STAGE, out)
+    out = refine_stage.run(RefineParams(window=window), args, inputs)
+    check_outputs(refine_stage, out)
     count = 2 if window == 0 else 1
     assert out.meta["frames"] == [3] * count
     np.testing.assert_allclose(out["poses"][:, :, 3], [[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]] * count, atol=2e-4)
@@ -425,7 +425,9 @@ def test_the_stage_gives_the_poses_of_the_last_segment_or_of_all(window):
     assert not out["covariance"][::3].any()
     assert (np.linalg.eigvalsh(np.delete(out["covariance"], slice(0, None, 3), 0))[:, 0] > 0).all()
     with raises("RIL-416"):
-        STAGE.run(RefineParams(), args | {"resect": ResectParams(landmarks="dem").model_dump(mode="json")}, inputs)
+        refine_stage.run(
+            RefineParams(), args | {"resect": ResectParams(landmarks="dem").model_dump(mode="json")}, inputs
+        )
 
 
 def test_a_frame_that_keeps_no_landmark_keeps_its_pose_and_ends_nothing():
@@ -434,7 +436,7 @@ def test_a_frame_that_keeps_no_landmark_keeps_its_pose_and_ends_nothing():
     back = RigidTransform(rotation_exp([0.0, math.pi, 0.0]), [0.0, 0.0, 0.1]).matrix34
     given["resections"][0].arrays["poses"][1] = back
     args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
-    out = STAGE.run(PARAMS, args, given)
+    out = refine_stage.run(PARAMS, args, given)
     output_digest({}, out.meta)  # can be committed
     np.testing.assert_array_equal(out["poses"][1], back)
     assert np.isfinite(out["covariance"]).all()
@@ -449,7 +451,7 @@ def test_a_lost_frame_stays_lost():
     for name in ("poses", "covariance", "shared"):
         inputs["resections"][0].arrays[name][1] = np.nan
     args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
-    out = STAGE.run(PARAMS, args, inputs)
+    out = refine_stage.run(PARAMS, args, inputs)
     for name in ("poses", "covariance", "shared"):
         assert np.isnan(out[name][1]).all()
         assert np.isfinite(out[name][[0, 2]]).all()

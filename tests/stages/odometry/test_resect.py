@@ -544,10 +544,10 @@ def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told):
         "row_disparity": np.full(shape, row, np.float32),
         "validity": np.full(shape, Validity.MATCHED, np.uint8),
     }
-    inputs = {"after": Bundle(disparity, {}), "rig_after": Bundle({}, {"rig": rig.to_dict()})}
-    facts = knocked(points[:, 1].astype(float), found, known, inputs)
-    assert bool(facts) == told
-    if told:
-        np.testing.assert_allclose(facts["jump"], [column, row], atol=0.05)
-        assert facts["knocked"].startswith("the rig moved at pair 7")
-        assert f"{(column or row):+.1f} px in the" in facts["knocked"]
+    jumped = knocked(points[:, 1].astype(float), found, known, Bundle(disparity, {}), rig)
+    assert (jumped is not None) == told
+    if jumped is not None:
+        line, jump = jumped
+        np.testing.assert_allclose(jump, [column, row], atol=0.05)
+        assert line.startswith("the rig moved at pair 7")
+        assert f"{(column or row):+.1f} px in the" in line

@@ -9,7 +9,7 @@ from raising import raises
 
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.odometry.covisibility import Step
-from rille.stages.odometry.step_table import STAGE, change, changes_of, steps_of
+from rille.stages.odometry.step_table import change, changes_of, step_table_stage, steps_of
 
 MOTIONS = [motion(shift(u), unmatched=lambda x, y, u=u: x + y < 3 * u) for u in (9.0, 9.5, 9.0, 60.0, -42.0, 9.0, 11.0)]
 
@@ -18,7 +18,7 @@ MOTIONS = [motion(shift(u), unmatched=lambda x, y, u=u: x + y < 3 * u) for u in 
 def test_tables_hold_the_steps_and_changes_of_their_motions(rows):
     made = tables(MOTIONS, rows)
     for table in made:
-        check_outputs(STAGE, table)
+        check_outputs(step_table_stage, table)
     for found, given in zip(steps_of(made), MOTIONS, strict=True):
         wanted = Step.from_bundle(given)
         np.testing.assert_array_equal(found.blocks, wanted.blocks)

@@ -12,9 +12,9 @@ from rille.stages.odometry.affinity import common_similarity, fit_affinity, know
 from rille.stages.odometry.exposure import log_ratio
 from rille.stages.odometry.level_displacements import LevelDisplacements
 from rille.stages.odometry.track import (
-    STAGE,
     TrackParams,
     track,
+    track_stage,
 )
 
 ROWS, COLS = 200, 260
@@ -171,7 +171,7 @@ def test_affinity_of_neighbours_resists_an_outlier_and_few_points():
 def test_stage_writes_what_it_declares_and_the_same_bits_twice():
     frames, places = sequence([1.0, 1.05, 1.1], [(0, 0), (2, 0), (4, 0)])
     inputs = {
-        "frames": [
+        "pyramids": [
             Bundle(
                 {f"level_{i}": a for i, a in enumerate(f.images)} | {f"valid_{i}": v for i, v in enumerate(f.valid)},
                 {"levels": f.levels},
@@ -182,8 +182,8 @@ def test_stage_writes_what_it_declares_and_the_same_bits_twice():
             Bundle({"column_disparity": m.column, "row_disparity": m.row}, {"level": 2}) for m in motions(places)
         ],
     }
-    first, second = (STAGE.run(PARAMS, {"frames": [4, 5, 6]}, inputs) for _ in range(2))
-    check_outputs(STAGE, first)
+    first, second = (track_stage.run(PARAMS, {"frames": [4, 5, 6]}, inputs) for _ in range(2))
+    check_outputs(track_stage, first)
     assert first.meta["frames"] == [4, 5, 6]
     for name, array in first.arrays.items():
         np.testing.assert_array_equal(array, second[name])

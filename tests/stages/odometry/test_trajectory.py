@@ -5,7 +5,7 @@ from raising import raises
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
-from rille.stages.odometry.resection.trajectory import STAGE, chain
+from rille.stages.odometry.resection.trajectory import chain, trajectory_stage
 
 NONE = np.zeros((9, 6, 2))
 """Nothing is shared."""
@@ -97,8 +97,8 @@ def broken_run(lost_rows, frames=8, cuts=((0, 3), (3, 6), (6, 7)), moved=False):
         segments.append(Bundle(arrays, {"per_frame": facts}))
     inputs = {"segments": segments, "levels": [Bundle({}, {"T_local_left": T.to_list()}) for T in levels]}
     steps = {"steps": [[0.2, 0.3]] * (frames - 1)} if moved else {}
-    out = STAGE.run(NoParams(), {"frames": list(range(frames))} | steps, inputs)
-    check_outputs(STAGE, out)
+    out = trajectory_stage.run(NoParams(), {"frames": list(range(frames))} | steps, inputs)
+    check_outputs(trajectory_stage, out)
     return truth, levels, out
 
 
@@ -174,7 +174,7 @@ def test_refined_poses_and_their_covariances_take_the_place_of_resected_ones():
     inputs["refined"] = [
         Bundle({n: a[part] for n, a in whole.items()}, {}) for part in (slice(first), slice(first, None))
     ]
-    out = STAGE.run(NoParams(), {"frames": list(range(8))}, inputs)
+    out = trajectory_stage.run(NoParams(), {"frames": list(range(8))}, inputs)
     # Of a frame of the first segment it is what was claimed, in the world: both parts are the same about all axes.
     np.testing.assert_allclose(out["covariance"][1], claimed, atol=1e-18)
     assert np.trace(out["covariance"][7][:3, :3]) > 2 * np.trace(claimed[:3, :3])
@@ -203,7 +203,7 @@ def test_the_vertical_of_a_later_pair_is_carried_back_where_the_first_has_none()
         for part, T in (([0, 1, 2], unlevelled), ([2, 3, 4], level_2))
     ]
     frames = {"frames": [0, 1, 2, 3, 4]}
-    found = STAGE.run(NoParams(), frames, {"segments": segments, "levels": levels})
+    found = trajectory_stage.run(NoParams(), frames, {"segments": segments, "levels": levels})
     assert found.meta["verticals"] == ["x"]
     assert not found.meta["warnings"]
     for got, T in zip(np.asarray(found["poses"]), true, strict=True):
@@ -213,7 +213,7 @@ def test_the_vertical_of_a_later_pair_is_carried_back_where_the_first_has_none()
     assert abs(axis[0]) < 1e-9 < axis[1]  # y is the first camera's axis, levelled
 
     levels[1].meta["source"] = "none"
-    blind = STAGE.run(NoParams(), frames, {"segments": segments, "levels": levels})
+    blind = trajectory_stage.run(NoParams(), frames, {"segments": segments, "levels": levels})
     assert blind.meta["verticals"] == ["none"]
     assert "frames 0-4" in blind.meta["warnings"][0]
     np.testing.assert_array_equal(np.asarray(blind["poses"])[0], unlevelled.matrix34)

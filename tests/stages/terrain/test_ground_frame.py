@@ -222,9 +222,9 @@ def test_stage_uses_only_measured_pixels_and_is_repeatable() -> None:
     maps = {"column_disparity": column.astype("f4"), "row_disparity": row.astype("f4"), "validity": validity}
     maps |= {"backmatch_error": error}
     inputs = {"disparity": Bundle(maps, {}), "rig": Bundle({}, {"rig": RIG.to_dict()})}
-    facts = level_stage.STAGE.run(PARAMS, {"pitch": math.radians(PITCH)}, inputs).meta
+    facts = level_stage.ground_frame_stage.run(PARAMS, {"pitch": math.radians(PITCH)}, inputs).meta
     assert facts["ground_height"] == pytest.approx(-HEIGHT, rel=1e-3)
-    assert facts == level_stage.STAGE.run(PARAMS, {"pitch": math.radians(PITCH)}, inputs).meta
+    assert facts == level_stage.ground_frame_stage.run(PARAMS, {"pitch": math.radians(PITCH)}, inputs).meta
     json.dumps(facts, allow_nan=False)
 
 

@@ -390,21 +390,21 @@ def bundles(rig: Rig, height: float, noise: np.random.Generator) -> dict[str, Bu
     arrays["backmatch_error"][:, :40] = 1.2
     inputs = {"disparity": Bundle(arrays, {}), "rig": Bundle({}, {"rig": rig.to_dict()})}
     up = T_LOCAL_LEFT.rotation[2].tolist()
-    level = level_stage.STAGE.run(level_stage.GroundFrameParams(), {"up": up}, inputs)
+    level = level_stage.ground_frame_stage.run(level_stage.GroundFrameParams(), {"up": up}, inputs)
     return inputs | {"level": level, "left": Bundle({"level_0": IMAGE}, {})}
 
 
 @pytest.mark.parametrize(("scale", "focal"), [(1.0, RIG.left.fx), (2.0, RIG.left.fx), (0.5, 0.5 * RIG.right.fx)])
 def test_the_coarser_pixel_tells_what_is_smoothed_away(scale: float, focal: float) -> None:
     inputs = bundles(scaled(scale), HEIGHT, np.random.default_rng(2))
-    local = stage.STAGE.run(LocusParams(cell_size=0.02), {"pair": 3, "frame": "local"}, inputs)
+    local = stage.locus_stage.run(LocusParams(cell_size=0.02), {"pair": 3, "frame": "local"}, inputs)
     assert local.meta["pixel_rad"] == pytest.approx(1.0 / focal)
 
 
 def test_stage_in_both_frames() -> None:
     inputs = bundles(RIG, HEIGHT, np.random.default_rng(2))
-    local = stage.STAGE.run(LocusParams(cell_size=0.01), {"pair": 3, "frame": "local"}, inputs)
-    check_outputs(stage.STAGE, local)
+    local = stage.locus_stage.run(LocusParams(cell_size=0.01), {"pair": 3, "frame": "local"}, inputs)
+    check_outputs(stage.locus_stage, local)
     lattice = Lattice.from_dict(local.meta["lattice"])
     assert lattice.cell == 0.01
     assert local.meta["defined"] > 0.3
@@ -412,14 +412,14 @@ def test_stage_in_both_frames() -> None:
     poses = {"poses": np.stack([np.full((3, 4), np.nan), (turn @ T_LOCAL_LEFT).matrix34])}
     covariances = np.arange(72.0).reshape(2, 6, 6)
     exact, world = (
-        stage.STAGE.run(
+        stage.locus_stage.run(
             LocusParams(cell_size=0.01),
             {"pair": 3, "frame": "world", "row": 1},
             inputs | {"trajectory": Bundle(arrays, {}), "local": local},
         )
         for arrays in (poses, {**poses, "covariance": covariances})
     )
-    check_outputs(stage.STAGE, world)
+    check_outputs(stage.locus_stage, world)
     json.dumps([local.meta, world.meta], allow_nan=False)
     assert world.meta.pop("pose_covariance") == list(range(36, 72))
     assert world.meta == exact.meta
@@ -440,12 +440,12 @@ def test_stage_in_both_frames() -> None:
 def test_each_cell_has_the_error_of_its_own_pixel_where_the_matcher_gives_one() -> None:
     inputs = bundles(RIG, HEIGHT, np.random.default_rng(2))
     args, params = {"pair": 0, "frame": "local"}, LocusParams(cell_size=0.01)
-    plain = stage.STAGE.run(params, args, inputs)
+    plain = stage.locus_stage.run(params, args, inputs)
     shape = inputs["disparity"]["column_disparity"].shape
     std = np.full(shape, 0.1, np.float32)
     std[:, shape[1] // 2 :] = 0.6
     disparity = Bundle({**inputs["disparity"].arrays, "disparity_std": std}, {})
-    own = stage.STAGE.run(params.model_copy(update={"max_std": 1.0}), args, inputs | {"disparity": disparity})
+    own = stage.locus_stage.run(params.model_copy(update={"max_std": 1.0}), args, inputs | {"disparity": disparity})
     both = np.isfinite(plain["elevation"])  # which the typical error bounds, and here a metre does not
     np.testing.assert_array_equal(own["elevation"][both], plain["elevation"][both])
     lattice = Lattice.from_dict(own.meta["lattice"])
@@ -459,25 +459,25 @@ def test_each_cell_has_the_error_of_its_own_pixel_where_the_matcher_gives_one() 
 def test_stage_parameters_of_the_lattice() -> None:
     inputs = bundles(RIG, HEIGHT, np.random.default_rng(2))
     args = {"pair": 0, "frame": "local"}
-    auto = stage.STAGE.run(LocusParams(), args, inputs)
+    auto = stage.locus_stage.run(LocusParams(), args, inputs)
     assert auto.meta["lattice"]["cell"] == inputs["level"].meta["cell_size"]
     first = Bundle({}, inputs["level"].meta | {"cell_size": 0.02})
-    shared = stage.STAGE.run(LocusParams(), args, inputs | {"reference": first})
+    shared = stage.locus_stage.run(LocusParams(), args, inputs | {"reference": first})
     assert shared.meta["lattice"]["cell"] == 0.02
-    extent = stage.STAGE.run(LocusParams(cell_size=0.01, extent=(-0.1, 0.1, 0.6, 0.9)), args, inputs)
+    extent = stage.locus_stage.run(LocusParams(cell_size=0.01, extent=(-0.1, 0.1, 0.6, 0.9)), args, inputs)
     assert Lattice.from_dict(extent.meta["lattice"]) == Lattice.snap((-0.1, 0.1, 0.6, 0.9), 0.01)
     with raises("RIL-391"):
-        stage.STAGE.run(LocusParams(max_sigma=1e-6, extent=(-0.1, 0.1, 0.6, 0.9)), args, inputs)
+        stage.locus_stage.run(LocusParams(max_sigma=1e-6, extent=(-0.1, 0.1, 0.6, 0.9)), args, inputs)
     with raises("RIL-387"):
-        stage.STAGE.run(LocusParams(cell_size=0.01, extent=(-0.3, 0.3, -5.0, -4.0)), args, inputs)
+        stage.locus_stage.run(LocusParams(cell_size=0.01, extent=(-0.3, 0.3, -5.0, -4.0)), args, inputs)
     with raises("RIL-356"):
-        stage.STAGE.run(LocusParams(cell_size=1e-5, extent=(-1, 1, 0, 1)), args, inputs)
+        stage.locus_stage.run(LocusParams(cell_size=1e-5, extent=(-1, 1, 0, 1)), args, inputs)
     with raises("RIL-383"):
-        stage.STAGE.run(LocusParams(extent=(1, -1, 0, 1)), args, inputs)
+        stage.locus_stage.run(LocusParams(extent=(1, -1, 0, 1)), args, inputs)
     empty = Bundle({"elevation": np.full((3, 3), np.nan, np.float32)}, {"lattice": Lattice.at(0, 0, 1, 3, 3).to_dict()})
     poses = Bundle({"poses": T_LOCAL_LEFT.matrix34[None]}, {})
     with raises("RIL-384"):
-        stage.STAGE.run(
+        stage.locus_stage.run(
             LocusParams(), {"pair": 0, "frame": "world", "row": 0}, inputs | {"trajectory": poses, "local": empty}
         )
 

@@ -259,8 +259,8 @@ def test_tiles_of_the_stage_equal_the_whole() -> None:
     at_once = merge(layers, whole, PARAMS)
     parts = []
     for tile in whole.tiles(16):
-        bundle = merge_stage.STAGE.run(PARAMS, {"lattice": tile.to_dict()}, {"dems": dems[::-1]})
-        check_outputs(merge_stage.STAGE, bundle)
+        bundle = merge_stage.merge_stage.run(PARAMS, {"lattice": tile.to_dict()}, {"dems": dems[::-1]})
+        check_outputs(merge_stage.merge_stage, bundle)
         json.dumps(bundle.meta, allow_nan=False)
         parts.append((tile, bundle))
     for name, nodata in (("elevation", np.nan), ("spread", np.nan), ("ortho", np.nan), ("count", 0), ("source", -1)):
@@ -295,7 +295,7 @@ def test_of_a_stored_model_the_tile_alone_is_read() -> None:
     lattice = Lattice.at(-500, 500, 0.1, 1000, 1000)
     maps = {n: np.full(lattice.shape, 0.5, np.float32) for n in ("elevation", "elevation_std", "residual", "ortho")}
     dem = Bundle(Watched(maps), {"lattice": lattice.to_dict(), "pair": 4, "frame": "world"})
-    merged = merge_stage.STAGE.run(PARAMS, {"lattice": TILE.to_dict()}, {"dems": [dem]})
+    merged = merge_stage.merge_stage.run(PARAMS, {"lattice": TILE.to_dict()}, {"dems": [dem]})
     assert Watched.cells == TILE.rows * TILE.cols
     assert (merged["elevation"] == 0.5).all()
 
@@ -321,7 +321,7 @@ def test_cells_seen_from_afar_alone_are_left_out_on_request_and_what_is_vouched_
 
     def merged(dems: list[Bundle], most: float | None) -> Bundle:
         params = MergeParams(max_footprint=most)
-        return merge_stage.STAGE.run(params, {"lattice": TILE.to_dict()}, {"dems": dems})
+        return merge_stage.merge_stage.run(params, {"lattice": TILE.to_dict()}, {"dems": dems})
 
     assert (merged([seen], None)["count"] == 1).all()
     assert np.array_equal(merged([seen], 0.01 * (1 + 0.31**2))["count"], near)
@@ -338,9 +338,9 @@ def test_exposures_are_levelled_and_stay_grey_values() -> None:
         for one in layers
     ]  # fmt: skip
     args = {"lattice": TILE.to_dict(), "exposure": {"4": 20}}
-    merged = merge_stage.STAGE.run(PARAMS, args, {"dems": bundles})
+    merged = merge_stage.merge_stage.run(PARAMS, args, {"dems": bundles})
     np.testing.assert_allclose(merged["ortho"], 50 * (1 + np.exp(0.2)), rtol=1e-5)
-    merged = merge_stage.STAGE.run(PARAMS, args | {"exposure": {"0": 99, "4": 99}}, {"dems": bundles})
+    merged = merge_stage.merge_stage.run(PARAMS, args | {"exposure": {"0": 99, "4": 99}}, {"dems": bundles})
     np.testing.assert_allclose(merged["ortho"], 255.0)
 
 

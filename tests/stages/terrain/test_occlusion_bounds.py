@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.terrain.occlusion_bounds import STAGE, OcclusionBoundsParams, ceiling
+from rille.stages.terrain.occlusion_bounds import OcclusionBoundsParams, ceiling, occlusion_bounds_stage
 
 LATTICE = Lattice.snap((-0.2, 0.2, 0.0, 0.8), 0.004)
 X, Y = LATTICE.xy()[..., 0], LATTICE.xy()[..., 1]
@@ -96,7 +96,9 @@ def test_raising_what_was_seen_never_lowers_a_bound(seed: int) -> None:
 def run(params: OcclusionBoundsParams, *dems: Bundle) -> Bundle:
     merged = np.asarray(dems[0]["elevation"])
     arrays = {"elevation": merged, "relief_std": np.where(np.isnan(merged), np.nan, 0.001).astype(np.float32)}
-    return STAGE.run(params, {}, {"merged": Bundle(arrays, {"lattice": LATTICE.to_dict()}), "dems": list(dems)})
+    return occlusion_bounds_stage.run(
+        params, {}, {"merged": Bundle(arrays, {"lattice": LATTICE.to_dict()}), "dems": list(dems)}
+    )
 
 
 def model(seen: np.ndarray, height: float = HEIGHT) -> Bundle:

@@ -22,11 +22,11 @@ def audited(dems: dict[int, Bundle]) -> tuple[list[Bundle], dict]:
     seams, pairs = [], sorted(dems)
     for i, pair in enumerate(pairs):
         inputs = {"dem": dems[pair], "others": [dems[other] for other in pairs[:i]][::-1]}
-        seams.append(seam_stage.STAGE.run(NoParams(), {}, inputs))
-        check_outputs(seam_stage.STAGE, seams[-1])
+        seams.append(seam_stage.overlap_qa_stage.run(NoParams(), {}, inputs))
+        check_outputs(seam_stage.overlap_qa_stage, seams[-1])
         json.dumps(seams[-1].meta, allow_nan=False)
     centres = {str(p): Lattice.from_dict(b.meta["lattice"]).xy().mean(axis=(0, 1)).tolist() for p, b in dems.items()}
-    found = audit_stage.STAGE.run(OverlapAuditParams(), {"centres": centres}, {"seams": seams})
+    found = audit_stage.overlap_audit_stage.run(OverlapAuditParams(), {"centres": centres}, {"seams": seams})
     json.dumps(found.meta, allow_nan=False)
     return seams, dict(found.meta)
 

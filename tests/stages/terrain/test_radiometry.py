@@ -66,6 +66,6 @@ def test_the_stage_reads_the_seams_and_can_be_switched_off() -> None:
     seams = [Bundle({}, {"seams": [{"pair": b, "other": a, "log_ratio": r}]}) for a, b, r in ratios({20: 0.3})]
     seams.append(Bundle({}, {"seams": [{"pair": 44, "other": 0, "log_ratio": None}]}))
     args = {"centres": {str(k): list(c) for k, c in CHAIN.items()}}
-    meta = stage.STAGE.run(RadiometryParams(), args, {"seams": seams}).meta
+    meta = stage.radiometry_stage.run(RadiometryParams(), args, {"seams": seams}).meta
     assert meta["steps"] == {str(k): n for k, n in level(CHAIN, ratios({20: 0.3})).items()}
-    assert stage.STAGE.run(RadiometryParams(level=False), args, {"seams": seams}).meta["steps"] == {}
+    assert stage.radiometry_stage.run(RadiometryParams(level=False), args, {"seams": seams}).meta["steps"] == {}

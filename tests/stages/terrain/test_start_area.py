@@ -8,7 +8,7 @@ import pytest
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.terrain.start_area import NOBODY, STAGE, StartAreaParams
+from rille.stages.terrain.start_area import NOBODY, StartAreaParams, start_area_stage
 
 CELL, RADIUS, WHEEL = 0.01, 0.2, 0.03
 STANDS = RigidTransform(rotation_exp([0.25, -0.1, 0.7]), np.array([1.0, -2.0, 0.4]))
@@ -20,8 +20,8 @@ def test_its_cells_lie_in_the_vehicles_own_ground_plane() -> None:
     poses = np.stack([np.eye(3, 4), (STANDS @ T_vehicle_left).matrix34])
     args = {"T_vehicle_left": T_vehicle_left.to_list(), "radius": RADIUS, "wheel_diameter": WHEEL}
     like = Bundle({}, {"lattice": Lattice.at(0, 0, CELL, 3, 3).to_dict()})
-    out = STAGE.run(StartAreaParams(sigma=0.1), args, {"pose": Bundle({"poses": poses}, {}), "like": like})
-    check_outputs(STAGE, out)
+    out = start_area_stage.run(StartAreaParams(sigma=0.1), args, {"pose": Bundle({"poses": poses}, {}), "like": like})
+    check_outputs(start_area_stage, out)
     lattice = Lattice.from_dict(out.meta["lattice"])
     xy, z = lattice.xy(), out["elevation"]
     known = np.hypot(xy[..., 0] - 1.0, xy[..., 1] + 2.0) <= RADIUS

@@ -52,11 +52,13 @@ def test_the_stage_gives_tiles_and_the_box_of_all_cells() -> None:
     z = np.full(lattice.shape, np.nan, np.float32)
     z[2, 3] = z[4, 4] = 1.0
     dem = Bundle({"elevation": z}, {"pair": 7, "lattice": lattice.to_dict()})
-    meta = stage.STAGE.run(NoParams(), {"side": 4, "margin": 0}, {"dem": dem}).meta
+    meta = stage.tile_index_stage.run(NoParams(), {"side": 4, "margin": 0}, {"dem": dem}).meta
     assert meta["pair"] == 7
     assert meta["tiles"] == [[0, 0, 3, 2, 1, 1], [1, 1, 4, 4, 1, 1]]
     box = Lattice.from_dict(meta["box"])
     assert (box.i0, box.j0, box.rows, box.cols) == (3, -2, 3, 2)
-    empty = stage.STAGE.run(NoParams(), {"side": 4, "margin": 0}, {"dem": Bundle({"elevation": z * np.nan}, dem.meta)})
+    empty = stage.tile_index_stage.run(
+        NoParams(), {"side": 4, "margin": 0}, {"dem": Bundle({"elevation": z * np.nan}, dem.meta)}
+    )
     assert (empty.meta["tiles"], empty.meta["box"]) == ([], None)
     assert tile_lattice([(0, 0, 2, 1), (-1, 3, 1, 1)], 0.1).bounds == pytest.approx((-0.15, 0.15, -0.35, 0.05))

@@ -1,0 +1,82 @@
+"""Facts of the stages that check and repair the calibration."""
+
+from typing import Any, NotRequired
+
+from rille.stages.core.declare import Facts
+
+
+class CalibrationFacts(Facts):
+    """``rig`` (:meth:`Rig.to_dict`) that is computed with, and its ``baseline``, m."""
+
+    rig: dict[str, Any]
+    baseline: float
+
+
+class OrientationFacts(Facts):
+    """Relative orientation from one pair; too few ``matches`` give ``words`` on that alone."""
+
+    pair: int
+    matches: int
+    parameters: list[dict[str, Any]]
+    """Name, value, asked, sigma, unit, observed, freed, why, of each parameter."""
+    words: str
+    outliers: NotRequired[int]
+    row_offset: NotRequired[float]
+    """Median distance from the epipolar line, px, along rows."""
+    roll_deg: NotRequired[float]
+    residual_before_px: NotRequired[float]
+    residual_after_px: NotRequired[float]
+    """RMS of inliers."""
+    median_before_px: NotRequired[float]
+    median_after_px: NotRequired[float]
+
+
+class RigFacts(Facts):
+    """The rig to be used; without a pair that can be used, the first six facts and ``warnings`` alone."""
+
+    rig: dict[str, Any]
+    """To be used, as :meth:`Rig.to_dict` gives it."""
+    given: dict[str, Any]
+    mode: str
+    baseline: float
+    source: str
+    changed: bool
+    parameters: NotRequired[list[dict[str, Any]]]
+    """Name, value, asked, sigma, unit, observed, freed, why; in mode ``fixed`` what would be changed."""
+    held: NotRequired[list[str]]
+    """Names and reasons."""
+    per_pair: NotRequired[list[dict[str, Any]]]
+    """Pair, values and sigma by name, degrees, of what is observed."""
+    residual_before_px: NotRequired[float]
+    residual_after_px: NotRequired[float]
+    """RMS of inliers; of the same points the medians."""
+    median_before_px: NotRequired[float]
+    median_after_px: NotRequired[float]
+    pairs: NotRequired[int]
+    matches: NotRequired[int]
+    suspects: NotRequired[list[int]]
+    """Pairs whose rows the rig does not explain."""
+    contradiction: NotRequired[str]
+    """A correction that no mount makes."""
+    knocked: NotRequired[str]
+    """A rig that one calibration does not describe."""
+
+
+class SwapFacts(Facts):
+    """Whether left and right are exchanged: shares of the matches that fit the rig either way."""
+
+    frame: int
+    matches: int
+    swapped: bool
+    as_given: NotRequired[float]
+    exchanged: NotRequired[float]
+
+
+class SynchronyFacts(Facts):
+    """Right frames that are of the time of left ones."""
+
+    rows: list[float]
+    """Spread of the rows of each pair, px."""
+    partners: list[list[int]]
+    """Left and right frame number, of pairs whose images are not of one time."""
+    contradiction: NotRequired[str]

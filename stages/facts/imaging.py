@@ -1,0 +1,28 @@
+"""Facts of images and pyramids."""
+
+from typing import Any
+
+from rille.stages.core.declare import Facts
+
+
+class PyramidFacts(Facts):
+    """``levels`` of the pyramid, and the standard deviation of the ``noise``, grey."""
+
+    levels: int
+    noise: float | None
+
+
+class UndistortedFacts(Facts):
+    """``frame`` and ``camera`` of an image, and the ``usable`` share of its pixels."""
+
+    frame: int
+    camera: str
+    usable: float
+
+
+class QualityFacts(Facts):
+    """Of each image of a frame: mean, deviation, sharpness, detail and digest."""
+
+    frame: int
+    left: dict[str, Any]
+    right: dict[str, Any]

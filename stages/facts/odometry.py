@@ -1,0 +1,125 @@
+"""Facts of the stages between the images and the trajectory."""
+
+from typing import Any, NotRequired
+
+from rille.stages.core.declare import Facts
+
+
+class MotionFacts(Facts):
+    """Coarse displacements, px of level 0 (None: nothing matches), and shares of the pixels with texture."""
+
+    level: int
+    median_column: float | None
+    median_row: float | None
+    median_length: float | None
+    match_rate: float | None
+    overlap: float | None
+    derotated: bool
+    turn_found_deg: float
+
+
+class StepTableFacts(Facts):
+    """``side`` of a block and ``size`` (columns, rows) of the image, px."""
+
+    side: float
+    size: list[float]
+
+
+class ScreeningFacts(Facts):
+    """Frames that the trajectory goes through, and those that it does not.
+
+    ``asks``: what must be known for an answer, ``bridges`` (pairs of frames) and ``sides`` (frames); where both are
+    empty the rest is final. ``lost`` are frame and cause, ``unfit`` frames that may not be basic, ``match_rate`` the
+    shares along the ``chain``.
+    """
+
+    asks: dict[str, list[Any]]
+    chain: list[int]
+    lost: list[dict[str, Any]]
+    unfit: list[int]
+    match_rate: list[float | None]
+
+
+class KeyframesFacts(Facts):
+    """Places in the chain that are ``basic``, and the ``segments`` between them (places).
+
+    ``why`` and ``overlap`` are of each basic pair, ``displacement`` (px, None: not known) and ``match_rate`` of each
+    step.
+    """
+
+    basic: list[int]
+    segments: list[list[int]]
+    rule: str
+    overlap: list[float | None]
+    why: list[str]
+    displacement: list[float | None]
+    match_rate: list[float | None]
+
+
+class TrackFacts(Facts):
+    """Numbers of the ``frames`` of a segment, and how many points were ``tracked`` to each."""
+
+    frames: list[int]
+    tracked: list[int]
+
+
+class ResectFacts(Facts):
+    """Poses of a segment's frames.
+
+    ``per_frame``: frame, inliers, rms_px, and what else is known of each. ``without_coordinates`` counts landmarks,
+    ``moving_tracks`` those of the ``tracks`` that move. ``jump`` (column, row, px) and ``knocked``: the rig moved
+    before the pair at the segment's end.
+    """
+
+    per_frame: list[dict[str, Any]]
+    landmark_source: str
+    without_coordinates: dict[str, int]
+    """By cause."""
+    tracks: int
+    moving_tracks: int
+    contradiction: NotRequired[str]
+    jump: NotRequired[list[float]]
+    knocked: NotRequired[str]
+
+
+class RefineFacts(Facts):
+    """Segments adjusted with their landmarks: how many ``frames`` and ``points`` each has.
+
+    ``tilt``: tilt of the disparities and its sigma, rad, of each segment that shows one; ``intrinsics``: contributions
+    of each segment to the errors of the intrinsics.
+    """
+
+    frames: list[int]
+    points: list[int]
+    adjustment: dict[str, Any]
+    per_frame: list[dict[str, Any]]
+    tilt: NotRequired[list[list[float]]]
+    intrinsics: NotRequired[list[Any]]
+
+
+class TiltFacts(Facts):
+    """Tilt of all disparities, rad, whether it is ``undone``, and errors of the intrinsics with their sigmas."""
+
+    undone: bool
+    tilt_rad: NotRequired[float]
+    sigma_rad: NotRequired[float]
+    intrinsics: NotRequired[dict[str, Any]]
+    contradiction: NotRequired[str]
+
+
+class TrajectoryFacts(Facts):
+    """Poses of all frames in the world, which is that of piece number ``main``."""
+
+    frames: list[int]
+    inliers: list[int]
+    positions: list[list[float] | None]
+    """x, y, z of each frame, m; None: lost."""
+    verticals: list[str]
+    """Source of the vertical of each piece."""
+    pieces: list[list[int]]
+    """First and last frame of each."""
+    main: int
+    posed: int
+    in_world: int
+    lost: list[dict[str, Any]]
+    """Frame, cause, and the frames between which it is bridged."""

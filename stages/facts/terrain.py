@@ -1,0 +1,127 @@
+"""Facts of the stages between disparities and the merged terrain."""
+
+from typing import Any, NotRequired
+
+from rille.stages.core.declare import Facts
+
+Json = dict[str, Any]
+
+
+class GroundFacts(Facts):
+    """Local frame and ground of one pair, in the local frame.
+
+    Where no ground is seen, ``no_ground`` says why, and what describes it is None, except ``cell_size``; ``plane`` and
+    ``relief`` are there where larger cells may show it.
+    """
+
+    T_local_left: list[float]
+    """3 x 4 numbers, row by row."""
+    source: str
+    """Of the vertical; ``none``: unknown, z is the camera's own up."""
+    ground_height: float | None
+    """z of the ground below the camera, m, negative."""
+    plane: list[float] | None
+    """(a, b, c) of z = c + a x + b y."""
+    tilt: float | None
+    """Of the ground, rad."""
+    relief: list[float] | None
+    """Lowest and highest terrain against the plane, m."""
+    z_range: list[float] | None
+    cell_size: float
+    """m, that suits the rig."""
+    footprint: list[float] | None
+    """x_min, x_max, y_min, y_max, m, for that cell."""
+    ground_share: float
+    """Of the sampled pixels."""
+    no_ground: NotRequired[str]
+    seen_up: NotRequired[list[float]]
+    """Up, in the left camera's frame, by ground that is seen but contradicts the given vertical."""
+
+
+class DemFacts(Facts):
+    """Elevation model of a basic ``pair`` on a ``lattice`` (:meth:`Lattice.to_dict`) of a ``frame``."""
+
+    lattice: Json
+    frame: str
+    pair: int
+    z_range: NotRequired[list[float]]
+    T_frame_left: NotRequired[list[float]]
+    pixel_rad: NotRequired[float]
+    """Angle of a pixel, rad."""
+    defined: NotRequired[float]
+    """Share of the cells."""
+    median_residual: NotRequired[float | None]
+    """px"""
+    median_elevation_std: NotRequired[float | None]
+    """m"""
+    pose_covariance: NotRequired[list[float]]
+    """6 x 6 numbers, row by row: of position, m, and rotation, rad, in the world."""
+
+
+class MergeFacts(Facts):
+    """Merged tile: its ``pairs``, the ``defined`` share of its cells, and how many were ``filled``."""
+
+    lattice: Json
+    frame: str
+    pairs: list[int]
+    defined: float
+    filled: int
+
+
+class BoundsFacts(Facts):
+    """``shares`` of the cells that are unknown, and that are bounded although not seen."""
+
+    lattice: Json
+    frame: str
+    shares: dict[str, float]
+
+
+class OverlapFacts(Facts):
+    """``seams`` of a ``pair`` with earlier ones: see :func:`rille.stages.terrain.overlap_qa.seam`."""
+
+    pair: int
+    seams: list[Json]
+
+
+class AuditFacts(Facts):
+    """``models``, the worst first (see :func:`rille.stages.terrain.overlap_audit.audit`), and the worst ``seams``."""
+
+    variance_factor: float
+    models: list[Json]
+    seam_count: int
+    seams: list[Json]
+
+
+class RadiometryFacts(Facts):
+    """Whole ``steps`` of log-exposure ``step`` that each model's grey values are raised by, from ``seams`` ratios."""
+
+    step: float
+    steps: dict[str, int]
+    seams: int
+
+
+class TileIndexFacts(Facts):
+    """``tiles`` (column, line, and the model's first column, first line, columns, lines there) that a model touches."""
+
+    pair: int
+    cell: float
+    box: Json | None
+    """Lattice of the defined cells."""
+    tiles: list[list[int]]
+
+
+class MapFixFacts(Facts):
+    """First pose in a global map, and how sure it is; one that was handed in has a ``source`` alone."""
+
+    T_global_local: list[float]
+    source: str
+    std: NotRequired[list[float]]
+    """x, y, m, and heading, rad."""
+    covariance: NotRequired[list[list[float]]]
+    overlap: NotRequired[float]
+    rms: NotRequired[float]
+    """m"""
+    cells: NotRequired[int]
+    other: NotRequired[Json | None]
+    """The next best place and its chi2."""
+    ambiguous: NotRequired[bool]
