@@ -167,6 +167,12 @@ class Graph:
         self.nodes.append(handle)
         return handle
 
+    def call(self, stage: Stage[Any, F], label: str, params: Params, /, **given: Any) -> Handle[F]:
+        """Add a task by what it is given, inputs (handles) and arguments alike; None stands for an absent one."""
+        args = {name: value for name, value in given.items() if value is not None}
+        inputs = {name: args.pop(name) for name in stage.ports() if name in args}
+        return self.node(stage, label, params, args, inputs=inputs)
+
     def flow(self, steps: Generator[Wait, Any, None]) -> None:
         """Run a generator on the client until it waits, and again when what it waits for is there.
 

@@ -27,8 +27,8 @@ KNOWN = {
 }
 """Import name to the distributions that may give it, where they are named otherwise: looking it up takes 0.2 s."""
 
-HARMLESS = frozenset({"pydantic", "rille"})
-"""What checks parameters, whose values are part of a key themselves; and the engine, whose format is."""
+HARMLESS = frozenset({"pydantic", "rille", "typing_extensions"})
+"""What checks parameters, whose values are part of a key themselves; the engine, whose format is; and types."""
 
 NAMED = (
     *("rille", "numpy", "numba", "scipy", "opencv-python-headless", "dask", "zarr", "rasterio", "pyogrio", "pycolmap"),

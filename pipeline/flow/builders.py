@@ -136,9 +136,7 @@ class Builder:
         """
         # A section is named as its stage; a stage without parameters has none.
         chosen: Params = params or getattr(self.config, stage.name, NO_PARAMS)
-        there = {name: value for name, value in given.items() if value is not None}
-        inputs = {name: there.pop(name) for name in stage.ports() if name in there}
-        return self.graph.node(stage, label, chosen, there, {}, inputs)
+        return self.graph.call(stage, label, chosen, **given)
 
     # -- images -------------------------------------------------------------------------------------------------
 

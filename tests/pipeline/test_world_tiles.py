@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,8 @@ from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.flow.builders import merge_tiles
 from rille.stages.core.declare import NoParams
-from rille.stages.terrain import merge, tile_index
-from rille.stages.terrain.merge import MergeParams
+from rille.stages.terrain.merge import MergeParams, merge_stage
+from rille.stages.terrain.tile_index import tile_index_stage
 
 SIDE = 16
 PLACES = {0: (0, 0), 4: (9, 3), 8: (22, -5), 12: (40, 2), 16: (-14, -30), 20: (33, -28)}
@@ -35,12 +34,12 @@ def run(
     """Labels of the tiles merged by this run, digest of each tile, and all nodes by label."""
     graph, merging = Graph(), params or MergeParams()
 
-    def node(stage: ModuleType, label: str, args: Mapping[str, Any], **inputs: Any) -> Any:
-        return graph.node(stage, label, merging if stage is merge else NoParams(), args, {}, inputs)
+    def node(stage: Any, label: str, **given: Any) -> Any:
+        return graph.call(stage, label, merging if stage is merge_stage else NoParams(), **given)
 
-    dems = {k: node(dem, f"dem/{k}", {"pair": k, "i0": i, "j0": j}) for k, (i, j) in places.items()}
+    dems = {k: node(dem.STAGE, f"dem/{k}", pair=k, i0=i, j0=j) for k, (i, j) in places.items()}
     cut = {"side": SIDE, "margin": merging.margin}
-    prints = [node(tile_index, f"tile_index/{k}", cut, dem=model) for k, model in dems.items()]
+    prints = [node(tile_index_stage, f"tile_index/{k}", dem=model, **cut) for k, model in dems.items()]
 
     def follow() -> Iterator[Any]:
         found: Any = yield prints

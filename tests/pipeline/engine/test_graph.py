@@ -16,11 +16,11 @@ NO = NoParams()
 
 
 def number(graph, frame):
-    return graph.node(numbers, f"numbers/{frame}", NumbersParams(size=8), {"frame": frame})
+    return graph.node(numbers.STAGE, f"numbers/{frame}", NumbersParams(size=8), {"frame": frame})
 
 
 def broken(graph, what="degenerate"):
-    return graph.node(mischief, f"broken/{what}", NO, {"what": what})
+    return graph.node(mischief.STAGE, f"broken/{what}", NO, {"what": what})
 
 
 def run(graph, tmp_path, **options):
@@ -34,13 +34,13 @@ def test_a_flow_gets_what_it_yielded_and_several_run_side_by_side(tmp_path):
         values = number(graph, frame)
         ref = yield values
         told.append(ref.meta["frame"])
-        again = yield [graph.node(scale, f"scale/{frame}", ScaleParams(), inputs={"values": values})]
+        again = yield [graph.node(scale.STAGE, f"scale/{frame}", ScaleParams(), inputs={"values": values})]
         return again[0].meta["levels"] + frame
 
     def whole():
         alone = yield from scaled(2)
         parts = [handle for handle in graph.nodes if handle.stage == "scale"]
-        found = yield graph.node(total, "total", NO, inputs={"parts": parts})
+        found = yield graph.node(total.STAGE, "total", NO, inputs={"parts": parts})
         told.append((alone, found.meta["count"], (yield [])))
 
     for flow in (scaled(0), scaled(1), whole()):
@@ -70,7 +70,7 @@ def test_what_is_missing_is_none_or_raises_where_it_is_waited_for(tmp_path):
         pytest.fail("went on")
 
     fine, bad = number(graph, 0), broken(graph)
-    after = graph.node(mischief, "after", NO, {"what": "fine"}, inputs={"after": bad})
+    after = graph.node(mischief.STAGE, "after", NO, {"what": "fine"}, inputs={"after": bad})
     graph.flow(careful())
     graph.flow(catching())
     graph.flow(careless())
@@ -92,7 +92,7 @@ def test_an_error_of_a_flow_is_a_failure_of_the_run(tmp_path):
     assert [f"{f.label}: {f.error}" for f in run(graph, tmp_path).failures] == ["plan after numbers/0: no such pair"]
 
 
-def test_a_stage_is_named_by_its_module(tmp_path):
+def test_a_stage_may_be_named_by_its_module(tmp_path):
     graph = Graph()
     a, b = number(graph, 0), graph.node("toys.numbers", "b", NumbersParams(size=8), {"frame": 0})
     assert a.spec.module == b.spec.module
