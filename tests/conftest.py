@@ -8,11 +8,16 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, NoReturn
 
+import hypothesis
 import pytest
 
 from rille.pipeline.engine.runtime.environment import prepare_environment
 
 prepare_environment()  # before NumPy and numba
+
+# A busy machine is no failure of the example.
+hypothesis.settings.register_profile("rille", deadline=None)
+hypothesis.settings.load_profile("rille")
 
 
 @pytest.fixture(scope="session")

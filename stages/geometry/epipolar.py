@@ -120,7 +120,9 @@ def inverse_depth(rig: Rig, pixels: Floats, disparity: Floats) -> tuple[Floats, 
     offset = p * m[:, 2:] - m[:, :2]
     # At the epipole itself there is no line.
     length2 = np.maximum((along**2).sum(-1), 1e-300)
-    return -(offset * along).sum(-1) / length2, np.abs(m[:, 2]) / np.sqrt(length2)
+    rho = -(offset * along).sum(-1) / length2
+    # p_r = (m + rho epipole) / (m_z + rho epipole_z) moves by |along| / (m_z + rho epipole_z) a unit of rho.
+    return rho, np.abs(m[:, 2] + rho * epipole[2]) / np.sqrt(length2)
 
 
 def depth_sensitivity(rig: Rig, left: Floats, right: Floats) -> Floats:
