@@ -28,9 +28,7 @@ import pycolmap
 import rasterio
 import trimesh
 import xarray
-import yaml
 from evo.tools import file_interface
-from rosbags.highlevel import AnyReader
 
 import rille
 from rille.pipeline.commands.options import cache_folder
@@ -43,7 +41,7 @@ from toys import map_server
 from toys.browser import Browser
 
 RASTERS = ("dem", "dem_sigma", "slope", "hillshade", "ortho", "risk", "hazard", "reason")
-EXPORTS = ("laz", "ply", "glb", "colmap", "nav2", "grid_map")
+EXPORTS = ("laz", "ply", "glb", "colmap", "nav2")
 
 QGIS = """
 import sys
@@ -276,32 +274,17 @@ def nav2(o: Opened) -> tuple[str, str]:
     with rasterio.open(o.run / "risk.tif") as risk, rasterio.open(o.run / "hazard.tif") as hazard:
         classes, p, corner = risk.read(1), hazard.read(hazard.descriptions.index("p_hazard") + 1), risk.bounds
     wanted = np.select([classes == 2, classes == 3], [100, -1], np.rint(100.0 * np.nan_to_num(p)))
-    masks = {"keepout": np.where(classes >= 2, 100, 0), "speed": np.where(classes == 1, 50, 0)}
-    for name, values in {"map": wanted, **masks}.items():
-        grid = map_server.load(o.exports / "nav2" / f"{name}.yaml")
-        assert np.allclose(grid.origin, (corner.left, corner.bottom), atol=1e-6), grid.origin
-        np.testing.assert_array_equal(grid.data[::-1] < 0, values < 0)
-        # hazard.tif keeps p_hazard to a thousandth, so that a half may be rounded to either side
-        assert np.abs(grid.data[::-1] - values).max() <= name.startswith("map"), name
-    poses = yaml.safe_load((o.exports / "nav2" / "path.yaml").read_text())["poses"]
-    return (
-        "as documented",
-        f"map, keepout and speed mask of {classes.size} cells, path of {len(poses)} poses",
-    )
+    grid = map_server.load(o.exports / "nav2" / "map.yaml")
+    assert np.allclose(grid.origin, (corner.left, corner.bottom), atol=1e-6), grid.origin
+    np.testing.assert_array_equal(grid.data[::-1] < 0, wanted < 0)
+    # hazard.tif keeps p_hazard to a thousandth, so that a half may be rounded to either side
+    assert np.abs(grid.data[::-1] - wanted).max() <= 1
+    return "as documented", f"map of {classes.size} cells"
 
 
 def khronos(o: Opened) -> tuple[str, str]:
     found, words = run_of("node", "-e", GLTF, os.environ["GLTF_VALIDATOR"], o.exports / "glb").strip().split("|")
     return found, words
-
-
-def by_rosbags(o: Opened) -> tuple[str, str]:
-    with AnyReader([o.exports / "grid_map"]) as reader:
-        ((connection, _, data),) = reader.messages()
-        message = reader.deserialize(data, connection.msgtype)
-    z = message.data[message.layers.index("elevation")].data
-    assert np.allclose((np.nanmin(z), np.nanmax(z)), o.range, atol=1e-5)
-    return version("rosbags"), f"GridMap with {', '.join(message.layers)}"
 
 
 def there(*programs: str) -> bool:
@@ -321,7 +304,6 @@ PROGRAMS: dict[str, tuple[Callable[[Opened], tuple[str, str]], bool]] = {
     "trimesh": (by_trimesh, True),
     "three.js, in chromium": (three, there("chromium")),
     "Khronos glTF validator": (khronos, "GLTF_VALIDATOR" in os.environ and there("node")),
-    "rosbags": (by_rosbags, True),
     "nav2_map_server": (nav2, True),
 }
 """Check and whether the program is here."""

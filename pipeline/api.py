@@ -192,10 +192,10 @@ class Run:
         """
         import xarray
 
-        from rille.pipeline.export.read_dem import open_group
+        from rille.pipeline.export.read_dem import check_group
 
         with self._reading():
-            open_group(self._file("terrain.zarr"))  # of a size that may be read
+            check_group(self._file("terrain.zarr"))
             found: xarray.Dataset = xarray.open_zarr(self._file("terrain.zarr"))
         for variable in found.variables.values():
             variable.attrs.pop("_CRS", None)  # GDAL's own, a mapping: NetCDF stores none; `spatial_ref` says the same

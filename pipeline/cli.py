@@ -69,7 +69,7 @@ COMMANDS = {
     ),
     "export": (
         "export:export",
-        "Write a run for other programs: cloud.laz or cloud.ply (points), terrain.glb (mesh), models, maps.",
+        "Write a run for other programs: cloud.laz or cloud.ply (points), terrain.glb (mesh), a model, a map.",
     ),
     "compare-dem": (
         "compare_dem:compare_dem",

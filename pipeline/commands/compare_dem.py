@@ -48,8 +48,7 @@ def compare_dem(
     Parameters
     ----------
     a
-        GeoTIFF, ESRI ASCII grid (.asc), zarr group with elevation, x and y, or a run: its folder or name (mockup,
-        latest).
+        GeoTIFF, ESRI ASCII grid (.asc), or a run: its folder or name (mockup, latest).
     b
         Reference, likewise.
     align

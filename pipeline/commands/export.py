@@ -22,7 +22,7 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.runs import lookup
 from rille.stages.core.errors import ConfigError
 
-Form = Literal["laz", "ply", "glb", "colmap", "nav2", "grid_map"]
+Form = Literal["laz", "ply", "glb", "colmap", "nav2"]
 
 
 def export(
@@ -34,14 +34,13 @@ def export(
     cache: CacheFolder = None,
     debug: Debug = False,
 ) -> int:
-    """Write a run for other programs: cloud.laz or cloud.ply (points), terrain.glb (mesh), models, maps.
+    """Write a run for other programs: cloud.laz or cloud.ply (points), terrain.glb (mesh), a model, a map.
 
     Parameters
     ----------
     to
         laz: CloudCompare, PDAL, QGIS; ply: CloudCompare, MeshLab; glb: any glTF viewer, Blender; colmap: cameras, rig,
-        poses and tracked points; nav2: map, keepout and speed mask, and path of ROS 2's navigation; grid_map: a bag
-        with one GridMap. May be repeated.
+        poses and tracked points; nav2: occupancy map of ROS 2's navigation. May be repeated.
     output
         What to write, for one form only; by default cloud.laz, cloud.ply, terrain.glb or a folder of the form's name in
         the run's folder.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from rille.pipeline.export.catalogue import OUTPUTS
@@ -12,7 +11,7 @@ from rille.pipeline.export.view import RunView
 from rille.pipeline.export.writers import FRAME, UNLEVELLED
 from rille.stages.geometry.pose_arrays import NO_VERTICAL
 
-FORMAT = 1
+FORMAT = 2
 """Raised when the meaning of a key of frames.json changes."""
 
 FRAMES: dict[str, dict[str, Any]] = {
@@ -29,16 +28,19 @@ FRAMES: dict[str, dict[str, Any]] = {
     },
 }
 
-_PLACED = {
-    "frame": "georeference",
-    "crs": "that of georeference: easting, northing, height; metres; rasters are turned by the azimuth, not resampled",
+CONVENTIONS = {
+    "pose": "of the left camera, T_world_left: x_world = R x_left + t",
+    "trajectory.kitti": "[R | t] row by row, a line a frame in the order of `frames` here; nan where there is no pose",
+    ".tum": "time x y z qx qy qz qw; frames without a pose have no line",
+    "quaternion": "x y z w (scalar last), Hamilton, w >= 0, rotates from the left camera to the world",
+    "raster": "row 0 at the greatest y of the world frame; the geotransform gives the corner of the first cell",
+    "world": "engineering CRS, metres: x, y and z of the world frame",
+    "georeference": "that CRS, metres: easting, northing, height; rasters are turned by the azimuth, not resampled",
 }
-IN_PLACE = {
-    ".tif": _PLACED
-    | {"raster": "row 0 at the greatest y of the world frame; the geotransform gives the corner of the first cell"},
-    ".gpkg": _PLACED,
-}
-"""By their endings, the files whose coordinates are those of the sequence's CRS where it has one: what is then said."""
+"""How poses and rasters are written, and what the coordinates of a file in either frame are."""
+
+IN_PLACE = (".tif", ".gpkg")
+"""Endings of the files whose coordinates are those of the sequence's CRS where it has one."""
 
 
 def describe(written: Sequence[str], run: RunView, vertical: str = "") -> dict[str, Any]:
@@ -54,13 +56,17 @@ def describe(written: Sequence[str], run: RunView, vertical: str = "") -> dict[s
     if vertical == NO_VERTICAL:
         world |= {"axes": {"x": "right", "y": "optical axis of the first camera", "z": "that camera's up"}}
         world |= {"definition": UNLEVELLED}
-    known = {o.name: {"frame": o.frame, **o.facts} for o in OUTPUTS if o.name in written and o.frame}
-    if place is not None:
-        known = {name: facts | IN_PLACE.get(Path(name).suffix, {}) for name, facts in known.items()}
+    placed = IN_PLACE if place is not None else ()
+    known = {
+        o.name: {"frame": "georeference" if o.name.endswith(placed) else o.frame, "holds": o.what}
+        for o in OUTPUTS
+        if o.name in written and o.frame
+    }
     return {
         "format": FORMAT,
         "units": {"length": "m", "angle": "rad, deg where the name says so", "time": "s" if times else "frame number"},
         "frames_of_reference": FRAMES | {"world": world},
+        "conventions": CONVENTIONS,
         "files": known,
         "georeference": None if place is None else place.to_dict(),
         "frames": [

@@ -12,7 +12,7 @@ these files: the page and ``report.json`` are rendered by each run around what i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from operator import methodcaller
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
@@ -49,7 +49,6 @@ class Output:
         that has no default in ``write`` is not there as a whole, the file is not made; of others (a list, a
         dictionary, a :class:`rille.pipeline.export.view.Part`) what is missing is None.
     frame : frame of reference of its values, a key of :data:`rille.pipeline.export.frames_json.FRAMES`; empty: none.
-    facts : what else a program has to know to read it, for ``frames.json``: units, columns, what is missing.
     """
 
     name: str
@@ -58,7 +57,6 @@ class Output:
     write: Callable[..., None] | None = None
     inputs: Callable[[RunView], Mapping[str, Any]] = lambda _: {}
     frame: str = ""
-    facts: Mapping[str, str] = field(default_factory=dict)
 
 
 def stage(name: str, summary: str, outputs: Sequence[Output]) -> Stage:

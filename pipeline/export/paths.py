@@ -24,7 +24,6 @@ OUTPUTS = (
         _write_gpkg,
         lambda run: {"planned": run.products.world_path, "place": run.sequence.georeference},
         "world",
-        {"crs": "engineering CRS, metres", "coordinates": "x y z, m"},
     ),
 )
 STAGE = stage("output.paths", "The path as a file", OUTPUTS)

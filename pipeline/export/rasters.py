@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +25,6 @@ from rille.stages.terrain import merge
 from rille.stages.terrain.shading import hillshade, slope_deg
 
 LIGHT = {"light": "from the upper left (315 degrees), 45 degrees high"}
-CRS = {
-    "crs": "engineering CRS, metres",
-    "raster": "row 0 at the greatest y; the geotransform gives the corner of the first cell; north is y",
-}
 GIS = "QGIS, GDAL"
 
 
@@ -157,10 +152,6 @@ def rounded(values: NDArray[np.float32], bits: int) -> NDArray[np.float32]:
     return np.asarray(np.ldexp(np.rint(mantissa * scale) / scale, exponent), dtype=np.float32)
 
 
-def _write_risk_style(path: Path, risk: Bundle) -> None:
-    atomic.write(path, risk_style())
-
-
 def dem_style(low: float, high: float) -> str:
     """QGIS style of elevations, in metres."""
     # Heights above the sea need more digits than six to tell the steps of a low relief apart.
@@ -170,30 +161,16 @@ def dem_style(low: float, high: float) -> str:
         f'<item value="{value}" label="{value}" color="{colour}" alpha="255"/>\n'
         for value, colour in zip(values, ELEVATIONS, strict=True)
     )
-    kind = f'type="singlebandpseudocolor" opacity="1" classificationMin="{values[0]}" classificationMax="{values[-1]}"'
+    first, last = values[0], values[-1]
     # clip 0: what lies beyond the range takes its end colours; 1 would leave it out.
-    shader = f'colorRampType="INTERPOLATED" clip="0" minimumValue="{values[0]}" maximumValue="{values[-1]}"'
-    limits = "<minMaxOrigin><limits>None</limits></minMaxOrigin>\n"
-    return _style(
-        kind, f"{limits}<rastershader>\n<colorrampshader {shader}>\n{items}</colorrampshader>\n</rastershader>\n"
-    )
-
-
-def risk_style() -> str:
-    """QGIS style of the classes."""
-    entries = "".join(
-        f'<paletteEntry value="{k}" label="{name}" color="{colour}" alpha="255"/>\n'
-        for k, (name, colour) in enumerate(CLASSES.items())
-    )
-    return _style('type="paletted" opacity="0.8"', f"<colorPalette>\n{entries}</colorPalette>\n")
-
-
-def _style(kind: str, content: str) -> str:
-    """Style file of QGIS 3 for the first band of a raster; QGIS applies it where it has the raster's name."""
     return (
         "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
         '<qgis version="3.22" styleCategories="Symbology" hasScaleBasedVisibilityFlag="0">\n<pipe>\n'
-        f'<rasterrenderer {kind} band="1" alphaBand="-1" nodataColor="">\n{content}</rasterrenderer>\n'
+        f'<rasterrenderer type="singlebandpseudocolor" opacity="1" classificationMin="{first}" '
+        f'classificationMax="{last}" band="1" alphaBand="-1" nodataColor="">\n'
+        "<minMaxOrigin><limits>None</limits></minMaxOrigin>\n<rastershader>\n"
+        f'<colorrampshader colorRampType="INTERPOLATED" clip="0" minimumValue="{first}" maximumValue="{last}">\n'
+        f"{items}</colorrampshader>\n</rastershader>\n</rasterrenderer>\n"
         '<rasterresampler maxOversampling="2"/>\n</pipe>\n<blendMode>0</blendMode>\n</qgis>\n'
     )
 
@@ -212,58 +189,39 @@ def _hazards(run: RunView) -> dict[str, Any]:
     return {"risk": run.products.world_risk, "place": run.sequence.georeference}
 
 
-def _risk(run: RunView) -> dict[str, Any]:
-    return {"risk": run.products.world_risk}
-
-
-def _of_terrain(name: str, what: str, write: Callable[..., None], values: str = "", missing: str = "nan") -> Output:
-    """Row of a raster of the merged terrain; ``values``: in more words than ``what``."""
-    facts = {**CRS, "values": values or what, "missing": missing}
-    return Output(name, what, GIS, write, _terrain, "world", facts)
+def _of_terrain(name: str, what: str, write: Callable[..., None]) -> Output:
+    """Row of a raster of the merged terrain."""
+    return Output(name, what, GIS, write, _terrain, "world")
 
 
 def _of_risk(name: str, what: str, write: Callable[..., None]) -> Output:
     """Row of a raster of the hazards."""
-    return Output(name, what, GIS, write, _hazards, "world", {**CRS, "values": what})
+    return Output(name, what, GIS, write, _hazards, "world")
 
 
 OUTPUTS = (
-    _of_terrain(
-        "dem.tif",
-        "merged elevation, m, NaN undefined",
-        _raster("elevation", "m", _height),
-        "elevation z of the cell centre, m; where the sequence has a place on Earth, its height there",
-    ),
+    _of_terrain("dem.tif", "merged elevation, m, NaN undefined", _raster("elevation", "m", _height)),
     Output("dem.qml", "colours of dem.tif, which QGIS applies by itself", "QGIS", _write_dem_style, _terrain),
     _of_terrain("dem_sigma.tif", "standard deviation of the elevation, m", _raster("elevation_std", "m", _sigma)),
     _of_terrain("slope.tif", "inclination of the terrain, degrees", _raster("slope", "degree", _slope)),
-    _of_terrain(
-        "hillshade.tif",
-        "shaded relief of the terrain",
-        _write_hillshade,
-        "shaded relief 1..255, light from the upper left",
-        "0",
-    ),
-    replace(
-        _of_terrain(
-            "ortho.tif",
-            "merged ortho image, grey 0..255, or red, green and blue where the images have colours",
-            write_ortho,
-            "grey value 0..255, or red, green, blue 1..255",
-            "nan; of colours 0",
-        ),
-        inputs=_coloured,
+    _of_terrain("hillshade.tif", "shaded relief of the terrain", _write_hillshade),
+    Output(
+        "ortho.tif",
+        "merged ortho image, grey 0..255, or red, green and blue where the images have colours",
+        GIS,
+        write_ortho,
+        _coloured,
+        "world",
     ),
     _of_risk("risk.tif", "risk map: class 0 safe, 1 caution, 2 hazard, 3 unknown, with colours", _write_risk),
-    Output("risk.tif.aux.xml", "names of the classes of risk.tif", GIS, _write_class_names, _risk),
+    Output(
+        "risk.tif.aux.xml",
+        "names of the classes of risk.tif",
+        GIS,
+        _write_class_names,
+        lambda run: {"risk": run.products.world_risk},
+    ),
     _of_risk("hazard.tif", "probability of a hazard, and the measures in metres and degrees", _write_hazard),
     _of_risk("reason.tif", "bits of the limits that a cell breaks; whether it was filled", _write_reasons),
-    Output(
-        "risk.qml",
-        "colours and names of the classes of risk.tif, which QGIS applies by itself",
-        "QGIS",
-        _write_risk_style,
-        _risk,
-    ),
 )
 STAGE = stage("output.rasters", "Rasters of the terrain and its hazards", OUTPUTS)

@@ -1,4 +1,4 @@
-"""Elevation models read back: from a GeoTIFF or ESRI ASCII grid, a run's folder, or a zarr group of Rille."""
+"""Elevation models read back: from a GeoTIFF or ESRI ASCII grid, or a run's folder."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LONGEST_AXIS = 10_000_000
 HIGHEST_WALL, HIGHEST_STEP = 1500.0, 300.0
 """Metres and cells; nothing on Earth rises more upright over less than a cell."""
 
-OURS = "give terrain.zarr of a run"
+OURS = "give a run as Rille writes it"
 
 METRE = ("m", "metre", "metres", "meter", "meters")
 
@@ -74,9 +74,8 @@ def read_elevation(path: Path) -> DemFile:
 
     Parameters
     ----------
-    path : GeoTIFF (its first band) or ESRI ASCII grid (``.asc``), folder of a run (its ``dem.tif``, with the cameras
-        of ``trajectory.kitti``), or zarr group with ``elevation`` and its coordinates ``x`` and ``y``
-        (``terrain.zarr`` of a run, an artifact).
+    path : GeoTIFF (its first band) or ESRI ASCII grid (``.asc``), or folder of a run (its ``dem.tif``, with the cameras
+        of ``trajectory.kitti``).
 
     Raises
     ------
@@ -84,11 +83,9 @@ def read_elevation(path: Path) -> DemFile:
         There is nothing, it is none of these, its unit is not the metre, or it has no known cell.
     """
     if not path.exists():
-        remedy = "give a GeoTIFF or ESRI ASCII grid, the folder of a run, or a zarr group"
+        remedy = "give a GeoTIFF or ESRI ASCII grid, or the folder of a run"
         raise InputError("RIL-627", f"{path} does not exist", remedy=remedy)
-    is_group = any((path / name).is_file() for name in ("zarr.json", ".zgroup"))
-    read = _of_zarr if is_group else _of_run if path.is_dir() else read_raster
-    dem = _without_marks(read(path))
+    dem = _without_marks(_of_run(path) if path.is_dir() else read_raster(path))
     if not np.isfinite(dem.values).any():
         text = f"{path} has no known cell among {dem.values.size}"
         raise InputError("RIL-628", text, remedy="give another elevation model")
@@ -214,59 +211,24 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
     return np.asarray(centres[:, :2], np.float64)
 
 
-def open_group(path: Path) -> Any:
-    """A zarr group to read, whose axes and chunks are no longer than any that Rille writes.
+def check_group(path: Path) -> None:
+    """Refuse a zarr group that is not worth opening: axes or chunks longer than any that Rille writes, or pipes.
 
     Raises
     ------
     InputError
-        One of them is.
+        It has such an array, or a file of it is no regular one: zarr would wait for a pipe for ever.
     ValueError, OSError, KeyError, TypeError
         It is no zarr group.
     """
     import zarr
     from zarr.storage import LocalStore
 
-    _stored(path)
-    group = zarr.open_group(store=LocalStore(path, read_only=True), mode="r")
-    for name, array in group.arrays():
+    search = Search()
+    for entry in (entry for folder in search.folders(path) for entry in search.entries(folder)):
+        if not (entry.is_file() or entry.is_dir()):
+            raise InputError("RIL-723", f"{entry.path} is no regular file", remedy=OURS)
+    for name, array in zarr.open_group(store=LocalStore(path, read_only=True), mode="r").arrays():
         if max(array.shape, default=0) > LONGEST_AXIS or math.prod(array.chunks) > MOST_CELLS:
             size = " x ".join(map(str, array.shape))
             raise InputError("RIL-982", f"{path}: {name} has {size} values, too many to be read", remedy=OURS)
-    return group
-
-
-def _stored(group: Path) -> int:
-    """Bytes of all files of a zarr group; each is a regular one, because zarr would wait for a pipe for ever."""
-    search = Search()
-    entries = [entry for folder in search.folders(group) for entry in search.entries(folder)]
-    if other := next((e.path for e in entries if not (e.is_file() or e.is_dir())), ""):
-        raise InputError("RIL-723", f"{other} is no regular file", remedy=OURS)
-    return sum(entry.stat().st_size for entry in entries)
-
-
-def _of_zarr(path: Path) -> DemFile:
-    try:
-        group = open_group(path)
-        _check_cells(path, group["elevation"].shape, _stored(path))
-        x, y, z = (np.asarray(group[name][...], np.float64) for name in ("x", "y", "elevation"))
-        unit = str(group["elevation"].attrs.get("units", "m"))
-        crs = str(group["spatial_ref"].attrs["crs_wkt"]) if "spatial_ref" in group else ""
-    except InputError:
-        raise
-    except (KeyError, ValueError, OSError, TypeError, RuntimeError) as error:
-        text = f"{path} has no elevation with coordinates x and y ({error})"
-        raise InputError("RIL-636", text, remedy=OURS) from error
-    if unit not in METRE:
-        raise InputError("RIL-637", f"{path} has elevations in {unit!r}, not in metres", remedy="give one in metres")
-    if z.shape != (y.size, x.size) or min(z.shape) < 2:
-        text = f"{path}: elevation is {z.shape}, its coordinates {(y.size, x.size)}"
-        raise InputError("RIL-638", text, remedy=OURS)
-    steps = np.concatenate([np.diff(x), -np.diff(y)])
-    cell = float(np.median(steps))
-    if not cell > 0 or np.abs(steps - cell).max() > 1e-3 * cell:
-        text = f"{path}: cells are {steps.min():g} to {steps.max():g} m wide"
-        raise InputError("RIL-639", text, remedy="give a regular one")
-    # Coordinates of CF name the middles of cells, an affine transform their corners.
-    corner = Affine(cell, 0.0, x[0] - 0.5 * cell, 0.0, -cell, y[0] + 0.5 * cell)
-    return DemFile(str(path), z, corner, crs, None)

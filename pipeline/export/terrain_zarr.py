@@ -6,10 +6,9 @@ spread, number of models, pair of the greatest weight). The format is zarr 2, wh
 3.10 reads no array that zarr-python writes.
 
 The world frame is no map projection: x and y are plain axes, and a scalar coordinate ``spatial_ref`` has the
-engineering CRS, where rioxarray looks for it. CF has no ``grid_mapping`` for such a frame, so none is claimed. Where
-the sequence has a place on Earth, ``easting`` and ``northing`` are two-dimensional coordinates of the projection that
-``crs`` holds, and each variable's ``grid_mapping`` says so. CF has standard names for heights above geoid, ellipsoid
-and ground; those above the first camera have none.
+engineering CRS, where rioxarray looks for it. CF has no ``grid_mapping`` for such a frame, so none is claimed, and no
+standard name for heights above the first camera. Where the sequence has a place on Earth, the attributes
+``georeference_*`` state it; ``dem.tif`` is in that place's system.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from typing import Any
 
 import numcodecs
 import numpy as np
-import pyproj
 import xarray
 from numpy.typing import NDArray
 
@@ -57,14 +55,12 @@ def write_terrain(
     place : of the world frame, where it is known.
     facts : attributes of the whole group, e.g. ``title``, ``source``.
     """
-    data = xarray.Dataset(
-        {name: _variable(name, arrays, place) for name in arrays},
-        _coordinates(lattice, place),
-        {"Conventions": CONVENTIONS, **facts, "frame": FRAME, "cell_size_m": lattice.cell},
-    )
-    if place is not None:
-        data.attrs |= {f"georeference_{name}": value for name, value in place.to_dict().items()}
-        data["crs"] = ((), np.int32(0), pyproj.CRS(place.crs).to_cf() | {"long_name": place.crs})
+    where = {} if place is None else {f"georeference_{name}": value for name, value in place.to_dict().items()}
+    about = {"Conventions": CONVENTIONS, **facts, "frame": FRAME, "cell_size_m": lattice.cell, **where}
+    variables = {name: _variable(spec, values) for name, (spec, values) in arrays.items()}
+    others = [name for name in arrays if name not in ("elevation", "ortho", SLOPE.name)]
+    variables["elevation"].attrs |= {"positive": "up", "ancillary_variables": " ".join(others)}
+    data = xarray.Dataset(variables, _coordinates(lattice), about)
     for variable in data.variables.values():
         variable.encoding["chunks"] = tuple(min(n, CHUNK) for n in variable.shape) or None
         # Of the compressors, zlib is in every build of GDAL.
@@ -74,10 +70,7 @@ def write_terrain(
         data.to_zarr(folder, mode="w", zarr_format=2, consolidated=True, write_empty_chunks=True)
 
 
-def _variable(
-    name: str, arrays: Mapping[str, tuple[Array, NDArray[Any]]], place: Georeference | None
-) -> xarray.Variable:
-    spec, values = arrays[name]
+def _variable(spec: Array, values: NDArray[Any]) -> xarray.Variable:
     about: dict[str, Any] = {
         "units": UNITS.get(spec.unit, spec.unit),
         "long_name": spec.long_name,
@@ -85,18 +78,13 @@ def _variable(
         # GDAL's own attribute for the system of a zarr array.
         "_CRS": {"wkt": ENGINEERING_CRS},
     }
-    if place is not None:
-        about["grid_mapping"] = "crs: easting northing"
-    if name == "elevation":
-        others = (n for n in arrays if n not in (name, "ortho", SLOPE.name))
-        about |= {"positive": "up", "ancillary_variables": " ".join(others)}
     if spec.unit in UNITS:
         about["quantity"] = spec.unit
     unknown = np.nan if values.dtype.kind == "f" else int(spec.nodata) if spec.nodata else None
     return xarray.Variable(("y", "x"), values, about, {"_FillValue": unknown})
 
 
-def _coordinates(lattice: Lattice, place: Georeference | None) -> dict[str, xarray.Variable]:
+def _coordinates(lattice: Lattice) -> dict[str, xarray.Variable]:
     half = 0.5 * lattice.cell
     # In GDAL's order, which is not that of affine.
     corner = lattice.x0 - half, lattice.cell, 0.0, lattice.y0 + half, 0.0, -lattice.cell
@@ -111,11 +99,6 @@ def _coordinates(lattice: Lattice, place: Georeference | None) -> dict[str, xarr
     for axis, values, words in (("x", lattice.xs(), "right"), ("y", lattice.ys(), "ahead")):
         about = {"units": "m", "axis": axis.upper(), "long_name": f"{axis} of the cell centre, world frame, {words}"}
         coordinates[axis] = xarray.Variable((axis,), values, about, {"_FillValue": None})
-    if place is not None:
-        there = place.apply(np.concatenate([lattice.xy(), np.zeros((*lattice.shape, 1))], axis=-1))
-        for k, (name, axis) in enumerate((("easting", "x"), ("northing", "y"))):
-            about = {"units": "m", "long_name": name, "standard_name": f"projection_{axis}_coordinate"}
-            coordinates[name] = xarray.Variable(("y", "x"), there[..., k], about, {"_FillValue": None})
     return coordinates
 
 
@@ -149,12 +132,6 @@ OUTPUTS = (
             "place": run.sequence.georeference,
         },
         "world",
-        {
-            "crs": "engineering CRS, metres; easting and northing beside x and y where the sequence has a place on "
-            "Earth",
-            "values": "all merged arrays as one zarr 2 group, by the CF conventions; units with each",
-            "opens_with": "xarray.open_zarr, GDAL",
-        },
     ),
 )
 STAGE = stage("output.terrain", "The merged terrain as one zarr group", OUTPUTS)

@@ -15,14 +15,6 @@ from rille.stages.core.declare import Bundle
 from rille.stages.geometry.pose_arrays import NO_VERTICAL
 from rille.stages.odometry.resection.trajectory import world_poses
 
-POSES = {"of": "left camera", "transform": "T_world_left: x_world = R x_left + t"}
-TUM = {
-    **POSES,
-    "columns": "time x y z qx qy qz qw",
-    "quaternion": "x y z w (scalar last), Hamilton, w >= 0, rotates from the left camera to the world",
-    "missing": "frames without a pose have no line",
-}
-
 
 def stamps(run: RunView) -> list[float]:
     """Time of each chosen frame, seconds; its number where there is no clock."""
@@ -89,12 +81,6 @@ OUTPUTS = (
         _write_kitti,
         lambda run: {"trajectory": run.products.trajectory},
         "world",
-        {
-            **POSES,
-            "columns": "3 x 4 matrix [R | t], row by row",
-            "lines": "one a frame, in the order of `frames` here",
-            "missing": "nan",
-        },
     ),
     Output(
         "trajectory.tum",
@@ -103,7 +89,6 @@ OUTPUTS = (
         _write_tum,
         _posed,
         "world",
-        TUM,
     ),
     Output(
         "trajectory.piece*.tum",
@@ -119,11 +104,6 @@ OUTPUTS = (
         _write_crosscheck,
         _compared,
         "world",
-        {
-            **TUM,
-            "source": "structure from motion by COLMAP with the given calibration; brought to the world by one rigid "
-            "transform (no scale) fitted to trajectory.tum",
-        },
     ),
     Output(
         "agreement.csv",
@@ -132,13 +112,6 @@ OUTPUTS = (
         _write_agreement,
         _compared,
         "world",
-        {
-            "columns": "frame number, name, time where the sequence has a clock; positions of both trajectories; "
-            "disagreement of pose and of the motion since the frame before; flagged 0 or 1, and for what; distance of "
-            "either from the truth, where there is truth",
-            "units": "s, m, deg as the column's name ends",
-            "missing": "empty",
-        },
     ),
 )
 STAGE = stage("output.trajectories", "Trajectories as files", OUTPUTS)

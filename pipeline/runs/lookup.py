@@ -79,9 +79,9 @@ def find(text: str, runs: Path) -> Path:
 
 
 def elevation(text: str, runs: Path) -> Path:
-    """Path of an elevation model: the file, zarr group or folder of that name, else the run of that name."""
+    """Path of an elevation model: the file or folder of that name, else the run of that name."""
     path = Path(text)
-    if path.is_file() or any((path / name).exists() for name in ("zarr.json", "dem.tif")):
+    if path.is_file() or (path / "dem.tif").exists():
         return path
     try:
         return find(text, runs)

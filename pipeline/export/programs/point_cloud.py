@@ -181,21 +181,23 @@ def _colours(ortho: NDArray[np.float64]) -> NDArray[np.uint8]:
 def _mesh(terrain: DemFile, step: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
     """Vertices (n, 3) in the CRS, triangles (m, 3) seen from above anticlockwise, texture coordinates (n, 2)."""
     z = terrain.values[::step, ::step]
-    known = np.isfinite(z)
-    quads = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
-    used = np.zeros_like(known)
-    for part in (used[:-1, :-1], used[1:, :-1], used[:-1, 1:], used[1:, 1:]):
-        part |= quads
-    number = np.cumsum(used.ravel()).reshape(used.shape) - 1
-    a, b, c, d = number[:-1, :-1][quads], number[1:, :-1][quads], number[:-1, 1:][quads], number[1:, 1:][quads]
+    number = np.arange(z.size).reshape(z.shape)
+    quads = np.stack([number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]], axis=-1).reshape(-1, 4)
+    a, b, c, d = quads[np.isfinite(z.ravel()[quads]).all(axis=1)].T
     # glTF takes the side from which corners run anticlockwise for the front.
-    faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([c, b, d])])
-    row, col = np.nonzero(used)
+    used, faces = np.unique(
+        np.concatenate([np.column_stack([a, b, c]), np.column_stack([c, b, d])]), return_inverse=True
+    )
+    row, col = np.divmod(used, z.shape[1])
     at = col * step + 0.5, row * step + 0.5
     x, y = terrain.transform @ at
     rows, cols = terrain.values.shape
     # trimesh has v = 0 at the foot of the texture, and turns it when it writes glTF.
-    return np.column_stack([x, y, z[used]]), faces, np.column_stack([at[0] / cols, 1.0 - at[1] / rows])
+    return (
+        np.column_stack([x, y, z[row, col]]),
+        faces.reshape(-1, 3),
+        np.column_stack([at[0] / cols, 1.0 - at[1] / rows]),
+    )
 
 
 def _texture(ortho: Layer) -> Any:

@@ -17,7 +17,7 @@ STOP = re.compile(r"risk/(\d{1,9})")
 
 
 def export_run(kind: str, run: Path, target: Path, store: Store) -> str:
-    """Write a run folder in a form, ``colmap``, ``nav2`` or ``grid_map``, as a folder; the line to print.
+    """Write a run folder in a form, ``colmap`` or ``nav2``, as a folder; the line to print.
 
     Raises
     ------
@@ -66,15 +66,10 @@ class RunArtifacts:
         names = [name for name, row in self._rows.items() if row["stage"] == stage]
         return {name.partition("/")[2]: self._open(name) for name in names}
 
-    def world(self) -> tuple[Bundle, list[Bundle], Bundle | None]:
-        """Risk map of the world, tiles of its terrain, and the path over it, if there is one.
-
-        Of a drive they are what it knew at its last stop, and there is no path.
-        """
+    def risk(self) -> Bundle:
+        """Risk map of the world; of a drive, what it knew at its last stop."""
         stops = [int(stop[1]) for name in self._rows if (stop := STOP.fullmatch(name))]
-        if stops and "risk/world" not in self._rows:
-            return self.one(f"risk/{max(stops)}"), [self.one(f"merge/{max(stops)}")], None
-        return self.one("risk/world"), list(self.all("merge").values()), self.find("path/world")
+        return self.one(f"risk/{max(stops)}" if stops and "risk/world" not in self._rows else "risk/world")
 
     def _open(self, label: str) -> Bundle:
         row = self._rows[label]

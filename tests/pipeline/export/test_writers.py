@@ -19,7 +19,7 @@ from toys.finished import FRAMES, sequence, view
 
 from rille.datasets.georeference import Georeference
 from rille.pipeline.export.frames_json import describe
-from rille.pipeline.export.rasters import dem_style, risk_style, rounded
+from rille.pipeline.export.rasters import dem_style, rounded
 from rille.pipeline.export.writers import (
     Meaning,
     write_path_gpkg,
@@ -176,15 +176,7 @@ def test_equal_paths_make_equal_files(tmp_path: Path) -> None:
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["path.gpkg"]
 
 
-def test_styles_name_the_classes_and_span_the_elevations(tmp_path: Path) -> None:
-    (tmp_path / "risk.qml").write_text(risk_style())
-    entries = ElementTree.parse(tmp_path / "risk.qml").findall(".//paletteEntry")
-    assert [(e.get("value"), (e.get("label") or "").split()[0]) for e in entries] == [
-        ("0", "safe"),
-        ("1", "caution"),
-        ("2", "hazard"),
-        ("3", "unknown"),
-    ]
+def test_the_style_spans_the_elevations(tmp_path: Path) -> None:
     (tmp_path / "dem.qml").write_text(dem_style(-1.0, 1.0))
     style = ElementTree.parse(tmp_path / "dem.qml")
     assert [float(e.get("value") or "nan") for e in style.findall(".//item")] == [-1.0 + k / 4 for k in range(9)]
@@ -222,8 +214,7 @@ def test_only_what_was_written_is_described() -> None:
     placed = describe(["dem.tif", "trajectory.tum"], view(sequence=replace(timed, georeference=place)))
     assert placed["files"]["dem.tif"]["frame"] == "georeference"
     assert placed["files"]["trajectory.tum"]["frame"] == "world"
-    assert facts["files"]["dem.tif"]["raster"].endswith("north is y")
-    assert "north" not in placed["files"]["dem.tif"]["raster"], "the raster is turned by the azimuth"
+    assert facts["files"]["dem.tif"]["frame"] == "world"
     assert placed["georeference"]["origin"] == [1.0, 2.0, 3.0]
 
 
