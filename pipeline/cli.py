@@ -1,4 +1,4 @@
-"""The command line: ``rille reconstruct | drive | plan | runs | why | timing | compile | check | init | match | ...``.
+"""The command line, ``rille COMMAND``.
 
 Exit codes: 0 complete; 1 failed; 2 usage, configuration or input; 3 finished, but not all of it: what the data do not
 determine, failures under ``--keep-going``, frames without a pose, images that do not match, a drive that did not reach
@@ -8,9 +8,11 @@ module of a command is imported when the command is named, so that ``rille --hel
 
 from __future__ import annotations
 
+import ast
 import os
 import sys
 import traceback
+from pathlib import Path
 
 from cyclopts import App, CycloptsError, MissingArgumentError, UnusedCliTokensError
 from rich.console import Console
@@ -22,63 +24,27 @@ LONGEST_COMPLAINT = 1000
 """Characters."""
 
 COMMANDS = {
-    "reconstruct": (
-        "reconstruct:reconstruct",
-        "Reconstruct a sequence; the same command again resumes, and recomputes only what changed.",
-    ),
-    "drive": (
-        "reconstruct:drive",
-        "Drive a simulated rover to a goal in a closed loop: stop, map, plan, drive, localise, repeat.",
-    ),
-    "plan": ("plan:plan", "Show what `reconstruct` would compute and why, and what is cached; nothing is computed."),
-    "graph": ("graph:graph", "Draw the tasks of a run and what each reads, by stage."),
-    "why": (
-        "why:why",
-        "Explain one task of a run: its inputs, why it was computed, its parameters and code, what changed since.",
-    ),
-    "timing": ("timing:timing", "Show where the time of a run went, by stage."),
-    "view": ("view:view", "Open the report of a run in the browser; print its path."),
-    "compare": (
-        "compare:compare",
-        "Compare two runs: which parameters, tasks, figures, positions and elevations differ.",
-    ),
-    "runs": ("runs:list_runs", "List runs, the latest last: name, state, tasks computed and cached, seconds."),
-    "params": (
-        "params:params",
-        "Print all parameters, or those of one section: default, what is permitted, and meaning.",
-    ),
-    "compile": (
-        "compile:compile_kernels",
-        "Compile the numerical kernels for this user and machine, so that the first run need not.",
-    ),
-    "check": (
-        "check:check",
-        "Check a sequence: one finding a line, and a picture of the first pair's epipolar residuals.",
-    ),
-    "init": (
-        "init:init",
-        "Write a commented manifest of a folder of stereo images: what was found, and what is still needed.",
-    ),
-    "calibrate": (
-        "calibrate:calibrate",
-        "Calibrate a stereo rig from pictures of a chessboard; prints the residual of each view.",
-    ),
-    "match": (
-        "match:match",
-        "Match any two images, without calibration or rectification, to a two-band disparity TIFF.",
-    ),
-    "export": (
-        "export:export",
-        "Write a run for other programs: cloud.laz or cloud.ply (points), terrain.glb (mesh), a model, a map.",
-    ),
-    "compare-dem": (
-        "compare_dem:compare_dem",
-        "Compare elevation model A with reference B: errors, completeness, error against range and slope.",
-    ),
-    "datasets": ("datasets:app", "Sequences that Rille knows: list them, or export one for other tools."),
-    "cache": ("cache:app", "Look after the cache of artifacts."),
+    "reconstruct": "reconstruct:reconstruct",
+    "drive": "reconstruct:drive",
+    "plan": "plan:plan",
+    "graph": "graph:graph",
+    "why": "why:why",
+    "timing": "timing:timing",
+    "view": "view:view",
+    "compare": "compare:compare",
+    "runs": "runs:list_runs",
+    "params": "params:params",
+    "compile": "compile:compile_kernels",
+    "check": "check:check",
+    "init": "init:init",
+    "calibrate": "calibrate:calibrate",
+    "match": "match:match",
+    "export": "export:export",
+    "compare-dem": "compare_dem:compare_dem",
+    "datasets": "datasets:app",
+    "cache": "cache:app",
 }
-"""Module and name of each command, and the line about it in the list of all."""
+"""Module and name of each command."""
 
 
 def _versions() -> str:
@@ -101,11 +67,19 @@ def program(*, listed: bool = False) -> App:
         version_format="plaintext",
         help="Stereo image sequences to terrain, trajectory, risk map and safe path, without rectification.",
     )
-    for name, (place, words) in COMMANDS.items():
+    for name, place in COMMANDS.items():
         # A line that is given here takes the place of the whole help text of the command.
-        app.command(f"rille.pipeline.commands.{place}", name=name, **({"help": words} if listed else {}))
+        app.command(f"rille.pipeline.commands.{place}", name=name, **({"help": summary(place)} if listed else {}))
     app.register_install_completion_command(help="Install completion of commands and options for your shell.")
     return app
+
+
+def summary(place: str) -> str:
+    """First line of the docstring of a command, or of the module of an app of several, read from its source alone."""
+    module, _, name = place.partition(":")
+    tree = ast.parse((Path(__file__).parent / "commands" / f"{module}.py").read_text(encoding="utf-8"))
+    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name]
+    return (ast.get_docstring(functions[0] if functions else tree) or "").partition("\n")[0]
 
 
 app = program()

@@ -1,4 +1,4 @@
-"""``rille cache``: look after the cache of artifacts."""
+"""Look after the cache of artifacts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cyclopts import App
 
 from rille.pipeline.commands.options import COMPLETE, FAILED, RUNS, CacheFolder, Debug, Runs, cache_folder, flag
 
-app = App(name="cache", help="Look after the cache of artifacts.")
+app = App(name="cache", help=__doc__)
 
 
 def _there(cache: str | None) -> Path:

@@ -1,4 +1,4 @@
-"""``rille compare A B``: which parameters, tasks, figures, poses and elevations of two runs differ."""
+"""``rille compare A B``: which parameters, tasks, figures and positions of two runs differ."""
 
 from __future__ import annotations
 
@@ -6,46 +6,30 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
 from rille.datasets.text.reading import TABLE, read_lines, read_text, read_toml
-from rille.pipeline.commands import compare_dem
-from rille.pipeline.commands.options import COMPLETE, RUNS, Debug, Output, Run, Runs, check_output
+from rille.pipeline.commands.options import COMPLETE, RUNS, Debug, Run, Runs
 from rille.pipeline.engine import events
-from rille.pipeline.engine.failures import reported
-from rille.pipeline.export.read_dem import read_elevation
 from rille.pipeline.report.words import metres, quantity
 from rille.pipeline.runs import lookup
-from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import ConfigError, InputError
+from rille.stages.core.errors import ConfigError
 
 
-def compare(
-    a: Run,
-    b: Run,
-    *,
-    output: Annotated[Path, Output] = Path("comparison.png"),
-    runs: Runs = RUNS,
-    debug: Debug = False,
-) -> int:
-    """Compare two runs: which parameters, tasks, figures, positions and elevations differ.
+def compare(a: Run, b: Run, *, runs: Runs = RUNS, debug: Debug = False) -> int:
+    """Compare two runs: which parameters, tasks, figures and positions differ.
 
-    Parameters
-    ----------
-    output
-        Picture of the difference of the elevations, A minus B, to write.
+    Their elevations: rille compare-dem A B.
     """
     one, other = both = lookup.find(a, runs), lookup.find(b, runs)
-    # All before anything is printed: where something cannot be read or written there is no half of a comparison.
-    check_output(output, ".png", ".pdf", ".svg")
+    # All before anything is printed: where something cannot be read there is no half of a comparison.
     with lookup.reading(*both):
         reports = [_report(run) for run in both]
         settings = [_flat(read_toml(run / "config.toml", "configuration")) for run in both]
         lines = [*_parameters(*settings), *_tasks(*both), *_figures(*reports), _positions(*both)]
-    terrain = _elevations(*both, output)
-    print("\n".join([f"A {lookup.name(one)}", f"B {lookup.name(other)}", *lines, terrain]))
+    print("\n".join([f"A {lookup.name(one)}", f"B {lookup.name(other)}", *lines]))
     return COMPLETE
 
 
@@ -112,25 +96,8 @@ def _positions(a: Path, b: Path) -> str:
         return "positions     not both runs have a trajectory"
     tables = (np.loadtxt(read_lines(path, "trajectory"), ndmin=2) for path in paths)
     one, other = ({row[0]: row[1:4] for row in table} for table in tables)
-    apart = [float(np.linalg.norm(one[time] - other[time])) for time in one if time in other]
-    if not apart:
+    apart = np.array([np.linalg.norm(one[time] - other[time]) for time in one if time in other])
+    if not apart.size:
         return "positions     no frame has a pose in both"
-    return f"positions     of {len(apart)} frames: {_size(np.array(apart))} apart"
-
-
-def _size(differences: Floats) -> str:
-    rms = float(np.sqrt(np.mean(np.square(differences))))
-    return f"RMS {metres(rms)}, at most {metres(float(np.abs(differences).max(initial=0.0)))}"
-
-
-def _elevations(a: Path, b: Path, output: Path) -> str:
-    try:
-        one, other = read_elevation(a), read_elevation(b)
-        compare_dem.check(one, other)
-        figures, error = compare_dem.measure(one, other)
-    except InputError as problem:
-        return f"elevations    not compared: {problem}"
-    with reported("RIL-892", f"{output} cannot be written", remedy="name another with -o", kind=ConfigError):
-        compare_dem.draw(output, figures, error)
-    known = error[np.isfinite(error)]
-    return f"elevations    {np.count_nonzero(known)} of {known.size} common cells differ: {_size(known)}\n{output}"
+    rms = metres(float(np.sqrt(np.mean(apart**2))))
+    return f"positions     of {apart.size} frames: RMS {rms}, at most {metres(float(apart.max()))} apart"

@@ -1,4 +1,4 @@
-"""``rille datasets``: sequences that Rille knows."""
+"""Sequences that Rille knows: list them, or export one for other tools."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rille.pipeline.engine.task import ensure
 from rille.pipeline.flow import config
 from rille.stages.core.errors import ConfigError
 
-app = App(name="datasets", help="Sequences that Rille knows: list them, or export one for other tools.")
+app = App(name="datasets", help=__doc__)
 
 
 @app.default

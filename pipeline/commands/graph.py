@@ -1,4 +1,4 @@
-"""``rille graph``: the tasks of a run and what each reads, by stage or by task, as text for Graphviz.
+"""``rille graph``: the stages of a run and what each reads, as text for Graphviz.
 
 What depends on results that are still to come is drawn as the last run had it, where there was one.
 """
@@ -7,27 +7,18 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
-from typing import Annotated
 
-from rille.pipeline.commands.options import COMPLETE, Output, Settings, cache_folder, check_output, flag
+from rille.pipeline.commands.options import COMPLETE, Settings, cache_folder
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.run import RunOptions, run
-from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.runs.session import lay_out, settings
 
 _SETTINGS = Settings()
 
 
-def graph(
-    seq: str = "mockup",
-    *,
-    output: Annotated[Path | None, Output] = None,
-    options: Settings = _SETTINGS,
-    tasks: Annotated[bool, flag("Each task, not each stage.")] = False,
-) -> int:
-    """Draw the tasks of a run and what each reads, by stage.
+def graph(seq: str = "mockup", *, options: Settings = _SETTINGS) -> int:
+    """Draw the stages of a run, the number of their tasks, and what each reads.
 
     Prints text for Graphviz: rille graph SEQ | dot -Tsvg > graph.svg.
 
@@ -35,29 +26,17 @@ def graph(
     ----------
     seq
         As for reconstruct.
-    output
-        File to write instead, .dot.
     """
-    if output is not None:
-        check_output(output, ".dot")
     settled = settings(replace(options, sequence=seq))
     laid_out = lay_out(settled.sequence, settled.config, settled.frames)
     run(laid_out, Store(cache_folder(options.cache)), RunOptions(dry=True)).check()
-    text = dot(laid_out, tasks=tasks)
-    if output is None:
-        print(text)
-    else:
-        atomic.write(output, f"{text}\n")
-        print(f"{output}  {len(laid_out.nodes)} tasks of {len({h.stage for h in laid_out.nodes})} stages")
+    print(dot(laid_out))
     return COMPLETE
 
 
-def dot(graph: Graph, *, tasks: bool = False) -> str:
-    """Return a box for each name with the number of its tasks, and an arrow for each that one reads."""
-    names, arrows = Counter[str](), dict[tuple[str, str], None]()
-    for handle in graph.nodes:
-        name = handle.label if tasks else handle.stage
-        names[name] += 1
-        arrows |= dict.fromkeys((source.label if tasks else source.stage, name) for source in handle.upstream())
-    boxes = [f'  "{name}"' + (f' [label="{name} x {n}"];' if n > 1 else ";") for name, n in names.items()]
+def dot(graph: Graph) -> str:
+    """Return a box for each stage with the number of its tasks, and an arrow for each stage that one reads."""
+    tasks = Counter(handle.stage for handle in graph.nodes)
+    arrows = dict.fromkeys((source.stage, handle.stage) for handle in graph.nodes for source in handle.upstream())
+    boxes = (f'  "{stage}" [label="{stage} x {count}"];' for stage, count in tasks.items())
     return "\n".join(["digraph {", *boxes, *(f'  "{a}" -> "{b}";' for a, b in arrows if a != b), "}"])

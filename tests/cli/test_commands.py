@@ -174,16 +174,13 @@ def test_view(place: Place) -> None:
     assert Path(done.lines[-1]).name == "report.html"
 
 
-def test_compare(place: Place, tmp_path: Path) -> None:
-    runs = [f"other/{run.name}" for run in (place.runs("other")[0], place.runs("other")[-1])]
-    same = place.rille("compare", *runs, "-o", tmp_path / "same.png")
+def test_compare(place: Place) -> None:
+    same = place.rille("compare", *(f"other/{run.name}" for run in (place.runs("other")[0], place.runs("other")[-1])))
     assert (same.status, same.err) == (0, "")
-    assert any(line.startswith("elevations    0 of ") for line in same.lines)
     assert any(line.endswith(" with the same result, 0 with another") for line in same.lines)
-    assert (tmp_path / "same.png").stat().st_size > 10_000
-    apart = place.rille("compare", "other", "mockup-short", "-o", tmp_path / "apart.png")
+    apart = place.rille("compare", "other", "mockup-short")
     assert apart.status == 0
-    assert any(line.startswith("positions     ") for line in apart.lines)
+    assert apart.last.startswith("positions     ")
 
 
 def test_check(place: Place) -> None:
