@@ -1,7 +1,7 @@
 """One stereo pair, one step at a time from Python: images to disparity, elevation model, hazards and path.
 
-Each function lays out the tasks that a run lays out for the same step, and computes them in this process without a
-cache: the values are those of a run, to the bit. Datasets are those of the stages' outputs, with coordinates and units;
+Each function runs the stages that a run has for the same step, in this process and without a cache: the values are
+those of a run, to the bit. Datasets are those of the stages' outputs, with coordinates and units;
 their attributes carry the facts and settings that the next step needs.
 
 >>> import rille
@@ -31,7 +31,7 @@ import numpy as np
 from rille.datasets import registry
 from rille.datasets.protocol import Sequence
 from rille.pipeline.engine.runtime.environment import prepare_environment
-from rille.stages.core.declare import Bundle, NoParams, Stage
+from rille.stages.core.declare import Bundle, Stage
 from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.geometry.geometry import Rig
 
@@ -311,6 +311,7 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
     >>> bool((agile.risk == 2).sum() < (timid.risk == 2).sum())
     True
     """
+    prepare_environment()
     from rille.pipeline.flow import config
     from rille.stages.hazard import risk as risk_stage
     from rille.stages.terrain.locus import stage as locus_stage
@@ -322,10 +323,10 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
     elif vehicle is not None:
         limits = dict(vehicle)
     settings = _merged(dem, {"vehicle": limits, "risk": risk})
-    make, given = _builder(None, settings), _placeholder("dem")
-    found = _computed(
-        make.hazards("risk", [given]), {given: _bundle(dem, locus_stage.locus_stage, "elevation", "rille.terrain")}, {}
-    )
+    built: Any = config.build(settings)
+    args = {"vehicle": built.vehicle.model_dump(mode="json", exclude={"name"})}
+    given = _bundle(dem, locus_stage.locus_stage, "elevation", "rille.terrain")
+    found = risk_stage.STAGE.run(built.risk, args, {"dem": [given]})
     return _dataset(risk_stage.STAGE, found, settings)
 
 
@@ -368,50 +369,42 @@ def path(
     >>> found.path[-1].values.round(2)[:2].tolist()
     [0.19, 0.63]
     """
+    prepare_environment()
+    from rille.pipeline.flow import config
     from rille.stages.hazard import risk as risk_stage
     from rille.stages.planning import path as path_stage
 
     ends = {name: list(end) for name, end in (("target", goal), ("start", start)) if end is not None}
     settings = _merged(hazards, {"path": {**path, **ends}})
-    make, given = _builder(None, settings), _placeholder("risk")
-    planned = make.node(path_stage.STAGE, "path", risk=given, use=None if ends else "local")
-    found = _computed(planned, {given: _bundle(hazards, risk_stage.STAGE, "risk", "rille.hazards")}, {})
+    built: Any = config.build(settings)
+    given = _bundle(hazards, risk_stage.STAGE, "risk", "rille.hazards")
+    found = path_stage.STAGE.run(built.path, {} if ends else {"use": "local"}, {"risk": given})
     return _dataset(path_stage.STAGE, found, settings)
 
 
 # -- tasks in this process ----------------------------------------------------------------------------------------
 
 
-def _builder(pair: StereoPair | None, settings: Settings) -> Builder:
+def _builder(pair: StereoPair, settings: Settings) -> Builder:
     prepare_environment()
     from rille.pipeline.engine.graph import Graph
     from rille.pipeline.flow import config
     from rille.pipeline.flow.builders import Builder
 
-    sequence: Any = None if pair is None else pair.sequence.source  # what needs none is given its inputs
-    return Builder(Graph(), sequence, config.build(settings))
-
-
-def _placeholder(label: str) -> Handle:
-    """A task whose result is known."""
-    from rille.pipeline.engine.graph import Handle
-    from rille.pipeline.engine.spec import Spec
-
-    return Handle(-1, Spec("", label, NoParams()), {})
+    return Builder(Graph(), pair.sequence.source, config.build(settings))
 
 
 def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
     """Result of a task; of those that it needs what is ``known``, or an image that was ``drawn`` before, is taken."""
+    from rille.pipeline.engine.spec import each
+
     if handle in known:
         return known[handle]
     # Images are kept: left and right of one pair, and every step of it, ask for them again.
     spec, recorded = handle.spec, handle.spec.module.startswith("rille.datasets.")
     if recorded and handle.label in drawn:
         return drawn[handle.label]
-    inputs = {
-        port: [_computed(h, known, drawn) for h in given] if isinstance(given, list) else _computed(given, known, drawn)
-        for port, given in handle.inputs.items()
-    }
+    inputs = each(lambda source: _computed(source, known, drawn), handle.inputs)
     found = known[handle] = spec.stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
     if recorded:
         drawn[handle.label] = found

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from rille.datasets.georeference import Georeference
-from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.view import Part, RunView
 from rille.stages.core.declare import AnyArray, Array, Bundle, Memory, NoParams, Stage
 from rille.stages.core.errors import InputError
@@ -169,9 +168,3 @@ def unpack(bundle: Bundle) -> dict[str, bytes]:
             remedy="somebody forged it: use another cache",
         ) from error
     return files
-
-
-def place(bundle: Bundle, folder: Path) -> None:
-    """Write copies of an artifact's files into the folder of a run."""
-    for name, content in unpack(bundle).items():
-        atomic.write(folder / name, content)

@@ -9,11 +9,14 @@ from types import ModuleType
 from typing import Any
 
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, Wait
+from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.base import GoneError, Store
+from rille.pipeline.engine.store.lazy_arrays import DamagedError
+from rille.pipeline.engine.task import ensure
 from rille.pipeline.export import catalogue
 from rille.pipeline.export.frames_json import describe
-from rille.pipeline.export.output import Output, place, unpack
+from rille.pipeline.export.output import Output, unpack
 from rille.pipeline.export.output_task import add, handles
 from rille.pipeline.export.view import RunView, TaskRow
 from rille.pipeline.report import gallery, summary
@@ -69,22 +72,23 @@ def write(folder: Path, view: RunView, made: Made, store: Store) -> Items:
     """Write all files of a run; what has no artifact is left out; give what the report lists as missing."""
     # Copies, not links: a user may edit or delete any file of a run, and the cache stays whole.
     for output in (output for module in catalogue.MADE for output in module.OUTPUTS):
-        ref = made[output.name].ref if output.name in made else None
-        if ref is not None:
-            place(store.open(ref), folder)
+        for name, content in _files(made.get(output.name), store).items():
+            atomic.write(folder / name, content)
     trajectory = view.products.trajectory
     meta = None if trajectory is None or trajectory.ref is None else trajectory.ref.meta
     frames = describe([p.name for p in folder.iterdir()], view, "" if meta is None else meta["verticals"][meta["main"]])
     atomic.write(folder / "frames.json", json.dumps(frames, indent=1) + "\n")
-    facts = json.loads(_content(made["facts"], store))
-    figures = [
-        FIGURE.validate_json(_content(made[o.name], store)) for o in gallery.OUTPUTS if made[o.name].ref is not None
-    ]
-    return write_report(folder, view, facts, figures)
+    (facts,) = _files(made["facts"], store).values()
+    figures = [FIGURE.validate_json(drawn) for o in gallery.OUTPUTS for drawn in _files(made[o.name], store).values()]
+    return write_report(folder, view, json.loads(facts), figures)
 
 
-def _content(handle: Handle, store: Store) -> bytes:
-    """The one file that an output holds."""
-    assert handle.ref is not None, handle.label
-    (content,) = unpack(store.open(handle.ref)).values()
-    return content
+def _files(handle: Handle | None, store: Store) -> dict[str, bytes]:
+    """Content of each file of an output by its name; none where it was not made."""
+    if handle is None or handle.ref is None:
+        return {}
+    try:
+        return unpack(store.open(handle.ref))
+    except (DamagedError, GoneError) as error:  # it is set aside by now
+        warn(f"{error.code}: {error.message}; computing it again")
+        return unpack(store.open(ensure(store.root, handle.spec, handle.refs()).ref))

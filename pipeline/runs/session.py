@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import shutil
 import sys
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -28,8 +27,7 @@ from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.packages import installed
 from rille.pipeline.engine.plain import warn
-from rille.pipeline.engine.store.base import GoneError, Store
-from rille.pipeline.engine.store.lazy_arrays import DamagedError
+from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.workers import check
 from rille.pipeline.export.view import UNSTATED, RunView
 from rille.pipeline.flow import config as configuration
@@ -133,20 +131,6 @@ def reconstruct(options: Options) -> int:
     return perform(options)[0]
 
 
-def perform(options: Options) -> tuple[int, Path]:
-    """Run the whole chain; gives the exit code and the folder of the results."""
-    healed: set[str] = set()
-    while True:
-        try:
-            return _reconstruct(options)
-        except (DamagedError, GoneError) as error:  # found when the results were drawn; it is set aside by now
-            # The same artifact damaged twice is a disk that fails, not one that failed.
-            if error.message in healed:
-                raise
-            healed.add(error.message)
-            warn(f"{error.code}: {error.message}; computing it again")
-
-
 @dataclass(frozen=True)
 class _Opened:
     """A run that is configured and laid out: ``view`` for the report, ``folder`` for its results."""
@@ -168,7 +152,8 @@ class _Opened:
         return replace(self.view, **known)
 
 
-def _reconstruct(options: Options) -> tuple[int, Path]:
+def perform(options: Options) -> tuple[int, Path]:
+    """Run the whole chain; gives the exit code and the folder of the results."""
     # They import matplotlib, which a wrong option should not have to wait for.
     from rille.pipeline.report.delivery import is_complete
     from rille.pipeline.runs import run_files
@@ -252,7 +237,7 @@ def _compute(opened: _Opened) -> driver.Result:
 
 
 def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> Items:
-    """Write everything that the run leaves, nothing of it where an artifact was found damaged; give what is missing."""
+    """Write everything that the run leaves; give what is missing."""
     from rille.pipeline.runs import run_files
 
     # The folder may go while a run of hours is under way; writing would make one without its first files.
@@ -263,14 +248,9 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> Item
             remedy="run again: what was computed is in the cache",
         )
     whole = opened.late(tasks=run_files.task_rows(opened.graph, opened.store), seconds=result.seconds)
-    try:
-        missing = run_files.write(opened.folder, whole, made, opened.store)
-        total = (datetime.now(UTC) - opened.started).total_seconds()
-        events.add_facts(opened.folder / "ledger.jsonl", total=total)
-    except (DamagedError, GoneError):
-        # Half a folder of results is none; the run is repeated, and what is sound comes from the cache.
-        shutil.rmtree(opened.folder)
-        raise
+    missing = run_files.write(opened.folder, whole, made, opened.store)
+    total = (datetime.now(UTC) - opened.started).total_seconds()
+    events.add_facts(opened.folder / "ledger.jsonl", total=total)
     return missing
 
 

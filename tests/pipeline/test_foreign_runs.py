@@ -22,7 +22,7 @@ from rille.pipeline.api import open_run
 from rille.pipeline.cli import main
 from rille.pipeline.engine.runtime.hints import read_hint
 from rille.pipeline.export import read_dem
-from rille.pipeline.export.output import place
+from rille.pipeline.export.output import unpack
 from rille.pipeline.export.programs import colmap
 from rille.pipeline.export.read_dem import read_elevation
 from rille.stages.core.declare import Bundle
@@ -282,13 +282,10 @@ def test_an_ascii_grid_that_claims_more_than_can_be_read(tmp_path: Path) -> None
         read_elevation(tmp_path / "dem.asc")
 
 
-@pytest.mark.parametrize("name", ["../outside", "a/../../outside", "{}/outside"])
-def test_a_forged_artifact_writes_nothing_outside_of_a_run(tmp_path: Path, name: str) -> None:
-    (tmp_path / "run").mkdir()
-    forged = Bundle({"content": np.zeros((1, 1024), np.uint8)}, {"files": [[name.format(tmp_path), 3]]})
+@pytest.mark.parametrize("name", ["../outside", "a/../../outside", "/outside"])
+def test_a_forged_artifact_writes_nothing_outside_of_a_run(name: str) -> None:
     with raises("RIL-983"):
-        place(forged, tmp_path / "run")
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+        unpack(Bundle({"content": np.zeros((1, 1024), np.uint8)}, {"files": [[name, 3]]}))
 
 
 def test_json_of_a_ledger_is_read_line_by_line(run: Path, capsys: Any) -> None:

@@ -26,7 +26,7 @@ from rille.pipeline.engine.keys import digest
 from rille.pipeline.export import catalogue
 from rille.pipeline.export.frames_json import FRAMES as REFERENCES
 from rille.pipeline.export.frames_json import describe
-from rille.pipeline.export.output import Output, pack, place, unpack
+from rille.pipeline.export.output import Output, pack, unpack
 from rille.pipeline.export.output_task import add, handles
 from rille.pipeline.export.programs import point_cloud
 from rille.pipeline.export.view import Part, part
@@ -65,6 +65,13 @@ def made_by(task: Handle | None, made: dict[str, Bundle]) -> Bundle:
 def read(task: Handle) -> list[Any]:
     """What a task reads."""
     return cast(list[Any], task.inputs["read"])
+
+
+def place(bundle: Bundle, folder: Path) -> None:
+    """The files of an artifact in a folder."""
+    for name, content in unpack(bundle).items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
 
 
 def write(output: Output, folder: Path, whole: Any, made: dict[str, Bundle]) -> None:
