@@ -1,4 +1,4 @@
-"""Files for other programs: GeoTIFFs, the path, the trajectory in KITTI's and TUM's formats.
+"""Files for other programs: GeoTIFFs, tables, the trajectory in KITTI's and TUM's formats.
 
 Every file is written beside its final name and moved there, so that a reader finds a whole file or none.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import io
 import math
-import struct
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -45,11 +44,6 @@ ENGINEERING_CRS = (
 """WKT 1, as GDAL reads a local system back from a GeoTIFF, which keeps its name, unit and directions alone: so all
 files state one text, and programs do not take path and rasters for two systems. The axes are not east and north; the
 tag AXES says what they are. rasterio's ``crs.is_valid`` is False for every engineering CRS: do not test that."""
-
-LINE_Z, POINT_Z = 1002, 1001
-"""Geometry types of ISO 19125 well-known binary."""
-GPKG_DATE = "2000-01-01T00:00:00.000Z"
-"""Written as time of change into every GeoPackage, so that equal paths make equal files."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +104,7 @@ def write_raster(
         "blocksize": 256,
         "overview_resampling": "mode" if meaning.nodata is None else "average",
     }
-    facts = {"FRAME": FRAME, "AXES": _axes(place), "CELL_SIZE_M": f"{lattice.cell:.12g}"}
+    facts = {"FRAME": FRAME, "AXES": axes(place), "CELL_SIZE_M": f"{lattice.cell:.12g}"}
     facts["UNIT"] = ", ".join(dict.fromkeys(meaning.units(bands)))
     _write_bands(path, bands, meaning, profile, facts)
 
@@ -158,7 +152,8 @@ def raster_transform(lattice: Lattice, place: Georeference | None) -> Any:
     return Affine(a, b, place.origin[0], c, d, place.origin[1]) @ corner
 
 
-def _axes(place: Georeference | None) -> str:
+def axes(place: Georeference | None) -> str:
+    """How the axes of a file's CRS lie to those of the world frame, in words."""
     if place is None:
         return "the CRS's x and y are the world frame's; rows fall with y"
     e, n, h = place.origin
@@ -166,44 +161,6 @@ def _axes(place: Georeference | None) -> str:
         f"easting = {e:.3f} + x cos a + y sin a, northing = {n:.3f} - x sin a + y cos a, height = {h:.3f} + z with x, "
         f"y, z of the frame and a = {np.degrees(place.azimuth):.6g} degrees, clockwise from grid north"
     )
-
-
-def write_path_gpkg(
-    path: Path, vertices: NDArray[np.float64], facts: Mapping[str, Any], place: Georeference | None = None
-) -> None:
-    """Write the path as GeoPackage: layers ``path`` (line) and ``ends`` (start, target).
-
-    Parameters
-    ----------
-    vertices : (vertex, xyz) metres, world frame; where no path was found they are empty, ``path`` holds a feature
-        without geometry, and there is no layer ``ends``.
-    facts : properties of the line; those that are no text, number or truth value are left out.
-    place : of the world frame; the coordinates are then those of its CRS, else of the engineering CRS.
-    """
-    import pyogrio
-    from pyogrio.raw import write
-
-    # SpatiaLite, which nothing here needs, would look for PROJ's data in the current folder.
-    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": GPKG_DATE, "SPATIALITE_LOAD": "NO"})
-    given = {"name": "path", "frame": FRAME, "axes": _axes(place), "unit": "m"} | dict(facts)
-    kept = {name: value for name, value in given.items() if isinstance(value, str | int | float)}
-    columns = [np.array([value], dtype=object if isinstance(value, str) else None) for value in kept.values()]
-    common = {"driver": "GPKG", "crs": ENGINEERING_CRS if place is None else place.crs}
-    vertices = vertices if place is None else place.apply(vertices)
-    line = _wkb(LINE_Z, vertices) if len(vertices) > 1 else None
-    with atomic.replacing(path) as temporary:
-        lines = np.array([line], dtype=object)
-        write(temporary, lines, columns, list(kept), layer="path", geometry_type="LineString Z", **common)
-        if len(vertices):
-            ends = np.array([_wkb(POINT_Z, vertices[at]) for at in (0, -1)], dtype=object)
-            names = [np.array(["start", "target"], dtype=object)]
-            write(temporary, ends, names, ["name"], layer="ends", geometry_type="Point Z", append=True, **common)
-
-
-def _wkb(kind: int, points: NDArray[np.float64]) -> bytes:
-    """Well-known binary, little-endian, of a point (3,) or a line (n, 3)."""
-    count = struct.pack("<I", len(points)) if kind == LINE_Z else b""
-    return struct.pack("<BI", 1, kind) + count + np.ascontiguousarray(points, dtype="<f8").tobytes()
 
 
 FORMULA = ("=", "+", "-", "@", "\t")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,8 +29,11 @@ FARTHEST = 0.5
 """Pixels from an observation to its point's projection. COLMAP weighs all observations alike, so that one which our
 resection hardly counted would pull an adjustment away: on a street of 60 m by 0.45 m, with the limit by 0.10 m."""
 
-LEFT, RIGHT = 1, 2
-"""Numbers of the two cameras; the rig has number 1, too, and the left camera is its origin."""
+SIDES = ("left", "right")
+"""The two cameras, numbers 1 and 2; the rig has number 1, and the left camera is its origin."""
+
+Seen = dict[tuple[int, str], list[Floats]]
+"""Pixels (column, row) by COLMAP's centre that show a point, of each image, named by its frame and side."""
 
 
 class MatchedSegment(NamedTuple):
@@ -46,20 +48,6 @@ class MatchedSegment(NamedTuple):
     matches: Mapping[int, Bundle]
     landmarks: Floats
     inlier: NDArray[np.uint8]
-
-
-@dataclass
-class _View:
-    """An image of the model: pixels (column, row) with COLMAP's centre, in the order in which points refer to them."""
-
-    image_id: int
-    name: str
-    pixels: list[Floats] = field(default_factory=list)
-
-    def element(self, pixel: Floats) -> tuple[int, int]:
-        """Add an observation; gives the numbers of image and pixel."""
-        self.pixels.append(pixel + PIXEL_CENTRE)
-        return self.image_id, len(self.pixels) - 1
 
 
 def write_run(folder: Path, run: RunArtifacts) -> str:
@@ -126,46 +114,44 @@ def build(
     """
     import pycolmap
 
-    model = pycolmap.Reconstruction()
     poses = {
         int(f): RigidTransform.from_matrix(pose)
         for f, pose in zip(trajectory.meta["frames"], world_poses(trajectory), strict=True)
         if np.isfinite(pose).all()
     }
-    cameras = [_camera(pycolmap, number, camera) for number, camera in ((LEFT, rig.left), (RIGHT, rig.right))]
-    for camera in cameras:
-        model.add_camera(camera)
+    # Before images are made: each point adds its pixels to the images that see it.
+    seen: Seen = {(frame, side): [] for frame in poses for side in SIDES}
+    points = [point for segment in segments for point in _points(segment, rig, poses, seen, images or {})]
+    number = {image: k for k, image in enumerate(seen, start=1)}
+
+    model = pycolmap.Reconstruction()
+    cameras = {side: _camera(pycolmap, k, getattr(rig, side)) for k, side in enumerate(SIDES, start=1)}
     body = pycolmap.Rig(rig_id=1)
-    body.add_ref_sensor(cameras[0].sensor_id)
-    body.add_sensor(cameras[1].sensor_id, _rigid(pycolmap, rig.T_right_left))
+    body.add_ref_sensor(cameras["left"].sensor_id)
+    body.add_sensor(cameras["right"].sensor_id, _rigid(pycolmap, rig.T_right_left))
+    for camera in cameras.values():
+        model.add_camera(camera)
     model.add_rig(body)
-    # Before images are made: each point adds its pixels to the views that see it.
-    views = {}
-    for number, frame in enumerate(poses):
-        name = names.get(frame, f"{frame:06d}.png")
-        views[frame] = [_View(2 * number + 1 + k, f"{side}/{name}") for k, side in enumerate(("left", "right"))]
-    # Before images are made: each point adds its pixels to the views that see it.
-    points = [point for segment in segments for point in _points(segment, rig, poses, views, images or {})]
-    for number, (frame, T_world_left) in enumerate(poses.items()):
-        ours = pycolmap.Frame(frame_id=number + 1, rig_id=1)
-        for view, camera in zip(views[frame], cameras, strict=True):
-            ours.add_data_id(pycolmap.data_t(camera.sensor_id, view.image_id))
+    for k, (frame, T_world_left) in enumerate(poses.items(), start=1):
+        ours = pycolmap.Frame(frame_id=k, rig_id=1)
+        for side, camera in cameras.items():
+            ours.add_data_id(pycolmap.data_t(camera.sensor_id, number[frame, side]))
         ours.rig_from_world = _rigid(pycolmap, T_world_left.inverse())
         model.add_frame(ours)
-        for view, camera in zip(views[frame], cameras, strict=True):
+        for side, camera in cameras.items():
             image = pycolmap.Image(
-                name=view.name,
-                keypoints=np.array(view.pixels).reshape(-1, 2),
+                name=f"{side}/{names.get(frame, f'{frame:06d}.png')}",
+                keypoints=np.array(seen[frame, side]).reshape(-1, 2),
                 camera_id=camera.camera_id,
-                image_id=view.image_id,
+                image_id=number[frame, side],
             )
-            image.frame_id = number + 1
+            image.frame_id = k
             model.add_image(image)
-    for position, elements, colour in points:
-        track = pycolmap.Track([pycolmap.TrackElement(*element) for element in elements])
-        model.add_point3D(position, track, np.full(3, colour, dtype=np.uint8))
-    for number in range(len(poses)):
-        model.register_frame(number + 1)
+    for position, elements, grey in points:
+        track = pycolmap.Track([pycolmap.TrackElement(number[image], at) for image, at in elements])
+        model.add_point3D(position, track, np.full(3, grey, dtype=np.uint8))
+    for k in range(1, len(poses) + 1):
+        model.register_frame(k)
     model.update_point_3d_errors()
     return model
 
@@ -180,10 +166,13 @@ def _points(
     segment: MatchedSegment,
     rig: Rig,
     poses: Mapping[int, RigidTransform],
-    views: Mapping[int, list[_View]],
+    seen: Seen,
     images: Mapping[int, Bundle],
-) -> Iterator[tuple[Floats, list[tuple[int, int]], int]]:
-    """Points of a segment in the world, where each is seen, and its grey value (black where that is not known)."""
+) -> Iterator[tuple[Floats, list[tuple[tuple[int, str], int]], int]]:
+    """Points of a segment in the world, by which pixel of which images each is seen, and its grey value (or black).
+
+    The pixels are added to ``seen``.
+    """
     frames = [int(f) for f in segment.track.meta["frames"]]
     key = frames[0]
     if key not in poses:
@@ -192,18 +181,18 @@ def _points(
     world = (poses[key] @ T_local_key.inverse()).apply(segment.landmarks)
     # Pixels (point, frame, camera, 2) of left and right cameras, and which of them are observations.
     pixels = np.repeat(np.asarray(segment.track["points"], dtype=np.float64)[:, :, None], 2, axis=2)
-    seen = np.zeros(pixels.shape[:3], bool)
+    shown = np.zeros(pixels.shape[:3], bool)
     for j, frame in enumerate(frames):
         if frame not in poses:
             continue
         in_left, left = poses[frame].inverse().apply(world), pixels[:, j, 0]
         agrees = segment.inlier[:, j] != 0
-        seen[:, j, 0] = agrees & _near(rig.left, in_left, left)
+        shown[:, j, 0] = agrees & _near(rig.left, in_left, left)
         if (pair := segment.matches.get(frame)) is not None:
             disparity = (np.asarray(pair[n]) for n in ("column_disparity", "row_disparity", "validity"))
             vectors, matched = matches_at(left, *disparity)
             pixels[:, j, 1] += vectors
-            seen[:, j, 1] = agrees & matched & _near(rig.right, rig.T_right_left.apply(in_left), pixels[:, j, 1])
+            shown[:, j, 1] = agrees & matched & _near(rig.right, rig.T_right_left.apply(in_left), pixels[:, j, 1])
     grey = np.asarray(images[key]["image"]) if key in images else np.zeros((1, 1), np.uint8)
     columns, rows = (
         np.clip(np.nan_to_num(pixels[:, 0, 0, k]).astype(int), 0, n - 1) for k, n in enumerate(grey.shape[::-1])
@@ -212,8 +201,12 @@ def _points(
     # COLMAP's colours have 8 bits: of 16 the high byte. Undistorted images are floats of 0..255.
     values = np.rint(values) if values.dtype.kind == "f" else values >> (8 * (values.itemsize - 1))
     # A point seen once would slide along its ray in any adjustment of the model.
-    for k in np.flatnonzero(np.isfinite(world).all(1) & (seen.sum(axis=(1, 2)) > 1)):
-        elements = [views[frames[j]][side].element(pixels[k, j, side]) for j, side in np.argwhere(seen[k])]
+    for k in np.flatnonzero(np.isfinite(world).all(1) & (shown.sum(axis=(1, 2)) > 1)):
+        elements = []
+        for j, side in np.argwhere(shown[k]):
+            image = frames[j], SIDES[side]
+            elements.append((image, len(seen[image])))
+            seen[image].append(pixels[k, j, side] + PIXEL_CENTRE)
         yield world[k], elements, int(values[k])
 
 

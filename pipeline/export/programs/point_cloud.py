@@ -47,11 +47,9 @@ def export(run: Path, kind: str, output: Path | None) -> tuple[Path, str]:
     Raises
     ------
     InputError
-        The folder is no run with a terrain, or the file cannot be written.
+        The run has no terrain, or the file cannot be written.
     """
     default, write = FORMATS[kind]
-    if not run.is_dir():
-        raise InputError("RIL-600", f"{run} is not the folder of a run", remedy="give RUNS/sequence/latest")
     target = output or run / default
     terrain = read_elevation(run)
     ortho, sigma = _beside(run, "ortho", terrain), _beside(run, "dem_sigma", terrain)

@@ -71,8 +71,9 @@ from rille.pipeline.commands.options import prepare
 prepare()
 import numba, matplotlib
 import numpy as np
-from rille.pipeline.export.writers import write_path_gpkg
-write_path_gpkg(Path(sys.argv[1]), np.zeros((2, 3)), {})
+from rille.pipeline.export.paths import write_path
+from rille.stages.core.declare import Bundle
+write_path(Path(sys.argv[1]), Bundle({"path": np.zeros((2, 3))}, {}))
 print(numba.njit(lambda x: x + 1)(1))
 """
 

@@ -19,15 +19,16 @@ from toys.finished import FRAMES, sequence, view
 
 from rille.datasets.georeference import Georeference
 from rille.pipeline.export.frames_json import describe
+from rille.pipeline.export.paths import write_path
 from rille.pipeline.export.rasters import dem_style, rounded
 from rille.pipeline.export.writers import (
     Meaning,
-    write_path_gpkg,
     write_raster,
     write_table,
     write_trajectory_kitti,
     write_trajectory_tum,
 )
+from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import rotation_exp
 from rille.stages.geometry.lattice import Lattice
 
@@ -68,7 +69,7 @@ def test_the_engineering_crs_is_in_metres_and_says_how_axes_lie(tmp_path: Path) 
     assert crs.is_engineering
     # GeoTIFF has no key for the names of axes: GDAL reads every local system back as easting and northing
     assert [(a.direction, a.unit_name) for a in crs.axis_info] == [("east", "metre"), ("north", "metre")]
-    write_path_gpkg(tmp_path / "path.gpkg", VERTICES, {"found": True})
+    write_path(tmp_path / "path.gpkg", Bundle({"path": VERTICES}, {"found": True}))
     # Nor may the path's file have better ones: programs would take path and rasters for two systems.
     again = pyproj.CRS.from_wkt(pyogrio.raw.read(tmp_path / "path.gpkg", layer="path")[0]["crs"])
     assert again.to_wkt("WKT1_GDAL") == crs.to_wkt("WKT1_GDAL")
@@ -84,7 +85,7 @@ def test_a_raster_with_a_place_is_turned_and_not_resampled(tmp_path: Path) -> No
         at = LATTICE.xs()[123], LATTICE.ys()[45], 0.0
         assert file.xy(45, 123) == pytest.approx(tuple(place.apply(at)[:2]), abs=1e-6)
         assert "clockwise from grid north" in file.tags()["AXES"]
-    write_path_gpkg(tmp_path / "path.gpkg", VERTICES, {"found": True}, place)
+    write_path(tmp_path / "path.gpkg", Bundle({"path": VERTICES}, {"found": True}), place)
     meta, _, geometry, _ = pyogrio.raw.read(tmp_path / "path.gpkg", layer="path")
     assert meta["crs"] == "EPSG:32633"
     np.testing.assert_allclose(np.frombuffer(geometry[0][9:], "<f8").reshape(-1, 3), place.apply(VERTICES), atol=1e-9)
@@ -145,7 +146,7 @@ VERTICES = np.array([[0.1, 0.2, -0.18], [0.1, 0.3, -0.181], [0.11, 0.4, -0.18]])
 
 def test_gdal_reads_the_path_in_its_own_coordinate_system(tmp_path: Path) -> None:
     facts = {"found": True, "length_m": 0.2, "reason": None, "grid": {"cell": 1}}
-    write_path_gpkg(tmp_path / "path.gpkg", VERTICES, facts)
+    write_path(tmp_path / "path.gpkg", Bundle({"path": VERTICES}, facts))
     meta, _, geometry, values = pyogrio.raw.read(tmp_path / "path.gpkg", layer="path")
     assert meta["geometry_type"] == "LineString Z"
     assert "local metres" in meta["crs"]
@@ -161,7 +162,7 @@ def test_gdal_reads_the_path_in_its_own_coordinate_system(tmp_path: Path) -> Non
 
 
 def test_no_path_is_a_layer_without_geometry(tmp_path: Path) -> None:
-    write_path_gpkg(tmp_path / "path.gpkg", np.empty((0, 3)), {"found": False, "reason": "blocked"})
+    write_path(tmp_path / "path.gpkg", Bundle({"path": np.empty((0, 3))}, {"found": False, "reason": "blocked"}))
     meta, _, geometry, values = pyogrio.raw.read(tmp_path / "path.gpkg")
     assert geometry[0] is None
     assert dict(zip(meta["fields"], values, strict=True))["reason"][0] == "blocked"
@@ -170,7 +171,7 @@ def test_no_path_is_a_layer_without_geometry(tmp_path: Path) -> None:
 
 def test_equal_paths_make_equal_files(tmp_path: Path) -> None:
     for name in "ab":
-        write_path_gpkg(tmp_path / name / "path.gpkg", VERTICES, {"found": True})
+        write_path(tmp_path / name / "path.gpkg", Bundle({"path": VERTICES}, {"found": True}))
     digests = {hashlib.sha256((tmp_path / name / "path.gpkg").read_bytes()).hexdigest() for name in "ab"}
     assert len(digests) == 1
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["path.gpkg"]

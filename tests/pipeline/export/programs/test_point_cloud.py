@@ -142,8 +142,6 @@ def test_large_terrain_is_thinned_and_says_so(tmp_path: Path, monkeypatch: pytes
 
 
 def test_what_is_no_run_is_said(tmp_path: Path) -> None:
-    with raises("RIL-600"):
-        point_cloud.export(tmp_path / "none", "laz", None)
     with raises("RIL-635"):
         point_cloud.export(tmp_path, "laz", None)
     (finished(tmp_path / "run") / "file").write_text("")
