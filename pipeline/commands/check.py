@@ -9,17 +9,15 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Generator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.datasets.protocol import CAMERAS, Sequence
-from rille.pipeline.commands.options import COMPLETE, FAILED, Output, Settings, cache_folder, check_output
-from rille.pipeline.engine.failures import reported
+from rille.pipeline.commands.options import COMPLETE, FAILED, Settings, cache_folder
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store
@@ -32,7 +30,6 @@ from rille.stages.core.errors import RilleError
 from rille.stages.geometry.epipolar import beyond_infinity, inverse_depth
 from rille.stages.imaging.image_quality import Look, look
 
-Floats = NDArray[np.float64]
 Steps = Generator[Wait, Any, None]
 
 MAX_MOTIONS = 12
@@ -49,31 +46,21 @@ MAX_NAMED = 3
 _SETTINGS = Settings()
 
 
-def check(seq: str, *, output: Annotated[Path | None, Output] = None, options: Settings = _SETTINGS) -> int:
-    """Check a sequence: one finding a line, and a picture of the first pair's epipolar residuals.
+def check(seq: str, *, options: Settings = _SETTINGS) -> int:
+    """Check a sequence: open everything, match its first pair, and print one finding a line.
 
     Parameters
     ----------
     seq
         As for reconstruct.
-    output
-        PNG to write; SEQUENCE-check.png by default.
     """
     settled = settings(replace(options, sequence=seq))
     refuse_unchecked(settled.given, settled.config)
-    path = output if output is not None else Path(f"{settled.sequence.name}-check.png")
-    check_output(path, ".png", ".pdf", ".svg")
-    return inspect(settled.sequence, settled.config, path, settled.frames, cache_folder(options.cache))
+    return inspect(settled.sequence, settled.config, settled.frames, cache_folder(options.cache))
 
 
-def inspect(sequence: Sequence, config: Any, path: Path, frames: tuple[int, ...], cache: Path) -> int:
-    """Print a line for each finding, and draw the first pair's epipolar residuals; 0, or 1 where something fails.
-
-    Raises
-    ------
-    RilleError
-        The picture cannot be written.
-    """
+def inspect(sequence: Sequence, config: Any, frames: tuple[int, ...], cache: Path) -> int:
+    """Print a line for each finding; 0, or 1 where something fails."""
     graph, store = Graph(), Store(cache)
     name(graph, sequence, frames)
     inspection = Inspection(Builder(graph, sequence, config), frames, store)
@@ -82,23 +69,9 @@ def inspect(sequence: Sequence, config: Any, path: Path, frames: tuple[int, ...]
     result = run(graph, store, RunOptions(executor="inline", keep_going=True))
     # What a stage refuses is a finding, said by then; any other failure is one of the program.
     Result(failures=[f for f in result.failures if not (f.stage and isinstance(f.error, RilleError))]).check()
-    if inspection.match is not None and len(inspection.match.left):
-        draw(path, sequence.name, sequence.frame_names[inspection.match.frame], inspection.match)
-        print(f"picture       {path}")
     levels = inspection.levels
     print(f"{sequence.name}: {levels['FAIL']} fail, {levels['WARN']} to look at, {levels['OK']} fine")
     return FAILED if levels["FAIL"] else COMPLETE
-
-
-@dataclass(frozen=True)
-class Match:
-    """A matched pair: left image (row, col), thinned matches (n, 2) px and their epipolar residuals (n,) px."""
-
-    frame: int
-    image: NDArray[Any]
-    left: Floats
-    right: Floats
-    residual: Floats
 
 
 class Inspection:
@@ -108,7 +81,6 @@ class Inspection:
         self.make, self.store, self.sequence = make, store, make.sequence
         self.lost = {f: why for f, why in self.sequence.lost.items() if f in frames}
         self.frames = tuple(f for f in frames if f not in self.lost)
-        self.match: Match | None = None
         self.levels: Counter[str] = Counter()
         self.broken: set[tuple[int, str]] = set()
 
@@ -187,19 +159,16 @@ class Inspection:
 
     def _first_pair(self, pair: int) -> Steps:
         """Match one pair, and compare it with the rig."""
-        tasks = [self.make.image(pair, "left"), self.make.disparity(pair), self.make.orientation(pair)]
         try:
-            image, disparity, oriented = yield tasks
+            disparity, oriented = yield [self.make.disparity(pair), self.make.orientation(pair)]
             arrays = {k: np.asarray(v, np.float64) for k, v in self.store.open(oriented).arrays.items()}
-            shown = np.asarray(self.store.open(image)["image"])
         except (MissingError, RilleError) as missing:
             error = _cause(missing.handles[0]) if isinstance(missing, MissingError) else missing
             self.refused(error, "matching", f"frame {self.sequence.frame_names[pair]}: ")
             return
         used = arrays["weight"] > 0
         used = used if used.any() else np.ones(len(used), bool)
-        left, right, residual = (arrays[name][used] for name in ("left", "right", "residual_before"))
-        self.match = Match(pair, shown, left, right, residual)
+        left, right = arrays["left"][used], arrays["right"][used]
         rig = self.sequence.rig
         rho, _ = inverse_depth(rig, left, right - left)
         self.say(judge.judge_matching(disparity.meta["match_rate"], 1.0 / rho[rho > 0], rig.baseline))
@@ -239,34 +208,3 @@ def _cause(handle: Handle) -> RilleError:
     if not isinstance(handle.error, RilleError):
         raise handle.error
     return handle.error
-
-
-def draw(path: Path, name: str, frame: str, match: Match) -> None:
-    """Picture of the epipolar residuals of one pair under the given rig: where, how large, and along columns and rows.
-
-    Raises
-    ------
-    RilleError
-        The file cannot be written.
-    """
-    from matplotlib.figure import Figure
-
-    points, residual, shown = match.left, match.residual, match.image.astype(np.float32)
-    # Scaled by the bulk, not by the worst match: a few outliers would wash all the others out.
-    limit = max(0.5, float(np.percentile(np.abs(residual), 98)))
-    height = 11.0 * min(shown.shape[0] / shown.shape[1], 0.8)  # inches
-    fig = Figure(figsize=(11.0, height + 2.8), layout="constrained")
-    plots: Any = fig.subplot_mosaic("III;CRH", height_ratios=[height, 2.8])
-    plots["I"].imshow(shown, cmap="gray", vmin=np.percentile(shown, 1), vmax=np.percentile(shown, 99))
-    shades = {"c": residual, "cmap": "coolwarm", "vmin": -limit, "vmax": limit}
-    drawn = plots["I"].scatter(*points.T, s=9, linewidths=0, **shades)
-    fig.colorbar(drawn, ax=plots["I"], label="px below the line", pad=0.01, aspect=30)
-    plots["I"].set_title(f"{name}, frame {frame}: epipolar residuals of the right image under the given rig")
-    for plot, axis, label in (("C", 0, "column in the left image"), ("R", 1, "row in the left image")):
-        plots[plot].scatter(points[:, axis], residual, s=3, color="0.3", linewidths=0)
-        plots[plot].axhline(0.0, color="tab:red", linewidth=1)
-        plots[plot].set(xlabel=label, ylabel="residual, px", ylim=(-1.5 * limit, 1.5 * limit))
-    plots["H"].hist(residual, bins=60, range=(-1.5 * limit, 1.5 * limit), color="0.5")
-    plots["H"].set(xlabel="residual, px", ylabel="matches")
-    with reported("RIL-016", f"cannot write {path}", remedy="choose another --output"):
-        fig.savefig(path, dpi=110)
