@@ -66,6 +66,7 @@ def program(*, listed: bool = False) -> App:
         version=_versions,
         version_format="plaintext",
         help="Stereo image sequences to terrain, trajectory, risk map and safe path, without rectification.",
+        help_epilogue="--debug, with any command, shows tracebacks.",
     )
     for name, place in COMMANDS.items():
         # A line that is given here takes the place of the whole help text of the command.
@@ -99,9 +100,9 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def _run(argv: list[str] | None) -> int:
-    tokens = list(sys.argv[1:] if argv is None else argv)
-    # Asked of the words, not of the command: an error may come before its options are known.
-    debug = "--debug" in tokens
+    words = list(sys.argv[1:] if argv is None else argv)
+    # Of every command, and asked of the words: an error may come before a command is known.
+    tokens, debug = [word for word in words if word != "--debug"], "--debug" in words
     try:
         prepare()
         console = Console(file=raw(sys.stdout))  # of the help, which has colours

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from cyclopts import App
 
-from rille.pipeline.commands.options import COMPLETE, FAILED, RUNS, CacheFolder, Debug, Runs, cache_folder, flag
+from rille.pipeline.commands.options import COMPLETE, FAILED, RUNS, CacheFolder, Runs, cache_folder, flag
 
 app = App(name="cache", help=__doc__)
 
@@ -25,7 +25,7 @@ def _there(cache: str | None) -> Path:
 
 
 @app.command
-def verify(*, cache: CacheFolder = None, debug: Debug = False) -> int:
+def verify(*, cache: CacheFolder = None) -> int:
     """Read and decode every artifact, and compare its digest; damaged ones are named and recomputed by the next run."""
     from rille.pipeline.engine.store import maintenance
     from rille.pipeline.engine.store.base import Store
@@ -43,7 +43,6 @@ def gc(
     cache: CacheFolder = None,
     runs: Runs = RUNS,
     dry_run: Annotated[bool, flag("List by stage what would be removed, and remove nothing.")] = False,
-    debug: Debug = False,
 ) -> int:
     """Remove artifacts that no kept run refers to, leftovers of interrupted runs, and kernels that nothing uses.
 

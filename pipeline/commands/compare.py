@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 
 from rille.datasets.text.reading import TABLE, read_lines, read_text, read_toml
-from rille.pipeline.commands.options import COMPLETE, RUNS, Debug, Run, Runs
+from rille.pipeline.commands.options import COMPLETE, RUNS, Run, Runs
 from rille.pipeline.engine import events
 from rille.pipeline.report.words import metres, quantity
 from rille.pipeline.runs import lookup
 from rille.stages.core.errors import ConfigError
 
 
-def compare(a: Run, b: Run, *, runs: Runs = RUNS, debug: Debug = False) -> int:
+def compare(a: Run, b: Run, *, runs: Runs = RUNS) -> int:
     """Compare two runs: which parameters, tasks, figures and positions differ.
 
     Their elevations: rille compare-dem A B.

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE, RUNS, Debug, Output, Runs
+from rille.pipeline.commands.options import COMPLETE, RUNS, Output, Runs
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
@@ -38,7 +38,6 @@ def compare_dem(
     align: Literal["none", "shift", "tilt", "rigid"] = "none",
     output: Annotated[Path, Output] = Path("dem_comparison"),
     runs: Runs = RUNS,
-    debug: Debug = False,
 ) -> int:
     """Compare elevation model A with reference B: errors, completeness, error against range and slope.
 

@@ -13,7 +13,7 @@ import time
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
-from rille.pipeline.commands.options import COMPLETE, Debug, Options
+from rille.pipeline.commands.options import COMPLETE, Options
 from rille.pipeline.engine.runtime import numba_cache
 from rille.pipeline.runs.session import perform
 
@@ -32,7 +32,7 @@ SHORT = ("drive.max_stops=3",)
 """A drive that ends, far from its goal, when all kernels of driving were called."""
 
 
-def compile_kernels(*, debug: Debug = False) -> int:
+def compile_kernels() -> int:
     """Compile the numerical kernels for this user and machine, so that the first run need not.
 
     Runs two small simulated sequences in a temporary folder. What is compiled stays: again, nothing is left to compile.

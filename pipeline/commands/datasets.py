@@ -9,7 +9,7 @@ from cyclopts import App
 from rille.datasets import registry
 from rille.datasets.export import export
 from rille.datasets.protocol import Source
-from rille.pipeline.commands.options import COMPLETE, Assignments, CacheFolder, Debug, cache_folder
+from rille.pipeline.commands.options import COMPLETE, Assignments, CacheFolder, cache_folder
 from rille.pipeline.engine.spec import Spec
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import Ref
@@ -36,7 +36,6 @@ def export_dataset(
     *,
     assignments: Assignments = (),
     cache: CacheFolder = None,
-    debug: Debug = False,
 ) -> int:
     """Write a built-in sequence as plain files (PNG, rig, poses, disparity, DEM, times), for use by other tools.
 

@@ -11,7 +11,6 @@ from rille.pipeline.commands.options import (
     COMPLETE,
     RUNS,
     CacheFolder,
-    Debug,
     Output,
     Run,
     Runs,
@@ -32,7 +31,6 @@ def export(
     output: Annotated[Path | None, Output] = None,
     runs: Runs = RUNS,
     cache: CacheFolder = None,
-    debug: Debug = False,
 ) -> int:
     """Write a run for other programs: cloud.laz or cloud.ply (points), terrain.glb (mesh), a model, a map.
 

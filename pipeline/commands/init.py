@@ -12,7 +12,7 @@ from rille.datasets.inspection import Findings, inspect
 from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_words
 from rille.datasets.registry import hindrance
 from rille.datasets.text.names import derived_name
-from rille.pipeline.commands.options import COMPLETE, Debug, Output, flag
+from rille.pipeline.commands.options import COMPLETE, Output, flag
 from rille.pipeline.engine.failures import reported
 from rille.stages.core.errors import ConfigError, InputError
 
@@ -22,7 +22,6 @@ def init(
     *,
     output: Annotated[Path | None, Output] = None,
     force: Annotated[bool, flag("Replace a manifest that is there.")] = False,
-    debug: Debug = False,
 ) -> int:
     """Write a commented manifest of a folder of stereo images: what was found, and what is still needed.
 

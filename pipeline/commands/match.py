@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rille.datasets.images.files import read_grey
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE, HOLES, Assignments, Debug, Output, check_output, flag
+from rille.pipeline.commands.options import COMPLETE, HOLES, Assignments, Output, check_output, flag
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import raw, warn
 from rille.pipeline.export.writers import read_disparity, write_confidence, write_disparity
@@ -109,7 +109,6 @@ def match(
     matcher: Matcher = _MATCHER,
     dense: Annotated[bool, flag("Fill undefined disparities by interpolation.")] = False,
     confidence: Path | None = None,
-    debug: Debug = False,
 ) -> int:
     """Match any two images, without calibration or rectification, to a two-band disparity TIFF.
 

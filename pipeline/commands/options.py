@@ -35,7 +35,6 @@ CacheFolder = Annotated[
     str | None,
     Parameter(name="--cache", help="Folder of cached artifacts; RILLE_CACHE or .rille/cache by default."),
 ]
-Debug = Annotated[bool, flag("Show tracebacks.")]
 Output = Parameter(name=["--output", "-o"])
 Run = Annotated[
     str, Parameter(help="A run by name: SEQUENCE (its latest), SEQUENCE/ID, ID, latest (of all); or its folder.")
@@ -56,7 +55,6 @@ class Settings:
     ] = None
     frames: Annotated[str | None, Parameter(help="Frame range START:STOP[:STEP], as in Python; all by default.")] = None
     cache: CacheFolder = None
-    debug: Debug = False
     verb: Annotated[str, Unparsed] = "reconstruct"
     opened: Annotated[Any, Unparsed] = None
     """The :class:`~rille.datasets.protocol.Sequence` itself, where it is open already."""

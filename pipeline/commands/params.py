@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 from rille.datasets.images.misalign import MisalignParams
 from rille.datasets.mockup.params import MockupParams
 from rille.datasets.mockup.rover import RoverParams
-from rille.pipeline.commands.options import COMPLETE, Debug, flag
+from rille.pipeline.commands.options import COMPLETE, flag
 from rille.pipeline.flow import config
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import ConfigError
@@ -22,9 +22,7 @@ WIDTH = 100
 SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 
-def params(
-    section: str = "", *, markdown: Annotated[bool, flag("As tables of Markdown.")] = False, debug: Debug = False
-) -> int:
+def params(section: str = "", *, markdown: Annotated[bool, flag("As tables of Markdown.")] = False) -> int:
     """Print all parameters, or those of one section: default, what is permitted, and meaning.
 
     Parameters

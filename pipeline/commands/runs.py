@@ -6,13 +6,13 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from rille.pipeline.commands.options import COMPLETE, RUNS, Debug, Runs
+from rille.pipeline.commands.options import COMPLETE, RUNS, Runs
 from rille.pipeline.engine import events
 from rille.pipeline.runs import lookup
 from rille.stages.core.errors import ConfigError
 
 
-def list_runs(sequence: str = "", *, runs: Runs = RUNS, debug: Debug = False) -> int:
+def list_runs(sequence: str = "", *, runs: Runs = RUNS) -> int:
     """List runs, the latest last: name, state, tasks computed and cached, seconds.
 
     Parameters

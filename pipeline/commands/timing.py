@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rille.datasets.text.count import count
-from rille.pipeline.commands.options import COMPLETE, RUNS, Debug, Run, Runs
+from rille.pipeline.commands.options import COMPLETE, RUNS, Run, Runs
 from rille.pipeline.engine import events
 from rille.pipeline.runs import lookup
 
 
-def timing(run: Run = "latest", *, runs: Runs = RUNS, debug: Debug = False) -> int:
+def timing(run: Run = "latest", *, runs: Runs = RUNS) -> int:
     """Show where the time of a run went, by stage.
 
     Seconds of all tasks of a stage together; compiling: the part that compiled kernels, or waited for another worker

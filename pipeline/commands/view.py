@@ -6,12 +6,12 @@ import os
 import sys
 import webbrowser
 
-from rille.pipeline.commands.options import COMPLETE, RUNS, Debug, Run, Runs
+from rille.pipeline.commands.options import COMPLETE, RUNS, Run, Runs
 from rille.pipeline.runs import lookup
 from rille.stages.core.errors import ConfigError
 
 
-def view(run: Run = "latest", *, runs: Runs = RUNS, debug: Debug = False) -> int:
+def view(run: Run = "latest", *, runs: Runs = RUNS) -> int:
     """Open the report of a run in the browser; print its path."""
     folder = lookup.find(run, runs)
     page = folder / "report.html"

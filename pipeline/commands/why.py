@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from rille.pipeline.commands.options import COMPLETE, RUNS, CacheFolder, Debug, Run, Runs, cache_folder
+from rille.pipeline.commands.options import COMPLETE, RUNS, CacheFolder, Run, Runs, cache_folder
 from rille.pipeline.engine import events, provenance
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.memory import words
@@ -27,7 +27,7 @@ WIDTH = 70
 """Characters of a value."""
 
 
-def why(run: Run, task: str, *, runs: Runs = RUNS, cache: CacheFolder = None, debug: Debug = False) -> int:
+def why(run: Run, task: str, *, runs: Runs = RUNS, cache: CacheFolder = None) -> int:
     """Explain one task of a run: its inputs, why it was computed, its parameters and code, what changed since.
 
     Parameters
