@@ -100,9 +100,9 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def _run(argv: list[str] | None) -> int:
-    words = list(sys.argv[1:] if argv is None else argv)
+    given = list(sys.argv[1:] if argv is None else argv)
     # Of every command, and asked of the words: an error may come before a command is known.
-    tokens, debug = [word for word in words if word != "--debug"], "--debug" in words
+    tokens, debug = [word for word in given if word != "--debug"], "--debug" in given
     try:
         prepare()
         console = Console(file=raw(sys.stdout))  # of the help, which has colours

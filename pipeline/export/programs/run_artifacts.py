@@ -22,8 +22,7 @@ def export_run(kind: str, run: Path, target: Path, store: Store) -> str:
     Raises
     ------
     InputError
-        ``run`` holds no finished run, or nothing that the form shows, its artifacts are gone from the cache, or
-        ``target`` is not empty.
+        The run has nothing that the form shows, its artifacts are gone from the cache, or ``target`` is not empty.
     """
     if target.exists() and any(target.iterdir()):
         raise InputError("RIL-607", f"{target} is not empty", remedy="give a new folder with --output")
@@ -37,13 +36,9 @@ class RunArtifacts:
     """The artifacts that the ledger of a run refers to; opened, they read their arrays when these are asked for."""
 
     def __init__(self, run: Path, store: Store) -> None:
-        path = run / "ledger.jsonl"
-        if not path.is_file():
-            raise InputError(
-                "RIL-608", f"{run} holds no ledger.jsonl", remedy="give the folder of a run, e.g. runs/mockup/latest"
-            )
         self.run, self._store = run, store
-        self._rows = {r["label"]: r for r in events.read(path) if r["status"] in ("computed", "cached") and "key" in r}
+        rows = events.read(run / "ledger.jsonl")
+        self._rows = {row["label"]: row for row in rows if row["status"] in ("computed", "cached") and "key" in row}
 
     def find(self, label: str) -> Bundle | None:
         """The artifact of exactly this label, if the run has it."""

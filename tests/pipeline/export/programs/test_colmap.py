@@ -146,9 +146,7 @@ def test_a_model_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     assert {p.name for p in tmp_path.iterdir()} == {"ledger.jsonl", "frames.json"}
 
 
-def test_what_is_no_run_or_has_content_is_said(tmp_path):
-    with raises("RIL-608"):
-        export_run("colmap", tmp_path, tmp_path / "model", Store(tmp_path / "cache"))
+def test_a_folder_with_content_is_said(tmp_path):
     (tmp_path / "x").touch()
     with raises("RIL-607"):
         export_run("colmap", tmp_path, tmp_path, Store(tmp_path / "cache"))
