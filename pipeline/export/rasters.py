@@ -32,10 +32,10 @@ NODATA = {array.name: float(array.nodata or 0) for array in merge.merge_stage.ou
 """Of the arrays of merged terrain."""
 
 
-def whole(tiles: Sequence[Bundle], name: str, lattice: Lattice | None = None) -> tuple[Lattice, NDArray[Any]]:
-    """One array of all world tiles put together, and the lattice it is on: by default the union of theirs."""
+def whole(tiles: Sequence[Bundle], name: str) -> tuple[Lattice, NDArray[Any]]:
+    """One array of all world tiles put together, and the union of their lattices, which it is on."""
     lattices = [Lattice.from_dict(tile.meta["lattice"]) for tile in tiles]
-    target = lattice or union(lattices)
+    target = union(lattices)
     parts = [(part, np.asarray(tile[name])) for part, tile in zip(lattices, tiles, strict=True)]
     return target, mosaic(parts, NODATA[name], target)
 
