@@ -9,20 +9,14 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import affine
-from affine import Affine
-
-from rille.datasets.text.reading import open_regular, read_text
-from rille.stages.core.errors import InputError
+from rille.datasets.text.reading import open_regular
 
 GRID = ".asc"
 """Ending of an ESRI ASCII grid; what has another one is read as a TIFF."""
-
-WORLD_FILES = (".tfw", ".tifw", ".wld")
 
 ALONE = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
 """GDAL's settings by which masks, overviews and notes beside a file are not looked for."""
@@ -48,14 +42,3 @@ def open_raster(path: Path, driver: str = "GTiff") -> Iterator[Any]:
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with rasterio.Env(**ALONE), rasterio.open(path, driver=driver) as file:
             yield file
-
-
-def place_of(file: Any, path: Path) -> Affine:
-    """Corners of cells (column, row) to the CRS: as the raster or the world file beside it says, else the identity."""
-    # GDAL gives the identity where a file states no geotransform.
-    if file.transform != Affine.identity():
-        return file.transform
-    for beside in map(path.with_suffix, WORLD_FILES):
-        with suppress(InputError, ValueError, TypeError):
-            return affine.loadsw(read_text(beside, "world file"))
-    return file.transform

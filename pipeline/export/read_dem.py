@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rille.datasets.text.reading import TABLE, Search, read_lines, read_text
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.memory import free, words
-from rille.pipeline.export.foreign_raster import GRID, open_raster, place_of
+from rille.pipeline.export.foreign_raster import GRID, open_raster
 from rille.stages.core.errors import InputError
 
 MOST_CELLS = 500_000_000
@@ -149,9 +149,10 @@ def read_raster(path: Path) -> DemFile:
     with opened_raster(path) as file:
         # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
         values = file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
-        crs, transform, unit = file.crs, place_of(file, path), file.units[0]
+        crs, transform, unit = file.crs, file.transform, file.units[0]
     if transform == Affine.identity():
-        raise InputError("RIL-630", f"{path} has no geotransform", remedy="give a raster that says where its cells are")
+        remedy = "give a raster that says itself where its cells are"
+        raise InputError("RIL-630", f"{path} has no geotransform", remedy=remedy)
     # Lengths of the cell's sides, not a and e: a raster may be turned.
     across, down = np.hypot(transform.a, transform.d), np.hypot(transform.b, transform.e)
     if not (0.0 < abs(transform.determinant) < math.inf and np.isclose(across, down, rtol=1e-6, atol=0.0)):

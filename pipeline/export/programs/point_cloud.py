@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.colour import LUMA
-from rille.pipeline.export.foreign_raster import place_of
 from rille.pipeline.export.read_dem import DemFile, opened_raster, read_elevation
 from rille.stages.core.errors import InputError
 
@@ -63,7 +62,7 @@ def _beside(run: Path, name: str, terrain: DemFile) -> Layer:
     if not path.is_file():
         return None
     with opened_raster(path) as raster:
-        if raster.shape != terrain.values.shape or place_of(raster, path) != terrain.transform:
+        if raster.shape != terrain.values.shape or raster.transform != terrain.transform:
             raise InputError("RIL-602", f"{path} and dem.tif have other cells", remedy="make the run again")
         bands = raster.read([1, 2, 3] if raster.count == 3 else [1], out_dtype="float64", masked=True).filled(np.nan)
     return np.asarray(np.moveaxis(bands, 0, 2) if len(bands) == 3 else bands[0], np.float64)

@@ -7,7 +7,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import affine
 import numpy as np
 import pytest
 import rasterio
@@ -107,17 +106,10 @@ def test_an_ascii_grid_is_as_good_as_a_tiff(tmp_path: Path, capsys: pytest.Captu
     assert "is in degrees" in refused(capsys, tmp_path / "a.tif", tmp_path / "b.ASC")
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_a_tiff_with_a_world_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    z, place = elevation(), from_origin(-1.0, 4.5, 0.05, 0.05)
+def test_a_tiff_without_a_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    z = elevation()
     placed, bare = tiff(tmp_path / "a.tif", z, 0.05, -1.0, 4.5), tiff(tmp_path / "b.tif", z, 1, 0, 0, transform=None)
     assert "has no geotransform" in refused(capsys, placed, bare)
-    (tmp_path / "b.tfw").write_text(affine.dumpsw(place))
-    compare(placed, bare, output=tmp_path / "out")
-    assert json.loads((tmp_path / "out.json").read_text())["figures"]["rmse"] == 0.0
-    capsys.readouterr()
-    (tmp_path / "b.tfw").write_text("0\n0\n0\n0\n1\n1\n")
-    assert "cells of 0 x 0" in refused(capsys, placed, bare)
 
 
 def coarse_cells(found: dict) -> int:
