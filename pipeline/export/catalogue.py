@@ -1,13 +1,21 @@
-"""All files that a run can have, each by its row, in the order in which the report lists them."""
+"""All files that a run can have, each by its row, in the order in which the report lists them, and ``frames.json``.
+
+``frames.json`` says in which frame, unit and order every file of a run is written, for who reads them with a program.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 from rille.pipeline.export import paths, rasters, terrain_zarr, trajectories
 from rille.pipeline.export.output import Output
+from rille.pipeline.export.trajectories import stamps
+from rille.pipeline.export.view import RunView
+from rille.pipeline.export.writers import FRAME, UNLEVELLED
+from rille.stages.geometry.pose_arrays import NO_VERTICAL
 
 MADE = (trajectories, rasters, terrain_zarr, paths)
 """Modules whose outputs are tasks."""
@@ -35,3 +43,70 @@ def listed(folder: Path) -> Iterator[tuple[str, str, str]]:
             left.remove(name)
             yield name, output.what, output.opens
     yield from ((name, "", "") for name in sorted(left))
+
+
+# -- frames.json --------------------------------------------------------------------------------------------------
+
+FORMAT = 2
+"""Raised when the meaning of a key of frames.json changes."""
+
+FRAMES: dict[str, dict[str, Any]] = {
+    "world": {
+        "handedness": "right",
+        "axes": {"x": "right", "y": "ahead", "z": "up"},
+        "origin": "centre of the left camera at the first frame that has a pose here",
+        "definition": FRAME,
+    },
+    "left camera": {
+        "handedness": "right",
+        "axes": {"x": "right in the image (columns)", "y": "down in the image (rows)", "z": "optical axis, forward"},
+        "origin": "projection centre of the left camera at that frame",
+    },
+}
+
+CONVENTIONS = {
+    "pose": "of the left camera, T_world_left: x_world = R x_left + t",
+    "trajectory.kitti": "[R | t] row by row, a line a frame in the order of `frames` here; nan where there is no pose",
+    ".tum": "time x y z qx qy qz qw; frames without a pose have no line",
+    "quaternion": "x y z w (scalar last), Hamilton, w >= 0, rotates from the left camera to the world",
+    "raster": "row 0 at the greatest y of the world frame; the geotransform gives the corner of the first cell",
+    "world": "engineering CRS, metres: x, y and z of the world frame",
+    "georeference": "that CRS, metres: easting, northing, height; rasters are turned by the azimuth, not resampled",
+}
+"""How poses and rasters are written, and what the coordinates of a file in either frame are."""
+
+IN_PLACE = (".tif", ".gpkg")
+"""Endings of the files whose coordinates are those of the sequence's CRS where it has one."""
+
+
+def describe(written: Sequence[str], run: RunView, vertical: str = "") -> dict[str, Any]:
+    """Return the content of ``frames.json``.
+
+    Parameters
+    ----------
+    written : names of the files that the run has written; only these are described.
+    vertical : source of the world's vertical, "none" if there is none; empty without a trajectory.
+    """
+    times, place, names = run.sequence.times, run.sequence.georeference, run.sequence.frame_names
+    world = FRAMES["world"] | ({"vertical": vertical} if vertical else {})
+    if vertical == NO_VERTICAL:
+        world |= {"axes": {"x": "right", "y": "optical axis of the first camera", "z": "that camera's up"}}
+        world |= {"definition": UNLEVELLED}
+    placed = IN_PLACE if place is not None else ()
+    known = {
+        o.name: {"frame": "georeference" if o.name.endswith(placed) else o.frame, "holds": o.what}
+        for o in OUTPUTS
+        if o.name in written and o.frame
+    }
+    return {
+        "format": FORMAT,
+        "units": {"length": "m", "angle": "rad, deg where the name says so", "time": "s" if times else "frame number"},
+        "frames_of_reference": FRAMES | {"world": world},
+        "conventions": CONVENTIONS,
+        "files": known,
+        "georeference": None if place is None else place.to_dict(),
+        "frames": [
+            {"frame": frame, "name": names[frame], "time": stamp}
+            for frame, stamp in zip(run.frames, stamps(run), strict=True)
+        ],
+    }

@@ -47,7 +47,7 @@ class Output:
     inputs : what ``write`` takes of a run, by name: products, which it gets as artifacts, and plain facts. Where one
         that has no default in ``write`` is not there as a whole, the file is not made; of others (a list, a
         dictionary, a :class:`rille.pipeline.export.view.Part`) what is missing is None.
-    frame : frame of reference of its values, a key of :data:`rille.pipeline.export.frames_json.FRAMES`; empty: none.
+    frame : frame of reference of its values, a key of :data:`rille.pipeline.export.catalogue.FRAMES`; empty: none.
     """
 
     name: str

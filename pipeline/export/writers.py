@@ -10,7 +10,7 @@ import io
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -104,18 +104,12 @@ def write_raster(
         "blocksize": 256,
         "overview_resampling": "mode" if meaning.nodata is None else "average",
     }
-    facts = {"FRAME": FRAME, "AXES": axes(place), "CELL_SIZE_M": f"{lattice.cell:.12g}"}
-    facts["UNIT"] = ", ".join(dict.fromkeys(meaning.units(bands)))
-    _write_bands(path, bands, meaning, profile, facts)
+    tags = {"frame": FRAME, "axes": axes(place), "cell_size_m": f"{lattice.cell:.12g}"}
+    tags["unit"] = ", ".join(dict.fromkeys(meaning.units(bands)))
+    _write_bands(path, bands, replace(meaning, tags=tags | dict(meaning.tags)), profile)
 
 
-def _write_bands(
-    path: Path,
-    bands: Mapping[str, NDArray[Any]],
-    meaning: Meaning,
-    profile: Mapping[str, Any],
-    facts: Mapping[str, str],
-) -> None:
+def _write_bands(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning, profile: Mapping[str, Any]) -> None:
     """Write bands of one shape and dtype by GDAL; ``profile``: driver, place and packing of the file.
 
     The file is made in memory: where the disk is full GDAL says nothing, and leaves a file that nobody can read.
@@ -135,7 +129,7 @@ def _write_bands(
             if meaning.colours:
                 file.write_colormap(1, {k: tuple(bytes.fromhex(c[1:])) for k, c in enumerate(meaning.colours)})
             file.units = tuple("metre" if u == "m" else u for u in meaning.units(bands))
-            file.update_tags(**facts, **{key.upper(): value for key, value in meaning.tags.items()})
+            file.update_tags(**{key.upper(): value for key, value in meaning.tags.items()})
         # The driver COG writes as it closes.
         atomic.write(path, bytes(memory.getbuffer()))
 
@@ -229,8 +223,8 @@ def write_disparity(path: Path, column: NDArray[Any], row: NDArray[Any], tags: M
     column, row : (row, col) pixels on the left image, right minus left, NaN undefined.
     tags : more metadata.
     """
-    facts = {"CONVENTION": "right minus left, pixels of the left image, NaN undefined"}
-    _write_image(path, {"column_disparity": column, "row_disparity": row}, Meaning("pixel", tags=tags), facts)
+    tags = {"convention": "right minus left, pixels of the left image, NaN undefined", **tags}
+    _write_image(path, {"column_disparity": column, "row_disparity": row}, Meaning("pixel", tags=tags))
 
 
 def write_confidence(
@@ -248,10 +242,10 @@ def write_confidence(
     bits = ", ".join(f"{bit.value} {str(bit.name).lower()}" for bit in Validity)
     units = {"disparity_std": "pixel", "validity": "", "backmatch_error": "pixel"}
     bands = dict(zip(units, (std, validity, backmatch_error), strict=True))
-    _write_image(path, bands, Meaning(units, tags=tags), {"VALIDITY": f"sum of {bits}"})
+    _write_image(path, bands, Meaning(units, tags={"validity": f"sum of {bits}", **tags}))
 
 
-def _write_image(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning, facts: Mapping[str, str]) -> None:
+def _write_image(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning) -> None:
     """Write arrays (row, col) on image pixels as bands of a float32 TIFF, NaN undefined."""
     from rasterio.errors import NotGeoreferencedWarning
 
@@ -259,7 +253,7 @@ def _write_image(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning
         warnings.simplefilter("ignore", NotGeoreferencedWarning)  # an image has no place on the ground
         # 3 is TIFF's predictor of floats; GTiff does not choose by itself, as COG does.
         profile = {"driver": "GTiff", "predictor": 3}
-        _write_bands(path, {n: np.asarray(v, np.float32) for n, v in bands.items()}, meaning, profile, facts)
+        _write_bands(path, {n: np.asarray(v, np.float32) for n, v in bands.items()}, meaning, profile)
 
 
 def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -15,7 +15,6 @@ from rille.pipeline.engine.store.base import GoneError, Store
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.task import ensure
 from rille.pipeline.export import catalogue
-from rille.pipeline.export.frames_json import describe
 from rille.pipeline.export.output import Output, unpack
 from rille.pipeline.export.output_task import add, handles
 from rille.pipeline.export.view import RunView, TaskRow
@@ -76,7 +75,8 @@ def write(folder: Path, view: RunView, made: Made, store: Store) -> Items:
             atomic.write(folder / name, content)
     trajectory = view.products.trajectory
     meta = None if trajectory is None or trajectory.ref is None else trajectory.ref.meta
-    frames = describe([p.name for p in folder.iterdir()], view, "" if meta is None else meta["verticals"][meta["main"]])
+    vertical = "" if meta is None else meta["verticals"][meta["main"]]
+    frames = catalogue.describe([p.name for p in folder.iterdir()], view, vertical)
     atomic.write(folder / "frames.json", json.dumps(frames, indent=1) + "\n")
     (facts,) = _files(made["facts"], store).values()
     figures = [FIGURE.validate_json(drawn) for o in gallery.OUTPUTS for drawn in _files(made[o.name], store).values()]

@@ -24,8 +24,6 @@ from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.export import catalogue
-from rille.pipeline.export.frames_json import FRAMES as REFERENCES
-from rille.pipeline.export.frames_json import describe
 from rille.pipeline.export.output import Output, pack, unpack
 from rille.pipeline.export.output_task import add, handles
 from rille.pipeline.export.programs import point_cloud
@@ -187,11 +185,11 @@ def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
         for output in module.OUTPUTS:
             write(output, tmp_path, whole, made)
     names = [p.name for p in tmp_path.iterdir()]
-    facts = describe(names, whole)
+    facts = catalogue.describe(names, whole)
     described = [o.name for o in catalogue.OUTPUTS if o.frame]
     assert list(facts["files"]) == described
     assert set(described) | {"dem.qml", "risk.tif.aux.xml"} == set(names)
-    assert {about["frame"] for about in facts["files"].values()} <= REFERENCES.keys()
+    assert {about["frame"] for about in facts["files"].values()} <= catalogue.FRAMES.keys()
     assert facts["frames"][4] == {"frame": 4, "name": "left004", "time": 4.0}
     assert facts["units"]["time"] == "frame number"
     assert facts["frames_of_reference"]["world"]["handedness"] == "right"

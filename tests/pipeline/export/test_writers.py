@@ -18,7 +18,7 @@ from raising import raises
 from toys.finished import FRAMES, sequence, view
 
 from rille.datasets.georeference import Georeference
-from rille.pipeline.export.frames_json import describe
+from rille.pipeline.export.catalogue import describe
 from rille.pipeline.export.paths import write_path
 from rille.pipeline.export.rasters import dem_style, rounded
 from rille.pipeline.export.writers import (
