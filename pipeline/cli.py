@@ -8,7 +8,6 @@ module of a command is imported when the command is named, so that ``rille --hel
 
 from __future__ import annotations
 
-import ast
 import os
 import sys
 import traceback
@@ -78,9 +77,8 @@ def program(*, listed: bool = False) -> App:
 def summary(place: str) -> str:
     """First line of the docstring of a command, or of the module of an app of several, read from its source alone."""
     module, _, name = place.partition(":")
-    tree = ast.parse((Path(__file__).parent / "commands" / f"{module}.py").read_text(encoding="utf-8"))
-    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name]
-    return (ast.get_docstring(functions[0] if functions else tree) or "").partition("\n")[0]
+    source = (Path(__file__).parent / "commands" / f"{module}.py").read_text(encoding="utf-8")
+    return source[max(source.find(f"def {name}("), 0) :].split('"""', 2)[1].partition("\n")[0]
 
 
 app = program()
