@@ -106,7 +106,7 @@ def assignments(settings: Mapping[str, Settings]) -> list[str]:
     >>> assignments({"locus": {"cell_size": 0.002, "both": True}, "drive": {"goal": (0.1, 2.0)}})
     ['locus.cell_size=0.002', 'locus.both=true', 'drive.goal=[ 0.1, 2.0, ]']
     """
-    found = []
+    words = []
     check_sections(settings)
     for section, values in settings.items():
         for name, value in values.items():
@@ -119,8 +119,8 @@ def assignments(settings: Mapping[str, Settings]) -> list[str]:
                     remedy="give a number, a text, True or False, or a list of these; or leave it out",
                 ) from None
             # Only a list has several lines: the line feed of a text is escaped.
-            found.append(f"{section}.{name}={' '.join(line.strip() for line in lines)}")
-    return found
+            words.append(f"{section}.{name}={' '.join(line.strip() for line in lines)}")
+    return words
 
 
 def open_run(path: str | Path, runs: str | Path = "runs") -> Run:
@@ -196,12 +196,12 @@ class Run:
 
         with self._reading():
             check_group(self._file("terrain.zarr"))
-            found: xarray.Dataset = xarray.open_zarr(self._file("terrain.zarr"))
-        for variable in found.variables.values():
+            terrain: xarray.Dataset = xarray.open_zarr(self._file("terrain.zarr"))
+        for variable in terrain.variables.values():
             variable.attrs.pop("_CRS", None)  # GDAL's own, a mapping: NetCDF stores none; `spatial_ref` says the same
             for codec in ("compressors", "filters"):  # those of zarr 2, which `to_zarr` refuses in its own format 3
                 variable.encoding.pop(codec, None)
-        return found
+        return terrain
 
     @property
     def trajectory(self) -> xarray.Dataset:

@@ -113,10 +113,10 @@ class StereoPair:
     def _image(self, camera: str) -> xarray.DataArray:
         import xarray
 
-        found = _computed(_builder(self, self.settings).image(self.frame, camera), {}, self.sequence.drawn)
-        valid = found.arrays.get("valid")
+        image = _computed(_builder(self, self.settings).image(self.frame, camera), {}, self.sequence.drawn)
+        valid = image.arrays.get("valid")
         return xarray.DataArray(
-            np.array(found["image"]),  # a copy: what a user draws into it must not reach the next step
+            np.array(image["image"]),  # a copy: what a user draws into it must not reach the next step
             dims=("row", "col"),
             coords={} if valid is None else {"valid": (("row", "col"), np.asarray(valid))},
             name=f"{camera}_image",
@@ -220,9 +220,9 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     valid = [np.asarray(image.valid) if "valid" in getattr(image, "coords", ()) else None for image in (left, right)]
     first, second = (pyramid.build(image, built.pyramid, mask) for image, mask in zip(images, valid, strict=True))
     side = tiles.side(built.tiling, built.hfvm, built.pyramid, (images[0].shape, images[1].shape))
-    found = hfvm_stage.match_pyramids(first, second, built.hfvm, side=side)
-    arrays = {name: value for name, value in vars(found).items() if name != "aligned"}
-    meta = hfvm_stage.facts(arrays, built.hfvm, found.aligned, int(np.count_nonzero(first.valid[0])))
+    disparity = hfvm_stage.match_pyramids(first, second, built.hfvm, side=side)
+    arrays = {name: value for name, value in vars(disparity).items() if name != "aligned"}
+    meta = hfvm_stage.facts(arrays, built.hfvm, disparity.aligned, int(np.count_nonzero(first.valid[0])))
     return _dataset(hfvm_stage.STAGE, Bundle(arrays, meta), config.merge(carried, {"hfvm": hfvm}))
 
 
@@ -278,8 +278,8 @@ def terrain(disparity: xarray.Dataset, pair: StereoPair, **locus: Any) -> xarray
     make = _builder(pair, settings)
     _, known = make.rig([pair.frame])
     model = make.pair(pair.frame, vertical(make, pair.frame, pair.frame == 0), known, None)
-    found = _computed(model.dem, {model.disparity: given}, pair.sequence.drawn)
-    return _dataset(locus_stage.locus_stage, found, settings)
+    dem = _computed(model.dem, {model.disparity: given}, pair.sequence.drawn)
+    return _dataset(locus_stage.locus_stage, dem, settings)
 
 
 def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, **risk: Any) -> xarray.Dataset:
@@ -326,8 +326,8 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
     built: Any = config.build(settings)
     args = {"vehicle": built.vehicle.model_dump(mode="json", exclude={"name"})}
     given = _bundle(dem, locus_stage.locus_stage, "elevation", "rille.terrain")
-    found = risk_stage.STAGE.run(built.risk, args, {"dem": [given]})
-    return _dataset(risk_stage.STAGE, found, settings)
+    hazards = risk_stage.STAGE.run(built.risk, args, {"dem": [given]})
+    return _dataset(risk_stage.STAGE, hazards, settings)
 
 
 def path(
@@ -378,8 +378,8 @@ def path(
     settings = _merged(hazards, {"path": {**path, **ends}})
     built: Any = config.build(settings)
     given = _bundle(hazards, risk_stage.STAGE, "risk", "rille.hazards")
-    found = path_stage.STAGE.run(built.path, {} if ends else {"use": "local"}, {"risk": given})
-    return _dataset(path_stage.STAGE, found, settings)
+    planned = path_stage.STAGE.run(built.path, {} if ends else {"use": "local"}, {"risk": given})
+    return _dataset(path_stage.STAGE, planned, settings)
 
 
 # -- tasks in this process ----------------------------------------------------------------------------------------
@@ -405,10 +405,10 @@ def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
     if recorded and handle.label in drawn:
         return drawn[handle.label]
     inputs = each(lambda source: _computed(source, known, drawn), handle.inputs)
-    found = known[handle] = spec.stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
+    result = known[handle] = spec.stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
     if recorded:
-        drawn[handle.label] = found
-    return found
+        drawn[handle.label] = result
+    return result
 
 
 # -- datasets -----------------------------------------------------------------------------------------------------
@@ -441,8 +441,8 @@ def _bundle(data: xarray.Dataset, stage: Stage, variable: str, maker: str) -> Bu
         "attribute rille": "rille" in getattr(data, "attrs", ()),
         variable: variable in getattr(data, "data_vars", ()),
     }
-    for what, found in there.items():
-        if not found:
+    for what, is_there in there.items():
+        if not is_there:
             raise InputError("RIL-864", f"the dataset has no {what}", remedy=f"give what {maker} returns")
     arrays = {str(name): np.asarray(array) for name, array in data.data_vars.items()}
     # A mask over the whole dataset makes floats of bits, with NaN for what is masked.
@@ -457,19 +457,19 @@ def _bundle(data: xarray.Dataset, stage: Stage, variable: str, maker: str) -> Bu
     return Bundle(arrays, json.loads(data.attrs["rille"])["meta"])
 
 
-def _dataset(stage: Stage, found: Bundle, settings: Settings) -> xarray.Dataset:
+def _dataset(stage: Stage, result: Bundle, settings: Settings) -> xarray.Dataset:
     """Arrays with the dimensions, units and words that the stage declares, and coordinates of their lattice."""
     import xarray
 
     from rille.pipeline.engine.store.cf_coordinates import DIMS, coordinates, lattice_of
 
-    variables, lattice = {}, lattice_of(found.meta)
-    for name, values in found.arrays.items():
+    variables, lattice = {}, lattice_of(result.meta)
+    for name, values in result.arrays.items():
         about = next(array for array in stage.outputs if array.matches(name))
         attrs = {"units": about.unit, "long_name": about.long_name}
         variables[name] = (about.dims, np.asarray(values), attrs)
-    places = {} if lattice is None else coordinates(lattice, str(found.meta.get("frame", "local")))
+    places = {} if lattice is None else coordinates(lattice, str(result.meta.get("frame", "local")))
     coords = {name: (dims, values, attrs) for name, (values, dims, attrs) in places.items()}
-    plain = {k: v for k, v in found.meta.items() if isinstance(v, str | int | float) and not isinstance(v, bool)}
+    plain = {k: v for k, v in result.meta.items() if isinstance(v, str | int | float) and not isinstance(v, bool)}
     kept = coords if lattice is not None and any(list(v[0]) == DIMS for v in variables.values()) else {}
-    return xarray.Dataset(variables, kept, {**plain, **_carried(found.meta, settings)})
+    return xarray.Dataset(variables, kept, {**plain, **_carried(result.meta, settings)})

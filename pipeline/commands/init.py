@@ -42,14 +42,14 @@ def init(
         text = f"no manifest is written for the bag {directory}: it opens as it is"
         raise hindered or ConfigError("RIL-938", text, remedy="rille check opens it")
     name = f"{derived_name(directory.resolve().name)}.rille.toml"
-    found = inspect(directory)
+    findings = inspect(directory)
     path = output if output is not None else Path(name)
     if path.suffix != ".toml":
         raise ConfigError("RIL-037", f"--output {path} is no .toml file", remedy=f"e.g. {name}")
     if path.exists() and not force:
         raise ConfigError("RIL-038", f"{path} exists", remedy="give another --output, or overwrite it by --force")
     # Written whether complete or not: what is missing stands in it as comments, at its place.
-    text = manifest_text(found, _root(directory, path))
+    text = manifest_text(findings, _root(directory, path))
     remedy = f"name another file, e.g. --output {name}"
     with reported("RIL-039", f"{path} cannot be written", remedy=remedy, kind=InputError):
         path.write_text(text, encoding="utf-8")
@@ -59,7 +59,7 @@ def init(
         needed = [f"{left.message}: {left.remedy}" if left.remedy else left.message]
     elif hindered is not None:
         print(f"{directory} does not open as it is: {hindered.message}")
-    print("\n".join(_report(found, path, needed)))
+    print("\n".join(_report(findings, path, needed)))
     return COMPLETE
 
 
@@ -70,17 +70,17 @@ def _root(directory: Path, path: Path) -> str:
     return str(directory.resolve()) if relative.startswith(os.path.join("..", "..")) else Path(relative).as_posix()
 
 
-def _report(found: Findings, path: Path, needed: list[str]) -> list[str]:
-    """What was found, what is needed, and what to type next."""
-    views, calibration = found.views, found.calibration
+def _report(findings: Findings, path: Path, needed: list[str]) -> list[str]:
+    """Lines on what was found, what is needed, and what to type next."""
+    views, calibration = findings.views, findings.calibration
     size = f", {size_words(views.sizes)} pixels" if views.sizes else ""
     lines = [f"images       {pair_words(views)}{size}: {views.left} and {views.right}"]
     lines += [f"pairs        {line}" for line in views.lines]
     if calibration is not None:
         baseline = f", baseline {calibration.baseline:.6g}" if calibration.baseline is not None else ""
         lines.append(f"calibration  {' and '.join(calibration.files)}{baseline}")
-    lines += [f"{kind:12s} {', '.join(files)}" for kind, files in found.tables.items()]
-    lines += [f"not read     {line}" for line in found.unread]
+    lines += [f"{kind:12s} {', '.join(files)}" for kind, files in findings.tables.items()]
+    lines += [f"not read     {line}" for line in findings.unread]
     lines += [f"wrote        {path}"]
     lines += [f"needed       {line}" for line in needed]
     return lines + _next(path, edit=bool(needed))

@@ -94,8 +94,8 @@ def _inputs(row: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]]) -> It
         labels = given if isinstance(given, list) else [given]
         for label in labels[:MAX_INPUTS]:
             up = rows.get(label, {})
-            found = f"digest {up['digest'][:SHORT_DIGITS]}, " if "digest" in up else ""
-            yield f"input         {port:12s} {label:24s} {found}{up.get('status', 'not known')}"
+            result = f"digest {up['digest'][:SHORT_DIGITS]}, " if "digest" in up else ""
+            yield f"input         {port:12s} {label:24s} {result}{up.get('status', 'not known')}"
         if len(labels) > MAX_INPUTS:
             states = sorted({str(rows.get(label, {}).get("status")) for label in labels[MAX_INPUTS:]})
             yield f"input         {port:12s} and {len(labels) - MAX_INPUTS} more, {' or '.join(states)}"
