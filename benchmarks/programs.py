@@ -209,9 +209,9 @@ def back_projection(o: Opened) -> tuple[float, float]:
     """
     rows = {r["name"]: r for r in json.loads((o.run / "report.json").read_text())["frames"] if r["rms_px"] is not None}
     with tempfile.TemporaryDirectory() as folder:
-        limit, colmap_export.FARTHEST = colmap_export.FARTHEST, np.inf
+        limit, colmap_export.MAX_REPROJECTION_PX = colmap_export.MAX_REPROJECTION_PX, np.inf
         export_run("colmap", o.run, Path(folder) / "all", Store(o.cache))
-        colmap_export.FARTHEST = limit
+        colmap_export.MAX_REPROJECTION_PX = limit
         model = pycolmap.Reconstruction(f"{folder}/all")
     found = []
     for image in (i for i in model.images.values() if i.name.split("/")[1] in rows and i.name.startswith("left/")):

@@ -24,13 +24,13 @@ from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.core.validity import Validity, has, matched, matched_back
 from rille.stages.imaging import levels
 
-LARGE = 1_000_000
+MIN_PIXELS_OF_BAR = 1_000_000
 """Pixels: above, matching takes seconds, and a bar on the terminal shows how far it is."""
 
-FEW = 0.05
+MIN_MATCHED_SHARE = 0.05
 """Share of matched pixels at which two images have little to do with each other; unrelated ones stay below."""
 
-BLANK = 0.5
+MAX_BLANK_SHARE = 0.5
 """Share of pixels without texture of which a user should hear, however well the others match."""
 
 WHY_NOT = (
@@ -157,7 +157,7 @@ def match(
     typical = f", standard deviation {np.nanmedian(result.disparity_std):.2f} px (median)" if share else ""
     figures = f"matched {100 * share:.1f} %, defined {100 * float(kept.mean()):.1f} % of {kept.size} pixels"
     print(f"{output}  {figures}{typical}")
-    return COMPLETE if share >= FEW else HOLES
+    return COMPLETE if share >= MIN_MATCHED_SHARE else HOLES
 
 
 def _written(path: Path) -> AbstractContextManager[None]:
@@ -183,13 +183,13 @@ def warnings(result: Any, left: NDArray[Any], right: NDArray[Any]) -> Iterator[s
 
     share, blank = float(matched(result.validity).mean()), float(has(result.validity, Validity.NO_TEXTURE).mean())
     ok = matched_back(result.validity, result.backmatch_error)
-    if share < FEW:
+    if share < MIN_MATCHED_SHARE:
         # The two most frequent reasons: they tell a user whether the light, the order or the scene is at fault.
         shares = sorted(((float(has(result.validity, bit).mean()), words) for bit, words in WHY_NOT), reverse=True)
         frequent = ", ".join(f"{100 * s:.0f} % {words}" for s, words in shares[:2] if s >= 0.005)
         text = f"only {100 * share:.1f} % of the pixels match ({frequent}): do both images show one scene in one light?"
         yield warning("RIL-700", text)
-    elif blank > BLANK:
+    elif blank > MAX_BLANK_SHARE:
         text = f"{100 * blank:.0f} % of the pixels have no texture (black, saturated or blank) and cannot match"
         yield warning("RIL-701", text)
     # Of images of unlike size nobody knows how their middles correspond, and so which displacement far things have.
@@ -219,7 +219,7 @@ def warnings(result: Any, left: NDArray[Any], right: NDArray[Any]) -> Iterator[s
 @contextmanager
 def _progress(pixels: int) -> Iterator[Callable[[float, str], None] | None]:
     """Callback that shows share and step of a large match as a bar, where stderr is a terminal."""
-    if pixels < LARGE or not sys.stderr.isatty():
+    if pixels < MIN_PIXELS_OF_BAR or not sys.stderr.isatty():
         yield None
         return
     from rich.console import Console

@@ -103,7 +103,7 @@ light, hazards dark, unknown medium."""
 ELEVATIONS = ("#00224e", "#1a386f", "#434e6c", "#61656f", "#7d7c78", "#9b9476", "#bcae6c", "#dec958", "#fee838")
 """Colours from the lowest elevation to the highest (matplotlib's cividis)."""
 
-BITS = 12
+SIGNIFICANT_BITS = 12
 """Significant bits of a written measure: 0.02 %, finer than any is known."""
 
 
@@ -136,7 +136,7 @@ def _write_hazard(path: Path, risk: Bundle, place: Place = None) -> None:
         if a.unit in ("m", "rad") and a.name != "elevation":
             bands[a.name] = np.degrees(risk[a.name]) if a.unit == "rad" else risk[a.name]
             units[a.name] = "degree" if a.unit == "rad" else a.unit
-    given = {name: rounded(np.asarray(values, dtype=np.float32), BITS) for name, values in bands.items()}
+    given = {name: rounded(np.asarray(values, dtype=np.float32), SIGNIFICANT_BITS) for name, values in bands.items()}
     write_raster(path, given, Lattice.from_dict(risk.meta["lattice"]), Meaning(units, tags=_vehicle(risk)), place)
 
 

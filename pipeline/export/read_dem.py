@@ -20,19 +20,19 @@ from rille.pipeline.engine.memory import free, words
 from rille.pipeline.export.foreign_raster import GRID, open_raster
 from rille.stages.core.errors import InputError
 
-MOST_CELLS = 500_000_000
+MAX_CELLS = 500_000_000
 """Of an elevation model, which is read whole."""
 
 CELL_BYTES = 100
 """Memory that a cell takes until it is read, and compared or exported."""
 
-ALWAYS_CELLS, CELLS_PER_BYTE = 4_000_000, 50
+ALLOWED_CELLS, MAX_CELLS_PER_BYTE = 4_000_000, 50
 """Cells that any file may have, and more of them if it has a byte for so many: a sparse file may claim any number."""
 
-LONGEST_AXIS = 10_000_000
+MAX_AXIS_CELLS = 10_000_000
 """Cells; coordinates are read whole even where nothing else is."""
 
-HIGHEST_WALL, HIGHEST_STEP = 1500.0, 300.0
+MAX_WALL_M, MAX_STEP_CELLS = 1500.0, 300.0
 """Metres and cells; nothing on Earth rises more upright over less than a cell."""
 
 OURS = "give a run as Rille writes it"
@@ -110,7 +110,7 @@ def _without_marks(dem: DemFile) -> DemFile:
     gap, mark = max((low - least, least), (most - high, most))
     marked = values == mark
     several, apart = marked.sum() > 1, gap > high - low
-    if not ((gap > HIGHEST_WALL and (several or apart)) or (gap > HIGHEST_STEP * dem.cell and several and apart)):
+    if not ((gap > MAX_WALL_M and (several or apart)) or (gap > MAX_STEP_CELLS * dem.cell and several and apart)):
         return dem
     text = f"{dem.name}: {mark:.9g} in {marked.sum()} cells is no elevation, the others are {low:.6g} to {high:.6g} m"
     line = warning("RIL-725", f"{text}: taken as unknown; state it in the file, as NODATA")
@@ -170,7 +170,7 @@ def read_raster(path: Path) -> DemFile:
 
 def _check_cells(path: Path, shape: tuple[int, ...], stored: int) -> None:
     """Refuse more cells than there is memory for, or than so many ``stored`` bytes can hold."""
-    most = min(MOST_CELLS, free() // CELL_BYTES, max(ALWAYS_CELLS, CELLS_PER_BYTE * stored))
+    most = min(MAX_CELLS, free() // CELL_BYTES, max(ALLOWED_CELLS, MAX_CELLS_PER_BYTE * stored))
     if math.prod(shape) > most:
         size = f"{' x '.join(map(str, shape))} cells in {words(stored)}"
         text = f"{path} has {size}, at most {most / 1e6:.3g} million are read"
@@ -230,6 +230,6 @@ def check_group(path: Path) -> None:
         if not (entry.is_file() or entry.is_dir()):
             raise InputError("RIL-723", f"{entry.path} is no regular file", remedy=OURS)
     for name, array in zarr.open_group(store=LocalStore(path, read_only=True), mode="r").arrays():
-        if max(array.shape, default=0) > LONGEST_AXIS or math.prod(array.chunks) > MOST_CELLS:
+        if max(array.shape, default=0) > MAX_AXIS_CELLS or math.prod(array.chunks) > MAX_CELLS:
             size = " x ".join(map(str, array.shape))
             raise InputError("RIL-982", f"{path}: {name} has {size} values, too many to be read", remedy=OURS)

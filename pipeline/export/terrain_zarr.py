@@ -34,7 +34,7 @@ from rille.stages.terrain import merge
 from rille.stages.terrain.shading import slope_deg
 
 CONVENTIONS = "CF-1.11"
-CHUNK = 512
+CHUNK_CELLS = 512
 UNITS = {"px": "1", "grey": "1"}
 """Units that UDUNITS does not know; the long name has the word."""
 
@@ -62,7 +62,7 @@ def write_terrain(
     variables["elevation"].attrs |= {"positive": "up", "ancillary_variables": " ".join(others)}
     data = xarray.Dataset(variables, _coordinates(lattice), about)
     for variable in data.variables.values():
-        variable.encoding["chunks"] = tuple(min(n, CHUNK) for n in variable.shape) or None
+        variable.encoding["chunks"] = tuple(min(n, CHUNK_CELLS) for n in variable.shape) or None
         # Of the compressors, zlib is in every build of GDAL.
         variable.encoding["compressors"] = [numcodecs.Zlib(level=1)]
     # zarr says that readers of other languages may not know consolidated metadata.

@@ -24,9 +24,9 @@ from rille.stages.imaging.image_quality import Look
 Floats = NDArray[np.float64]
 Level = Literal["OK", "WARN", "FAIL"]
 
-BLURRED = 0.6  # of a camera's median sharpness: a Gaussian blur of one more pixel reduces it to this
-UNIFORM = 1.0  # grey levels, standard deviation of an image below which it is blank
-GAP = 2.5  # median steps of time above which a step is a gap
+MIN_SHARPNESS_RATIO = 0.6  # of a camera's median sharpness: a Gaussian blur of one more pixel reduces it to this
+MIN_DEVIATION_GREY = 1.0  # grey levels, standard deviation of an image below which it is blank
+MAX_STEP_RATIO = 2.5  # median steps of time above which a step is a gap
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def judge_times(times: Sequence[float] | None) -> Finding:
         k = int(np.argmax(steps <= 0))
         return judge("times", f"time goes back or rests from frame {k} to {k + 1}", {"steps back": 1})
     usual = float(np.median(steps))
-    gaps, longest = int((steps > GAP * usual).sum()), int(np.argmax(steps))
+    gaps, longest = int((steps > MAX_STEP_RATIO * usual).sum()), int(np.argmax(steps))
     words = f"{1 / usual:.3g} frames a second over {float(steps.sum()):.4g} s"
     if gaps:
         words += f"; {gaps} gaps, the longest {steps[longest]:.3g} s from frame {longest} to {longest + 1}"
@@ -247,7 +247,7 @@ def judge_looks(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -
 def _camera(camera: str, looks: Mapping[int, Look], names: Sequence[str]) -> Iterator[Finding]:
     """Findings on the images of one camera."""
     at = [names[k] for k in looks]
-    blank = np.flatnonzero(_figure(looks, "deviation") < UNIFORM)
+    blank = np.flatnonzero(_figure(looks, "deviation") < MIN_DEVIATION_GREY)
     if blank.size:
         text = f"{blank.size} {camera} images show nothing, first frame {at[blank[0]]}"
         yield judge("images", text, {"blank": blank.size})
@@ -261,7 +261,7 @@ def _camera(camera: str, looks: Mapping[int, Look], names: Sequence[str]) -> Ite
         yield judge("exposure", text, {"change": change[k]})
     sharpness = _figure(looks, "sharpness")
     share_of_usual = np.nan_to_num(sharpness / _usual(sharpness), nan=1.0)
-    blurred, k = int((share_of_usual < BLURRED).sum()), int(np.argmin(share_of_usual))
+    blurred, k = int((share_of_usual < MIN_SHARPNESS_RATIO).sum()), int(np.argmin(share_of_usual))
     worst = f"the worst frame {at[k]} ({100 * share_of_usual[k]:.0f} % of usual)"
     yield judge("sharpness", f"{blurred} {camera} images are blurred, {worst}", {"blurred": blurred})
 

@@ -25,7 +25,7 @@ from rille.stages.odometry.resection.trajectory import world_poses
 
 Floats = NDArray[np.float64]
 
-FARTHEST = 0.5
+MAX_REPROJECTION_PX = 0.5
 """Pixels from an observation to its point's projection. COLMAP weighs all observations alike, so that one which our
 resection hardly counted would pull an adjustment away: on a street of 60 m by 0.45 m, with the limit by 0.10 m."""
 
@@ -211,8 +211,8 @@ def _points(
 
 
 def _near(camera: Camera, points: Floats, pixels: Floats) -> NDArray[np.bool_]:
-    """Whether points (n, 3) of the camera frame, metres, project to within :data:`FARTHEST` of pixels (n, 2)."""
-    return np.asarray(np.hypot(*(camera.project(points) - pixels).T) <= FARTHEST)
+    """Whether points (n, 3) of the camera frame, metres, project to within :data:`MAX_REPROJECTION_PX` of pixels (n, 2)."""
+    return np.asarray(np.hypot(*(camera.project(points) - pixels).T) <= MAX_REPROJECTION_PX)
 
 
 def _camera(pycolmap: Any, number: int, camera: Camera) -> Any:

@@ -19,15 +19,15 @@ from rille.stages.core.errors import InputError
 
 MADE = date(2000, 1, 1)
 """Date that every LAZ file states, so that equal clouds make equal files."""
-STEPS = 1000
+STEPS_PER_CELL = 1000
 """Steps of a LAZ coordinate in one cell."""
 PLY_TYPES = {"float64": "double", "float32": "float", "uint8": "uchar"}
 """PLY's names of types."""
 MAX_FACES = 2_000_000
 """Most triangles of a mesh: more make browsers and phones fail; a coarser one is made beyond, and said to be."""
-UNSEEN = 128
+UNSEEN_GREY = 128
 """Grey of a cell without ortho image: neutral, for black would look like a shadow."""
-MAX_TEXTURE = 4096
+MAX_TEXTURE_PX = 4096
 """Greatest edge of the texture, pixels: what every WebGL implementation takes."""
 
 Layer = NDArray[np.float64] | None
@@ -94,7 +94,7 @@ def write_laz(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
     header.creation_date, header.generating_software, header.system_identifier = MADE, "Rille", "stereo"
     # LAS has coordinates of 32 bits: without offsets eastings would overflow at steps as fine as these.
     header.offsets = [float(np.floor(points[axis].min())) for axis in "xyz"]
-    header.scales = np.full(3, 10.0 ** np.floor(np.log10(terrain.cell / STEPS)))
+    header.scales = np.full(3, 10.0 ** np.floor(np.log10(terrain.cell / STEPS_PER_CELL)))
     if terrain.crs:
         # LAS 1.4 allows only WKT with point formats 6 to 10, wants this bit set, and knows the first version alone.
         header.vlrs.append(WktCoordinateSystemVlr(pyproj.CRS(terrain.crs).to_wkt("WKT1_GDAL")))
@@ -170,9 +170,9 @@ def write_glb(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
 
 
 def _colours(ortho: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Red, green and blue (rows, cols, 3) of an ortho image, grey or coloured; :data:`UNSEEN` where it has no value."""
+    """Red, green and blue (rows, cols, 3) of an ortho image, grey or coloured; :data:`UNSEEN_GREY` where it has no value."""
     bands = ortho if ortho.ndim == 3 else np.repeat(ortho[..., None], 3, axis=2)
-    return np.rint(np.clip(np.nan_to_num(bands, nan=UNSEEN), 0, 255)).astype(np.uint8)
+    return np.rint(np.clip(np.nan_to_num(bands, nan=UNSEEN_GREY), 0, 255)).astype(np.uint8)
 
 
 def _mesh(terrain: DemFile, step: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
@@ -204,8 +204,8 @@ def _texture(ortho: Layer) -> Any:
     from trimesh.visual.material import PBRMaterial
 
     image = Image.fromarray(_colours(ortho))
-    if max(image.size) > MAX_TEXTURE:
-        image.thumbnail((MAX_TEXTURE, MAX_TEXTURE))
+    if max(image.size) > MAX_TEXTURE_PX:
+        image.thumbnail((MAX_TEXTURE_PX, MAX_TEXTURE_PX))
     # glTF's material is a metal unless told otherwise, and would mirror instead of showing the texture.
     return PBRMaterial(name="ortho", baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
 

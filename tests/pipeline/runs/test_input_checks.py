@@ -115,7 +115,7 @@ def test_sharpness_falls_with_blur_and_not_with_contrast():
     sharp = look(image, valid).sharpness
     assert look(128 + 0.3 * (image - 128), valid).sharpness == pytest.approx(sharp, rel=1e-3)
     blurred = look(cv2.GaussianBlur(image, (0, 0), 1.5), valid).sharpness
-    assert blurred < input_checks.BLURRED * sharp
+    assert blurred < input_checks.MIN_SHARPNESS_RATIO * sharp
 
 
 def looks(left: list[Look], right: list[Look]):

@@ -154,13 +154,13 @@ def test_cells_without_an_image_are_grey(tmp_path: Path) -> None:
     look = np.full(KNOWN.shape, np.nan)
     look[KNOWN] = np.where(np.arange(KNOWN.sum()) == 0, 7.0, np.nan)
     point_cloud.write_ply(tmp_path / "a.ply", terrain, look, None)
-    assert np.unique(trimesh.load(tmp_path / "a.ply").colors[:, 0]).tolist() == [7, point_cloud.UNSEEN]
+    assert np.unique(trimesh.load(tmp_path / "a.ply").colors[:, 0]).tolist() == [7, point_cloud.UNSEEN_GREY]
     point_cloud.write_laz(tmp_path / "a.laz", terrain, look, None)
-    assert np.unique(np.asarray(laspy.read(tmp_path / "a.laz").red) // 257).tolist() == [7, point_cloud.UNSEEN]
+    assert np.unique(np.asarray(laspy.read(tmp_path / "a.laz").red) // 257).tolist() == [7, point_cloud.UNSEEN_GREY]
     point_cloud.write_glb(tmp_path / "a.glb", terrain, look, None)
     (mesh,) = trimesh.load(tmp_path / "a.glb").geometry.values()
     texture = np.asarray(mesh.visual.material.baseColorTexture.convert("L"))
-    assert np.unique(texture).tolist() == [7, point_cloud.UNSEEN]
+    assert np.unique(texture).tolist() == [7, point_cloud.UNSEEN_GREY]
 
 
 def test_cells_without_an_image_are_grey_in_a_coloured_run_too(tmp_path: Path) -> None:
@@ -169,4 +169,4 @@ def test_cells_without_an_image_are_grey_in_a_coloured_run_too(tmp_path: Path) -
     bands[:, 20:25] = 0  # 0 means unknown in the file
     write_raster(run / "ortho.tif", dict(zip(("red", "green", "blue"), bands, strict=True)), LATTICE, Meaning(nodata=0))
     path, _ = point_cloud.export(run, "ply", None)
-    assert np.unique(trimesh.load(path).colors[:, :3]).tolist() == [90, point_cloud.UNSEEN]
+    assert np.unique(trimesh.load(path).colors[:, :3]).tolist() == [90, point_cloud.UNSEEN_GREY]
