@@ -211,7 +211,7 @@ def _points(
 
 
 def _near(camera: Camera, points: Floats, pixels: Floats) -> NDArray[np.bool_]:
-    """Whether points (n, 3) of the camera frame, metres, project to within :data:`MAX_REPROJECTION_PX` of pixels (n, 2)."""
+    """Whether points (n, 3) of the camera frame, metres, project near to pixels (n, 2)."""
     return np.asarray(np.hypot(*(camera.project(points) - pixels).T) <= MAX_REPROJECTION_PX)
 
 

@@ -170,7 +170,7 @@ def write_glb(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
 
 
 def _colours(ortho: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Red, green and blue (rows, cols, 3) of an ortho image, grey or coloured; :data:`UNSEEN_GREY` where it has no value."""
+    """Red, green and blue (rows, cols, 3) of an ortho image, grey or coloured; grey where it has no value."""
     bands = ortho if ortho.ndim == 3 else np.repeat(ortho[..., None], 3, axis=2)
     return np.rint(np.clip(np.nan_to_num(bands, nan=UNSEEN_GREY), 0, 255)).astype(np.uint8)
 
