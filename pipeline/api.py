@@ -195,8 +195,8 @@ class Run:
         from rille.pipeline.export.read_dem import check_group
 
         with self._reading():
-            check_group(self._file("terrain.zarr"))
-            terrain: xarray.Dataset = xarray.open_zarr(self._file("terrain.zarr"))
+            check_group(self.file("terrain.zarr"))
+            terrain: xarray.Dataset = xarray.open_zarr(self.file("terrain.zarr"))
         for variable in terrain.variables.values():
             variable.attrs.pop("_CRS", None)  # GDAL's own, a mapping: NetCDF stores none; `spatial_ref` says the same
             for codec in ("compressors", "filters"):  # those of zarr 2, which `to_zarr` refuses in its own format 3
@@ -221,7 +221,7 @@ class Run:
         import xarray
 
         with self._reading():
-            lines = read_lines(self._file("trajectory.kitti"), "trajectory")
+            lines = read_lines(self.file("trajectory.kitti"), "trajectory")
             poses = np.loadtxt(lines, ndmin=2).reshape(-1, 3, 4)
             facts = self._json("frames.json")
             frames, about = facts["frames"], facts["frames_of_reference"]["world"]
@@ -246,7 +246,7 @@ class Run:
 
     def show(self) -> None:
         """Open the report in the web browser."""
-        webbrowser.open(self._file("report.html").resolve().as_uri())
+        webbrowser.open(self.file("report.html").resolve().as_uri())
 
     def _reading(self) -> AbstractContextManager[None]:
         from rille.pipeline.runs import lookup
@@ -254,9 +254,16 @@ class Run:
         return lookup.reading(self.folder)
 
     def _json(self, name: str) -> Any:
-        return json.loads(read_text(self._file(name), name, TABLE))
+        return json.loads(read_text(self.file(name), name, TABLE))
 
-    def _file(self, name: str) -> Path:
+    def file(self, name: str) -> Path:
+        """Path of one of its files.
+
+        Raises
+        ------
+        InputError
+            The run has none of this name.
+        """
         path = self.folder / name
         if not path.exists():
             raise InputError(

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from rille.datasets.text.reading import TABLE, read_lines, read_text, read_toml
+from rille.datasets.text.reading import read_lines, read_toml
+from rille.pipeline import api
 from rille.pipeline.commands.options import COMPLETE, RUNS, Run, Runs
 from rille.pipeline.engine import events
 from rille.pipeline.report.words import metres, quantity
 from rille.pipeline.runs import lookup
-from rille.stages.core.errors import ConfigError
 
 
 def compare(a: Run, b: Run, *, runs: Runs = RUNS) -> int:
@@ -26,20 +26,11 @@ def compare(a: Run, b: Run, *, runs: Runs = RUNS) -> int:
     one, other = both = lookup.find(a, runs), lookup.find(b, runs)
     # All before anything is printed: where something cannot be read there is no half of a comparison.
     with lookup.reading(*both):
-        reports = [_report(run) for run in both]
+        reports = [api.Run(run).report for run in both]
         settings = [_flat(read_toml(run / "config.toml", "configuration")) for run in both]
         lines = [*_parameters(*settings), *_tasks(*both), *_figures(*reports), _positions(*both)]
     print("\n".join([f"A {lookup.name(one)}", f"B {lookup.name(other)}", *lines]))
     return COMPLETE
-
-
-def _report(run: Path) -> dict[str, Any]:
-    path = run / "report.json"
-    if not path.exists():
-        raise ConfigError(
-            "RIL-890", f"run {lookup.name(run)} did not come to its end", remedy="run the same command again"
-        )
-    return dict(json.loads(read_text(path, "report", TABLE)))
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
