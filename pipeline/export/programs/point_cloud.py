@@ -122,9 +122,8 @@ def write_ply(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
     """
     columns = _points(terrain, ortho, sigma)
     count = len(columns["x"])
-    points = np.empty(count, [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
-    for name, values in columns.items():
-        points[name] = values
+    kinds = [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
+    points = np.rec.fromarrays(list(columns.values()), dtype=kinds)
     # One line: a line feed would end the comment, and its rest would be read as a line of the header.
     crs = [f"comment crs {' '.join(terrain.crs.split())}"] if terrain.crs else []
     properties = [f"property {PLY_TYPES[values.dtype.name]} {name}" for name, values in columns.items()]
