@@ -226,6 +226,72 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     return _dataset(hfvm_stage.STAGE, Bundle(arrays, meta), config.merge(carried, {"hfvm": hfvm}))
 
 
+def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarray.Dataset:
+    """Place every matched pixel of a pair in space, in the frame of its left camera: x right, y down, z ahead, metres.
+
+    No ground is needed. The rig is used as given; :func:`terrain` repairs its orientation where the matches ask for it.
+
+    Parameters
+    ----------
+    disparity
+        Of :func:`match`, of this pair.
+    every
+        Each so many-th row and column alone.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``position`` (point, xyz), ``sigma_along`` and ``sigma_across`` (point), standard deviations along and across
+        the ray, m, ``colour`` (point, rgb) and ``pixel`` (point, uv), column and row. Errors of the rig are not in it.
+
+    Raises
+    ------
+    InputError
+        The disparity is not that of an image of this size.
+
+    Examples
+    --------
+    >>> import rille
+    >>> small = {"frames": 1, "image_width": 190, "image_height": 174, "focal_length": 200}
+    >>> pair = rille.open("mockup-short", mockup=small)[0]
+    >>> cloud = rille.points(rille.match(pair.left, pair.right, preset="fast"), pair)
+    >>> bool(cloud.sizes["point"] > 10000), round(float(cloud.position[:, 2].median()), 1)
+    (True, 0.4)
+    """
+    import xarray
+
+    from rille.stages.terrain.points import colours
+    from rille.stages.terrain.points import points as points_of
+
+    given = _disparity(disparity, pair)
+    found = points_of(given, pair.sequence.rig, every)
+    left: Bundle = Bundle({"image": np.asarray(pair.left)}, {})
+    return xarray.Dataset(
+        {
+            "position": (("point", "xyz"), found.position, {"units": "m", "frame": "left camera"}),
+            "sigma_along": ("point", found.sigma_along, {"units": "m"}),
+            "sigma_across": ("point", found.sigma_across, {"units": "m"}),
+            "colour": (("point", "rgb"), colours(found, left)),
+            "pixel": (("point", "uv"), found.pixel, {"units": "px"}),
+        }
+    )
+
+
+def _disparity(disparity: xarray.Dataset, pair: StereoPair) -> Bundle:
+    """The result of the matcher, if it has the size of the pair's images."""
+    from rille.stages.hfvm import stage as hfvm_stage
+
+    given = _bundle(disparity, hfvm_stage.STAGE, "column_disparity", "rille.match")
+    size = pair.sequence.rig.left.height, pair.sequence.rig.left.width
+    if disparity.column_disparity.shape != size:
+        raise InputError(
+            "RIL-865",
+            f"disparity of {disparity.column_disparity.shape} pixels, the pair's images have {size}",
+            remedy="give the disparity that rille.match finds for this pair",
+        )
+    return given
+
+
 def terrain(disparity: xarray.Dataset, pair: StereoPair, **locus: Any) -> xarray.Dataset:
     """Reconstruct the elevation model of a pair (Locus), in the pair's own frame: x right, y ahead, z up, metres.
 
@@ -263,17 +329,9 @@ def terrain(disparity: xarray.Dataset, pair: StereoPair, **locus: Any) -> xarray
     (-0.18, 'm')
     """
     from rille.pipeline.flow.reconstruction import vertical
-    from rille.stages.hfvm import stage as hfvm_stage
     from rille.stages.terrain.locus import stage as locus_stage
 
-    given = _bundle(disparity, hfvm_stage.STAGE, "column_disparity", "rille.match")
-    size = pair.sequence.rig.left.height, pair.sequence.rig.left.width
-    if disparity.column_disparity.shape != size:
-        raise InputError(
-            "RIL-865",
-            f"disparity of {disparity.column_disparity.shape} pixels, the pair's images have {size}",
-            remedy="give the disparity that rille.match finds for this pair",
-        )
+    given = _disparity(disparity, pair)
     settings = _merged(disparity, pair.settings, {"locus": locus})
     make = _builder(pair, settings)
     _, known = make.rig([pair.frame])

@@ -1,6 +1,6 @@
 """Stereo image sequences to terrain, trajectory, risk map and safe path.
 
-One pair, step by step: ``open``, ``match``, ``terrain``, ``hazards``, ``path`` (:mod:`rille.pipeline.steps`). A whole
+One pair, step by step: ``open``, ``match``, ``points``, ``terrain``, ``hazards``, ``path`` (:mod:`rille.pipeline.steps`). A whole
 sequence: ``reconstruct``, ``open_run`` (:mod:`rille.pipeline.api`).
 """
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from rille.pipeline.api import Run, open_run, reconstruct
-    from rille.pipeline.steps import StereoPair, StereoSequence, hazards, match, open, path, terrain
+    from rille.pipeline.steps import StereoPair, StereoSequence, hazards, match, open, path, points, terrain
     from rille.stages.core.errors import RilleError
 
     __version__: str
@@ -26,6 +26,7 @@ __all__ = [
     "open",
     "open_run",
     "path",
+    "points",
     "reconstruct",
     "terrain",
 ]

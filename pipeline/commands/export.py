@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
+from cyclopts.validators import Number
 
 from rille.pipeline.commands.options import (
     COMPLETE,
@@ -29,6 +30,8 @@ def export(
     *,
     to: Annotated[list[Form], Parameter(negative="")],
     output: Annotated[Path | None, Output] = None,
+    every: Annotated[int, Parameter(validator=Number(gte=1))] = 1,
+    voxel: Annotated[float, Parameter(validator=Number(gte=0))] = 0.0,
     runs: Runs = RUNS,
     cache: CacheFolder = None,
 ) -> int:
@@ -37,11 +40,16 @@ def export(
     Parameters
     ----------
     to
-        laz: CloudCompare, PDAL, QGIS; ply: CloudCompare, MeshLab; glb: any glTF viewer, Blender; colmap: cameras, rig,
-        poses and tracked points; nav2: occupancy map of ROS 2's navigation. May be repeated.
+        laz (CloudCompare, PDAL, QGIS), ply (CloudCompare, MeshLab): every matched pixel as a point with its standard
+        deviations; glb: the ground as a mesh, for any glTF viewer, Blender; colmap: cameras, rig, poses and tracked
+        points; nav2: occupancy map of ROS 2's navigation. May be repeated.
     output
         What to write, for one form only; by default cloud.laz, cloud.ply, terrain.glb or a folder of the form's name in
         the run's folder.
+    every
+        laz, ply: each so many-th row and column of the images alone.
+    voxel
+        laz, ply: one point in each cube of so many metres; 0: all.
     """
     if output is not None and len(to) > 1:
         raise ConfigError(
@@ -49,13 +57,21 @@ def export(
         )
     folder = lookup.find(run, runs)
     for form in to:
-        if form in ("laz", "ply", "glb"):
-            from rille.pipeline.export.programs import point_cloud
+        if output is not None and form in ("laz", "ply", "glb"):
+            check_output(output, f".{form}")
+        if form == "glb":
+            from rille.pipeline.export.programs import mesh
 
-            if output is not None:
-                check_output(output, f".{form}")
-            path, words = point_cloud.export(folder, form, output)
+            path, words = mesh.export(folder, output)
             print(f"{path}  {words}")
+        elif form in ("laz", "ply"):
+            from rille.pipeline.export.programs import cloud
+            from rille.pipeline.export.programs.run_artifacts import RunArtifacts
+
+            path = output or folder / f"cloud.{form}"
+            with lookup.reading(folder):
+                artifacts = RunArtifacts(folder, Store(cache_folder(cache)))
+                print(f"{path}  {cloud.export(artifacts, path, cloud.Choice(every, voxel))}")
         else:
             from rille.pipeline.export.programs.run_artifacts import export_run
 

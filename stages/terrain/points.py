@@ -20,12 +20,17 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes, Floats, Floats32
 from rille.stages.core.declare import AnyArray, Bundle
+from rille.stages.core.errors import InputError
 from rille.stages.core.validity import matched
 from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Rig
 
 MIN_DEPTH_SIGMAS = 3.0
 """An inverse depth that is not this many of its standard deviations above 0 may as well be infinitely far."""
+
+
+MAX_CUBES = 1_000_000
+"""Cubes to either side of the origin."""
 
 
 @dataclass(frozen=True)
@@ -95,10 +100,28 @@ def colours(found: Points, image: Bundle) -> Bytes:
     return np.repeat(np.clip(np.rint(grey), 0, 255).astype(np.uint8)[:, None], 3, axis=1)
 
 
-def one_a_voxel(position: Floats, sigma: Floats32, side: float) -> NDArray[np.intp]:
-    """Indices, ascending, of the most certain point in each cube of ``side`` m of a grid that holds the origin."""
-    cube = np.floor(position / side).astype(np.int64)
-    order = np.lexsort((sigma, *cube.T))
+def cubes(position: Floats, side: float) -> NDArray[np.int64]:
+    """Numbers (n,) of the cubes that points lie in, of a grid of cubes of ``side`` m with a corner at the origin.
+
+    Raises
+    ------
+    InputError
+        The points reach farther than a million cubes.
+    """
+    cube = np.floor(position / side)
+    if cube.size and np.abs(cube).max() >= MAX_CUBES:
+        raise InputError(
+            "RIL-614",
+            f"points lie more than {MAX_CUBES} voxels of {side:g} m from the origin",
+            remedy="give larger ones with --voxel",
+        )
+    whole = cube.astype(np.int64) + MAX_CUBES
+    return np.asarray((whole[:, 0] * 2 * MAX_CUBES + whole[:, 1]) * 2 * MAX_CUBES + whole[:, 2])
+
+
+def one_a_cube(cube: NDArray[np.int64], sigma: Floats32) -> NDArray[np.intp]:
+    """Indices, ascending, of the most certain point of each cube."""
+    order = np.lexsort((sigma, cube))
     change = np.ones(len(order), bool)
-    change[1:] = (np.diff(cube[order], axis=0) != 0).any(axis=1)
+    change[1:] = np.diff(cube[order]) != 0
     return np.sort(order[change])

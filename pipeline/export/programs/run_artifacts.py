@@ -61,6 +61,15 @@ class RunArtifacts:
         names = [name for name, row in self._rows.items() if row["stage"] == stage]
         return {name.partition("/")[2]: self._open(name) for name in names}
 
+    def labels(self, pattern: str) -> list[str]:
+        """Of the labels that match a pattern whole, what its group is."""
+        return [match[1] for name in self._rows if (match := re.fullmatch(pattern, name))]
+
+    def input(self, label: str, port: str) -> Bundle:
+        """The artifact that a task of the run has read at a port."""
+        self.one(label)
+        return self.one(self._rows[label]["inputs"][port])
+
     def risk(self) -> Bundle:
         """Risk map of the world; of a drive, what it knew at its last stop."""
         stops = [int(stop[1]) for name in self._rows if (stop := STOP.fullmatch(name))]

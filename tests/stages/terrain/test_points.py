@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from raising import raises
 
 from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
-from rille.stages.terrain.points import colours, one_a_voxel, points
+from rille.stages.terrain.points import colours, cubes, one_a_cube, points
 
 LEFT, RIGHT = Camera(210.0, 205.0, 63.0, 40.0, 120, 90), Camera(260.0, 262.0, 50.0, 47.0, 110, 96)
 RIG = Rig(LEFT, RIGHT, RigidTransform(rotation_exp([0.02, 0.05, -0.08]), np.array([-0.3, 0.04, 0.02])))
@@ -103,4 +104,9 @@ def test_of_a_voxel_the_most_certain_point_stays():
         known = best.get(tuple(place))
         if known is None or sigma[k] < sigma[known]:
             best[tuple(place)] = k
-    np.testing.assert_array_equal(one_a_voxel(position, sigma, 0.5), sorted(best.values()))
+    np.testing.assert_array_equal(one_a_cube(cubes(position, 0.5), sigma), sorted(best.values()))
+
+
+def test_points_beyond_a_million_voxels_are_refused():
+    with raises("RIL-614"):
+        cubes(np.array([[0.0, 0.0, 2e3]]), 1e-3)

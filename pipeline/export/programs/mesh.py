@@ -1,28 +1,18 @@
-"""The terrain of a run as a point cloud (LAZ 1.4, PLY) and as a textured mesh (glTF 2.0 binary)."""
+"""The terrain of a run as a textured mesh (glTF 2.0 binary)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from datetime import date
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyproj
 from numpy.typing import NDArray
 
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.export.colour import LUMA
 from rille.pipeline.export.read_dem import DemFile, opened_raster, read_elevation
 from rille.stages.core.errors import InputError
 
-MADE = date(2000, 1, 1)
-"""Date that every LAZ file states, so that equal clouds make equal files."""
-STEPS_PER_CELL = 1000
-"""Steps of a LAZ coordinate in one cell."""
-PLY_TYPES = {"float64": "double", "float32": "float", "uint8": "uchar"}
-"""PLY's names of types."""
 MAX_FACES = 2_000_000
 """Most triangles of a mesh: more make browsers and phones fail; a coarser one is made beyond, and said to be."""
 UNSEEN_GREY = 128
@@ -34,26 +24,18 @@ Layer = NDArray[np.float64] | None
 """Values of the cells of a terrain, (rows, cols) or of colours (rows, cols, 3), where the run has them."""
 
 
-def export(run: Path, kind: str, output: Path | None) -> tuple[Path, str]:
-    """Write the terrain of a run in another form; gives the file and what is in it.
-
-    Parameters
-    ----------
-    run : folder of a run.
-    kind : name in :data:`FORMATS`.
-    output : file to write; by default the form's own name in the run's folder.
+def export(run: Path, output: Path | None) -> tuple[Path, str]:
+    """Write the terrain of the run in a folder as a mesh, by default ``terrain.glb`` there; what is in the file.
 
     Raises
     ------
     InputError
         The run has no terrain, or the file cannot be written.
     """
-    default, write = FORMATS[kind]
-    target = output or run / default
+    target = output or run / "terrain.glb"
     terrain = read_elevation(run)
-    ortho, sigma = _beside(run, "ortho", terrain), _beside(run, "dem_sigma", terrain)
     with reported("RIL-601", f"{target} cannot be written", remedy="name another file with -o", kind=InputError):
-        return target, write(target, terrain, ortho, sigma)
+        return target, write_glb(target, terrain, _beside(run, "ortho", terrain))
 
 
 def _beside(run: Path, name: str, terrain: DemFile) -> Layer:
@@ -68,73 +50,7 @@ def _beside(run: Path, name: str, terrain: DemFile) -> Layer:
     return np.asarray(np.moveaxis(bands, 0, 2) if len(bands) == 3 else bands[0], np.float64)
 
 
-def _points(terrain: DemFile, ortho: Layer, sigma: Layer) -> dict[str, NDArray[Any]]:
-    """Columns (n,) of the known cells: x, y, z, and red, green, blue and ``sigma`` of z (m) where there are any."""
-    row, col = np.nonzero(np.isfinite(terrain.values))
-    x, y = terrain.transform @ (col + 0.5, row + 0.5)
-    columns = {"x": x, "y": y, "z": terrain.values[row, col]}
-    if ortho is not None:
-        columns |= zip(("red", "green", "blue"), _colours(ortho)[row, col].T, strict=True)
-    if sigma is not None:
-        columns["sigma"] = sigma[row, col].astype(np.float32)
-    return columns
-
-
-def write_laz(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
-    """Write a point for each known cell: x, y, z, intensity and colour of the ortho image, ``sigma`` of z (m).
-
-    LAS 1.4, point format 7, the CRS as WKT 1. A step of the coordinates is a thousandth of a cell or less, an elevation
-    is off by half a step at most.
-    """
-    import laspy
-    from laspy.vlrs.known import WktCoordinateSystemVlr
-
-    points = _points(terrain, ortho, sigma)
-    header = laspy.LasHeader(point_format=7, version="1.4")
-    header.creation_date, header.generating_software, header.system_identifier = MADE, "Rille", "stereo"
-    # LAS has coordinates of 32 bits: without offsets eastings would overflow at steps as fine as these.
-    header.offsets = [float(np.floor(points[axis].min())) for axis in "xyz"]
-    header.scales = np.full(3, 10.0 ** np.floor(np.log10(terrain.cell / STEPS_PER_CELL)))
-    if terrain.crs:
-        # LAS 1.4 allows only WKT with point formats 6 to 10, wants this bit set, and knows the first version alone.
-        header.vlrs.append(WktCoordinateSystemVlr(pyproj.CRS(terrain.crs).to_wkt("WKT1_GDAL")))
-        header.global_encoding.wkt = True
-    if "sigma" in points:
-        about = laspy.ExtraBytesParams("sigma", type=np.float32, description="standard deviation of z, m")
-        header.add_extra_dim(about)
-    cloud = laspy.LasData(header)
-    for name, values in points.items():
-        # LAS has colours of 16 bits.
-        setattr(cloud, name, values.astype(np.uint16) * np.uint16(257) if values.dtype == np.uint8 else values)
-    # LAS counts returns from 1: 0 of 0, which laspy leaves, is not valid.
-    cloud.return_number[:] = cloud.number_of_returns[:] = 1
-    if ortho is not None:
-        cloud.intensity = np.rint(np.column_stack([cloud.red, cloud.green, cloud.blue]) @ LUMA).astype(np.uint16)
-    with atomic.replacing(path) as temporary:
-        cloud.write(str(temporary), do_compress=True)
-    return f"{len(points['x'])} points"
-
-
-def write_ply(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
-    """Write a point for each known cell as binary PLY: x, y, z, colour of the ortho image, ``sigma`` of z (m).
-
-    Coordinates are 64-bit floats: eastings of 32 bits would jump by decimetres. A comment states the CRS as WKT.
-    """
-    columns = _points(terrain, ortho, sigma)
-    count = len(columns["x"])
-    kinds = [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
-    points = np.rec.fromarrays(list(columns.values()), dtype=kinds)
-    # One line: a line feed would end the comment, and its rest would be read as a line of the header.
-    crs = [f"comment crs {' '.join(terrain.crs.split())}"] if terrain.crs else []
-    properties = [f"property {PLY_TYPES[values.dtype.name]} {name}" for name, values in columns.items()]
-    lines = ["ply", "format binary_little_endian 1.0", *crs, "comment metres; sigma: standard deviation of z"]
-    lines += [f"element vertex {count}", *properties, "end_header"]
-    with atomic.replacing(path) as temporary:
-        temporary.write_bytes("".join(f"{line}\n" for line in lines).encode() + points.tobytes())
-    return f"{count} points"
-
-
-def write_glb(path: Path, terrain: DemFile, ortho: Layer, sigma: Layer) -> str:
+def write_glb(path: Path, terrain: DemFile, ortho: Layer) -> str:
     """Write the triangles between known neighbouring cells, with the ortho image as texture.
 
     glTF's axes are x right, y up, z towards the viewer: x = x, y = z, z = -y of the terrain's frame. Coordinates are
@@ -207,12 +123,3 @@ def _texture(ortho: Layer) -> Any:
         image.thumbnail((MAX_TEXTURE_PX, MAX_TEXTURE_PX))
     # glTF's material is a metal unless told otherwise, and would mirror instead of showing the texture.
     return PBRMaterial(name="ortho", baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
-
-
-Writer = Callable[[Path, DemFile, Layer, Layer], str]
-FORMATS: dict[str, tuple[str, Writer]] = {
-    "laz": ("cloud.laz", write_laz),
-    "ply": ("cloud.ply", write_ply),
-    "glb": ("terrain.glb", write_glb),
-}
-"""Default file name and writer of each form."""

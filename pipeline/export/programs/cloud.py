@@ -1,0 +1,201 @@
+"""The matched pixels of a run as a point cloud (LAZ 1.4, PLY): one pair after the other, in the world frame."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+
+from rille.datasets.georeference import Georeference
+from rille.pipeline.engine.failures import reported
+from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.export.colour import LUMA
+from rille.pipeline.export.programs.run_artifacts import RunArtifacts
+from rille.pipeline.export.writers import ENGINEERING_CRS
+from rille.stages.core.declare import Bundle
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.terrain.points import colours, cubes, one_a_cube, points
+
+MADE = date(2000, 1, 1)
+"""Date that every LAZ file states, so that equal clouds make equal files."""
+
+STEPS_PER_SIGMA = 10
+"""Steps of a LAZ coordinate in the median standard deviation across the ray of the first pair."""
+
+ABOUT = {
+    "sigma_along": "standard deviation along ray, m",
+    "sigma_across": "standard deviation across it, m",
+    "ray_x": "direction from camera to point",
+    "ray_y": "direction from camera to point",
+    "ray_z": "direction from camera to point",
+    "pair": "frame number of the stereo pair",
+}
+"""What the columns are that LAS does not know, in 32 letters at most."""
+
+PLY_TYPES = {"float64": "double", "float32": "float", "uint8": "uchar", "uint32": "uint"}
+"""PLY's names of types."""
+
+Columns = Mapping[str, NDArray[Any]]
+
+
+@dataclass
+class Choice:
+    """Points that are written: of each ``every``-th row and column, and one in each cube of side ``voxel``, m (0: all).
+
+    In a cube that points of several pairs fall into the first pair's stays, and of one pair's the most certain point.
+    """
+
+    every: int = 1
+    voxel: float = 0.0
+    _taken: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def of(self, columns: Columns) -> Columns:
+        """The points of a pair that stay."""
+        if not self.voxel:
+            return columns
+        cube = cubes(np.column_stack([columns[axis] for axis in "xyz"]), self.voxel)
+        first = one_a_cube(cube, columns["sigma_along"])
+        first = first[~np.isin(cube[first], self._taken)]
+        self._taken = np.union1d(self._taken, cube[first])
+        return {name: values[first] for name, values in columns.items()}
+
+
+def export(run: RunArtifacts, output: Path, choice: Choice) -> str:
+    """Write the points of a run as LAZ or PLY, by the ending of the file; what is in it.
+
+    Columns: x, y, z (m; of the place on Earth where the sequence has one), red, green, blue of the left image, the
+    standard deviations along and across the ray of the left camera (m), the ray's direction, and the pair's frame.
+
+    Raises
+    ------
+    InputError
+        The run has no pair with a disparity and a pose, or the file cannot be written.
+    """
+    place, made = _place(run.run), _Made()
+    # LAS 1.4 knows the first version of WKT alone.
+    crs = pyproj.CRS(place.crs if place is not None else ENGINEERING_CRS).to_wkt("WKT1_GDAL")
+    write = _write_laz if output.suffix == ".laz" else _write_ply
+    with (
+        reported("RIL-601", f"{output} cannot be written", remedy="name another file with -o", kind=InputError),
+        atomic.replacing(output) as temporary,
+    ):
+        write(temporary, made.counted(map(choice.of, _pairs(run, choice.every, place, made))), crs)
+    unplaced = f", {made.unplaced} without a pose are left out" if made.unplaced else ""
+    return f"{made.points} points of {made.pairs} pairs{unplaced}"
+
+
+@dataclass
+class _Made:
+    """Counts of what was written."""
+
+    points: int = 0
+    pairs: int = 0
+    unplaced: int = 0
+
+    def counted(self, parts: Iterator[Columns]) -> Iterator[Columns]:
+        for part in parts:
+            self.points, self.pairs = self.points + len(part["x"]), self.pairs + 1
+            yield part
+
+
+def _place(run: Path) -> Georeference | None:
+    """Place of the world frame on Earth, as the run's ``frames.json`` states it."""
+    with suppress(FileNotFoundError):
+        if (about := json.loads((run / "frames.json").read_bytes())["georeference"]) is not None:
+            return Georeference(about["crs"], tuple(about["origin"]), about["azimuth"])
+    return None
+
+
+def _pairs(run: RunArtifacts, every: int, place: Georeference | None, made: _Made) -> Iterator[Columns]:
+    """Columns of each pair's points, in order of the pairs; one pair is in memory at a time."""
+    trajectory = run.one("trajectory", last=True)
+    pose = dict(zip(trajectory.meta["frames"], np.asarray(trajectory["poses"]), strict=True))
+    piece = dict(zip(trajectory.meta["frames"], np.asarray(trajectory["piece"]).tolist(), strict=True))
+    pairs = sorted(int(name) for name in run.labels(r"hfvm/(\d{1,9})"))
+    placed = [pair for pair in pairs if piece.get(pair) == trajectory.meta["main"]]
+    made.unplaced = len(pairs) - len(placed)
+    if not placed:
+        raise InputError(
+            "RIL-613", "no pair of the run has both a disparity and a pose", remedy="its report says what failed"
+        )
+    for pair in placed:
+        rig = Rig.from_dict(run.input(f"ground_frame/{pair}", "rig").meta["rig"])
+        found = points(run.one(f"hfvm/{pair}"), rig, every)
+        T_world_left = RigidTransform.from_matrix(pose[pair])
+        ray = found.position / np.linalg.norm(found.position, axis=1, keepdims=True) @ T_world_left.rotation.T
+        position = T_world_left.apply(found.position)
+        if place is not None:
+            ray[:, :2], position = ray[:, :2] @ place.rotation.T, place.apply(position)
+        columns = dict(zip("xyz", position.T, strict=True))
+        columns |= zip(("red", "green", "blue"), colours(found, _image(run, pair)).T, strict=True)
+        columns |= {"sigma_along": found.sigma_along, "sigma_across": found.sigma_across}
+        columns |= zip(("ray_x", "ray_y", "ray_z"), ray.T.astype(np.float32), strict=True)
+        columns["pair"] = np.full(len(position), pair, np.uint32)
+        yield columns
+
+
+def _image(run: RunArtifacts, pair: int) -> Bundle:
+    """The left image that was matched, free of distortion."""
+    ideal = run.find(f"undistort/left/{pair}")
+    return run.one(f"image/left/{pair}") if ideal is None else ideal
+
+
+def _write_laz(path: Path, parts: Iterator[Columns], crs: str) -> None:
+    """LAS 1.4, point format 7, the CRS as WKT 1."""
+    import laspy
+    from laspy.vlrs.known import WktCoordinateSystemVlr
+
+    first = next(parts)
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.creation_date, header.generating_software, header.system_identifier = MADE, "Rille", "stereo"
+    # LAS has coordinates of 32 bits: without offsets eastings would overflow at steps as fine as these.
+    if len(first["x"]):
+        header.offsets = [float(np.floor(first[axis].min())) for axis in "xyz"]
+    step = np.median(first["sigma_across"]) / STEPS_PER_SIGMA if len(first["x"]) else 1e-3
+    header.scales = np.full(3, 10.0 ** np.floor(np.log10(step)))
+    # With point formats 6 to 10 LAS 1.4 allows only WKT, and wants this bit set.
+    header.vlrs.append(WktCoordinateSystemVlr(crs))
+    header.global_encoding.wkt = True
+    for name, about in ABOUT.items():
+        header.add_extra_dim(laspy.ExtraBytesParams(name, type=first[name].dtype, description=about))
+    with laspy.open(path, mode="w", header=header, do_compress=True) as file:
+        for part in itertools.chain([first], parts):
+            record = laspy.ScaleAwarePointRecord.zeros(len(part["x"]), header=header)
+            for name, values in part.items():
+                # LAS has colours of 16 bits.
+                record[name] = values.astype(np.uint16) * np.uint16(257) if values.dtype == np.uint8 else values
+            record["intensity"] = np.rint(np.column_stack([record[b] for b in ("red", "green", "blue")]) @ LUMA)
+            # LAS counts returns from 1: 0 of 0, which laspy leaves, is not valid.
+            record["return_number"][:] = record["number_of_returns"][:] = 1
+            file.write_points(record)
+
+
+def _write_ply(path: Path, parts: Iterator[Columns], crs: str) -> None:
+    """Binary PLY; coordinates are 64-bit floats: eastings of 32 bits would jump by decimetres."""
+    body, count, properties = path.with_suffix(".body"), 0, []
+    with body.open("wb") as file:
+        for part in parts:
+            kinds = [(name, values.dtype.newbyteorder("<")) for name, values in part.items()]
+            file.write(np.rec.fromarrays(list(part.values()), dtype=kinds).tobytes())
+            count += len(part["x"])
+            properties = [f"property {PLY_TYPES[values.dtype.name]} {name}" for name, values in part.items()]
+    # One line: a line feed would end the comment, and its rest would be read as a line of the header.
+    lines = ["ply", "format binary_little_endian 1.0", f"comment crs {' '.join(crs.split())}"]
+    lines += [f"comment {name}: {about}" for name, about in ABOUT.items()]
+    lines += [f"element vertex {count}", *properties, "end_header"]
+    # How many points there are is known at the end.
+    with path.open("wb") as file, body.open("rb") as points:
+        file.write("".join(f"{line}\n" for line in lines).encode())
+        shutil.copyfileobj(points, file)
+    body.unlink()
