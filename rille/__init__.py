@@ -1,7 +1,7 @@
 """Stereo image sequences to terrain, trajectory, risk map and safe path.
 
-One pair, step by step: ``open``, ``match``, ``points``, ``terrain``, ``hazards``, ``path`` (:mod:`rille.pipeline.steps`). A whole
-sequence: ``reconstruct``, ``open_run`` (:mod:`rille.pipeline.api`).
+One pair, step by step: ``open``, ``match``, ``points``, ``terrain``, ``hazards``, ``path``
+(:mod:`rille.pipeline.steps`). A whole sequence: ``reconstruct``, ``open_run`` (:mod:`rille.pipeline.api`).
 """
 
 # Not even `__future__` is imported here: `python -m rille` looks for it in the current folder first, and until
