@@ -34,6 +34,7 @@ FLOORS = (
     "rille.pipeline.report",
     "rille.pipeline.commands.options",
     "rille.pipeline.runs",
+    "rille.pipeline.steps",
     "rille.pipeline.api",
     "rille.pipeline.commands",
     "rille.pipeline",

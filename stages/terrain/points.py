@@ -111,7 +111,7 @@ def cubes(position: Floats, side: float) -> NDArray[np.int64]:
     cube = np.floor(position / side)
     if cube.size and np.abs(cube).max() >= MAX_CUBES:
         raise InputError(
-            "RIL-616",
+            "RIL-619",
             f"points lie more than {MAX_CUBES} voxels of {side:g} m from the origin",
             remedy="give larger ones with --voxel",
         )

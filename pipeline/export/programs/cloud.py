@@ -87,7 +87,7 @@ def export(run: RunArtifacts, output: Path, choice: Choice) -> str:
     crs = pyproj.CRS(place.crs if place is not None else ENGINEERING_CRS).to_wkt("WKT1_GDAL")
     write = _write_laz if output.suffix == ".laz" else _write_ply
     with (
-        reported("RIL-615", f"{output} cannot be written", remedy="name another file with -o", kind=InputError),
+        reported("RIL-618", f"{output} cannot be written", remedy="name another file with -o", kind=InputError),
         atomic.replacing(output) as temporary,
     ):
         write(temporary, made.counted(map(choice.of, _pairs(run, choice.every, place, made))), crs)

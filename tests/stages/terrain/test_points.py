@@ -108,5 +108,5 @@ def test_of_a_voxel_the_most_certain_point_stays():
 
 
 def test_points_beyond_a_million_voxels_are_refused():
-    with raises("RIL-616"):
+    with raises("RIL-619"):
         cubes(np.array([[0.0, 0.0, 2e3]]), 1e-3)
