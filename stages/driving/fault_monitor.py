@@ -93,7 +93,6 @@ def judge(
     inliers : landmarks of each pose.
     vehicle : its ``max_slope_deg`` and ``wheel_base``.
     """
-    up, acceleration, odometry = readings
     # Motions are those of the vehicle's middle, as the wheels report them, not of the camera, which a turn swings.
     there = [bool(np.isfinite(pose).all()) for pose in poses]
     key = RigidTransform.from_matrix(poses[0]) @ T_vehicle_left.inverse() if there[0] else RigidTransform.identity()
@@ -105,20 +104,22 @@ def judge(
             if not np.isfinite(values[k]).all():
                 return Verdict(k, kind, f"the {sensor} gives no reading")
         # Rounding may carry the cosine of a vehicle that is upright, or upside down, beyond 1.
-        tilt = math.degrees(math.acos(np.clip((T_vehicle_left.rotation @ up[k])[2], -1.0, 1.0)))
+        tilt = math.degrees(math.acos(np.clip((T_vehicle_left.rotation @ readings.up[k])[2], -1.0, 1.0)))
         if tilt > steepest:
             return Verdict(k, "attitude", f"tilt of {tilt:.1f} degrees by the inclinometer, {steepest:.1f} permitted")
-        if acceleration[k] > params.max_acceleration:
+        if readings.acceleration[k] > params.max_acceleration:
             limit = f"{params.max_acceleration:g} permitted"
-            return Verdict(k, "acceleration", f"peak of {acceleration[k]:.1f} m/s2 by the accelerometer, {limit}")
+            return Verdict(
+                k, "acceleration", f"peak of {readings.acceleration[k]:.1f} m/s2 by the accelerometer, {limit}"
+            )
         agree = inliers[k] if there[0] and there[k] else 0
         if agree < params.min_landmarks:
             few = f"{agree} landmarks agree with the pose, {params.min_landmarks} are needed"
             return Verdict(k, "lost", f"tracking is lost: {few}")
         moved = key.inverse() @ (RigidTransform.from_matrix(poses[k]) @ T_vehicle_left.inverse())
-        found = _disagreement(odometry[k], moved, float(vehicle["wheel_base"]), params)
-        if found:
-            return Verdict(k, "slip", found)
+        contradiction = _disagreement(readings.odometry[k], moved, float(vehicle["wheel_base"]), params)
+        if contradiction:
+            return Verdict(k, "slip", contradiction)
     return Verdict(None, "", "")
 
 
@@ -143,7 +144,7 @@ def _run(params: FaultMonitorParams, args: Mapping[str, Any], inputs: Inputs) ->
     sense, resect = inputs["sense"], inputs["resect"]
     rows = [int(r) for r in args["rows"]]  # of the readings, those frames that were resected
     wheels = np.asarray(sense["odometry"])[rows]
-    found = judge(
+    verdict = judge(
         Readings(np.asarray(sense["up"])[rows], np.asarray(sense["acceleration"])[rows], _relative(wheels)),
         np.asarray(resect["poses"]),
         [int(f["inliers"]) for f in resect.meta["per_frame"]],
@@ -152,8 +153,8 @@ def _run(params: FaultMonitorParams, args: Mapping[str, Any], inputs: Inputs) ->
         params,
     )
     frames = [int(f["frame"]) for f in resect.meta["per_frame"]]
-    meta = {"stop": found.stop, "kind": found.kind, "reason": found.reason}
-    return Bundle({}, meta | {"frame": None if found.stop is None else frames[found.stop]})
+    meta = {"stop": verdict.stop, "kind": verdict.kind, "reason": verdict.reason}
+    return Bundle({}, meta | {"frame": None if verdict.stop is None else frames[verdict.stop]})
 
 
 def _relative(wheels: Floats) -> Floats:

@@ -2,10 +2,9 @@
 
 Places lie on a coarse grid, every seventh of a wheel; heights are first reduced to the highest and the lowest of each
 of its blocks, so that nothing is left out. A wheel *stands* on the highest ground in its contact patch, half a wheel
-wide;
-*ground* is the lowest there. At each place the vehicle is turned through ``HEADINGS`` headings. Four wheels touch in
-threes: of each three, two span the wheel base and two the track, so the plane through them has the gradient (difference
-along a side / wheel base, difference along an axle / track). The greatest over threes and headings is
+wide; *ground* is the lowest there. At each place the vehicle is turned through ``HEADINGS`` headings. Four wheels touch
+in threes: of each three, two span the wheel base and two the track, so the plane through them has the gradient
+(difference along a side / wheel base, difference along an axle / track). The greatest over threes and headings is
 
 * tilt, from where the wheels stand (stones count), and
 * slope of the footprint's plane, from the ground beneath (stones narrower than a wheel do not).
@@ -137,13 +136,9 @@ def place(high: Floats32, low: Floats32, vehicle: Vehicle, cell: float, whole: B
     # Beyond the map all is unknown.
     padded += [np.pad(a.astype(np.uint16), reach, constant_values=1) for a in patchy]
     out = Places(*(np.zeros(high.shape, dtype=np.float32) for _ in Places._fields))
-    wheels, under = ((at + reach).astype(np.uint64) for at in (stance.wheels, stance.belly))
-    _place(_Ground(*padded), _Offsets(wheels, under, stance.spans, stance.weights), out)
+    offsets = _Offsets(stance.wheels + reach, stance.belly + reach, stance.spans, stance.weights)
+    _place(_Ground(*padded), offsets, out)
     return Places(np.sqrt(out.tilt), np.sqrt(out.slope), out.rise, out.unstood)
-
-
-# Lines are read in place, by offsets that are not signed: a line is short, and to make it an array of its own takes as
-# long as the work on it; and a signed index would be looked at for whether it counts from the end.
 
 
 class _Ground(NamedTuple):
@@ -158,48 +153,55 @@ class _Ground(NamedTuple):
 
 
 class _Offsets(NamedTuple):
-    """Those of :class:`Stance` in the padded maps, not signed."""
+    """Those of :class:`Stance`, counted in the padded maps."""
 
-    wheels: NDArray[np.uint64]
-    under: NDArray[np.uint64]
+    wheels: Ints
+    belly: Ints
     spans: Floats32
     weights: Floats32
 
 
 @njit(cache=True, nogil=True)
-def _place(ground, stance, out):  # type: ignore[no-untyped-def]
-    wheels, under, spans, weights = stance
-    tilt, slope, rise, unstood = out
-    headings = wheels.shape[0]
-    # A table, by repeated addition: a division a cell would be the slowest operation of the loop.
-    parts = headings * (wheels.shape[1] + under.shape[1])
-    shares = np.zeros(parts + 1, dtype=np.float32)
-    for k in range(parts):
-        shares[k + 1] = shares[k] + np.float32(1.0 / parts)
-    missing = np.empty(tilt.shape[1], dtype=np.uint16)
-    for r in range(np.uint64(tilt.shape[0])):
+def _place(ground, offsets, out):  # type: ignore[no-untyped-def]
+    """Fill ``out``, tilt and slope squared, row by row: a row of a map, moved by an offset, lies below one part of the
+    vehicle at all places of the row."""
+    rows, cols = out.tilt.shape
+    headings = offsets.wheels.shape[0]
+    parts = headings * (offsets.wheels.shape[1] + offsets.belly.shape[1])
+    missing = np.empty(cols, dtype=np.uint16)
+    for r in range(rows):
         missing[:] = 0
         for k in range(headings):
-            _steepest(ground.stand, wheels, spans, k, r, tilt)
-            _steepest(ground.lowest, wheels, spans, k, r, slope)
-            for j in range(0, wheels.shape[1], 2):
-                _count(ground.gaps, wheels, k, j, r, missing)
-            for j in range(0, under.shape[1], 2):
-                _count(ground.gaps_below, under, k, j, r, missing)
-                _rise((ground.stand, ground.belly), (wheels, under, weights), (k, j, r), rise)
-        for c in range(missing.shape[0]):
-            unstood[r, c] = shares[missing[c]]
+            stand = _below_wheels(ground.stand, offsets.wheels[k], r, cols)
+            _steepest(stand, offsets.spans[k], out.tilt[r])
+            _steepest(_below_wheels(ground.lowest, offsets.wheels[k], r, cols), offsets.spans[k], out.slope[r])
+            for y, x in offsets.wheels[k]:
+                missing += ground.gaps[r + y, x : x + cols]
+            for j in range(offsets.belly.shape[1]):
+                y, x = offsets.belly[k, j]
+                missing += ground.gaps_below[r + y, x : x + cols]
+                _rise(stand, ground.belly[r + y, x : x + cols], offsets.weights[j], out.rise[r])
+        out.unstood[r] = missing / np.float32(parts)
 
 
 @njit(cache=True, nogil=True)
-def _steepest(a, wheels, spans, k, r, out):  # type: ignore[no-untyped-def]
+def _below_wheels(a, wheels, r, cols):  # type: ignore[no-untyped-def]
+    """Lines of a map below the four wheels at the places of row ``r``."""
+    return (
+        a[r + wheels[0, 0], wheels[0, 1] : wheels[0, 1] + cols],
+        a[r + wheels[1, 0], wheels[1, 1] : wheels[1, 1] + cols],
+        a[r + wheels[2, 0], wheels[2, 1] : wheels[2, 1] + cols],
+        a[r + wheels[3, 0], wheels[3, 1] : wheels[3, 1] + cols],
+    )
+
+
+@njit(cache=True, nogil=True)
+def _steepest(wheels, spans, out):  # type: ignore[no-untyped-def]
     """Raise ``out`` to the greatest squared gradient of the planes through three wheels, those that are known."""
-    y0, y1, y2, y3 = r + wheels[k, 0, 0], r + wheels[k, 1, 0], r + wheels[k, 2, 0], r + wheels[k, 3, 0]
-    x0, x1, x2, x3 = wheels[k, 0, 1], wheels[k, 1, 1], wheels[k, 2, 1], wheels[k, 3, 1]
     one, zero = np.float32(1.0), np.float32(0.0)
-    left, right, front, rear = one / spans[k, 0], one / spans[k, 1], one / spans[k, 2], one / spans[k, 3]
-    for c in range(np.uint64(out.shape[1])):
-        fl, fr, rl, rr = a[y0, c + x0], a[y1, c + x1], a[y2, c + x2], a[y3, c + x3]
+    left, right, front, rear = one / spans[0], one / spans[1], one / spans[2], one / spans[3]
+    for c in range(out.shape[0]):
+        fl, fr, rl, rr = wheels[0][c], wheels[1][c], wheels[2][c], wheels[3][c]
         u, v = abs(fl - rl) * left, abs(fr - rr) * right
         # NaN compares false: a plane with a wheel over unknown ground is left out.
         along = u if u > zero else zero
@@ -208,39 +210,19 @@ def _steepest(a, wheels, spans, k, r, out):  # type: ignore[no-untyped-def]
         across = u if u > zero else zero
         across = v if v > across else across
         square = along * along + across * across
-        out[r, c] = square if square > out[r, c] else out[r, c]
+        out[c] = square if square > out[c] else out[c]
 
 
 @njit(cache=True, nogil=True)
-def _count(gaps, at, k, j, r, out):  # type: ignore[no-untyped-def]
-    """Add one for each of parts ``j`` and ``j + 1`` where there is a gap; of wheels and of the belly's parts there is
-    an even number."""
-    y0, y1, x0, x1 = r + at[k, j, 0], r + at[k, j + 1, 0], at[k, j, 1], at[k, j + 1, 1]
-    for c in range(np.uint64(out.shape[0])):
-        out[c] += gaps[y0, c + x0] + gaps[y1, c + x1]
-
-
-# Inlined: to count the references of its arrays once a line would take 40 % of the placement.
-@njit(cache=True, nogil=True, inline="always")
-def _rise(maps, stance, at, out):  # type: ignore[no-untyped-def]
-    """Raise ``out`` to the rise of points ``j`` and ``j + 1`` of the belly over the wheels' plane."""
-    (stand, belly), (wheels, under, w), (k, j, r) = maps, stance, at
-    y0, y1, y2, y3 = r + wheels[k, 0, 0], r + wheels[k, 1, 0], r + wheels[k, 2, 0], r + wheels[k, 3, 0]
-    x0, x1, x2, x3 = wheels[k, 0, 1], wheels[k, 1, 1], wheels[k, 2, 1], wheels[k, 3, 1]
-    y, x, v0, v1, v2, v3 = r + under[k, j, 0], under[k, j, 1], w[j, 0], w[j, 1], w[j, 2], w[j, 3]
-    z, s = r + under[k, j + 1, 0], under[k, j + 1, 1]
-    w0, w1, w2, w3 = w[j + 1, 0], w[j + 1, 1], w[j + 1, 2], w[j + 1, 3]
+def _rise(wheels, belly, weights, out):  # type: ignore[no-untyped-def]
+    """Raise ``out`` to the rise of a point of the belly, with these weights of the wheels, over the wheels' plane."""
+    w0, w1, w2, w3 = weights[0], weights[1], weights[2], weights[3]
     zero = np.float32(0.0)
-    for c in range(np.uint64(out.shape[1])):
-        fl, fr, rl, rr = stand[y0, c + x0], stand[y1, c + x1], stand[y2, c + x2], stand[y3, c + x3]
-        p, q, most = belly[y, c + x], belly[z, c + s], out[r, c]
+    for c in range(out.shape[0]):
+        fl, fr = belly[c] - wheels[0][c], belly[c] - wheels[1][c]
+        rl, rr = belly[c] - wheels[2][c], belly[c] - wheels[3][c]
         # Each gap is cut off at 0 before it is weighed: a hollow under one wheel must not make up for a stone at
         # another.
-        a, b, d, e = p - fl, p - fr, p - rl, p - rr
-        total = v0 * (a if a > zero else zero) + v1 * (b if b > zero else zero)
-        total += v2 * (d if d > zero else zero) + v3 * (e if e > zero else zero)
-        most = total if total > most else most
-        a, b, d, e = q - fl, q - fr, q - rl, q - rr
-        total = w0 * (a if a > zero else zero) + w1 * (b if b > zero else zero)
-        total += w2 * (d if d > zero else zero) + w3 * (e if e > zero else zero)
-        out[r, c] = total if total > most else most
+        total = w0 * (fl if fl > zero else zero) + w1 * (fr if fr > zero else zero)
+        total += w2 * (rl if rl > zero else zero) + w3 * (rr if rr > zero else zero)
+        out[c] = total if total > out[c] else out[c]
