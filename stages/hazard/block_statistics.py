@@ -18,13 +18,13 @@ from rille.stages.core.arrays import Floats, Floats32
 class Blocks(NamedTuple):
     """Arrays (row, col) of blocks: ``high`` and ``low`` float32 m, NaN where nothing is known; sums float64:
 
-    ``count`` of known cells, ``variance`` of their squared standard deviations (m2), ``pairs`` of cells ``lag`` apart
+    ``known``: how many cells are, ``variance`` of their squared standard deviations (m2), ``pairs`` of cells ``lag`` apart
     along either axis, counted at both ends, and ``deviation`` of their squared differences (m2).
     """
 
     high: Floats32
     low: Floats32
-    count: Floats
+    known: Floats
     variance: Floats
     pairs: Floats
     deviation: Floats
@@ -63,7 +63,7 @@ def _reduce_heights(surface, closed, std, n, blocks):  # type: ignore[no-untyped
                     count += 1
                     variance += std[r, c] * std[r, c]
             blocks.high[r // n, j], blocks.low[r // n, j] = high, low
-            blocks.count[r // n, j] += count
+            blocks.known[r // n, j] += count
             blocks.variance[r // n, j] += variance
 
 

@@ -84,7 +84,7 @@ class HazardInput:
     def places(self) -> Places:
         """The vehicle put down with its middle on every block."""
         # Counts are sums in floating point.
-        whole = self.blocks.count > self.stride**2 - 0.5
+        whole = self.blocks.known > self.stride**2 - 0.5
         return place(self.blocks.high, self.blocks.low, self.vehicle, self.stride * self.cell, whole)
 
     @property
@@ -94,17 +94,17 @@ class HazardInput:
 
     def window_noise(self) -> Floats32:
         """RMS standard deviation (row, col) of the blocks' heights in the wheel's window, metres."""
-        return _rms(self.blocks.variance, self.blocks.count, self.side)
+        return _rms(self.blocks.variance, self.blocks.known, self.side)
 
     def footprint_noise(self) -> Floats32:
         """RMS standard deviation (row, col) of the blocks' heights below the vehicle, metres."""
         # Mean of both halves: the window serves all headings.
         half = self.vehicle.half_length + self.vehicle.half_width
-        return _rms(self.blocks.variance, self.blocks.count, 2 * round(half / (2.0 * self.stride * self.cell)) + 1)
+        return _rms(self.blocks.variance, self.blocks.known, 2 * round(half / (2.0 * self.stride * self.cell)) + 1)
 
     def known_share(self) -> Floats32:
         """Share (row, col) of each block's wheel window that is known."""
-        count = np.maximum(window_sum(self.blocks.count, self.side), 0.0)
+        count = np.maximum(window_sum(self.blocks.known, self.side), 0.0)
         return (count / float((self.side * self.stride) ** 2)).astype(np.float32)
 
 

@@ -2,7 +2,7 @@
 
 Dijkstra's algorithm with a binary heap, from the target to the start: the final cost of a cell is its cost to go. The
 cost of an edge is the weighted sum of its length, its climb or descent, and the cost of the cell entered (``toll``), in
-whole numbers, so that sums are exact. Ties go to the lower cell index. scipy's Dijkstra wants the graph as a matrix, of
+whole numbers, so that sums are exact. Ties go to the lower cell index. scipy's Dijkstra needs the graph as a matrix of
 15 million entries for a map of 1300 x 1500, which takes longer to build than this takes to search.
 """
 
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes
 from rille.stages.numeric.heap import grown, pop, push
-from rille.stages.numeric.line import copy_line
 from rille.stages.planning.configuration_space import ACROSS, LEFT, RIGHT, STRAIGHT
 from rille.stages.planning.row_graph import UNREACHED
 
@@ -74,9 +73,10 @@ def parts(ways: Bytes) -> tuple[NDArray[np.int32], Ints]:
     """Ground that is connected by edges: its number of every cell (row, col), -1 where the vehicle may not stand; and
     the first and the last row of each (number, 2), in reading order of their first cells."""
     number = np.full(ways.shape, -1, dtype=np.int32)
-    spans = np.empty((1024, 2), dtype=np.int64)
-    count, spans = _flood(ways, number, spans)
-    return number, spans[:count]
+    # At most one a cell; memory that is not written is not taken.
+    spans = np.empty((ways.size, 2), dtype=np.int64)
+    count = _flood(ways, number, spans)
+    return number, spans[:count].copy()
 
 
 @njit(cache=True, nogil=True)
@@ -88,11 +88,6 @@ def _flood(ways, number, spans):  # type: ignore[no-untyped-def]
         # In reading order of first cells: the numbers do not depend on the order in which the stack is emptied.
         if ways[at // cols, at % cols] == 0 or number[at // cols, at % cols] >= 0:
             continue
-        if count == spans.shape[0]:
-            more = np.empty((2 * count, 2), dtype=np.int64)
-            for k in range(count):
-                copy_line(spans[k], more[k])
-            spans = more
         spans[count, 0] = spans[count, 1] = at // cols
         number[at // cols, at % cols], stack[0], size = count, at, 1
         while size:
@@ -110,7 +105,7 @@ def _flood(ways, number, spans):  # type: ignore[no-untyped-def]
                     number[i, j], stack[size] = count, i * cols + j
                     size += 1
         count += 1
-    return count, spans
+    return count
 
 
 class _Ground(NamedTuple):
@@ -124,7 +119,7 @@ class _Ground(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _search(ground, target, end, cost, step):  # type: ignore[no-untyped-def]
-    height, ways, toll, lengths = ground
+    height, ways, toll = ground.height, ground.ways, ground.toll
     rows, cols = height.shape
     keys, nodes, size = np.empty(1024, dtype=np.int64), np.empty(1024, dtype=np.int64), 1
     keys[0], nodes[0] = 0, target
@@ -133,7 +128,7 @@ def _search(ground, target, end, cost, step):  # type: ignore[no-untyped-def]
         key, node = keys[0], nodes[0]
         size = pop(keys, nodes, size)
         r, c = node // cols, node % cols
-        # A cell that was reached more cheaply later stands in the heap twice: the dearer entry is passed over.
+        # A cell that was reached more cheaply later is in the heap twice: the dearer entry is skipped.
         if key > cost[r, c]:
             continue
         if node == end:
@@ -144,7 +139,7 @@ def _search(ground, target, end, cost, step):  # type: ignore[no-untyped-def]
             if i < 0 or j < 0 or i >= rows or j >= cols or not ways[r, c] & ways[i, j] & way:
                 continue
             # The search runs from the target, so the cell entered on the way there is (r, c), whose toll is paid.
-            total = key + lengths[k] + abs(height[r, c] - height[i, j]) + toll[r, c]
+            total = key + ground.lengths[k] + abs(height[r, c] - height[i, j]) + toll[r, c]
             # Not at equal cost: what was reached first stays, so that ties do not hang on the heap's layout.
             if total < cost[i, j]:
                 cost[i, j], step[i, j] = total, k

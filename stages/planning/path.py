@@ -34,7 +34,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -49,7 +49,7 @@ from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning import grid8
 from rille.stages.planning.path_ground import GROUNDS, Maps, PathMaps, PathPrices, Point, RowGrid
 from rille.stages.planning.path_words import GOAL, Route, describe, ending, hazard_words
-from rille.stages.planning.row_graph import UNREACHED, Cell, Charges, Plan, nearest_middle, plan, row_span
+from rille.stages.planning.row_graph import UNREACHED, Charges, EndCells, Plan, nearest_middle, plan, row_span
 
 __all__ = ["STAGE", "PathParams", "Route", "describe", "find_path"]
 
@@ -134,128 +134,114 @@ def find_path(
     DegenerateError
         The vehicle is wider than the map.
     """
-    p = params or PathParams()
+    search = _Search(maps, lattice, vehicle, ends, params or PathParams())
     check_size(vehicle, lattice.shape, lattice.cell)
-    start, target = ends
-    for name, point in (("start", start), ("target", target)):
+    for name, point in zip(("start", "target"), ends, strict=True):
         if point is not None:
             _check_end(maps, lattice, vehicle, name, point)
+    start, target = ends[0], ends[1]
     if start is not None and target is not None:
         heading = (target[0] - start[0], target[1] - start[1])
-    found = _found(maps, lattice, vehicle, heading, ends, stretch, p)
-    if len(found.cells):
-        end = GOAL if target is not None else ending(found, maps, lattice, vehicle, p.p_certain_hazard)
-        return replace(found, ended_by=end)
+    route = search.route(heading, stretch=stretch)
+    limit = search.params.p_certain_hazard
+    if len(route.cells):
+        return replace(route, ended_by=GOAL if target is not None else ending(route, maps, lattice, vehicle, limit))
     # A limit that closed nothing cannot be the reason.
-    if p.p_certain_hazard >= 1 or "p_hazard" not in maps:
-        return found
+    if limit >= 1 or "p_hazard" not in maps:
+        return route
     # Searched once more without the limit, only to name the figure that would open a way.
-    other = _found(maps, lattice, vehicle, heading, ends, stretch, p.model_copy(update={"p_certain_hazard": 1.0}))
+    without = replace(search, params=search.params.model_copy(update={"p_certain_hazard": 1.0}))
+    other = without.route(heading, stretch=stretch)
     if not len(other.cells):
-        return found
+        return route
     at = tuple(np.rint(lattice.index(other.xyz[:, :2])).astype(np.int64).T)
-    # Rounded up to three digits, so that the figure as it is told lets the path through.
+    # Rounded up to three digits, so that a path with the printed figure as its limit exists.
     chance = math.ceil(1e3 * float(np.nanmax(maps["p_hazard"][at])) - 1e-3) / 1e3
     reason = (
-        f"ground with a p_hazard above path.p_certain_hazard {p.p_certain_hazard:g} closes every path; without it one "
+        f"ground with a p_hazard above path.p_certain_hazard {limit:g} closes every path; without it one "
         f"leads over ground of up to {chance:.3g}: raise path.p_certain_hazard to that to take it"
     )
-    return replace(found, plan=replace(found.plan, reason=reason))
+    return replace(route, plan=replace(route.plan, reason=reason))
 
 
-def _found(
-    maps: Maps,
-    lattice: Lattice,
-    vehicle: Vehicle,
-    heading: Point,
-    ends: Ends,
-    stretch: bool,
-    p: PathParams,
-) -> Route:
-    before = None if p.planner == "grid8" else _by_rows(maps, lattice, vehicle, heading, ends, p)
-    if before is not None and (p.planner == "rows" or len(before.cells)):
-        return before
-    return _by_grid(maps, lattice, vehicle, ends, p, before, near=not stretch and ends[1] is None)
+@dataclass(frozen=True)
+class _Search:
+    """Arguments of :func:`find_path` that both planners read."""
 
+    maps: Maps
+    lattice: Lattice
+    vehicle: Vehicle
+    ends: Ends
+    params: PathParams
 
-def _length_cells(vehicle: Vehicle, lattice: Lattice) -> int:
-    """The vehicle's length from the front of the front wheels to the back of the rear ones, cells."""
-    return math.ceil(2.0 * vehicle.half_length / lattice.cell)
+    def route(self, heading: Point, *, stretch: bool) -> Route:
+        """Path of the planner that is asked for; ``auto``: by rows, else in any direction."""
+        before = None if self.params.planner == "grid8" else self.by_rows(heading)
+        if before is not None and (self.params.planner == "rows" or len(before.cells)):
+            return before
+        return self.by_grid(before, near=not stretch and self.ends[1] is None)
 
+    def ground(self, grid: RowGrid) -> PathMaps:
+        """The maps on a grid."""
+        p = self.params
+        unit = p.height_step * self.vehicle.max_step
+        prices = PathPrices(unit, p.caution_cost, p.uncertainty_cost, p.p_certain_hazard)
+        return PathMaps(self.maps, self.lattice, grid, self.vehicle, prices)
 
-def _ground(maps: Maps, lattice: Lattice, grid: RowGrid, vehicle: Vehicle, p: PathParams) -> PathMaps:
-    prices = PathPrices(p.height_step * vehicle.max_step, p.caution_cost, p.uncertainty_cost, p.p_certain_hazard)
-    return PathMaps(maps, lattice, grid, vehicle, prices)
+    @property
+    def length_cells(self) -> int:
+        """The vehicle's length from the front of the front wheels to the back of the rear ones, cells."""
+        return math.ceil(2.0 * self.vehicle.half_length / self.lattice.cell)
 
+    def by_rows(self, heading: Point) -> Route:
+        """Path monotone in rows across a heading."""
+        ground = self.ground(RowGrid.over(self.lattice, heading))
+        grid, span = ground.grid, row_span(~ground.closed)
+        ends = EndCells(*(None if point is None else grid.nearest(point) for point in self.ends))
+        # A diagonal is longer than a row is wide; the rows themselves every path crosses.
+        sideways = round(self.params.detour_cost * (grid8.DIAGONAL - 1) * grid.cell / ground.unit)
+        for name in GROUNDS:
+            charges = Charges(ground.toll, sideways)
+            planned = plan(ground.height, ground.ways(name), self.length_cells, ends, span, charges)
+            if len(planned.cells):
+                break
+        cost = ground.metres(planned.cost, UNREACHED, grid.rows)
+        return Route(planned.cells, ground.xyz(planned.cells), planned, grid, "rows", name, cost, span or (0, 0))
 
-def _by_rows(
-    maps: Maps,
-    lattice: Lattice,
-    vehicle: Vehicle,
-    heading: Point,
-    ends: Ends,
-    p: PathParams,
-) -> Route:
-    ground = _ground(maps, lattice, RowGrid.over(lattice, heading), vehicle, p)
-    grid = ground.grid
-    first, last = (None if point is None else grid.nearest(point) for point in ends)
-    span = row_span(~ground.closed)
-    # A diagonal is longer than a row is wide; the rows themselves every path crosses.
-    charges = Charges(ground.toll, round(p.detour_cost * (grid8.DIAGONAL - 1) * grid.cell / ground.unit))
-    for name in GROUNDS:
-        # How far one can go takes a sweep of its own, which only the last and most lenient try needs.
-        explain = name == GROUNDS[-1]
-        ways = ground.ways(name)
-        found = plan(ground.height, ways, _length_cells(vehicle, lattice), (first, last), span, charges, explain)
-        if len(found.cells):
-            break
-    cost = ground.metres(found.cost, UNREACHED, grid.rows)
-    return Route(found.cells, ground.xyz(found.cells), found, grid, "rows", name, cost, span or (0, 0))
-
-
-def _by_grid(
-    maps: Maps,
-    lattice: Lattice,
-    vehicle: Vehicle,
-    ends: Ends,
-    p: PathParams,
-    before: Route | None,
-    *,
-    near: bool,
-) -> Route:
-    """``near``: from the first rows, or the start, on connected ground as far as that leads."""
-    grid = before.grid if near and before is not None else RowGrid.over(lattice, (0.0, 1.0))
-    ground = _ground(maps, lattice, grid, vehicle, p)
-    # A step costs its length in units of height: else a path of no climb could be of any length.
-    unit = max(1, round(lattice.cell / ground.unit))
-    given = tuple(None if point is None else grid.index(point) for point in ends)
-    length, span = _length_cells(vehicle, lattice), row_span(~ground.closed) or (0, 0)
-    if near and given[0] is None:
-        ground.first_row = max(span[1] - min(length, (span[1] - span[0]) // 4), 0)
-    nothing = np.empty((0, 2), dtype=np.int64)
-    cells, cost, name = nothing, np.full(ground.height.shape, UNREACHED), GROUNDS[0]
-    # With a free end a stricter ground would always find some path, on however small a part.
-    for name in GROUNDS if None not in given else ground.by_worth(given[0] or given[1]):
-        ways = ground.ways(name)
-        first, last = _chosen(ground, name, *given, far=near)
-        if first is None or last is None or not ways[first] or not ways[last]:
-            continue
-        if given == (None, None) and first[0] - last[0] < length:
-            continue
-        cost, step = grid8.cost_to_go(ground.height, ways, last, first, unit, ground.toll)
-        if cost[first] < UNREACHED:
-            cells = grid8.trace(step, first)
-            break
-    free = "no ground that is known and safe leads a vehicle's length ahead"
-    reason = free if None in given else "start and target are not connected by ground that the vehicle may cross"
-    # What rows found lies on their grid: where that is turned, its rows are none of this one.
-    same = before is not None and before.grid == grid
-    base = before.plan if before is not None and same else Plan(nothing, cost, np.zeros(grid.cols, dtype=bool), 0)
-    found = replace(base, cells=cells, cost=cost, reachable=np.zeros(grid.cols, dtype=bool), reason=reason)
-    if len(cells):
-        found = replace(found, target_row=int(cells[-1, 0]), blocking_row=None, reason="")
-        found.reachable[cells[-1, 1]] = True
-    return Route(cells, ground.xyz(cells), found, grid, "grid8", name, ground.metres(cost, UNREACHED), span)
+    def by_grid(self, before: Route | None, *, near: bool) -> Route:
+        """Path in any direction; ``near``: from the first rows, or the start, as far as connected ground leads."""
+        grid = before.grid if near and before is not None else RowGrid.over(self.lattice, (0.0, 1.0))
+        ground = self.ground(grid)
+        # A step costs its length in units of height: else a path of no climb could be of any length.
+        unit = max(1, round(self.lattice.cell / ground.unit))
+        ends = EndCells(*(None if point is None else grid.index(point) for point in self.ends))
+        length, span = self.length_cells, row_span(~ground.closed) or (0, 0)
+        if near and ends.start is None:
+            ground.first_row = max(span[1] - min(length, (span[1] - span[0]) // 4), 0)
+        nothing = np.empty((0, 2), dtype=np.int64)
+        cells, cost, name = nothing, np.full(ground.height.shape, UNREACHED), GROUNDS[0]
+        # With a free end a stricter ground would always find some path, on however small a part.
+        for name in GROUNDS if None not in ends else ground.by_worth(ends.start or ends.target):
+            ways = ground.ways(name)
+            first, last = _free_ends(ground, name, ends, far=near)
+            if first is None or last is None or not ways[first] or not ways[last]:
+                continue
+            if ends == (None, None) and first[0] - last[0] < length:
+                continue
+            cost, step = grid8.cost_to_go(ground.height, ways, last, first, unit, ground.toll)
+            if cost[first] < UNREACHED:
+                cells = grid8.trace(step, first)
+                break
+        free = "no ground that is known and safe leads a vehicle's length ahead"
+        reason = free if None in ends else "start and target are not connected by ground that the vehicle may cross"
+        # A plan by rows of a turned grid is in rows that are none of this grid.
+        same = before is not None and before.grid == grid
+        base = before.plan if before is not None and same else Plan(nothing, cost, np.zeros(grid.cols, dtype=bool), 0)
+        planned = replace(base, cells=cells, cost=cost, reachable=np.zeros(grid.cols, dtype=bool), reason=reason)
+        if len(cells):
+            planned = replace(planned, target_row=int(cells[-1, 0]), blocking_row=None, reason="")
+            planned.reachable[cells[-1, 1]] = True
+        return Route(cells, ground.xyz(cells), planned, grid, "grid8", name, ground.metres(cost, UNREACHED), span)
 
 
 def _check_end(maps: Maps, lattice: Lattice, vehicle: Vehicle, name: str, point: Point) -> None:
@@ -288,28 +274,29 @@ def _away(cells: NDArray[np.intp], row: int, col: int, cell: float) -> float:
     return float(np.hypot(cells[:, 0] - row, cells[:, 1] - col).min()) * cell
 
 
-def _chosen(
-    ground: PathMaps, below: str, start: Cell | None, target: Cell | None, *, far: bool
-) -> tuple[Cell | None, Cell | None]:
+def _free_ends(ground: PathMaps, below: str, ends: EndCells, *, far: bool) -> EndCells:
     """Ends as given; else, of the connected ground over most rows (that of the end that is given), the cell nearest to
     the middle of the first row, and the one nearest to that of the last; ``far``: to that of its own last one, in it.
 
     Parameters
     ----------
-    below : of :data:`rille.stages.planning.path_ground.GROUNDS`, what stays on known ground.
+    below : of :data:`rille.stages.planning.path_ground.GROUNDS`, the part that stays on known ground.
     """
     span = row_span(ground.ways(below) > 0)
-    if span is None or (start is not None and target is not None):
-        return (None, None) if span is None else (start, target)
+    if span is None:
+        return EndCells()
+    if None not in ends:
+        return ends
     number, spans = ground.parts(below)
-    given = start if start is not None else target
+    given = ends.start or ends.target
     part = int(number[given]) if given is not None else int(np.argmax(spans[:, 1] - spans[:, 0]))
-    if part < 0 or not (number == part).any():
-        return start, target
-    cells, row = number == part, int(spans[part, 0]) if far else span[0]
+    cells = number == part
+    if part < 0 or not cells.any():
+        return ends
+    row = int(spans[part, 0]) if far else span[0]
     ahead, behind = (cells[: row + 1], ground.first_row) if far else (cells, 0)
     r, c = nearest_middle(cells[behind:], span[1] - behind)
-    return start or (r + behind, c), target or nearest_middle(ahead, row)
+    return EndCells(ends.start or (r + behind, c), ends.target or nearest_middle(ahead, row))
 
 
 def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

@@ -11,10 +11,9 @@ from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
+from rille.stages.core.arrays import Bytes, Floats, Floats32
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.measures import BODY_BITS, WHEEL_BITS
@@ -38,10 +37,7 @@ Unknown ground under the belly may touch it, so the weight is lower by a quarter
 the vehicle, so it is lower by half.
 """
 
-LARGE = 1 << 30
-"""Heights above it are kept in 64 bits."""
-
-FINEST = 16
+MIN_UNITS_PER_CELL = 16
 """Units of cost of a cell's length, at least: with fewer, prices of a metre would round to nothing on fine cells."""
 
 
@@ -127,34 +123,6 @@ class PathPrices(NamedTuple):
     p_certain: float = 1.0
 
 
-class _CellPrices(NamedTuple):
-    """The same in units a cell, so that the kernel works in 32 bits; a height is rounded to ``parts`` units."""
-
-    unit: np.float32
-    parts: np.int32
-    caution: int
-    uncertainty: np.float32
-    p_certain: np.float32
-
-
-class _Sampled(NamedTuple):
-    """Maps (row, col) on the grid: class, reason bits, probability of a hazard, mean height under a wheel (m)."""
-
-    risk: Bytes
-    reason: Ints
-    chance: Floats32
-    stand: Floats32
-
-
-class _Masks(NamedTuple):
-    """Cells (row, col): unknown, not entered, hazardous to a wheel, hazardous to the vehicle as a whole."""
-
-    unknown: Bools
-    closed: Bools
-    wheels: Bools
-    body: Bools
-
-
 class PathMaps:
     """The maps on a grid.
 
@@ -178,31 +146,26 @@ class PathMaps:
         maps : arrays (row, col) of stage ``risk`` on ``lattice``: ``risk``, ``reason``, ``elevation`` and, where
             uncertainty costs, ``p_hazard``.
         """
-        unit, caution, uncertainty, p_certain = prices
-        # Heights are told apart by the unit of the prices; costs are counted in parts of it where cells are fine.
-        parts = max(1, math.ceil(FINEST * unit / grid.cell))
-        self.grid, self.unit = grid, unit / parts
+        # Heights are rounded to the unit of the prices; costs are counted in parts of it where cells are fine.
+        parts = max(1, math.ceil(MIN_UNITS_PER_CELL * prices.unit / grid.cell))
+        self.grid, self.unit = grid, prices.unit / parts
         risk = grid.sample(lattice, maps["risk"], UNKNOWN)
         reason = grid.sample(lattice, maps["reason"], 0)
-        known = "p_hazard" in maps
-        chance = grid.sample(lattice, maps["p_hazard"], np.nan) if known else np.zeros(risk.shape, np.float32)
+        chance = grid.sample(lattice, maps["p_hazard"], np.nan) if "p_hazard" in maps else np.zeros(1, np.float32)
         mean = window_mean(maps["elevation"], window_cells(vehicle.wheel_diameter, lattice.cell))
         self.stand = grid.sample(lattice, mean, np.nan)
-        masks = _Masks(*(np.empty(risk.shape, dtype=np.bool_) for _ in range(4)))
-        self.closed = masks.closed
-        toll = round(caution * grid.cell / self.unit)
-        dearest = toll + round(uncertainty * grid.cell / self.unit)
-        self.height: Ints = np.empty(risk.shape, dtype=np.int32)
-        self.toll: Ints = np.empty(risk.shape, dtype=np.int16 if dearest <= np.iinfo(np.int16).max else np.int64)
         # A limit of 1 is none, even where rounding lifts a probability above it.
-        limit = np.float32(p_certain if p_certain < 1 else np.inf)
-        doubt = np.float32(uncertainty * grid.cell / self.unit)
-        each = _CellPrices(np.float32(unit), np.int32(parts), toll, doubt, limit)
-        if _lay(_Sampled(risk, reason, chance, self.stand), each, masks, self.height, self.toll):
-            # Heights of a tall world in small units do not fit 32 bits.
-            whole = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(unit))
-            self.height = parts * whole.astype(np.int64)
-        self._stand = FreePlaces(masks.wheels, masks.body, vehicle, grid.cell, masks.unknown, masks.closed)
+        limit = np.float32(prices.p_certain if prices.p_certain < 1 else np.inf)
+        self.closed = (risk >= HAZARDOUS) | (chance > limit)
+        height = np.where(self.closed, np.float32(0), self.stand) / np.float32(prices.unit)
+        self.height: Ints = parts * np.rint(height).astype(np.int64)
+        caution, doubt = (price * grid.cell / self.unit for price in (prices.caution, prices.uncertainty))
+        # NaN, which is unknown and closed, costs nothing.
+        self.toll: Ints = np.rint(np.float32(doubt) * np.nan_to_num(chance)).astype(np.int64)
+        self.toll = self.toll + np.where(risk == CAUTION, round(caution), 0)
+        hazard = risk == HAZARDOUS
+        wheels, body = (hazard & (reason & bits != 0) for bits in (WHEEL_BITS, BODY_BITS))
+        self._stand = FreePlaces(wheels, body, vehicle, grid.cell, risk == UNKNOWN, self.closed)
         self._ways: dict[str, Bytes] = {}
         self._parts: dict[str, tuple[NDArray[np.int32], Ints]] = {}
         self.first_row = 0
@@ -238,47 +201,9 @@ class PathMaps:
 
     def metres(self, cost: Ints, unreached: int, each: int = 1) -> Floats32:
         """A cost (row, col) of which ``each`` are a unit, rounded down to units, in metres; NaN where not reached."""
-        out = np.empty(cost.shape, dtype=np.float32)
-        _metres(cost, unreached, float(each), self.unit, out)
-        return out
+        return np.where(cost < unreached, (cost // each) * self.unit, np.nan).astype(np.float32)
 
     def xyz(self, cells: NDArray[np.int64]) -> Floats:
         """Points (vertex, 3), metres, of cells (vertex, 2)."""
         row, col = cells[:, 0], cells[:, 1]
         return np.column_stack([self.grid.xy(row, col), self.stand[row, col]])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _lay(maps, prices, masks, height, toll):  # type: ignore[no-untyped-def]
-    """Fill the masks, the heights in units and the tolls; ``prices`` in units. Whether some height is too large."""
-    risk, reason, chance, stand = maps
-    unit, parts, caution, uncertainty, p_certain = prices
-    unknown, closed, wheels, body = masks
-    large = np.uint8(0)
-    for r in range(risk.shape[0]):
-        for c in range(risk.shape[1]):
-            unknown[r, c] = risk[r, c] == UNKNOWN
-            closed[r, c] = (risk[r, c] >= HAZARDOUS) | (chance[r, c] > p_certain)
-        for c in range(risk.shape[1]):
-            # Short loops without branches, one a kind of array: each becomes vector code, a loop over all of them does
-            # not.
-            wheels[r, c] = (risk[r, c] == HAZARDOUS) & (reason[r, c] & WHEEL_BITS != 0)
-            body[r, c] = (risk[r, c] == HAZARDOUS) & (reason[r, c] & BODY_BITS != 0)
-        for c in range(risk.shape[1]):
-            v = np.rint(stand[r, c] / unit) if risk[r, c] < HAZARDOUS else np.float32(0.0)
-            # Casts what is too large to anything: the caller then makes the heights anew in 64 bits.
-            height[r, c] = np.int32(v) * parts
-            large |= np.uint8(abs(v) * np.float32(parts) > np.float32(LARGE))
-        for c in range(risk.shape[1]):
-            # NaN, which is unknown and closed, costs nothing
-            p = chance[r, c] if chance[r, c] > np.float32(0.0) else np.float32(0.0)
-            toll[r, c] = np.int64(np.rint(uncertainty * p)) + (caution if risk[r, c] == CAUTION else 0)
-    return large > 0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _metres(cost, unreached, each, unit, out):  # type: ignore[no-untyped-def]
-    for r in range(cost.shape[0]):
-        for c in range(cost.shape[1]):
-            v = cost[r, c]
-            out[r, c] = np.floor(v / each) * unit if v < unreached else np.nan

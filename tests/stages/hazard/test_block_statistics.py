@@ -26,7 +26,7 @@ def test_blocks_equal_a_look_at_every_cell(seed: int, rows: int, cols: int, n: i
         inside, known = z[part][~np.isnan(z[part])], ~np.isnan(closed[part])
         np.testing.assert_array_equal(found.high[i, j], inside.max() if inside.size else np.nan)
         np.testing.assert_array_equal(found.low[i, j], inside.min() if inside.size else np.nan)
-        assert found.count[i, j] == known.sum()
+        assert found.known[i, j] == known.sum()
         assert found.variance[i, j] == pytest.approx((std[part][known].astype(float) ** 2).sum(), rel=1e-6)
         apart = [
             float(z[r, c]) - float(z[r + dr, c + dc])

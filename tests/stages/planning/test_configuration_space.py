@@ -10,23 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from vehicles import SHORT
 
-from rille.stages.numeric.packed import Canvas
-from rille.stages.planning.configuration_space import ACROSS, STEPS, STRAIGHT, FreePlaces, _grow, _reach, _widen
+from rille.stages.planning.configuration_space import ACROSS, STEPS, STRAIGHT, FreePlaces, _widened, distance
 
 CELL = 0.01
-
-
-def widened(mask: np.ndarray, length: float, width: float, step: tuple[int, int]) -> np.ndarray:
-    """The mask widened by a rectangle; what lies outside counts as in the mask."""
-    canvas = Canvas.of(mask, _reach(length, width, step), outside=True)
-    _widen(canvas, length, width, step)
-    return canvas.mask()
-
-
-def grown(mask: np.ndarray, reach: float) -> np.ndarray:
-    canvas = Canvas.of(mask, math.ceil(reach - 1e-9))
-    _grow(canvas, reach)
-    return canvas.mask()
 
 
 @pytest.mark.parametrize("step", [(-1, 0), (0, 1), (-1, 1), (-1, -1)])
@@ -34,7 +20,7 @@ def grown(mask: np.ndarray, reach: float) -> np.ndarray:
 @given(seed=st.integers(0, 999), length=st.floats(0, 6), width=st.floats(0, 4))
 def test_a_rectangle_covers_what_lies_under_it(step: tuple[int, int], seed: int, length: float, width: float) -> None:
     mask = np.random.default_rng(seed).random((25, 27)) < 0.01
-    found = widened(mask, length, width, step)
+    found = _widened(mask, length, width, step)
     unit = math.hypot(*step)
     ahead, aside = np.array(step) / unit, np.array([step[1], -step[0]]) / unit
     for r, c in np.argwhere(mask):
@@ -51,14 +37,13 @@ def test_a_rectangle_covers_what_lies_under_it(step: tuple[int, int], seed: int,
 
 
 @settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 999), reach=st.floats(0, 9))
-def test_growing_covers_the_circle(seed: int, reach: float) -> None:
-    mask = np.random.default_rng(seed).random((30, 31)) < 0.005
-    found = grown(mask, reach)
-    for r, c in np.argwhere(mask):
-        away = np.hypot(*(np.stack(np.mgrid[:30, :31]) - np.array([r, c])[:, None, None]))
-        assert found[away <= reach].all()
-    assert (found | ~mask).all()
+@given(seed=st.integers(0, 999), share=st.sampled_from([0.0, 0.005, 0.05]))
+def test_distances_equal_a_look_at_every_cell(seed: int, share: float) -> None:
+    mask = np.random.default_rng(seed).random((30, 31)) < share
+    at = np.stack(np.mgrid[:30, :31], axis=-1)
+    nearest = [np.hypot(*np.moveaxis(at - cell, -1, 0)) for cell in np.argwhere(mask)]
+    expected = CELL * np.minimum.reduce(nearest) if nearest else np.full(mask.shape, np.inf)
+    np.testing.assert_allclose(distance(mask, CELL), expected, rtol=1e-6)
 
 
 @settings(max_examples=20, deadline=None)
@@ -99,16 +84,16 @@ def test_where_a_vehicle_may_stand_by_hand() -> None:
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 999), margin=st.sampled_from([0.0, 0.02, 0.045]), cols=st.integers(1, 140))
 def test_where_a_vehicle_may_stand_equals_a_look_at_every_wheel(seed: int, margin: float, cols: int) -> None:
-    """All three grounds, on maps narrower and wider than the words that masks are packed in."""
+    """All three grounds, on narrow and wide maps."""
     rng = np.random.default_rng(seed)
     wheel, body, unknown = (rng.random((23, cols)) < 0.03 for _ in range(3))
     vehicle = SHORT.model_copy(update={"wheel_base": 0.07, "track": 0.05, "margin": margin})
     stand = FreePlaces(wheel, body, vehicle, CELL, unknown)
-    near, middle = grown(wheel, margin / CELL), grown(body, margin / CELL)
+    near, middle = (distance(mask, CELL) <= margin + 1e-6 * CELL for mask in (wheel, body))
     found = {below: stand.ways(below) for below in ("outline", "wheels", "middle")}
     for bit, dr, dc in STEPS:
         unit = math.hypot(dr, dc)
-        outline = widened(unknown, vehicle.half_length / CELL, vehicle.half_width / CELL, (dr, dc))
+        outline = _widened(unknown, vehicle.half_length / CELL, vehicle.half_width / CELL, (dr, dc))
         for r in range(23):
             for c in range(cols):
                 at = [

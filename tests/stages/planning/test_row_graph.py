@@ -11,7 +11,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from rille.stages.planning.configuration_space import ALL, LEFT, RIGHT, STRAIGHT
-from rille.stages.planning.row_graph import UNREACHED, Charges, leading, nearest_middle, plan, sweep
+from rille.stages.planning.row_graph import UNREACHED, Charges, EndCells, leading, nearest_middle, plan, sweep
 
 
 def edges(
@@ -159,19 +159,19 @@ def test_a_closed_row_of_a_small_map_is_not_excused_by_the_vehicles_length(row: 
 
 def test_given_ends() -> None:
     flat, free = np.zeros((12, 12), dtype=np.int64), np.ones((12, 12), dtype=bool)
-    found = plan(flat, every_way(free), ends=((10, 1), (2, 8)))
+    found = plan(flat, every_way(free), ends=EndCells((10, 1), (2, 8)))
     np.testing.assert_array_equal(found.cells[[0, -1]], [[10, 1], [2, 8]])
     for row in (2, 10):
-        assert "not ahead" in plan(flat, every_way(free), ends=((row, 1), (10, 8))).reason
+        assert "not ahead" in plan(flat, every_way(free), ends=EndCells((row, 1), (10, 8))).reason
     free[10, 1] = False
-    refused = plan(flat, every_way(free), ends=((10, 1), None))
+    refused = plan(flat, every_way(free), ends=EndCells((10, 1)))
     assert (refused.blocking_row, refused.reason) == (10, "the start is not a free cell")
     assert plan(flat, every_way(np.zeros_like(free))).reason
 
 
 def test_a_target_out_of_the_fan_of_the_start_is_not_reached() -> None:
     free = np.ones((6, 20), dtype=bool)
-    found = plan(np.zeros((6, 20), dtype=np.int64), every_way(free), ends=((5, 0), (0, 6)))
+    found = plan(np.zeros((6, 20), dtype=np.int64), every_way(free), ends=EndCells((5, 0), (0, 6)))
     assert len(found.cells) == 0
 
 
