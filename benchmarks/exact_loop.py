@@ -71,7 +71,7 @@ def drive(sequence: Any, config: Any, goal: tuple[float, float]) -> dict[str, An
         maps, follows, (place, heading) = (judged(near), judged(far)), "again", place_of(T)
         while follows == "again":
             leg = next_leg(SeenGround(*maps, bounds), (*place, heading), goal, p, memory, view, before)
-            follows = memory.after(leg.verdict, (*place, heading), leg.where)
+            follows = memory.after(leg.verdict, leg.where)
         before = (leg.rest, leg.rest_gear) if len(leg.rest_gear) else None
         T = bed.at(*after(leg, heading))
         stops, way = stops + 1, way + way_length(leg.path)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 NOMINAL = (0.0, 1.0)
-LEAST = 0.7
-"""m; of the goal from the start."""
+MIN_GOAL_DISTANCE_M = 0.7
+"""Of the goal from the start."""
 COVERS = (0.05, 0.1)
 
 
@@ -18,17 +17,17 @@ def choose_goal(bed: Any, config: Any) -> tuple[float, float] | None:
 
     from rille.stages.hazard.risk import risk_map
     from rille.stages.planning.local_planner.clearance import Footing, Hazards
-    from rille.stages.planning.local_planner.ground import Ground
+    from rille.stages.planning.local_planner.ground import KnownFreeGround
 
     cell = config.locus.cell_size
     judged = risk_map(bed.elevation, np.zeros_like(bed.elevation), cell, config.vehicle, config.risk)
     footing = Footing.of(Hazards(judged["risk"], judged["reason"]), bed.lattice, config.vehicle)
     start, heading = bed.start()
-    ground = Ground(footing, start, heading, config.local_planner.model_copy(update={"unknown_cost": math.inf}))
+    ground = KnownFreeGround(footing, start, heading, config.local_planner)
     _, cost, _ = ground.search(start, cell, whole=True)
     x, y = ground.places()
     far = np.where(np.isfinite(cost).all(axis=0), np.hypot(x - NOMINAL[0], y - NOMINAL[1]), np.inf)
-    far[np.hypot(x - start[0], y - start[1]) < LEAST] = np.inf
+    far[np.hypot(x - start[0], y - start[1]) < MIN_GOAL_DISTANCE_M] = np.inf
     best = np.unravel_index(int(np.argmin(far)), far.shape)
     return (float(x[best]), float(y[best])) if np.isfinite(far[best]) else None
 

@@ -340,7 +340,7 @@ class Drive:
             stop.leg = self._leg(label, self.memory, {}, pose=self.poses[-1], **known)
             leg = (yield stop.leg).meta
             where = None if leg["where"] is None else tuple(leg["where"])
-            follows = self.memory.after(leg["verdict"], tuple(leg["start"]), where)
+            follows = self.memory.after(leg["verdict"], where)
             if follows == "again":
                 stop.thoughts += 1
                 label = f"leg/{stop.index}/{stop.thoughts}"
@@ -354,7 +354,7 @@ class Drive:
 
     def _leg(self, label: str, memory: PlannerMemory, more: dict[str, Any], **inputs: Handle) -> Handle:
         args: dict[str, Any] = {"goal": list(self.goal), "looks": memory.looks, **self.mounting}
-        args |= {"closed": [list(p) for p in memory.closed], "stands": [list(p) for p in memory.stands]}
+        args |= {"closed": [list(p) for p in memory.closed]}
         return self.make.node(local_planner.STAGE, label, rig=self.pairs[0].rig, **args, **more, **inputs)
 
     # -- a leg --------------------------------------------------------------------------------------------------

@@ -9,8 +9,7 @@ point goes; what the image shows instead is put down to another depth along the 
 
 with t the share of the distance to the camera, and so to a point in space. It counts as raised where it lies higher
 than all of the model within reach of its errors, by more than half a wheel's radius and by more than its noise. Enough
-raised points together are an obstacle, at once where they are much of what is seen there, else where the next image
-shows them again: the vehicle stops and looks.
+raised points together, which are much of the points seen there, are an obstacle: the vehicle stops and looks.
 """
 
 from __future__ import annotations
@@ -69,9 +68,6 @@ class ObstacleMonitorParams(Params):
         8, ge=1, description="raised points within one wheel diameter from which on they are an obstacle"
     )
     min_share: float = Field(0.35, ge=0, le=1, description="least share of raised points among all points there")
-    min_share_again: float = Field(
-        0.15, ge=0, le=1, description="the same, where the previous image showed an obstacle at this place, too"
-    )
 
 
 @dataclass(frozen=True)
@@ -116,11 +112,9 @@ class ViewPair:
 
 @dataclass(frozen=True)
 class Points:
-    """Points ahead: ``place`` (n, 2) right and ahead of the vehicle, m; ``ground`` (n, 2) the same in the
-    model's frame; ``rise`` (n,) m over the model; ``raised``."""
+    """Points ahead: ``place`` (n, 2) right and ahead of the vehicle, m; ``rise`` (n,) m over the model; ``raised``."""
 
     place: Floats
-    ground: Floats
     rise: Floats
     raised: Bools
 
@@ -173,7 +167,7 @@ def look(
     noise = error / np.maximum(np.hypot(slope[:, 0], slope[:, 1]), 1e-9) * to_camera[:, 2]
     raised = along & (rise > p.min_rise * wheel) & (rise > p.sigmas * noise) & np.isfinite(rise)
     place = T_vehicle_local.apply(q)[:, :2]
-    return Points(place[along], q[along, :2], rise[along], raised[along])
+    return Points(place[along], rise[along], raised[along])
 
 
 def _seen(view: ViewPair, cells: Floats, camera: Camera) -> tuple[NDArray[np.intp], Floats, Floats]:
@@ -200,26 +194,20 @@ def _seen(view: ViewPair, cells: Floats, camera: Camera) -> tuple[NDArray[np.int
     return np.asarray(at[keep]), np.asarray(ground), np.asarray(centre)
 
 
-def obstacle(points: Points, wheel: float, p: ObstacleMonitorParams, before: Floats) -> tuple[Obstacle | None, Floats]:
-    """The largest group of raised points within one wheel's diameter that counts, and what counts if it is seen again.
-
-    ``before`` (n, 2) m, the model's frame: what counted so in the image before.
-    """
-    up, ground = points.place[points.raised], points.ground[points.raised]
-    if len(up) < p.min_points:
-        return None, np.zeros((0, 2))
-    raised, around = (
-        scipy.spatial.KDTree(some).query_ball_point(up, 0.5 * wheel, p=np.inf, return_length=True)
-        for some in (up, points.place)
+def obstacle(points: Points, wheel: float, p: ObstacleMonitorParams) -> Obstacle | None:
+    """The largest group of raised points within one wheel's diameter that counts; None: there is none."""
+    raised = points.place[points.raised]
+    if len(raised) < p.min_points:
+        return None
+    together, around = (
+        scipy.spatial.KDTree(places).query_ball_point(raised, 0.5 * wheel, p=np.inf, return_length=True)
+        for places in (raised, points.place)
     )
-    enough = raised >= p.min_points
-    doubtful = enough & (raised >= p.min_share_again * around)
-    apart = scipy.spatial.KDTree(before).query(ground)[0] if len(before) else np.full(len(up), np.inf)
-    counts = enough & (raised >= p.min_share * around) | doubtful & (apart <= 0.5 * wheel)
+    counts = (together >= p.min_points) & (together >= p.min_share * around)
     if not counts.any():
-        return None, ground[doubtful]
-    best = int(np.argmax(np.where(counts, raised, -1)))
-    return Obstacle(int(raised[best]), up[best]), ground[doubtful]
+        return None
+    best = int(np.argmax(np.where(counts, together, -1)))
+    return Obstacle(int(together[best]), raised[best])
 
 
 def _run(params: ObstacleMonitorParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
@@ -234,7 +222,7 @@ def _run(params: ObstacleMonitorParams, args: Mapping[str, Any], inputs: Inputs)
     frames = [int(f["frame"]) for f in resect.meta["per_frame"]]
     raised = np.zeros(len(frames), np.int32)
     where = np.full((len(frames), 2), np.nan)
-    stop, reason, doubtful = None, "", np.zeros((0, 2))
+    stop, reason = None, ""
     for (i, j), motion in zip(args["pairs"], inputs["motions"], strict=True):
         if not (known[i] and known[j]):
             continue
@@ -243,14 +231,14 @@ def _run(params: ObstacleMonitorParams, args: Mapping[str, Any], inputs: Inputs)
         first, second = (RigidTransform.from_matrix(poses[k]) for k in (i, j))
         view = ViewPair(first, second, column, row, ok, int(motion.meta["level"]))
         points = look(view, surface, camera, T_vehicle_left, vehicle, params)
-        found, doubtful = obstacle(points, wheel, params, doubtful)
-        if found is None:
+        group = obstacle(points, wheel, params)
+        if group is None:
             continue
-        raised[j], where[j] = found.count, found.place
+        raised[j], where[j] = group.count, group.place
         if stop is None:
-            away = 1000.0 * (found.place[1] - 0.5 * vehicle.wheel_base - 0.5 * wheel)
+            away = 1000.0 * (group.place[1] - 0.5 * vehicle.wheel_base - 0.5 * wheel)
             stop = j
-            reason = f"obstacle {away:.0f} mm before the wheels: {found.count} points rise above the model"
+            reason = f"obstacle {away:.0f} mm before the wheels: {group.count} points rise above the model"
     meta = {"stop": stop, "frame": None if stop is None else frames[stop], "reason": reason, "frames": frames}
     watched = [int(j) for i, j in args["pairs"] if known[i] and known[j]]
     return Bundle({"raised": raised, "where": where}, meta | {"watched": watched})

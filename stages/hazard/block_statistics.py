@@ -18,8 +18,8 @@ from rille.stages.core.arrays import Floats, Floats32
 class Blocks(NamedTuple):
     """Arrays (row, col) of blocks: ``high`` and ``low`` float32 m, NaN where nothing is known; sums float64:
 
-    ``known``: how many cells are, ``variance`` of their squared standard deviations (m2), ``pairs`` of cells ``lag`` apart
-    along either axis, counted at both ends, and ``deviation`` of their squared differences (m2).
+    ``known``: number of known cells, ``variance``: their squared standard deviations (m2), ``pairs``: cells ``lag``
+    apart along either axis, counted at both ends, and ``deviation``: their squared differences (m2).
     """
 
     high: Floats32

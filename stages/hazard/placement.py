@@ -19,7 +19,6 @@ most g wheel_base / 4 along, and as much across with the track.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -52,8 +51,7 @@ class Places(NamedTuple):
     unstood: Floats32
 
 
-@dataclass(frozen=True)
-class Stance:
+class Stance(NamedTuple):
     """Offsets (row, col) in coarse cells: wheels (heading, 4, 2), belly (heading, point, 2), and sizes in coarse cells.
 
     Wheels: front left, front right, rear left, rear right. ``spans`` (heading, 4) metres: left side, right side, front
@@ -136,8 +134,7 @@ def place(high: Floats32, low: Floats32, vehicle: Vehicle, cell: float, whole: B
     # Beyond the map all is unknown.
     padded += [np.pad(a.astype(np.uint16), reach, constant_values=1) for a in patchy]
     out = Places(*(np.zeros(high.shape, dtype=np.float32) for _ in Places._fields))
-    offsets = _Offsets(stance.wheels + reach, stance.belly + reach, stance.spans, stance.weights)
-    _place(_Ground(*padded), offsets, out)
+    _place(_Ground(*padded), stance._replace(wheels=stance.wheels + reach, belly=stance.belly + reach), out)
     return Places(np.sqrt(out.tilt), np.sqrt(out.slope), out.rise, out.unstood)
 
 
@@ -152,35 +149,26 @@ class _Ground(NamedTuple):
     gaps_below: NDArray[np.uint16]
 
 
-class _Offsets(NamedTuple):
-    """Those of :class:`Stance`, counted in the padded maps."""
-
-    wheels: Ints
-    belly: Ints
-    spans: Floats32
-    weights: Floats32
-
-
 @njit(cache=True, nogil=True)
-def _place(ground, offsets, out):  # type: ignore[no-untyped-def]
-    """Fill ``out``, tilt and slope squared, row by row: a row of a map, moved by an offset, lies below one part of the
-    vehicle at all places of the row."""
+def _place(ground, stance, out):  # type: ignore[no-untyped-def]
+    """Fill ``out``, tilt and slope squared, row by row: a row of a padded map, moved by an offset of ``stance``, lies
+    below one part of the vehicle at all places of the row."""
     rows, cols = out.tilt.shape
-    headings = offsets.wheels.shape[0]
-    parts = headings * (offsets.wheels.shape[1] + offsets.belly.shape[1])
+    headings = stance.wheels.shape[0]
+    parts = headings * (stance.wheels.shape[1] + stance.belly.shape[1])
     missing = np.empty(cols, dtype=np.uint16)
     for r in range(rows):
         missing[:] = 0
         for k in range(headings):
-            stand = _below_wheels(ground.stand, offsets.wheels[k], r, cols)
-            _steepest(stand, offsets.spans[k], out.tilt[r])
-            _steepest(_below_wheels(ground.lowest, offsets.wheels[k], r, cols), offsets.spans[k], out.slope[r])
-            for y, x in offsets.wheels[k]:
+            stand = _below_wheels(ground.stand, stance.wheels[k], r, cols)
+            _steepest(stand, stance.spans[k], out.tilt[r])
+            _steepest(_below_wheels(ground.lowest, stance.wheels[k], r, cols), stance.spans[k], out.slope[r])
+            for y, x in stance.wheels[k]:
                 missing += ground.gaps[r + y, x : x + cols]
-            for j in range(offsets.belly.shape[1]):
-                y, x = offsets.belly[k, j]
+            for j in range(stance.belly.shape[1]):
+                y, x = stance.belly[k, j]
                 missing += ground.gaps_below[r + y, x : x + cols]
-                _rise(stand, ground.belly[r + y, x : x + cols], offsets.weights[j], out.rise[r])
+                _rise(stand, ground.belly[r + y, x : x + cols], stance.weights[j], out.rise[r])
         out.unstood[r] = missing / np.float32(parts)
 
 

@@ -31,7 +31,7 @@ def distance(mask: Bools, cell: float) -> Floats32:
         return np.full(mask.shape, np.inf, np.float32)
     cells = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     # In 64 bits, so that a whole number of cells is the same number of metres as a margin of the same length.
-    return (cells.astype(np.float64) * cell).astype(np.float32)
+    return np.asarray(cells.astype(np.float64) * cell, np.float32)
 
 
 class FreePlaces:

@@ -1,17 +1,15 @@
-"""Views of a vehicle: the ground in view of its cameras, its memory of earlier views, and the choice of the next one.
+"""Views of a vehicle: the ground in view of its cameras, its memory, and the choice of the next view.
 
 The field of view follows from the geometry of the cameras alone; occlusion by stones is not modelled. The next view is
-of the ground at the first pose of the path that is not known to be free.
-
-Ground nearer than the images show, or to the side, must be seen before the vehicle comes too near to it, or from
-farther back. Ground that was in view already, from the same side and no farther away, and is still unknown, lies behind
-a stone or is the stone: looking again shows no more.
+of the ground at the first pose of the path that is not known to be free. Ground that is in view already from the
+present place, from the same side and no farther away, and is still unknown lies behind a stone or is the stone:
+looking again shows no more.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -26,21 +24,17 @@ Point = tuple[float, float]
 Stand = tuple[float, float, float]
 """x, y (m) of the middle of a vehicle and its heading (rad to the left of y)."""
 
-RIM = 0.04
+RIM_SHARE = 0.04
 """Share of the image's width and height along its border that does not count as seen: no matching window fits there,
 and the vehicle does not stand exactly level."""
-MOST = 0.9
+MIN_VIEW_SHARE = 0.9
 """Share of a set of points that must be in view for the set to count as in view."""
 STEP = math.radians(5.0)
 """Step [rad] between the turns that are tried."""
-ROUND = math.radians(120.0)
-"""Largest turn [rad] that is tried; a turn beyond the bound of a leg is made in several legs."""
-SIDE = math.radians(25.0)
-"""Angle [rad] between two viewing directions below which both show the same of what stones hide."""
-FARTHER = 1.25
-"""Ratio of distances above which a look from farther away shows less than the earlier one."""
-TWICE = 2
-"""Number of looks from one side at one place, where a look needs no driving."""
+SAME_SIDE = math.radians(25.0)
+"""Angle [rad] between two viewing directions below which both show the same of the ground that stones hide."""
+MAX_FARTHER = 1.25
+"""Ratio of distances up to which a nearer view shows no more than the earlier one."""
 
 
 @dataclass(frozen=True)
@@ -68,13 +62,13 @@ class FieldOfView:
         return np.asarray((self.edges @ at > 0).all(axis=0))
 
     def holds(self, points: Floats, stand: Stand) -> bool:
-        """Whether :data:`MOST` of these points lie in view."""
-        return bool(self.sees(points, stand).mean() >= MOST)
+        """Whether :data:`MIN_VIEW_SHARE` of these points lie in view."""
+        return bool(self.sees(points, stand).mean() >= MIN_VIEW_SHARE)
 
 
 def _edges(camera: Camera, T_vehicle_camera: RigidTransform) -> Floats:
     """(4, 3): lines on the ground, positive inside."""
-    u, v = RIM * camera.width, RIM * camera.height
+    u, v = RIM_SHARE * camera.width, RIM_SHARE * camera.height
     corners = np.array([[u, v], [camera.width - u, v], [camera.width - u, camera.height - v], [u, camera.height - v]])
     # Corners of an image lie half a pixel outside the centres of its corner pixels.
     rays = camera.rays(corners - 0.5) @ T_vehicle_camera.rotation.T
@@ -84,11 +78,6 @@ def _edges(camera: Camera, T_vehicle_camera: RigidTransform) -> Floats:
 
 AHEAD = FieldOfView(np.array([[0.0, 1.0, 0.0]]))
 """All that is before the middle of the vehicle."""
-
-
-def looked(view: FieldOfView, stands: Iterable[Stand], points: Floats) -> list[tuple[float, float]]:
-    """Direction (rad) and distance (m), from the mean of points (n, 2), m, to each pose that had them in view."""
-    return [bearing(points, stand) for stand in stands if view.holds(points, stand)]
 
 
 def bearing(points: Floats, stand: Stand) -> tuple[float, float]:
@@ -105,22 +94,19 @@ class PlannerMemory:
     ----------
     looks : number of looks since the last leg that was driven.
     closed : places (m); the ground around them was still unknown after it had been looked at.
-    stands : poses from which the vehicle has looked.
     reopened : whether the closed places were tried once more, because no other path was left.
     """
 
     looks: int = 0
     closed: list[Point] = field(default_factory=list)
-    stands: list[Stand] = field(default_factory=list)
     reopened: bool = False
 
-    def after(self, verdict: str, stand: Stand, where: Point | None = None) -> Literal["end", "again", "drive"]:
-        """Update the memory after a planned leg (:class:`rille.stages.planning.local_planner.stage.Leg`); return what
+    def after(self, verdict: str, where: Point | None = None) -> Literal["end", "again", "drive"]:
+        """Update the memory after a planned leg (:class:`rille.stages.planning.local_planner.policy.Leg`); return what
         follows: the end, another plan from the same place, or the drive.
 
         Parameters
         ----------
-        stand : where the leg begins.
         where : m; place that it closes.
         """
         if verdict == "no path" and self.closed and not self.reopened:
@@ -134,7 +120,6 @@ class PlannerMemory:
             self.closed, self.looks = [*self.closed, where], 0
             return "again"
         self.looks = {"drive": 0, "turn": self.looks, "look": self.looks + 1}[verdict]
-        self.stands = [*self.stands, stand]
         return "drive"
 
 
@@ -146,41 +131,40 @@ class Target:
     ----------
     view : field of view of the cameras.
     points : (n, 2) m, the ground.
-    unseen : it was never seen from near; otherwise it was, and is a doubtful hazard nevertheless.
-    before : direction (rad) and distance (m) of each place from which it was in view already.
+    present : direction (rad) and distance (m) of the vehicle, if it has the points in view; None: it has not.
     """
 
     ground: Ground
     view: FieldOfView
     points: Floats
-    unseen: bool
-    before: list[tuple[float, float]]
+    present: tuple[float, float] | None
 
     @staticmethod
-    def of(ground: Ground, way: Sequence[Piece], first: int, view: FieldOfView, stands: Sequence[Stand]) -> Target:
-        """Build for the first piece of a path that is not known to be free; ``stands``: poses of earlier looks."""
-        points, unseen = ground.lacking(way, first)
-        return Target(ground, view, points, unseen, looked(view, [*stands, (*ground.start, ground.heading)], points))
+    def of(ground: Ground, way: Sequence[Piece], first: int, view: FieldOfView) -> Target:
+        """Build for the first piece of a path that is not known to be free."""
+        points, stand = ground.lacking(way, first), (*ground.start, ground.heading)
+        return Target(ground, view, points, bearing(points, stand) if view.holds(points, stand) else None)
 
-    def shows(self, stand: Stand, looks: int = 1) -> bool:
-        """Whether it is in view from a pose, and was in view fewer than ``looks`` times from there or nearer."""
+    def shows(self, stand: Stand) -> bool:
+        """Whether the points are in view from a pose, and from another side or nearer than from the present one."""
         if not self.view.holds(self.points, stand):
             return False
+        if self.present is None:
+            return True
         side, far = bearing(self.points, stand)
         # The remainder, since two directions either side of due west differ by almost a full turn as numbers.
-        same = (d <= FARTHER * far and abs(math.remainder(a - side, 2 * math.pi)) < SIDE for a, d in self.before)
-        return sum(same) < looks
+        turned = abs(math.remainder(self.present[0] - side, 2 * math.pi))
+        return turned >= SAME_SIDE or self.present[1] > MAX_FARTHER * far
 
-    def turn(self, at: Point, heading: float, right: float, left: float, looks: int = 1) -> float | None:
+    def turn(self, at: Point, heading: float, right: float, left: float) -> float | None:
         """Least turn (rad) on the spot, within bounds and where the wheels have room, after which it is in view."""
-        found = [0.0]
-        for sign, most in ((1.0, left), (-1.0, right)):
-            # Outwards until the wheels have no room: what lies behind a stone that blocks the turn is not reached
-            # through it.
-            turns = np.array([sign * k * STEP for k in range(1, 1 + math.floor(max(most, 0.0) / STEP + 1e-9))])
-            free = self.ground.free(np.full(turns.shape, at[0]), np.full(turns.shape, at[1]), heading + turns)
-            found += turns[np.logical_and.accumulate(free)].tolist()
-        return next((t for t in sorted(found, key=abs) if self.shows((*at, heading + t), looks)), None)
+        turns = [0.0]
+        for sign, bound in ((1.0, left), (-1.0, right)):
+            # Outwards until the wheels have no room: a stone that blocks the turn blocks all beyond.
+            more = np.array([sign * k * STEP for k in range(1, 1 + math.floor(max(bound, 0.0) / STEP + 1e-9))])
+            free = self.ground.free(np.full(more.shape, at[0]), np.full(more.shape, at[1]), heading + more)
+            turns += more[np.logical_and.accumulate(free)].tolist()
+        return next((t for t in sorted(turns, key=abs) if self.shows((*at, heading + t))), None)
 
     def last_view(self, leg: Sequence[Piece], bound: float) -> tuple[float, float] | None:
         """Return the last position on a leg from which the target is in view, and the turn on the spot that shows it.
@@ -205,31 +189,6 @@ class Target:
             if turn is not None:
                 return done, turn
         return None
-
-    def back(self) -> tuple[list[Piece], float] | None:
-        """The least way straight back, and turn (rad) then, after which it is in view; None: there is none, or it was
-        seen from near and is doubtful, which it mostly stays."""
-        if not self.unseen:
-            return None
-        ground, bound = self.ground, math.radians(self.ground.p.max_turn_deg)
-        p, base = ground.p, ground.vehicle.wheel_base
-        for piece in free_back(ground, p.occluded_radius * base):
-            if length_of([piece]) < p.min_length * base:
-                continue
-            turn = self.turn(piece.b, ground.heading, bound, bound)
-            if turn is not None:
-                return [piece], turn
-        return None
-
-
-def free_back(ground: Ground, most: float) -> list[Piece]:
-    """Straight back, as far as it is free and at most so many metres: pieces, each longer than the one before."""
-    n = math.ceil(2.0 * most / ground.cell)
-    way = np.linspace(0.0, most, n + 1)
-    x, y = ground.start[0] + way * math.sin(ground.heading), ground.start[1] - way * math.cos(ground.heading)
-    free = np.logical_and.accumulate(ground.free(x, y, np.full(way.shape, ground.heading)))
-    ends = list(zip(x[free].tolist(), y[free].tolist(), strict=True))
-    return [Piece(ground.start, end, ground.heading, -1) for end in ends[1:]]
 
 
 def _backward(leg: Sequence[Piece], step: float) -> Iterator[tuple[float, int, float]]:

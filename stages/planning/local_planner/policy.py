@@ -33,9 +33,9 @@ from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.planning.local_planner.clearance import Footing
-from rille.stages.planning.local_planner.ground import Ground
-from rille.stages.planning.local_planner.look import AHEAD, ROUND, TWICE, FieldOfView, PlannerMemory, Stand, Target
-from rille.stages.planning.local_planner.params import LocalPlannerParams
+from rille.stages.planning.local_planner.ground import Ground, KnownFreeGround
+from rille.stages.planning.local_planner.look import AHEAD, FieldOfView, PlannerMemory, Stand, Target
+from rille.stages.planning.local_planner.params import MIN_LEG_WHEELBASES, LocalPlannerParams
 from rille.stages.planning.local_planner.route import (
     Piece,
     first_metres,
@@ -50,10 +50,12 @@ from rille.stages.planning.local_planner.route import (
 
 Point = tuple[float, float]
 Before = tuple[Floats, NDArray[np.int8]]
-"""What is left of a way: vertices (vertex, 2), m, and how it is driven (piece,), 1 ahead, -1 back."""
+"""Rest of a way: vertices (vertex, 2), m, and how it is driven (piece,), 1 ahead, -1 back."""
 
-ASIDE = tuple(math.radians(d) for d in (15.0, -15.0))
-"""Turns for another look at what is in view."""
+MAX_LOOK_TURN = math.radians(120.0)
+"""Largest turn that is tried to see the way from one place; one beyond the bound of a leg is made in several legs."""
+LOOK_TURN = math.radians(25.0)
+"""First turn of a look around; the next ones go as far to the other side."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +63,11 @@ class Leg:
     """``verdict``: drive, turn, look, closed, goal or no path; ``path`` (vertex, 2) m to drive, ``gear`` (piece,) 1 for
     ahead and -1 for back; ``turn`` rad then.
 
-    A look around turns, or drives back to see what lies nearer than the camera's view. ``closed``: it did not help;
-    ``where`` the way is not known to be free.
+    ``closed``: looking did not help; ``where`` the way is not known to be free.
 
-    ``way`` (vertex, 2) m to the goal, as it is planned; ``rest`` (vertex, 2) m what is left of it after the leg, and
-    ``rest_gear`` (piece,) how it is driven; ``cost`` (row, col) m to the goal at these prices at the best
-    heading, NaN where it is closed, or farther than the vehicle.
+    ``way`` (vertex, 2) m to the goal, as it is planned; ``rest`` (vertex, 2) m of it after the leg, and ``rest_gear``
+    (piece,) how it is driven; ``cost`` (row, col) m to the goal at these prices at the best heading, NaN where it is
+    closed, or farther than the vehicle.
     """
 
     verdict: str
@@ -108,7 +109,6 @@ def plan_leg(
         Start or goal lies outside the map.
     """
     start, heading, memory = (stand[0], stand[1]), stand[2], memory or PlannerMemory()
-    looks = memory.looks
     for name, point in (("start", start), ("goal", goal)):
         _check(footing.lattice, name, point)
     base = footing.vehicle.wheel_base
@@ -123,97 +123,85 @@ def plan_leg(
     kept, price = list[Piece](), math.inf
     if before is not None:
         kept, price = ground.again(_onward(before, start, heading, ground.grid.spacing))
-    # Only as the last resort: each of them builds a graph of its own, which takes as long as the first.
-    for other in ground.beside() if not np.isfinite(min(least, price)) and ground.opens(goals) else ():
-        _, found, move = other.search(goal, 0.5 * params.tolerance * base)
-        least = other.from_start(found)
-        if np.isfinite(least):
-            ground, shown = other, other.on_map(found)
-            break
     if not np.isfinite(min(least, price)):
         why = _why_closed(ground, goals, cost)
-        turn = 0.0 if looks >= params.max_looks else _free_turn(ground, looks)
+        turn = 0.0 if memory.looks >= params.max_looks else _free_turn(ground, memory.looks)
         if turn:
-            return _stay("look", f"{why}: looks around", start, [], shown, turn)
+            return _stay("look", f"{why}: looks around", start, [], shown, turn=turn)
         return _stay("no path", why, start, [], shown)
     # Without this the cheaper of two ways round a stone may change at each stop, and the vehicle goes to and fro.
     way = kept if kept and price <= (1.0 + params.replan_hysteresis) * least else ground.way(move)
-    plan = _plain(ground, way)
-    first = _sure(plan)
-    target = Target.of(ground, plan, first, view, memory.stands) if first < len(plan) else None
-    onwards = _onwards(ground, way, plan, shown, target, looks)
-    if onwards is None:
-        assert target is not None, "what is known to the goal can be driven"
-        return _look(target, way, plan, shown, looks)
-    return onwards
+    plan = _straight(ground, way)
+    known = _known_pieces(plan)
+    target = Target.of(ground, plan, known, view) if known < len(plan) else None
+    return _Plan(ground, way, plan, shown, target, can_look=memory.looks < params.max_looks).leg()
 
 
-def _plain(ground: Ground, way: Sequence[Piece]) -> list[Piece]:
+@dataclass(frozen=True)
+class _Plan:
+    """A way to the goal, with straightened first metres ``pieces``; the cost to go (row, col); the ground that has to
+    be seen, None where all is known; whether the vehicle may look once more."""
+
+    ground: Ground
+    way: Sequence[Piece]
+    pieces: Sequence[Piece]
+    cost: Floats32
+    target: Target | None
+    can_look: bool
+
+    def leg(self) -> Leg:
+        """Return the leg to the end of known ground, or to the last place that sees the unknown ground; where it would
+        be shorter than the shortest leg, a look, or the place that looking did not open."""
+        ground, target = self.ground, self.target
+        base, start, heading = ground.vehicle.wheel_base, ground.start, ground.heading
+        bound = math.radians(ground.p.max_turn_deg)
+        leg = first_metres(self.pieces[: _known_pieces(self.pieces)], ground.p.max_length * base)
+        least = MIN_LEG_WHEELBASES * base
+        # A last piece to the goal may be shorter.
+        if length_of(leg) < min(least, length_of(self.pieces) - 1e-9):
+            return self._look(MAX_LOOK_TURN) or self._closed()
+        facing = 0.0
+        view = None if target is None else target.last_view(leg, bound)
+        if view is not None and view[0] >= least:
+            leg, facing = first_metres(leg, view[0]), view[1]
+        elif (look := self._look(bound)) is not None:
+            return look
+        leg, turn = within_turn(leg, heading, bound)
+        if not leg:
+            reason = f"turns {math.degrees(turn):.0f} degrees to where it goes on"
+            return _stay("turn", reason, start, self.pieces, self.cost, turn=turn)
+        end, turn = leg[-1], turn or facing
+        if not turnable(end.b, end.heading, end.heading + turn, ground.clear):
+            turn = 0.0
+        rest = last_metres(self.pieces, length_of(leg))
+        return Leg("drive", "", *_line(leg, start), turn, vertices(self.way, start), *_line(rest, end.b), self.cost)
+
+    def _look(self, widest: float) -> Leg | None:
+        """A turn on the spot that shows the target; None: it was looked at too often, or is in view, or cannot be."""
+        if self.target is None or not self.can_look:
+            return None
+        turn = self.target.turn(self.ground.start, self.ground.heading, widest, widest)
+        if not turn:
+            return None
+        bound = math.radians(self.ground.p.max_turn_deg)
+        turn = max(-bound, min(bound, turn))
+        reason = f"turns {math.degrees(turn):.0f} degrees to see the way"
+        return _stay("look", reason, self.ground.start, self.pieces, self.cost, turn=turn)
+
+    def _closed(self) -> Leg:
+        """The place that looking did not open."""
+        way, start = self.way, self.ground.start
+        x, y = way[min(_known_pieces(way), len(way) - 1)].cut(self.ground.grid.spacing).b
+        reason = f"the ground at ({x:.3f}, {y:.3f}) m was looked at in vain"
+        return _stay("closed", reason, start, way, self.cost, where=(x, y))
+
+
+def _straight(ground: Ground, way: Sequence[Piece]) -> list[Piece]:
     """A way whose first metres are made straighter, as far as they are known."""
     # Beyond some legs the map will have changed before the vehicle is there: straightening it is for nothing.
-    sure = first_metres(way[: _sure(way)], 4.0 * ground.p.max_length * ground.vehicle.wheel_base)
-    straight = straightened(sure, ground.heading, ground.plain, ground.cell)
-    return [*straight, *last_metres(way, length_of(sure))]
-
-
-def _onwards(
-    ground: Ground,
-    way: Sequence[Piece],
-    plan: Sequence[Piece],
-    shown: Floats32,
-    target: Target | None,
-    looks: int,
-) -> Leg | None:
-    """Return the leg along a path: to the end of known ground, or to the last place that sees the unknown ground.
-
-    None: this leg would be shorter than ``min_length``.
-    """
-    p, base, start, heading = ground.p, ground.vehicle.wheel_base, ground.start, ground.heading
-    bound = math.radians(p.max_turn_deg)
-    leg = first_metres(plan[: _sure(plan)], p.max_length * base)
-    # A last piece to the goal may be shorter.
-    if length_of(leg) < min(p.min_length * base, length_of(plan) - 1e-9):
-        return None
-    seen = None if target is None else target.last_view(leg, bound)
-    facing = 0.0
-    if seen is not None and seen[0] >= p.min_length * base:
-        leg, facing = first_metres(leg, seen[0]), seen[1]
-    elif target is not None and looks < p.max_looks:
-        turn = target.turn(start, heading, bound, bound)
-        if turn:
-            return _stay("look", f"turns {math.degrees(turn):.0f} degrees to see the way", start, plan, shown, turn)
-    leg, turn = within_turn(leg, heading, bound)
-    if not leg:
-        return _stay("turn", f"turns {math.degrees(turn):.0f} degrees to where it goes on", start, plan, shown, turn)
-    end = leg[-1]
-    turn = turn or facing
-    if not turnable(end.b, end.heading, end.heading + turn, ground.clear):
-        turn = 0.0
-    rest = last_metres(plan, length_of(leg))
-    return Leg("drive", "", *_line(leg, start), turn, vertices(way, start), *_line(rest, end.b), shown)
-
-
-def _look(target: Target, way: Sequence[Piece], plan: Sequence[Piece], shown: Floats32, looks: int) -> Leg:
-    """A look at where a way is not known, or that looks did not help."""
-    ground = target.ground
-    p, start, heading = ground.p, ground.start, ground.heading
-    if looks < p.max_looks:
-        turn = target.turn(start, heading, ROUND, ROUND, TWICE)
-        if turn == 0.0:  # in view, but not known: once more from a little aside
-            turn = next((t for t in ASIDE if turnable(start, heading, heading + t, ground.clear)), 0.0)
-        if turn:
-            bound = math.radians(p.max_turn_deg)
-            turn = max(-bound, min(bound, turn))
-            return _stay("look", f"turns {math.degrees(turn):.0f} degrees to see the way", start, way, shown, turn)
-        found = target.back()
-        if found is not None:
-            back, turn = found
-            reason = f"drives back {1000 * length_of(back):.0f} mm to see the ground before it"
-            rest = [Piece(back[-1].b, start, heading, 1), *plan]
-            return Leg("look", reason, *_line(back, start), turn, vertices(way, start), *_line(rest, back[-1].b), shown)
-    x, y = way[min(_sure(way), len(way) - 1)].cut(ground.grid.spacing).b
-    reason = f"the ground at ({x:.3f}, {y:.3f}) m was looked at in vain"
-    return _stay("closed", reason, start, way, shown, where=(x, y))
+    first = first_metres(way[: _known_pieces(way)], 4.0 * ground.p.max_length * ground.vehicle.wheel_base)
+    straight = straightened(first, ground.heading, ground.plain, ground.cell)
+    return [*straight, *last_metres(way, length_of(first))]
 
 
 def _line(way: Sequence[Piece], start: Point) -> tuple[Floats, NDArray[np.int8]]:
@@ -222,7 +210,7 @@ def _line(way: Sequence[Piece], start: Point) -> tuple[Floats, NDArray[np.int8]]
 
 
 def _onward(before: Before, start: Point, heading: float, least: float) -> list[Piece]:
-    """What was left of a way, from where the vehicle is now; vertices nearer than ``least`` metres are passed."""
+    """Rest of a way from where the vehicle is now; vertices nearer than ``least`` metres are passed."""
     (points, gear), first = before, 1
     while first + 1 < len(points) and math.hypot(*(points[first] - start)) < least:
         first += 1
@@ -235,6 +223,7 @@ def _stay(
     start: Point,
     way: Sequence[Piece],
     cost: Floats32,
+    *,
     turn: float = 0.0,
     where: Point | None = None,
 ) -> Leg:
@@ -242,29 +231,23 @@ def _stay(
     return Leg(verdict, reason, *_line([], start), turn, vertices(way, start), *_line(way, start), cost, where)
 
 
-def _sure(way: Sequence[Piece]) -> int:
+def _known_pieces(way: Sequence[Piece]) -> int:
     """Number of pieces before the first that is not known to be free."""
     return next((i for i, piece in enumerate(way) if not piece.known), len(way))
 
 
 def _free_turn(ground: Ground, looks: int) -> float:
-    """Turn (rad) to look around, to one side and then to the other, that the wheels have room for; 0: none."""
-    bound = math.radians(ground.p.max_turn_deg)
-    # Each turn starts where the last one ended: they look 25 degrees to the left of the first heading, 25 to the right
-    # and 50 to the left, as far as the bound lets them.
-    aside = [math.radians(d) for d in (25.0, -50.0, 75.0)]
-    aside = aside[looks % 3 :] + aside[: looks % 3] + [math.radians(d) for d in (-25.0, 15.0, -15.0)]
-    for turn in (max(-bound, min(bound, a)) for a in aside):
-        if turnable(ground.start, ground.heading, ground.heading + turn, ground.clear):
-            return turn
-    return 0.0
+    """Turn (rad) to look around, to one side and then farther to the other, that the wheels have room for; 0: none."""
+    side = 1.0 if looks % 2 == 0 else -1.0
+    turn = side * min(LOOK_TURN * (looks + 1), math.radians(ground.p.max_turn_deg))
+    free = (t for t in (turn, -turn) if turnable(ground.start, ground.heading, ground.heading + t, ground.clear))
+    return next(free, 0.0)
 
 
 def shortest(footing: Footing, stand: Stand, goal: Point, params: LocalPlannerParams) -> float | None:
     """Length, m, of the shortest way over known ground, at no price but its length; None: none."""
-    free = {"unknown_cost": math.inf, "proximity_cost": 0.0, "caution_cost": 0.0, "turn_cost": 0.0, "reverse_cost": 1.0}
     start, heading = (stand[0], stand[1]), stand[2]
-    ground = Ground(footing, start, heading, params.model_copy(update=free))
+    ground = KnownFreeGround(footing, start, heading, params)
     _, cost, move = ground.search(goal, 0.5 * params.tolerance * footing.vehicle.wheel_base)
     if not np.isfinite(ground.from_start(cost)):
         return None

@@ -56,6 +56,11 @@ class PoseGrid:
         shape = row0 + 1 + math.ceil(-ahead.min()), col0 + 1 + math.ceil(right.max())
         return PoseGrid(middle, heading, spacing, shape, (row0, col0))
 
+    def places(self) -> tuple[Floats, Floats]:
+        """x and y (row, col), m, of all places."""
+        row, col = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in self.shape), indexing="ij")
+        return self.xy(row, col)
+
     def xy(self, row: Floats, col: Floats) -> tuple[Floats, Floats]:
         """Metres, of fractional rows and columns."""
         right, ahead = (col - self.origin[1]) * self.spacing, (self.origin[0] - row) * self.spacing
@@ -116,7 +121,7 @@ class PoseGraph:
         end = -1 if whole else r * size[2] + c
         angles = np.mod(np.diff(np.append(ANGLES, 2 * np.pi)), 2 * np.pi)
         moves = _Moves(STEPS, LENGTHS * self.grid.spacing, angles * turn_price, back)
-        _search((self.pose, self.step, self.turn), goals, moves, end, cost, move)
+        _search(_Costs(self.pose, self.step, self.turn), goals, moves, end, cost, move)
         return cost, move
 
     def follow(self, move: NDArray[np.int8]) -> list[tuple[int, int, int, int]]:
@@ -138,6 +143,14 @@ def angle_of(k: int) -> float:
     return 2 * math.pi * turns + float(ANGLES[rest])
 
 
+class _Costs(NamedTuple):
+    """Those of :class:`PoseGraph`."""
+
+    pose: Floats
+    step: Floats
+    turn: Floats
+
+
 class _Moves(NamedTuple):
     """Of each heading (16): row and column of a step ahead, its length (m), the price of a turn to the left; and the
     price of driving back, ahead is 1."""
@@ -150,15 +163,13 @@ class _Moves(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _search(prices, goals, moves, end, cost, move):  # type: ignore[no-untyped-def]
-    pose, step, turn = prices
-    steps, lengths, turns, back = moves
     rows, cols = goals.shape
     area = rows * cols
     keys, nodes, size = np.empty(4096, np.float64), np.empty(4096, np.int64), 0
     for k in range(16):
         for r in range(rows):
             for c in range(cols):
-                if goals[r, c] and pose[k % 8, r, c] < np.inf:
+                if goals[r, c] and prices.pose[k % 8, r, c] < np.inf:
                     cost[k, r, c] = 0.0
                     if size == keys.shape[0]:
                         keys, nodes = grown(keys), grown(nodes)
@@ -173,25 +184,25 @@ def _search(prices, goals, moves, end, cost, move):  # type: ignore[no-untyped-d
             continue
         if node == end:
             break
-        here = pose[k % 8, r, c]
+        here = prices.pose[k % 8, r, c]
         for m in range(4):
             before, i, j, scale = k, r, c, 1.0
             if m < 2:
                 sign = -1 if m == 0 else 1
-                i, j = r + sign * steps[k, 0], c + sign * steps[k, 1]
+                i, j = r + sign * moves.steps[k, 0], c + sign * moves.steps[k, 1]
                 if i < 0 or j < 0 or i >= rows or j >= cols:
                     continue
                 # the step along heading k % 8 that joins both places begins at one of them
                 first = (m == 0) == (k < 8)
-                between = step[k % 8, i, j] if first else step[k % 8, r, c]
-                scale = lengths[k] * (back if m == 1 else 1.0)
+                between = prices.step[k % 8, i, j] if first else prices.step[k % 8, r, c]
+                scale = moves.lengths[k] * (moves.back if m == 1 else 1.0)
             else:
                 # Searched backwards: a turn to the left (2) that ends at k began one heading to its right.
                 before = (k + 15) % 16 if m == 2 else (k + 1) % 16
                 lower = before if m == 2 else k
-                between, scale = turn[lower % 8, r, c], turns[lower]
+                between, scale = prices.turn[lower % 8, r, c], moves.turns[lower]
             # The highest cost of both ends and the middle, so that a step does not jump over costly ground.
-            price = max(here, pose[before % 8, i, j], between)
+            price = max(here, prices.pose[before % 8, i, j], between)
             total = key + scale * price
             if total < cost[before, i, j]:
                 cost[before, i, j], move[before, i, j] = total, m

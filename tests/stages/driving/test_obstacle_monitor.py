@@ -79,11 +79,8 @@ def surface(block: tuple[float, float, float, float] | None = None) -> LastModel
     return LastModel.of(z, LATTICE, P.model_radius * ROVER.wheel_diameter)
 
 
-NOTHING = np.zeros((0, 2))
-
-
 def found(v: ViewPair, s: LastModel) -> Obstacle | None:
-    return obstacle(look(v, s, CAMERA, T_VEHICLE_LEFT, ROVER, P), ROVER.wheel_diameter, P, NOTHING)[0]
+    return obstacle(look(v, s, CAMERA, T_VEHICLE_LEFT, ROVER, P), ROVER.wheel_diameter, P)
 
 
 @pytest.mark.parametrize("y1", [0.05, 0.075])
@@ -121,39 +118,24 @@ def test_rises_are_those_of_the_block() -> None:
     assert np.abs(flat).max() < 1e-4
 
 
-def scattered(raised: int, flat: int, at: float = 0.2, *, moved: float = 0.0) -> Points:
-    """So many points within a wheel's diameter, ``at`` metres ahead; the model's frame is ``moved`` metres behind."""
+def scattered(raised: int, flat: int, at: float = 0.2) -> Points:
+    """So many points within a wheel's diameter, ``at`` metres ahead."""
     place = np.array([0.0, at]) + 0.008 * np.random.default_rng(raised).uniform(-1, 1, (raised + flat, 2))
     up = np.arange(raised + flat) < raised
-    return Points(place, place + np.array([0.0, moved]), np.where(up, 0.012, 0.0), up)
-
-
-def test_few_among_many_count_where_the_image_before_showed_them_as_well() -> None:
-    wheel, few = ROVER.wheel_diameter, scattered(8, 36)
-    alone, doubtful = obstacle(few, wheel, P, NOTHING)
-    assert alone is None
-    assert len(doubtful) == 8
-    nearer = scattered(9, 40, 0.175, moved=0.025)
-    again, _ = obstacle(nearer, wheel, P, doubtful)
-    assert again is not None
-    assert again.count == 9
-    elsewhere, _ = obstacle(scattered(9, 40, 0.175, moved=0.025 + 2 * wheel), wheel, P, doubtful)
-    assert elsewhere is None
+    return Points(place, np.where(up, 0.012, 0.0), up)
 
 
 def test_too_few_never_count() -> None:
     wheel = ROVER.wheel_diameter
-    assert obstacle(scattered(P.min_points - 1, 0), wheel, P, np.array([[0.0, 0.2]]))[0] is None
-    assert obstacle(scattered(8, 80), wheel, P, np.array([[0.0, 0.2]]))[0] is None, "a tenth of what is seen there"
+    assert obstacle(scattered(P.min_points - 1, 0), wheel, P) is None
+    assert obstacle(scattered(8, 80), wheel, P) is None, "a tenth of what is seen there"
 
 
 def test_the_largest_group_does_not_hide_a_surer_one() -> None:
     """Twelve of a hundred, and nine of twelve beside them."""
     parts = [scattered(12, 88), scattered(9, 3, 0.3)]
-    both = Points(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("place", "ground", "rise", "raised"))
-    )
-    seen, _ = obstacle(both, ROVER.wheel_diameter, P, NOTHING)
+    both = Points(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("place", "rise", "raised")))
+    seen = obstacle(both, ROVER.wheel_diameter, P)
     assert seen is not None
     assert seen.count == 9
     assert seen.place[1] == pytest.approx(0.3, abs=0.01)

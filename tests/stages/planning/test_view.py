@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pointing_angles import rotation_from_angles
 
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
-from rille.stages.planning.local_planner.look import RIM, FieldOfView, looked
+from rille.stages.planning.local_planner.look import RIM_SHARE, FieldOfView, bearing
 
 LEFT = Camera(180.0, 175.0, 150.0, 125.0, 320, 240)
 RIGHT = Camera(190.0, 190.0, 159.5, 119.5, 320, 240)
@@ -44,17 +44,13 @@ def test_what_is_in_view_lies_in_both_images(toe: float, roll: float, stand: tup
     right, ahead = (points - (x, y)) @ [[c, -s], [s, c]] @ np.eye(2)[:, :1], (points - (x, y)) @ [[-s], [c]]
     there = np.column_stack([right, ahead, np.zeros(len(points))])
     in_left = T_vehicle_left.inverse().apply(there)
-    want = inside(rig.left, in_left, RIM) & inside(rig.right, rig.T_right_left.apply(in_left), RIM)
+    want = inside(rig.left, in_left, RIM_SHARE) & inside(rig.right, rig.T_right_left.apply(in_left), RIM_SHARE)
     seen = FieldOfView.of(rig, T_vehicle_left).sees(points, stand)
     assert 20 < want.sum() < 1500
     assert (seen != want).sum() <= 1, "but for rounding at an edge"
 
 
-def test_from_where_points_were_in_view_has_a_side_and_a_distance() -> None:
-    rig, T_vehicle_left = rig_of(0.0, 0.0)
-    view, points = FieldOfView.of(rig, T_vehicle_left), np.array([(0.0, 0.3), (0.02, 0.3), (-0.02, 0.3)])
-    ahead, beside, beyond = (0.0, 0.0, 0.0), (0.3, 0.0, math.pi / 4), (0.0, 0.6, 0.0)
-    assert looked(view, [ahead, beside, beyond], points) == [
-        pytest.approx((-math.pi / 2, 0.3)),
-        pytest.approx((-math.pi / 4, math.hypot(0.3, 0.3))),
-    ]
+def test_points_are_seen_from_a_side_and_a_distance() -> None:
+    points = np.array([(0.0, 0.3), (0.02, 0.3), (-0.02, 0.3)])
+    assert bearing(points, (0.0, 0.0, 0.0)) == pytest.approx((-math.pi / 2, 0.3))
+    assert bearing(points, (0.3, 0.0, math.pi / 4)) == pytest.approx((-math.pi / 4, math.hypot(0.3, 0.3)))
