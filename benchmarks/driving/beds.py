@@ -25,7 +25,7 @@ def choose_goal(bed: Any, config: Any) -> tuple[float, float] | None:
     start, heading = bed.start()
     ground = KnownFreeGround(footing, start, heading, config.local_planner)
     _, cost, _ = ground.search(start, cell, whole=True)
-    x, y = ground.places()
+    x, y = ground.grid.places()
     far = np.where(np.isfinite(cost).all(axis=0), np.hypot(x - NOMINAL[0], y - NOMINAL[1]), np.inf)
     far[np.hypot(x - start[0], y - start[1]) < MIN_GOAL_DISTANCE_M] = np.inf
     best = np.unravel_index(int(np.argmin(far)), far.shape)

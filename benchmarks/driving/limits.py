@@ -62,7 +62,7 @@ def shortest_within_limits(bed: ExactBed, goal: tuple[float, float], params: Any
         return free, np.where(free, 1.0, np.inf)
 
     graph = PoseGraph.of(limits, grid, price)  # type: ignore[arg-type]
-    px, py = grid.xy(*np.meshgrid(*(np.arange(n, dtype=np.float64) for n in grid.shape), indexing="ij"))
+    px, py = grid.places()
     goals = np.hypot(px - gx, py - gy) <= 0.5 * params.tolerance * vehicle.wheel_base
     cost, move = graph.search(goals, 0.0, 1.0)
     if not np.isfinite(cost[0, grid.origin[0], grid.origin[1]]):

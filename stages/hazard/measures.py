@@ -38,7 +38,7 @@ from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.numeric.extrema import median3, relief
 from rille.stages.numeric.windows import window_sum
 
-FINE = 5
+MIN_FINE_CELLS = 5
 """Cells along a wheel's radius from which a 3 x 3 median is taken: at most three wrong cells are no stone there."""
 
 
@@ -59,7 +59,7 @@ class HazardInput:
         self, surface: Floats32, closed: Floats32, std: Floats32, cell: float, vehicle: Vehicle, window: float
     ) -> None:
         # Of coarser models a single cell may be the top of a stone.
-        self.surface = median3(surface) if FINE * cell <= 0.5 * vehicle.wheel_diameter else surface
+        self.surface = median3(surface) if MIN_FINE_CELLS * cell <= 0.5 * vehicle.wheel_diameter else surface
         self.closed, self.std, self.cell, self.vehicle = closed, std, cell, vehicle
         self.reach, self.near = window_reach(window, cell), window_reach(0.5 * window, cell)
         self.stride = stride(vehicle, cell)

@@ -83,8 +83,14 @@ class Fields(NamedTuple):
     proven: Floats32
 
 
-class _Ground(NamedTuple):
-    """The maps of :class:`Footing` that its kernel reads."""
+class FootingMaps(NamedTuple):
+    """Maps (row, col) as a vehicle meets them, distances in metres.
+
+    ``wheels``, ``body``: distances to hazards to a wheel, and to the vehicle. ``unknown``: distance to unknown ground;
+    ``frontier``: to that of it where a wheel has room, for the rest is mostly the shadows of stones. ``cost_class``: 0
+    (clear), :data:`CAUTION_GROUND` or :data:`DOUBTED_GROUND`. ``straddle``: unknown ground over which the belly may
+    pass.
+    """
 
     wheels: Fields
     body: Fields
@@ -115,22 +121,11 @@ class _Parts(NamedTuple):
 
 @dataclass(frozen=True)
 class Footing:
-    """A risk map as a vehicle meets it; all arrays (row, col), distances in metres.
-
-    ``wheels``, ``body``: distances to hazards to a wheel, and to the vehicle. ``unknown``: distance to unknown ground;
-    ``frontier``: to that of it where a wheel has room, for the rest is mostly the shadows of stones. ``cost_class``: 0
-    (clear), :data:`CAUTION_GROUND` or :data:`DOUBTED_GROUND`. ``straddle``: unknown ground over which the belly may
-    pass. ``glanced``: where unknown ground was seen from afar; None: nowhere.
-    """
+    """A risk map as a vehicle meets it; ``glanced`` (row, col): unknown ground that was seen from afar, None: none."""
 
     lattice: Lattice
     vehicle: Vehicle
-    wheels: Fields
-    body: Fields
-    unknown: Floats32
-    frontier: Floats32
-    cost_class: Bytes
-    straddle: Straddle
+    maps: FootingMaps
     glanced: Bools | None = None
 
     @staticmethod
@@ -177,7 +172,8 @@ class Footing:
         void = distance(unknown if bounds is None else unknown & np.isnan(bounds.upper), cell)
         straddle = Straddle.of(void, bounds, vehicle, _belly(vehicle), cell)
         unseen, frontier = distance(unknown, cell), distance(wide, cell)
-        return Footing(lattice, vehicle, wheels, body, unseen, frontier, cost_class, straddle, known.glanced)
+        maps = FootingMaps(wheels, body, unseen, frontier, cost_class, straddle)
+        return Footing(lattice, vehicle, maps, known.glanced)
 
     def gaps(self, x: Floats, y: Floats, heading: Floats) -> Gaps:
         """Compute the distances at poses: x, y (m) and heading (rad to the left of y), arrays of one shape."""
@@ -187,14 +183,9 @@ class Footing:
         # Rounding to cells takes up to one and a half of them.
         radius = 0.5 * math.hypot(vehicle.track, vehicle.wheel_base) + 1.5 * cell + vehicle.margin
         points = wheel_positions(vehicle) / cell, _belly(vehicle) / cell
-        ground = _Ground(self.wheels, self.body, self.unknown, self.frontier, self.cost_class, self.straddle)
         out = Gaps(*(np.zeros(len(at), np.float32) for _ in Gaps._fields))
-        _gaps(
-            _Poses(at, np.cos(turn), np.sin(turn)),
-            _Parts(*points, f(vehicle.margin), f(cell), f(radius)),
-            ground,
-            out,
-        )
+        poses, parts = _Poses(at, np.cos(turn), np.sin(turn)), _Parts(*points, f(vehicle.margin), f(cell), f(radius))
+        _gaps(poses, parts, self.maps, out)
         for distances in (out.unknown, out.frontier):
             distances -= MIN_UNKNOWN_CELLS * cell
         return Gaps(*(a.reshape(np.shape(x)) for a in out))
@@ -238,9 +229,9 @@ def _cell_under(poses, n, point):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _gaps(poses, parts, ground, out):  # type: ignore[no-untyped-def]
+def _gaps(poses, parts, maps, out):  # type: ignore[no-untyped-def]
     """Fill ``out``, the arrays (n,) of :class:`Gaps`."""
-    rows, cols = ground.unknown.shape
+    rows, cols = maps.unknown.shape
     stand, heights = np.empty((4, 2), dtype=np.int64), np.empty(4)
     middle = np.zeros(2)
     for n in range(poses.at.shape[0]):
@@ -251,12 +242,12 @@ def _gaps(poses, parts, ground, out):  # type: ignore[no-untyped-def]
             out.unknown[n] = out.frontier[n] = -1.0
             continue
         # The middle keeps off cells hazardous to the vehicle, the wheels keep off those hazardous to wheels.
-        gap, doubtful, proven = ground.body.likely[i, j], ground.body.doubtful[i, j], ground.body.proven[i, j]
+        gap, doubtful, proven = maps.body.likely[i, j], maps.body.doubtful[i, j], maps.body.proven[i, j]
         cautious, doubted = (
-            int(ground.cost_class[i, j] == CAUTION_GROUND),
-            int(ground.cost_class[i, j] == DOUBTED_GROUND),
+            int(maps.cost_class[i, j] == CAUTION_GROUND),
+            int(maps.cost_class[i, j] == DOUBTED_GROUND),
         )
-        spare = ground.unknown[i, j] - parts.radius
+        spare = maps.unknown[i, j] - parts.radius
         inside, unknown, frontier = True, np.float32(np.inf), np.float32(np.inf)
         for k in range(4):
             i, j = _cell_under(poses, n, parts.wheels[k])
@@ -264,27 +255,27 @@ def _gaps(poses, parts, ground, out):  # type: ignore[no-untyped-def]
                 inside, unknown, frontier = False, np.float32(-1.0), np.float32(-1.0)
                 continue
             stand[k, 0], stand[k, 1] = i, j
-            gap, doubtful = min(gap, ground.wheels.likely[i, j]), min(doubtful, ground.wheels.doubtful[i, j])
-            proven = min(proven, ground.wheels.proven[i, j])
-            cautious += ground.cost_class[i, j] == CAUTION_GROUND
-            doubted += ground.cost_class[i, j] == DOUBTED_GROUND
-            unknown = min(unknown, ground.unknown[i, j] - parts.margin)
-            frontier = min(frontier, ground.frontier[i, j] - parts.margin)
+            gap, doubtful = min(gap, maps.wheels.likely[i, j]), min(doubtful, maps.wheels.doubtful[i, j])
+            proven = min(proven, maps.wheels.proven[i, j])
+            cautious += maps.cost_class[i, j] == CAUTION_GROUND
+            doubted += maps.cost_class[i, j] == DOUBTED_GROUND
+            unknown = min(unknown, maps.unknown[i, j] - parts.margin)
+            frontier = min(frontier, maps.frontier[i, j] - parts.margin)
         if inside and spare > 0:
             # No unknown ground within the circle about the vehicle: its belly need not be judged point by point.
             unknown = frontier = spare + parts.cell
         elif inside:
-            steady = stands(ground.straddle, stand, heights)
+            steady = stands(maps.straddle, stand, heights)
             for k in range(parts.belly.shape[0]):
                 i, j = _cell_under(poses, n, parts.belly[k])
                 # All wheels are on the map: a point outside is a rounding to cells.
                 i, j = min(max(i, 0), rows - 1), min(max(j, 0), cols - 1)
-                void = ground.straddle.void[i, j]
+                void = maps.straddle.void[i, j]
                 # Unknown, but bounded and low enough: then only the nearest ground without a bound counts.
-                if steady and void > ground.unknown[i, j] and clears(ground.straddle, k, i, j, heights):
+                if steady and void > maps.unknown[i, j] and clears(maps.straddle, k, i, j, heights):
                     unknown = min(unknown, void)
                 else:
-                    unknown, frontier = min(unknown, ground.unknown[i, j]), min(frontier, ground.frontier[i, j])
+                    unknown, frontier = min(unknown, maps.unknown[i, j]), min(frontier, maps.frontier[i, j])
         out.gap[n], out.doubtful[n], out.proven[n] = gap, doubtful, proven
         out.unknown[n], out.frontier[n] = unknown, frontier
         out.caution[n], out.doubted[n] = cautious, doubted

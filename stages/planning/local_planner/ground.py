@@ -131,13 +131,9 @@ class Ground:
         """Which of these poses may be driven."""
         return self._split(self.footing.gaps(x, y, heading), x, y)[0]
 
-    def places(self) -> tuple[Floats, Floats]:
-        """x and y (row, col), m, of the graph's places."""
-        return self.grid.places()
-
     def search(self, goal: Point, reach: float, *, whole: bool = False) -> tuple[Bools, Floats, NDArray[np.int8]]:
         """Goals (row, col) within ``reach`` metres, cost and move (heading, row, col)."""
-        x, y = self.places()
+        x, y = self.grid.places()
         goals: Bools = np.asarray(np.hypot(x - goal[0], y - goal[1]) <= reach)
         turn = self.turn_cost * self.vehicle.wheel_base
         return goals, *self.graph.search(goals, turn, self.reverse_cost, whole=whole)
@@ -195,8 +191,8 @@ class Ground:
         _, x, y, angle = self._along(piece.cut(self.grid.spacing), before)
         k = int(np.argmin(self.free(x, y, angle)))
         stand = float(x[k]), float(y[k]), float(angle[k])
-        hazards = (self.footing.wheels.likely == 0) | (self.footing.wheels.doubtful == 0)
-        for mask in (self.footing.unknown == 0, hazards):
+        maps = self.footing.maps
+        for mask in (maps.unknown == 0, (maps.wheels.likely == 0) | (maps.wheels.doubtful == 0)):
             points = self.footing.beneath(mask, stand)
             if len(points):
                 return points

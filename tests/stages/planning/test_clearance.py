@@ -143,5 +143,5 @@ def test_ground_within_a_quarter_of_a_wheel_of_doubted_ground_is_dear() -> None:
     unknown = Y > 0.2
     footing = Footing.of(Hazards(risk), LATTICE, ROVER, KnownGround(unknown, doubted=X > 0.059))
     assert np.array_equal(
-        footing.cost_class == DOUBTED_GROUND, (X > 0.054) & ~unknown
+        footing.maps.cost_class == DOUBTED_GROUND, (X > 0.054) & ~unknown
     )  # a cell of 5 mm beside it, not the next

@@ -73,9 +73,11 @@ def test_steep_stands_and_wheels_on_what_was_not_seen_do_not_count() -> None:
         assert (unknown(footing(SPOT, low, slope * Y)) > 0) == free
         assert (unknown(footing(SPOT, low, slope * X)) > 0) == free
     seen = footing(SPOT, low)
-    far = np.asarray(seen.straddle.stand).copy()
+    straddle = seen.maps.straddle
+    far = np.asarray(straddle.stand).copy()
     far[:, Y > 0.03] = np.nan  # the front wheels stand where only the far view knows the ground
-    blind = Footing(**{**vars(seen), "straddle": seen.straddle._replace(stand=far)})
+    maps = seen.maps._replace(straddle=straddle._replace(stand=far))
+    blind = Footing(LATTICE, ROVER, maps)
     assert unknown(blind) <= 0
 
 
