@@ -14,6 +14,7 @@ import numpy as np
 
 from rille.stages.core.arrays import Bools, Bytes, Floats32
 from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.numeric.extrema import octagon
 from rille.stages.planning.wheels import wheel_positions
 
 STRAIGHT, RIGHT, ACROSS, LEFT = 1, 2, 4, 8
@@ -21,8 +22,8 @@ STRAIGHT, RIGHT, ACROSS, LEFT = 1, 2, 4, 8
 ALL = STRAIGHT | RIGHT | ACROSS | LEFT
 STEPS = ((STRAIGHT, -1, 0), (RIGHT, -1, 1), (ACROSS, 0, 1), (LEFT, -1, -1))
 """Bit, row and column of one step in each direction."""
-ROUNDING_CELLS = 1e-6
-"""Cells by which a distance may exceed a margin by rounding alone."""
+ROUNDING_CELLS = 1e-9
+"""Cells by which rounding alone may make a whole number of cells larger."""
 
 
 def distance(mask: Bools, cell: float) -> Floats32:
@@ -59,11 +60,9 @@ class FreePlaces:
         self._half_cells = vehicle.half_length / cell, vehicle.half_width / cell
         self._wheels = [_wheel_cells(vehicle, cell, dr, dc) for _, dr, dc in STEPS]
         self._unknown = unknown
-        reach = vehicle.margin + ROUNDING_CELLS * cell
-        middle = distance(body_hazard, cell) <= reach
+        near, middle = (_grown(mask, vehicle.margin / cell) for mask in (wheel_hazard, body_hazard))
         if closed is not None:
             middle |= closed
-        near = distance(wheel_hazard, cell) <= reach
         self._closed = [middle | _touching(near, wheels, outside=False) for wheels in self._wheels]
 
     def ways(self, below: str = "middle") -> Bytes:
@@ -95,19 +94,34 @@ def _touching(mask: Bools, wheels: list[tuple[int, int]], *, outside: bool) -> B
     return np.asarray(np.logical_or.reduce(moved))
 
 
+def _grown(mask: Bools, reach: float) -> Bools:
+    """Cells within ``reach`` cells of the mask: an octagon that holds the circle."""
+    # Rounded up: a margin that is a fraction of a cell too wide closes a way, one too narrow touches a hazard.
+    side, diagonal = octagon(math.ceil(reach - ROUNDING_CELLS))
+    return _dilated(mask, [(side, 0, 1), (side, 1, 0), (diagonal, 1, 1), (diagonal, 1, -1)], outside=False)
+
+
 def _widened(mask: Bools, half_length: float, half_width: float, step: tuple[int, int]) -> Bools:
     """Cells from which a rectangle, cells, aligned with ``step`` (row, col), touches the mask or leaves the map."""
-    dr, dc = step
-    lines = [(half_length, dr, dc), (half_width, dc, -dr)]
-    if dr and dc:
+    # A size that is a whole number of steps may come out a rounding above it, and must not grow by a step.
+    along, across = (max(0, math.ceil(v / math.hypot(*step) - ROUNDING_CELLS)) for v in (half_length, half_width))
+    lines = [(along, step[0], step[1]), (across, step[1], -step[0])]
+    if step[0] and step[1]:
         # A diagonal line leaves every other cell out; three cells of a row close them.
-        lines.append((1.0, 0, 1))
-    out = mask.astype(np.uint8)
-    for half, r, c in lines:
-        # A size that is a whole number of steps may come out a rounding above it, and must not grow by a step.
-        n = max(0, math.ceil(half / math.hypot(r, c) - 1e-9))
+        lines.append((1, 0, 1))
+    return _dilated(mask, lines, outside=True)
+
+
+def _dilated(mask: Bools, lines: list[tuple[int, int, int]], *, outside: bool) -> Bools:
+    """The mask dilated by lines, one after the other: of so many steps (row, col) to either side; cells off the map
+    count as ``outside``."""
+    # A line may lead off the map and the next one back.
+    border = sum(n for n, _, _ in lines)
+    out = np.pad(mask.astype(np.uint8), border, constant_values=int(outside))
+    for n, r, c in lines:
         k = np.arange(-n, n + 1)
         line = np.zeros((2 * n * abs(r) + 1, 2 * n * abs(c) + 1), np.uint8)
         line[n * abs(r) + k * r, n * abs(c) + k * c] = 1
-        out = cv2.dilate(out, line, borderType=cv2.BORDER_CONSTANT, borderValue=1)
-    return out > 0
+        out = cv2.dilate(out, line, borderType=cv2.BORDER_CONSTANT, borderValue=int(outside))
+    rows, cols = mask.shape
+    return out[border : border + rows, border : border + cols] > 0
