@@ -144,8 +144,8 @@ def look(
     near = (np.abs(ahead[:, 0]) <= wide) & (ahead[:, 1] > 0.5 * vehicle.wheel_base) & (ahead[:, 1] <= p.reach * wheel)
     cells = surface.points[near]
     pixel, cells, first = _seen(view, cells, camera)
-    found = np.stack([view.column[pixel[:, 1], pixel[:, 0]], view.row[pixel[:, 1], pixel[:, 0]]], axis=1)
-    target = first + found.astype(np.float64)
+    displacement = np.stack([view.column[pixel[:, 1], pixel[:, 0]], view.row[pixel[:, 1], pixel[:, 0]]], axis=1)
+    target = first + displacement.astype(np.float64)
     # t = 0 is the model's ground, t = 1 the camera: obstacles lie between.
     to_camera = view.before.translation - cells
     t = np.zeros(len(cells))

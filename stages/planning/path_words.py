@@ -43,6 +43,13 @@ class Route:
 
 
 GOAL = "the goal"
+WORST = {
+    "max_inclination": ("inclination", np.nanmax),
+    "max_tilt": ("tilt", np.nanmax),
+    "least_clearance": ("clearance", np.nanmin),
+    "max_p_hazard": ("p_hazard", np.nanmax),
+}
+"""Facts of a path by the map that they are the worst of."""
 ENDS = ("the edge of the map", "unknown ground", "ground too uncertain to be called safe", "a hazard")
 """What a path does not go beyond."""
 
@@ -67,59 +74,51 @@ def ending(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle, p_certa
 
 def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> dict[str, Any]:
     """Facts of a route: length, climb, and the worst that it meets."""
-    found, grid, xyz = route.plan, route.grid, route.xyz
+    plan, grid, xyz = route.plan, route.grid, route.xyz
     meta: dict[str, Any] = {
         "found": len(xyz) > 0,
         "planner": route.planner,
         "ground": route.ground,
-        "reason": found.reason if len(xyz) else _why(found, maps, vehicle),
-        "blocking_row": found.blocking_row,
-        "blocking_y": None if found.blocking_row is None else (grid.j0 - found.blocking_row) * grid.cell,
+        "reason": plan.reason if len(xyz) else _why(plan, maps, vehicle),
+        "blocking_row": plan.blocking_row,
+        "blocking_y": None if plan.blocking_row is None else (grid.j0 - plan.blocking_row) * grid.cell,
         "ended_by": route.ended_by,
         "beside_unknown": route.ground != GROUNDS[0],
-        "target_row": found.target_row,
-        "reachable_targets": int(found.reachable.sum()),
+        "target_row": plan.target_row,
+        "reachable_targets": int(plan.reachable.sum()),
         "vertices": len(xyz),
         "grid": grid.to_dict(),
     }
-    none = ("length_m", "climb_m", "max_inclination", "max_tilt", "least_clearance", "max_p_hazard", "caution_share")
     if len(xyz) == 0:
-        return meta | dict.fromkeys((*none, "start", "target", "left_out_m"))
+        others = ("length_m", "climb_m", "caution_share", "start", "target", "left_out_m")
+        return meta | dict.fromkeys((*WORST, *others))
     at = tuple(np.rint(lattice.index(xyz[:, :2])).astype(np.int64).T)
-    steps = np.diff(xyz, axis=0)
-    return meta | {
-        "length_m": float(np.sqrt((steps**2).sum(axis=1)).sum()),
-        "climb_m": float(np.maximum(steps[:, 2], 0.0).sum()),
-        "max_inclination": _worst(maps, "inclination", at, np.nanmax),
-        "max_tilt": _worst(maps, "tilt", at, np.nanmax),
-        "least_clearance": _worst(maps, "clearance", at, np.nanmin),
-        "max_p_hazard": _worst(maps, "p_hazard", at, np.nanmax),
-        "caution_share": float((maps["risk"][at] == CAUTION).mean()),
-        "left_out_m": _left_out(route),
-        "start": [float(v) for v in xyz[0]],
-        "target": [float(v) for v in xyz[-1]],
-    }
+    steps, ends = np.diff(xyz, axis=0), route.cells[[0, -1], 0]
+    worst = {name: float(of(maps[band][at])) if band in maps else None for name, (band, of) in WORST.items()}
+    return (
+        meta
+        | worst
+        | {
+            "length_m": float(np.sqrt((steps**2).sum(axis=1)).sum()),
+            "climb_m": float(np.maximum(steps[:, 2], 0.0).sum()),
+            "caution_share": float((maps["risk"][at] == CAUTION).mean()),
+            # Rows with known ground before the start and beyond the target.
+            "left_out_m": [float(rows) * grid.cell for rows in (route.span[1] - ends[0], ends[1] - route.span[0])],
+            "start": [float(v) for v in xyz[0]],
+            "target": [float(v) for v in xyz[-1]],
+        }
+    )
 
 
-def _left_out(route: Route) -> list[float]:
-    """Metres of rows with known ground before the start and beyond the target."""
-    span, rows = route.span, route.cells[[0, -1], 0]
-    return [float(span[1] - rows[0]) * route.grid.cell, float(rows[1] - span[0]) * route.grid.cell]
-
-
-def _worst(maps: Maps, name: str, at: Any, of: Any) -> float | None:
-    return float(of(maps[name][at])) if name in maps else None
-
-
-def _why(found: Plan, maps: Maps, vehicle: Vehicle) -> str:
+def _why(plan: Plan, maps: Maps, vehicle: Vehicle) -> str:
     """Why there is no path; where hazards leave nothing to drive on, the limit that does the most."""
     risk = maps["risk"]
     judged = int((risk != UNKNOWN).sum())
     # Where something is free, the search's own reason says more than a count of hazards.
     if judged == 0 or (risk[risk != UNKNOWN] < HAZARDOUS).any():
-        return found.reason
+        return plan.reason
     counts = [int(((maps["reason"] & m.bit) > 0).sum()) for m in MEASURES]
-    most, count = max(zip(MEASURES, counts, strict=True), key=lambda found: found[1])
+    most, count = max(zip(MEASURES, counts, strict=True), key=lambda pair: pair[1])
     return (
         f"all {judged} known cells are hazardous, {100 * count / judged:.0f} % of them by {most.words}: "
         f"is vehicle.{most.limit} {getattr(vehicle, most.limit):g} at the scale of the sequence?"
@@ -128,17 +127,17 @@ def _why(found: Plan, maps: Maps, vehicle: Vehicle) -> str:
 
 def hazard_words(maps: Maps, at: tuple[int, int], vehicle: Vehicle) -> str:
     """The measures over their limits at a cell, with both figures."""
-    told = []
+    parts = []
     for m in MEASURES:
         if not int(maps["reason"][at]) & m.bit:
             continue
         limit = getattr(vehicle, m.limit)
         if m.band not in maps:
-            told.append(f"{m.words} over vehicle.{m.limit}")
+            parts.append(f"{m.words} over vehicle.{m.limit}")
             continue
         value, unit = float(maps[m.band][at]), "deg" if m.in_degrees else "m"
         value = limit - value if m.left else math.degrees(value) if m.in_degrees else value
         # Below the limit by itself: the figure alone would seem to say that the ground is permitted.
         doubt = "" if value > limit else " plus risk.sigmas standard deviations"
-        told.append(f"{m.words} {value:.3g} {unit}{doubt}, vehicle.{m.limit} {limit:g}")
-    return "; ".join(told)
+        parts.append(f"{m.words} {value:.3g} {unit}{doubt}, vehicle.{m.limit} {limit:g}")
+    return "; ".join(parts)

@@ -90,12 +90,12 @@ def _along(z: Floats, reach: float, axis: int) -> list[Floats]:
     """Largest of the nodes within ``reach`` cells of each node along an axis, and the heights at both ends of that."""
     whole = int(reach + 1e-6)
     part = reach - whole
-    found = [scipy.ndimage.maximum_filter1d(z, 2 * whole + 1, axis=axis, mode="nearest")]
+    heights = [scipy.ndimage.maximum_filter1d(z, 2 * whole + 1, axis=axis, mode="nearest")]
     nodes = np.arange(z.shape[axis])
     for side in (-1, 1) if part > 1e-6 else ():
         near, far = (np.take(z, np.clip(nodes + side * (whole + k), 0, len(nodes) - 1), axis=axis) for k in (0, 1))
-        found.append((1.0 - part) * near + part * far)
-    return found
+        heights.append((1.0 - part) * near + part * far)
+    return heights
 
 
 @dataclass(frozen=True)
@@ -159,15 +159,15 @@ def measured(ground: HeightGrid, x: Floats, y: Floats, heading: Floats, vehicle:
 
 def stand(ground: HeightGrid, x: float, y: float, heading: float, vehicle: Vehicle) -> Stand | None:
     """The vehicle with its centre above (x, y), turned by ``heading`` (rad, to the left of y); None: off the ground."""
-    found = measured(ground, np.array([x]), np.array([y]), np.array([heading]), vehicle)
-    if not np.isfinite(found.middle[0]):
+    placed = measured(ground, np.array([x]), np.array([y]), np.array([heading]), vehicle)
+    if not np.isfinite(placed.middle[0]):
         return None
-    lean, rise = float(found.lean[0]), float(found.rise[0])
+    lean, rise = float(placed.lean[0]), float(placed.rise[0])
     c, s = math.cos(heading), math.sin(heading)
     up = np.array([-lean, -rise, 1.0]) / math.sqrt(1.0 + lean * lean + rise * rise)
     ahead = np.array([0.0, 1.0, rise]) / math.sqrt(1.0 + rise * rise)
     right = np.cross(ahead, up)
     level = np.stack([right, ahead, up], axis=1)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    pose = RigidTransform(R @ level, np.array([x, y, float(found.middle[0])]))
-    return Stand(pose, float(found.tilt[0]), float(found.clearance[0]), float(found.step[0]))
+    pose = RigidTransform(R @ level, np.array([x, y, float(placed.middle[0])]))
+    return Stand(pose, float(placed.tilt[0]), float(placed.clearance[0]), float(placed.step[0]))
