@@ -52,6 +52,8 @@ from rille.stages.numeric.holes import close_into
 __all__ = ["BITS", "CAUTION", "DOUBT_BIT", "HAZARDOUS", "REASONS", "SAFE", "UNKNOWN", "UNKNOWN_BIT", "risk_map"]
 
 
+CLASSES = {"safe": SAFE, "caution": CAUTION, "hazardous": HAZARDOUS, "unknown": UNKNOWN}
+"""Values of ``risk``."""
 REASONS = BITS | {"unknown": UNKNOWN_BIT, "filled": FILLED_BIT, "uncertain": DOUBT_BIT, "unseen": UNSEEN_BIT}
 """Bits of ``reason``: a measure over its limit; too little known to judge; elevation interpolated; over a limit only
 because of sigma; some of the ground that is looked at is unknown."""
@@ -171,24 +173,9 @@ def _run(params: RiskParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         "lattice": whole.to_dict(),
         "frame": dems[0].meta.get("frame", "local"),
         "vehicle": vehicle.model_dump(mode="json"),
-        "window_cells": window_cells(params.window * vehicle.wheel_diameter, whole.cell),
-        "shares": _shares(arrays),
+        "shares": {name: float((arrays["risk"] == value).mean()) for name, value in CLASSES.items()},
     }
     return Bundle(arrays, meta)
-
-
-def _shares(arrays: Mapping[str, NDArray[Any]]) -> dict[str, float | None]:
-    """Shares of all cells, and of the judged ones, by class and cause."""
-    risk, reason = arrays["risk"], arrays["reason"]
-    judged, hazardous = int((risk != UNKNOWN).sum()), risk == HAZARDOUS
-    classes = (("safe", SAFE), ("caution", CAUTION), ("hazardous", HAZARDOUS), ("unknown", UNKNOWN))
-    shares: dict[str, float | None] = {name: float((risk == value).mean()) for name, value in classes}
-    shares["filled"] = float(arrays["filled"].mean())
-    hits = {"hazardous": hazardous, "uncertain": hazardous & ((reason & DOUBT_BIT) > 0)}
-    hits |= {name: hazardous & ((reason & bit) > 0) for name, bit in BITS.items()}
-    for name, hit in hits.items():
-        shares[f"{name}_of_judged"] = float(hit.sum()) / judged if judged else None
-    return shares
 
 
 STAGE = Stage(
