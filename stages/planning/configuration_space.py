@@ -117,11 +117,19 @@ def _dilated(mask: Bools, lines: list[tuple[int, int, int]], *, outside: bool) -
     count as ``outside``."""
     # A line may lead off the map and the next one back.
     border = sum(n for n, _, _ in lines)
-    out = np.pad(mask.astype(np.uint8), border, constant_values=int(outside))
+    out = np.pad(mask, border, constant_values=outside)
     for n, r, c in lines:
-        k = np.arange(-n, n + 1)
-        line = np.zeros((2 * n * abs(r) + 1, 2 * n * abs(c) + 1), np.uint8)
-        line[n * abs(r) + k * r, n * abs(c) + k * c] = 1
-        out = cv2.dilate(out, line, borderType=cv2.BORDER_CONSTANT, borderValue=int(outside))
+        reached = 0
+        while reached < n:
+            # Lines of 2 k + 1 cells, moved by as many to either side, make a line three times as long.
+            step = min(2 * reached + 1, n - reached)
+            source, reached = out.copy(), reached + step
+            for i, j in ((step * r, step * c), (-step * r, -step * c)):
+                out[_from(i), _from(j)] |= source[_from(-i), _from(-j)]
     rows, cols = mask.shape
-    return out[border : border + rows, border : border + cols] > 0
+    return np.asarray(out[border : border + rows, border : border + cols])
+
+
+def _from(offset: int) -> slice:
+    """The part of an axis that an equal axis covers when it is moved by an offset."""
+    return slice(max(offset, 0), min(offset, 0) or None)
