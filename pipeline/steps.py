@@ -384,8 +384,8 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
     built: Any = config.build(settings)
     args = {"vehicle": built.vehicle.model_dump(mode="json", exclude={"name"})}
     given = _bundle(dem, locus_stage.locus_stage, "elevation", "rille.terrain")
-    hazards = risk_stage.STAGE.run(built.risk, args, {"dem": [given]})
-    return _dataset(risk_stage.STAGE, hazards, settings)
+    hazards = risk_stage.risk_stage.run(built.risk, args, {"dem": [given]})
+    return _dataset(risk_stage.risk_stage, hazards, settings)
 
 
 def path(
@@ -435,9 +435,9 @@ def path(
     ends = {name: list(end) for name, end in (("target", goal), ("start", start)) if end is not None}
     settings = _merged(hazards, {"path": {**path, **ends}})
     built: Any = config.build(settings)
-    given = _bundle(hazards, risk_stage.STAGE, "risk", "rille.hazards")
-    planned = path_stage.STAGE.run(built.path, {} if ends else {"use": "local"}, {"risk": given})
-    return _dataset(path_stage.STAGE, planned, settings)
+    given = _bundle(hazards, risk_stage.risk_stage, "risk", "rille.hazards")
+    planned = path_stage.path_stage.run(built.path, {} if ends else {"use": "local"}, {"risk": given})
+    return _dataset(path_stage.path_stage, planned, settings)
 
 
 # -- tasks in this process ----------------------------------------------------------------------------------------

@@ -19,8 +19,7 @@ from rille.pipeline.export.view import RunView, part
 from rille.pipeline.export.writers import Meaning, write_raster
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.lattice import Lattice, mosaic, union
-from rille.stages.hazard.risk import REASONS
-from rille.stages.hazard.risk import STAGE as RISK
+from rille.stages.hazard.risk import REASONS, risk_stage
 from rille.stages.terrain import merge
 from rille.stages.terrain.shading import hillshade, slope_deg
 
@@ -132,7 +131,7 @@ def _write_reasons(path: Path, risk: Bundle, place: Place = None) -> None:
 def _write_hazard(path: Path, risk: Bundle, place: Place = None) -> None:
     """Write the probability of a hazard and the measures, in metres and degrees."""
     bands, units = {"p_hazard": risk["p_hazard"]}, {"p_hazard": ""}
-    for a in RISK.outputs:
+    for a in risk_stage.outputs:
         if a.unit in ("m", "rad") and a.name != "elevation":
             bands[a.name] = np.degrees(risk[a.name]) if a.unit == "rad" else risk[a.name]
             units[a.name] = "degree" if a.unit == "rad" else a.unit

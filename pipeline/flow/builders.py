@@ -30,7 +30,7 @@ from rille.stages.facts.calibration import CalibrationFacts, OrientationFacts, R
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts, ResectFacts, TrackFacts, TrajectoryFacts
 from rille.stages.facts.terrain import DemFacts, GroundFacts, MergeFacts, TileIndexFacts
-from rille.stages.hazard import risk
+from rille.stages.hazard.risk import risk_stage
 from rille.stages.hfvm import stage as hfvm
 from rille.stages.imaging.pyramid import pyramid_stage
 from rille.stages.imaging.undistort import undistort_stage
@@ -340,7 +340,7 @@ class Builder:
 
     def hazards(self, label: str, dems: Series[Handle]) -> Handle:
         """Add the task that judges hazards on the tiles of an elevation model."""
-        return self.node(risk.STAGE, label, dem=list(dems), vehicle=self.given_vehicle)
+        return self.node(risk_stage, label, dem=list(dems), vehicle=self.given_vehicle)
 
 
 def merge_tiles(

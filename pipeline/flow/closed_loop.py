@@ -48,7 +48,9 @@ from rille.pipeline.flow.products import Driven, Products, Stop
 from rille.pipeline.flow.reconstruction import reconstruction
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import ConfigError, DegenerateError
-from rille.stages.driving import fault_monitor, obstacle_monitor
+from rille.stages.driving import obstacle_monitor
+from rille.stages.driving.fault_monitor import fault_monitor_stage
+from rille.stages.driving.obstacle_monitor import obstacle_monitor_stage
 from rille.stages.evaluation.accuracy import accuracy_stage
 from rille.stages.evaluation.dem_accuracy import dem_accuracy_stage
 from rille.stages.evaluation.drive_check import drive_check_stage
@@ -59,8 +61,8 @@ from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.odometry.motion import motion_stage
 from rille.stages.odometry.resection.trajectory import trajectory_stage
-from rille.stages.planning.local_planner import stage as local_planner
 from rille.stages.planning.local_planner.look import PlannerMemory
+from rille.stages.planning.local_planner.stage import local_planner_stage
 from rille.stages.terrain.map_localization import map_localization_stage
 from rille.stages.terrain.merge import merge_stage
 from rille.stages.terrain.occlusion_bounds import occlusion_bounds_stage
@@ -355,7 +357,7 @@ class Drive:
     def _leg(self, label: str, memory: PlannerMemory, more: dict[str, Any], **inputs: Handle) -> Handle:
         args: dict[str, Any] = {"goal": list(self.goal), "looks": memory.looks, **self.mounting}
         args |= {"closed": [list(p) for p in memory.closed]}
-        return self.make.node(local_planner.STAGE, label, rig=self.pairs[0].rig, **args, **more, **inputs)
+        return self.make.node(local_planner_stage, label, rig=self.pairs[0].rig, **args, **more, **inputs)
 
     # -- a leg --------------------------------------------------------------------------------------------------
 
@@ -409,7 +411,7 @@ class Drive:
         self.products.tracks.append(segment.track)
         assert stop.sense is not None
         stop.safety = self.make.node(
-            fault_monitor.STAGE,
+            fault_monitor_stage,
             f"fault_monitor/{stop.index}",
             sense=stop.sense,
             resect=segment.resection,
@@ -461,7 +463,7 @@ class Drive:
             images = {"a": self.make.pyramid(a, "left"), "b": self.make.pyramid(b, "left")}
             motions.append(self.make.node(motion_stage, f"motion/way/{a}-{b}", params, **images))
         return self.make.node(
-            obstacle_monitor.STAGE,
+            obstacle_monitor_stage,
             f"obstacle_monitor/{stop.index}",
             dem=key.dem,
             resect=segment.resection,

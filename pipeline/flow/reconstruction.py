@@ -74,7 +74,7 @@ from rille.stages.odometry.resection.refine import refine_stage
 from rille.stages.odometry.resection.resect import LEAST_JUMP
 from rille.stages.odometry.resection.trajectory import trajectory_stage
 from rille.stages.odometry.step_table import step_table_stage
-from rille.stages.planning import path
+from rille.stages.planning.path import path_stage
 from rille.stages.terrain.overlap_audit import overlap_audit_stage
 from rille.stages.terrain.overlap_qa import overlap_qa_stage
 from rille.stages.terrain.radiometry import radiometry_stage
@@ -187,7 +187,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     levelled = yield from done(make.node(radiometry_stage, "radiometry", **known))
     p.world_tiles = merge_tiles(make.node, footprints, p.world_dem, levelled.meta["steps"])
     p.world_risk = make.hazards("risk/world", p.world_tiles)
-    p.world_path = make.node(path.STAGE, "path/world", risk=p.world_risk, use="world", heading=heading(posed.meta))
+    p.world_path = make.node(path_stage, "path/world", risk=p.world_risk, use="world", heading=heading(posed.meta))
     yield from assessment.of_world(make, [pairs[k] for k in there])
 
 
@@ -306,7 +306,7 @@ def basic_pairs(make: Builder, rigs: dict[int, Handle[CalibrationFacts]], first:
         pair = pairs[k] = make.pair(k, vertical(make, k, k == first), known, pairs.get(next(iter(rigs))))
         p.level[k], p.local_dem[k] = pair.level, pair.dem
         p.local_risk[k] = make.hazards(f"risk/local/{k}", [pair.dem])
-        p.local_path[k] = make.node(path.STAGE, f"path/local/{k}", risk=p.local_risk[k], use="local")
+        p.local_path[k] = make.node(path_stage, f"path/local/{k}", risk=p.local_risk[k], use="local")
         make.graph.flow(assessment.of_pair(make, pair))
     return pairs
 

@@ -20,7 +20,9 @@ import numpy as np
 from pydantic import Field
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import Bundle, Params, stage
+from rille.stages.facts.odometry import ResectFacts
+from rille.stages.facts.planning import StopFacts
 from rille.stages.geometry.geometry import RigidTransform, heading_of
 
 
@@ -140,23 +142,6 @@ def _disagreement(wheels: Floats, moved: RigidTransform, base: float, params: Fa
     return f"slip of {slip:.0%}: {1000 * way:.0f} mm by the wheels, {1000 * seen:.0f} mm by vision"
 
 
-def _run(params: FaultMonitorParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    sense, resect = inputs["sense"], inputs["resect"]
-    rows = [int(r) for r in args["rows"]]  # of the readings, those frames that were resected
-    wheels = np.asarray(sense["odometry"])[rows]
-    verdict = judge(
-        Readings(np.asarray(sense["up"])[rows], np.asarray(sense["acceleration"])[rows], _relative(wheels)),
-        np.asarray(resect["poses"]),
-        [int(f["inliers"]) for f in resect.meta["per_frame"]],
-        RigidTransform.from_matrix(args["T_vehicle_left"]),
-        args["vehicle"],
-        params,
-    )
-    frames = [int(f["frame"]) for f in resect.meta["per_frame"]]
-    meta = {"stop": verdict.stop, "kind": verdict.kind, "reason": verdict.reason}
-    return Bundle({}, meta | {"frame": None if verdict.stop is None else frames[verdict.stop]})
-
-
 def _relative(wheels: Floats) -> Floats:
     """Readings (frame, 3) since the first of them."""
     x, y = (wheels[:, k] - wheels[0, k] for k in (0, 1))
@@ -165,12 +150,26 @@ def _relative(wheels: Floats) -> Floats:
     return np.stack([c * x + s * y, c * y - s * x, wheels[:, 2] - wheels[0, 2]], axis=1)
 
 
-STAGE = Stage(
-    name="fault_monitor",
-    version=1,
-    summary="whether the vehicle stopped on a leg for its safety, where and why",
-    params=FaultMonitorParams,
-    inputs=("sense", "resect"),
-    outputs=(),
-    run=_run,
-)
+@stage("fault_monitor")
+def fault_monitor_stage(
+    params: FaultMonitorParams,
+    sense: Bundle,
+    resect: Bundle[ResectFacts],
+    *,
+    rows: list[int],
+    T_vehicle_left: RigidTransform,
+    vehicle: Mapping[str, Any],
+) -> Bundle[StopFacts]:
+    """Whether the vehicle stopped on a leg for its safety, where and why."""
+    # Of the readings, those frames that were resected.
+    wheels = np.asarray(sense["odometry"])[rows]
+    verdict = judge(
+        Readings(np.asarray(sense["up"])[rows], np.asarray(sense["acceleration"])[rows], _relative(wheels)),
+        np.asarray(resect["poses"]),
+        [int(f["inliers"]) for f in resect.meta["per_frame"]],
+        T_vehicle_left,
+        vehicle,
+        params,
+    )
+    frame = None if verdict.stop is None else int(resect.meta["per_frame"][verdict.stop]["frame"])
+    return Bundle({}, {"stop": verdict.stop, "kind": verdict.kind, "reason": verdict.reason, "frame": frame})

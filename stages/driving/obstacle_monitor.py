@@ -15,9 +15,8 @@ raised points together, which are much of the points seen there, are an obstacle
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy
@@ -25,8 +24,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
-from rille.stages.core.declare import Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import Array, Bundle, Params, stage
 from rille.stages.core.validity import matched
+from rille.stages.facts.calibration import CalibrationFacts
+from rille.stages.facts.odometry import MotionFacts, ResectFacts
+from rille.stages.facts.planning import StopFacts
+from rille.stages.facts.terrain import DemFacts
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.vehicle import Vehicle
@@ -210,10 +213,27 @@ def obstacle(points: Points, wheel: float, p: ObstacleMonitorParams) -> Obstacle
     return Obstacle(int(together[best]), raised[best])
 
 
-def _run(params: ObstacleMonitorParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    dem, resect = inputs["dem"], inputs["resect"]
-    vehicle, camera = Vehicle.model_validate(args["vehicle"]), Rig.from_dict(inputs["rig"].meta["rig"]).left
-    T_vehicle_left = RigidTransform.from_matrix(args["T_vehicle_left"])
+@stage(
+    "obstacle_monitor",
+    version=2,
+    outputs=[
+        Array("raised", ("frame",), "int32", "1", "points of the largest raised group"),
+        Array("where", ("frame", "xy"), "float64", "m", "its place, right and ahead of the vehicle's centre", "nan"),
+    ],
+)
+def obstacle_monitor_stage(
+    params: ObstacleMonitorParams,
+    dem: Bundle[DemFacts],
+    resect: Bundle[ResectFacts],
+    rig: Bundle[CalibrationFacts],
+    motions: Sequence[Bundle[MotionFacts]],
+    *,
+    vehicle: Vehicle,
+    pairs: Sequence[tuple[int, int]],
+    T_vehicle_left: RigidTransform,
+) -> Bundle[StopFacts]:
+    """Obstacles that the last elevation model does not know, seen on the way."""
+    camera = Rig.from_dict(rig.meta["rig"]).left
     wheel = vehicle.wheel_diameter
     lattice = Lattice.from_dict(dem.meta["lattice"])
     surface = LastModel.of(np.asarray(dem["elevation"]), lattice, params.model_radius * wheel)
@@ -223,7 +243,7 @@ def _run(params: ObstacleMonitorParams, args: Mapping[str, Any], inputs: Inputs)
     raised = np.zeros(len(frames), np.int32)
     where = np.full((len(frames), 2), np.nan)
     stop, reason = None, ""
-    for (i, j), motion in zip(args["pairs"], inputs["motions"], strict=True):
+    for (i, j), motion in zip(pairs, motions, strict=True):
         if not (known[i] and known[j]):
             continue
         ok = matched(np.asarray(motion["validity"]))
@@ -239,23 +259,14 @@ def _run(params: ObstacleMonitorParams, args: Mapping[str, Any], inputs: Inputs)
             away = 1000.0 * (group.place[1] - 0.5 * vehicle.wheel_base - 0.5 * wheel)
             stop = j
             reason = f"obstacle {away:.0f} mm before the wheels: {group.count} points rise above the model"
-    meta = {"stop": stop, "frame": None if stop is None else frames[stop], "reason": reason, "frames": frames}
-    watched = [int(j) for i, j in args["pairs"] if known[i] and known[j]]
-    return Bundle({"raised": raised, "where": where}, meta | {"watched": watched})
-
-
-STAGE = Stage(
-    name="obstacle_monitor",
-    version=2,
-    summary="obstacles that the last elevation model does not know, seen on the way",
-    params=ObstacleMonitorParams,
-    inputs=("dem", "resect", "rig", "motions*"),
-    outputs=(
-        Array("raised", ("frame",), "int32", "1", "points of the largest raised group"),
-        Array("where", ("frame", "xy"), "float64", "m", "its place, right and ahead of the vehicle's centre", "nan"),
-    ),
-    run=_run,
-)
+    meta: StopFacts = {
+        "stop": stop,
+        "frame": None if stop is None else frames[stop],
+        "reason": reason,
+        "frames": frames,
+        "watched": [int(j) for i, j in pairs if known[i] and known[j]],
+    }
+    return Bundle({"raised": raised, "where": where}, meta)
 
 
 def pairs(odometry: Floats, wheel: float, p: ObstacleMonitorParams) -> list[tuple[int, int]]:

@@ -22,7 +22,7 @@ height.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,8 +30,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.core.arrays import Floats32
-from rille.stages.core.declare import Bundle, Inputs, Memory, Params, Stage, raster
+from rille.stages.core.declare import Bundle, Memory, Params, raster, stage
 from rille.stages.core.errors import DegenerateError
+from rille.stages.facts.planning import RiskFacts
 from rille.stages.geometry.lattice import Lattice, mosaic, union
 from rille.stages.hazard.classification import (
     CAUTION,
@@ -158,40 +159,33 @@ def window_cells(side: float, cell: float) -> int:
     return 2 * window_reach(side, cell) + 1
 
 
-def _run(params: RiskParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    dems: list[Bundle] = inputs["dem"]
-    lattices = [Lattice.from_dict(dem.meta["lattice"]) for dem in dems]
-    whole = union(lattices)
-    z = mosaic([(part, dem["elevation"]) for part, dem in zip(lattices, dems, strict=True)], np.nan, whole)
-    # Slopes and steps compare a cell with the ground around it, so the error that all of it shares does not count.
-    names = [next((n for n in ("relief_std", "elevation_std") if n in d.arrays), None) for d in dems]
-    stds = [(part, d[name]) for part, d, name in zip(lattices, dems, names, strict=True) if name is not None]
-    s = mosaic(stds, np.nan, whole) if stds else np.zeros(whole.shape, dtype=np.float32)
-    vehicle = Vehicle.model_validate(args["vehicle"]) if "vehicle" in args else DEFAULT_VEHICLE
-    arrays = risk_map(z.astype(np.float32), s.astype(np.float32), whole.cell, vehicle, params)
-    meta = {
-        "lattice": whole.to_dict(),
-        "frame": dems[0].meta.get("frame", "local"),
-        "vehicle": vehicle.model_dump(mode="json"),
-        "shares": {name: float((arrays["risk"] == value).mean()) for name, value in CLASSES.items()},
-    }
-    return Bundle(arrays, meta)
-
-
-STAGE = Stage(
-    name="risk",
+@stage(
+    "risk",
     version=5,
-    summary="safe, caution, hazard and unknown cells by seven measures against a vehicle's limits",
-    params=RiskParams,
-    inputs=("dem*",),
-    outputs=(
+    outputs=[
         raster("risk", "1", "class: 0 safe, 1 caution, 2 hazard, 3 unknown", "uint8", ""),
         raster("reason", "1", "bits: " + ", ".join(f"{bit} {name}" for name, bit in REASONS.items()), "uint16", ""),
         *(raster(m.band, "rad" if m.in_degrees else "m", m.description) for m in MEASURES),
         raster("p_hazard", "1", "probability that a measure exceeds its limit"),
         raster("filled", "1", "1 where the elevation was interpolated", "uint8", ""),
         raster("elevation", "m", "elevation with small holes closed"),
-    ),
-    run=_run,
+    ],
     memory=Memory(factor=16.0, lower=("locus.cell_size",)),
 )
+def risk_stage(params: RiskParams, dem: Sequence[Bundle], *, vehicle: Vehicle = DEFAULT_VEHICLE) -> Bundle[RiskFacts]:
+    """Safe, caution, hazard and unknown cells by seven measures against a vehicle's limits."""
+    lattices = [Lattice.from_dict(one.meta["lattice"]) for one in dem]
+    whole = union(lattices)
+    z = mosaic([(part, one["elevation"]) for part, one in zip(lattices, dem, strict=True)], np.nan, whole)
+    # Slopes and steps compare a cell with the ground around it, so the error that all of it shares does not count.
+    names = [next((n for n in ("relief_std", "elevation_std") if n in d.arrays), None) for d in dem]
+    stds = [(part, d[name]) for part, d, name in zip(lattices, dem, names, strict=True) if name is not None]
+    s = mosaic(stds, np.nan, whole) if stds else np.zeros(whole.shape, dtype=np.float32)
+    arrays = risk_map(z.astype(np.float32), s.astype(np.float32), whole.cell, vehicle, params)
+    meta: RiskFacts = {
+        "lattice": whole.to_dict(),
+        "frame": dem[0].meta.get("frame", "local"),
+        "vehicle": vehicle.model_dump(mode="json"),
+        "shares": {name: float((arrays["risk"] == value).mean()) for name, value in CLASSES.items()},
+    }
+    return Bundle(arrays, meta)

@@ -33,16 +33,17 @@ length left out is reported (``left_out_m``).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from rille.stages.core.declare import Array, Bundle, Memory, Params, stage
 from rille.stages.core.errors import InputError
+from rille.stages.facts.planning import PathFacts, RiskFacts
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN, check_size
 from rille.stages.hazard.vehicle import Vehicle
@@ -51,7 +52,7 @@ from rille.stages.planning.path_ground import GROUNDS, Maps, PathMaps, PathPrice
 from rille.stages.planning.path_words import GOAL, Route, describe, ending, hazard_words
 from rille.stages.planning.row_graph import UNREACHED, Charges, EndCells, Plan, nearest_middle, plan, row_span
 
-__all__ = ["STAGE", "PathParams", "Route", "describe", "find_path"]
+__all__ = ["PathParams", "Route", "describe", "find_path", "path_stage"]
 
 Planner = Literal["rows", "grid8", "auto"]
 Ends = tuple[Point | None, Point | None]
@@ -299,12 +300,24 @@ def _free_ends(ground: PathMaps, below: str, ends: EndCells, *, far: bool) -> En
     return EndCells(ends.start or (r + behind, c), ends.target or nearest_middle(ahead, row))
 
 
-def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    source: Bundle = inputs["risk"]
-    lattice, vehicle = Lattice.from_dict(source.meta["lattice"]), Vehicle.model_validate(source.meta["vehicle"])
-    local = args.get("use") == "local"
-    dx, dy = args.get("heading", (0.0, 1.0))
-    maps = {name: np.asarray(source[name]) for name in source.arrays}
+@stage(
+    "path",
+    version=3,
+    outputs=[
+        Array("path", ("vertex", "xyz"), "float64", "m", "vertices from start to target; z = mean under a wheel"),
+        Array("cost_to_go", ("row", "col"), "float32", "m", "rows: cost from the start; grid8: to the target", "nan"),
+        Array("reachable", ("col",), "uint8", "1", "1 where the target row can be reached"),
+    ],
+    memory=Memory(factor=6.0, lower=("locus.cell_size",)),
+)
+def path_stage(
+    params: PathParams, risk: Bundle[RiskFacts], *, use: str | None = None, heading: Sequence[float] = (0.0, 1.0)
+) -> Bundle[PathFacts]:
+    """Path of least height differences for a vehicle with a width: monotone in the rows, or any direction."""
+    lattice, vehicle = Lattice.from_dict(risk.meta["lattice"]), Vehicle.model_validate(risk.meta["vehicle"])
+    local = use == "local"
+    dx, dy = heading
+    maps = {name: np.asarray(risk[name]) for name in risk.arrays}
     ends = (None, None) if local else (params.start, params.target)
     route = find_path(maps, lattice, vehicle, heading=(dx, dy), ends=ends, stretch=not local, params=params)
     arrays: dict[str, NDArray[Any]] = {
@@ -312,20 +325,5 @@ def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         "cost_to_go": route.cost,
         "reachable": route.plan.reachable.astype(np.uint8),
     }
-    return Bundle(arrays, describe(route, maps, lattice, vehicle) | {"frame": source.meta.get("frame", "local")})
-
-
-STAGE = Stage(
-    name="path",
-    version=3,
-    summary="path of least height differences for a vehicle with a width: monotone in the rows, or any direction",
-    params=PathParams,
-    inputs=("risk",),
-    outputs=(
-        Array("path", ("vertex", "xyz"), "float64", "m", "vertices from start to target; z = mean under a wheel"),
-        Array("cost_to_go", ("row", "col"), "float32", "m", "rows: cost from the start; grid8: to the target", "nan"),
-        Array("reachable", ("col",), "uint8", "1", "1 where the target row can be reached"),
-    ),
-    run=_run,
-    memory=Memory(factor=6.0, lower=("locus.cell_size",)),
-)
+    facts = describe(route, maps, lattice, vehicle) | {"frame": risk.meta.get("frame", "local")}
+    return Bundle(arrays, cast(PathFacts, facts))

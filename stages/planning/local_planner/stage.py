@@ -8,13 +8,16 @@ closes every way, only what is next to certain does.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.core.declare import Array, Bundle, Inputs, Stage
+from rille.stages.core.declare import Array, Bundle, stage
+from rille.stages.facts.calibration import CalibrationFacts
+from rille.stages.facts.planning import LegFacts, RiskFacts
+from rille.stages.facts.terrain import BoundsFacts
 from rille.stages.geometry.geometry import Rig, RigidTransform, from_above, way_length
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.classification import HAZARDOUS, UNKNOWN, UNSEEN_BIT
@@ -93,37 +96,6 @@ def shortest_way(
     return None, None
 
 
-def _run(params: LocalPlannerParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    risk, ceiling, before = inputs["risk"], inputs.get("ceiling"), inputs.get("before")
-    T_world_left = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1])
-    T_vehicle_left = RigidTransform.from_matrix(args["T_vehicle_left"])
-    stand = from_above(T_world_left @ T_vehicle_left.inverse())
-    goal = (float(args["goal"][0]), float(args["goal"][1]))
-    memory = PlannerMemory(int(args["looks"]), [(float(x), float(y)) for x, y in args["closed"]])
-    rest = None
-    if before is not None and len(before["rest_gear"]):
-        rest = np.asarray(before["rest"]), np.asarray(before["rest_gear"])
-    bounds = None if ceiling is None else Bounds(upper=np.asarray(ceiling["upper"]), lower=np.asarray(ceiling["lower"]))
-    view = FieldOfView.of(Rig.from_dict(inputs["rig"].meta["rig"]), T_vehicle_left)
-    leg = next_leg(SeenGround(risk, inputs.get("far"), bounds), stand, goal, params, memory, view, rest)
-    best, margin = shortest_way(risk, stand, goal, params) if args.get("whole") else (None, None)
-    meta = {
-        "shortest_m": best,
-        "shortest_margin_m": margin,
-        "verdict": leg.verdict,
-        "reason": leg.reason,
-        "turn": leg.turn,
-        "where": None if leg.where is None else list(leg.where),
-        "start": list(stand),
-        "goal": list(goal),
-        "left_m": math.hypot(goal[0] - stand[0], goal[1] - stand[1]),
-        "length_m": way_length(leg.path),
-        "way_m": way_length(leg.way),
-    }
-    arrays: dict[str, NDArray[Any]] = {"path": leg.path, "gear": leg.gear, "way": leg.way}
-    return Bundle(arrays | {"rest": leg.rest, "rest_gear": leg.rest_gear, "cost_to_go": leg.cost}, meta)
-
-
 def seen_so_far(near: Bundle, far: Bundle | None) -> tuple[Hazards, KnownGround]:
     """Hazards of a map of which only near ground is driven on, and how well each cell is known."""
     names = Hazards._fields
@@ -141,13 +113,10 @@ def seen_so_far(near: Bundle, far: Bundle | None) -> tuple[Hazards, KnownGround]
     return Hazards(*maps), KnownGround(unknown, glanced, maps[2] >= P_COSTLY)
 
 
-STAGE = Stage(
-    name="local_planner",
+@stage(
+    "local_planner",
     version=10,
-    summary="the next leg of a drive to a goal, over ground that is known to be free",
-    params=LocalPlannerParams,
-    inputs=("risk", "far?", "ceiling?", "pose", "rig", "before?"),
-    outputs=(
+    outputs=[
         Array(
             "path",
             ("vertex", "xy"),
@@ -163,6 +132,47 @@ STAGE = Stage(
         ),
         Array("rest_gear", ("rest_piece",), "int8", "1", "1 where that is driven ahead, -1 where it is driven back"),
         Array("cost_to_go", ("row", "col"), "float32", "m", "price of the way from each cell to the goal", "nan"),
-    ),
-    run=_run,
+    ],
 )
+def local_planner_stage(
+    params: LocalPlannerParams,
+    risk: Bundle[RiskFacts],
+    pose: Bundle,
+    rig: Bundle[CalibrationFacts],
+    far: Bundle[RiskFacts] | None = None,
+    ceiling: Bundle[BoundsFacts] | None = None,
+    before: Bundle[LegFacts] | None = None,
+    *,
+    goal: Sequence[float],
+    looks: int,
+    closed: Sequence[Sequence[float]],
+    T_vehicle_left: RigidTransform,
+    whole: bool = False,
+) -> Bundle[LegFacts]:
+    """The next leg of a drive to a goal, over ground that is known to be free."""
+    T_world_left = RigidTransform.from_matrix(np.asarray(pose["poses"])[-1])
+    stand = from_above(T_world_left @ T_vehicle_left.inverse())
+    end = (float(goal[0]), float(goal[1]))
+    memory = PlannerMemory(looks, [(float(x), float(y)) for x, y in closed])
+    rest = None
+    if before is not None and len(before["rest_gear"]):
+        rest = np.asarray(before["rest"]), np.asarray(before["rest_gear"])
+    bounds = None if ceiling is None else Bounds(upper=np.asarray(ceiling["upper"]), lower=np.asarray(ceiling["lower"]))
+    view = FieldOfView.of(Rig.from_dict(rig.meta["rig"]), T_vehicle_left)
+    leg = next_leg(SeenGround(risk, far, bounds), stand, end, params, memory, view, rest)
+    best, margin = shortest_way(risk, stand, end, params) if whole else (None, None)
+    meta: LegFacts = {
+        "shortest_m": best,
+        "shortest_margin_m": margin,
+        "verdict": leg.verdict,
+        "reason": leg.reason,
+        "turn": leg.turn,
+        "where": None if leg.where is None else list(leg.where),
+        "start": list(stand),
+        "goal": list(end),
+        "left_m": math.hypot(end[0] - stand[0], end[1] - stand[1]),
+        "length_m": way_length(leg.path),
+        "way_m": way_length(leg.way),
+    }
+    arrays: dict[str, NDArray[Any]] = {"path": leg.path, "gear": leg.gear, "way": leg.way}
+    return Bundle(arrays | {"rest": leg.rest, "rest_gear": leg.rest_gear, "cost_to_go": leg.cost}, meta)

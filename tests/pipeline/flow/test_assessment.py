@@ -26,7 +26,7 @@ def test_the_other_program_s_longest_piece_is_judged(split: int) -> None:
     known = truth.truth_stage.run(NoParams(), {"poses": poses.reshape(12, 12).tolist(), "frames": frames}, {})
     given: list[dict[str, Any]] = []
     make: Any = SimpleNamespace(
-        node=lambda stage, label, args, **inputs: given.append(args),
+        node=lambda stage, label, **words: given.append(words),
         sequence=SimpleNamespace(truth=poses),
         products=SimpleNamespace(),
     )
@@ -34,6 +34,6 @@ def test_the_other_program_s_longest_piece_is_judged(split: int) -> None:
     next(steps)
     with pytest.raises(StopIteration):
         steps.send(joined)
-    metrics = accuracy.accuracy_stage.run(NoParams(), given[0], {"trajectory": joined, "truth": known}).meta["metrics"]
+    metrics = accuracy.accuracy_stage(NoParams(), joined, known, piece=given[0]["piece"]).meta["metrics"]
     assert metrics["frames_judged"]["value"] == max(split, 12 - split)
     assert metrics["drift"]["value"] == pytest.approx(0.0, abs=1e-9)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import Validity
 from rille.stages.driving.obstacle_monitor import (
-    STAGE,
     LastModel,
     Obstacle,
     ObstacleMonitorParams,
@@ -19,6 +18,7 @@ from rille.stages.driving.obstacle_monitor import (
     ViewPair,
     look,
     obstacle,
+    obstacle_monitor_stage,
     pairs,
 )
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
@@ -168,7 +168,7 @@ def along_the_way(lost: int | None) -> Bundle:
         "motions": motions,
     }
     args = {"pairs": compared, "vehicle": ROVER.model_dump(mode="json"), "T_vehicle_left": T_VEHICLE_LEFT.to_list()}
-    return STAGE.run(P, args, inputs)
+    return obstacle_monitor_stage.run(P, args, inputs)
 
 
 def test_the_stage_says_where_it_stops_and_leaves_out_images_without_a_pose() -> None:

@@ -19,12 +19,12 @@ from rille.stages.hazard.risk import (
     FILLED_BIT,
     HAZARDOUS,
     SAFE,
-    STAGE,
     UNKNOWN,
     UNKNOWN_BIT,
     UNSEEN_BIT,
     RiskParams,
     risk_map,
+    risk_stage,
     window_cells,
 )
 from rille.stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
@@ -282,19 +282,19 @@ def test_the_stage_assembles_tiles() -> None:
         )
         for p in parts
     ]
-    out = STAGE.run(RiskParams(), {"vehicle": MODEL.model_dump()}, {"dem": dems})
-    check_outputs(STAGE, out)
+    out = risk_stage.run(RiskParams(), {"vehicle": MODEL.model_dump()}, {"dem": dems})
+    check_outputs(risk_stage, out)
     one = judge(z, std=1e-4)
     np.testing.assert_array_equal(out["risk"], one["risk"])
     assert out.meta["lattice"] == whole.to_dict()
     for dem in dems:  # a merged model: what its poses share neither makes a slope nor a step
         dem.arrays["relief_std"], dem.arrays["elevation_std"] = dem.arrays["elevation_std"], dem["elevation_std"] + 9
     np.testing.assert_array_equal(
-        STAGE.run(RiskParams(), {"vehicle": MODEL.model_dump()}, {"dem": dems})["p_hazard"], one["p_hazard"]
+        risk_stage.run(RiskParams(), {"vehicle": MODEL.model_dump()}, {"dem": dems})["p_hazard"], one["p_hazard"]
     )
     assert sum(out.meta["shares"][k] for k in ("safe", "caution", "hazardous", "unknown")) == pytest.approx(1.0)
     small = DEFAULT_VEHICLE.model_copy(update={"track": 0.05, "wheel_diameter": 0.02})
-    exact = STAGE.run(
+    exact = risk_stage.run(
         RiskParams(), {"vehicle": small.model_dump()}, {"dem": [Bundle({"elevation": z}, {"lattice": whole.to_dict()})]}
     )
     assert exact.meta["vehicle"]["name"] == "default rover"

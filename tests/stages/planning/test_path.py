@@ -15,7 +15,7 @@ from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import BITS, CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning.path import STAGE, PathParams, Route, describe, find_path
+from rille.stages.planning.path import PathParams, Route, describe, find_path, path_stage
 
 CELL = 0.01
 
@@ -203,7 +203,7 @@ def test_ground_that_is_probably_a_hazard_everywhere_is_said_with_the_figure() -
     lattice = Lattice.at(0, 40, CELL, 40, 30)
     arrays = maps(*level(lattice)) | {"p_hazard": np.full(lattice.shape, 0.15, dtype=np.float32)}
     source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": SHORT.model_dump()})
-    reason = STAGE.run(PathParams(), {}, {"risk": source}).meta["reason"]
+    reason = path_stage.run(PathParams(), {}, {"risk": source}).meta["reason"]
     assert reason.startswith("ground with a p_hazard above path.p_certain_hazard 0.1 closes every path")
     assert "up to 0.15" in reason
 
@@ -461,8 +461,8 @@ def test_the_stage(blocked: bool) -> None:
     }
     arrays["clearance"][30, 10] = 0.015
     source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": SHORT.model_dump(), "frame": "local"})
-    out = STAGE.run(PathParams(start=(9.0, 9.0)), {"use": "local"}, {"risk": source})
-    check_outputs(STAGE, out)
+    out = path_stage.run(PathParams(start=(9.0, 9.0)), {"use": "local"}, {"risk": source})
+    check_outputs(path_stage, out)
     assert out.meta["found"]
     if blocked:
         # the front wheels stand half a wheel base before the row
