@@ -3,7 +3,8 @@
 
 The code digest of a module covers all *own* modules that it reaches by import statements, at any depth and also from
 within functions, with the ``__init__`` of every package on the way. Each counts as its syntax tree without
-docstrings, so comments, docstrings and formatting change nothing. Own are ``rille.stages``, ``rille.datasets`` and the
+docstrings, so comments, docstrings and formatting change nothing. C sources beside a package's ``__init__`` count with
+their bytes. Own are ``rille.stages``, ``rille.datasets`` and the
 package of the module itself. Imports under ``if TYPE_CHECKING:`` never run and do not count; modules loaded by a
 computed name are not seen, and neither are data files beside the code: keep tables in modules.
 
@@ -123,6 +124,7 @@ def tree_digest(own: Iterable[str] = OWN) -> str:
                 name = ".".join([package, *(p for p in parts if p != "__init__")])
                 try:
                     found[name] = _read(name, path).sha256
+                    found |= _other_languages(name, path)
                 except SyntaxError:  # somebody is editing; it matters only to who imports it
                     found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
     remember()
@@ -156,9 +158,16 @@ def _reachable(module: str) -> tuple[tuple[str, str], ...]:
         source = _read(name, path)
         found[name] = source.sha256
         queue += source.imports
+        found |= _other_languages(name, path)
         # Importing a module runs the __init__ of every package above it.
         queue += _parents(name)
     return tuple(sorted(found.items()))
+
+
+def _other_languages(name: str, path: Path) -> dict[str, str]:
+    """Digests of C sources beside a package's ``__init__``, by ``package/file``: what is compiled from them runs."""
+    sources = sorted(path.parent.glob("*.[ch]")) if path.name == "__init__.py" else []
+    return {f"{name}/{source.name}": hashlib.sha256(source.read_bytes()).hexdigest() for source in sources}
 
 
 def _parents(name: str) -> list[str]:

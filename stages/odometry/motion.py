@@ -108,7 +108,6 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
         top_rows=params.top_rows,
         # Both directions alike: displacements between frames have no epipolar line to prefer.
         search_columns=1,
-        centres=5,
         smoothness=params.smoothness,
         rounds=params.rounds,
     )

@@ -13,7 +13,7 @@ window that is the whole image is one way among others.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -42,12 +42,12 @@ from rille.stages.hfvm.level import (
     depth_edges,
     epipolar,
     paper,
-    propagation,
     search,
-    subpixel,
     subpixel_lut,
 )
-from rille.stages.hfvm.level.simd import SUM_RADIUS
+from rille.stages.hfvm.native.problem import Field, Pair, PathCosts, Smoothing, pack_map, unpacked
+from rille.stages.hfvm.native.reference import SUM_RADIUS
+from rille.stages.hfvm.native.solver import solver as native
 from rille.stages.imaging.pyramid import Pyramid
 
 FIT_SAMPLES = 500
@@ -86,10 +86,6 @@ class Band:
     f: epipolar.Matrix
     mu: float
 
-    def lines(self, window: Window) -> AnyArray:
-        """Line of every pixel of a window, nothing where there is no band."""
-        return epipolar.lines(self.f, window.shape if self.mu > 0 else (1, 1), window.x0, window.y0)
-
     def reverse(self) -> Band:
         """The band of the right image."""
         return Band(np.ascontiguousarray(self.f.T), self.mu)
@@ -123,9 +119,6 @@ def offset(a: Patch, b: Patch) -> tuple[int, int]:
     return a.window.x0 - b.window.x0, a.window.y0 - b.window.y0
 
 
-ROOM = (("packed", np.int32), ("data", np.int32), ("dirty", np.uint8))
-
-
 @dataclass(frozen=True)
 class FastSolver:
     """Packed features, several centres, band, propagation; of preset ``accurate`` also along paths, which cross the
@@ -134,7 +127,6 @@ class FastSolver:
     params: HfvmParams
     uses_band: bool = True
     back: bool = False
-    room: dict[str, AnyArray] = field(default_factory=dict)
 
     def rounds(self, level: int) -> int:
         """Rounds of propagation at a level."""
@@ -143,50 +135,38 @@ class FastSolver:
         return min(rounds, p.back_rounds) if level == 0 and self.back else rounds
 
     def reverse(self) -> FastSolver:
-        """The matcher from right to left, in the same room."""
-        return FastSolver(self.params, back=not self.back, room=self.room)
+        """The matcher from right to left."""
+        return FastSolver(self.params, back=not self.back)
 
     def match(self, level: int, a: Patch, b: Patch, shapes: tuple[Shape, Shape], up: Map | None, band: Band) -> Map:
         """Integer map of a level."""
         p, shape = self.params, a.window.shape
-        at = (*offset(a, b), a.window.x0, a.window.y0)
-        u, v = np.empty(shape, np.int16), np.empty(shape, np.int16)
-        packed, data, dirty = (self._room(name, shape, kind) for name, kind in ROOM)
-        words, soft = (a.words, b.words), (band.f, np.float32(band.mu))
+        pair = Pair(a.words, b.words, band.f, band.mu, a.window.x0, a.window.y0, *offset(a, b))
+        field = Field(np.empty(shape, np.int32), np.empty(shape, np.int32))
         if up is None:
-            search.exhaustive(words, top_reach(p, *shapes), 1, (u, v, data))
-            propagation.pack_map(u, v, packed)
+            u, v = np.empty(shape, np.int16), np.empty(shape, np.int16)
+            search.exhaustive((a.words, b.words), top_reach(p, *shapes), 1, (u, v, field.cost))
+            field.shift[:] = pack_map(u, v)
         else:
-            reach = p.search_columns, p.search_rows
-            propagation.descend(words, (up.u, up.v), reach, p.centres, soft, (packed, data), at)
+            native.search(pair, (up.u, up.v), (p.search_columns, p.search_rows), field)
         rounds = self.rounds(level)
         # Row displacements are found on the coarser levels, where trying them costs little. On the finest level, which
         # costs most, a single round only tries jumps: the search has just tried the neighbouring columns.
         beside = 2 if level > 0 else 1 if rounds > 1 else 0
-        propagation.checkerboard(words, (packed, data, dirty), soft, p.smoothness, rounds, beside, at)
-        propagation.unpack(packed, u, v)
+        native.propagate(pair, field, Smoothing(p.smoothness, rounds, beside))
+        u, v = unpacked(field.shift)
         if p.path_rounds:
             coarse = None if up is None else (np.asarray(up.u), np.asarray(up.v))
-            weights = paths.Weights(p.path_compact, p.path_small, p.path_large, p.path_grey)
+            costs = PathCosts(p.path_compact, p.path_small, p.path_large, p.path_grey)
             left, right = (paths.LevelView(patch.words, patch.compact, patch.grey) for patch in (a, b))
-            soft_lines = band.lines(a.window), band.mu
-            u, v = paths.propagate(left, right, (u, v), coarse, soft_lines, weights, p.path_rounds)
+            u, v = paths.propagate(left, right, (u, v), coarse, (band.f, band.mu), costs, p.path_rounds)
         return Map(u, v, np.zeros(shape, bool))
-
-    def _room(self, name: str, shape: tuple[int, ...], kind: type) -> AnyArray:
-        """Array to write to, for both directions and all levels: fresh memory costs more than filling it."""
-        size = int(np.prod(shape))
-        held = self.room.get(name)
-        if held is None or held.size < size:
-            held = self.room[name] = np.empty(size, kind)
-        return held[:size].reshape(shape)
 
     def fine(self, a: Patch, b: Patch, m: Map, wanted: AnyArray) -> Fine:
         """Sub-pixel map from distances summed over :data:`SUM_RADIUS`."""
-        u, v, d = (np.empty(a.window.shape, np.float32) for _ in range(3))
-        at = offset(a, b)
-        subpixel.summed((a.words, b.words), (m.u, m.v), wanted.astype(np.uint8), (u, v, d), at)
-        return Fine(u, v, d)
+        ahead_x, ahead_y = offset(a, b)
+        pair = Pair(a.words, b.words, epipolar.NO_BAND, 0.0, ahead_x=ahead_x, ahead_y=ahead_y)
+        return Fine(*native.sums(pair, np.asarray(m.u), np.asarray(m.v), wanted.astype(np.uint8)))
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,8 @@ from rille.stages.hfvm.images.window import (
     whole,
 )
 from rille.stages.hfvm.level import consistency, epipolar, rowwise
-from rille.stages.hfvm.level.simd import SUM_RADIUS
 from rille.stages.hfvm.level.window_pair import WindowPair
+from rille.stages.hfvm.native.reference import SUM_RADIUS
 
 Rasters = Mapping[str, Raster]
 

@@ -34,7 +34,6 @@ ACCURATE: Mapping[str, Any] = {
     "rounds": 4,
     "fine_rounds": None,
     "back_rounds": 4,
-    "centres": 5,
     # One round instead of three, and four steps instead of seven: two of four savings that took ``accurate``
     # from 34 times SGBM's time to 12.
     "path_rounds": 1,
@@ -153,13 +152,6 @@ class HfvmParams(Params):
         default=True,
         description="in large regions without texture, such as walls, match wide windows that agree on a plane; false: "
         "such regions stay without matches",
-    )
-    centres: int = Field(
-        default=5,
-        ge=1,
-        le=9,
-        description="predictions searched per pixel: its pixel at the coarser level, then that pixel's neighbours "
-        "along row, column and diagonals; more: sharper depth edges, longer time",
     )
     finest: Literal[0, 1] = Field(
         default=0,

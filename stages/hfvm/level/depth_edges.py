@@ -22,21 +22,18 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 
 from rille.stages.core.arrays import Floats32
 from rille.stages.core.declare import AnyArray
-from rille.stages.hfvm.level import edge_simd, simd
 from rille.stages.hfvm.level.features import Words
+from rille.stages.hfvm.native.problem import EdgeRule, Pair
+from rille.stages.hfvm.native.reference import EDGE_RADIUS
+from rille.stages.hfvm.native.solver import solver
 
 REACH = 4
 """Pixels to the farthest ones whose displacement is tried: features put an edge a few pixels too far out."""
 
-RADIUS = 3
-SIDE = 2 * RADIUS + 1
-"""Side of the window, pixels."""
-
-READ = RADIUS + 1
+READ = EDGE_RADIUS + 1
 """Pixels around one that are read in either image: compact features reach one farther than the window."""
 
 APART = 4
@@ -53,9 +50,6 @@ BETTER = 9, 10
 """A candidate wins if it costs less than this ratio of the pixel's own displacement: of weak evidence none changes.
 A farther one need only cost less, since features put an outline too far out, not too far in: with the ratio for it,
 too, bad-2 after filling was 1 % more on both halves of the Middlebury pairs, and that of the matched 8 %."""
-
-ALL = 1 << 40
-"""Above every cost."""
 
 AROUND = tuple((j * k, i * k) for k in (REACH // 2, REACH) for j, i in ((1, 0), (-1, 0), (0, 1), (0, -1)))
 """Rows and columns from a pixel to those whose displacements are tried."""
@@ -82,11 +76,10 @@ def place(
     ----------
     given : (row, col) int16 columns and rows of displacement.
     wanted : (row, col) bool, the pixels that may change; those nearer than :data:`REACH` to an edge of the left window
-        stay, and those that their own displacement leads nearer than :data:`RADIUS` to one of the right window.
+        stay, and those that their own displacement leads nearer than :data:`EDGE_RADIUS` to one of the right window.
     at : column and row of the left window's first pixel in the right one.
     near_sign : -1 where nearer things have lesser column displacements, +1 greater, 0 where that is not known.
     """
-    out = given[0].copy(), given[1].copy()
     # Most pixels have one displacement around them.
     around = np.zeros((2 * REACH + 1, 2 * REACH + 1), np.uint8)
     around[REACH, REACH] = 1
@@ -94,55 +87,9 @@ def place(
         around[REACH + j, REACH + i] = 1
     near = [cv2.dilate(plane, around) - cv2.erode(plane, around) >= APART for plane in given]
     grey = np.rint(left.grey).astype(np.int16)
-    words = left.compact.ravel(), right.compact.ravel()
-    _place(grey, words, right.grey.shape, given, wanted & (near[0] | near[1]), (at, int(near_sign)), out)
-    return out
-
-
-window_cost = edge_simd.make_window_cost(simd.widest(), SIDE, GREY, FAR)
-"""``window_cost((left, right), grey, (here, there), (cols, right cols))``: C between the windows that begin at words
-``left[here]`` and ``right[there]``; all arrays are flat. ``grey``: int16, of the left image; of each of its rows a
-value more than the window's is read.
-"""
-
-
-@njit(cache=True, nogil=True)
-def _place(grey, words, right_shape, given, wanted, sides, out):  # type: ignore[no-untyped-def]
-    (u, v), (out_u, out_v), (at, near) = given, out, sides
-    (rows, cols), (high, wide) = u.shape, right_shape
-    columns, downs = np.empty(len(AROUND) + 1, np.int32), np.empty(len(AROUND) + 1, np.int32)
-    flat, around = (u.ravel(), v.ravel(), grey.ravel()), np.array([j * cols + i for j, i in AROUND])
-    for y in range(REACH, rows - REACH):
-        for x in range(REACH, cols - REACH):
-            if not wanted[y, x]:
-                continue
-            count = _candidates(flat[0], flat[1], y * cols + x, around, columns, downs)
-            if count == 1:
-                continue
-            best, chosen = np.int64(ALL), 0
-            for k in range(count):
-                q, p = y + at[1] + downs[k], x + at[0] + columns[k]
-                if q >= RADIUS and q < high - RADIUS and p >= RADIUS and p < wide - RADIUS:
-                    # The pixel's own displacement comes first.
-                    factor = BETTER[0] if k == 0 or near * (columns[k] - columns[0]) < 0 else BETTER[1]
-                    first = (y - RADIUS) * cols + x - RADIUS, (q - RADIUS) * wide + p - RADIUS
-                    cost = factor * window_cost(words, flat[2], first, (cols, wide))
-                    if cost < best:
-                        best, chosen = cost, k
-                elif k == 0:
-                    break
-            out_u[y, x], out_v[y, x] = columns[chosen], downs[chosen]
-
-
-@njit(cache=True, nogil=True)
-def _candidates(u, v, at, around, columns, downs):  # type: ignore[no-untyped-def]
-    """Number of different displacements at the place ``at`` of flat maps and ``around`` it, its own first."""
-    count, columns[0], downs[0] = 1, u[at], v[at]
-    for n in range(len(around)):
-        column, down, k = np.int32(u[at + around[n]]), np.int32(v[at + around[n]]), 0
-        while k < count and max(abs(columns[k] - column), abs(downs[k] - down)) >= APART:
-            k += 1
-        if k == count:
-            columns[count], downs[count] = column, down
-            count += 1
-    return count
+    pair = Pair(left.compact, right.compact, np.zeros((3, 3)), 0.0, ahead_x=at[0], ahead_y=at[1])
+    rule = EdgeRule(REACH, APART, GREY, FAR, *BETTER, int(near_sign))
+    placed: tuple[AnyArray, AnyArray] = solver.edges(
+        pair, grey, given, (wanted & (near[0] | near[1])).view(np.uint8), rule
+    )
+    return placed

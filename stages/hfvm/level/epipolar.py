@@ -180,18 +180,22 @@ def lines(f: Matrix, shape: tuple[int, ...], x0: int = 0, y0: int = 0) -> NDArra
     return found
 
 
+@njit(cache=True, nogil=True, inline="always")
+def unit_line(f, x, y):  # type: ignore[no-untyped-def]
+    """Epipolar line (a, b, c) of a pixel, its normal of length one; float32."""
+    a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
+    b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
+    c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
+    # Without a band all is zero, and 0 / 0 must stay 0.
+    scale = 1.0 / max(np.sqrt(a * a + b * b), 1e-12)
+    return np.float32(a * scale), np.float32(b * scale), np.float32((c + a * x + b * y) * scale)
+
+
 @njit(cache=True, nogil=True)
 def _lines(f, found, x0, y0):  # type: ignore[no-untyped-def]
     for j in range(found.shape[0]):
-        y = np.float64(j + y0)
         for i in range(found.shape[1]):
-            x = np.float64(i + x0)
-            a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
-            b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
-            c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
-            # Without a band all is zero, and 0 / 0 must stay 0.
-            scale = 1.0 / max(np.sqrt(a * a + b * b), 1e-12)
-            found[j, i, 0], found[j, i, 1], found[j, i, 2] = a * scale, b * scale, (c + a * x + b * y) * scale
+            found[j, i, 0], found[j, i, 1], found[j, i, 2] = unit_line(f, np.float64(i + x0), np.float64(j + y0))
 
 
 @njit(cache=True, nogil=True)

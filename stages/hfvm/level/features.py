@@ -12,10 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]
-from numba import njit, types
-from numba.core import cgutils
-from numba.extending import intrinsic
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from rille.stages.core.declare import AnyArray
@@ -206,22 +203,15 @@ def pack_rows(a, start, scale, words, deviation):  # type: ignore[no-untyped-def
             )
 
 
-@intrinsic
-def distance(typingctx, a, b):  # type: ignore[no-untyped-def]
-    """Sum of absolute differences of the eight bytes of two words (Eq. 1, absolute form), for numba kernels.
-
-    Written as generic vector code, which LLVM turns into ``psadbw`` on x86 and its like elsewhere.
-    """
-    signature = types.int64(types.uint64, types.uint64)
-
-    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        # Widened first: the difference of two bytes needs nine bits.
-        wide = ir.VectorType(ir.IntType(32), 8)
-        x, y = (builder.zext(builder.bitcast(w, ir.VectorType(ir.IntType(8), 8)), wide) for w in args)
-        d = builder.sub(x, y)
-        d = builder.select(builder.icmp_signed("<", d, ir.Constant(wide, [0] * 8)), builder.neg(d), d)
-        kind = ir.FunctionType(ir.IntType(32), [wide])
-        total = cgutils.get_or_insert_function(builder.module, kind, "llvm.vector.reduce.add.v8i32")
-        return builder.zext(builder.call(total, [d]), ir.IntType(64))
-
-    return signature, codegen
+@njit(cache=True, nogil=True, inline="always")
+def distance(a, b):  # type: ignore[no-untyped-def]
+    """Sum of absolute differences of the eight bytes of two words (Eq. 1, absolute form), for numba kernels."""
+    one, low, eight = np.uint64(0x0001000100010001), np.uint64(0x00FF00FF00FF00FF), np.uint64(8)
+    # Four bytes at a time, each with sixteen bits of room: 256 + p - q, whose ninth bit says whether p >= q.
+    even = ((a & low) | (one << eight)) - (b & low)
+    odd = (((a >> eight) & low) | (one << eight)) - ((b >> eight) & low)
+    even_less, odd_less = one - ((even >> eight) & one), one - ((odd >> eight) & one)
+    # Where p < q the lower byte is 256 - |p - q|: its complement and one more.
+    even = ((even & low) ^ ((even_less << eight) - even_less)) + even_less
+    odd = ((odd & low) ^ ((odd_less << eight) - odd_less)) + odd_less
+    return np.int64(((even + odd) * one) >> np.uint64(48))

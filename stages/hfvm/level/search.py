@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from rille.stages.hfvm.level.features import distance
-from rille.stages.hfvm.level.simd import FAR
+from rille.stages.hfvm.native.problem import FAR
 
 NONE = np.iinfo(np.int32).max
 """Cost above every cost."""

@@ -148,8 +148,9 @@ def test_no_stage_loads_code_or_tables_that_its_digest_does_not_see():
         for module in code_digest.module_digests(name)
     }
     found = {name for name, text in modules().items() if name in reached and hidden.search(text)}
-    # it asks for the declaration of the images that it changes, whose values are its input
-    assert found <= {"rille.datasets.images.misalign"}
+    # the one asks for the declaration of the images that it changes, whose values are its input; the other reads C
+    # sources, whose bytes count
+    assert found <= {"rille.datasets.images.misalign", "rille.stages.hfvm.native.build"}
     assert len(reached) > 150
 
 

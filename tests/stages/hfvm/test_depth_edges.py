@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from rille.stages.hfvm.level import compact, depth_edges
-from rille.stages.hfvm.level.depth_edges import AROUND, BETTER, FAR, GREY, RADIUS, REACH, EdgeView, place
+from rille.stages.hfvm.level.depth_edges import AROUND, BETTER, FAR, GREY, REACH, EdgeView, place
+from rille.stages.hfvm.native.reference import EDGE_RADIUS as RADIUS
 
 ROWS, COLS = 40, 60
 

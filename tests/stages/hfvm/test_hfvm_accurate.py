@@ -12,14 +12,15 @@ from rille.stages.geometry.spline import coefficients
 from rille.stages.hfvm.coarse_to_fine import paths
 from rille.stages.hfvm.finish import guided, variational_refinement
 from rille.stages.hfvm.images.params import ACCURATE, HfvmParams
-from rille.stages.hfvm.level import compact, consistency
-from rille.stages.hfvm.level.propagation import pack_map
+from rille.stages.hfvm.level import compact, consistency, epipolar
+from rille.stages.hfvm.native import reference
+from rille.stages.hfvm.native.problem import CANDIDATES, NONE, Candidates, Pair, PathCosts, pack_map
 from rille.stages.hfvm.stage import match
 from rille.stages.imaging.pyramid import PyramidParams, build
 
 ACC = HfvmParams(preset="accurate")
-WEIGHTS = paths.Weights(ACC.path_compact, ACC.path_small, ACC.path_large, ACC.path_grey)
-NO_LINES = np.zeros((1, 1, 3), np.float32)
+COSTS = PathCosts(ACC.path_compact, ACC.path_small, ACC.path_large, ACC.path_grey)
+NO_BAND = np.zeros((3, 3))
 
 
 def view(image):
@@ -105,16 +106,16 @@ def brute_force(cu, cv, cost, grey, small, large, half):
 @given(st.integers(0, 10**6))
 def test_path_costs_are_those_of_the_definition(seed):
     rng = np.random.default_rng(seed)
-    shape = (4, 5, paths.MOST)
+    shape = (4, 5, CANDIDATES)
     cu, cv = rng.integers(-9, 9, (2, *shape)).astype(np.int16)
     cost = rng.integers(0, 16001, shape).astype(np.int16)
-    cost[rng.random(shape) < 0.2] = paths.NONE
+    cost[rng.random(shape) < 0.2] = NONE
     cost[..., 0] = np.minimum(cost[..., 0], 16000)  # a pixel has one candidate at least: its own
     grey = rng.uniform(0, 255, shape[:2]).astype(np.float32)
     total = np.zeros(shape, np.int32)
     for backward in (False, True):
-        paths._sweep(paths.Candidates(cu, cv, cost), grey, paths.Weights(8, 36, 240, 10.0), backward, total)
-    there = cost != paths.NONE
+        reference.sweep(Candidates(cu, cv, cost), grey, PathCosts(8, 36, 240, 10.0), backward, total)
+    there = cost != NONE
     np.testing.assert_array_equal(total[there], brute_force(cu, cv, cost, grey, 36, 240, 10.0)[there])
 
 
@@ -124,7 +125,7 @@ def listed(maps, up, y, x, right_shape):
     rows, cols = u.shape
     found = [(int(u[y, x]), int(v[y, x]))]
     more = [(u[y, x] + i, v[y, x] + j) for j, i in ((0, -1), (0, 1), (-1, 0), (1, 0))]
-    for j, i in paths.AROUND:
+    for j, i in reference.AROUND:
         near = min(max(y + j, 0), rows - 1), min(max(x + i, 0), cols - 1)
         more.append((u[near], v[near]))
     for k in range(9 if up is not None else 0):
@@ -135,7 +136,7 @@ def listed(maps, up, y, x, right_shape):
         more.append((2 * up[0][above], 2 * up[1][above]))
     for a, b in more:
         inside = 0 <= x + a < right_shape[1] and 0 <= y + b < right_shape[0]
-        if inside and (int(a), int(b)) not in found and len(found) < paths.MOST:
+        if inside and (int(a), int(b)) not in found and len(found) < CANDIDATES:
             found.append((int(a), int(b)))
     return found
 
@@ -148,29 +149,26 @@ def test_candidates_and_their_costs_are_those_of_the_definition(mu, with_up):
     a, b = view(left), view(right)
     maps = rng.integers(-6, 6, (2, *left.shape)).astype(np.int16)
     up = rng.integers(-3, 3, (2, 6, 7)).astype(np.int16) if with_up else None
-    lines = rng.normal(0, 1, (*left.shape, 3)).astype(np.float32)
-    found = paths.Candidates(*(np.empty((*left.shape, paths.MOST), np.int16) for _ in range(3)))
-    packed = np.empty(left.shape, np.int32)
-    pack_map(*maps, packed)
-    above = np.empty((0, 0), np.int32) if up is None else paths._doubled(*up)
-    paths._gather(a, b, 8, packed, above, (lines, mu), found)
-    cu, cv, cost = found
+    f = rng.normal(0, 1, (3, 3))
+    lines = epipolar.lines(f, left.shape)
+    given = (a.compact, b.compact), pack_map(*maps), None if up is None else tuple(up), COSTS
+    cu, cv, cost = reference.candidates(Pair(a.words, b.words, f, mu), *given)
 
     def apart(word, other):
         return int(np.abs(bytes_of(word).astype(int) - bytes_of(other)).sum())
 
     for y, x in np.ndindex(left.shape):
         want = listed(maps, up, y, x, right.shape)
-        there = cost[y, x] != paths.NONE
+        there = cost[y, x] != NONE
         assert list(zip(cu[y, x, there].tolist(), cv[y, x, there].tolist(), strict=True)) == want
         for k, (i, j) in enumerate(want):
-            expected = paths.OUTSIDE
+            expected = reference.OUTSIDE
             if 0 <= x + i < right.shape[1] and 0 <= y + j < right.shape[0]:
                 other = y + j, x + i
                 expected = 4 * apart(a.words[y, x], b.words[other]) + 8 * apart(a.compact[y, x], b.compact[other])
             n = lines[y, x].astype(np.float64)
             expected += int(12 * mu * abs(n[0] * i + n[1] * j + n[2]))
-            assert cost[y, x, k] == min(expected, 2 * paths.OUTSIDE)
+            assert cost[y, x, k] == min(expected, 2 * reference.OUTSIDE)
 
 
 def bytes_of(word):
@@ -182,7 +180,7 @@ def test_paths_find_both_sides_of_a_step_from_a_poor_start():
     rng = np.random.default_rng(0)
     start = np.where(rng.random(u.shape) < 0.3, u, rng.integers(-15, 3, u.shape)).astype(np.int16)
     found, rows = paths.propagate(
-        view(left), view(right), (start, np.zeros_like(start)), None, (NO_LINES, 0.0), WEIGHTS, 3
+        view(left), view(right), (start, np.zeros_like(start)), None, (NO_BAND, 0.0), COSTS, 3
     )
     visible = ~occluded & seen(u, 0 * u, left.shape, 3)
     assert np.mean((found == u)[visible]) > 0.97
@@ -195,7 +193,7 @@ def test_paths_find_both_sides_of_a_step_from_a_poor_start():
 def test_the_true_map_of_equal_images_stays():
     image = Texture(5)(*np.indices((40, 50))[::-1].astype(float))
     nothing = np.zeros(image.shape, np.int16)
-    u, v = paths.propagate(view(image), view(image), (nothing, nothing), None, (NO_LINES, 0.0), WEIGHTS, 2)
+    u, v = paths.propagate(view(image), view(image), (nothing, nothing), None, (NO_BAND, 0.0), COSTS, 2)
     assert not u.any()
     assert not v.any()
 
@@ -204,7 +202,7 @@ def test_the_true_map_of_equal_images_stays():
 def test_paths_on_tiny_images(shape):
     image = np.random.default_rng(0).uniform(0, 255, shape).astype(np.float32)
     start = np.full(shape, 5, np.int16)  # leads out
-    u, v = paths.propagate(view(image), view(image), (start, start), (start, start), (NO_LINES, 0.0), WEIGHTS, 2)
+    u, v = paths.propagate(view(image), view(image), (start, start), (start, start), (NO_BAND, 0.0), COSTS, 2)
     assert u.shape == v.shape == shape
 
 

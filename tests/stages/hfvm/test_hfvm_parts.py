@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matching_scenes import convergent_rig, pair, rig_displacement
+from numba import njit
 from scipy import ndimage
 
 from rille.stages.core.validity import Validity, has
@@ -364,3 +365,16 @@ def test_a_patch_without_texture_on_a_textured_wall_is_matched_with_a_larger_dev
     around = found.disparity_std[20:60, 40:180]
     more = np.nanmin(found.disparity_std[inside]) ** 2 - np.nanmedian(around) ** 2
     assert more > 0.99 * uncertainty.BLANK**2
+
+
+def test_a_spline_is_scipys_between_pixels():
+    @njit
+    def call(found, x, y):
+        i, j = int(x), int(y)
+        t, s = x - np.float32(i), y - np.float32(j)
+        return rowwise.spline_value(found.ravel(), j * found.shape[1] + i, found.shape[1], t, s)
+
+    image = np.random.default_rng(8).uniform(0, 255, (9, 10)).astype(np.float32)
+    for x, y in np.random.default_rng(9).uniform(2, 6, (50, 2)).astype(np.float32):
+        expected = ndimage.map_coordinates(image, [[y], [x]], np.float64, order=3, mode="mirror")
+        np.testing.assert_allclose(call(coefficients(image), x, y), expected[0], atol=5e-3)

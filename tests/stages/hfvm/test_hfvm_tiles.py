@@ -138,7 +138,7 @@ def test_parameters_that_widen_the_reach_widen_the_surroundings():
     """Rounds, median, refinement and filling reach farther than by default; so do centres far apart."""
     views = both(misaligned)
     more = {"rounds": 6, "fine_rounds": 5, "median": 5, "refine_steps": 3, "refine_radius": 4, "search_columns": 4}
-    params = HfvmParams(**more, search_rows=3, fill_reach=15, min_support=0.4, guided_fill=True, centres=5)
+    params = HfvmParams(**more, search_rows=3, fill_reach=15, min_support=0.4, guided_fill=True)
     once = tiled.match(*views, params, None, quiet, None)
     found = in_tiles(views, params, 53, 0)
     for name, values in once.arrays.items():

@@ -1,0 +1,371 @@
+/* Loops over the pixels of a level; one thread, in order. Compiled once for each instruction set, which VARIANT names. */
+#include <math.h>
+#include <string.h>
+#include "level.h"
+
+#define JOIN(name, variant) name##variant
+#define NAMED(name, variant) JOIN(name, variant)
+#define EXPORT(name) NAMED(name, VARIANT)
+
+/* Number of the best instruction set of this processor; compiled for any processor only. */
+#ifdef ANY_PROCESSOR
+int supported(void) {
+#if defined(__x86_64__)
+  __builtin_cpu_init();
+  if (__builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl")) return 2;
+  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2")) return 1;
+#endif
+  return 0;
+}
+#endif
+
+/* ---- search ---- */
+
+/* `centres`: room, (rows + 2) x (cols + 2) of the parents; a border repeats the edge. */
+void EXPORT(search)(const Pair *pair, const Parents *up, Shift reach, Field out, int32_t *centres) {
+  int32_t stride = up->cols + 2, rows = pair->left.rows, cols = pair->left.cols;
+  for (int32_t j = 0; j < up->rows; j++) {
+    RowLines row = row_lines(&pair->band, pair->y0 + 2 * j + 0.5);
+    int32_t *to = centres + (int64_t)(j + 1) * stride;
+    for (int32_t i = 0; i < up->cols; i++) to[i + 1] = centre_of(pair, up, row, i, j);
+    to[0] = to[1], to[up->cols + 1] = to[up->cols];
+  }
+  memcpy(centres, centres + stride, stride * sizeof *centres);
+  memcpy(centres + (int64_t)(up->rows + 1) * stride, centres + (int64_t)up->rows * stride, stride * sizeof *centres);
+  for (int32_t j = 0; j < up->rows; j++) {
+    RowLines row = row_lines(&pair->band, pair->y0 + 2 * j + 0.5);
+    for (int32_t i = 0; i < up->cols; i++) {
+      const int32_t *centre = centres + (int64_t)(j + 1) * stride + i + 1;
+      Children best = search_parent(pair, row, centre, stride, (Shift){i, j}, reach);
+      for (int n = 0; n < 4; n++) {
+        int32_t x = 2 * i + (n & 1), y = 2 * j + (n >> 1);
+        if (x >= cols || y >= rows) continue;
+        out.shift[(int64_t)y * cols + x] = best.shift[n];
+        out.cost[(int64_t)y * cols + x] = best.cost[n];
+      }
+    }
+  }
+}
+
+/* ---- propagation ---- */
+
+typedef struct { int32_t *columns, *shift, *cost; } Todo; /* columns of a row to look at, and what was settled there */
+
+/* One colour of row y. `dirty`: pixels to look at; `again`: whether a later turn looks again at what changes. */
+static void turn_row(const Pair *pair, Field field, uint8_t *dirty, Todo todo, int32_t y, int32_t turn, Smoothing how,
+                     int again) {
+  int32_t rows = pair->left.rows, cols = pair->left.cols, n = 0;
+  int32_t above = y > 0 ? y - 1 : rows > 1, below_ = y + 1 < rows ? y + 1 : rows > 1 ? rows - 2 : 0;
+  int64_t start = (int64_t)y * cols;
+  uint8_t *flags = dirty + start, *before = dirty + (int64_t)above * cols, *after = dirty + (int64_t)below_ * cols;
+  /* The first turn of each colour looks at every pixel; later ones at what was marked. */
+  for (int32_t x = (y + turn) & 1; x < cols; x += 2) {
+    todo.columns[n] = x;
+    n += turn < 2 || flags[x];
+    flags[x] = 0;
+  }
+  if (n == 0) return;
+  /* Vectors run past the end of the list; settling the last pixel again does no harm. */
+  for (int k = 0; k < LANES; k++) todo.columns[n + k] = todo.columns[n - 1];
+  RowLines row = row_lines(&pair->band, y + pair->y0);
+  const int32_t *own = field.shift + start, *up = field.shift + (int64_t)above * cols;
+  const int32_t *down = field.shift + (int64_t)below_ * cols, *cost = field.cost + start;
+  for (int32_t k = 0; k < n; k += LANES) {
+    Eight x, first, last, mine, stay, near[4];
+    memcpy(&x, todo.columns + k, sizeof x);
+    int32_t a = x[0], b = x[LANES - 1];
+    /* Without a gap between the eight columns plain loads stand for gathered ones. */
+    if (k + LANES <= n && b - a == 2 * LANES - 2 && a > 0 && b + 2 < cols) {
+      mine = every_other(own + a), stay = every_other(cost + a);
+      near[0] = every_other(up + a), near[1] = every_other(own + a - 1);
+      near[2] = every_other(own + a + 1), near[3] = every_other(down + a);
+    } else {
+      /* Beyond the border the pixel on the other side stands in. */
+      first = x == 0, last = x == cols - 1;
+      Eight west = PICK(first, (Eight){} + (cols > 1), x - 1);
+      Eight east = PICK(last, (Eight){} + (cols > 1 ? cols - 2 : 0), x + 1);
+      mine = ints_at(own, x), stay = ints_at(cost, x);
+      near[0] = ints_at(up, x), near[1] = ints_at(own, west), near[2] = ints_at(own, east), near[3] = ints_at(down, x);
+    }
+    Words words = words_at(pair->left.words + start, x);
+    Look look = {pair, words, x, y, lines_at(row, floats(x + pair->x0)), near, how.smoothness};
+    Settled best = settle(&look, mine, stay, how.beside);
+    memcpy(todo.shift + k, &best.shift, sizeof best.shift);
+    memcpy(todo.cost + k, &best.cost, sizeof best.cost);
+  }
+  for (int32_t k = 0; k < n; k++) {
+    int32_t x = todo.columns[k];
+    int32_t changed = again && todo.shift[k] != own[x];
+    field.shift[start + x] = todo.shift[k], field.cost[start + x] = todo.cost[k];
+    /* The pixel itself as well: what lies beside its new displacement has not been tried. */
+    if (changed) before[x] = after[x] = flags[x] = flags[x > 0 ? x - 1 : 0] = flags[x + 1 < cols ? x + 1 : x] = 1;
+  }
+}
+
+/* Rounds over the two colours of a checkerboard, in place. Each turn follows the one before at a row's distance, so that
+   all of them pass over the image while it is at hand. `dirty`: room, a byte a pixel, `room`: 3 (cols + LANES). */
+void EXPORT(propagate)(const Pair *pair, Field field, Smoothing how, int32_t rounds, uint8_t *dirty, int32_t *room) {
+  int32_t rows = pair->left.rows, wide = pair->left.cols + LANES, turns = 2 * rounds;
+  Todo todo = {room, room + wide, room + 2 * wide};
+  if (pair->band.cost < SHARP) how.beside = 2;
+  memset(dirty, 0, (size_t)rows * pair->left.cols);
+  for (int32_t step = 0; turns && step < rows + turns - 1; step++) {
+    for (int32_t turn = step - rows + 1 > 0 ? step - rows + 1 : 0; turn < turns && turn <= step; turn++)
+      turn_row(pair, field, dirty, todo, step - turn, turn, how, turns > 2);
+  }
+}
+
+/* ---- fractions of a pixel ---- */
+
+enum { SUM_RADIUS = 2, WINDOW = 2 * SUM_RADIUS + 1, SIDE_BY_SIDE = 4 };
+typedef struct { float *u, *v, *distance; } Fine;
+typedef struct { int32_t at[5]; } Sums; /* distances at a displacement, and a pixel west, east, north, south of it */
+
+/* Where two lines of equal and opposite slope through three distances meet, within half a pixel. */
+static inline float fraction(int32_t before, int32_t at, int32_t after) {
+  float steep = (float)((before > after ? before : after) - at);
+  if (steep <= 0) return 0.0f;
+  float d = (float)(before - after) / steep * 0.5f;
+  return d < -0.5f ? -0.5f : d > 0.5f ? 0.5f : d;
+}
+/* Sums over the windows of up to four pixels side by side, from word `here` of the left and `there` of the right. */
+static inline void sum_windows(const uint64_t *here, const uint64_t *there, int32_t cols, int32_t right_cols, int count,
+                               Sums *out) {
+  static const int aside[5] = {0, -1, 1, 0, 0}, down[5] = {0, 0, 0, -1, 1};
+  int words = count + WINDOW - 1;
+  Words total[5] = {0};
+  for (int j = -SUM_RADIUS; j <= SUM_RADIUS; j++) {
+    const uint64_t *p = here + j * cols - SUM_RADIUS;
+    for (int k = 0; k < 5; k++) {
+      const uint64_t *q = there + (j + down[k]) * right_cols - SUM_RADIUS + aside[k];
+      if (words == LANES) {
+        Words a, b;
+        memcpy(&a, p, sizeof a), memcpy(&b, q, sizeof b);
+        total[k].low += square_sad(a.low, b.low), total[k].high += square_sad(a.high, b.high);
+      } else {
+        for (int i = 0; i < words; i++) {
+          if (i < 4) total[k].low[i] += distance(p[i], q[i]);
+          else total[k].high[i - 4] += distance(p[i], q[i]);
+        }
+      }
+    }
+  }
+  /* A sum of 25 distances has 16 bits: four are added up in one word. */
+  uint64_t four[LANES], last[LANES];
+  Words packed = {total[0].low | total[1].low << 16 | total[2].low << 32 | total[3].low << 48,
+                  total[0].high | total[1].high << 16 | total[2].high << 32 | total[3].high << 48};
+  memcpy(four, &packed, sizeof four), memcpy(last, &total[4], sizeof last);
+  for (int n = 0; n < count; n++) {
+    uint64_t sum = four[n] + four[n + 1] + four[n + 2] + four[n + 3] + four[n + 4];
+    for (int k = 0; k < 4; k++) out[n].at[k] = (int32_t)(sum >> 16 * k & 0xFFFF);
+    out[n].at[4] = (int32_t)(last[n] + last[n + 1] + last[n + 2] + last[n + 3] + last[n + 4]);
+  }
+}
+/* Displacements with fractions from distances summed over 5 x 5 pixels, and the mean distance; where the window, moved
+   by a pixel, leaves an image, the displacement as it is and the pixel's own distance; -1 outside, or not wanted. */
+void EXPORT(sums)(const Pair *pair, const int16_t *us, const int16_t *vs, const uint8_t *wanted, Fine out) {
+  int32_t rows = pair->left.rows, cols = pair->left.cols, far = SUM_RADIUS + 1;
+  int32_t right_rows = pair->right.rows, right_cols = pair->right.cols;
+  Sums found[SIDE_BY_SIDE];
+  for (int32_t y = 0; y < rows; y++) {
+    for (int32_t x = 0, n = 1; x < cols; x += n) {
+      int64_t i = (int64_t)y * cols + x;
+      int32_t u = us[i], v = vs[i], xr = x + pair->ahead_x + u, yr = y + pair->ahead_y + v;
+      n = 1;
+      out.u[i] = (float)u, out.v[i] = (float)v, out.distance[i] = -1.0f;
+      if (!wanted[i] || xr < 0 || xr >= right_cols || yr < 0 || yr >= right_rows) continue;
+      const uint64_t *here = pair->left.words + i, *there = pair->right.words + (int64_t)yr * right_cols + xr;
+      int32_t most = cols - SUM_RADIUS - x < right_cols - far - xr ? cols - SUM_RADIUS - x : right_cols - far - xr;
+      if (x < SUM_RADIUS || y < SUM_RADIUS || y + SUM_RADIUS >= rows || xr < far || yr < far || yr + far >= right_rows ||
+          most <= 0) {
+        out.distance[i] = (float)distance(*here, *there);
+        continue;
+      }
+      /* Neighbours of equal displacement are summed together. */
+      while (n < SIDE_BY_SIDE && n < most && us[i + n] == u && vs[i + n] == v && wanted[i + n]) n++;
+      sum_windows(here, there, cols, right_cols, n, found);
+      for (int k = 0; k < n; k++) {
+        const int32_t *s = found[k].at;
+        out.u[i + k] = (float)u + fraction(s[1], s[0], s[2]);
+        out.v[i + k] = (float)v + fraction(s[3], s[0], s[4]);
+        out.distance[i + k] = (float)s[0] / (float)(WINDOW * WINDOW);
+      }
+    }
+  }
+}
+
+/* ---- depth edges ---- */
+
+enum { EDGE_RADIUS = 3, EDGE_SIDE = 2 * EDGE_RADIUS + 1 };
+typedef struct {
+  int32_t reach;      /* pixels to the farthest whose displacement is tried; half of them, too */
+  int32_t apart;      /* pixels between displacements of two sides */
+  int32_t grey, far;  /* grey levels from which on a pixel does not count; greatest distance */
+  int32_t better[2];  /* the own displacement counts by the first, others by the second, but farther ones */
+  int32_t near;       /* sign of the columns of nearer things, 0 unknown */
+} EdgeRule;
+
+static int32_t edge_cost(const uint64_t *here, const uint64_t *there, const int16_t *grey, int32_t cols,
+                         int32_t right_cols, const EdgeRule *rule) {
+  int32_t own = grey[EDGE_RADIUS * cols + EDGE_RADIUS];
+  Eight total = {0};
+  for (int j = 0; j < EDGE_SIDE; j++, here += cols, there += right_cols, grey += cols) {
+    Eight near = {grey[0], grey[1], grey[2], grey[3], grey[4], grey[5], grey[6], own + rule->grey};
+    near -= own;
+    Eight weight = rule->grey - PICK(near < 0, -near, near);
+    weight &= weight > 0;
+    Eight apart_by = distances(words_from(here, EDGE_SIDE), words_from(there, EDGE_SIDE));
+    total += weight * least_of(apart_by, (Eight){} + rule->far);
+  }
+  int32_t sum = 0;
+  for (int k = 0; k < EDGE_SIDE; k++) sum += total[k];
+  return sum;
+}
+/* Displacements of the wanted pixels, chosen anew among those around; pair: words of compact features. */
+void EXPORT(edges)(const Pair *pair, const int16_t *grey, const int16_t *u, const int16_t *v, const uint8_t *wanted,
+                   const EdgeRule *rule, int16_t *out_u, int16_t *out_v) {
+  int32_t rows = pair->left.rows, cols = pair->left.cols, right_rows = pair->right.rows, right_cols = pair->right.cols;
+  int32_t reach = rule->reach, half = reach / 2;
+  const int32_t aside[8][2] = {{half, 0}, {-half, 0}, {0, half}, {0, -half}, {reach, 0}, {-reach, 0}, {0, reach}, {0, -reach}};
+  for (int32_t y = reach; y < rows - reach; y++) {
+    for (int32_t x = reach; x < cols - reach; x++) {
+      int64_t i = (int64_t)y * cols + x;
+      if (!wanted[i]) continue;
+      Shift tried[9] = {{u[i], v[i]}};
+      int32_t count = 1, chosen = 0;
+      for (int n = 0; n < 8; n++) {
+        int64_t at = i + (int64_t)aside[n][0] * cols + aside[n][1];
+        int32_t k = 0;
+        for (; k < count; k++) {
+          int32_t du = tried[k].u - u[at], dv = tried[k].v - v[at];
+          if ((du < 0 ? -du : du) < rule->apart && (dv < 0 ? -dv : dv) < rule->apart) break;
+        }
+        if (k == count) tried[count++] = (Shift){u[at], v[at]};
+      }
+      int64_t least = INT64_MAX;
+      for (int32_t k = 0; k < count && count > 1; k++) {
+        int32_t q = y + pair->ahead_y + tried[k].v, p = x + pair->ahead_x + tried[k].u;
+        if (q >= EDGE_RADIUS && q < right_rows - EDGE_RADIUS && p >= EDGE_RADIUS && p < right_cols - EDGE_RADIUS) {
+          int32_t farther = rule->near * (tried[k].u - tried[0].u) < 0;
+          int64_t from = i - (int64_t)EDGE_RADIUS * cols - EDGE_RADIUS;
+          int64_t to = (int64_t)(q - EDGE_RADIUS) * right_cols + p - EDGE_RADIUS;
+          int64_t cost = edge_cost(pair->left.words + from, pair->right.words + to, grey + from, cols, right_cols, rule);
+          cost *= rule->better[k > 0 && !farther];
+          if (cost < least) least = cost, chosen = k;
+        } else if (k == 0) {
+          break;
+        }
+      }
+      out_u[i] = (int16_t)tried[chosen].u, out_v[i] = (int16_t)tried[chosen].v;
+    }
+  }
+}
+
+/* ---- paths ---- */
+
+enum { MOST = 8, NONE = 32767, UNIT = 4, OUTSIDE = 8000 }; /* candidates; costs: none, of a byte step, outside */
+typedef struct { int16_t *u, *v, *cost; } Candidates;      /* MOST of each pixel */
+typedef struct { int32_t compact, small, large; float grey; } PathCosts;
+
+/* Candidates of every pixel, each once: the own displacement, those a pixel beside it, those around, those of the coarser
+   level; all but the first lead into the right image. `compact`: words of both images' compact features. */
+void EXPORT(candidates)(const Pair *pair, const uint64_t *const compact[2], const int32_t *maps, const Parents *up,
+                        PathCosts costs, Candidates out) {
+  static const int8_t around[12][2] = {{0, -1}, {0, 1}, {-1, 0}, {1, 0}, {-3, -3}, {-3, 3}, {3, -3}, {3, 3},
+                                       {0, -8}, {0, 8}, {-8, 0}, {8, 0}};
+  static const int8_t beside[5][2] = {{0, 0}, {0, -1}, {0, 1}, {-1, 0}, {1, 0}};
+  int32_t rows = pair->left.rows, cols = pair->left.cols, right_rows = pair->right.rows, right_cols = pair->right.cols;
+  double share = (UNIT + costs.compact) * pair->band.cost;
+  for (int32_t y = 0; y < rows; y++) {
+    for (int32_t x = 0; x < cols; x++) {
+      int64_t i = (int64_t)y * cols + x, at = i * MOST;
+      Line line = unit_line(&pair->band, x + pair->x0, y + pair->y0);
+      Shift own = unpack(maps[i]);
+      int32_t count = 0;
+      for (int n = 0; n < 17 + (up->rows > 0 ? 9 : 0) && count < MOST; n++) {
+        Shift s;
+        if (n < 5) {
+          s = (Shift){own.u + beside[n][1], own.v + beside[n][0]};
+        } else if (n < 17) {
+          s = unpack(maps[(int64_t)within(y + around[n - 5][0], rows) * cols + within(x + around[n - 5][1], cols)]);
+        } else {
+          int32_t j = within(y / 2 + (n - 17) / 3 - 1, up->rows), k = within(x / 2 + (n - 17) % 3 - 1, up->cols);
+          s = (Shift){2 * up->u[(int64_t)j * up->cols + k], 2 * up->v[(int64_t)j * up->cols + k]};
+        }
+        int32_t xr = x + s.u, yr = y + s.v, inside = xr >= 0 && yr >= 0 && xr < right_cols && yr < right_rows;
+        int32_t known = n > 0 && !inside;
+        for (int k = 0; k < count; k++) known |= out.u[at + k] == s.u && out.v[at + k] == s.v;
+        if (known) continue;
+        int64_t to = (int64_t)yr * right_cols + xr;
+        int32_t cost = OUTSIDE;
+        if (inside) {
+          cost = UNIT * distance(pair->left.words[i], pair->right.words[to]);
+          cost += costs.compact * distance(compact[0][i], compact[1][to]);
+        }
+        double off = share * fabs((double)line.a * s.u + (double)line.b * s.v + line.c);
+        cost += (int32_t)(off < 2 * OUTSIDE ? off : 2 * OUTSIDE);
+        /* Leaves room below NONE for the greatest step, 10000. */
+        out.u[at + count] = (int16_t)s.u, out.v[at + count] = (int16_t)s.v;
+        out.cost[at + count++] = (int16_t)(cost < 2 * OUTSIDE ? cost : 2 * OUTSIDE);
+      }
+      for (; count < MOST; count++) out.u[at + count] = out.v[at + count] = 0, out.cost[at + count] = NONE;
+    }
+  }
+}
+static inline Eight widened(const int16_t *numbers) {
+  return (Eight){numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5], numbers[6], numbers[7]};
+}
+/* Costs of a pixel's candidates from those of the pixel before on a path:
+   cost + min over m (before[m] + min(small |difference to m|, far)) - min over m before[m]. */
+static inline Eight path_step(Candidates all, int64_t at, int64_t from, const int32_t *before, int32_t small, int32_t far) {
+  Eight u = widened(all.u + at), v = widened(all.v + at), top = (Eight){} + far;
+  int32_t least = before[0];
+  for (int m = 1; m < MOST; m++) least = before[m] < least ? before[m] : least;
+  Eight best = top + least;
+  for (int m = 0; m < MOST; m++) {
+    Eight du = u - all.u[from + m], dv = v - all.v[from + m];
+    Eight gap = PICK(du < 0, -du, du) + PICK(dv < 0, -dv, dv);
+    best = least_of(best, before[m] + least_of(small * gap, top));
+  }
+  return least_of(widened(all.cost + at) + best - least, (Eight){} + NONE);
+}
+/* Add to `total` the costs along three directions: from the upper left, above, the upper right; `backward`: their
+   opposites. `room`: 6 rows of MOST numbers a pixel. */
+void EXPORT(sweep)(int32_t rows, int32_t cols, Candidates all, const float *grey, PathCosts costs, int32_t backward,
+                   int32_t *total, int32_t *room) {
+  int32_t s = backward ? -1 : 1;
+  int64_t size = (int64_t)3 * cols * MOST;
+  int32_t *before = room, *after = room + size;
+  for (int32_t row = 0; row < rows; row++) {
+    int32_t y = backward ? rows - 1 - row : row, j = y - s;
+    for (int32_t x = 0; x < cols; x++) {
+      int64_t at = ((int64_t)y * cols + x) * MOST;
+      for (int d = 0; d < 3; d++) {
+        int32_t i = x + s * (d - 1);
+        Eight cost = widened(all.cost + at), sum;
+        if (j >= 0 && j < rows && i >= 0 && i < cols) {
+          float change = fabsf(grey[(int64_t)y * cols + x] - grey[(int64_t)j * cols + i]);
+          float jump = (float)costs.large / (1.0f + change / costs.grey), small = (float)(2 * costs.small);
+          int64_t from = ((int64_t)j * cols + i) * MOST;
+          /* Small differences cost less than jumps even where the grey step is greatest. */
+          int32_t far = (int32_t)(jump > small ? jump : small);
+          cost = path_step(all, at, from, before + ((int64_t)d * cols + i) * MOST, costs.small, far);
+        }
+        memcpy(after + ((int64_t)d * cols + x) * MOST, &cost, sizeof cost);
+        memcpy(&sum, total + at, sizeof sum);
+        sum += cost;
+        memcpy(total + at, &sum, sizeof sum);
+      }
+    }
+    int32_t *other = before;
+    before = after, after = other;
+  }
+}
+/* Displacement of least total; the first of equal ones. */
+void EXPORT(choose)(Candidates all, const int32_t *total, int64_t pixels, int32_t *maps) {
+  for (int64_t i = 0; i < pixels; i++) {
+    int64_t at = i * MOST, best = at;
+    for (int64_t k = at + 1; k < at + MOST; k++) best = all.cost[k] != NONE && total[k] < total[best] ? k : best;
+    maps[i] = pack(all.u[best], all.v[best]);
+  }
+}
