@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import webbrowser
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,7 +18,7 @@ import tomli_w
 
 from rille.datasets.text.reading import TABLE, read_lines, read_text
 from rille.pipeline.steps import StereoSequence, check_place, check_sections
-from rille.stages.core.errors import ConfigError, InputError
+from rille.stages.core.errors import ConfigError, InputError, RilleError
 
 if TYPE_CHECKING:
     import xarray
@@ -98,6 +98,35 @@ def reconstruct(
     )
     # Absolute: the program may change its folder, or send the run to another.
     return Run(session.perform(options)[1].resolve())
+
+
+def reconstruct_many(
+    seqs: Iterable[StereoSequence | str | Path], client: Any = None, **same: Any
+) -> list[Run | RilleError]:
+    """Reconstruct sequences one after another; of each the run, or the error that ended it.
+
+    Parameters
+    ----------
+    seqs
+        Each as for :func:`reconstruct`.
+    client
+        ``distributed.Client`` of the cluster that computes all of them.
+    same
+        What :func:`reconstruct` takes, for all of them.
+
+    Examples
+    --------
+    >>> import rille
+    >>> [type(one).__name__ for one in rille.reconstruct_many(["no/such/folder", "none"])]
+    ['InputError', 'InputError']
+    """
+    ended: list[Run | RilleError] = []
+    for seq in seqs:
+        try:
+            ended.append(reconstruct(seq, client, **same))
+        except RilleError as error:
+            ended.append(error)
+    return ended
 
 
 def assignments(settings: Mapping[str, Settings]) -> list[str]:

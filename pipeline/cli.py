@@ -10,17 +10,14 @@ from __future__ import annotations
 
 import os
 import sys
-import traceback
 from pathlib import Path
 
 from cyclopts import App, CycloptsError, MissingArgumentError, UnusedCliTokensError
 from rich.console import Console
 
+from rille.pipeline.commands.complaints import complain, print_error
 from rille.pipeline.commands.options import COMPLETE, FAILED, INTERRUPTED, USAGE, prepare
 from rille.pipeline.engine.plain import plain_output, raw
-
-LONGEST_COMPLAINT = 1000
-"""Characters."""
 
 COMMANDS = {
     "reconstruct": "reconstruct:reconstruct",
@@ -116,34 +113,12 @@ def _run(argv: list[str] | None) -> int:
         extra = isinstance(error, UnusedCliTokensError)
         text = f"unexpected {', '.join(map(repr, error.unused_tokens or ()))}." if extra else str(error)
         hint = f" `{words} --help` says what it takes." if extra or isinstance(error, MissingArgumentError) else ""
-        _print_error("RIL-001", f"{text}{hint}")
+        print_error("RIL-001", f"{text}{hint}")
         return USAGE
     except BrokenPipeError:
         raise
     except Exception as error:
-        return _complain(error, debug)
-
-
-def _complain(error: Exception, debug: bool) -> int:
-    """One line that says what to change; the traceback on request."""
-    from rille.pipeline.engine.failures import translated
-    from rille.stages.core.errors import ConfigError, InputError
-
-    if debug:
-        traceback.print_exception(error)
-    if (known := translated(error)) is not None:
-        _print_error(known.code, str(known))
-    else:
-        hint = "" if debug else " (run again with --debug for the traceback)"
-        _print_error("RIL-999", f"{type(error).__name__}: {error}{hint}")
-    return USAGE if isinstance(error, ConfigError | InputError) else FAILED
-
-
-def _print_error(code: str, words: str) -> None:
-    line = " ".join(words.split())
-    if len(line) > LONGEST_COMPLAINT:  # of what a file holds, enough to find it
-        line = f"{line[: LONGEST_COMPLAINT // 2]} ... {line[-LONGEST_COMPLAINT // 2 :]}"
-    print(f"rille: error {code}: {line}", file=sys.stderr)
+        return complain(error, debug=debug)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """Stereo image sequences to terrain, trajectory, risk map and safe path.
 
 One pair, step by step: ``open``, ``match``, ``points``, ``terrain``, ``hazards``, ``path``
-(:mod:`rille.pipeline.steps`). A whole sequence: ``reconstruct``, ``open_run`` (:mod:`rille.pipeline.api`).
+(:mod:`rille.pipeline.steps`). Whole sequences: ``reconstruct``, ``reconstruct_many``, ``open_run``
+(:mod:`rille.pipeline.api`).
 """
 
 # Not even `__future__` is imported here: `python -m rille` looks for it in the current folder first, and until
@@ -10,7 +11,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from rille.pipeline.api import Run, open_run, reconstruct
+    from rille.pipeline.api import Run, open_run, reconstruct, reconstruct_many
     from rille.pipeline.steps import StereoPair, StereoSequence, hazards, match, open, path, points, terrain
     from rille.stages.core.errors import RilleError
 
@@ -28,6 +29,7 @@ __all__ = [
     "path",
     "points",
     "reconstruct",
+    "reconstruct_many",
     "terrain",
 ]
 
@@ -44,5 +46,6 @@ def __getattr__(name: str) -> "Any":
     if name not in __all__:
         raise AttributeError(f"module {__name__} has no attribute {name}")
     # Loaded at first use: `import rille` must not import NumPy before threads are set.
-    homes = {"RilleError": "stages.core.errors"} | dict.fromkeys(("Run", "open_run", "reconstruct"), "pipeline.api")
+    runs = ("Run", "open_run", "reconstruct", "reconstruct_many")
+    homes = {"RilleError": "stages.core.errors"} | dict.fromkeys(runs, "pipeline.api")
     return getattr(import_module(f"rille.{homes.get(name, 'pipeline.steps')}"), name)

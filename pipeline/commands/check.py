@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from rille.datasets.protocol import CAMERAS, Sequence
+from rille.pipeline.commands import batch
 from rille.pipeline.commands.options import COMPLETE, FAILED, Settings, cache_folder
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.run import Result, RunOptions, run
@@ -46,14 +47,22 @@ MAX_NAMED = 3
 _SETTINGS = Settings()
 
 
-def check(seq: str, *, options: Settings = _SETTINGS) -> int:
-    """Check a sequence: open everything, match its first pair, and print one finding a line.
+def check(seq: str, *more: str, options: Settings = _SETTINGS) -> int:
+    """Check sequences: open everything, match the first pair of each, and print one finding a line.
 
     Parameters
     ----------
     seq
         As for reconstruct.
+    more
+        Others, which follow; the exit code is that of the worst.
     """
+    if not more:
+        return _check(seq, options)
+    return batch.worst(batch.each((seq, *more), lambda name: (_check(name, options), None), keep_going=True))
+
+
+def _check(seq: str, options: Settings) -> int:
     settled = settings(replace(options, sequence=seq))
     refuse_unchecked(settled.given, settled.config)
     return inspect(settled.sequence, settled.config, settled.frames, cache_folder(options.cache))
