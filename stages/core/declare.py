@@ -187,9 +187,10 @@ def stage(
     (('dem', 'masks*?'), 'an elevation model, doubled')
 
     First come the parameters (a :class:`Params`), then the ports (a bundle, or a list of bundles; one with a default
-    may be absent), then by keyword the arguments that identify a task, which travel as JSON: one that is annotated
-    with a class that has ``from_dict``, ``from_matrix`` or is a model of pydantic arrives as such an object. The
-    docstring's first line is the summary.
+    may be absent): each by itself, or where they are many all as the fields of one ``NamedTuple``. Then follow by
+    keyword the arguments that identify a task, which travel as JSON: one that is annotated with a class that has
+    ``from_dict``, ``from_matrix`` or is a model of pydantic arrives as such an object. The docstring's first line is
+    the summary.
     ``version`` is raised when results change although the code of the module does not.
     """
 
@@ -197,17 +198,21 @@ def stage(
         types = get_type_hints(function)
         first, *rest = inspect.signature(function).parameters.values()
         ports = [p for p in rest if p.kind is p.POSITIONAL_OR_KEYWORD]
+        named = types[ports[0].name] if ports and hasattr(types[ports[0].name], "_fields") else None
+        if named is not None:
+            types |= get_type_hints(named)
+            ports = list(inspect.signature(named).parameters.values())
         several = {p.name for p in ports if get_origin(types[p.name]) is cast(Any, Sequence)}
         inputs = tuple(
             p.name + "*" * (p.name in several) + "?" * (p.default is not inspect.Parameter.empty) for p in ports
         )
         facts = get_args(types["return"])
-
         readers = {p.name: read for p in rest if (read := _reader(types[p.name])) is not None}
 
         def run(params: M, args: Mapping[str, Any], inputs: Inputs) -> Bundle[F]:
             typed = {n: readers[n](v) if n in readers and v is not None else v for n, v in args.items()}
-            return cast(Callable[..., Bundle[F]], function)(params, **inputs, **typed)
+            given = inputs if named is None else {rest[0].name: named(**inputs)}
+            return cast(Callable[..., Bundle[F]], function)(params, **given, **typed)
 
         line = (function.__doc__ or "").strip().split("\n")[0].removesuffix(".")
         summary = line[:1].lower() + line[1:] if line[1:2].islower() or line[1:2] == " " else line
