@@ -1,6 +1,9 @@
-"""What each step of preset ``accurate`` costs and gains: the preset with one step left out or changed at a time.
+"""What each idea costs and gains, left out or changed one at a time: steps of preset ``accurate``, or of navigation.
 
-    RILLE_DATA=... python benchmarks/ablation.py [--half judged]
+    RILLE_DATA=... python benchmarks/ablation.py [navigation] [--half judged]
+
+Navigation: pieces of the street and of the mockup (``benchmarks/odometry/ideas.py``), also with a knocked rig; lost
+frames, error a frame and drift, over those with all ideas. The rest of this page is on the matcher.
 
 Pairs: those that settings may be chosen with (``CHOSEN`` of ``benchmarks/stereo/pairs.py``) and the mockup, or with
 ``--half judged`` the others. Time: processor seconds a pair on one thread, both directions, over those of OpenCV's SGBM
@@ -11,7 +14,9 @@ filled alike, once by Rille's own filling. Bad-2 of the matched, their median er
 from __future__ import annotations
 
 import argparse
+import os
 import time
+from pathlib import Path
 from typing import Any
 
 STEPS = (
@@ -31,10 +36,16 @@ STEPS = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--half", choices=("chosen", "judged"), default="chosen", help="of the pairs (chosen)")
+    parser.add_argument("of", nargs="?", choices=("accurate", "navigation"), default="accurate", help="whose ideas")
     given = parser.parse_args()
     from rille.pipeline.engine.runtime.environment import prepare_environment
 
     prepare_environment()
+    if given.of == "navigation":
+        from odometry.ideas import table
+
+        table(Path(os.environ["RILLE_DATA"]), given.half)
+        return
     from stereo import methods
     from stereo.pairs import halves, mockup
 

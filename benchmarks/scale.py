@@ -135,8 +135,8 @@ def _real(name: str) -> Any:
 def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
     if name == "frame_screening":
         return {"asks": {}, "chain": args["frames"], "lost": [], "unfit": []}
-    if name == "common_tilt":
-        return {"undone": False}
+    if name == "intrinsics":
+        return {}
     if name == "keyframes":
         n = args["frames"]
         steps = {"displacement": [1.0] * (n - 1), "match_rate": [1.0] * (n - 1)}

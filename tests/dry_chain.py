@@ -48,7 +48,7 @@ FACTS: dict[str, dict[str, Any]] = {
     "frame_screening": {"asks": {"bridges": [], "sides": []}, "chain": list(FRAMES), "unfit": [], "lost": []},
     "trajectory": {**POSITIONS, "pieces": [[0, 4]], "main": 0},
     "crosscheck_join": {**POSITIONS, "pieces": [list(FRAMES)], "longest": 0},
-    "common_tilt": {"undone": False},
+    "intrinsics": {},
     "radiometry": {"steps": {"2": 3}},
 }
 

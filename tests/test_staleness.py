@@ -34,12 +34,11 @@ RESECT = {p for p in PARAMETERS if p.startswith("resect.")}
 ARGUMENTS: dict[str, set[str]] = {
     "risk": VEHICLE,
     "refine": RESECT,
-    "common_tilt": {"refine.tilt_sigma_deg", "refine.tilt_significance"},
     "tile_index": {"merge.max_hole"},
 }
 """Stages that get parameters of another section as arguments."""
 
-REWIRING = {"rig.mode", "locus.both", "resect.landmarks", "refine.enabled", "refine.window", "crosscheck.enabled"}
+REWIRING = {"rig.mode", "locus.both", "refine.enabled", "crosscheck.enabled"}
 REWIRING |= {"tiling.tile"}
 """Parameters by which there are other tasks, or the same ones read others."""
 

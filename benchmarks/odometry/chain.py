@@ -23,6 +23,7 @@ from rille.stages.odometry.resection.trajectory import world_poses
 
 MATCHING = ("hfvm", "orientation", "rig", "calibration", "ground_frame")
 """Stages of the basic pairs; all others see every frame."""
+STAGES = configuration.stages()
 
 
 @dataclass
@@ -71,7 +72,7 @@ class Images:
             return bundle
         pinhole = self.sequence.rig.left if camera == "left" else self.sequence.rig.right
         args = {"lens": lens.to_dict(), "camera": pinhole.to_dict(), "frame": frame, "camera_name": camera}
-        stage = configuration.stage("undistort")
+        stage = STAGES["undistort"]
         found: Bundle = stage.run(stage.params(), args, {"image": bundle})
         return found
 
@@ -116,8 +117,8 @@ class Chain:
         self.calibration = self._calibration(basic)
         segments = [self._segment(part) for part in parts]
         given = {"segments": [r for r, _, _ in segments], "levels": [level for _, level, _ in segments]}
-        if self.config.refine.enabled and self.config.resect.landmarks == "disparity":
-            given["refined"] = self._refined(basic, segments)
+        if self.config.refine.enabled:
+            given["refined"] = self._refined(segments)
         trajectory = self._stage("trajectory", {"frames": self.frames, "lost": lost}, **given)
         facts = {"basic": basic, "select": select.meta, "resect": [r.meta for r, _, _ in segments]}
         facts |= {"rig": self.rig_facts, "trajectory": trajectory.meta}
@@ -134,7 +135,7 @@ class Chain:
         bridges: list[tuple[int, int]] = []
         while True:
             given = {"steps": steps, "bridges": [self.motion[s] for s in bridges], "sides": list(sides.values())}
-            found = self._stage("frame_screening", {"frames": frames, "bridges": bridges}, qualities=qualities, **given)
+            found = self._stage("frame_screening", {"frames": frames, "bridged": bridges}, qualities=qualities, **given)
             asks = found.meta["asks"]
             if not any(asks.values()):
                 missing = [{"frame": f, "cause": why} for f, why in self.sequence.lost.items()]
@@ -150,34 +151,24 @@ class Chain:
         motions = [self.motion[step] for step in itertools.pairwise(frames)]
         return [self._stage("step_table", {}, motions=motions)] if motions else []
 
-    def _refined(self, basic: list[int], segments: list[tuple[Bundle, Bundle, Bundle]]) -> list[Bundle]:
-        params = self.config.refine
-        windows = [segments]
-        if params.window:
-            windows = [segments[max(0, k + 1 - params.window) : k + 1] for k in range(len(segments))]
-
-        def adjusted(window: list[tuple[Bundle, Bundle, Bundle]], **tilt: Bundle) -> Bundle:
-            return self._stage(
+    def _refined(self, segments: list[tuple[Bundle, Bundle, Bundle]]) -> list[Bundle]:
+        lenses = {side: lens.to_dict() for side, lens in (self.sequence.lenses or {}).items()}
+        given = {"resect": self.config.resect.model_dump(mode="json")} | ({"lenses": lenses} if lenses else {})
+        return [
+            self._stage(
                 "refine",
-                {"pairs": basic, "resect": self.config.resect.model_dump(mode="json")},
-                tracks=[track for _, _, track in window],
-                resections=[r for r, _, _ in window],
-                levels=[level for _, level, _ in window],
-                disparities=[self.disparity[k] for k in basic],
-                rigs=[self.calibration] * len(basic),
-                **tilt,
+                given,
+                track=track,
+                resection=resection,
+                level=level,
+                rig=self.calibration,
+                disparity=self.disparity[track.meta["frames"][0]],
             )
-
-        found = [adjusted(window) for window in windows]
-        if params.tilt_sigma_deg > 0:
-            args = {"sigma_deg": params.tilt_sigma_deg, "significance": params.tilt_significance}
-            tilt = self._stage("common_tilt", args, segments=found, rig=self.calibration)
-            if tilt.meta["undone"]:
-                found = [adjusted(window, tilt=tilt) for window in windows]
-        return found
+            for resection, level, track in segments
+        ]
 
     def _motion(self, a: int, b: int) -> Bundle:
-        s, args = self.sequence, {"frames": [a, b]}
+        s, args = self.sequence, dict[str, Any]()
         before, after = (None if s.attitude is None else s.attitude[f] for f in (a, b))
         if before is not None and after is not None:
             args |= {"rotation": (np.array(after).T @ np.array(before)).tolist(), "camera": s.rig.left.to_dict()}
@@ -196,7 +187,7 @@ class Chain:
 
     def _segment(self, part: list[int]) -> tuple[Bundle, Bundle, Bundle]:
         key, s = part[0], self.sequence
-        args: dict[str, Any] = {"pair": key}
+        args: dict[str, Any] = {}
         if s.up is not None and s.up[key] is not None:
             args["up"] = list(s.up[key])
         if s.initial_pose is not None and key == self.frames[0]:
@@ -207,12 +198,12 @@ class Chain:
         track = self._stage(
             "track",
             {"frames": part},
-            frames=[self._pyramid(f, "left") for f in part],
+            pyramids=[self._pyramid(f, "left") for f in part],
             motions=[self.motion[step] for step in itertools.pairwise(part)],
         )
         found = self._stage(
             "resect",
-            {"frames": part},
+            {},
             track=track,
             disparity=self.disparity[key],
             level=level,
@@ -231,7 +222,7 @@ class Chain:
         return self._ideal[frame, camera]
 
     def _stage(self, name: str, args: Mapping[str, Any], **inputs: Any) -> Bundle:
-        stage = configuration.stage(name)
+        stage = STAGES[name]
         params = getattr(self.config, name, NoParams())
         found: Bundle = self.clock.timed(name, stage.run, params, args, inputs)
         return found

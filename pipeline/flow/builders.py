@@ -328,8 +328,6 @@ class Builder:
             level=key.level,
             rig=key.rig,
             disparity=key.disparity,
-            # Landmarks come from the disparity, or from where rays meet the local elevation model.
-            dem=key.dem if self.config.resect.landmarks == "dem" else None,
             after=after and after.disparity,
             rig_after=after and after.rig,
             **(more or {}),

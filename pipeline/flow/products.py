@@ -16,11 +16,11 @@ from rille.stages.facts.evaluation import (
     WindowFacts,
 )
 from rille.stages.facts.odometry import (
+    IntrinsicsFacts,
     KeyframesFacts,
     RefineFacts,
     ResectFacts,
     ScreeningFacts,
-    TiltFacts,
     TrackFacts,
     TrajectoryFacts,
 )
@@ -85,7 +85,7 @@ class Products:
     tracks: list[Handle[TrackFacts]] = field(default_factory=list)
     resections: list[Handle[ResectFacts]] = field(default_factory=list)
     refined: list[Handle[RefineFacts]] = field(default_factory=list)
-    common_tilt: Handle[TiltFacts] | None = None
+    intrinsics: Handle[IntrinsicsFacts] | None = None
     world_dem: dict[int, Handle[DemFacts]] = field(default_factory=dict)
     seams: dict[int, Handle[OverlapFacts]] = field(default_factory=dict)
     overlap_audit: Handle[AuditFacts] | None = None

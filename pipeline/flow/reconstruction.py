@@ -26,8 +26,8 @@ whose rows the rig does not explain go through ``synchrony`` (right images of ot
 basic, and ``keyframes`` chooses anew. ``resect`` compares each basic pair with the one before: behind a rig that was
 knocked nothing is posed.
 
-A segment needs landmarks only relative to its own basic pair, so all segments are resected and refined in parallel (and
-refined again if ``common_tilt`` finds a tilt of all disparities). ``trajectory`` chains them. Locus then runs a second
+A segment needs landmarks only relative to its own basic pair, so all segments are resected and refined in parallel,
+and ``trajectory`` chains them; ``intrinsics`` asks all of them for an error of the cameras. Locus then runs a second
 time, directly on the shared world lattice, so nothing is resampled. With ``locus.both`` it reads the disparities of
 both images (``hfvm/back``). What depends on data (which pairs are basic, how far the world reaches) follows as results
 arrive: ``reconstruction`` is a generator that yields tasks and goes on with their results. Ports of single stages are
@@ -62,18 +62,17 @@ from rille.stages.facts.odometry import (
     RefineFacts,
     ScreeningFacts,
     StepTableFacts,
-    TiltFacts,
     TrajectoryFacts,
 )
 from rille.stages.facts.terrain import OverlapFacts, TileIndexFacts
 from rille.stages.imaging.image_quality import image_quality_stage
 from rille.stages.odometry.frame_screening import frame_screening_stage
 from rille.stages.odometry.keyframes import keyframes_stage
-from rille.stages.odometry.resection.common_tilt import common_tilt_stage
+from rille.stages.odometry.resection.intrinsics import intrinsics_stage
 from rille.stages.odometry.resection.refine import refine_stage
-from rille.stages.odometry.resection.resect import LEAST_JUMP
+from rille.stages.odometry.resection.resect import MIN_JUMP_PX
 from rille.stages.odometry.resection.trajectory import trajectory_stage
-from rille.stages.odometry.step_table import step_table_stage
+from rille.stages.odometry.steps import step_table_stage
 from rille.stages.planning.path import path_stage
 from rille.stages.terrain.overlap_audit import overlap_audit_stage
 from rille.stages.terrain.overlap_qa import overlap_qa_stage
@@ -147,7 +146,9 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         segments.append(make.segment(way, pairs[way[0]], dead_reckoning(make, way), after=pairs.get(way[-1])))
     segments, moved = yield from unmoved(make, pairs, segments)
     p.tracks, p.resections = [s.track for s in segments], [s.resection for s in segments]
-    p.refined = yield from refined(make, pairs, segments)
+    p.refined = refined(make, pairs, segments)
+    if p.refined:
+        flow(checked_intrinsics(make, pairs[basic[0]]))
     p.trajectory = make.node(
         trajectory_stage,
         "trajectory",
@@ -340,7 +341,7 @@ def unmoved(
         if one is not None and "jump" in one.meta:
             by, cause = by + one.meta["jump"], one.meta["knocked"]
             p.contradictions.append(s.resection)
-        if end in pairs and np.linalg.norm(by) > LEAST_JUMP:
+        if end in pairs and np.linalg.norm(by) > MIN_JUMP_PX:
             moved.add(end)
             for models in (p.local_dem, p.local_risk, p.local_path):
                 models.pop(end)
@@ -365,49 +366,37 @@ def dead_reckoning(make: Builder, segment: list[int]) -> dict[str, Any]:
     return {"prediction": [None if T is None else (key.inverse() @ T).to_list() for T in poses]}
 
 
-def refined(
-    make: Builder, pairs: Mapping[int, Pair], segments: list[Segment]
-) -> Generator[Wait, Any, list[Handle[RefineFacts]]]:
-    """Segments adjusted with their landmarks in windows, where that is wanted; again if disparities are tilted."""
-    p, config = make.products, make.config
-    if not (config.refine.enabled and segments and config.resect.landmarks == "disparity"):
+def refined(make: Builder, pairs: Mapping[int, Pair], segments: list[Segment]) -> list[Handle[RefineFacts]]:
+    """Segments adjusted with their landmarks, where that is wanted."""
+    if not make.config.refine.enabled:
         return []
-    params, count = config.refine, config.refine.window or len(segments)
-    windows = [segments[max(0, k - count) : k] for k in (range(1, len(segments) + 1) if params.window else [count])]
     lenses = {side: lens.to_dict() for side, lens in (make.sequence.lenses or {}).items()}
-
-    def adjusted(label: str, window: list[Segment], tilt: Handle[TiltFacts] | None = None) -> Handle[RefineFacts]:
-        keys = [pairs[s.frames[0]] for s in window]
-        return make.node(
-            refine_stage,
-            f"{label}/{keys[-1].frame}",
-            pairs=[pair.frame for pair in keys],
-            resect=make.given_resect,
-            lenses=lenses if lenses and tilt is None else None,
-            tracks=[s.track for s in window],
-            resections=[s.resection for s in window],
-            levels=[pair.level for pair in keys],
-            disparities=[pair.disparity for pair in keys],
-            rigs=[pair.rig for pair in keys],
-            tilt=tilt,
+    out = []
+    for segment in segments:
+        key = pairs[segment.frames[0]]
+        out.append(
+            make.node(
+                refine_stage,
+                f"refine/{key.frame}",
+                resect=make.given_resect,
+                lenses=lenses or None,
+                track=segment.track,
+                resection=segment.resection,
+                level=key.level,
+                rig=key.rig,
+                disparity=key.disparity,
+            )
         )
+    return out
 
-    found = [adjusted("refine", window) for window in windows]
-    if params.tilt_sigma_deg > 0:
-        tilt = p.common_tilt = make.node(
-            common_tilt_stage,
-            "common_tilt",
-            segments=found,
-            rig=pairs[segments[0].frames[0]].rig,
-            sigma_deg=params.tilt_sigma_deg,
-            significance=params.tilt_significance,
-        )
-        shared = yield from done(tilt)
-        if "contradiction" in shared.meta:
-            p.contradictions.append(tilt)
-        if shared.meta["undone"]:
-            found = [adjusted("refine/untilted", window, tilt) for window in windows]
-    return found
+
+def checked_intrinsics(make: Builder, key: Pair) -> Generator[Wait, Any, None]:
+    """Ask all segments for an error of the cameras' intrinsics; of the rig of pair ``key``."""
+    p = make.products
+    p.intrinsics = make.node(intrinsics_stage, "intrinsics", segments=p.refined, rig=key.rig)
+    judged = yield from done(p.intrinsics)
+    if "contradiction" in judged.meta:
+        p.contradictions.append(p.intrinsics)
 
 
 def another_program(make: Builder, whole: list[int]) -> Handle[JoinFacts]:

@@ -83,7 +83,7 @@ def find_warnings(scene: Scene, figures: Mapping[str, Any]) -> list[str]:
     view, p, compared = scene.view, scene.view.products, scene.comparison
     lines = list(view.sequence.warnings)
     lines += scene.calibration.collected("warnings") if scene.calibration is not None else []
-    early = [p.screening, *p.contradictions, p.keyframes, p.common_tilt, *p.crosschecks, p.crosscheck, p.agreement]
+    early = [p.screening, *p.contradictions, p.keyframes, p.intrinsics, *p.crosschecks, p.crosscheck, p.agreement]
     for handle in (*early, p.trajectory, p.accuracy, p.position_accuracy, p.overlap_audit):
         lines += facts_of(view, handle).get("warnings") or []
     # Against truth that was misread no standard deviation can hold.
@@ -321,7 +321,7 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
 def _reads(run: RunView) -> tuple[object, ...]:
     p, s, config = run.products, run.sequence, run.config
     return (
-        *(p.contradictions, p.common_tilt, p.crosschecks, p.crosscheck, p.agreement, p.crosscheck_accuracy),
+        *(p.contradictions, p.intrinsics, p.crosschecks, p.crosscheck, p.agreement, p.crosscheck_accuracy),
         *(p.trajectory, p.accuracy, p.position_accuracy, p.overlap_audit, p.rigs, p.resections, p.refined),
         *(p.world_tiles, p.world_risk, p.world_path, p.dem_accuracy, p.path_check, p.drive, *tables.of_pairs(p)),
         *(config.vehicle, config.rig.significance, config.crosscheck.enabled),

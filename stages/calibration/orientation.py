@@ -12,12 +12,11 @@ import math
 from typing import Any, cast
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from pydantic import Field
 
 from rille.stages.calibration.parameter_selection import Decision, RelativeParams, decide
-from rille.stages.calibration.relative_orientation import LEAST_MATCHES, RIG, PointPairs, rms
+from rille.stages.calibration.relative_orientation import MIN_MATCHES, RIG, PointPairs, rms
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, stage
 from rille.stages.core.errors import InputError
@@ -49,34 +48,22 @@ def thin(column: ArrayLike, row: ArrayLike, usable: Bools, quality: ArrayLike, s
     quality : (rows, cols) error of matching there and back, pixels; the least counts as best, NaN as worst.
     samples : number of cells.
     """
-    u, v = np.asarray(column), np.asarray(row)
     side = max(1, round(math.sqrt(usable.size / samples)))
-    best = _best_of_cells(usable, np.asarray(quality), side)
-    r, c = np.divmod(best[best >= 0], usable.shape[1])
+    r, c = _best_of_cells(usable, np.asarray(quality), side)
     left = np.stack([c, r], axis=-1).astype(np.float64)
-    return left, left + np.stack([u[r, c], v[r, c]], axis=-1).astype(np.float64)
+    return left, left + np.stack([np.asarray(column)[r, c], np.asarray(row)[r, c]], axis=-1).astype(np.float64)
 
 
-@njit(cache=True, nogil=True)
-def _best_of_cells(usable, quality, side):  # type: ignore[no-untyped-def]
-    """Flat index of the usable pixel of least error in each cell, the first of equals; -1 none. Cells in order."""
-    rows, cols = usable.shape
-    # Cells are counted row by row; the last one may be partial.
-    across = cols // side + 1
-    best = np.full((rows // side + 1) * across, -1, np.int64)
-    least = np.empty(len(best))
-    for r in range(rows):
-        for c in range(cols):
-            if not usable[r, c]:
-                continue
-            cell = (r // side) * across + c // side
-            error = quality[r, c]
-            # NaN compares as neither less nor greater: the first pixel of a cell would never give way.
-            if error != error:
-                error = np.inf
-            if best[cell] < 0 or error < least[cell]:
-                best[cell], least[cell] = r * cols + c, error
-    return best
+def _best_of_cells(usable: Bools, quality: Floats, side: int) -> tuple[Floats, Floats]:
+    """Row and column of the usable pixel of least error in each cell that has one, the first of equals; in order."""
+    known = np.where(np.isnan(quality), np.finfo(np.float32).max, quality)
+    rest = [(0, -n % side) for n in usable.shape]
+    error = np.pad(np.where(usable, known, np.inf), rest, constant_values=np.inf)
+    down, across = (n // side for n in error.shape)
+    cells = error.reshape(down, side, across, side).swapaxes(1, 2).reshape(down, across, -1)
+    y, x = np.nonzero(np.isfinite(cells.min(-1)))
+    r, c = np.divmod(cells.argmin(-1)[y, x], side)
+    return y * side + r, x * side + c
 
 
 def orient(rig: Rig, matches: PointPairs, params: RelativeParams) -> tuple[dict[str, AnyArray], dict[str, Any]]:
@@ -91,8 +78,8 @@ def orient(rig: Rig, matches: PointPairs, params: RelativeParams) -> tuple[dict[
     """
     count = len(matches.left)
     before, _ = distances(rig, np.zeros(RIG), matches.left, matches.right)
-    if count < LEAST_MATCHES:
-        words = f"not checked: {count} matches are fewer than {LEAST_MATCHES}"
+    if count < MIN_MATCHES:
+        words = f"not checked: {count} matches are fewer than {MIN_MATCHES}"
         weight = np.zeros(count)
         return _arrays(before, before, weight), {"matches": count, "parameters": [], "words": words}
     decision = decide(rig, [matches], params)

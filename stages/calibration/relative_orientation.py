@@ -20,13 +20,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.epipolar import NAMES, distances, normals
 from rille.stages.geometry.geometry import Rig
-from rille.stages.numeric.robust import MAD_TO_SIGMA, TUKEY_BISQUARE, bisquare
+from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
 
 RIG = len(NAMES)
 PRINCIPAL = 2
@@ -40,28 +39,30 @@ SMOOTH = slice(RIG + PRINCIPAL, SIZE)
 PARTNERS = ((NAMES.index("yaw"), 0), (NAMES.index("pitch"), 1))
 """Angles, and the coordinate of the principal point that looks like each."""
 
-NO_SHIFT = 1e-3
+NO_SHIFT_PX = 1e-3
 """Standard deviation [pixels] of a principal point that is held as given."""
 
-EXACT = 1e-7
+EXACT_RAD = 1e-7
 """Standard deviation [rad] of a parameter that is held exactly."""
 
-LEAST_SMOOTH = 1e-3
+MIN_SMOOTH_PX = 1e-3
 """Smallest standard deviation [pixels] of a term of the smooth error."""
 
-LEAST_MATCHES = 50
-LEAST_NOISE = 0.02
+MIN_MATCHES = 50
+MIN_NOISE_PX = 0.02
 """Smallest standard deviation [pixels] of a match."""
 
 BLOCKS = 6
 """Blocks along either side of the image whose means show how far errors of neighbours go together."""
+MIN_MATCHES_OF_BLOCK = 5
+"""Fewest matches of a block that have a mean, or a median, to speak of."""
 
-ITERATIONS = 30
-INNER = 10
+MAX_ITERATIONS = 30
+EM_ROUNDS = 10
 """Rounds for the smooth error's size between two passes over the matches."""
-LINEAR = 1e-3
+MAX_LINEAR_STEP_RAD = 1e-3
 """Change [rad] of the corrections up to which the derivatives are kept; the neglected part is below 0.001 pixels."""
-CONVERGED = 1e-2
+CONVERGED_SHARE = 1e-2
 """Step, as a share of a parameter's standard deviation, below which the adjustment has converged."""
 
 
@@ -140,7 +141,7 @@ def adjust(
     priors: Priors,
     *,
     rival: bool,
-    start: list[Linear] | None = None,
+    start: Sequence[Linear] | None = None,
 ) -> OrientationFit:
     """Adjust a rig to point pairs, together with the errors of the images that no rig explains.
 
@@ -158,16 +159,16 @@ def adjust(
 
 
 def settle(
-    rig: Rig, pairs: Sequence[PointPairs], free: Sequence[bool], priors: Priors, start: list[Linear] | None = None
+    rig: Rig, pairs: Sequence[PointPairs], free: Sequence[bool], priors: Priors, start: Sequence[Linear] | None = None
 ) -> OrientationFit:
     """Fit the free parameters so that the residuals of the resulting rig are smallest.
 
     The other parameters are fixed at their given values, and the smooth error is not estimated. Neither may take up a
     part of the residuals here, because in the resulting rig the others are as given and the smooth error remains.
     """
-    nil = replace(priors, rotation=EXACT, baseline=EXACT)
-    prior = precision(free, nil, LEAST_SMOOTH, rival=False)
-    return _adjust(rig, pairs, prior, LEAST_SMOOTH, start, estimate=False)
+    nil = replace(priors, rotation=EXACT_RAD, baseline=EXACT_RAD)
+    prior = precision(free, nil, MIN_SMOOTH_PX, rival=False)
+    return _adjust(rig, pairs, prior, MIN_SMOOTH_PX, start, estimate=False)
 
 
 def consider_covariance(
@@ -193,21 +194,27 @@ def consider_covariance(
 
 
 def _adjust(
-    rig: Rig, pairs: Sequence[PointPairs], prior: Floats, smooth: float, start: list[Linear] | None, *, estimate: bool
+    rig: Rig,
+    pairs: Sequence[PointPairs],
+    prior: Floats,
+    smooth: float,
+    start: Sequence[Linear] | None,
+    *,
+    estimate: bool,
 ) -> OrientationFit:
     """Gauss-Newton with weights from the scatter; ``prior`` matrix, the smooth error's size kept or estimated."""
-    x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), linearised(rig, pairs) if start is None else start
-    for _ in range(ITERATIONS):
+    x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), start or linearised(rig, pairs)
+    for _ in range(MAX_ITERATIONS):
         # All pairs are linearised about the same x, so the first tells.
-        if np.abs(x - linear[0].about)[:RIG].max() > LINEAR:
+        if np.abs(x - linear[0].about)[:RIG].max() > MAX_LINEAR_STEP_RAD:
             linear = [_linear(rig, m, x, one) for m, one in zip(pairs, linear, strict=True)]
         parts = [_pair(one, scale, x) for one, scale in zip(linear, scales, strict=True)]
         scales = [p.noise for p in parts]
         normal = np.sum([p.normal for p in parts], axis=0)
         pull = np.sum([p.pull for p in parts], axis=0)
         last = x
-        x, variance, smooth = _maximised(normal, pull, prior, smooth, INNER if estimate else 0)
-        if bool(np.all(np.abs(x - last)[:RIG] < CONVERGED * np.sqrt(variance[:RIG]))):
+        x, variance, smooth = _maximised(normal, pull, prior, smooth, EM_ROUNDS if estimate else 0)
+        if bool(np.all(np.abs(x - last)[:RIG] < CONVERGED_SHARE * np.sqrt(variance[:RIG]))):
             break
     return OrientationFit(x, normal, pull, smooth, tuple(scales), tuple(p.weights for p in parts))
 
@@ -224,8 +231,8 @@ def _maximised(normal: Floats, pull: Floats, prior: Floats, smooth: float, round
         covariance = np.linalg.inv(total)
         x, variance = covariance @ pull, np.diag(covariance)
         # The expected square has the estimate's variance, too: without it the size would shrink round by round.
-        size = max(LEAST_SMOOTH, float(np.sqrt(np.mean(x[SMOOTH] ** 2 + variance[SMOOTH]))))
-        if rounds == 0 or abs(size - smooth) <= CONVERGED * smooth:
+        size = max(MIN_SMOOTH_PX, float(np.sqrt(np.mean(x[SMOOTH] ** 2 + variance[SMOOTH]))))
+        if rounds == 0 or abs(size - smooth) <= CONVERGED_SHARE * smooth:
             break
         smooth = size
     return x, variance, smooth
@@ -242,7 +249,7 @@ def precision(free: Sequence[bool], priors: Priors, smooth: float, *, rival: boo
     sigma[:RIG] = np.where(np.asarray(free), 1.0, sigma[:RIG])
     for angle, coordinate in PARTNERS:
         if free[angle] and not rival:
-            sigma[RIG + coordinate] = NO_SHIFT
+            sigma[RIG + coordinate] = NO_SHIFT_PX
     return np.diag(sigma**-2.0)
 
 
@@ -287,61 +294,17 @@ def _blocks(rig: Rig, matches: PointPairs) -> NDArray[np.int64]:
 
 def _pair(linear: Linear, last: float, x: Floats) -> _Part:
     """One pair's part of the normal equations, with weights from its own scatter (at most ``last``, pixels)."""
-    weights, normal, pull = np.empty(len(linear.constant)), np.empty((SIZE, SIZE)), np.empty(SIZE)
-    noise = _weigh(linear.constant, linear.design, linear.block, x, last, (weights, normal, pull))
-    return _Part(normal, pull, float(noise), weights)
-
-
-@njit(cache=True, nogil=True)
-def _weigh(constant, design, block, x, last, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` with one pair's normal equations about ``x`` (m,); returns the scale, pixels.
-
-    Sums run in the order of the matches.
-
-    Parameters
-    ----------
-    constant, design : residuals ``constant + design @ x``, (n,) and (n, m), pixels.
-    block : (n,) block of the image, below ``BLOCKS`` squared.
-    last : pixels; greatest scale.
-    out : weights (n,), normal matrix (m, m) and right side (m,).
-    """
-    weights, normal, pull = out
-    count, unknowns = design.shape
-    rest = np.empty(count)
-    for n in range(count):
-        total = constant[n]
-        for k in range(unknowns):
-            total += design[n, k] * x[k]
-        rest[n] = total
+    rest = linear.constant + linear.design @ x
     # At most the last scale: weights only narrow, so that the fit cannot swing between two sets of inliers.
-    noise = max(LEAST_NOISE, min(last, MAD_TO_SIGMA * np.median(np.abs(rest))))
+    noise = max(MIN_NOISE_PX, min(last, mad_sigma(rest, 0.0)))
+    weights = np.asarray(bisquare(rest / (TUKEY_BISQUARE * noise)), dtype=np.float64)
     # Errors of neighbours go together: means of blocks scatter by more than the matches in them explain.
-    number, sums = np.zeros(BLOCKS**2), np.zeros(BLOCKS**2)
-    for n in range(count):
-        weights[n] = bisquare(rest[n] / (TUKEY_BISQUARE * noise))
-        number[block[n]] += weights[n]
-        sums[block[n]] += weights[n] * rest[n]
-    together, used = 0.0, 0
-    for k in range(BLOCKS**2):
-        # Fewer matches have no mean to speak of.
-        if number[k] >= 5.0:
-            together += sums[k] ** 2 / number[k]
-            used += 1
-    spread = max(1.0, together / used / noise**2) if used else 1.0
-    normal[:], pull[:] = 0.0, 0.0
-    for n in range(count):
-        information = weights[n] / (noise**2 * spread)
-        if information == 0.0:
-            continue
-        for i in range(unknowns):
-            a = information * design[n, i]
-            pull[i] -= a * constant[n]
-            for k in range(i + 1):
-                normal[i, k] += a * design[n, k]
-    for i in range(unknowns):
-        for k in range(i):
-            normal[k, i] = normal[i, k]
-    return noise
+    number = np.bincount(linear.block, weights, BLOCKS**2)
+    sums = np.bincount(linear.block, weights * rest, BLOCKS**2)
+    used = number >= MIN_MATCHES_OF_BLOCK
+    together = float(np.mean(sums[used] ** 2 / number[used])) / noise**2 if used.any() else 1.0
+    weighted = linear.design.T * (weights / (noise**2 * max(1.0, together)))
+    return _Part(weighted @ linear.design, -weighted @ linear.constant, noise, weights)
 
 
 def _smooth_terms(rig: Rig, matches: PointPairs) -> Floats:

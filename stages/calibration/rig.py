@@ -26,7 +26,8 @@ from rille.stages.calibration.parameter_selection import (
 )
 from rille.stages.calibration.relative_orientation import (
     BLOCKS,
-    LEAST_MATCHES,
+    MIN_MATCHES,
+    MIN_MATCHES_OF_BLOCK,
     RIG,
     Linear,
     PointPairs,
@@ -42,22 +43,20 @@ from rille.stages.geometry.epipolar import NAMES, corrected, distances
 from rille.stages.geometry.geometry import Rig
 from rille.stages.numeric.robust import mad_sigma
 
-MOST_MATCHES = 10_000
+MAX_MATCHES = 10_000
 """Most matches of all pairs together: with more, systematic errors dominate."""
 
-LEAST_OF_A_PAIR = 200
+MIN_MATCHES_OF_PAIR = 200
+"""Matches of a pair that count at least, however many pairs there are."""
 
-LEAST_OF_A_BLOCK = 5
-"""Fewest matches of a block whose median counts."""
-
-BAD_ROWS = 1.0
+BAD_ROWS_PX = 1.0
 """Residual [pixels] after the repair from which on it is doubted: RMS of all pairs, lens distortion or a wrong
 calibration; spread of one, its images may be of two moments."""
 
-MOST_TURN = 5.0
+MAX_TURN_DEG = 5.0
 """Largest correction [degrees] of each parameter: a mount that was knocked turns by less, and so does a baseline."""
 
-SWAPPED = 0.5
+SWAPPED_SHARE = 0.5
 """Share of matches beyond infinity from which on left and right are taken to be swapped."""
 
 
@@ -92,7 +91,7 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams) -> Ri
         "changed": False,
         "warnings": [],
     }
-    usable = [m for m in pairs if len(m.left) >= LEAST_MATCHES]
+    usable = [m for m in pairs if len(m.left) >= MIN_MATCHES]
     if usable:
         facts |= cast(RigFacts, _judged(given, _share(usable), params))
         if len(usable) < len(pairs):
@@ -106,12 +105,12 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams) -> Ri
 def _judged(given: Rig, pairs: list[PointPairs], params: RigParams) -> dict[str, Any]:
     """What the pairs say on the given rig, and the rig that follows."""
     decision = decide(given, pairs, params)
-    far = any(abs(math.degrees(p.value)) > MOST_TURN for p in decision.parameters)
+    far = any(abs(math.degrees(p.value)) > MAX_TURN_DEG for p in decision.parameters)
     applied = params.mode != "fixed" and decision.changed and not far
     rig = corrected(given, decision.correction) if applied else given
     per_pair = [_alone(given, m, one, decision, params) for m, one in zip(pairs, decision.start, strict=True)]
     share = impossible_share(rig, pairs, decision.fit)
-    if share > SWAPPED:
+    if share > SWAPPED_SHARE:
         raise InputError(
             "RIL-428",
             f"{100 * share:.0f} % of the matches lie beyond infinity: left and right are swapped, or the baseline "
@@ -123,7 +122,7 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams) -> dict[str,
     warnings = _contradiction(given, pairs, decision, "repaired" if applied else kept)
     marks: dict[str, Any] = {"contradiction": warnings[0]} if far else {}
     rows = [distances(rig, np.zeros(RIG), m.left, m.right)[0] for m in pairs]
-    suspects = [m.pair for m, d in zip(pairs, rows, strict=True) if far or mad_sigma(d) > BAD_ROWS]
+    suspects = [m.pair for m, d in zip(pairs, rows, strict=True) if far or mad_sigma(d) > BAD_ROWS_PX]
     marks |= {"suspects": suspects} if suspects else {}
     warnings += _doubts(share, residuals["residual_after_px"])
     moves, knocked = _drift(decision.start, per_pair, params)
@@ -146,7 +145,7 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams) -> dict[str,
 
 def _share(pairs: list[PointPairs]) -> list[PointPairs]:
     """Every so manieth match of each pair, so that many pairs together stay affordable."""
-    most = max(LEAST_OF_A_PAIR, MOST_MATCHES // len(pairs))
+    most = max(MIN_MATCHES_OF_PAIR, MAX_MATCHES // len(pairs))
     steps = [max(1, math.ceil(len(m.left) / most)) for m in pairs]
     return [PointPairs(m.pair, m.left[::s], m.right[::s]) for m, s in zip(pairs, steps, strict=True)]
 
@@ -208,7 +207,7 @@ def _contradiction(given: Rig, pairs: Sequence[PointPairs], decision: Decision, 
 def _doubts(share: float, residual: float) -> list[str]:
     """Signs that something other than the rig's orientation is wrong."""
     lines = []
-    if residual > BAD_ROWS:
+    if residual > BAD_ROWS_PX:
         lines.append(
             f"matches lie {residual:.1f} px RMS off their epipolar lines: is lens distortion left in the images, or "
             "the wrong calibration given?"
@@ -234,7 +233,7 @@ def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigP
     usual = np.quantile(values, 0.5, axis=0, method="lower") if names else np.zeros(0)
     departure = values - usual
     moved = _shown(start, [NAMES.index(name) for name in names], np.radians(usual), np.radians(departure))
-    lines, knocked, most = [], "", BAD_ROWS
+    lines, knocked, most = [], "", BAD_ROWS_PX
     for k, name in enumerate(names):
         away = np.abs(departure[:, k])
         odd = (away > params.significance * sigma[:, k]) & (moved > params.least_rows)
@@ -267,7 +266,7 @@ def _shown(start: Sequence[Linear], columns: list[int], usual: Floats, departure
     for k, (one, by) in enumerate(zip(start, departure, strict=True)):
         design = one.design[:, columns]
         off, shift = one.constant + design @ usual, -(design @ by)
-        for block in np.flatnonzero(np.bincount(one.block) >= LEAST_OF_A_BLOCK):
+        for block in np.flatnonzero(np.bincount(one.block) >= MIN_MATCHES_OF_BLOCK):
             inside = one.block == block
             error[k, block], claimed[k, block] = np.median(off[inside]), np.median(shift[inside])
             left[k, block] = np.median((off - shift)[inside])

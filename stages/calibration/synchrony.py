@@ -17,7 +17,7 @@ from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.numeric.robust import mad_sigma
-from rille.stages.odometry.roll_search import features, matches
+from rille.stages.odometry.features import features, matches
 
 MAX_FEATURES = 1500
 """Most features of an image."""

@@ -21,6 +21,7 @@ from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes, orthonormal, rotation_exp
 from rille.stages.geometry.lens import Lens
+from rille.stages.numeric.least_squares import levenberg_marquardt
 
 MODELS: Mapping[str, tuple[str, ...]] = {
     "radtan": ("k1", "k2", "p1", "p2", "k3"),
@@ -42,7 +43,7 @@ BAD_RATIO, BAD_PX = 4.0, 0.5
 FOCAL_STARTS = 0.15 * 1.15 ** np.arange(20)
 """Shares of an image's longer side that are tried as a fisheye's focal length: a diagonal of 220 to 25 degrees."""
 
-MOST_STEPS, SETTLED = 100, 1e-10
+MAX_STEPS, SETTLED = 100, 1e-10
 """Largest number of steps of an adjustment, and the relative decrease of its cost at which it has converged."""
 
 UNDETERMINED = "the views do not determine the cameras"
@@ -268,40 +269,17 @@ class Adjustment:
         return points.reshape(-1) - found.reshape(-1), by_lens, by_pose
 
     def solve(self, x: Floats, *, robust: bool = False) -> Floats:
-        """Least squares from ``x`` (Levenberg and Marquardt); robust: Cauchy's loss, which bounds what a view can do.
+        """Least squares from ``x``; robust: Cauchy's loss, which bounds what a view can do.
 
         Raises
         ------
         DegenerateError
             The adjustment diverges.
         """
-        damping, (cost, gradient, normal) = 1e-3, self._normal(x, robust)
-        for _ in range(MOST_STEPS):
-            step = np.linalg.lstsq(normal + damping * np.diag(np.diag(normal)), -gradient, rcond=None)[0]
-            ahead = self._normal(x + step, robust)
-            if ahead[0] <= cost:
-                gain, damping = cost - ahead[0], max(0.1 * damping, 1e-12)
-                x, (cost, gradient, normal) = x + step, ahead
-                if gain <= SETTLED * cost:
-                    break
-            else:
-                damping *= 10.0
-                if damping > 1e12:
-                    break
+        x = levenberg_marquardt(_Corners(self, robust), x, MAX_STEPS, SETTLED).state
         if not (np.isfinite(x).all() and min(x[0], x[1], x[self.lens], x[self.lens + 1]) > 0):
             raise DegenerateError("RIL-312", "the adjustment of the cameras diverges", remedy=MORE_VIEWS)
         return x
-
-    def _normal(self, x: Floats, robust: bool) -> tuple[float, Floats, Floats]:
-        """Cost, its gradient and its Gauss-Newton matrix, each scaled alike."""
-        residual, jacobian = self.evaluate(x)
-        if not np.isfinite(residual).all():
-            return math.inf, np.zeros(x.size), np.eye(x.size)
-        square = np.repeat((residual.reshape(-1, 2) ** 2).sum(1), 2) / CORNER_SCALE**2
-        weight = 1.0 / (1.0 + square) if robust else np.ones(residual.size)
-        cost = CORNER_SCALE**2 * float(np.log1p(square[::2]).sum()) if robust else float(residual @ residual)
-        weighted = jacobian * weight[:, None]
-        return cost, weighted.T @ residual, weighted.T @ jacobian
 
     def lenses(self, x: Floats) -> tuple[Lens, Lens]:
         """Left and right lens."""
@@ -361,6 +339,40 @@ class Adjustment:
         lens = ("fx", "fy", "cx", "cy", *MODELS[self.model])
         rig = [f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"]
         return [f"{side} {name}" for side in ("left", "right") for name in lens] + rig
+
+
+@dataclass(frozen=True)
+class _Corners:
+    """The corners of an adjustment as a problem of least squares."""
+
+    of: Adjustment
+    robust: bool
+
+    def cost(self, x: Floats) -> float:
+        """Sum of squares, pixels squared; infinite where a corner has no image."""
+        residual, _ = self.of.evaluate(x)
+        if not np.isfinite(residual).all():
+            return math.inf
+        return (
+            CORNER_SCALE**2 * float(np.log1p(_squares(residual)).sum()) if self.robust else float(residual @ residual)
+        )
+
+    def normal(self, x: Floats) -> tuple[Floats, Floats]:
+        """Gauss-Newton matrix and gradient."""
+        residual, jacobian = self.of.evaluate(x)
+        weight = np.repeat(1.0 / (1.0 + _squares(residual)), 2) if self.robust else np.ones(residual.size)
+        weighted = (jacobian * weight[:, None]).T
+        return weighted @ jacobian, weighted @ residual
+
+    def ahead(self, x: Floats, normal: tuple[Floats, Floats], damping: float) -> Floats:
+        """The unknowns one damped step on."""
+        matrix, gradient = normal
+        return x + np.linalg.lstsq(matrix + damping * np.diag(np.diag(matrix)), -gradient, rcond=None)[0]
+
+
+def _squares(residual: Floats) -> Floats:
+    """Squared distance of each corner, over that beyond which it loses weight."""
+    return np.asarray((residual.reshape(-1, 2) ** 2).sum(1) / CORNER_SCALE**2)
 
 
 def _flat_pose(board: Floats, angles: Floats) -> tuple[float, RigidTransform]:

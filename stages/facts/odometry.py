@@ -72,7 +72,6 @@ class ResectFacts(Facts):
     """
 
     per_frame: list[dict[str, Any]]
-    landmark_source: str
     without_coordinates: dict[str, int]
     """By cause."""
     tracks: int
@@ -83,26 +82,17 @@ class ResectFacts(Facts):
 
 
 class RefineFacts(Facts):
-    """Segments adjusted with their landmarks: how many ``frames`` and ``points`` each has.
+    """A segment adjusted with its landmarks: bias and costs of the ``adjustment``, and contributions to the errors of
+    the ``intrinsics``; both empty where no frame has a pose."""
 
-    ``tilt``: tilt of the disparities and its sigma, rad, of each segment that shows one; ``intrinsics``: contributions
-    of each segment to the errors of the intrinsics.
-    """
-
-    frames: list[int]
-    points: list[int]
     adjustment: dict[str, Any]
+    intrinsics: list[tuple[float, float]]
     per_frame: list[dict[str, Any]]
-    tilt: NotRequired[list[list[float]]]
-    intrinsics: NotRequired[list[Any]]
 
 
-class TiltFacts(Facts):
-    """Tilt of all disparities, rad, whether it is ``undone``, and errors of the intrinsics with their sigmas."""
+class IntrinsicsFacts(Facts):
+    """Errors of the intrinsics with their sigmas, over the focal length; none of a few segments."""
 
-    undone: bool
-    tilt_rad: NotRequired[float]
-    sigma_rad: NotRequired[float]
     intrinsics: NotRequired[dict[str, Any]]
     contradiction: NotRequired[str]
 

@@ -1,8 +1,7 @@
 """Projection of points by a pinhole camera, with its derivatives (paper, Eq. 4, 7 and 8).
 
 With ``x = R X + t`` in the camera frame and the left perturbation ``R <- exp(w) R, t <- exp(w) t + v``,
-``dx/d(v, w) = [I | -[x]_x]``; the pixel is ``(fx x/z + cx, fy y/z + cy)``. The compiled functions serve kernels that
-take one point at a time.
+``dx/d(v, w) = [I | -[x]_x]``; the pixel is ``(fx x/z + cx, fy y/z + cy)``.
 """
 
 from __future__ import annotations
@@ -12,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from rille.stages.core.arrays import Bools, Floats
+from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import Camera, rotation_exp
 
-NEAREST = 1e-6
+NEAREST_M = 1e-6
 """Depth [m] below which a point counts as behind the camera."""
 
 
@@ -31,21 +30,6 @@ class Pinhole(NamedTuple):
     def of(camera: Camera) -> Pinhole:
         """Take the intrinsics of a camera."""
         return Pinhole(float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
-
-
-def project(camera: Camera, x: Floats) -> tuple[Floats, Floats, Bools]:
-    """Pixels (..., 2) of camera points (..., 3), metres, derivatives (..., 2, 3), and which are behind the camera.
-
-    Points behind the camera are taken at a depth of 1 m, so that sums over all points stay finite.
-    """
-    behind: Bools = np.asarray(x[..., 2] < NEAREST)
-    # Any depth that divides: callers leave these points out by the mask.
-    z = np.where(behind, 1.0, x[..., 2])
-    u, v = x[..., 0] / z, x[..., 1] / z
-    slopes = np.zeros((*z.shape, 2, 3))
-    slopes[..., 0, 0], slopes[..., 0, 2] = camera.fx / z, -camera.fx * u / z
-    slopes[..., 1, 1], slopes[..., 1, 2] = camera.fy / z, -camera.fy * v / z
-    return np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], -1), slopes, behind
 
 
 def perturbed(R: Floats, t: Floats, step: Floats) -> tuple[Floats, Floats]:
@@ -65,19 +49,12 @@ def rotated(R, v):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def to_camera(R, t, X, along, shift):  # type: ignore[no-untyped-def]
-    """``R (X + shift along) + t`` as three numbers: a landmark whose disparity changes by ``shift`` pixels."""
-    x, y, z = rotated(R, (X[0] + shift * along[0], X[1] + shift * along[1], X[2] + shift * along[2]))
-    return x + t[0], y + t[1], z + t[2]
-
-
-@njit(cache=True, nogil=True)
 def linearise(camera, x, along, pixel, j):  # type: ignore[no-untyped-def]
     """Fill ``j`` (2, 8): derivatives of a projection by ``v`` and ``w`` (6), by a shift ``along``; and its error.
 
     ``x``, ``along``: three numbers each in the camera frame; ``pixel`` (2): where the point was seen.
     """
-    fx, fy, cx, cy = camera
+    fx, fy = camera.fx, camera.fy
     x, y, z = x
     wx, wy, wz = along
     u, v = x / z, y / z
@@ -87,4 +64,4 @@ def linearise(camera, x, along, pixel, j):  # type: ignore[no-untyped-def]
     j[0, 3], j[0, 4], j[0, 5] = -kx * u * y, kx * (z + u * x), -kx * y
     j[1, 3], j[1, 4], j[1, 5] = -ky * (z + v * y), ky * v * x, ky * x
     j[0, 6], j[1, 6] = kx * (wx - u * wz), ky * (wy - v * wz)
-    j[0, 7], j[1, 7] = fx * u + cx - pixel[0], fy * v + cy - pixel[1]
+    j[0, 7], j[1, 7] = fx * u + camera.cx - pixel[0], fy * v + camera.cy - pixel[1]

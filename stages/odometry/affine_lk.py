@@ -25,6 +25,8 @@ SETTLED = 0.01
 """Step [pixels] below which a template has converged: a tenth of the error that remains."""
 UNKNOWNS = 8
 """Shift (2), affinity (4), offset, gain."""
+MIN_TEXTURE = 1e-9
+"""Sum of squared differences [grey levels] in each direction, below which a template has none: it is rounding."""
 
 
 class Templates(NamedTuple):
@@ -36,10 +38,16 @@ class Templates(NamedTuple):
     affinity: Floats
 
 
-def align(
-    a: Floats32, b: Floats32, templates: Templates, *, noise: float, spread: float, reach: float
-) -> tuple[Floats, Floats]:
-    """Align templates around points of ``a`` in ``b``.
+class Aligned(NamedTuple):
+    """``position`` (n, 2) column, row in b, NaN where it leaves the image, does not converge or is refused; ``error``
+    (n,) rms grey difference over the template before the last step, NaN likewise."""
+
+    position: Floats
+    error: Floats
+
+
+def align(a: Floats32, b: Floats32, templates: Templates, *, noise: float, spread: float, reach: float) -> Aligned:
+    """Positions in ``b`` of the templates around points of ``a``.
 
     Parameters
     ----------
@@ -47,14 +55,8 @@ def align(
     noise : grey levels, standard deviation of a difference.
     spread : standard deviation of an element of the affinity around the expected one.
     reach : pixels; a result farther than this from ``start`` is refused.
-
-    Returns
-    -------
-    position : (n, 2) column, row in b; NaN where it leaves the image, does not converge or is refused.
-    error : (n,) rms grey difference over the template before the last step; NaN likewise.
     """
-    points = templates.points
-    position, error = np.full(points.shape, np.nan), np.full(len(points), np.nan)
+    out = Aligned(np.full(templates.points.shape, np.nan), np.full(len(templates.points), np.nan))
     _align_all(
         np.ascontiguousarray(a, dtype=np.float32),
         np.ascontiguousarray(b, dtype=np.float32),
@@ -63,44 +65,55 @@ def align(
         # affinity.
         (noise / spread) ** 2,
         float(reach),
-        position,
-        error,
+        out,
     )
-    return position, error
+    return out
 
 
 @njit(cache=True, nogil=True)
-def _align_all(a, b, templates, ridge, reach, position, error):  # type: ignore[no-untyped-def]
-    points, start, affinity = templates
+def _align_all(a, b, templates, ridge, reach, out):  # type: ignore[no-untyped-def]
     patch, template = np.empty((SIDE + 2) ** 2), np.empty(SIDE * SIDE)
     descent, grey = np.empty((SIDE * SIDE, UNKNOWNS)), np.empty(SIDE * SIDE)
-    gram, step = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
-    for n in range(points.shape[0]):
-        if not _descent(a, points[n, 0], points[n, 1], patch, template, descent):
+    for n in range(len(templates.points)):
+        point, start, expected = templates.points[n], templates.start[n], templates.affinity[n]
+        if not _descent(a, point[0], point[1], patch, template, descent):
             continue
-        _gram(descent, ridge, gram)
-        # Inverse compositional: derivatives are those of the template, so one factorisation serves all steps.
-        if not _factor(gram):
+        derivatives = np.ascontiguousarray(descent.T)
+        gram = np.dot(derivatives, descent)
+        # The template is flat, or has one direction only.
+        if not gram[0, 0] * gram[1, 1] - gram[0, 1] ** 2 > MIN_TEXTURE * (gram[0, 0] + gram[1, 1]):
             continue
+        for k in range(UNKNOWNS):
+            gram[k, k] += 1e-9 + (ridge if 2 <= k < 6 else 0.0)
+        # Inverse compositional: derivatives are those of the template, so one inverse serves all steps.
+        inverse, unexpected = np.linalg.inv(gram), _inverse(expected)
         # Steps are composed into the copy; the prior pulls towards what was given.
-        m = affinity[n].copy()
-        x, y = start[n, 0], start[n, 1]
+        affinity, at = expected.copy(), start.copy()
         for _ in range(STEPS):
-            if not _warp(b, x, y, m, grey):
+            if not _warp(b, at[0], at[1], affinity, grey):
                 break
-            square = _right_side(grey, template, descent, step)
-            _prior(affinity[n], m, ridge, step)
-            _solve(gram, step)
-            dx, dy = _compose(m, step)
-            x -= dx
-            y -= dy
+            right = np.dot(derivatives, grey - template)
+            # Added, not subtracted: a step is composed inversely, so what the affinity has too much counts like a grey
+            # difference.
+            right[2:6] += ridge * (np.dot(unexpected, affinity) - np.eye(2)).ravel()
+            step = np.dot(inverse, right)
+            affinity = np.dot(affinity, _inverse(np.eye(2) + step[2:6].reshape(2, 2)))
+            move = np.dot(affinity, step[:2])
+            at -= move
             # Negated so that NaN, of a singular system, is refused as well.
-            if not (abs(x - start[n, 0]) <= reach and abs(y - start[n, 1]) <= reach):
+            if not np.abs(at - start).max() <= reach:
                 break
-            if abs(dx) < SETTLED and abs(dy) < SETTLED:
-                position[n, 0], position[n, 1] = x, y
-                error[n] = np.sqrt(square / (SIDE * SIDE))
+            if np.abs(move).max() < SETTLED:
+                out.position[n] = at
+                out.error[n] = np.sqrt(np.mean((grey - template) ** 2))
                 break
+
+
+@njit(cache=True, nogil=True)
+def _inverse(m):  # type: ignore[no-untyped-def]
+    """Inverse (2, 2); not finite of a singular matrix."""
+    det = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
+    return np.array([[m[1, 1], -m[0, 1]], [-m[1, 0], m[0, 0]]]) / det
 
 
 @njit(cache=True, nogil=True)
@@ -148,94 +161,6 @@ def _warp(b, x0, y0, m, grey):  # type: ignore[no-untyped-def]
             grey[k] = cubic(b, x0 + m[0, 0] * i + m[0, 1] * j, y0 + m[1, 0] * i + m[1, 1] * j)
             k += 1
     return True
-
-
-@njit(cache=True, nogil=True)
-def _right_side(grey, template, descent, out):  # type: ignore[no-untyped-def]
-    """Differences of grey values to the template, projected on the derivatives; returns their sum of squares."""
-    square = o0 = o1 = o2 = o3 = o4 = o5 = o6 = o7 = 0.0
-    for i in range(SIDE * SIDE):
-        d = grey[i] - template[i]
-        r = descent[i]
-        square += d * d
-        o0, o1, o2, o3 = o0 + r[0] * d, o1 + r[1] * d, o2 + r[2] * d, o3 + r[3] * d
-        o4, o5, o6, o7 = o4 + r[4] * d, o5 + r[5] * d, o6 + r[6] * d, o7 + r[7] * d
-    out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7] = o0, o1, o2, o3, o4, o5, o6, o7
-    return square
-
-
-@njit(cache=True, nogil=True)
-def _prior(expected, m, ridge, out):  # type: ignore[no-untyped-def]
-    """Pull towards the expected affinity: how far ``expected^-1 m`` is from the identity."""
-    det = expected[0, 0] * expected[1, 1] - expected[0, 1] * expected[1, 0]
-    for j in range(2):
-        first = (expected[1, 1] * m[0, j] - expected[0, 1] * m[1, j]) / det
-        second = (expected[0, 0] * m[1, j] - expected[1, 0] * m[0, j]) / det
-        # Added, not subtracted: a step is composed inversely, so what the affinity has too much counts like a grey
-        # difference.
-        out[2 + j] += ridge * (first - (1.0 - j))
-        out[4 + j] += ridge * (second - j)
-
-
-@njit(cache=True, nogil=True)
-def _gram(descent, ridge, out):  # type: ignore[no-untyped-def]
-    """Products of the derivatives, summed over the template, with the prior of the affinity."""
-    out[:] = 0.0
-    for i in range(SIDE * SIDE):
-        r = descent[i]
-        # Values in registers first: stores to ``out`` might change ``r`` for all that the compiler knows.
-        v = (r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7])
-        for j in range(UNKNOWNS):
-            o, w = out[j], r[j]
-            o[0], o[1], o[2], o[3] = o[0] + w * v[0], o[1] + w * v[1], o[2] + w * v[2], o[3] + w * v[3]
-            o[4], o[5], o[6], o[7] = o[4] + w * v[4], o[5] + w * v[5], o[6] + w * v[6], o[7] + w * v[7]
-    for k in range(2, 6):
-        out[k, k] += ridge
-
-
-@njit(cache=True, nogil=True)
-def _compose(m, step):  # type: ignore[no-untyped-def]
-    """Compose the affinity with the inverse of a step, in place; returns the shift of the position to subtract."""
-    det = (1.0 + step[2]) * (1.0 + step[5]) - step[3] * step[4]
-    for i in range(2):
-        p, q = m[i, 0], m[i, 1]
-        m[i, 0] = (p * (1.0 + step[5]) - q * step[4]) / det
-        m[i, 1] = (q * (1.0 + step[2]) - p * step[3]) / det
-    return m[0, 0] * step[0] + m[0, 1] * step[1], m[1, 0] * step[0] + m[1, 1] * step[1]
-
-
-@njit(cache=True, nogil=True)
-def _factor(a):  # type: ignore[no-untyped-def]
-    """Factors of a symmetric positive matrix in place, by Gauss: multipliers below, pivots' inverses on the diagonal.
-
-    False where it is singular.
-    """
-    n = a.shape[0]
-    for i in range(n):
-        # Sums of squared grey differences this small are rounding: the template is flat, or has one direction only.
-        if not a[i, i] > 1e-9:
-            return False
-        a[i, i] = 1.0 / a[i, i]
-        for j in range(i + 1, n):
-            # No pivoting: the matrix is symmetric and positive, and all templates round alike.
-            f = a[j, i] * a[i, i]
-            a[j, i] = f
-            for k in range(i + 1, n):
-                a[j, k] -= f * a[i, k]
-    return True
-
-
-@njit(cache=True, nogil=True)
-def _solve(factors, b):  # type: ignore[no-untyped-def]
-    """Solve in place by the factors of :func:`_factor`."""
-    n = b.shape[0]
-    for i in range(n):
-        for j in range(i + 1, n):
-            b[j] -= factors[j, i] * b[i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            b[i] -= factors[i, k] * b[k]
-        b[i] *= factors[i, i]
 
 
 @njit(cache=True, nogil=True, inline="always")

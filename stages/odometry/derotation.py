@@ -8,6 +8,7 @@ does no harm, since matching still searches in two dimensions.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,6 +63,15 @@ class Derotation:
         if (moved[:, 2] <= 0).any():
             return float("inf")
         return float(np.linalg.norm(moved[:, :2] / moved[:, 2:] - corners[:, :2], axis=1).max())
+
+    @property
+    def roll_deg(self) -> float:
+        """Rotation, degrees, column towards row, that the homography makes of the image about its centre."""
+        centre = np.array([(self.shape[1] - 1) / 2.0, (self.shape[0] - 1) / 2.0, 1.0])
+        x, y, w = self.homography @ centre
+        # Quotient rule of (H p)_xy / (H p)_z: what a homography does to lengths and angles there.
+        slopes = self.homography[:2, :2] - np.outer([x / w, y / w], self.homography[2, :2])
+        return math.degrees(math.atan2((slopes[1, 0] - slopes[0, 1]) / w, (slopes[0, 0] + slopes[1, 1]) / w))
 
     def apply(self, b: Pyramid) -> Pyramid:
         """Pyramid of frame b held like a, with a margin; masked where b does not reach."""

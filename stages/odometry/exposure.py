@@ -15,7 +15,7 @@ import numpy as np
 from rille.stages.hfvm.images.brightness import DARK, LEAST, NOTABLE, SAMPLES, SATURATED
 from rille.stages.hfvm.images.window import thinned
 from rille.stages.imaging.pyramid import Pyramid
-from rille.stages.odometry.level_displacements import LevelDisplacements
+from rille.stages.odometry.displacements import LevelDisplacements
 
 
 def levelled(frames: Sequence[Pyramid], motions: Sequence[LevelDisplacements]) -> list[Pyramid]:

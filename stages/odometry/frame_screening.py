@@ -29,9 +29,8 @@ from rille.stages.facts.calibration import SwapFacts
 from rille.stages.facts.imaging import QualityFacts
 from rille.stages.facts.odometry import MotionFacts, ScreeningFacts
 from rille.stages.imaging.image_quality import HIGH, LOW
-from rille.stages.odometry.covisibility import Step
 from rille.stages.odometry.keyframes import LEAST_BLOCKS
-from rille.stages.odometry.step_table import changes_of, steps_of
+from rille.stages.odometry.steps import Step, changes_of, steps_of
 
 Steps = Mapping[tuple[int, int], float]
 Asks = dict[str, list[Any]]

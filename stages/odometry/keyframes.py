@@ -4,7 +4,7 @@ Successive basic pairs bound a *segment*: the left images from one to the next a
 elevation model of the first. Positions behind the last basic pair are an open last segment.
 
 The paper takes every fourth pair of a camera that moves evenly. Here the next basic pair is the last one whose image
-still shows the wanted share of what the one before shows (:mod:`rille.stages.odometry.covisibility`): poses are not
+still shows the wanted share of what the one before shows (:mod:`rille.stages.odometry.steps`): poses are not
 known yet, the coarse displacements are. A camera that rests needs no new elevation model, one that turns needs them
 often.
 """
@@ -22,8 +22,7 @@ from pydantic import Field, model_validator
 from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.facts.odometry import KeyframesFacts
-from rille.stages.odometry.covisibility import Covisibility, Step
-from rille.stages.odometry.step_table import steps_of
+from rille.stages.odometry.steps import Covisibility, Step, steps_of
 
 LEAST_BLOCKS = 12
 """Least number of blocks with a displacement from which the overlap of two images is estimated."""

@@ -14,7 +14,6 @@ import math
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
@@ -29,42 +28,22 @@ def interest_operator(image: Floats32) -> Floats32:
 
     The three outermost pixels, where a window leaves the image, are 0.
     """
-    rows, cols = image.shape
-    out = np.zeros((rows, cols), np.float32)
     reach = HALF + 1
-    if min(rows, cols) <= 2 * reach:
+    image = np.asarray(image, dtype=np.float32)
+    out = np.zeros(image.shape, np.float32)
+    if min(image.shape) <= 2 * reach:
         return out
-    _operator(np.ascontiguousarray(image, dtype=np.float32), np.array(DIRECTIONS), out)
+    inner = (slice(1, -1), slice(1, -1))
+    least = np.full_like(image, np.inf)
+    for dr, dc in DIRECTIONS:
+        square = np.zeros_like(image)
+        # Both senses of a direction, or the operator would prefer the side of a corner it is shifted to.
+        for sign in (1, -1):
+            square[inner] += (np.roll(image, (sign * dr, sign * dc), (0, 1))[inner] - image[inner]) ** 2
+        # Half, for the two senses: the mean of both sums.
+        least = np.minimum(least, 0.5 * cv2.boxFilter(square, -1, (2 * HALF + 1, 2 * HALF + 1), normalize=False))
+    out[reach:-reach, reach:-reach] = least[reach:-reach, reach:-reach]
     return out
-
-
-@njit(cache=True, nogil=True)
-def _operator(image, directions, out):  # type: ignore[no-untyped-def]
-    """Works on slices, whose indices start at 0 and need no check: only such loops become vector code."""
-    rows, cols = image.shape
-    wide = cols - 2
-    square = np.zeros((rows, cols), np.float32)
-    tall, ssd = np.empty(cols, np.float32), np.empty(cols, np.float32)
-    for d in range(len(directions)):
-        dr, dc = directions[d]
-        for y in range(1, rows - 1):
-            here, found = image[y, 1 : 1 + wide], square[y, 1 : 1 + wide]
-            there, back = image[y + dr, 1 + dc : 1 + dc + wide], image[y - dr, 1 - dc : 1 - dc + wide]
-            for x in range(wide):
-                # Both senses of a direction, or the operator would prefer the side of a corner it is shifted to.
-                ahead, behind = there[x] - here[x], back[x] - here[x]
-                found[x] = ahead * ahead + behind * behind
-        for y in range(HALF + 1, rows - HALF - 1):
-            a, b, c, e, f = square[y - 2], square[y - 1], square[y], square[y + 1], square[y + 2]
-            for x in range(cols):
-                tall[x] = a[x] + b[x] + c[x] + e[x] + f[x]
-            least, inner = out[y, HALF + 1 : cols - HALF - 1], tall[1:]
-            for x in range(cols - 2 * HALF - 2):
-                total = inner[x] + inner[x + 1] + inner[x + 2] + inner[x + 3] + inner[x + 4]
-                # Half, for the two senses: the mean of both sums.
-                ssd[x] = np.float32(0.5) * total
-            for x in range(cols - 2 * HALF - 2):
-                least[x] = ssd[x] if d == 0 or ssd[x] < least[x] else least[x]
 
 
 def interest_points(
@@ -118,24 +97,14 @@ def interest_points(
 
 def _peaks(response: Floats32, least: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows and columns of pixels above ``least``, and greatest of the 5 x 5 neighbourhood; of equal ones the first."""
-    side = np.ones((2 * HALF + 1, 2 * HALF + 1), np.uint8)
-    found = (response > least) & (response == cv2.dilate(response, side))
-    rows, cols = np.divmod(np.flatnonzero(found), response.shape[1])
-    first = _first_of_equals(response, rows, cols)
-    return rows[first], cols[first]
-
-
-@njit(cache=True, nogil=True)
-def _first_of_equals(response, rows, cols):  # type: ignore[no-untyped-def]
-    """Whether (n,) no pixel of the neighbourhood that is read before is as great."""
-    first = np.ones(len(rows), np.bool_)
-    for n in range(len(rows)):
-        y, x = rows[n], cols[n]
-        for j in range(max(y - HALF, 0), y + 1):
-            for i in range(max(x - HALF, 0), min(x + HALF + 1, response.shape[1])):
-                if (j < y or i < x) and response[j, i] == response[y, x]:
-                    first[n] = False
-    return first
+    side = 2 * HALF + 1
+    all_around = np.ones((side, side), np.uint8)
+    before = (np.arange(side**2) < side**2 // 2).astype(np.uint8).reshape(side, side)
+    peak = (
+        (response > least) & (response == cv2.dilate(response, all_around)) & (response > cv2.dilate(response, before))
+    )
+    rows, cols = np.nonzero(peak)
+    return rows, cols
 
 
 def _inside(valid: Bytes, border: int) -> Bools:

@@ -4,20 +4,21 @@ The hierarchical matcher of stage ``hfvm``, stopped at a coarse level. There is 
 forward has radial flow, whose epipolar lines meet inside the image, where a band says nothing about the way along it.
 
 Where the rotation between the frames is known from a sensor, it is undone before matching
-(:mod:`rille.stages.odometry.derotation`); where the matches are too few, the homography that features show, or else an
-in-plane rotation that is looked for, is undone, as is one that the matches show
-(:mod:`rille.stages.odometry.roll_search`). The displacements are those of the frames as they were taken all the same.
+(:mod:`rille.stages.odometry.derotation`); where the matches are too few, or show a rotation of the image, the
+homography that features show is undone (:mod:`rille.stages.odometry.features`). The displacements are those of the
+frames as they were taken all the same.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field
 
-from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.core.arrays import Floats32
 from rille.stages.core.declare import AnyArray, Bundle, Params, raster, stage
 from rille.stages.core.validity import Mask, Validity, defined, mark, matched, matched_share
 from rille.stages.facts.imaging import PyramidFacts
@@ -28,8 +29,9 @@ from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.window import whole
 from rille.stages.hfvm.level import consistency
 from rille.stages.imaging.pyramid import Pyramid
-from rille.stages.odometry import roll_search
 from rille.stages.odometry.derotation import Derotation
+from rille.stages.odometry.displacements import common_similarity
+from rille.stages.odometry.features import feature_homography
 
 
 class MotionParams(Params):
@@ -59,12 +61,9 @@ class MotionParams(Params):
         default=0.5,
         ge=0,
         le=1,
-        description="if fewer than this share of the textured pixels match, undo a homography fitted to features, "
-        "else an image rotation, and match again; an upright window matches 3/4 of a street scene and 1/3"
-        " when turned by 30 degrees; 0: undo only a rotation that an attitude sensor gives",
-    )
-    turn_range_deg: float = Field(
-        default=60.0, gt=0, le=180, description="largest image rotation [degrees] tried to either side"
+        description="if fewer than this share of the textured pixels match, undo a homography fitted to features and "
+        "match again; an upright window matches 3/4 of a street scene and 1/3 when turned by 30 degrees; 0: undo only"
+        " a rotation that an attitude sensor gives",
     )
 
 
@@ -83,8 +82,14 @@ class Motion:
     validity: Mask
 
 
-STILL = 2.0
+STILL_PX = 2.0
 """Pixels of the result's level: a rotation that moves no corner farther is left to the matcher."""
+MIN_ROLL_DEG = 10.0
+"""Rotation of the image below which nothing is undone: up to there, one to three per cent of the tracks are wrong."""
+MIN_TEXTURED = 100
+"""Pixels with texture, at the coarse level, from which on a rotation can show."""
+MIN_GAIN = 1.2
+"""A homography is believed if it raises the share of matches by a fifth; chance matches do not."""
 
 
 def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation | None = None) -> Motion:
@@ -137,47 +142,36 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     return Motion(level, u, v, validity)
 
 
-def _rolled(
+def _turned(
     a: Pyramid, b: Pyramid, plain: Motion, params: MotionParams, turn: Derotation | None
-) -> tuple[Motion, Derotation, float] | None:
-    """Displacements after undoing a rotation found in the images, that rotation, and degrees; None: none is needed."""
-    share = matched_share(plain.validity)
-    if params.turn_below == 0 or not matched_texture(plain):
+) -> tuple[Motion, Derotation] | None:
+    """Displacements after undoing the homography of features, and that homography; None: not needed, or no better."""
+    textured = int(np.count_nonzero((plain.validity & np.uint8(Validity.NO_TEXTURE)) == 0))
+    if params.turn_below == 0 or textured < MIN_TEXTURED:
         return None
-
-    def attempt(homography: Floats, which: MotionParams) -> tuple[Motion, Derotation]:
-        # The rotation that is searched is added to the one that a sensor measured.
-        upright = Derotation(homography if turn is None else turn.homography @ homography, a.shape)
-        return coarse_motion(a, b, which, upright), upright
-
-    best, needed = plain, 1.0
-    if share < params.turn_below:
-        wide = roll_search.feature_homography(a, b)
-        if wide is not None:
-            upright = Derotation(wide, a.shape)
-            found = coarse_motion(a, b, params, upright)
-            if matched_share(found.validity) > roll_search.GAIN * share:
-                degrees = -roll_search.relative((0.0, 1.0), wide, a.shape)[0]
-                known = np.eye(3) if turn is None else turn.homography
-                return found, upright, roll_search.relative((degrees, 1.0), known, a.shape)[0]
-        # One level coarser: a quarter of the pixels for each of the angles.
-        coarse, needed = params.model_copy(update={"level": params.level + 1}), roll_search.GAIN
-        for degrees in roll_search.candidates(params.turn_range_deg):
-            found, _ = attempt(roll_search.similarity(degrees, 1.0, a.shape), coarse)
-            best = max(best, found, key=lambda motion: matched_share(motion.validity))
-    fitted = roll_search.fit(best.column_disparity, best.row_disparity, matched(best.validity), best.level)
-    if fitted is not None and turn is not None:  # what the attitude left over
-        fitted = roll_search.relative(fitted, turn.homography, a.shape)
-    # Small rotations are the matcher's, which stands them: resampling the image costs more than they do.
-    if fitted is None or abs(fitted[0]) < roll_search.LEAST_DEG:
+    share, needed = matched_share(plain.validity), MIN_GAIN
+    if share >= params.turn_below:
+        # Small rotations are the matcher's, which stands them: resampling the image costs more than they do.
+        if abs(_roll_deg(plain) - (0.0 if turn is None else turn.roll_deg)) < MIN_ROLL_DEG:
+            return None
+        needed = 1.0
+    homography = feature_homography(a, b)
+    if homography is None:
         return None
-    found, upright = attempt(roll_search.similarity(fitted[0], fitted[1], a.shape), params)
-    return (found, upright, fitted[0]) if matched_share(found.validity) > needed * share else None
+    upright = Derotation(homography, a.shape)
+    motion = coarse_motion(a, b, params, upright)
+    return (motion, upright) if matched_share(motion.validity) > needed * share else None
 
 
-def matched_texture(found: Motion) -> bool:
-    """Whether enough of the image has texture for a rotation to show."""
-    return int(np.count_nonzero((found.validity & np.uint8(Validity.NO_TEXTURE)) == 0)) >= roll_search.LEAST
+def _roll_deg(motion: Motion) -> float:
+    """Rotation of the image, degrees, that the displacements share."""
+    row, col = np.nonzero(matched(motion.validity))
+    if len(row) < MIN_TEXTURED:
+        return 0.0
+    origin = np.asarray((np.stack([col, row], -1) + 0.5) * 2.0**motion.level - 0.5, dtype=np.float64)
+    shift = np.stack([motion.column_disparity[row, col], motion.row_disparity[row, col]], -1).astype(np.float64)
+    similarity = common_similarity(origin, origin + shift)
+    return math.degrees(math.atan2(similarity[1, 0], similarity[0, 0]))
 
 
 def known_turn(rotation: Sequence[Sequence[float]] | None, camera: Camera | None, level: int) -> Derotation | None:
@@ -190,7 +184,7 @@ def known_turn(rotation: Sequence[Sequence[float]] | None, camera: Camera | None
     if rotation is None or camera is None:
         return None
     turn = Derotation.of(rotation, camera)
-    return turn if turn.reach > STILL * 2.0**level else None
+    return turn if turn.reach > STILL_PX * 2.0**level else None
 
 
 _GRID = "coarse level of a"
@@ -216,10 +210,12 @@ def motion_stage(
     turn = known_turn(rotation, camera, params.level)
     before, after = Pyramid.from_bundle(a), Pyramid.from_bundle(b)
     found = coarse_motion(before, after, params, turn)
-    rolled = _rolled(before, after, found, params, turn)
-    roll_deg = 0.0
-    if rolled is not None:
-        found, turn, roll_deg = rolled
+    turned, roll_deg = _turned(before, after, found, params, turn), 0.0
+    if turned is not None:
+        roll_deg = -turn.roll_deg if turn is not None else 0.0
+        found, turn = turned
+        # Into -180 .. 180: a difference of 350 degrees is a turn by 10 the other way.
+        roll_deg = (roll_deg + turn.roll_deg + 180.0) % 360.0 - 180.0
     ok = matched(found.validity)
     rows, cols = ok.shape
     scale = np.float32(2.0**found.level)

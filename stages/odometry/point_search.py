@@ -119,7 +119,6 @@ class _Templates(NamedTuple):
 @njit(cache=True, nogil=True)
 def _search_all(a, b, templates, radius, scale, offset, cost):  # type: ignore[no-untyped-def]
     """Each point by itself: its template, the area around its prediction, and where in it the template fits best."""
-    points, whole, shape = templates
     # Features at all places of the sum need their kernels' reach around.
     side = 2 * (SUM_RADIUS + features.RADIUS) + 1
     wide = side + 2 * (radius + 1)
@@ -127,8 +126,9 @@ def _search_all(a, b, templates, radius, scale, offset, cost):  # type: ignore[n
     m = wide - 2 * features.RADIUS
     words, searched = np.empty((SIDE, SIDE), np.uint64), np.empty((m, m), np.uint64)
     deviation = np.empty((m, m), np.float32)
-    for k in range(len(points)):
-        if not _cut(a, points[k, 0], points[k, 1], shape[k], template) or not _copy(b, whole[k], area):
+    for k in range(len(templates.points)):
+        x, y = templates.points[k]
+        if not _cut(a, x, y, templates.shape[k], template) or not _copy(b, templates.whole[k], area):
             continue
         features.pack_rows(template, 0, scale, words, deviation)
         features.pack_rows(area, 0, scale, searched, deviation)

@@ -29,9 +29,8 @@ from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts, TrackFacts
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.odometry.affine_lk import HALF, Templates, align
-from rille.stages.odometry.affinity import NEIGHBOURS, fit_affinity, known
+from rille.stages.odometry.displacements import NEIGHBOURS, LevelDisplacements, fit_affinity, known
 from rille.stages.odometry.exposure import levelled
-from rille.stages.odometry.level_displacements import LevelDisplacements
 from rille.stages.odometry.moravec import clear_of_mask, interest_points
 from rille.stages.odometry.point_search import match_points
 

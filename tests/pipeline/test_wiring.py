@@ -19,7 +19,7 @@ LEG = {"start": [0.0, 0.0, 0.0], "where": None, "reason": "", "left_m": 1.0, "wa
 FACTS: dict[str, dict[str, Any]] = {
     "frame_screening": {"asks": {"bridges": [], "sides": []}, "chain": [0, 1, 2], "lost": [], "unfit": []},
     "keyframes": {"basic": [0, 2], "segments": [[0, 1, 2]], "displacement": [1.0, 1.0], "match_rate": [1.0, 1.0]},
-    "common_tilt": {"undone": False},
+    "intrinsics": {},
     "trajectory": {"pieces": [[0, 2]], "main": 0, "frames": [0, 1, 2], "positions": [[0, k, 0] for k in range(3)]},
     "radiometry": {"steps": {}},
     "tile_index": {"tiles": [(0, 0, 0, 0, 4, 4)], "box": BOX, "cell": 0.01},
@@ -114,11 +114,10 @@ def ports(graph: Graph) -> dict[str, set[frozenset[str]]]:
     return found
 
 
-@pytest.mark.parametrize("landmarks", ["disparity", "dem"])
 @pytest.mark.parametrize("both", [True, False])
-def test_each_stage_gets_the_same_ports_in_a_drive_as_in_a_reconstruction(landmarks: str, both: bool) -> None:
+def test_each_stage_gets_the_same_ports_in_a_drive_as_in_a_reconstruction(both: bool) -> None:
     driven, recorded = open_sequence("mockup-loop"), open_sequence("mockup-short", {"mockup": {"frames": 3}})
-    more = {"resect": {"landmarks": landmarks}, "locus": {"both": both}}
+    more = {"locus": {"both": both}}
     settings = config.build(config.expand(driven.defaults), more)
     graphs = Graph(), Graph()
     dataflow(graphs[0], driven, settings, (0,))

@@ -7,7 +7,7 @@ import numpy as np
 from rille.stages.core.declare import Bundle, NoParams
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Camera
-from rille.stages.odometry import step_table
+from rille.stages.odometry import steps
 
 CAMERA = Camera(300.0, 300.0, 239.5, 159.5, 480, 320)
 LEVEL = 2
@@ -82,7 +82,7 @@ def tables(motions, rows=3):
     """Tables of steps of so many motions each, as the flow cuts them."""
     cuts = range(0, len(motions), rows)
     return [
-        step_table.step_table_stage.run(
+        steps.step_table_stage.run(
             NoParams(), {}, {"motions": motions[k : k + rows]} | ({"before": motions[k - 1]} if k else {})
         )
         for k in cuts

@@ -19,7 +19,6 @@ from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.stages.core.declare import Bundle
 from rille.stages.evaluation.crosscheck import PIXEL_CENTRE
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
-from rille.stages.odometry.resection import refine
 from rille.stages.odometry.resection.landmarks import matches_at
 from rille.stages.odometry.resection.trajectory import world_poses
 
@@ -80,12 +79,11 @@ def _segments(bundles: RunArtifacts) -> list[MatchedSegment]:
     keys = sorted(of_key)
     tracked = [of_key[key] for key in keys]
     points = [(np.asarray(resection["landmarks"]), np.asarray(resection["inlier"])) for _, resection in tracked]
-    # Where disparities were tilted, the adjustment without the tilt is the one whose poses count.
-    for label in ("refine/untilted", "refine"):
-        adjusted = [part for k in keys if (b := bundles.find(f"{label}/{k}")) is not None for part in refine.parts(b)]
-        if len(adjusted) == len(points):
-            points = adjusted
-            break
+    refined = [bundles.find(f"refine/{key}") for key in keys]
+    points = [
+        (np.asarray(b["landmarks"]), np.asarray(b["inlier"])) if b is not None else one
+        for b, one in zip(refined, points, strict=True)
+    ]
     return [
         MatchedSegment(
             track, resection, {f: b for f in _ends(track) if (b := bundles.find(f"hfvm/{f}")) is not None}, *of
@@ -189,8 +187,7 @@ def _points(
         agrees = segment.inlier[:, j] != 0
         shown[:, j, 0] = agrees & _near(rig.left, in_left, left)
         if (pair := segment.matches.get(frame)) is not None:
-            disparity = (np.asarray(pair[n]) for n in ("column_disparity", "row_disparity", "validity"))
-            vectors, matched = matches_at(left, *disparity)
+            vectors, matched = matches_at(left, pair)
             pixels[:, j, 1] += vectors
             shown[:, j, 1] = agrees & matched & _near(rig.right, rig.T_right_left.apply(in_left), pixels[:, j, 1])
     grey = np.asarray(images[key]["image"]) if key in images else np.zeros((1, 1), np.uint8)

@@ -17,8 +17,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rille.stages.core.arrays import Floats
+from rille.stages.core.declare import Bundle, NoParams, stage
+from rille.stages.facts.calibration import CalibrationFacts
+from rille.stages.facts.odometry import IntrinsicsFacts, RefineFacts
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lens import Lens
+from rille.stages.numeric.robust import huber_weight, mad_sigma
 from rille.stages.odometry.resection.bundle_adjustment import RefineParams, SegmentState, SegmentTracks, adjust
 from rille.stages.odometry.resection.landmarks import triangulated
 
@@ -29,6 +33,9 @@ STEP = 0.01
 
 MIN_TURN_DEG = 4.0
 """Turn of a segment from which on it counts: errors that all tracks share hide what smaller ones show."""
+
+MIN_SEGMENTS = 3
+"""Segments that turn, below which nothing is said."""
 
 MIN_ERROR = 0.0175
 """Error over the focal length up to which calibrations pass for good: what remains of lens distortion looks like it."""
@@ -89,9 +96,34 @@ def contribution(
         three = [with_change(views, cameras, name, by) for by in (-STEP, 0.0, STEP)]
         finite = [np.isfinite(v.position).all(1) & np.isfinite(v.pixels).all(2) for v in three]
         seen = views.seen & np.all(finite, axis=0)
-        below, at, above = (adjust([(replace(v, seen=seen), state)], params)[3] for v in three)
+        below, at, above = (adjust(replace(v, seen=seen), state, params).after for v in three)
         parts.append(((below - 2.0 * at + above) / STEP**2, (below - above) / (2.0 * STEP)))
     return parts
+
+
+def common_error(parts: Floats) -> tuple[float, float]:
+    """Error that all segments share and its standard deviation, infinite of too few segments.
+
+    The segments' own values scatter by more than their errors, for their landmarks are few and near each other; the
+    scatter decides.
+
+    Parameters
+    ----------
+    parts : (segment, 2) information and pull of each.
+    """
+    # Rounding leaves a segment that tells nothing with no or negative information.
+    parts = parts[parts[:, 0] > 0]
+    if len(parts) < MIN_SEGMENTS:
+        return 0.0, float("inf")
+    claimed, value = parts[:, 0], parts[:, 1] / parts[:, 0]
+    information = claimed
+    for _ in range(5):  # of a segment that is far off, no more than of one at two deviations
+        error = float((information * value).sum() / information.sum())
+        off = np.abs(value - error) * np.sqrt(claimed)
+        # At least what the segments claim: few of them may agree by chance.
+        spread = max(1.0, mad_sigma(off, 0.0))
+        information = claimed * huber_weight(off, 2.0 * spread)
+    return error, spread * float(information.sum()) ** -0.5
 
 
 def contradiction(errors: Sequence[tuple[float, float]], focal: float) -> str:
@@ -115,3 +147,18 @@ def contradiction(errors: Sequence[tuple[float, float]], focal: float) -> str:
         "the tracks contradict the calibration of both cameras: where the camera turns they ask for another one, "
         f"{' or '.join(wrong)}; scale and heading are wrong: calibrate anew"
     )
+
+
+@stage("intrinsics")
+def intrinsics_stage(
+    params: NoParams, segments: Sequence[Bundle[RefineFacts]], rig: Bundle[CalibrationFacts]
+) -> Bundle[IntrinsicsFacts]:
+    """Errors of the intrinsics that the tracks of all segments show."""
+    parts = np.array([segment.meta["intrinsics"] for segment in segments if segment.meta["intrinsics"]])
+    if len(parts) < MIN_SEGMENTS:
+        return Bundle({}, {})
+    errors = [common_error(parts[:, k]) for k in range(len(NAMES))]
+    facts: IntrinsicsFacts = {"intrinsics": dict(zip(NAMES, errors, strict=True))}
+    if line := contradiction(errors, Rig.from_dict(rig.meta["rig"]).left.fx):
+        facts |= {"contradiction": line, "warnings": [line]}
+    return Bundle({}, facts)

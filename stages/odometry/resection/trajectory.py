@@ -24,7 +24,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,16 @@ from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform, cross_matrix, level_rotation, orthonormal
 from rille.stages.geometry.pose_arrays import COVARIANCE, NO_VERTICAL, POSES
 
-Segment = tuple[Floats, Floats, Floats]
+
+class SegmentPoses(NamedTuple):
+    """Poses (frames, 3, 4) T_local_left of a segment, key frame first, NaN of a lost frame.
+
+    ``covariance`` (frames, 6, 6), and the root ``shared`` (frames, 6, k) of the part of it that all segments share.
+    """
+
+    poses: Floats
+    covariance: Floats
+    shared: Floats
 
 
 @dataclass(frozen=True)
@@ -55,15 +64,14 @@ class Chained:
     piece: NDArray[np.int16]
 
 
-def chain(segments: Sequence[Segment], levels: Sequence[RigidTransform]) -> Chained:
+def chain(segments: Sequence[SegmentPoses], levels: Sequence[RigidTransform]) -> Chained:
     """Compose the poses of segments into one trajectory.
 
     Where the last frame of a segment is lost, the next segment begins a new piece in the local frame of its own key.
 
     Parameters
     ----------
-    segments : poses (frames, 3, 4) T_local_left, covariances (frames, 6, 6) and the root (frames, 6, k) of the part of
-        them that all segments share, key frame first, NaN of a lost frame; none for a sequence of one pair.
+    segments : none for a sequence of one pair.
     levels : T_local_left of each segment's key frame by its own level stage; of the only pair without segments.
 
     Raises
@@ -73,11 +81,12 @@ def chain(segments: Sequence[Segment], levels: Sequence[RigidTransform]) -> Chai
     """
     if len(levels) != max(len(segments), 1):
         raise InputError("RIL-450", f"{len(segments)} segments and {len(levels)} levels do not make a trajectory")
-    kinds = segments[0][2].shape[2] if segments else 0
+    kinds = segments[0].shared.shape[2] if segments else 0
     nothing = np.zeros((6, 6)), np.zeros((6, kinds))
     world, (own, common), broken, piece = levels[0], nothing, False, 0
     poses, covariances, owner, pieces = [world.matrix34], [own], [0], [0]
-    for number, ((local, local_cov, shared), level) in enumerate(zip(segments, levels, strict=False)):
+    for number, (segment, level) in enumerate(zip(segments, levels, strict=False)):
+        local = segment.poses
         # Both come from the same level stage: a difference beyond rounding means that the wrong ones were paired.
         if np.abs(local[0] - level.matrix34).max() > 1e-9 * max(1.0, float(np.abs(local[0]).max())):
             raise InputError("RIL-451", f"segment {number} was not resected in the local frame of its own basic pair")
@@ -87,7 +96,7 @@ def chain(segments: Sequence[Segment], levels: Sequence[RigidTransform]) -> Chai
         # Once a segment: over thousands of products rounding would bend the rotation.
         T_world_local = _clean(world @ level.inverse())
         key, key_own, key_common = world, own, common
-        for pose, pose_cov, pose_shared in zip(local[1:], local_cov[1:], shared[1:], strict=True):
+        for pose, pose_cov, pose_shared in zip(*(each[1:] for each in segment), strict=True):
             broken = not np.isfinite(pose).all()
             if not broken:
                 world = T_world_local @ RigidTransform.from_matrix(pose)
@@ -277,11 +286,8 @@ def trajectory_stage(
 ) -> Bundle[TrajectoryFacts]:
     """Poses of all left frames in the world frame."""
     level = [RigidTransform.from_matrix(b.meta["T_local_left"]) for b in levels]
-    names = ("poses", "covariance", "shared")
     posed: Sequence[Bundle] = refined or segments
-    ends = np.cumsum([len(b.meta["per_frame"]) for b in segments])[:-1]
-    parts = [np.split(np.concatenate([b[name] for b in posed]), ends) for name in names] if posed else [[]] * 3
-    chained = list(zip(*parts, strict=True))
+    chained = [SegmentPoses(*(np.asarray(b[name]) for name in SegmentPoses._fields)) for b in posed]
     facts = _facts(segments) or [{"frame": frames[0], "inliers": 0}]
     causes = {int(f["frame"]): str(f["cause"]) for f in lost}
     causes |= {int(f["frame"]): str(f["lost"]) for f in facts if "lost" in f}

@@ -25,7 +25,6 @@ def lay_out(
     answer: dict[str, Any],
     chosen: dict[str, Any],
     trajectory: dict[str, Any],
-    tilted: bool = False,
     doubts: list[tuple[str, dict[str, Any]]] | None = None,
     jumps: dict[str, dict[str, Any]] | None = None,
     **given: Any,
@@ -47,7 +46,7 @@ def lay_out(
     for handles, go_on, _ in list(graph.expansions):
         if handles[0].stage == "resect":
             go_on(*(SimpleNamespace(meta=(jumps or {}).get(h.label, {})) for h in handles))
-    for stage, meta in (("common_tilt", {"undone": tilted}), ("trajectory", trajectory)):
+    for stage, meta in (("intrinsics", {}), ("trajectory", trajectory)):
         for handles, go_on, _ in list(graph.expansions):
             if handles[0].label == stage:
                 go_on(SimpleNamespace(meta=meta))
@@ -127,13 +126,13 @@ def test_the_world_is_that_of_the_largest_piece_and_each_piece_is_judged() -> No
         {"chain": list(range(8)), "lost": [], "unfit": []},
         {"basic": [0, 3, 6], "segments": [[0, 1, 2, 3], [3, 4, 5, 6], [6, 7]]},
         {"frames": list(range(8)), "pieces": [[0, 2], [3, 7]], "main": 1, "positions": [[0, 0, k] for k in range(8)]},
-        resect={"landmarks": "dem"},
+        refine={"enabled": False},
     )
     assert list(products.world_dem) == [3, 6]
     assert products.world_dem[6].inputs["reference"] is products.level[3]
     assert labels(graph, "accuracy") == ["accuracy/piece/1", "accuracy"]
     assert products.accuracy is products.accuracy_pieces[1]
-    assert labels(graph, "refine") == []  # it needs landmarks of the disparity
+    assert labels(graph, "refine") == labels(graph, "intrinsics") == []
 
 
 def test_a_first_frame_that_is_lost_leaves_no_pair_behind() -> None:
@@ -142,14 +141,13 @@ def test_a_first_frame_that_is_lost_leaves_no_pair_behind() -> None:
         {"chain": list(range(1, 8)), "lost": [{"frame": 0, "cause": "black"}], "unfit": []},
         {"basic": [0, 3], "segments": [[0, 1, 2, 3], [3, 4, 5, 6]]},
         {"frames": list(range(8)), "pieces": [[1, 7]], "main": 0, "positions": [None, *([0, 0, k] for k in range(7))]},
-        tilted=True,
     )
     assert list(products.disparity) == [1, 4]
-    assert labels(graph, "refine") == ["refine/1", "refine/4", "refine/untilted/1", "refine/untilted/4"]
+    assert labels(graph, "refine") == ["refine/1", "refine/4"]
     assert products.trajectory is not None
     refined = products.trajectory.inputs["refined"]
     assert isinstance(refined, list)
-    assert [h.label for h in refined] == ["refine/untilted/1", "refine/untilted/4"]
+    assert [h.label for h in refined] == ["refine/1", "refine/4"]
 
 
 def test_what_many_tasks_are_given_is_held_once() -> None:
@@ -216,7 +214,6 @@ def test_what_a_knocked_rig_measures_is_worth_no_pose(back: bool, refused: list[
         jumps["resect/5"] = {"jump": [-2.6, 0.1], "knocked": "the rig moved at pair 6"}
     _, products = lay_out([], WHOLE, CHOICE, POSED, jumps=jumps)
     said = [h.spec.args.get("refused") for h in products.resections]
-    stops = [int(h.label.split("/")[1]) for h, cause in zip(products.resections, said, strict=True) if cause]
-    assert stops == refused
+    assert [int(h.label.split("/")[1]) for h, cause in zip(products.resections, said, strict=True) if cause] == refused
     assert set(said) == {None, "the rig moved at pair 5"}
     assert list(products.world_dem) == list(products.local_dem) == world

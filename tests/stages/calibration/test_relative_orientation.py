@@ -7,13 +7,11 @@ import pytest
 from rig_scenes import knocked, matches, street_depth, street_rig
 
 from rille.stages.calibration.relative_orientation import (
-    BLOCKS,
     SIZE,
     TERMS,
     PointPairs,
     Priors,
     _smooth_terms,
-    _weigh,
     adjust,
     consider_covariance,
     precision,
@@ -106,26 +104,6 @@ def test_the_pair_order_does_not_matter_to_rounding():
     pairs = [matches(knocked(street_rig(), pitch_deg=0.3), street_depth, pair=k) for k in range(3)]
     here, there = (adjust(street_rig(), p, ANGLES, PRIORS, rival=True).x for p in (pairs, pairs[::-1]))
     np.testing.assert_allclose(here, there, rtol=0, atol=1e-6)
-
-
-def test_normal_equations_and_weights_by_plain_numpy():
-    rng = np.random.default_rng(5)
-    n, m, blocks = 300, 4, BLOCKS**2
-    constant, design = rng.normal(0.0, 0.4, n), rng.normal(size=(n, m))
-    constant[:20] += 30.0
-    x, block = 0.1 * rng.normal(size=m), rng.integers(0, 9, n)
-    weights, normal, pull = np.empty(n), np.empty((m, m)), np.empty(m)
-    noise = _weigh(constant, design, block, x, np.inf, (weights, normal, pull))
-    rest = constant + design @ x
-    assert noise == pytest.approx(1.4826 * np.median(np.abs(rest)))
-    expected = np.maximum(0.0, 1.0 - (rest / (4.685 * noise)) ** 2) ** 2
-    np.testing.assert_allclose(weights, expected, atol=1e-12)
-    assert (weights[:20] == 0).all()
-    count, total = (np.bincount(block, w, blocks) for w in (expected, expected * rest))
-    together = np.mean(total[count > 0] ** 2 / count[count > 0])
-    information = expected / (noise**2 * max(1.0, together / noise**2))
-    np.testing.assert_allclose(normal, design.T @ (design * information[:, None]), rtol=1e-9)
-    np.testing.assert_allclose(pull, -design.T @ (information * constant), rtol=1e-9)
 
 
 def test_the_gain_is_half_the_drop_of_the_weighed_squares():

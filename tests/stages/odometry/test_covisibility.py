@@ -5,7 +5,7 @@ import pytest
 from motion_scenes import CAMERA, drive, motion, share_kept, shift, turned, zoom
 
 from rille.stages.geometry.geometry import rotation_exp
-from rille.stages.odometry.covisibility import Covisibility, Step
+from rille.stages.odometry.steps import Covisibility, Step
 
 # The edge of the image cuts blocks, of which the part inside is taken by the distance of the centre: exact for shifts,
 # and off by a few per cent of a block (17 x 12 of them) where they are scaled or turned.

@@ -10,8 +10,14 @@ import pytest
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 from rille.stages.odometry.resection.bundle_adjustment import RefineParams, SegmentState, SegmentTracks, adjust
-from rille.stages.odometry.resection.common_tilt import common_tilt
-from rille.stages.odometry.resection.intrinsics import NAMES, SegmentCameras, changed, contradiction, contribution
+from rille.stages.odometry.resection.intrinsics import (
+    NAMES,
+    SegmentCameras,
+    changed,
+    common_error,
+    contradiction,
+    contribution,
+)
 from rille.stages.odometry.resection.landmarks import triangulated
 
 CAMERA = Camera(450.0, 450.0, 375.5, 239.5, 752, 480)
@@ -39,12 +45,12 @@ def contributions(given: Camera, lens: Lens, turn: float) -> list[list[tuple[flo
         ]
         at = triangulated(measured(X), measured(T_right_left.apply(X)), rig, LEVEL, np.full(80, 0.2))
         pixels = np.array([measured(move.apply(X)) for move in moves])
-        views = SegmentTracks(at.position, at.per_pixel, at.sigma, pixels, np.ones((2, 80), bool), given, np.zeros(80))
+        views = SegmentTracks(at.position, at.per_pixel, at.sigma, pixels, np.ones((2, 80), bool), given)
         start = [move @ LEVEL.inverse() for move in moves]
         state = SegmentState(
             np.array([T.rotation for T in start]), np.array([T.translation for T in start]), np.zeros(80)
         )
-        (state,), *_ = adjust([(views, state)], PARAMS)
+        state = adjust(views, state, PARAMS).state
         lenses = {} if lens.ideal else {"left": wrong, "right": wrong}
         out.append(contribution(views, state, SegmentCameras(rig, lenses, LEVEL), PARAMS))
     return out
@@ -52,7 +58,7 @@ def contributions(given: Camera, lens: Lens, turn: float) -> list[list[tuple[flo
 
 def errors(given: Camera, lens: Lens, turn: float = 0.03) -> list[tuple[float, float]]:
     parts = np.array(contributions(given, lens, turn))
-    return [common_tilt(parts[:, k], 1.0) for k in range(len(NAMES))]
+    return [common_error(parts[:, k]) for k in range(len(NAMES))]
 
 
 @pytest.mark.parametrize(("by", "lens"), [(-0.05, Lens(CAMERA)), (0.03, BENT)], ids=["pinhole", "lens"])
@@ -71,3 +77,21 @@ def test_right_numbers_are_believed(lens):
 
 def test_a_straight_drive_does_not_tell_a_focal_length():
     assert contradiction(errors(changed(CAMERA, NAMES[0], 0.1), Lens(CAMERA), 0.001), CAMERA.fx) == ""
+
+
+def test_the_common_error_is_the_mean_and_a_segment_far_off_counts_as_one_at_two_deviations():
+    same = np.array([[1e4, 10.0]] * 12)
+    error, sigma = common_error(same)
+    assert error == pytest.approx(0.001)
+    assert sigma == pytest.approx((12e4) ** -0.5)
+    # Huber's mean: eleven at 0 and one far off balance where 11 t = 2 deviations.
+    same[:, 1] = [0.0] * 11 + [20.0 * 1e4**0.5]
+    assert common_error(same)[0] == pytest.approx(2.0 * 1e4**-0.5 / 11, rel=1e-3)
+    assert common_error(same[:2]) == (0.0, float("inf"))
+
+
+def test_segments_that_scatter_by_more_than_they_claim_widen_the_error():
+    value = 0.003 * np.random.default_rng(1).standard_normal(400)
+    error, sigma = common_error(np.column_stack([np.full(400, 1e6), 1e6 * value]))  # claimed: 0.001
+    assert sigma == pytest.approx(0.003 / 20.0, rel=0.15)
+    assert abs(error) < 4.0 * sigma

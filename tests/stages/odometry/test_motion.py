@@ -10,8 +10,8 @@ from rille.stages.geometry.geometry import Camera, rotation_exp
 from rille.stages.imaging.pyramid import PyramidParams, build
 from rille.stages.odometry import motion
 from rille.stages.odometry.derotation import Derotation
+from rille.stages.odometry.features import feature_homography
 from rille.stages.odometry.motion import MotionParams, coarse_motion
-from rille.stages.odometry.roll_search import feature_homography
 
 
 def forward_flow(x, y):

@@ -16,18 +16,13 @@ from rille.stages.geometry.geometry import (
     RigidTransform,
     rotation_exp,
 )
+from rille.stages.geometry.projection import Pinhole, perturbed
+from rille.stages.numeric.least_squares import levenberg_marquardt
+from rille.stages.odometry.resection import robust_pose
 from rille.stages.odometry.resection.landmarks import Landmarks
-from rille.stages.odometry.resection.pnp import (
-    Observations,
-    Poses,
-    back_projection,
-    bias_information,
-    derivatives,
-    levenberg_marquardt,
-    normal_matrix,
-    norms,
-)
-from rille.stages.odometry.resection.resect import ResectParams, knocked, moving_tracks, resect, resect_segment
+from rille.stages.odometry.resection.pnp import Observations, Pose, PoseAdjustment, back_projection
+from rille.stages.odometry.resection.resect import SegmentPoints, knocked, moving_tracks, resect_segment
+from rille.stages.odometry.resection.robust_pose import ResectParams, resect
 
 CAMERA = Camera(600.0, 610.0, 300.0, 250.0, 600, 500)
 PARAMS = ResectParams()
@@ -51,9 +46,19 @@ def solve(landmarks, pixels, *, per_pixel=None, sigma=0.0, params=PARAMS, seed=0
     """Resect from the identity; landmarks are exact unless told how they move with their disparity."""
     per_pixel = np.zeros_like(landmarks) if per_pixel is None else per_pixel
     known = Landmarks(landmarks, per_pixel, np.broadcast_to(sigma, len(landmarks)).astype(float), {})
-    return resect(
-        known, pixels, CAMERA, [RigidTransform.identity()], params, np.random.default_rng(seed), where="frame 7"
-    )
+    return resect(known, pixels, CAMERA, [RigidTransform.identity()], params.model_copy(update={"seed": seed}), 7)
+
+
+def observed(landmarks, per_pixel, sigma, pixels, pixel_sigma=0.2):
+    """Observations by the camera of these tests."""
+    return Observations(landmarks, per_pixel, sigma, pixels, Pinhole.of(CAMERA), pixel_sigma)
+
+
+def segment_poses(points, landmarks, key, frames, reckoned=None):
+    """Points of a segment, whose landmarks are exact, and its poses."""
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(len(landmarks)), {"too far": 3})
+    given = SegmentPoints(points, known, CAMERA, key)
+    return given, resect_segment(given, frames, PARAMS, reckoned)
 
 
 def test_projection_is_eq_4_with_t_the_translation_and_the_position_minus_rt_t():
@@ -63,8 +68,8 @@ def test_projection_is_eq_4_with_t_the_translation_and_the_position_minus_rt_t()
     X = np.array([[0.3, 0.4, 6.0], [-1.0, 0.5, 5.0]])
     h = np.column_stack([X, np.ones(2)]) @ T.T
     by_eq_7_and_8 = h[:, :2] / h[:, 2:]
-    obs = Observations(X[None], np.zeros((1, 2, 3)), np.zeros((1, 2)), np.zeros((1, 2, 2)), CAMERA, 1.0, 0.1)
-    by_us = back_projection(obs, Poses.of(RigidTransform(R, t))).pixels[0]
+    obs = observed(X, np.zeros((2, 3)), np.zeros(2), np.zeros((2, 2)), 1.0)
+    by_us = back_projection(obs, Pose(R, t)).error
     np.testing.assert_allclose(by_us, by_eq_7_and_8, rtol=1e-12)
     rng = np.random.default_rng(0)
     landmarks = scene(rng)
@@ -80,21 +85,24 @@ def test_jacobian_against_central_differences():
     per_pixel = 0.1 * landmarks * rng.uniform(0.5, 2.0, (5, 1))
     sigma = np.array([0.0, 0.1, 0.2, 0.3, 0.5])
     T = true_pose(rng).inverse()
-    poses = Poses(T.rotation[None], T.translation[None], np.array([0.05]))
-    obs = Observations(landmarks[None], per_pixel[None], sigma[None], rng.uniform(0, 500, (1, 5, 2)), CAMERA, 0.3, 0.1)
-    errors = back_projection(obs, poses)
-    analytic = derivatives(obs, errors)[0]
-    h = 1e-6
-    along = errors.per_pixel[0] * sigma[:, None]
-    S = 0.3**2 * np.eye(2) + along[:, :, None] * along[:, None, :]
-    for k in range(7):
-        step = np.zeros((1, 7))
-        step[0, k] = h
-        numeric = (back_projection(obs, poses.moved(step)).pixels - back_projection(obs, poses.moved(-step)).pixels)[0]
-        for i in range(5):
-            values, vectors = np.linalg.eigh(S[i])
-            root = vectors / np.sqrt(values) @ vectors.T  # held fixed within a step, as in reweighted least squares
-            np.testing.assert_allclose(analytic[i, :, k], root @ numeric[i] / (2 * h), rtol=1e-5, atol=1e-4)
+    pixels = rng.uniform(0, 500, (5, 2))
+    errors = back_projection(observed(landmarks, per_pixel, sigma, pixels, 0.3), Pose(T.rotation, T.translation, 0.05))
+
+    def plain(step):
+        """Errors in pixels after a step of pose and bias."""
+        R, t = perturbed(T.rotation[None], T.translation[None], step[None, :6])
+        return CAMERA.project((landmarks + (0.05 + step[6]) * per_pixel) @ R[0].T + t[0]) - pixels
+
+    numeric = np.array([(plain(e) - plain(-e)) / 2e-6 for e in 1e-6 * np.eye(7)])
+    along = numeric[6] * sigma[:, None]
+    for i in range(5):
+        values, vectors = np.linalg.eigh(0.3**2 * np.eye(2) + np.outer(along[i], along[i]))
+        root = vectors / np.sqrt(values) @ vectors.T  # held fixed within a step, as in reweighted least squares
+        np.testing.assert_allclose(errors.jacobian[i], root @ numeric[:, i].T, rtol=1e-5, atol=1e-4)
+        np.testing.assert_allclose(errors.error[i], root @ plain(np.zeros(7))[i], rtol=1e-6)
+        assert errors.stretch[i] == pytest.approx(np.sqrt(values[1]) / 0.3, rel=1e-6)
+    np.testing.assert_allclose(errors.norm, np.linalg.norm(errors.error, axis=1))
+    np.testing.assert_allclose(errors.pixels, np.linalg.norm(plain(np.zeros(7)), axis=1))
 
 
 def test_a_landmark_just_before_the_camera_has_a_finite_error():
@@ -102,9 +110,8 @@ def test_a_landmark_just_before_the_camera_has_a_finite_error():
     rng = np.random.default_rng(8)
     landmarks = np.column_stack([rng.uniform([-30, -2], [30, 2], (2000, 2)), 10.0 ** rng.uniform(-6, -4, 2000)])
     per_pixel = landmarks + np.array([0.0, 0.0, 30.0])
-    pixels = rng.uniform([0, 0], [600, 500], (2000, 2))
-    obs = Observations(landmarks[None], per_pixel[None], np.full((1, 2000), 0.2), pixels[None], CAMERA, 0.2, 0.1)
-    assert np.isfinite(norms(obs, Poses.of(RigidTransform.identity()))).all()
+    obs = observed(landmarks, per_pixel, np.full(2000, 0.2), rng.uniform([0, 0], [600, 500], (2000, 2)))
+    assert np.isfinite(back_projection(obs, Pose.of(RigidTransform.identity())).norm).all()
 
 
 def test_exact_data_give_the_exact_pose():
@@ -200,7 +207,7 @@ def test_covariance_is_calibrated(bias_sigma):
     """Normalised squared error of 200 noisy resections: chi-square of 6 degrees of freedom each."""
     rng = np.random.default_rng(6)
     trials, total = 200, 0.0
-    params = ResectParams(pixel_sigma=0.3, threshold=2.0, hypotheses=20, bias_sigma=bias_sigma)
+    params = ResectParams(pixel_sigma=0.3, threshold=2.0, bias_sigma=bias_sigma)
     for trial in range(trials):
         T, landmarks = true_pose(rng), scene(rng, 50)
         per_pixel = stereo(landmarks, 400.0)  # depths good to 1 % a pixel: first-order theory holds
@@ -311,14 +318,12 @@ def test_segment_keeps_the_key_pose_and_poses_each_frame():
     points[:30, 2] = np.nan  # lost
     position = landmarks.copy()
     position[75:] = np.nan  # without coordinates
-    known = Landmarks(position, np.zeros_like(position), np.zeros(80), {"too far": 3})
-    found = resect_segment(points, known, CAMERA, key, [4, 5, 6, 7], PARAMS)
+    _, found = segment_poses(points, position, key, [4, 5, 6, 7])
     np.testing.assert_array_equal(found.poses[0], key.matrix34)
     np.testing.assert_allclose(found.poses, [T.matrix34 for T in truth], atol=1e-5)  # float32 pixels: 3e-5 px
     assert not found.covariance[0].any()
     assert found.inlier.sum(0).tolist() == [75, 75, 45, 75]
     assert [f["landmarks"] for f in found.facts] == [75, 75, 45, 75]
-    points[:, 3] = np.nan
 
 
 def test_a_frame_that_cannot_be_posed_is_lost_and_the_next_one_is_posed():
@@ -328,8 +333,7 @@ def test_a_frame_that_cannot_be_posed_is_lost_and_the_next_one_is_posed():
     points = np.stack([seen(T, landmarks) for T in steps], 1).astype(np.float32)
     points[:, 1] = np.nan  # nothing found
     points[:, 2] = rng.uniform([0, 0], [600, 500], (80, 2))  # nothing but chance
-    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {"too far": 3})
-    found = resect_segment(points, known, CAMERA, steps[0], [4, 5, 6, 7], PARAMS)
+    _, found = segment_poses(points, landmarks, steps[0], [4, 5, 6, 7])
     assert np.isnan(found.poses[1:3]).all()
     assert np.isnan(found.covariance[1:3]).all()
     assert "0 of 80" in found.facts[1]["lost"]
@@ -342,30 +346,22 @@ def test_a_frame_that_cannot_be_posed_is_lost_and_the_next_one_is_posed():
 
 def test_solver_stands_still_on_singular_data():
     """One landmark seen many times: the damping keeps the step finite."""
-    one = np.tile([[[0.0, 0.0, 5.0]]], (1, 8, 1))
-    obs = Observations(one, 0.1 * one, np.zeros((1, 8)), np.full((1, 8, 2), 300.0), CAMERA, 1.0, 0.1)
-    poses, _ = levenberg_marquardt(obs, Poses.of(RigidTransform.identity()), np.ones((1, 8), bool), 20)
-    assert np.isfinite(poses.t).all()
-    assert np.abs(poses.t).max() < 5.0
+    one = np.tile([[0.0, 0.0, 5.0]], (8, 1))
+    obs = observed(one, 0.1 * one, np.zeros(8), np.full((8, 2), 300.0), 1.0)
+    problem = PoseAdjustment(obs, np.ones(8, bool), 0.1)
+    t = levenberg_marquardt(problem, Pose.of(RigidTransform.identity()), 20).state.t
+    assert np.isfinite(t).all()
+    assert np.abs(t).max() < 5.0
 
 
-def test_dead_reckoning_finds_a_pose_that_the_last_one_does_not():
-    """The camera has turned about: from the last pose all landmarks lie behind the image."""
+def test_a_camera_that_has_turned_about_is_posed():
+    """From the last pose all landmarks lie behind the image."""
     rng = np.random.default_rng(14)
     truth = RigidTransform(rotation_exp([0.0, 2.9, 0.0]), np.array([0.2, -0.1, 0.3]))
     landmarks = truth.apply(scene(rng, 80))
     pixels = seen(truth, landmarks)
     pixels[:16] += rng.uniform(-60, 60, (16, 2))
-    reckoned = truth @ RigidTransform(rotation_exp([0.05, -0.05, 0.05]), np.array([0.1, 0.1, -0.1]))
-    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {})
-
-    def from_identity(*others):
-        starts = [RigidTransform.identity(), *others]
-        return resect(known, pixels, CAMERA, starts, PARAMS, np.random.default_rng(0), where="frame 7")
-
-    with raises("RIL-421", "frame 7"):
-        from_identity()
-    found = from_identity(reckoned)
+    found = solve(landmarks, pixels)
     np.testing.assert_allclose(found.T_local_left.matrix34, truth.matrix34, atol=1e-6)
     assert not found.inlier[:16].any()
 
@@ -378,14 +374,15 @@ def test_wrong_dead_reckoning_does_no_harm():
     known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(60), {})
     astray = RigidTransform(rotation_exp([0.0, 1.5, 0.0]), np.array([3.0, 2.0, -4.0]))
     plain, misled = (
-        resect(known, pixels, CAMERA, [RigidTransform.identity(), *others], PARAMS, np.random.default_rng(0))
-        for others in ((), (astray,))
+        resect(known, pixels, CAMERA, [RigidTransform.identity(), *others], PARAMS, 0) for others in ((), (astray,))
     )
     np.testing.assert_allclose(misled.T_local_left.matrix34, plain.T_local_left.matrix34, atol=1e-9)
     np.testing.assert_array_equal(misled.inlier, plain.inlier)
 
 
-def test_a_segment_takes_predictions_relative_to_its_key_frame():
+def test_a_segment_takes_predictions_relative_to_its_key_frame(monkeypatch):
+    """With nothing else to start from, frames are posed by their predictions alone."""
+    monkeypatch.setattr(robust_pose, "_sampled", lambda *given: [])
     rng = np.random.default_rng(16)
     key = RigidTransform(rotation_exp([0.2, 2.5, 0.1]), np.array([1.0, 2.0, 3.0]))
     about = RigidTransform(rotation_exp([0.0, 2.9, 0.0]), np.array([0.1, 0.0, 0.2]))
@@ -396,46 +393,14 @@ def test_a_segment_takes_predictions_relative_to_its_key_frame():
     points = np.full((80, 3, 2), np.nan, np.float32)
     points[:, 0] = 100.0
     points[:40, 1], points[40:, 2] = seen(key @ near, groups[0]), seen(key @ about, groups[1])
-    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {})
-    assert resect_segment(points, known, CAMERA, key, [0, 1, 2], PARAMS).facts[2]["lost"]
-    found = resect_segment(points, known, CAMERA, key, [0, 1, 2], PARAMS, [None, None, about])
+    assert segment_poses(points, landmarks, key, [0, 1, 2])[1].facts[2]["lost"]
+    _, found = segment_poses(points, landmarks, key, [0, 1, 2], [None, near, about])
     np.testing.assert_allclose(found.poses, [(key @ step).matrix34 for step in steps], atol=1e-5)
-
-
-def test_compiled_errors_are_those_of_the_arrays():
-    rng = np.random.default_rng(12)
-    n = 30
-    landmarks = rng.uniform([-2, -2, 2], [2, 2, 9], (n, 3))
-    landmarks[0, 2] = -1.0  # behind
-    obs = Observations(
-        landmarks[None],
-        rng.normal(0, 0.1, (1, n, 3)),
-        np.where(np.arange(n) % 3 == 0, 0.0, rng.uniform(0.1, 1.0, n))[None],
-        rng.uniform(0, 400, (1, n, 2)),
-        Camera(300.0, 310.0, 200.0, 150.0, 400, 300),
-        0.2,
-        0.1,
-    )
-    steps = np.concatenate([np.zeros((1, 7)), rng.normal(0, 0.05, (4, 7))])
-    one = Poses.of(RigidTransform.identity())
-    poses = Poses(*(np.repeat(a, 5, axis=0) for a in (one.R, one.t, one.bias))).moved(steps)
-    np.testing.assert_allclose(norms(obs, poses), back_projection(obs, poses).norm, rtol=1e-9)
-    # Newton's step of the arrays' normal equations is what one undamped compiled step does.
-    active = np.arange(n)[None] > 0
-    normal, gradient, _ = normal_matrix(obs, back_projection(obs, one), active)
-    normal[:, 6, 6] += bias_information(obs.bias_sigma)
-    expected = -np.linalg.solve(normal[0] + 1e-4 * np.diag(np.diag(normal[0])), gradient[0])
-    moved, done = levenberg_marquardt(obs, one, active, 1)
-    by_arrays = one.moved(expected[None])
-    assert done == 1
-    np.testing.assert_allclose(moved.t, by_arrays.t, rtol=1e-6)
-    np.testing.assert_allclose(moved.R, by_arrays.R, atol=1e-9)
-    np.testing.assert_allclose(moved.bias, by_arrays.bias, rtol=1e-6)
 
 
 def test_errors_smaller_than_stated_leave_what_residuals_do_not_show_to_the_shared_part():
     rng = np.random.default_rng(21)
-    params = ResectParams(pixel_sigma=0.4, threshold=2.0, hypotheses=20, bias_sigma=0.0)
+    params = ResectParams(pixel_sigma=0.4, threshold=2.0, bias_sigma=0.0)
     T, landmarks = true_pose(rng), scene(rng, 400)
     pixels = seen(T, landmarks) + 0.2 * rng.standard_normal((400, 2))
     found = solve(landmarks, pixels, params=params)
@@ -453,9 +418,8 @@ def test_what_moves_by_itself_is_counted():
     points = np.stack([seen(T, landmarks) for T in steps], 1).astype(np.float32)
     points[:12] = points[:12, :1]
     points[75:, 1:] = np.nan
-    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {})
-    found = resect_segment(points, known, CAMERA, steps[0], [0, 1, 2, 3], PARAMS)
-    assert moving_tracks(points, known, found) == (75, 12)
+    given, found = segment_poses(points, landmarks, steps[0], [0, 1, 2, 3])
+    assert moving_tracks(given, found) == (75, 12)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -495,8 +459,7 @@ def carried(carried_near, carried_far, moved):
     landmarks = np.concatenate([scene(rng, carried_near, 1.0, 2.0), scene(rng, carried_far + moved)])
     points = np.stack([seen(T, landmarks) for T in (RigidTransform.identity(), step)], 1).astype(np.float32)
     points[: carried_near + carried_far, 1] = points[: carried_near + carried_far, 0]
-    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(len(landmarks)), {})
-    return resect_segment(points, known, CAMERA, RigidTransform.identity(), [4, 5], PARAMS), step
+    return segment_poses(points, landmarks, RigidTransform.identity(), [4, 5])[1], step
 
 
 @pytest.mark.parametrize(
@@ -533,8 +496,7 @@ def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told):
     landmarks = scene(rng, 80)
     landmarks[:, 2] = 8.0  # a wall: one disparity at the key, and another one behind the step
     points = np.stack([seen(T, landmarks) for T in (RigidTransform.identity(), step)], 1).astype(np.float32)
-    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {})
-    found = resect_segment(points, known, CAMERA, RigidTransform.identity(), [4, 7], PARAMS)
+    given, found = segment_poses(points, landmarks, RigidTransform.identity(), [4, 7])
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     rays = CAMERA.rays(np.stack([u.ravel(), v.ravel()], 1).astype(float)) @ step.rotation.T
     depth = (8.0 - step.translation[2]) / rays[:, 2]
@@ -544,7 +506,7 @@ def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told):
         "row_disparity": np.full(shape, row, np.float32),
         "validity": np.full(shape, Validity.MATCHED, np.uint8),
     }
-    jumped = knocked(points[:, 1].astype(float), found, known, Bundle(disparity, {}), rig)
+    jumped = knocked(given, found, Bundle(disparity, {}), rig)
     assert (jumped is not None) == told
     if jumped is not None:
         line, jump = jumped

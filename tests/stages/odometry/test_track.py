@@ -8,9 +8,8 @@ from raising import raises
 
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.imaging.pyramid import PyramidParams, build
-from rille.stages.odometry.affinity import common_similarity, fit_affinity, known_median
+from rille.stages.odometry.displacements import LevelDisplacements, common_similarity, fit_affinity, known_median
 from rille.stages.odometry.exposure import log_ratio
-from rille.stages.odometry.level_displacements import LevelDisplacements
 from rille.stages.odometry.track import (
     TrackParams,
     track,
@@ -264,7 +263,7 @@ def test_affinity_of_the_nearest_by_arrays():
         rest = (q - p)[near] - offset @ (common - np.eye(2)).T
         basis, weight = np.column_stack([offset, np.ones(12)]), np.ones(12)
         for _ in range(4):
-            pull = np.diag([25.0 * weight.sum(), 25.0 * weight.sum(), 1e-6])
+            pull = np.diag([25.0 * weight.sum(), 25.0 * weight.sum(), 0.0])
             x = np.linalg.solve(basis.T @ (basis * weight[:, None]) + pull, basis.T @ (rest * weight[:, None]))
             weight = 1.0 / (1.0 + ((rest - basis @ x) ** 2).sum(1))
         np.testing.assert_allclose(affinity[k], common + x[:2].T, atol=1e-10)

@@ -8,8 +8,7 @@ from motion_scenes import motion, shift, tables
 from raising import raises
 
 from rille.stages.core.declare import Bundle, check_outputs
-from rille.stages.odometry.covisibility import Step
-from rille.stages.odometry.step_table import change, changes_of, step_table_stage, steps_of
+from rille.stages.odometry.steps import Step, change, changes_of, step_table_stage, steps_of
 
 MOTIONS = [motion(shift(u), unmatched=lambda x, y, u=u: x + y < 3 * u) for u in (9.0, 9.5, 9.0, 60.0, -42.0, 9.0, 11.0)]
 

@@ -1,4 +1,7 @@
-"""Overlap of two frames that are some frames apart, estimated from coarse displacements alone.
+"""Steps between successive frames, in tables of about a hundred, and what two frames some steps apart have in common.
+
+The choice of basic pairs and the screening of frames go through the whole sequence. They need blocks of each motion's
+displacements, not the maps: read from tables, a sequence of thousands of frames is some tens of artifacts.
 
 Blocks of the first frame are carried along the chain of displacements (stage ``motion``). The displacement of a block
 is the median of its matches; where too few of its pixels match, the affinity of the surroundings is extrapolated. That
@@ -9,15 +12,19 @@ an overlap of 66 % looks like 85 %.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain, pairwise
 
 import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats
-from rille.stages.core.declare import AnyArray, Bundle
+from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
+from rille.stages.core.errors import InputError
 from rille.stages.core.validity import matched, matched_share
-from rille.stages.odometry.affinity import fit_affinity, known_median
+from rille.stages.facts.odometry import MotionFacts, StepTableFacts
+from rille.stages.odometry.displacements import fit_affinity, known_median
 
 BLOCKS = 200
 """Approximate number of blocks of an image; more change the overlap by less than 1 %, at a cost that grows with their
@@ -144,3 +151,62 @@ def _part_inside(centres: Floats, step: Step) -> Floats:
     # Distance to the nearest edge of the image, which lies half a pixel outside the first and last pixel centres.
     beyond = np.minimum(centres + 0.5, np.array(step.size) - 0.5 - centres)
     return np.asarray(np.clip(beyond / step.side + 0.5, 0.0, 1.0).prod(axis=1), dtype=np.float64)
+
+
+def change(a: Bundle, b: Bundle) -> float:
+    """Median change of the displacements from one step to the next, pixels, where both are measured; 0: nowhere."""
+    both = matched(np.asarray(a["validity"])) & matched(np.asarray(b["validity"]))
+    if not both.any():
+        return 0.0
+    apart = [np.asarray(b[n])[both] - np.asarray(a[n])[both] for n in ("column_disparity", "row_disparity")]
+    return float(np.median(np.hypot(*apart)))
+
+
+def steps_of(tables: Sequence[Bundle]) -> list[Step]:
+    """The steps of all tables, in order."""
+    return list(chain.from_iterable(_rows(table) for table in tables))
+
+
+def changes_of(tables: Sequence[Bundle]) -> list[float]:
+    """Change from each step to the next, pixels: one fewer than there are steps."""
+    return [float(v) for v in np.concatenate([np.empty(0), *(table["change"] for table in tables)])[1:]]
+
+
+def _rows(table: Bundle) -> Iterator[Step]:
+    blocks, shift, rates = (np.asarray(table[name]) for name in ("blocks", "shift", "match_rate"))
+    width, height = table.meta["size"]
+    for k, rate in enumerate(rates):
+        yield Step(blocks, float(table.meta["side"]), shift[k], (width, height), float(rate))
+
+
+@stage(
+    "step_table",
+    outputs=[
+        Array("blocks", ("block", "uv"), "float64", "px", "column and row of the centre of each block"),
+        Array("shift", ("step", "block", "uv"), "float64", "px", "displacement of each block", "nan"),
+        Array("match_rate", ("step",), "float64", "1", "share of the pixels with texture that have a displacement"),
+        Array("change", ("step",), "float64", "px", "median change of the displacements since the step before"),
+    ],
+)
+def step_table_stage(
+    params: NoParams, motions: Sequence[Bundle[MotionFacts]], before: Bundle[MotionFacts] | None = None
+) -> Bundle[StepTableFacts]:
+    """Displacements of the blocks of the image from frame to frame, of many motions."""
+    steps = [Step.from_bundle(motion) for motion in motions]
+    first = steps[0]
+    if any(not np.array_equal(step.blocks, first.blocks) for step in steps):
+        raise InputError(
+            "RIL-895", "motions of one table have different grids", remedy="give images of one size to a sequence"
+        )
+    # A change needs two steps: the first of a table that has one before it is measured against that one's last.
+    earlier = [] if before is None else [before]
+    changes = [change(a, b) for a, b in pairwise([*earlier, *motions])]
+    return Bundle(
+        {
+            "blocks": first.blocks,
+            "shift": np.array([step.shift for step in steps]),
+            "match_rate": np.array([step.match_rate for step in steps]),
+            "change": np.array(changes if earlier else [0.0, *changes]),
+        },
+        {"side": first.side, "size": list(first.size)},
+    )

@@ -1,0 +1,412 @@
+"""Pose of one frame from landmarks whose 3-D coordinates are known, robustly, with its covariance (section 5.2.2).
+
+Source: Kolesnik, Paar, Bauer, Ulm (1999), section 5.2.2, Eq. 4-8: the six extrinsics that minimise the back-projection
+errors, intrinsics fixed; then "the calibration is iterated with the most inconsistent interest points removed, until
+this error gets below a certain threshold for all interest points".
+
+Departures: the start need not be good (a pose by random samples of three landmarks competes with the predictions);
+errors are weighted by how exactly the landmark itself is known (see :mod:`rille.stages.odometry.resection.pnp`), and
+"error" in the rule above is that weighted one in units of ``pixel_sigma``; for exact landmarks it is the paper's.
+
+Covariances here are 6 x 6 of ``(dt, dtheta)`` in the destination frame: position error in metres, then the rotation
+vector ``R_true = exp(dtheta) R`` in radians. They contain the errors of the measurements and a shared error of the
+disparities, but not errors of the calibration (focal length, direction of the camera in the vehicle). They have two
+parts:
+
+* what the residuals show: the errors found, times what they go together by (:func:`scatter_of_blocks`). It begins anew
+  with the landmarks of every segment;
+* what they do not show, and every segment *shares* (``shared``): the error common to all disparities, and what the
+  stated errors of tracks and disparities leave once those found are subtracted. An error that all landmarks of a
+  neighbourhood have (of sub-pixel interpolation, of relief under a template) bends the pose and leaves no residual; the
+  same camera makes the same over the same kind of ground, so along a chain these errors add up, and not their squares.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import pycolmap
+import scipy
+from pydantic import Field
+
+from rille.stages.core.arrays import Bools, Floats
+from rille.stages.core.declare import Params
+from rille.stages.core.errors import DegenerateError
+from rille.stages.geometry.geometry import Camera, RigidTransform
+from rille.stages.geometry.projection import Pinhole
+from rille.stages.numeric.least_squares import levenberg_marquardt
+from rille.stages.odometry.resection.landmarks import Landmarks
+from rille.stages.odometry.resection.pnp import (
+    Errors,
+    Observations,
+    Pose,
+    PoseAdjustment,
+    PoseCovariance,
+    back_projection,
+    bias_information,
+    normal_equations,
+    pose_covariance,
+)
+
+MIN_LANDMARKS = 6
+"""Fewest landmarks of a pose: twelve equations for six unknowns, so that one wrong landmark shows."""
+MORE_POINTS = "set track.points higher or choose basic pairs closer"
+MAX_BLOCKS = 6
+"""Blocks along either side of the image whose mean errors show how far neighbours' errors go together."""
+MIN_PER_BLOCK = 6
+"""Mean number of landmarks in a block, at least."""
+SHARED_SOURCES = 7
+"""Error sources that all segments share: one for each of the six pose parameters, and the bias of the disparities."""
+REMOVED_SHARE = 8
+"""Per iteration, the worst ceil(n / 8) of n landmarks above the threshold are removed; then the pose is adjusted."""
+SEARCHED_PX = 9.0
+"""Side [pixels] of the square around a prediction within which tracking finds a point, right or wrong: 2 * 4 + 1."""
+THRESHOLD_SHARES = (0.25, 0.5, 1.0)
+"""Shares of the threshold at which agreement is counted."""
+MAX_FALSE_ALARMS = 0.01
+"""Expected number of poses that chance alone makes in a frame whose tracks are all wrong: one in a hundred frames."""
+
+
+class ResectParams(Params):
+    """Parameters of the stage ``resect``."""
+
+    pixel_sigma: float = Field(0.2, gt=0, description="standard deviation [pixels] of a tracked position")
+    disparity_sigma: float = Field(
+        0.2,
+        ge=0,
+        description="standard deviation [pixels] of the disparity under a landmark; moves the landmark along its ray",
+    )
+    bias_sigma: float = Field(
+        0.1,
+        ge=0,
+        description="prior standard deviation [pixels] of an error common to all disparities (toe-in of the rig); 0: "
+        "no such error",
+    )
+    threshold: float = Field(
+        1.0,
+        gt=0,
+        description="largest back-projection error [pixels] of an inlier; the worst landmarks are removed until all "
+        "are below; 1.0: 5 pixel_sigma",
+    )
+    max_depth_ratio: float = Field(
+        0.2,
+        gt=0,
+        description="largest standard deviation of a landmark's distance over the distance; beyond, first-order error"
+        " propagation fails",
+    )
+    max_position_ratio: float = Field(
+        0.02,
+        gt=0,
+        description="largest standard deviation of the camera position over the landmarks' median distance; beyond, "
+        "the pose counts as degenerate",
+    )
+    min_share: float = Field(
+        0.15,
+        ge=0,
+        le=1,
+        description="share of a frame's landmarks that must agree with its pose; 0.05 agree with a wrong pose by "
+        "chance, since all are searched near their predictions",
+    )
+    iterations: int = Field(50, ge=1, description="limit of Levenberg-Marquardt iterations; about 10 suffice")
+    seed: int = Field(1999, ge=0, description="seed of the random samples")
+
+
+@dataclass(frozen=True)
+class Resection:
+    """Pose of one frame.
+
+    ``T_local_left``; ``covariance`` (6, 6) of (position m, rotation rad) in the local frame, without what is shared;
+    ``shared`` (6, 7): pose errors per standard deviation of what all segments have in common; ``inlier`` (n,);
+    ``residual`` (n,) back-projection error, pixels, of every landmark (NaN: behind the camera); ``bias`` of the
+    disparities, pixels;
+    ``condition`` of the normal matrix with unit diagonal; ``together``: how many times as far as independent errors the
+    mean errors of image blocks scatter (variance), see :func:`scatter_of_blocks`.
+    """
+
+    T_local_left: RigidTransform
+    covariance: Floats
+    shared: Floats
+    inlier: Bools
+    residual: Floats
+    bias: float
+    iterations: int
+    condition: float
+    together: float
+
+    @property
+    def total(self) -> Floats:
+        """Covariance (6, 6) of the pose, all errors together."""
+        return np.asarray(self.covariance + self.shared @ self.shared.T)
+
+    def facts(self) -> dict[str, Any]:
+        """Facts of the frame."""
+        return {
+            "inliers": int(self.inlier.sum()),
+            "rms_px": float(np.sqrt(np.mean(self.residual[self.inlier] ** 2))),
+            "iterations": self.iterations,
+            "condition": self.condition,
+            "disparity_bias_px": self.bias,
+            "errors_together": self.together,
+        }
+
+
+def resect(
+    landmarks: Landmarks,
+    pixels: Floats,
+    camera: Camera,
+    starts: Sequence[RigidTransform],
+    params: ResectParams,
+    frame: int,
+) -> Resection:
+    """Pose of a camera from landmarks and their image positions (Eq. 4-8), robustly.
+
+    Parameters
+    ----------
+    landmarks : n of them, in the local frame; all finite.
+    pixels : (n, 2) column, row.
+    starts : predictions of T_local_left, which decide nothing but where the search starts.
+    frame : its number, for messages and for the seed of the random samples.
+
+    Raises
+    ------
+    DegenerateError
+        Fewer than six landmarks (in all, or consistent), all on a line, or a pose that they do not determine.
+    """
+    where = f"frame {frame}"
+    enough(len(pixels), f"{where}: too few landmarks: {len(pixels)} have coordinates and were found", MORE_POINTS)
+    _not_collinear(landmarks.position, where)
+    obs = observations(landmarks, pixels, camera, params)
+    predictions = [Pose.of(T.inverse()) for T in starts]
+    pose, near = _robust_start(obs, predictions, params, frame)
+    posed = _without_inconsistent(obs, pose, near, params, where)
+    agree = int(posed.active.sum())
+    if agree < params.min_share * len(pixels):
+        raise DegenerateError(
+            "RIL-419",
+            f"{where}: only {agree} of {len(pixels)} landmarks agree with one pose",
+            remedy="look at the image; or lower resect.min_share",
+        )
+    errors = back_projection(obs, posed.pose)
+    _not_by_chance(errors, agree, params, where)
+    _not_collinear(landmarks.position[posed.active], where)
+    return _result(obs, posed, errors, camera, params, where)
+
+
+def observations(landmarks: Landmarks, pixels: Floats, camera: Camera, params: ResectParams) -> Observations:
+    """Landmarks as a frame observes them at ``pixels`` (n, 2)."""
+    position, per_pixel, sigma, seen = (
+        np.ascontiguousarray(a, dtype=np.float64)
+        for a in (landmarks.position, landmarks.per_pixel, landmarks.sigma, pixels)
+    )
+    return Observations(position, per_pixel, sigma, seen, Pinhole.of(camera), float(params.pixel_sigma))
+
+
+def _robust_start(obs: Observations, predictions: list[Pose], params: ResectParams, frame: int) -> tuple[Pose, Bools]:
+    """The pose that most landmarks agree with, adjusted to those; and which agree (n,).
+
+    Locally optimised RANSAC (Chum, Matas, Kittler 2003, doi:10.1007/978-3-540-45243-0_31, by COLMAP) competes with the
+    predictions, with truncated squares as the score.
+    """
+    # Twice the threshold: three points fix a pose with errors of their own, which must not cost it its landmarks.
+    bound = 2.0 * params.threshold / params.pixel_sigma
+    # Truncated squares, not a count: of poses that as many landmarks agree with, the one they fit better.
+    candidates = [*predictions, *_sampled(obs, 2.0 * params.threshold, params.seed * 100_003 + frame)]
+    best = min(candidates, key=lambda pose: float((np.minimum(back_projection(obs, pose).norm, bound) ** 2).sum()))
+    for _ in range(2):
+        active = back_projection(obs, best).norm <= bound
+        if active.sum() >= 4:
+            problem = PoseAdjustment(obs, active, params.bias_sigma)
+            best = levenberg_marquardt(problem, best, 10, tolerance=1e-4).state
+    return best, back_projection(obs, best).norm <= bound
+
+
+def _sampled(obs: Observations, threshold: float, seed: int) -> list[Pose]:
+    """The pose of random samples of landmarks that most others are within ``threshold`` pixels of; none of few."""
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error, options.ransac.random_seed = threshold, seed % 2**31
+    size = (2 * round(obs.camera.cx) + 2, 2 * round(obs.camera.cy) + 2)  # plays no part, but must be there
+    camera = pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=list(obs.camera))
+    answer = pycolmap.estimate_absolute_pose(obs.pixels, obs.landmarks, camera, options)
+    return [] if answer is None else [Pose.of(RigidTransform.from_matrix(answer["cam_from_world"].matrix()))]
+
+
+class _Posed(NamedTuple):
+    """An adjusted pose, the landmarks (n,) that agree with it, and the steps of all adjustments."""
+
+    pose: Pose
+    active: Bools
+    steps: int
+
+
+def _without_inconsistent(obs: Observations, pose: Pose, active: Bools, params: ResectParams, where: str) -> _Posed:
+    """The paper's rule: adjust, remove the most inconsistent, again until all are under the threshold."""
+    bound, steps = params.threshold / params.pixel_sigma, 0
+    while True:
+        count = int(active.sum())
+        enough(
+            count,
+            f"{where}: too few landmarks: {count} agree with one pose",
+            "raise resect.threshold or choose basic pairs closer",
+        )
+        minimum = levenberg_marquardt(PoseAdjustment(obs, active, params.bias_sigma), pose, params.iterations, 1e-6)
+        pose, steps = minimum.state, steps + minimum.steps
+        usable = _first_order(obs, pose, params)
+        if (active & ~usable).any():
+            active = active & usable
+            continue
+        norm = np.where(active, back_projection(obs, pose).norm, -1.0)
+        beyond = int((norm > bound).sum())
+        if beyond == 0:
+            # Only the last adjustment needs the full accuracy.
+            problem = PoseAdjustment(obs, active, params.bias_sigma)
+            minimum = levenberg_marquardt(problem, pose, params.iterations, 1e-12)
+            return _Posed(minimum.state, active, steps + minimum.steps)
+        active = active.copy()
+        # Not all of them at once: the worst pull the pose, and others agree once these are gone.
+        active[np.argsort(-norm, kind="stable")[: math.ceil(beyond / REMOVED_SHARE)]] = False
+
+
+def _first_order(obs: Observations, pose: Pose, params: ResectParams) -> Bools:
+    """Which landmarks (n,) are so far before the camera that first-order errors hold.
+
+    A camera that has come close to a landmark, or passed it, sees its error along the old ray at any size: such a
+    landmark agrees with everything, thousands of pixels off.
+    """
+    depth = obs.landmarks @ pose.R[2] + pose.t[2]
+    return np.asarray(obs.sigma * np.sqrt((obs.per_pixel**2).sum(1)) <= params.max_depth_ratio * depth)
+
+
+def _result(
+    obs: Observations, posed: _Posed, errors: Errors, camera: Camera, params: ResectParams, where: str
+) -> Resection:
+    pose, active = posed.pose, posed.active
+    normal, prior = normal_equations(errors, active), bias_information(params.bias_sigma)
+    # A posteriori variance factor: the errors found, not the ones expected, set the scale.
+    squares = (normal.weight[active] * errors.norm[active] ** 2).sum()
+    factor = max(float(squares / (2 * active.sum() - 6)), 1e-12)
+    depth = float(np.median(obs.landmarks[active] @ pose.R[2] + pose.t[2]))
+    expected = pose_covariance(normal.matrix, prior)
+    position_sigma = float(np.sqrt(np.trace(expected.noise[:3, :3]) + (expected.by_bias[:3] ** 2).sum()))
+    if position_sigma > params.max_position_ratio * depth:
+        raise DegenerateError(
+            "RIL-420",
+            f"{where}: {int(active.sum())} landmarks at a median distance of {depth:.3g} m leave the position uncertain"
+            f" by {position_sigma:.2g} m (condition {expected.condition:.1e})",
+            remedy="they are too far, too few or in one direction: set track.points higher or use nearer texture",
+        )
+    measured = pose_covariance(normal.matrix / factor, prior)
+    stated = pose_covariance(normal.matrix / max(factor, 1.0), prior)
+    covariance, shared = frame_errors(measured, stated, pose.R, depth)
+    return Resection(
+        RigidTransform(pose.R, pose.t).inverse(),
+        covariance,
+        shared,
+        active,
+        np.where(np.isfinite(errors.norm), errors.pixels, np.nan),
+        float(pose.bias),
+        posed.steps,
+        stated.condition,
+        scatter_of_blocks(obs.pixels[active], errors.error[active], normal.weight[active], camera),
+    )
+
+
+def frame_errors(
+    measured: PoseCovariance, stated: PoseCovariance, R_cam_local: Floats, depth: float, at: int = 0
+) -> tuple[Floats, Floats]:
+    """Covariance (6, 6) of one pose in the local frame by the errors found, and the root (6, 7) of what is shared.
+
+    ``C = -R^T t`` and ``R^T`` change by ``-R^T v`` and ``-R^T w`` under a step (v, w); signs drop out of a covariance.
+
+    Parameters
+    ----------
+    measured, stated : scaled by the errors found, and by the larger of those and the expected ones; the difference is
+        what segments share, and ``stated`` has the part of the bias.
+    depth : median distance of the landmarks, m.
+    at : place of the pose among those that were adjusted together.
+    """
+    turn, rows = np.kron(np.eye(2), R_cam_local.T), slice(6 * at, 6 * at + 6)
+    covariance = turn @ measured.noise[rows, rows] @ turn.T
+    shared = root(turn @ stated.noise[rows, rows] @ turn.T - covariance, depth)
+    return covariance, np.column_stack([shared, turn @ stated.by_bias[rows]])
+
+
+def root(covariance: Floats, depth: float) -> Floats:
+    """Symmetric root (6, 6) of a covariance, radians counted as what they move at a depth (m)."""
+    unit = np.array([1.0] * 3 + [depth] * 3)
+    values, vectors = np.linalg.eigh(covariance * np.outer(unit, unit))
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T / unit[:, None])
+
+
+def scatter_of_blocks(pixels: Floats, white: Floats, weight: Floats, camera: Camera) -> float:
+    """Return the ratio of the variance of block means of errors to that of independent errors; 1: independent.
+
+    Neighbouring landmarks share matches, texture and relief, so their errors are correlated, and they determine the
+    pose less well than as many independent ones. ``white`` (n, 2): whitened errors after adjustment, at ``pixels``
+    (n, 2), with ``weight`` (n,). The six unknowns of the pose take up as many degrees of freedom of the means.
+    """
+    side = min(MAX_BLOCKS, int(math.sqrt(len(pixels) / MIN_PER_BLOCK)))
+    if side < 3:
+        return 1.0
+    col = np.clip(pixels[:, 0] * side / camera.width, 0, side - 1).astype(np.intp)
+    row = np.clip(pixels[:, 1] * side / camera.height, 0, side - 1).astype(np.intp)
+    block = row * side + col
+    root = np.sqrt(weight)
+    count = np.bincount(block, minlength=side * side)
+    sums = np.stack([np.bincount(block, root * white[:, k], side * side) for k in range(2)])
+    used = count > 0
+    freedom = 2 * int(used.sum()) - 6
+    spread = float((weight[:, None] * white**2).sum()) / max(2 * len(pixels) - 6, 1)
+    if freedom < 6 or spread <= 0.0:
+        return 1.0
+    return float((sums[:, used] ** 2 / count[used]).sum()) / spread / freedom
+
+
+def enough(count: int, what: str, remedy: str) -> None:
+    """Refuse a pose of fewer than :data:`MIN_LANDMARKS` landmarks; ``what`` says of which frame, and how many."""
+    if count < MIN_LANDMARKS:
+        raise DegenerateError("RIL-421", f"{what}, {MIN_LANDMARKS} are needed", remedy=remedy)
+
+
+def _not_by_chance(errors: Errors, agree: int, params: ResectParams, where: str) -> None:
+    """Refuse a pose that as many landmarks may agree with though none was found where it is.
+
+    Any three landmarks fix a pose. Where the others were found by mistake, anywhere in what tracking searches, each
+    agrees with the share of that area that is below the threshold; the number of false alarms is that of triples times
+    the chance that so many others do (Desolneux, Moisan, Morel 2000, doi:10.1023/A:1026593302236), the least of some
+    thresholds times their number: right landmarks agree better than they need to. A few landmarks of many tell nothing
+    then, however small their residuals are.
+    """
+    n = len(errors.norm)
+    stretch = errors.stretch[np.isfinite(errors.stretch)]
+    alarms = math.inf
+    for part in THRESHOLD_SHARES:
+        bound = part * params.threshold
+        count = int((errors.norm <= bound / params.pixel_sigma).sum())
+        strip = min(2.0 * bound / SEARCHED_PX, 1.0)  # the most that a long ellipse leaves of the square
+        share = float(np.minimum(math.pi * (bound / SEARCHED_PX) ** 2 * stretch, strip).mean())
+        if share == 1.0:  # a threshold that every place passes was chosen so as to believe everything
+            return
+        if count >= MIN_LANDMARKS:
+            chance = float(scipy.special.bdtrc(count - 4, n - 3, share))
+            alarms = min(alarms, len(THRESHOLD_SHARES) * math.comb(n, 3) * chance)
+    if alarms > MAX_FALSE_ALARMS:
+        raise DegenerateError(
+            "RIL-720",
+            f"{where}: {agree} of {n} landmarks agree with one pose, which as many may do by chance",
+            remedy="set track.points higher, or choose frames that are closer to each other",
+        )
+
+
+def _not_collinear(landmarks: Floats, where: str) -> None:
+    """A line of landmarks leaves the rotation about it free; below 1 % of their spread is a line in practice."""
+    spread = np.linalg.svd(landmarks - landmarks.mean(0), compute_uv=False)
+    if spread[1] < 0.01 * spread[0]:
+        raise DegenerateError(
+            "RIL-422",
+            f"{where}: the {len(landmarks)} landmarks are collinear, the rotation about their line is free",
+            remedy="set track.points higher so that landmarks cover the image",
+        )
