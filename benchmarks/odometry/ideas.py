@@ -70,11 +70,6 @@ IDEAS = (
     Idea("rig as it is given", ("rig.mode=fixed",)),
     Idea("no smooth error beside the rig", ("rig.systematic=0.001", "orientation.systematic=0.001")),
     Idea(
-        "no estimate of the smooth error's size",
-        name="calibration.relative_orientation.EM_ROUNDS",
-        function=0,  # type: ignore[arg-type]
-    ),
-    Idea(
         "no principal point beside the angles", ("rig.prior_principal=0.00001", "orientation.prior_principal=0.00001")
     ),
 )

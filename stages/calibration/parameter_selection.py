@@ -301,7 +301,7 @@ class _Chooser:
             why = self._refusal(i, chosen) or "not worth it: with the others it moves rows and depth by too little"
             return Parameter(NAMES[i], 0.0, value, sigma, observed, False, why)
         free = [k in chosen for k in range(RIG)]
-        sigma = math.sqrt(float(consider_covariance(fit, free, self.priors, self.all.smooth, self._held(chosen))[i, i]))
+        sigma = math.sqrt(float(consider_covariance(fit, free, self.priors, self._held(chosen))[i, i]))
         value = float(fit.x[i])
         asked, certain = self._estimate(i, others)
         why = (

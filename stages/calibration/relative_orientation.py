@@ -45,8 +45,8 @@ NO_SHIFT_PX = 1e-3
 EXACT_RAD = 1e-7
 """Standard deviation [rad] of a parameter that is held exactly."""
 
-MIN_SMOOTH_PX = 1e-3
-"""Smallest standard deviation [pixels] of a term of the smooth error."""
+NO_SMOOTH_PX = 3e-3
+"""RMS [pixels] of a smooth error that is held at none."""
 
 MIN_MATCHES = 50
 MIN_NOISE_PX = 0.02
@@ -58,8 +58,6 @@ MIN_MATCHES_OF_BLOCK = 5
 """Fewest matches of a block that have a mean, or a median, to speak of."""
 
 MAX_ITERATIONS = 30
-EM_ROUNDS = 10
-"""Rounds for the smooth error's size between two passes over the matches."""
 MAX_LINEAR_STEP_RAD = 1e-3
 """Change [rad] of the corrections up to which the derivatives are kept; the neglected part is below 0.001 pixels."""
 CONVERGED_SHARE = 1e-2
@@ -107,14 +105,13 @@ class OrientationFit:
     """Result of :func:`adjust`.
 
     ``x`` (SIZE,): the five corrections (radians), principal point (2, pixels), smooth error (pixels). ``normal`` and
-    ``pull``: the data's part of the normal equations ``normal @ x = pull``, linear about ``x``. ``smooth``: deviation
-    of each term of the smooth error, pixels. ``noise``: of each pair's matches, pixels. ``weights``: (n,) a pair.
+    ``pull``: the data's part of the normal equations ``normal @ x = pull``, linear about ``x``. ``noise``:
+    deviation of each pair's matches, pixels. ``weights``: (n,) a pair.
     """
 
     x: Floats
     normal: Floats
     pull: Floats
-    smooth: float
     noise: tuple[float, ...]
     weights: tuple[Floats, ...]
 
@@ -151,11 +148,8 @@ def adjust(
         (``priors``), so that they take up their part of the residuals and the free ones do not.
     rival : see :func:`precision`.
     start : the result of :func:`linearised` for these pairs, if it is known already.
-
-    The size of the smooth error is estimated, too: by expectation maximisation, starting from its prior.
     """
-    prior = precision(free, priors, priors.term, rival=rival)
-    return _adjust(rig, pairs, prior, priors.term, start, estimate=True)
+    return _adjust(rig, pairs, precision(free, priors, rival=rival), start)
 
 
 def settle(
@@ -166,21 +160,18 @@ def settle(
     The other parameters are fixed at their given values, and the smooth error is not estimated. Neither may take up a
     part of the residuals here, because in the resulting rig the others are as given and the smooth error remains.
     """
-    nil = replace(priors, rotation=EXACT_RAD, baseline=EXACT_RAD)
-    prior = precision(free, nil, MIN_SMOOTH_PX, rival=False)
-    return _adjust(rig, pairs, prior, MIN_SMOOTH_PX, start, estimate=False)
+    none = replace(priors, rotation=EXACT_RAD, baseline=EXACT_RAD, systematic=NO_SMOOTH_PX)
+    return _adjust(rig, pairs, precision(free, none, rival=False), start)
 
 
-def consider_covariance(
-    fit: OrientationFit, free: Sequence[bool], priors: Priors, smooth: float, held: Floats
-) -> Floats:
+def consider_covariance(fit: OrientationFit, free: Sequence[bool], priors: Priors, held: Floats) -> Floats:
     """Return the covariance (5, 5), radians^2, of the free parameters of a fit by :func:`settle`; zero for the others.
 
     It is a consider covariance (Bierman 1977, chapter 8): parameters that the fit did not estimate contribute their
-    uncertainty. These are the held parameters, with standard deviations ``held`` (5,), radians, and the smooth error,
-    with ``smooth`` pixels a term, but at least the prior's (:class:`Priors`).
+    uncertainty. These are the held parameters, with standard deviations ``held`` (5,), radians, and the smooth error
+    with that of its prior (:class:`Priors`).
     """
-    prior = precision(free, priors, max(priors.term, smooth), rival=False)
+    prior = precision(free, priors, rival=False)
     for i in np.flatnonzero(~np.asarray(free)):
         # By the standard deviations that they are known to have now, not by the priors of the fit.
         prior[i, i] = held[i] ** -2.0
@@ -193,16 +184,8 @@ def consider_covariance(
     return np.asarray(covariance[:RIG, :RIG], dtype=np.float64)
 
 
-def _adjust(
-    rig: Rig,
-    pairs: Sequence[PointPairs],
-    prior: Floats,
-    smooth: float,
-    start: Sequence[Linear] | None,
-    *,
-    estimate: bool,
-) -> OrientationFit:
-    """Gauss-Newton with weights from the scatter; ``prior`` matrix, the smooth error's size kept or estimated."""
+def _adjust(rig: Rig, pairs: Sequence[PointPairs], prior: Floats, start: Sequence[Linear] | None) -> OrientationFit:
+    """Gauss-Newton with weights from the scatter; ``prior`` matrix (SIZE, SIZE)."""
     x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), start or linearised(rig, pairs)
     for _ in range(MAX_ITERATIONS):
         # All pairs are linearised about the same x, so the first tells.
@@ -212,39 +195,20 @@ def _adjust(
         scales = [p.noise for p in parts]
         normal = np.sum([p.normal for p in parts], axis=0)
         pull = np.sum([p.pull for p in parts], axis=0)
-        last = x
-        x, variance, smooth = _maximised(normal, pull, prior, smooth, EM_ROUNDS if estimate else 0)
-        if bool(np.all(np.abs(x - last)[:RIG] < CONVERGED_SHARE * np.sqrt(variance[:RIG]))):
+        covariance, last = np.linalg.inv(normal + prior), x
+        x = covariance @ pull
+        if bool(np.all(np.abs(x - last)[:RIG] < CONVERGED_SHARE * np.sqrt(np.diag(covariance)[:RIG]))):
             break
-    return OrientationFit(x, normal, pull, smooth, tuple(scales), tuple(p.weights for p in parts))
+    return OrientationFit(x, normal, pull, tuple(scales), tuple(p.weights for p in parts))
 
 
-def _maximised(normal: Floats, pull: Floats, prior: Floats, smooth: float, rounds: int) -> tuple[Floats, Floats, float]:
-    """Unknowns, their variances, and the smooth error's size by so many rounds of expectation maximisation.
-
-    The rounds need the normal equations alone, which took a pass over all matches.
-    """
-    total, terms = normal + prior, np.arange(SIZE)[SMOOTH]
-    for _ in range(rounds + 1):
-        # Of the prior only these terms change with the size: the rest of the sum stays.
-        total[terms, terms] = normal[terms, terms] + smooth**-2.0
-        covariance = np.linalg.inv(total)
-        x, variance = covariance @ pull, np.diag(covariance)
-        # The expected square has the estimate's variance, too: without it the size would shrink round by round.
-        size = max(MIN_SMOOTH_PX, float(np.sqrt(np.mean(x[SMOOTH] ** 2 + variance[SMOOTH]))))
-        if rounds == 0 or abs(size - smooth) <= CONVERGED_SHARE * smooth:
-            break
-        smooth = size
-    return x, variance, smooth
-
-
-def precision(free: Sequence[bool], priors: Priors, smooth: float, *, rival: bool) -> Floats:
+def precision(free: Sequence[bool], priors: Priors, *, rival: bool) -> Floats:
     """The priors' part (SIZE, SIZE) of the normal matrix.
 
     ``rival``: a principal point that is off may stand in for a free angle, as it always may for a held one. With it,
     what is knowable shows; without it, the angle takes all (lenses stay on their cameras when a mount turns).
     """
-    sigma = np.concatenate([priors.held(), priors.principal, np.full(len(TERMS), smooth)], dtype=np.float64)
+    sigma = np.concatenate([priors.held(), priors.principal, np.full(len(TERMS), priors.term)], dtype=np.float64)
     # Free means: anywhere within a radian, which keeps the matrix regular where a scene says nothing at all.
     sigma[:RIG] = np.where(np.asarray(free), 1.0, sigma[:RIG])
     for angle, coordinate in PARTNERS:
@@ -254,11 +218,8 @@ def precision(free: Sequence[bool], priors: Priors, smooth: float, *, rival: boo
 
 
 def solution(fit: OrientationFit, free: Sequence[bool], priors: Priors, *, rival: bool) -> tuple[Floats, Floats, float]:
-    """Values (SIZE,), covariance and gain (half the drop of chi-square) of a fit's quadratic for another choice.
-
-    The smooth error counts with no less than is believed of it.
-    """
-    total = fit.normal + precision(free, priors, max(priors.term, fit.smooth), rival=rival)
+    """Values (SIZE,), covariance and gain (half the drop of chi-square) of a fit's quadratic for another choice."""
+    total = fit.normal + precision(free, priors, rival=rival)
     covariance = np.asarray(np.linalg.inv(total), dtype=np.float64)
     x = covariance @ fit.pull
     return x, covariance, 0.5 * float(np.sum(fit.pull * x))

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numba import njit
 
 from rille.stages.core.arrays import Floats
-from rille.stages.geometry.geometry import Camera, rotation_exp
+from rille.stages.geometry.geometry import Camera
 
 NEAREST_M = 1e-6
 """Depth [m] below which a point counts as behind the camera."""
@@ -34,7 +35,7 @@ class Pinhole(NamedTuple):
 
 def perturbed(R: Floats, t: Floats, step: Floats) -> tuple[Floats, Floats]:
     """Poses (n, 3, 3), (n, 3) after left perturbations (n, 6) ``v``, ``w``."""
-    turn = rotation_exp(step[:, 3:])
+    turn = np.array([cv2.Rodrigues(w)[0] for w in step[:, 3:]])
     return turn @ R, np.einsum("nij,nj->ni", turn, t) + step[:, :3]
 
 

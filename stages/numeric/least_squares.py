@@ -78,5 +78,6 @@ def irls(
     for _ in range(rounds):
         weighted = np.swapaxes(design * weights[..., None], -1, -2)
         x = np.linalg.solve(weighted @ design + prior, weighted @ target)
-        weights = weigh(np.linalg.norm(target - design @ x, axis=-1))
+        rest = target - design @ x
+        weights = weigh(np.sqrt((rest**2).sum(-1)))
     return np.asarray(x, dtype=np.float64), weights

@@ -29,20 +29,25 @@ def interest_operator(image: Floats32) -> Floats32:
     The three outermost pixels, where a window leaves the image, are 0.
     """
     reach = HALF + 1
-    image = np.asarray(image, dtype=np.float32)
+    rows, cols = image.shape
     out = np.zeros(image.shape, np.float32)
-    if min(image.shape) <= 2 * reach:
+    if min(rows, cols) <= 2 * reach:
         return out
-    inner = (slice(1, -1), slice(1, -1))
-    least = np.full_like(image, np.inf)
+    inner = slice(reach, rows - reach), slice(reach, cols - reach)
+    grey, least = np.asarray(image, dtype=np.float32), np.full(out[inner].shape, np.inf, np.float32)
+    # Buffers serve all directions: of images, allocating takes longer than computing.
+    ahead, square, both = np.zeros_like(out), np.empty_like(out), np.empty_like(least)
     for dr, dc in DIRECTIONS:
-        square = np.zeros_like(image)
-        # Both senses of a direction, or the operator would prefer the side of a corner it is shifted to.
-        for sign in (1, -1):
-            square[inner] += (np.roll(image, (sign * dr, sign * dc), (0, 1))[inner] - image[inner]) ** 2
-        # Half, for the two senses: the mean of both sums.
-        least = np.minimum(least, 0.5 * cv2.boxFilter(square, -1, (2 * HALF + 1, 2 * HALF + 1), normalize=False))
-    out[reach:-reach, reach:-reach] = least[reach:-reach, reach:-reach]
+        there = grey[1 + dr : rows - 1 + dr, 1 + dc : cols - 1 + dc]
+        np.subtract(there, grey[1:-1, 1:-1], out=ahead[1:-1, 1:-1])
+        cv2.multiply(ahead, ahead, dst=square)
+        square = cv2.boxFilter(square, -1, (2 * HALF + 1, 2 * HALF + 1), dst=square, normalize=False)
+        # Both senses of a direction, or the operator would prefer the side of a corner it is shifted to. The other
+        # sense is the same sum one step back.
+        behind = square[reach - dr : rows - reach - dr, reach - dc : cols - reach - dc]
+        cv2.addWeighted(square[inner], 0.5, behind, 0.5, 0.0, dst=both)
+        cv2.min(least, both, dst=least)
+    out[inner] = least
     return out
 
 
@@ -98,13 +103,12 @@ def interest_points(
 def _peaks(response: Floats32, least: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows and columns of pixels above ``least``, and greatest of the 5 x 5 neighbourhood; of equal ones the first."""
     side = 2 * HALF + 1
-    all_around = np.ones((side, side), np.uint8)
-    before = (np.arange(side**2) < side**2 // 2).astype(np.uint8).reshape(side, side)
-    peak = (
-        (response > least) & (response == cv2.dilate(response, all_around)) & (response > cv2.dilate(response, before))
-    )
-    rows, cols = np.nonzero(peak)
-    return rows, cols
+    rows, cols = np.nonzero((response > least) & (response == cv2.dilate(response, np.ones((side, side), np.uint8))))
+    # The border has no response, so that all neighbours exist: those that are read before a peak must be less.
+    y, x = np.divmod(np.arange(side**2 // 2), side)
+    before = response[rows[:, None] + y - HALF, cols[:, None] + x - HALF]
+    first = (before < response[rows, cols][:, None]).all(axis=1)
+    return rows[first], cols[first]
 
 
 def _inside(valid: Bytes, border: int) -> Bools:

@@ -152,9 +152,10 @@ def relief(points: Floats, disparity: Bundle) -> Floats:
     values[~use] = 0.0
     # In units of the template, so that all sums are of the same size.
     design = np.stack([np.ones(dx.size), dx / TEMPLATE_HALF_PX, dy / TEMPLATE_HALF_PX], -1)
-    normal = np.einsum("nk,ki,kj->nij", use.astype(np.float64), design, design, optimize=True)
+    products = (design[:, :, None] * design[:, None, :]).reshape(-1, 9)
+    normal = (use @ products).reshape(-1, 3, 3)
     # Matched pixels on a line leave the slope across open: it is 0 then.
-    plane = np.linalg.solve(normal + 1e-9 * np.eye(3), np.einsum("ki,nkc->nic", design, values, optimize=True))
+    plane = np.linalg.solve(normal + 1e-9 * np.eye(3), design.T @ values)
     squares = (((values - design @ plane) ** 2).sum(-1) * use).sum(1)
     rms = np.sqrt(squares / np.maximum(use.sum(1), 1))
     return np.where((2 * use.sum(1) > dx.size) & (rms <= MAX_DISPARITY_STEP_PX), rms, np.nan)

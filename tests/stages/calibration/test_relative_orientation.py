@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rig_scenes import knocked, matches, street_depth, street_rig
 
 from rille.stages.calibration.relative_orientation import (
     SIZE,
+    SMOOTH,
     TERMS,
     PointPairs,
     Priors,
@@ -49,15 +52,14 @@ def test_smooth_error_is_told_from_the_rig():
     m = matches(knocked(street_rig(), pitch_deg=0.3), street_depth, field=field)
     fit = adjust(street_rig(), [m], ANGLES, PRIORS, rival=True)
     assert np.degrees(fit.x[0]) == pytest.approx(0.3, abs=0.01)
-    assert fit.smooth > PRIORS.term / 2
+    assert np.abs(fit.x[SMOOTH]).max() > PRIORS.term / 2
 
 
-def test_images_without_smooth_error_are_used_to_the_full():
+def test_images_without_smooth_error_are_as_certain_as_is_believed_of_rows():
     pairs = [matches(knocked(street_rig(), pitch_deg=0.3), street_depth, pair=k) for k in range(2)]
     fit = adjust(street_rig(), pairs, [True, False, True, False, False], PRIORS, rival=False)
-    assert fit.smooth < 0.5 * PRIORS.term
     sigma = np.sqrt(np.diag(solution(fit, ANGLES, PRIORS, rival=False)[1]))
-    # but no sigma is smaller than what is believed of rows: 0.03 px of 707 px
+    # no sigma is smaller than what is believed of rows: 0.03 px of 707 px
     assert sigma[0] > 0.5 * PRIORS.term / 707.0
 
 
@@ -92,12 +94,15 @@ def test_what_took_no_share_is_an_error_of_the_result():
     m = matches(knocked(rig, pitch_deg=0.3), street_depth)
     fit = settle(rig, [m], free, PRIORS)
     sure = np.full(5, 1e-7)
-    covariance = consider_covariance(fit, free, PRIORS, 0.0, sure)
+    covariance = consider_covariance(fit, free, PRIORS, sure)
     # the constant term alone, 0.032 px of rows; pitch moves them by 707 px a radian and more
     assert covariance[0, 0] > (0.5 * PRIORS.term / 707.0) ** 2
     assert not covariance[1:].any()
-    assert consider_covariance(fit, free, PRIORS, 10 * PRIORS.term, sure)[0, 0] > 20 * covariance[0, 0]
-    assert consider_covariance(fit, free, PRIORS, 0.0, PRIORS.held())[0, 0] > 1.1 * covariance[0, 0]
+    assert (
+        consider_covariance(fit, free, replace(PRIORS, systematic=10 * PRIORS.systematic), sure)[0, 0]
+        > 20 * covariance[0, 0]
+    )
+    assert consider_covariance(fit, free, PRIORS, PRIORS.held())[0, 0] > 1.1 * covariance[0, 0]
 
 
 def test_the_pair_order_does_not_matter_to_rounding():
@@ -110,7 +115,7 @@ def test_the_gain_is_half_the_drop_of_the_weighed_squares():
     m = matches(knocked(street_rig(), pitch_deg=0.3), street_depth)
     fit = adjust(street_rig(), [m], ANGLES, PRIORS, rival=True)
     x, _, gain = solution(fit, ANGLES, PRIORS, rival=True)
-    total = fit.normal + precision(ANGLES, PRIORS, max(PRIORS.term, fit.smooth), rival=True)
+    total = fit.normal + precision(ANGLES, PRIORS, rival=True)
 
     def squares(at):
         return at @ total @ at - 2.0 * fit.pull @ at
