@@ -53,7 +53,8 @@ def levenberg_marquardt(problem: Problem[X, N], state: X, iterations: int, toler
         # Normal equations stay as they are while a step is refused: only the damping grows.
         while not (then := problem.cost(ahead := problem.ahead(state, normal, damping))) < now:
             damping *= 10.0
-            if damping > MAX_DAMPING:
+            # A step that changes the cost by rounding alone was refused at the minimum itself.
+            if damping > MAX_DAMPING or then - now <= tolerance * now:
                 return Minimum(state, first, now, steps)
         finished = now - then <= tolerance * now
         state, now, damping, steps = ahead, then, max(0.1 * damping, 1e-12), steps + 1
@@ -62,10 +63,8 @@ def levenberg_marquardt(problem: Problem[X, N], state: X, iterations: int, toler
     return Minimum(state, first, now, steps)
 
 
-def irls(
-    design: Floats, target: Floats, weigh: Callable[[Floats], Floats], prior: Floats, rounds: int = 5
-) -> tuple[Floats, Floats]:
-    """Unknowns (..., k, m) of ``design @ x = target`` by reweighted least squares, and the last weights (..., n).
+def irls(design: Floats, target: Floats, weigh: Callable[[Floats], Floats], prior: Floats, rounds: int = 5) -> Floats:
+    """Unknowns (..., k, m) of ``design @ x = target`` by reweighted least squares.
 
     Parameters
     ----------
@@ -74,10 +73,12 @@ def irls(
     prior : (k, k), added to the normal matrices.
     rounds : a fixed number, so that a result never hangs on a rounding that decides whether one more is done.
     """
+    x = np.zeros((*target.shape[:-2], design.shape[-1], target.shape[-1]))
     weights = np.ones(target.shape[:-1])
-    for _ in range(rounds):
+    for again in range(rounds):
+        if again:
+            rest = target - design @ x
+            weights = weigh(np.sqrt((rest**2).sum(-1)))
         weighted = np.swapaxes(design * weights[..., None], -1, -2)
         x = np.linalg.solve(weighted @ design + prior, weighted @ target)
-        rest = target - design @ x
-        weights = weigh(np.sqrt((rest**2).sum(-1)))
-    return np.asarray(x, dtype=np.float64), weights
+    return x

@@ -62,7 +62,7 @@ def fit_affinity(origin: Floats, moved: Floats, use: Bools, at: Floats) -> tuple
         return np.asarray(weight * count / weight.sum(-1, keepdims=True))
 
     design = np.concatenate([offset, np.ones((n, count, 1))], -1)
-    fitted, _ = irls(design, shift, cauchy, count * np.diag([PULL**2, PULL**2, 0.0]), rounds=4)
+    fitted = irls(design, shift, cauchy, count * np.diag([PULL**2, PULL**2, 0.0]), rounds=4)
     return common + np.swapaxes(fitted[:, :2], 1, 2), fitted[:, 2]
 
 
