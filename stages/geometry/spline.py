@@ -67,3 +67,23 @@ def slopes(t):  # type: ignore[no-untyped-def]
     """Derivatives of :func:`weights`."""
     q, half, three, four = np.float32(1) - t, np.float32(0.5), np.float32(3), np.float32(4)
     return -half * q * q, half * t * (three * t - four), -half * q * (three * q - four), half * t * t
+
+
+@njit(cache=True, nogil=True)
+def value_and_gradient(spline, x, y):  # type: ignore[no-untyped-def]
+    """Value of a spline, by its coefficients (row, col), at a point, and its derivatives along x and y; float32.
+
+    The point lies at 1 <= x < cols - 2, and y alike: a spline reads from one pixel before to two behind it.
+    """
+    i, j = np.uint32(x - 1.0), np.uint32(y - 1.0)  # unsigned: not counted from the end, so no check at each use
+    t, s = np.float32(x - 1.0 - i), np.float32(y - 1.0 - j)
+    wx, wy, dx, dy = weights(t), weights(s), slopes(t), slopes(s)
+    value = along_x = along_y = np.float32(0.0)
+    for k in range(4):
+        a, b, c, d = spline[j + k, i], spline[j + k, i + 1], spline[j + k, i + 2], spline[j + k, i + 3]
+        across = wx[0] * a + wx[1] * b + wx[2] * c + wx[3] * d
+        along = dx[0] * a + dx[1] * b + dx[2] * c + dx[3] * d
+        value += wy[k] * across
+        along_x += wy[k] * along
+        along_y += dy[k] * across
+    return value, along_x, along_y

@@ -9,7 +9,7 @@ with p_l and p_r the cell's projections, m the local mean of the difference, a t
 found, so that neither a wrong cell nor an edge drags its neighbours along. It is object-space matching (Helava 1988;
 Wrobel 1987, facets stereo vision): no image is the master, the geometry is the calibrated one, and smoothness is that
 of the terrain and not of its perspective picture. A fixed number of Gauss-Newton steps, each solved by a fixed number
-of Gauss-Seidel sweeps in reading order.
+of sweeps (:mod:`rille.stages.numeric.relaxation`).
 
 What remains says how far each cell may be trusted. With sigma_d / |ds/dZ| the standard deviation that the disparity
 brings, b the second difference of Z in 7 x 7 cells, t the step of Z from cell to cell there (both RMS) and r the
@@ -17,9 +17,9 @@ correlation of both images' ortho gradients in 5 x 5 cells,
 
     sigma_Z^2 = FLOOR^2 + FACTOR^2 ((sigma_d / |ds/dZ|)^2 + b^2 + t^2) / r^2        (FLOOR in pixels of disparity)
 
-b: windows on relief and beside what nobody saw answer for a part of each surface. t: a position that is wrong by a cell
-is an elevation that is wrong by its step. r: in a shadow noise finds noise to match, smoothly and wrongly; the noise of
-two images does not correlate.
+b: a matching window on relief, or beside unknown ground, is the mean of several surfaces. t: a position that is wrong
+by a cell is an elevation that is wrong by its step. r: in a shadow noise finds noise to match, smoothly and wrongly;
+the noise of two images does not correlate.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from numba import njit
 
 from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.geometry.surface import Surface
+from rille.stages.numeric.relaxation import bend_weights, relax
 from rille.stages.numeric.windows import window_sum32
-from rille.stages.terrain.locus.sweep import Terms, diagonals, sweep
 from rille.stages.terrain.locus.views import OrthoPair, Views, look
 
 STIFFNESS = 4000.0
@@ -41,8 +41,6 @@ from 2000 to 16000."""
 BEND = 0.05
 """Second difference [pixels of disparity] beyond which stiffness gives way to an edge."""
 SWEEPS = 20
-OVERSHOOT = 1.7
-"""Factor on each Gauss-Seidel step (successive over-relaxation), which stays convergent below 2."""
 FARTHEST = 1.0
 """Largest total change [pixels of disparity] of a cell: beyond it, the images match at another place."""
 
@@ -82,20 +80,17 @@ def refine(views: Views, surface: Surface, elevation: Floats32, steps: int) -> t
     # From the first look, for all steps: an exposure does not change with the elevations.
     gain = _gain(seen)
     _level(seen, gain)
-    room = diagonals(elevation.shape)
     for _ in range(steps):
         keep = np.isfinite(seen.scale)
         weight, rest = _misfit(seen, keep)
-        slope = seen.right_slope - seen.left_slope
-        across, down = np.zeros((2, *z.shape), np.float32)
-        _stiffness(z, seen.scale, across, down)
-        moved = z.copy()
-        terms = Terms(weight * slope * slope, weight * slope * rest, z, keep, across, down)
-        sweep(terms, moved, SWEEPS, OVERSHOOT, room)
+        slope = np.where(keep, seen.right_slope - seen.left_slope, np.float32(0.0))
+        power, pull = (weight * slope * slope)[None, None], (weight * slope * rest)[None]
+        bends = bend_weights(z[None], seen.scale, BEND, STIFFNESS)
+        moved = relax(z[None], power, pull, bends, keep, SWEEPS)[0]
         # About the start, not the last step: many small steps could otherwise wander to another likeness.
         reach = FARTHEST / seen.scale
         z = np.where(keep, np.clip(moved, elevation - reach, elevation + reach), elevation)
-        seen = look(views, surface, z, seen)
+        seen = look(views, surface, z)
         _level(seen, gain)
     return z, seen
 
@@ -171,7 +166,7 @@ def _misfit(seen: OrthoPair, keep: Bools) -> tuple[Floats32, Floats32]:
         weighted, weights = (window_sum32(v, MEAN_SIDE) for v in (weight * rest, weight))
         _weigh(rest, keep, weighted, weights, misfit, weight)
     # A cell smaller than a pixel brings no more than its share of what the pixel tells.
-    return weight * np.fmin(seen.area, 1.0), misfit
+    return np.where(keep, weight * np.fmin(seen.area, 1.0), np.float32(0.0)), misfit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -185,28 +180,6 @@ def _weigh(rest, keep, weighted, weights, misfit, weight):  # type: ignore[no-un
             misfit[r, c] = off if keep[r, c] else 0.0
             # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once.
             weight[r, c] = one / (one + (off / residual) ** 2) if keep[r, c] else 0.0
-
-
-@njit(cache=True, nogil=True)
-def _stiffness(z, scale, across, down):  # type: ignore[no-untyped-def]
-    """Weight of the second difference at each cell along its row and column, 0 where a neighbour is unknown.
-
-    ``scale``: pixels of disparity a metre of elevation, NaN unknown.
-    """
-    rows, cols = z.shape
-    for r in range(rows):
-        for c in range(cols):
-            s = scale[r, c]
-            if not s > 0.0:
-                continue
-            if c > 0 and c < cols - 1:
-                d = s * (z[r, c - 1] - z[r, c] + z[r, c + 1] - z[r, c]) / BEND
-                if np.isfinite(d):
-                    across[r, c] = STIFFNESS * s * s / (1.0 + d * d)
-            if r > 0 and r < rows - 1:
-                d = s * (z[r - 1, c] - z[r, c] + z[r + 1, c] - z[r, c]) / BEND
-                if np.isfinite(d):
-                    down[r, c] = STIFFNESS * s * s / (1.0 + d * d)
 
 
 @njit(cache=True, nogil=True)

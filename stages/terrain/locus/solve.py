@@ -15,25 +15,11 @@ from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.scale import of_rig
 from rille.stages.geometry.surface import Surface
-from rille.stages.terrain.locus.kernel import BlockCells, Observed, PairCameras, search
+from rille.stages.terrain.locus.kernel import BlockCells, Dem, Observed, PairCameras, search
 
-COARSE = 8  # cells a coarse cell is wide: a 64th of the cells search the whole range
+COARSE = 8  # cells that a coarse cell is wide: a 64th of the cells search the whole range
 BLOCK_ROWS = 32  # rows of cells in one kernel call, so that a large surface stays small in memory
 ONE_SIDED = 2.0  # matched one way alone: errors of such cells are two to three times as large
-
-
-@dataclass(frozen=True)
-class Dem:
-    """Elevation model on a reference surface, arrays (rows, cols) float32, NaN undefined.
-
-    ``elevation`` and its standard deviation ``elevation_std`` in metres along the surface's normal, ``residual`` the
-    mismatch at the solution in pixels, ``ortho`` the grey value of the left image.
-    """
-
-    elevation: Floats32
-    elevation_std: Floats32
-    residual: Floats32
-    ortho: Floats32
 
 
 @dataclass(frozen=True)
@@ -49,53 +35,53 @@ class Matches:
     std: ArrayLike | None = None
 
 
-class PairArrays:
-    """The arrays of one pair as the kernel wants them.
+@dataclass(frozen=True)
+class SearchLimits:
+    """What the search of elevations is bounded by.
 
-    ``sigma``: standard deviation of disparities that have none of their own, pixels; ``limits``: greatest residual and
-    greatest jump in the bilinear cell, pixels.
+    ``z_range`` lowest and highest elevation, metres; ``max_residual`` of a solution and ``max_jump`` in its bilinear
+    cell, pixels; ``sigma`` standard deviation of disparities that have none of their own, pixels.
     """
 
+    z_range: tuple[float, float]
+    max_residual: float
+    max_jump: float
+    sigma: float
+
+
+class PairArrays:
+    """The arrays of one pair as the kernel wants them."""
+
     def __init__(
-        self,
-        given: Matches,
-        image: ArrayLike,
-        rig: Rig,
-        T_surface_left: RigidTransform,
-        z_range: tuple[float, float],
-        sigma: float,
-        limits: tuple[float, float],
+        self, matches: Matches, image: ArrayLike, rig: Rig, T_surface_left: RigidTransform, limits: SearchLimits
     ) -> None:
+        low, high = limits.z_range
         if not rig.baseline > 0:
             raise DegenerateError(
                 "RIL-394", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
             )
-        if not z_range[0] < z_range[1]:
-            raise InputError("RIL-395", f"the range of elevations {z_range[0]}..{z_range[1]} m is empty")
+        if not low < high:
+            raise InputError("RIL-395", f"the range of elevations {low}..{high} m is empty")
         shape = (rig.left.height, rig.left.width)
-        maps = [np.asarray(a) for a in (given.column, given.row, image)]
+        maps = [np.asarray(a) for a in (matches.column, matches.row, image)]
         for name, array in zip(("column disparity", "row disparity", "image"), maps, strict=True):
             if array.shape != shape:
                 raise InputError("RIL-396", f"the {name} is {array.shape}, the left camera's image {shape}")
         disparity = np.stack(maps[:2], axis=-1, dtype=np.float32, casting="unsafe")
         # NaN in the arrays, not a mask: the kernel's sums become NaN by themselves where a pixel must not be used.
-        disparity[~given.usable] = np.nan
-        std = np.full(shape, sigma) if given.std is None else given.std
+        disparity[~matches.usable] = np.nan
+        std = np.full(shape, limits.sigma) if matches.std is None else matches.std
         grey, std = (np.ascontiguousarray(a, np.float32) for a in (maps[2], std))
-        self.seen = Observed(disparity.ravel(), std, grey, np.array(limits), of_rig(rig))
+        self.seen = Observed(disparity, std, grey, float(limits.max_residual), float(limits.max_jump), of_rig(rig))
         epipole = rig.right.matrix @ rig.T_right_left.translation
         sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)
         self.cameras = PairCameras(*projections(rig, T_surface_left), epipole, sizes)
-        self.z_range = float(z_range[0]), float(z_range[1])
+        self.z_range = float(low), float(high)
 
-    def cells(
-        self, surface: Surface, rows: ArrayLike, cols: ArrayLike, low: ArrayLike, high: ArrayLike, out: Dem
-    ) -> None:
-        """Fill ``out`` (r, c) with the cells rows x cols, searched from low..high (NaN: left out)."""
-        feet, normals = surface.block(rows, cols)
+    def cells(self, feet: Floats, normals: Floats, low: ArrayLike, high: ArrayLike, out: Dem) -> None:
+        """Fill ``out`` (r, c) with cells (r, c, 3), searched from low..high (NaN: left out)."""
         start = [np.ascontiguousarray(np.broadcast_to(v, feet.shape[:2]), np.float32) for v in (low, high)]
-        found = out.elevation, out.elevation_std, out.residual, out.ortho
-        search(BlockCells(feet, normals, *start), self.z_range, self.cameras, self.seen, found)
+        search(BlockCells(feet, normals, *start), self.z_range, self.cameras, self.seen, out)
 
 
 def solve(task: PairArrays, surface: Surface) -> Dem:
@@ -103,14 +89,14 @@ def solve(task: PairArrays, surface: Surface) -> Dem:
     # The last row and column as well, so that every cell lies between coarse ones.
     rows, cols = (np.unique(np.append(np.arange(0, n, COARSE), n - 1)) for n in (surface.rows, surface.cols))
     coarse, out = _undefined(rows.size, cols.size), _undefined(surface.rows, surface.cols)
-    task.cells(surface, rows, cols, task.z_range[0], task.z_range[1], coarse)
+    task.cells(*surface.block(rows, cols), *task.z_range, coarse)
     cols = np.arange(surface.cols)
     lowest, highest = (v[:, cols // COARSE + 1] for v in _around(coarse.elevation))
     for start in range(0, surface.rows, BLOCK_ROWS):
         rows = np.arange(start, min(start + BLOCK_ROWS, surface.rows))
         near = rows // COARSE + 1
-        block = Dem(*(array[start : start + rows.size] for array in vars(out).values()))
-        task.cells(surface, rows, cols, lowest[near], highest[near], block)
+        block = Dem(*(array[start : start + rows.size] for array in out))
+        task.cells(*surface.block(rows, cols), lowest[near], highest[near], block)
     return out
 
 

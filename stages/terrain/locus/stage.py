@@ -36,8 +36,9 @@ from rille.stages.geometry.surface import Surface, plane
 from rille.stages.terrain.ground import view_ground
 from rille.stages.terrain.ground_frame import z_range as plane_z_range
 from rille.stages.terrain.locus.empty import explain
+from rille.stages.terrain.locus.kernel import Dem
 from rille.stages.terrain.locus.refinement import refine, standard_deviation
-from rille.stages.terrain.locus.solve import Dem, Matches, PairArrays, join, projections, solve
+from rille.stages.terrain.locus.solve import Matches, PairArrays, SearchLimits, join, projections, solve
 from rille.stages.terrain.locus.uncertainty import from_both
 from rille.stages.terrain.locus.views import Views, views
 
@@ -166,8 +167,8 @@ def reconstruct(
         The baseline is zero.
     """
     image, right, back = pair.left, pair.right, pair.back
-    told = z_range, params.sigma_disparity, (params.max_residual, params.max_jump)
-    out = solve(PairArrays(pair.matches, image, rig, T_surface_left, *told), surface)
+    limits = SearchLimits(z_range, params.max_residual, params.max_jump, params.sigma_disparity)
+    out = solve(PairArrays(pair.matches, image, rig, T_surface_left, limits), surface)
     seen = None if right is None else _views(image, right, rig, T_surface_left)
     apart = None
     if back is not None:
@@ -177,7 +178,7 @@ def reconstruct(
         # is.
         turned = Rig(rig.right, rig.left, rig.T_right_left.inverse())
         T_surface_right = T_surface_left @ rig.T_right_left.inverse()
-        other = solve(PairArrays(back, right, turned, T_surface_right, *told), surface)
+        other = solve(PairArrays(back, right, turned, T_surface_right, limits), surface)
         apart = out.elevation.astype(np.float64) - other.elevation
         out = join(out, other)
     if seen is not None and (params.refine_steps or back is not None):
@@ -186,7 +187,7 @@ def reconstruct(
     if greatest is not None:
         # Negated, so that NaN is unsure as well.
         unsure = ~(out.elevation_std <= greatest)
-        for array in vars(out).values():
+        for array in out:
             np.copyto(array, np.nan, where=unsure)
     return out
 
@@ -365,4 +366,4 @@ def locus_stage(
     }
     if trajectory is not None and "covariance" in trajectory.arrays:
         meta["pose_covariance"] = np.asarray(trajectory["covariance"])[row].ravel().tolist()
-    return Bundle(vars(dem), meta)
+    return Bundle(dem._asdict(), meta)

@@ -17,7 +17,9 @@ from rille.stages.geometry.surface import plane as reference_plane
 from rille.stages.terrain import ground_frame as level_stage
 from rille.stages.terrain.locus import kernel, stage
 from rille.stages.terrain.locus import solve as locus_solve
-from rille.stages.terrain.locus.stage import Dem, LocusParams, MatchedPair, Matches, reconstruct
+from rille.stages.terrain.locus.kernel import Dem
+from rille.stages.terrain.locus.solve import Matches
+from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
 
 RIG = toed_in_rig()
 T_LOCAL_LEFT = pitched(30.0, roll_deg=3.0)
@@ -260,11 +262,11 @@ def test_a_search_that_begins_below_the_surface_finds_it_or_nothing() -> None:
     column, row, usable = maps = disparity(RIG, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
     there = usable & (np.random.default_rng(4).random(usable.shape) < 0.85)
     task = locus_solve.PairArrays(
-        Matches(column, row, there), IMAGE, RIG, T_LOCAL_LEFT, (-1.0, -0.3), PARAMS.sigma_disparity, (0.5, 3.0)
+        Matches(column, row, there), IMAGE, RIG, T_LOCAL_LEFT, locus_solve.SearchLimits((-1.0, -0.3), 0.5, 3.0, 0.2)
     )
     dem = Dem(*np.full((4, *LATTICE.shape), np.nan, np.float32))
     every = np.arange(LATTICE.rows), np.arange(LATTICE.cols)
-    task.cells(reference_plane(LATTICE), *every, -HEIGHT - 0.05, -HEIGHT - 0.01, dem)
+    task.cells(*reference_plane(LATTICE).block(*every), -HEIGHT - 0.05, -HEIGHT - 0.01, dem)
     found = np.isfinite(dem.elevation)
     assert 0.05 < found.mean() < 0.9
     truth = np.full(LATTICE.shape, -HEIGHT)

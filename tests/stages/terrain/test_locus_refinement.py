@@ -11,18 +11,16 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.surface import Surface
 from rille.stages.geometry.surface import plane as reference_plane
 from rille.stages.terrain.locus import views as locus_views
+from rille.stages.terrain.locus.kernel import Dem
 from rille.stages.terrain.locus.refinement import (
-    BEND,
     FACTOR,
     FLOOR,
     LEAST_CORRELATION,
-    STIFFNESS,
     UNKNOWN_BEND,
-    _stiffness,
     refine,
     standard_deviation,
 )
-from rille.stages.terrain.locus.solve import ONE_SIDED, Dem, Matches, join
+from rille.stages.terrain.locus.solve import ONE_SIDED, Matches, join
 from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
 from rille.stages.terrain.locus.views import OrthoPair, Views, look, views
 
@@ -270,18 +268,6 @@ def test_the_standard_deviation_is_that_of_the_equation_in_plain_numpy() -> None
     assert found[5, 6] == 0.3
 
 
-def test_stiffness_gives_way_to_the_second_difference() -> None:
-    z, seen = rough()
-    across, down = np.zeros((2, *z.shape), np.float32)
-    _stiffness(z, seen.scale, across, down)
-    for found, axis in ((across, 1), (down, 0)):
-        s = seen.scale
-        d = s * (np.roll(z, 1, axis) - 2.0 * z + np.roll(z, -1, axis)) / BEND
-        expected = np.moveaxis(np.where(np.isfinite(d), STIFFNESS * s**2 / (1.0 + d**2), 0.0), axis, 0)
-        expected[[0, -1]] = 0.0
-        np.testing.assert_allclose(np.moveaxis(found, axis, 0), expected, rtol=1e-4)
-
-
 def test_the_result_does_not_depend_on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = look(through(), SURFACE, TRUTH)
     monkeypatch.setattr(locus_views, "BLOCK_ROWS", 7)
@@ -291,7 +277,7 @@ def test_the_result_does_not_depend_on_blocks(monkeypatch: pytest.MonkeyPatch) -
 def test_without_steps_or_a_right_image_the_disparity_decides() -> None:
     column = noisy()
     plain, none = model(column, right=None), model(column, steps=0)
-    for name, values in vars(plain).items():
+    for name, values in plain._asdict().items():
         np.testing.assert_array_equal(values, getattr(none, name))
 
 
