@@ -180,12 +180,10 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
 
     # Seams are audited, exposures levelled, models merged in world tiles; then hazards and the path over all of it.
     p.seams = overlaps(make, footprints)
-    known = {
-        "seams": list(p.seams.values()),
-        "centres": {str(f["pair"]): centre(f["box"]) for f in footprints if f["box"] is not None},
-    }
-    p.overlap_audit = make.node(overlap_audit_stage, "overlap_audit", **known)
-    levelled = yield from done(make.node(radiometry_stage, "radiometry", **known))
+    seams = list(p.seams.values())
+    p.overlap_audit = make.node(overlap_audit_stage, "overlap_audit", seams=seams)
+    centres = {str(f["pair"]): centre(f["box"]) for f in footprints if f["box"] is not None}
+    levelled = yield from done(make.node(radiometry_stage, "radiometry", seams=seams, centres=centres))
     p.world_tiles = merge_tiles(make.node, footprints, p.world_dem, levelled.meta["steps"])
     p.world_risk = make.hazards("risk/world", p.world_tiles)
     p.world_path = make.node(path_stage, "path/world", risk=p.world_risk, use="world", heading=heading(posed.meta))

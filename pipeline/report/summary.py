@@ -232,9 +232,9 @@ def _way_words(view: RunView, length: float | None) -> str:
 
 
 def _seams(view: RunView) -> dict[str, Any] | None:
-    """The audit of seams: variance factor, models, how many seams there are and the worst of them."""
+    """The audit of seams: models, how many seams there are and the worst of them."""
     audit = facts_of(view, view.products.overlap_audit)
-    names = ("variance_factor", "models", "seam_count", "seams")
+    names = ("models", "seam_count", "seams")
     return {name: audit[name] for name in names} if audit.get("seams") else None
 
 

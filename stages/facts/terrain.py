@@ -86,7 +86,6 @@ class OverlapFacts(Facts):
 class AuditFacts(Facts):
     """``models``, the worst first (see :func:`rille.stages.terrain.overlap_audit.audit`), and the worst ``seams``."""
 
-    variance_factor: float
     models: list[Json]
     seam_count: int
     seams: list[Json]

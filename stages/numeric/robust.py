@@ -6,14 +6,20 @@ alike to the bit. Source: Huber and Ronchetti (2009), Robust Statistics, section
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
+
+from rille.stages.core.arrays import Floats
 
 MAD_TO_SIGMA = 1.4826
 """Standard deviation over median absolute deviation, of normal errors."""
 TUKEY_BISQUARE = 4.685
 """Standard deviations beyond which the bisquare ignores a residual: 95 % efficiency where errors are normal."""
+SETTLED_SHARE = 1e-9
+"""Change of the parameters over their size below which a fit has settled: of a height of metres, nanometres."""
 
 
 def mad_sigma(values: NDArray, centre: float | None = None) -> float:
@@ -40,3 +46,37 @@ def huber_weight(size, bound):  # type: ignore[no-untyped-def]
 def huber_cost(size, bound):  # type: ignore[no-untyped-def]
     """Huber's cost of one residual of absolute value ``size``: a parabola, beyond ``bound`` its tangent."""
     return 0.5 * size * size if size <= bound else bound * size - 0.5 * bound * bound
+
+
+def irls(
+    design: Floats,
+    target: Floats,
+    weight: Floats,
+    reweigh: Callable[[Floats], Floats],
+    start: Floats | None = None,
+    max_rounds: int = 20,
+) -> tuple[Floats, Floats]:
+    """Parameters (p,) by iteratively re-weighted least squares of ``design @ parameters = target``, and final weights.
+
+    Parameters
+    ----------
+    design, target : (n, p) and (n,).
+    weight : (n,) of the observations, the inverses of their variances.
+    reweigh : factors (n,) on the weights by the residuals (n,), target minus fit, of the last round.
+    start : (p,) whose residuals the first weights are of; None: of the plain weighted fit.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        The observations that are left do not determine the parameters.
+    """
+    last, found, used = start, start, weight
+    for _ in range(max_rounds):
+        if found is not None:
+            used = reweigh(target - design @ found) * weight
+        weighted = design * used[:, None]
+        last, found = found, np.asarray(np.linalg.solve(weighted.T @ design, weighted.T @ target), dtype=np.float64)
+        if last is not None and np.abs(found - last).max() <= SETTLED_SHARE * np.abs(found).max():
+            break
+    assert found is not None
+    return found, used

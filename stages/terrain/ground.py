@@ -19,6 +19,7 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.scale import of_rig
+from rille.stages.numeric.robust import irls
 
 
 class NoGroundError(DegenerateError):
@@ -75,13 +76,12 @@ def fit_plane(
     theta = _consensus(rays, rho, sigma, tolerance, allowed, rng)
     if theta is not None:
         information = tolerance**-2.0
-        for _ in range(20):
-            # Tukey's biweight of the deviation over twice the tolerance: what is beyond that counts nothing.
-            weight = np.maximum(0.0, 1.0 - 0.25 * (rho - rays @ theta) ** 2 * information) ** 2 * information
-            weighted = rays * weight[:, None]
-            last, theta = theta, np.asarray(np.linalg.solve(weighted.T @ rays, weighted.T @ rho), dtype=np.float64)
-            if np.abs(theta - last).max() <= SETTLED * np.abs(theta).max():
-                break
+
+        def biweight(residual: Floats) -> Floats:
+            """Tukey's weight of the residual over twice the tolerance."""
+            return np.asarray(np.maximum(0.0, 1.0 - 0.25 * residual**2 * information) ** 2)
+
+        theta, _ = irls(rays, rho, information, biweight, theta)
         expected = rays @ theta
         share = float(np.mean((expected > HORIZON * sigma) & (np.abs(rho - expected) < tolerance)))
         # theta = -n / h: its length is one over the height.
@@ -92,7 +92,6 @@ def fit_plane(
 
 
 MIN_POINTS = 100
-SETTLED = 1e-9  # share of the plane's parameters: of a height of metres, nanometres
 MIN_SHARE = 0.05
 HORIZON = 5.0  # standard deviations of an inverse depth below which it agrees with any plane, and is not counted
 SCORED = 1200  # points, about, that planes are compared on: the best one is then fitted to all

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from rille.stages.terrain.overlap_qa import fit_seam
+from rille.stages.terrain.overlap_qa import SeamFit, fit_seam
 
 X, Y = 0.01 * np.arange(90), -0.01 * np.arange(70)
 
@@ -15,10 +15,14 @@ def plane(bias: float, tx: float, ty: float) -> np.ndarray:
     return bias + tx * (X - 0.4) + ty * (Y[:, None] + 0.3)
 
 
+def at(fit: SeamFit) -> float:
+    return float(fit.plane @ [1.0, 0.4 - fit.centre[0], -0.3 - fit.centre[1]])
+
+
 def test_a_plane_is_found_exactly() -> None:
     fit = fit_seam(plane(0.002, 0.01, -0.02), X, Y)
     assert fit is not None
-    np.testing.assert_allclose(fit.at(np.array([0.4]), np.array([-0.3])), 0.002, atol=1e-12)
+    np.testing.assert_allclose(at(fit), 0.002, atol=1e-12)
     np.testing.assert_allclose(fit.plane[1:], [0.01, -0.02], atol=1e-10)
     assert fit.noise < 1e-12
     assert fit.cells == 6300
@@ -31,7 +35,7 @@ def test_rocks_that_one_model_lacks_do_not_pull() -> None:
     d[10:30, 10:40] += 0.5  # a tenth of the overlap
     fit = fit_seam(d, X, Y)
     assert fit is not None
-    np.testing.assert_allclose(fit.at(np.array([0.4]), np.array([-0.3])), 0.002, atol=1e-5)
+    np.testing.assert_allclose(at(fit), 0.002, atol=1e-5)
     np.testing.assert_allclose(fit.plane[1:], [0.01, -0.02], atol=1e-4)
     assert fit.noise == pytest.approx(1e-4, rel=0.2)
 
