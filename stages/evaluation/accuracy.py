@@ -24,26 +24,13 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
-from rille.stages.evaluation.accuracy_parts import (
-    along,
-    angle,
-    inverse,
-    metric,
-    posed,
-    relative_error,
-    rms,
-    square,
-    umeyama,
-)
+from rille.stages.evaluation.accuracy_parts import along, angle, inverse, metric, posed, rms, square, umeyama
 from rille.stages.evaluation.conventions import better_reading
-from rille.stages.evaluation.trajectory_error import against_claims, by_cause, by_shares, by_steps
+from rille.stages.evaluation.trajectory_error import against_claims, by_cause, by_kitti, by_shares, by_steps
 from rille.stages.facts.evaluation import AccuracyFacts, Metric, TruthFacts
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.odometry.resection.trajectory import world_poses
-
-KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-KITTI_STEP = 10
 
 
 def trajectory_accuracy(
@@ -80,19 +67,13 @@ def trajectory_accuracy(
     # By the first frame that has both: a run is judged by what grows from its own start, not by where the truth's
     # origin lies.
     aligned = P[judged[0]] @ inverse(Q[judged[0]]) @ Q
-    arrays = {
-        "position": P[:, :3, 3].copy(),
-        "position_truth": aligned[:, :3, 3].copy(),
-        "displacement": np.diff(P[:, :3, 3], axis=0),
-        "displacement_truth": np.diff(aligned[:, :3, 3], axis=0),
-    }
+    arrays = _curves(P, aligned)
     metrics = _absolute(P[judged], Q[judged], aligned[judged])
     metrics |= _drift(P, aligned, judged)
-    metrics |= _relative(P, Q)
     metrics |= _displacement(arrays["displacement"], arrays["displacement_truth"])
     # With the frames between that have no pose: the true path leads on there.
     whole = slice(judged[0], judged[-1] + 1)
-    metrics |= _kitti(P, Q) | by_steps(P, Q) | by_shares(P[whole], Q[whole]) | by_cause(P, Q)
+    metrics |= by_steps(P, Q) | by_kitti(P, Q) | by_shares(P[whole], Q[whole]) | by_cause(P, Q)
     if covariance is not None:
         metrics |= against_claims(P, aligned, covariance)
     if len(judged) == 1:
@@ -100,6 +81,17 @@ def trajectory_accuracy(
         why = "not applicable: one frame alone has a pose and truth, and by it they are aligned"
         metrics = {name: metric(None, figure["unit"], why) for name, figure in metrics.items()}
     return arrays, _counts(has_pose, has_truth) | metrics
+
+
+def _curves(estimate: Floats, truth: Floats) -> dict[str, Floats]:
+    """Arrays of the stage, of poses (frame, 3 or 4, 4)."""
+    a, b = estimate[:, :3, 3].copy(), truth[:, :3, 3].copy()
+    return {
+        "position": a,
+        "position_truth": b,
+        "displacement": np.diff(a, axis=0),
+        "displacement_truth": np.diff(b, axis=0),
+    }
 
 
 def _counts(has_pose: Bools, has_truth: Bools) -> dict[str, Metric]:
@@ -144,22 +136,6 @@ def _drift(P: Floats, aligned: Floats, judged: NDArray[np.intp]) -> dict[str, Me
     }
 
 
-def _relative(P: Floats, Q: Floats) -> dict[str, Metric]:
-    E = relative_error(P, Q, slice(None, -1), slice(1, None))
-    E = E[posed(E)]
-    if len(E) == 0:
-        none = "not applicable: no two successive frames have poses"
-        return {k: metric(None, u, none) for k, u in (("rpe_translation_rmse", "m"), ("rpe_rotation_rmse", "deg"))}
-    shift, turn = np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(angle(E))
-    how = f"of the motion between successive frames, {len(E)} pairs"
-    return {
-        "rpe_translation_rmse": metric(rms(E[:, :3, 3]), "m", f"RMS error {how}"),
-        "rpe_translation_median": metric(float(np.median(shift)), "m", f"median error {how}"),
-        "rpe_translation_max": metric(float(shift.max()), "m", f"largest error {how}"),
-        "rpe_rotation_rmse": metric(float(np.sqrt(np.mean(turn**2))), "deg", f"RMS rotation error {how}"),
-    }
-
-
 def _displacement(estimate: Floats, truth: Floats) -> dict[str, Metric]:
     """Figure 9: components of the displacement between successive frames in the first levelled camera frame."""
     error = estimate - truth
@@ -171,32 +147,6 @@ def _displacement(estimate: Floats, truth: Floats) -> dict[str, Metric]:
             f"RMS error of the {axis} displacement between successive frames, {len(error)} pairs",
         )
         for k, axis in enumerate("xyz")
-    }
-
-
-def _kitti(P: Floats, Q: Floats) -> dict[str, Metric]:
-    way, _ = along(Q[:, :3, 3])
-    has_truth = np.isfinite(Q[:, 0, 0])
-    errors = []
-    for first in range(0, len(Q), KITTI_STEP):
-        for length in KITTI_LENGTHS:
-            # The first frame beyond the length, as in the development kit.
-            last = int(np.searchsorted(way, way[first] + length, side="right"))
-            if last >= len(Q) or not np.isfinite(P[[first, last]]).all() or not has_truth[first : last + 1].all():
-                continue
-            # KITTI's own order: the inverse of the other errors here, of the same length and angle.
-            E = relative_error(Q, P, first, last)
-            errors.append((np.linalg.norm(E[:3, 3]) / length, angle(E) / length))
-    if not errors:
-        why = f"not applicable: the true path is {way[-1]:.1f} m long, the shortest section 100 m"
-        if way[-1] > KITTI_LENGTHS[0]:
-            why = "not applicable: no section of 100 m has poses at both ends and truth throughout"
-        return {"kitti_translation": metric(None, "%", why), "kitti_rotation": metric(None, "deg/100 m", why)}
-    shift, turn = np.mean(np.array(errors), axis=0)
-    how = f"mean relative error of {len(errors)} sections of 100-800 m, one set every {KITTI_STEP} frames"
-    return {
-        "kitti_translation": metric(100.0 * float(shift), "%", how),
-        "kitti_rotation": metric(100.0 * math.degrees(float(turn)), "deg/100 m", how),
     }
 
 
@@ -213,15 +163,6 @@ def by_frame(values: Floats, frames: list[int], wanted: list[int]) -> Floats:
         if frame in row:
             out[k] = values[row[frame]]
     return out
-
-
-def _nothing(estimate: Floats) -> dict[str, Floats]:
-    """What is drawn where no frame can be judged: the estimate alone."""
-    position = estimate[:, :, 3].copy()
-    # The report draws the estimate all the same, without a curve of the truth.
-    none = np.full_like(position, np.nan)
-    arrays = {"position": position, "position_truth": none}
-    return arrays | {"displacement": np.diff(position, axis=0), "displacement_truth": none[1:].copy()}
 
 
 @stage(
@@ -250,7 +191,8 @@ def accuracy_stage(
     has_pose, has_truth = posed(estimate), posed(true)
     warnings: list[str] = []
     if len(estimate) == len(true) and not (has_pose & has_truth).any():
-        arrays, metrics = _nothing(estimate), _counts(has_pose, has_truth)
+        # The report draws the estimate all the same, without a curve of the truth.
+        arrays, metrics = _curves(estimate, np.full_like(estimate, np.nan)), _counts(has_pose, has_truth)
     else:
         claims = "covariance" in trajectory.arrays
         claimed = by_frame(np.asarray(trajectory["covariance"]), given, wanted) if claims else None

@@ -76,18 +76,18 @@ def relax(
     around = (BORDER, BORDER)
     at = np.pad(np.nan_to_num(start - middle), [(0, 0), around, around])
     across, down = (np.pad(b, BORDER) for b in bends)
-    goal, inverse = np.zeros_like(start), np.zeros_like(power)
-    _equations(power, pull, at, (across, down), keep, (goal, inverse))
+    goal, inverse = _equations(power, pull, at, (across, down), keep)
     _sweeps(at, goal, inverse, (across, down), sweeps)
     moved = at[:, BORDER:-BORDER, BORDER:-BORDER]
     return np.where(keep, moved + middle, start)
 
 
 @njit(cache=True, nogil=True)
-def _equations(power, pull, at, bends, keep, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` of the cells that move: A f_0 + b (k, rows, cols), and the inverse (k, k, rows, cols) of A and all
-    weights of the cell's bends; it stays 0 where these determine nothing."""
-    (across, down), (goal, inverse) = bends, out
+def _equations(power, pull, at, bends, keep):  # type: ignore[no-untyped-def]
+    """A f_0 + b (k, rows, cols) of the cells that move, and the inverse (k, k, rows, cols) of A and all weights of the
+    cell's bends; 0 where these determine nothing."""
+    across, down = bends
+    goal, inverse = np.zeros_like(pull), np.zeros_like(power)
     count, rows, cols = goal.shape
     for r in range(rows):
         for c in range(cols):
@@ -109,6 +109,7 @@ def _equations(power, pull, at, bends, keep, out):  # type: ignore[no-untyped-de
             if det > 0.0:
                 inverse[0, 0, r, c], inverse[1, 1, r, c] = second / det, first / det
                 inverse[0, 1, r, c] = inverse[1, 0, r, c] = -mixed / det
+    return goal, inverse
 
 
 @njit(cache=True, nogil=True)

@@ -12,11 +12,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -27,6 +26,14 @@ from rille.stages.facts.terrain import DemFacts, MapFixFacts
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.numeric.robust import huber_weight
+
+SLOPE_STEP = 1e-3
+"""Of a cell: half the way that slopes are taken over."""
+MIN_KNOWN = 6
+"""Points that the map must know for a place to be compared."""
+MIN_EIGENVALUE = 1e-6
+"""Of the normal matrix scaled to a diagonal of ones: below, something is not determined."""
+MAX_ROUNDS = 20
 
 
 class MapLocalizationParams(Params):
@@ -47,6 +54,17 @@ class MapLocalizationParams(Params):
     min_chi2_gap: float = Field(
         9.0, gt=0, description="least difference of chi2 to the second best place; below, the answer is ambiguous"
     )
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Rough place of the local frame: x, y (m) and heading (rad, to the left), with standard deviations."""
+
+    x: float
+    y: float
+    heading: float
+    sigma: float
+    sigma_heading: float
 
 
 @dataclass(frozen=True)
@@ -80,67 +98,61 @@ def thin(elevation: NDArray[np.floating], lattice: Lattice, cell: float) -> Floa
     return np.stack([s / count for s in sums], axis=1)[full]
 
 
-@njit(cache=True, nogil=True)
-def _height(ground, row, col):  # type: ignore[no-untyped-def]
-    r, c = math.floor(row), math.floor(col)
-    if r < 0 or c < 0 or r + 1 >= ground.shape[0] or c + 1 >= ground.shape[1]:
-        return np.nan, 0.0, 0.0
-    u, v = row - r, col - c
-    a, b, d, e = ground[r, c], ground[r, c + 1], ground[r + 1, c], ground[r + 1, c + 1]
-    value = (1 - u) * ((1 - v) * a + v * b) + u * ((1 - v) * d + v * e)
-    return value, (1 - v) * (d - a) + v * (e - b), (1 - u) * (b - a) + u * (e - d)
+@dataclass(frozen=True)
+class GlobalMap:
+    """Heights (row, col) on ``lattice``, m, NaN unknown, bilinear between the cells' centres."""
+
+    heights: Floats
+    lattice: Lattice
+
+    def at(self, x: Floats, y: Floats) -> Floats:
+        """Height (...), m, at x, y (...), m; NaN outside and beside unknown cells."""
+        rows, cols = (self.lattice.y0 - y) / self.lattice.cell, (x - self.lattice.x0) / self.lattice.cell
+        return np.asarray(scipy.ndimage.map_coordinates(self.heights, [rows, cols], order=1, cval=np.nan))
+
+    def slopes(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Slopes along x and y within the bilinear cells."""
+        step = SLOPE_STEP * self.lattice.cell
+        return (
+            (self.at(x + step, y) - self.at(x - step, y)) / (2.0 * step),
+            (self.at(x, y + step) - self.at(x, y - step)) / (2.0 * step),
+        )
 
 
-@njit(cache=True, nogil=True)
-def _search(points, ground, frame, places, bound, scores, overlaps):  # type: ignore[no-untyped-def]
+def _turned(points: Floats, heading: float) -> tuple[Floats, Floats]:
+    """x and y (n,) of points, turned to the left by a heading."""
+    c, s = math.cos(heading), math.sin(heading)
+    return c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]
+
+
+def _scores(points: Floats, ground: GlobalMap, axes: Sequence[Floats], bound: float) -> tuple[Floats, Floats]:
     """Truncated mean square of the height differences at each place (heading, y, x), and the share that is known.
 
-    ``frame``: x and y of the ground's first cell and its side, m; ``places``: x, y (m) and headings (rad) tried.
+    ``axes``: headings, y and x that are tried.
     """
-    x0, y0, cell = frame
-    xs, ys, headings = places
-    n = len(points)
-    differences = np.empty(n)
-    for h in range(len(headings)):
-        c, s = math.cos(headings[h]), math.sin(headings[h])
-        for i in range(len(ys)):
-            for j in range(len(xs)):
-                m = 0
-                for k in range(n):
-                    x = xs[j] + c * points[k, 0] - s * points[k, 1]
-                    y = ys[i] + s * points[k, 0] + c * points[k, 1]
-                    value, _, _ = _height(ground, (y0 - y) / cell, (x - x0) / cell)
-                    if not math.isnan(value):
-                        differences[m] = value - points[k, 2]
-                        m += 1
-                overlaps[h, i, j] = m / n
-                if m < 6:
-                    continue
-                # The height of the local frame on the map is not known: the median difference takes it out.
-                middle = np.median(differences[:m])
-                total = 0.0
-                # Truncated: a rock that the coarse map does not hold counts no more than the bound.
-                for k in range(m):
-                    total += min((differences[k] - middle) ** 2, bound * bound)
-                scores[h, i, j] = total / m
+    scores, overlaps = np.full((2, *(len(axis) for axis in axes)), np.inf)
+    for h, heading in enumerate(axes[0]):
+        dx, dy = _turned(points, heading)
+        for i, y in enumerate(axes[1]):
+            x, y_all = np.broadcast_arrays(axes[2][:, None] + dx, y + dy)
+            # NaN is sorted last. The height of the local frame on the map is not known: the median takes it out.
+            differences = np.sort(ground.at(x, y_all) - points[:, 2], axis=1)
+            count = np.isfinite(differences).sum(axis=1)
+            halves = np.maximum(np.stack([count - 1, count], axis=1) // 2, 0) % len(points)
+            middle = np.take_along_axis(differences, halves, axis=1).mean(axis=1)
+            # Truncated: a rock that the coarse map does not hold counts no more than the bound.
+            off = np.minimum((differences - middle[:, None]) ** 2, bound**2)
+            overlaps[h, i] = count / len(points)
+            scores[h, i] = np.where(count >= MIN_KNOWN, np.nansum(off, axis=1) / np.maximum(count, 1), np.inf)
+    return scores, overlaps
 
 
-def fix(
-    points: Floats,
-    ground: NDArray[np.floating],
-    lattice: Lattice,
-    prior: tuple[float, float, float],
-    prior_sigma: tuple[float, float],
-    params: MapLocalizationParams,
-) -> Fix:
+def fix(points: Floats, ground: GlobalMap, prior: Prior, params: MapLocalizationParams) -> Fix:
     """Place the points of a local model on a global map.
 
     Parameters
     ----------
     points : (n, 3) of :func:`thin`, local frame, m.
-    ground, lattice : heights (row, col) of the global map, m, NaN unknown.
-    prior : x, y (m) and heading (rad, to the left) of the local frame. ``prior_sigma``: of either.
-
     Raises
     ------
     DegenerateError
@@ -154,80 +166,68 @@ def fix(
             f"the local model covers {len(points)} cells of the global map, {params.min_cells} are needed",
             remedy="give a finer global map, or a first pair that sees farther",
         )
-    cell = lattice.cell
+    cell = ground.lattice.cell
     sigma = params.sigma_height * cell
     far = float(np.hypot(points[:, 0], points[:, 1]).max())
     # Half a cell, and turns that move the farthest point by one cell: finer steps find no other minimum.
-    xs, ys, headings = _steps(prior, prior_sigma, 0.5 * cell, cell / far, params.reach)
-    scores = np.full((len(headings), len(ys), len(xs)), np.inf)
-    overlaps = np.zeros_like(scores)
-    z = np.ascontiguousarray(ground, dtype=np.float64)
-    frame = lattice.x0, lattice.y0, cell
-    _search(points, z, frame, (xs, ys, headings), params.truncation * sigma, scores, overlaps)
+    shifts = _around(params.reach * prior.sigma, 0.5 * cell)
+    turns = _around(params.reach * prior.sigma_heading, cell / far)
+    axes = prior.heading + turns, prior.y + shifts, prior.x + shifts
+    scores, overlaps = _scores(points, ground, axes, params.truncation * sigma)
     enough = overlaps >= params.min_overlap
     if not enough.any():
         raise InputError(
             "RIL-338",
             f"the global map knows at most {overlaps.max():.0%} of the ground of the first model around the prior "
-            f"({prior[0]:.2f}, {prior[1]:.2f}) m, {params.min_overlap:.0%} are needed",
+            f"({prior.x:.2f}, {prior.y:.2f}) m, {params.min_overlap:.0%} are needed",
             remedy="give a map that covers the start, or a better prior",
         )
     scores[~enough] = np.inf
-    best = tuple(int(v) for v in np.unravel_index(int(np.argmin(scores)), scores.shape))
-    start = np.array([xs[best[2]], ys[best[1]], headings[best[0]], 0.0])
     independent = max(1.0, len(points) / params.correlation**2)
-    other = _other(scores, best, (xs, ys, headings), independent / sigma**2)
-    return _refine(points, z, lattice, start, params, independent, other)
+    found = _refined(points, ground, _place(axes, int(np.argmin(scores))), params)
+    # By the errors found, and as many independent cells as there are correlation lengths.
+    covariance = found.covariance * max(1.0, found.cells / independent)
+    return replace(found, covariance=covariance, other=_other(scores, axes, independent / sigma**2))
 
 
-def _steps(
-    prior: tuple[float, float, float], sigma: tuple[float, float], step: float, turn: float, reach: float
-) -> tuple[Floats, Floats, Floats]:
-    n, m = math.ceil(reach * sigma[0] / step), math.ceil(reach * sigma[1] / turn)
-    offsets: Floats = step * np.arange(-n, n + 1, dtype=np.float64)
-    turns: Floats = turn * np.arange(-m, m + 1, dtype=np.float64)
-    return np.asarray(prior[0] + offsets), np.asarray(prior[1] + offsets), np.asarray(prior[2] + turns)
+def _around(reach: float, step: float) -> Floats:
+    """Multiples of a step up to a reach to either side."""
+    n = math.ceil(reach / step)
+    return np.asarray(step * np.arange(-n, n + 1, dtype=np.float64))
 
 
-def _other(
-    scores: Floats, best: tuple[int, ...], axes: tuple[Floats, Floats, Floats], weight: float
-) -> tuple[Floats, float] | None:
+def _place(axes: Sequence[Floats], index: int) -> Floats:
+    """x, y and heading of a place, by its number among the scores."""
+    at = np.unravel_index(index, [len(axis) for axis in axes])
+    return np.array([axis[k] for axis, k in zip(axes, at, strict=True)][::-1])
+
+
+def _other(scores: Floats, axes: Sequence[Floats], weight: float) -> tuple[Floats, float] | None:
     """The least of the local minima that do not touch the best one's valley, and its chi2 above the best."""
+    best = np.unravel_index(int(np.argmin(scores)), scores.shape)
     low = scores == scipy.ndimage.minimum_filter(scores, 3, mode="constant", cval=np.inf)
-    # More than three steps: nearer minima belong to the same valley.
-    away = np.max(np.abs(np.indices(scores.shape) - np.array(best).reshape(3, 1, 1, 1)), axis=0) > 3
+    # Farther off than three steps: nearer minima belong to the same valley.
+    away = np.max(np.abs(np.indices(scores.shape) - np.reshape(best, (3, 1, 1, 1))), axis=0) > 3
     low &= away & np.isfinite(scores)
     if not low.any():
         return None
-    at = np.unravel_index(int(np.argmin(np.where(low, scores, np.inf))), scores.shape)
-    where = np.array([axes[0][at[2]], axes[1][at[1]], axes[2][at[0]]])
-    return where, float((scores[at] - scores[best]) * weight)
+    number = int(np.argmin(np.where(low, scores, np.inf)))
+    return _place(axes, number), float((scores.flat[number] - scores[best]) * weight)
 
 
-def _refine(
-    points: Floats,
-    ground: Floats,
-    lattice: Lattice,
-    start: Floats,
-    params: MapLocalizationParams,
-    independent: float,
-    other: tuple[Floats, float] | None,
-) -> Fix:
-    """Gauss-Newton on x, y, heading and z with Huber's weights."""
-    place = start.copy()
-    sigma = params.sigma_height * lattice.cell
+def _refined(points: Floats, ground: GlobalMap, start: Floats, params: MapLocalizationParams) -> Fix:
+    """Gauss-Newton on x, y, heading and z with Huber's weights; the covariance is that of independent points."""
+    cell = ground.lattice.cell
+    bound = params.truncation * params.sigma_height * cell / 2.0
     # Height first: Huber's weights would take a wrong one for outliers everywhere.
-    place[3] = -float(np.nanmedian(_differences(points, ground, lattice, place)[0]))
-    normal, used, weight, r = np.eye(4), np.zeros(len(points), bool), np.ones(0), np.zeros(0)
-    for _ in range(20):
-        difference, slopes = _differences(points, ground, lattice, place)
-        used = np.isfinite(difference)
-        r, J = difference[used], slopes[used]
-        weight = huber_weight(np.abs(r), params.truncation * sigma / 2.0)
+    place = np.append(start, 0.0)
+    place[3] = -float(np.nanmedian(_differences(points, ground, place)[0]))
+    for _ in range(MAX_ROUNDS):
+        r, J = _differences(points, ground, place)
+        weight = huber_weight(np.abs(r), bound)
         normal = J.T @ (weight[:, None] * J)
         scale = np.sqrt(np.diag(normal)) + 1e-12
-        values = np.linalg.eigvalsh(normal / np.outer(scale, scale))
-        if values[0] < 1e-6:
+        if np.linalg.eigvalsh(normal / np.outer(scale, scale))[0] < MIN_EIGENVALUE:
             raise DegenerateError(
                 "RIL-339",
                 "the global map is too flat around the start to tell the position",
@@ -235,32 +235,21 @@ def _refine(
             )
         step = -np.linalg.solve(normal, J.T @ (weight * r))
         place = place + step
-        if np.abs(step[:2]).max() < 1e-4 * lattice.cell:
+        if np.abs(step[:2]).max() < 1e-4 * cell:
             break
-    n = int(used.sum())
     rms = float(np.sqrt((weight * r**2).sum() / max(weight.sum(), 1e-12)))
-    # By the errors found, and as many independent cells as there are correlation lengths.
-    covariance: Floats = np.asarray(np.linalg.inv(normal) * rms**2 * max(1.0, n / independent), dtype=np.float64)
-    return Fix(place, covariance, n / len(points), rms, n, other)
+    return Fix(place, np.linalg.inv(normal) * rms**2, len(r) / len(points), rms, len(r), None)
 
 
-def _differences(points: Floats, ground: Floats, lattice: Lattice, place: Floats) -> tuple[Floats, Floats]:
-    """Local minus global heights (n,), NaN outside, and their derivatives (n, 4) by x, y, heading and z."""
-    c, s = math.cos(place[2]), math.sin(place[2])
-    dx, dy = c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]
-    rows, cols = (lattice.y0 - place[1] - dy) / lattice.cell, (place[0] + dx - lattice.x0) / lattice.cell
-    value, by_row, by_col = _sample(ground, rows, cols)
-    gx, gy = by_col / lattice.cell, -by_row / lattice.cell
+def _differences(points: Floats, ground: GlobalMap, place: Floats) -> tuple[Floats, Floats]:
+    """Local minus global heights (m,) of the points that the map knows, and derivatives (m, 4) by x, y, heading, z."""
+    dx, dy = _turned(points, place[2])
+    x, y = place[0] + dx, place[1] + dy
+    gx, gy = ground.slopes(x, y)
+    difference = points[:, 2] + place[3] - ground.at(x, y)
+    known = np.isfinite(difference) & np.isfinite(gx) & np.isfinite(gy)
     slopes = np.stack([-gx, -gy, gx * dy - gy * dx, np.ones(len(points))], axis=1)
-    return points[:, 2] + place[3] - value, slopes
-
-
-@njit(cache=True, nogil=True)
-def _sample(ground, rows, cols):  # type: ignore[no-untyped-def]
-    out = np.empty((3, len(rows)))
-    for k in range(len(rows)):
-        out[0, k], out[1, k], out[2, k] = _height(ground, rows[k], cols[k])
-    return out[0], out[1], out[2]
+    return difference[known], slopes[known]
 
 
 def _transform(x: float, y: float, heading: float, z: float) -> list[float]:
@@ -284,12 +273,11 @@ def map_localization_stage(
         return Bundle({}, {"T_global_local": _transform(x, y, heading, z), "source": "handed in"})
     assert dem is not None
     assert global_map is not None
-    lattice = Lattice.from_dict(global_map.meta["lattice"])
-    points = thin(np.asarray(dem["elevation"]), Lattice.from_dict(dem.meta["lattice"]), lattice.cell)
-    x, y, heading = prior
-    found = fix(
-        points, np.asarray(global_map["elevation"]), lattice, (x, y, heading), (prior_sigma[0], prior_sigma[1]), params
+    ground = GlobalMap(
+        np.asarray(global_map["elevation"], dtype=np.float64), Lattice.from_dict(global_map.meta["lattice"])
     )
+    points = thin(np.asarray(dem["elevation"]), Lattice.from_dict(dem.meta["lattice"]), ground.lattice.cell)
+    found = fix(points, ground, Prior(*prior, *prior_sigma), params)
     std = np.sqrt(np.diag(found.covariance))
     meta: MapFixFacts = {
         "T_global_local": _transform(*found.place),

@@ -40,7 +40,7 @@ from rille.stages.facts.terrain import DemFacts, MergeFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice, Window
 from rille.stages.numeric.holes import close_holes
-from rille.stages.terrain.merge_kernel import PLANES, CellMaps, Rule, Stack, merge_cells
+from rille.stages.terrain.merge_kernel import CellMaps, Rule, Stack, merge_cells
 from rille.stages.terrain.radiometry import STEP
 
 ALIKE = 0.8
@@ -49,7 +49,6 @@ below one standard deviation."""
 SHARPNESS = 8  # exponent of the ortho image's weights: the best image, but without a visible seam
 STRIP_BYTES = 1 << 26
 """Bytes of the models that are in memory at once: 64 MiB are all of a usual tile, and a part where dozens meet."""
-MAPS = ("elevation", "elevation_std", "residual", "ortho")
 
 
 class MergeParams(Params):
@@ -209,20 +208,20 @@ def _merge_strip(layers: Sequence[Layer], strip: Lattice, params: MergeParams, o
     present = [layer for layer in layers if strip.intersection(layer.lattice) is not None]
     if not present:
         return
-    elevation, std, residual, ortho = (_stacked(present, strip, name) for name in MAPS)
-    gain = np.array([layer.gain for layer in present])
-    centre, pose = (np.array([getattr(layer.pose, name) for layer in present]) for name in ("centre", "covariance"))
-    floats = np.empty((PLANES, *strip.shape), dtype=np.float32)
-    best = np.empty(strip.shape, dtype=np.int64)
+    poses = [layer.pose for layer in present]
+    stack = Stack(
+        *(_stacked(present, strip, name) for name in ("elevation", "elevation_std", "residual", "ortho")),
+        np.array([layer.gain for layer in present]),
+        np.array([pose.centre for pose in poses]),
+        np.array([pose.covariance for pose in poses]),
+    )
     worst = math.inf if params.max_std_cells is None else params.max_std_cells * strip.cell
+    names = ("elevation", "elevation_std", "spread", "ortho", "relief_std", "count")
+    best = np.full(strip.shape, -1, dtype=np.int64)
+    maps = CellMaps(*(getattr(out, name)[rows] for name in names), best)
     rule = Rule(params.residual_scale, SHARPNESS, params.alike, worst)
-    filled = CellMaps(floats, out.count[rows], best)
-    stack = Stack(elevation, std, residual, ortho, gain, centre, pose)
-    merge_cells(stack, strip.xs(), strip.ys(), rule, filled)
-    for name, values in zip(("elevation", "elevation_std", "spread", "ortho", "relief_std"), floats, strict=True):
-        getattr(out, name)[rows] = values
-    pairs = np.array([*(layer.pair for layer in present), -1])
-    out.source[rows] = pairs[best]
+    merge_cells(stack, strip.xs(), strip.ys(), rule, maps)
+    out.source[rows] = np.array([*(layer.pair for layer in present), -1])[best]
 
 
 def _stacked(layers: Sequence[Layer], strip: Lattice, name: str) -> Floats32:
@@ -235,7 +234,7 @@ def _stacked(layers: Sequence[Layer], strip: Lattice, name: str) -> Floats32:
 
 
 def _close(merged: Merged, params: MergeParams) -> None:
-    """Close the small holes in place; their grey value stays undefined, nobody took it."""
+    """Close the small holes in place; their grey value stays undefined."""
     gap, window = float(params.max_hole), params.hole_window
     stds = merged.elevation_std, merged.relief_std
     closed = [close_holes(merged.elevation, std, gap, window, params.hole_known, judged=True) for std in stds]
@@ -259,7 +258,7 @@ def _empty(tile: Lattice) -> Merged:
 
 def _fine(dem: Bundle, lattice: Lattice, most: float) -> Callable[[str, Window], Any]:
     """Parts of a model without the elevations of cells whose footprint is greater than ``most`` metres."""
-    if "pixel_rad" not in dem.meta:  # nobody looked at it: vouched for
+    if "pixel_rad" not in dem.meta:  # no image: vouched for
         return dem.part
     centre = RigidTransform.from_matrix(dem.meta["T_frame_left"]).translation
     angle = float(dem.meta["pixel_rad"])

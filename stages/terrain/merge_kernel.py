@@ -16,9 +16,6 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.numeric.robust import MAD_TO_SIGMA, TUKEY_BISQUARE, bisquare
 
-PLANES = 5
-"""Maps that :func:`merge_cells` fills."""
-
 
 class Stack(NamedTuple):
     """Models (n, rows, cols) float32, NaN undefined: elevations, their standard deviations, residuals, grey values.
@@ -47,73 +44,66 @@ class Rule(NamedTuple):
 
 
 class CellMaps(NamedTuple):
-    """``maps`` (5, rows, cols) float32: elevation, its standard deviation, spread, grey value and the standard
-    deviation of unrelated errors alone; ``used``: number of models that count; ``best`` index of the one of greatest
-    weight, -1 none."""
+    """Maps (rows, cols) of the merged cells: ``elevation``, its standard deviation ``std`` (poses included),
+    ``spread``, ``ortho`` and ``relief_std``, float32; ``used``: number of models that count; ``best``: index of the
+    one of greatest weight, -1 none."""
 
-    maps: Floats32
+    elevation: Floats32
+    std: Floats32
+    spread: Floats32
+    ortho: Floats32
+    relief_std: Floats32
     used: NDArray[np.integer[Any]]
     best: NDArray[np.int64]
 
 
+class _Cell(NamedTuple):
+    """What the models that know a cell say of it (n,): elevation, standard deviations of its own and of the pose, m,
+    weight, grey value, and the model's index in the stack."""
+
+    z: Floats
+    sigma: Floats
+    pose: Floats
+    weight: Floats
+    grey: Floats
+    model: NDArray[np.int64]
+
+
 @njit(cache=True, nogil=True)
-def merge_cells(stack, x, y, rule, filled):  # type: ignore[no-untyped-def]
+def merge_cells(stack, x, y, rule, out):  # type: ignore[no-untyped-def]
     """Merge a stack of models; weights and equations are those of :mod:`rille.stages.terrain.merge`.
 
-    ``x`` (cols,), ``y`` (rows,) of the cells, m. Fills the maps of a :class:`CellMaps`.
+    ``x`` (cols,), ``y`` (rows,) of the cells, m; ``out``: the :class:`CellMaps` to fill, NaN and -1 before.
     """
-    z, sigma, residual, _, _, centre, pose = stack
-    scale, worst = rule.scale, rule.worst
-    out, count, best = filled
-    n, rows, cols = z.shape
-    h, s, w, d, p = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    which, order = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    count, rows, cols = stack.z.shape
+    floats = np.empty((5, count))
+    cell = _Cell(floats[0], floats[1], floats[2], floats[3], floats[4], np.empty(count, np.int64))
+    apart, order = np.empty(count), np.empty(count, np.int64)
     for r in range(rows):
         for c in range(cols):
-            m = 0
-            for k in range(n):
-                if not (math.isfinite(z[k, r, c]) and sigma[k, r, c] > 0.0 and residual[k, r, c] >= 0.0):
-                    continue
-                step = float(sigma[k, r, c])
-                misfit = float(residual[k, r, c]) / scale
-                weight = 1.0 / (step * step * (1.0 + misfit * misfit))
-                if weight > 0.0 and weight < math.inf:
-                    h[m], s[m], w[m], which[m] = z[k, r, c], step, weight, k
-                    p[m] = _swing(pose[k], x[c] - centre[k, 0], y[r] - centre[k, 1])
-                    m += 1
-            if m == 0:
-                _forget(r, c, out, count, best)
-                continue
+            known = _gather(stack, r, c, (x[c], y[r]), rule.scale, cell)
             # Of two models that contradict each other none is the outlier.
-            if m >= 3:
-                _agree(h, s, w, d, order, m)
-            _average((h, s, w, which), m, stack, rule, (r, c), filled)
-            # The limit is on the models' own errors, so it is asked before the poses' part is added.
-            if out[1, r, c] > worst:
-                _forget(r, c, out, count, best)
-            else:
-                placed = _placed(w, p, m)
-                out[1, r, c] = math.sqrt(out[1, r, c] ** 2 + placed * placed)
+            if known >= 3:
+                _reweigh(cell, apart, order, known)
+            if known:
+                _average(cell, known, rule, r, c, out)
 
 
 @njit(cache=True, nogil=True)
-def _forget(r, c, out, count, best):  # type: ignore[no-untyped-def]
-    """Nothing is known of a cell."""
-    count[r, c] = 0
-    best[r, c] = -1
-    for i in range(PLANES):
-        out[i, r, c] = math.nan
-
-
-@njit(cache=True, nogil=True)
-def _placed(w, p, m):  # type: ignore[no-untyped-def]
-    """Standard deviation by the poses: they drift together, so that their errors do not average out."""
-    total = 0.0
-    found = 0.0
-    for i in range(m):
-        total += w[i]
-        found += w[i] * p[i]
-    return found / total
+def _gather(stack, r, c, place, scale, cell):  # type: ignore[no-untyped-def]
+    """Number of models that know a cell at ``place`` (x, y), m, which are put into ``cell``."""
+    n = 0
+    for k in range(stack.z.shape[0]):
+        z, sigma, residual = stack.z[k, r, c], float(stack.sigma[k, r, c]), float(stack.residual[k, r, c]) / scale
+        if not (math.isfinite(z) and sigma > 0.0 and residual >= 0.0):
+            continue
+        weight = 1.0 / (sigma * sigma * (1.0 + residual * residual))
+        if weight > 0.0 and weight < math.inf:
+            cell.z[n], cell.sigma[n], cell.weight[n], cell.model[n] = z, sigma, weight, k
+            cell.grey[n] = min(stack.gain[k] * stack.ortho[k, r, c], 255.0)
+            cell.pose[n] = _swing(stack.pose[k], place[0] - stack.centre[k, 0], place[1] - stack.centre[k, 1])
+            n += 1
+    return n
 
 
 @njit(cache=True, nogil=True)
@@ -124,81 +114,65 @@ def _swing(cov, dx, dy):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _median(values, weight, order, m, alike):  # type: ignore[no-untyped-def]
-    """Lower weighted median of ``m`` values: the least that half of the weight does not exceed; ``alike``: of ones."""
-    for i in range(m):
+def _reweigh(cell, apart, order, n):  # type: ignore[no-untyped-def]
+    """Multiply the weights by Tukey's biweight about the weighted median; ``apart``, ``order``: room for n numbers."""
+    centre = _median(cell.z, cell.weight, order, n)
+    for i in range(n):
+        apart[i] = abs(cell.z[i] - centre)
+    typical = MAD_TO_SIGMA * _median(apart, np.ones(n), order, n)
+    for i in range(n):
+        # At least its own standard deviation: models that agree by chance must not shut out a third.
+        cell.weight[i] *= bisquare((cell.z[i] - centre) / (TUKEY_BISQUARE * max(typical, cell.sigma[i])))
+
+
+@njit(cache=True, nogil=True)
+def _median(values, weight, order, n):  # type: ignore[no-untyped-def]
+    """Lower weighted median of ``n`` values: the least that half of the weight does not exceed."""
+    total = 0.0
+    for i in range(n):
+        total += weight[i]
         j = i
         while j > 0 and values[order[j - 1]] > values[i]:
             order[j] = order[j - 1]
             j -= 1
         order[j] = i
-    total = 0.0
-    for i in range(m):
-        total += 1.0 if alike else weight[order[i]]
     running = 0.0
-    for i in range(m):
-        running += 1.0 if alike else weight[order[i]]
+    for i in range(n):
+        running += weight[order[i]]
         if running >= 0.5 * total:
             return values[order[i]]
-    return values[order[m - 1]]
+    return values[order[n - 1]]
 
 
 @njit(cache=True, nogil=True)
-def _agree(h, s, w, d, order, m):  # type: ignore[no-untyped-def]
-    """Multiply the weights by Tukey's biweight about the weighted median."""
-    centre = _median(h, w, order, m, False)
-    for i in range(m):
-        d[i] = abs(h[i] - centre)
-    typical = MAD_TO_SIGMA * _median(d, w, order, m, True)
-    for i in range(m):
-        # At least its own standard deviation: models that agree by chance must not shut out a third.
-        w[i] *= bisquare(d[i] / (TUKEY_BISQUARE * max(typical, s[i])))
-
-
-# Inlined: to count the references of its arrays once a cell would take 15 % of the merge.
-@njit(cache=True, nogil=True, inline="always")
-def _average(models, m, stack, rule, at, filled):  # type: ignore[no-untyped-def]
-    """Weighted means of the ``m`` models that a cell has; ``models``: elevations, their standard deviations, weights
-    and indices in the stack."""
-    h, s, w, which = models
-    ortho, gain = stack.ortho, stack.gain
-    sharpness, alike = rule.sharpness, rule.alike
-    r, c = at
-    out, count, best = filled
-    total = 0.0
-    top = 0.0
-    used = 0
-    for i in range(m):
-        total += w[i]
-        if w[i] > 0.0:
+def _average(cell, n, rule, r, c, out):  # type: ignore[no-untyped-def]
+    """Weighted means of the ``n`` models that know a cell; nothing where they are too uncertain."""
+    total = top = mean = apart = together = placed = grey = greys = spread = 0.0
+    used, best = 0, -1
+    for i in range(n):
+        total += cell.weight[i]
+        if cell.weight[i] > 0.0:
             used += 1
-        if w[i] > top:
-            top = w[i]
-            best[r, c] = which[i]
-    count[r, c] = used
-    mean = 0.0
-    variance = 0.0
-    together = 0.0
-    grey = 0.0
-    greys = 0.0
-    for i in range(m):
-        if w[i] > 0.0:
-            share = w[i] / total
-            mean += share * h[i]
-            variance += (share * s[i]) ** 2
-            together += share * s[i]
-            value = ortho[which[i], r, c]
-            if math.isfinite(value):
-                sharp = (w[i] / top) ** sharpness
-                grey += sharp * min(gain[which[i]] * value, 255.0)
-                greys += sharp
-    spread = 0.0
-    for i in range(m):
-        if w[i] > 0.0:
-            spread += w[i] / total * (h[i] - mean) ** 2
-    out[0, r, c] = mean
+        if cell.weight[i] > top:
+            top, best = cell.weight[i], cell.model[i]
+    for i in range(n):
+        share = cell.weight[i] / total
+        mean += share * cell.z[i]
+        apart += (share * cell.sigma[i]) ** 2
+        together += share * cell.sigma[i]
+        # Poses drift together, so that their errors do not average out.
+        placed += share * cell.pose[i]
+        if cell.weight[i] > 0.0 and math.isfinite(cell.grey[i]):
+            sharp = (cell.weight[i] / top) ** rule.sharpness
+            grey += sharp * cell.grey[i]
+            greys += sharp
+    for i in range(n):
+        spread += cell.weight[i] / total * (cell.z[i] - mean) ** 2
     # Unrelated errors (alike = 0) average out; errors of one cause (alike = 1) add up as if there were one model.
-    out[1, r, c] = math.sqrt(variance + alike * (together * together - variance))
-    out[2, r, c] = math.sqrt(spread)
-    out[3, r, c] = grey / greys if greys > 0.0 else math.nan
-    out[4, r, c] = math.sqrt(variance)
+    variance = apart + rule.alike * (together * together - apart)
+    # The limit is on the models' own errors, without the poses' part.
+    if math.sqrt(variance) <= rule.worst:
+        out.elevation[r, c], out.std[r, c] = mean, math.sqrt(variance + placed * placed)
+        out.spread[r, c], out.relief_std[r, c] = math.sqrt(spread), math.sqrt(apart)
+        out.ortho[r, c] = grey / greys if greys > 0.0 else math.nan
+        out.used[r, c], out.best[r, c] = used, best

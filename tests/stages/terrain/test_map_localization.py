@@ -12,13 +12,13 @@ from raising import raises
 from scipy.interpolate import RegularGridInterpolator
 
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.terrain.map_localization import MapLocalizationParams, fix, thin
+from rille.stages.terrain.map_localization import GlobalMap, MapLocalizationParams, Prior, fix, thin
 
 Floats = NDArray[np.float64]
 CELL = 0.04
 TRUE = (0.31, -0.22, math.radians(12.0), 0.07)
-PRIOR = (0.25, -0.2, 0.0)
 SIGMA = (0.1, math.radians(8.0))
+PRIOR = Prior(0.25, -0.2, 0.0, *SIGMA)
 
 
 def hills(x: Floats, y: Floats) -> Floats:
@@ -36,7 +36,7 @@ def ridges(x: Floats, y: Floats) -> Floats:
     return 0.02 * np.sin(2 * math.pi * x / 0.16) + 0.02 * np.sin(2 * math.pi * y / 1.3)
 
 
-def scene(ground: Callable[[Floats, Floats], Floats], noise: float = 0.0) -> tuple[Floats, Floats, Lattice]:
+def scene(ground: Callable[[Floats, Floats], Floats], noise: float = 0.0) -> tuple[Floats, GlobalMap]:
     """Points of a local model at TRUE, and the global map."""
     whole = Lattice.snap((-1.5, 1.5, -1.5, 1.5), CELL)
     local = Lattice.snap((-0.3, 0.3, 0.1, 0.8), 0.01)
@@ -45,11 +45,12 @@ def scene(ground: Callable[[Floats, Floats], Floats], noise: float = 0.0) -> tup
     z = ground(TRUE[0] + c * x - s * y, TRUE[1] + s * x + c * y) - TRUE[3]
     xy = whole.xy()
     rng = np.random.default_rng(1)
-    return thin(z, local, CELL), ground(xy[..., 0], xy[..., 1]) + noise * rng.standard_normal(whole.shape), whole
+    heights = ground(xy[..., 0], xy[..., 1]) + noise * rng.standard_normal(whole.shape)
+    return thin(z, local, CELL), GlobalMap(heights, whole)
 
 
 def test_the_place_is_found_within_the_curvature_of_the_cells() -> None:
-    found = fix(*scene(hills), PRIOR, SIGMA, MapLocalizationParams())
+    found = fix(*scene(hills), PRIOR, MapLocalizationParams())
     # bilinear cells of 40 mm on waves of at most 0.02 m and 13 / m differ from them by up to 0.02 (13 * 0.04)^2 / 8 m
     assert found.place[:2] == pytest.approx(TRUE[:2], abs=0.1 * CELL)
     assert found.place[2] == pytest.approx(TRUE[2], abs=math.radians(0.5))
@@ -58,16 +59,17 @@ def test_the_place_is_found_within_the_curvature_of_the_cells() -> None:
 
 
 def test_errors_are_of_the_size_that_the_covariance_claims() -> None:
-    found = fix(*scene(hills, noise=0.003), PRIOR, SIGMA, MapLocalizationParams())
+    found = fix(*scene(hills, noise=0.003), PRIOR, MapLocalizationParams())
     error = found.place - TRUE
     assert error @ np.linalg.solve(found.covariance, error) < 18.5  # chi2 of 4, 0.1 %
     assert math.sqrt(found.covariance[0, 0]) < 0.25 * CELL
 
 
 def test_the_covariance_is_that_of_least_squares_with_one_cell_a_correlation_length() -> None:
-    points, ground, whole = scene(hills, noise=0.002)
-    found = fix(points, ground, whole, PRIOR, SIGMA, MapLocalizationParams(correlation=3.0))
-    height = RegularGridInterpolator((whole.ys()[::-1], whole.xs()), ground[::-1])
+    points, ground = scene(hills, noise=0.002)
+    found = fix(points, ground, PRIOR, MapLocalizationParams(correlation=3.0))
+    whole = ground.lattice
+    height = RegularGridInterpolator((whole.ys()[::-1], whole.xs()), ground.heights[::-1])
 
     def left(place: Floats) -> Floats:
         c, s = math.cos(place[2]), math.sin(place[2])
@@ -93,8 +95,8 @@ def test_a_block_counts_from_three_tenths_of_its_cells_on() -> None:
 
 
 def test_ground_that_repeats_is_ambiguous() -> None:
-    repeated = fix(*scene(ridges), PRIOR, SIGMA, MapLocalizationParams())
-    unique = fix(*scene(hills), PRIOR, SIGMA, MapLocalizationParams())
+    repeated = fix(*scene(ridges), PRIOR, MapLocalizationParams())
+    unique = fix(*scene(hills), PRIOR, MapLocalizationParams())
     assert repeated.other is not None
     assert repeated.other[1] < MapLocalizationParams().min_chi2_gap
     periods = (repeated.other[0][0] - repeated.place[0]) / 0.16
@@ -104,20 +106,20 @@ def test_ground_that_repeats_is_ambiguous() -> None:
 
 
 def test_a_map_elsewhere_is_refused_with_the_share_that_it_knows() -> None:
-    points, ground, whole = scene(hills)
+    points, ground = scene(hills)
     with raises("RIL-338", "50%"):
-        fix(points, ground, whole, (5.0, 5.0, 0.0), SIGMA, MapLocalizationParams())
-    ground[:, : whole.cols // 2 + 5] = np.nan
+        fix(points, ground, Prior(5.0, 5.0, 0.0, *SIGMA), MapLocalizationParams())
+    ground.heights[:, : ground.lattice.cols // 2 + 5] = np.nan
     with raises("RIL-338"):
-        fix(points, ground, whole, (-0.6, -0.2, 0.0), SIGMA, MapLocalizationParams())
+        fix(points, ground, Prior(-0.6, -0.2, 0.0, *SIGMA), MapLocalizationParams())
 
 
 def test_flat_ground_tells_no_place() -> None:
     with raises("RIL-339"):
-        fix(*scene(lambda x, y: 0.0 * x), PRIOR, SIGMA, MapLocalizationParams())
+        fix(*scene(lambda x, y: 0.0 * x), PRIOR, MapLocalizationParams())
 
 
 def test_a_handful_of_cells_is_no_model() -> None:
-    points, ground, whole = scene(hills)
+    points, ground = scene(hills)
     with raises("RIL-337"):
-        fix(points[:5], ground, whole, PRIOR, SIGMA, MapLocalizationParams())
+        fix(points[:5], ground, PRIOR, MapLocalizationParams())
