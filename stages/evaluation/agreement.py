@@ -31,6 +31,12 @@ REST = 10.0
 """Ratio of the spread of positions to the error of a step below which a camera counts as at rest: its positions then
 determine no rotation."""
 
+MIN_RATIO = 2.0
+"""Of the median, below which no frame is flagged."""
+
+MIN_ANGLE_DEG = 0.05
+"""Rotation difference below which no frame is flagged: one pixel at a focal length of 1100."""
+
 REASONS: Mapping[str, tuple[int, str]] = {
     "distance": (1, "position"),
     "angle": (2, "rotation"),
@@ -48,13 +54,6 @@ class AgreementParams(Params):
         gt=0,
         description="robust standard deviations (1.4826 MAD) above the median from which on a frame is flagged; 5, "
         "not 3: drift is not normally distributed",
-    )
-    least_ratio: float = Field(default=2.0, ge=1, description="multiple of the median below which no frame is flagged")
-    least_angle_deg: float = Field(
-        default=0.05,
-        ge=0,
-        description="rotation difference [degrees] below which no frame is flagged; 0.05: one pixel at a focal length"
-        " of 1100",
     )
 
 
@@ -120,8 +119,8 @@ def _steps(arrays: dict[str, Floats], ours: Floats, laid: Floats, rows: NDArray[
 def flag(arrays: Mapping[str, Floats], params: AgreementParams) -> tuple[Bytes, dict[str, float | None]]:
     """Bits of :data:`REASONS` for each frame that stands out, and the limit of each disagreement (None: no values).
 
-    The limit is the median plus ``threshold`` robust standard deviations, at least ``least_ratio`` medians, and for
-    rotations at least ``least_angle_deg``.
+    The limit is the median plus ``threshold`` robust standard deviations, at least two medians, and for
+    rotations at least :data:`MIN_ANGLE_DEG`.
     """
     flags = np.zeros(len(arrays["distance"]), np.uint8)
     limits: dict[str, float | None] = {}
@@ -133,8 +132,8 @@ def flag(arrays: Mapping[str, Floats], params: AgreementParams) -> tuple[Bytes, 
         median = float(np.median(values))
         sigma = mad_sigma(values)
         # Where both agree to rounding, the robust deviation is nearly 0 and every frame would stand out.
-        least = math.radians(params.least_angle_deg) if "angle" in name else 1e-9  # rounding is no reason
-        limit = max(median + params.threshold * sigma, params.least_ratio * median, least)
+        least = math.radians(MIN_ANGLE_DEG) if "angle" in name else 1e-9  # rounding is no reason
+        limit = max(median + params.threshold * sigma, MIN_RATIO * median, least)
         limits[name] = limit
         with np.errstate(invalid="ignore"):
             flags[arrays[name] > limit] |= np.uint8(bit)
@@ -163,24 +162,20 @@ def unbroken(theirs: NDArray[np.int64], ours: NDArray[np.int64]) -> NDArray[np.i
 
 
 def _metrics(arrays: Mapping[str, Floats], facts: Mapping[str, Any], length: float) -> dict[str, Metric]:
-    def rms_of(name: str) -> float:
-        """NaN where no frame has a value, of which :func:`metric` makes None."""
-        values = arrays[name][np.isfinite(arrays[name])]
-        return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
-
-    distance, angle, step, step_angle = (rms_of(name) for name in REASONS)
-    after = "after one rotation and translation, no scale"
+    # NaN where no frame has a value.
+    sizes = {n: rms(v[:, None]) if v.size else math.nan for n in REASONS for v in [arrays[n][np.isfinite(arrays[n])]]}
+    after, apart = "after one rotation and translation, no scale", "RMS disagreement of"
     return {
-        "rmse": metric(distance, "m", f"RMS disagreement of positions {after}"),
-        "rmse_rotation": metric(math.degrees(angle), "deg", f"RMS disagreement of orientations {after}"),
-        "step_rmse": metric(step, "m", "RMS disagreement of the motion between successive frames"),
-        "step_rmse_rotation": metric(math.degrees(step_angle), "deg", "the same, rotation"),
+        "rmse": metric(sizes["distance"], "m", f"{apart} positions {after}"),
+        "rmse_rotation": metric(math.degrees(sizes["angle"]), "deg", f"{apart} orientations {after}"),
+        "step_rmse": metric(sizes["step_distance"], "m", f"{apart} the motion between successive frames"),
+        "step_rmse_rotation": metric(math.degrees(sizes["step_angle"]), "deg", "the same, rotation"),
         "length": metric(length, "m", "length of our trajectory over the compared frames"),
-        "share": metric(100.0 * distance / length if length > 0 else None, "%", "rmse over the length"),
+        "share": metric(100.0 * sizes["distance"] / length if length > 0 else None, "%", "rmse over the length"),
         "scale_ratio": metric(
             facts["scale_ratio"], "1", "scale that would fit the crosscheck to ours best; 1 where both agree"
         ),
-        "rmse_scaled": metric(facts["rmse_scaled_m"], "m", "RMS disagreement of positions with that scale"),
+        "rmse_scaled": metric(facts["rmse_scaled_m"], "m", f"{apart} positions with that scale"),
     }
 
 
@@ -223,8 +218,8 @@ def agreement_stage(
         "pieces": len(crosscheck.meta["pieces"]),
         "metrics": _metrics(arrays, facts, length),
         "rule": f"disagreement above the median by more than {params.threshold:g} robust standard deviations "
-        f"(1.4826 MAD), and above {params.least_ratio:g} medians; in position, rotation (from "
-        f"{params.least_angle_deg:g}° on), or the motion since the frame before",
+        f"(1.4826 MAD), and above {MIN_RATIO:g} medians; in position, rotation (from "
+        f"{MIN_ANGLE_DEG:g}° on), or the motion since the frame before",
         "limits": {n: v if v is None or "angle" not in n else math.degrees(v) for n, v in limits.items()},
         "limits_unit": {n: "deg" if "angle" in n else "m" for n in limits},
         "flagged": [

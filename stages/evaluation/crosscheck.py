@@ -36,7 +36,19 @@ UNIT_BYTES = 512.0
 MASK_SCALES = 3.0
 """Distance to the mask, in scales of the feature, below which a feature is dropped: it may describe the edge."""
 
-SMALL_IMAGE = 150_000
+SPAN = 3
+"""Following frames that each frame is matched with, in both cameras."""
+
+MAX_FEATURES, MAX_IMAGE_SIDE = 2000, 1400
+"""Features of an image, the largest first; and pixels of its longer side, above which it is reduced before."""
+
+MIN_START_ANGLE_DEG = 0.1
+"""Triangulation angle of the images that a model begins with: a pixel of disparity at a focal length of 600."""
+
+SEED = 0
+"""Of COLMAP's random sampling."""
+
+MAX_DOUBLED_PIXELS = 150_000
 """Pixels up to which an image is doubled: of a street at 320 x 96, all of 29 frames have a pose so, 8 without it."""
 
 MAX_RATIO, MAX_DISTANCE = 0.8, 0.7
@@ -57,30 +69,6 @@ class CrosscheckParams(Params):
         "and 30 are equally accurate, and 30 took a tenth less time in all",
     )
     overlap: int = Field(default=6, ge=1, description="frames common to successive windows; they join the windows")
-    span: int = Field(default=3, ge=1, description="match each frame with this many following frames, in both cameras")
-    max_features: int = Field(
-        default=2000, ge=100, description="features per image, largest first; matching time grows with their square"
-    )
-    max_image_size: int = Field(
-        default=1400,
-        ge=64,
-        description="reduce images whose longer side exceeds this [pixels] before features are detected",
-    )
-    first_octave: int | None = Field(
-        default=None,
-        ge=-1,
-        le=3,
-        description="first octave of the feature detector; -1 doubles the image: on a street 1/8 nearer to the truth "
-        "at 8 times the time; null: -1 for images of up to 150 000 pixels, which show too few features else, and 0",
-    )
-    init_min_tri_angle: float = Field(
-        default=0.1,
-        gt=0,
-        lt=90,
-        description="smallest triangulation angle [degrees] of the left and right image that COLMAP begins with; 0.1 "
-        "is a pixel of disparity at a focal length of 600",
-    )
-    seed: int = Field(default=0, ge=0, description="seed of COLMAP's random sampling")
 
     @model_validator(mode="after")
     def _windows_advance(self) -> CrosscheckParams:
@@ -115,18 +103,18 @@ def grey_bytes(image: NDArray[Any]) -> Bytes:
     return np.clip(np.rint(np.nan_to_num(grey)), 0, 255).astype(np.uint8)
 
 
-def extract(image: NDArray[Any], valid: NDArray[Any], params: CrosscheckParams) -> Features:
+def extract(image: NDArray[Any], valid: NDArray[Any]) -> Features:
     """SIFT features of an image (row, col) where ``valid`` (row, col) is not 0."""
     import pycolmap
 
     height, width = image.shape
     grey = grey_bytes(image)
-    reduction = max(width, height) / params.max_image_size
+    reduction = max(width, height) / MAX_IMAGE_SIDE
     if reduction > 1:
         size = (max(1, round(width / reduction)), max(1, round(height / reduction)))
         # Area means: SIFT's first octave expects an image without aliasing.
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    keypoints, descriptors = _extractor(params, grey.size).extract_from_uint8_array(grey)
+    keypoints, descriptors = _extractor(grey.size).extract_from_uint8_array(grey)
     if len(keypoints) == 0:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     table = np.asarray(pycolmap.keypoints_to_matrix(keypoints), dtype=np.float64)
@@ -137,14 +125,13 @@ def extract(image: NDArray[Any], valid: NDArray[Any], params: CrosscheckParams) 
     return Features(points[keep], np.asarray(descriptors.data, np.float32)[keep])
 
 
-def _extractor(params: CrosscheckParams, pixels: int) -> Any:
+def _extractor(pixels: int) -> Any:
     import pycolmap
 
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu, options.num_threads = False, 1
-    first = params.first_octave
-    options.sift.first_octave = (-1 if pixels <= SMALL_IMAGE else 0) if first is None else first
-    options.sift.max_num_features = params.max_features
+    options.sift.first_octave = -1 if pixels <= MAX_DOUBLED_PIXELS else 0
+    options.sift.max_num_features = MAX_FEATURES
     return pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
 
 
@@ -187,8 +174,8 @@ def _nearest(products: Floats32) -> NDArray[np.intp]:
     return np.where((near <= MAX_DISTANCE) & (near < MAX_RATIO * next_near), best, -1)
 
 
-def image_pairs(frames: int, span: int) -> list[tuple[int, int]]:
-    """Image numbers to match: left with right of a frame, and each camera with itself over ``span`` frames.
+def image_pairs(frames: int) -> list[tuple[int, int]]:
+    """Image numbers to match: left with right of a frame, and each camera with itself over :data:`SPAN` frames.
 
     Image ``2 k + 1`` is the left one of frame k, ``2 k + 2`` the right one. Left against right of *other* frames is
     left out: it takes time and adds no accuracy.
@@ -197,7 +184,7 @@ def image_pairs(frames: int, span: int) -> list[tuple[int, int]]:
     for k in range(frames):
         pairs.append((2 * k + 1, 2 * k + 2))
         # Later frames only: a pair is matched once.
-        for j in range(k + 1, min(k + span, frames - 1) + 1):
+        for j in range(k + 1, min(k + SPAN, frames - 1) + 1):
             pairs += [(2 * k + 1, 2 * j + 1), (2 * k + 2, 2 * j + 2)]
     return pairs
 
@@ -235,9 +222,7 @@ def _camera(number: int, camera: Camera) -> Any:
     return out
 
 
-def _write_frames(
-    database: Any, cameras: list[Any], features: list[Features], params: CrosscheckParams
-) -> dict[tuple[int, int], int]:
+def _write_frames(database: Any, cameras: list[Any], features: list[Features]) -> dict[tuple[int, int], int]:
     """Features and verified matches to the database; how many of each image pair that matches."""
     import pycolmap
 
@@ -251,10 +236,10 @@ def _write_frames(
             frame.add_data_id(pycolmap.data_t(camera.sensor_id, number))
         database.write_frame(frame, use_frame_id=True)
     options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed, options.ransac.num_threads = params.seed, 1
+    options.ransac.random_seed, options.ransac.num_threads = SEED, 1
     options.detect_watermark = False
     verified = {}
-    for i, j in image_pairs(len(features) // 2, params.span):
+    for i, j in image_pairs(len(features) // 2):
         a, b = features[i - 1], features[j - 1]
         matches = match(a, b)
         if len(matches) < MIN_MATCHES:
@@ -269,7 +254,7 @@ def _write_frames(
     return verified
 
 
-def _models(database: Any, params: CrosscheckParams, verified: dict[tuple[int, int], int]) -> list[Any]:
+def _models(database: Any, verified: dict[tuple[int, int], int]) -> list[Any]:
     """Models, each begun with the best stereo pair that no model holds yet, as long as it might become the greatest.
 
     ``verified``: number of matches of each image pair (:func:`image_pairs`).
@@ -280,30 +265,30 @@ def _models(database: Any, params: CrosscheckParams, verified: dict[tuple[int, i
     while len(left) > most:
         start = max(left, key=lambda number: (stereo[number], -number))
         left.discard(start)
-        for model in _map(database, params, (start, start + 1)):
+        for model in _map(database, (start, start + 1)):
             models.append(model)
             left -= {2 * frame - 1 for frame in model.reg_frame_ids()}
             most = max(most, model.num_reg_frames())
     return models
 
 
-def _map(database: Any, params: CrosscheckParams, start: tuple[int, int]) -> list[Any]:
+def _map(database: Any, start: tuple[int, int]) -> list[Any]:
     """Incremental mapping from two images on, with the rig and all intrinsics held."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
     # With more threads the order of sums, and so the result, differs from run to run.
     options.num_threads = options.mapper.num_threads = 1
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = params.seed
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
     # The calibration is given to both: refined here, it would hide what it does to our trajectory.
     options.ba_refine_focal_length = options.ba_refine_principal_point = False
     options.ba_refine_extra_params = options.ba_refine_sensor_from_rig = False
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     options.init_image_id1, options.init_image_id2 = start
     options.multiple_models, options.init_num_trials = False, 1
-    options.mapper.init_min_tri_angle = params.init_min_tri_angle
+    options.mapper.init_min_tri_angle = MIN_START_ANGLE_DEG
     options.min_model_size, options.extract_colors = 2, False
-    pycolmap.set_random_seed(params.seed)
+    pycolmap.set_random_seed(SEED)
     manager = pycolmap.ReconstructionManager()
     pycolmap.IncrementalPipeline(options, database, manager).run()
     return [manager.get(k) for k in range(manager.size())]
@@ -337,11 +322,11 @@ def crosscheck_stage(
 
     pycolmap.logging.minloglevel = 3  # fatal: what goes wrong is said by the result
     bundles = itertools.chain.from_iterable(zip(left, right, strict=True))
-    features = [extract(np.asarray(b["image"]), np.asarray(b["valid"]), params) for b in bundles]
+    features = [extract(np.asarray(b["image"]), np.asarray(b["valid"])) for b in bundles]
     with pycolmap.Database.open(":memory:") as database:
         cameras = _write_rig(database, rig)
-        verified = _write_frames(database, cameras, features, params)
-        models = _models(database, params, verified)
+        verified = _write_frames(database, cameras, features)
+        models = _models(database, verified)
     poses, observations = np.full((len(frames), 3, 4), np.nan), np.zeros(len(frames), np.int32)
     best = None
     if models:
@@ -353,7 +338,7 @@ def crosscheck_stage(
     meta: WindowFacts = {
         "frames": list(frames),
         "features": float(np.median([len(f.points) for f in features])),
-        "pairs": len(image_pairs(len(frames), params.span)),
+        "pairs": len(image_pairs(len(frames))),
         "pairs_verified": len(verified),
         "models": len(models),
         "points": 0 if best is None else int(best.num_points3D()),

@@ -27,6 +27,14 @@ from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.numeric.robust import huber_weight
 
+TRUNCATION_SIGMAS = 3.0
+"""Height difference beyond which it costs no more: outliers."""
+MIN_CELLS = 30
+"""Cells of the global map that the local model must cover."""
+CORRELATION_CELLS = 2.0
+"""Correlation length of height differences."""
+MIN_CHI2_GAP = 9.0
+"""Difference of chi2 to the second best place, below which the answer is ambiguous."""
 SLOPE_STEP = 1e-3
 """Of a cell: half the way that slopes are taken over."""
 MIN_KNOWN = 6
@@ -43,17 +51,7 @@ class MapLocalizationParams(Params):
     sigma_height: float = Field(
         0.15, gt=0, description="standard deviation of a height difference to the global map [its cells]"
     )
-    truncation: float = Field(
-        3.0, gt=0, description="height difference [standard deviations] beyond which it costs no more: outliers"
-    )
     min_overlap: float = Field(0.5, gt=0, le=1, description="least share of the local model that the global map covers")
-    min_cells: int = Field(30, ge=6, description="least number of cells of the global map that the local model covers")
-    correlation: float = Field(
-        2.0, ge=1, description="correlation length of height differences [cells]; larger: larger standard deviations"
-    )
-    min_chi2_gap: float = Field(
-        9.0, gt=0, description="least difference of chi2 to the second best place; below, the answer is ambiguous"
-    )
 
 
 @dataclass(frozen=True)
@@ -160,10 +158,10 @@ def fix(points: Floats, ground: GlobalMap, prior: Prior, params: MapLocalization
     InputError
         Nowhere around the prior the map knows enough of the ground that the local model shows.
     """
-    if len(points) < params.min_cells:
+    if len(points) < MIN_CELLS:
         raise DegenerateError(
             "RIL-337",
-            f"the local model covers {len(points)} cells of the global map, {params.min_cells} are needed",
+            f"the local model covers {len(points)} cells of the global map, {MIN_CELLS} are needed",
             remedy="give a finer global map, or a first pair that sees farther",
         )
     cell = ground.lattice.cell
@@ -173,7 +171,7 @@ def fix(points: Floats, ground: GlobalMap, prior: Prior, params: MapLocalization
     shifts = _around(params.reach * prior.sigma, 0.5 * cell)
     turns = _around(params.reach * prior.sigma_heading, cell / far)
     axes = prior.heading + turns, prior.y + shifts, prior.x + shifts
-    scores, overlaps = _scores(points, ground, axes, params.truncation * sigma)
+    scores, overlaps = _scores(points, ground, axes, TRUNCATION_SIGMAS * sigma)
     enough = overlaps >= params.min_overlap
     if not enough.any():
         raise InputError(
@@ -183,7 +181,7 @@ def fix(points: Floats, ground: GlobalMap, prior: Prior, params: MapLocalization
             remedy="give a map that covers the start, or a better prior",
         )
     scores[~enough] = np.inf
-    independent = max(1.0, len(points) / params.correlation**2)
+    independent = max(1.0, len(points) / CORRELATION_CELLS**2)
     found = _refined(points, ground, _place(axes, int(np.argmin(scores))), params)
     # By the errors found, and as many independent cells as there are correlation lengths.
     covariance = found.covariance * max(1.0, found.cells / independent)
@@ -218,7 +216,7 @@ def _other(scores: Floats, axes: Sequence[Floats], weight: float) -> tuple[Float
 def _refined(points: Floats, ground: GlobalMap, start: Floats, params: MapLocalizationParams) -> Fix:
     """Gauss-Newton on x, y, heading and z with Huber's weights; the covariance is that of independent points."""
     cell = ground.lattice.cell
-    bound = params.truncation * params.sigma_height * cell / 2.0
+    bound = TRUNCATION_SIGMAS * params.sigma_height * cell / 2.0
     # Height first: Huber's weights would take a wrong one for outliers everywhere.
     place = np.append(start, 0.0)
     place[3] = -float(np.nanmedian(_differences(points, ground, place)[0]))
@@ -289,13 +287,13 @@ def map_localization_stage(
         "cells": found.cells,
         "other": None if found.other is None else {"place": found.other[0].tolist(), "chi2": found.other[1]},
     }
-    ambiguous = found.other is not None and found.other[1] < params.min_chi2_gap
+    ambiguous = found.other is not None and found.other[1] < MIN_CHI2_GAP
     meta["ambiguous"] = ambiguous
     if found.other is not None and ambiguous:
         ox, oy, _ = found.other[0]
         meta["warnings"] = [
             f"the first pose in the global map is ambiguous: ({ox:.2f}, {oy:.2f}) m fits nearly as well as "
             f"({found.place[0]:.2f}, {found.place[1]:.2f}) m (chi2 larger by {found.other[1]:.1f}, "
-            f"{params.min_chi2_gap:g} wanted)"
+            f"{MIN_CHI2_GAP:g} wanted)"
         ]
     return Bundle({}, meta)

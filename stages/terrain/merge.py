@@ -46,6 +46,10 @@ from rille.stages.terrain.radiometry import STEP
 ALIKE = 0.8
 """Found with the simulator's models at their true poses on 21 November 2026: with it 70 % of the merged errors are
 below one standard deviation."""
+RESIDUAL_SCALE_PX = 0.1
+"""Residual that halves a model's weight: the error of a good disparity."""
+MIN_KNOWN_SHARE = 0.5
+"""Of the ground around a cell, for it to be closed."""
 SHARPNESS = 8  # exponent of the ortho image's weights: the best image, but without a visible seam
 STRIP_BYTES = 1 << 26
 """Bytes of the models that are in memory at once: 64 MiB are all of a usual tile, and a part where dozens meet."""
@@ -54,9 +58,6 @@ STRIP_BYTES = 1 << 26
 class MergeParams(Params):
     """Parameters of the stage ``merge``."""
 
-    residual_scale: float = Field(
-        0.1, gt=0, description="residual [pixels] that halves a model's weight; 0.1: the error of a good disparity"
-    )
     alike: float = Field(
         ALIKE,
         ge=0,
@@ -81,9 +82,6 @@ class MergeParams(Params):
         ge=0,
         le=64,
         description="width of the widest hole [cells] that is closed by interpolation and flagged; 0: none",
-    )
-    hole_known: float = Field(
-        0.5, gt=0, le=1, description="smallest known share of the ground around a cell for it to be closed"
     )
 
     @property
@@ -219,7 +217,7 @@ def _merge_strip(layers: Sequence[Layer], strip: Lattice, params: MergeParams, o
     names = ("elevation", "elevation_std", "spread", "ortho", "relief_std", "count")
     best = np.full(strip.shape, -1, dtype=np.int64)
     maps = CellMaps(*(getattr(out, name)[rows] for name in names), best)
-    rule = Rule(params.residual_scale, SHARPNESS, params.alike, worst)
+    rule = Rule(RESIDUAL_SCALE_PX, SHARPNESS, params.alike, worst)
     merge_cells(stack, strip.xs(), strip.ys(), rule, maps)
     out.source[rows] = np.array([*(layer.pair for layer in present), -1])[best]
 
@@ -237,7 +235,7 @@ def _close(merged: Merged, params: MergeParams) -> None:
     """Close the small holes in place; their grey value stays undefined."""
     gap, window = float(params.max_hole), params.hole_window
     stds = merged.elevation_std, merged.relief_std
-    closed = [close_holes(merged.elevation, std, gap, window, params.hole_known, judged=True) for std in stds]
+    closed = [close_holes(merged.elevation, std, gap, window, MIN_KNOWN_SHARE, judged=True) for std in stds]
     for std, (z, sigma, filled) in zip(stds, closed, strict=True):
         merged.elevation[...], std[...], merged.filled[...] = z, sigma, filled
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.evaluation import crosscheck
 from rille.stages.evaluation.accuracy import angles_between, posed
 from rille.stages.evaluation.crosscheck import (
     CrosscheckParams,
@@ -32,7 +33,7 @@ from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 BASELINE = 0.2
 RIG = Rig(CAMERA, CAMERA, RigidTransform(rotation_exp([0.0, 0.01, 0.005]), [-BASELINE, 0.002, 0.0]))
-PARAMS = CrosscheckParams(span=2)
+PARAMS = CrosscheckParams()
 
 
 def board() -> list[tuple[np.ndarray, np.ndarray]]:
@@ -157,29 +158,30 @@ def test_features_keep_away_from_what_is_masked(scene: Any) -> None:
     valid = np.ones(image.shape, np.uint8)
     valid[:, 100:] = 0
     dark = np.where(valid, image, 0).astype(np.uint8)
-    everywhere, masked = extract(dark, np.ones_like(valid), PARAMS), extract(dark, valid, PARAMS)
+    everywhere, masked = extract(dark, np.ones_like(valid)), extract(dark, valid)
     assert 20 < len(masked.points) < len(everywhere.points)
     assert everywhere.points[:, 0].max() > 100  # the edge itself has features, were it not for the mask
     assert masked.points[:, 0].max() < 100 - 3 * 0.8  # SIFT's smallest scale in a doubled image
-    assert len(extract(dark, np.zeros_like(valid), PARAMS).points) == 0
+    assert len(extract(dark, np.zeros_like(valid)).points) == 0
 
 
 def test_the_first_pixel_s_centre_is_at_one_half() -> None:
     """A blob of 4 px about pixel (row 60, column 100); COLMAP's camera is shifted as its positions are."""
     rows, cols = np.mgrid[:240, :320]
     image = 40 + 150 * np.exp(-((rows - 60) ** 2 + (cols - 100) ** 2) / (2 * 4.0**2))
-    points = extract(image.astype(np.float32), np.ones(image.shape, np.uint8), PARAMS).points
+    points = extract(image.astype(np.float32), np.ones(image.shape, np.uint8)).points
     assert np.abs(points - (100.5, 60.5)).max() < 0.05
     camera = _camera(1, CAMERA)
     assert (camera.principal_point_x, camera.principal_point_y) == (CAMERA.cx + 0.5, CAMERA.cy + 0.5)
     np.testing.assert_allclose(camera.img_from_cam(np.array([0.0, 0.0, 1.0])), [CAMERA.cx + 0.5, CAMERA.cy + 0.5])
 
 
-def test_a_reduced_image_gives_positions_of_the_full_one(scene: Any) -> None:
+def test_a_reduced_image_gives_positions_of_the_full_one(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     image = scene[1]["left"][0]["image"]
     twice = cv2.resize(image, (640, 480), interpolation=cv2.INTER_CUBIC)
-    small = extract(image, np.ones_like(image), PARAMS)
-    large = extract(twice, np.ones_like(twice), CrosscheckParams(max_image_size=320))
+    small = extract(image, np.ones_like(image))
+    monkeypatch.setattr(crosscheck, "MAX_IMAGE_SIDE", 320)
+    large = extract(twice, np.ones_like(twice))
     pairs = match(small, large)
     assert len(pairs) > 50
     # COLMAP's (0, 0) is the corner of the image, so that a doubled image doubles positions
@@ -187,25 +189,24 @@ def test_a_reduced_image_gives_positions_of_the_full_one(scene: Any) -> None:
     assert np.abs(np.median(error, axis=0)).max() < 0.1
 
 
-def test_only_a_small_image_is_doubled(scene: Any) -> None:
+def test_only_a_small_image_is_doubled(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     small = scene[1]["left"][0]["image"]
-    for image, octave in ((small, -1), (cv2.resize(small, (640, 480)), 0)):
-        points, same, other = (
-            extract(image, np.ones_like(image), CrosscheckParams(first_octave=o)).points
-            for o in (None, octave, -1 - octave)
-        )
-        np.testing.assert_array_equal(points, same)
-        assert len(other) != len(same)
+    large, counts = cv2.resize(small, (640, 480)), []
+    for limit in (small.size, small.size - 1, large.size):
+        monkeypatch.setattr(crosscheck, "MAX_DOUBLED_PIXELS", limit)
+        counts.append([len(extract(image, np.ones_like(image)).points) for image in (small, large)])
+    assert counts[0][0] > counts[1][0]
+    assert counts[0][1] == counts[1][1] != counts[2][1]
 
 
 def test_matching_equals_colmap_s_own_matcher(scene: Any) -> None:
     images = [scene[1]["left"][k]["image"] for k in (0, 1)]
-    native = [_extractor(PARAMS, image.size).extract_from_uint8_array(image) for image in images]
+    native = [_extractor(image.size).extract_from_uint8_array(image) for image in images]
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu, options.num_threads = False, 1
     matcher = pycolmap.FeatureMatcher.create(options, pycolmap.Device.cpu)
     expected = matcher.match(native[0][0], native[0][1], native[1][0], native[1][1])
-    ours = match(*(extract(image, np.ones_like(image), PARAMS) for image in images))
+    ours = match(*(extract(image, np.ones_like(image)) for image in images))
     assert len(expected) > 50
     assert {tuple(row) for row in ours.tolist()} == {tuple(row) for row in expected.tolist()}
 
@@ -224,9 +225,9 @@ def test_grey_of_each_kind() -> None:
 
 
 def test_pairs_by_hand() -> None:
-    assert image_pairs(3, 1) == [(1, 2), (1, 3), (2, 4), (3, 4), (3, 5), (4, 6), (5, 6)]
-    assert (1, 7) not in image_pairs(4, 2)
-    assert (1, 7) in image_pairs(4, 3)
+    assert image_pairs(3) == [(1, 2), (1, 3), (2, 4), (1, 5), (2, 6), (3, 4), (3, 5), (4, 6), (5, 6)]
+    assert (1, 7) in image_pairs(5)
+    assert (1, 9) not in image_pairs(5)
 
 
 @given(st.integers(1, 200), st.integers(2, 40), st.integers(1, 39))

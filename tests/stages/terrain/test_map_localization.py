@@ -12,7 +12,15 @@ from raising import raises
 from scipy.interpolate import RegularGridInterpolator
 
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.terrain.map_localization import GlobalMap, MapLocalizationParams, Prior, fix, thin
+from rille.stages.terrain.map_localization import (
+    CORRELATION_CELLS,
+    MIN_CHI2_GAP,
+    GlobalMap,
+    MapLocalizationParams,
+    Prior,
+    fix,
+    thin,
+)
 
 Floats = NDArray[np.float64]
 CELL = 0.04
@@ -67,7 +75,7 @@ def test_errors_are_of_the_size_that_the_covariance_claims() -> None:
 
 def test_the_covariance_is_that_of_least_squares_with_one_cell_a_correlation_length() -> None:
     points, ground = scene(hills, noise=0.002)
-    found = fix(points, ground, PRIOR, MapLocalizationParams(correlation=3.0))
+    found = fix(points, ground, PRIOR, MapLocalizationParams())
     whole = ground.lattice
     height = RegularGridInterpolator((whole.ys()[::-1], whole.xs()), ground.heights[::-1])
 
@@ -78,7 +86,7 @@ def test_the_covariance_is_that_of_least_squares_with_one_cell_a_correlation_len
 
     step = 1e-6
     slopes = np.stack([(left(found.place + d) - left(found.place - d)) / (2 * step) for d in step * np.eye(4)], axis=1)
-    expected = np.linalg.inv(slopes.T @ slopes) * (left(found.place) ** 2).mean() * 3.0**2
+    expected = np.linalg.inv(slopes.T @ slopes) * (left(found.place) ** 2).mean() * CORRELATION_CELLS**2
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(found.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.02)
 
@@ -98,11 +106,11 @@ def test_ground_that_repeats_is_ambiguous() -> None:
     repeated = fix(*scene(ridges), PRIOR, MapLocalizationParams())
     unique = fix(*scene(hills), PRIOR, MapLocalizationParams())
     assert repeated.other is not None
-    assert repeated.other[1] < MapLocalizationParams().min_chi2_gap
+    assert repeated.other[1] < MIN_CHI2_GAP
     periods = (repeated.other[0][0] - repeated.place[0]) / 0.16
     assert periods == pytest.approx(round(periods), abs=CELL / 0.16)
     assert round(periods) != 0
-    assert unique.other is None or unique.other[1] > MapLocalizationParams().min_chi2_gap
+    assert unique.other is None or unique.other[1] > MIN_CHI2_GAP
 
 
 def test_a_map_elsewhere_is_refused_with_the_share_that_it_knows() -> None:

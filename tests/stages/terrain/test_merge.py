@@ -13,7 +13,7 @@ from terrain_scenes import ArrayLayer
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.geometry.lattice import Lattice, mosaic
 from rille.stages.terrain import merge as merge_stage
-from rille.stages.terrain.merge import EXACT, Merged, MergeParams, Placed, footprint, merge
+from rille.stages.terrain.merge import EXACT, RESIDUAL_SCALE_PX, Merged, MergeParams, Placed, footprint, merge
 
 TILE = Lattice.at(0, 0, 0.1, 4, 5)
 PARAMS = MergeParams()
@@ -67,7 +67,7 @@ def test_two_models_of_any_standard_deviations_by_the_equations() -> None:
         rng.uniform(*ends, (2, *TILE.shape)) for ends in ((0, 1), (0.05, 0.2), (0, 0.3), (9, 200))
     )
     merged = merge([layer(k, z[k], std[k], residual[k], ortho[k]) for k in range(2)], TILE, PARAMS)
-    weight = 1.0 / (std**2 * (1.0 + (residual / PARAMS.residual_scale) ** 2))
+    weight = 1.0 / (std**2 * (1.0 + (residual / RESIDUAL_SCALE_PX) ** 2))
     share = weight / weight.sum(axis=0)
     mean = (share * z).sum(axis=0)
     alone, together = ((share * std) ** 2).sum(axis=0), (share * std).sum(axis=0) ** 2
