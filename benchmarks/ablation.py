@@ -1,9 +1,10 @@
 """What each idea costs and gains, left out or changed one at a time: steps of preset ``accurate``, or of navigation.
 
-    RILLE_DATA=... python benchmarks/ablation.py [navigation] [--half judged]
+    RILLE_DATA=... python benchmarks/ablation.py [navigation | terrain] [--half judged]
 
 Navigation: pieces of the street and of the mockup (``benchmarks/odometry/ideas.py``), also with a knocked rig; lost
-frames, error a frame and drift, over those with all ideas. The rest of this page is on the matcher.
+frames, error a frame and drift, over those with all ideas. Terrain: pairs of the simulator
+(``benchmarks/gridding/ideas.py``). The rest of this page is on the matcher.
 
 Pairs: those that settings may be chosen with (``CHOSEN`` of ``benchmarks/stereo/pairs.py``) and the mockup, or with
 ``--half judged`` the others. Time: processor seconds a pair on one thread, both directions, over those of OpenCV's SGBM
@@ -36,15 +37,21 @@ STEPS = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--half", choices=("chosen", "judged"), default="chosen", help="of the pairs (chosen)")
-    parser.add_argument("of", nargs="?", choices=("accurate", "navigation"), default="accurate", help="whose ideas")
+    ideas = ("accurate", "navigation", "terrain")
+    parser.add_argument("of", nargs="?", choices=ideas, default="accurate", help="whose ideas")
     given = parser.parse_args()
     from rille.pipeline.engine.runtime.environment import prepare_environment
 
     prepare_environment()
     if given.of == "navigation":
-        from odometry.ideas import table
+        from odometry import ideas as of_navigation
 
-        table(Path(os.environ["RILLE_DATA"]), given.half)
+        of_navigation.table(Path(os.environ["RILLE_DATA"]), given.half)
+        return
+    if given.of == "terrain":
+        from gridding import ideas as of_terrain
+
+        of_terrain.table(given.half)
         return
     from stereo import methods
     from stereo.pairs import halves, mockup

@@ -13,13 +13,12 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Bundle, NoParams, raster, stage
 from rille.stages.geometry.lattice import Lattice
 
 HERE = Path(__file__).parent
@@ -27,30 +26,17 @@ CELLS = 1500
 LIMIT = 1 << 30
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+@stage("synthetic_dem", outputs=[raster(n, "m", n) for n in ("elevation", "elevation_std", "residual", "ortho")])
+def synthetic_dem(params: NoParams, *, pair: int, i0: int, j0: int, cells: int) -> Bundle:
     """A model: waves, noise of its own, and a border that is not straight."""
-    lattice = Lattice.at(args["i0"], args["j0"], 0.01, args["cells"], args["cells"])
-    rng = np.random.default_rng(args["pair"])
+    lattice = Lattice.at(i0, j0, 0.01, cells, cells)
+    rng = np.random.default_rng(pair)
     x, y = lattice.xs().astype(np.float32)[None], lattice.ys().astype(np.float32)[:, None]
     z = np.sin(x) * np.cos(y) + rng.normal(0, 0.01, lattice.shape).astype(np.float32)
     z[np.abs(x - x.mean()) + 0.2 * np.abs(y - y.mean()) > 0.5 * np.ptp(x)] = np.nan
     even = np.ones(lattice.shape, np.float32)
     maps = {"elevation": z, "elevation_std": 0.01 * even, "residual": 0.05 * even, "ortho": np.rint(100 + 50 * z)}
-    return Bundle(maps, {"pair": args["pair"], "lattice": lattice.to_dict(), "frame": "world"})
-
-
-STAGE = Stage(
-    name="synthetic_dem",
-    version=1,
-    summary="synthetic elevation model",
-    params=NoParams,
-    inputs=(),
-    outputs=tuple(
-        Array(name, ("row", "col"), "float32", "m", name, "nan")
-        for name in ("elevation", "elevation_std", "residual", "ortho")
-    ),
-    run=_run,
-)
+    return Bundle(maps, {"pair": pair, "lattice": lattice.to_dict(), "frame": "world"})
 
 
 def places(side: int, models: int, cells: int) -> list[tuple[int, int]]:
@@ -67,17 +53,22 @@ def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, led
     from rille.pipeline.engine.store.base import Store
     from rille.pipeline.flow.builders import merge_tiles
     from rille.pipeline.flow.reconstruction import TILE_CELLS
-    from rille.stages.terrain import merge, tile_index
+    from rille.stages.terrain.merge import MergeParams, merge_stage
+    from rille.stages.terrain.tile_index import tile_index_stage
 
     graph = Graph()
 
-    def node(stage: Any, label: str, args: Any, **inputs: Any) -> Any:
-        params = merge.MergeParams() if stage is merge else NoParams()
-        return graph.node(stage, label, params, args, {}, inputs)
+    def node(stage: Any, label: str, **given: Any) -> Any:
+        params = MergeParams() if stage is merge_stage else NoParams()
+        inputs = {port: given.pop(port) for port in stage.ports() if port in given}
+        return graph.node(stage, label, params, {k: v for k, v in given.items() if v is not None}, {}, inputs)
 
-    here = "benchmarks.merge_scale"
-    dems = {k: node(here, f"dem/{k}", {"pair": k, "i0": i, "j0": -j, "cells": cells}) for k, (i, j) in enumerate(where)}
-    prints = [node(tile_index, f"tile_index/{k}", {"side": TILE_CELLS, "margin": 0}, dem=d) for k, d in dems.items()]
+    dems = {}
+    for k, (i, j) in enumerate(where):
+        args = {"pair": k, "i0": i, "j0": -j, "cells": cells}
+        dems[k] = graph.node("benchmarks.merge_scale", f"dem/{k}", NoParams(), args, {}, {})
+    cut = {"side": TILE_CELLS, "margin": 0}
+    prints = [node(tile_index_stage, f"tile_index/{k}", dem=dem, **cut) for k, dem in dems.items()]
 
     def follow() -> Any:
         found = yield prints
@@ -96,7 +87,7 @@ def tiles_of(cells: int, at: tuple[int, int], cache: Path) -> set[str]:
     """Labels of the tiles that a model's cells touch, cell by cell."""
     from rille.pipeline.flow.reconstruction import TILE_CELLS
 
-    z = _run(NoParams(), {"pair": 0, "i0": at[0], "j0": -at[1], "cells": cells}, {})["elevation"]
+    z = synthetic_dem(NoParams(), pair=0, i0=at[0], j0=-at[1], cells=cells)["elevation"]
     rows, cols = np.nonzero(np.isfinite(z))
     index = np.unique(np.column_stack([(cols + at[0]) // TILE_CELLS, (rows + at[1]) // TILE_CELLS]), axis=0)
     return {f"merge/{tx}_{ty}" for tx, ty in index}

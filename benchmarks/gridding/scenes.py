@@ -72,14 +72,16 @@ class Scene:
         return replace(self, disparities=match(self, preset))
 
 
-def match(scene: Scene, preset: str = "default") -> Disparities:
-    """Disparities by the matcher with a preset."""
+def match(scene: Scene, preset: str = "default", turned: bool = False) -> Disparities:
+    """Disparities by the matcher with a preset; ``turned``: of the right image."""
     from rille.pipeline.flow import config
     from rille.stages.core.validity import matched
     from rille.stages.hfvm.stage import match as hfvm
 
     params = config.build({"hfvm": {"preset": preset}}).hfvm
-    found = hfvm(scene.left, scene.right, params, valid=(scene.valid[0], scene.valid[1]))
+    sides = ((scene.left, scene.valid[0]), (scene.right, scene.valid[1]))
+    (image, own), (other, its) = sides[::-1] if turned else sides
+    found = hfvm(image, other, params, valid=(own, its))
     maps = found.column_disparity, found.row_disparity, matched(found.validity)
     return Disparities(*maps, found.backmatch_error, found.disparity_std)
 
@@ -93,10 +95,11 @@ def mockup(pairs: int | None = None) -> Iterator[Scene]:
     assert sequence.truth is not None
     frames = range(0, sequence.frames, int(sequence.defaults.get("keyframes.stride", 1)))
     for frame in list(frames)[:pairs]:
-        yield _simulated(sequence, fetch, frame)
+        yield simulated(sequence, fetch, frame)
 
 
-def _simulated(sequence: Any, fetch: Any, frame: int) -> Scene:
+def simulated(sequence: Any, fetch: Any, frame: int) -> Scene:
+    """One pair of a simulated sequence; ``fetch`` computes a source or reads it from the cache."""
     images = [fetch(sequence.image(frame, c)) for c in ("left", "right")]
     left, right = (np.asarray(i["image"]) for i in images)
     exact = fetch(sequence.truth_disparity(frame))

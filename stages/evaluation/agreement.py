@@ -50,10 +50,7 @@ class AgreementParams(Params):
     """When a frame is flagged."""
 
     threshold: float = Field(
-        default=5.0,
-        gt=0,
-        description="robust standard deviations (1.4826 MAD) above the median from which on a frame is flagged; 5, "
-        "not 3: drift is not normally distributed",
+        5.0, gt=0, description="robust standard deviations above the median from which on a frame is flagged"
     )
 
 

@@ -61,14 +61,9 @@ MIN_MATCHES = 15
 class CrosscheckParams(Params):
     """Parameters of the second opinion on the trajectory."""
 
-    enabled: bool = Field(default=True, description="compute the trajectory with COLMAP as well, and compare")
-    window: int = Field(
-        default=20,
-        ge=2,
-        description="frames per bundle adjustment; larger: fewer and longer tasks; on a street of 51 frames 15, 20 "
-        "and 30 are equally accurate, and 30 took a tenth less time in all",
-    )
-    overlap: int = Field(default=6, ge=1, description="frames common to successive windows; they join the windows")
+    enabled: bool = Field(True, description="compute the trajectory with COLMAP as well, and compare")
+    window: int = Field(20, ge=2, description="frames per bundle adjustment; larger: fewer and longer tasks")
+    overlap: int = Field(6, ge=1, description="frames common to successive windows; they join the windows")
 
     @model_validator(mode="after")
     def _windows_advance(self) -> CrosscheckParams:

@@ -40,8 +40,14 @@ from rille.stages.terrain.ground import (
     view_ground,
 )
 
-Samples = tuple[Floats, Floats, Floats]
-"""Rays (n, 3) with z = 1 of the left camera, inverse depths (n,) and their standard deviations, 1/m."""
+
+class Samples(NamedTuple):
+    """Rays (n, 3) with z = 1 of the left camera, inverse depths ``rho`` (n,) and their standard deviations, 1/m."""
+
+    rays: Floats
+    rho: Floats
+    sigma: Floats
+
 
 DEFAULT_RANGE_CELLS = 6.0  # of the footprint in meta; the stage locus has its own parameter
 SAMPLES = 5000  # matched pixels that the plane is fitted to: three parameters need no more
@@ -62,45 +68,27 @@ class GroundFrameParams(Params):
     """Parameters of the stage ``ground_frame``."""
 
     max_tilt_deg: float = Field(
-        30.0,
-        gt=0,
-        lt=90,
-        description="largest slope of the ground, and largest roll of a rig whose attitude is unknown [degrees]",
+        30.0, gt=0, lt=90, description="largest slope of the ground, and largest roll of an unknown attitude [degrees]"
     )
     min_pitch_deg: float = Field(
-        -20.0,
-        gt=-90,
-        lt=90,
-        description="smallest downward pitch [degrees] of a rig whose attitude is unknown; negative on bumps and hills",
+        -20.0, gt=-90, lt=90, description="smallest downward pitch [degrees] of a rig whose attitude is unknown"
     )
     max_pitch_deg: float = Field(
-        75.0,
-        gt=-90,
-        lt=90,
-        description="largest downward pitch [degrees] of a rig whose attitude is unknown; 75 is nearly nadir",
+        75.0, gt=-90, lt=90, description="largest downward pitch [degrees] of a rig whose attitude is unknown"
     )
     relief: float = Field(
         0.02,
         gt=0,
         lt=1,
-        description="largest distance from the plane that counts as ground, as a share of the camera's height; less "
-        "than a kerb, or road and pavement make one tilted plane",
+        description="largest distance of ground from the plane, as a share of the camera's height",
     )
     ceiling: float = Field(
-        1.0,
-        ge=0,
-        description="greatest elevation that is searched, above the camera, in camera heights; surfaces above it are "
-        "not seen from above, only walls and crowns",
+        1.0, ge=0, description="greatest elevation that is searched, above the camera, in camera heights"
     )
     reference_height: float | None = Field(
-        None,
-        gt=0,
-        description="depth [m] below the camera of a horizontal plane around which elevations are searched where no "
-        "ground is seen; not set: then there is no elevation model",
+        None, gt=0, description="depth [m] of a plane below the camera that stands for ground which is not seen"
     )
-    sigma_disparity: float = Field(
-        0.2, gt=0, description="standard deviation of a disparity [pixels] after sub-pixel refinement"
-    )
+    sigma_disparity: float = Field(0.2, gt=0, description="standard deviation of a disparity [pixels]")
     seed: int = Field(1999, ge=0, description="seed of the random samples of the ground plane")
 
 
@@ -137,9 +125,10 @@ def level(
     DegenerateError
         Left and right seem swapped, or the rig has no baseline.
     """
-    rays, rho, sigma = _samples(np.asarray(column_disparity), np.asarray(row_disparity), usable, rig, params)
+    samples = _samples(np.asarray(column_disparity), np.asarray(row_disparity), usable, rig, params)
     known_up, source = _given_vertical(vertical or VerticalHint())
-    samples, ground = (rays, rho, sigma), None
+    rays, rho, sigma = samples
+    ground = None
     try:
         ground = _fitted(samples, lambda n: _allowed(n, known_up, params), params)
         R_local_left = level_rotation(ground.up if known_up is None else known_up)
@@ -207,13 +196,12 @@ def _on_ground(
     ground: GroundPlane, R_local_left: Floats, samples: Samples, rig: Rig, params: GroundFrameParams, source: str
 ) -> GroundFacts:
     """What :func:`level` says of a pair whose ground plane is known."""
-    rays, rho, _ = samples
     plane = _local_plane(ground, R_local_left)
     view = view_ground(rig, R_local_left, plane)
     cell = view.cell_size()
     footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, params.sigma_disparity, cell)
-    points = (rays / np.maximum(rho, 1e-12)[:, None]) @ R_local_left.T
-    relief = _relief(points[rho > 0], plane, footprint, ground.height, params)
+    points = (samples.rays / np.maximum(samples.rho, 1e-12)[:, None]) @ R_local_left.T
+    relief = _relief(points[samples.rho > 0], plane, footprint, ground.height, params)
     return {
         "T_local_left": RigidTransform(R_local_left, np.zeros(3)).to_list(),
         "source": source,
@@ -259,7 +247,7 @@ def _samples(column: NDArray[Any], row: NDArray[Any], usable: Bools, rig: Rig, p
     if len(pixels) >= MIN_POINTS:
         # Before the ground is fitted: exchanged images show none, and that message would mislead.
         _refuse_swapped(rig, pixels, pixels + disparity, float(np.mean(rho < -BEYOND * sigma)))
-    return rig.left.rays(pixels), rho, sigma
+    return Samples(rig.left.rays(pixels), rho, sigma)
 
 
 def _refuse_swapped(rig: Rig, left: Floats, right: Floats, beyond: float) -> None:

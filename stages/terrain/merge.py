@@ -62,27 +62,15 @@ class MergeParams(Params):
         ALIKE,
         ge=0,
         le=1,
-        description="correlation of the errors of two models at one cell, beyond those of their poses; 0.8 was found "
-        "with the simulator's true poses",
+        description="correlation of two models' errors at one cell, beyond those of their poses",
     )
     max_std_cells: float | None = Field(
-        None,
-        gt=0,
-        description="largest standard deviation of a merged cell, without the poses' part, in sides of a cell; other "
-        "cells are left undefined; not set: no limit",
+        None, gt=0, description="largest standard deviation of a cell against those around [cells]; not set: no limit"
     )
     max_footprint: float | None = Field(
-        None,
-        gt=0,
-        description="largest ground [m] that a pixel may cover along the range; other cells of a model are left out, "
-        "since a matching window smooths away what is smaller; not set: no limit",
+        None, gt=0, description="largest ground [m] that a pixel may cover along the range; not set: no limit"
     )
-    max_hole: int = Field(
-        0,
-        ge=0,
-        le=64,
-        description="width of the widest hole [cells] that is closed by interpolation and flagged; 0: none",
-    )
+    max_hole: int = Field(0, ge=0, le=64, description="width of the widest hole [cells] that is closed and flagged")
 
     @property
     def hole_window(self) -> int:
@@ -208,15 +196,25 @@ def _merge_strip(layers: Sequence[Layer], strip: Lattice, params: MergeParams, o
         return
     poses = [layer.pose for layer in present]
     stack = Stack(
-        *(_stacked(present, strip, name) for name in ("elevation", "elevation_std", "residual", "ortho")),
+        _stacked(present, strip, "elevation"),
+        _stacked(present, strip, "elevation_std"),
+        _stacked(present, strip, "residual"),
+        _stacked(present, strip, "ortho"),
         np.array([layer.gain for layer in present]),
         np.array([pose.centre for pose in poses]),
         np.array([pose.covariance for pose in poses]),
     )
     worst = math.inf if params.max_std_cells is None else params.max_std_cells * strip.cell
-    names = ("elevation", "elevation_std", "spread", "ortho", "relief_std", "count")
     best = np.full(strip.shape, -1, dtype=np.int64)
-    maps = CellMaps(*(getattr(out, name)[rows] for name in names), best)
+    maps = CellMaps(
+        out.elevation[rows],
+        out.elevation_std[rows],
+        out.spread[rows],
+        out.ortho[rows],
+        out.relief_std[rows],
+        out.count[rows],
+        best,
+    )
     rule = Rule(RESIDUAL_SCALE_PX, SHARPNESS, params.alike, worst)
     merge_cells(stack, strip.xs(), strip.ys(), rule, maps)
     out.source[rows] = np.array([*(layer.pair for layer in present), -1])[best]

@@ -34,17 +34,11 @@ STEP = 0.5
 class OcclusionBoundsParams(Params):
     """Parameters of the stage ``occlusion_bounds``."""
 
-    sigmas: float = Field(
-        default=1.25,
-        ge=0,
-        le=10,
-        description="number of standard deviations between an elevation and the bounds of the ground",
-    )
+    sigmas: float = Field(1.25, ge=0, le=10, description="standard deviations between an elevation and the bounds")
     max_footprint: float | None = Field(
         None,
         gt=0,
-        description="largest ground [m] that a pixel may cover along the range where a line of sight ends; not set: "
-        "no limit",
+        description="largest ground [m] of a pixel where a line of sight ends; not set: no limit",
     )
 
 

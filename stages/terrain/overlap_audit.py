@@ -32,10 +32,7 @@ class OverlapAuditParams(Params):
     """Parameters of the stage ``overlap_audit``."""
 
     allowed_sigmas: float = Field(
-        2.0,
-        gt=0,
-        description="standard deviations of one cell's difference that a model's bias and tilt may amount to before "
-        "it is reported to contradict its neighbours; 95 % of the differences by noise are smaller than 2",
+        2.0, gt=0, description="standard deviations of a cell's difference that bias and tilt of a seam may amount to"
     )
 
 

@@ -22,9 +22,7 @@ NOBODY = -1
 class StartAreaParams(Params):
     """Parameters of the stage ``start_area``."""
 
-    sigma: float = Field(
-        0.03, gt=0, description="standard deviation [wheel diameters] of the elevations of the start area"
-    )
+    sigma: float = Field(0.03, gt=0, description="standard deviation [wheel diameters] of the start area's elevations")
 
 
 def pad(T_world_vehicle: RigidTransform, radius: float, cell: float) -> tuple[Lattice, np.ndarray]:

@@ -48,12 +48,7 @@ OWN_STD = 1.5  # times max_sigma: a cell's own standard deviation scatters about
 class LocusParams(Params):
     """Parameters of the stage ``locus``."""
 
-    cell_size: float | None = Field(
-        None,
-        gt=0,
-        description="side of a cell [m]; not set: the size of a pixel on the ground at twice the nearest distance, "
-        "rounded to 1, 2 or 5 times a power of ten",
-    )
+    cell_size: float | None = Field(None, gt=0, description="side of a cell [m]; not set: it follows from the rig")
     extent: tuple[float, float, float, float] | None = Field(
         None, description="x_min, x_max, y_min, y_max [m] in the local frame; not set: the ground that both cameras see"
     )
@@ -61,60 +56,25 @@ class LocusParams(Params):
         6.0, gt=0, description="number of cells that a pixel may cover along the range within the automatic extent"
     )
     max_sigma: float | None = Field(
-        None,
-        gt=0,
-        description="largest standard deviation of elevation [m] within the automatic extent, by sigma_disparity; "
-        "where the matcher gives no standard deviations, cells beyond it are left undefined; not set: one"
-        " cell size",
+        None, gt=0, description="largest standard deviation [m], by sigma_disparity; not set: one cell size"
     )
     max_std: float | None = Field(
-        None,
-        gt=0,
-        description="largest standard deviation of a cell's elevation [m], where the matcher gives standard "
-        "deviations; other cells are left undefined, most gross errors among them; not set: 1.5 "
-        "max_sigma, which 5 to 10 % of the cells exceed",
+        None, gt=0, description="largest standard deviation [m] of a cell, by the matcher's; not set: 1.5 max_sigma"
     )
-    sigma_disparity: float = Field(
-        0.2,
-        gt=0,
-        description="standard deviation of a typical disparity [pixels]; bounds the automatic extent, and replaces "
-        "each pixel's own standard deviation where the matcher gives none",
-    )
-    max_residual: float = Field(
-        0.5, gt=0, description="largest residual |p_l + d - p_r| of a solution [pixels]; 0.5: 2.5 sigma_disparity"
-    )
-    max_backmatch: float = Field(
-        1.0,
-        gt=0,
-        description="largest back-matching error [pixels] (4.3.3); a smaller limit removes more good cells than bad "
-        "ones, which max_std tells apart",
-    )
+    sigma_disparity: float = Field(0.2, gt=0, description="standard deviation of a typical disparity [pixels]")
+    max_residual: float = Field(0.5, gt=0, description="largest residual |p_l + d - p_r| of a solution [pixels]")
+    max_backmatch: float = Field(1.0, gt=0, description="largest back-matching error [pixels] (4.3.3)")
     refine_steps: int = Field(
-        2,
-        ge=0,
-        le=20,
-        description="number of Gauss-Newton steps that refine the elevations by what both images show of the surface;"
-        " a third step gains one per cent; 0: none, and standard deviations are those of the disparity "
-        "alone",
+        2, ge=0, le=20, description="number of Gauss-Newton steps that refine the elevations by both images; 0: none"
     )
     refined_share: float = Field(
-        1.0,
-        gt=0,
-        le=1,
-        description="weight of the refined elevation in the result, the rest is that of the disparity; 0.5 for "
-        "matches of preset accurate, whose errors are as large as those of the refined elevations and "
-        "differ from them; 1 for others",
+        1.0, gt=0, le=1, description="weight of the refined elevation; 0.5 for matches of preset accurate, 1 for others"
     )
     both: bool = Field(
-        False,
-        description="also match from right to left and use both elevations: more cells, and errors where the two "
-        "differ show; doubles the time of matching",
+        False, description="also match from right to left and use both elevations; doubles the time of matching"
     )
     max_jump: float = Field(
-        3.0,
-        gt=0,
-        description="largest range of the four disparities around a cell [pixels] that still belong to one surface; "
-        "relief at a grazing angle changes by 1.5 pixels per pixel, twice that along the diagonal",
+        3.0, gt=0, description="largest range of the four disparities around a cell [pixels] that are one surface"
     )
 
 

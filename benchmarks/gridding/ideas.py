@@ -1,0 +1,102 @@
+"""What each idea of a terrain model gains: Locus with one idea left out at a time, on pairs of the simulator.
+
+Ratios to the model with all ideas, means over the pairs: RMS error of all cells, of the surest 70 % of the cells that
+both cameras see, completeness; and the share of the errors within one standard deviation. Seeds 1 to 3 are those that
+settings may be chosen with, 4 to 6 those to judge by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from rille.stages.geometry.surface import plane
+from rille.stages.terrain.locus import refinement, solve, stage
+from rille.stages.terrain.locus.solve import Matches
+from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
+
+SEEDS = {"chosen": (1, 2, 3), "judged": (4, 5, 6)}
+FRAMES = (0, 6)
+SUREST = 0.7
+"""Share of the cells that both cameras see."""
+
+Changes = Mapping[tuple[Any, str], Any]
+IDEAS: tuple[tuple[str, dict[str, Any], Changes], ...] = (
+    ("refinement by both images", {"refine_steps": 0}, {}),
+    ("second step of it", {"refine_steps": 1}, {}),
+    ("edges in it", {}, {(refinement, "BEND"): 1e9}),
+    ("smoothness in it", {}, {(refinement, "STIFFNESS"): 40.0}),
+    ("local mean of brightness", {}, {(refinement, "MEAN_SIDE"): 151}),
+    ("limit of a jump", {"max_jump": 1e9}, {}),
+    ("limit of the residual", {"max_residual": 1e9}, {}),
+    ("limit of back-matching", {"max_backmatch": 1e9}, {}),
+    ("limit of the standard deviation", {"max_std": 1e9}, {}),
+    ("coarse to fine search", {}, {(solve, "COARSE"): 1}),
+)
+"""What is left out, in words, as parameters, and as constants of modules."""
+TWO_WAYS: tuple[tuple[str, dict[str, Any], Changes], ...] = (
+    ("both directions", {"both": False}, {}),
+    ("a standard deviation of their own", {"both": True}, {(stage, "from_both"): None}),
+)
+
+
+def table(half: str) -> None:
+    """Print the table of one half of the seeds."""
+    scenes = list(_scenes(SEEDS[half]))
+    print("| left out | RMS error | of the surest 70 % | completeness | within 1 std |\n|---|---|---|---|---|")
+    for ideas, given in ((IDEAS, {}), (TWO_WAYS, {"both": True})):
+        whole = [_figures(scene, given, {}) for scene in scenes]
+        _row("nothing" + (", both directions" if given else ""), whole, whole)
+        for words, params, changes in ideas:
+            _row(words, [_figures(scene, {**given, **params}, changes) for scene in scenes], whole)
+
+
+def _scenes(seeds: tuple[int, ...]) -> Iterator[tuple[Any, dict[str, Any]]]:
+    from stereo.pairs import fetcher
+
+    from rille.datasets.registry import open_sequence
+    from rille.pipeline.commands.options import cache_folder
+
+    from .scenes import match, simulated
+
+    fetch = fetcher(cache_folder(None))
+    for seed in seeds:
+        sequence = open_sequence("mockup-short", {"mockup": {"seed": seed}})
+        for frame in FRAMES:
+            scene = simulated(sequence, fetch, frame)
+            yield scene, {side: match(scene, turned=side == "back") for side in ("forth", "back")}
+
+
+def _figures(given: tuple[Any, dict[str, Any]], params: dict[str, Any], changes: Changes) -> list[float]:
+    """RMS error of all and of the surest cells, completeness, share of errors within one standard deviation."""
+    (scene, found), before = given, {place: getattr(*place) for place in changes}
+    chosen = LocusParams(max_sigma=scene.max_sigma, **params)
+    forth, back = (
+        Matches(d.column, d.row, d.usable(chosen.max_backmatch), d.std) for d in (found["forth"], found["back"])
+    )
+    pair = MatchedPair(scene.left, forth, scene.right, back if chosen.both else None)
+    try:
+        for (module, name), value in changes.items():
+            setattr(module, name, _one_model if name == "from_both" else value)
+        dem = reconstruct(pair, scene.rig, scene.T_surface_left, plane(scene.lattice), scene.z_range, chosen)
+    finally:
+        for (module, name), value in before.items():
+            setattr(module, name, value)
+    known = scene.judged & np.isfinite(dem.elevation)
+    error, std = dem.elevation[known].astype(np.float64) - scene.truth[known], dem.elevation_std[known]
+    surest = np.argsort(std, kind="stable")[: round(SUREST * scene.judged.sum())]
+    rms = [float(np.sqrt(np.mean(e**2))) for e in (error, error[surest])]
+    return [*rms, known.sum() / scene.judged.sum(), float(np.mean(np.abs(error) < std))]
+
+
+def _one_model(elevation: Any, seen: Any, moved: Any, apart: Any, otherwise: Any) -> Any:
+    """The standard deviation that one direction has, for both."""
+    return refinement.standard_deviation(elevation, seen, otherwise.astype(np.float32))
+
+
+def _row(words: str, mine: list[list[float]], whole: list[list[float]]) -> None:
+    a, b = (np.array(figures) for figures in (mine, whole))
+    ratios = np.mean(a[:, :3] / b[:, :3], axis=0)
+    print(f"| {words} | {' | '.join(f'{v:.3f}' for v in ratios)} | {a[:, 3].mean():.3f} |", flush=True)
