@@ -18,7 +18,7 @@ from pydantic import Field
 from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, Params, stage
 from rille.stages.evaluation.accuracy import angles_between, by_frame
-from rille.stages.evaluation.accuracy_parts import metric, posed, rms
+from rille.stages.evaluation.accuracy_parts import angle, metric, posed, relative_error, rms, square
 from rille.stages.evaluation.pose_alignment import align, moved, spread
 from rille.stages.facts.evaluation import AgreementFacts, JoinFacts, Metric
 from rille.stages.facts.odometry import TrajectoryFacts
@@ -104,13 +104,9 @@ def _steps(arrays: dict[str, Floats], ours: Floats, laid: Floats, rows: NDArray[
     """Disagreement of the motions from frame to frame, in place; in the frame before, so free of the alignment."""
     # Frames whose neighbour before is in the piece as well: a step over a gap is no motion between frames.
     second = rows[1:][np.diff(rows) == 1]
-    moves = []
-    for poses in (ours, laid):
-        R = np.swapaxes(poses[second - 1, :, :3], 1, 2)
-        shift = R @ (poses[second, :, 3] - poses[second - 1, :, 3])[:, :, None]
-        moves.append(np.concatenate([R @ poses[second, :, :3], shift], axis=2))
-    arrays["step_distance"][second] = np.linalg.norm(moves[0][:, :, 3] - moves[1][:, :, 3], axis=1)
-    arrays["step_angle"][second] = angles_between(moves[0], moves[1])
+    E = relative_error(square(laid), square(ours), second - 1, second)
+    arrays["step_distance"][second] = np.linalg.norm(E[:, :3, 3], axis=1)
+    arrays["step_angle"][second] = angle(E)
 
 
 def flag(arrays: Mapping[str, Floats], params: AgreementParams) -> tuple[Bytes, dict[str, float | None]]:

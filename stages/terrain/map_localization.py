@@ -267,7 +267,7 @@ def map_localization_stage(
 ) -> Bundle[MapFixFacts]:
     """First pose in a global map, by aligning the first elevation model or as handed in."""
     if pose is not None:
-        x, y, z, heading = pose
+        x, y, heading, z = (float(pose[k]) for k in (0, 1, 3, 2))
         return Bundle({}, {"T_global_local": _transform(x, y, heading, z), "source": "handed in"})
     assert dem is not None
     assert global_map is not None
