@@ -28,6 +28,7 @@ IDEAS: tuple[tuple[str, dict[str, Any], Changes], ...] = (
     ("second step of it", {"refine_steps": 1}, {}),
     ("edges in it", {}, {(refinement, "BEND"): 1e9}),
     ("smoothness in it", {}, {(refinement, "STIFFNESS"): 40.0}),
+    ("weights against highlights", {}, {(refinement, "RESIDUAL"): 1e9}),
     ("a window for the local mean", {}, {(refinement, "MEAN_SIDE"): 151}),
     ("limit of a jump", {"max_jump": 1e9}, {}),
     ("limit of the residual", {"max_residual": 1e9}, {}),

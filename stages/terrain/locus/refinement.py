@@ -61,6 +61,8 @@ RELIEF_SIDE, TEXTURE_SIDE = 7, 5
 UNKNOWN_BEND = 2.0
 """Pixels of disparity that stand for the bend towards a neighbour that nobody saw."""
 LEAST_CORRELATION = 0.02
+MIN_POWER = 1e-6
+"""Squared grey levels: so that a blank wall is not divided by."""
 
 
 def refine(views: Views, surface: Surface, elevation: Floats32, steps: int) -> tuple[Floats32, OrthoPair]:
@@ -106,49 +108,24 @@ def standard_deviation(elevation: Floats32, seen: OrthoPair, from_disparity: Flo
     sides = (RELIEF_SIDE,) * 3 + (TEXTURE_SIDE,) * 3
     for part, side in zip(parts, sides, strict=True):
         part[...] = window_sum32(part, side)
-    std = from_disparity.copy()
-    _join(parts, known, seen.scale, std)
-    return std
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _join(sums, known, scale, std):  # type: ignore[no-untyped-def]
-    """Replace the disparity's part of each known cell by the whole standard deviation; ``sums`` as :func:`_neighbours`
-    gives them, over their windows."""
-    rows, cols = std.shape
-    half = RELIEF_SIDE // 2
-    for r in range(rows):
-        for c in range(cols):
-            if known[r, c]:
-                bends, steps, count = sums[0, r, c], sums[1, r, c], sums[2, r, c]
-                both, of_left, of_right = sums[3, r, c], max(sums[4, r, c], 0.0), max(sums[5, r, c], 0.0)
-                height, width = min(r + half + 1, rows) - max(r - half, 0), min(c + half + 1, cols) - max(c - half, 0)
-                relief = max(bends / (height * width) + steps / max(count, 1.0), 0.0)
-                alike = min(max(both / max(math.sqrt(of_left * of_right), 1e-6), LEAST_CORRELATION), 1.0)
-                variance = FACTOR**2 * (std[r, c] ** 2 + relief) / alike**2
-                std[r, c] = math.sqrt(variance + (FLOOR / scale[r, c]) ** 2)
+    bends, steps, count, both, of_left, of_right = parts
+    cells = window_sum32(np.ones(elevation.shape, np.float32), RELIEF_SIDE)
+    relief = np.maximum(bends / cells + steps / np.maximum(count, 1.0), 0.0)
+    # Differences of running sums may fall below zero by their rounding.
+    power = np.sqrt(np.maximum(of_left, 0.0) * np.maximum(of_right, 0.0))
+    alike = np.clip(both / np.maximum(power, MIN_POWER), LEAST_CORRELATION, 1.0)
+    floor = np.where(known, FLOOR / seen.scale, 0.0)
+    std = np.sqrt((FACTOR / alike) ** 2 * (np.square(from_disparity) + relief) + floor**2)
+    return np.where(known, std, from_disparity).astype(np.float32)
 
 
 def _gain(seen: OrthoPair) -> float:
     """Factor that gives the right image the left one's contrast, from the gradients along the surface's axes."""
-    left, right = float(_steps(seen.left)), float(_steps(seen.right))
+    left, right = (
+        sum(float(np.nansum(np.square(np.diff(image, axis=axis)), dtype=np.float64)) for axis in (0, 1))
+        for image in (seen.left, seen.right)
+    )
     return math.sqrt(left / right) if min(left, right) > 0 else 1.0
-
-
-@njit(cache=True, nogil=True)
-def _steps(image):  # type: ignore[no-untyped-def]
-    """Sum of the squared differences of known neighbours."""
-    rows, cols = image.shape
-    total = 0.0
-    for r in range(rows):
-        for c in range(cols):
-            if np.isnan(image[r, c]):
-                continue
-            across = image[r, c + 1] - image[r, c] if c + 1 < cols else np.float32(0.0)
-            down = image[r + 1, c] - image[r, c] if r + 1 < rows else np.float32(0.0)
-            for step in (across, down):
-                total += float(step * step) if step == step else 0.0
-    return total
 
 
 def _level(seen: OrthoPair, gain: float) -> None:
@@ -159,27 +136,15 @@ def _level(seen: OrthoPair, gain: float) -> None:
 
 def _misfit(seen: OrthoPair, keep: Bools) -> tuple[Floats32, Floats32]:
     """Weight of each cell's equation, and difference of both images without its local mean; zero where not kept."""
-    rest, weight, misfit = (np.zeros(keep.shape, np.float32) for _ in range(3))
-    np.subtract(seen.left, seen.right, out=rest, where=keep)
-    weight[keep] = 1.0
+    rest = np.where(keep, seen.left - seen.right, np.float32(0.0))
+    weight = misfit = keep.astype(np.float32)
     for _ in range(MEAN_ROUNDS + 1):
-        weighted, weights = (window_sum32(v, MEAN_SIDE) for v in (weight * rest, weight))
-        _weigh(rest, keep, weighted, weights, misfit, weight)
-    # A cell smaller than a pixel brings no more than its share of what the pixel tells.
+        mean = window_sum32(weight * rest, MEAN_SIDE) / np.maximum(window_sum32(weight, MEAN_SIDE), LEAST_WEIGHT)
+        misfit = np.where(keep, rest - mean, np.float32(0.0))
+        # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once.
+        weight = keep / (np.float32(1.0) + np.square(misfit / np.float32(RESIDUAL)))
+    # A cell smaller than a pixel brings no more than its share of the pixel.
     return np.where(keep, weight * np.fmin(seen.area, 1.0), np.float32(0.0)), misfit
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _weigh(rest, keep, weighted, weights, misfit, weight):  # type: ignore[no-untyped-def]
-    """Difference of each kept cell from the weighted mean around it, and the weight that follows."""
-    one, residual, least = np.float32(1.0), np.float32(RESIDUAL), np.float32(LEAST_WEIGHT)
-    rows, cols = rest.shape
-    for r in range(rows):
-        for c in range(cols):
-            off = rest[r, c] - weighted[r, c] / max(weights[r, c], least)
-            misfit[r, c] = off if keep[r, c] else 0.0
-            # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once.
-            weight[r, c] = one / (one + (off / residual) ** 2) if keep[r, c] else 0.0
 
 
 @njit(cache=True, nogil=True)
