@@ -6,6 +6,7 @@ Call :func:`prepare_environment` first thing in a program. Worker processes get 
 from __future__ import annotations
 
 import os
+from functools import cache
 
 from rille.pipeline.engine.code_digest import remember_in
 from rille.pipeline.engine.runtime.apart import absolute_search_paths
@@ -28,9 +29,15 @@ def worker_environment() -> dict[str, str]:
 
 def prepare_environment() -> None:
     """Set this process up to run stages itself, and to start workers."""
-    remember_in(private_folder() / "sources.json")
+    _remember_sources()
     os.environ.update(worker_environment())
     guard()
+
+
+@cache
+def _remember_sources() -> None:
+    """Read once a process what is known of source files: each call from Python would take a tenth of a second."""
+    remember_in(private_folder() / "sources.json")
 
 
 def cores() -> int:

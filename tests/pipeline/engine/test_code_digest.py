@@ -133,7 +133,7 @@ def test_an_edit_of_the_planner_compiles_no_kernel_of_another_room():
 
 
 def test_what_walks_the_whole_sequence_hangs_on_no_matcher():
-    for name in ("step_table", "keyframes", "frame_screening"):
+    for name in ("steps", "keyframes", "frame_screening"):
         reached = code_digest.module_digests(f"rille.stages.odometry.{name}")
         assert not any(".hfvm" in module for module in reached), name
 
