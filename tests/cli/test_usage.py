@@ -18,7 +18,6 @@ WRONG = {
     "reconstruct": [
         ("no-such-sequence", "RIL-276"),
         ("--no-such-option", "RIL-001"),
-        ("other other", "RIL-001"),
         ("other --frames 7:9", "RIL-057"),
         ("other --frames a:b", "RIL-055"),
         ("other --set locus.no_such_key=1", "RIL-027"),

@@ -1,6 +1,7 @@
 """Compile the native solver with the C compiler ``cc`` of this machine, into the folder of its sources.
 
-The name of the binary holds a digest of the sources, so that none of other sources is ever loaded. Each instruction set
+The name of the binary holds a digest of the sources, so that none of other sources is ever loaded; it is not that of a
+module of Python, which walks over the package would import. Each instruction set
 is compiled from the same file; :mod:`rille.stages.hfvm.native.library` takes the best one that the processor has. Needs
 nothing but Python: it runs while the package is built, when nothing else is installed.
 """
@@ -32,7 +33,7 @@ VARIANTS = {
 def binary() -> Path:
     """Path of the binary that belongs to these sources, whether it exists or not."""
     parts = [(FOLDER / name).read_bytes() for name in SOURCES] + [repr((FLAGS, VARIANTS)).encode()]
-    return FOLDER / f"_level-{hashlib.sha256(b''.join(parts)).hexdigest()[:16]}-{platform.machine()}.so"
+    return FOLDER / f"_level-{hashlib.sha256(b''.join(parts)).hexdigest()[:16]}-{platform.machine()}.bin"
 
 
 def compiled() -> Path | None:
@@ -49,7 +50,7 @@ def compiled() -> Path | None:
             part.unlink(missing_ok=True)
             return None
         part.replace(path)
-    for other in FOLDER.glob("_level-*.so"):
+    for other in FOLDER.glob("_level-*.bin"):
         if other != path:
             other.unlink(missing_ok=True)
     return path

@@ -235,11 +235,11 @@ def test_command_line_has_it_all(folder, capsys):
 def test_progress_is_a_bar_on_a_terminal_for_large_pairs(monkeypatch):
     stream = io.StringIO()
     monkeypatch.setattr(command.sys, "stderr", stream)
-    with command._progress(command.LARGE) as tell:
+    with command._progress(command.MIN_PIXELS_OF_BAR) as tell:
         assert tell is None
     monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
-    with command._progress(command.LARGE - 1) as tell:
+    with command._progress(command.MIN_PIXELS_OF_BAR - 1) as tell:
         assert tell is None
-    with command._progress(command.LARGE) as tell:
+    with command._progress(command.MIN_PIXELS_OF_BAR) as tell:
         tell(0.5, "level 0")
     assert "level 0" in stream.getvalue()

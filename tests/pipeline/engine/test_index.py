@@ -132,7 +132,7 @@ def with_a_trigger(path):
     [
         *(pipe, of_gigabytes, of_another_program, a_program, with_a_trigger),
         lambda path: path.write_bytes(b"\xff" * 99),
-        lambda path: path.write_bytes(path.read_bytes()[:5000]),
+        lambda path: path.write_bytes(path.read_bytes()[:3000]),
         lambda path: (path.unlink(), path.mkdir()),
     ],
 )

@@ -158,7 +158,7 @@ def test_a_binary_of_other_sources_is_not_taken_but_replaced(copy):
     source.write_text(source.read_text() + "\n/* later */\n")
     assert not build.binary().is_file()
     second = build.compiled()
-    assert sorted(copy.glob("*.so")) == [second]
+    assert sorted(copy.glob("*.bin")) == [second]
     assert second != first
 
 
@@ -177,7 +177,7 @@ def test_without_a_compiler_the_reference_runs_and_one_warning_says_so(tmp_path)
     code = """
 import warnings
 from rille.stages.hfvm.native import build
-build.binary, build.compiled = lambda: build.FOLDER / "none.so", lambda: None
+build.binary, build.compiled = lambda: build.FOLDER / "none.bin", lambda: None
 with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
     from rille.stages.hfvm.native import reference, solver
