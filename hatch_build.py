@@ -29,7 +29,7 @@ class Preparation(BuildHookInterface):
             return
         binary = _builder(root / "rille" / NATIVE / "build.py").compiled()
         if binary is None:
-            self.app.display_warning("rille: no C compiler (cc), so that matching will take up to 1.9 times as long")
+            self.app.display_warning("rille: no C compiler (cc), so that matching will take two to three times as long")
             return
         # It calls nothing of Python's, so that one binary serves every version.
         build_data["pure_python"] = False
