@@ -13,7 +13,7 @@ class SceneFacts(Facts):
     obstacle: NotRequired[list[float] | None]
 
 
-class LegFacts(Facts):
+class DrivenFacts(Facts):
     """True motion along one ``leg``: number of ``frames``, and the left camera's ``poses``, 3 x 4 numbers each, m."""
 
     leg: int
@@ -29,7 +29,7 @@ class SensedFacts(Facts):
     odometry: list[list[float]]
 
 
-class TruthFacts(Facts):
+class ExactFacts(Facts):
     """Number of a ``frame``, and of the pixels that both cameras have ``seen``."""
 
     frame: int

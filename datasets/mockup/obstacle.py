@@ -9,7 +9,7 @@ import numpy as np
 
 from rille.datasets.mockup import scene as bed
 from rille.datasets.mockup import terrain
-from rille.datasets.mockup.facts import LegFacts, SceneFacts
+from rille.datasets.mockup.facts import DrivenFacts, SceneFacts
 from rille.datasets.mockup.params import SceneParams
 from rille.datasets.mockup.rover import RoverParams, true_and_believed
 from rille.stages.core.declare import Bundle, stage
@@ -48,7 +48,7 @@ def lay(scene: Bundle, x: float, y: float) -> dict[str, Any]:
 def obstacle_stage(
     params: RoverParams,
     scene: Bundle[SceneFacts],
-    before: Bundle[LegFacts],
+    before: Bundle[DrivenFacts],
     pose: Bundle,
     leg: Bundle,
     *,

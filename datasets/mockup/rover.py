@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from rille.datasets.mockup.facts import LegFacts, SceneFacts
+from rille.datasets.mockup.facts import DrivenFacts, SceneFacts
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, Params, stage
 from rille.stages.core.errors import InputError
@@ -181,7 +181,7 @@ def bed_ground(scene: Bundle, vehicle: Vehicle, at: tuple[float, float], reach: 
 
 
 def true_and_believed(
-    before: Bundle[LegFacts], row: int, pose: Bundle, T_vehicle_left: RigidTransform
+    before: Bundle[DrivenFacts], row: int, pose: Bundle, T_vehicle_left: RigidTransform
 ) -> tuple[Pose, Pose]:
     """True pose of the vehicle on the bed before a leg, and its estimate in the frame of the reconstruction."""
     true = RigidTransform.from_matrix(np.asarray(before["vehicle"])[row])
@@ -206,7 +206,7 @@ def true_and_believed(
 def drive_stage(
     params: RoverParams,
     scene: Bundle[SceneFacts],
-    before: Bundle[LegFacts] | None = None,
+    before: Bundle[DrivenFacts] | None = None,
     pose: Bundle | None = None,
     plan: Bundle | None = None,
     *,
@@ -214,7 +214,7 @@ def drive_stage(
     T_vehicle_left: RigidTransform,
     leg: int,
     row: int = 0,
-) -> Bundle[LegFacts]:
+) -> Bundle[DrivenFacts]:
     """True motion of the simulated rover along one leg."""
     start, believed, sent = START, (0.0, 0.0, 0.0), SentLeg(np.zeros((1, 2)), [], 0.0)
     if before is not None and pose is not None and plan is not None:

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from rille.datasets.mockup.facts import LegFacts, SensedFacts
+from rille.datasets.mockup.facts import DrivenFacts, SensedFacts
 from rille.datasets.mockup.rover import RoverParams
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, stage
@@ -39,7 +39,7 @@ def _peaks(z: Floats, wheels: Floats) -> Floats:
         Array("acceleration", ("frame",), "float64", "1", "peak of vertical acceleration since the last image, m/s2"),
     ],
 )
-def sense_stage(params: RoverParams, drive: Bundle[LegFacts], *, leg: int) -> Bundle[SensedFacts]:
+def sense_stage(params: RoverParams, drive: Bundle[DrivenFacts], *, leg: int) -> Bundle[SensedFacts]:
     """What the simulated rover's sensors report of a leg."""
     rng = np.random.default_rng([params.seed, 71, 1 + leg])
     at = np.asarray(drive["frame_at"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.datasets.mockup.facts import SceneFacts, TruthFacts
+from rille.datasets.mockup.facts import ExactFacts, SceneFacts
 from rille.datasets.mockup.raycast import HeightField
 from rille.datasets.mockup.render import camera_rays, transform
 from rille.datasets.mockup.scene import height_field
@@ -86,7 +86,7 @@ def true_disparity(field: HeightField, rig: Rig, T_bed_left: RigidTransform) -> 
 )
 def truth_stage(
     params: NoParams, scene: Bundle[SceneFacts], *, T_bed_left: RigidTransform, rig: Rig, frame: int
-) -> Bundle[TruthFacts]:
+) -> Bundle[ExactFacts]:
     """Exact disparity of a simulated pair."""
     arrays = true_disparity(height_field(scene), rig, T_bed_left)
     return Bundle(arrays, {"frame": frame, "seen": int((arrays["occluded"] == SEEN).sum())})
