@@ -71,7 +71,7 @@ def export(
             path = output or folder / f"cloud.{form}"
             with lookup.reading(folder):
                 artifacts = RunArtifacts(folder, Store(cache_folder(cache)))
-                print(f"{path}  {cloud.export(artifacts, path, cloud.Choice(every, voxel))}")
+                print(f"{path}  {cloud.export(artifacts, path, cloud.Thinning(every, voxel))}")
         else:
             from rille.pipeline.export.programs.run_artifacts import export_run
 

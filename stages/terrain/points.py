@@ -34,7 +34,7 @@ MAX_CUBES = 1_000_000
 
 
 @dataclass(frozen=True)
-class Points:
+class PairPoints:
     """Points in the left camera's frame.
 
     Parameters
@@ -49,8 +49,8 @@ class Points:
     sigma_across: Floats32
     pixel: NDArray[np.int32]
 
-    def __getitem__(self, which: AnyArray) -> Points:
-        return Points(self.position[which], self.sigma_along[which], self.sigma_across[which], self.pixel[which])
+    def __getitem__(self, which: AnyArray) -> PairPoints:
+        return PairPoints(self.position[which], self.sigma_along[which], self.sigma_across[which], self.pixel[which])
 
     def covariance(self) -> Floats:
         """Covariances (n, 3, 3), m^2, in the left camera's frame."""
@@ -61,7 +61,7 @@ class Points:
         return np.asarray(sum(square * part for square, part in zip(squares, (along, across), strict=True)))
 
 
-def points(disparity: Bundle, rig: Rig, every: int = 1) -> Points:
+def points(disparity: Bundle, rig: Rig, every: int = 1) -> PairPoints:
     """Points of the matched pixels of a pair, row by row.
 
     Parameters
@@ -82,7 +82,7 @@ def points(disparity: Bundle, rig: Rig, every: int = 1) -> Points:
     position = rig.left.rays(pixel.astype(np.float64)) / rho[:, None]
     away = np.linalg.norm(position, axis=1)
     focal = min(rig.left.fx, rig.left.fy)
-    return Points(
+    return PairPoints(
         position,
         (away * sigma / rho).astype(np.float32),
         (away / (focal * np.sqrt(12.0))).astype(np.float32),
@@ -90,7 +90,7 @@ def points(disparity: Bundle, rig: Rig, every: int = 1) -> Points:
     )
 
 
-def colours(found: Points, image: Bundle) -> Bytes:
+def colours(found: PairPoints, image: Bundle) -> Bytes:
     """Red, green and blue (n, 3) of points in the left image of their pair; three times its grey where it is grey."""
     column, row = found.pixel.T
     if "colour" in image.arrays:

@@ -50,7 +50,7 @@ Columns = Mapping[str, NDArray[Any]]
 
 
 @dataclass
-class Choice:
+class Thinning:
     """Points that are written: of each ``every``-th row and column, and one in each cube of side ``voxel``, m (0: all).
 
     In a cube that points of several pairs fall into the first pair's stays, and of one pair's the most certain point.
@@ -71,7 +71,7 @@ class Choice:
         return {name: values[first] for name, values in columns.items()}
 
 
-def export(run: RunArtifacts, output: Path, choice: Choice) -> str:
+def export(run: RunArtifacts, output: Path, choice: Thinning) -> str:
     """Write the points of a run as LAZ or PLY, by the ending of the file; what is in it.
 
     Columns: x, y, z (m; of the place on Earth where the sequence has one), red, green, blue of the left image, the
