@@ -22,14 +22,12 @@ from typing import Any
 
 STEPS = (
     ("accurate", ""),
-    ("no propagation along paths", "path_rounds=0"),
-    ("3 rounds of it", "path_rounds=3"),
-    ("no compact features in it", "path_compact=0"),
-    ("no variational refinement", "variational_steps=0"),
-    ("7 steps of it", "variational_steps=7"),
+    ("no propagation along paths", "without=paths"),
+    ("no variational refinement", "without=smooth"),
+    ("no placement of depth edges", "without=edges"),
+    ("no planes without texture", "without=planes"),
+    ("no Lucas-Kanade step", "without=refine"),
     ("lonely matches kept", "min_support=0"),
-    ("no guided filling", "guided_fill=false"),
-    ("two rounds at the finest level", "fine_rounds=2 back_rounds=2"),
 )
 """What is changed, in words and as parameters."""
 

@@ -1,4 +1,4 @@
-"""Standard deviation of disparities against exact ones: the factors of ``rille.stages.hfvm.finish.uncertainty`` and
+"""Standard deviation of disparities against exact ones: the factors of ``rille.stages.hfvm.uncertainty`` and
 their check.
 
 ``python benchmarks/disparity_std.py`` renders pairs of the built-in mockup (kept in ``--cache``), matches them and
@@ -83,18 +83,15 @@ def judged(
     Parts are NaN at pixels without texture, which the factors do not describe alone.
     """
     from rille.stages.hfvm import stage as hfvm
-    from rille.stages.hfvm.finish import uncertainty
-    from rille.stages.hfvm.images.params import HfvmParams
+    from rille.stages.hfvm import uncertainty
+    from rille.stages.hfvm.params import HfvmParams
 
     parts: list[Any] = []
     original = uncertainty.standard_deviation
 
-    def recording(noise: Any, column: Any, keep: Any, params: Any) -> Any:
-        # A second call is for pixels without texture.
-        parts.extend(
-            [] if parts else [np.where(keep, p, np.nan) for p in (noise, *uncertainty.neighbours(column, keep))]
-        )
-        return original(noise, column, keep, params)
+    def recording(noise: Any, column: Any, keep: Any) -> Any:
+        parts.extend(np.where(keep, p, np.nan) for p in (noise, *uncertainty.neighbours(column, keep)))
+        return original(noise, column, keep)
 
     uncertainty.standard_deviation = recording
     try:

@@ -36,7 +36,7 @@ def measure(name: str, files: list[str]) -> None:
     cv2.setNumThreads(1)
     if name == "reference":
         build.binary, build.compiled = (lambda: Path("/none")), (lambda: None)
-    from rille.stages.hfvm.images.params import HfvmParams
+    from rille.stages.hfvm.params import HfvmParams
     from rille.stages.hfvm.stage import match
 
     left, right = (cv2.imread(file, cv2.IMREAD_GRAYSCALE) for file in files)

@@ -69,7 +69,7 @@ def shifted(image: Grey, factor: int, rows: int, cols: int) -> tuple[Grey, Grey]
 def matchers(pandora2d: Path | None) -> dict[str, Matcher]:
     """By name; Pandora2D where it is given."""
     from rille.stages.core.validity import matched
-    from rille.stages.hfvm.images.params import HfvmParams
+    from rille.stages.hfvm.params import HfvmParams
     from rille.stages.hfvm.stage import match
 
     def hfvm(preset: Any) -> Matcher:

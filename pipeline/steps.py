@@ -207,7 +207,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     """
     prepare_environment()
     from rille.pipeline.flow import config, tiles
-    from rille.stages.hfvm import stage as hfvm_stage
+    from rille.stages.hfvm.stage import facts, hfvm_stage, match_pyramids
     from rille.stages.imaging import pyramid
 
     carried = _settings(left)
@@ -220,10 +220,10 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     valid = [np.asarray(image.valid) if "valid" in getattr(image, "coords", ()) else None for image in (left, right)]
     first, second = (pyramid.build(image, built.pyramid, mask) for image, mask in zip(images, valid, strict=True))
     side = tiles.side(built.tiling, built.hfvm, built.pyramid, (images[0].shape, images[1].shape))
-    disparity = hfvm_stage.match_pyramids(first, second, built.hfvm, side=side)
+    disparity = match_pyramids(first, second, built.hfvm, side=side)
     arrays = {name: value for name, value in vars(disparity).items() if name != "aligned"}
-    meta = hfvm_stage.facts(arrays, built.hfvm, disparity.aligned, int(np.count_nonzero(first.valid[0])))
-    return _dataset(hfvm_stage.STAGE, Bundle(arrays, meta), config.merge(carried, {"hfvm": hfvm}))
+    meta = facts(arrays, built.hfvm, disparity.aligned, int(np.count_nonzero(first.valid[0])))
+    return _dataset(hfvm_stage, Bundle(arrays, meta), config.merge(carried, {"hfvm": hfvm}))
 
 
 def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarray.Dataset:
@@ -279,9 +279,9 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
 
 def _disparity(disparity: xarray.Dataset, pair: StereoPair) -> Bundle:
     """The result of the matcher, if it has the size of the pair's images."""
-    from rille.stages.hfvm import stage as hfvm_stage
+    from rille.stages.hfvm.stage import hfvm_stage
 
-    given = _bundle(disparity, hfvm_stage.STAGE, "column_disparity", "rille.match")
+    given = _bundle(disparity, hfvm_stage, "column_disparity", "rille.match")
     size = pair.sequence.rig.left.height, pair.sequence.rig.left.width
     if disparity.column_disparity.shape != size:
         raise InputError(

@@ -39,7 +39,13 @@ RUNS = {
     "drive": ("mockup-loop", "drive", (*LOOP, "hfvm.preset=fast")),
 }
 ELSEWHERE = {
-    *("calibration.swap_check", "evaluation.position_accuracy", "imaging.undistort", "terrain.map_localization"),
+    *(
+        "calibration.swap_check",
+        "calibration.synchrony",
+        "evaluation.position_accuracy",
+        "imaging.undistort",
+        "terrain.map_localization",
+    ),
 }
 """Stages that need a lens, positions, a map or a doubt: tested beside their own modules."""
 

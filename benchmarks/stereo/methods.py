@@ -142,7 +142,7 @@ def _ask(python: Path, *words: str) -> str:
 
 def hfvm(variants: list[str], threads: int) -> list[Method]:
     """Every preset of the matcher's parameters, and variants ``key=value key=value ...`` of them."""
-    from rille.stages.hfvm.images.params import HfvmParams
+    from rille.stages.hfvm.params import HfvmParams
 
     presets = [str(p) for p in get_args(HfvmParams.model_fields["preset"].annotation)]
     found = [_hfvm(f"HFVM {p}", {"preset": p}, threads) for p in presets]
@@ -150,14 +150,14 @@ def hfvm(variants: list[str], threads: int) -> list[Method]:
         values = {}
         for word in text.replace(",", " ").split():
             key, _, value = word.partition("=")
-            values[key] = _value(value)
+            values[key] = value.split("+") if key == "without" else _value(value)
         found.append(_hfvm(f"HFVM {text}", values, threads))
     return found
 
 
 def _hfvm(name: str, values: dict[str, Any], threads: int) -> Method:
     from rille.stages.core.validity import matched
-    from rille.stages.hfvm.images.params import HfvmParams
+    from rille.stages.hfvm.params import HfvmParams
     from rille.stages.hfvm.stage import match
 
     params = HfvmParams(**values)

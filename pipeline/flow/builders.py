@@ -31,7 +31,7 @@ from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts, ResectFacts, TrackFacts, TrajectoryFacts
 from rille.stages.facts.terrain import DemFacts, GroundFacts, MergeFacts, TileIndexFacts
 from rille.stages.hazard.risk import risk_stage
-from rille.stages.hfvm import stage as hfvm
+from rille.stages.hfvm.stage import hfvm_stage
 from rille.stages.imaging.pyramid import pyramid_stage
 from rille.stages.imaging.undistort import undistort_stage
 from rille.stages.odometry.motion import motion_stage
@@ -242,9 +242,8 @@ class Builder:
         if side is None:
             # A smaller right image may be aligned to the left one, and is then as large.
             more = PYRAMID_BYTES * max(math.prod(first) - math.prod(second), 0)
-            return self.graph.node(hfvm.STAGE, label, self.config.hfvm, {"pair": pair}, {}, ports, more)
-        given = self.config.hfvm, self.config.pyramid, ports, (first, second), side
-        return tiles.Tiles(self.graph, *given, label).build()
+            return self.graph.node(hfvm_stage, label, self.config.hfvm, {}, {}, ports, more)
+        return tiles.Tiles(self.graph, self.config.hfvm, ports, first, side, label).build()
 
     # -- a stereo pair ------------------------------------------------------------------------------------------
 

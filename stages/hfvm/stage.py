@@ -1,14 +1,14 @@
 """Hierarchical feature vector matching: dense two-dimensional disparities of any two images (paper, 4.3).
 
-Nothing is rectified and no calibration is used. ``match`` works on plain arrays; see
-:class:`~rille.stages.hfvm.images.params.HfvmParams` for the presets. The rooms, in the order of the dataflow:
+Nothing is rectified and no calibration is used. ``match`` works on plain arrays; :mod:`~rille.stages.hfvm.matcher` has
+the method on one page, in the order of the paper; see :class:`~rille.stages.hfvm.params.HfvmParams` for the presets.
 
-- ``tiled`` composes the matcher of windows: for images in memory here, as tasks in ``tile_stage`` and ``join_stage``.
-- ``images`` holds the parameters, and gives each window its grey values, masks and features.
-- ``coarse_to_fine`` goes down the pyramid; its solver of a level is the fast search, with preset ``accurate`` improved
-  along paths, or that of preset ``paper``.
-- ``level`` matches one level: features, search, propagation, the paper's version to the letter, consistency.
-- ``finish`` treats the finest level: sub-pixel refinement, standard deviations, filling.
+- ``image``, ``features``: grey values, masks and features of a level; ``brightness``, ``plane``, ``viewpoint``: what
+  makes the images alike; ``start``: disparities known beforehand.
+- ``level``: one level: search, propagation, paths, depth edges, check, band (``epipolar``). ``native``: its loops.
+- ``finest``: the finest level: ``lucas_kanade``, ``relief``, ``validation``, ``textureless``, ``fill``,
+  ``uncertainty``.
+- ``paper``: section 4.3 to the letter. ``tiles``: large pairs. ``sanity``: whether to believe a result.
 """
 
 from __future__ import annotations
@@ -20,17 +20,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Memory, Stage
+from rille.stages.core.declare import AnyArray, Array, Bundle, Memory, stage
 from rille.stages.core.validity import Mask, counts, matched
-from rille.stages.hfvm import tiled
-from rille.stages.hfvm.coarse_to_fine import start
-from rille.stages.hfvm.images.params import HfvmParams
-from rille.stages.hfvm.images.views import Plain
-from rille.stages.hfvm.tiled import Tell
+from rille.stages.facts.matching import DisparityFacts
+from rille.stages.hfvm import matcher, paper, start, tiles
+from rille.stages.hfvm.image import view
+from rille.stages.hfvm.matcher import Found, Tell
+from rille.stages.hfvm.params import HfvmParams
+from rille.stages.hfvm.windows import Window
+from rille.stages.hfvm.windows import tiles as cut
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
-__all__ = ["OUTPUTS", "STAGE", "Disparity", "HfvmParams", "facts", "match", "match_pyramids"]
+__all__ = ["OUTPUTS", "Disparity", "HfvmParams", "facts", "hfvm_stage", "match", "match_pyramids"]
 
 Map = NDArray[np.float32]
 
@@ -42,10 +44,10 @@ class Disparity:
     All arrays are (row, col) of the left image. ``column_disparity, row_disparity``: float32 pixels, NaN undefined;
     interpolated ones included. ``validity``: bits of :class:`~rille.stages.core.validity.Validity`.
     ``backmatch_error``: float32 pixels, NaN where the match leaves the right image, and on the planes of textureless
-    regions (:mod:`~rille.stages.hfvm.finish.textureless`). ``distance``: float32 mean feature distance at the
+    regions (:mod:`~rille.stages.hfvm.textureless`). ``distance``: float32 mean feature distance at the
     whole-pixel match (byte steps; preset ``paper``: Eq. 1, grey levels), NaN on such planes and where the match
     leaves the right image. ``disparity_std``: float32 pixels, standard deviation of the column disparity (see
-    :mod:`~rille.stages.hfvm.finish.uncertainty`), NaN where not ``MATCHED``. ``aligned``: whether the right image was
+    :mod:`~rille.stages.hfvm.uncertainty`), NaN where not ``MATCHED``. ``aligned``: whether the right image was
     pre-aligned by a plane.
     """
 
@@ -76,10 +78,10 @@ def match(
     params : matcher's parameters; None: preset ``default``.
     valid : of the left and the right image (row, col), not zero where usable; None: everywhere.
     prior : column and row disparities of the left image, pixels, NaN undefined, to start from (see
-        :mod:`rille.stages.hfvm.coarse_to_fine.start`); None: nothing is known.
+        :mod:`rille.stages.hfvm.start`); None: nothing is known.
     tell : called with the progress.
-    side : pixels of a tile; None: the whole image. The result does not depend on it, the memory needed does. Presets
-        ``accurate`` and those with a relief are matched whole.
+    side : pixels of a tile; None: the whole image. Tiles need less memory; all but a thousandth of the pixels are
+        within .01 px. Presets ``accurate`` and ``paper`` are matched whole.
 
     Raises
     ------
@@ -105,30 +107,73 @@ def match_pyramids(
     side: int | None = None,
 ) -> Disparity:
     """Match two image pyramids as :func:`match` does. ``side``: pixels of a tile; None: whole images."""
-    found = tiled.match(Plain.of(left), Plain.of(right), params, prior, tell or (lambda share, step: None), side)
+    tell = tell or _silent
+    if side is not None and tiles.tileable(params):
+        found = _in_tiles(left, right, params, prior, tell, side)
+    else:
+        found = _whole(left, right, params, prior, tell)
     arrays: dict[str, Any] = found.arrays
     return Disparity(**arrays, aligned=found.aligned)
 
 
-def _run(params: HfvmParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    left, right = (Pyramid.from_bundle(inputs[port]) for port in ("left", "right"))
-    found = tiled.match(Plain.of(left), Plain.of(right), params, None, lambda share, step: None, None)
-    return Bundle(found.arrays, facts(found.arrays, params, found.aligned, int(np.count_nonzero(left.valid[0]))))
+def _silent(share: float, step: str) -> None:
+    """Tell nothing."""
 
 
-def facts(arrays: Mapping[str, AnyArray], params: HfvmParams, aligned: bool, usable: int) -> dict[str, Any]:
-    """Metadata of disparities; ``usable``: how many pixels of the left image are."""
+def _whole(left: Pyramid, right: Pyramid, params: HfvmParams, prior: start.Prior | None, tell: Tell) -> Found:
+    if params.preset in matcher.WHOLE:
+        return Found(paper.match(left, right, params, tell), False)
+    return matcher.match(left, right, params, prior, tell)
+
+
+def _in_tiles(
+    left: Pyramid, right: Pyramid, params: HfvmParams, prior: start.Prior | None, tell: Tell, side: int
+) -> Found:
+    """One tile after the other, in this process."""
+    recipe = matcher.recipe_of(params)
+    if matcher.halves(recipe, left.levels, right.levels):
+        half = _in_tiles(left.above(1), right.above(1), matcher.halved(params), start.halved(prior), tell, side)
+        return matcher.enlarged(half, left, right)
+    images = view(left, params), view(right, params)
+    if min(left.levels, right.levels) < 2:
+        return matcher.match(left, right, params, prior, tell)
+    pair = tiles.Pair.of(*images, tiles.coarse(*images, params, recipe, prior), params, recipe)
+    shape = images[0].shapes[0]
+    windows = cut(shape, side)
+    tell(0.2, "tiles")
+    fine = _gathered(shape, {w: pair.fine(w) for w in windows})
+    ending = pair.ending(fine)
+    tell(0.9, "filling")
+    final = {w: pair.final(w, {k: a[pair.around(w).slices] for k, a in fine.items()}, ending) for w in windows}
+    return Found(_gathered(shape, final), pair.coarse.alignment is not None)
+
+
+def _gathered(shape: tuple[int, ...], parts: Mapping[Window, Mapping[str, AnyArray]]) -> dict[str, AnyArray]:
+    """Arrays of a whole image from those of its tiles."""
+    total: dict[str, AnyArray] = {}
+    for window, arrays in parts.items():
+        for name, values in arrays.items():
+            total.setdefault(name, np.empty(shape, values.dtype))[window.slices] = values
+    return total
+
+
+def facts(arrays: Mapping[str, AnyArray], params: HfvmParams, aligned: bool, usable: int) -> DisparityFacts:
+    """Facts of disparities; ``usable``: how many pixels of the left image are."""
     bits, ok = counts(arrays["validity"]), matched(arrays["validity"])
-    meta = {
+
+    def median(name: str) -> float | None:
+        return float(np.median(arrays[name][ok])) if ok.any() else None
+
+    return {
         "preset": params.preset,
         "aligned": aligned,
         "usable": usable,
         "match_rate": bits["matched"] / usable if usable else None,
         "counts": bits,
+        "median_column_disparity": median("column_disparity"),
+        "median_row_disparity": median("row_disparity"),
+        "median_disparity_std": median("disparity_std"),
     }
-    for name in ("column_disparity", "row_disparity", "disparity_std"):
-        meta[f"median_{name}"] = float(np.median(arrays[name][ok])) if ok.any() else None
-    return meta
 
 
 _GRID = ("row", "col")
@@ -140,13 +185,16 @@ OUTPUTS = (
     Array("distance", _GRID, "float32", "1", "least feature distance", "nan", "left image"),
     Array("disparity_std", _GRID, "float32", "px", "standard deviation of the column disparity", "nan", "left image"),
 )
-STAGE = Stage(
-    name="hfvm",
-    version=2,
-    summary="dense two-dimensional disparities of a stereo pair by hierarchical feature vector matching",
-    params=HfvmParams,
-    inputs=("left", "right"),
+
+
+@stage(
+    "hfvm",
+    version=3,
     outputs=OUTPUTS,
-    run=_run,
-    memory=Memory(fixed=30e6, factor=10.0, result=1.6, lower=("hfvm.preset", "hfvm.finest")),
+    memory=Memory(fixed=30e6, factor=10.0, result=1.6, lower=("hfvm.preset",)),
 )
+def hfvm_stage(params: HfvmParams, left: Bundle, right: Bundle) -> Bundle[DisparityFacts]:
+    """Dense two-dimensional disparities of a stereo pair by hierarchical feature vector matching."""
+    a, b = Pyramid.from_bundle(left), Pyramid.from_bundle(right)
+    found = _whole(a, b, params, None, _silent)
+    return Bundle(found.arrays, facts(found.arrays, params, found.aligned, int(np.count_nonzero(a.valid[0]))))

@@ -80,3 +80,36 @@ def irls(
             break
     assert found is not None
     return found, used
+
+
+def irls_held(
+    terms: NDArray,
+    target: NDArray,
+    weigh: Callable[[NDArray], NDArray],
+    hold: NDArray,
+    start: NDArray | None = None,
+    iterations: int = 10,
+) -> NDArray[np.float64]:
+    """Coefficients (i,) of a linear model by iteratively reweighted least squares.
+
+    They minimise ``sum w (g . terms - target)^2 + sum hold (g - start)^2``, with the weights of the residuals that the
+    coefficients before left.
+
+    Parameters
+    ----------
+    terms : (i, n); ``target`` (n,).
+    weigh : weights (n,) of residuals (n,), see also :func:`cauchy`.
+    hold : (i,) precisions with which the coefficients are held at ``start`` (zeros without it), not all zero: so that
+        what the data leave open is determined.
+    """
+    first = np.zeros(len(terms)) if start is None else start
+    g = first
+    for _ in range(iterations):
+        weighted = terms * weigh(g @ terms - target)
+        g = np.linalg.solve(weighted @ terms.T + np.diag(hold), weighted @ target + hold * first)
+    return g
+
+
+def cauchy(residual: NDArray, spread: float) -> NDArray:
+    """Cauchy's weights of residuals: a half at ``spread``."""
+    return 1.0 / (1.0 + (residual / spread) ** 2)

@@ -32,6 +32,14 @@ def window_count(mask: Bools, n: int) -> NDArray[np.int32]:
     return total
 
 
+def window_room(shape: tuple[int, int], n: int) -> NDArray[np.int32]:
+    """Number (row, col) of cells in the window that the raster has."""
+    middle = [np.arange(size, dtype=np.int32) for size in shape]
+    rows, cols = (np.minimum(a, n // 2) + np.minimum(a[::-1], n // 2) + 1 for a in middle)
+    room: NDArray[np.int32] = np.multiply.outer(rows, cols)
+    return room
+
+
 def _box(values: NDArray, depth: int, n: int) -> Any:
     return cv2.boxFilter(values, depth, (n, n), normalize=False, borderType=cv2.BORDER_CONSTANT)
 

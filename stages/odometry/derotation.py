@@ -18,8 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera
-from rille.stages.hfvm.images.plane import translation, warp
-from rille.stages.hfvm.level.window_pair import WindowPair
+from rille.stages.hfvm.plane import translation, warp
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
@@ -79,8 +78,7 @@ class Derotation:
         valid = np.empty(image.shape, np.uint8)
         # Masked pixels are filled before the interpolation, which would spread their NaN.
         grey, usable = b.filled[0], b.valid[0]
-        place = WindowPair(0, 0, 0, 0, *usable.shape)
-        warp(grey, usable, self.homography @ translation(-MARGIN), image, valid, place)
+        warp(grey, usable, self.homography @ translation(-MARGIN), image, valid)
         return pyramid.build(image, PyramidParams(levels=b.levels), valid)
 
     def compose(self, u: NDArray[Any], v: NDArray[Any], level: int) -> tuple[Floats32, Floats32]:

@@ -12,8 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from rille.stages.hfvm.images.brightness import DARK, LEAST, NOTABLE, SAMPLES, SATURATED
-from rille.stages.hfvm.images.window import thinned
+from rille.stages.hfvm.brightness import DARK, LEAST, NOTABLE, SAMPLES, SATURATED
+from rille.stages.hfvm.windows import thinned
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.odometry.displacements import LevelDisplacements
 
@@ -32,7 +32,7 @@ def levelled(frames: Sequence[Pyramid], motions: Sequence[LevelDisplacements]) -
 
 def log_ratio(a: Pyramid, b: Pyramid, motion: LevelDisplacements) -> float:
     """Logarithm of the factor by which frame b is brighter than a: median over the displacements; 0 of too few."""
-    y, x = np.divmod(thinned(motion.column, SAMPLES, np.isfinite), motion.column.shape[1])
+    y, x = thinned(np.isfinite(motion.column), SAMPLES)
     # Centres of the level's pixels, to the nearest pixel of the images; of odd sizes the last one lies outside.
     here = (np.stack([x, y]) + 0.5) * 2.0**motion.level - 0.5
     there = here + np.stack([motion.column[y, x], motion.row[y, x]])

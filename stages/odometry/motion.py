@@ -24,10 +24,13 @@ from rille.stages.core.validity import Mask, Validity, defined, mark, matched, m
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts
 from rille.stages.geometry.geometry import Camera
-from rille.stages.hfvm.coarse_to_fine import hierarchy
-from rille.stages.hfvm.images.params import HfvmParams
-from rille.stages.hfvm.images.window import whole
-from rille.stages.hfvm.level import consistency
+from rille.stages.hfvm import epipolar, fill
+from rille.stages.hfvm.image import view
+from rille.stages.hfvm.level import Steps, Views, descend, median, propagate, search
+from rille.stages.hfvm.matcher import DEFAULT
+from rille.stages.hfvm.native.problem import Pair
+from rille.stages.hfvm.native.solver import solver
+from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.odometry.derotation import Derotation
 from rille.stages.odometry.displacements import common_similarity
@@ -105,10 +108,6 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     a, b = a.above(level), b.above(level)
     hp = HfvmParams(
         band=0.0,
-        depth_edges=False,
-        # At a coarse level no level is finest: all have the same rounds. At level 0 the matcher's own figures hold.
-        fine_rounds=None if level else HfvmParams().fine_rounds,
-        back_rounds=params.rounds if level else HfvmParams().back_rounds,
         top_columns=params.top_columns,
         top_rows=params.top_rows,
         # Both directions alike: displacements between frames have no epipolar line to prefer.
@@ -116,21 +115,22 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
         smoothness=params.smoothness,
         rounds=params.rounds,
     )
-    pair = hierarchy.prepare(a, b, hp)
-    state = hierarchy.run(pair, hp, 0)
-    fine = hierarchy.fine(pair, state)
-    scale = np.float32(2.0**level)
+    # At a coarse level no level is finest: all have the same rounds. At level 0 the matcher's own figures hold.
+    rounds = (params.rounds, params.rounds) if level else DEFAULT.steps.rounds
+    views = Views(view(a, hp), view(b, hp), hp, Steps((search, propagate, median), (), rounds))
+    state, layers = descend(views, 0), (views.left.layers[0], views.right.layers[0])
     validity = np.zeros(state.left.u.shape, np.uint8)
-    everywhere = whole(validity.shape)
-    textured = pair.deviation(0, everywhere) >= hp.texture
+    pair = Pair(layers[0].words, layers[1].words, epipolar.NO_BAND, 0.0)
+    u, v, distance = solver.sums(pair, state.left.u, state.left.v, np.ones_like(validity))
+    scale = np.float32(2.0**level)
     mark(validity, a.valid[0] == 0, Validity.OUT_OF_IMAGE)
-    mark(validity, ~textured, Validity.NO_TEXTURE)
-    mark(validity, ~hierarchy.consistent(pair, 0, state.left, state.right, everywhere), Validity.BACKMATCH_FAILED)
-    mark(validity, fine.distance > hp.threshold, Validity.OVER_THRESHOLD)
+    mark(validity, layers[0].deviation < hp.texture, Validity.NO_TEXTURE)
+    mark(validity, ~state.left_ok, Validity.BACKMATCH_FAILED)
+    mark(validity, distance > hp.threshold, Validity.OVER_THRESHOLD)
     good = validity == 0
-    u, v, interpolated = fine.u.copy(), fine.v.copy(), np.zeros(good.shape, np.uint8)
+    interpolated = np.zeros(good.shape, np.uint8)
     # Small gaps are filled, so that tracks across them have a prediction; they are marked as no measurements.
-    consistency.fill_rows(u, v, good, hp.fill_reach, state.near_sign or -1.0, interpolated)
+    fill.rows(u, v, good, hp.fill_reach, state.near_sign or -1.0, interpolated)
     mark(validity, good, Validity.MATCHED)
     mark(validity, interpolated != 0, Validity.INTERPOLATED)
     u[~defined(validity)] = v[~defined(validity)] = np.nan

@@ -96,6 +96,12 @@ RULE Square square(const uint64_t *words, int64_t at, int cols) {
 RULE Words words_at(const uint64_t *w, Eight i) {
   return (Words){{w[i[0]], w[i[1]], w[i[2]], w[i[3]]}, {w[i[4]], w[i[5]], w[i[6]], w[i[7]]}};
 }
+RULE Words eight_words(const uint64_t *w) { /* in halves: as one, GCC would send them through memory */
+  Words words;
+  __builtin_memcpy(&words.low, w, sizeof words.low);
+  __builtin_memcpy(&words.high, w + LANES / 2, sizeof words.high);
+  return words;
+}
 RULE Words words_from(const uint64_t *w, int count) { /* the first 7 or 8 words; what is not read is 0 */
   return (Words){{w[0], w[1], w[2], w[3]}, {w[4], w[5], w[6], count > 7 ? w[7] : 0}};
 }

@@ -117,48 +117,49 @@ void EXPORT(propagate)(const Pair *pair, Field field, Smoothing how, int32_t rou
 
 /* ---- fractions of a pixel ---- */
 
-enum { SUM_RADIUS = 2, WINDOW = 2 * SUM_RADIUS + 1, SIDE_BY_SIDE = 4 };
+enum { SUM_RADIUS = 2, WINDOW = 2 * SUM_RADIUS + 1, SIDE_BY_SIDE = LANES - WINDOW + 1 };
 typedef struct { float *u, *v, *distance; } Fine;
-typedef struct { int32_t at[5]; } Sums; /* distances at a displacement, and a pixel west, east, north, south of it */
+typedef struct { int32_t at, west, east, north, south; } Sums; /* distances at a displacement, and a pixel beside it */
 
 /* Where two lines of equal and opposite slope through three distances meet, within half a pixel. */
 static inline float fraction(int32_t before, int32_t at, int32_t after) {
-  float steep = (float)((before > after ? before : after) - at);
-  if (steep <= 0) return 0.0f;
-  float d = (float)(before - after) / steep * 0.5f;
-  return d < -0.5f ? -0.5f : d > 0.5f ? 0.5f : d;
+  int32_t steep = (before > after ? before : after) - at;
+  float d = (float)(before - after) / (float)(steep > 1 ? steep : 1) * 0.5f;
+  d = d > -0.5f ? d : -0.5f;
+  d = d < 0.5f ? d : 0.5f;
+  return steep > 0 ? d : 0.0f;
 }
-/* Sums over the windows of up to four pixels side by side, from word `here` of the left and `there` of the right. */
-static inline void sum_windows(const uint64_t *here, const uint64_t *there, int32_t cols, int32_t right_cols, int count,
-                               Sums *out) {
-  static const int aside[5] = {0, -1, 1, 0, 0}, down[5] = {0, 0, 0, -1, 1};
-  int words = count + WINDOW - 1;
-  Words total[5] = {0};
+/* Sum over the window of a pixel, from words `here` of the left and `there` of the right image. */
+static int32_t window_sum(const uint64_t *here, const uint64_t *there, int32_t cols, int32_t right_cols) {
+  int32_t sum = 0;
+  for (int j = -SUM_RADIUS; j <= SUM_RADIUS; j++)
+    for (int i = -SUM_RADIUS; i <= SUM_RADIUS; i++) sum += distance(here[j * cols + i], there[j * right_cols + i]);
+  return sum;
+}
+static inline void add_distances(Words *total, Words own, const uint64_t *there) {
+  Words other = eight_words(there);
+  total->low += square_sad(own.low, other.low), total->high += square_sad(own.high, other.high);
+}
+/* Sums over the windows of pixels side by side, of eight words from two columns before `here` and `there` on. */
+static inline void sum_windows(const uint64_t *here, const uint64_t *there, int32_t cols, int32_t right_cols,
+                               Sums out[SIDE_BY_SIDE]) {
+  Words at = {0}, west = {0}, east = {0}, north = {0}, south = {0};
   for (int j = -SUM_RADIUS; j <= SUM_RADIUS; j++) {
-    const uint64_t *p = here + j * cols - SUM_RADIUS;
-    for (int k = 0; k < 5; k++) {
-      const uint64_t *q = there + (j + down[k]) * right_cols - SUM_RADIUS + aside[k];
-      if (words == LANES) {
-        Words a, b;
-        memcpy(&a, p, sizeof a), memcpy(&b, q, sizeof b);
-        total[k].low += square_sad(a.low, b.low), total[k].high += square_sad(a.high, b.high);
-      } else {
-        for (int i = 0; i < words; i++) {
-          if (i < 4) total[k].low[i] += distance(p[i], q[i]);
-          else total[k].high[i - 4] += distance(p[i], q[i]);
-        }
-      }
-    }
+    const uint64_t *row = there + j * right_cols - SUM_RADIUS;
+    Words own = eight_words(here + j * cols - SUM_RADIUS);
+    add_distances(&at, own, row);
+    add_distances(&west, own, row - 1), add_distances(&east, own, row + 1);
+    add_distances(&north, own, row - right_cols), add_distances(&south, own, row + right_cols);
   }
   /* A sum of 25 distances has 16 bits: four are added up in one word. */
+  Words packed = {at.low | west.low << 16 | east.low << 32 | north.low << 48,
+                  at.high | west.high << 16 | east.high << 32 | north.high << 48};
   uint64_t four[LANES], last[LANES];
-  Words packed = {total[0].low | total[1].low << 16 | total[2].low << 32 | total[3].low << 48,
-                  total[0].high | total[1].high << 16 | total[2].high << 32 | total[3].high << 48};
-  memcpy(four, &packed, sizeof four), memcpy(last, &total[4], sizeof last);
-  for (int n = 0; n < count; n++) {
-    uint64_t sum = four[n] + four[n + 1] + four[n + 2] + four[n + 3] + four[n + 4];
-    for (int k = 0; k < 4; k++) out[n].at[k] = (int32_t)(sum >> 16 * k & 0xFFFF);
-    out[n].at[4] = (int32_t)(last[n] + last[n + 1] + last[n + 2] + last[n + 3] + last[n + 4]);
+  memcpy(four, &packed, sizeof four), memcpy(last, &south, sizeof last);
+  for (int n = 0; n < SIDE_BY_SIDE; n++) {
+    uint64_t sum = 0, fifth = 0;
+    for (int i = 0; i < WINDOW; i++) sum += four[n + i], fifth += last[n + i];
+    out[n] = (Sums){sum & 0xFFFF, sum >> 16 & 0xFFFF, sum >> 32 & 0xFFFF, sum >> 48, (int32_t)fifth};
   }
 }
 /* Displacements with fractions from distances summed over 5 x 5 pixels, and the mean distance; where the window, moved
@@ -181,14 +182,21 @@ void EXPORT(sums)(const Pair *pair, const int16_t *us, const int16_t *vs, const 
         out.distance[i] = (float)distance(*here, *there);
         continue;
       }
-      /* Neighbours of equal displacement are summed together. */
-      while (n < SIDE_BY_SIDE && n < most && us[i + n] == u && vs[i + n] == v && wanted[i + n]) n++;
-      sum_windows(here, there, cols, right_cols, n, found);
+      if (most >= SIDE_BY_SIDE) {
+        /* Neighbours of equal displacement are summed together. */
+        while (n < SIDE_BY_SIDE && us[i + n] == u && vs[i + n] == v && wanted[i + n]) n++;
+        sum_windows(here, there, cols, right_cols, found);
+      } else {
+        found[0] = (Sums){window_sum(here, there, cols, right_cols),
+                          window_sum(here, there - 1, cols, right_cols), window_sum(here, there + 1, cols, right_cols),
+                          window_sum(here, there - right_cols, cols, right_cols),
+                          window_sum(here, there + right_cols, cols, right_cols)};
+      }
       for (int k = 0; k < n; k++) {
-        const int32_t *s = found[k].at;
-        out.u[i + k] = (float)u + fraction(s[1], s[0], s[2]);
-        out.v[i + k] = (float)v + fraction(s[3], s[0], s[4]);
-        out.distance[i + k] = (float)s[0] / (float)(WINDOW * WINDOW);
+        Sums s = found[k];
+        out.u[i + k] = (float)u + fraction(s.west, s.at, s.east);
+        out.v[i + k] = (float)v + fraction(s.north, s.at, s.south);
+        out.distance[i + k] = (float)s.at / (float)(WINDOW * WINDOW);
       }
     }
   }

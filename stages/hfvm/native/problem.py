@@ -44,7 +44,7 @@ class Smoothing(NamedTuple):
 
 
 class EdgeRule(NamedTuple):
-    """Placement of depth edges, see :mod:`rille.stages.hfvm.level.depth_edges`.
+    """Placement of depth edges, see :mod:`rille.stages.hfvm.level`.
 
     ``reach``: pixels to the farthest whose displacement is tried. ``apart``: pixels between displacements of two sides.
     ``grey``: grey levels from which on a pixel does not count. ``far``: greatest distance. ``own, other``: factors of
@@ -94,7 +94,10 @@ FAR = 1 << 25
 
 def pack_map(u: AnyArray, v: AnyArray) -> AnyArray:
     """Packed displacements, int32, of two int16 maps."""
-    return (v.astype(np.int32) << 16) | (u.astype(np.int32) & 0xFFFF)
+    shift = v.astype(np.int32)
+    shift <<= 16
+    shift |= u.view(np.uint16)
+    return shift
 
 
 def unpacked(shift: AnyArray) -> tuple[AnyArray, AnyArray]:

@@ -9,9 +9,8 @@ import numpy as np
 from numba import njit
 
 from rille.stages.core.declare import AnyArray
-from rille.stages.hfvm.level import epipolar
-from rille.stages.hfvm.level.features import distance
-from rille.stages.hfvm.level.subpixel import linear
+from rille.stages.hfvm import epipolar
+from rille.stages.hfvm.features import distance
 from rille.stages.hfvm.native.problem import (
     CANDIDATES,
     FAR,
@@ -41,6 +40,12 @@ SUM_RADIUS = 2
 
 EDGE_RADIUS = 3
 """Pixels: reach of the windows that place depth edges."""
+
+TOP_RADIUS = 1
+"""Pixels: reach of the windows of the top level."""
+
+UNSEEN = np.iinfo(np.int32).max
+"""More than any cost of the top level."""
 
 UNIT, OUTSIDE = 4, 8000
 """Cost of a byte step on a path, and of a candidate that leads out of the other image: that of unlike pixels."""
@@ -76,6 +81,74 @@ def _off_line(line, u, v):  # type: ignore[no-untyped-def]
     """Cost of displacement (u, v) off an epipolar line, whole byte steps."""
     off = abs((line[0] * np.float32(u) + line[1] * np.float32(v)) + line[2])
     return np.int64(off if off < FARTHEST_OFF else FARTHEST_OFF)
+
+
+# -- the top level -----------------------------------------------------------------------------------------------------
+
+
+def exhaustive(pair: Pair, reach: tuple[int, int], out: Field) -> None:
+    """Write the displacements within ``reach`` (columns, rows) whose distance, summed over 3 x 3 pixels, is least.
+
+    Null prediction and large search area (4.3.4), for the top level. Mean over the window's pixels that both images
+    show; of equal ones the shorter displacement wins. The cost is the distance of each pixel alone.
+    """
+    _exhaustive(pair.left, pair.right, reach[0], reach[1], out)
+
+
+@njit(cache=True, nogil=True)
+def _keep_least(total, tall, first, last, tried, best, out):  # type: ignore[no-untyped-def]
+    """Take ``tried`` in ``out`` where the mean of ``total``, in sixteenths, then its length, is less than ``best``.
+
+    ``first, last``: the columns that both images show; ``tall``: how many rows of the window they show. Displacements
+    are packed.
+    """
+    length = np.int32(abs(columns(tried)) + abs(rows_of(tried)))
+    for x in range(first, last):
+        inner = first + TOP_RADIUS <= x < last - TOP_RADIUS
+        wide = 2 * TOP_RADIUS + 1 if inner else min(last, x + TOP_RADIUS + 1) - max(first, x - TOP_RADIUS)
+        # Mean and length in one number, so that one comparison decides both: 2040 x 16 x 4096 is below 2^31.
+        cost = np.int32(np.float64(total[x]) * 16.0 / np.float64(tall * wide)) * np.int32(4096) + length
+        # Strictly less: of equal ones the first displacement in row, column order stays.
+        if cost < best[x]:
+            best[x], out[x] = cost, tried
+
+
+@njit(cache=True, nogil=True)
+def _exhaustive(left, right, reach_x, reach_y, out):  # type: ignore[no-untyped-def]
+    rows, cols = left.shape
+    rrows, rcols = right.shape
+    radius, side = TOP_RADIUS, 2 * TOP_RADIUS + 1
+    best = np.full((rows, cols), UNSEEN, np.int32)
+    out.shift[:] = 0
+    single = np.zeros((rows + 2 * radius, cols + 2 * radius), np.int32)
+    total = np.zeros(cols, np.int32)
+    for v in range(-reach_y, reach_y + 1):
+        top, bottom = max(0, -v), min(rows, rrows - v)
+        for u in range(-reach_x, reach_x + 1):
+            first, last = max(0, -u), min(cols, rcols - u)
+            if top >= bottom or first >= last:
+                continue
+            # A frame of nothing stands for pixels that not both images show.
+            single[top : top + radius] = 0
+            for y in range(top, bottom):
+                row, words, others = single[y + radius], left[y], right[y + v]
+                row[:] = 0
+                for x in range(first, last):
+                    row[x + radius] = distance(words[x], others[x + u])
+            single[bottom + radius : bottom + 2 * radius] = 0
+            for y in range(top, bottom):
+                total[:] = 0
+                for j in range(y, y + side):
+                    for i in range(side):
+                        part = single[j, i : i + cols]
+                        for x in range(cols):
+                            total[x] += part[x]
+                tall = min(bottom, y + radius + 1) - max(top, y - radius)
+                _keep_least(total, tall, first, last, pack(u, v), best[y], out.shift[y])
+    for y in range(rows):
+        for x in range(cols):
+            j, i = y + rows_of(out.shift[y, x]), x + columns(out.shift[y, x])
+            out.cost[y, x] = distance(left[y, x], right[j, i]) if best[y, x] < UNSEEN else FAR
 
 
 # -- search ------------------------------------------------------------------------------------------------------------
@@ -313,6 +386,18 @@ def sums(pair: Pair, u: AnyArray, v: AnyArray, wanted: AnyArray) -> tuple[AnyArr
     return out
 
 
+@njit(cache=True, nogil=True, inline="always")
+def linear(before, at, after):  # type: ignore[no-untyped-def]
+    """Where two lines of equal and opposite slope through three distances meet, within half a pixel."""
+    steep = np.float32(max(before, after) - at)
+    # Neither side costs more: after propagation and median the middle need not be the least.
+    if steep <= 0:
+        return np.float32(0.0)
+    d = np.float32(before - after) / steep * np.float32(0.5)
+    # Where one side costs less than the middle the lines meet more than half a pixel away.
+    return min(max(d, np.float32(-0.5)), np.float32(0.5))
+
+
 @njit(cache=True, nogil=True, forceinline=True)
 def _column(left, right, at, to):  # type: ignore[no-untyped-def]
     """Distances summed over a column of the window: undisplaced, west, east, north (16 bits each), and south."""
@@ -369,7 +454,7 @@ def _sums(pair, maps, wanted, out):  # type: ignore[no-untyped-def]
 def edges(
     pair: Pair, grey: AnyArray, maps: tuple[AnyArray, AnyArray], wanted: AnyArray, rule: EdgeRule
 ) -> tuple[AnyArray, AnyArray]:
-    """Displacements (row, col) int16, depth edges placed anew, see :mod:`rille.stages.hfvm.level.depth_edges`.
+    """Displacements (row, col) int16, depth edges placed anew, see :mod:`rille.stages.hfvm.level`.
 
     Parameters
     ----------
@@ -385,8 +470,7 @@ def edges(
 
 @njit(cache=True, nogil=True)
 def _edges(pair, grey, maps, wanted, rule, out):  # type: ignore[no-untyped-def]
-    left, right = pair.left, pair.right
-    (rows, cols), (high, wide) = grey.shape, right.shape
+    (rows, cols), (high, wide) = grey.shape, pair.right.shape
     us, vs = np.empty(9, np.int64), np.empty(9, np.int64)
     for y in range(rule.reach, rows - rule.reach):
         for x in range(rule.reach, cols - rule.reach):
@@ -404,7 +488,7 @@ def _edges(pair, grey, maps, wanted, rule, out):  # type: ignore[no-untyped-def]
                     continue
                 # The pixel's own displacement comes first.
                 factor = rule.own if k == 0 or rule.near * (us[k] - us[0]) < 0 else rule.other
-                cost = factor * _window_cost(left, right, grey, (y, x), (q, p), (rule.far, rule.grey))
+                cost = factor * _window_cost(pair, grey, y, x, us[k], vs[k], rule)
                 if cost < best:
                     best, chosen = cost, k
             out[0][y, x], out[1][y, x] = us[chosen], vs[chosen]
@@ -427,11 +511,12 @@ def _sides(maps, at, rule, us, vs):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _window_cost(left, right, grey, at, to, limits):  # type: ignore[no-untyped-def]
+def _window_cost(pair, grey, y, x, u, v, rule):  # type: ignore[no-untyped-def]
     """Sum over a window of the distances, limited, by how alike in grey a pixel is to the middle."""
-    (y, x), (q, p) = at, to
+    q, p = y + pair.ahead_y + v, x + pair.ahead_x + u
+    left, right = pair.left, pair.right
     own, total = np.int32(grey[y, x]), np.int32(0)
-    far, bright, nil = np.int64(limits[0]), np.int32(limits[1]), np.int32(0)
+    far, bright, nil = np.int64(rule.far), np.int32(rule.grey), np.int32(0)
     for j in range(-EDGE_RADIUS, EDGE_RADIUS + 1):
         here, there = left[np.uint64(y + j)], right[np.uint64(q + j)]
         greys = grey[np.uint64(y + j)]

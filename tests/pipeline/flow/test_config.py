@@ -27,7 +27,7 @@ def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -
     assert (plain.locus.refined_share, built.locus.refined_share) == (1.0, 0.5)
     assert (built.locus.cell_size, built.locus.max_jump) == (0.01, 5.0)
     assert (plain.track.points, built.track.points) == (400, 2000)
-    assert built.hfvm.variational_steps == config.build({"hfvm": {"preset": "accurate"}}).hfvm.variational_steps
+    assert built.hfvm == config.build({"hfvm": {"preset": "accurate"}}).hfvm
     built = config.build({"terrain": {"preset": "accurate"}}, config.parse_assignments(["locus.both=false"]))
     assert (built.hfvm.preset, built.locus.both) == ("accurate", False)
     assert built.locus.max_jump == plain.locus.max_jump, "as without both"
@@ -41,7 +41,7 @@ def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -
 def test_navigation_matches_fast_unless_told_otherwise(tmp_path: Path) -> None:
     assert config.build({}).hfvm.preset == "default"
     built = config.build(config.parse_assignments(["keyframes.preset=navigation"]))
-    assert (built.hfvm.preset, built.hfvm.finest, built.keyframes.overlap) == ("fast", 1, 0.6)
+    assert (built.hfvm.preset, built.hfvm.rounds, built.keyframes.overlap) == ("fast", 2, 0.6)
     assert (built.motion.level, built.track.points) == (3, 200)
     assert (
         config.build(config.parse_assignments(["keyframes.preset=navigation", "track.points=300"])).track.points == 300
@@ -49,7 +49,7 @@ def test_navigation_matches_fast_unless_told_otherwise(tmp_path: Path) -> None:
     for given in ("hfvm.preset=default", "hfvm.preset=accurate"):
         kept = config.build(config.parse_assignments(["keyframes.preset=navigation", given]))
         assert kept.hfvm == config.build(config.parse_assignments([given])).hfvm
-    assert config.build(config.parse_assignments(["keyframes.preset=navigation", "hfvm.finest=0"])).hfvm.finest == 0
+    assert config.build(config.parse_assignments(["keyframes.preset=navigation", "hfvm.rounds=3"])).hfvm.rounds == 3
     path = tmp_path / "config.toml"
     path.write_text(config.to_toml(built))
     assert config.build(config.read_toml(path)) == built

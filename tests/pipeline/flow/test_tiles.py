@@ -1,4 +1,4 @@
-"""Large pairs as tasks: equal digests, whatever the tiles; which pairs are tiled."""
+"""Large pairs as tasks: results of tiles against those of the whole; which pairs are tiled."""
 
 import hashlib
 
@@ -13,10 +13,10 @@ from rille.pipeline.flow import tiles
 from rille.pipeline.flow.config import build
 from rille.pipeline.flow.tiles import Tiling
 from rille.stages.core.declare import NoParams
-from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging.pyramid import PyramidParams
 
-SHAPE = (150, 190)
+SHAPE = (300, 380)
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def images(tmp_path_factory):
     right = cv2.GaussianBlur(rng.normal(0, 1, SHAPE), (0, 0), 1.6)
     right = np.clip(128 + 35 * right / right.std(), 0, 255).astype(np.uint8)
     y, x = np.indices(SHAPE, np.float32)
-    left = cv2.remap(right, x + 10 - np.float32(0.5) * y, y + 1, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    left = cv2.remap(right, x + 60 - np.float32(0.5) * y, y + 1, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     folder = tmp_path_factory.mktemp("images")
     paths = {"left": folder / "left.png", "right": folder / "right.png"}
     for camera, image in (("left", left), ("right", right)):
@@ -52,43 +52,30 @@ def disparity(store, images, params, side):
     if side is None:
         node = graph.node("rille.stages.hfvm.stage", "hfvm", params, inputs=given)
     else:
-        node = tiles.Tiles(graph, params, PyramidParams(), given, (SHAPE, SHAPE), side, "hfvm").build()
+        node = tiles.Tiles(graph, params, given, SHAPE, side, "hfvm").build()
     driver.run(graph, store, driver.RunOptions(executor="inline")).check()
     return node.ref
 
 
-@pytest.mark.parametrize(("preset", "side"), [("default", 96), ("fast", 50)])
-def test_the_artifact_is_that_of_the_pair_matched_whole(tmp_path, images, preset, side):
+@pytest.mark.parametrize(("preset", "side"), [("default", 160), ("fast", 100)])
+def test_the_artifact_is_nearly_that_of_the_pair_matched_whole(tmp_path, images, preset, side):
     store, params = Store(tmp_path), HfvmParams(preset=preset)
     once = disparity(store, images, params, None)
     assert once.meta["aligned"]
     assert once.meta["match_rate"] > 0.4
     found = disparity(store, images, params, side)
     assert found.key != once.key
-    assert found.digest == once.digest
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("preset", ["default", "fast"])
-def test_mockup_in_tiles_of_256_has_the_digest_of_the_whole(tmp_path, preset):
-    from rille.pipeline.flow.builders import Builder
-    from rille.pipeline.runs.session import Options, settings
-
-    digests = []
-    for side in (0, 256):
-        found = settings(Options("mockup-short", (f"hfvm.preset={preset}", f"tiling.tile={side}")))
-        graph = Graph()
-        disparity = Builder(graph, found.sequence, found.config).disparity(0)
-        driver.run(graph, Store(tmp_path), driver.RunOptions(executor="inline")).check()
-        digests.append(disparity.ref.digest)
-    assert digests[0] == digests[1]
+    assert found.meta["aligned"]
+    a, b = (np.stack([store.open(ref)[f"{way}_disparity"] for way in ("column", "row")]) for ref in (once, found))
+    same = (np.abs(a - b) <= 0.01) | (np.isnan(a) & np.isnan(b))
+    assert same.all(axis=0).mean() >= 0.999
 
 
 def test_wrong_size_of_the_camera_is_one_clear_line(tmp_path, images):
     graph = Graph()
     given = pyramids(graph, images)
     less = (SHAPE[0] // 2, SHAPE[1] // 2)
-    tiles.Tiles(graph, HfvmParams(), PyramidParams(), given, (less, less), 50, "hfvm").build()
+    tiles.Tiles(graph, HfvmParams(), given, less, 50, "hfvm").build()
     result = driver.run(graph, Store(tmp_path), driver.RunOptions(executor="inline"))
     assert {failure.error.code for failure in result.failures} == {"RIL-351"}
 
@@ -107,12 +94,11 @@ def test_tiles_follow_size_and_memory():
 
 
 def test_a_pair_is_whole_where_an_image_lacks_the_level_that_tiles_start_from():
-    tiling, shapes = Tiling(tile=96), ((200, 300), (96, 150))
-    assert tiles.side(tiling, HfvmParams(plane_level=3), PyramidParams(), shapes) == 96
-    # The right image ends at level 3; aligned to the left one it has level 4, which no task would have been there for.
-    assert tiles.side(tiling, HfvmParams(plane_level=4), PyramidParams(), shapes) is None
-    assert tiles.side(tiling, HfvmParams(plane_level=3, preset="fast"), PyramidParams(), shapes) is None
-    assert tiles.side(tiling, HfvmParams(), PyramidParams(levels=1), shapes) is None
+    tiling, small = Tiling(tile=96), ((200, 300), (48, 150))
+    # Alignment and brightness are decided on at level 2.
+    assert tiles.side(tiling, HfvmParams(), PyramidParams(), small) == 96
+    assert tiles.side(tiling, HfvmParams(preset="fast"), PyramidParams(), small) is None
+    assert tiles.side(tiling, HfvmParams(), PyramidParams(levels=2), small) is None
 
 
 def test_tiling_is_a_section_of_the_configuration():

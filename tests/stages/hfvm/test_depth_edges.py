@@ -3,30 +3,39 @@
 import numpy as np
 import pytest
 
-from rille.stages.hfvm.level import compact, depth_edges
-from rille.stages.hfvm.level.depth_edges import AROUND, BETTER, FAR, GREY, REACH, EdgeView, place
+from rille.stages.hfvm.features import compact
+from rille.stages.hfvm.level import EDGES
+from rille.stages.hfvm.native.problem import Pair
 from rille.stages.hfvm.native.reference import EDGE_RADIUS as RADIUS
+from rille.stages.hfvm.native.solver import solver
 
 ROWS, COLS = 40, 60
 
 
-def view(image):
-    return EdgeView(compact.pack(image), image)
+REACH, GREY, FAR, BETTER = EDGES.reach, EDGES.grey, EDGES.far, (EDGES.own, EDGES.other)
+AROUND = tuple((j * k, i * k) for k in (REACH // 2, REACH) for j, i in ((1, 0), (-1, 0), (0, 1), (0, -1)))
+
+
+def place(left, right, maps, wanted, at, near_sign):
+    """Displacements with depth edges placed anew."""
+    words = Pair(compact(left), compact(right), np.zeros((3, 3)), 0.0, ahead_x=at[0], ahead_y=at[1])
+    rule = EDGES._replace(near=int(near_sign))
+    return solver.edges(words, np.rint(left).astype(np.int16), maps, wanted.view(np.uint8), rule)
 
 
 def by_the_equation(left, right, u, v, wanted, at, near_sign):
     """C(d) of every candidate, pixel by pixel."""
     out = u.copy(), v.copy()
     rows, cols = u.shape
-    a, b = (side.compact.view(np.uint8).reshape(*side.compact.shape, 8).astype(int) for side in (left, right))
-    grey = np.rint(left.grey).astype(int)
+    a, b = (compact(side).view(np.uint8).reshape(*side.shape, 8).astype(int) for side in (left, right))
+    grey = np.rint(left).astype(int)
     offsets = np.arange(-RADIUS, RADIUS + 1)
     for y in range(REACH, rows - REACH):
         for x in range(REACH, cols - REACH):
             tried = [(int(u[y, x]), int(v[y, x]))]
             for j, i in AROUND:
                 one = int(u[y + j, x + i]), int(v[y + j, x + i])
-                if all(max(abs(one[0] - p), abs(one[1] - q)) >= depth_edges.APART for p, q in tried):
+                if all(max(abs(one[0] - p), abs(one[1] - q)) >= EDGES.apart for p, q in tried):
                     tried.append(one)
             if len(tried) == 1 or not wanted[y, x]:
                 continue
@@ -66,8 +75,8 @@ def test_kernel_and_equation_agree(at, near_sign):
     )
     v = rng.integers(4 - at[1], 7 - at[1], (ROWS, COLS)).astype(np.int16)
     wanted = rng.random((ROWS, COLS)) < 0.9
-    found = place(view(left), view(right), (u, v), wanted, at, near_sign)
-    expected = by_the_equation(view(left), view(right), u, v, wanted, at, near_sign)
+    found = place(left, right, (u, v), wanted, at, near_sign)
+    expected = by_the_equation(left, right, u, v, wanted, at, near_sign)
     np.testing.assert_array_equal(found[0], expected[0])
     np.testing.assert_array_equal(found[1], expected[1])
     assert (found[0] != u).any(), "something was decided anew"
@@ -90,7 +99,7 @@ def test_an_outline_that_was_too_wide_is_put_in_its_place():
     wide = truth.copy()
     wide[9:31, 21:47] = truth[15, 30]
     nothing = np.zeros_like(truth)
-    found, rows = place(view(left), view(right), (wide, nothing), np.ones(truth.shape, bool), (0, 0), -1.0)
+    found, rows = place(left, right, (wide, nothing), np.ones(truth.shape, bool), (0, 0), -1.0)
     # Beside the square's left side the right image hides the wall, so that there is no evidence for it.
     seen = np.ones(truth.shape, bool)
     seen[12:28, 24 - 7 : 24] = False
@@ -101,6 +110,6 @@ def test_an_outline_that_was_too_wide_is_put_in_its_place():
 
 def test_without_evidence_nothing_changes():
     _, _, truth = pair()
-    flat = view(np.full(truth.shape, 90, np.float32))
+    flat = np.full(truth.shape, 90, np.float32)
     found = place(flat, flat, (truth, np.zeros_like(truth)), np.ones(truth.shape, bool), (0, 0), -1.0)
     np.testing.assert_array_equal(found[0], truth)

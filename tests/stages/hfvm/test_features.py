@@ -2,8 +2,8 @@ import numpy as np
 from numba import njit
 from scipy import ndimage
 
-from rille.stages.hfvm.level import features
-from rille.stages.hfvm.level.features import BAND_PASS, GAUSSIAN, HIGH_PASS, WIDE_BAND_PASS
+from rille.stages.hfvm import features
+from rille.stages.hfvm.features import BAND_PASS, GAUSSIAN, HIGH_PASS, WIDE_BAND_PASS
 
 WEIGHTS = (4.0, 4.0, 2.0, 2.0, 0.5, 0.5, 2.0, 1.0)
 

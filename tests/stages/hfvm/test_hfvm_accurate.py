@@ -1,4 +1,4 @@
-"""Parts of preset ``accurate``: compact features, propagation along paths, relief, guided filling; and the whole."""
+"""Parts of preset ``accurate``: compact features, propagation along paths, relief; and the whole."""
 
 import numpy as np
 import pytest
@@ -9,25 +9,34 @@ from matching_scenes import Texture, pair, seen
 from rille.stages.core.errors import RilleError
 from rille.stages.core.validity import Validity, has, matched
 from rille.stages.geometry.spline import coefficients
-from rille.stages.hfvm.coarse_to_fine import paths
-from rille.stages.hfvm.finish import guided, variational_refinement
-from rille.stages.hfvm.images.params import ACCURATE, HfvmParams
-from rille.stages.hfvm.level import compact, consistency, epipolar
+from rille.stages.hfvm import epipolar, relief
+from rille.stages.hfvm.features import compact
+from rille.stages.hfvm.image import Layer
+from rille.stages.hfvm.level import FREE, Look, Map, paths
+from rille.stages.hfvm.lucas_kanade import Images
 from rille.stages.hfvm.native import reference
-from rille.stages.hfvm.native.problem import CANDIDATES, NONE, Candidates, Pair, PathCosts, pack_map
+from rille.stages.hfvm.native.problem import CANDIDATES, NONE, Candidates, Field, Pair, PathCosts, pack_map, unpacked
+from rille.stages.hfvm.params import PRESETS, HfvmParams
 from rille.stages.hfvm.stage import match
+from rille.stages.hfvm.validation import lonely
 from rille.stages.imaging.pyramid import PyramidParams, build
 
 ACC = HfvmParams(preset="accurate")
-COSTS = PathCosts(ACC.path_compact, ACC.path_small, ACC.path_large, ACC.path_grey)
-NO_BAND = np.zeros((3, 3))
+COSTS = PathCosts(8, 36, 240, 10.0)
 
 
 def view(image):
-    from rille.stages.hfvm.level import features
+    usable = np.ones(image.shape, np.uint8)
+    return Layer.of(
+        lambda window: (np.ascontiguousarray(image[window.slices]), usable[window.slices]), image.shape, ACC.weights
+    )
 
-    words, _ = features.pack(image, ACC.weights)
-    return paths.LevelView(words, compact.pack(image), image)
+
+def propagated(left, right, start, up=None):
+    """Displacements of two images improved along paths."""
+    look = Look(1, view(left), view(right), None if up is None else Map(*up), FREE, 0.0, 1, ACC)
+    nothing = np.zeros(left.shape, np.int32)
+    return unpacked(paths(look, Field(pack_map(*start), nothing)).shift)
 
 
 def stairs(shape=(60, 120), near=-12, far=-4, edges=(40, 80)):
@@ -50,7 +59,7 @@ def stairs(shape=(60, 120), near=-12, far=-4, edges=(40, 80)):
 def test_compact_features_by_hand():
     image = np.full((3, 3), 10.0, np.float32)
     image[1, 0], image[1, 2], image[0, 1], image[2, 1], image[2, 2] = 19.0, 6.0, 10.0, 11.0, 255.0 + 10.0
-    word = int(compact.pack(image)[1, 1])
+    word = int(compact(image)[1, 1])
     steps = [9.0, -4.0, 0.0, 1.0, 0.0, 0.0, 0.0, 255.0]
     expected = [min(int(128.5 + 8 * np.sign(s) * np.sqrt(abs(s))), 255) for s in steps]
     assert [(word >> 8 * k) & 255 for k in range(8)] == expected
@@ -61,10 +70,10 @@ def test_compact_features_by_hand():
 def test_compact_features_know_no_brightness_and_reach_one_pixel():
     rng = np.random.default_rng(1)
     image = rng.integers(20, 200, (20, 30)).astype(np.float32)
-    np.testing.assert_array_equal(compact.pack(image + 30), compact.pack(image))
+    np.testing.assert_array_equal(compact(image + 30), compact(image))
     other = image.copy()
     other[10, 12] += 40
-    rows, cols = np.nonzero(compact.pack(other) != compact.pack(image))
+    rows, cols = np.nonzero(compact(other) != compact(image))
     assert (rows.min(), rows.max(), cols.min(), cols.max()) == (9, 11, 11, 13)
 
 
@@ -179,9 +188,9 @@ def test_paths_find_both_sides_of_a_step_from_a_poor_start():
     left, right, u, occluded = stairs()
     rng = np.random.default_rng(0)
     start = np.where(rng.random(u.shape) < 0.3, u, rng.integers(-15, 3, u.shape)).astype(np.int16)
-    found, rows = paths.propagate(
-        view(left), view(right), (start, np.zeros_like(start)), None, (NO_BAND, 0.0), COSTS, 3
-    )
+    found, rows = start, np.zeros_like(start)
+    for _ in range(3):
+        found, rows = propagated(left, right, (found, rows))
     visible = ~occluded & seen(u, 0 * u, left.shape, 3)
     assert np.mean((found == u)[visible]) > 0.97
     assert np.mean((rows == 0)[visible]) > 0.97
@@ -193,7 +202,7 @@ def test_paths_find_both_sides_of_a_step_from_a_poor_start():
 def test_the_true_map_of_equal_images_stays():
     image = Texture(5)(*np.indices((40, 50))[::-1].astype(float))
     nothing = np.zeros(image.shape, np.int16)
-    u, v = paths.propagate(view(image), view(image), (nothing, nothing), None, (NO_BAND, 0.0), COSTS, 2)
+    u, v = propagated(image, image, (nothing, nothing))
     assert not u.any()
     assert not v.any()
 
@@ -202,7 +211,7 @@ def test_the_true_map_of_equal_images_stays():
 def test_paths_on_tiny_images(shape):
     image = np.random.default_rng(0).uniform(0, 255, shape).astype(np.float32)
     start = np.full(shape, 5, np.int16)  # leads out
-    u, v = paths.propagate(view(image), view(image), (start, start), (start, start), (NO_BAND, 0.0), COSTS, 2)
+    u, v = propagated(image, image, (start, start), (start, start))
     assert u.shape == v.shape == shape
 
 
@@ -214,8 +223,8 @@ def slanted(noise):
     return pair(displacement, (90, 120), (90, 160), noise=noise)
 
 
-def relief(left, right, start, keep):
-    return variational_refinement.fit(left, coefficients(right), np.ones(right.shape, np.uint8), *start, keep, ACC)
+def fitted(left, right, start, keep):
+    return relief.fit(Images(left, coefficients(right), np.ones(right.shape, np.uint8)), *start, keep)
 
 
 def test_relief_restores_a_slanted_plane():
@@ -223,7 +232,7 @@ def test_relief_restores_a_slanted_plane():
     keep = seen(u, v, right.shape, 8)
     rng = np.random.default_rng(0)
     start = [(a + rng.normal(0, 0.2, a.shape)).astype(np.float32) for a in (u, v)]
-    found_u, found_v = relief(left, right, start, keep)
+    found_u, found_v = fitted(left, right, start, keep)
     error = np.hypot(found_u - u, found_v - v)
     # A plane bends nowhere. One pixel tells sqrt(2) noise / gradient = .4 px (gradient about 7 a pixel in either
     # direction); stiffness averages some 7 x 7 pixels: .06 px.
@@ -239,7 +248,7 @@ def test_matches_far_off_their_line_are_led_to_it():
     astray[30:40, 50:60] = astray[60:63, 80:83] = True
     assert keep[astray].all()
     start = u.astype(np.float32), np.where(astray, v + 2.0, v).astype(np.float32)
-    found_u, found_v = relief(left, right, start, keep)
+    found_u, found_v = fitted(left, right, start, keep)
     # As far off as the others, whose rows the lines fitted to all of them hold.
     assert np.abs(found_v - v)[astray].max() < 0.1
     assert np.hypot(found_u - u, found_v - v)[astray].max() < 1.0
@@ -249,7 +258,7 @@ def test_relief_keeps_a_step():
     left, right, u, occluded = stairs()
     keep = ~occluded & seen(u, 0 * u, left.shape, 4)
     start = (u.astype(np.float32), np.zeros(u.shape, np.float32))
-    found, _ = relief(left, right, start, keep)
+    found, _ = fitted(left, right, start, keep)
     # Four times the bend beyond which stiffness gives way; a linear smoother would leave pixels here.
     assert np.abs(found - u)[keep].max() < 0.5
     assert np.median(np.abs(found - u)[keep]) < 0.02
@@ -264,8 +273,9 @@ def test_sweeps_converge_to_the_minimum():
     u, v = np.where(keep, rng.normal(0, 1, (2, *shape)), 0).astype(float32)
     grey = rng.normal(0, 4, (4, *shape)).astype(float32)
     grey[0] = np.where(keep, rng.uniform(0.2, 1, shape), 0)
-    across, down = np.zeros(shape, float32), np.zeros(shape, float32)
-    variational_refinement._stiffness(u, v, keep, float32(2.0), float32(30.0), across, down)
+    stiff = np.zeros((2, *shape), float32)
+    relief._stiffness(u, v, keep, float32(2.0), float32(30.0), stiff)
+    across, down = stiff
     direction = rng.uniform(0, np.pi, shape)
     lines = np.stack([np.cos(direction), np.sin(direction), rng.normal(0, 1, shape)], -1).astype(float32)
     hold, own = float32(50.0), np.arange(n).reshape(shape)
@@ -292,10 +302,10 @@ def test_sweeps_converge_to_the_minimum():
     want = np.zeros(2 * n)
     want[there] = np.linalg.solve(matrix[np.ix_(there, there)], right[there])
     normal = np.zeros((5, *shape), float32)
-    variational_refinement._normal(grey, lines, hold, (u, v), keep, (across, down), normal)
+    relief._normal(grey, u, v, lines * np.sqrt(hold), keep, stiff, normal)
     assert np.count_nonzero(normal[0]) == keep.sum()
     for _ in range(60):
-        u, v = variational_refinement._solve(normal, across, down, u, v)
+        u, v = relief._solve(normal, stiff, u, v)
     np.testing.assert_allclose(np.concatenate([u.ravel(), v.ravel()]), want, atol=2e-3)
 
 
@@ -303,69 +313,33 @@ def test_relief_of_nothing_is_nothing():
     left, right, u, v = slanted(noise=0.0)
     start = (u.astype(np.float32), v.astype(np.float32))
     none = np.zeros(u.shape, bool)
-    found = relief(left, right, start, none)
+    found = fitted(left, right, start, none)
     np.testing.assert_array_equal(found[0], start[0])
     flat = np.full_like(left, 7.0), np.full_like(right, 7.0)
-    found = relief(*flat, start, ~none)
+    found = fitted(*flat, start, ~none)
     assert np.isfinite(found[0]).all()
     assert np.abs(found[0] - start[0]).max() < 0.05
 
 
-# -- filling -----------------------------------------------------------------------------------------------------------
-
-
-def test_guided_median_follows_the_outline_and_keeps_matches():
-    shape = (40, 40)
-    x = np.indices(shape)[1]
-    grey = np.where(x < 20, 50.0, 180.0).astype(np.float32)
-    u = np.where(x < 20, -10.0, -3.0).astype(np.float32)
-    keep = np.ones(shape, bool)
-    keep[10:30, 16:24] = False
-    streaked = np.where(keep, u, np.float32(-3.0))
-    streaked[15, 22] = -10.0
-    found, _ = guided.median(streaked, 0 * u, keep, ~keep, grey)
-    np.testing.assert_array_equal(found[keep], u[keep])
-    np.testing.assert_array_equal(found[:, 20:], u[:, 20:])
-    assert np.mean(found[10:30, 16:18] == -10.0) > 0.9
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.lists(st.tuples(st.integers(-5000, 5000), st.integers(1, 9000)), min_size=1, max_size=64))
-def test_weighted_median_is_that_of_its_definition(pairs):
-    value, weight = np.array(pairs, np.int32).T
-    order = np.argsort(value, kind="stable")
-    passed = np.cumsum(weight[order].astype(np.int64))
-    want = value[order][np.searchsorted(2 * passed, passed[-1])]
-    assert guided._weighted_median(value.copy(), weight.copy()) == want
-
-
-def test_guided_median_never_invents_a_displacement():
-    rng = np.random.default_rng(2)
-    u, v = rng.integers(-9, 9, (2, 20, 24)).astype(np.float32)
-    keep = rng.random(u.shape) < 0.5
-    grey = rng.uniform(0, 255, u.shape).astype(np.float32)
-    found_u, found_v = guided.median(u, v, keep, ~keep, grey)
-    known = set(zip(u.ravel(), v.ravel(), strict=True))
-    assert set(zip(found_u.ravel(), found_v.ravel(), strict=True)) <= known
+# -- matches by themselves ---------------------------------------------------------------------------------------------
 
 
 def test_lonely_pixels_are_counted_within_the_image():
     keep = np.zeros((20, 20), bool)
     keep[:5, :5] = True  # the corner pixel sees 5 x 5 of the 81 and all of them are kept
     keep[12, 12] = True
-    lonely = consistency.lonely(keep, 0.5)
-    assert lonely[12, 12]
-    assert not lonely[0, 0]
-    assert not consistency.lonely(keep, 0.0).any()
+    alone = lonely(keep, 0.5)
+    assert alone[12, 12]
+    assert not alone[0, 0]
+    assert not lonely(keep, 0.0).any()
 
 
 # -- the whole ---------------------------------------------------------------------------------------------------------
 
 
 def test_preset_sets_its_values_and_gives_way_to_the_users():
-    assert {k: getattr(ACC, k) for k in ACCURATE} == dict(ACCURATE)
-    assert HfvmParams(preset="accurate", median=5).median == 5
-    assert HfvmParams().path_rounds == 0
+    assert {k: getattr(ACC, k) for k in PRESETS["accurate"]} == dict(PRESETS["accurate"])
+    assert HfvmParams(preset="accurate", rounds=5).rounds == 5
     with pytest.raises((RilleError, ValueError)):
         HfvmParams(preset="accurat")
 

@@ -8,12 +8,11 @@ from raising import raises
 
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Validity, defined, has, matched
-from rille.stages.hfvm.coarse_to_fine import start
-from rille.stages.hfvm.finish.refine import contrast
-from rille.stages.hfvm.images.params import HfvmParams
-from rille.stages.hfvm.level.consistency import patches, unsupported
+from rille.stages.hfvm import start
+from rille.stages.hfvm.params import HfvmParams
+from rille.stages.hfvm.sanity import swapped
 from rille.stages.hfvm.stage import match
-from rille.stages.hfvm.swap_check import swapped
+from rille.stages.hfvm.validation import isolated
 
 BORDER = 8
 MOST_CHANCE = 0.05
@@ -69,15 +68,6 @@ def test_exposure_ratio_of_two(ratio):
     good, complete = share_within(found, u, v, right.shape, 0.5)
     assert good > 0.97
     assert complete > 0.9
-
-
-def test_contrast_is_levelled_only_where_it_differs_grossly():
-    left, right, u, v = pair(lambda x, y: (-7.0, 1.0))
-    maps = np.int16(u), np.int16(v), np.ones(u.shape, bool)
-    assert contrast(left, right, *maps) == 1
-    assert contrast(left, right * np.float32(0.85), *maps) == 1
-    assert contrast(left, 0.4 * right + 90, *maps) == pytest.approx(2.5, rel=0.02)
-    assert contrast(left, 0.4 * right + 90, u, v, np.zeros(u.shape, bool)) == 1
 
 
 @pytest.mark.parametrize("shapes", [((97, 141), (60, 300)), ((40, 40), (200, 220)), ((150, 33), (33, 150))])
@@ -174,14 +164,13 @@ def test_two_seeds_of_noise_match_hardly_anywhere(blur):
 
 
 def test_patches_of_chance_go_where_nearly_all_are_small_and_stay_beside_a_large_one():
-    u = np.zeros((160, 200), np.float32)
+    u = np.zeros((160, 200), np.int16)
     keep = np.zeros(u.shape, bool)
     keep[10:20, 10:20] = keep[40:48, 100:110] = keep[90:101, 30:40] = True
-    assert patches(u, u, keep)[keep].min() >= 40
-    np.testing.assert_array_equal(unsupported(u, u, keep, 40), keep)
+    np.testing.assert_array_equal(isolated(u, keep, 40), keep)
     keep[110:150, 60:160] = True
-    assert not unsupported(u, u, keep, 40).any()
-    assert not unsupported(u, u, keep, 1).any()
+    assert not isolated(u, keep, 40).any()
+    assert not isolated(u, keep, 1).any()
 
 
 def test_prior_chooses_among_repetitions_and_is_refined():
@@ -229,10 +218,10 @@ def test_prior_that_a_plane_leads_beyond_all_bounds_is_unknown():
     # A plane whose horizon lies 16000 px to the right, and given displacements that end just before it.
     horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0 / 16000.0, 0.0, 1.0]])
     ends = np.full((64, 64), 15900.0, np.float32)
-    led = start.align(start.check((ends, 0 * ends), ends.shape), horizon)
+    led = start.aligned(start.check((ends, 0 * ends), ends.shape), horizon)
     assert led is not None
     np.testing.assert_array_less(np.abs(led.u[np.isfinite(led.u)]), start.MOST)
-    near = start.align(start.check((0 * ends, 0 * ends), ends.shape), horizon)
+    near = start.aligned(start.check((0 * ends, 0 * ends), ends.shape), horizon)
     assert near is not None
     assert np.isfinite(near.u).all()
 
@@ -245,7 +234,7 @@ def test_progress_grows_from_nothing_to_all():
     assert shares[0] == 0
     assert shares == sorted(shares)
     assert shares[-1] < 1
-    assert any("level 0" in step for _, step in told)
+    assert any("refinement" in step for _, step in told)
 
 
 @pytest.mark.data

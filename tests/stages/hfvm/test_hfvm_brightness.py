@@ -5,11 +5,12 @@ import pytest
 from matching_scenes import pair, seen
 
 from rille.stages.core.validity import matched
-from rille.stages.hfvm.images import brightness
-from rille.stages.hfvm.images.params import HfvmParams
-from rille.stages.hfvm.images.views import Plain
-from rille.stages.hfvm.images.window import Window
+from rille.stages.hfvm import brightness
+from rille.stages.hfvm.image import view as image_of
+from rille.stages.hfvm.level import FREE, Map, State
+from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
+from rille.stages.hfvm.windows import Window
 from rille.stages.imaging.pyramid import PyramidParams, build
 
 SHAPE = (160, 220)
@@ -17,7 +18,13 @@ RATIO = np.array([0.2, -0.1, 0.15, 0.3, -0.05, 0.2, 0.04])
 
 
 def view(image):
-    return Plain.of(build(image, PyramidParams()))
+    return image_of(build(image, PyramidParams()), HfvmParams(denoise_from=1e6))
+
+
+def state(level, u, ok):
+    """Matches of a level along its rows."""
+    matches = Map(u, np.zeros(u.shape, np.int16))
+    return State(level, matches, matches, ok, ok, FREE, 0.0)
 
 
 def logarithm(shape, level=0):
@@ -42,9 +49,9 @@ def test_levelled_view_is_multiplied_by_the_exponential(level):
     plain = view(np.random.default_rng(0).uniform(10, 200, SHAPE).astype(np.float32))
     found = brightness.levelled(plain, RATIO)
     window = Window(3, 30, 5, 41)
-    expected = plain.grey(level, window) * np.exp(logarithm(plain.shapes[level], level))[window.slices]
-    np.testing.assert_allclose(found.grey(level, window), expected, rtol=1e-5)
-    np.testing.assert_allclose(found.filled(level, window), expected, rtol=1e-5)
+    expected = plain.layers[level].grey * np.exp(logarithm(plain.shapes[level], level))
+    np.testing.assert_allclose(found.layers[level].grey, expected, rtol=1e-5)
+    np.testing.assert_allclose(found.layers[level].cut(window).grey, expected[window.slices], rtol=1e-5)
     assert brightness.levelled(plain, None) is plain
 
 
@@ -54,13 +61,12 @@ def test_matches_tell_the_ratio_though_a_third_is_wrong():
     right = left / np.exp(logarithm(SHAPE)).astype(np.float32)
     u = np.where(rng.random(SHAPE) < 1 / 3, 7, 0).astype(np.int16)
     ok = np.arange(SHAPE[1]) < SHAPE[1] - 7
-    nothing = np.zeros(SHAPE, np.int16)
-    found = brightness.matched(view(left), view(right), 0, u, nothing, np.broadcast_to(ok, SHAPE).copy())
+    found = brightness.matched(view(left), view(right), state(0, u, np.broadcast_to(ok, SHAPE).copy()))
     y, x = np.indices(SHAPE)
     # a wrong match errs by .28 in the mean of squares; held down by the robust fit and by 2600 others
     off = np.tensordot(found - RATIO, brightness.terms(x, y, 0, SHAPE), 1)
     assert np.abs(off).mean() < 0.02
-    assert brightness.matched(view(left), view(right), 0, u, nothing, np.zeros(SHAPE, bool)) is None
+    assert brightness.matched(view(left), view(right), state(0, u, np.zeros(SHAPE, bool))) is None
 
 
 def test_guess_of_one_scene_in_two_lights():
@@ -94,5 +100,5 @@ def test_equal_light_is_left_alone():
     u = np.full(shape, -3, np.int16)
     ok = np.zeros(shape, bool)
     ok[:, 6:] = True
-    found = brightness.matched(*views, level, u, np.zeros(shape, np.int16), ok)
+    found = brightness.matched(*views, state(level, u, ok))
     assert brightness.greatest(found) < brightness.NOTABLE

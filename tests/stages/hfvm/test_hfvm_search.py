@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from rille.stages.hfvm.level import epipolar, paper, search, subpixel
+from rille.stages.hfvm import epipolar, paper
+from rille.stages.hfvm.level import Map
 from rille.stages.hfvm.native import reference
 from rille.stages.hfvm.native.problem import FAR, Field, Pair, Smoothing, pack_map, unpacked
 
@@ -41,7 +42,7 @@ def off_line(f, y, x, u, v, mu):
 
 def test_terms_of_a_row_make_its_lines():
     f = some_band(1)
-    planes = np.moveaxis(epipolar.lines(f, (ROWS, COLS), X0, Y0), 2, 0)
+    planes = np.moveaxis(epipolar.lines(epipolar.moved(f, (X0, Y0), (X0, Y0)), (ROWS, COLS)), 2, 0)
     for y, x in np.ndindex(ROWS, COLS):
         np.testing.assert_allclose(line(f, y, x, 1.0), planes[:, y, x], rtol=1e-5, atol=1e-5)
         np.testing.assert_allclose(line(f, y, x, 3.0), 3 * planes[:, y, x], rtol=1e-5, atol=1e-5)
@@ -52,14 +53,14 @@ def test_rows_are_settled_onto_their_lines():
     f, u = some_band(2), np.random.default_rng(3).uniform(-5, 5, (ROWS, COLS)).astype(np.float32)
     v, wanted = np.full((ROWS, COLS), 7.0, np.float32), np.zeros((ROWS, COLS), np.uint8)
     wanted[::2] = 1
-    epipolar.settle_rows(f, u, v, wanted, X0, Y0)
+    v = epipolar.settled(epipolar.moved(f, (X0, Y0), (X0, Y0)), u, v, wanted)
     assert (v[1::2] == 7.0).all()
     for y, x in np.ndindex(ROWS, COLS):
         if wanted[y, x]:
             p, q = np.array([x + X0, y + Y0, 1.0]), np.array([x + X0 + u[y, x], y + Y0 + v[y, x], 1.0])
             assert abs(q @ f @ p) < 1e-4
     down = np.full((ROWS, COLS), 7.0, np.float32)
-    epipolar.settle_rows(np.array([[0.0, 0, -1], [0, 0, 0], [1, 0, 0.0]]), u, down, wanted, X0, Y0)
+    down = epipolar.settled(np.array([[0.0, 0, -1], [0, 0, 0], [1, 0, 0.0]]), u, down, wanted)
     assert (down == 7.0).all()  # lines along the columns do not say how far
 
 
@@ -184,18 +185,17 @@ def costs(left, right, u, v, f, mu):
 def test_exhaustive_search_finds_a_two_dimensional_shift_and_prefers_the_short_one():
     big = words((20, 24), 9)
     left, right = big[4:16, 6:18], big[2:14, 3:15]
-    u, v = np.full((2, 12, 12), 99, np.int16)
-    cost = np.zeros((12, 12), np.int32)
-    search.exhaustive((left, right), (6, 6), 1, (u, v, cost))
+    none, out = np.zeros((3, 3)), Field(*np.zeros((2, 12, 12), np.int32))
+    reference.exhaustive(Pair(left, right, none, 0.0), (6, 6), out)
+    u, v = unpacked(out.shift)
     assert (u[:9, :8] == 3).all()
     assert (v[:9, :8] == 2).all()
     for y, x in np.ndindex(12, 12):
-        assert cost[y, x] == sad(left[y, x], right[y + v[y, x], x + u[y, x]])
+        assert out.cost[y, x] == sad(left[y, x], right[y + v[y, x], x + u[y, x]])
     flat = np.zeros((5, 5), np.uint64)
-    u, v = np.full((2, 5, 5), 99, np.int16)
-    search.exhaustive((flat, flat), (3, 3), 1, (u, v, np.zeros((5, 5), np.int32)))
-    assert (u == 0).all()
-    assert (v == 0).all()
+    out = Field(*np.full((2, 5, 5), 99, np.int32))
+    reference.exhaustive(Pair(flat, flat, none, 0.0), (3, 3), out)
+    assert (out.shift == 0).all()
 
 
 def test_summed_distances_against_numpy():
@@ -230,8 +230,8 @@ def test_summed_distances_against_numpy():
 def test_linear_interpolation_is_exact_for_two_equal_slopes():
     for true in (-0.5, -0.3, 0.0, 0.25, 0.5):
         d = [abs(x - true) * 40 + 7 for x in (-1, 0, 1)]
-        assert subpixel.linear(*d) == pytest.approx(true, abs=1e-6)
-    assert subpixel.linear(5, 5, 5) == 0
+        assert reference.linear(*d) == pytest.approx(true, abs=1e-6)
+    assert reference.linear(5, 5, 5) == 0
 
 
 def test_papers_search_is_equation_1_to_3():
@@ -240,9 +240,7 @@ def test_papers_search_is_equation_1_to_3():
     weights = (2.0, 2.0, 3.0, 3.0, 3.0, 3.0, 10.0, 4.0)
     a, b = (paper.weighted(p, weights) for p in planes)
     centre_u, centre_v = rng.integers(-2, 3, (2, 10, 12)).astype(np.int16)
-    u, v = np.empty((2, 10, 12), np.int16)
-    d, offset = np.empty((10, 12), np.float32), np.empty((10, 12, 2), np.float32)
-    paper.search((a, b), (centre_u, centre_v), (2, 1), (u, v, d, offset))
+    u, v, d, _ = paper._search(a, b, Map(centre_u, centre_v), (2, 1))
     w = np.array(weights)
     for y in range(10):
         for x in range(12):

@@ -6,33 +6,27 @@ from matching_scenes import Texture, pair
 
 from rille.stages.core.validity import matched
 from rille.stages.geometry.spline import coefficients
-from rille.stages.hfvm.finish import refine
-from rille.stages.hfvm.finish.uncertainty import REFINED, neighbours, standard_deviation
-from rille.stages.hfvm.images.params import HfvmParams
-from rille.stages.hfvm.level import rowwise
-from rille.stages.hfvm.level.window_pair import WindowPair
+from rille.stages.hfvm import lucas_kanade
+from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
+from rille.stages.hfvm.uncertainty import FLOOR, neighbours, standard_deviation
 
-PARAMS = HfvmParams()
 
-
-def whole_image(grey):
-    """All of a right image, usable everywhere, in whose frame steps are taken."""
-    place = WindowPair(0, 0, 0, 0, *grey.shape)
-    return rowwise.Right(coefficients(grey), np.ones(grey.shape, np.uint8), place), lambda u, v: (u, v)
+def per_noise(left, right):
+    """Variance of undisplaced columns for a unit of variance of the grey levels."""
+    nothing, keep = np.zeros(left.shape, np.float32), np.ones(left.shape, bool)
+    images = lucas_kanade.Images(left, coefficients(right), np.ones(right.shape, np.uint8))
+    return lucas_kanade.refine(images, lambda u, v: (u, v), (nothing, nothing), keep, 1).per_noise
 
 
 def test_noise_part_is_the_inverse_structure_tensor_of_the_window():
     image = np.random.default_rng(0).uniform(0, 255, (15, 17)).astype(np.float32)
-    keep = np.ones(image.shape, bool)
-    nothing = np.zeros(image.shape, np.float32)
-    per_noise = refine.refine(image, *whole_image(image), nothing, nothing, keep, PARAMS)[3]
     y, x = 7, 8
     window = np.s_[y - 2 : y + 3, x - 2 : x + 3]
     gy, gx = np.gradient(image.astype(np.float64))
     g = np.stack([gx[window].ravel(), gy[window].ravel()])
-    tensor = 25 * np.cov(g, bias=True) + 25 * PARAMS.refine_noise * np.eye(2)
-    assert per_noise[y, x] == pytest.approx(np.linalg.inv(tensor)[0, 0], rel=1e-4)
+    tensor = 25 * np.cov(g, bias=True) + 25 * lucas_kanade.NOISE * np.eye(2)
+    assert per_noise(image, image)[y, x] == pytest.approx(np.linalg.inv(tensor)[0, 0], rel=1e-4)
 
 
 def test_relief_and_border_parts_by_their_definition():
@@ -83,18 +77,18 @@ def test_undefined_exactly_where_nothing_was_matched():
     left, right, *_ = pair(lambda x, y: (-8.0, 1.0), noise=3.0)
     found = match(left, right)
     np.testing.assert_array_equal(np.isfinite(found.disparity_std), matched(found.validity))
-    assert np.nanmin(found.disparity_std) >= REFINED.floor
+    assert np.nanmin(found.disparity_std) >= FLOOR
 
 
 def test_no_kept_pixel_gives_no_number_and_no_warning():
     image = np.zeros((6, 7), np.float32)
-    std = standard_deviation(image, image, np.zeros(image.shape, bool), PARAMS)
+    std = standard_deviation(image, image, np.zeros(image.shape, bool))
     assert np.isnan(std).all()
 
 
 def beyond_floor(std):
     """What a standard deviation has beside the floor, which no pixel shows."""
-    return np.sqrt(max(float(std) ** 2 - REFINED.floor**2, 0.0))
+    return np.sqrt(max(float(std) ** 2 - FLOOR**2, 0.0))
 
 
 def test_edges_along_the_rows_leave_the_column_uncertain():
@@ -102,8 +96,8 @@ def test_edges_along_the_rows_leave_the_column_uncertain():
     keep, flat = np.ones(x.shape, bool), np.zeros(x.shape, np.float32)
     found = []
     for image in (across := (128 + 60 * np.sin(x)).astype(np.float32), across.T.copy()):
-        noise = 150.0 * refine.refine(image, *whole_image(image), flat, flat, keep, PARAMS)[3]
-        found.append(standard_deviation(noise, flat, keep, PARAMS)[30, 30])
+        noise = 150.0 * per_noise(image, image)
+        found.append(standard_deviation(noise, flat, keep)[30, 30])
     up, along = found
     assert beyond_floor(along) > 5 * beyond_floor(up)
 
@@ -133,7 +127,7 @@ def test_stated_errors_hold_against_exact_displacements_on_relief_and_noise():
         assert np.mean(ratio <= 0.5) < 0.68
 
 
-@pytest.mark.parametrize("params", [HfvmParams(preset="paper"), HfvmParams(refine=False)])
+@pytest.mark.parametrize("params", [HfvmParams(preset="paper"), HfvmParams(without=("refine",))])
 def test_unrefined_disparities_have_one_too(params):
     left, right, u, _ = pair(lambda x, y: (-6.4, 1.3), noise=3.0)
     found = match(left, right, params)

@@ -6,9 +6,9 @@ import pytest
 from matching_scenes import Texture, pair, seen
 
 from rille.stages.core.validity import matched
-from rille.stages.hfvm.images import plane, viewpoint
-from rille.stages.hfvm.images.params import HfvmParams
-from rille.stages.hfvm.images.views import Plain
+from rille.stages.hfvm import plane, viewpoint
+from rille.stages.hfvm.image import view
+from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
 from rille.stages.imaging.pyramid import PyramidParams, build
 
@@ -40,7 +40,7 @@ def test_turned_views_are_matched_in_their_own_frame(degrees, scale, slant):
     assert np.median(error[both & matched(found.validity)]) < 0.1
     # What was interpolated follows the turned surface, too.
     assert np.mean(error[both] < 1) > 0.97
-    assert np.mean(matched(match(left, right, HfvmParams(turned=False)).validity)) < 0.02
+    assert np.mean(matched(match(left, right, HfvmParams(without=("turn",))).validity)) < 0.02
 
 
 @pytest.mark.parametrize(("preset", "degrees", "wide"), [("fast", 180, 0.2), ("accurate", 150, 0.1)])
@@ -64,7 +64,7 @@ def test_a_plane_fitted_to_chance_matches_does_not_rule_out_a_turn(monkeypatch):
 
 def test_keypoints_tell_the_homography_at_full_resolution():
     left, right, u, v = turned(75, 1.2)
-    views = [Plain.of(build(cv2.resize(image, None, fx=4, fy=4), PyramidParams())) for image in (left, right)]
+    views = [view(build(cv2.resize(image, None, fx=4, fy=4), PyramidParams()), HfvmParams()) for image in (left, right)]
     assert max(views[1].shapes[0]) > viewpoint.SIDE
     h = viewpoint.find(*views)
     x, y, _ = h @ (4 * 100 + 1.5, 4 * 80 + 1.5, 1) / (h[2] @ (4 * 100 + 1.5, 4 * 80 + 1.5, 1))
@@ -80,7 +80,7 @@ def test_unrelated_views_are_refused(right):
         "nothing": np.full(SHAPE, 90, np.float32),
         "mirrored": np.ascontiguousarray(Texture(0)(x, y)[:, ::-1]),
     }
-    views = [Plain.of(build(image, PyramidParams())) for image in (Texture(0)(x, y), images[right])]
+    views = [view(build(image, PyramidParams()), HfvmParams()) for image in (Texture(0)(x, y), images[right])]
     assert viewpoint.find(*views) is None
 
 

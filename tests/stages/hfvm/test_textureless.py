@@ -5,16 +5,12 @@ import numpy as np
 import pytest
 
 from rille.stages.core.validity import matched
-from rille.stages.hfvm import tiled
-from rille.stages.hfvm.finish import textureless
-from rille.stages.hfvm.finish.textureless import Planes
-from rille.stages.hfvm.finish.wide_search import APART, CAP, SIDE, search
-from rille.stages.hfvm.images.params import HfvmParams
-from rille.stages.hfvm.images.views import Plain
-from rille.stages.hfvm.images.window import Window, whole
-from rille.stages.hfvm.level import epipolar, features
+from rille.stages.hfvm import epipolar, features, textureless
+from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
-from rille.stages.imaging.pyramid import PyramidParams, build
+from rille.stages.hfvm.textureless import Planes
+from rille.stages.hfvm.wide_search import APART, CAP, SIDE, Pair, search
+from rille.stages.hfvm.windows import Window, whole
 
 ROWS, COLS = 220, 300
 WALL = -8.0
@@ -47,7 +43,7 @@ def scene(wall=0.3, noise=0.05, tilt=0.0):
 @pytest.mark.parametrize("tilt", [0.0, 0.02])
 def test_a_wall_of_little_contrast_is_matched_on_its_plane(tilt):
     left, right, u, wall = scene(tilt=tilt)
-    found, without = (match(left, right, HfvmParams(textureless=on)) for on in (True, False))
+    found, without = (match(left, right, HfvmParams(without=steps)) for steps in ((), ("planes",)))
     ok = matched(found.validity) & wall
     assert ok[wall].mean() > 0.5 > 0.2 > matched(without.validity)[wall].mean()
     error = np.hypot(found.column_disparity - u, found.row_disparity)[ok]
@@ -89,12 +85,13 @@ def test_a_wall_whose_displacement_is_beyond_all_that_is_searched_is_left_alone(
     assert np.mean(np.abs(found.column_disparity[still] - WALL) < 1) > 0.95
 
 
-def test_tiles_give_the_same_to_the_bit():
-    left, right, *_ = scene(tilt=0.02)
-    views = [Plain.of(build(image, PyramidParams(), None)) for image in (left, right)]
-    once, tiles = (tiled.match(*views, HfvmParams(), None, lambda share, step: None, side) for side in (None, 77))
-    for name, values in once.arrays.items():
-        assert values.tobytes() == tiles.arrays[name].tobytes(), name
+def test_tiles_have_the_planes_of_the_whole():
+    left, right, _, wall = scene(tilt=0.02)
+    once, tiles = (match(left, right, side=side) for side in (None, 77))
+    assert np.mean(matched(once.validity) == matched(tiles.validity)) > 0.99
+    both = matched(once.validity) & matched(tiles.validity) & wall
+    assert both[wall].mean() > 0.5
+    assert np.mean(np.abs(once.column_disparity - tiles.column_disparity)[both] < 0.05) > 0.99
 
 
 def test_masked_pixels_and_lonely_matches_have_neither_match_nor_standard_deviation():
@@ -128,7 +125,8 @@ def test_lines_lead_to_displacements_and_back():
     np.testing.assert_allclose(np.sum(ends * (f @ starts), axis=0), 0, atol=1e-3)
     assert (np.diff(u[np.argsort(along)]) > 0).all()
     for i, j, expected in zip(x, y, epipolar.lines_at(f, x, y).T, strict=True):
-        np.testing.assert_allclose(epipolar.lines(f, (1, 1), i, j)[0, 0], expected, rtol=1e-4)
+        line = epipolar.lines(epipolar.moved(f, (i, j), (i, j)), (1, 1))[0, 0]
+        np.testing.assert_allclose(line, expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("window", [Window(0, 9, 0, 13), Window(3, 8, 5, 12), Window(4, 9, 2, 13)])
@@ -156,8 +154,8 @@ def test_search_and_its_definition_agree():
     region = np.zeros(window.shape, bool)
     region[2:24, 3:36] = True
     region[10:14, 12:20] = False
-    lines = epipolar.lines(np.array([[0, 0, 0], [0, 0, 1.0], [0, -1.0, -1.0]]), window.shape, window.x0, window.y0)
-    found = search((words[window.slices], (others, valid)), region, lines, steps, window)
+    lines = epipolar.lines(np.array([[0, 0, 0], [0, 0, 1.0], [0, -1.0, -1.0]]), window.shape)
+    found = search(Pair(words, others, valid, window), region, lines, steps)
     a, b = (w.view(np.uint8).reshape(*w.shape, 8).astype(int) for w in (words, others))
     inside_region = np.argwhere(region)
     sums, sizes = np.full((*region.shape, len(steps)), np.inf), np.zeros(region.shape)

@@ -1,1 +1,0 @@
-"""From the top of the pyramid to the finest level, with either solver of a level."""

@@ -1,0 +1,244 @@
+"""Soft epipolar band: a fundamental matrix fitted robustly to the consistent matches of one level.
+
+A free two-dimensional search loses accuracy; knowing where matches lie in *any* geometry restores it. The matrix is
+only a help to the search: it is estimated anew at every level and never leaves the matcher.
+
+The constraint ``p'^T F p = 0`` is linear in F. Divided by the coefficient of ``y'`` it reads ``y' = y + small`` for a
+rig whose baseline lies along the rows, divided by that of ``x'`` likewise for one along the columns; both are fitted as
+a maximum a posteriori with a weak prior on the small terms (a few degrees of roll and toe-in), which decides what a
+flat scene leaves open. The first one is taken where most matches lie on its lines, else the likelier one.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+
+from rille.stages.core.declare import AnyArray
+from rille.stages.numeric.robust import cauchy, irls_held
+
+Matrix = NDArray[np.float64]
+
+NO_BAND: Matrix = np.zeros((3, 3))
+
+SIGMA = 0.5
+"""Pixels: deviation of an integer match from its line."""
+
+PRIOR = np.array([0.2, 0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.5])
+"""Deviations of the eight free terms (x', x'x, x'y, y'x, y'y, x, y, 1) in half image sides."""
+
+SHARP = 0.2
+"""Pixels: median distance of sub-pixel matches from their lines in an ideal rig; beyond it the band is softened."""
+
+MIN_MATCHES = 40
+LEAST_NORMAL = np.float32(1e-12)
+"""Length below which a normal is none: there is no band."""
+
+ITERATIONS = 10
+
+
+def fit_points(
+    x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray, left_shape: tuple[int, ...], right_shape: tuple[int, ...]
+) -> tuple[Matrix, float] | None:
+    """Fundamental matrix of matches of one level, or None where it is not determined.
+
+    Parameters
+    ----------
+    x, y, u, v : (n,) columns, rows and displacements, pixels.
+    left_shape, right_shape : rows and columns of both images.
+
+    Returns
+    -------
+    F : (3, 3) float64 with ``(x + u, y + v, 1) F (x, y, 1)^T = 0`` in pixels of this level.
+    spread : median distance of the matches from their lines, pixels.
+    """
+    if len(y) < MIN_MATCHES:
+        return None
+    scale = 0.5 * max(left_shape)
+    left_mid = (0.5 * (left_shape[1] - 1), 0.5 * (left_shape[0] - 1))
+    right_mid = (0.5 * (right_shape[1] - 1), 0.5 * (right_shape[0] - 1))
+    p = np.stack([(x - left_mid[0]) / scale, (y - left_mid[1]) / scale])
+    q = np.stack([(x + u - right_mid[0]) / scale, (y + v - right_mid[1]) / scale])
+    rows = _solve(p, q, SIGMA / scale)
+    f, _, spread = rows
+    if spread * scale > SIGMA:
+        cols = _solve(p[::-1], q[::-1], SIGMA / scale)
+        swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        f, spread = (rows[0], rows[2]) if rows[1] <= cols[1] else (swap @ cols[0] @ swap, cols[2])
+    to_left = np.array([[1 / scale, 0.0, -left_mid[0] / scale], [0.0, 1 / scale, -left_mid[1] / scale], [0, 0, 1.0]])
+    to_right = np.array([[1 / scale, 0.0, -right_mid[0] / scale], [0.0, 1 / scale, -right_mid[1] / scale], [0, 0, 1.0]])
+    return np.asarray(to_right.T @ f @ to_left, dtype=np.float64), spread * scale
+
+
+def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float]:
+    """Robust fit (Cauchy weights) of ``y' + g . terms = 0``: matrix in normalised coordinates, cost, spread."""
+    x, y, xr, yr = p[0], p[1], q[0], q[1]
+    terms = np.stack([xr, xr * x, xr * y, yr * x, yr * y, x, y, np.ones_like(x)])
+    prior = np.zeros(8)
+    # y' = y: the baseline lies along the rows.
+    prior[6] = -1.0
+    spread = math.inf
+
+    def weigh(residual: AnyArray) -> AnyArray:
+        # Start as wide as the matches scatter about the prior, and narrow to what an integer match deserves.
+        nonlocal spread
+        middle, first = typical(residual), math.isinf(spread)
+        spread = max(sigma, 2.0 * middle if first else min(0.5 * spread, 1.5 * middle + sigma))
+        return cauchy(residual, spread) / sigma**2
+
+    g = irls_held(terms, -yr, weigh, PRIOR**-2.0, prior, ITERATIONS)
+    residual = g @ terms + yr
+    cost = float(np.sum(np.log1p((residual / sigma) ** 2)) + np.sum(((g - prior) / PRIOR) ** 2))
+    f = np.array([[g[1], g[2], g[0]], [g[3], g[4], 1.0], [g[5], g[6], g[7]]])
+    return f, cost, typical(residual)
+
+
+def typical(residual: AnyArray) -> float:
+    """Median magnitude (the upper one of two)."""
+    size = np.abs(residual)
+    return float(np.partition(size, size.size // 2)[size.size // 2])
+
+
+def finer(f: Matrix) -> Matrix:
+    """The same constraint in pixels of the next finer level (``x_n = (x + 0.5) / 2 - 0.5``)."""
+    s = np.array([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]])
+    return np.asarray(s.T @ f @ s, dtype=np.float64)
+
+
+def near_sign(f: Matrix, u: AnyArray, left_shape: tuple[int, ...], right_shape: tuple[int, ...]) -> float:
+    """Sign of the column displacement of near things against far ones: -1 on a usual rig, +1 with images swapped.
+
+    On a convergent rig the displacement of far things is not zero; the toe-in shows in the terms ``y'x`` and ``x'y``
+    (keystone), which give it for a focal length of about the image width. A vote: only the filling of gaps hangs on it.
+    ``u``: column displacements of matches (n,).
+    """
+    rows, cols = left_shape
+    to_left = np.array([[1.0, 0.0, 0.5 * (cols - 1)], [0.0, 1.0, 0.5 * (rows - 1)], [0.0, 0.0, 1.0]])
+    to_right = np.array(
+        [[1.0, 0.0, 0.5 * (right_shape[1] - 1)], [0.0, 1.0, 0.5 * (right_shape[0] - 1)], [0.0, 0.0, 1.0]]
+    )
+    g = to_right.T @ f @ to_left
+    # Lines along the columns: column displacements do not tell near from far, and the usual sign stands.
+    if abs(g[1, 2]) < abs(g[0, 2]):
+        return -1.0
+    shift = 0.5 * (right_shape[1] - cols)
+    far = -(g[1, 0] + g[0, 1]) / g[1, 2] * float(cols) ** 2 + shift
+    return -1.0 if np.median(u) <= far else 1.0
+
+
+def lines(f: Matrix, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Epipolar line of every left pixel: unit normal and offset (row, col, 3) with n . displacement + c = 0.
+
+    Zeros where ``f`` is zero.
+    """
+    found = np.empty((*shape, 3), np.float32)
+    _lines(f, found)
+    return found
+
+
+def moved(f: Matrix, left: tuple[int, int], right: tuple[int, int]) -> Matrix:
+    """The same constraint in pixels of windows that begin at these columns and rows of the images."""
+    to_left, to_right = (np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]]) for x, y in (left, right))
+    return np.asarray(to_right.T @ f @ to_left, dtype=np.float64)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def unit_line(f, x, y):  # type: ignore[no-untyped-def]
+    """Epipolar line (a, b, c) of a pixel, its normal of length one; float32."""
+    a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
+    b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
+    c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
+    # Without a band all is zero, and 0 / 0 must stay 0.
+    scale = 1.0 / max(np.sqrt(a * a + b * b), 1e-12)
+    return np.float32(a * scale), np.float32(b * scale), np.float32((c + a * x + b * y) * scale)
+
+
+@njit(cache=True, nogil=True)
+def _lines(f, found):  # type: ignore[no-untyped-def]
+    for j in range(found.shape[0]):
+        for i in range(found.shape[1]):
+            found[j, i, 0], found[j, i, 1], found[j, i, 2] = unit_line(f, np.float64(i), np.float64(j))
+
+
+@njit(cache=True, nogil=True)
+def row_terms(f, y):  # type: ignore[no-untyped-def]
+    """Lines of a row as polynomials of the column: seven float32, see :func:`line`.
+
+    Summed up in double precision, so that on a nearly rectified rig nothing cancels in single precision.
+    """
+    a, b = f[0, 1] * y + f[0, 2], f[1, 1] * y + f[1, 2]
+    c = f[2, 2] + f[2, 1] * y + b * y
+    terms = a, f[0, 0], b, f[1, 0], c, f[2, 0] + a + f[1, 0] * y, f[0, 0]
+    return (
+        np.float32(terms[0]),
+        np.float32(terms[1]),
+        np.float32(terms[2]),
+        np.float32(terms[3]),
+        np.float32(terms[4]),
+        np.float32(terms[5]),
+        np.float32(terms[6]),
+    )
+
+
+@njit(cache=True, nogil=True)
+def line(terms, x, length):  # type: ignore[no-untyped-def]
+    """Normal of ``length`` and offset (a, b, c) of the epipolar line of column ``x``; zeros where there is no band.
+
+    ``|a u + b v + c|`` is ``length`` times the distance of displacement (u, v) from the line. All float32.
+    """
+    a, b = terms[0] + terms[1] * x, terms[2] + terms[3] * x
+    c = terms[4] + x * (terms[5] + x * terms[6])
+    scale = length / max(np.sqrt(a * a + b * b), LEAST_NORMAL)
+    return a * scale, b * scale, c * scale
+
+
+def along_line(line: AnyArray, u: AnyArray, v: AnyArray) -> AnyArray:
+    """How far along their lines (3, n) displacements lead, pixels: what :func:`on_line` undoes."""
+    a, b, _ = line
+    return np.asarray(b * u - a * v)
+
+
+@register_jitable
+def on_line(line, along):  # type: ignore[no-untyped-def]
+    """Displacement (column, row) on a line (a, b, c) of unit normal, ``along`` pixels from the shortest one on it."""
+    a, b, c = line
+    return along * b - c * a, -along * a - c * b
+
+
+@njit(cache=True, nogil=True)
+def lines_at(f, x, y):  # type: ignore[no-untyped-def]
+    """As :func:`lines`, of single pixels (n,): (3, n) float32."""
+    found = np.empty((3, len(x)), np.float32)
+    for n in range(len(x)):
+        found[0, n], found[1, n], found[2, n] = unit_line(f, np.float64(x[n]), np.float64(y[n]))
+    return found
+
+
+def along_rows(f: Matrix, shape: tuple[int, ...]) -> bool:
+    """Whether the lines of an image of ``shape`` run along the rows rather than along the columns."""
+    a, b, _ = unit_line(f, float(shape[1] // 2), float(shape[0] // 2))
+    return bool(abs(b) >= abs(a))
+
+
+def oriented(f: Matrix, shape: tuple[int, ...]) -> Matrix:
+    """The matrix with the sign by which :func:`on_line` leads to greater columns, or rows on upright lines."""
+    a, b, _ = unit_line(f, float(shape[1] // 2), float(shape[0] // 2))
+    return f if (b if along_rows(f, shape) else -a) > 0 else -f
+
+
+def settled(f: Matrix, u: AnyArray, v: AnyArray, wanted: AnyArray) -> AnyArray:
+    """Row displacements (row, col), those of the ``wanted`` pixels by their column displacements and their lines.
+
+    Only where lines run along the rows rather than along the columns: there an error of the column is not enlarged.
+    """
+    at = np.flatnonzero(wanted)
+    y, x = np.divmod(at, wanted.shape[1])
+    a, b, c = lines_at(f, x, y)
+    flat = np.abs(b) > np.abs(a)
+    out = v.copy()
+    out.flat[at[flat]] = -(a * u.flat[at] + c)[flat] / b[flat]
+    return out

@@ -1,1 +1,0 @@
-"""The finest level: sub-pixel refinement, standard deviations, filling."""

@@ -1,1 +1,0 @@
-"""Images as the matcher reads them, window by window, and its parameters."""

@@ -1,1 +1,0 @@
-"""Matching on one level of the pyramid: features, search, consistency."""

@@ -1,0 +1,283 @@
+"""Pre-alignment of the right image by the homography of the dominant plane, fitted to coarse matches.
+
+Feature vectors compare upright windows. On ground seen obliquely the disparity changes by half a pixel from row to row,
+and a 13-pixel kernel shears by several pixels: the matcher then finds plateaus instead of a slope. So the images are
+first matched coarsely as they are; where one plane (and with it roll, row offset and toe-in) explains most of those
+matches and distorts windows noticeably, the right image is resampled by its homography and matching starts anew. Only
+matches say how: no calibration is used, and displacements are given in the original images.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+
+from rille.stages.core.declare import AnyArray
+from rille.stages.geometry.cubic import cubic
+from rille.stages.hfvm.epipolar import typical
+from rille.stages.hfvm.image import Grey, Image, Layer
+from rille.stages.hfvm.windows import Shape, Window
+from rille.stages.imaging.pyramid import filled_from
+from rille.stages.numeric.robust import cauchy, irls_held
+
+Matrix = NDArray[np.float64]
+
+
+class Sample(NamedTuple):
+    """Sub-pixel matches of a level, in reading order: columns, rows, displacements (n,), pixels."""
+
+    x: AnyArray
+    y: AnyArray
+    u: AnyArray
+    v: AnyArray
+
+
+ITERATIONS = 15
+
+MIN_MATCHES = 60
+
+KERNEL = 2
+"""Pixels that the cubic kernel reaches beyond a place."""
+
+MIN_SHARE = 0.6
+"""Least share of the coarse matches that the plane must explain."""
+
+WIDEST = 1e6
+"""Half image sides: no error is greater."""
+
+MIN_DISTORTION, MAX_DISTORTION = 0.2, 3.0
+"""Shear or stretch, pixels per pixel, from which on images are aligned. Beyond the other the plane is no ground but a
+bad fit; views turned by 180 degrees have 2, and more if scaled."""
+
+TOLERANCE = 1.0
+"""Pixels of the coarse level: a match within twice this belongs to the plane; at this distance it has a quarter of the
+weight."""
+
+MARGIN = 1.0 / 16.0
+"""Share of the width added around the aligned image, for what stands out of the plane."""
+
+
+def find(sample: Sample, level: int, shapes: Sequence[Shape]) -> Matrix | None:
+    """Homography from aligned pixels to right image pixels (level 0), or None where alignment would not help.
+
+    ``shapes``: of the left image's levels.
+    """
+    found = fit_points(sample, shapes[level], TOLERANCE)
+    if found is None or found[1] < MIN_SHARE:
+        return None
+    h = to_level_0(found[0], level)
+    shear = distortion(h, (shapes[0][0], shapes[0][1]))
+    return h if MIN_DISTORTION <= shear < MAX_DISTORTION else None
+
+
+def aligned(right: Image, h: Matrix, left: Image) -> Image:
+    """The right image resampled to the left one's geometry, with :func:`margin` pixels more on every side."""
+    layers: list[Layer] = []
+    m, levels = margin(left.shapes[0]), min(len(left.layers), len(right.layers))
+    # From the top down: masked pixels take their grey from the level above.
+    for n in range(levels - 1, -1, -1):
+        layer, up = right.layers[n], finer(n)
+        own = np.linalg.inv(up) @ h @ up @ translation(-(m >> n))
+        wide = tuple(k + 2 * (m >> n) for k in left.shapes[n])
+        layers.insert(0, Layer.of(partial(_resampled, layer, own, layers[0] if layers else None), wide, layer.weights))
+    return Image(tuple(layers), right.noise)
+
+
+def _resampled(layer: Layer, h: Matrix, above: Layer | None, window: Window) -> Grey:
+    source = _source(h, window, layer.shape)
+    grey, mask = layer.read(source)
+    # The edge is repeated for the kernel: of the few pixels of a coarse level none may be lost.
+    grey, mask = np.pad(grey, KERNEL, mode="edge"), np.pad(mask, KERNEL)
+    image, valid = np.empty(window.shape, np.float32), np.empty(window.shape, np.uint8)
+    there = translation(KERNEL - source.x0, KERNEL - source.y0)
+    warp(grey, mask, there @ h @ translation(window.x0, window.y0), image, valid)
+    seen = valid != 0
+    if seen.all():
+        return image, valid
+    if above is None:
+        # The same for every window.
+        return np.where(seen, image, layer.grey.mean()), valid
+    outer = window.parent()
+    coarse, _ = above.read(outer)
+    return filled_from(coarse, image, seen, window.y0 - 2 * outer.y0, window.x0 - 2 * outer.x0), valid
+
+
+@register_jitable
+def mapped(h, x, y):  # type: ignore[no-untyped-def]
+    """Column and row to which a homography maps a place, both to be divided by the third number, which is positive on
+    this side of the horizon."""
+    return (
+        h[0, 0] * x + h[0, 1] * y + h[0, 2],
+        h[1, 0] * x + h[1, 1] * y + h[1, 2],
+        h[2, 0] * x + h[2, 1] * y + h[2, 2],
+    )
+
+
+def _source(h: Matrix, window: Window, shape: Shape) -> Window:
+    """Window of an image of ``shape`` that :func:`warp` reads for a window of its result."""
+    y, x = np.meshgrid([window.y0, window.y1 - 1], [window.x0, window.x1 - 1], indexing="ij")
+    p, q, w = mapped(h, x, y)
+    if (w <= 1e-3).any():  # the horizon crosses it: a quadrangle does not hold it
+        return Window(0, shape[0], 0, shape[1])
+    # Near the horizon ends run off to numbers that no index holds; four pixels hold the cubic kernel.
+    y0, x0 = (int(np.clip(np.floor(a.min()) - 4, 0, n - 1)) for a, n in zip((q / w, p / w), shape, strict=True))
+    y1, x1 = (int(np.clip(np.ceil(a.max()) + 5, 1, n)) for a, n in zip((q / w, p / w), shape, strict=True))
+    return Window(y0, max(y1, y0 + 1), x0, max(x1, x0 + 1))
+
+
+def compose(
+    h: Matrix, u: AnyArray, v: AnyArray, left_shape: Shape, x0: int = 0, y0: int = 0
+) -> tuple[AnyArray, AnyArray]:
+    """Displacements to the original right image of displacements to the aligned one (margin included).
+
+    ``x0, y0``: first column and row of a window of the left image, which has ``left_shape``.
+    """
+    out = np.empty(u.shape, np.float32), np.empty(v.shape, np.float32)
+    _compose(h @ translation(-margin(left_shape)), u, v, (x0, y0), out)
+    return out
+
+
+def decompose(
+    h: Matrix, u: AnyArray, v: AnyArray, left_shape: Shape, x0: int = 0, y0: int = 0
+) -> tuple[AnyArray, AnyArray]:
+    """Displacements to the aligned right image: the inverse of :func:`compose`."""
+    out = np.empty(u.shape, np.float32), np.empty(v.shape, np.float32)
+    _compose(np.linalg.inv(h @ translation(-margin(left_shape))), u, v, (x0, y0), out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _compose(g, u, v, first, out):  # type: ignore[no-untyped-def]
+    for row in range(u.shape[0]):
+        for col in range(u.shape[1]):
+            # In double precision: the difference of two columns must keep their fractions.
+            x, y = np.float64(col + first[0]), np.float64(row + first[1])
+            p, q, w = mapped(g, x + u[row, col], y + v[row, col])
+            # Points beyond the horizon would come back mirrored.
+            w = w if w > 0.0 else np.nan
+            out[0][row, col], out[1][row, col] = p / w - x, q / w - y
+
+
+def margin(left_shape: tuple[int, ...]) -> int:
+    """Pixels added on every side of the aligned image: whole ones of the sixth level, too."""
+    return int(np.ceil(MARGIN * left_shape[1] / 32.0)) * 32
+
+
+def translation(x: float, y: float | None = None) -> Matrix:
+    """Homography that adds ``x`` to columns and ``y`` (None: as much) to rows, pixels."""
+    return np.array([[1.0, 0.0, x], [0.0, 1.0, x if y is None else y], [0.0, 0.0, 1.0]])
+
+
+def fit_points(sample: Sample, shape: Shape, tolerance: float) -> tuple[Matrix, float] | None:
+    """Homography of the dominant plane, and the share of matches within twice ``tolerance`` of it; None: too few.
+
+    Parameters
+    ----------
+    sample : matches of one level, which has ``shape``.
+    tolerance : pixels; a match this far from the plane has a quarter of the weight.
+
+    Returns
+    -------
+    (3, 3) float64 H with ``(x + u, y + v, 1) ~ H (x, y, 1)``, and the share.
+    """
+    x, y, u, v = sample
+    if len(y) < MIN_MATCHES:
+        return None
+    # In half image sides all eight terms are of like size, so that one weak hold suits them all.
+    scale = 0.5 * max(shape)
+    middle = (0.5 * shape[1] / scale, 0.5 * shape[0] / scale)
+    to_unit = np.array([[1 / scale, 0.0, -middle[0]], [0.0, 1 / scale, -middle[1]], [0.0, 0.0, 1.0]])
+    p = np.stack([x / scale - middle[0], y / scale - middle[1]])
+    d = np.stack([u, v]).astype(np.float64) / scale
+    unit, error = _solve(p, d, tolerance / scale)
+    return np.linalg.inv(to_unit) @ unit @ to_unit, float(np.mean(error <= 2 * tolerance / scale))
+
+
+def _solve(p: AnyArray, d: AnyArray, tolerance: float) -> tuple[Matrix, AnyArray]:
+    """Homography of points (2, n) moved by ``d`` (2, n), robustly, and each point's error.
+
+    ``q = p + d`` with q ~ H p is linear in the eight terms of H - I where H[2, 2] = 1; they are weakly held at zero.
+    """
+    one, nil, q = np.ones_like(p[0]), np.zeros_like(p[0]), p + d
+    along = [p[0], p[1], one, nil, nil, nil, -q[0] * p[0], -q[0] * p[1]]
+    across = [nil, nil, nil, p[0], p[1], one, -q[1] * p[0], -q[1] * p[1]]
+    terms, target, spread = np.hstack([along, across]), d.ravel(), math.inf
+
+    def weigh(residual: AnyArray) -> AnyArray:
+        nonlocal spread
+        error = np.hypot(*residual.reshape(2, -1))
+        # The first fit is of all alike; then start as wide as the matches scatter, and narrow onto the dominant plane.
+        if math.isinf(spread):
+            spread = WIDEST
+            return np.ones(len(target))
+        spread = max(tolerance, min(1.5 * typical(error), 0.7 * spread))
+        # Squared Cauchy weights: other surfaces, off by many pixels, must not drag the plane along.
+        return np.tile(cauchy(error, spread) ** 2, 2)
+
+    h = irls_held(terms, target, weigh, np.full(8, 1e-6 * len(one)), iterations=ITERATIONS)
+    error = np.hypot(*(h @ terms - target).reshape(2, -1))
+    return np.append(h, 0.0).reshape(3, 3) + np.eye(3), error
+
+
+def to_level_0(h: Matrix, level: int) -> Matrix:
+    """Homography of level ``level`` pixels as one of level 0 pixels."""
+    up = finer(level)
+    return np.asarray(up @ h @ np.linalg.inv(up), dtype=np.float64)
+
+
+def finer(level: int) -> Matrix:
+    """Homography from pixels of a level to those of level 0, whose centres lie half a pixel inside their corners."""
+    k = 2.0**level
+    # Pixel x of the level covers k pixels from k x on, whose middle is k x + (k - 1) / 2: at level 1 it is 2x + 0.5.
+    return np.array([[k, 0.0, 0.5 * k - 0.5], [0.0, k, 0.5 * k - 0.5], [0.0, 0.0, 1.0]])
+
+
+def scale(h: Matrix, shape: Shape) -> float:
+    """Pixels of the right image that one in the middle of an aligned image is wide and high, in the geometric mean."""
+    w = mapped(h, 0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1))[2]
+    # The determinant of the derivative of a homography.
+    return math.sqrt(abs(float(np.linalg.det(h))) / abs(w) ** 3)
+
+
+def distortion(h: Matrix, shape: tuple[int, int]) -> float:
+    """Greatest element of the derivative's departure from the identity, each taken as the median over an image."""
+    y, x = np.meshgrid(np.linspace(0, shape[0] - 1, 5), np.linspace(0, shape[1] - 1, 5), indexing="ij")
+    p, q, w = mapped(h, x, y)
+    # So near the horizon it is no ground but a bad fit, which infinity has refused.
+    if (w <= 0.1).any():
+        return np.inf
+    p, q = p / w, q / w
+    parts = [
+        (h[0, 0] - p * h[2, 0]) / w - 1,
+        (h[0, 1] - p * h[2, 1]) / w,
+        (h[1, 0] - q * h[2, 0]) / w,
+        (h[1, 1] - q * h[2, 1]) / w - 1,
+    ]
+    return float(max(np.median(np.abs(d)) for d in parts))
+
+
+@njit(cache=True, nogil=True)
+def warp(image, valid, h, out, out_valid):  # type: ignore[no-untyped-def]
+    """``out(x, y) = image(H (x, y))``, Catmull-Rom; ``out_valid`` 0 where that is outside or masked."""
+    height, width = image.shape
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            out[y, x], out_valid[y, x] = 0.0, 0
+            p, q, w = mapped(h, x, y)
+            if w <= 1e-6:
+                continue
+            p, q = p / w, q / w
+            # The cubic kernel reads one pixel before and two after.
+            if not (p >= 1 and p < width - 2 and q >= 1 and q < height - 2):
+                continue
+            # The nearest pixel decides: masked ones beside it carry grey from above and do not darken the kernel.
+            if valid[int(q + 0.5), int(p + 0.5)]:
+                out[y, x] = cubic(image, np.float32(p), np.float32(q))
+                out_valid[y, x] = 1

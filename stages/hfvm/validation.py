@@ -1,0 +1,118 @@
+"""Validation of displacements: consistency, reasons against a match, isolated patches (paper, 4.3.1 and 4.3.3)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rille.stages.core.declare import AnyArray
+from rille.stages.numeric.windows import window_count, window_room
+
+FAILED = np.float32(1e9)
+"""Back-matching error where there is nothing to match back from."""
+
+CHANCE = 16
+"""Times the size of an isolated patch: none of chance is as large (measured on blurred noise: up to 8 times)."""
+
+CROWD = 9
+"""Pixels: side of the neighbourhood in which matches support each other, about that of the features."""
+
+OUTSIDE = -32768
+"""Displacement of pixels that are in no patch."""
+
+
+def agree(own: Any, other: Any, own_valid: AnyArray, other_valid: AnyArray, limit: float) -> NDArray[np.bool_]:
+    """Usable pixels whose whole displacement is undone by the other map within ``limit`` pixels (4.3.3).
+
+    ``own, other``: maps, ``u`` and ``v`` int16.
+    """
+    found = np.zeros(own.u.shape, bool)
+    _agree((own.u, own.v), (other.u, other.v), (own_valid, other_valid), np.float32(limit * limit), found)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _agree(own, other, valid, most, found):  # type: ignore[no-untyped-def]
+    (au, av), (bu, bv) = own, other
+    rows, cols = au.shape
+    brows, bcols = np.uint64(bu.shape[0]), np.uint64(bu.shape[1])
+    for y in range(rows):
+        for x in range(cols):
+            # Unsigned: what is negative lies beyond every column.
+            i, j = np.uint64(x + np.int64(au[y, x])), np.uint64(y + np.int64(av[y, x]))
+            if valid[0][y, x] and i < bcols and j < brows and valid[1][j, i]:
+                du, dv = np.int64(au[y, x]) + bu[j, i], np.int64(av[y, x]) + bv[j, i]
+                found[y, x] = du * du + dv * dv <= most
+
+
+@njit(cache=True, nogil=True)
+def backmatch(u, v, right, right_valid, error):  # type: ignore[no-untyped-def]
+    """Distance |l - l'| of each left pixel after matching to the right and back (4.3.3), pixels.
+
+    ``error`` comes as FAILED and stays so outside the right image and on its masked pixels. The right map, columns and
+    rows of displacement, is read at the nearest pixel.
+    """
+    ru, rv = right
+    last_x, last_y, half = np.float32(ru.shape[1] - 1), np.float32(ru.shape[0] - 1), np.float32(0.5)
+    for y in range(u.shape[0]):
+        for x in range(u.shape[1]):
+            xr, yr = np.float32(x) + u[y, x], np.float32(y) + v[y, x]
+            if not (xr >= 0 and xr <= last_x and yr >= 0 and yr <= last_y):
+                continue
+            # A half and truncation round to the nearest pixel, since neither is negative here.
+            i, j = np.int64(xr + half), np.int64(yr + half)
+            if right_valid[j, i]:
+                du, dv = u[y, x] + ru[j, i], v[y, x] + rv[j, i]
+                error[y, x] = min(np.sqrt(du * du + dv * dv), FAILED)
+
+
+@njit(cache=True, nogil=True)
+def lands(u, v, keep, right_valid):  # type: ignore[no-untyped-def]
+    """Pixels (bool) of ``keep`` whose displacement ends on a usable pixel of the right image."""
+    found, half = np.zeros(keep.shape, np.bool_), np.float32(0.5)
+    rows, cols = right_valid.shape
+    for y in range(u.shape[0]):
+        for x in range(u.shape[1]):
+            # Half a pixel beyond the outermost centres is still on the image.
+            xr, yr = np.float32(x) + u[y, x] + half, np.float32(y) + v[y, x] + half
+            if keep[y, x] and 0 < xr < cols and 0 < yr < rows:
+                found[y, x] = right_valid[np.int64(yr), np.int64(xr)] != 0
+    return found
+
+
+def lonely(keep: AnyArray, share: float) -> NDArray[np.bool_]:
+    """Pixels of ``keep`` in whose neighbourhood (CROWD x CROWD, clipped at the border) less than ``share`` is kept."""
+    if share <= 0:
+        return np.zeros(keep.shape, dtype=bool)
+    return np.asarray(keep & (window_count(keep, CROWD) < share * window_room(keep.shape, CROWD)))
+
+
+def isolated(u: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
+    """Pixels of ``keep`` in patches of fewer than ``size``; where most of the rest lies in small ones, those too.
+
+    Patches hang together along rows and columns where column displacements differ by at most one pixel. Images that
+    have nothing to do with each other match by chance in patches up to some hundred pixels. Of a pair that shows one
+    scene nearly everything lies in patches of thousands: there small ones are believed.
+
+    Parameters
+    ----------
+    u : (row, col) int16 column displacements, pixels.
+    """
+    if size <= 1:
+        return np.zeros(keep.shape, dtype=bool)
+    small = _in_small_patches(u, keep, size)
+    # In a small image patches of CHANCE times the size may not fit: an eighth of it is enough.
+    smaller = _in_small_patches(u, keep, max(size, min(CHANCE * size, keep.size // 8)))
+    rest, large = np.count_nonzero(keep & ~small), np.count_nonzero(keep & ~smaller)
+    return smaller if large < 0.5 * rest else small
+
+
+def _in_small_patches(u: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
+    """Pixels of ``keep`` that are in a patch of fewer than ``size``."""
+    plane = np.where(keep, u, np.int16(OUTSIDE))
+    cv2.filterSpeckles(plane, OUTSIDE, size - 1, 1)
+    return np.asarray(keep & (plane == OUTSIDE))
