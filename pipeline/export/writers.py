@@ -106,20 +106,23 @@ def write_raster(
     }
     tags = {"frame": FRAME, "axes": axes(place), "cell_size_m": f"{lattice.cell:.12g}"}
     tags["unit"] = ", ".join(dict.fromkeys(meaning.units(bands)))
-    _write_bands(path, bands, replace(meaning, tags=tags | dict(meaning.tags)), profile)
+    write_bands(path, bands, replace(meaning, tags=tags | dict(meaning.tags)), profile)
 
 
-def _write_bands(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning, profile: Mapping[str, Any]) -> None:
+def write_bands(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning, profile: Mapping[str, Any]) -> None:
     """Write bands of one shape and dtype by GDAL; ``profile``: driver, place and packing of the file.
 
     The file is made in memory: where the disk is full GDAL says nothing, and leaves a file that nobody can read.
     """
     from rasterio.enums import ColorInterp
+    from rasterio.errors import NotGeoreferencedWarning
     from rasterio.io import MemoryFile
 
     first = next(iter(bands.values()))
     about = {"height": first.shape[0], "width": first.shape[1], "count": len(bands), "dtype": first.dtype.name}
-    with MemoryFile() as memory:
+    with MemoryFile() as memory, warnings.catch_warnings():
+        # A raster in the geometry of an image has no place.
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with memory.open(**profile, **about, nodata=meaning.nodata, compress="deflate") as file:
             for number, (name, values) in enumerate(bands.items(), start=1):
                 file.write(values, number)
@@ -253,7 +256,7 @@ def _write_image(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning
         warnings.simplefilter("ignore", NotGeoreferencedWarning)  # an image has no place on the ground
         # 3 is TIFF's predictor of floats; GTiff does not choose by itself, as COG does.
         profile = {"driver": "GTiff", "predictor": 3}
-        _write_bands(path, {n: np.asarray(v, np.float32) for n, v in bands.items()}, meaning, profile)
+        write_bands(path, {n: np.asarray(v, np.float32) for n, v in bands.items()}, meaning, profile)
 
 
 def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

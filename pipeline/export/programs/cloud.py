@@ -20,12 +20,12 @@ from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.colour import LUMA
+from rille.pipeline.export.programs.placed_pairs import PlacedPairs
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.writers import ENGINEERING_CRS
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
-from rille.stages.geometry.geometry import Rig, RigidTransform
-from rille.stages.terrain.points import colours, cubes, one_a_cube, points
+from rille.stages.terrain.points import colours, cubes, one_a_cube
 
 MADE = date(2000, 1, 1)
 """Date that every LAZ file states, so that equal clouds make equal files."""
@@ -119,29 +119,19 @@ def _place(run: Path) -> Georeference | None:
 
 def _pairs(run: RunArtifacts, every: int, place: Georeference | None, made: _Made) -> Iterator[Columns]:
     """Columns of each pair's points, in order of the pairs; one pair is in memory at a time."""
-    trajectory = run.one("trajectory", last=True)
-    pose = dict(zip(trajectory.meta["frames"], np.asarray(trajectory["poses"]), strict=True))
-    piece = dict(zip(trajectory.meta["frames"], np.asarray(trajectory["piece"]).tolist(), strict=True))
-    pairs = sorted(int(name) for name in run.labels(r"hfvm/(\d{1,9})"))
-    placed = [pair for pair in pairs if piece.get(pair) == trajectory.meta["main"]]
-    made.unplaced = len(pairs) - len(placed)
-    if not placed:
-        raise InputError(
-            "RIL-613", "no pair of the run has both a disparity and a pose", remedy="its report says what failed"
-        )
-    for pair in placed:
-        rig = Rig.from_dict(run.input(f"ground_frame/{pair}", "rig").meta["rig"])
-        found = points(run.one(f"hfvm/{pair}"), rig, every)
-        T_world_left = RigidTransform.from_matrix(pose[pair])
+    pairs = PlacedPairs(run, every)
+    made.unplaced = pairs.unplaced
+    for one in pairs:
+        found, T_world_left = one.points, one.T_world_left
         ray = found.position / np.linalg.norm(found.position, axis=1, keepdims=True) @ T_world_left.rotation.T
         position = T_world_left.apply(found.position)
         if place is not None:
             ray[:, :2], position = ray[:, :2] @ place.rotation.T, place.apply(position)
         columns = dict(zip("xyz", position.T, strict=True))
-        columns |= zip(("red", "green", "blue"), colours(found, _image(run, pair)).T, strict=True)
+        columns |= zip(("red", "green", "blue"), colours(found, _image(run, one.pair)).T, strict=True)
         columns |= {"sigma_along": found.sigma_along, "sigma_across": found.sigma_across}
         columns |= zip(("ray_x", "ray_y", "ray_z"), ray.T.astype(np.float32), strict=True)
-        columns["pair"] = np.full(len(position), pair, np.uint32)
+        columns["pair"] = np.full(len(position), one.pair, np.uint32)
         yield columns
 
 

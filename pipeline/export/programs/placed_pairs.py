@@ -1,0 +1,56 @@
+"""The stereo pairs of a run that have a disparity and a pose in its world: their points, rigs and poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from rille.pipeline.export.programs.run_artifacts import RunArtifacts
+from rille.stages.core.declare import Bundle
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.terrain.points import PairPoints, points
+
+
+@dataclass(frozen=True)
+class PlacedPair:
+    """A pair of frame ``pair``: points in the frame of its left camera, and that camera's pose in the world."""
+
+    pair: int
+    disparity: Bundle
+    points: PairPoints
+    rig: Rig
+    T_world_left: RigidTransform
+
+
+class PlacedPairs:
+    """All of a run; iterated, one is opened at a time. ``unplaced``: how many have a disparity and no pose.
+
+    Raises
+    ------
+    InputError
+        No pair of the run has both.
+    """
+
+    def __init__(self, run: RunArtifacts, every: int = 1) -> None:
+        """Of each pair each ``every``-th row and column."""
+        trajectory = run.one("trajectory", last=True)
+        frames, pieces = trajectory.meta["frames"], np.asarray(trajectory["piece"]).tolist()
+        self._poses = dict(zip(frames, np.asarray(trajectory["poses"]), strict=True))
+        here = {frame for frame, piece in zip(frames, pieces, strict=True) if piece == trajectory.meta["main"]}
+        pairs = sorted(int(name) for name in run.labels(r"hfvm/(\d{1,9})"))
+        self._run, self._every, self.pairs = run, every, [pair for pair in pairs if pair in here]
+        self.unplaced = len(pairs) - len(self.pairs)
+        if not self.pairs:
+            raise InputError(
+                "RIL-613", "no pair of the run has both a disparity and a pose", remedy="its report says what failed"
+            )
+
+    def __iter__(self) -> Iterator[PlacedPair]:
+        for pair in self.pairs:
+            rig = Rig.from_dict(self._run.input(f"ground_frame/{pair}", "rig").meta["rig"])
+            disparity = self._run.one(f"hfvm/{pair}")
+            found = points(disparity, rig, self._every)
+            yield PlacedPair(pair, disparity, found, rig, RigidTransform.from_matrix(self._poses[pair]))
