@@ -1,4 +1,4 @@
-"""``rille why RUN TASK``: where a result comes from, and what has changed since the run before."""
+"""``rille why RUN [TASK]``: where results come from, and what has changed since the run before."""
 
 from __future__ import annotations
 
@@ -27,18 +27,33 @@ WIDTH = 70
 """Characters of a value."""
 
 
-def why(run: Run, task: str, *, runs: Runs = RUNS, cache: CacheFolder = None) -> int:
+def why(run: Run, task: str | None = None, *, runs: Runs = RUNS, cache: CacheFolder = None) -> int:
     """Explain one task of a run: its inputs, why it was computed, its parameters and code, what changed since.
 
     Parameters
     ----------
     task
-        The task's label, as in the run's ledger.jsonl: hfvm/12, locus/world/12, trajectory.
+        The task's label, as in the run's ledger.jsonl: hfvm/12, locus/world/12, trajectory; without one all tasks by
+        stage and reason.
     """
     folder = lookup.find(run, runs)
     with lookup.reading(folder):
-        print("\n".join(describe(folder, task, Store(cache_folder(cache)))))
+        lines = summary(folder) if task is None else describe(folder, task, Store(cache_folder(cache)))
+        print("\n".join(lines))
     return COMPLETE
+
+
+def summary(run: Path) -> Iterable[str]:
+    """Lines on all tasks of a run: how many of each stage ended in which way, and for what reason."""
+    rows = events.read(run / lookup.LEDGER)
+    yield f"{len(rows)} tasks in run {lookup.name(run)}"
+    groups: dict[tuple[str, str, str], list[str]] = {}
+    for row in rows:
+        # Cached ones have one reason, which needs no words.
+        reason = "" if row["status"] == "cached" else brief(row.get("reason", ""), WIDTH)
+        groups.setdefault((row["stage"], row["status"], reason), []).append(row["label"])
+    for (stage, status, reason), labels in groups.items():
+        yield f"{stage:24s} {len(labels):5d} {status:9s} {reason or some(labels, 3)}".rstrip()
 
 
 def describe(run: Path, label: str, store: Store) -> Iterable[str]:

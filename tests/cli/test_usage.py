@@ -55,7 +55,6 @@ WRONG = {
     ],
     "why": [
         ("", "RIL-001"),
-        ("other", "RIL-001"),
         ("no-such-run trajectory", "RIL-067"),
         ("other no-such-task", "RIL-068"),
         ("other trajectory --no-such-option", "RIL-001"),

@@ -49,6 +49,16 @@ def test_a_cached_task_names_the_run_that_computed_it(three):
     assert told(folder, first, "numbers/0")[-1] == "since         no earlier run of this sequence had this task"
 
 
+def test_a_run_alone_lists_its_tasks_by_stage_and_reason(three):
+    _, first, second, third = three
+    lines = [" ".join(line.split()) for line in why.summary(third)]
+    assert lines[0].endswith("tasks in run toy/3")
+    assert any(line.startswith("numbers 4 cached numbers/0, numbers/1") for line in lines)
+    assert "scale 4 computed params.offset 0.0 -> 0.5" in lines
+    assert "scale 4 computed never computed" in [" ".join(line.split()) for line in why.summary(first)]
+    assert all(" cached " in f"{line} " for line in list(why.summary(second))[1:])
+
+
 def test_it_may_be_a_run_of_another_sequence(tmp_path):
     run(tmp_path, "1"), run(tmp_path, "2", sequence="other", offset=0.5)
     at = run(tmp_path, "3", sequence="other")
