@@ -35,6 +35,7 @@ def reconstruct(
     runs: str | Path = "runs",
     cache: str | Path | None = None,
     executor: str = "dask",
+    quiet: bool = False,
     **settings: Settings,
 ) -> Run:
     """Run the whole chain, or what of it is not cached yet, and write its files and its report.
@@ -53,6 +54,8 @@ def reconstruct(
         Folder of the artifacts; ``RILLE_CACHE`` or ``.rille/cache`` by default.
     executor
         As ``--executor``, where there is no client.
+    quiet
+        Show no progress; the closing line and what is missing are printed all the same.
     settings
         Parameters by section, e.g. ``locus={"cell_size": 0.002}``.
 
@@ -95,6 +98,7 @@ def reconstruct(
         runs=Path(runs),
         cache=None if cache is None else str(cache),
         opened=opened,
+        quiet=quiet,
     )
     # Absolute: the program may change its folder, or send the run to another.
     return Run(session.perform(options)[1].resolve())
@@ -199,6 +203,21 @@ class Run:
         """
         with self._reading():
             return bool(self.report["complete"])
+
+    @property
+    def missing(self) -> list[Mapping[str, str]]:
+        """What could not be delivered: of each ``what`` it is, and ``why``."""
+        with self._reading():
+            return list(self.report["missing"])
+
+    @property
+    def tasks(self) -> list[Mapping[str, Any]]:
+        """Rows of the ledger, one a task: ``label``, ``stage``, ``status``, ``reason``, ``seconds`` and more."""
+        from rille.pipeline.engine import events
+        from rille.pipeline.runs.lookup import LEDGER
+
+        with self._reading():
+            return list(events.read(self.folder / LEDGER))
 
     @property
     def metrics(self) -> Mapping[str, Any]:

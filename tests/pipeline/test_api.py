@@ -133,6 +133,21 @@ def test_a_run_is_opened_and_shown(run: rille.Run, monkeypatch: pytest.MonkeyPat
     assert shown == [(run.folder / "report.html").resolve().as_uri()]
 
 
+def test_a_run_tells_its_tasks_and_what_is_missing(run: rille.Run) -> None:
+    assert {row["label"]: row["digest"] for row in run.tasks} == digests(run.folder)
+    assert all(item["what"] for item in run.missing)
+    assert run.complete or run.missing
+
+
+def test_a_quiet_run_shows_no_progress(run: rille.Run, capsys: pytest.CaptureFixture[str]) -> None:
+    places = {"runs": run.folder.parents[1], "cache": run.folder.parents[2] / "cache"}
+    sequence = rille.open("mockup-short", mockup=MOCKUP)
+    rille.reconstruct(sequence, **places, executor="inline", quiet=True, **STAGES)  # type: ignore[arg-type]
+    said = capsys.readouterr()
+    assert said.out.count("\n") == 1
+    assert all(line.startswith("rille: missing") for line in said.err.splitlines())
+
+
 def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
     sequence = rille.open("mockup-short", mockup=MOCKUP)
     with raises("RIL-860"):
