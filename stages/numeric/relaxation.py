@@ -1,18 +1,21 @@
-"""Successive over-relaxation of fields that are smooth but for their bends: surfaces, disparities.
+"""Successive over-relaxation of a field that is smooth but for its bends, such as a surface.
 
-Fields f_1 .. f_k (k, rows, cols) minimise together, with the second differences f_xx along rows and f_yy along columns,
+The field f (rows, cols) minimises, with the second differences f_xx along rows and f_yy along columns,
 
-    sum ((f - f_0)' A (f - f_0) - 2 b' (f - f_0))  +  sum across |f_xx|^2  +  sum down |f_yy|^2
+    sum (power (f - f_0)^2 - 2 pull (f - f_0))  +  sum across f_xx^2  +  sum down f_yy^2
 
-where A (k x k) and b (k) are what the data say of each cell about its start f_0, and ``across`` and ``down`` the
+where ``power`` and ``pull`` are what the data say of each cell about its start f_0, and ``across`` and ``down`` the
 weights of the bends (:func:`bend_weights`), 0 where a neighbour is unknown.
 
 A cell shares second differences with the two cells beside it on each side of its row and of its column, so three
 colours, (row + column) mod 3, part the cells into sets without a common term. In each sweep one colour after the other
-is relaxed; within a colour the order makes no difference.
+is relaxed; within a colour the order makes no difference. Every third column of a row is stored side by side, so that
+the cells of a colour are neighbours in memory and are relaxed as vectors.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -21,23 +24,35 @@ from rille.stages.core.arrays import Bools, Floats32
 
 OVERSHOOT = 1.7
 """Factor on each step, which stays convergent below 2."""
+COLOURS = 3
 BORDER = 2
-"""Cells of nothing around: a second difference reaches two cells far."""
+"""Rows of nothing around: a second difference reaches two cells far. Beside them it is a column of each colour."""
+
+
+class _Equations(NamedTuple):
+    """Arrays (row, colour of the column, column / 3) with a border: the field ``at``, the weights ``across`` and
+    ``down``, ``goal`` power f_0 + pull, and ``inverse`` 1 over all weights of a cell, 0 where it does not move."""
+
+    at: Floats32
+    across: Floats32
+    down: Floats32
+    goal: Floats32
+    inverse: Floats32
 
 
 @njit(cache=True, nogil=True)
 def bend_weights(field, scale, bend, strength):  # type: ignore[no-untyped-def]
     """Weights ``across``, ``down`` (rows, cols) of the second differences at each cell, float32.
 
-    They are ``strength scale^2 / (1 + (|scale second difference| / bend)^2)``: strong on smooth parts, weak at edges,
-    0 where a neighbour is NaN.
+    They are ``strength scale^2 / (1 + (scale second difference / bend)^2)``: strong on smooth parts, weak at edges, 0
+    where a neighbour is NaN.
 
     Parameters
     ----------
-    field : (k, rows, cols), NaN unknown.
+    field : (rows, cols), NaN unknown.
     scale : (rows, cols) units of ``bend`` in one of the field; NaN unknown.
     """
-    count, rows, cols = field.shape
+    rows, cols = field.shape
     across, down = np.zeros((rows, cols), np.float32), np.zeros((rows, cols), np.float32)
     for r in range(rows):
         for c in range(cols):
@@ -45,108 +60,101 @@ def bend_weights(field, scale, bend, strength):  # type: ignore[no-untyped-def]
             if not s > 0.0:
                 continue
             if 0 < c < cols - 1:
-                square = 0.0
-                for k in range(count):
-                    square += (field[k, r, c - 1] - field[k, r, c] + field[k, r, c + 1] - field[k, r, c]) ** 2
-                if np.isfinite(square):
-                    across[r, c] = strength * s * s / (1.0 + square * (s / bend) ** 2)
+                second = field[r, c - 1] - field[r, c] + field[r, c + 1] - field[r, c]
+                if np.isfinite(second):
+                    across[r, c] = strength * s * s / (1.0 + (second * s / bend) ** 2)
             if 0 < r < rows - 1:
-                square = 0.0
-                for k in range(count):
-                    square += (field[k, r - 1, c] - field[k, r, c] + field[k, r + 1, c] - field[k, r, c]) ** 2
-                if np.isfinite(square):
-                    down[r, c] = strength * s * s / (1.0 + square * (s / bend) ** 2)
+                second = field[r - 1, c] - field[r, c] + field[r + 1, c] - field[r, c]
+                if np.isfinite(second):
+                    down[r, c] = strength * s * s / (1.0 + (second * s / bend) ** 2)
     return across, down
 
 
 def relax(
     start: Floats32, power: Floats32, pull: Floats32, bends: tuple[Floats32, Floats32], keep: Bools, sweeps: int
 ) -> Floats32:
-    """Fields (k, rows, cols) float32 after a number of sweeps.
+    """Field (rows, cols) float32 after a number of sweeps.
 
     Parameters
     ----------
-    start : (k, rows, cols) float32 to start from, NaN unknown; k is 1 or 2.
-    power, pull : (k, k, rows, cols) and (k, rows, cols) float32, A and b; 0 where the data say nothing.
+    start : (rows, cols) float32 to start from, NaN unknown.
+    power, pull : (rows, cols) float32; 0 where the data say nothing.
     bends : ``across`` and ``down`` as :func:`bend_weights` gives them.
     keep : (rows, cols) known cells that move; the others are returned as they are.
     """
+    if not keep.any():
+        return start
+    across, down = bends
     # About the mean, so that single precision is enough.
-    middle = np.array([np.nanmean(f) if np.isfinite(f).any() else 0.0 for f in start], np.float32)[:, None, None]
-    around = (BORDER, BORDER)
-    at = np.pad(np.nan_to_num(start - middle), [(0, 0), around, around])
-    across, down = (np.pad(b, BORDER) for b in bends)
-    goal, inverse = _equations(power, pull, at, (across, down), keep)
-    _sweeps(at, goal, inverse, (across, down), sweeps)
-    moved = at[:, BORDER:-BORDER, BORDER:-BORDER]
+    middle = np.nanmean(start)
+    at = np.nan_to_num(start - middle)
+    total = power + np.float32(4.0) * (across + down)
+    total[:, 1:] += across[:, :-1]
+    total[:, :-1] += across[:, 1:]
+    total[1:] += down[:-1]
+    total[:-1] += down[1:]
+    inverse = np.divide(np.float32(1.0), total, out=np.zeros_like(total), where=keep & (total > 0.0))
+    equations = _Equations(*map(_coloured, (at, across, down, power * at + pull, inverse)))
+    _sweeps(equations, sweeps)
+    rows, cols = start.shape
+    moved = equations.at[BORDER:-BORDER].transpose(0, 2, 1).reshape(rows, -1)[:, COLOURS : COLOURS + cols]
     return np.where(keep, moved + middle, start)
 
 
-@njit(cache=True, nogil=True)
-def _equations(power, pull, at, bends, keep):  # type: ignore[no-untyped-def]
-    """A f_0 + b (k, rows, cols) of the cells that move, and the inverse (k, k, rows, cols) of A and all weights of the
-    cell's bends; 0 where these determine nothing."""
-    across, down = bends
-    goal, inverse = np.zeros_like(pull), np.zeros_like(power)
-    count, rows, cols = goal.shape
-    for r in range(rows):
-        for c in range(cols):
-            if not keep[r, c]:
-                continue
-            i, j = r + BORDER, c + BORDER
-            bend = np.float32(4.0) * (across[i, j] + down[i, j])
-            bend += across[i, j - 1] + across[i, j + 1] + down[i - 1, j] + down[i + 1, j]
-            for k in range(count):
-                goal[k, r, c] = pull[k, r, c]
-                for m in range(count):
-                    goal[k, r, c] += power[k, m, r, c] * at[m, i, j]
-            first = power[0, 0, r, c] + bend
-            if count == 1:
-                inverse[0, 0, r, c] = np.float32(1.0) / first if first > 0.0 else np.float32(0.0)
-                continue
-            mixed, second = power[0, 1, r, c], power[1, 1, r, c] + bend
-            det = first * second - mixed * mixed
-            if det > 0.0:
-                inverse[0, 0, r, c], inverse[1, 1, r, c] = second / det, first / det
-                inverse[0, 1, r, c] = inverse[1, 0, r, c] = -mixed / det
-    return goal, inverse
+def _coloured(field: Floats32) -> Floats32:
+    """A field (rows, cols) as (row, colour, column / 3), with a border of nothing."""
+    padded = np.pad(field, [(BORDER, BORDER), (COLOURS, COLOURS + -field.shape[1] % COLOURS)])
+    return np.ascontiguousarray(padded.reshape(len(padded), -1, COLOURS).transpose(0, 2, 1), np.float32)
 
 
 @njit(cache=True, nogil=True)
-def _sweeps(at, goal, inverse, bends, sweeps):  # type: ignore[no-untyped-def]
-    """Relax in place; ``at`` and ``bends`` have a border."""
-    count, rows, cols = goal.shape
-    passes, overshoot, wanted = 3 * sweeps, np.float32(OVERSHOOT), np.zeros(2, np.float32)
+def _sweeps(equations, sweeps):  # type: ignore[no-untyped-def]
+    """Relax the field in place."""
+    rows, passes = equations.at.shape[0] - 2 * BORDER, COLOURS * sweeps
+    sums = np.empty(equations.at.shape[2] - 2, np.float32)
     # Each pass of a colour two rows behind the one before it: the same result as one after the other, while the rows
     # are in the cache.
     for turn in range(rows + BORDER * (passes - 1)):
         for n in range(passes):
             r = turn - BORDER * n
-            if r < 0 or r >= rows:
-                continue
-            for c in range((n - r) % 3, cols, 3):
-                if count == 1:
-                    own, part = at[0, r + BORDER, c + BORDER], inverse[0, 0, r, c]
-                    moved = part * (goal[0, r, c] + _bend_pull(at, 0, bends, r, c))
-                    at[0, r + BORDER, c + BORDER] = own + overshoot * (moved - own) if part > 0.0 else own
-                elif inverse[0, 0, r, c] > 0.0:
-                    for k in range(2):
-                        wanted[k] = goal[k, r, c] + _bend_pull(at, k, bends, r, c)
-                    for k in range(2):
-                        moved = inverse[k, 0, r, c] * wanted[0] + inverse[k, 1, r, c] * wanted[1]
-                        own = at[k, r + BORDER, c + BORDER]
-                        at[k, r + BORDER, c + BORDER] = own + overshoot * (moved - own)
+            if 0 <= r < rows:
+                _relax_row(equations, r + BORDER, (n - r) % COLOURS, sums)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
-def _bend_pull(f, k, bends, r, c):  # type: ignore[no-untyped-def]
-    """Sum of what the second differences want field ``k`` to be at a cell, times their weights: as their middle and as
-    either end. Of arrays with a border the cell is at (r + 2, c + 2)."""
-    (a, d), two = bends, np.float32(2.0)
-    i, j = np.uint32(r), np.uint32(c)  # unsigned: not counted from the end, so no check at each use
-    left, right, above, below = f[k, i + 2, j + 1], f[k, i + 2, j + 3], f[k, i + 1, j + 2], f[k, i + 3, j + 2]
-    total = two * (a[i + 2, j + 2] * (left + right) + d[i + 2, j + 2] * (above + below))
-    total += a[i + 2, j + 1] * (two * left - f[k, i + 2, j]) + a[i + 2, j + 3] * (two * right - f[k, i + 2, j + 4])
-    return total + (
-        d[i + 1, j + 2] * (two * above - f[k, i, j + 2]) + d[i + 3, j + 2] * (two * below - f[k, i + 4, j + 2])
-    )
+@njit(cache=True, nogil=True)
+def _relax_row(equations, r, colour, sums):  # type: ignore[no-untyped-def]
+    """Relax the cells of a row whose columns are of a colour; ``sums``: room for a number each."""
+    at, across, down = equations.at, equations.across, equations.down
+    own, two, overshoot = _beside(at[r], colour, 0), np.float32(2.0), np.float32(OVERSHOOT)
+    left, right, above, below = (
+        _beside(at[r], colour, -1), _beside(at[r], colour, 1), _beside(at[r - 1], colour, 0),
+        _beside(at[r + 1], colour, 0),
+    )  # fmt: skip
+    a, d = _beside(across[r], colour, 0), _beside(down[r], colour, 0)
+    # What the second differences want the cell to be, times their weights: as their middle, and as either end.
+    for m in range(sums.size):
+        sums[m] = two * (a[m] * (left[m] + right[m]) + d[m] * (above[m] + below[m]))
+    _add_end(_beside(across[r], colour, -1), left, _beside(at[r], colour, -2), sums)
+    _add_end(_beside(across[r], colour, 1), right, _beside(at[r], colour, 2), sums)
+    _add_end(_beside(down[r - 1], colour, 0), above, _beside(at[r - 2], colour, 0), sums)
+    _add_end(_beside(down[r + 1], colour, 0), below, _beside(at[r + 2], colour, 0), sums)
+    goal, inverse = _beside(equations.goal[r], colour, 0), _beside(equations.inverse[r], colour, 0)
+    for m in range(sums.size):
+        moved = own[m] + overshoot * (inverse[m] * (goal[m] + sums[m]) - own[m])
+        own[m] = moved if inverse[m] > 0.0 else own[m]
+
+
+@njit(cache=True, nogil=True)
+def _beside(row, colour, shift):  # type: ignore[no-untyped-def]
+    """Numbers of a row (colour, column / 3) ``shift`` columns beside those of a colour, without the border."""
+    column = colour + shift
+    first = 1 + column // COLOURS
+    return row[column % COLOURS, first : first + row.shape[1] - 2]
+
+
+@njit(cache=True, nogil=True)
+def _add_end(weight, middle, far, sums):  # type: ignore[no-untyped-def]
+    """Add what second differences about ``middle`` want their near end to be."""
+    two = np.float32(2.0)
+    for m in range(sums.size):
+        sums[m] += weight[m] * (two * middle[m] - far[m])

@@ -51,7 +51,7 @@ class Observed(NamedTuple):
 
     ``disparity`` (rows, cols, 2) right minus left, column and row, pixels, NaN where it must not be used; ``std``
     (rows, cols) its standard deviation, pixels; ``image`` (rows, cols) grey values; ``max_residual`` and ``max_jump``
-    (in the bilinear cell) of a solution, pixels; ``scale`` (2,) pixels of the right image that one of the left one is
+    (in the bilinear cell) of a solution, pixels; ``scale`` pixels of the right image that one of the left one is
     wide and high.
     """
 
@@ -60,7 +60,7 @@ class Observed(NamedTuple):
     image: Floats32
     max_residual: float
     max_jump: float
-    scale: Floats
+    scale: tuple[float, float]
 
 
 class Dem(NamedTuple):
@@ -109,11 +109,15 @@ class PairLines(NamedTuple):
 
 
 class Mismatch(NamedTuple):
-    """Mismatch g at a point, pixels: ``s`` along the epipolar line, ``across`` it; NaN where disparity is undefined or
-    the point outside an image. ``x``, ``y``: the point in the left image."""
+    """Mismatch g at a point, times the length of e: ``s`` along the epipolar line, ``across`` it; ``power`` |e|^2,
+    pixels^2. NaN where disparity is undefined or the point outside an image. ``x``, ``y``: the point in the left image.
+
+    The search needs the sign of s alone, so neither a root nor a division is spent on a step.
+    """
 
     s: float
     across: float
+    power: float
     x: float
     y: float
 
@@ -155,19 +159,22 @@ def search(cells, z_range, cameras, seen, out):  # type: ignore[no-untyped-def]
 
     ``z_range``: limits of Z, metres; ``out``: the :class:`Dem` of the block, to be filled with NaN before.
     """
-    left, right, epipole = projection_rows(cameras.left), projection_rows(cameras.right), cameras.epipole
-    direction = epipole[0], epipole[1], epipole[2]
-    rows, cols = cells.low.shape
+    # Arrays are taken out of their tuples before the loops: each time costs an atomic count of references.
+    feet, normals, low, high = cells.feet, cells.normals, cells.low, cells.high
+    elevation, std, residual, ortho = out.elevation, out.elevation_std, out.residual, out.ortho
+    left, right, sizes = projection_rows(cameras.left), projection_rows(cameras.right), cameras.sizes
+    direction = cameras.epipole[0], cameras.epipole[1], cameras.epipole[2]
+    size = sizes[0], sizes[1], sizes[2], sizes[3]
+    rows, cols = low.shape
     for r in range(rows):
         for c in range(cols):
-            if math.isnan(cells.low[r, c]):
+            if math.isnan(low[r, c]):
                 continue
-            foot, normal = vector(cells.feet, r, c), vector(cells.normals, r, c)
+            foot, normal = vector(feet, r, c), vector(normals, r, c)
             lines = PairLines(line_of(left, foot, normal), line_of(right, foot, normal))
-            start = cells.low[r, c], cells.high[r, c]
-            found = solve_cell(lines, visible(lines, cameras.sizes, z_range), start, direction, seen)
-            out.elevation[r, c], out.elevation_std[r, c] = found.elevation, found.std
-            out.residual[r, c], out.ortho[r, c] = found.residual, found.grey
+            start = low[r, c], high[r, c]
+            cell = solve_cell(lines, visible(lines, size, z_range), start, direction, seen)
+            elevation[r, c], std[r, c], residual[r, c], ortho[r, c] = cell
 
 
 @njit(cache=True, nogil=True)
@@ -258,106 +265,108 @@ def steps_of(lines, span, start):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def mismatch(lines, z, epipole, disparity):  # type: ignore[no-untyped-def]
     """:class:`Mismatch` of a cell's point at elevation z."""
-    left, right, found = lines.left, lines.right, Mismatch(np.nan, np.nan, np.nan, np.nan)
+    left, right = lines.left, lines.right
     w, w_right = left.a2 + z * left.b2, right.a2 + z * right.b2
     part, part_right = 1.0 / w, 1.0 / w_right
     x, y = (left.a0 + z * left.b0) * part, (left.a1 + z * left.b1) * part
     rows, cols = disparity.shape[:2]
-    if w >= MIN_DEPTH and w_right >= MIN_DEPTH and x >= 0.0 and y >= 0.0 and x < cols - 1.0 and y < rows - 1.0:
-        c, r = np.uint32(x), np.uint32(y)  # unsigned: not counted from the end, so no check at each use
-        fx, fy, d = x - c, y - r, disparity
-        w00, w01, w10, w11 = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
-        u = w00 * d[r, c, 0] + w01 * d[r, c + 1, 0] + w10 * d[r + 1, c, 0] + w11 * d[r + 1, c + 1, 0]
-        v = w00 * d[r, c, 1] + w01 * d[r, c + 1, 1] + w10 * d[r + 1, c, 1] + w11 * d[r + 1, c + 1, 1]
-        # g = p_l + d(p_l) - p_r
-        x_right, y_right = (right.a0 + z * right.b0) * part_right, (right.a1 + z * right.b1) * part_right
-        gx, gy = x + u - x_right, y + v - y_right
-        # On the ray of p_l, p_r(t) = (epipole + t q) / w for a fixed q: d p_r / d t is parallel to
-        # p_r * epipole_2 - epipole_01.
-        ex, ey = x_right * epipole[2] - epipole[0], y_right * epipole[2] - epipole[1]
-        size = 1.0 / math.sqrt(ex * ex + ey * ey)
-        # NaN at the epipole itself, where no direction is that of the line.
-        found = Mismatch((gx * ex + gy * ey) * size, (gy * ex - gx * ey) * size, x, y)
-    return found
+    if not (w >= MIN_DEPTH and w_right >= MIN_DEPTH and x >= 0.0 and y >= 0.0 and x < cols - 1.0 and y < rows - 1.0):
+        return Mismatch(np.nan, np.nan, np.nan, np.nan, np.nan)
+    c, r = np.uint32(x), np.uint32(y)  # unsigned: not counted from the end, so no check at each use
+    fx, fy, d = x - c, y - r, disparity
+    w00, w01, w10, w11 = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
+    u = w00 * d[r, c, 0] + w01 * d[r, c + 1, 0] + w10 * d[r + 1, c, 0] + w11 * d[r + 1, c + 1, 0]
+    v = w00 * d[r, c, 1] + w01 * d[r, c + 1, 1] + w10 * d[r + 1, c, 1] + w11 * d[r + 1, c + 1, 1]
+    # g = p_l + d(p_l) - p_r
+    x_right, y_right = (right.a0 + z * right.b0) * part_right, (right.a1 + z * right.b1) * part_right
+    gx, gy = x + u - x_right, y + v - y_right
+    # On the ray of p_l, p_r(t) = (epipole + t q) / w for a fixed q: d p_r / d t is parallel to
+    # p_r * epipole_2 - epipole_01.
+    ex, ey = x_right * epipole[2] - epipole[0], y_right * epipole[2] - epipole[1]
+    power = ex * ex + ey * ey
+    # At the epipole itself no direction is that of the line.
+    s = gx * ex + gy * ey if power > 0.0 else np.nan
+    return Mismatch(s, gy * ex - gx * ey, power, x, y)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def solve_cell(lines, span, start, epipole, seen):  # type: ignore[no-untyped-def]
     """:class:`Solution` of one cell on the visible ``span`` of Z, searched from the interval ``start``."""
-    nothing = Solution(np.nan, np.nan, np.nan, np.nan)
+    solution = Solution(np.nan, np.nan, np.nan, np.nan)
     if not span[1] > span[0]:
-        return nothing
+        return solution
+    disparity = seen.disparity
     bottom, dz, most, first, last = steps_of(lines, span, start)
-    s_first = s = mismatch(lines, bottom + first * dz, epipole, seen.disparity).s
+    s_first = s = mismatch(lines, bottom + first * dz, epipole, disparity).s
     # Upwards while behind.
     k, below = first, s
     while s < 0.0 and k < most:
         k, below = k + 1, s
-        s = mismatch(lines, bottom + k * dz, epipole, seen.disparity).s
+        s = mismatch(lines, bottom + k * dz, epipole, disparity).s
     if k > first and s >= 0.0:
         z = bottom + k * dz
-        found = _judged(lines, Bracket(z, s, z - dz, below), dz, epipole, seen)
-        if not math.isnan(found.elevation):
-            return found
+        solution = _judged(lines, Bracket(z, s, z - dz, below), dz, epipole, seen)
     # Downwards from free to behind; beyond the last step only while free.
     k, above = first - 1, s_first
-    while k >= 0:
+    while k >= 0 and math.isnan(solution.elevation):
         z = bottom + k * dz
-        s = mismatch(lines, z, epipole, seen.disparity).s
+        s = mismatch(lines, z, epipole, disparity).s
         if above >= 0.0 and s < 0.0:
-            found = _judged(lines, Bracket(z + dz, above, z, s), dz, epipole, seen)
-            if not math.isnan(found.elevation):
-                return found
+            solution = _judged(lines, Bracket(z + dz, above, z, s), dz, epipole, seen)
         if k <= last and not s >= 0.0:
             break
         k, above = k - 1, s
-    return nothing
+    return solution
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def root(lines, bracket, epipole, disparity):  # type: ignore[no-untyped-def]
-    """Elevation in a bracket at which s is 0, by regula falsi (Illinois); NaN where disparity is undefined there."""
+    """Elevation in a bracket at which s is 0, by regula falsi (Illinois), and the :class:`Mismatch` there; NaN where
+    disparity is undefined."""
     z0, s0, z1, s1 = bracket
-    z, side = np.nan, 0
+    side = 0
+    z = (z0 * s1 - z1 * s0) / (s1 - s0)
+    at = mismatch(lines, z, epipole, disparity)
     for _ in range(MAX_TURNS):
-        z = (z0 * s1 - z1 * s0) / (s1 - s0)
-        s = mismatch(lines, z, epipole, disparity).s
-        if not abs(s) >= SOLVED_PX:
-            return z if s == s else np.nan
+        # Negated, so that NaN ends it as well.
+        if not at.s * at.s >= SOLVED_PX * SOLVED_PX * at.power:
+            break
         # Illinois: an end that stays twice counts half, else the chord would creep towards the root from one side.
-        if s > 0.0:
-            z0, s0, s1, side = z, s, (0.5 * s1 if side > 0 else s1), 1
+        if at.s > 0.0:
+            z0, s0, s1, side = z, at.s, (0.5 * s1 if side > 0 else s1), 1
         else:
-            z1, s1, s0, side = z, s, (0.5 * s0 if side < 0 else s0), -1
-    return z
+            z1, s1, s0, side = z, at.s, (0.5 * s0 if side < 0 else s0), -1
+        z = (z0 * s1 - z1 * s0) / (s1 - s0)
+        at = mismatch(lines, z, epipole, disparity)
+    return z, at
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _judged(lines, bracket, dz, epipole, seen):  # type: ignore[no-untyped-def]
     """:class:`Solution` in a bracket, ``dz`` high; NaN where it does not stand."""
     nothing = Solution(np.nan, np.nan, np.nan, np.nan)
-    z = root(lines, bracket, epipole, seen.disparity)
-    at = mismatch(lines, z, epipole, seen.disparity)
-    residual = math.sqrt(at.s * at.s + at.across * at.across)
-    if not residual <= seen.max_residual:
+    disparity, image = seen.disparity, seen.image
+    z, at = root(lines, bracket, epipole, disparity)
+    residual = math.sqrt((at.s * at.s + at.across * at.across) / at.power)
+    c, r = np.uint32(at.x), np.uint32(at.y)
+    if not residual <= seen.max_residual or is_jump(disparity, seen, r, c):
         return nothing
     # The lesser slope: beside a jump the other side is steep, and would make the elevation look certain.
-    up = mismatch(lines, z + dz, epipole, seen.disparity).s / dz
-    down = -mismatch(lines, z - dz, epipole, seen.disparity).s / dz
+    above, below = mismatch(lines, z + dz, epipole, disparity), mismatch(lines, z - dz, epipole, disparity)
+    up, down = above.s / (math.sqrt(above.power) * dz), -below.s / (math.sqrt(below.power) * dz)
     slope = up if math.isnan(down) else (down if math.isnan(up) else min(up, down))
-    c, r = int(at.x), int(at.y)
-    if not slope > 0.0 or is_jump(seen, r, c):
+    if not slope > 0.0:
         return nothing
-    fx, fy, image = at.x - c, at.y - r, seen.image
-    above = image[r, c] * (1.0 - fx) + image[r, c + 1] * fx
-    below = image[r + 1, c] * (1.0 - fx) + image[r + 1, c + 1] * fx
+    fx, fy = at.x - c, at.y - r
+    upper = image[r, c] * (1.0 - fx) + image[r, c + 1] * fx
+    lower = image[r + 1, c] * (1.0 - fx) + image[r + 1, c + 1] * fx
     # sigma_Z = sigma_d / |ds/dZ|
-    std = seen.std[int(np.rint(at.y)), int(np.rint(at.x))] / slope
-    return Solution(z, std, residual, above * (1.0 - fy) + below * fy)
+    std = seen.std[np.uint32(np.rint(at.y)), np.uint32(np.rint(at.x))] / slope
+    return Solution(z, std, residual, upper * (1.0 - fy) + lower * fy)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def is_jump(seen, r, c):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def is_jump(disparity, seen, r, c):  # type: ignore[no-untyped-def]
     """Whether the disparities of the bilinear cell at row r and column c differ by more than ``max_jump``.
 
     In pixels of the left image: what an unlike scale of the right one adds from pixel to pixel is no jump.
@@ -367,7 +376,7 @@ def is_jump(seen, r, c):  # type: ignore[no-untyped-def]
         low, high = np.inf, -np.inf
         for i in range(2):
             for j in range(2):
-                value = seen.disparity[r + i, c + j, k] - (seen.scale[k] - 1.0) * (i if k else j)
+                value = disparity[r + i, c + j, k] - (seen.scale[k] - 1.0) * (i if k else j)
                 low, high = min(low, value), max(high, value)
         total += ((high - low) / seen.scale[k]) ** 2
     return total > seen.max_jump**2

@@ -86,9 +86,8 @@ def refine(views: Views, surface: Surface, elevation: Floats32, steps: int) -> t
         keep = np.isfinite(seen.scale)
         weight, rest = _misfit(seen, keep)
         slope = np.where(keep, seen.right_slope - seen.left_slope, np.float32(0.0))
-        power, pull = (weight * slope * slope)[None, None], (weight * slope * rest)[None]
-        bends = bend_weights(z[None], seen.scale, BEND, STIFFNESS)
-        moved = relax(z[None], power, pull, bends, keep, SWEEPS)[0]
+        bends = bend_weights(z, seen.scale, BEND, STIFFNESS)
+        moved = relax(z, weight * slope * slope, weight * slope * rest, bends, keep, SWEEPS)
         # About the start, not the last step: many small steps could otherwise wander to another likeness.
         reach = FARTHEST / seen.scale
         z = np.where(keep, np.clip(moved, elevation - reach, elevation + reach), elevation)

@@ -55,13 +55,13 @@ class PairArrays:
     def __init__(
         self, matches: Matches, image: ArrayLike, rig: Rig, T_surface_left: RigidTransform, limits: SearchLimits
     ) -> None:
-        low, high = limits.z_range
+        lowest, highest = limits.z_range
         if not rig.baseline > 0:
             raise DegenerateError(
                 "RIL-394", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
             )
-        if not low < high:
-            raise InputError("RIL-395", f"the range of elevations {low}..{high} m is empty")
+        if not lowest < highest:
+            raise InputError("RIL-395", f"the range of elevations {lowest}..{highest} m is empty")
         shape = (rig.left.height, rig.left.width)
         maps = [np.asarray(a) for a in (matches.column, matches.row, image)]
         for name, array in zip(("column disparity", "row disparity", "image"), maps, strict=True):
@@ -72,11 +72,13 @@ class PairArrays:
         disparity[~matches.usable] = np.nan
         std = np.full(shape, limits.sigma) if matches.std is None else matches.std
         grey, std = (np.ascontiguousarray(a, np.float32) for a in (maps[2], std))
-        self.seen = Observed(disparity, std, grey, float(limits.max_residual), float(limits.max_jump), of_rig(rig))
+        wide, high = of_rig(rig)
+        scale = float(wide), float(high)
+        self.seen = Observed(disparity, std, grey, float(limits.max_residual), float(limits.max_jump), scale)
         epipole = rig.right.matrix @ rig.T_right_left.translation
         sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)
         self.cameras = PairCameras(*projections(rig, T_surface_left), epipole, sizes)
-        self.z_range = float(low), float(high)
+        self.z_range = float(lowest), float(highest)
 
     def cells(self, feet: Floats, normals: Floats, low: ArrayLike, high: ArrayLike, out: Dem) -> None:
         """Fill ``out`` (r, c) with cells (r, c, 3), searched from low..high (NaN: left out)."""
