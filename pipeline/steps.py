@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from collections.abc import Sequence as Series
 from dataclasses import dataclass, field
 from operator import index
 from pathlib import Path
@@ -292,16 +293,21 @@ def _disparity(disparity: xarray.Dataset, pair: StereoPair) -> Bundle:
     return given
 
 
-def terrain(disparity: xarray.Dataset, pair: StereoPair, **locus: Any) -> xarray.Dataset:
+def terrain(
+    disparity: xarray.Dataset, pair: StereoPair, reference: str | Series[float] | None = None, **locus: Any
+) -> xarray.Dataset:
     """Reconstruct the elevation model of a pair (Locus), in the pair's own frame: x right, y ahead, z up, metres.
 
     The origin is the left camera's centre. The relative orientation is repaired where the matches contradict it, and
-    the vertical is found, as in a run that has this pair alone.
+    the vertical is found, as in a run that has this pair alone. Where no ground is seen, z is the distance from the
+    plane that most of the scene lies on.
 
     Parameters
     ----------
     disparity
         Of :func:`match`, of this pair.
+    reference
+        ``"ground"``, ``"scene"``, or a plane, as parameter ``terrain.reference``.
     locus
         Parameters of section ``locus``, e.g. ``cell_size=0.01``.
 
@@ -313,7 +319,7 @@ def terrain(disparity: xarray.Dataset, pair: StereoPair, **locus: Any) -> xarray
     Raises
     ------
     DegenerateError
-        The pair shows no ground.
+        Nothing is matched, or the pair shows no ground and nothing else is wanted.
     InputError
         The disparity is not that of an image of this size.
 
@@ -328,15 +334,20 @@ def terrain(disparity: xarray.Dataset, pair: StereoPair, **locus: Any) -> xarray
     >>> round(float(dem.elevation.median()), 2), dem.elevation.units
     (-0.18, 'm')
     """
+    from rille.pipeline.flow.builders import other_plane
     from rille.pipeline.flow.reconstruction import vertical
     from rille.stages.terrain.locus import stage as locus_stage
 
     given = _disparity(disparity, pair)
-    settings = _merged(disparity, pair.settings, {"locus": locus})
+    settings = _merged(disparity, pair.settings, {"terrain": {"reference": reference}, "locus": locus})
     make = _builder(pair, settings)
     _, known = make.rig([pair.frame])
-    model = make.pair(pair.frame, vertical(make, pair.frame, pair.frame == 0), known, None)
-    dem = _computed(model.dem, {model.disparity: given}, pair.sequence.drawn)
+    at, done = vertical(make, pair.frame, pair.frame == 0), {make.disparity(pair.frame): given}
+    level = make.level(pair.frame, at, known)
+    plane = other_plane(make.config, [_computed(level, done, pair.sequence.drawn).meta], placed=False)
+    if plane is not None:
+        level = make.level(pair.frame, at, known, plane)
+    dem = _computed(make.pair(pair.frame, level, known, None).dem, done, pair.sequence.drawn)
     return _dataset(locus_stage.locus_stage, dem, settings)
 
 
@@ -384,6 +395,12 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
     built: Any = config.build(settings)
     args = {"vehicle": built.vehicle.model_dump(mode="json", exclude={"name"})}
     given = _bundle(dem, locus_stage.locus_stage, "elevation", "rille.terrain")
+    if "reference" in given.meta:
+        raise InputError(
+            "RIL-386",
+            "the elevations are distances from a plane that is no ground, so nothing can drive there",
+            remedy="if it is ground, state its normal as world.up in the manifest",
+        )
     hazards = risk_stage.risk_stage.run(built.risk, args, {"dem": [given]})
     return _dataset(risk_stage.risk_stage, hazards, settings)
 

@@ -14,8 +14,8 @@ from rille.pipeline.export import paths, rasters, terrain_zarr, trajectories
 from rille.pipeline.export.output import Output
 from rille.pipeline.export.trajectories import stamps
 from rille.pipeline.export.view import RunView
-from rille.pipeline.export.writers import FRAME, UNLEVELLED
-from rille.stages.geometry.pose_arrays import NO_VERTICAL
+from rille.pipeline.export.writers import FRAME, ON_PLANE, UNLEVELLED
+from rille.stages.geometry.pose_arrays import NO_VERTICAL, REFERENCE_PLANE
 
 MADE = (trajectories, rasters, terrain_zarr, paths)
 """Modules whose outputs are tasks."""
@@ -92,6 +92,9 @@ def describe(written: Sequence[str], run: RunView, vertical: str = "") -> dict[s
     if vertical == NO_VERTICAL:
         world |= {"axes": {"x": "right", "y": "optical axis of the first camera", "z": "that camera's up"}}
         world |= {"definition": UNLEVELLED}
+    if vertical == REFERENCE_PLANE:
+        world |= {"axes": {"x": "right", "y": "up in the image", "z": "away from the reference plane, to the cameras"}}
+        world |= {"definition": ON_PLANE, "origin": "point of the reference plane nearest to the first left camera"}
     placed = IN_PLACE if place is not None else ()
     known = {
         o.name: {"frame": "georeference" if o.name.endswith(placed) else o.frame, "holds": o.what}

@@ -16,7 +16,7 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export import colour, ranges
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView, part
-from rille.pipeline.export.writers import Meaning, write_raster
+from rille.pipeline.export.writers import ON_PLANE, Meaning, write_raster
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.lattice import Lattice, mosaic, union
 from rille.stages.hazard.risk import REASONS, risk_stage
@@ -66,9 +66,14 @@ def _raster(
 
     def write(path: Path, tiles: Tiles, place: Place = None) -> None:
         lattice, cells = values(tiles, place)
-        write_raster(path, {band: np.asarray(cells, np.float32)}, lattice, Meaning(unit), place)
+        write_raster(path, {band: np.asarray(cells, np.float32)}, lattice, Meaning(unit, tags=above(tiles)), place)
 
     return write
+
+
+def above(tiles: Tiles) -> dict[str, str]:
+    """The frame of merged terrain in words, where its elevations are distances from a plane that is no ground."""
+    return {"frame": ON_PLANE} if any("reference" in tile.meta for tile in tiles) else {}
 
 
 def _write_hillshade(path: Path, tiles: Tiles, place: Place = None) -> None:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.rasters import whole
+from rille.pipeline.export.rasters import above, whole
 from rille.pipeline.export.writers import ENGINEERING_CRS, FRAME
 from rille.stages.core.declare import Array, Bundle
 from rille.stages.geometry.lattice import Lattice
@@ -56,7 +56,7 @@ def write_terrain(
     facts : attributes of the whole group, e.g. ``title``, ``source``.
     """
     where = {} if place is None else {f"georeference_{name}": value for name, value in place.to_dict().items()}
-    about = {"Conventions": CONVENTIONS, **facts, "frame": FRAME, "cell_size_m": lattice.cell, **where}
+    about = {"Conventions": CONVENTIONS, "frame": FRAME, **facts, "cell_size_m": lattice.cell, **where}
     variables = {name: _variable(spec, values) for name, (spec, values) in arrays.items()}
     others = [name for name in arrays if name not in ("elevation", "ortho", SLOPE.name)]
     variables["elevation"].attrs |= {"positive": "up", "ancillary_variables": " ".join(others)}
@@ -116,6 +116,7 @@ def _write_output(path: Path, tiles: Sequence[Bundle], sequence: str, place: Geo
     about = {
         "title": f"Merged terrain of the sequence {sequence}",
         "source": "stereo images: disparity by HFVM, elevation models by Locus, merged; Rille",
+        **above(tiles),
     }
     write_terrain(path, arrays, lattice, place, about)
 

@@ -12,7 +12,7 @@ from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView, part
 from rille.pipeline.export.writers import write_table, write_trajectory_kitti, write_trajectory_tum
 from rille.stages.core.declare import Bundle
-from rille.stages.geometry.pose_arrays import NO_VERTICAL
+from rille.stages.geometry.pose_arrays import NO_VERTICAL, REFERENCE_PLANE
 from rille.stages.odometry.resection.trajectory import world_poses
 
 
@@ -24,7 +24,8 @@ def stamps(run: RunView) -> list[float]:
 
 def _world(trajectory: Bundle, piece: int) -> str:
     """Frame of a piece in words."""
-    return writers.UNLEVELLED if trajectory.meta["verticals"][piece] == NO_VERTICAL else writers.FRAME
+    special = {NO_VERTICAL: writers.UNLEVELLED, REFERENCE_PLANE: writers.ON_PLANE}
+    return special.get(trajectory.meta["verticals"][piece], writers.FRAME)
 
 
 def _write_kitti(path: Path, trajectory: Bundle) -> None:

@@ -37,6 +37,12 @@ UNLEVELLED = (
 )
 """The same where the vertical is not known."""
 
+ON_PLANE = (
+    "right-handed, metres: z is the distance from a reference plane that is no ground, towards the cameras; origin at "
+    "the point of the plane that is nearest to the first left camera, x right in its image, y up"
+)
+"""The same where elevations are distances from another plane than the ground."""
+
 ENGINEERING_CRS = (
     'LOCAL_CS["Rille world frame (local metres)",UNIT["metre",1,AUTHORITY["EPSG","9001"]],'
     'AXIS["Easting",EAST],AXIS["Northing",NORTH]]'

@@ -95,13 +95,13 @@ def of_world(make: Builder, pairs: Sequence[Pair]) -> Steps:
     p, first = make.products, pairs[0]
     if make.sequence.truth_dem is None or _truth(make, first.frame) is None:
         return
-    assert p.world_path is not None
     level = yield from done(first.level)
     whole = union(Lattice.from_dict(tile.spec.args["lattice"]) for tile in p.world_tiles)
     exact = _truth_dem(make, whole, first.frame, level, tuple(pair.frame for pair in pairs), "world")
     p.dem_accuracy = make.node(dem_accuracy_stage, "dem_accuracy/world", dem=p.world_tiles, truth=exact)
-    p.truth_risk = make.hazards("risk/truth", [exact])
-    p.path_check = make.node(path_check_stage, "path_check", path=p.world_path, risk=p.truth_risk)
+    if p.world_path is not None:
+        p.truth_risk = make.hazards("risk/truth", [exact])
+        p.path_check = make.node(path_check_stage, "path_check", path=p.world_path, risk=p.truth_risk)
 
 
 def _truth(make: Builder, frame: int) -> RigidTransform | None:

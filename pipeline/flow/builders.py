@@ -26,6 +26,7 @@ from rille.stages.calibration.rig import rig_stage
 from rille.stages.calibration.swap_check import swap_check_stage
 from rille.stages.calibration.synchrony import synchrony_stage
 from rille.stages.core.declare import F, NoParams, Params, Stage
+from rille.stages.core.errors import ConfigError
 from rille.stages.facts.calibration import CalibrationFacts, OrientationFacts, RigFacts, SwapFacts, SynchronyFacts
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts, ResectFacts, TrackFacts, TrajectoryFacts
@@ -38,7 +39,7 @@ from rille.stages.odometry.motion import motion_stage
 from rille.stages.odometry.resection.pose import pose_stage
 from rille.stages.odometry.resection.resect import resect_stage
 from rille.stages.odometry.track import track_stage
-from rille.stages.terrain.ground_frame import ground_frame_stage
+from rille.stages.terrain.ground_frame import SCENE, ground_frame_stage
 from rille.stages.terrain.locus.stage import locus_stage
 from rille.stages.terrain.merge import merge_stage
 from rille.stages.terrain.tile_index import Box, tile_lattice
@@ -259,15 +260,19 @@ class Builder:
         found = self.node(rig_stage, f"rig{which}", orientations=orientations, rig=self.given_rig)
         return found, self.node(calibration_stage, f"calibration{which}", rig=found)
 
-    def pair(
-        self, frame: int, vertical: Mapping[str, Any], known: Handle[CalibrationFacts], first: Pair | None
-    ) -> Pair:
-        """Vertical and local elevation model of a pair; ``known`` is its rig.
+    def level(
+        self, frame: int, vertical: Args, known: Handle[CalibrationFacts], plane: Any = None
+    ) -> Handle[GroundFacts]:
+        """Vertical and reference plane of a pair: the ground, or another ``plane``; ``known`` is its rig."""
+        given = {"disparity": self.disparity(frame), "rig": known, **vertical}
+        label = "ground_frame" if plane is None else "reference_plane"
+        return self.node(ground_frame_stage, f"{label}/{frame}", **given, reference=plane)
+
+    def pair(self, frame: int, level: Handle[GroundFacts], known: Handle[CalibrationFacts], first: Pair | None) -> Pair:
+        """Local elevation model of a pair above its reference plane; ``known`` is its rig.
 
         Cells and extent of the ``first`` pair (None: this one) serve all, so that they merge.
         """
-        disparity = self.disparity(frame)
-        level = self.node(ground_frame_stage, f"ground_frame/{frame}", disparity=disparity, rig=known, **vertical)
         reference = level if first is None else first.level
         seen = self._seen(frame)
         dem = self.node(
@@ -280,7 +285,7 @@ class Builder:
             pair=frame,
             frame="local",
         )
-        return Pair(frame, disparity, known, level, dem)
+        return Pair(frame, self.disparity(frame), known, level, dem)
 
     def world_model(
         self, pair: Pair, first: Pair, row: int, trajectory: Handle[TrajectoryFacts]
@@ -338,6 +343,30 @@ class Builder:
     def hazards(self, label: str, dems: Series[Handle]) -> Handle:
         """Add the task that judges hazards on the tiles of an elevation model."""
         return self.node(risk_stage, label, dem=list(dems), vehicle=self.given_vehicle)
+
+
+def other_plane(config: Any, levels: Series[Args], *, placed: bool) -> str | list[float] | None:
+    """The reference plane instead of the ground, as stage ``ground_frame`` takes it; None: the ground.
+
+    ``levels``: of all pairs that are known, with the ground as reference. One that shows ground makes it a drive.
+    ``placed``: the world has a place on Earth, so that its z is up.
+
+    Raises
+    ------
+    ConfigError
+        Another plane is wanted of a world that has a place on Earth.
+    """
+    wanted, coarse = config.terrain.reference, config.locus.cell_size is not None
+    if wanted is None:
+        shown = any("no_ground" not in facts or (coarse and facts["plane"]) for facts in levels)
+        return None if shown or placed or not levels else SCENE
+    if placed and wanted != "ground":
+        raise ConfigError(
+            "RIL-052",
+            "distances from a plane that is no ground have no place on Earth",
+            remedy="leave world.origin out, or terrain.reference",
+        )
+    return list(wanted) if isinstance(wanted, tuple) else {"ground": None, "scene": SCENE}[wanted]
 
 
 def merge_tiles(

@@ -248,7 +248,8 @@ class Drive:
         else:
             # One rig for the drive, that of the first pair: cameras do not move against each other on the way.
             p.rigs[frame], known = p.rigs[0], self.pairs[0].rig
-        pair = make.pair(frame, {"up": at.up}, known, self.pairs[0] if self.pairs else None)
+        level = make.level(frame, {"up": at.up}, known)
+        pair = make.pair(frame, level, known, self.pairs[0] if self.pairs else None)
         p.level[frame], p.local_dem[frame] = pair.level, pair.dem
         self.pairs.append(pair)
         return stop

@@ -66,6 +66,12 @@ class TerrainParams(Params):
         description="accurate: sets hfvm.preset accurate, locus.both, track.points 2000 and merge.max_std_cells "
         "0.7; errors are about two fifths smaller, matching takes many times as long; keys set explicitly win",
     )
+    reference: Literal["ground", "scene"] | tuple[float, float, float, float, float, float] | None = Field(
+        default=None,
+        description="what elevations are measured from: ground; scene: the plane that most of the scene lies on; or "
+        "the plane with a normal x, y, z through a point x, y, z [m] of the left camera's frame (x right, y down, z "
+        "ahead); not set: the ground, or the scene's plane where no pair shows ground",
+    )
 
 
 DATASET_SECTIONS = ("mockup", "misalign", "rover")

@@ -51,7 +51,7 @@ import numpy as np
 from rille.pipeline.engine.graph import Handle, Maybe, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow import assessment
-from rille.pipeline.flow.builders import Builder, Pair, Segment, centre, merge_tiles
+from rille.pipeline.flow.builders import Builder, Pair, Segment, centre, merge_tiles, other_plane
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.evaluation.crosscheck import crosscheck_stage, windows
 from rille.stages.evaluation.crosscheck_join import crosscheck_join_stage
@@ -137,7 +137,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     basic = [chain[i] for i in chosen.meta["basic"]]
 
     # At each basic pair, the rover's stop: local elevation model, hazards and path.
-    pairs = basic_pairs(make, rigs, frames[0])
+    pairs = yield from basic_pairs(make, rigs, frames[0])
 
     # In between: tracks, poses in the frame of the segment's basic pair, and their product.
     segments = []
@@ -185,8 +185,9 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     centres = {str(f["pair"]): centre(f["box"]) for f in footprints if f["box"] is not None}
     levelled = yield from done(make.node(radiometry_stage, "radiometry", seams=seams, centres=centres))
     p.world_tiles = merge_tiles(make.node, footprints, p.world_dem, levelled.meta["steps"])
-    p.world_risk = make.hazards("risk/world", p.world_tiles)
-    p.world_path = make.node(path_stage, "path/world", risk=p.world_risk, use="world", heading=heading(posed.meta))
+    if p.local_risk:
+        p.world_risk = make.hazards("risk/world", p.world_tiles)
+        p.world_path = make.node(path_stage, "path/world", risk=p.world_risk, use="world", heading=heading(posed.meta))
     yield from assessment.of_world(make, [pairs[k] for k in there])
 
 
@@ -297,15 +298,25 @@ def simultaneous(
         mode = "per_pair"
 
 
-def basic_pairs(make: Builder, rigs: dict[int, Handle[CalibrationFacts]], first: int) -> dict[int, Pair]:
-    """Stereo pairs to local elevation models, risk maps and paths, each with its rig."""
+def basic_pairs(
+    make: Builder, rigs: dict[int, Handle[CalibrationFacts]], first: int
+) -> Generator[Wait, Any, dict[int, Pair]]:
+    """Stereo pairs to local elevation models, each with its rig; on ground also to risk maps and paths."""
     p, pairs = make.products, dict[int, Pair]()
+    verticals = {k: vertical(make, k, k == first) for k in rigs}
+    p.level = {k: make.level(k, verticals[k], known) for k, known in rigs.items()}
+    judged = yield Maybe(list(p.level.values()))
+    placed = make.sequence.georeference is not None
+    plane = other_plane(make.config, [level.meta for level in judged if level is not None], placed=placed)
+    if plane is not None:
+        p.level = {k: make.level(k, verticals[k], known, plane) for k, known in rigs.items()}
     for k, known in rigs.items():
         p.disparity[k], p.orientations[k] = make.disparity(k), make.orientation(k)
-        pair = pairs[k] = make.pair(k, vertical(make, k, k == first), known, pairs.get(next(iter(rigs))))
-        p.level[k], p.local_dem[k] = pair.level, pair.dem
-        p.local_risk[k] = make.hazards(f"risk/local/{k}", [pair.dem])
-        p.local_path[k] = make.node(path_stage, f"path/local/{k}", risk=p.local_risk[k], use="local")
+        pair = pairs[k] = make.pair(k, p.level[k], known, pairs.get(next(iter(rigs))))
+        p.local_dem[k] = pair.dem
+        if plane is None:
+            p.local_risk[k] = make.hazards(f"risk/local/{k}", [pair.dem])
+            p.local_path[k] = make.node(path_stage, f"path/local/{k}", risk=p.local_risk[k], use="local")
         make.graph.flow(assessment.of_pair(make, pair))
     return pairs
 
@@ -342,7 +353,7 @@ def unmoved(
         if end in pairs and np.linalg.norm(by) > MIN_JUMP_PX:
             moved.add(end)
             for models in (p.local_dem, p.local_risk, p.local_path):
-                models.pop(end)
+                models.pop(end, None)
     return out, moved
 
 

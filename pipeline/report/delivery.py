@@ -19,6 +19,7 @@ from rille.pipeline.export.view import UNSTATED, RunView, TaskRow
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene, facts_of, frames_of
 from rille.pipeline.report.words import metres, spans
+from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
 
 Rows = list[dict[str, Any]]
 Items = list[dict[str, str]]
@@ -40,7 +41,7 @@ def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
     view = scene.view
     contradicted = [_item("contradiction", line, "") for line in contradictions(view)]
     missing = contradicted + _poses(frames) + _path(view) + _crosscheck_lost(scene)
-    absent = _local_paths(pairs) + _truth(view) + _crosscheck_off(view) + _vehicle(view)
+    absent = _reference(view) + _local_paths(pairs) + _truth(view) + _crosscheck_off(view) + _vehicle(view)
     return {"delivered": _delivered(view, frames, pairs), "missing": missing, "absent": absent}
 
 
@@ -164,12 +165,55 @@ def _local_paths(pairs: Rows) -> Items:
     return [_item("no local path", f"No local path from {asked - reached} of {asked} stops", why)] if why else []
 
 
+def on_plane(view: RunView) -> bool:
+    """Whether elevations are distances from a plane that is no ground."""
+    return any(facts_of(view, level).get("source") == REFERENCE_PLANE for level in view.products.level.values())
+
+
+def _reference(view: RunView) -> Items:
+    """That nothing was asked of a vehicle, and why."""
+    if not on_plane(view):
+        return []
+    first = facts_of(view, next(iter(view.products.level.values())))
+    normal = ", ".join(f"{v + 0.0:.2f}" for v in first["T_local_left"][8:11])
+    share = first["ground_share"]
+    whose = f"the plane that {share:.0%} of the scene lies on" if share else "a plane, stated or across the view,"
+    why = (
+        f"elevations are distances from {whose} (normal [{normal}] in the first camera's frame, "
+        f"{metres(first['T_local_left'][11])} away), z points to the cameras; hazards and paths mean nothing there. If "
+        "that is the ground, state its normal as world.up in a manifest"
+    )
+    return [_item("reference", "No ground, so neither hazards nor paths", why)]
+
+
+def coverage(view: RunView) -> list[str]:
+    """Which matched pixels the map of a pair lacks, and what would bring them in: one line for the run."""
+    maps = {pair: facts_of(view, dem).get("coverage", {}) for pair, dem in view.products.local_dem.items()}
+    lacking = {pair: facts["outside"] + facts["unsure"] for pair, facts in maps.items() if facts.get("settings")}
+    pair = max(lacking, key=lambda k: lacking[k], default=-1)
+    if lacking.get(pair, 0.0) < SAID_LACKING:
+        return []
+    facts, size = maps[pair], [metres(v) for v in maps[pair]["size"]]
+    settings = " ".join(f"--set {name}={value:g}" for name, value in facts["settings"].items())
+    return [
+        f"{lacking[pair]:.0%} of the matched pixels of pair {pair} are not on its map: {facts['outside']:.0%} lie "
+        f"outside, {facts['unsure']:.0%} are too uncertain for it (locus.max_sigma, locus.max_range_cells). {settings} "
+        f"brings most in, on {size[0]} x {size[1]}. Points of all of them: rille export RUN --to laz."
+    ]
+
+
+SAID_LACKING = 0.1
+"""Share of the matched pixels from which on it is said that limits keep them off the map."""
+
+
 def _path(view: RunView) -> Items:
     drive = view.products.drive
     if drive is not None:
         # No answer: a drive is asked for its goal, and all that it did not come to is missing with that.
         return [] if drive.verdict == "goal" else [_item("drive", f"Drive: {drive.verdict}", drive.reason)]
     path = view.bundle(view.products.world_path)
+    if on_plane(view):
+        return []
     if path is None:
         return [_item("no path", "No path", "the path over the merged terrain was not computed")]
     if path.meta.get("found"):

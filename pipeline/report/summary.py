@@ -41,7 +41,7 @@ def gather(view: RunView) -> dict[str, Any]:
         "frames": frames,
         "pairs": pairs,
         "vehicle": view.config.vehicle.model_dump(mode="json"),
-        "notes": [*view.sequence.notes, *given_numbers(view)],
+        "notes": [*view.sequence.notes, *delivery.coverage(view), *given_numbers(view)],
         "rig": _rig(scene),
         "crosscheck": _crosscheck(scene),
         "path": _path(scene),
@@ -107,7 +107,8 @@ def given_numbers(view: RunView) -> list[str]:
     """
     trajectory, rig = view.bundle(view.products.trajectory), view.sequence.rig
     levels = [view.bundle(handle) for handle in view.products.level.values()]
-    grounds = [level.meta["footprint"] for level in levels if level is not None and level.meta.get("footprint")]
+    known = [] if delivery.on_plane(view) else [level.meta for level in levels if level is not None]
+    grounds = [facts["footprint"] for facts in known if facts.get("footprint")]
     poses = np.zeros((0, 3, 4)) if trajectory is None else world_poses(trajectory)
     poses = poses[np.isfinite(poses).all(axis=(1, 2))]
     steps = np.einsum("nji,nj->ni", poses[:-1, :, :3], np.diff(poses[:, :, 3], axis=0))
@@ -228,6 +229,8 @@ def _way_words(view: RunView, length: float | None) -> str:
         drive = view.products.drive
         reason = f" ({drive.reason})" if drive.reason else ""
         return f"{drive.verdict} after {count(len(drive.stops), 'stop')}{reason}"
+    if delivery.on_plane(view):
+        return "distances from a plane that is no ground"
     return "no path" if length is None else f"a path of {length:.3g} m{delivery.start_words(view)}"
 
 

@@ -78,6 +78,7 @@ def pairs(scene: gather.Scene) -> list[Row]:
                 "vertical": facts_of(view, p.level.get(pair)).get("source"),
                 "modelled": view.bundle(p.local_dem.get(pair)) is not None,
                 "defined": dem.get("defined"),
+                "coverage": dem.get("coverage"),
                 "sigma_m": dem.get("median_elevation_std"),
                 "hazardous": shares.get("hazardous"),
                 "unknown": shares.get("unknown"),

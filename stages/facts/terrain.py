@@ -8,16 +8,16 @@ Json = dict[str, Any]
 
 
 class GroundFacts(Facts):
-    """Local frame and ground of one pair, in the local frame.
+    """Local frame and reference plane of one pair, in the local frame.
 
     Where no ground is seen, ``no_ground`` says why, and what describes it is None, except ``cell_size``; ``plane`` and
-    ``relief`` are there where larger cells may show it.
+    ``relief`` are there where larger cells may show it, and where the reference is a plane that is no ground.
     """
 
     T_local_left: list[float]
     """3 x 4 numbers, row by row."""
     source: str
-    """Of the vertical; ``none``: unknown, z is the camera's own up."""
+    """Of the vertical; ``none``: unknown, z is the camera's own up; ``reference plane``: z is its normal."""
     ground_height: float | None
     """z of the ground below the camera, m, negative."""
     plane: list[float] | None
@@ -32,7 +32,9 @@ class GroundFacts(Facts):
     footprint: list[float] | None
     """x_min, x_max, y_min, y_max, m, for that cell."""
     ground_share: float
-    """Of the sampled pixels."""
+    """Of the sampled pixels, on the reference plane."""
+    max_sigma: NotRequired[float]
+    """Largest standard deviation, m, of elevations above a plane that is no ground."""
     no_ground: NotRequired[str]
     seen_up: NotRequired[list[float]]
     """Up, in the left camera's frame, by ground that is seen but contradicts the given vertical."""
@@ -44,6 +46,8 @@ class DemFacts(Facts):
     lattice: Json
     frame: str
     pair: int
+    reference: NotRequired[str]
+    """There where elevations are distances from a plane that is no ground."""
     z_range: NotRequired[list[float]]
     T_frame_left: NotRequired[list[float]]
     pixel_rad: NotRequired[float]
@@ -54,6 +58,8 @@ class DemFacts(Facts):
     """px"""
     median_elevation_std: NotRequired[float | None]
     """m"""
+    coverage: NotRequired[Json]
+    """Which matched pixels the map of a pair lacks: see :func:`rille.stages.terrain.locus.coverage.coverage`."""
     pose_covariance: NotRequired[list[float]]
     """6 x 6 numbers, row by row: of position, m, and rotation, rad, in the world."""
 
@@ -66,6 +72,8 @@ class MergeFacts(Facts):
     pairs: list[int]
     defined: float
     filled: int
+    reference: NotRequired[str]
+    """There where elevations are distances from a plane that is no ground."""
 
 
 class BoundsFacts(Facts):

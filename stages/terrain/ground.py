@@ -1,9 +1,11 @@
-"""Ground plane of a stereo pair, straight from the disparity, and what of it the pair can reconstruct.
+"""Reference plane of a stereo pair, straight from the disparity, and what of it the pair can reconstruct.
 
 The inverse depth 1/Z of a plane n . X = -h (camera frame, n up, h the camera's height above it) is linear in the ray
 r = (x, y, 1): 1/Z = theta . r with theta = -n / h. And the error of 1/Z is the disparity's, the same near and far. So
 the plane is a linear fit with uniform noise ("v-disparity" and its kin, Labayrade et al. 2002,
 doi:10.1109/IVS.2002.1188024), for any rig: the inverse depth comes from the projection on the local epipolar line.
+
+Any plane of the scene is fitted alike: which one is the ground, its normal says.
 """
 
 from __future__ import annotations
@@ -11,14 +13,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import DegenerateError
-from rille.stages.geometry.geometry import Rig
-from rille.stages.geometry.scale import of_rig
+from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.scale import coarser_focal, of_rig
 from rille.stages.numeric.robust import irls
 
 
@@ -138,20 +141,30 @@ def _totals(theta, rays, rho, horizon, information, out):  # type: ignore[no-unt
         out[m] = total
 
 
-@dataclass(frozen=True)
-class GroundView:
-    """View of a plane by a pair: sampled pixels that hit the plane where both cameras see it.
+class Samples(NamedTuple):
+    """Rays (n, 3) with z = 1 of the left camera, inverse depths ``rho`` (n,) and their standard deviations, 1/m."""
 
-    ``xy`` (n, 2) metres, local frame; ``slant`` (n,) distance from the left camera, m; ``along``, ``across`` (n,)
-    size on the ground of one pixel, m per pixel, of the right camera where its pixels are the coarser ones; ``slope``
-    (n,) ds/dZ, pixels of disparity per metre of elevation.
+    rays: Floats
+    rho: Floats
+    sigma: Floats
+
+
+@dataclass(frozen=True)
+class PlaneView:
+    """View of a plane by a pair: points on it, of pixels sampled where both cameras see it, or of matched pixels.
+
+    ``xyz`` (n, 3) metres, local frame; ``slant`` (n,) distance from the left camera, m; ``along``, ``across`` (n,)
+    size on the plane of one pixel, m per pixel, of the right camera where its pixels are the coarser ones; ``slope``
+    (n,) ds/dZ, pixels of disparity per metre of elevation. ``stray``: share of the points at either end of an axis that
+    count as mismatches.
     """
 
-    xy: Floats
+    xyz: Floats
     slant: Floats
     along: Floats
     across: Floats
     slope: Floats
+    stray: float = 0.0
 
     def cell_size(self) -> float:
         """Pixel footprint (geometric mean of both directions) at twice the nearest distance, to 1, 2 or 5."""
@@ -160,7 +173,7 @@ class GroundView:
         return rounded_cell(float(np.sqrt(self.along * self.across)[near].max()))
 
     def footprint(self, cell: float, max_cells: float, sigma_d: float, max_sigma: float) -> list[float]:
-        """Extent x_min, x_max, y_min, y_max, metres, of the ground that is seen well enough.
+        """Extent x_min, x_max, y_min, y_max, metres, of the plane that is seen well enough.
 
         ``max_cells``: a pixel may cover so many cells along the range; ``max_sigma``: error of elevation, m, at
         ``sigma_d`` pixels of disparity.
@@ -173,7 +186,7 @@ class GroundView:
                 f"no ground is seen well enough for cells of {cell:g} m",
                 remedy=f"set locus.cell_size to {1.1 * enough:.2g} m or more",
             )
-        low, high = self.xy[good].min(axis=0), self.xy[good].max(axis=0)
+        low, high = np.quantile(self.xyz[good, :2], [self.stray, 1.0 - self.stray], axis=0)
         return [float(low[0]), float(high[0]), float(low[1]), float(high[1])]
 
 
@@ -186,7 +199,27 @@ def rounded_cell(size: float) -> float:
 _125 = (1.0, 2.0, 5.0)
 
 
-def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> GroundView:
+def view_matches(samples: Samples, rig: Rig, T_local_left: RigidTransform, sigma_d: float) -> PlaneView:
+    """View of the plane z = 0 of the local frame by matched pixels, each on a surface parallel to it.
+
+    A depth 1/rho with the error sigma / rho^2 moves a point along its ray r by as much of r, and the elevation by that
+    part of it which is along the plane's normal. ``sigma_d``: pixels of disparity that ``sigma`` stands for.
+    """
+    rays, rho, sigma = (values[samples.rho > NEAREST_SIGMAS * samples.sigma] for values in samples)
+    points = rays / rho[:, None]
+    slant, toward = _length(points), np.abs(rays @ T_local_left.rotation[2])
+    across = slant / coarser_focal(rig)
+    along = across * _length(rays) / np.maximum(toward, 1e-3)
+    slope = sigma_d * rho**2 / (sigma * np.maximum(toward, 1e-3))
+    return PlaneView(T_local_left.apply(points), slant, along, across, slope, STRAY)
+
+
+NEAREST_SIGMAS = 3.0
+"""Standard deviations of an inverse depth above 0 from which on a match is not infinitely far."""
+STRAY = 0.005
+
+
+def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> PlaneView:
     """Compute the view of the plane z = c + a x + b y (``plane`` = a, b, c) of the local frame.
 
     Raises
@@ -216,7 +249,7 @@ def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> Groun
         )
     # By columns and rows of the left image, a pixel of which is a part of a coarser one of the right.
     size = _singular_values(jacobian[good] / np.minimum(of_rig(rig), 1.0))
-    return GroundView(here[good, :2], _length(here[good]), size[:, 0], size[:, 1], slope[good])
+    return PlaneView(here[good], _length(here[good]), size[:, 0], size[:, 1], slope[good])
 
 
 def _singular_values(m: Floats) -> Floats:

@@ -1,12 +1,16 @@
-"""Vertical and ground of one basic pair: the levelled local frame, without any pose of another frame.
+"""Vertical and reference plane of one basic pair: its local frame, without any pose of another frame.
 
 The local frame of a basic pair has its origin at the left camera's centre, z up, y along the horizontal projection of
 the optical axis (paper, sections 3.2 and 4.7: the local path is planned heading-aligned). Where "up" is comes from the
 best source at hand: a measured attitude, the given initial pose, the rig's stated pitch, else the ground plane that the
 disparity shows. The ground plane is fitted in any case: it gives the range of elevations that Locus searches.
 
-A trajectory needs neither. Where no ground is seen, no elevation model can be made (unless ``reference_height`` states
-a surface); if nothing gives the vertical either, the local frame is that of the camera: its own up is z.
+A trajectory needs neither. Where no ground is seen (unless ``reference_height`` states it) and nothing gives the
+vertical either, the local frame is that of the camera: its own up is z.
+
+Elevations of scenes without ground (walls, views straight down) are distances from another *reference plane*: the
+dominant plane of the matched points, or a stated one. The local frame is then that plane's: z = 0 on it, z along its
+normal towards the camera, x the right of the image. All that reads elevations works on it as it does on ground.
 """
 
 from __future__ import annotations
@@ -28,25 +32,22 @@ from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.epipolar import exchanged, fits, inverse_depth
 from rille.stages.geometry.geometry import Rig, RigidTransform, level_rotation
-from rille.stages.geometry.pose_arrays import NO_VERTICAL
+from rille.stages.geometry.pose_arrays import NO_VERTICAL, REFERENCE_PLANE
 from rille.stages.geometry.scale import coarser_focal
 from rille.stages.terrain.ground import (
     MIN_POINTS,
     CoarseGroundError,
     GroundPlane,
     NoGroundError,
+    Samples,
     fit_plane,
     rounded_cell,
     view_ground,
+    view_matches,
 )
 
-
-class Samples(NamedTuple):
-    """Rays (n, 3) with z = 1 of the left camera, inverse depths ``rho`` (n,) and their standard deviations, 1/m."""
-
-    rays: Floats
-    rho: Floats
-    sigma: Floats
+SCENE = "scene"
+"""Instead of a stated reference plane: the scene's own."""
 
 
 DEFAULT_RANGE_CELLS = 6.0  # of the footprint in meta; the stage locus has its own parameter
@@ -60,8 +61,11 @@ NEAR = 2.0  # pixels: distance to its epipolar line at which a match fits a rig
 NEAREST = 0.05  # share of the matches that may be nearer than what counts as nearest: gross mismatches
 UNSEEN = 20.0  # baselines; distance that stands for what is not seen at all
 
-DOMINANT = 0.3  # share of the matches from which a plane may be the ground, though its tilt is beyond the limits
+DOMINANT = 0.3  # share of the matches from which a plane may be the reference, though its tilt is beyond the limits
 SWAPPED = 0.5  # share of such matches: nearly all where left and right are swapped
+
+MAX_SLANT_DEG = 65.0  # between the view and a scene plane's normal: what is seen along the plane makes no map
+WORST_SIGMA = 10.0  # times the median one: a match that is so uncertain brings a hundredth of the median one's weight
 
 
 class GroundFrameParams(Params):
@@ -111,21 +115,28 @@ def level(
     rig: Rig,
     params: GroundFrameParams,
     vertical: VerticalHint | None = None,
+    reference: str | Sequence[float] | None = None,
 ) -> GroundFacts:
-    """Local frame and ground of one pair.
+    """Local frame and reference plane of one pair.
 
     Parameters
     ----------
     column_disparity, row_disparity : (rows, cols) right minus left, pixels, of the left image.
     usable : (rows, cols) pixels with a measured disparity.
     vertical : None: it is that of the ground.
+    reference : None: the ground; :data:`SCENE`: the scene's own plane; otherwise normal and point (6,) of a plane in
+        the left camera's frame, m.
 
     Raises
     ------
     DegenerateError
-        Left and right seem swapped, or the rig has no baseline.
+        Left and right seem swapped, the rig has no baseline, or nothing is matched that a plane is fitted to.
     """
-    samples = _samples(np.asarray(column_disparity), np.asarray(row_disparity), usable, rig, params)
+    maps = np.asarray(column_disparity), np.asarray(row_disparity)
+    samples = sampled(maps, usable, rig, params.sigma_disparity)
+    if reference is not None:
+        stated = scene_plane(samples, params) if isinstance(reference, str) else stated_plane(reference)
+        return _on_plane(stated, samples, rig, params)
     known_up, source = _given_vertical(vertical or VerticalHint())
     rays, rho, sigma = samples
     ground = None
@@ -216,6 +227,66 @@ def _on_ground(
     }
 
 
+def scene_plane(samples: Samples, params: GroundFrameParams) -> GroundPlane:
+    """The plane that the scene lies on, if one dominates it and is not seen along itself; else across the view.
+
+    Across the view, elevations are a depth map: whatever the scene is, each matched pixel has its own place there.
+    """
+    rays, rho, _ = samples
+    if not len(rays):
+        raise NoGroundError("RIL-385", "no pixel is matched, so no surface is seen")
+    view = rays.mean(axis=0) / np.linalg.norm(rays.mean(axis=0))
+    with suppress(NoGroundError):
+        plane = _fitted(samples, lambda n: np.asarray(-n @ view >= math.cos(math.radians(MAX_SLANT_DEG))), params)
+        if plane.inliers >= DOMINANT:
+            return plane
+    return GroundPlane(np.array([0.0, 0.0, -1.0]), 1.0 / max(float(np.median(rho)), 1e-9), 0.0)
+
+
+def stated_plane(reference: Sequence[float]) -> GroundPlane:
+    """The plane with a normal through a point (6,) of the left camera's frame, the normal turned to the camera."""
+    normal, point = np.array(reference[:3], dtype=np.float64), np.array(reference[3:], dtype=np.float64)
+    length = float(np.linalg.norm(normal))
+    height = -float(normal @ point) / length if length > 0 else 0.0
+    if height == 0.0:
+        raise InputError(
+            "RIL-379",
+            f"no plane with normal {list(reference[:3])} through {list(reference[3:])} m of the camera's frame is "
+            "seen from the camera, which lies on it",
+            remedy="set terrain.reference to [normal x, y, z, point x, y, z] (x right, y down, z ahead)",
+        )
+    return GroundPlane(math.copysign(1.0, height) * normal / length, abs(height), 0.0)
+
+
+def _on_plane(reference: GroundPlane, samples: Samples, rig: Rig, params: GroundFrameParams) -> GroundFacts:
+    """What :func:`level` says of a pair whose reference plane is no ground."""
+    z = reference.up
+    # Along the plane, right in the image; for a plane that holds that direction's normal alone, along the optical axis.
+    right = np.eye(3)[0 if abs(z[0]) < 0.9 else 2]
+    x = (right - (right @ z) * z) / np.linalg.norm(right - (right @ z) * z)
+    T_local_left = RigidTransform(np.array([x, np.cross(z, x), z]), np.array([0.0, 0.0, reference.height]))
+    view = view_matches(samples, rig, T_local_left, params.sigma_disparity)
+    if not len(view.slant):
+        raise NoGroundError("RIL-392", "all matches may as well be infinitely far: no surface can be measured")
+    cell = rounded_cell(float(np.median(np.sqrt(view.along * view.across))))
+    max_sigma = float(f"{WORST_SIGMA * np.median(params.sigma_disparity / view.slope):.2g}")
+    footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, params.sigma_disparity, max_sigma)
+    relief = _spread(view.xyz, [0.0, 0.0, 0.0], footprint, MARGIN * reference.height)
+    return {
+        "T_local_left": T_local_left.to_list(),
+        "source": REFERENCE_PLANE,
+        "ground_height": None,
+        "plane": [0.0, 0.0, 0.0],
+        "tilt": None,
+        "relief": relief,
+        "z_range": relief,
+        "cell_size": cell,
+        "max_sigma": max_sigma,
+        "footprint": footprint,
+        "ground_share": reference.inliers,
+    }
+
+
 def _cell_without_ground(rho: Floats, rig: Rig) -> float:
     """Cell size, m, by what is seen instead, inverse depths ``rho`` (n,): a pixel at twice the nearest distance."""
     near = 1.0 / float(np.quantile(rho, 1.0 - NEAREST)) if rho.size else UNSEEN * rig.baseline
@@ -228,8 +299,9 @@ def z_range(plane: list[float], relief: list[float], extent: list[float]) -> lis
     return [min(corners) + relief[0], max(corners) + relief[1]]
 
 
-def _samples(column: NDArray[Any], row: NDArray[Any], usable: Bools, rig: Rig, params: GroundFrameParams) -> Samples:
-    """Rays, inverse depths and their errors at a regular sparse grid of usable pixels."""
+def sampled(maps: tuple[NDArray[Any], NDArray[Any]], usable: Bools, rig: Rig, sigma_disparity: float) -> Samples:
+    """Rays, inverse depths and their errors at a regular sparse grid of usable pixels; ``maps``: both disparities."""
+    column, row = maps
     expected = (rig.left.height, rig.left.width)
     if column.shape != expected:
         raise InputError("RIL-376", f"the disparity is {column.shape}, the left camera's image {expected}")
@@ -243,7 +315,7 @@ def _samples(column: NDArray[Any], row: NDArray[Any], usable: Bools, rig: Rig, p
     pixels = np.stack([c, r], axis=-1).astype(np.float64)
     disparity = np.stack([column[r, c], row[r, c]], axis=-1).astype(np.float64)
     rho, per_pixel = inverse_depth(rig, pixels, disparity)
-    sigma = per_pixel * params.sigma_disparity
+    sigma = per_pixel * sigma_disparity
     if len(pixels) >= MIN_POINTS:
         # Before the ground is fitted: exchanged images show none, and that message would mislead.
         _refuse_swapped(rig, pixels, pixels + disparity, float(np.mean(rho < -BEYOND * sigma)))
@@ -298,18 +370,25 @@ def _local_plane(ground: GroundPlane, R_local_left: Floats) -> list[float]:
 def _relief(
     points: Floats, plane: list[float], extent: list[float], height: float, params: GroundFrameParams
 ) -> list[float]:
-    """Robust lowest and highest terrain against the plane within the extent, metres, widened by a tenth."""
+    """Robust lowest and highest terrain against the plane within the extent, metres, as far as ground reaches."""
+    low, high = _spread(points, plane, extent, MARGIN * height)
+    # Below, nothing is known that deep but mismatches; above, walls and crowns.
+    return [max(low, -height), min(high, (1.0 + params.ceiling) * height)]
+
+
+def _spread(points: Floats, plane: list[float], extent: list[float], margin: float) -> list[float]:
+    """Robust lowest and highest point against the plane within the extent, m, at least ``margin``, widened by a tenth
+    and as much again."""
     x, y, z = points.T
     inside = (x >= extent[0]) & (x <= extent[1]) & (y >= extent[2]) & (y <= extent[3])
     above = z - (plane[2] + plane[0] * x + plane[1] * y)
-    low, high = -MARGIN * height, MARGIN * height
+    low, high = -margin, margin
     if np.count_nonzero(inside) >= 20:
         # Quantiles, not extremes: of thousands of matches some are gross.
         q = np.quantile(above[inside], [0.005, 0.995])
         low, high = min(low, float(q[0])), max(high, float(q[1]))
-    margin = 0.1 * (high - low) + MARGIN * height
-    # Below, nothing is known that deep but mismatches; above, walls and crowns.
-    return [max(low - margin, -height), min(high + margin, (1.0 + params.ceiling) * height)]
+    more = 0.1 * (high - low) + margin
+    return [low - more, high + more]
 
 
 @stage("ground_frame")
@@ -321,8 +400,9 @@ def ground_frame_stage(
     up: Sequence[float] | None = None,
     initial_up: Sequence[float] | None = None,
     pitch: float | None = None,
+    reference: str | Sequence[float] | None = None,
 ) -> Bundle[GroundFacts]:
-    """Vertical and ground plane of a basic pair."""
+    """Vertical and reference plane of a basic pair."""
     facts = level(
         disparity["column_disparity"],
         disparity["row_disparity"],
@@ -330,5 +410,6 @@ def ground_frame_stage(
         Rig.from_dict(rig.meta["rig"]),
         params,
         VerticalHint(up, initial_up, pitch),
+        reference,
     )
     return Bundle({}, facts)

@@ -39,6 +39,7 @@ from rille.stages.core.errors import InputError
 from rille.stages.facts.terrain import DemFacts, MergeFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice, Window
+from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
 from rille.stages.numeric.holes import close_holes
 from rille.stages.terrain.merge_kernel import CellMaps, Rule, Stack, merge_cells
 from rille.stages.terrain.radiometry import STEP
@@ -307,4 +308,6 @@ def merge_stage(
         "defined": float(np.mean(merged.count > 0)),
         "filled": int(merged.filled.sum()),
     }
+    if any("reference" in dem.meta for dem in dems):
+        meta["reference"] = REFERENCE_PLANE
     return Bundle(vars(merged), meta)

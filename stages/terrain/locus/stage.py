@@ -13,9 +13,10 @@ the pixel where the matcher gives one; what else makes it uncertain is seen on t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,10 +32,13 @@ from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.facts.terrain import DemFacts, GroundFacts
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
 from rille.stages.geometry.scale import coarser_focal
 from rille.stages.geometry.surface import Surface, plane
-from rille.stages.terrain.ground import view_ground
+from rille.stages.terrain.ground import PlaneView, view_ground, view_matches
+from rille.stages.terrain.ground_frame import sampled
 from rille.stages.terrain.ground_frame import z_range as plane_z_range
+from rille.stages.terrain.locus.coverage import Limits, coverage
 from rille.stages.terrain.locus.empty import explain
 from rille.stages.terrain.locus.kernel import Dem
 from rille.stages.terrain.locus.refinement import refine, standard_deviation
@@ -43,6 +47,7 @@ from rille.stages.terrain.locus.uncertainty import from_both
 from rille.stages.terrain.locus.views import Views, views
 
 OWN_STD = 1.5  # times max_sigma: a cell's own standard deviation scatters about the typical one
+NO_LIMIT = {"max_sigma": None, "max_std": None}
 
 
 class LocusParams(Params):
@@ -50,13 +55,16 @@ class LocusParams(Params):
 
     cell_size: float | None = Field(None, gt=0, description="side of a cell [m]; not set: it follows from the rig")
     extent: tuple[float, float, float, float] | None = Field(
-        None, description="x_min, x_max, y_min, y_max [m] in the local frame; not set: the ground that both cameras see"
+        None, description="x_min, x_max, y_min, y_max [m] in the local frame; not set: what both cameras see well"
     )
     max_range_cells: float = Field(
         6.0, gt=0, description="number of cells that a pixel may cover along the range within the automatic extent"
     )
     max_sigma: float | None = Field(
-        None, gt=0, description="largest standard deviation [m], by sigma_disparity; not set: one cell size"
+        None,
+        gt=0,
+        description="largest standard deviation [m], by sigma_disparity; not set: one cell size, and above a plane "
+        "that is no ground ten times that of the median match",
     )
     max_std: float | None = Field(
         None, gt=0, description="largest standard deviation [m] of a cell, by the matcher's; not set: 1.5 max_sigma"
@@ -143,13 +151,17 @@ def reconstruct(
         out = join(out, other)
     if seen is not None and (params.refine_steps or back is not None):
         _refine(out, seen, surface, params, apart)
-    greatest = _greatest_std(params, pair.matches.std is not None)
+    leave_out_unsure(out, greatest_std(params, pair.matches.std is not None))
+    return out
+
+
+def leave_out_unsure(dem: Dem, greatest: float | None) -> None:
+    """Make the cells of a model undefined, in place, whose standard deviation exceeds ``greatest``, m; None: none."""
     if greatest is not None:
         # Negated, so that NaN is unsure as well.
-        unsure = ~(out.elevation_std <= greatest)
-        for array in out:
+        unsure = ~(dem.elevation_std <= greatest)
+        for array in dem:
             np.copyto(array, np.nan, where=unsure)
-    return out
 
 
 def _views(image: ArrayLike, right: ArrayLike, rig: Rig, T_surface_left: RigidTransform) -> Views:
@@ -178,7 +190,7 @@ def _refine(dem: Dem, views: Views, surface: Surface, params: LocusParams, apart
     dem.ortho[...] = np.clip(seen.left, 0.0, 255.0)
 
 
-def _greatest_std(params: LocusParams, measured: bool) -> float | None:
+def greatest_std(params: LocusParams, measured: bool) -> float | None:
     """Standard deviation of elevation, m, up to which a cell is accepted; None: any."""
     if measured and params.max_std is not None:
         return params.max_std
@@ -187,8 +199,8 @@ def _greatest_std(params: LocusParams, measured: bool) -> float | None:
     return OWN_STD * params.max_sigma if measured else params.max_sigma
 
 
-def local_lattice(rig: Rig, level: Mapping[str, Any], cell: float, params: LocusParams) -> Lattice:
-    """Lattice of a pair's local model: the stated extent, else the ground that both cameras see well enough."""
+def local_lattice(view: PlaneView, cell: float, params: LocusParams) -> Lattice:
+    """Lattice of a pair's local model: the stated extent, else the plane that both cameras see well enough."""
     if params.extent is not None:
         x_min, x_max, y_min, y_max = params.extent
         if not (x_min < x_max and y_min < y_max):
@@ -196,10 +208,18 @@ def local_lattice(rig: Rig, level: Mapping[str, Any], cell: float, params: Locus
                 "RIL-383", f"locus.extent={list(params.extent)} is empty", remedy="give x_min, x_max, y_min, y_max"
             )
         return Lattice.snap(params.extent, cell)
-    R = RigidTransform.from_matrix(level["T_local_left"]).rotation
-    view = view_ground(rig, R, level["plane"])
-    sigma = params.max_sigma if params.max_sigma is not None else cell
-    return Lattice.snap(view.footprint(cell, params.max_range_cells, params.sigma_disparity, sigma), cell)
+    assert params.max_sigma is not None
+    return Lattice.snap(view.footprint(cell, params.max_range_cells, params.sigma_disparity, params.max_sigma), cell)
+
+
+def _of_ground(rig: Rig, level: Mapping[str, Any]) -> PlaneView:
+    """View of the ground of a pair."""
+    return view_ground(rig, RigidTransform.from_matrix(level["T_local_left"]).rotation, level["plane"])
+
+
+def _limited(params: LocusParams, level: Mapping[str, Any], cell: float) -> LocusParams:
+    """The parameters with the largest standard deviation, where none is given: it follows from the scene."""
+    return params.model_copy(update={"max_sigma": params.max_sigma or max(level.get("max_sigma", 0.0), cell)})
 
 
 def world_lattice(elevation: Floats32, lattice: Lattice, T_world_local: RigidTransform) -> tuple[Lattice, list[float]]:
@@ -231,7 +251,7 @@ def usable(validity: ArrayLike, backmatch_error: ArrayLike, params: LocusParams)
         return matched(np.asarray(validity)) & (np.asarray(backmatch_error) <= params.max_backmatch)
 
 
-def _backward(disparity: Bundle, params: LocusParams) -> Matches:
+def _matches(disparity: Bundle, params: LocusParams) -> Matches:
     good = usable(disparity["validity"], disparity["backmatch_error"], params)
     maps = np.asarray(disparity["column_disparity"]), np.asarray(disparity["row_disparity"])
     return Matches(*maps, good, disparity.arrays.get("disparity_std"))
@@ -244,8 +264,14 @@ def _size(params: LocusParams, args: Mapping[str, Any], metas: Mapping[str, Any]
     elif "no_ground" in metas["level"]:
         return 0.0
     else:
-        cell = params.cell_size or metas.get("reference", metas["level"])["cell_size"]
-        lattice = local_lattice(Rig.from_dict(metas["rig"]["rig"]), metas["level"], cell, params)
+        level = metas["level"]
+        cell = params.cell_size or metas.get("reference", level)["cell_size"]
+        if level["source"] == REFERENCE_PLANE:
+            lattice = Lattice.snap(params.extent or level["footprint"], cell)
+        else:
+            lattice = local_lattice(
+                _of_ground(Rig.from_dict(metas["rig"]["rig"]), level), cell, _limited(params, level, cell)
+            )
     return 24.0 * lattice.rows * lattice.cols
 
 
@@ -255,6 +281,22 @@ def _median(array: Floats32) -> float | None:
 
 
 _FRAME = "local or world (meta: frame)"
+
+
+class LocusInputs(NamedTuple):
+    """Ports: ``disparity`` and images of the pair, its ``rig`` and reference plane (``level``), disparity of the right
+    image (``back``), and the plane of the first pair (``reference``), whose cells serve all. In the world: the
+    ``trajectory``, and the pair's ``local`` model."""
+
+    disparity: Bundle
+    rig: Bundle[CalibrationFacts]
+    left: Bundle[PyramidFacts]
+    level: Bundle[GroundFacts]
+    right: Bundle[PyramidFacts] | None = None
+    back: Bundle | None = None
+    reference: Bundle[GroundFacts] | None = None
+    trajectory: Bundle[TrajectoryFacts] | None = None
+    local: Bundle[DemFacts] | None = None
 
 
 @stage(
@@ -268,62 +310,66 @@ _FRAME = "local or world (meta: frame)"
     ],
     memory=Memory(lower=("locus.cell_size", "locus.extent"), size=_size),
 )
-def locus_stage(
-    params: LocusParams,
-    disparity: Bundle,
-    rig: Bundle[CalibrationFacts],
-    left: Bundle[PyramidFacts],
-    level: Bundle[GroundFacts],
-    right: Bundle[PyramidFacts] | None = None,
-    back: Bundle | None = None,
-    reference: Bundle[GroundFacts] | None = None,
-    trajectory: Bundle[TrajectoryFacts] | None = None,
-    local: Bundle[DemFacts] | None = None,
-    *,
-    frame: str,
-    pair: int,
-    row: int = 0,
-) -> Bundle[DemFacts]:
+def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: int, row: int = 0) -> Bundle[DemFacts]:
     """Elevation model and ortho image of a basic pair."""
-    used, ground = Rig.from_dict(rig.meta["rig"]), level.meta
-    T_local_left = RigidTransform.from_matrix(ground["T_local_left"])
+    rig, level, trajectory = Rig.from_dict(inputs.rig.meta["rig"]), inputs.level.meta, inputs.trajectory
+    T_local_left = RigidTransform.from_matrix(level["T_local_left"])
+    matches = _matches(inputs.disparity, params)
+    seen: PlaneView | None = None
+    # One cell for the whole run: that which suits the first basic pair, where that pair is connected.
+    reference = (inputs.reference or inputs.level).meta
     if frame == "world":
         assert trajectory is not None
-        assert local is not None
+        assert inputs.local is not None
+        local = Lattice.from_dict(inputs.local.meta["lattice"])
         T = RigidTransform.from_matrix(np.asarray(trajectory["poses"])[row])
-        lattice, z_range = world_lattice(
-            np.asarray(local["elevation"]), Lattice.from_dict(local.meta["lattice"]), T @ T_local_left.inverse()
-        )
+        lattice, z_range = world_lattice(np.asarray(inputs.local["elevation"]), local, T @ T_local_left.inverse())
+        params = _limited(params, reference, local.cell)
     else:
-        # One cell for the whole run: that which suits the first basic pair, where that pair is connected.
-        if ground["plane"] is None or ground["relief"] is None or ("no_ground" in ground and params.cell_size is None):
-            raise DegenerateError("RIL-780", f"no elevation model without ground: {ground['no_ground']}")
-        cell = params.cell_size or (reference or level).meta["cell_size"]
-        T, lattice = T_local_left, local_lattice(used, ground, cell, params)
-        z_range = plane_z_range(ground["plane"], ground["relief"], list(lattice.bounds))
-    if params.max_sigma is None:
-        params = params.model_copy(update={"max_sigma": lattice.cell})
-    good = usable(disparity["validity"], disparity["backmatch_error"], params)
+        if level["plane"] is None or level["relief"] is None or ("no_ground" in level and params.cell_size is None):
+            raise DegenerateError("RIL-780", f"no elevation model without ground: {level['no_ground']}")
+        cell = params.cell_size or reference["cell_size"]
+        params = _limited(params, reference, cell)
+        maps = np.asarray(matches.column), np.asarray(matches.row)
+        samples = sampled(maps, matches.usable, rig, params.sigma_disparity)
+        seen = view_matches(samples, rig, T_local_left, params.sigma_disparity)
+        T, lattice = (
+            T_local_left,
+            local_lattice(seen if level["source"] == REFERENCE_PLANE else _of_ground(rig, level), cell, params),
+        )
+        z_range = plane_z_range(level["plane"], level["relief"], list(lattice.bounds))
     matched = MatchedPair(
-        left["level_0"],
-        Matches(disparity["column_disparity"], disparity["row_disparity"], good, disparity.arrays.get("disparity_std")),
-        right["level_0"] if right is not None else None,
-        _backward(back, params) if back is not None else None,
+        inputs.left["level_0"],
+        matches,
+        inputs.right["level_0"] if inputs.right is not None else None,
+        _matches(inputs.back, params) if inputs.back is not None else None,
     )
-    dem = reconstruct(matched, used, T, plane(lattice), (z_range[0], z_range[1]), params)
+    low, high = z_range
+    dem = reconstruct(matched, rig, T, plane(lattice), (low, high), params.model_copy(update=NO_LIMIT))
+    greatest = greatest_std(params, matches.std is not None)
+    covered: dict[str, Any] | None = None
+    if seen is not None:
+        farthest = params.max_range_cells if params.extent is None else math.inf
+        limits = Limits((low, high), greatest or math.inf, params.max_sigma or math.inf, farthest)
+        covered = coverage(seen, (dem.elevation, dem.elevation_std), lattice, params.sigma_disparity, limits)
+    leave_out_unsure(dem, greatest)
     if not np.isfinite(dem.elevation).any():
-        raise explain(used, T, plane(lattice), (z_range[0], z_range[1]), good)
+        raise explain(rig, T, plane(lattice), (low, high), matches.usable)
     meta: DemFacts = {
         "lattice": lattice.to_dict(),
         "frame": frame,
         "pair": pair,
         "z_range": z_range,
         "T_frame_left": T.to_list(),
-        "pixel_rad": 1.0 / coarser_focal(used),
+        "pixel_rad": 1.0 / coarser_focal(rig),
         "defined": float(np.mean(np.isfinite(dem.elevation))),
         "median_residual": _median(dem.residual),
         "median_elevation_std": _median(dem.elevation_std),
     }
+    if level["source"] == REFERENCE_PLANE:
+        meta["reference"] = REFERENCE_PLANE
+    if covered is not None:
+        meta["coverage"] = covered
     if trajectory is not None and "covariance" in trajectory.arrays:
         meta["pose_covariance"] = np.asarray(trajectory["covariance"])[row].ravel().tolist()
     return Bundle(dem._asdict(), meta)

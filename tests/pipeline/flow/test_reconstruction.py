@@ -7,14 +7,16 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from raising import raises
 
 from rille.datasets.registry import open_sequence
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.flow import config
-from rille.pipeline.flow.builders import PYRAMID_BYTES, Builder
+from rille.pipeline.flow.builders import PYRAMID_BYTES, Builder, other_plane
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.flow.products import Products
 from rille.pipeline.flow.reconstruction import SEAMS, cells_in_both, overlaps, spread
+from rille.stages.terrain.ground_frame import SCENE
 from rille.stages.terrain.tile_index import Box
 
 FRAMES = 8
@@ -27,6 +29,7 @@ def lay_out(
     trajectory: dict[str, Any],
     doubts: list[tuple[str, dict[str, Any]]] | None = None,
     jumps: dict[str, dict[str, Any]] | None = None,
+    ground: dict[str, Any] | None = None,
     **given: Any,
 ) -> tuple[Graph, Products]:
     """The graph as it grows with these facts of the stages; ``doubts`` are those behind the first choice, in order."""
@@ -43,6 +46,9 @@ def lay_out(
         handles, go_on, _ = [w for w in graph.expansions if w[0][0].stage == stage][-1]
         facts = found | meta if stage == "keyframes" else meta
         go_on(*(SimpleNamespace(meta=facts) for _ in handles))
+    for handles, go_on, _ in list(graph.expansions):
+        if handles[0].label.startswith("ground_frame"):
+            go_on(*(SimpleNamespace(meta=ground or {}) for _ in handles))
     for handles, go_on, _ in list(graph.expansions):
         if handles[0].stage == "resect":
             go_on(*(SimpleNamespace(meta=(jumps or {}).get(h.label, {})) for h in handles))
@@ -75,6 +81,31 @@ def test_a_lost_frame_is_bridged_and_no_pyramid_is_made_twice() -> None:
     assert products.trajectory.spec.args["lost"] == [{"frame": 3, "cause": "black"}]
     assert list(products.world_dem) == [0, 4, 6]
     assert labels(graph, "accuracy") == ["accuracy"]
+
+
+@pytest.mark.parametrize("sees_ground", [True, False])
+def test_nothing_is_asked_of_a_vehicle_where_no_pair_sees_ground(sees_ground: bool) -> None:
+    graph, products = lay_out(
+        [],
+        {"chain": list(range(8)), "lost": [], "unfit": []},
+        {"basic": [0, 4], "segments": [[0, 1, 2, 3, 4], [4, 5, 6, 7]]},
+        {"frames": list(range(8)), "pieces": [[0, 7]], "main": 0, "positions": [[0, 0, k] for k in range(8)]},
+        ground={} if sees_ground else {"no_ground": "a wall", "plane": None},
+    )
+    kind = "ground_frame" if sees_ground else "reference_plane"
+    assert [level.label for level in products.level.values()] == [f"{kind}/0", f"{kind}/4"]
+    assert (len(products.local_risk), len(products.local_path)) == ((2, 2) if sees_ground else (0, 0))
+    assert list(products.world_dem) == [0, 4]
+    assert labels(graph, "ground_frame")[:2] == ["ground_frame/0", "ground_frame/4"]
+
+
+def test_a_plane_that_is_no_ground_has_no_place_on_earth() -> None:
+    chosen = config.build({"terrain": {"reference": [0.0, 0.0, -1.0, 0.0, 0.0, 2.0]}})
+    assert other_plane(chosen, [], placed=False) == [0.0, 0.0, -1.0, 0.0, 0.0, 2.0]
+    with raises("RIL-052"):
+        other_plane(chosen, [], placed=True)
+    wall = [{"no_ground": "a wall", "plane": None}]
+    assert [other_plane(config.build(), wall, placed=placed) for placed in (False, True)] == [SCENE, None]
 
 
 def test_a_small_right_image_is_expected_to_take_the_room_of_a_left_one() -> None:

@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from raising import raises
-from terrain_scenes import ball, box, disparity, nearest, pitched, plane, smooth_noise, toed_in_rig
+from terrain_scenes import Distance, ball, box, disparity, nearest, pitched, plane, smooth_noise, toed_in_rig
 
 from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
 from rille.stages.terrain import ground_frame as level_stage
 from rille.stages.terrain.ground import _singular_values, view_ground
-from rille.stages.terrain.ground_frame import GroundFrameParams, VerticalHint, level
+from rille.stages.terrain.ground_frame import SCENE, GroundFrameParams, VerticalHint, level
 from rille.stages.terrain.locus.stage import LocusParams, local_lattice
 
 RIG = toed_in_rig()
@@ -188,10 +189,53 @@ def test_ground_that_is_seen_too_coarsely_says_which_cells_show_it() -> None:
     facts = level(column, row, usable, RIG, PARAMS.model_copy(update={"sigma_disparity": 0.01}))
     assert facts["no_ground"]
     cell = float(facts["no_ground"].split("locus.cell_size to ")[1].split()[0])
-    params = LocusParams(cell_size=cell, sigma_disparity=0.01)
-    assert local_lattice(RIG, facts, cell, params).rows > 0
+    params = LocusParams(cell_size=cell, max_sigma=cell, sigma_disparity=0.01)
+    view = view_ground(RIG, RigidTransform.from_matrix(facts["T_local_left"]).rotation, facts["plane"])
+    assert local_lattice(view, cell, params).rows > 0
     with raises("RIL-344"):
-        local_lattice(RIG, facts, 0.5 * cell, params)
+        local_lattice(view, 0.5 * cell, params.model_copy(update={"max_sigma": 0.5 * cell}))
+
+
+WALL = pitched(90.0)
+"""Of a camera that looks at a wall z = -1.5 + 0.2 x, which a ball of half its points hides in part."""
+
+
+def wall(*more: Distance, noise: float = 0.1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    column, row, usable = disparity(RIG, WALL, nearest(plane(0.2, 0.0, -1.5), *more))
+    return column + smooth_noise(column.shape, noise, np.random.default_rng(3)), row, usable
+
+
+@pytest.mark.parametrize("reference", [SCENE, [*(WALL.rotation.T @ [0.2, 0.0, -1.0]), 0.0, 0.0, 1.5]])
+def test_without_ground_elevations_are_distances_from_another_plane(reference: str | list[float]) -> None:
+    maps = wall(ball((0.1, 0.1, -1.45), 0.15))
+    assert "no_ground" in level(*maps, RIG, PARAMS)
+    facts = level(*maps, RIG, PARAMS, reference=reference)
+    assert (facts["source"], "no_ground" in facts) == (REFERENCE_PLANE, False)
+    T = RigidTransform.from_matrix(facts["T_local_left"])
+    # The wall's normal towards the camera, in the camera's frame; z = 0 on the wall.
+    normal = WALL.rotation.T @ np.array([-0.2, 0.0, 1.0]) / math.hypot(0.2, 1.0)
+    assert T.rotation[2] @ normal > math.cos(math.radians(0.2))
+    assert T.translation == pytest.approx([0.0, 0.0, 1.5 / math.hypot(0.2, 1.0)], rel=3e-3, abs=1e-9)
+    # Right in the image is right on the wall, and the ball, which stands out by 0.1 m, within the range of the search.
+    assert T.rotation[0, 0] > 0.9
+    assert facts["z_range"][1] > 0.09
+    assert facts["footprint"][1] - facts["footprint"][0] > 0.8
+
+
+def test_a_scene_without_a_plane_is_measured_across_the_view() -> None:
+    heap = [
+        ball((x, y, -1.2 - 0.3 * ((5 * k) % 7)), 0.25)
+        for k, (x, y) in enumerate(np.mgrid[-2:3, -2:3].reshape(2, -1).T * 0.35)
+    ]
+    column, row, usable = disparity(RIG, WALL, nearest(*heap))
+    T = RigidTransform.from_matrix(level(column, row, usable, RIG, PARAMS, reference=SCENE)["T_local_left"])
+    assert T.rotation[2].tolist() == [0.0, 0.0, -1.0]
+
+
+def test_a_plane_through_the_camera_is_refused() -> None:
+    for plane_given in ([0.0, 0.0, 1.0, 0.3, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0, 1.0]):
+        with raises("RIL-379"):
+            level(*FLAT, RIG, PARAMS, reference=plane_given)
 
 
 def test_what_no_frame_can_be_posed_from_is_said_with_a_remedy() -> None:

@@ -6,7 +6,18 @@ import math
 import numpy as np
 import pytest
 from raising import raises
-from terrain_scenes import ball, box, disparity, interpolation_error, nearest, pitched, plane, smooth_noise, toed_in_rig
+from terrain_scenes import (
+    Distance,
+    ball,
+    box,
+    disparity,
+    interpolation_error,
+    nearest,
+    pitched,
+    plane,
+    smooth_noise,
+    toed_in_rig,
+)
 
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.core.validity import Validity
@@ -15,6 +26,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.surface import Surface, cylinder, sphere
 from rille.stages.geometry.surface import plane as reference_plane
 from rille.stages.terrain import ground_frame as level_stage
+from rille.stages.terrain.ground import view_ground
 from rille.stages.terrain.locus import kernel, stage
 from rille.stages.terrain.locus import solve as locus_solve
 from rille.stages.terrain.locus.kernel import Dem
@@ -380,8 +392,14 @@ def test_degraded_input() -> None:
         solve((column, row, usable), (-0.3, -1.0))
 
 
-def bundles(rig: Rig, height: float, noise: np.random.Generator) -> dict[str, Bundle]:
-    column, row, usable = disparity(rig, T_LOCAL_LEFT, plane(0.0, 0.0, -height))
+def bundles(
+    rig: Rig,
+    height: float,
+    noise: np.random.Generator,
+    seen: tuple[RigidTransform, Distance] | None = None,
+    reference: str | None = None,
+) -> dict[str, Bundle]:
+    column, row, usable = disparity(rig, *(seen or (T_LOCAL_LEFT, plane(0.0, 0.0, -height))))
     column = column + smooth_noise(column.shape, 0.1, noise)
     arrays = {
         "column_disparity": column.astype(np.float32),
@@ -392,7 +410,8 @@ def bundles(rig: Rig, height: float, noise: np.random.Generator) -> dict[str, Bu
     arrays["backmatch_error"][:, :40] = 1.2
     inputs = {"disparity": Bundle(arrays, {}), "rig": Bundle({}, {"rig": rig.to_dict()})}
     up = T_LOCAL_LEFT.rotation[2].tolist()
-    level = level_stage.ground_frame_stage.run(level_stage.GroundFrameParams(), {"up": up}, inputs)
+    given = {"up": up} if reference is None else {"reference": reference}
+    level = level_stage.ground_frame_stage.run(level_stage.GroundFrameParams(), given, inputs)
     return inputs | {"level": level, "left": Bundle({"level_0": IMAGE}, {})}
 
 
@@ -401,6 +420,39 @@ def test_the_coarser_pixel_tells_what_is_smoothed_away(scale: float, focal: floa
     inputs = bundles(scaled(scale), HEIGHT, np.random.default_rng(2))
     local = stage.locus_stage.run(LocusParams(cell_size=0.02), {"pair": 3, "frame": "local"}, inputs)
     assert local.meta["pixel_rad"] == pytest.approx(1.0 / focal)
+
+
+def test_the_surface_of_a_wall() -> None:
+    """Seen straight on and 1.5 m away, with a ball that stands out of it: its distances from the wall."""
+    facing, out = pitched(90.0), ball((0.1, 0.1, -1.55), 0.2)
+    inputs = bundles(RIG, HEIGHT, np.random.default_rng(2), (facing, nearest(plane(0.0, 0.0, -1.5), out)), "scene")
+    dem = stage.locus_stage.run(LocusParams(), {"pair": 3, "frame": "local"}, inputs)
+    check_outputs(stage.locus_stage, dem)
+    lattice, z = Lattice.from_dict(dem.meta["lattice"]), np.asarray(dem["elevation"])
+    T_wall = facing @ RigidTransform.from_matrix(inputs["level"].meta["T_local_left"]).inverse()
+    at = T_wall.apply(np.column_stack([lattice.xy().reshape(-1, 2), np.zeros(z.size)])).reshape(*z.shape, 3)
+    away = np.hypot(at[..., 0] - 0.1, at[..., 1] - 0.1)
+    truth = np.where(away < 0.19, np.sqrt(np.maximum(0.04 - away**2, 0.0)) - 0.05, 0.0)
+    given = np.isfinite(z) & ((away < 0.15) | (away > 0.3))
+    assert given.sum() > 0.8 * ((away < 0.15) | (away > 0.3)).sum() * dem.meta["defined"]
+    assert np.median(np.abs(z - truth)[given & (away < 0.1)]) < 0.02
+    assert np.mean(np.abs(z - truth)[given] < 2.0 * np.asarray(dem["elevation_std"])[given]) > 0.9
+    covered = dem.meta["coverage"]
+    assert covered["outside"] + covered["unsure"] < 0.1
+
+
+def test_limits_that_keep_pixels_off_the_map_are_named_and_bring_them_in() -> None:
+    inputs = bundles(RIG, HEIGHT, np.random.default_rng(2))
+    narrow = LocusParams(cell_size=0.01, max_sigma=0.004)
+    covered = stage.locus_stage.run(narrow, {"pair": 3, "frame": "local"}, inputs).meta["coverage"]
+    assert covered["outside"] + covered["unsure"] > 0.3
+    wider = narrow.model_copy(update={name.split(".")[1]: value for name, value in covered["settings"].items()})
+    dem = stage.locus_stage.run(wider, {"pair": 3, "frame": "local"}, inputs)
+    assert dem.meta["coverage"]["outside"] + dem.meta["coverage"]["unsure"] < 0.12
+    # Of the matched pixels, which leave out the left border of the image.
+    x_min, x_max, y_min, y_max = Lattice.from_dict(dem.meta["lattice"]).bounds
+    assert 0.6 * (x_max - x_min) < covered["size"][0] < x_max - x_min
+    assert covered["size"][1] == pytest.approx(y_max - y_min, rel=0.2)
 
 
 def test_stage_in_both_frames() -> None:
@@ -488,8 +540,8 @@ def test_the_automatic_extent_ends_where_pixels_cover_too_many_cells() -> None:
     """Camera 1.65 m above a street: a pixel at y covers y^2 / (f h) along the range."""
     rig = toed_in_rig()
     straight = Rig(rig.left, rig.left, RigidTransform(np.eye(3), [-0.5, 0.0, 0.0]))
-    level = {"T_local_left": pitched(0.0).to_list(), "plane": [0.0, 0.0, -1.65]}
-    lattice = stage.local_lattice(straight, level, 0.1, LocusParams(max_range_cells=5.0))
+    view = view_ground(straight, pitched(0.0).rotation, [0.0, 0.0, -1.65])
+    lattice = stage.local_lattice(view, 0.1, LocusParams(max_range_cells=5.0, max_sigma=0.1))
     assert lattice.bounds[3] == pytest.approx(math.sqrt(5 * 0.1 * rig.left.fy * 1.65), rel=0.05)
     near = 1.65 * rig.left.fy / (rig.left.height - 1 - rig.left.cy)
     assert lattice.bounds[2] == pytest.approx(near, rel=0.05)

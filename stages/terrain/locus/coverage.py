@@ -1,0 +1,82 @@
+"""Which of a pair's matched pixels its map holds, and by which limits it would hold nearly all of them.
+
+A matched pixel that the map lacks lies outside of it; or the cell there is too unsure to be given; or it is off the
+surface, hidden by what is higher there or on a face that stands upright on the plane, and no limit brings it in.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.geometry.lattice import MAX_CELLS, Lattice
+from rille.stages.terrain.ground import PlaneView
+
+NEARLY_ALL = 0.95
+"""Of the matched pixels that wider limits bring in."""
+ROOM = 1.05
+"""Factor on limits, for what is rounded."""
+SIGMAS = 3.0
+"""Standard deviations, besides a cell, within which a point lies on the surface."""
+
+
+class Limits(NamedTuple):
+    """``z_range`` of the search, m; largest standard deviation, m, of a cell (``std``) and by a typical disparity of a
+    pixel within the extent (``sigma``), infinite for none; ``range_cells`` that a pixel may cover there, infinite for a
+    stated extent."""
+
+    z_range: tuple[float, float]
+    std: float
+    sigma: float
+    range_cells: float
+
+
+def coverage(
+    view: PlaneView, surface: tuple[Floats32, Floats32], lattice: Lattice, sigma_d: float, limits: Limits
+) -> dict[str, Any]:
+    """Shares of the matched pixels that are ``outside``, ``unsure`` and ``off`` the surface; ``settings`` by which the
+    map would hold nearly all that lie within the range of elevations (None: no limit keeps them out), and ``size`` m
+    wide and high of it then.
+
+    Parameters
+    ----------
+    view : of the matched pixels.
+    surface : elevation and standard deviation (rows, cols), m, of all cells, the unsure ones too.
+    sigma_d : standard deviation of a typical disparity, pixels.
+    """
+    x, y, z = view.xyz.T
+    x_min, x_max, y_min, y_max = lattice.bounds
+    searched = (z >= limits.z_range[0]) & (z <= limits.z_range[1])
+    inside = searched & (x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max)
+    row, col = np.rint(lattice.index(view.xyz[inside, :2])).astype(np.intp).clip(0, np.array(lattice.shape) - 1).T
+    elevation, std = (values[row, col].astype(np.float64) for values in surface)
+    on = np.abs(elevation - z[inside]) <= SIGMAS * std + lattice.cell
+    shares = {
+        "outside": 1.0 - np.count_nonzero(inside) / len(z),
+        "unsure": np.count_nonzero(on & (std > limits.std)) / len(z),
+        "off": np.count_nonzero(~on) / len(z),
+    }
+    facts: dict[str, Any] = {**shares, "settings": None, "size": None}
+    if not on.any():
+        return facts
+    # Cells that are too unsure ask for a higher limit in proportion.
+    sigma = max(_most(std[on]) * limits.sigma / limits.std, _most(sigma_d / view.slope[searched]))
+    cells = _most(view.along[searched] / lattice.cell)
+    needs = {"locus.max_sigma": (sigma, limits.sigma), "locus.max_range_cells": (cells, limits.range_cells)}
+    wider = {name: need for name, (need, limit) in needs.items() if need > limit}
+    if wider:
+        good = searched & (sigma_d / view.slope <= max(sigma, limits.sigma))
+        good &= view.along <= max(cells, limits.range_cells) * lattice.cell
+        low, high = np.quantile(view.xyz[good, :2], [view.stray, 1.0 - view.stray], axis=0)
+        facts["size"] = (high - low).tolist()
+        if np.prod(high - low) > 0.5 * MAX_CELLS * lattice.cell**2:
+            wider = {"locus.cell_size": max(sigma, cells * lattice.cell / limits.range_cells)}
+        facts["settings"] = {name: float(f"{need:.2g}") for name, need in wider.items()}
+    return facts
+
+
+def _most(values: Floats) -> float:
+    """What nearly all of the values do not exceed, with some room."""
+    return ROOM * float(np.quantile(values, NEARLY_ALL))
