@@ -19,7 +19,8 @@ from rille.stages.hfvm.epipolar import typical
 from rille.stages.hfvm.image import Grey, Image
 from rille.stages.hfvm.level import State
 from rille.stages.hfvm.windows import Shape, Window, thinned
-from rille.stages.numeric.robust import cauchy, irls_held
+from rille.stages.numeric.least_squares import irls
+from rille.stages.numeric.robust import cauchy
 
 SAMPLES, LEAST = 4000, 100
 """Pixels that a polynomial is fitted to at most, and that it needs at least."""
@@ -100,7 +101,8 @@ def _fit(basis: Floats, target: Floats) -> Floats:
         return cauchy(off, max(SCATTER, 1.5 * typical(off)))
 
     # Terms that the matches leave open stay near zero instead of growing outside of them.
-    return irls_held(basis, target, weigh, np.full(len(basis), 1e-3 * target.size), iterations=ITERATIONS)
+    hold = 1e-3 * target.size * np.eye(len(basis))
+    return irls(basis.T, target, weigh, hold, np.zeros(len(basis)), ITERATIONS)
 
 
 def greatest(ratio: Floats) -> float:

@@ -19,7 +19,8 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
-from rille.stages.numeric.robust import cauchy, irls_held
+from rille.stages.numeric.least_squares import irls
+from rille.stages.numeric.robust import cauchy
 
 Matrix = NDArray[np.float64]
 
@@ -90,7 +91,7 @@ def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float
         spread = max(sigma, 2.0 * middle if first else min(0.5 * spread, 1.5 * middle + sigma))
         return cauchy(residual, spread) / sigma**2
 
-    g = irls_held(terms, -yr, weigh, PRIOR**-2.0, prior, ITERATIONS)
+    g = irls(terms.T, -yr, weigh, np.diag(PRIOR**-2.0), prior, ITERATIONS)
     residual = g @ terms + yr
     cost = float(np.sum(np.log1p((residual / sigma) ** 2)) + np.sum(((g - prior) / PRIOR) ** 2))
     f = np.array([[g[1], g[2], g[0]], [g[3], g[4], 1.0], [g[5], g[6], g[7]]])

@@ -25,7 +25,8 @@ from rille.stages.hfvm.epipolar import typical
 from rille.stages.hfvm.image import Grey, Image, Layer
 from rille.stages.hfvm.windows import Shape, Window
 from rille.stages.imaging.pyramid import filled_from
-from rille.stages.numeric.robust import cauchy, irls_held
+from rille.stages.numeric.least_squares import irls
+from rille.stages.numeric.robust import cauchy
 
 Matrix = NDArray[np.float64]
 
@@ -221,7 +222,7 @@ def _solve(p: AnyArray, d: AnyArray, tolerance: float) -> tuple[Matrix, AnyArray
         # Squared Cauchy weights: other surfaces, off by many pixels, must not drag the plane along.
         return np.tile(cauchy(error, spread) ** 2, 2)
 
-    h = irls_held(terms, target, weigh, np.full(8, 1e-6 * len(one)), iterations=ITERATIONS)
+    h = irls(terms.T, target, weigh, 1e-6 * len(one) * np.eye(8), rounds=ITERATIONS)
     error = np.hypot(*(h @ terms - target).reshape(2, -1))
     return np.append(h, 0.0).reshape(3, 3) + np.eye(3), error
 

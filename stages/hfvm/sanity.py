@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
-from rille.stages.numeric.robust import cauchy, irls_held
+from rille.stages.numeric.least_squares import irls
+from rille.stages.numeric.robust import cauchy
 
 LEAST, SAMPLES, PATCHES = 100, 2000, 150
 """Matches that a judgement needs at least, those that the lines are fitted to, and those whose likeness is sought."""
@@ -174,8 +175,8 @@ def _keystone(x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray) -> tuple[float
         return cauchy(residual, spread)
 
     # A flat scene has no depth, whose terms are zero: without a hold the matrix would be singular.
-    hold = np.full(terms.shape[1], 1e-9 * len(x))
-    solution = irls_held(terms.T, v, weigh, hold, iterations=SWAP_ITERATIONS)
+    hold = 1e-9 * len(x) * np.eye(terms.shape[1])
+    solution = irls(terms, v, weigh, hold, np.zeros(terms.shape[1]), SWAP_ITERATIONS)
     weight = weigh(terms @ solution - v)
-    normal = (terms * weight[:, None]).T @ terms + np.diag(hold)
+    normal = (terms * weight[:, None]).T @ terms + hold
     return float(solution[0]), spread * float(np.sqrt(np.linalg.inv(normal)[0, 0]))

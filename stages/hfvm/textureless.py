@@ -42,7 +42,8 @@ from rille.stages.hfvm.image import Layer
 from rille.stages.hfvm.uncertainty import BLANK
 from rille.stages.hfvm.wide_search import RADIUS, SIDE, Pair, excess, search
 from rille.stages.hfvm.windows import Window
-from rille.stages.numeric.robust import MAD_TO_SIGMA, cauchy, irls_held
+from rille.stages.numeric.least_squares import irls
+from rille.stages.numeric.robust import MAD_TO_SIGMA, cauchy
 
 LEVEL = 1
 """Halving once halves noise, and a quarter of the pixels is to be searched."""
@@ -214,7 +215,7 @@ def _fit(x: AnyArray, y: AnyArray, step: AnyArray, votes: AnyArray) -> tuple[Any
     # Should all be steep, the flat one is left.
     planes = np.vstack([[np.median(d), 0.0, 0.0], planes[(np.abs(planes[:, 1:]) <= STEEPEST).all(axis=1)]])
     g = planes[np.argmax(_support(planes, t, d, weight.astype(np.int64)))]
-    g = irls_held(t, d, lambda error: weight * cauchy(error, NEAR) ** 2, np.full(3, 1e-6), g, ITERATIONS)
+    g = irls(t.T, d, lambda error: weight * cauchy(error, NEAR) ** 2, 1e-6 * np.eye(3), g, ITERATIONS)
     return g, np.abs(g @ terms - step)
 
 

@@ -63,22 +63,47 @@ def levenberg_marquardt(problem: Problem[X, N], state: X, iterations: int, toler
     return Minimum(state, first, now, steps)
 
 
-def irls(design: Floats, target: Floats, weigh: Callable[[Floats], Floats], prior: Floats, rounds: int = 5) -> Floats:
-    """Unknowns (..., k, m) of ``design @ x = target`` by reweighted least squares.
+SETTLED_SHARE = 1e-9
+"""Change of the unknowns over their size below which a fit has settled: of a height of metres, nanometres."""
+
+
+def irls(
+    design: Floats,
+    target: Floats,
+    weigh: Callable[[Floats], Floats],
+    prior: Floats | None = None,
+    start: Floats | None = None,
+    rounds: int = 20,
+) -> Floats:
+    """Unknowns x of ``design @ x = target`` by reweighted least squares, as ``target`` (..., k, m) or (k,).
+
+    They minimise ``sum w |design x - target|^2 + (x - start)' prior (x - start)``, the weights w being those of the
+    residuals that the round before left.
 
     Parameters
     ----------
-    design, target : (..., n, k) and (..., n, m); leading axes are problems of their own.
+    design, target : (..., n, k) and (..., n, m), leading axes being problems of their own; or (n, k) and (n,).
     weigh : weights (..., n) of the lengths (..., n) of the rows' residuals.
-    prior : (k, k), added to the normal matrices.
-    rounds : a fixed number, so that a result never hangs on a rounding that decides whether one more is done.
+    prior : (k, k), information that is held besides; without any the weighted rows must determine the unknowns.
+    start : what the first weights are of, and what the prior holds; None: weights of residuals of 0, and zeros.
+    rounds : at most; fewer where the unknowns have settled.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        The rows that have weight do not determine the unknowns.
     """
-    x = np.zeros((*target.shape[:-2], design.shape[-1], target.shape[-1]))
-    weights = np.ones(target.shape[:-1])
-    for again in range(rounds):
-        if again:
-            rest = target - design @ x
-            weights = weigh(np.sqrt((rest**2).sum(-1)))
-        weighted = np.swapaxes(design * weights[..., None], -1, -2)
-        x = np.linalg.solve(weighted @ design + prior, weighted @ target)
-    return x
+    several = target.ndim == design.ndim
+    y = target if several else target[..., None]
+    x = first = np.zeros((*y.shape[:-2], design.shape[-1], y.shape[-1]))
+    if start is not None:
+        x = first = start if several else start[..., None]
+    rest = np.zeros(y.shape) if start is None else y - design @ x
+    held = np.zeros(2 * (design.shape[-1],)) if prior is None else prior
+    for _ in range(rounds):
+        weighted = np.swapaxes(design * weigh(np.sqrt((rest**2).sum(-1)))[..., None], -1, -2)
+        last, x = x, np.linalg.solve(weighted @ design + held, weighted @ y + held @ first)
+        if np.abs(x - last).max() <= SETTLED_SHARE * np.abs(x).max():
+            break
+        rest = y - design @ x
+    return x if several else x[..., 0]

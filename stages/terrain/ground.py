@@ -22,7 +22,7 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.scale import coarser_focal, of_rig
-from rille.stages.numeric.robust import irls
+from rille.stages.numeric.least_squares import irls
 
 
 class NoGroundError(DegenerateError):
@@ -81,10 +81,10 @@ def fit_plane(
         information = tolerance**-2.0
 
         def biweight(residual: Floats) -> Floats:
-            """Tukey's weight of the residual over twice the tolerance."""
-            return np.asarray(np.maximum(0.0, 1.0 - 0.25 * residual**2 * information) ** 2)
+            """Tukey's weight of the residual over twice the tolerance, on that of the observation."""
+            return np.asarray(information * np.maximum(0.0, 1.0 - 0.25 * residual**2 * information) ** 2)
 
-        theta, _ = irls(rays, rho, information, biweight, theta)
+        theta = irls(rays, rho, biweight, start=theta)
         expected = rays @ theta
         share = float(np.mean((expected > HORIZON * sigma) & (np.abs(rho - expected) < tolerance)))
         # theta = -n / h: its length is one over the height.

@@ -23,7 +23,8 @@ from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import Bundle, NoParams, raster, stage
 from rille.stages.facts.terrain import DemFacts, OverlapFacts
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, irls, mad_sigma
+from rille.stages.numeric.least_squares import irls
+from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
 
 BLOCKS = 49
 """Approximate number of blocks of an overlap; each is wider than errors are alike."""
@@ -93,9 +94,9 @@ def fit_seam(difference: Floats, x: Floats, y: Floats) -> SeamFit | None:
 def _robust(design: Floats, value: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """Plane (3,) and its covariance: first by least absolute deviations, which gross errors do not capture."""
     floor = 1e-12 * float(np.abs(value).max(initial=0.0)) + 1e-300
-    start, _ = irls(design, value, weight, lambda r: 1.0 / np.maximum(np.abs(r), 0.01 * mad_sigma(r, 0.0) + floor))
+    start = irls(design, value, lambda r: weight / np.maximum(r, 0.01 * mad_sigma(r, 0.0) + floor))
     scale = mad_sigma(value - design @ start, 0.0) + floor
-    plane, _ = irls(design, value, weight, lambda r: bisquare(r / (TUKEY_BISQUARE * scale)), start)
+    plane = irls(design, value, lambda r: weight * bisquare(r / (TUKEY_BISQUARE * scale)), start=start)
     residual = value - design @ plane
     u = np.minimum((residual / (TUKEY_BISQUARE * scale)) ** 2, 1.0)
     # Tukey's psi and its derivative: variance of an M-estimate, with three parameters taken from n blocks.
