@@ -74,7 +74,8 @@ def refuse_unreadable(keys: Iterable[str], config: Params, sequence: Sequence) -
     """
     simulated = sequence.simulation is not None
     foreign = recorded() if simulated else driven()
-    lost = [key for key in keys if key.partition(".")[0] in foreign]
+    # A drive is over ground.
+    lost = [key for key in keys if key.partition(".")[0] in foreign or (simulated and key == "terrain.reference")]
     if sequence.simulation is None and sequence.lenses is None:
         lost += [key for key in keys if key.startswith("undistort.")]
     if lost:
@@ -104,9 +105,8 @@ def unread(keys: Iterable[str], config: Params, graph: Graph) -> list[str]:
     """Those of the keys that no task of a complete graph reads."""
     kinds = {type(h.spec.params) for h in graph.nodes}
     read = {name for name in type(config).model_fields if type(getattr(config, name)) in kinds}
-    # Sections that reach stages as arguments, not as their parameters: the flow of a drive, the vehicle, resection in
-    # `refine`.
-    read |= {"drive"} | {name for h in graph.nodes for name in h.spec.args if name in ("vehicle", "resect")}
+    # Sections that reach stages as arguments, not as their parameters: the flow, the vehicle, resection in `refine`.
+    read |= {"drive", "terrain"} | {name for h in graph.nodes for name in h.spec.args if name in ("vehicle", "resect")}
     read |= {"tiling"} if "hfvm" in read else set()
     return [key for key in keys if key.partition(".")[0] not in read]
 

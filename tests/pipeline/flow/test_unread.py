@@ -53,6 +53,7 @@ def test_what_a_user_has_switched_off_himself_may_stay(tmp_path):
         ("mockup", "undistort.interpolation=linear"),
         ("mockup-loop", "refine.iterations=3"),
         ("mockup-loop", "crosscheck.enabled=true"),
+        ("mockup-loop", "terrain.reference=scene"),
     ],
 )
 def test_what_no_such_run_can_read_is_refused_before_anything_is_computed(tmp_path, name, assignment, capsys):
