@@ -84,27 +84,42 @@ def relax(
     """
     if not keep.any():
         return start
-    across, down = bends
     # About the mean, so that single precision is enough.
     middle = np.nanmean(start)
-    at = np.nan_to_num(start - middle)
-    total = power + np.float32(4.0) * (across + down)
-    total[:, 1:] += across[:, :-1]
-    total[:, :-1] += across[:, 1:]
-    total[1:] += down[:-1]
-    total[:-1] += down[1:]
-    inverse = np.divide(np.float32(1.0), total, out=np.zeros_like(total), where=keep & (total > 0.0))
-    equations = _Equations(*map(_coloured, (at, across, down, power * at + pull, inverse)))
+    shape = start.shape[0] + 2 * BORDER, COLOURS, -(-start.shape[1] // COLOURS) + 2
+    equations = _Equations(*np.zeros((len(_Equations._fields), *shape), np.float32))
+    _colour(start - middle, power, pull, bends, equations)
+    _invert(power, keep, equations)
     _sweeps(equations, sweeps)
-    rows, cols = start.shape
-    moved = equations.at[BORDER:-BORDER].transpose(0, 2, 1).reshape(rows, -1)[:, COLOURS : COLOURS + cols]
-    return np.where(keep, moved + middle, start)
+    moved = equations.at[BORDER:-BORDER].transpose(0, 2, 1).reshape(len(start), -1)[:, COLOURS:]
+    return np.where(keep, moved[:, : start.shape[1]] + middle, start)
 
 
-def _coloured(field: Floats32) -> Floats32:
-    """A field (rows, cols) as (row, colour, column / 3), with a border of nothing."""
-    padded = np.pad(field, [(BORDER, BORDER), (COLOURS, COLOURS + -field.shape[1] % COLOURS)])
-    return np.ascontiguousarray(padded.reshape(len(padded), -1, COLOURS).transpose(0, 2, 1), np.float32)
+@njit(cache=True, nogil=True)
+def _colour(start, power, pull, bends, out):  # type: ignore[no-untyped-def]
+    """Fill the equations, all but the inverse, from arrays (rows, cols); what is NaN in the start stays 0."""
+    (across, down), (at, by_row, by_column, goal, _) = bends, out
+    for r in range(start.shape[0]):
+        for c in range(start.shape[1]):
+            i, k, m = r + BORDER, c % COLOURS, c // COLOURS + 1
+            by_row[i, k, m], by_column[i, k, m], goal[i, k, m] = across[r, c], down[r, c], pull[r, c]
+            if np.isfinite(start[r, c]):
+                at[i, k, m] = start[r, c]
+                goal[i, k, m] += power[r, c] * start[r, c]
+
+
+@njit(cache=True, nogil=True)
+def _invert(power, keep, out):  # type: ignore[no-untyped-def]
+    """Fill the inverse of all weights of a cell: of the data, of the bend about it, and of those that end there."""
+    (_, across, down, _, inverse), four = out, np.float32(4.0)
+    for r in range(power.shape[0]):
+        for c in range(power.shape[1]):
+            i, k, m = r + BORDER, c % COLOURS, c // COLOURS + 1
+            before, behind = (c - 1) % COLOURS, (c + 1) % COLOURS
+            weight = power[r, c] + four * (across[i, k, m] + down[i, k, m]) + down[i - 1, k, m] + down[i + 1, k, m]
+            weight += across[i, before, (c - 1) // COLOURS + 1] + across[i, behind, (c + 1) // COLOURS + 1]
+            if keep[r, c] and weight > 0.0:
+                inverse[i, k, m] = np.float32(1.0) / weight
 
 
 @njit(cache=True, nogil=True)

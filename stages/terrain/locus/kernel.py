@@ -238,7 +238,7 @@ def _bound(p, q, span):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fastest(line, span):  # type: ignore[no-untyped-def]
-    """Greatest image speed |d p / d Z| of a line on a span, pixels per metre.
+    """Square of the greatest image speed |d p / d Z| of a line on a span, pixels per metre.
 
     d p / d Z = (b - p b_2) / w with w linear in Z, so it is greatest at one of the ends.
     """
@@ -247,7 +247,7 @@ def fastest(line, span):  # type: ignore[no-untyped-def]
         part = 1.0 / max(line.a2 + z * line.b2, MIN_DEPTH)
         x, y = (line.a0 + z * line.b0) * part, (line.a1 + z * line.b1) * part
         dx, dy = (line.b0 - x * line.b2) * part, (line.b1 - y * line.b2) * part
-        speed = max(speed, math.sqrt(dx * dx + dy * dy))
+        speed = max(speed, dx * dx + dy * dy)
     return speed
 
 
@@ -255,7 +255,7 @@ def fastest(line, span):  # type: ignore[no-untyped-def]
 def steps_of(lines, span, start):  # type: ignore[no-untyped-def]
     """:class:`Steps` of a cell on the visible ``span`` of Z, searched from the interval ``start``, both (low, high)."""
     bottom, top = span
-    speed = max(fastest(lines.left, span), fastest(lines.right, span))
+    speed = math.sqrt(max(fastest(lines.left, span), fastest(lines.right, span)))
     count = max(1.0, min(np.ceil(speed * (top - bottom) / STEP_PX), MAX_STEPS))
     dz = (top - bottom) / count
     first = max(0.0, min(count, np.ceil((start[1] - bottom) / dz) + MARGIN_STEPS))

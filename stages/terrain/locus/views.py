@@ -110,7 +110,8 @@ def _look(block, z, views, out):  # type: ignore[no-untyped-def]
             u, v = _motion(P_right, at_right, normal)
             out.right[r, c], out.right_slope[r, c] = grey, gx * u + gy * v
             # Along the left ray the left image stays: what the right one moves by is disparity.
-            u, v = _motion(P_right, at_right, (ray[0] / toward, ray[1] / toward, ray[2] / toward))
+            part = 1.0 / toward
+            u, v = _motion(P_right, at_right, (ray[0] * part, ray[1] * part, ray[2] * part))
             out.scale[r, c], out.area[r, c] = math.sqrt(u * u + v * v), 1.0
             if rows > 1 and cols > 1:
                 down = _motion(P, at, _step(foot, vector(feet, below, c)))
@@ -125,24 +126,24 @@ def _step(a, b):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _pixel(P, point):  # type: ignore[no-untyped-def]
-    """x, y, pixels, and the projective depth of a point."""
+    """x, y, pixels, and the inverse of the projective depth of a point."""
     p, q, w = P
-    depth = dot(w, point) + w[3]
-    return (dot(p, point) + p[3]) / depth, (dot(q, point) + q[3]) / depth, depth
+    part = 1.0 / (dot(w, point) + w[3])
+    return (dot(p, point) + p[3]) * part, (dot(q, point) + q[3]) * part, part
 
 
 @njit(cache=True, nogil=True)
 def _is_inside(at, shape):  # type: ignore[no-untyped-def]
     """Whether the spline of an image of a shape is defined at a pixel in front of the camera."""
-    x, y, depth = at
+    x, y, part = at
     rows, cols = shape
-    return depth > 0.0 and x >= 1.0 and y >= 1.0 and x < cols - 2.0 and y < rows - 2.0
+    return part > 0.0 and x >= 1.0 and y >= 1.0 and x < cols - 2.0 and y < rows - 2.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _motion(P, at, step):  # type: ignore[no-untyped-def]
-    """Pixels that the projection ``at`` (x, y, depth) of a point moves by when the point moves by ``step``."""
-    x, y, depth = at
+    """Pixels that the projection ``at`` (x, y, 1 / depth) of a point moves by when the point moves by ``step``."""
+    x, y, part = at
     p, q, w = P
     d2 = dot(w, step)
-    return (dot(p, step) - x * d2) / depth, (dot(q, step) - y * d2) / depth
+    return (dot(p, step) - x * d2) * part, (dot(q, step) - y * d2) * part
