@@ -98,7 +98,8 @@ def relax(
 @njit(cache=True, nogil=True)
 def _colour(start, power, pull, bends, out):  # type: ignore[no-untyped-def]
     """Fill the equations, all but the inverse, from arrays (rows, cols); what is NaN in the start stays 0."""
-    (across, down), (at, by_row, by_column, goal, _) = bends, out
+    (across, down), at, goal = bends, out.at, out.goal
+    by_row, by_column = out.across, out.down
     for r in range(start.shape[0]):
         for c in range(start.shape[1]):
             i, k, m = r + BORDER, c % COLOURS, c // COLOURS + 1
@@ -111,7 +112,7 @@ def _colour(start, power, pull, bends, out):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _invert(power, keep, out):  # type: ignore[no-untyped-def]
     """Fill the inverse of all weights of a cell: of the data, of the bend about it, and of those that end there."""
-    (_, across, down, _, inverse), four = out, np.float32(4.0)
+    across, down, inverse, four = out.across, out.down, out.inverse, np.float32(4.0)
     for r in range(power.shape[0]):
         for c in range(power.shape[1]):
             i, k, m = r + BORDER, c % COLOURS, c // COLOURS + 1
