@@ -49,7 +49,7 @@ def gc(
     What was made or used within a day stays: a run may be under way.
     """
     from rille.pipeline.engine.memory import words
-    from rille.pipeline.engine.runtime import numba_cache
+    from rille.pipeline.engine.runtime import kernels
     from rille.pipeline.engine.store import maintenance
     from rille.pipeline.engine.store.base import Store
     from rille.pipeline.runs import lookup, roots
@@ -70,7 +70,7 @@ def gc(
         for stage, sizes in sorted(cleared.items(), key=lambda item: -sum(item[1])):
             print(f"{stage:18s} {len(sizes):6d} {words(sum(sizes)):>8s}")
     else:
-        for path in numba_cache.unused():
+        for path in kernels.unused():
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
     verb, artifacts = "would remove" if dry_run else "removed", [size for sizes in cleared.values() for size in sizes]
     size = sum(artifacts) + sum(leftovers)

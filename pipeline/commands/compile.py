@@ -14,7 +14,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 from rille.pipeline.commands.options import COMPLETE, Options
-from rille.pipeline.engine.runtime import numba_cache
+from rille.pipeline.engine.runtime import kernels
 from rille.pipeline.runs.session import perform
 
 SMALL = (
@@ -44,9 +44,9 @@ def compile_kernels() -> int:
         perform(Options("mockup-short", SMALL, runs=runs, cache=cache, progress="quiet"))
         perform(Options("mockup-loop", SHORT, runs=runs, cache=cache, progress="quiet", verb="drive"))
     made, seconds = len(_kernels() - before), time.perf_counter() - began
-    print(f"{numba_cache.folder()}  kernels compiled: {made}, in {seconds:.0f} s")
+    print(f"{kernels.folder()}  kernels compiled: {made}, in {seconds:.0f} s")
     return COMPLETE
 
 
 def _kernels() -> set[str]:
-    return {path.name for path in numba_cache.folder().glob("*.nbc")}
+    return {path.name for path in kernels.folder().glob("*.nbc")}

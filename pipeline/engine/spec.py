@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, TypeVar
 from rille.pipeline.engine.code_digest import module_digests
 from rille.pipeline.engine.keys import text
 from rille.pipeline.engine.packages import versions
-from rille.pipeline.engine.runtime.numba_cache import guard
+from rille.pipeline.engine.runtime.kernels import use_own_folder
 from rille.pipeline.engine.store.manifest import Ref
 from rille.stages.core.declare import Params, Stage, declared
 
@@ -96,7 +96,7 @@ _forms_by_id: dict[int, _Forms] = {}
 def resolve(module: str) -> Stage:
     """The stage of a module; its source is digested just before the import, so that both see the same files."""
     module_digests(module)
-    guard()
+    use_own_folder()
     stage = declared(importlib.import_module(module))
     if "cv2" in sys.modules:
         # OpenCV takes a thread a core by default, and there is a worker for each core already.

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rille.pipeline.engine.graph import Took
-from rille.pipeline.engine.runtime.numba_cache import COMPILING
+from rille.pipeline.engine.runtime.kernels import COMPILING
 from rille.pipeline.engine.spec import Refs, Spec, each, key_of, recipe
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import Ref

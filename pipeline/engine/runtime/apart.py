@@ -19,11 +19,12 @@ from typing import Any
 
 from rille.pipeline.engine.runtime.private import private_folder
 
-Execute = Callable[[ModuleType], None]
-
 SEARCH_PATHS = ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH")
 
 NUMBA_CONFIG = "numba.core.config"
+
+READ_SETTINGS = (NUMBA_CONFIG, "matplotlib")
+"""Modules that read settings of the current folder when they are imported."""
 
 _lock, _was_on_path = Lock(), list[bool]()
 
@@ -57,25 +58,16 @@ def take_back() -> None:
             os.environ.pop("PYTHONSAFEPATH", None)
 
 
-class Hook(importlib.abc.MetaPathFinder):
-    """Lets ``run`` execute a module, when it is imported."""
-
-    def __init__(self, name: str, run: Callable[[Execute, ModuleType], None]) -> None:
-        self.name, self.run = name, run
+class _Elsewhere(importlib.abc.MetaPathFinder):
+    """Finds modules that read settings of the current folder as Python does, and has them executed elsewhere."""
 
     def find_spec(self, name: str, path: Any, target: ModuleType | None = None) -> ModuleSpec | None:
-        """Find the module as Python does; also where it is only asked for, and not imported."""
-        spec = PathFinder.find_spec(name, path) if name == self.name else None
+        """Find the module; also where it is only asked for, and not imported."""
+        spec = PathFinder.find_spec(name, path) if name in READ_SETTINGS else None
         if spec is not None and spec.loader is not None:
             execute = spec.loader.exec_module
-            spec.loader.exec_module = lambda module: self.run(execute, module)  # type: ignore[method-assign]
+            spec.loader.exec_module = lambda module: _execute_elsewhere(execute, module)  # type: ignore[method-assign]
         return spec
-
-
-def hook(name: str, run: Callable[[Execute, ModuleType], None]) -> None:
-    """Let ``run`` execute a module that is not imported yet; a second time nothing changes."""
-    if not any(isinstance(finder, Hook) and finder.name == name for finder in sys.meta_path):
-        sys.meta_path.insert(0, Hook(name, run))
 
 
 def ignore_settings() -> None:
@@ -83,11 +75,11 @@ def ignore_settings() -> None:
 
     For processes of our own: while one of them is imported, the process is in another folder.
     """
-    for name in (NUMBA_CONFIG, "matplotlib"):
-        hook(name, _execute_elsewhere)
+    if not any(isinstance(finder, _Elsewhere) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _Elsewhere())
 
 
-def _execute_elsewhere(execute: Execute, module: ModuleType) -> None:
+def _execute_elsewhere(execute: Callable[[ModuleType], None], module: ModuleType) -> None:
     with ExitStack() as stack:
         with suppress(FileNotFoundError):  # the current folder was removed: it holds nothing
             stack.enter_context(chdir(private_folder()))

@@ -10,7 +10,7 @@ from functools import cache
 
 from rille.pipeline.engine.code_digest import remember_in
 from rille.pipeline.engine.runtime.apart import absolute_search_paths
-from rille.pipeline.engine.runtime.numba_cache import guard
+from rille.pipeline.engine.runtime.kernels import use_own_folder
 from rille.pipeline.engine.runtime.private import private_folder
 
 SINGLE = ("OMP", "OPENBLAS", "MKL", "NUMBA", "BLIS", "VECLIB_MAXIMUM", "NUMEXPR")
@@ -31,7 +31,7 @@ def prepare_environment() -> None:
     """Set this process up to run stages itself, and to start workers."""
     _remember_sources()
     os.environ.update(worker_environment())
-    guard()
+    use_own_folder()
 
 
 @cache

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rille.pipeline.commands import compile as compilation
-from rille.pipeline.engine.runtime import numba_cache
+from rille.pipeline.engine.runtime import kernels as compiled
 from rille.stages.core.errors import RilleError
 
 
@@ -22,7 +22,7 @@ def kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     made = tmp_path / "kernels"
     made.mkdir()
     (made / "old.nbc").touch()
-    monkeypatch.setattr(numba_cache, "folder", lambda: made)
+    monkeypatch.setattr(compiled, "folder", lambda: made)
     return made
 
 

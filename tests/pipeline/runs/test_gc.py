@@ -11,7 +11,7 @@ from raising import raises
 from toys.chain import run
 
 from rille.pipeline.commands import cache as commands
-from rille.pipeline.engine.runtime import numba_cache
+from rille.pipeline.engine.runtime import kernels
 from rille.pipeline.engine.store import maintenance
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import artifact_path
@@ -32,7 +32,7 @@ def test_what_no_kept_run_needs_goes_and_is_listed_first(two, tmp_path, capsys, 
         path.write_bytes(b"1234")
     (store.root / "quarantine").mkdir()
     (store.root / "quarantine/toy.zarr.zip").write_bytes(b"1234")
-    monkeypatch.setattr(numba_cache, "unused", lambda: [kernel, older])
+    monkeypatch.setattr(kernels, "unused", lambda: [kernel, older])
     shutil.rmtree(second)
     assert maintenance.gc(store, kept) == {}, "all is young"
     for path in store.root.rglob("*"):
