@@ -99,7 +99,7 @@ class Options(Work):
     ] = False
     runs: Runs = RUNS
     progress: Annotated[
-        Literal["auto", "bar", "plain", "json", "quiet"], Parameter(help="How progress is shown on stderr.")
+        Literal["auto", "bar", "plain", "quiet"], Parameter(help="How progress is shown on stderr.")
     ] = "auto"
     quiet: Annotated[bool, flag("No progress; warnings and errors only.", "--quiet", "-q")] = False
     verbose: Annotated[bool, flag("Say where to watch dask at work.", "--verbose", "-v")] = False

@@ -2,7 +2,7 @@
 
 Every worker must have the source code, the Python and the packages of the client, use one thread a library, and see
 the same cache: a probe is written by each side and read by the other. One that differs is named with the difference,
-and the run does not begin. A worker that joins later is compared at its first task, which fails there.
+and the run does not begin. One that joins later computes the key of each task itself, and fails where it differs.
 """
 
 from __future__ import annotations
@@ -13,13 +13,11 @@ import time
 import uuid
 from collections.abc import Mapping
 from contextlib import suppress
-from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine.code_digest import OWN, tree_digest
-from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.packages import version
 from rille.pipeline.engine.runtime import atomic
 from rille.stages.core.errors import ConfigError, RilleError
@@ -54,12 +52,6 @@ def identity() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             found[name] = "none"
     return found
-
-
-@cache
-def likeness() -> str:
-    """Digest of the facts that client and workers must share, as this process has them."""
-    return digest(identity())
 
 
 def compare(ours: Identity, cache: Path, token: str) -> str:

@@ -1,14 +1,13 @@
-"""Progress of a run on stderr: a bar with an estimate on a terminal, plain lines elsewhere, JSON lines, or nothing.
+"""Progress of a run on stderr: a bar with an estimate on a terminal, plain lines elsewhere, or nothing.
 
 The estimate of the time left is that of :mod:`rille.pipeline.engine.estimate`.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 import time
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from rille.pipeline.engine.estimate import Earlier, Estimate
 from rille.pipeline.engine.plain import plain, raw
@@ -27,11 +26,11 @@ SLOW_COMPILE = 1.0
 
 
 def make(mode: str = "auto", stream: TextIO | None = None, *, verbose: bool = False) -> Progress:
-    """``auto`` (bar on a terminal, else plain), ``bar``, ``plain``, ``json``, ``quiet``; ``verbose``: with details."""
+    """``auto`` (bar on a terminal, else plain), ``bar``, ``plain``, ``quiet``; ``verbose``: with details."""
     stream = stream or sys.stderr
     if mode == "auto":
         mode = "bar" if stream.isatty() else "plain"
-    kinds: dict[str, type[Progress]] = {"bar": Bar, "plain": Lines, "json": Json, "quiet": Progress}
+    kinds: dict[str, type[Progress]] = {"bar": Bar, "plain": Lines, "quiet": Progress}
     if mode not in kinds:
         raise ConfigError("RIL-568", f"progress {mode!r} is unknown", remedy=f"one of auto, {', '.join(kinds)}")
     progress = kinds[mode](stream)
@@ -114,38 +113,6 @@ class Lines(Progress):
 
     def _say(self, text: str) -> None:
         print(f"rille: {text}", file=self.stream, flush=True)
-
-
-class Json(Progress):
-    """One JSON object a line for every step: for programs."""
-
-    def running(self, handle: Handle) -> None:
-        """``{"event": "running", ...}``."""
-        self._say(event="running", label=handle.label, stage=handle.stage, reason=handle.reason)
-
-    def resolved(self, handle: Handle) -> None:
-        """``{"event": "computed" | "cached" | "failed" | "skipped" | "planned", ...}``."""
-        super().resolved(handle)
-        self._say(
-            event=handle.status,
-            label=handle.label,
-            stage=handle.stage,
-            seconds=round(handle.took.seconds, 4),
-            done=self.done,
-            total=self.total(),
-            left=self.estimate.left(),
-        )
-
-    def failed(self, label: str, error: BaseException) -> None:
-        """``{"event": "error", ...}``."""
-        self._say(event="error", label=label, error=type(error).__name__, message=str(error))
-
-    def close(self, result: Result) -> None:
-        """``{"event": "end", ...}``."""
-        self._say(event="end", ok=result.ok, **vars(result.total()) | {"seconds": round(result.seconds, 3)})
-
-    def _say(self, **facts: Any) -> None:
-        print(json.dumps(facts), file=self.stream, flush=True)
 
 
 class Bar(Lines):

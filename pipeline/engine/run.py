@@ -191,8 +191,6 @@ class _Run:
         """Numbers of nodes to be taken up again, the least first."""
         self.in_flight: dict[int, Handle] = {}
         """With the workers."""
-        self.computing: dict[str, int] = {}
-        """Numbers of nodes in flight, by their keys so far as these are known."""
         self.suspects: list[int] = []
         """Numbers of nodes whose workers died; each is tried when nothing else runs, and is then in ``alone``."""
         self.alone: set[int] = set()
@@ -312,12 +310,8 @@ class _Run:
         if needs > self.largest:
             self.largest = needs
             self.workers.shrink(self.budget.workers(self.jobs, needs))
-        # A node of the same key (equal parameters and inputs) is found in the cache after the first.
-        after = (self.computing[handle.key],) if handle.key in self.computing else ()
-        if handle.key:
-            self.computing[handle.key] = handle.index
         force = handle.stage in self.force
-        call = Call(handle.index, self.store.root, handle.spec, each(_given, handle.inputs), handle.key, force, after)
+        call = Call(handle.index, self.store.root, handle.spec, each(_given, handle.inputs), handle.key, force)
         handle.status = "running"
         self.in_flight[handle.index] = handle
         self.workers.submit(call)
@@ -367,8 +361,6 @@ class _Run:
     def _land(self, handle: Handle, ended: Ended) -> None:
         """Take up what the workers give back."""
         handle.status = "pending"
-        if self.computing.get(handle.key) == handle.index:
-            del self.computing[handle.key]
         if isinstance(ended, Outcome):
             self._succeed(handle, ended)
         elif isinstance(ended, NotBegun):

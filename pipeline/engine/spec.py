@@ -2,19 +2,17 @@
 
 A :class:`Spec` names a stage by its module, validated parameters, the arguments that
 identify the task, and hints (paths) that cannot change the result. The key is the digest of all of it but the hints
-and the label, of the code and packages behind the stage, and of the *output digests* of the inputs. Parameters that
-many tasks share are put into canonical form, and pickled, only once.
+and the label, of the code and packages behind the stage, and of the *output digests* of the inputs.
 """
 
 from __future__ import annotations
 
 import hashlib
 import importlib
-import pickle
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from functools import cache
 from typing import Any, NamedTuple, TypeVar
 
 from rille.pipeline.engine.code_digest import module_digests
@@ -59,26 +57,6 @@ class Spec:
         """The declaration behind the module."""
         return resolve(self.module)
 
-    @property
-    def canonical(self) -> str:
-        """The parameters as canonical text."""
-        return _forms(self).canonical
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _unpickled, (self.module, self.label, _forms(self).pickled, self.args, self.hints)
-
-
-MANY = 4096
-"""Parameter models of which a process keeps the forms."""
-
-
-class _Forms(NamedTuple):
-    """A parameter model, held so that its id stays its own, with its canonical text and its pickle."""
-
-    params: Params
-    canonical: str
-    pickled: bytes
-
 
 class _Common(NamedTuple):
     """What all tasks of a stage have in common, and its canonical text in the order of the names: what stands before
@@ -87,9 +65,6 @@ class _Common(NamedTuple):
     parts: dict[str, Any]
     before: str
     after: str
-
-
-_forms_by_id: dict[int, _Forms] = {}
 
 
 @cache
@@ -112,30 +87,11 @@ def recipe(spec: Spec, refs: Refs) -> dict[str, Any]:
 
 
 def key_of(spec: Spec, refs: Refs) -> str:
-    """Key of a task, ``digest(recipe(spec, refs))``; what many tasks share is put into its canonical form only once."""
+    """Key of a task, ``digest(recipe(spec, refs))``; what all tasks of a stage share is made text once."""
     common = _shared(spec.module)
-    args, inputs = text(dict(spec.args), f"{spec.label}.args"), text(each(_digest, refs))
-    parts = f'{{"args":{args},{common.before},"inputs":{inputs},"params":{spec.canonical},{common.after}}}'
+    args, params = text(dict(spec.args), f"{spec.label}.args"), text(spec.params, f"{spec.label}.params")
+    parts = f'{{"args":{args},{common.before},"inputs":{text(each(_digest, refs))},"params":{params},{common.after}}}'
     return hashlib.sha256(parts.encode()).hexdigest()
-
-
-def _forms(spec: Spec) -> _Forms:
-    """Forms of a task's parameters, which many tasks share."""
-    known = _forms_by_id.get(id(spec.params))
-    if known is None or known.params is not spec.params:
-        if len(_forms_by_id) > MANY:
-            _forms_by_id.clear()
-        known = _Forms(spec.params, text(spec.params, f"{spec.label}.params"), pickle.dumps(spec.params))
-        _forms_by_id[id(spec.params)] = known
-    return known
-
-
-def _unpickled(module: str, label: str, params: bytes, *more: Any) -> Spec:
-    return Spec(module, label, _model(params), *more)
-
-
-_model = lru_cache(MANY)(pickle.loads)
-"""Tasks that shared a model share one again in the process that they are sent to, where its forms are kept as well."""
 
 
 @cache

@@ -29,7 +29,7 @@ from functools import cache
 from importlib.util import find_spec
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import psutil
 
@@ -42,7 +42,7 @@ from rille.pipeline.engine.runtime.interrupts import held
 from rille.pipeline.engine.runtime.private import private_folder
 from rille.pipeline.engine.spec import Spec, flat
 from rille.pipeline.engine.store.manifest import Ref
-from rille.pipeline.engine.task import CodeChangedError, Outcome, ensure
+from rille.pipeline.engine.task import Outcome, ensure
 from rille.stages.core.errors import ConfigError
 
 KINDS = ("dask", "inline")
@@ -77,12 +77,10 @@ class Call:
     refs: Mapping[str, Ref | int | list[Ref | int]]
     key: str = ""
     force: bool = False
-    after: tuple[int, ...] = ()
-    """Numbers of calls in flight that it waits for, and reads nothing of."""
 
     def upstream(self) -> list[int]:
         """Numbers of the calls in flight that it waits for, each once, in a fixed order."""
-        return list(dict.fromkeys([*(g for g in flat(self.refs) if isinstance(g, int)), *self.after]))
+        return list(dict.fromkeys(g for g in flat(self.refs) if isinstance(g, int)))
 
     def run(self, made: Mapping[int, Ref]) -> Outcome | Failed:
         """Run it here, with the artifacts of the calls that it waited for."""
@@ -130,28 +128,6 @@ class Died:
 
 
 Ended = Outcome | Failed | NotBegun | Died
-
-
-class Workers(Protocol):
-    """Run calls, each known by its number; the least number first."""
-
-    room: int
-    """Calls that they may have, those that wait for others among them."""
-
-    def submit(self, call: Call) -> None:
-        """Start a call after those in flight that it waits for."""
-
-    def wait(self) -> list[tuple[int, Ended]]:
-        """Block until at least one call has ended."""
-
-    def shrink(self, jobs: int) -> None:
-        """Keep no more than so many workers of our own."""
-
-    def cancel(self) -> None:
-        """Begin nothing that was submitted, and forget what is running."""
-
-    def close(self, *, kill: bool = False) -> None:
-        """Leave nothing behind; ``kill`` does not wait."""
 
 
 def check(kind: Any, jobs: int | None = None) -> None:
@@ -292,7 +268,7 @@ def _elsewhere(where: Any, cache: Path) -> Dask:
         while not presence.threads():
             time.sleep(WATCH_SECONDS)
         foreign.examine(client, cache)
-        return Dask(client, presence, ours=client is not where, likeness=foreign.likeness())
+        return Dask(client, presence, ours=client is not where)
     except BaseException:
         if client is not where:
             _leave(client, HURRY_SECONDS)
@@ -300,10 +276,7 @@ def _elsewhere(where: Any, cache: Path) -> Dask:
 
 
 class Dask:
-    """Workers of dask; ``cluster`` is one of our own, ``ours`` whether the client is.
-
-    ``likeness`` is that of this process, if others have started the workers: one that joins later is compared.
-    """
+    """Workers of dask; ``cluster`` is one of our own, ``ours`` whether the client is."""
 
     room = 2000  # workers need not wait for this process, and the scheduler stays small
 
@@ -314,10 +287,8 @@ class Dask:
         *,
         cluster: Any = None,
         ours: bool = True,
-        likeness: str = "",
     ) -> None:
         self._client, self._presence, self._cluster, self._ours = client, presence, cluster, ours
-        self._likeness = likeness
         self._run, self._submitted = f"rille-{uuid.uuid4().hex}", 0
         self._looked = time.monotonic()
         self._futures: dict[int, Any] = {}
@@ -352,7 +323,7 @@ class Dask:
             # Bytes: dask would unpickle a call, and import its stage, on the thread on which a worker hears of others.
             pickle.dumps(call),
             self._run,
-            self._likeness,
+            self._cluster is not None,
             *inputs,
             key=name,
             priority=-call.number,
@@ -480,23 +451,25 @@ class Dask:
         take_back()
 
 
-def work(pickled: bytes, run: str, likeness: str, *made: Ref | None) -> Ref | None:
-    """Run a call on a worker, unless an input did not come or the worker is unlike the client; give its artifact to
-    the calls that wait for it.
+Workers = Inline | Dask
+"""They run calls, each known by its number, the least first; of ``room`` many at a time, those that wait for others
+among them."""
+
+
+def work(pickled: bytes, run: str, ours: bool, *made: Ref | None) -> Ref | None:
+    """Run a call on a worker, which is ``ours`` or another's, unless an input did not come; give its artifact to the
+    calls that wait for it.
 
     What became of it leaves as an event of dask for the client of ``run``, which costs half of what fetching a result
     does. Never an exception: dask would state it as the failure of every call that waits for this one.
     """
     from distributed import get_worker
 
-    _prepare(ours=not likeness)
+    _prepare(ours=ours)
     call: Call = pickle.loads(pickled)
     worker, outcome = get_worker(), NotBegun()  # type: tuple[Any, Ended]
     refs = {number: ref for number, ref in zip(call.upstream(), made, strict=True) if ref is not None}
-    if likeness and foreign.likeness() != likeness:
-        text = f"worker {worker.name} has other source code or packages than this process"
-        outcome = Failed(CodeChangedError("RIL-524", text, remedy="install the same there"))
-    elif len(refs) == len(made):
+    if len(refs) == len(made):
         outcome = call.run(refs)
     if isinstance(outcome, Outcome):
         outcome = replace(outcome, took=replace(outcome.took, worker=str(worker.name)))
