@@ -48,7 +48,7 @@ from rille.stages.core.declare import declared
 
 from idle.source import nothing
 
-STAGE = replace(declared(real), run=nothing("{name}"))
+STAGE = replace(declared(real), run=nothing("{name}"), facts=None, function=None)
 '''
 
 IMAGE_MODULE = '''"""An image of a few pixels."""
@@ -142,7 +142,7 @@ def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
         steps = {"displacement": [1.0] * (n - 1), "match_rate": [1.0] * (n - 1)}
         return {"basic": list(range(n)), "segments": [[k, k + 1] for k in range(n - 1)], **steps}
     if name == "ground_frame":
-        return {"T_local_left": np.eye(4)[:3].tolist(), "pair": args["pair"]}
+        return {"T_local_left": np.eye(4)[:3].tolist()}
     if name == "trajectory":
         frames = args["frames"]
         positions = [[0.0, SPACING * k, 0.0] for k in range(len(frames))]
