@@ -266,15 +266,6 @@ class World(Table):
         return Georeference(self.crs, self.origin, math.radians(self.azimuth_deg))
 
 
-class Urdf(Table):
-    """A robot description that says how large the vehicle is and how its left camera is mounted."""
-
-    file: str
-    """URDF; what [vehicle] does not state of the wheels and the clearance is taken from it"""
-    left: str = ""
-    """optical link of the left camera; its pitch is taken, if none is stated"""
-
-
 class Manifest(Table):
     """A stereo sequence in a folder of any form."""
 
@@ -292,7 +283,6 @@ class Manifest(Table):
     imu: Imu | None = None
     world: World = World()
     vehicle: Vehicle | None = None
-    urdf: Urdf | None = None
     defaults: dict[str, Any] = Field(default={})
     """parameters that suit the sequence, e.g. locus.cell_size = 0.05"""
     notes: tuple[str, ...] = ()

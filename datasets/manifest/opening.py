@@ -26,7 +26,6 @@ from rille.datasets.manifest.rig import read_optics
 from rille.datasets.protocol import Sequence, Source
 from rille.datasets.text.names import derived_name
 from rille.datasets.text.reading import Search
-from rille.datasets.urdf import read_urdf
 from rille.stages.core.errors import InputError
 
 VARIABLE = re.compile(r"\$\{(\w+)\}")
@@ -55,16 +54,8 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
     """
     base, pairs = _of_bag(manifest, root, name) or _of_files(manifest, root, name, digests)
     motion = MotionReader(root, name, pairs, StatedMotion(base.times)).read(manifest)
-    up = motion.up or base.up
     world = manifest.world
     pitch = None if world.pitch_deg is None else math.radians(world.pitch_deg)
-    vehicle = manifest.vehicle
-    if manifest.urdf is not None:
-        robot = read_urdf(root / manifest.urdf.file, manifest.urdf.left, vehicle)
-        vehicle = robot.vehicle
-        # What the manifest states of the vertical goes before the robot's description.
-        if pitch is None and up is None:
-            pitch = robot.pitch
     return replace(
         base,
         name=manifest.name,
@@ -73,13 +64,13 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
         truth_positions=motion.truth_positions,
         truth_source=motion.truth_source,
         truth_mount=motion.truth_mount,
-        up=up,
+        up=motion.up or base.up,
         attitude=motion.attitude or base.attitude,
         imu_axes=motion.imu_axes,
         odometry=motion.odometry or base.odometry,
         pitch=pitch,
         georeference=world.place,
-        vehicle=vehicle,
+        vehicle=manifest.vehicle,
         defaults={**base.defaults, **dict(dotted(manifest.defaults))},
         notes=(*base.notes, *motion.notes, *manifest.notes),
         warnings=(*base.warnings, *motion.warnings),
