@@ -9,7 +9,6 @@ that does not fit even alone is refused, with the parameter that makes it smalle
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -28,10 +27,6 @@ SHARE = 0.9
 WORKER_BYTES = 250e6
 """Memory of a worker process between tasks: Python with NumPy, SciPy and numba."""
 
-UNITS = {"": 1, "k": 1e3, "m": 1e6, "g": 1e9, "t": 1e12, "ki": 2**10, "mi": 2**20, "gi": 2**30, "ti": 2**40}
-
-_WORDS = re.compile(r"([\d.]+)\s*([kmgt]?i?)b?", re.IGNORECASE)
-
 
 class MemoryRefusedError(ConfigError):
     """A task needs more memory than the limit, all others aside."""
@@ -45,14 +40,14 @@ def parse(text: str) -> int:
     ConfigError
         It is none of these.
     """
-    words = text.strip()
-    # The pattern lets 1.2.3 pass, float() does not.
-    with suppress(ValueError):
-        if words.endswith("%") and 0 < float(words[:-1]) <= 100:
-            return int(float(words[:-1]) / 100 * total())
-        match = _WORDS.fullmatch(words)
-        if match and float(match[1]) > 0:
-            return int(float(match[1]) * UNITS[match[2].lower()])
+    from dask.utils import parse_bytes
+
+    given = text.strip()
+    share = given.endswith("%")
+    with suppress(ValueError, OverflowError):
+        amount = float(given[:-1]) / 100 * total() if share else parse_bytes(given)
+        if given[:1].isdecimal() and 0 < amount <= (total() if share else math.inf):
+            return int(amount)
     raise ConfigError(
         "RIL-553", f"--memory-limit {text!r} is no amount of memory", remedy="give e.g. 6GB, 800MB or 75%"
     )

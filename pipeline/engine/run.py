@@ -35,7 +35,6 @@ from rille.pipeline.engine import estimate, memory, provenance
 from rille.pipeline.engine.events import Ledger
 from rille.pipeline.engine.failures import translated
 from rille.pipeline.engine.graph import Expansion, Graph, Handle
-from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.plain import some
 from rille.pipeline.engine.progress import Progress
 from rille.pipeline.engine.runtime.interrupts import Interrupts
@@ -233,7 +232,7 @@ class _Run:
 
     def _loop(self, interrupts: Interrupts) -> None:
         self.progress.open(self.graph, estimate.recall(self.hints), self.jobs)
-        self.store.survey(_sequence(self.graph))
+        self.store.survey(self.graph.sequence)
         while True:
             while self._take() or self._go_on():
                 # An interrupt in a finaliser or a callback of a weak reference was remembered, not raised.
@@ -484,12 +483,6 @@ class _Run:
             if handle.status not in ("pending", "running"):
                 setattr(counts, handle.status, getattr(counts, handle.status) + 1)
                 counts.seconds += handle.took.seconds
-
-
-def _sequence(graph: Graph) -> str:
-    """Name of what the graph works on: its first task reads the first image, or what all images are made from."""
-    first = graph.nodes[0].spec if graph.nodes else None
-    return digest(None if first is None else [first.module, first.params, dict(first.args)])[:16]
 
 
 def _given(handle: Handle) -> Ref | int:

@@ -74,7 +74,7 @@ class Store:
     def survey(self, sequence: str) -> None:
         """Before many look-ups: read the index of earlier runs, which spares the manifests of what it names.
 
-        ``sequence`` names what runs over the same images, whatever their parameters.
+        ``sequence`` is the name of the sequence that the runs are of.
         """
         self._index = Index(self.root, sequence)
 

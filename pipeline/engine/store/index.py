@@ -37,7 +37,7 @@ TIMEOUT_S = 5.0
 
 
 class Index:
-    """Rows of one sequence, that is, of what runs over the same images, read once."""
+    """Rows of one sequence, read once."""
 
     def __init__(self, root: Path, sequence: str) -> None:
         self._root, self._sequence = root, sequence
