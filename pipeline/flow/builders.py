@@ -50,11 +50,10 @@ T = TypeVar("T")
 
 
 NO_PARAMS = NoParams()
+"""One object for all tasks without parameters."""
 
 AROUND = 3
 """Frames before and behind a pair whose right images may be of its time."""
-"""One object for all tasks without parameters: its canonical form is then made once."""
-
 
 PYRAMID_BYTES = 20 / 3
 """Bytes of a pyramid for each pixel of its image: grey and mask, a third more for the levels above."""
