@@ -194,11 +194,6 @@ def test_one_risk_parameter_reruns_risk_path_and_what_reads_them(cold: Path) -> 
     assert not drawn & {"dem.tif", "terrain.zarr", "trajectory.tum", "Trajectory", "Disparity"}
 
 
-def test_one_vehicle_limit_reruns_the_same(cold: Path) -> None:
-    assert session.reconstruct(options(cold, "vehicle.max_slope_deg=12")) == 0
-    assert {label.split("/")[0] for label in computed(cold)} == {"risk", "path", "path_check", "output"}
-
-
 def test_what_the_data_do_not_determine_is_missing_and_the_rest_is_delivered(cold: Path, tmp_path: Path) -> None:
     folder = tmp_path / "runs"
     assert session.reconstruct(replace(options(cold, "vehicle.track=5.0"), runs=folder)) == 3

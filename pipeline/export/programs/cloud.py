@@ -23,7 +23,6 @@ from rille.pipeline.export.colour import LUMA
 from rille.pipeline.export.programs.placed_pairs import PlacedPairs
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.writers import ENGINEERING_CRS
-from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
 from rille.stages.terrain.points import colours, cubes, one_a_cube
 
@@ -128,17 +127,11 @@ def _pairs(run: RunArtifacts, every: int, place: Georeference | None, made: _Mad
         if place is not None:
             ray[:, :2], position = ray[:, :2] @ place.rotation.T, place.apply(position)
         columns = dict(zip("xyz", position.T, strict=True))
-        columns |= zip(("red", "green", "blue"), colours(found, _image(run, one.pair)).T, strict=True)
+        columns |= zip(("red", "green", "blue"), colours(found, run.left_image(one.pair)).T, strict=True)
         columns |= {"sigma_along": found.sigma_along, "sigma_across": found.sigma_across}
         columns |= zip(("ray_x", "ray_y", "ray_z"), ray.T.astype(np.float32), strict=True)
         columns["pair"] = np.full(len(position), one.pair, np.uint32)
         yield columns
-
-
-def _image(run: RunArtifacts, pair: int) -> Bundle:
-    """The left image that was matched, free of distortion."""
-    ideal = run.find(f"undistort/left/{pair}")
-    return run.one(f"image/left/{pair}") if ideal is None else ideal
 
 
 def _write_laz(path: Path, parts: Iterator[Columns], crs: str) -> None:

@@ -54,7 +54,7 @@ def write_run(folder: Path, run: RunArtifacts) -> str:
     rig = Rig.from_dict(run.one("calibration").meta["rig"])
     segments = _segments(run)
     keys = [_ends(segment.track)[0] for segment in segments]
-    images = {key: image for key in keys if (image := _image(run, key)) is not None}
+    images = {key: run.left_image(key) for key in keys}
     # A drive has a trajectory at each stop: the last one is all of it.
     model = build(rig, run.one("trajectory", last=True), _names(run.run), segments, images)
     folder.mkdir()
@@ -63,12 +63,6 @@ def write_run(folder: Path, run: RunArtifacts) -> str:
         f"{model.num_reg_frames()} frames of 2 images, {model.num_points3D()} points, "
         f"{model.compute_mean_reprojection_error():.2f} px; open it with colmap gui --import_path"
     )
-
-
-def _image(bundles: RunArtifacts, frame: int) -> Bundle | None:
-    """The left image of an ideal camera."""
-    undistorted = bundles.find(f"undistort/left/{frame}")
-    return bundles.find(f"image/left/{frame}") if undistorted is None else undistorted
 
 
 def _segments(bundles: RunArtifacts) -> list[MatchedSegment]:

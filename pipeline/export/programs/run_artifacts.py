@@ -70,6 +70,11 @@ class RunArtifacts:
         self.one(label)
         return self.one(self._rows[label]["inputs"][port])
 
+    def left_image(self, frame: int) -> Bundle:
+        """The left image of an ideal camera, which was matched and tracked."""
+        undistorted = self.find(f"undistort/left/{frame}")
+        return self.one(f"image/left/{frame}") if undistorted is None else undistorted
+
     def risk(self) -> Bundle:
         """Risk map of the world; of a drive, what it knew at its last stop."""
         stops = [int(stop[1]) for name in self._rows if (stop := STOP.fullmatch(name))]

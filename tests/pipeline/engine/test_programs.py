@@ -108,23 +108,6 @@ def test_interruption_leaves_nobody_behind(cache, program_environment, executor)
     assert maintenance.verify(Store(cache))[1] == []
 
 
-def test_killed_at_any_moment_a_run_resumes_to_the_same_digests(cache, tmp_path, program_environment):
-    undisturbed = {n: v[1] for n, v in finish(start(tmp_path / "calm", program_environment, "inline", "many")).items()}
-    manifests = []
-    for delay in (0.05, 0.13, 0.21):
-        process = start(cache, program_environment, "inline", "many")
-        process.stdout.readline()
-        time.sleep(delay)
-        process.kill()
-        process.communicate()
-        manifests.append(len(list(cache.glob("artifacts/*/*/*.zip"))))
-    assert maintenance.verify(Store(cache))[1] == []
-    resumed = finish(start(cache, program_environment, "inline", "many"))
-    assert {n: v[1] for n, v in resumed.items()} == undisturbed
-    assert sum(v[0] == "cached" for v in resumed.values()) == manifests[-1]
-    assert manifests == sorted(manifests)
-
-
 def test_workers_end_when_the_program_is_killed(cache, program_environment):
     process = start(cache, program_environment, "dask", "sleep", start_new_session=True)
     deadline = time.monotonic() + 30

@@ -198,15 +198,6 @@ def test_hints_and_labels_are_no_part_of_the_key(cache):
     assert not ensure(cache, c, {}).cached
 
 
-def test_two_nodes_of_one_key_are_computed_once(cache):
-    def make(graph):
-        for i in range(3):
-            graph.node("toys.numbers", f"n/{i}", NumbersParams(), {"frame": 7})
-
-    graph, _ = run(cache, make=make, executor="inline")
-    assert sorted(statuses(graph).values()) == ["cached", "cached", "computed"]
-
-
 def test_without_keep_going_nothing_new_is_begun(cache, tmp_path):
     graph, result = run(cache, make=mischief("value", "fine"), ledger=tmp_path / "ledger.jsonl")
     assert statuses(graph) == {"value": "failed"} | dict.fromkeys(
@@ -433,10 +424,8 @@ def test_details_are_for_who_asks(verbose):
     assert stream.getvalue() == ("rille: dask at work: \\x1b[1m\n" if verbose else "")
 
 
-def test_unknown_modes_and_executors_are_refused(cache):
+def test_unknown_modes_and_no_workers_are_refused(cache):
     with raises("RIL-568"):
         progress.make("loud")
-    with raises("RIL-539", "'cloud'"):
-        run(cache, executor="cloud")
     with raises("RIL-540"):
         run(cache, jobs=0)

@@ -112,11 +112,6 @@ def test_a_worker_that_falls_silent_is_named_once_with_its_task(monkeypatch, cap
     assert warned_after(21.0, "tcp://b").startswith(line)
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_a_cluster_of_this_machine_gives_what_one_process_gives(tmp_path, jobs):
-    assert run(tmp_path / "dask", "dask", jobs=jobs) == run(tmp_path / "inline")
-
-
 def test_the_ledger_of_a_default_run_names_the_dask_worker_of_each_task(tmp_path):
     graph, ledger = Graph(), tmp_path / "ledger.jsonl"
     chain.build(graph)

@@ -58,8 +58,8 @@ class Recorded:
     def one(self, label: str, *, last: bool = False) -> Bundle:
         return self.made[label]
 
-    def find(self, label: str) -> Bundle | None:
-        return self.made.get(label)
+    def left_image(self, frame: int) -> Bundle:
+        return self.made[f"image/left/{frame}"]
 
     def input(self, label: str, port: str) -> Bundle:
         return self.made["calibration"]
