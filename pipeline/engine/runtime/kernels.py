@@ -115,7 +115,8 @@ class Locator:
 
     def note_checksums(self) -> None:
         """Write the checksums of the function's kernels."""
-        write_hint(self._checksums(), {path.name: _sha256(path) for path in self._files()})
+        with suppress(OSError):  # cleared away just now
+            write_hint(self._checksums(), {path.name: _sha256(path) for path in self._files()})
 
     def remove_damaged(self) -> None:
         """Remove files that are not as they were saved; mark the others as used."""
