@@ -143,7 +143,6 @@ class Sequence:
     imu_axes : R_imu_left, where ``up`` and ``attitude`` are those of an IMU.
     odometry : T_odometry_left of each frame by dead reckoning, metres; predicts, and is never part of the result.
     pitch : downward pitch of the left camera's optical axis, radians, stated with the rig; roll 0.
-    initial_pose : T_world_left of frame 0 handed in from outside.
     georeference : where the world frame lies, where that is known.
     vehicle : the vehicle whose limits suit the scale of the sequence.
     truth_dem : exact elevations on any lattice of any frame whose pose in the truth frame is given.
@@ -173,7 +172,6 @@ class Sequence:
     imu_axes: Rows | None = None
     odometry: tuple[RigidTransform | None, ...] | None = None
     pitch: float | None = None
-    initial_pose: RigidTransform | None = None
     georeference: Georeference | None = None
     vehicle: Vehicle | None = None
     truth_dem: TruthDem | None = None

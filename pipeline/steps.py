@@ -342,7 +342,7 @@ def terrain(
     settings = _merged(disparity, pair.settings, {"terrain": {"reference": reference}, "locus": locus})
     make = _builder(pair, settings)
     _, known = make.rig([pair.frame])
-    at, done = vertical(make, pair.frame, pair.frame == 0), {make.disparity(pair.frame): given}
+    at, done = vertical(make, pair.frame), {make.disparity(pair.frame): given}
     level = make.level(pair.frame, at, known)
     plane = other_plane(make.config, [_computed(level, done, pair.sequence.drawn).meta], placed=False)
     if plane is not None:

@@ -190,8 +190,6 @@ class Chain:
         args: dict[str, Any] = {}
         if s.up is not None and s.up[key] is not None:
             args["up"] = list(s.up[key])
-        if s.initial_pose is not None and key == self.frames[0]:
-            args["initial_up"] = [float(v) for v in s.initial_pose.rotation[2]]
         if s.pitch is not None:
             args["pitch"] = s.pitch
         level = self._stage("ground_frame", args, disparity=self.disparity[key], rig=self.calibration)

@@ -137,7 +137,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     basic = [chain[i] for i in chosen.meta["basic"]]
 
     # At each basic pair, the rover's stop: local elevation model, hazards and path.
-    pairs = yield from basic_pairs(make, rigs, frames[0])
+    pairs = yield from basic_pairs(make, rigs)
 
     # In between: tracks, poses in the frame of the segment's basic pair, and their product.
     segments = []
@@ -299,11 +299,11 @@ def simultaneous(
 
 
 def basic_pairs(
-    make: Builder, rigs: dict[int, Handle[CalibrationFacts]], first: int
+    make: Builder, rigs: dict[int, Handle[CalibrationFacts]]
 ) -> Generator[Wait, Any, dict[int, Pair]]:
     """Stereo pairs to local elevation models, each with its rig; on ground also to risk maps and paths."""
     p, pairs = make.products, dict[int, Pair]()
-    verticals = {k: vertical(make, k, k == first) for k in rigs}
+    verticals = {k: vertical(make, k) for k in rigs}
     p.level = {k: make.level(k, verticals[k], known) for k, known in rigs.items()}
     judged = yield Maybe(list(p.level.values()))
     placed = make.sequence.georeference is not None
@@ -321,14 +321,12 @@ def basic_pairs(
     return pairs
 
 
-def vertical(make: Builder, pair: int, first: bool) -> dict[str, Any]:
-    """Collect the known facts about the vertical of a pair (attitude, initial pose, pitch) as arguments of a stage."""
+def vertical(make: Builder, pair: int) -> dict[str, Any]:
+    """Collect the known facts about the vertical of a pair (attitude, pitch) as arguments of a stage."""
     s, args = make.sequence, dict[str, Any]()
     up = None if s.up is None else s.up[pair]
     if up is not None:
         args["up"] = list(up)
-    if s.initial_pose is not None and first:
-        args["initial_up"] = [float(v) for v in s.initial_pose.rotation[2]]
     if s.pitch is not None:
         args["pitch"] = s.pitch
     return args
