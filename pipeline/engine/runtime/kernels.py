@@ -148,7 +148,7 @@ def _sha256(path: Path) -> str:
 class Compiling:
     """Follows numba while it looks for kernels, compiles and saves them: one process of this user at a time.
 
-    ``seconds`` are those for which this process did, or waited for another one.
+    ``seconds`` are those for which this process compiled, or waited for another one; loading alone does not count.
     """
 
     def __init__(self) -> None:
@@ -157,14 +157,14 @@ class Compiling:
         """Functions whose files were not compared with their checksums yet."""
         self.saved: list[Locator] = []
         """Functions of which a kernel is saved just now."""
-        self._depth, self._since, self._change = 0, 0.0, threading.Lock()
+        self._depth, self._since, self._waited, self._change = 0, 0.0, False, threading.Lock()
 
     def begin(self) -> None:
         """A thread begins; kernels that call each other, and threads, may do so several times."""
         with self._change:
             if self._depth == 0:
                 self._since = time.perf_counter()
-                _lock()
+                self._waited = _lock()
                 while self.unchecked:
                     self.unchecked.pop().remove_damaged()
             self._depth += 1
@@ -174,10 +174,12 @@ class Compiling:
         with self._change:
             self._depth -= 1
             if self._depth == 0:
+                compiled = bool(self.saved)
                 while self.saved:
                     self.saved.pop().note_checksums()
                 _unlock()
-                self.seconds += time.perf_counter() - self._since
+                if compiled or self._waited:
+                    self.seconds += time.perf_counter() - self._since
 
     def take(self) -> float:
         """The seconds since this was last asked."""
@@ -210,21 +212,23 @@ def _locks() -> int:
     return os.open(private_folder() / "compiling", os.O_RDWR | os.O_CREAT, 0o600)
 
 
-def _lock() -> None:
-    """Wait until no other process compiles; the system frees the lock when that process ends.
+def _lock() -> bool:
+    """Wait until no other process compiles; whether one did. The system frees the lock when that process ends.
 
     Waiting only saves time: if files cannot be locked, or the other process hangs, both compile.
     """
-    until = time.monotonic() + PATIENCE_SECONDS
-    while True:
+    begin, waited = time.monotonic(), False
+    while time.monotonic() < begin + PATIENCE_SECONDS:
         try:
             # A lock of the system ends with the process; a lock file would outlive a crash.
             fcntl.lockf(_locks(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return
+            break
         except OSError as error:
-            if error.errno not in (errno.EACCES, errno.EAGAIN) or time.monotonic() > until:
-                return
+            if error.errno not in (errno.EACCES, errno.EAGAIN):
+                break
+        waited = True
         time.sleep(PAUSE_SECONDS)
+    return waited
 
 
 def _unlock() -> None:

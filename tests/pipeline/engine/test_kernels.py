@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from toys.numbers import NumbersParams
@@ -121,15 +122,19 @@ def test_kernels_that_nothing_loads_are_cleared(tmp_path, monkeypatch):
 
 
 def test_seconds_of_compiling_end_with_the_outermost_kernel(monkeypatch):
-    clock = iter([10.0, 41.0])
+    clock = iter([10.0, 41.0, 50.0, 60.0])
     monkeypatch.setattr(kernels.time, "perf_counter", lambda: next(clock))
     compiling = Compiling()
     compiling.begin()
     compiling.begin()
+    compiling.saved.append(SimpleNamespace(note_checksums=lambda: None))
     compiling.end()
     assert compiling.seconds == 0
     compiling.end()
     assert compiling.take() == 31.0
+    compiling.begin()  # a kernel is loaded
+    compiling.end()
+    assert compiling.take() == 0.0
 
 
 @pytest.mark.parametrize("patience", [100.0, 0.1])
