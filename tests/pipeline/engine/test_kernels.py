@@ -12,6 +12,8 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import numba
+import numba.core.caching
 import pytest
 from toys.numbers import NumbersParams
 
@@ -105,6 +107,15 @@ def test_a_damaged_kernel_is_compiled_anew(checkout, tmp_path, kind, damage):
         path.write_bytes(damage(path.read_bytes()))
     assert said(start()) == ["43", "0"]
     assert said(start()) == ["43", "1"]
+
+
+def test_numba_asks_us_first_also_where_it_is_imported_already(monkeypatch):
+    monkeypatch.setattr(numba.config, "CACHE_LOCATOR_CLASSES", "")
+    monkeypatch.delenv(kernels.LOCATORS, raising=False)
+    kernels.use_own_folder()
+    first, *others = numba.config.CACHE_LOCATOR_CLASSES.split(",")
+    assert first == f"{Locator.__module__}.Locator"
+    assert {getattr(numba.core.caching, name) for name in others} == set(numba.core.caching.CacheImpl._locator_classes)
 
 
 def test_functions_of_others_stay_where_numba_keeps_them():
