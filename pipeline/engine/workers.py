@@ -62,6 +62,9 @@ CONNECT_SECONDS = 10.0
 LEAVE_SECONDS, HURRY_SECONDS = 2.0, 0.5
 """Time to take leave of a scheduler at the end of a run, and of an interrupted one."""
 
+BATCH = 100
+"""Calls that are handed to dask at once: one by one they cost the client and the scheduler twice the time."""
+
 DEATHS = 1
 """Deaths of its worker after which dask, on this machine, begins a task once more; at the next it gives it back."""
 
@@ -291,6 +294,8 @@ class Dask:
         self._client, self._presence, self._cluster, self._ours = client, presence, cluster, ours
         self._run, self._submitted = f"rille-{uuid.uuid4().hex}", 0
         self._looked = time.monotonic()
+        self._unsent: dict[int, Call] = {}
+        """Calls that were submitted, and not handed to dask yet."""
         self._futures: dict[int, Any] = {}
         self._leaving: list[Any] = []
         self._labels: dict[str, str] = {}
@@ -313,27 +318,30 @@ class Dask:
             return ""  # it has gone; the first wait for a task says so
 
     def submit(self, call: Call) -> None:
-        """Start a call after those in flight that it waits for."""
-        self._submitted += 1
-        # Dask takes equal names for equal results: a call that is tried again needs a new one.
-        name = f"{call.spec.stage.name}-{self._run}-{self._submitted}"
-        inputs = [self._futures[number] for number in call.upstream()]
-        self._futures[call.number] = self._client.submit(
-            work,
+        """Start a call after those in flight that it waits for, at the next :meth:`wait` if not before."""
+        self._unsent[call.number] = call
+        if len(self._unsent) >= BATCH:
+            self._send()
+
+    def _send(self) -> None:
+        """Hand what was submitted to dask, as one graph."""
+        names, graph = dict[int, str](), dict[str, tuple[Any, ...]]()
+        for number, call in self._unsent.items():
+            self._submitted += 1
+            # Dask takes equal names for equal results: a call that is tried again needs a new one.
+            name = names[number] = f"{call.spec.stage.name}-{self._run}-{self._submitted}"
+            self._labels[name] = call.spec.label
+            inputs = [names[n] if n in names else self._futures[n] for n in call.upstream()]
             # Bytes: dask would unpickle a call, and import its stage, on the thread on which a worker hears of others.
-            pickle.dumps(call),
-            self._run,
-            self._cluster is not None,
-            *inputs,
-            key=name,
-            priority=-call.number,
-            pure=False,
-            retries=0,
-        )
-        self._labels[name] = call.spec.label
+            graph[name] = (work, pickle.dumps(call), self._run, self._cluster is not None, *inputs)
+        if graph:
+            futures = self._client.get(graph, list(graph), sync=False, priority=-min(names), retries=0)
+            self._futures |= zip(names, futures, strict=True)
+        self._unsent.clear()
 
     def wait(self) -> list[tuple[int, Ended]]:
         """Block until at least one call has ended; all that have ended meanwhile are given."""
+        self._send()
         ended: list[tuple[int, Ended]] = []
         while not ended:
             # Not for ever: a call whose worker died, a scheduler that is lost, and silent workers send no event.
@@ -420,6 +428,7 @@ class Dask:
     def cancel(self) -> None:
         """Begin nothing that was submitted, and forget what is running."""
         futures, self._futures = list(self._futures.values()), {}
+        self._unsent.clear()
         self._labels.clear()
         with suppress(Exception):
             self._client.cancel(futures, force=True)
