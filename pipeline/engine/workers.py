@@ -346,7 +346,9 @@ class Dask:
         while not ended:
             # Not for ever: a call whose worker died, a scheduler that is lost, and silent workers send no event.
             ended = self._events_of(WATCH_SECONDS)
-            if time.monotonic() - self._looked > LOOK_SECONDS:
+            if ended and time.monotonic() - self._looked < LOOK_SECONDS:
+                break
+            if time.monotonic() - self._looked >= LOOK_SECONDS:
                 self._look()
             lost = [n for n, future in self._futures.items() if future.status not in ("pending", "finished")]
             # A call must not come back before the inputs that it had.
