@@ -1,6 +1,6 @@
 """Workers that run tasks: those of a dask cluster of this machine, of a scheduler that others have started, or inline.
 
-A task is a future that depends on the futures of the tasks that make its inputs: dask's scheduler chains them without
+Tasks go there as graphs of up to a hundred, which depend on those before: dask's scheduler chains them without
 asking this process, gives a task to another worker if its own dies, and ends a worker that takes too much memory. What
 became of a task comes back as an event. A task that comes back because its workers died is named ``Died``; the run
 tries it once more when nothing else runs, so that the culprit is known for certain (:mod:`rille.pipeline.engine.run`).
@@ -346,15 +346,19 @@ class Dask:
         while not ended:
             # Not for ever: a call whose worker died, a scheduler that is lost, and silent workers send no event.
             ended = self._events_of(WATCH_SECONDS)
-            if ended and time.monotonic() - self._looked < LOOK_SECONDS:
-                break
-            if time.monotonic() - self._looked >= LOOK_SECONDS:
+            due = time.monotonic() - self._looked > LOOK_SECONDS
+            if due:
                 self._look()
-            lost = [n for n, future in self._futures.items() if future.status not in ("pending", "finished")]
-            # A call must not come back before the inputs that it had.
-            ended += self._events_of(0) if lost else []
-            ended += [(n, self._why(self._release(n))) for n in lost if n in self._futures]
+            if due or not ended:
+                ended += self._lost()
         return ended
+
+    def _lost(self) -> list[tuple[int, Ended]]:
+        """What has ended without a word."""
+        lost = [n for n, future in self._futures.items() if future.status not in ("pending", "finished")]
+        # A call must not come back before the inputs that it had.
+        ended = self._events_of(0) if lost else []
+        return ended + [(n, self._why(self._release(n))) for n in lost if n in self._futures]
 
     def _events_of(self, timeout: float) -> list[tuple[int, Ended]]:
         """What has ended by its own word; the first of it is waited for."""
