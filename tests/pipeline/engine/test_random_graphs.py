@@ -5,10 +5,13 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
+import pytest
+from distributed import Client, LocalCluster
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rille.pipeline.engine import run as driver
+from rille.pipeline.engine import workers
 from rille.pipeline.engine.graph import Graph, Maybe
 from rille.pipeline.engine.store.base import Store
 from rille.stages.core.declare import NoParams
@@ -84,6 +87,23 @@ def test_a_run_computes_what_a_naive_evaluator_does_also_after_a_loss(nodes, gon
         values, result, handles = evaluate(nodes, store)
         assert values == expected
         assert {h.key for h in handles.values() if h.status == "computed"} == lost
+
+
+@pytest.fixture(scope="module")
+def client():
+    with (
+        LocalCluster(2, processes=False, threads_per_worker=1, dashboard_address=None) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
+
+
+@settings(max_examples=15, deadline=None)
+@given(graphs(), st.sampled_from([1, 2, 100]))
+def test_a_cluster_computes_the_same_however_many_tasks_it_gets_at_once(client, nodes, batch):
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(workers, "BATCH", batch)
+        assert evaluate(nodes, Store(Path(folder) / "cache"), client)[0] == naive(nodes)
 
 
 def _place(store, handles, key):
