@@ -525,6 +525,9 @@ def _configure() -> None:
     dask.config.set(
         {
             "distributed.scheduler.allowed-failures": DEATHS,
+            # By default a cluster forgets a worker for good whose nanny has not started it again within 15 s, which on
+            # a busy machine is usual.
+            "distributed.deploy.lost-worker-timeout": "1h",
             # A share of the limit: the bytes given are meant whole, by default dask ends a worker at 95 % of them.
             "distributed.worker.memory.terminate": 1.0,
             # Entries of each of dask's logs, which nobody reads; some keep whole messages, with all tasks in them.

@@ -185,7 +185,8 @@ def test_workers_killed_mid_tile(whole, tmp_path, row):
     calm, torn = tmp_path / "calm", tmp_path / "torn"
     subprocess.run(command(calm, *TILED), check=True, stdout=subprocess.DEVNULL)
     process, kills, tiles = begin(torn, *TILED, "--set", "tiling.tile=128"), 0, 0
-    for wanted in (2, 5, 9):
+    # Twice: a task that loses its workers a third time counts as their killer.
+    for wanted in (2, 9):
         while tiles < wanted and process.poll() is None:
             time.sleep(0.02)
             tiles = sum(path.read_text().count('"label": "hfvm/0/') for path in torn.glob("runs/*/*/ledger.jsonl"))
@@ -201,7 +202,7 @@ def test_workers_killed_mid_tile(whole, tmp_path, row):
     assert upkeep_finds_nothing(torn / "cache")
     row(
         "workers killed mid-tile",
-        3,
+        2,
         [],
         wrong,
         len(found),
