@@ -190,12 +190,13 @@ def test_workers_killed_mid_tile(whole, tmp_path, row):
         while tiles < wanted and process.poll() is None:
             time.sleep(0.02)
             tiles = sum(path.read_text().count('"label": "hfvm/0/') for path in torn.glob("runs/*/*/ledger.jsonl"))
+        assert process.poll() is None, process.stderr.read()
         for child in psutil.Process(process.pid).children():
             # A worker killed before may still be a zombie, which has no command.
             if child.status() != psutil.STATUS_ZOMBIE and "spawn_main" in " ".join(child.cmdline()):
                 child.kill()
                 kills += 1
-    assert process.wait() == 0
+    assert process.wait() == 0, process.stderr.read()
     found = rows(torn)
     wrong = [label for label, r in rows(calm).items() if found[label]["digest"] != r["digest"]]
     wrong += [label for label, r in found.items() if r["status"] != "computed"]
