@@ -1,6 +1,6 @@
 """Workers that run tasks: those of a dask cluster of this machine, of a scheduler that others have started, or inline.
 
-Tasks go there as graphs of up to a hundred, which depend on those before: dask's scheduler chains them without
+A task is a future that depends on the futures of the tasks that make its inputs: dask's scheduler chains them without
 asking this process, gives a task to another worker if its own dies, and ends a worker that takes too much memory. What
 became of a task comes back as an event. A task that comes back because its workers died is named ``Died``; the run
 tries it once more when nothing else runs, so that the culprit is known for certain (:mod:`rille.pipeline.engine.run`).
@@ -61,9 +61,6 @@ CONNECT_SECONDS = 10.0
 
 LEAVE_SECONDS, HURRY_SECONDS = 2.0, 0.5
 """Time to take leave of a scheduler at the end of a run, and of an interrupted one."""
-
-BATCH = 100
-"""Calls that are handed to dask at once: one by one they cost the client and the scheduler twice the time."""
 
 DEATHS = 1
 """Deaths of its worker after which dask, on this machine, begins a task once more; at the next it gives it back."""
@@ -294,8 +291,6 @@ class Dask:
         self._client, self._presence, self._cluster, self._ours = client, presence, cluster, ours
         self._run, self._submitted = f"rille-{uuid.uuid4().hex}", 0
         self._looked = time.monotonic()
-        self._unsent: dict[int, Call] = {}
-        """Calls that were submitted, and not handed to dask yet."""
         self._futures: dict[int, Any] = {}
         self._leaving: list[Any] = []
         self._labels: dict[str, str] = {}
@@ -318,30 +313,27 @@ class Dask:
             return ""  # it has gone; the first wait for a task says so
 
     def submit(self, call: Call) -> None:
-        """Start a call after those in flight that it waits for, at the next :meth:`wait` if not before."""
-        self._unsent[call.number] = call
-        if len(self._unsent) >= BATCH:
-            self._send()
-
-    def _send(self) -> None:
-        """Hand what was submitted to dask, as one graph."""
-        names, graph = dict[int, str](), dict[str, tuple[Any, ...]]()
-        for number, call in self._unsent.items():
-            self._submitted += 1
-            # Dask takes equal names for equal results: a call that is tried again needs a new one.
-            name = names[number] = f"{call.spec.stage.name}-{self._run}-{self._submitted}"
-            self._labels[name] = call.spec.label
-            inputs = [names[n] if n in names else self._futures[n] for n in call.upstream()]
+        """Start a call after those in flight that it waits for."""
+        self._submitted += 1
+        # Dask takes equal names for equal results: a call that is tried again needs a new one.
+        name = f"{call.spec.stage.name}-{self._run}-{self._submitted}"
+        inputs = [self._futures[number] for number in call.upstream()]
+        self._futures[call.number] = self._client.submit(
+            work,
             # Bytes: dask would unpickle a call, and import its stage, on the thread on which a worker hears of others.
-            graph[name] = (work, pickle.dumps(call), self._run, self._cluster is not None, *inputs)
-        if graph:
-            futures = self._client.get(graph, list(graph), sync=False, priority=-min(names), retries=0)
-            self._futures |= zip(names, futures, strict=True)
-        self._unsent.clear()
+            pickle.dumps(call),
+            self._run,
+            self._cluster is not None,
+            *inputs,
+            key=name,
+            priority=-call.number,
+            pure=False,
+            retries=0,
+        )
+        self._labels[name] = call.spec.label
 
     def wait(self) -> list[tuple[int, Ended]]:
         """Block until at least one call has ended; all that have ended meanwhile are given."""
-        self._send()
         ended: list[tuple[int, Ended]] = []
         while not ended:
             # Not for ever: a call whose worker died, a scheduler that is lost, and silent workers send no event.
@@ -434,7 +426,6 @@ class Dask:
     def cancel(self) -> None:
         """Begin nothing that was submitted, and forget what is running."""
         futures, self._futures = list(self._futures.values()), {}
-        self._unsent.clear()
         self._labels.clear()
         with suppress(Exception):
             self._client.cancel(futures, force=True)

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rille.pipeline.engine import run as driver
-from rille.pipeline.engine import workers
 from rille.pipeline.engine.graph import Graph, Maybe
 from rille.pipeline.engine.store.base import Store
 from rille.stages.core.declare import NoParams
@@ -99,10 +98,9 @@ def client():
 
 
 @settings(max_examples=15, deadline=None)
-@given(graphs(), st.sampled_from([1, 2, 100]))
-def test_a_cluster_computes_the_same_however_many_tasks_it_gets_at_once(client, nodes, batch):
-    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workers, "BATCH", batch)
+@given(graphs())
+def test_a_cluster_computes_the_same(client, nodes):
+    with tempfile.TemporaryDirectory() as folder:
         assert evaluate(nodes, Store(Path(folder) / "cache"), client)[0] == naive(nodes)
 
 
