@@ -298,9 +298,7 @@ def simultaneous(
         mode = "per_pair"
 
 
-def basic_pairs(
-    make: Builder, rigs: dict[int, Handle[CalibrationFacts]]
-) -> Generator[Wait, Any, dict[int, Pair]]:
+def basic_pairs(make: Builder, rigs: dict[int, Handle[CalibrationFacts]]) -> Generator[Wait, Any, dict[int, Pair]]:
     """Stereo pairs to local elevation models, each with its rig; on ground also to risk maps and paths."""
     p, pairs = make.products, dict[int, Pair]()
     verticals = {k: vertical(make, k) for k in rigs}

@@ -68,7 +68,7 @@ MIN_SWING = 0.1
 # m, of a large vehicle; more is an error of the track.
 MAX_LEVER_ARM = 5.0
 # Sources of the vertical by which heights of truth and world have one direction; ground is not level.
-MEASURED = ("attitude", "initial pose")
+MEASURED = ("attitude",)
 
 
 @dataclass(frozen=True)

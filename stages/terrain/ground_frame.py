@@ -2,7 +2,7 @@
 
 The local frame of a basic pair has its origin at the left camera's centre, z up, y along the horizontal projection of
 the optical axis (paper, sections 3.2 and 4.7: the local path is planned heading-aligned). Where "up" is comes from the
-best source at hand: a measured attitude, the given initial pose, the rig's stated pitch, else the ground plane that the
+best source at hand: a measured attitude, the rig's stated pitch, else the ground plane that the
 disparity shows. The ground plane is fitted in any case: it gives the range of elevations that Locus searches.
 
 A trajectory needs neither. Where no ground is seen (unless ``reference_height`` states it) and nothing gives the
@@ -97,14 +97,13 @@ class GroundFrameParams(Params):
 
 
 class VerticalHint(NamedTuple):
-    """Given sources of the vertical; the first of the three that is not None is used.
+    """Given sources of the vertical; the first that is not None is used.
 
-    ``up``, ``initial_up`` (3,) direction of up in the left camera frame, from an attitude and from an initial pose;
-    ``pitch`` downward pitch of the optical axis, radians, roll 0.
+    ``up`` (3,) direction of up in the left camera frame, from an attitude; ``pitch`` downward pitch of the optical axis,
+    radians, roll 0.
     """
 
     up: ArrayLike | None = None
-    initial_up: ArrayLike | None = None
     pitch: float | None = None
 
 
@@ -337,16 +336,14 @@ def _refuse_swapped(rig: Rig, left: Floats, right: Floats, beyond: float) -> Non
 
 
 def _given_vertical(hint: VerticalHint) -> tuple[Floats | None, str]:
-    up, initial_up, pitch = hint
-    for value, source in ((up, "attitude"), (initial_up, "initial pose")):
-        if value is not None:
-            v = np.asarray(value, dtype=np.float64)
-            length = float(np.linalg.norm(v))
-            if v.shape != (3,) or not math.isfinite(length) or length == 0.0:
-                raise InputError(
-                    "RIL-378", f"the {source}'s direction of up {value} is no direction", remedy="give three numbers"
-                )
-            return v / length, source
+    up, pitch = hint
+    if up is not None:
+        v = np.asarray(up, dtype=np.float64)
+        length = float(np.linalg.norm(v))
+        if v.shape != (3,) or not math.isfinite(length) or length == 0.0:
+            text = f"the attitude's direction of up {up} is no direction"
+            raise InputError("RIL-378", text, remedy="give three numbers")
+        return v / length, "attitude"
     if pitch is not None:
         return np.array([0.0, -math.cos(pitch), -math.sin(pitch)]), "pitch"
     return None, ""
@@ -398,7 +395,6 @@ def ground_frame_stage(
     rig: Bundle[CalibrationFacts],
     *,
     up: Sequence[float] | None = None,
-    initial_up: Sequence[float] | None = None,
     pitch: float | None = None,
     reference: str | Sequence[float] | None = None,
 ) -> Bundle[GroundFacts]:
@@ -409,7 +405,7 @@ def ground_frame_stage(
         matched_back(np.asarray(disparity["validity"]), np.asarray(disparity["backmatch_error"])),
         Rig.from_dict(rig.meta["rig"]),
         params,
-        VerticalHint(up, initial_up, pitch),
+        VerticalHint(up, pitch),
         reference,
     )
     return Bundle({}, facts)

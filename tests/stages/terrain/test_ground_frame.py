@@ -65,12 +65,8 @@ def test_each_source_and_their_order() -> None:
     slope = math.radians(8.0)
     maps = disparity(RIG, pitched(PITCH), plane(0.0, math.tan(slope), -HEIGHT))  # the ground rises ahead
     level_up = pitched(PITCH).rotation[2]
-    given = {"up": level_up, "initial_up": level_up, "pitch": math.radians(PITCH)}
-    for source, keys in (
-        ("attitude", ("up", "initial_up", "pitch")),
-        ("initial pose", ("initial_up", "pitch")),
-        ("pitch", ("pitch",)),
-    ):
+    given = {"up": level_up, "pitch": math.radians(PITCH)}
+    for source, keys in (("attitude", ("up", "pitch")), ("pitch", ("pitch",))):
         facts = level(*maps, RIG, PARAMS, VerticalHint(**{k: given[k] for k in keys}))
         assert facts["source"] == source
         np.testing.assert_allclose(up_of(facts), level_up, atol=1e-12)
