@@ -99,8 +99,8 @@ class GroundFrameParams(Params):
 class VerticalHint(NamedTuple):
     """Given sources of the vertical; the first that is not None is used.
 
-    ``up`` (3,) direction of up in the left camera frame, from an attitude; ``pitch`` downward pitch of the optical axis,
-    radians, roll 0.
+    ``up`` (3,) direction of up in the left camera frame, from an attitude; ``pitch`` downward pitch of the optical
+    axis, radians, roll 0.
     """
 
     up: ArrayLike | None = None
