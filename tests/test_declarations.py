@@ -10,7 +10,7 @@ import pytest
 from rille.pipeline.flow.config import stages
 from rille.stages.core.declare import declared
 
-UNITS = {"1", "px", "m", "rad", "grey", "m^2, m rad, rad^2", "m, rad"}
+UNITS = {"1", "px", "m", "rad", "grey", "m^2, m rad, rad^2", "m, rad", "m/px"}
 DATASET_STAGES = ("images.files", "mockup.scene", "mockup.render", "mockup.truth", "mockup.truth_dem")
 DRIVE_STAGES = ("mockup.rover", "mockup.sense", "mockup.obstacle", "mockup.overview")
 TILE_STAGES = ("tile_stage", "join_stage")

@@ -153,7 +153,7 @@ class Chain:
 
     def _refined(self, segments: list[tuple[Bundle, Bundle, Bundle]]) -> list[Bundle]:
         lenses = {side: lens.to_dict() for side, lens in (self.sequence.lenses or {}).items()}
-        given = {"resect": self.config.resect.model_dump(mode="json")} | ({"lenses": lenses} if lenses else {})
+        given = {"lenses": lenses} if lenses else {}
         return [
             self._stage(
                 "refine",
@@ -162,7 +162,6 @@ class Chain:
                 resection=resection,
                 level=level,
                 rig=self.calibration,
-                disparity=self.disparity[track.meta["frames"][0]],
             )
             for resection, level, track in segments
         ]

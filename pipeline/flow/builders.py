@@ -123,12 +123,6 @@ class Builder:
         found: dict[str, Any] = self.config.vehicle.model_dump(mode="json", exclude={"name"})
         return found
 
-    @cached_property
-    def given_resect(self) -> dict[str, Any]:
-        """The parameters of stage ``resect``, for stages that read them too."""
-        found: dict[str, Any] = self.config.resect.model_dump(mode="json")
-        return found
-
     def node(self, stage: Stage[Any, F], label: str, params: Any = None, /, **given: Any) -> Handle[F]:
         """One task of a stage, with the parameters that it has in the configuration, or with others.
 

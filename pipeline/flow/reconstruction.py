@@ -383,13 +383,11 @@ def refined(make: Builder, pairs: Mapping[int, Pair], segments: list[Segment]) -
             make.node(
                 refine_stage,
                 f"refine/{key.frame}",
-                resect=make.given_resect,
                 lenses=lenses or None,
                 track=segment.track,
                 resection=segment.resection,
                 level=key.level,
                 rig=key.rig,
-                disparity=key.disparity,
             )
         )
     return out

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -341,6 +341,14 @@ class Adjustment:
         return [f"{side} {name}" for side in ("left", "right") for name in lens] + rig
 
 
+class _Normal(NamedTuple):
+    """Gauss-Newton matrix and gradient; sum of squares, pixels squared, infinite where a corner has no image."""
+
+    matrix: Floats
+    gradient: Floats
+    cost: float
+
+
 @dataclass(frozen=True)
 class _Corners:
     """The corners of an adjustment as a problem of least squares."""
@@ -348,26 +356,19 @@ class _Corners:
     of: Adjustment
     robust: bool
 
-    def cost(self, x: Floats) -> float:
-        """Sum of squares, pixels squared; infinite where a corner has no image."""
-        residual, _ = self.of.evaluate(x)
-        if not np.isfinite(residual).all():
-            return math.inf
-        return (
-            CORNER_SCALE**2 * float(np.log1p(_squares(residual)).sum()) if self.robust else float(residual @ residual)
-        )
-
-    def normal(self, x: Floats) -> tuple[Floats, Floats]:
-        """Gauss-Newton matrix and gradient."""
+    def normal(self, x: Floats) -> _Normal:
+        """Normal equations, by Cauchy's weights or plain."""
         residual, jacobian = self.of.evaluate(x)
-        weight = np.repeat(1.0 / (1.0 + _squares(residual)), 2) if self.robust else np.ones(residual.size)
+        squares = _squares(residual)
+        weight = np.repeat(1.0 / (1.0 + squares), 2) if self.robust else np.ones(residual.size)
         weighted = (jacobian * weight[:, None]).T
-        return weighted @ jacobian, weighted @ residual
+        cost = CORNER_SCALE**2 * float((np.log1p(squares) if self.robust else squares).sum())
+        return _Normal(weighted @ jacobian, weighted @ residual, cost if math.isfinite(cost) else math.inf)
 
-    def ahead(self, x: Floats, normal: tuple[Floats, Floats], damping: float) -> Floats:
+    def ahead(self, x: Floats, normal: _Normal, damping: float) -> Floats:
         """The unknowns one damped step on."""
-        matrix, gradient = normal
-        return x + np.linalg.lstsq(matrix + damping * np.diag(np.diag(matrix)), -gradient, rcond=None)[0]
+        damped = normal.matrix + damping * np.diag(np.diag(normal.matrix))
+        return x + np.linalg.lstsq(damped, -normal.gradient, rcond=None)[0]
 
 
 def _squares(residual: Floats) -> Floats:

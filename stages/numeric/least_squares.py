@@ -15,19 +15,25 @@ from rille.stages.core.arrays import Floats
 FIRST_DAMPING, MAX_DAMPING = 1e-4, 1e8
 """Marquardt's factor at the start, and that from which on no step is expected to lower the cost any more."""
 
+
+class Equations(Protocol):
+    """Normal equations at a state, and the cost there: infinite of a state that cannot be."""
+
+    @property
+    def cost(self) -> float:
+        """Half the weighted sum of squares, or what stands in its place."""
+        ...
+
+
 X = TypeVar("X")
-N = TypeVar("N")
+N = TypeVar("N", bound=Equations)
 
 
 class Problem(Protocol[X, N]):
-    """A cost of a state, its normal equations there, and the state a damped step on."""
-
-    def cost(self, state: X) -> float:
-        """Cost, infinite of a state that cannot be."""
-        ...
+    """Normal equations at a state, and the state a damped step on."""
 
     def normal(self, state: X) -> N:
-        """Normal equations at a state."""
+        """Normal equations at a state, with its cost."""
         ...
 
     def ahead(self, state: X, normal: N, damping: float) -> X:
@@ -46,21 +52,19 @@ class Minimum(NamedTuple, Generic[X]):
 
 def levenberg_marquardt(problem: Problem[X, N], state: X, iterations: int, tolerance: float = 1e-9) -> Minimum[X]:
     """Minimum from ``state``; never worse than the start. Ends where a step lowers the cost by ``tolerance`` of it."""
-    damping, steps = FIRST_DAMPING, 0
-    first = now = problem.cost(state)
-    while steps < iterations:
-        normal = problem.normal(state)
-        # Normal equations stay as they are while a step is refused: only the damping grows.
-        while not (then := problem.cost(ahead := problem.ahead(state, normal, damping))) < now:
+    damping, steps, finished = FIRST_DAMPING, 0, False
+    now = problem.normal(state)
+    first = now.cost
+    while steps < iterations and not finished and damping <= MAX_DAMPING:
+        ahead = problem.ahead(state, now, damping)
+        then = problem.normal(ahead)
+        # Also of a refused step: at the minimum it changes the cost by rounding alone.
+        finished = abs(now.cost - then.cost) <= tolerance * now.cost
+        if then.cost < now.cost:
+            state, now, damping, steps = ahead, then, max(0.1 * damping, 1e-12), steps + 1
+        else:
             damping *= 10.0
-            # A step that changes the cost by rounding alone was refused at the minimum itself.
-            if damping > MAX_DAMPING or then - now <= tolerance * now:
-                return Minimum(state, first, now, steps)
-        finished = now - then <= tolerance * now
-        state, now, damping, steps = ahead, then, max(0.1 * damping, 1e-12), steps + 1
-        if finished:
-            break
-    return Minimum(state, first, now, steps)
+    return Minimum(state, first, now.cost, steps)
 
 
 SETTLED_SHARE = 1e-9

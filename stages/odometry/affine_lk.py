@@ -73,13 +73,12 @@ def align(a: Floats32, b: Floats32, templates: Templates, *, noise: float, sprea
 @njit(cache=True, nogil=True)
 def _align_all(a, b, templates, ridge, reach, out):  # type: ignore[no-untyped-def]
     patch, template = np.empty((SIDE + 2) ** 2), np.empty(SIDE * SIDE)
-    descent, grey = np.empty((SIDE * SIDE, UNKNOWNS)), np.empty(SIDE * SIDE)
+    descent, grey = np.empty((UNKNOWNS, SIDE * SIDE)), np.empty(SIDE * SIDE)
     for n in range(len(templates.points)):
         point, start, expected = templates.points[n], templates.start[n], templates.affinity[n]
         if not _descent(a, point[0], point[1], patch, template, descent):
             continue
-        derivatives = np.ascontiguousarray(descent.T)
-        gram = np.dot(derivatives, descent)
+        gram = np.dot(descent, descent.T)
         # The template is flat, or has one direction only.
         if not gram[0, 0] * gram[1, 1] - gram[0, 1] ** 2 > MIN_TEXTURE * (gram[0, 0] + gram[1, 1]):
             continue
@@ -92,28 +91,40 @@ def _align_all(a, b, templates, ridge, reach, out):  # type: ignore[no-untyped-d
         for _ in range(STEPS):
             if not _warp(b, at[0], at[1], affinity, grey):
                 break
-            right = np.dot(derivatives, grey - template)
+            grey -= template
+            right = np.dot(descent, grey)
             # Added, not subtracted: a step is composed inversely, so what the affinity has too much counts like a grey
             # difference.
-            right[2:6] += ridge * (np.dot(unexpected, affinity) - np.eye(2)).ravel()
+            right[2:6] += ridge * (_product(unexpected, affinity) - np.eye(2)).ravel()
             step = np.dot(inverse, right)
-            affinity = np.dot(affinity, _inverse(np.eye(2) + step[2:6].reshape(2, 2)))
-            move = np.dot(affinity, step[:2])
-            at -= move
+            affinity = _product(affinity, _inverse(np.eye(2) + step[2:6].reshape(2, 2)))
+            dx = affinity[0, 0] * step[0] + affinity[0, 1] * step[1]
+            dy = affinity[1, 0] * step[0] + affinity[1, 1] * step[1]
+            at[0], at[1] = at[0] - dx, at[1] - dy
             # Negated so that NaN, of a singular system, is refused as well.
-            if not np.abs(at - start).max() <= reach:
+            if not (abs(at[0] - start[0]) <= reach and abs(at[1] - start[1]) <= reach):
                 break
-            if np.abs(move).max() < SETTLED:
+            if max(abs(dx), abs(dy)) < SETTLED:
                 out.position[n] = at
-                out.error[n] = np.sqrt(np.mean((grey - template) ** 2))
+                out.error[n] = np.sqrt(np.mean(grey**2))
                 break
+
+
+@njit(cache=True, nogil=True)
+def _product(a, b):  # type: ignore[no-untyped-def]
+    """Product (2, 2); of matrices this small a call of BLAS takes longer than their sums."""
+    out = np.empty((2, 2))
+    for i in range(2):
+        for j in range(2):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j]
+    return out
 
 
 @njit(cache=True, nogil=True)
 def _inverse(m):  # type: ignore[no-untyped-def]
     """Inverse (2, 2); not finite of a singular matrix."""
     det = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
-    return np.array([[m[1, 1], -m[0, 1]], [-m[1, 0], m[0, 0]]]) / det
+    return np.array([[m[1, 1] / det, -m[0, 1] / det], [-m[1, 0] / det, m[0, 0] / det]])
 
 
 @njit(cache=True, nogil=True)
@@ -138,12 +149,12 @@ def _descent(a, x0, y0, patch, template, descent):  # type: ignore[no-untyped-de
         gx, gy = 0.5 * (patch[at + 1] - patch[at - 1]), 0.5 * (patch[at + wide] - patch[at - wide])
         template[i] = patch[at]
         mean += patch[at]
-        descent[i, 0], descent[i, 1] = gx, gy
-        descent[i, 2], descent[i, 3], descent[i, 4], descent[i, 5] = gx * x, gx * y, gy * x, gy * y
-        descent[i, 6] = 1.0
+        descent[0, i], descent[1, i] = gx, gy
+        descent[2, i], descent[3, i], descent[4, i], descent[5, i] = gx * x, gx * y, gy * x, gy * y
+        descent[6, i] = 1.0
     for i in range(SIDE * SIDE):
         # Gain about the mean: its derivative is then orthogonal to that of the offset.
-        descent[i, 7] = template[i] - mean / (SIDE * SIDE)
+        descent[7, i] = template[i] - mean / (SIDE * SIDE)
     return True
 
 

@@ -14,6 +14,7 @@ import math
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
@@ -28,27 +29,35 @@ def interest_operator(image: Floats32) -> Floats32:
 
     The three outermost pixels, where a window leaves the image, are 0.
     """
-    reach = HALF + 1
-    rows, cols = image.shape
     out = np.zeros(image.shape, np.float32)
-    if min(rows, cols) <= 2 * reach:
-        return out
-    inner = slice(reach, rows - reach), slice(reach, cols - reach)
-    grey, least = np.asarray(image, dtype=np.float32), np.full(out[inner].shape, np.inf, np.float32)
-    # Buffers serve all directions: of images, allocating takes longer than computing.
-    ahead, square, both = np.zeros_like(out), np.empty_like(out), np.empty_like(least)
-    for dr, dc in DIRECTIONS:
-        there = grey[1 + dr : rows - 1 + dr, 1 + dc : cols - 1 + dc]
-        np.subtract(there, grey[1:-1, 1:-1], out=ahead[1:-1, 1:-1])
-        cv2.multiply(ahead, ahead, dst=square)
-        square = cv2.boxFilter(square, -1, (2 * HALF + 1, 2 * HALF + 1), dst=square, normalize=False)
-        # Both senses of a direction, or the operator would prefer the side of a corner it is shifted to. The other
-        # sense is the same sum one step back.
-        behind = square[reach - dr : rows - reach - dr, reach - dc : cols - reach - dc]
-        cv2.addWeighted(square[inner], 0.5, behind, 0.5, 0.0, dst=both)
-        cv2.min(least, both, dst=least)
-    out[inner] = least
+    if min(image.shape) > 2 * (HALF + 1):
+        _least_sums(np.ascontiguousarray(image, dtype=np.float32), out)
     return out
+
+
+@njit(cache=True, nogil=True)
+def _least_sums(image, out):  # type: ignore[no-untyped-def]
+    """Fill ``out``. Works on slices of rows, whose indices start at 0: only such loops become vector code."""
+    rows, cols = image.shape
+    square, tall = np.zeros((rows, cols), np.float32), np.empty(cols, np.float32)
+    out[HALF + 1 : -HALF - 1, HALF + 1 : -HALF - 1] = np.inf
+    wide, inner = cols - 2, cols - 2 * HALF - 2
+    for dr, dc in DIRECTIONS:
+        for y in range(1, rows - 1):
+            here, both = image[y, 1 : 1 + wide], square[y, 1 : 1 + wide]
+            there, back = image[y + dr, 1 + dc : 1 + dc + wide], image[y - dr, 1 - dc : 1 - dc + wide]
+            for x in range(wide):
+                # Both senses of a direction, or the operator would prefer the side of a corner it is shifted to.
+                ahead, behind = there[x] - here[x], back[x] - here[x]
+                both[x] = np.float32(0.5) * (ahead * ahead + behind * behind)
+        for y in range(HALF + 1, rows - HALF - 1):
+            a, b, c, d, e = square[y - 2], square[y - 1], square[y], square[y + 1], square[y + 2]
+            for x in range(cols):
+                tall[x] = a[x] + b[x] + c[x] + d[x] + e[x]
+            least, first = out[y, HALF + 1 : cols - HALF - 1], tall[1:]
+            for x in range(inner):
+                total = first[x] + first[x + 1] + first[x + 2] + first[x + 3] + first[x + 4]
+                least[x] = min(least[x], total)
 
 
 def interest_points(
@@ -103,12 +112,24 @@ def interest_points(
 def _peaks(response: Floats32, least: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows and columns of pixels above ``least``, and greatest of the 5 x 5 neighbourhood; of equal ones the first."""
     side = 2 * HALF + 1
-    rows, cols = np.nonzero((response > least) & (response == cv2.dilate(response, np.ones((side, side), np.uint8))))
-    # The border has no response, so that all neighbours exist: those that are read before a peak must be less.
-    y, x = np.divmod(np.arange(side**2 // 2), side)
-    before = response[rows[:, None] + y - HALF, cols[:, None] + x - HALF]
-    first = (before < response[rows, cols][:, None]).all(axis=1)
+    rows, cols = np.divmod(
+        np.flatnonzero((response > least) & (response == cv2.dilate(response, np.ones((side, side), np.uint8)))),
+        response.shape[1],
+    )
+    first = _first_of_equals(response, rows, cols)
     return rows[first], cols[first]
+
+
+@njit(cache=True, nogil=True)
+def _first_of_equals(response, rows, cols):  # type: ignore[no-untyped-def]
+    """Whether (n,) no neighbour before in reading order is as great. The border has no response: all of them exist."""
+    side = 2 * HALF + 1
+    first = np.ones(len(rows), np.bool_)
+    for n in range(len(rows)):
+        for k in range(side**2 // 2):
+            if response[rows[n] + k // side - HALF, cols[n] + k % side - HALF] == response[rows[n], cols[n]]:
+                first[n] = False
+    return first
 
 
 def _inside(valid: Bytes, border: int) -> Bools:

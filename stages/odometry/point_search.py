@@ -132,7 +132,7 @@ def _search_all(a, b, templates, radius, scale, offset, cost):  # type: ignore[n
             continue
         features.pack_rows(template, 0, scale, words, deviation)
         features.pack_rows(area, 0, scale, searched, deviation)
-        cost[k] = _best(words.ravel(), searched.ravel(), radius + 1, offset[k])
+        cost[k] = _best(words.view(np.uint8), searched.view(np.uint8), radius + 1, offset[k])
 
 
 @njit(cache=True, nogil=True)
@@ -176,46 +176,45 @@ def _copy(image, point, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _sum_at(words, area, wide, u, v, most):  # type: ignore[no-untyped-def]
-    """Summed distance at a place of the area; given up, and greater than ``most``, after the row that exceeds it.
+def _sum_at(template, area, u, v, most):  # type: ignore[no-untyped-def]
+    """Summed distance (Eq. 1, absolute form) at a place of the area; given up after the row that exceeds ``most``.
 
-    Both in reading order, ``area`` in rows of ``wide``. Unsigned indices need no check for counting from the end.
+    Both as bytes, eight a pixel.
     """
     total = np.int64(0)
-    k, at = np.uint64(0), np.uint64(v * wide + u)
-    for _ in range(SIDE):
-        for i in range(SIDE):
-            total += distance(words[k + np.uint64(i)], area[at + np.uint64(i)])
+    for j in range(SIDE):
+        a, b = template[j], area[v + j, 8 * u : 8 * (u + SIDE)]
+        for i in range(8 * SIDE):
+            total += max(a[i], b[i]) - min(a[i], b[i])
         if total > most:
             break
-        k, at = k + np.uint64(SIDE), at + np.uint64(wide)
     return total
 
 
 @njit(cache=True, nogil=True)
-def _best(words, area, middle, offset):  # type: ignore[no-untyped-def]
+def _best(template, area, middle, offset):  # type: ignore[no-untyped-def]
     """Mean distance of a template at its best place in an area, of equals the first in reading order; -1 at the border.
 
     ``middle`` places to every side of the prediction; ``offset`` (2,) from there, with linear sub-pixel parts.
     """
-    wide, all_of_it = 2 * middle + SIDE, np.int64(2**62)
+    all_of_it = np.int64(2**62)
     most, bu, bv = all_of_it, middle, middle
     # From the prediction outwards, so that most places are given up early.
     for ring in range(middle + 1):
         for v in range(middle - ring, middle + ring + 1):
             step = 1 if abs(v - middle) == ring else max(2 * ring, 1)
             for u in range(middle - ring, middle + ring + 1, step):
-                total = _sum_at(words, area, wide, u, v, most)
+                total = _sum_at(template, area, u, v, most)
                 # Rings are no reading order: of equals the first in reading order is kept all the same.
                 if total < most or (total == most and (v < bv or (v == bv and u < bu))):
                     most, bu, bv = total, u, v
     # At the rim the least distance may lie beyond it, and the sub-pixel part has no neighbour there.
     if min(bu, bv) < 1 or max(bu, bv) > 2 * middle - 1:
         return -1.0
-    before = _sum_at(words, area, wide, bu - 1, bv, all_of_it)
-    behind = _sum_at(words, area, wide, bu + 1, bv, all_of_it)
-    above = _sum_at(words, area, wide, bu, bv - 1, all_of_it)
-    below = _sum_at(words, area, wide, bu, bv + 1, all_of_it)
+    before = _sum_at(template, area, bu - 1, bv, all_of_it)
+    behind = _sum_at(template, area, bu + 1, bv, all_of_it)
+    above = _sum_at(template, area, bu, bv - 1, all_of_it)
+    below = _sum_at(template, area, bu, bv + 1, all_of_it)
     offset[0] = bu - middle + linear(before, most, behind)
     offset[1] = bv - middle + linear(above, most, below)
     return most / (SIDE * SIDE)

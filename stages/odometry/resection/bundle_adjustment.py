@@ -72,7 +72,8 @@ class SegmentState(NamedTuple):
 class SegmentNormal(NamedTuple):
     """Normal equations: of the p = 6 frames + 1 unknowns of poses and bias, of the n depths, and between them.
 
-    ``poses`` (p, p), ``between`` (p, n), ``depths`` (n,) the diagonal; ``pose_gradient`` (p,), ``depth_gradient`` (n,).
+    ``poses`` (p, p), ``between`` (p, n), ``depths`` (n,) the diagonal; ``pose_gradient`` (p,), ``depth_gradient`` (n,);
+    ``cost`` that they are of.
     """
 
     poses: Floats
@@ -80,6 +81,7 @@ class SegmentNormal(NamedTuple):
     depths: Floats
     pose_gradient: Floats
     depth_gradient: Floats
+    cost: float
 
     def without_depths(self) -> tuple[Floats, Floats]:
         """Matrix (p, p) and right side (p,) of poses and bias alone: depths are eliminated by a division.
@@ -115,31 +117,24 @@ class SegmentAdjustment:
         """Huber's weights (n,) of frame ``f``; 0 of what is not seen there."""
         return huber_weights(errors.norm, self.tracks.seen[f])
 
-    def cost(self, state: SegmentState) -> float:
-        """Huber's cost of the tracks, with the priors of depths and bias; landmarks behind a camera do not count."""
-        total = 0.5 * float(((state.depth / self.tracks.sigma) ** 2).sum())
-        total += 0.5 * bias_information(self.params.bias_sigma) * state.bias**2
-        for f, seen in enumerate(self.tracks.seen):
-            norm = self.errors(state, f).norm[seen]
-            total += huber_costs(norm[np.isfinite(norm)])
-        return total
-
     def normal(self, state: SegmentState) -> SegmentNormal:
-        """Normal equations, with the priors of depths and bias."""
+        """Normal equations and Huber's cost of the tracks, with the priors of depths and bias."""
         out = self.measured(state)
         prior = bias_information(self.params.bias_sigma)
         out.poses[-1, -1] += prior
         out.pose_gradient[-1] += prior * state.bias
-        return out
+        return out._replace(cost=out.cost + 0.5 * prior * state.bias**2)
 
     def measured(self, state: SegmentState) -> SegmentNormal:
-        """Normal equations without the prior of the bias."""
+        """The same without the prior of the bias; landmarks behind a camera do not count."""
         p, n = 6 * len(state.R) + 1, len(state.depth)
         held = self.tracks.sigma**-2.0
-        out = SegmentNormal(np.zeros((p, p)), np.zeros((p, n)), held.copy(), np.zeros(p), state.depth * held)
+        out = SegmentNormal(np.zeros((p, p)), np.zeros((p, n)), held.copy(), np.zeros(p), state.depth * held, 0.0)
+        cost = 0.5 * float((state.depth**2 * held).sum())
         for f in range(len(state.R)):
             errors = self.errors(state, f)
             weight, at = self.weights(errors, f), slice(6 * f, 6 * f + 6)
+            cost += huber_costs(errors.norm[self.tracks.seen[f] & np.isfinite(errors.norm)])
             by_pose, by_depth = errors.jacobian[..., :6], errors.jacobian[..., 6]
             weighted = by_pose * weight[:, None, None]
             out.poses[at, at] = np.einsum("nai,nak->ik", weighted, by_pose, optimize=True)
@@ -152,7 +147,7 @@ class SegmentAdjustment:
             out.between[-1] += square
             out.pose_gradient[-1] += slope.sum()
         out.poses[-1] = out.poses[:, -1] = out.between.sum(1)
-        return out
+        return out._replace(cost=cost)
 
     def ahead(self, state: SegmentState, normal: SegmentNormal, damping: float) -> SegmentState:
         """The state one damped step on."""

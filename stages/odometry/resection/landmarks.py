@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
@@ -115,7 +116,8 @@ def matches_at(points: Floats, disparity: Bundle) -> tuple[Floats, Bools]:
     corners = np.stack([column[y4, x4], row[y4, x4]], -1).astype(np.float64)
     # A corner of weight 0 (the point is on the pixel grid) may be anything.
     needed = weights > 1e-9
-    good = (_measured(disparity)[y4, x4] & np.isfinite(corners).all(-1)) | ~needed
+    matched = (np.asarray(disparity["validity"])[y4, x4] & np.uint8(Validity.MATCHED)) != 0
+    good = (matched & np.isfinite(corners).all(-1)) | ~needed
     corners = np.where(needed[..., None] & good[..., None], corners, np.nan)
     ok = inside & good.all(1)
     corners[~ok] = 0.0
@@ -123,11 +125,6 @@ def matches_at(points: Floats, disparity: Bundle) -> tuple[Floats, Bools]:
     apart = np.nanmax(corners, axis=1) - np.nanmin(corners, axis=1)
     value = np.einsum("nk,nki->ni", weights, np.where(np.isfinite(corners), corners, 0.0))
     return value, ok & (apart <= MAX_DISPARITY_STEP_PX).all(1)
-
-
-def _measured(disparity: Bundle) -> Bools:
-    """Pixels with a measured disparity."""
-    return np.asarray((np.asarray(disparity["validity"]) & np.uint8(Validity.MATCHED)) != 0)
 
 
 def relief(points: Floats, disparity: Bundle) -> Floats:
@@ -138,25 +135,33 @@ def relief(points: Floats, disparity: Bundle) -> Floats:
     :data:`MAX_DISPARITY_STEP_PX`, since then there are two surfaces, or where less than half of the template is
     matched.
     """
-    both = np.stack([np.asarray(disparity[name]) for name in ("column_disparity", "row_disparity")], -1)
-    rows, cols = both.shape[:2]
+    side = 2 * TEMPLATE_HALF_PX + 1
+    first = np.floor(np.where(known(points)[:, None], points, -1e6) + 0.5).astype(np.intp) - TEMPLATE_HALF_PX
+    rows, cols = np.shape(disparity["validity"])
+    if min(rows, cols) < side:
+        return np.full(len(points), np.nan)
+    # No template leaves the image.
+    inside = np.asarray((first >= 0).all(1) & (first <= [cols - side, rows - side]).all(1))
+    x, y = np.where(inside[:, None], first, 0).T
+    column, row, valid = (
+        sliding_window_view(np.asarray(disparity[name]), (side, side))[y, x].reshape(-1, side**2)
+        for name in ("column_disparity", "row_disparity", "validity")
+    )
+    values = np.stack([column, row], -1).astype(np.float64)
+    use = inside[:, None] & ((valid & np.uint8(Validity.MATCHED)) != 0) & np.isfinite(values).all(-1)
+    values[~use] = 0.0
     dy, dx = (
         o.ravel() for o in np.mgrid[-TEMPLATE_HALF_PX : TEMPLATE_HALF_PX + 1, -TEMPLATE_HALF_PX : TEMPLATE_HALF_PX + 1]
     )
-    centre = np.floor(np.where(known(points)[:, None], points, -1e6) + 0.5).astype(np.intp)
-    x, y = centre[:, :1] + dx, centre[:, 1:] + dy
-    inside = (x >= 0) & (y >= 0) & (x < cols) & (y < rows)
-    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
-    values = both[y, x].astype(np.float64)
-    use = inside & _measured(disparity)[y, x] & np.isfinite(values).all(-1)
-    values[~use] = 0.0
     # In units of the template, so that all sums are of the same size.
     design = np.stack([np.ones(dx.size), dx / TEMPLATE_HALF_PX, dy / TEMPLATE_HALF_PX], -1)
     products = (design[:, :, None] * design[:, None, :]).reshape(-1, 9)
     normal = (use @ products).reshape(-1, 3, 3)
     # Matched pixels on a line leave the slope across open: it is 0 then.
-    plane = np.linalg.solve(normal + 1e-9 * np.eye(3), design.T @ values)
-    squares = (((values - design @ plane) ** 2).sum(-1) * use).sum(1)
+    right = design.T @ values
+    plane = np.linalg.solve(normal + 1e-9 * np.eye(3), right)
+    # Of a least-squares fit: the squares of the values less those of the plane.
+    squares = np.maximum((values**2).sum((1, 2)) - (right * plane).sum((1, 2)), 0.0)
     rms = np.sqrt(squares / np.maximum(use.sum(1), 1))
     return np.where((2 * use.sum(1) > dx.size) & (rms <= MAX_DISPARITY_STEP_PX), rms, np.nan)
 

@@ -108,11 +108,12 @@ def _linearised(obs, R, t, whitened, lengths):  # type: ignore[no-untyped-def]
 
 
 class Normal(NamedTuple):
-    """Weighted normal matrix (7, 7), gradient (7,) and weights (n,) of Huber's cost."""
+    """Weighted normal matrix (7, 7), gradient (7,), weights (n,), and Huber's cost that they are of."""
 
     matrix: Floats
     gradient: Floats
     weight: Floats
+    cost: float
 
 
 def huber_weights(norm: Floats, active: Bools | None = None) -> Floats:
@@ -128,11 +129,14 @@ def huber_costs(norm: Floats) -> float:
 
 
 def normal_equations(errors: Errors, active: Bools) -> Normal:
-    """Normal equations of the active (n,) landmarks, without the prior of the bias."""
+    """Normal equations of the active (n,) landmarks, without the prior of the bias.
+
+    The cost is infinite where one of them is behind the camera.
+    """
     weight = huber_weights(errors.norm, active)
     jacobian = errors.jacobian.reshape(-1, 7)
     weighted = (jacobian * np.repeat(weight, 2)[:, None]).T
-    return Normal(weighted @ jacobian, weighted @ errors.error.ravel(), weight)
+    return Normal(weighted @ jacobian, weighted @ errors.error.ravel(), weight, huber_costs(errors.norm[active]))
 
 
 def bias_information(sigma: float) -> float:
@@ -149,11 +153,6 @@ class PoseAdjustment:
     active: Bools
     bias_sigma: float
 
-    def cost(self, pose: Pose) -> float:
-        """Huber's cost with the prior of the bias; infinite where a landmark is behind the camera."""
-        norm = back_projection(self.obs, pose).norm[self.active]
-        return huber_costs(norm) + 0.5 * bias_information(self.bias_sigma) * float(pose.bias) ** 2
-
     def normal(self, pose: Pose) -> Normal:
         """Normal equations with the prior of the bias."""
         normal, prior = (
@@ -162,7 +161,7 @@ class PoseAdjustment:
         )
         normal.matrix[6, 6] += prior
         normal.gradient[6] += prior * float(pose.bias)
-        return normal
+        return normal._replace(cost=normal.cost + 0.5 * prior * float(pose.bias) ** 2)
 
     def ahead(self, pose: Pose, normal: Normal, damping: float) -> Pose:
         """The pose one damped step on."""

@@ -39,13 +39,10 @@ from rille.stages.odometry.resection.bundle_adjustment import (
     adjust,
 )
 from rille.stages.odometry.resection.intrinsics import SegmentCameras, contribution
-from rille.stages.odometry.resection.landmarks import Landmarks
 from rille.stages.odometry.resection.pnp import Pose, back_projection, bias_information, pose_covariance
-from rille.stages.odometry.resection.resect import key_landmarks
 from rille.stages.odometry.resection.robust_pose import (
     MIN_LANDMARKS,
     SHARED_SOURCES,
-    ResectParams,
     frame_errors,
     scatter_of_blocks,
 )
@@ -72,24 +69,23 @@ class SegmentStart(NamedTuple):
         return self.tracks.position + (self.state.depth + self.state.bias)[:, None] * self.tracks.along
 
 
-def segment_start(track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig) -> SegmentStart | None:
-    """Measurements and start of a segment; None: fewer than one frame behind the key is posed.
-
-    ``landmarks`` are those of all points of the track, in the local frame.
-    """
+def segment_start(track: Bundle, resection: Bundle, rig: Rig) -> SegmentStart | None:
+    """Measurements and start of a segment; None: fewer than one frame behind the key is posed."""
     poses, tracked = np.asarray(resection["poses"]), np.asarray(track["points"], dtype=np.float64)
     frames = 1 + np.flatnonzero(np.isfinite(poses[1:]).all((1, 2)))
     inlier = (np.asarray(resection["inlier"]) != 0) & np.isfinite(tracked).all(-1)
-    points = np.flatnonzero(np.isfinite(landmarks.position).all(1) & inlier[:, frames].any(1))
+    landmarks = np.asarray(resection["landmarks"])
+    points = np.flatnonzero(np.isfinite(landmarks).all(1) & inlier[:, frames].any(1))
     if not len(points):
         return None
-    known, pixels = landmarks.take(points), np.ascontiguousarray(np.swapaxes(tracked[points][:, frames], 0, 1))
+    pixels = np.ascontiguousarray(np.swapaxes(tracked[points][:, frames], 0, 1))
     T = [RigidTransform.from_matrix(poses[j]).inverse() for j in frames]
     state = SegmentState(np.array([p.rotation for p in T]), np.array([p.translation for p in T]), np.zeros(len(points)))
     seen = np.ascontiguousarray(inlier[points][:, frames].T)
     # An exact disparity would have infinite information.
-    sigma = np.maximum(known.sigma, 1e-3)
-    tracks = SegmentTracks(known.position, known.per_pixel, sigma, pixels, seen, rig.left)
+    sigma = np.maximum(np.asarray(resection["disparity_sigma"])[points], 1e-3)
+    along = np.asarray(resection["per_pixel"])[points]
+    tracks = SegmentTracks(landmarks[points], along, sigma, pixels, seen, rig.left)
     return SegmentStart(tracks, state, frames, points).determined()
 
 
@@ -124,18 +120,17 @@ def pose_errors(tracks: SegmentTracks, state: SegmentState, params: RefineParams
 
 
 class RefineInputs(NamedTuple):
-    """Tracks and resection of a segment; vertical, rig and disparity of its basic pair."""
+    """Tracks and resection of a segment; vertical and rig of its basic pair."""
 
     track: Bundle[TrackFacts]
     resection: Bundle[ResectFacts]
     level: Bundle[GroundFacts]
     rig: Bundle[CalibrationFacts]
-    disparity: Bundle
 
 
 @stage(
     "refine",
-    version=5,
+    version=6,
     outputs=[
         replace(POSES, frame="local"),
         replace(COVARIANCE, frame="local"),
@@ -145,19 +140,18 @@ class RefineInputs(NamedTuple):
     ],
 )
 def refine_stage(
-    params: RefineParams, inputs: RefineInputs, *, resect: ResectParams, lenses: Mapping[str, Any] | None = None
+    params: RefineParams, inputs: RefineInputs, *, lenses: Mapping[str, Any] | None = None
 ) -> Bundle[RefineFacts]:
     """Poses of a segment adjusted jointly with its landmarks."""
     rig, T_local_key = (
         Rig.from_dict(inputs.rig.meta["rig"]),
         RigidTransform.from_matrix(inputs.level.meta["T_local_left"]),
     )
-    landmarks = key_landmarks(inputs.track, inputs.disparity, rig, T_local_key, resect)
     # A frame that keeps too few landmarks keeps the pose of its resection.
     names = ("poses", "covariance", "shared", "landmarks", "inlier")
     out = {name: np.array(inputs.resection[name]) for name in names}
     meta: RefineFacts = {"adjustment": {}, "intrinsics": [], "per_frame": []}
-    start = segment_start(inputs.track, inputs.resection, landmarks, rig)
+    start = segment_start(inputs.track, inputs.resection, rig)
     if start is not None:
         minimum = adjust(start.tracks, start.state, params)
         costs = {"cost_before": minimum.before, "cost_after": minimum.after}

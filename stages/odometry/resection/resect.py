@@ -263,15 +263,6 @@ def knocked(points: SegmentPoints, segment: SegmentPoses, after: Bundle, rig: Ri
     return line, jump.tolist()
 
 
-def key_landmarks(
-    track: Bundle[TrackFacts], disparity: Bundle, rig: Rig, T_local_key: RigidTransform, params: ResectParams
-) -> Landmarks:
-    """Landmarks of all points of a track, by the disparity of its key frame."""
-    points = np.asarray(track["points"])[:, 0].astype(np.float64)
-    errors = {"disparity_sigma": params.disparity_sigma, "max_depth_ratio": params.max_depth_ratio}
-    return landmarks_of(points, disparity, rig, T_local_key, **errors)
-
-
 class ResectInputs(NamedTuple):
     """Tracks of a segment; vertical, rig and disparity of its basic pair; disparity and rig of the pair at its end."""
 
@@ -285,13 +276,15 @@ class ResectInputs(NamedTuple):
 
 @stage(
     "resect",
-    version=3,
+    version=4,
     outputs=[
         replace(POSES, frame="local"),
         replace(COVARIANCE, frame="local"),
         replace(SHARED, frame="local"),
         Array("inlier", ("point", "frame"), "uint8", "1", "landmark agrees with the pose", nodata="0"),
         Array("landmarks", ("point", "xyz"), "float64", "m", "coordinates of the landmarks", "nan", "local"),
+        Array("per_pixel", ("point", "xyz"), "float64", "m/px", "their motion with the disparity", "nan", "local"),
+        Array("disparity_sigma", ("point",), "float64", "px", "standard deviation of their disparity", "nan"),
         Array("residual", ("point", "frame"), "float32", "px", "back-projection error", nodata="nan"),
     ],
 )
@@ -308,7 +301,14 @@ def resect_stage(
         RigidTransform.from_matrix(inputs.level.meta["T_local_left"]),
     )
     frames, tracks = inputs.track.meta["frames"], np.asarray(inputs.track["points"])
-    landmarks = key_landmarks(inputs.track, inputs.disparity, rig, T_local_key, params)
+    landmarks = landmarks_of(
+        np.asarray(inputs.track["points"])[:, 0].astype(np.float64),
+        inputs.disparity,
+        rig,
+        T_local_key,
+        disparity_sigma=params.disparity_sigma,
+        max_depth_ratio=params.max_depth_ratio,
+    )
     reckoned = None
     if prediction is not None:
         reckoned = [None if T is None else RigidTransform.from_matrix(T) for T in prediction]
@@ -343,4 +343,5 @@ def resect_stage(
     for line in [fact["contradiction"] for fact in segment.facts if "contradiction" in fact]:
         meta["contradiction"], meta["warnings"] = line, [line]
     arrays = {name: getattr(segment, name) for name in ("poses", "covariance", "shared", "inlier", "residual")}
-    return Bundle({**arrays, "landmarks": landmarks.position}, meta)
+    arrays |= {"landmarks": landmarks.position, "per_pixel": landmarks.per_pixel, "disparity_sigma": landmarks.sigma}
+    return Bundle(arrays, meta)

@@ -252,7 +252,7 @@ def _without_inconsistent(obs: Observations, pose: Pose, active: Bools, params: 
             f"{where}: too few landmarks: {count} agree with one pose",
             "raise resect.threshold or choose basic pairs closer",
         )
-        minimum = levenberg_marquardt(PoseAdjustment(obs, active, params.bias_sigma), pose, params.iterations, 1e-6)
+        minimum = levenberg_marquardt(PoseAdjustment(obs, active, params.bias_sigma), pose, params.iterations, 1e-3)
         pose, steps = minimum.state, steps + minimum.steps
         usable = _first_order(obs, pose, params)
         if (active & ~usable).any():
@@ -263,7 +263,7 @@ def _without_inconsistent(obs: Observations, pose: Pose, active: Bools, params: 
         if beyond == 0:
             # Only the last adjustment needs the full accuracy.
             problem = PoseAdjustment(obs, active, params.bias_sigma)
-            minimum = levenberg_marquardt(problem, pose, params.iterations, 1e-12)
+            minimum = levenberg_marquardt(problem, pose, params.iterations, 1e-10)
             return _Posed(minimum.state, active, steps + minimum.steps)
         active = active.copy()
         # Not all of them at once: the worst pull the pose, and others agree once these are gone.
