@@ -31,6 +31,10 @@ NAMES = ("focal length", "principal point's column", "principal point's row")
 STEP = 0.01
 """Change of each number by which the cost is differentiated, over the focal length, as all errors here."""
 
+MAX_MOVE, MAX_ERROR, MAX_MOVES = 0.03, 0.2, 8
+"""Largest move towards a segment's own minimum, largest error over the focal length, and number of moves: far from its
+minimum the cost is no parabola."""
+
 MIN_TURN_DEG = 4.0
 """Turn of a segment from which on it counts: errors that all tracks share hide what smaller ones show."""
 
@@ -86,18 +90,30 @@ def contribution(
 ) -> list[tuple[float, float]]:
     """Information and pull of the error of each of :data:`NAMES` by an adjusted segment, all its unknowns free.
 
-    0 where the segment turns too little.
+    Both are those of the parabola at the segment's own minimum; 0 where the segment turns too little.
     """
     turns = Rotation.from_matrix(state.R @ cameras.T_local_key.rotation).magnitude()
     if turns.max() < math.radians(MIN_TURN_DEG):
         return [(0.0, 0.0)] * len(NAMES)
-    parts = []
-    for name in NAMES:
-        three = [with_change(views, cameras, name, by) for by in (-STEP, 0.0, STEP)]
+
+    def parabola(name: str, by: float) -> tuple[float, float]:
+        """Second derivative of the cost by an error, and minus the first, at an error."""
+        three = [with_change(views, cameras, name, by + step) for step in (-STEP, 0.0, STEP)]
         finite = [np.isfinite(v.position).all(1) & np.isfinite(v.pixels).all(2) for v in three]
         seen = views.seen & np.all(finite, axis=0)
         below, at, above = (adjust(replace(v, seen=seen), state, params).after for v in three)
-        parts.append(((below - 2.0 * at + above) / STEP**2, (below - above) / (2.0 * STEP)))
+        return (below - 2.0 * at + above) / STEP**2, (below - above) / (2.0 * STEP)
+
+    parts = []
+    for name in NAMES:
+        by = 0.0
+        for _ in range(MAX_MOVES):
+            information, pull = parabola(name, by)
+            move = pull / information if information > 0 else math.copysign(MAX_MOVE, pull)
+            if abs(move) <= MAX_MOVE or abs(by) > MAX_ERROR:
+                break
+            by += math.copysign(MAX_MOVE, move)
+        parts.append((information, information * by + pull))
     return parts
 
 

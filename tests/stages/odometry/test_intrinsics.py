@@ -61,13 +61,12 @@ def errors(given: Camera, lens: Lens, turn: float = 0.03) -> list[tuple[float, f
     return [common_error(parts[:, k]) for k in range(len(NAMES))]
 
 
-@pytest.mark.parametrize(("by", "lens"), [(-0.05, Lens(CAMERA)), (0.03, BENT)], ids=["pinhole", "lens"])
+@pytest.mark.parametrize(("by", "lens"), [(0.1, Lens(CAMERA)), (0.03, BENT)], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_wrong_number_is_named_where_the_camera_turns(name, by, lens):
     found = errors(changed(CAMERA, name, by), lens)
     assert name in contradiction(found, CAMERA.fx)
-    # Larger errors are no longer linear: Huber's weights make them larger still.
-    assert 0.6 < -found[NAMES.index(name)][0] / by < 2.0
+    assert 0.7 < -found[NAMES.index(name)][0] / by < 1.4
 
 
 @pytest.mark.parametrize("lens", [Lens(CAMERA), BENT], ids=["pinhole", "lens"])
