@@ -113,6 +113,18 @@ def seen_so_far(near: Bundle, far: Bundle | None) -> tuple[Hazards, KnownGround]
     return Hazards(*maps), KnownGround(unknown, glanced, maps[2] >= P_COSTLY)
 
 
+class LegInputs(NamedTuple):
+    """Hazards of near ground, of all that was seen, and bounds of the ground that was not; pose and rig of the cameras;
+    the leg before."""
+
+    risk: Bundle[RiskFacts]
+    pose: Bundle
+    rig: Bundle[CalibrationFacts]
+    far: Bundle[RiskFacts] | None = None
+    ceiling: Bundle[BoundsFacts] | None = None
+    before: Bundle[LegFacts] | None = None
+
+
 @stage(
     "local_planner",
     version=10,
@@ -136,12 +148,7 @@ def seen_so_far(near: Bundle, far: Bundle | None) -> tuple[Hazards, KnownGround]
 )
 def local_planner_stage(
     params: LocalPlannerParams,
-    risk: Bundle[RiskFacts],
-    pose: Bundle,
-    rig: Bundle[CalibrationFacts],
-    far: Bundle[RiskFacts] | None = None,
-    ceiling: Bundle[BoundsFacts] | None = None,
-    before: Bundle[LegFacts] | None = None,
+    inputs: LegInputs,
     *,
     goal: Sequence[float],
     looks: int,
@@ -150,17 +157,17 @@ def local_planner_stage(
     whole: bool = False,
 ) -> Bundle[LegFacts]:
     """The next leg of a drive to a goal, over ground that is known to be free."""
-    T_world_left = RigidTransform.from_matrix(np.asarray(pose["poses"])[-1])
+    T_world_left = RigidTransform.from_matrix(np.asarray(inputs.pose["poses"])[-1])
     stand = from_above(T_world_left @ T_vehicle_left.inverse())
     end = (float(goal[0]), float(goal[1]))
     memory = PlannerMemory(looks, [(float(x), float(y)) for x, y in closed])
-    rest = None
+    rest, before, ceiling = None, inputs.before, inputs.ceiling
     if before is not None and len(before["rest_gear"]):
         rest = np.asarray(before["rest"]), np.asarray(before["rest_gear"])
     bounds = None if ceiling is None else Bounds(upper=np.asarray(ceiling["upper"]), lower=np.asarray(ceiling["lower"]))
-    view = FieldOfView.of(Rig.from_dict(rig.meta["rig"]), T_vehicle_left)
-    leg = next_leg(SeenGround(risk, far, bounds), stand, end, params, memory, view, rest)
-    best, margin = shortest_way(risk, stand, end, params) if whole else (None, None)
+    view = FieldOfView.of(Rig.from_dict(inputs.rig.meta["rig"]), T_vehicle_left)
+    leg = next_leg(SeenGround(inputs.risk, inputs.far, bounds), stand, end, params, memory, view, rest)
+    best, margin = shortest_way(inputs.risk, stand, end, params) if whole else (None, None)
     meta: LegFacts = {
         "shortest_m": best,
         "shortest_margin_m": margin,
