@@ -58,7 +58,7 @@ IDEAS = (
         "no relief under templates", name="odometry.resection.landmarks.relief", function=lambda p, d: np.zeros(len(p))
     ),
     Idea("no affinity of the neighbours", name="odometry.track.fit_affinity", function=_no_change),
-    Idea("no new points in empty parts", ("track.reseed=false",)),
+    Idea("no new points in empty parts", name="odometry.track._reseed", function=lambda state, *given: state),
     Idea("exposure as it is", name="odometry.track.levelled", function=lambda frames, motions: list(frames)),
     Idea("no turned frames", ("motion.turn_below=0",)),
     Idea("no random samples", name="odometry.resection.robust_pose._sampled", function=lambda *given: []),
@@ -68,7 +68,7 @@ IDEAS = (
         function=lambda *given: None,
     ),
     Idea("rig as it is given", ("rig.mode=fixed",)),
-    Idea("no smooth error beside the rig", ("rig.systematic=0.001", "orientation.systematic=0.001")),
+    Idea("no smooth error beside the rig", name="calibration.parameter_selection.SYSTEMATIC_PX", function=0.001),
     Idea(
         "no principal point beside the angles", ("rig.prior_principal=0.00001", "orientation.prior_principal=0.00001")
     ),

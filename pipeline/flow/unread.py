@@ -69,15 +69,12 @@ def refuse_unreadable(keys: Iterable[str], config: Params, sequence: Sequence) -
     Raises
     ------
     ConfigError
-        A key belongs to a section that only the other kind of run has, or to ``undistort`` though the images are
-        undistorted.
+        A key belongs to a section that only the other kind of run has.
     """
     simulated = sequence.simulation is not None
     foreign = recorded() if simulated else driven()
     # A drive is over ground.
     lost = [key for key in keys if key.partition(".")[0] in foreign or (simulated and key == "terrain.reference")]
-    if sequence.simulation is None and sequence.lenses is None:
-        lost += [key for key in keys if key.startswith("undistort.")]
     if lost:
         who = "a drive" if simulated else f"a reconstruction of {sequence.name}"
         raise ConfigError("RIL-730", f"{values(lost, config)}: no task of {who} reads it", remedy="leave it out")

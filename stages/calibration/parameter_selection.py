@@ -57,6 +57,13 @@ BEYOND_LEFT = 0.03
 
 ROUNDS = 3
 
+PRIOR_ROTATION_DEG, PRIOR_BASELINE_DEG = 0.05, 0.2
+"""Standard deviations [degrees] of each rotation angle, and of the baseline's direction, of an intact calibration."""
+
+SYSTEMATIC_PX = 0.1
+"""Smooth row error [pixels RMS over the image] that no rig explains and more matches do not reduce: remains of lens
+model and rectification."""
+
 
 class RelativeParams(Params):
     """When a parameter of the rig may depart from the calibration."""
@@ -82,33 +89,20 @@ class RelativeParams(Params):
     least_depth: float = Field(
         0.005, ge=0, description="relative change of depth from which on a correction is applied, too"
     )
-    prior_rotation_deg: float = Field(
-        0.05, gt=0, description="standard deviation [degrees] of each rotation angle of an intact calibration"
-    )
-    prior_baseline_deg: float = Field(
-        0.2, gt=0, description="standard deviation [degrees] of the baseline's direction of an intact calibration"
-    )
     prior_principal: float = Field(
         0.005,
         gt=0,
         description="standard deviation of the principal point over the focal length; 0.005 is usual for a "
         "calibration with a target; smaller values make more toe-in observable",
     )
-    systematic: float = Field(
-        0.1,
-        gt=0,
-        le=10,
-        description="smooth row error [pixels RMS over the image] that no rig explains and more matches do not "
-        "reduce: remains of lens model and rectification",
-    )
 
     def priors(self, rig: Rig) -> Priors:
         """Prior standard deviations of a rig, in radians and pixels."""
         return Priors(
-            math.radians(self.prior_rotation_deg),
-            math.radians(self.prior_baseline_deg),
+            math.radians(PRIOR_ROTATION_DEG),
+            math.radians(PRIOR_BASELINE_DEG),
             (self.prior_principal * rig.right.fx, self.prior_principal * rig.right.fy),
-            self.systematic,
+            SYSTEMATIC_PX,
         )
 
 

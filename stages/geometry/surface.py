@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import InputError
 from rille.stages.geometry.lattice import Lattice
 
 
@@ -59,42 +58,3 @@ def plane(lattice: Lattice) -> Surface:
         return feet, normals
 
     return Surface(lattice.rows, lattice.cols, locate, grid)
-
-
-def cylinder(centre: ArrayLike, radius: float, angles: ArrayLike, heights: ArrayLike, *, inside: bool) -> Surface:
-    """Upright cylinder around ``centre`` (3,), metres.
-
-    Row r is at ``heights[r]`` above the centre (metres), column c at azimuth ``angles[c]`` (radians from x to y).
-    ``inside``: the cameras are inside (a panorama), so normals point inwards; elevation always grows to the cameras.
-    """
-    o, azimuth, z = (np.asarray(v, dtype=np.float64) for v in (centre, angles, heights))
-    _check_radius(radius)
-
-    def locate(rows: Floats, cols: Floats) -> tuple[Floats, Floats]:
-        a, h = azimuth[cols.astype(np.intp)], z[rows.astype(np.intp)]
-        outwards = np.stack([np.cos(a), np.sin(a), np.zeros(a.size)], axis=-1)
-        feet = o + radius * outwards + h[:, None] * np.array([0.0, 0.0, 1.0])
-        return feet, -outwards if inside else outwards
-
-    return Surface(z.size, azimuth.size, locate)
-
-
-def sphere(centre: ArrayLike, radius: float, longitudes: ArrayLike, latitudes: ArrayLike, *, inside: bool) -> Surface:
-    """Sphere around ``centre`` (3,); row r at ``latitudes[r]``, column c at ``longitudes[c]``, radians.
-
-    ``inside`` as of :func:`cylinder`.
-    """
-    o, lon, lat = (np.asarray(v, dtype=np.float64) for v in (centre, longitudes, latitudes))
-    _check_radius(radius)
-
-    def locate(rows: Floats, cols: Floats) -> tuple[Floats, Floats]:
-        a, b = lon[cols.astype(np.intp)], lat[rows.astype(np.intp)]
-        outwards = np.stack([np.cos(b) * np.cos(a), np.cos(b) * np.sin(a), np.sin(b)], axis=-1)
-        return o + radius * outwards, -outwards if inside else outwards
-
-    return Surface(lat.size, lon.size, locate)
-
-
-def _check_radius(radius: float) -> None:
-    if not radius > 0:
-        raise InputError("RIL-444", f"the reference surface's radius {radius} m is not positive")

@@ -10,15 +10,11 @@ doi:10.1109/TASSP.1981.1163711, the six-point kernel of fourth order.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Literal
-
 import numpy as np
 from numba import njit
-from pydantic import Field
 
 from rille.stages.core.arrays import Bytes, Floats, Floats32
-from rille.stages.core.declare import AnyArray, Array, Bundle, Params, stage
+from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
 from rille.stages.facts.imaging import UndistortedFacts
 from rille.stages.geometry.geometry import Camera
@@ -28,20 +24,9 @@ from rille.stages.imaging.pyramid import grey
 PHASES = 4096
 """Positions between two pixels that weights are tabulated for; the nearest one is taken."""
 
-
-class UndistortParams(Params):
-    """Parameters of the removal of lens distortion."""
-
-    interpolation: Literal["cubic", "lanczos", "linear"] = Field(
-        default="cubic",
-        description="cubic: six taps, displaces texture of a period of 6 pixels by at most 0.004 pixels; lanczos: "
-        "eight taps, keeps the finest contrast, displaces smooth texture by up to 0.011 pixels; linear: "
-        "fast, blurs",
-    )
-
-
-def _linear(d: Floats) -> Floats:
-    return np.maximum(0.0, 1.0 - d)
+REACH = 3
+"""Pixels that the kernel reaches to each side. Six taps displace texture of a period of 6 pixels by at most 0.004
+pixels; Lanczos' eight keep the finest contrast and displace smooth texture by up to 0.011."""
 
 
 def _cubic(d: Floats) -> Floats:
@@ -52,29 +37,14 @@ def _cubic(d: Floats) -> Floats:
     return np.where(d <= 1, near, np.where(d <= 2, middle, np.where(d <= 3, far, 0.0)))
 
 
-def _lanczos(d: Floats) -> Floats:
-    return np.where(d < 4, np.sinc(d) * np.sinc(d / 4), 0.0)
-
-
-KERNELS: Mapping[str, tuple[Callable[[Floats], Floats], int]] = {
-    "linear": (_linear, 1),
-    "cubic": (_cubic, 3),
-    "lanczos": (_lanczos, 4),
-}
-"""Weight by distance in pixels, and how many pixels it reaches to each side."""
-
-
-def weights(interpolation: str) -> Floats32:
+def weights() -> Floats32:
     """Weights (phase, tap): phase i is i / ``PHASES`` past the tap in the middle's left half; each row sums to 1."""
-    kernel, reach = KERNELS[interpolation]
     phase = np.arange(PHASES + 1) / PHASES
-    table = kernel(np.abs(phase[:, None] - np.arange(1 - reach, reach + 1)))
+    table = _cubic(np.abs(phase[:, None] - np.arange(1 - REACH, REACH + 1)))
     return np.asarray(table / table.sum(axis=1, keepdims=True), dtype=np.float32)
 
 
-def undistort(
-    image: AnyArray, lens: Lens, camera: Camera, params: UndistortParams, valid: AnyArray | None = None
-) -> tuple[Floats32, Bytes]:
+def undistort(image: AnyArray, lens: Lens, camera: Camera, valid: AnyArray | None = None) -> tuple[Floats32, Bytes]:
     """The image that ``camera`` would have taken from the same place.
 
     Parameters
@@ -114,7 +84,7 @@ def undistort(
     x, y = lens.maps(camera)
     out, out_valid = np.zeros(x.shape, np.float32), np.zeros(x.shape, np.uint8)
     # most images have no mask: then no pixel's neighbourhood need be looked up
-    _resample(raw, usable, bool(usable.all()), (x, y), weights(params.interpolation), out, out_valid)
+    _resample(raw, usable, bool(usable.all()), (x, y), weights(), out, out_valid)
     # Kernels with negative weights overshoot at edges.
     return np.clip(out, 0.0, 255.0, out=out), out_valid
 
@@ -157,11 +127,11 @@ def _resample(image, usable, whole, maps, table, out, out_valid):  # type: ignor
     ],
 )
 def undistort_stage(
-    params: UndistortParams, image: Bundle, *, lens: Lens, camera: Camera, frame: int, camera_name: str
+    params: NoParams, image: Bundle, *, lens: Lens, camera: Camera, frame: int, camera_name: str
 ) -> Bundle[UndistortedFacts]:
     """One image with its lens distortion removed."""
     try:
-        ideal, valid = undistort(image["image"], lens, camera, params, image["valid"])
+        ideal, valid = undistort(image["image"], lens, camera, image["valid"])
     except InputError as error:
         raise error.at(f"frame {frame}, {camera_name} camera") from error
     meta: UndistortedFacts = {
@@ -171,6 +141,6 @@ def undistort_stage(
     }
     arrays: dict[str, AnyArray] = {"image": ideal, "valid": valid}
     if "colour" in image.arrays:
-        bands = [undistort(band, lens, camera, params)[0] for band in np.moveaxis(image["colour"], 2, 0)]
+        bands = [undistort(band, lens, camera)[0] for band in np.moveaxis(image["colour"], 2, 0)]
         arrays["colour"] = np.rint(np.stack(bands, axis=2)).astype(np.uint8)
     return Bundle(arrays, meta)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
 from rille.stages.geometry.cubic import cubic
 from rille.stages.hfvm import features
-from rille.stages.hfvm.features import distance
 from rille.stages.hfvm.native.reference import linear
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging.pyramid import Pyramid

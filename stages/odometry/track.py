@@ -37,6 +37,12 @@ from rille.stages.odometry.point_search import match_points
 BORDER = 8
 """Pixels between an interest point and the image's edge: template, cubic interpolation and a search step."""
 
+AFFINITY_SIGMA = 0.1
+"""Standard deviation of each element of a template's affinity about the one fitted to its neighbours."""
+
+MAX_SCALE = 2.0
+"""Change of scale since a point's first frame up to which that frame's template is used; beyond, the last frame's."""
+
 
 class TrackParams(Params):
     """Parameters of the stage ``track``."""
@@ -58,19 +64,6 @@ class TrackParams(Params):
         ge=1,
         description="search radius [pixels] around the predicted position; 4: one pixel of the coarse displacement map",
     )
-    affinity_sigma: float = Field(
-        0.1,
-        gt=0,
-        description="standard deviation of each element of a template's affinity about the one fitted to its "
-        "neighbours",
-    )
-    max_scale: float = Field(
-        2.0,
-        gt=1,
-        description="scale change since a point's first frame up to which that frame's template is used; beyond, the "
-        "previous frame's",
-    )
-    reseed: bool = Field(True, description="add points in empty parts of intermediate frames")
 
 
 @dataclass(frozen=True)
@@ -103,7 +96,7 @@ def track(frames: Sequence[Pyramid], motions: Sequence[LevelDisplacements], para
     state = _State.born(seeds.astype(np.float64), 0, len(frames))
     for j in range(1, len(frames)):
         _advance(state, frames, motions[j - 1], j, params)
-        if params.reseed and j < len(frames) - 1:
+        if j < len(frames) - 1:
             state = _reseed(state, frames, j, params)
     return Tracks(state.points.astype(np.float32), state.birth, state.distance.astype(np.float32))
 
@@ -152,7 +145,7 @@ def _advance(state: _State, frames: Sequence[Pyramid], motion: LevelDisplacement
         affinity, _ = fit_affinity(then, matched, found & known(then), then[group])
         # Singular values: the largest and the smallest stretch of the template, whatever the direction.
         scale = np.linalg.svd(affinity, compute_uv=False)
-        near = (scale[:, 0] < params.max_scale) & (scale[:, 1] > 1.0 / params.max_scale)
+        near = (scale[:, 0] < MAX_SCALE) & (scale[:, 1] > 1.0 / MAX_SCALE)
         # A template that is stretched beyond this has lost its detail or shows none: the last frame's then, at the
         # price of drift.
         for source, chosen in ((int(birth), near), (j - 1, ~near & known(state.points[group, j - 1]))):
@@ -192,7 +185,7 @@ def _align(
         Templates(points, start, affinity),
         # A difference of two images has the noise of both.
         noise=params.noise * 2.0**0.5,
-        spread=params.affinity_sigma,
+        spread=AFFINITY_SIGMA,
         reach=2.0,
     )
     good = clear_of_mask(b.valid[0], place, HALF)

@@ -59,6 +59,10 @@ MAX_BLOCKS = 6
 """Blocks along either side of the image whose mean errors show how far neighbours' errors go together."""
 MIN_PER_BLOCK = 6
 """Mean number of landmarks in a block, at least."""
+MAX_STEPS = 50
+"""Steps of Levenberg-Marquardt, at most; about 10 suffice."""
+SEED = 1999 * 100_003
+"""Seed of the random samples, to which the frame's number is added."""
 SHARED_SOURCES = 7
 """Error sources that all segments share: one for each of the six pose parameters, and the bias of the disparities."""
 REMOVED_SHARE = 8
@@ -111,8 +115,6 @@ class ResectParams(Params):
         description="share of a frame's landmarks that must agree with its pose; 0.05 agree with a wrong pose by "
         "chance, since all are searched near their predictions",
     )
-    iterations: int = Field(50, ge=1, description="limit of Levenberg-Marquardt iterations; about 10 suffice")
-    seed: int = Field(1999, ge=0, description="seed of the random samples")
 
 
 @dataclass(frozen=True)
@@ -214,7 +216,7 @@ def _robust_start(obs: Observations, predictions: list[Pose], params: ResectPara
     # Twice the threshold: three points fix a pose with errors of their own, which must not cost it its landmarks.
     bound = 2.0 * params.threshold / params.pixel_sigma
     # Truncated squares, not a count: of poses that as many landmarks agree with, the one they fit better.
-    candidates = [*predictions, *_sampled(obs, 2.0 * params.threshold, params.seed * 100_003 + frame)]
+    candidates = [*predictions, *_sampled(obs, 2.0 * params.threshold, SEED + frame)]
     best = min(candidates, key=lambda pose: float((np.minimum(back_projection(obs, pose).norm, bound) ** 2).sum()))
     for _ in range(2):
         active = back_projection(obs, best).norm <= bound
@@ -252,7 +254,7 @@ def _without_inconsistent(obs: Observations, pose: Pose, active: Bools, params: 
             f"{where}: too few landmarks: {count} agree with one pose",
             "raise resect.threshold or choose basic pairs closer",
         )
-        minimum = levenberg_marquardt(PoseAdjustment(obs, active, params.bias_sigma), pose, params.iterations, 1e-3)
+        minimum = levenberg_marquardt(PoseAdjustment(obs, active, params.bias_sigma), pose, MAX_STEPS, 1e-3)
         pose, steps = minimum.state, steps + minimum.steps
         usable = _first_order(obs, pose, params)
         if (active & ~usable).any():
@@ -263,7 +265,7 @@ def _without_inconsistent(obs: Observations, pose: Pose, active: Bools, params: 
         if beyond == 0:
             # Only the last adjustment needs the full accuracy.
             problem = PoseAdjustment(obs, active, params.bias_sigma)
-            minimum = levenberg_marquardt(problem, pose, params.iterations, 1e-10)
+            minimum = levenberg_marquardt(problem, pose, MAX_STEPS, 1e-10)
             return _Posed(minimum.state, active, steps + minimum.steps)
         active = active.copy()
         # Not all of them at once: the worst pull the pose, and others agree once these are gone.

@@ -50,7 +50,6 @@ def test_what_a_user_has_switched_off_himself_may_stay(tmp_path):
     [
         ("mockup", "local_planner.max_length=0.3"),
         ("mockup", "drive.goal=[0.0,1.0]"),
-        ("mockup", "undistort.interpolation=linear"),
         ("mockup-loop", "refine.iterations=3"),
         ("mockup-loop", "crosscheck.enabled=true"),
         ("mockup-loop", "terrain.reference=scene"),

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from raising import raises
 
-from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import Lens
 from rille.stages.imaging import undistort
-from rille.stages.imaging.undistort import KERNELS, PHASES, UndistortParams, weights
+from rille.stages.imaging.undistort import PHASES, REACH, weights
 
 RAW = Camera(230.0, 229.0, 184.0, 124.0, 376, 240)
 LENSES = {
@@ -57,51 +57,34 @@ def displacements(image, valid, period, block=40):
 @pytest.mark.parametrize("period", [8.0, 16.0])
 def test_content_lies_where_the_ideal_camera_sees_it(lens, period):
     ideal = lens.ideal_camera()
-    image, valid = undistort.undistort(taken(lens, period), lens, ideal, UndistortParams())
+    image, valid = undistort.undistort(taken(lens, period), lens, ideal)
     shifts = displacements(image, valid, period)
     assert len(shifts) > 20
     assert np.abs(shifts).max() < 0.005
 
 
-@pytest.mark.parametrize(("interpolation", "most"), [("linear", 0.02), ("cubic", 0.005), ("lanczos", 0.02)])
-def test_every_interpolation_is_exact_to_a_fiftieth_of_a_pixel(interpolation, most):
-    lens = LENSES["radtan"]
-    params = UndistortParams(interpolation=interpolation)
-    image, valid = undistort.undistort(taken(lens, 12.0), lens, RAW, params)
-    shifts = displacements(image, valid, 12.0)
-    assert np.abs(shifts).max() < most
-
-
 def test_principal_point_a_quarter_pixel_further_right():
     lens, moved = Lens(RAW), Camera(RAW.fx, RAW.fy, RAW.cx + 0.25, RAW.cy, RAW.width, RAW.height)
-    image, valid = undistort.undistort(taken(lens, 12.0), lens, moved, UndistortParams())
+    image, valid = undistort.undistort(taken(lens, 12.0), lens, moved)
     y, x = np.mgrid[0 : RAW.height, 0 : RAW.width].astype(float)
     ok = valid == 1
     # Six-point cubic at a 12-pixel period: error of the fourth order, below a tenth of a grey value.
     np.testing.assert_allclose(image[ok], pattern(x - 0.25, y, 12.0)[ok], atol=0.2)
 
 
-@pytest.mark.parametrize("interpolation", KERNELS)
-def test_weights_sum_to_one_and_keep_pixels(interpolation):
-    table = weights(interpolation)
-    reach = KERNELS[interpolation][1]
+def test_weights_sum_to_one_keep_pixels_and_reproduce_cubic_polynomials():
+    table = weights()
     np.testing.assert_allclose(table.sum(axis=1), 1, atol=1e-6)
-    np.testing.assert_allclose(table[0], np.eye(2 * reach)[reach - 1], atol=1e-7)
-    np.testing.assert_allclose(table[PHASES], np.eye(2 * reach)[reach], atol=1e-7)
-
-
-@pytest.mark.parametrize(("interpolation", "degree"), [("linear", 1), ("cubic", 3)])
-def test_weights_reproduce_polynomials(interpolation, degree):
-    table, reach = weights(interpolation).astype(np.float64), KERNELS[interpolation][1]
-    taps, phase = np.arange(1 - reach, reach + 1), np.arange(PHASES + 1) / PHASES
-    for n in range(degree + 1):
-        np.testing.assert_allclose(table @ taps.astype(float) ** n, phase**n, atol=1e-5)
-    assert np.abs(table @ taps.astype(float) ** (degree + 1) - phase ** (degree + 1)).max() > 1e-2
+    np.testing.assert_allclose(table[0], np.eye(2 * REACH)[REACH - 1], atol=1e-7)
+    np.testing.assert_allclose(table[PHASES], np.eye(2 * REACH)[REACH], atol=1e-7)
+    taps, phase = np.arange(1.0 - REACH, REACH + 1), np.arange(PHASES + 1) / PHASES
+    for n in range(4):
+        np.testing.assert_allclose(table.astype(np.float64) @ taps**n, phase**n, atol=1e-5)
 
 
 def test_without_distortion_the_inside_stays_and_the_border_is_masked():
     raw = np.random.default_rng(1).integers(0, 256, (240, 376)).astype(np.uint8)
-    image, valid = undistort.undistort(raw, Lens(RAW), RAW, UndistortParams())
+    image, valid = undistort.undistort(raw, Lens(RAW), RAW)
     np.testing.assert_allclose(image[valid == 1], raw[valid == 1].astype(np.float32), atol=1e-3)
     inside = np.zeros(raw.shape, np.uint8)
     inside[2:-3, 2:-3] = 1
@@ -113,7 +96,7 @@ def test_mask_takes_all_that_touches_it():
     raw, mask = np.full((240, 376), 90, np.uint8), np.ones((240, 376), np.uint8)
     mask[100, 200] = 0
     raw[100, 200] = 255
-    image, valid = undistort.undistort(raw, Lens(RAW), RAW, UndistortParams(), mask)
+    image, valid = undistort.undistort(raw, Lens(RAW), RAW, mask)
     # Taps 2 before to 3 behind: pixels 3 before to 2 behind the masked one use it.
     np.testing.assert_array_equal(np.argwhere(valid[2:-3, 2:-3] == 0).min(axis=0) + 2, [97, 197])
     np.testing.assert_array_equal(np.argwhere(valid[2:-3, 2:-3] == 0).max(axis=0) + 2, [102, 202])
@@ -123,7 +106,7 @@ def test_mask_takes_all_that_touches_it():
 def test_not_finite_is_not_usable():
     raw = np.full((240, 376), 90, np.float32)
     raw[100, 200] = np.nan
-    image, valid = undistort.undistort(raw, Lens(RAW), RAW, UndistortParams())
+    image, valid = undistort.undistort(raw, Lens(RAW), RAW)
     assert np.isfinite(image).all()
     assert valid[100, 200] == 0
 
@@ -131,7 +114,7 @@ def test_not_finite_is_not_usable():
 def test_where_the_model_folds_back_nothing_is_seen():
     lens = Lens(RAW, "radtan", (-0.9, 0.0, 0.0, 0.0))
     raw = np.full((240, 376), 90, np.uint8)
-    _, valid = undistort.undistort(raw, lens, RAW, UndistortParams())
+    _, valid = undistort.undistort(raw, lens, RAW)
     y, x = np.mgrid[0:240, 0:376].astype(float)
     # r (1 - 0.9 r^2) turns at r = sqrt(1 / 2.7); beyond it the ghost would read pixels inside the raw image.
     r = np.hypot((x - RAW.cx) / RAW.fx, (y - RAW.cy) / RAW.fy)
@@ -144,8 +127,8 @@ def test_where_the_model_folds_back_nothing_is_seen():
 def test_sixteen_bits_are_the_same_grey():
     raw = np.random.default_rng(2).integers(0, 256, (240, 376)).astype(np.uint8)
     lens = LENSES["radtan"]
-    eight, valid = undistort.undistort(raw, lens, RAW, UndistortParams())
-    sixteen, same = undistort.undistort(raw.astype(np.uint16) * 257, lens, RAW, UndistortParams())
+    eight, valid = undistort.undistort(raw, lens, RAW)
+    sixteen, same = undistort.undistort(raw.astype(np.uint16) * 257, lens, RAW)
     np.testing.assert_allclose(sixteen, eight, atol=1e-3)
     np.testing.assert_array_equal(valid, same)
     assert eight.min() >= 0
@@ -155,7 +138,7 @@ def test_sixteen_bits_are_the_same_grey():
 def run(image, lens, camera):
     inputs = {"image": Bundle({"image": image, "valid": np.ones(image.shape, np.uint8)}, {})}
     args = {"lens": lens.to_dict(), "camera": camera.to_dict(), "frame": 7, "camera_name": "right"}
-    return undistort.undistort_stage.run(UndistortParams(), args, inputs)
+    return undistort.undistort_stage.run(NoParams(), args, inputs)
 
 
 def test_stage():
@@ -170,4 +153,4 @@ def test_image_of_another_size_is_named():
     with raises("RIL-454", "frame 7", "300 x 200", "376 x 240"):
         run(np.zeros((200, 300), np.uint8), LENSES["radtan"], RAW)
     with raises("RIL-455"):
-        undistort.undistort(np.zeros((240, 376), np.uint8), Lens(RAW), RAW, UndistortParams(), np.ones((3, 3)))
+        undistort.undistort(np.zeros((240, 376), np.uint8), Lens(RAW), RAW, np.ones((3, 3)))

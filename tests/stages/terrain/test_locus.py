@@ -23,7 +23,7 @@ from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.geometry.surface import Surface, cylinder, sphere
+from rille.stages.geometry.surface import Surface
 from rille.stages.geometry.surface import plane as reference_plane
 from rille.stages.terrain import ground_frame as level_stage
 from rille.stages.terrain.ground import view_ground
@@ -329,32 +329,6 @@ def test_a_reference_surface_of_ones_own() -> None:
     assert seen.mean() > 0.9
     points = T.apply(np.dstack([lattice.xy(), np.full(lattice.shape, below)]).reshape(-1, 3)).reshape(*lattice.shape, 3)
     assert (np.abs(found.elevation - below) <= tolerance(maps, points))[seen].all()
-
-
-def test_other_reference_surfaces() -> None:
-    """The inside of a ball of radius 2 m seen from its middle: 5 cm inside a cylinder and a sphere of 2.05 m."""
-    radius, reference = 2.0, 2.05
-    column, row, usable = disparity(RIG, T_LOCAL_LEFT, lambda o, v: inside_ball(o, v, radius))
-    centre = np.zeros(3)
-    azimuth, latitude = np.radians(np.arange(75, 105, 0.5)), np.radians(np.arange(-35, -20, 0.5))
-    surfaces: list[tuple[Surface, float]] = [
-        (sphere(centre, reference, azimuth, latitude, inside=True), 1.0),
-        (cylinder(centre, reference, azimuth, reference * np.sin(latitude), inside=True), 0.0),
-    ]
-    for surface, is_sphere in surfaces:
-        dem = reconstruct(pair(column, row, usable), RIG, T_LOCAL_LEFT, surface, (-0.3, 0.8), PARAMS)
-        seen = np.isfinite(dem.elevation)
-        assert seen.mean() > 0.5
-        z = np.repeat((reference * np.sin(latitude))[:, None], azimuth.size, axis=1)
-        truth = np.where(is_sphere, reference - radius, reference - np.sqrt(radius**2 - z**2))
-        errors = interpolation_error(np.where(usable, column, np.nan), np.where(usable, row, np.nan)) + 1e-3
-        bound = 3.0 * radius**2 / (RIG.left.fx * RIG.baseline) * errors
-        assert np.abs(dem.elevation - truth)[seen].max() <= bound
-
-
-def inside_ball(o: np.ndarray, v: np.ndarray, radius: float) -> np.ndarray:
-    a, b, c = (v**2).sum(-1), v @ o, o @ o - radius**2
-    return np.asarray((-b + np.sqrt(b * b - a * c)) / a)
 
 
 def test_a_block_border_shows_nowhere() -> None:
