@@ -15,6 +15,7 @@ import math
 import cv2
 import numpy as np
 from numba import njit
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
@@ -142,8 +143,10 @@ def _inside(valid: Bytes, border: int) -> Bools:
 
 def clear_of_mask(valid: Bytes, points: Floats, border: int) -> Bools:
     """Whether points (n, 2) are at least ``border`` pixels away from the image's edge and from anything unusable."""
-    rows, cols = valid.shape
-    x, y = np.floor(np.where(np.isfinite(points), points, -1.0) + 0.5).astype(np.intp).T
-    seen = (x >= 0) & (y >= 0) & (x < cols) & (y < rows)
-    # Any place that is inside: its answer is refused.
-    return np.asarray(seen & _inside(valid, border)[np.where(seen, y, 0), np.where(seen, x, 0)])
+    side, (rows, cols) = 2 * border + 1, valid.shape
+    if min(rows, cols) < side:
+        return np.zeros(len(points), bool)
+    first = np.floor(np.where(np.isfinite(points), points, -1.0) + 0.5).astype(np.intp) - border
+    inside = np.asarray((first >= 0).all(1) & (first <= [cols - side, rows - side]).all(1))
+    x, y = np.where(inside[:, None], first, 0).T
+    return np.asarray(inside & (sliding_window_view(valid, (side, side))[y, x] != 0).all((1, 2)))
