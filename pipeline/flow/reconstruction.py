@@ -16,7 +16,7 @@
                     |                                           |     +-> overlap_audit; radiometry -+
                     |                                           +-> merge (world tile) <-------------+
                     |                                                 +-> risk, path (mission)
-                    +-> crosscheck (window; images of both cameras) -> crosscheck_join -> agreement <- trajectory
+                    +-> features (image) -> crosscheck (window) -> crosscheck_join -> agreement <- trajectory
     leaves:  accuracy (trajectory, crosscheck), position_accuracy, dem_accuracy (local and merged DEM), path_check
     outputs: rasters, tracks, tables, figures: a task each; then report.html and report.json around them
 
@@ -55,6 +55,7 @@ from rille.pipeline.flow.builders import Builder, Pair, Segment, centre, merge_t
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.evaluation.crosscheck import crosscheck_stage, windows
 from rille.stages.evaluation.crosscheck_join import crosscheck_join_stage
+from rille.stages.evaluation.features import features_stage
 from rille.stages.facts.calibration import CalibrationFacts, RigFacts
 from rille.stages.facts.evaluation import JoinFacts
 from rille.stages.facts.odometry import (
@@ -404,14 +405,19 @@ def checked_intrinsics(make: Builder, key: Pair) -> Generator[Wait, Any, None]:
 
 def another_program(make: Builder, whole: list[int]) -> Handle[JoinFacts]:
     """Structure from motion by another program, in windows; it knows nothing of our trajectory, nor we of its."""
+    features = {
+        (f, camera): make.node(features_stage, f"features/{camera}/{f}", image=make.image(f, camera))
+        for f in whole
+        for camera in ("left", "right")
+    }
     parts = [
         make.node(
             crosscheck_stage,
             f"crosscheck/{window[0]}-{window[-1]}",
             frames=window,
             rig=make.given_rig,
-            left=[make.image(f, "left") for f in window],
-            right=[make.image(f, "right") for f in window],
+            left=[features[f, "left"] for f in window],
+            right=[features[f, "right"] for f in window],
         )
         for window in windows(whole, make.config.crosscheck)
     ]

@@ -20,7 +20,7 @@ from rille.pipeline.report.canvas import Block, Panel
 from rille.pipeline.report.gather import Scene, Terrain
 from rille.pipeline.report.words import metres
 from rille.stages.core.validity import matched
-from rille.stages.evaluation.crosscheck import grey_bytes
+from rille.stages.evaluation.features import grey_bytes
 from rille.stages.geometry.geometry import Rig
 
 if TYPE_CHECKING:

@@ -1,46 +1,33 @@
 """Camera poses by another program, for comparison: structure from motion by COLMAP over a window of stereo frames.
 
-Nothing of the chain enters. Features, verification of matches, registration, triangulation and bundle adjustment are
-pycolmap's (Schönberger & Frahm 2016, doi:10.1109/CVPR.2016.445; SIFT, Lowe 2004,
-doi:10.1023/B:VISI.0000029664.99615.94). What both share is the given calibration: the two cameras are one rig whose
-relative pose and intrinsics are held, so that the scale is metric. A model begins with the two images of one frame,
-whose baseline is known. Of its own, COLMAP begins with any two: at the scale that they then have by chance the rig's
-baseline may seem to be nothing, and the model grows to thousands of times its size. Everything runs in memory, on one
-thread and with given seeds, so that the same images give the same bytes.
+Nothing of the chain enters. Verification of matches, registration, triangulation and bundle adjustment are pycolmap's
+(Schönberger & Frahm 2016, doi:10.1109/CVPR.2016.445), features OpenCV's (:mod:`rille.stages.evaluation.features`). What
+both share is the given calibration: the two cameras are one rig whose relative pose and intrinsics are held, so that
+the scale is metric. A model begins with the two images of one frame, whose baseline is known. Of its own, COLMAP begins
+with any two: at the scale that they then have by chance the rig's baseline may seem to be nothing, and the model grows
+to thousands of times its size. Everything runs in memory, on one thread and with given seeds, so that the same images
+give the same bytes.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
+from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Memory, Params, stage
 from rille.stages.evaluation.accuracy_parts import posed
+from rille.stages.evaluation.features import PIXEL_CENTRE, UNIT_BYTES
 from rille.stages.facts.evaluation import WindowFacts
 from rille.stages.geometry.geometry import Camera, Rig
 
-PIXEL_CENTRE = 0.5
-"""COLMAP puts the centre of the first pixel at (0.5, 0.5), we at (0, 0)."""
-
-UNIT_BYTES = 512.0
-"""Length of COLMAP's byte descriptors."""
-
-MASK_SCALES = 3.0
-"""Distance to the mask, in scales of the feature, below which a feature is dropped: it may describe the edge."""
-
 SPAN = 3
 """Following frames that each frame is matched with, in both cameras."""
-
-MAX_FEATURES, MAX_IMAGE_SIDE = 2000, 1400
-"""Features of an image, the largest first; and pixels of its longer side, above which it is reduced before."""
 
 MIN_START_ANGLE_DEG = 0.1
 """Triangulation angle of the images that a model begins with: a pixel of disparity at a focal length of 600."""
@@ -48,11 +35,15 @@ MIN_START_ANGLE_DEG = 0.1
 SEED = 0
 """Of COLMAP's random sampling."""
 
-MAX_DOUBLED_PIXELS = 150_000
-"""Pixels up to which an image is doubled: of a street at 320 x 96, all of 29 frames have a pose so, 8 without it."""
-
 MAX_RATIO, MAX_DISTANCE = 0.8, 0.7
 """COLMAP's limits of a match: angle to the nearest descriptor over that to the second, and that angle, radians."""
+
+ADJUSTED_GROWTH = 1.4
+"""Factor in frames or points by which a model grows before all of it is adjusted again."""
+
+MIN_TRIALS = 30
+"""Samples that verification draws at least, of COLMAP's 100: nearly all matches here are right; where they are not, it
+draws more."""
 
 MIN_MATCHES = 15
 """COLMAP's own limit for a pair of images to count."""
@@ -72,14 +63,6 @@ class CrosscheckParams(Params):
         return self
 
 
-@dataclass(frozen=True)
-class Features:
-    """Of one image: ``points`` (n, 2) float64 column, row as COLMAP counts; ``descriptors`` (n, 128) float32, bytes."""
-
-    points: Floats
-    descriptors: Floats32
-
-
 def windows(frames: Sequence[int], params: CrosscheckParams) -> list[list[int]]:
     """Frames of each window, in order: as few as possible of at most ``window`` frames, all of nearly equal length."""
     n, most, shared = len(frames), params.window, params.overlap
@@ -90,69 +73,19 @@ def windows(frames: Sequence[int], params: CrosscheckParams) -> list[list[int]]:
     return [list(frames[a : b + shared]) for a, b in itertools.pairwise(edges)]
 
 
-def grey_bytes(image: NDArray[Any]) -> Bytes:
-    """Image (row, col) as uint8: uint16 is divided by 257, floats of 0..255 are rounded."""
-    if image.dtype == np.uint8:
-        return np.ascontiguousarray(image)
-    grey = image / 257.0 if image.dtype == np.uint16 else image
-    return np.clip(np.rint(np.nan_to_num(grey)), 0, 255).astype(np.uint8)
-
-
-def extract(image: NDArray[Any], valid: NDArray[Any]) -> Features:
-    """SIFT features of an image (row, col) where ``valid`` (row, col) is not 0."""
-    import pycolmap
-
-    height, width = image.shape
-    grey = grey_bytes(image)
-    reduction = max(width, height) / MAX_IMAGE_SIDE
-    if reduction > 1:
-        size = (max(1, round(width / reduction)), max(1, round(height / reduction)))
-        # Area means: SIFT's first octave expects an image without aliasing.
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    keypoints, descriptors = _extractor(grey.size).extract_from_uint8_array(grey)
-    if len(keypoints) == 0:
-        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
-    table = np.asarray(pycolmap.keypoints_to_matrix(keypoints), dtype=np.float64)
-    factor = np.array([width / grey.shape[1], height / grey.shape[0]])
-    points = table[:, :2] * factor
-    scale = table[:, 2] * factor[0]
-    keep = _away_from_mask(points, scale, valid)
-    return Features(points[keep], np.asarray(descriptors.data, np.float32)[keep])
-
-
-def _extractor(pixels: int) -> Any:
-    import pycolmap
-
-    options = pycolmap.FeatureExtractionOptions()
-    options.use_gpu, options.num_threads = False, 1
-    options.sift.first_octave = -1 if pixels <= MAX_DOUBLED_PIXELS else 0
-    options.sift.max_num_features = MAX_FEATURES
-    return pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-
-
-def _away_from_mask(points: Floats, scale: Floats, valid: NDArray[Any]) -> Bools:
-    if np.all(valid):
-        return np.ones(len(points), bool)
-    # Distance to the nearest masked pixel at every pixel, looked up at the features.
-    distance = cv2.distanceTransform((valid != 0).astype(np.uint8), cv2.DIST_L2, 5)
-    cols, rows = np.floor(points).astype(np.intp).T
-    inside = distance[np.clip(rows, 0, valid.shape[0] - 1), np.clip(cols, 0, valid.shape[1] - 1)]
-    return np.asarray(inside > MASK_SCALES * scale)
-
-
-def match(a: Features, b: Features) -> NDArray[np.uint32]:
-    """Indices (m, 2) of matching features: nearest in both directions, and clearly nearer than the second.
+def match(a: Floats32, b: Floats32) -> NDArray[np.uint32]:
+    """Indices (m, 2) of matching descriptors (n, 128), bytes: nearest in both directions, clearly before the second.
 
     Products of bytes summed over 128 stay below 2**24 and are thus exact in float32, in any order of summation; a
     matrix product is some ten times faster than COLMAP's loops.
     """
-    if min(len(a.points), len(b.points)) == 0:
+    if min(len(a), len(b)) == 0:
         return np.zeros((0, 2), np.uint32)
     # All descriptors have nearly the same length, so the greatest product is the least angle.
-    forward = _nearest(a.descriptors @ b.descriptors.T)
+    forward = _nearest(a @ b.T)
     rows = np.flatnonzero(forward >= 0)
     wanted, place = np.unique(forward[rows], return_inverse=True)
-    backward = _nearest(b.descriptors[wanted] @ a.descriptors.T)
+    backward = _nearest(b[wanted] @ a.T)
     rows = rows[backward[place] == rows]
     return np.stack([rows, forward[rows]], axis=1).astype(np.uint32)
 
@@ -217,30 +150,35 @@ def _camera(number: int, camera: Camera) -> Any:
     return out
 
 
-def _write_frames(database: Any, cameras: list[Any], features: list[Features]) -> dict[tuple[int, int], int]:
-    """Features and verified matches to the database; how many of each image pair that matches."""
+def _write_frames(database: Any, cameras: list[Any], features: Sequence[Bundle]) -> dict[tuple[int, int], int]:
+    """Features and verified matches to the database; how many of each image pair that matches.
+
+    ``features`` of stage ``features``, left and right in turn.
+    """
     import pycolmap
 
+    points = [np.asarray(b["points"]) for b in features]
+    descriptors = [np.asarray(b["descriptors"], np.float32) for b in features]
     for k in range(len(features) // 2):
         frame = pycolmap.Frame(frame_id=k + 1, rig_id=1)
         for side, camera in enumerate(cameras):
             number = 2 * k + side + 1
             image = pycolmap.Image(name=f"{k:06d}/{side}", camera_id=side + 1, image_id=number)
             database.write_image(image, use_image_id=True)
-            database.write_keypoints(number, features[number - 1].points.astype(np.float32))
+            database.write_keypoints(number, points[number - 1])
             frame.add_data_id(pycolmap.data_t(camera.sensor_id, number))
         database.write_frame(frame, use_frame_id=True)
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed, options.ransac.num_threads = SEED, 1
+    options.ransac.min_num_trials = MIN_TRIALS
     options.detect_watermark = False
     verified = {}
     for i, j in image_pairs(len(features) // 2):
-        a, b = features[i - 1], features[j - 1]
-        matches = match(a, b)
+        matches = match(descriptors[i - 1], descriptors[j - 1])
         if len(matches) < MIN_MATCHES:
             continue
         geometry = pycolmap.estimate_two_view_geometry(
-            cameras[(i - 1) % 2], a.points, cameras[(j - 1) % 2], b.points, matches, options
+            cameras[(i - 1) % 2], points[i - 1], cameras[(j - 1) % 2], points[j - 1], matches, options
         )
         database.write_matches(i, j, matches)
         database.write_two_view_geometry(i, j, geometry)
@@ -283,6 +221,9 @@ def _map(database: Any, start: tuple[int, int]) -> list[Any]:
     options.multiple_models, options.init_num_trials = False, 1
     options.mapper.init_min_tri_angle = MIN_START_ANGLE_DEG
     options.min_model_size, options.extract_colors = 2, False
+    # Adjusted less often on the way, which of a street changes no error by a hundredth, and as well at the end.
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = ADJUSTED_GROWTH
+    options.ba_local_max_refinements, options.ba_global_max_refinements = 1, 2
     pycolmap.set_random_seed(SEED)
     manager = pycolmap.ReconstructionManager()
     pycolmap.IncrementalPipeline(options, database, manager).run()
@@ -307,7 +248,7 @@ def _read(model: Any, poses: Floats, observations: NDArray[np.int32]) -> None:
         Array("registered", ("frame",), "uint8", "1", "1 = the frame has a pose"),
         Array("observations", ("frame",), "int32", "1", "adjusted image points of the frame, both cameras"),
     ],
-    memory=Memory(factor=10.0, result=0.0, lower=("crosscheck.window", "crosscheck.max_image_size")),
+    memory=Memory(fixed=150e6, factor=20.0, result=0.0, lower=("crosscheck.window",)),
 )
 def crosscheck_stage(
     params: CrosscheckParams, left: Sequence[Bundle], right: Sequence[Bundle], *, frames: Sequence[int], rig: Rig
@@ -316,8 +257,7 @@ def crosscheck_stage(
     import pycolmap
 
     pycolmap.logging.minloglevel = 3  # fatal: what goes wrong is said by the result
-    bundles = itertools.chain.from_iterable(zip(left, right, strict=True))
-    features = [extract(np.asarray(b["image"]), np.asarray(b["valid"])) for b in bundles]
+    features = list(itertools.chain.from_iterable(zip(left, right, strict=True)))
     with pycolmap.Database.open(":memory:") as database:
         cameras = _write_rig(database, rig)
         verified = _write_frames(database, cameras, features)
@@ -332,7 +272,7 @@ def crosscheck_stage(
     registered = posed(poses)
     meta: WindowFacts = {
         "frames": list(frames),
-        "features": float(np.median([len(f.points) for f in features])),
+        "features": float(np.median([len(f["points"]) for f in features])),
         "pairs": len(image_pairs(len(frames))),
         "pairs_verified": len(verified),
         "models": len(models),

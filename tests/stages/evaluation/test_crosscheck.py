@@ -14,20 +14,16 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from rille.stages.core.declare import Bundle, check_outputs
-from rille.stages.evaluation import crosscheck
 from rille.stages.evaluation.accuracy import angles_between, posed
 from rille.stages.evaluation.crosscheck import (
     CrosscheckParams,
-    Features,
     _camera,
-    _extractor,
     crosscheck_stage,
-    extract,
-    grey_bytes,
     image_pairs,
     match,
     windows,
 )
+from rille.stages.evaluation.features import extract
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
@@ -69,7 +65,8 @@ def drive(n: int) -> list[RigidTransform]:
 
 
 def bundle(image: np.ndarray, valid: np.ndarray | None = None) -> Bundle:
-    return Bundle({"image": image, "valid": np.ones(image.shape, np.uint8) if valid is None else valid}, {})
+    """Features of an image."""
+    return extract(image, np.ones(image.shape, np.uint8) if valid is None else valid)
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +115,7 @@ def test_a_wrong_rig_is_held_not_repaired(scene: Any) -> None:
 def test_without_a_stereo_pair_nothing_has_a_scale(scene: Any) -> None:
     """The left images alone would give a model of any size."""
     _, images = scene
-    covered = [bundle(image["image"], np.zeros(image["image"].shape, np.uint8)) for image in images["right"]]
+    covered = [bundle(np.zeros((240, 320), np.uint8))] * len(images["right"])
     found = run({"left": images["left"], "right": covered}, [0, 1, 2, 3])
     assert found.meta["pairs_verified"] >= 3
     assert (found.meta["models"], found.meta["registered"]) == (0, 0)
@@ -153,75 +150,30 @@ def test_a_window_without_a_model_is_a_fact(kind: str) -> None:
     assert out.meta["reprojection_px"] is None
 
 
-def test_features_keep_away_from_what_is_masked(scene: Any) -> None:
-    image = scene[1]["left"][0]["image"]
-    valid = np.ones(image.shape, np.uint8)
-    valid[:, 100:] = 0
-    dark = np.where(valid, image, 0).astype(np.uint8)
-    everywhere, masked = extract(dark, np.ones_like(valid)), extract(dark, valid)
-    assert 20 < len(masked.points) < len(everywhere.points)
-    assert everywhere.points[:, 0].max() > 100  # the edge itself has features, were it not for the mask
-    assert masked.points[:, 0].max() < 100 - 3 * 0.8  # SIFT's smallest scale in a doubled image
-    assert len(extract(dark, np.zeros_like(valid)).points) == 0
-
-
-def test_the_first_pixel_s_centre_is_at_one_half() -> None:
-    """A blob of 4 px about pixel (row 60, column 100); COLMAP's camera is shifted as its positions are."""
-    rows, cols = np.mgrid[:240, :320]
-    image = 40 + 150 * np.exp(-((rows - 60) ** 2 + (cols - 100) ** 2) / (2 * 4.0**2))
-    points = extract(image.astype(np.float32), np.ones(image.shape, np.uint8)).points
-    assert np.abs(points - (100.5, 60.5)).max() < 0.05
-    camera = _camera(1, CAMERA)
-    assert (camera.principal_point_x, camera.principal_point_y) == (CAMERA.cx + 0.5, CAMERA.cy + 0.5)
-    np.testing.assert_allclose(camera.img_from_cam(np.array([0.0, 0.0, 1.0])), [CAMERA.cx + 0.5, CAMERA.cy + 0.5])
-
-
-def test_a_reduced_image_gives_positions_of_the_full_one(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    image = scene[1]["left"][0]["image"]
-    twice = cv2.resize(image, (640, 480), interpolation=cv2.INTER_CUBIC)
-    small = extract(image, np.ones_like(image))
-    monkeypatch.setattr(crosscheck, "MAX_IMAGE_SIDE", 320)
-    large = extract(twice, np.ones_like(twice))
-    pairs = match(small, large)
-    assert len(pairs) > 50
-    # COLMAP's (0, 0) is the corner of the image, so that a doubled image doubles positions
-    error = large.points[pairs[:, 1]] - 2 * small.points[pairs[:, 0]]
-    assert np.abs(np.median(error, axis=0)).max() < 0.1
-
-
-def test_only_a_small_image_is_doubled(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    small = scene[1]["left"][0]["image"]
-    large, counts = cv2.resize(small, (640, 480)), []
-    for limit in (small.size, small.size - 1, large.size):
-        monkeypatch.setattr(crosscheck, "MAX_DOUBLED_PIXELS", limit)
-        counts.append([len(extract(image, np.ones_like(image)).points) for image in (small, large)])
-    assert counts[0][0] > counts[1][0]
-    assert counts[0][1] == counts[1][1] != counts[2][1]
-
-
 def test_matching_equals_colmap_s_own_matcher(scene: Any) -> None:
-    images = [scene[1]["left"][k]["image"] for k in (0, 1)]
-    native = [_extractor(image.size).extract_from_uint8_array(image) for image in images]
+    a, b = (np.asarray(image["descriptors"]) for image in scene[1]["left"][:2])
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu, options.num_threads = False, 1
     matcher = pycolmap.FeatureMatcher.create(options, pycolmap.Device.cpu)
-    expected = matcher.match(native[0][0], native[0][1], native[1][0], native[1][1])
-    ours = match(*(extract(image, np.ones_like(image)) for image in images))
+    kind = pycolmap.FeatureExtractorType.SIFT
+    keypoints = [pycolmap.FeatureKeypoints([pycolmap.FeatureKeypoint()] * len(x)) for x in (a, b)]
+    native = [pycolmap.FeatureDescriptors(type=kind, data=x) for x in (a, b)]
+    expected = matcher.match(keypoints[0], native[0], keypoints[1], native[1])
     assert len(expected) > 50
+    ours = match(a.astype(np.float32), b.astype(np.float32))
     assert {tuple(row) for row in ours.tolist()} == {tuple(row) for row in expected.tolist()}
 
 
 def test_matching_of_nothing_and_of_one() -> None:
-    nothing = Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
-    one = Features(np.zeros((1, 2)), np.full((1, 128), 512 / np.sqrt(128), np.float32))
+    nothing, one = np.zeros((0, 128), np.float32), np.full((1, 128), 512 / np.sqrt(128), np.float32)
     assert match(nothing, one).shape == (0, 2)
     assert match(one, one).tolist() == [[0, 0]]
 
 
-def test_grey_of_each_kind() -> None:
-    assert grey_bytes(np.array([[0, 257, 65535]], np.uint16)).tolist() == [[0, 1, 255]]
-    assert grey_bytes(np.array([[-3.0, 1.6, 300.0, np.nan]], np.float32)).tolist() == [[0, 2, 255, 0]]
-    assert grey_bytes(np.array([[7]], np.uint8)).tolist() == [[7]]
+def test_the_principal_point_is_counted_as_positions_are() -> None:
+    camera = _camera(1, CAMERA)
+    assert (camera.principal_point_x, camera.principal_point_y) == (CAMERA.cx + 0.5, CAMERA.cy + 0.5)
+    np.testing.assert_allclose(camera.img_from_cam(np.array([0.0, 0.0, 1.0])), [CAMERA.cx + 0.5, CAMERA.cy + 0.5])
 
 
 def test_pairs_by_hand() -> None:

@@ -1,0 +1,95 @@
+"""SIFT features of an image, for the crosscheck: one task an image, however many windows read it.
+
+Keypoints and descriptors are OpenCV's (Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94); the square root of the
+descriptors' L1-normalised values as bytes is that of COLMAP (Arandjelovic and Zisserman 2012,
+doi:10.1109/CVPR.2012.6248018). OpenCV always begins with an image of twice the size: a large image is halved before, so
+that its first octave has the image's own resolution, which is a fifth of the work.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rille.stages.core.arrays import Bools, Bytes, Floats
+from rille.stages.core.declare import Array, Bundle, Memory, NoParams, stage
+
+PIXEL_CENTRE = 0.5
+"""COLMAP puts the centre of the first pixel at (0.5, 0.5), we at (0, 0)."""
+
+UNIT_BYTES = 512.0
+"""Length of COLMAP's byte descriptors."""
+
+MASK_SCALES = 3.0
+"""Distance to the mask, in scales of the feature, below which a feature is dropped: it may describe the edge."""
+
+MAX_FEATURES, MAX_IMAGE_SIDE = 2000, 1400
+"""Features of an image, the largest first; and pixels of its longer side, above which it is reduced before."""
+
+MAX_DOUBLED_PIXELS = 150_000
+"""Pixels up to which an image is not halved: of a street at 320 x 96, all of 29 frames have a pose so, 8 otherwise."""
+
+MIN_CONTRAST = 0.03
+"""Of a keypoint, as OpenCV counts: of a street .02 gives a fifth more features, and errors that are no smaller."""
+
+
+def grey_bytes(image: NDArray[Any]) -> Bytes:
+    """Image (row, col) as uint8: uint16 is divided by 257, floats of 0..255 are rounded."""
+    if image.dtype == np.uint8:
+        return np.ascontiguousarray(image)
+    grey = image / 257.0 if image.dtype == np.uint16 else image
+    return np.clip(np.rint(np.nan_to_num(grey)), 0, 255).astype(np.uint8)
+
+
+def extract(image: NDArray[Any], valid: NDArray[Any]) -> Bundle:
+    """Points and descriptors of an image (row, col) where ``valid`` (row, col) is not 0."""
+    height, width = image.shape
+    grey = grey_bytes(image)
+    reduction = max(width, height) / MAX_IMAGE_SIDE
+    if reduction > 1:
+        size = (max(1, round(width / reduction)), max(1, round(height / reduction)))
+        # Area means: SIFT's first octave expects an image without aliasing.
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    factor = np.array([width / grey.shape[1], height / grey.shape[0]])
+    halving = 2 if grey.size > MAX_DOUBLED_PIXELS else 1
+    if halving == 2:
+        # Smoothed by the blur that SIFT assumes; area means would leave aliases, and errors a tenth larger.
+        grey = cv2.pyrDown(grey)
+    sift = cv2.SIFT.create(nfeatures=0, contrastThreshold=MIN_CONTRAST, enable_precise_upscale=True)
+    keypoints, values = sift.detectAndCompute(grey, None)
+    if not keypoints:
+        return Bundle({"points": np.zeros((0, 2), np.float32), "descriptors": np.zeros((0, 128), np.uint8)}, {})
+    points = (halving * np.array([k.pt for k in keypoints]) + PIXEL_CENTRE) * factor
+    # Their size is the diameter, two scales.
+    scale = 0.5 * halving * factor[0] * np.array([k.size for k in keypoints])
+    largest = np.argsort(-scale, kind="stable")
+    keep = largest[_away_from_mask(points, scale, valid)[largest]][:MAX_FEATURES]
+    unit = np.sqrt(values / np.maximum(values.sum(axis=1, keepdims=True), 1.0))
+    descriptors = np.minimum(np.rint(UNIT_BYTES * unit), 255).astype(np.uint8)
+    return Bundle({"points": points[keep].astype(np.float32), "descriptors": descriptors[keep]}, {})
+
+
+def _away_from_mask(points: Floats, scale: Floats, valid: NDArray[Any]) -> Bools:
+    if np.all(valid):
+        return np.ones(len(points), bool)
+    # Distance to the nearest masked pixel at every pixel, looked up at the features.
+    distance = cv2.distanceTransform((valid != 0).astype(np.uint8), cv2.DIST_L2, 5)
+    cols, rows = np.floor(points).astype(np.intp).T
+    inside = distance[np.clip(rows, 0, valid.shape[0] - 1), np.clip(cols, 0, valid.shape[1] - 1)]
+    return np.asarray(inside > MASK_SCALES * scale)
+
+
+@stage(
+    "features",
+    outputs=[
+        Array("points", ("feature", "xy"), "float32", "px", "column, row as COLMAP counts, largest features first"),
+        Array("descriptors", ("feature", "value"), "uint8", "1", "square root of the gradients' histogram"),
+    ],
+    memory=Memory(factor=30.0, result=0.3),
+)
+def features_stage(params: NoParams, image: Bundle) -> Bundle:
+    """SIFT features of an image, for the crosscheck."""
+    return extract(np.asarray(image["image"]), np.asarray(image["valid"]))
