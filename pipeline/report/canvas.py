@@ -142,6 +142,7 @@ def compressed(picture: Any, kind: str, **options: Any) -> str:
     return address(out.getvalue(), kind)
 
 
+@cache
 def ramp(name: str) -> NDArray[np.uint8]:
     """The 256 colours (256, 3) of a colour map of matplotlib."""
     import matplotlib

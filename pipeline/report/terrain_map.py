@@ -135,7 +135,7 @@ def _picture(*planes: NDArray[Any]) -> str:
 
     # No alpha: a canvas multiplies colours by it, and the bytes read back would be others.
     picture = Image.fromarray(np.stack([np.asarray(p, np.uint8) for p in planes], axis=-1))
-    return canvas.compressed(picture, "png", compress_level=9)
+    return canvas.compressed(picture, "png", compress_level=6)
 
 
 def _ortho(scene: Scene, world: Terrain, step: int) -> str:
