@@ -143,6 +143,8 @@ def candidates(kind: Any, value: Any) -> Iterator[Any]:
     """Other values of a parameter, the nearest first."""
     if typing.get_origin(kind) is typing.Literal:
         yield from (v for v in typing.get_args(kind) if v != value)
+    elif choices := [v for inner in typing.get_args(kind) for v in typing.get_args(inner) if isinstance(v, str)]:
+        yield from ((v,) for v in choices) if isinstance(value, tuple) else choices
     elif isinstance(value, bool):
         yield not value
     elif isinstance(value, int):

@@ -29,11 +29,9 @@ ROOT = Path(__file__).resolve().parent.parent
 SECTIONS: dict[str, type[Params]] = {name: type(s) for name, s in configuration.build()}
 PARAMETERS = [f"{section}.{name}" for section, kind in SECTIONS.items() for name in kind.model_fields]
 VEHICLE = {p for p in PARAMETERS if p.startswith("vehicle.")} - {"vehicle.name"}  # a name changes no risk
-RESECT = {p for p in PARAMETERS if p.startswith("resect.")}
 
 ARGUMENTS: dict[str, set[str]] = {
     "risk": VEHICLE,
-    "refine": RESECT,
     "tile_index": {"merge.max_hole"},
 }
 """Stages that get parameters of another section as arguments."""
@@ -188,7 +186,7 @@ def test_an_edit_makes_stale_exactly_the_stages_that_reach_the_module(chain: Cha
 
 EDITS_THAT_CHANGE_NOTHING: dict[str, tuple[str, Callable[[str], str]]] = {
     "a comment": ("rille.stages.geometry.geometry", lambda text: f"{text}\n# only words\n"),
-    "a docstring": ("rille.stages.hfvm.level.search", lambda text: text.replace('"""', '"""Said otherwise. ', 1)),
+    "a docstring": ("rille.stages.hfvm.level", lambda text: text.replace('"""', '"""Said otherwise. ', 1)),
     "the engine": ("rille.pipeline.engine.run", lambda text: f"{text}\nMORE = 1\n"),
 }
 

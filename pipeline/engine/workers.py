@@ -507,10 +507,6 @@ def _configure() -> None:
         "PYTHONSAFEPATH": "1",
         "DASK_DISTRIBUTED__LOGGING__DISTRIBUTED": "critical",
         "MALLOC_ARENA_MAX": "1",  # tasks run on a second thread, whose own arena gives memory back and takes it anew
-        # glibc keeps freed memory for the next task up to this, and takes arrays of 32 MiB (its limit) from it: fresh
-        # pages took an eighth of a task's time.
-        "MALLOC_TRIM_THRESHOLD_": str(128 << 20),
-        "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
     }
     memory = {f"distributed.worker.memory.{what}": False for what in ("target", "spill", "pause")}
     dask.config.set(

@@ -39,10 +39,11 @@ def doubled(
 def _doubled(small, first, right, big, inside):  # type: ignore[no-untyped-def]
     """Displacements twice as large, along their slopes, and whether they end in the right image."""
     rows, cols = inside.shape
-    for j in range(small[0].shape[0]):
-        for i in range(small[0].shape[1]):
-            for k in range(2):
-                a, out = small[k], big[k]
+    u, v = big
+    for k in range(2):
+        a, out = small[k], big[k]
+        for j in range(a.shape[0]):
+            for i in range(a.shape[1]):
                 along, down = _slope(a, j, i, 0, 1), _slope(a, j, i, 1, 0)
                 for y in range(2 * j, min(2 * j + 2, rows)):
                     for x in range(2 * i, min(2 * i + 2, cols)):
@@ -51,7 +52,7 @@ def _doubled(small, first, right, big, inside):  # type: ignore[no-untyped-def]
                         out[y, x] = 2 * a[j, i] + down * below + along * beside
     for y in range(rows):
         for x in range(cols):
-            xr, yr = np.float32(x + first[0]) + big[0][y, x], np.float32(y + first[1]) + big[1][y, x]
+            xr, yr = np.float32(x + first[0]) + u[y, x], np.float32(y + first[1]) + v[y, x]
             inside[y, x] = (xr >= 0) & (xr <= right[1] - 1) & (yr >= 0) & (yr <= right[0] - 1)
 
 

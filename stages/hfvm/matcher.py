@@ -27,7 +27,10 @@ TOO_FEW = 0.45
 ``accurate``, which smooths more, up to .40."""
 
 ENOUGH, CORRECTIONS = 0.85, 2
-"""Share of consistent pixels from which on no other brightness is tried, and how often matches correct it."""
+"""Share of consistent pixels from which on no other brightness is guessed, and how often matches correct it."""
+
+LEFT_OVER = 0.95
+"""Share of the consistent pixels that must stay so when brightness is corrected by them: a few change anyway."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,7 @@ def even(begun: Begun) -> Begun:
             break
         other = brightness.levelled(right, ratio)
         tried = begun.anew(other, right=other, ratio=ratio)
-        if tried.state.share < begun.state.share:
+        if tried.state.share < LEFT_OVER * begun.state.share:
             break
         begun = tried
     return begun

@@ -38,13 +38,14 @@ def agree(own: Any, other: Any, own_valid: AnyArray, other_valid: AnyArray, limi
 @njit(cache=True, nogil=True)
 def _agree(own, other, valid, most, found):  # type: ignore[no-untyped-def]
     (au, av), (bu, bv) = own, other
+    own_valid, other_valid = valid
     rows, cols = au.shape
     brows, bcols = np.uint64(bu.shape[0]), np.uint64(bu.shape[1])
     for y in range(rows):
         for x in range(cols):
             # Unsigned: what is negative lies beyond every column.
             i, j = np.uint64(x + np.int64(au[y, x])), np.uint64(y + np.int64(av[y, x]))
-            if valid[0][y, x] and i < bcols and j < brows and valid[1][j, i]:
+            if own_valid[y, x] and i < bcols and j < brows and other_valid[j, i]:
                 du, dv = np.int64(au[y, x]) + bu[j, i], np.int64(av[y, x]) + bv[j, i]
                 found[y, x] = du * du + dv * dv <= most
 

@@ -188,7 +188,7 @@ def test_what_many_tasks_are_given_is_held_once() -> None:
         {"basic": [0, 3, 5], "segments": [[0, 1, 2, 3], [3, 4, 5], [5, 6, 7]]},
         {"frames": list(range(8)), "pieces": [[0, 7]], "main": 0, "positions": [[0, 0, k] for k in range(8)]},
     )
-    for name, least in (("rig", 3), ("vehicle", 3), ("resect", 3)):
+    for name, least in (("rig", 3), ("vehicle", 3)):
         given = [h.spec.args[name] for h in graph.nodes if name in h.spec.args]
         assert len(given) >= least
         assert len({id(value) for value in given}) == 1, name
