@@ -212,15 +212,16 @@ def edges(look: Look, found: Field) -> Field:
 def match_level(views: Views, level: int, above: State | None, near_sign: float = 0.0) -> State:
     """The state of a level, from that of the level above (None: the top): search, propagate, check, band."""
     known = near_sign if above is None else above.near_sign
-    left = _one_way(views, level, above, known, views.steps.rounds[0])
-    right = _one_way(views.reverse(), level, None if above is None else above.reverse(), -known, views.steps.rounds[1])
+    left = one_way(views, level, above, known, views.steps.rounds[0])
+    right = one_way(views.reverse(), level, None if above is None else above.reverse(), -known, views.steps.rounds[1])
     a, b = views.left.layers[level].valid, views.right.layers[level].valid
     ok = agree(left, right, a, b, views.params.backmatch), agree(right, left, b, a, views.params.backmatch)
     return with_band(views, State(level, left, right, *ok, FREE, known))
 
 
-def _one_way(views: Views, level: int, above: State | None, near_sign: float, fine_rounds: int) -> Map:
-    """Displacements from the left image to the right one."""
+def one_way(views: Views, level: int, above: State | None, near_sign: float, fine_rounds: int) -> Map:
+    """Displacements from the left image to the right one, at a level below that of the state ``above``, by the rounds
+    ``fine_rounds`` at the finest; ``above`` None: the top."""
     up = None if above is None else hand_down(above, views.params)
     rounds = min(views.params.rounds, fine_rounds if level == 0 else views.steps.rounds[0] + level)
     band = FREE if above is None else above.band

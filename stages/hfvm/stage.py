@@ -8,7 +8,8 @@ the method on one page, in the order of the paper; see :class:`~rille.stages.hfv
 - ``level``: one level: search, propagation, paths, depth edges, check, band (``epipolar``). ``native``: its loops.
 - ``finest``: the finest level: ``lucas_kanade``, ``relief``, ``validation``, ``textureless``, ``fill``,
   ``uncertainty``.
-- ``paper``: section 4.3 to the letter. ``tiles``: large pairs. ``sanity``: whether to believe a result.
+- ``paper``: section 4.3 to the letter. ``tiles``: large pairs. ``sanity``: whether to believe a result. ``given``:
+  whether to believe another program's.
 """
 
 from __future__ import annotations
