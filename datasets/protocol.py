@@ -147,6 +147,8 @@ class Sequence:
     vehicle : the vehicle whose limits suit the scale of the sequence.
     truth_dem : exact elevations on any lattice of any frame whose pose in the truth frame is given.
     truth_disparity : ``truth_disparity(frame)``: source of the exact disparity of a pair.
+    disparity : ``disparity(frame)``: source of the ``column_disparity`` of a pair (right minus left, pixels) that
+        another program made, and maybe its ``disparity_std``; it is checked, and takes the matcher's place.
     evaluation_window : (x_min, y_min, x_max, y_max), metres, local frame of a basic pair: where a DEM is judged.
     lost : frames that have no pair of images, and why; nothing asks for their images.
     defaults : dotted configuration that suits the sequence.
@@ -176,6 +178,7 @@ class Sequence:
     vehicle: Vehicle | None = None
     truth_dem: TruthDem | None = None
     truth_disparity: Callable[[int], Source] | None = None
+    disparity: Callable[[int], Source] | None = None
     evaluation_window: tuple[float, float, float, float] | None = None
     lost: Mapping[int, str] = field(default_factory=dict)
     defaults: Mapping[str, Any] = field(default_factory=dict)

@@ -255,6 +255,20 @@ def image_source(path: Path, frame: int, camera: str, header: Header, digests: D
     return Source("rille.datasets.images.files", NoParams(), args, hints={"path": str(path.resolve())})
 
 
+def read_unchanged(path: Path, sha256: str, name: str) -> bytes:
+    """Content of a file whose digest is in the key of a task.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or its digest is another by now: it must not be stored under the key of the former content.
+    """
+    data = read_bytes(path, "image", MOST_BYTES)
+    if hashlib.sha256(data).hexdigest() != sha256:
+        raise InputError("RIL-177", f"{name} has changed since the run began", remedy="run the same command again")
+    return data
+
+
 def check_size(found: Header, wanted: Header, name: str) -> None:
     """Refuse an image whose width, height or depth differs from those of its camera's other images."""
     if found != wanted:
@@ -287,10 +301,7 @@ def image_stage(
 ) -> Bundle[ImageFacts]:
     """One image file, checked and grey."""
     name = f"frame {frame}, {camera} image {path}"
-    data = read_bytes(Path(path), "image", MOST_BYTES)
-    # The digest is in the key: a file that was replaced since must not be stored under the key of the former one.
-    if hashlib.sha256(data).hexdigest() != sha256:
-        raise InputError("RIL-177", f"{name} has changed since the run began", remedy="run the same command again")
+    data = read_unchanged(Path(path), sha256, name)
     image, colour = decode_colour(data, name, (width, height, depth), levels)
     meta: ImageFacts = {"frame": frame, "camera": camera}
     arrays: dict[str, NDArray[Any]] = {"image": image, "valid": np.ones(image.shape, np.uint8)}

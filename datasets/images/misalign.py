@@ -18,6 +18,7 @@ from rille.datasets.images import files
 from rille.datasets.protocol import Sequence, Source
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray, Bundle, Params, stage
+from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import rotation_exp
 from rille.stages.geometry.lens import Lens
 
@@ -59,9 +60,17 @@ def misalign(sequence: Sequence, params: MisalignParams) -> Sequence:
     """The sequence with its right images warped; the same object where nothing is to be changed.
 
     It has no exact disparity any more.
+
+    Raises
+    ------
+    InputError
+        Another program's disparities of it are given, which are of other images then.
     """
     if params.none:
         return sequence
+    if sequence.disparity is not None:
+        text = "the maps of [disparity] do not hold for right images that misalign moves"
+        raise InputError("RIL-903", text, remedy="leave one of the two out")
     lens = (sequence.lenses or {}).get("right", Lens(sequence.rig.right))
 
     def image(frame: int, camera: str) -> Source:

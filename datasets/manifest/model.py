@@ -156,6 +156,19 @@ class RigSection(Table):
         return self
 
 
+class Disparity(Table):
+    """``[disparity]``: maps that another program made of the left images, in the place of the matcher's."""
+
+    left: str
+    """pattern of the maps, one a pair, named or numbered as the left images are: .pfm, .tif or .npy of floating point
+    (px; 0, infinite or NaN: unknown), or 16-bit .png (256 a pixel, 0 unknown)"""
+    sign: Literal["left-right", "right-left"] = "left-right"
+    """left-right: values are the column in the left image minus that in the right one, the usual; right-left: the
+    reverse"""
+    sigma: Annotated[float, Field(gt=0)] | str | None = None
+    """px; standard deviation of all values, or pattern of maps of it; estimated by default"""
+
+
 class Times(Table):
     """``[times]``: when the pairs were taken."""
 
@@ -276,6 +289,7 @@ class Manifest(Table):
     images: Images
     cameras: Cameras = Cameras()
     rig: RigSection = RigSection()
+    disparity: Disparity | None = None
     times: Times | None = None
     truth: Truth | None = None
     odometry: PoseFile | None = None

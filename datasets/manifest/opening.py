@@ -10,22 +10,23 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from rille.datasets.bags import is_bag, open_bag
 from rille.datasets.cameras.model import RECTIFIED
-from rille.datasets.images import files
+from rille.datasets.images import disparities, files
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import ImagePair, common_headers, pair_up
-from rille.datasets.manifest.model import Cameras, Images, Manifest, RigSection, read_manifest
+from rille.datasets.manifest.model import Cameras, Disparity, Images, Manifest, RigSection, read_manifest
 from rille.datasets.manifest.motion import MotionReader, StatedMotion
 from rille.datasets.manifest.rig import read_optics
 from rille.datasets.protocol import Sequence, Source
 from rille.datasets.text.names import derived_name
-from rille.datasets.text.reading import Search
+from rille.datasets.text.reading import Search, read_bytes
+from rille.stages.core.declare import NoParams
 from rille.stages.core.errors import InputError
 
 VARIABLE = re.compile(r"\$\{(\w+)\}")
@@ -53,6 +54,10 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
     name : the manifest's or the folder's, for errors.
     """
     base, pairs = _of_bag(manifest, root, name) or _of_files(manifest, root, name, digests)
+    if manifest.disparity is not None:
+        note = f"disparities are those of {manifest.disparity.left}, made by another program, and checked"
+        disparity = _disparity(manifest.disparity, root, name, (base, pairs), digests)
+        base = replace(base, disparity=disparity, notes=(*base.notes, note))
     motion = MotionReader(root, name, pairs, StatedMotion(base.times)).read(manifest)
     world = manifest.world
     pitch = None if world.pitch_deg is None else math.radians(world.pitch_deg)
@@ -122,6 +127,35 @@ def _of_bag(manifest: Manifest, root: Path, name: str) -> tuple[Sequence, tuple[
     optics_of = (lambda sizes: read_optics(manifest, root, name, sizes, rectified)) if stated else None
     sequence = open_bag((root / path).resolve(), topics, optics_of, manifest.images.tolerance)
     return sequence, tuple(ImagePair(stamp, Path(stamp), Path(stamp)) for stamp in sequence.frame_names)
+
+
+def _disparity(
+    stated: Disparity, root: Path, name: str, found: tuple[Sequence, tuple[ImagePair, ...]], digests: files.Digests
+) -> Callable[[int], Source]:
+    """Source of the disparity of a frame that another program made."""
+    sequence, pairs = found
+    if sequence.lenses:
+        text = f"{name}: [disparity] needs images without distortion: maps are of undistorted, rectified images"
+        remedy = "give the images that the maps were made of (images.rectified = true), or leave [disparity] out"
+        raise InputError("RIL-902", text, remedy=remedy)
+    frames = [k for k, pair in enumerate(pairs) if not pair.absent]
+    lefts = [pairs[k].left for k in frames]
+    maps = {"column_disparity": disparities.find(stated.left, root, lefts, f"{name}: disparity.left")}
+    sigma = stated.sigma if isinstance(stated.sigma, float) else None
+    if isinstance(stated.sigma, str):
+        maps["disparity_std"] = disparities.find(stated.sigma, root, lefts, f"{name}: disparity.sigma")
+    size = sequence.rig.left.width, sequence.rig.left.height
+    common = {"size": list(size), "sign": stated.sign, "sigma": sigma}
+    for first, *_ in maps.values():
+        disparities.decode(read_bytes(first, "map", files.MOST_BYTES), size, f"{name}: {first}")  # says what is wrong
+
+    def source(frame: int) -> Source:
+        paths = {array: of[frames.index(frame)] for array, of in maps.items()}
+        args = {**common, "frame": frame, "digests": {array: digests.sha256(path) for array, path in paths.items()}}
+        hints = {"paths": {array: str(path.resolve()) for array, path in paths.items()}}
+        return Source("rille.datasets.images.disparities", NoParams(), args, hints)
+
+    return source
 
 
 def default_name(path: Path) -> str:

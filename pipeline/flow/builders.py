@@ -15,7 +15,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
-from rille.datasets.protocol import Sequence, Source
+from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.flow import tiles
@@ -219,8 +219,14 @@ class Builder:
 
     @once
     def disparity(self, pair: int) -> Handle:
-        """Disparity of the left image of a pair."""
-        return self._matched(f"hfvm/{pair}", pair, "left", "right")
+        """Disparity of the left image of a pair: the matcher's, or that of another program, checked."""
+        label = f"hfvm/{pair}"
+        if self.sequence.disparity is None:
+            return self._matched(label, pair, "left", "right")
+        ports: dict[str, Handle] = {side: self.pyramid(pair, side) for side in CAMERAS}
+        ports["given"] = self.source(self.sequence.disparity(pair), f"disparity/{pair}")
+        # By name: it has no section of its own, but reads the matcher's.
+        return self.graph.node("rille.stages.hfvm.given", label, self.config.hfvm, {}, {}, ports)
 
     @once
     def backward(self, pair: int) -> Handle:

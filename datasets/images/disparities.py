@@ -1,0 +1,159 @@
+"""Stage ``disparity``: disparities of a left image that another program wrote; and which of its files is which pair's.
+
+Files are PFM, TIFF and npy of floating point, pixels, or PNG of 16 bits as KITTI has them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Literal
+from warnings import catch_warnings
+
+import numpy as np
+
+from rille.datasets.facts import ImageFacts
+from rille.datasets.images import files
+from rille.datasets.images.headers import opened
+from rille.datasets.images.pairing import ends, natural, without_side
+from rille.datasets.text.count import count
+from rille.datasets.text.reading import Search
+from rille.stages.core.arrays import Floats32
+from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
+from rille.stages.core.errors import InputError
+
+Sign = Literal["left-right", "right-left"]
+
+PNG_UNITS = 256
+"""Values of a 16-bit PNG a pixel."""
+
+NODATA = 42113
+"""GDAL's TIFF tag: value of the pixels without data."""
+
+NPY = b"\x93NUMPY"
+"""How files of NumPy begin."""
+
+KINDS = "PFM, TIFF or npy of floating point (pixels), or 16-bit PNG (256 a pixel, 0 unknown)"
+
+
+def decode(data: bytes, size: tuple[int, int], name: str) -> Floats32:
+    """Values of an encoded map (row, col), from the top; NaN where they are no finite number, 0, or marked as no data.
+
+    Parameters
+    ----------
+    size : width and height that it must have, compared before anything is unpacked.
+    name : what to call it in an error.
+
+    Raises
+    ------
+    InputError
+        The file is damaged, of another kind or size, or its values are of another type.
+    """
+    try:
+        with catch_warnings(action="ignore"):
+            values = _numpy(data, size) if data.startswith(NPY) else _image(data, size)
+            values = values.astype(np.float32)
+    except Exception as error:  # whatever the parser of a damaged file comes upon
+        text = f"{name} cannot be read as a map of disparities: {' '.join(str(error).split())[:100]}"
+        raise InputError("RIL-900", text, remedy=f"give a map of the whole left image as {KINDS}") from error
+    return np.where(np.isfinite(values) & (values != 0), values, np.float32(np.nan))
+
+
+def _check(size: tuple[int, ...], wanted: tuple[int, int], floating: bool) -> None:
+    """Refuse, by a ``ValueError``, a map of another size, or of values that may be in any unit."""
+    if size != wanted:
+        words = [" x ".join(map(str, sides)) for sides in (size, wanted)]
+        raise ValueError(f"it has {words[0]} values, the left image {words[1]} pixels")
+    if not floating:
+        raise ValueError("its values are of a type whose unit is not known")
+
+
+def _numpy(data: bytes, size: tuple[int, int]) -> AnyArray:
+    """An array of NumPy; nothing in it is executed, and no more is allocated than the file has."""
+    file = BytesIO(data)
+    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    shape, by_columns, dtype = read_header[np.lib.format.read_magic(file)](file)
+    _check(shape[::-1], size, dtype.kind == "f")
+    return np.frombuffer(data, dtype, size[0] * size[1], file.tell()).reshape(shape, order="F" if by_columns else "C")
+
+
+def _image(data: bytes, size: tuple[int, int]) -> AnyArray:
+    """An image whose values are no grey levels."""
+    image = opened(BytesIO(data))
+    if image is None:
+        raise ValueError("it is of no kind that is read")
+    coded = image.format == "PNG" and image.mode == "I;16"
+    _check(image.size, size, coded or image.mode == "F")
+    # PFM's rows, which run from the bottom, and the byte order in its sign are Pillow's business.
+    values = np.asarray(image, np.float32) / (PNG_UNITS if coded else 1)
+    if image.format == "TIFF" and NODATA in image.tag_v2:
+        values[values == np.float32(image.tag_v2[NODATA].strip("\0 "))] = np.nan
+    return values
+
+
+def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> list[Path]:
+    """The map of each left image, by name (sides' tokens aside) or number; by order where names have nothing in common.
+
+    Parameters
+    ----------
+    pattern : of the maps below ``root``.
+    key : name of the manifest's entry, for errors.
+
+    Raises
+    ------
+    InputError
+        Maps and images do not fit, or the pattern is none.
+    """
+    try:
+        maps = sorted(Search().matching(root, pattern), key=lambda path: natural(path.name))
+    except InputError as error:
+        raise error.at(key) from error
+    shared = False
+    for name in (lambda path: without_side(path.stem, 0), _number):
+        ours, theirs = ({name(path): path for path in paths} for paths in (maps, lefts))
+        if len(ours) < len(maps) or len(theirs) < len(lefts):
+            continue  # it does not tell them apart
+        if ours.keys() >= theirs.keys():
+            return [ours[one] for one in theirs]
+        shared |= not ours.keys().isdisjoint(theirs)
+    if len(maps) == len(lefts) and (len(maps) == 1 or not shared):
+        return maps
+    text = f"{key} = {pattern!r}: {count(len(maps), 'map')} ({ends(maps)}) for {count(len(lefts), 'left image')}"
+    remedy = f"give one map a pair, named or numbered as the left images are ({ends(lefts)})"
+    raise InputError("RIL-901", text, remedy=remedy)
+
+
+def _number(path: Path) -> int:
+    """The last number in a file's name; -1: none."""
+    return int(["-1", *re.findall(r"\d+", path.stem)][-1])
+
+
+@stage(
+    "disparity",
+    outputs=[
+        Array("column_disparity", ("row", "col"), "float32", "px", "column in the right image minus column", "nan"),
+        Array("disparity_std", ("row", "col"), "float32", "px", "its standard deviation", "nan", optional=True),
+    ],
+)
+def disparity_stage(
+    params: NoParams,
+    *,
+    frame: int,
+    size: tuple[int, int],
+    sign: Sign,
+    sigma: float | None,
+    digests: Mapping[str, str],
+    paths: Mapping[str, str],
+) -> Bundle[ImageFacts]:
+    """Disparities of a left image that another program wrote."""
+    arrays = {}
+    for array, digest in digests.items():
+        name = f"frame {frame}, map {paths[array]}"
+        arrays[array] = decode(files.read_unchanged(Path(paths[array]), digest, name), (size[0], size[1]), name)
+    if sign == "left-right":
+        arrays["column_disparity"] *= -1
+    if sigma is not None:
+        arrays["disparity_std"] = np.full_like(arrays["column_disparity"], sigma)
+    return Bundle(arrays, {"frame": frame, "camera": "left"})

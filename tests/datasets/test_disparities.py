@@ -1,0 +1,241 @@
+"""Disparity maps of other programs: every kind reads the same, hostile files are refused, each image gets its map."""
+
+from __future__ import annotations
+
+import pickle
+from contextlib import suppress
+from io import BytesIO
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from folders import SIZE, write_sequence
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from raising import raises
+
+from rille.datasets.images.disparities import decode, find
+from rille.datasets.images.files import Digests
+from rille.datasets.images.misalign import MisalignParams, misalign
+from rille.datasets.manifest.opening import open_manifest
+from rille.stages.core.errors import InputError
+
+MAP = np.array([[1.5, 2.25, 0.0], [-3.0, 60.0, 7.75]], np.float32)
+"""No two rows or columns alike; 0 is unknown. Exact in all kinds but for the negative one, which PNG does not have."""
+
+WANTED = np.where(MAP == 0, np.float32(np.nan), MAP)
+COLUMNS_ROWS = (3, 2)
+
+
+def pfm(values, scale=-1.0):
+    """Rows from the bottom, little-endian where the scale is negative."""
+    rows, cols = values.shape
+    return f"Pf\n{cols} {rows}\n{scale}\n".encode() + values[::-1].astype("<f4" if scale < 0 else ">f4").tobytes()
+
+
+def npy(values, **kind):
+    file = BytesIO()
+    np.save(file, values, **kind)
+    return file.getvalue()
+
+
+def encoded(suffix, values):
+    done, data = cv2.imencode(suffix, values)
+    assert done
+    return data.tobytes()
+
+
+def tiff(values, nodata):
+    file = BytesIO()
+    Image.fromarray(values).save(file, "TIFF", tiffinfo={42113: nodata})
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        pfm(MAP),
+        pfm(MAP, 1.0),
+        pfm(MAP, -0.0039),  # a scale other than 1 is no factor
+        encoded(".pfm", MAP),
+        encoded(".tif", MAP),
+        tiff(np.where(MAP == 0, np.float32(-9999), MAP), "-9999"),
+        npy(MAP),
+        npy(np.asfortranarray(MAP.astype(">f8"))),
+        npy(np.where(MAP == 0, np.inf, MAP)),
+    ],
+)
+def test_all_kinds_read_alike(data):
+    np.testing.assert_array_equal(decode(data, COLUMNS_ROWS, "a map"), WANTED)
+
+
+def test_png_has_256_values_a_pixel():
+    values = np.abs(MAP)
+    found = decode(encoded(".png", np.rint(256 * values).astype(np.uint16)), COLUMNS_ROWS, "a map")
+    np.testing.assert_array_equal(found, np.abs(WANTED))
+
+
+class Trap:
+    """A pickle of it makes a file."""
+
+    def __reduce__(self):
+        return Path.touch, (Path("trap"),)
+
+
+def header(shape):
+    """The beginning of a .npy file of that shape, and nothing behind."""
+    file = BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("data", "fact"),
+    [
+        (b"", ""),
+        (b"no map at all", ""),
+        (pfm(MAP)[:-1], ""),
+        (b"PF\n3 2\n-1\n" + bytes(72), ""),  # colours
+        (b"Pf\n3 2\nnan\n" + bytes(24), ""),
+        (b"Pf\n1000000 1000000\n-1\n" + bytes(24), "1000000 x 1000000"),
+        (pfm(MAP.T.copy()), "2 x 3"),
+        (npy(MAP)[:-1], ""),
+        (header((2, 3)), ""),
+        (header((10**9, 10**9)), "1000000000 x 1000000000"),
+        (header((-2, -3)), ""),
+        (header((6,)), ""),
+        (npy(np.array([[Trap()] * 3] * 2, object), allow_pickle=True), "type"),
+        (pickle.dumps(Trap()), ""),
+        (npy((16 * MAP).astype(np.int16)), "type"),
+        (encoded(".png", MAP.astype(np.uint8)), "type"),
+        (encoded(".tif", MAP.astype(np.uint16)), "type"),
+        (encoded(".png", np.zeros((2, 3, 3), np.uint16)), "type"),
+    ],
+)
+def test_other_files_are_refused_in_one_line(data, fact, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with raises("RIL-900", "a map", fact) as caught:
+        decode(data, COLUMNS_ROWS, "a map")
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+SEEDS = [pfm(MAP), encoded(".tif", MAP), encoded(".png", np.zeros((2, 3), np.uint16)), npy(MAP)]
+
+
+@given(st.sampled_from(SEEDS), st.integers(0, 400), st.binary(max_size=8))
+def test_damaged_files_are_read_or_refused(data, at, change):
+    damaged = data[: at % len(data)] + change + data[at % len(data) + len(change) :]
+    with suppress(InputError):
+        assert decode(damaged, COLUMNS_ROWS, "a map").shape == (2, 3)
+
+
+# -- which map is whose ------------------------------------------------------------------------------------------------
+
+
+def paths(folder, names):
+    found = [folder / name for name in names.split()]
+    for path in found:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("lefts", "maps", "wanted"),
+    [
+        ("07.png 08.png 09.png", "09.pfm 08.pfm 07.pfm 06.pfm", "07 08 09"),
+        ("left_7.png left_10.png", "left_10.npy left_7.npy", "left_7 left_10"),
+        ("cam0_7.png cam0_10.png", "disp_0010.npy disp_0007.npy", "disp_0007 disp_0010"),
+        ("00_10.png 01_10.png", "d_00_10.npy d_01_10.npy", "d_00_10 d_01_10"),  # the last number tells nothing apart
+        ("a.png b.png", "2.npy 10.npy", "2 10"),
+        ("im0.png", "disp.pfm", "disp"),
+    ],
+)
+def test_maps_are_paired_by_name_number_or_order(tmp_path, lefts, maps, wanted):
+    paths(tmp_path, " ".join(f"disp/{name}" for name in maps.split()))
+    found = find("disp/*", tmp_path, [Path(name) for name in lefts.split()], "disparity.left")
+    assert [path.stem for path in found] == wanted.split()
+
+
+@pytest.mark.parametrize(
+    ("lefts", "maps"),
+    [
+        ("07.png 08.png 09.png", "07.pfm 09.pfm"),
+        ("07.png 08.png 09.png", "07.pfm 09.pfm 10.pfm"),  # as many, but not of these images
+        ("a.png b.png", "1.npy 2.npy 3.npy"),
+        ("a.png b.png", "map.npy"),
+        ("a.png", ""),
+    ],
+)
+def test_maps_that_do_not_fit_are_refused(tmp_path, lefts, maps):
+    paths(tmp_path, " ".join(f"disp/{name}" for name in maps.split()))
+    counts = f"{len(maps.split())} map", f"{len(lefts.split())} left image"
+    with raises("RIL-901", "disparity.left", *counts):
+        find("disp/*", tmp_path, [Path(name) for name in lefts.split()], "disparity.left")
+
+
+# -- in a manifest -----------------------------------------------------------------------------------------------------
+
+
+def sequence(tmp_path, table='left = "disp/*.npy"', **more):
+    """Three frames whose maps hold 10, 20 and 30 px."""
+    path = write_sequence(tmp_path, f"[disparity]\n{table}\n", **more)
+    for name in ("disp", "sigma"):
+        (tmp_path / name).mkdir()
+        for k in range(3):
+            np.save(tmp_path / name / f"{k:02d}.npy", np.full(SIZE[::-1], 10.0 * (k + 1), np.float32))
+    return open_manifest(path, Digests())
+
+
+@pytest.mark.parametrize(
+    ("more", "column", "sigma"),
+    [
+        ("", -20, None),
+        ('sign = "right-left"', 20, None),
+        ("sigma = 0.25", -20, 0.25),
+        ("sigma = 1", -20, 1.0),
+        ('sigma = "sigma/*.npy"', -20, 20.0),
+    ],
+)
+def test_a_manifest_names_maps(tmp_path, materialise, more, column, sigma):
+    s = sequence(tmp_path, f'left = "disp/*.npy"\n{more}')
+    bundle = materialise(s.disparity(1))
+    assert (bundle["column_disparity"] == column).all()
+    assert ("disparity_std" in bundle.arrays) == (sigma is not None)
+    assert sigma is None or (bundle["disparity_std"] == sigma).all()
+    assert any("disp/*.npy" in note for note in s.notes)
+
+
+def test_lost_frames_need_no_map(tmp_path, materialise):
+    sequence(tmp_path)
+    (tmp_path / "left" / "01.png").unlink()
+    (tmp_path / "disp" / "01.npy").unlink()
+    s = open_manifest(tmp_path / "rover.rille.toml", Digests())
+    assert (materialise(s.disparity(2))["column_disparity"] == -30).all()
+
+
+def test_a_map_that_changed_since_is_refused(tmp_path, materialise):
+    s = sequence(tmp_path)
+    np.save(tmp_path / "disp" / "01.npy", np.full(SIZE[::-1], 77.0, np.float32))
+    source = s.disparity(1)
+    np.save(tmp_path / "disp" / "01.npy", np.zeros(SIZE[::-1], np.float32))
+    with raises("RIL-177", "01.npy"):
+        materialise(source)
+
+
+def test_maps_are_of_undistorted_and_unmoved_images(tmp_path):
+    cameras = "[cameras]\nfx = 60.0\ncx = 31.5\ncy = 23.5\ndistortion = [0.1, 0, 0, 0]\n"
+    with raises("RIL-902", "distortion"):
+        sequence(tmp_path, cameras=cameras)
+    plain = write_sequence(tmp_path, '[disparity]\nleft = "disp/*.npy"\n')
+    with raises("RIL-903", "[disparity]", "misalign"):
+        misalign(open_manifest(plain, Digests()), MisalignParams(rows=2))
+
+
+@pytest.mark.parametrize("line", ["sigma = 0", "sigma = -1.5", 'sign = "up"', "right = 1"])
+def test_bad_tables(tmp_path, line):
+    with raises("RIL-223", line.split()[0]):
+        sequence(tmp_path, f'left = "disp/*.npy"\n{line}')
