@@ -183,8 +183,9 @@ TILED = ("--frames", "0:2", "--set", "hfvm.preset=fast", "--set", "crosscheck.en
 
 def test_workers_killed_mid_tile(whole, tmp_path, row):
     calm, torn = tmp_path / "calm", tmp_path / "torn"
-    subprocess.run(command(calm, *TILED), check=True, stdout=subprocess.DEVNULL)
-    process, kills, tiles = begin(torn, *TILED, "--set", "tiling.tile=128"), 0, 0
+    words = (*TILED, "--set", "tiling.tile=128")
+    subprocess.run(command(calm, *words), check=True, stdout=subprocess.DEVNULL)
+    process, kills, tiles = begin(torn, *words), 0, 0
     # Twice: a task that loses its workers a third time counts as their killer.
     for wanted in (2, 9):
         while tiles < wanted and process.poll() is None:
