@@ -220,8 +220,8 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
             raise InputError("RIL-973", text, remedy="multiply by 255")
     valid = [np.asarray(image.valid) if "valid" in getattr(image, "coords", ()) else None for image in (left, right)]
     first, second = (pyramid.build(image, built.pyramid, mask) for image, mask in zip(images, valid, strict=True))
-    side = tiles.side(built.tiling, built.hfvm, built.pyramid, (images[0].shape, images[1].shape))
-    disparity = match_pyramids(first, second, built.hfvm, side=side)
+    how = tiles.how(built.tiling, built.hfvm, built.pyramid, (images[0].shape, images[1].shape))
+    disparity = match_pyramids(first, second, built.hfvm, how=how)
     arrays = {name: value for name, value in vars(disparity).items() if name != "aligned"}
     meta = facts(arrays, built.hfvm, disparity.aligned, int(np.count_nonzero(first.valid[0])))
     return _dataset(hfvm_stage, Bundle(arrays, meta), config.merge(carried, {"hfvm": hfvm}))

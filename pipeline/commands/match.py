@@ -140,9 +140,10 @@ def match(
     from rille.stages.hfvm import stage as hfvm
     from rille.stages.imaging.pyramid import PyramidParams
 
-    side = tiles.side(tiles.Tiling(), params, PyramidParams(), (images[0].shape, images[1].shape))
+    shapes = images[0].shape, images[1].shape
     with _progress(max(image.size for image in images)) as tell:
-        result = hfvm.match(*images, params, prior=prior, tell=tell, side=side)
+        how = tiles.how(tiles.Tiling(), params, PyramidParams(), shapes, tell)
+        result = hfvm.match(*images, params, prior=prior, how=how)
     kept = np.isfinite(result.column_disparity) if dense else matched(result.validity)
     column, row = (np.where(kept, array, np.nan) for array in (result.column_disparity, result.row_disparity))
     tags = {"LEFT": left.name, "RIGHT": right.name}
@@ -216,10 +217,10 @@ def warnings(result: Any, left: NDArray[Any], right: NDArray[Any]) -> Iterator[s
 
 
 @contextmanager
-def _progress(pixels: int) -> Iterator[Callable[[float, str], None] | None]:
+def _progress(pixels: int) -> Iterator[Callable[[float, str], None]]:
     """Callback that shows share and step of a large match as a bar, where stderr is a terminal."""
     if pixels < MIN_PIXELS_OF_BAR or not sys.stderr.isatty():
-        yield None
+        yield lambda share, step: None
         return
     from rich.console import Console
     from rich.progress import Progress

@@ -6,11 +6,13 @@ from typing import Any
 
 from pydantic import Field
 
+from rille.pipeline.engine import memory
 from rille.pipeline.engine.graph import Graph, Handle
+from rille.pipeline.engine.runtime.environment import cores
 from rille.stages.core.declare import Params
-from rille.stages.hfvm import matcher
-from rille.stages.hfvm import tiles as large
+from rille.stages.hfvm import coarse, presets
 from rille.stages.hfvm.join_stage import hfvm_join_stage
+from rille.stages.hfvm.matcher import How, Tell, silent
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.tile_stage import hfvm_tile_stage
 from rille.stages.hfvm.windows import Shape, tiles
@@ -49,10 +51,10 @@ class Tiling(Params):
 
 def side(tiling: Tiling, params: HfvmParams, pyramid: PyramidParams, shapes: tuple[Shape, Shape]) -> int | None:
     """Side of the tiles of a pair of images, pixels; None: it is matched whole, as one task."""
-    if not large.tileable(params) or tiling.tile == 0:
+    if not presets.local(params) or tiling.tile == 0:
         return None
     # Tiles start from the maps of level 1, which the decisions on brightness and alignment precede.
-    if min(_levels(pyramid, shape) - _half(params) for shape in shapes) <= matcher.COARSE:
+    if min(_levels(pyramid, shape) - _half(params) for shape in shapes) <= coarse.COARSE:
         return None
     chosen = tiling.tile
     if chosen is None:
@@ -61,6 +63,16 @@ def side(tiling: Tiling, params: HfvmParams, pyramid: PyramidParams, shapes: tup
         most = int((tiling.memory * 1e6 / TILE_BYTES) ** 0.5)
         chosen = max(most // STEP * STEP, LEAST)
     return chosen if chosen < max(*shapes[0], *shapes[1]) else None
+
+
+def how(
+    tiling: Tiling, params: HfvmParams, pyramid: PyramidParams, shapes: tuple[Shape, Shape], tell: Tell = silent
+) -> How:
+    """How one pair is matched by this process alone: by all of its cores, as far as memory permits."""
+    size = side(tiling, params, pyramid, shapes)
+    # Both directions side by side, or as many tiles as fit.
+    most = 2 if size is None else int(memory.free() / (tiling.memory * 1e6))
+    return How(tell, size, max(1, min(cores(), most)))
 
 
 def _levels(pyramid: PyramidParams, shape: Shape) -> int:
@@ -73,7 +85,7 @@ def _levels(pyramid: PyramidParams, shape: Shape) -> int:
 
 def _half(params: HfvmParams) -> int:
     """Levels that are left out at the fine end."""
-    return int(matcher.recipe_of(params).half)
+    return int(presets.recipe_of(params).half)
 
 
 class Tiles:

@@ -7,17 +7,13 @@ from rille.stages.core.declare import Facts
 
 class DisparityFacts(Facts):
     """``preset``; whether the right image was ``aligned`` by a plane; how many pixels are ``usable``, of these the
-    share that is matched, and ``counts`` by reason; medians over the matched pixels, pixels, None where there is none.
-    """
+    share that is matched, and ``counts`` by reason."""
 
     preset: str
     aligned: bool
     usable: int
     match_rate: float | None
     counts: dict[str, int]
-    median_column_disparity: float | None
-    median_row_disparity: float | None
-    median_disparity_std: float | None
 
 
 class TileFacts(Facts, total=False):

@@ -21,7 +21,7 @@ import numpy as np
 from rille.stages.core.declare import AnyArray, Bundle, Memory, stage
 from rille.stages.core.validity import Validity, matched
 from rille.stages.facts.matching import DisparityFacts
-from rille.stages.hfvm import brightness, finest, matcher, start, uncertainty
+from rille.stages.hfvm import brightness, finest, presets, start, uncertainty
 from rille.stages.hfvm.finest import Ending, Work
 from rille.stages.hfvm.image import view
 from rille.stages.hfvm.level import FREE, Map, State, Views, one_way
@@ -40,7 +40,7 @@ def check(left: Pyramid, right: Pyramid, given: start.Prior, params: HfvmParams)
 
     ``params``: thresholds of the checks; those of preset ``paper`` have other units, and the default's are taken.
     """
-    params = HfvmParams() if params.preset in matcher.WHOLE else params
+    params = HfvmParams() if params.preset in presets.WHOLE else params
     known = np.isfinite(given.u)
     u, zeros = np.where(known, given.u, np.float32(0.0)), np.zeros_like(given.u)
     there = Map(np.rint(u).astype(np.int16), np.zeros(u.shape, np.int16))
@@ -49,7 +49,7 @@ def check(left: Pyramid, right: Pyramid, given: start.Prior, params: HfvmParams)
     ratio = brightness.matched(a, b, State(0, there, there, inside, inside, FREE, NEAR_SIGN))
     if ratio is not None and brightness.greatest(ratio) > brightness.NOTABLE:
         b = brightness.levelled(b, ratio)
-    back = _way_back(Views(a, b, params, matcher.recipe_of(params).steps), given)
+    back = _way_back(Views(a, b, params, presets.recipe_of(params).steps), given)
     one, other = a.layers[0], b.layers[0]
     work = Work(one, other, other, there, back, params, None, (a.noise, b.noise), one.shape)
     fine = finest.check(work, replace(finest.subpixel(work), u=u))

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -22,6 +24,7 @@ from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.plane import Sample
 from rille.stages.hfvm.validation import agree
 from rille.stages.hfvm.windows import thinned
+from rille.stages.numeric.threads import side_by_side
 
 FIT_SAMPLES = 500
 """Matches that a band or plane is fitted to; more change nothing that matters and cost time."""
@@ -44,8 +47,7 @@ REACH = 2 * 4 + 2 + EDGES.reach + EDGE_RADIUS + 2
 each, half a median and a parent's neighbours, and the placement of depth edges; features come on top."""
 
 
-@dataclass(frozen=True)
-class Map:
+class Map(NamedTuple):
     """Displacements of one direction at one level, (row, col) int16 columns and rows."""
 
     u: AnyArray
@@ -129,12 +131,13 @@ class Steps:
 
 @dataclass(frozen=True)
 class Views:
-    """The left and the right image as they are matched, and how."""
+    """The left and the right image as they are matched, and how; two ``threads`` match both directions side by side."""
 
     left: Image
     right: Image
     params: HfvmParams
     steps: Steps
+    threads: int = 1
 
     def reverse(self) -> Views:
         """The images exchanged."""
@@ -197,23 +200,21 @@ def edges(look: Look, found: Field) -> Field:
     with D the distance of the compact features, which reach one pixel, and I the grey values: pixels like p count,
     since they mostly lie on its surface. Adaptive support weights: Yoon and Kweon (2006), doi:10.1109/TPAMI.2006.70.
     """
-    maps = unpacked(found.shift)
-    # Most pixels have one displacement around them.
-    around, r = np.zeros((2 * EDGES.reach + 1, 2 * EDGES.reach + 1), np.uint8), EDGES.reach
-    around[:: r // 2, r] = around[r, :: r // 2] = 1
     wanted = (look.a.deviation >= look.params.texture) & (look.a.valid != 0)
-    wanted &= np.logical_or(*(cv2.dilate(a, around) - cv2.erode(a, around) >= EDGES.apart for a in maps))
     pair = Pair(look.a.compact, look.b.compact, epipolar.NO_BAND, 0.0)
     rule = EDGES._replace(near=int(look.near_sign))
     grey = np.rint(look.a.grey).astype(np.int16)
-    return Field(pack_map(*solver.edges(pair, grey, maps, wanted.view(np.uint8), rule)), found.cost)
+    return Field(solver.edges(pair, grey, found.shift, wanted.view(np.uint8), rule), found.cost)
 
 
 def match_level(views: Views, level: int, above: State | None, near_sign: float = 0.0) -> State:
     """The state of a level, from that of the level above (None: the top): search, propagate, check, band."""
-    known = near_sign if above is None else above.near_sign
-    left = one_way(views, level, above, known, views.steps.rounds[0])
-    right = one_way(views.reverse(), level, None if above is None else above.reverse(), -known, views.steps.rounds[1])
+    known, rounds = near_sign if above is None else above.near_sign, views.steps.rounds
+    back = None if above is None else above.reverse()
+    ahead = partial(one_way, views, level, above, known, rounds[0])
+    left, right = side_by_side(
+        [ahead, partial(one_way, views.reverse(), level, back, -known, rounds[1])], views.threads
+    )
     a, b = views.left.layers[level].valid, views.right.layers[level].valid
     ok = agree(left, right, a, b, views.params.backmatch), agree(right, left, b, a, views.params.backmatch)
     return with_band(views, State(level, left, right, *ok, FREE, known))

@@ -20,7 +20,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     # Grey levels: distances are Eq. 1's there, no sums of bytes.
     "paper": {"weights": PAPER_WEIGHTS, "threshold": 15.0, "texture": 0.0, "fill_reach": 100000},
 }
-"""Parameters that a preset sets differently; a value given by the user wins. Its steps: ``matcher.RECIPES``."""
+"""Parameters that a preset sets differently; a value given by the user wins. Its steps: ``presets.RECIPES``."""
 
 
 class HfvmParams(Params):

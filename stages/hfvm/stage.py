@@ -1,14 +1,15 @@
 """Hierarchical feature vector matching: dense two-dimensional disparities of any two images (paper, 4.3).
 
 Nothing is rectified and no calibration is used. ``match`` works on plain arrays; :mod:`~rille.stages.hfvm.matcher` has
-the method on one page, in the order of the paper; see :class:`~rille.stages.hfvm.params.HfvmParams` for the presets.
+the method on one page, in the order of the paper; ``presets``: each preset as a list of steps (their parameters:
+:class:`~rille.stages.hfvm.params.HfvmParams`).
 
 - ``image``, ``features``: grey values, masks and features of a level; ``brightness``, ``plane``, ``viewpoint``: what
-  makes the images alike; ``start``: disparities known beforehand.
+  makes the images alike, which ``coarse`` puts together; ``start``: disparities known beforehand.
 - ``level``: one level: search, propagation, paths, depth edges, check, band (``epipolar``). ``native``: its loops.
-- ``finest``: the finest level: ``lucas_kanade``, ``relief``, ``validation``, ``textureless``, ``fill``,
-  ``uncertainty``.
-- ``paper``: section 4.3 to the letter. ``tiles``: large pairs. ``sanity``: whether to believe a result. ``given``:
+- ``tiles``, ``finest``: the finest level, window by window: ``lucas_kanade``, ``relief``, ``validation``,
+  ``textureless``, ``fill``, ``uncertainty``.
+- ``paper``: section 4.3 to the letter. ``sanity``: whether to believe a result. ``given``:
   whether to believe another program's.
 """
 
@@ -22,20 +23,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray, Array, Bundle, Memory, stage
-from rille.stages.core.validity import Mask, counts, matched
+from rille.stages.core.validity import Mask, counts
 from rille.stages.facts.matching import DisparityFacts
-from rille.stages.hfvm import matcher, paper, start, tiles
-from rille.stages.hfvm.image import view
-from rille.stages.hfvm.matcher import Found, Tell
+from rille.stages.hfvm import matcher, paper, start
+from rille.stages.hfvm.matcher import Found, How
 from rille.stages.hfvm.params import HfvmParams
-from rille.stages.hfvm.windows import Window
-from rille.stages.hfvm.windows import tiles as cut
+from rille.stages.hfvm.presets import WHOLE
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
 __all__ = ["OUTPUTS", "Disparity", "HfvmParams", "facts", "hfvm_stage", "match", "match_pyramids"]
 
 Map = NDArray[np.float32]
+
+HOW = How()
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,7 @@ def match(
     *,
     valid: tuple[AnyArray | None, AnyArray | None] = (None, None),
     prior: tuple[AnyArray, AnyArray] | None = None,
-    tell: Tell | None = None,
-    side: int | None = None,
+    how: How = HOW,
 ) -> Disparity:
     """Dense disparity vectors from ``left`` to ``right``, searched in two dimensions.
 
@@ -80,9 +80,8 @@ def match(
     valid : of the left and the right image (row, col), not zero where usable; None: everywhere.
     prior : column and row disparities of the left image, pixels, NaN undefined, to start from (see
         :mod:`rille.stages.hfvm.start`); None: nothing is known.
-    tell : called with the progress.
-    side : pixels of a tile; None: the whole image. Tiles need less memory; all but a thousandth of the pixels are
-        within .01 px. Presets ``accurate`` and ``paper`` are matched whole.
+    how : progress, tiles, threads. Tiles need less memory; all but a thousandth of the pixels are within .01 px.
+        Presets ``accurate`` and ``paper`` are matched whole.
 
     Raises
     ------
@@ -96,84 +95,30 @@ def match(
     """
     levels = PyramidParams()
     a, b = (pyramid.build(image, levels, usable) for image, usable in zip((left, right), valid, strict=True))
-    return match_pyramids(a, b, params or HfvmParams(), start.check(prior, left.shape), tell, side)
+    return match_pyramids(a, b, params or HfvmParams(), start.check(prior, left.shape), how)
 
 
 def match_pyramids(
-    left: Pyramid,
-    right: Pyramid,
-    params: HfvmParams,
-    prior: start.Prior | None = None,
-    tell: Tell | None = None,
-    side: int | None = None,
+    left: Pyramid, right: Pyramid, params: HfvmParams, prior: start.Prior | None = None, how: How = HOW
 ) -> Disparity:
-    """Match two image pyramids as :func:`match` does. ``side``: pixels of a tile; None: whole images."""
-    tell = tell or _silent
-    if side is not None and tiles.tileable(params):
-        found = _in_tiles(left, right, params, prior, tell, side)
+    """Match two image pyramids as :func:`match` does."""
+    if params.preset in WHOLE:
+        found = Found(paper.match(left, right, params, how.tell), False)
     else:
-        found = _whole(left, right, params, prior, tell)
-    arrays: dict[str, Any] = found.arrays
+        found = matcher.match(left, right, params, prior, how)
+    arrays: dict[str, Any] = dict(found.arrays)
     return Disparity(**arrays, aligned=found.aligned)
-
-
-def _silent(share: float, step: str) -> None:
-    """Tell nothing."""
-
-
-def _whole(left: Pyramid, right: Pyramid, params: HfvmParams, prior: start.Prior | None, tell: Tell) -> Found:
-    if params.preset in matcher.WHOLE:
-        return Found(paper.match(left, right, params, tell), False)
-    return matcher.match(left, right, params, prior, tell)
-
-
-def _in_tiles(
-    left: Pyramid, right: Pyramid, params: HfvmParams, prior: start.Prior | None, tell: Tell, side: int
-) -> Found:
-    """One tile after the other, in this process."""
-    recipe = matcher.recipe_of(params)
-    if matcher.halves(recipe, left.levels, right.levels):
-        half = _in_tiles(left.above(1), right.above(1), matcher.halved(params), start.halved(prior), tell, side)
-        return matcher.enlarged(half, left, right)
-    images = view(left, params), view(right, params)
-    if min(left.levels, right.levels) < 2:
-        return matcher.match(left, right, params, prior, tell)
-    pair = tiles.Pair.of(*images, tiles.coarse(*images, params, recipe, prior), params, recipe)
-    shape = images[0].shapes[0]
-    windows = cut(shape, side)
-    tell(0.2, "tiles")
-    fine = _gathered(shape, {w: pair.fine(w) for w in windows})
-    ending = pair.ending(fine)
-    tell(0.9, "filling")
-    final = {w: pair.final(w, {k: a[pair.around(w).slices] for k, a in fine.items()}, ending) for w in windows}
-    return Found(_gathered(shape, final), pair.coarse.alignment is not None)
-
-
-def _gathered(shape: tuple[int, ...], parts: Mapping[Window, Mapping[str, AnyArray]]) -> dict[str, AnyArray]:
-    """Arrays of a whole image from those of its tiles."""
-    total: dict[str, AnyArray] = {}
-    for window, arrays in parts.items():
-        for name, values in arrays.items():
-            total.setdefault(name, np.empty(shape, values.dtype))[window.slices] = values
-    return total
 
 
 def facts(arrays: Mapping[str, AnyArray], params: HfvmParams, aligned: bool, usable: int) -> DisparityFacts:
     """Facts of disparities; ``usable``: how many pixels of the left image are."""
-    bits, ok = counts(arrays["validity"]), matched(arrays["validity"])
-
-    def median(name: str) -> float | None:
-        return float(np.median(arrays[name][ok])) if ok.any() else None
-
+    bits = counts(arrays["validity"])
     return {
         "preset": params.preset,
         "aligned": aligned,
         "usable": usable,
         "match_rate": bits["matched"] / usable if usable else None,
         "counts": bits,
-        "median_column_disparity": median("column_disparity"),
-        "median_row_disparity": median("row_disparity"),
-        "median_disparity_std": median("disparity_std"),
     }
 
 
@@ -197,5 +142,6 @@ OUTPUTS = (
 def hfvm_stage(params: HfvmParams, left: Bundle, right: Bundle) -> Bundle[DisparityFacts]:
     """Dense two-dimensional disparities of a stereo pair by hierarchical feature vector matching."""
     a, b = Pyramid.from_bundle(left), Pyramid.from_bundle(right)
-    found = _whole(a, b, params, None, _silent)
-    return Bundle(found.arrays, facts(found.arrays, params, found.aligned, int(np.count_nonzero(a.valid[0]))))
+    arrays = vars(match_pyramids(a, b, params))
+    aligned = arrays.pop("aligned")
+    return Bundle(arrays, facts(arrays, params, aligned, int(np.count_nonzero(a.valid[0]))))

@@ -15,14 +15,15 @@ import numpy as np
 from rille.stages.core.declare import AnyArray, Array, Bundle, stage
 from rille.stages.core.errors import InputError
 from rille.stages.facts.matching import TileFacts
-from rille.stages.hfvm import enlarge, matcher, textureless
+from rille.stages.hfvm import coarse, enlarge, presets, textureless, tiles
+from rille.stages.hfvm.coarse import Coarse
 from rille.stages.hfvm.finest import Ending
-from rille.stages.hfvm.image import Image, view
-from rille.stages.hfvm.level import Band, Map, State
+from rille.stages.hfvm.image import view
+from rille.stages.hfvm.level import Band, Map, State, Views
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS
-from rille.stages.hfvm.tiles import Coarse, Pair, coarse
-from rille.stages.hfvm.windows import Window, tiles, whole
+from rille.stages.hfvm.windows import Window, whole
+from rille.stages.hfvm.windows import tiles as cut
 from rille.stages.imaging.pyramid import Pyramid
 
 FINE = ("u", "v", "validity", "error", "distance", "noise")
@@ -85,25 +86,30 @@ class Task:
     @cached_property
     def half(self) -> bool:
         """Whether the pair is matched at half its resolution."""
-        recipe = matcher.recipe_of(self.params)
-        return matcher.halves(recipe, *(int(one.meta["levels"]) for one in self.given[:2]))
+        recipe = presets.recipe_of(self.params)
+        return presets.halves(recipe, *(int(one.meta["levels"]) for one in self.given[:2]))
 
     @cached_property
-    def matching(self) -> HfvmParams:
-        """Parameters at the resolution at which the pair is matched."""
-        return matcher.halved(self.params) if self.half else self.params
+    def recipe(self) -> presets.Recipe:
+        """Steps of matching at the resolution at which the pair is matched."""
+        return presets.recipe_of(self.views.params)
 
     @cached_property
-    def images(self) -> tuple[Image, Image]:
+    def views(self) -> Views:
         """Both images at that resolution."""
-        left, right = (opened(one) for one in self.given[:2])
-        first = 1 if self.half else 0
-        return view(left.above(first), self.matching), view(right.above(first), self.matching)
+        params, first = (presets.halved(self.params), 1) if self.half else (self.params, 0)
+        left, right = (view(opened(one).above(first), params) for one in self.given[:2])
+        return Views(left, right, params, presets.recipe_of(params).steps)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Rows and columns of the left image at that resolution."""
+        return self.views.left.shapes[0]
 
     @cached_property
     def windows(self) -> list[Window]:
         """Tiles of the left image."""
-        return tiles(self.images[0].shapes[0], self.side)
+        return cut(self.shape, self.side)
 
     @property
     def window(self) -> Window:
@@ -111,28 +117,34 @@ class Task:
         return self.windows[min(self.tile, len(self.windows) - 1)]
 
     @cached_property
-    def pair(self) -> Pair:
-        """Both images with the result of step ``coarse``."""
-        assert self.given.coarse is not None
-        found = _coarse_of(self.given.coarse)
-        return Pair.of(*self.images, found, self.matching, matcher.recipe_of(self.matching))
+    def pair(self) -> Coarse:
+        """The result of step ``coarse``."""
+        bundle = self.given.coarse
+        assert bundle is not None
+        maps = [Map(bundle[f"{way}_u"], bundle[f"{way}_v"]) for way in ("left", "right")]
+        oks = [bundle[f"{way}_ok"] != 0 for way in ("left", "right")]
+        meta = bundle.meta
+        band = Band(np.array(meta["f"]), meta["mu"])
+        state = State(meta["level"], maps[0], maps[1], oks[0], oks[1], band, meta["near_sign"])
+        ratio, alignment = (None if meta[name] is None else np.array(meta[name]) for name in ("ratio", "alignment"))
+        return Coarse.again(self.views, state, ratio, alignment)
 
-    def fine(self, window: Window) -> dict[str, AnyArray]:
+    def fine(self, window: Window, names: Sequence[str] = FINE) -> dict[str, AnyArray]:
         """Arrays of the tiles' fine results."""
-        return {name: mosaic(self.given.fine, name, self.windows, window) for name in FINE}
+        return {name: mosaic(self.given.fine, name, self.windows, window) for name in names}
 
 
 def _coarse(task: Task) -> Bundle[TileFacts]:
-    found = coarse(*task.images, task.matching, matcher.recipe_of(task.matching))
-    s = found.state
+    pair = coarse.begin(task.views, task.recipe.begin)
+    s = pair.state
     arrays: dict[str, AnyArray] = {}
     for way, m, ok in (("left", s.left, s.left_ok), ("right", s.right, s.right_ok)):
         arrays |= {f"{way}_u": m.u, f"{way}_v": m.v, f"{way}_ok": ok.view(np.uint8)}
     meta: TileFacts = {
         "level": s.level,
-        "aligned": found.alignment is not None,
-        "alignment": None if found.alignment is None else found.alignment.tolist(),
-        "ratio": None if found.ratio is None else found.ratio.tolist(),
+        "aligned": pair.alignment is not None,
+        "alignment": None if pair.alignment is None else pair.alignment.tolist(),
+        "ratio": None if pair.ratio is None else pair.ratio.tolist(),
         "f": s.band.f.tolist(),
         "mu": float(s.band.mu),
         "near_sign": float(s.near_sign),
@@ -140,24 +152,13 @@ def _coarse(task: Task) -> Bundle[TileFacts]:
     return Bundle(arrays, meta)
 
 
-def _coarse_of(bundle: Bundle[TileFacts]) -> Coarse:
-    maps = [Map(bundle[f"{way}_u"], bundle[f"{way}_v"]) for way in ("left", "right")]
-    oks = [bundle[f"{way}_ok"] != 0 for way in ("left", "right")]
-    meta = bundle.meta
-    band = Band(np.array(meta["f"]), meta["mu"])
-    state = State(meta["level"], maps[0], maps[1], oks[0], oks[1], band, meta["near_sign"])
-    ratio, alignment = (None if meta[name] is None else np.array(meta[name]) for name in ("ratio", "alignment"))
-    return Coarse(state, ratio, alignment)
-
-
 def _fine(task: Task) -> Bundle[TileFacts]:
-    return Bundle(task.pair.fine(task.window), {})
+    return Bundle(tiles.fine(task.pair, task.recipe.refinement, task.window), {})
 
 
 def _ending(task: Task) -> Bundle[TileFacts]:
-    shape = task.images[0].shapes[0]
-    found = {name: mosaic(task.given.fine, name, task.windows, whole(shape)) for name in ("u", "v", "validity")}
-    ending = task.pair.ending(found)
+    found = task.fine(whole(task.shape), ("u", "v", "validity"))
+    ending = tiles.ending(task.pair, found, task.recipe.planes)
     meta: TileFacts = {"f": None if ending.f is None else ending.f.tolist(), "terms": None}
     if ending.planes is None:
         return Bundle({}, meta)
@@ -166,15 +167,15 @@ def _ending(task: Task) -> Bundle[TileFacts]:
 
 
 def _final(task: Task) -> Bundle[TileFacts]:
-    bundle, shape = task.given.ending, task.images[0].shapes[0]
+    bundle, shape = task.given.ending, task.shape
     assert bundle is not None
     f = None if bundle.meta["f"] is None else np.array(bundle.meta["f"])
     terms = bundle.meta["terms"]
     planes = None if terms is None or f is None else textureless.Planes(bundle["region"], terms, f)
-    ending = Ending(task.pair.coarse.state.near_sign, task.pair.coarse.alignment, f, planes, shape)
+    ending = Ending(task.pair.state.near_sign, task.pair.alignment, f, planes, shape)
     # At half the resolution with the neighbours that slopes are taken from.
     window = task.window.grow(1, 1, shape) if task.half else task.window
-    arrays = task.pair.final(window, task.fine(task.pair.around(window)), ending)
+    arrays = tiles.final(task.pair, window, task.fine(tiles.around(task.pair, window)), ending)
     if task.half:
         left, right = (tuple(one.raster("level_0").shape) for one in task.given[:2])
         outer, inner = window.child(left), task.window.child(left)

@@ -31,22 +31,20 @@ def agree(own: Any, other: Any, own_valid: AnyArray, other_valid: AnyArray, limi
     ``own, other``: maps, ``u`` and ``v`` int16.
     """
     found = np.zeros(own.u.shape, bool)
-    _agree((own.u, own.v), (other.u, other.v), (own_valid, other_valid), np.float32(limit * limit), found)
+    _agree(own, other, own_valid, other_valid, np.float32(limit * limit), found)
     return found
 
 
 @njit(cache=True, nogil=True)
-def _agree(own, other, valid, most, found):  # type: ignore[no-untyped-def]
-    (au, av), (bu, bv) = own, other
-    own_valid, other_valid = valid
-    rows, cols = au.shape
-    brows, bcols = np.uint64(bu.shape[0]), np.uint64(bu.shape[1])
+def _agree(own, other, own_valid, other_valid, most, found):  # type: ignore[no-untyped-def]
+    rows, cols = found.shape
+    brows, bcols = np.uint64(other_valid.shape[0]), np.uint64(other_valid.shape[1])
     for y in range(rows):
         for x in range(cols):
             # Unsigned: what is negative lies beyond every column.
-            i, j = np.uint64(x + np.int64(au[y, x])), np.uint64(y + np.int64(av[y, x]))
+            i, j = np.uint64(x + np.int64(own.u[y, x])), np.uint64(y + np.int64(own.v[y, x]))
             if own_valid[y, x] and i < bcols and j < brows and other_valid[j, i]:
-                du, dv = np.int64(au[y, x]) + bu[j, i], np.int64(av[y, x]) + bv[j, i]
+                du, dv = np.int64(own.u[y, x]) + other.u[j, i], np.int64(own.v[y, x]) + other.v[j, i]
                 found[y, x] = du * du + dv * dv <= most
 
 
@@ -105,11 +103,13 @@ def isolated(u: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
     """
     if size <= 1:
         return np.zeros(keep.shape, dtype=bool)
-    small = _in_small_patches(u, keep, size)
     # In a small image patches of CHANCE times the size may not fit: an eighth of it is enough.
-    smaller = _in_small_patches(u, keep, max(size, min(CHANCE * size, keep.size // 8)))
-    rest, large = np.count_nonzero(keep & ~small), np.count_nonzero(keep & ~smaller)
-    return smaller if large < 0.5 * rest else small
+    suspect = _in_small_patches(u, keep, max(size, min(CHANCE * size, keep.size // 8)))
+    # The smaller patches are among these, and most matches are not.
+    small = _in_small_patches(u, suspect, size)
+    all_of_them = np.count_nonzero(keep)
+    rest, large = all_of_them - np.count_nonzero(small), all_of_them - np.count_nonzero(suspect)
+    return suspect if large < 0.5 * rest else small
 
 
 def _in_small_patches(u: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:

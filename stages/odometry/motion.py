@@ -27,10 +27,10 @@ from rille.stages.geometry.geometry import Camera
 from rille.stages.hfvm import epipolar, fill
 from rille.stages.hfvm.image import view
 from rille.stages.hfvm.level import Steps, Views, descend, median, propagate, search
-from rille.stages.hfvm.matcher import DEFAULT
 from rille.stages.hfvm.native.problem import Pair
 from rille.stages.hfvm.native.solver import solver
 from rille.stages.hfvm.params import HfvmParams
+from rille.stages.hfvm.presets import DEFAULT
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.odometry.derotation import Derotation
 from rille.stages.odometry.displacements import common_similarity

@@ -102,8 +102,24 @@ RULE Words eight_words(const uint64_t *w) { /* in halves: as one, GCC would send
   __builtin_memcpy(&words.high, w + LANES / 2, sizeof words.high);
   return words;
 }
-RULE Words words_from(const uint64_t *w, int count) { /* the first 7 or 8 words; what is not read is 0 */
-  return (Words){{w[0], w[1], w[2], w[3]}, {w[4], w[5], w[6], count > 7 ? w[7] : 0}};
+RULE Words seven_words(const uint64_t *w) { /* the fourth one twice: what follows the seven is not read */
+  Words words;
+  __builtin_memcpy(&words.low, w, sizeof words.low);
+  __builtin_memcpy(&words.high, w + 3, sizeof words.high);
+  return words;
+}
+RULE Sixteen four_wide(const int16_t *numbers) { /* four numbers, 64 bits each */
+  typedef int16_t Numbers __attribute__((vector_size(8)));
+  Numbers four;
+  __builtin_memcpy(&four, numbers, sizeof four);
+  return (Sixteen)__builtin_convertvector(four, Square);
+}
+RULE Sixteen least_of_sixteen(Sixteen a, Sixteen b) {
+#if defined(__AVX2__)
+  return (Sixteen)_mm256_min_epi16((__m256i)a, (__m256i)b);
+#else
+  return (Sixteen)PICK(a < b, a, b);
+#endif
 }
 RULE Eight ints_at(const int32_t *n, Eight i) {
   return (Eight){n[i[0]], n[i[1]], n[i[2]], n[i[3]], n[i[4]], n[i[5]], n[i[6]], n[i[7]]};
@@ -114,26 +130,36 @@ RULE Eight every_other(const int32_t *numbers) { /* eight of fifteen; one more i
   __builtin_memcpy(&high, numbers + LANES, sizeof high);
   return __builtin_shufflevector(low, high, 0, 2, 4, 6, 8, 10, 12, 14);
 }
-RULE int32_t any(Eight mask) {
+RULE Eight first_ints(const int32_t *numbers, int count) { /* of eight, zeros beyond `count` */
+  Eight ints = {0};
+  if (count >= LANES) __builtin_memcpy(&ints, numbers, sizeof ints);
+  else __builtin_memcpy(&ints, numbers, count * sizeof *numbers);
+  return ints;
+}
+RULE uint32_t bits_of(Eight mask) { /* a bit for each lane, the first one lowest */
 #if defined(__AVX2__)
-  return _mm256_movemask_epi8((__m256i)mask);
+  return (uint32_t)_mm256_movemask_ps((__m256)mask);
 #else
-  Square all = (Square)mask;
-  return (all[0] | all[1] | all[2] | all[3]) != 0;
+  uint32_t bits = 0;
+  for (int k = 0; k < LANES; k++) bits |= (uint32_t)(mask[k] & 1) << k;
+  return bits;
 #endif
 }
+RULE int32_t any(Eight mask) { return bits_of(mask) != 0; }
 RULE Eight columns(Eight shift) { return shift << 16 >> 16; }
 RULE Eight moved(Eight shift, int u, int v) { /* in halves: no carry runs from the columns into the rows */
   Eight step = (Eight){} + (int32_t)((uint32_t)v << 16 | (u & 0xFFFF));
   return (Eight)((Sixteen)shift + (Sixteen)step);
 }
-RULE Eight apart(Eight a, Eight b) { /* |u| + |v| of the difference of two displacements */
-  Sixteen d = (Sixteen)a - (Sixteen)b;
+RULE Sixteen size_of(Sixteen a) {
 #if defined(__AVX2__)
-  Eight size = (Eight)_mm256_abs_epi16((__m256i)d);
+  return (Sixteen)_mm256_abs_epi16((__m256i)a);
 #else
-  Eight size = (Eight)PICK(d < 0, -d, d);
+  return PICK(a < 0, -a, a);
 #endif
+}
+RULE Eight apart(Eight a, Eight b) { /* |u| + |v| of the difference of two displacements */
+  Eight size = (Eight)size_of((Sixteen)a - (Sixteen)b);
   return (size & 0xFFFF) + (Eight)((EightUnsigned)size >> 16);
 }
 RULE Eight below(Eight a, int limit) { return (Eight)((EightUnsigned)a < (uint32_t)limit); }

@@ -209,62 +209,88 @@ typedef struct {
   int32_t reach;      /* pixels to the farthest whose displacement is tried; half of them, too */
   int32_t apart;      /* pixels between displacements of two sides */
   int32_t grey, far;  /* grey levels from which on a pixel does not count; greatest distance */
-  int32_t better[2];  /* the own displacement counts by the first, others by the second, but farther ones */
+  int32_t own, other; /* factors of what the own displacement costs, and the others, but for farther ones */
   int32_t near;       /* sign of the columns of nearer things, 0 unknown */
 } EdgeRule;
 
-static int32_t edge_cost(const uint64_t *here, const uint64_t *there, const int16_t *grey, int32_t cols,
-                         int32_t right_cols, const EdgeRule *rule) {
-  int32_t own = grey[EDGE_RADIUS * cols + EDGE_RADIUS];
-  Eight total = {0};
-  for (int j = 0; j < EDGE_SIDE; j++, here += cols, there += right_cols, grey += cols) {
-    Eight near = {grey[0], grey[1], grey[2], grey[3], grey[4], grey[5], grey[6], own + rule->grey};
-    near -= own;
-    Eight weight = rule->grey - PICK(near < 0, -near, near);
-    weight &= weight > 0;
-    Eight apart_by = distances(words_from(here, EDGE_SIDE), words_from(there, EDGE_SIDE));
-    total += weight * least_of(apart_by, (Eight){} + rule->far);
+typedef struct { Sixteen low, high; } Weights; /* of seven pixels side by side, as `seven_words` has them */
+
+static inline Sixteen edge_weight(Sixteen near, const EdgeRule *rule) {
+  Sixteen weight = (int16_t)rule->grey - PICK(near < 0, -near, near);
+  return weight & (weight > 0);
+}
+/* By how much less than rule->grey the pixels of the window from `grey` on differ from its middle. */
+static inline void edge_weights(const int16_t *grey, int32_t cols, const EdgeRule *rule, Weights out[EDGE_SIDE]) {
+  int16_t own = grey[EDGE_RADIUS * cols + EDGE_RADIUS];
+  for (int j = 0; j < EDGE_SIDE; j++, grey += cols) {
+    /* A distance is in the first of the four numbers of a word, and the others are zero, whatever their weight. */
+    out[j] = (Weights){edge_weight(four_wide(grey) - own, rule), edge_weight(four_wide(grey + 3) - own, rule)};
+    out[j].high[0] = 0;
+  }
+}
+/* Sum of the distances, each at most rule->far, by their weights: below 7 x 7 x 100 x 16, so that 16 bits hold a column. */
+static inline int32_t edge_cost(const uint64_t *here, const uint64_t *there, const Weights *weight, int32_t cols,
+                                int32_t right_cols, int16_t far) {
+  Sixteen total = {0}, most = total + far;
+  for (int j = 0; j < EDGE_SIDE; j++, here += cols, there += right_cols) {
+    Words a = seven_words(here), b = seven_words(there);
+    total += weight[j].low * least_of_sixteen((Sixteen)square_sad(a.low, b.low), most);
+    total += weight[j].high * least_of_sixteen((Sixteen)square_sad(a.high, b.high), most);
   }
   int32_t sum = 0;
-  for (int k = 0; k < EDGE_SIDE; k++) sum += total[k];
+  for (int k = 0; k < LANES * 2; k += 4) sum += total[k];
   return sum;
 }
+typedef struct { int32_t x, y; int64_t at; } Place; /* a pixel, and its index */
+
+/* Which displacements differ from others by rule->apart columns or rows. */
+static inline Eight differ(Eight shift, Eight other, const EdgeRule *rule) {
+  return (Eight)(size_of((Sixteen)shift - (Sixteen)other) >= (int16_t)rule->apart) != 0;
+}
+/* What the displacement of a pixel costs; negative: it leads out of the right image. */
+static inline int32_t cost_there(const Pair *pair, Place p, int32_t shift, const Weights *weight, const EdgeRule *rule) {
+  int32_t cols = pair->left.cols, right_cols = pair->right.cols;
+  int32_t y = p.y + pair->ahead_y + (shift >> 16), x = p.x + pair->ahead_x + (int16_t)shift;
+  if (y < EDGE_RADIUS || y >= pair->right.rows - EDGE_RADIUS || x < EDGE_RADIUS || x >= right_cols - EDGE_RADIUS) return -1;
+  const uint64_t *here = pair->left.words + p.at - (int64_t)EDGE_RADIUS * cols - EDGE_RADIUS;
+  const uint64_t *there = pair->right.words + (int64_t)(y - EDGE_RADIUS) * right_cols + x - EDGE_RADIUS;
+  return edge_cost(here, there, weight, cols, right_cols, (int16_t)rule->far);
+}
+/* The displacement of a pixel, chosen among its own and the different ones of those `around`. */
+static int32_t chosen(const Pair *pair, Place p, const int16_t *grey, int32_t own, Eight around, const EdgeRule *rule) {
+  Weights weight[EDGE_SIDE];
+  edge_weights(grey + p.at - (int64_t)EDGE_RADIUS * pair->left.cols - EDGE_RADIUS, pair->left.cols, rule, weight);
+  int32_t best = own, least = cost_there(pair, p, own, weight, rule) * rule->own;
+  Eight other = differ(around, (Eight){} + own, rule);
+  for (uint32_t left; least >= 0 && (left = bits_of(other));) {
+    int32_t tried = around[__builtin_ctz(left)], cost = cost_there(pair, p, tried, weight, rule);
+    cost *= rule->near * ((int16_t)tried - (int16_t)own) < 0 ? rule->own : rule->other;
+    if (cost >= 0 && cost < least) least = cost, best = tried;
+    other &= differ(around, (Eight){} + tried, rule);
+  }
+  return best;
+}
 /* Displacements of the wanted pixels, chosen anew among those around; pair: words of compact features. */
-void EXPORT(edges)(const Pair *pair, const int16_t *grey, const int16_t *u, const int16_t *v, const uint8_t *wanted,
-                   const EdgeRule *rule, int16_t *out_u, int16_t *out_v) {
-  int32_t rows = pair->left.rows, cols = pair->left.cols, right_rows = pair->right.rows, right_cols = pair->right.cols;
-  int32_t reach = rule->reach, half = reach / 2;
-  const int32_t aside[8][2] = {{half, 0}, {-half, 0}, {0, half}, {0, -half}, {reach, 0}, {-reach, 0}, {0, reach}, {0, -reach}};
-  for (int32_t y = reach; y < rows - reach; y++) {
-    for (int32_t x = reach; x < cols - reach; x++) {
+void EXPORT(edges)(const Pair *pair, const int16_t *grey, const int32_t *shift, const uint8_t *wanted, const EdgeRule *rule,
+                   int32_t *out) {
+  int32_t cols = pair->left.cols, reach = rule->reach;
+  const int64_t far = reach, half = far / 2;
+  const int64_t aside[8] = {half * cols, -half * cols, half, -half, far * cols, -far * cols, far, -far};
+  for (int32_t y = reach; y < pair->left.rows - reach; y++) {
+    for (int32_t x = reach; x < cols - reach; x += LANES) {
       int64_t i = (int64_t)y * cols + x;
-      if (!wanted[i]) continue;
-      Shift tried[9] = {{u[i], v[i]}};
-      int32_t count = 1, chosen = 0;
-      for (int n = 0; n < 8; n++) {
-        int64_t at = i + (int64_t)aside[n][0] * cols + aside[n][1];
-        int32_t k = 0;
-        for (; k < count; k++) {
-          int32_t du = tried[k].u - u[at], dv = tried[k].v - v[at];
-          if ((du < 0 ? -du : du) < rule->apart && (dv < 0 ? -dv : dv) < rule->apart) break;
-        }
-        if (k == count) tried[count++] = (Shift){u[at], v[at]};
+      int32_t count = cols - reach - x;
+      Eight own = first_ints(shift + i, count), marks = {0};
+      for (int n = 0; n < 8; n++) marks |= differ(first_ints(shift + i + aside[n], count), own, rule);
+      /* Most pixels have one displacement around them. */
+      for (uint32_t left = bits_of(marks); left; left &= left - 1) {
+        int32_t k = __builtin_ctz(left);
+        int64_t at = i + k;
+        if (!wanted[at]) continue;
+        Eight around = {0};
+        for (int n = 0; n < 8; n++) around[n] = shift[at + aside[n]];
+        out[at] = chosen(pair, (Place){x + k, y, at}, grey, own[k], around, rule);
       }
-      int64_t least = INT64_MAX;
-      for (int32_t k = 0; k < count && count > 1; k++) {
-        int32_t q = y + pair->ahead_y + tried[k].v, p = x + pair->ahead_x + tried[k].u;
-        if (q >= EDGE_RADIUS && q < right_rows - EDGE_RADIUS && p >= EDGE_RADIUS && p < right_cols - EDGE_RADIUS) {
-          int32_t farther = rule->near * (tried[k].u - tried[0].u) < 0;
-          int64_t from = i - (int64_t)EDGE_RADIUS * cols - EDGE_RADIUS;
-          int64_t to = (int64_t)(q - EDGE_RADIUS) * right_cols + p - EDGE_RADIUS;
-          int64_t cost = edge_cost(pair->left.words + from, pair->right.words + to, grey + from, cols, right_cols, rule);
-          cost *= rule->better[k > 0 && !farther];
-          if (cost < least) least = cost, chosen = k;
-        } else if (k == 0) {
-          break;
-        }
-      }
-      out_u[i] = (int16_t)tried[chosen].u, out_v[i] = (int16_t)tried[chosen].v;
     }
   }
 }

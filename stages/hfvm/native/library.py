@@ -67,7 +67,7 @@ _ARGUMENTS: dict[str, tuple[Any, ...]] = {
     "search": (POINTER(_Pair), POINTER(_Parents), _Shift, _Field, c_void_p),
     "propagate": (POINTER(_Pair), _Field, _Smoothing, c_int32, c_void_p, c_void_p),
     "sums": (POINTER(_Pair), c_void_p, c_void_p, c_void_p, _Three),
-    "edges": (POINTER(_Pair), c_void_p, c_void_p, c_void_p, c_void_p, POINTER(_EdgeRule), c_void_p, c_void_p),
+    "edges": (POINTER(_Pair), c_void_p, c_void_p, c_void_p, POINTER(_EdgeRule), c_void_p),
     "candidates": (POINTER(_Pair), POINTER(c_void_p * 2), c_void_p, POINTER(_Parents), _PathCosts, _Three),
     "sweep": (c_int32, c_int32, _Three, c_void_p, _PathCosts, c_int32, c_void_p, c_void_p),
     "choose": (_Three, c_void_p, c_int64, c_void_p),
@@ -142,14 +142,11 @@ class Library:
         self._call("sums", _pair(pair), *given, _Three(*(array.ctypes.data for array in out)))
         return out
 
-    def edges(
-        self, pair: Pair, grey: AnyArray, maps: tuple[AnyArray, AnyArray], wanted: AnyArray, rule: EdgeRule
-    ) -> tuple[AnyArray, AnyArray]:
+    def edges(self, pair: Pair, grey: AnyArray, shift: AnyArray, wanted: AnyArray, rule: EdgeRule) -> AnyArray:
         """Displacements with depth edges placed anew, see ``reference.edges``."""
-        shape = pair.left.shape
-        out = maps[0].copy(), maps[1].copy()
-        given = [_at(grey, np.int16, shape), *(_at(a, np.int16, shape) for a in maps), _at(wanted, np.uint8, shape)]
-        self._call("edges", _pair(pair), *given, _EdgeRule(*rule), *(array.ctypes.data for array in out))
+        shape, out = pair.left.shape, shift.copy()
+        given = _at(grey, np.int16, shape), _at(shift, np.int32, shape), _at(wanted, np.uint8, shape)
+        self._call("edges", _pair(pair), *given, _EdgeRule(*rule), out.ctypes.data)
         return out
 
     def candidates(

@@ -21,6 +21,7 @@ from rille.stages.hfvm.native.problem import (
     Pair,
     PathCosts,
     Smoothing,
+    unpacked,
 )
 
 FARTHEST_OFF = np.float32(2047)
@@ -451,20 +452,18 @@ def _sums(pair, maps, wanted, out):  # type: ignore[no-untyped-def]
 # -- depth edges -------------------------------------------------------------------------------------------------------
 
 
-def edges(
-    pair: Pair, grey: AnyArray, maps: tuple[AnyArray, AnyArray], wanted: AnyArray, rule: EdgeRule
-) -> tuple[AnyArray, AnyArray]:
-    """Displacements (row, col) int16, depth edges placed anew, see :mod:`rille.stages.hfvm.level`.
+def edges(pair: Pair, grey: AnyArray, shift: AnyArray, wanted: AnyArray, rule: EdgeRule) -> AnyArray:
+    """Packed displacements (row, col) int32, depth edges placed anew, see :mod:`rille.stages.hfvm.level`.
 
     Parameters
     ----------
     pair : words of compact features.
     grey : (row, col) int16 grey values of the left image.
-    maps : columns and rows of displacement, (row, col) int16.
+    shift : (row, col) int32 packed displacements.
     wanted : (row, col) uint8, the pixels that may change.
     """
-    out = maps[0].copy(), maps[1].copy()
-    _edges(pair, grey, maps, wanted, rule, out)
+    out = shift.copy()
+    _edges(pair, grey, unpacked(shift), wanted, rule, out)
     return out
 
 
@@ -491,7 +490,7 @@ def _edges(pair, grey, maps, wanted, rule, out):  # type: ignore[no-untyped-def]
                 cost = factor * _window_cost(pair, grey, y, x, us[k], vs[k], rule)
                 if cost < best:
                     best, chosen = cost, k
-            out[0][y, x], out[1][y, x] = us[chosen], vs[chosen]
+            out[y, x] = pack(us[chosen], vs[chosen])
 
 
 @njit(cache=True, nogil=True)

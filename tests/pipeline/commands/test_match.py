@@ -236,10 +236,11 @@ def test_progress_is_a_bar_on_a_terminal_for_large_pairs(monkeypatch):
     stream = io.StringIO()
     monkeypatch.setattr(command.sys, "stderr", stream)
     with command._progress(command.MIN_PIXELS_OF_BAR) as tell:
-        assert tell is None
+        tell(0.5, "level 0")
     monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
     with command._progress(command.MIN_PIXELS_OF_BAR - 1) as tell:
-        assert tell is None
+        tell(0.5, "level 0")
+    assert not stream.getvalue()
     with command._progress(command.MIN_PIXELS_OF_BAR) as tell:
         tell(0.5, "level 0")
     assert "level 0" in stream.getvalue()

@@ -5,7 +5,7 @@ import pytest
 
 from rille.stages.hfvm.features import compact
 from rille.stages.hfvm.level import EDGES
-from rille.stages.hfvm.native.problem import Pair
+from rille.stages.hfvm.native.problem import Pair, pack_map, unpacked
 from rille.stages.hfvm.native.reference import EDGE_RADIUS as RADIUS
 from rille.stages.hfvm.native.solver import solver
 
@@ -20,7 +20,7 @@ def place(left, right, maps, wanted, at, near_sign):
     """Displacements with depth edges placed anew."""
     words = Pair(compact(left), compact(right), np.zeros((3, 3)), 0.0, ahead_x=at[0], ahead_y=at[1])
     rule = EDGES._replace(near=int(near_sign))
-    return solver.edges(words, np.rint(left).astype(np.int16), maps, wanted.view(np.uint8), rule)
+    return unpacked(solver.edges(words, np.rint(left).astype(np.int16), pack_map(*maps), wanted.view(np.uint8), rule))
 
 
 def by_the_equation(left, right, u, v, wanted, at, near_sign):

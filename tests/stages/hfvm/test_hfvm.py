@@ -288,7 +288,6 @@ def test_stage_gives_what_it_declares():
     ]
     out = hfvm.hfvm_stage.run(HfvmParams(), {}, {"left": bundles[0], "right": bundles[1]})
     check_outputs(hfvm.hfvm_stage, out)
-    assert out.meta["median_column_disparity"] == pytest.approx(-8, abs=0.05)
     assert 0.8 < out.meta["match_rate"] < 1
     np.testing.assert_array_equal(out["column_disparity"], match(left, right).column_disparity)
 

@@ -9,6 +9,7 @@ from raising import raises
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Validity, defined, has, matched
 from rille.stages.hfvm import start
+from rille.stages.hfvm.matcher import How
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.sanity import swapped
 from rille.stages.hfvm.stage import match
@@ -229,12 +230,12 @@ def test_prior_that_a_plane_leads_beyond_all_bounds_is_unknown():
 def test_progress_grows_from_nothing_to_all():
     left, right, *_ = pair(lambda x, y: (-5.0, 0.0))
     told = []
-    match(left, right, tell=lambda share, step: told.append((share, step)))
+    match(left, right, how=How(lambda share, step: told.append((share, step))))
     shares = [share for share, _ in told]
     assert shares[0] == 0
     assert shares == sorted(shares)
     assert shares[-1] < 1
-    assert any("refinement" in step for _, step in told)
+    assert any("fine levels" in step for _, step in told)
 
 
 @pytest.mark.data

@@ -5,10 +5,12 @@ import pytest
 from matching_scenes import pair
 
 from rille.stages.core.validity import matched
-from rille.stages.hfvm import tiles as large
 from rille.stages.hfvm.image import view
+from rille.stages.hfvm.matcher import How
 from rille.stages.hfvm.params import HfvmParams
+from rille.stages.hfvm.presets import local
 from rille.stages.hfvm.stage import match
+from rille.stages.hfvm.tiles import _bounded
 from rille.stages.hfvm.windows import Window, thinned, tiles, whole
 from rille.stages.imaging.pyramid import PyramidParams, build
 
@@ -54,7 +56,7 @@ def vignetted():
 def test_tiles_are_within_a_hundredth_of_a_pixel_of_the_whole(scene, aligned, preset):
     left, right = scene()
     params = HfvmParams(preset=preset)
-    once, cut = match(left, right, params), match(left, right, params, side=160)
+    once, cut = match(left, right, params), match(left, right, params, how=How(side=160))
     assert once.aligned == cut.aligned == aligned
     assert matched(once.validity).mean() > 0.5
     a, b = (np.stack([found.column_disparity, found.row_disparity]) for found in (once, cut))
@@ -64,8 +66,16 @@ def test_tiles_are_within_a_hundredth_of_a_pixel_of_the_whole(scene, aligned, pr
 
 
 def test_presets_that_reach_over_the_image_are_matched_whole():
-    assert [large.tileable(HfvmParams(preset=p)) for p in ("default", "fast", "accurate", "paper")] == [1, 1, 0, 0]
-    assert large.tileable(HfvmParams(preset="accurate", without=("paths", "smooth")))
+    assert [local(HfvmParams(preset=p)) for p in ("default", "fast", "accurate", "paper")] == [1, 1, 0, 0]
+    assert local(HfvmParams(preset="accurate", without=("paths", "smooth")))
+
+
+@pytest.mark.parametrize("side", [None, 160])
+def test_threads_change_no_bit(side):
+    left, right = misaligned()
+    one, three = (match(left, right, how=How(side=side, threads=n)) for n in (1, 3))
+    for name, values in vars(one).items():
+        np.testing.assert_array_equal(values, getattr(three, name))
 
 
 def test_noisy_images_are_smoothed_unless_told_otherwise():
@@ -118,4 +128,4 @@ def test_windows():
     assert Window(2, 9, 4, 7).parent() == Window(1, 5, 2, 4)
     assert Window(1, 5, 2, 4).child((9, 7)) == Window(2, 9, 4, 7)
     # nothing of it lies in the image: still two pixels, which no place can mean
-    assert large._bounded(Window(-9, -5, 20, 30), (10, 7), 2) == Window(0, 2, 4, 7)
+    assert _bounded(Window(-9, -5, 20, 30), (10, 7), 2) == Window(0, 2, 4, 7)
