@@ -31,7 +31,6 @@ PAIRS: dict[str, tuple[dict[str, Any], int, bool]] = {
     "seed 5, frame 28": ({"seed": 5}, 28, False),
     "more rocks": ({"seed": 8, "rocks": 150.0, "relief": 0.012}, 4, False),
     "little grain": ({"seed": 9, "grain": 0.02}, 4, False),
-    "blur 1.5": ({"seed": 10, "blur": 1.5}, 4, False),
     "pitch 35": ({"seed": 11, "pitch_deg": 35.0, "jitter_deg": 1.0}, 2, False),
 }
 """Name to mockup parameters, frame, and whether factors are fitted to it."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Sequence_
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rille.datasets.georeference import Georeference
@@ -149,6 +150,7 @@ class Sequence:
     truth_disparity : ``truth_disparity(frame)``: source of the exact disparity of a pair.
     disparity : ``disparity(frame)``: source of the ``column_disparity`` of a pair (right minus left, pixels) that
         another program made, and maybe its ``disparity_std``; it is checked, and takes the matcher's place.
+    masks : of cameras, files that say which pixels never show the scene (see :mod:`rille.datasets.images.masks`).
     evaluation_window : (x_min, y_min, x_max, y_max), metres, local frame of a basic pair: where a DEM is judged.
     lost : frames that have no pair of images, and why; nothing asks for their images.
     defaults : dotted configuration that suits the sequence.
@@ -179,6 +181,7 @@ class Sequence:
     truth_dem: TruthDem | None = None
     truth_disparity: Callable[[int], Source] | None = None
     disparity: Callable[[int], Source] | None = None
+    masks: Mapping[str, Path] = field(default_factory=dict)
     evaluation_window: tuple[float, float, float, float] | None = None
     lost: Mapping[int, str] = field(default_factory=dict)
     defaults: Mapping[str, Any] = field(default_factory=dict)

@@ -16,6 +16,7 @@ from typing import Any
 
 from rille.datasets.images.files import Digests
 from rille.datasets.images.kinds import unread
+from rille.datasets.images.masks import masked
 from rille.datasets.images.misalign import MisalignParams, misalign
 from rille.datasets.images.samples import examined
 from rille.datasets.manifest.opening import open_manifest
@@ -107,7 +108,7 @@ def open_sequence(
         sequence = mockup(_section("mockup", MockupParams, {**preset, **given}), name_or_path)
     else:
         _none_left(sections, name_or_path)
-        sequence = examined(_of_files(name_or_path, Digests(memory)))
+        sequence = _opened(name_or_path, Digests(memory))
     return misalign(sequence, warp)
 
 
@@ -122,6 +123,10 @@ def _loop(sections: dict[str, Mapping[str, Any]], name: str) -> Sequence:
                 "RIL-734", f"mockup.{key} = {getattr(params, key)}: nothing of a drive reads it", remedy="leave it out"
             )
     return mockup_loop(params, rover, name)
+
+
+def _opened(name_or_path: str, digests: Digests) -> Sequence:
+    return masked(examined(_of_files(name_or_path, digests)), digests)
 
 
 def _of_files(name_or_path: str, digests: Digests) -> Sequence:
@@ -157,7 +162,7 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
 def hindrance(place: Path) -> RilleError | None:
     """Why a folder or a manifest does not open as it is; None where it does."""
     try:
-        examined(_of_files(str(place), Digests(None)))
+        _opened(str(place), Digests(None))
     except RilleError as error:
         return error
     return None

@@ -169,6 +169,15 @@ class Disparity(Table):
     """px; standard deviation of all values, or pattern of maps of it; estimated by default"""
 
 
+class Masks(Table):
+    """``[masks]``: parts of the images that never show the scene, such as the vehicle's own body."""
+
+    left: str | None = None
+    """grey image of the left camera's size, as it takes them: bright where a pixel is used, dark where it is not"""
+    right: str | None = None
+    """the same of the right camera"""
+
+
 class Times(Table):
     """``[times]``: when the pairs were taken."""
 
@@ -290,6 +299,7 @@ class Manifest(Table):
     cameras: Cameras = Cameras()
     rig: RigSection = RigSection()
     disparity: Disparity | None = None
+    masks: Masks = Masks()
     times: Times | None = None
     truth: Truth | None = None
     odometry: PoseFile | None = None

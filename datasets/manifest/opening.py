@@ -75,6 +75,7 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
         odometry=motion.odometry or base.odometry,
         pitch=pitch,
         georeference=world.place,
+        masks={side: root / path for side, path in manifest.masks if path is not None},
         vehicle=manifest.vehicle,
         defaults={**base.defaults, **dict(dotted(manifest.defaults))},
         notes=(*base.notes, *motion.notes, *manifest.notes),

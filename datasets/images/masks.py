@@ -1,0 +1,74 @@
+"""A mask of a camera: which of its pixels never show the scene, such as the vehicle's own body.
+
+A mask is an image of the camera's size as it takes them, before any lens distortion is removed. Its bright pixels are
+used, its dark ones are not: everything from matching to the map sees an image without them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from rille.datasets.facts import ImageFacts
+from rille.datasets.images import files
+from rille.datasets.protocol import Sequence, Source
+from rille.stages.core.arrays import Bools
+from rille.stages.core.declare import AnyArray, Bundle, NoParams, stage
+from rille.stages.core.errors import InputError
+
+LEAST_SHARE = 0.05
+"""Of the pixels that must stay: with fewer there is nothing to match."""
+
+
+def usable(mask: AnyArray) -> Bools:
+    """Pixels (row, col) that a mask leaves: those brighter than half of its greatest value, whatever its scale."""
+    return np.asarray(mask.astype(np.float32) > 0.5 * float(mask.max()))
+
+
+def masked(sequence: Sequence, digests: files.Digests) -> Sequence:
+    """The sequence without the pixels that the masks of its cameras leave out.
+
+    Raises
+    ------
+    InputError
+        A mask cannot be read, has not the size of the camera's images, or leaves next to nothing.
+    """
+    if not sequence.masks:
+        return sequence
+    notes, masks = [], sequence.masks
+    for side, path in masks.items():
+        lens = (sequence.lenses or {}).get(side)
+        camera = getattr(sequence.rig, side) if lens is None else lens.camera
+        keep = usable(files.read_grey(path))
+        place = f"{sequence.name}: masks.{side} = {path}"
+        if keep.shape != (camera.height, camera.width):
+            text = f"{place} is {keep.shape[1]} x {keep.shape[0]} pixels, the images {camera.width} x {camera.height}"
+            raise InputError("RIL-904", text, remedy="draw the mask on an image as the camera gave it")
+        if keep.mean() < LEAST_SHARE:
+            text = f"{place} leaves {100 * keep.mean():.1f} % of the image"
+            raise InputError("RIL-905", text, remedy="make bright what is to be used, and dark what is not")
+        notes.append(f"a mask leaves out {100 * (1 - keep.mean()):.1f} % of the {side} images ({path.name})")
+
+    def image(frame: int, camera: str) -> Source:
+        source = sequence.image(frame, camera)
+        if camera not in masks:
+            return source
+        args = {"frame": frame, "camera": camera, "sha256": digests.sha256(masks[camera])}
+        hints = {"path": str(masks[camera].resolve())}
+        return Source("rille.datasets.images.masks", NoParams(), args, hints, {"image": source})
+
+    return replace(sequence, image=image, notes=(*sequence.notes, *notes))
+
+
+@stage("masked_image", outputs=files.image_stage.outputs)
+def masked_image_stage(
+    params: NoParams, image: Bundle[ImageFacts], *, frame: int, camera: str, path: str, sha256: str
+) -> Bundle[ImageFacts]:
+    """One image without the pixels that its camera's mask leaves out."""
+    name = f"mask of the {camera} camera {path}"
+    mask = usable(files.decode(files.read_unchanged(Path(path), sha256, name), name))
+    arrays = {key: np.asarray(array) for key, array in image.arrays.items()}
+    arrays["valid"] = (mask & (arrays["valid"] != 0)).astype(np.uint8)
+    return Bundle(arrays, {"frame": frame, "camera": camera})

@@ -1,0 +1,75 @@
+"""Masks of cameras: which pixels they leave, whatever their scale, and what is refused."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from folders import SIZE, write_sequence
+from raising import raises
+
+from rille.datasets.images.masks import usable
+from rille.datasets.registry import open_sequence
+
+DARK = np.s_[30:, :]
+"""Rows of a mask that leave out a body at the bottom."""
+
+
+def sequence(folder, mask, sides=("left", "right"), **more):
+    """Three frames, with one mask for the cameras ``sides``."""
+    lines = "\n".join(f'{side} = "mask.png"' for side in sides)
+    path = write_sequence(folder, f"[masks]\n{lines}\n", **more)
+    assert cv2.imwrite(str(folder / "mask.png"), mask)
+    return open_sequence(str(path))
+
+
+def body(value=255, shape=SIZE[::-1]):
+    mask = np.full(shape, value, np.uint8)
+    mask[DARK] = 0
+    return mask
+
+
+@pytest.mark.parametrize("sides", [("left", "right"), ("right",)])
+def test_a_mask_leaves_out_what_is_dark(tmp_path, materialise, sides):
+    s = sequence(tmp_path, body(), sides)
+    for side in ("left", "right"):
+        seen = materialise(s.image(1, side))
+        wanted = body(1) if side in sides else np.ones(SIZE[::-1])
+        np.testing.assert_array_equal(seen["valid"], wanted)
+        np.testing.assert_array_equal(seen["image"], int(side == "right") + 2)
+    assert sum("37.5 % of the" in note for note in s.notes) == len(sides)
+
+
+@pytest.mark.parametrize("scale", [1, 255, 65535])
+def test_any_scale_means_the_same(scale):
+    mask = body(1).astype(np.uint16) * scale
+    np.testing.assert_array_equal(usable(mask), body() > 0)
+
+
+def test_traces_of_compression_are_dark():
+    mask = body()
+    mask[40, :] = 9
+    np.testing.assert_array_equal(usable(mask), body() > 0)
+
+
+def test_a_mask_that_changed_since_is_refused(tmp_path, materialise):
+    s = sequence(tmp_path, body())
+    source = s.image(0, "left")
+    assert cv2.imwrite(str(tmp_path / "mask.png"), body(200))
+    with raises("RIL-177", "mask.png"):
+        materialise(source)
+
+
+@pytest.mark.parametrize(
+    ("mask", "code"),
+    [(body(shape=(24, 64)), "RIL-904"), (body(0), "RIL-905"), (np.pad([[255]], ((0, 47), (0, 63))), "RIL-905")],
+)
+def test_masks_that_do_not_fit_are_refused(tmp_path, mask, code):
+    with raises(code, "masks.left"):
+        sequence(tmp_path, mask.astype(np.uint8))
+
+
+def test_masks_of_a_lens_are_of_the_images_as_taken(tmp_path, materialise):
+    cameras = "[cameras]\nfx = 60.0\ncx = 31.5\ncy = 23.5\ndistortion = [0.1, 0, 0, 0]\n"
+    s = sequence(tmp_path, body(), cameras=cameras)
+    np.testing.assert_array_equal(materialise(s.image(0, "left"))["valid"], body(1))
