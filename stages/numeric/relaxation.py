@@ -7,10 +7,10 @@ The field f (rows, cols) minimises, with the second differences f_xx along rows 
 where ``power`` and ``pull`` are what the data say of each cell about its start f_0, and ``across`` and ``down`` the
 weights of the bends (:func:`bend_weights`), 0 where a neighbour is unknown.
 
-A cell shares second differences with the two cells beside it on each side of its row and of its column, so three
-colours, (row + column) mod 3, part the cells into sets without a common term. In each sweep one colour after the other
-is relaxed; within a colour the order makes no difference. Every third column of a row is stored side by side, so that
-the cells of a colour are neighbours in memory and are relaxed as vectors.
+A cell shares second differences with two cells to each side of its row and of its column, so the cells of one diagonal
+(row + column) do not depend on each other. A sweep goes from diagonal to diagonal, which is the order of reading to
+the bit. A diagonal is a line in memory here, so its cells are computed as vectors, and the next sweep follows a few
+diagonals behind, while they are in the cache.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ from rille.stages.core.arrays import Bools, Floats32
 
 OVERSHOOT = 1.7
 """Factor on each step, which stays convergent below 2."""
-COLOURS = 3
 BORDER = 2
-"""Rows of nothing around: a second difference reaches two cells far. Beside them it is a column of each colour."""
+"""Diagonals and rows of nothing around: a second difference reaches two cells far."""
+BEHIND = 3
+"""Diagonals that a sweep keeps behind the one before it."""
 
 
 class _Equations(NamedTuple):
-    """Arrays (row, colour of the column, column / 3) with a border: the field ``at``, the weights ``across`` and
-    ``down``, ``goal`` power f_0 + pull, and ``inverse`` 1 over all weights of a cell, 0 where it does not move."""
+    """Arrays (diagonal, row) with a border: the field ``at``, the weights ``across`` and ``down``, ``goal``
+    power f_0 + pull, and ``inverse`` 1 over all weights of a cell, 0 where it does not move."""
 
     at: Floats32
     across: Floats32
@@ -86,91 +87,79 @@ def relax(
         return start
     # About the mean, so that single precision is enough.
     middle = np.nanmean(start)
-    shape = start.shape[0] + 2 * BORDER, COLOURS, -(-start.shape[1] // COLOURS) + 2
-    equations = _Equations(*np.zeros((len(_Equations._fields), *shape), np.float32))
-    _colour(start - middle, power, pull, bends, equations)
-    _invert(power, keep, equations)
-    _sweeps(equations, sweeps)
-    moved = equations.at[BORDER:-BORDER].transpose(0, 2, 1).reshape(len(start), -1)[:, COLOURS:]
-    return np.where(keep, moved[:, : start.shape[1]] + middle, start)
+    rows, cols = start.shape
+    equations = _Equations(*np.zeros((len(_Equations._fields), rows + cols - 1 + 2 * BORDER, rows + 2 * BORDER), "f4"))
+    _shear(start - middle, power, pull, bends, keep, equations)
+    _sweeps(equations, cols, sweeps)
+    out = start.copy()
+    _read(equations.at, middle, keep, out)
+    return out
 
 
 @njit(cache=True, nogil=True)
-def _colour(start, power, pull, bends, out):  # type: ignore[no-untyped-def]
-    """Fill the equations, all but the inverse, from arrays (rows, cols); what is NaN in the start stays 0."""
-    (across, down), at, goal = bends, out.at, out.goal
-    by_row, by_column = out.across, out.down
-    for r in range(start.shape[0]):
-        for c in range(start.shape[1]):
-            i, k, m = r + BORDER, c % COLOURS, c // COLOURS + 1
-            by_row[i, k, m], by_column[i, k, m], goal[i, k, m] = across[r, c], down[r, c], pull[r, c]
-            if np.isfinite(start[r, c]):
-                at[i, k, m] = start[r, c]
-                goal[i, k, m] += power[r, c] * start[r, c]
+def _shear(start, power, pull, bends, keep, out):  # type: ignore[no-untyped-def]
+    """Fill the equations from arrays (rows, cols); what is NaN in the start stays 0."""
+    (across, down), (rows, cols) = bends, start.shape
+    four, none = np.float32(4.0), np.float32(0.0)
+    for r in range(rows):
+        for c in range(cols):
+            if not np.isfinite(start[r, c]):
+                continue
+            t, i = r + c + BORDER, r + BORDER
+            out.at[t, i], out.across[t, i], out.down[t, i] = start[r, c], across[r, c], down[r, c]
+            if not keep[r, c]:
+                continue
+            out.goal[t, i] = power[r, c] * start[r, c] + pull[r, c]
+            # Of the bend about the cell, and of those that end there.
+            weight = power[r, c] + four * (across[r, c] + down[r, c])
+            weight += (across[r, c - 1] if c > 0 else none) + (across[r, c + 1] if c + 1 < cols else none)
+            weight += (down[r - 1, c] if r > 0 else none) + (down[r + 1, c] if r + 1 < rows else none)
+            if weight > 0.0:
+                out.inverse[t, i] = np.float32(1.0) / weight
 
 
 @njit(cache=True, nogil=True)
-def _invert(power, keep, out):  # type: ignore[no-untyped-def]
-    """Fill the inverse of all weights of a cell: of the data, of the bend about it, and of those that end there."""
-    across, down, inverse, four = out.across, out.down, out.inverse, np.float32(4.0)
-    for r in range(power.shape[0]):
-        for c in range(power.shape[1]):
-            i, k, m = r + BORDER, c % COLOURS, c // COLOURS + 1
-            before, behind = (c - 1) % COLOURS, (c + 1) % COLOURS
-            weight = power[r, c] + four * (across[i, k, m] + down[i, k, m]) + down[i - 1, k, m] + down[i + 1, k, m]
-            weight += across[i, before, (c - 1) // COLOURS + 1] + across[i, behind, (c + 1) // COLOURS + 1]
-            if keep[r, c] and weight > 0.0:
-                inverse[i, k, m] = np.float32(1.0) / weight
+def _read(at, middle, keep, out):  # type: ignore[no-untyped-def]
+    """Fill the cells that move from the field of the equations."""
+    for r in range(out.shape[0]):
+        for c in range(out.shape[1]):
+            if keep[r, c]:
+                out[r, c] = at[r + c + BORDER, r + BORDER] + middle
 
 
 @njit(cache=True, nogil=True)
-def _sweeps(equations, sweeps):  # type: ignore[no-untyped-def]
-    """Relax the field in place."""
-    rows, passes = equations.at.shape[0] - 2 * BORDER, COLOURS * sweeps
-    sums = np.empty(equations.at.shape[2] - 2, np.float32)
-    # Each pass of a colour two rows behind the one before it: the same result as one after the other, while the rows
-    # are in the cache.
-    for turn in range(rows + BORDER * (passes - 1)):
-        for n in range(passes):
-            r = turn - BORDER * n
-            if 0 <= r < rows:
-                _relax_row(equations, r + BORDER, (n - r) % COLOURS, sums)
+def _sweeps(equations, cols, sweeps):  # type: ignore[no-untyped-def]
+    """Relax a field of a number of columns in place."""
+    diagonals = equations.at.shape[0] - 2 * BORDER
+    rows = diagonals + 1 - cols
+    sums = np.empty(rows, np.float32)
+    for turn in range(diagonals + BEHIND * (sweeps - 1)):
+        for k in range(sweeps):
+            t = turn - BEHIND * k
+            if 0 <= t < diagonals:
+                _relax_diagonal(equations, t + BORDER, max(0, t + 1 - cols) + BORDER, min(rows, t + 1) + BORDER, sums)
 
 
 @njit(cache=True, nogil=True)
-def _relax_row(equations, r, colour, sums):  # type: ignore[no-untyped-def]
-    """Relax the cells of a row whose columns are of a colour; ``sums``: room for a number each."""
+def _relax_diagonal(equations, t, i, j, sums):  # type: ignore[no-untyped-def]
+    """Relax the cells of rows i to j of diagonal t; ``sums``: room for a number each."""
     at, across, down = equations.at, equations.across, equations.down
-    own, two, overshoot = _beside(at[r], colour, 0), np.float32(2.0), np.float32(OVERSHOOT)
-    left, right, above, below = (
-        _beside(at[r], colour, -1), _beside(at[r], colour, 1), _beside(at[r - 1], colour, 0),
-        _beside(at[r + 1], colour, 0),
-    )  # fmt: skip
-    a, d = _beside(across[r], colour, 0), _beside(down[r], colour, 0)
-    # What the second differences want the cell to be, times their weights: as their middle, and as either end.
-    for m in range(sums.size):
-        sums[m] = two * (a[m] * (left[m] + right[m]) + d[m] * (above[m] + below[m]))
-    _add_end(_beside(across[r], colour, -1), left, _beside(at[r], colour, -2), sums)
-    _add_end(_beside(across[r], colour, 1), right, _beside(at[r], colour, 2), sums)
-    _add_end(_beside(down[r - 1], colour, 0), above, _beside(at[r - 2], colour, 0), sums)
-    _add_end(_beside(down[r + 1], colour, 0), below, _beside(at[r + 2], colour, 0), sums)
-    goal, inverse = _beside(equations.goal[r], colour, 0), _beside(equations.inverse[r], colour, 0)
-    for m in range(sums.size):
-        moved = own[m] + overshoot * (inverse[m] * (goal[m] + sums[m]) - own[m])
+    two, overshoot, n = np.float32(2.0), np.float32(OVERSHOOT), j - i
+    # What the second differences along the row, then the column want the cell to be, times their weights: as their
+    # second end, their middle and their first end.
+    before, weight, behind = across[t - 1, i:j], across[t, i:j], across[t + 1, i:j]
+    far, left, right, beyond = at[t - 2, i:j], at[t - 1, i:j], at[t + 1, i:j], at[t + 2, i:j]
+    goal = equations.goal[t, i:j]
+    for m in range(n):
+        sums[m] = goal[m] + before[m] * (two * left[m] - far[m]) + behind[m] * (two * right[m] - beyond[m])
+        sums[m] += two * weight[m] * (left[m] + right[m])
+    before, weight, behind = down[t - 1, i - 1 : j - 1], down[t, i:j], down[t + 1, i + 1 : j + 1]
+    far, above, below = at[t - 2, i - 2 : j - 2], at[t - 1, i - 1 : j - 1], at[t + 1, i + 1 : j + 1]
+    beyond = at[t + 2, i + 2 : j + 2]
+    for m in range(n):
+        sums[m] += before[m] * (two * above[m] - far[m]) + behind[m] * (two * below[m] - beyond[m])
+        sums[m] += two * weight[m] * (above[m] + below[m])
+    own, inverse = at[t, i:j], equations.inverse[t, i:j]
+    for m in range(n):
+        moved = own[m] + overshoot * (inverse[m] * sums[m] - own[m])
         own[m] = moved if inverse[m] > 0.0 else own[m]
-
-
-@njit(cache=True, nogil=True)
-def _beside(row, colour, shift):  # type: ignore[no-untyped-def]
-    """Numbers of a row (colour, column / 3) ``shift`` columns beside those of a colour, without the border."""
-    column = colour + shift
-    first = 1 + column // COLOURS
-    return row[column % COLOURS, first : first + row.shape[1] - 2]
-
-
-@njit(cache=True, nogil=True)
-def _add_end(weight, middle, far, sums):  # type: ignore[no-untyped-def]
-    """Add what second differences about ``middle`` want their near end to be."""
-    two = np.float32(2.0)
-    for m in range(sums.size):
-        sums[m] += weight[m] * (two * middle[m] - far[m])
