@@ -32,10 +32,16 @@ class GroundFacts(Facts):
     footprint: list[float] | None
     """x_min, x_max, y_min, y_max, m, for that cell."""
     ground_share: float
-    """Of the sampled pixels, on the reference plane."""
+    """Of the sampled pixels, on the reference plane; of a stated one 0."""
+    ground_reach: NotRequired[float]
+    """Camera heights up to which nine tenths of the pixels on the ground are seen."""
     max_sigma: NotRequired[float]
     """Largest standard deviation, m, of elevations above a plane that is no ground."""
     no_ground: NotRequired[str]
+    other_share: NotRequired[float]
+    """Of the sampled pixels, where most lie on a plane that cannot be ground by its attitude."""
+    why: NotRequired[str]
+    """The reference is a plane that is no ground, though none was asked for."""
     seen_up: NotRequired[list[float]]
     """Up, in the left camera's frame, by ground that is seen but contradicts the given vertical."""
 

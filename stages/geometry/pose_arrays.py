@@ -6,6 +6,8 @@ from rille.stages.core.declare import Array
 
 NO_VERTICAL = "none"
 """Source of the vertical if nothing gives it: z is then the camera's own up."""
+GROUND_PLANE = "ground plane"
+"""Source of the vertical where the ground gives it that the images show."""
 REFERENCE_PLANE = "reference plane"
 """Source of the vertical where elevations are distances from a plane that is no ground: z is its normal."""
 

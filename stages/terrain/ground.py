@@ -37,12 +37,13 @@ class CoarseGroundError(NoGroundError):
 class GroundPlane:
     """Plane of the left camera frame: ``up`` unit normal (3,), ``height`` of the camera above it in metres.
 
-    ``inliers``: share of the points that lie on it.
+    ``inliers``: share of the points that lie on it; ``reach``: distance up to which nine tenths of these do, heights.
     """
 
     up: Floats
     height: float
-    inliers: float
+    inliers: float = 0.0
+    reach: float = 0.0
 
 
 def fit_plane(
@@ -86,11 +87,12 @@ def fit_plane(
 
         theta = irls(rays, rho, biweight, start=theta)
         expected = rays @ theta
-        share = float(np.mean((expected > HORIZON * sigma) & (np.abs(rho - expected) < tolerance)))
+        on = (expected > HORIZON * sigma) & (np.abs(rho - expected) < tolerance)
         # theta = -n / h: its length is one over the height.
-        length = float(np.linalg.norm(theta))
+        share, length = float(np.mean(on)), float(np.linalg.norm(theta))
         if share >= MIN_SHARE and bool(allowed(-theta[None] / length)[0]):
-            return GroundPlane(-theta / length, 1.0 / length, share)
+            reach = length * float(np.quantile(_length(rays[on]) / expected[on], 0.9))
+            return GroundPlane(-theta / length, 1.0 / length, share, reach)
     raise NoGroundError("RIL-343", "the disparity shows no ground plane below the camera")
 
 

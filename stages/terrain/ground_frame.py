@@ -32,7 +32,7 @@ from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.epipolar import exchanged, fits, inverse_depth
 from rille.stages.geometry.geometry import Rig, RigidTransform, level_rotation
-from rille.stages.geometry.pose_arrays import NO_VERTICAL, REFERENCE_PLANE
+from rille.stages.geometry.pose_arrays import GROUND_PLANE, NO_VERTICAL, REFERENCE_PLANE
 from rille.stages.geometry.scale import coarser_focal
 from rille.stages.terrain.ground import (
     MIN_POINTS,
@@ -142,15 +142,15 @@ def level(
     try:
         ground = _fitted(samples, lambda n: _allowed(n, known_up, params), params)
         R_local_left = level_rotation(ground.up if known_up is None else known_up)
-        return _on_ground(ground, R_local_left, samples, rig, params, source or "ground plane")
+        return _on_ground(ground, R_local_left, samples, rig, params, source or GROUND_PLANE)
     except DegenerateError as error:
-        why = _explained(error, samples, ground, params)
+        why, other_share = _explained(error, samples, ground, params)
     up = np.array([0.0, -1.0, 0.0]) if known_up is None else known_up
     # No ground is seen: odometry, which needs none, still gets a frame.
     source, R_local_left = source or NO_VERTICAL, level_rotation(up)
     try:
         if params.reference_height is not None:
-            stated = GroundPlane(up, params.reference_height, 0.0)
+            stated = GroundPlane(up, params.reference_height)
             return _on_ground(stated, R_local_left, samples, rig, params, source)
     except DegenerateError as error:
         why = error
@@ -167,6 +167,8 @@ def level(
         "ground_share": 0.0,
         "no_ground": str(why),
     }
+    if other_share:
+        facts["other_share"] = other_share
     if known_up is not None:
         with suppress(DegenerateError):
             # The images may show ground where the given vertical has none: then one of the two is wrong.
@@ -176,6 +178,7 @@ def level(
         plane, everywhere = _local_plane(ground, R_local_left), [-math.inf, math.inf] * 2
         points = (rays[rho > 0] / rho[rho > 0, None]) @ R_local_left.T
         facts["plane"], facts["relief"] = plane, _relief(points, plane, everywhere, ground.height, params)
+        facts["ground_share"], facts["ground_reach"] = ground.inliers, ground.reach
     return facts
 
 
@@ -186,20 +189,22 @@ def _fitted(samples: Samples, allowed: Callable[[Floats], Bools], params: Ground
 
 def _explained(
     error: DegenerateError, samples: Samples, ground: GroundPlane | None, params: GroundFrameParams
-) -> DegenerateError:
-    """Why there is no ground, or none that is seen well enough, with the remedy of that cause."""
+) -> tuple[DegenerateError, float]:
+    """Why there is no ground, or none that is seen well enough, with the remedy of that cause; and the share of the
+    samples on another plane, 0 where none dominates."""
     if not isinstance(error, NoGroundError) or (ground is not None and ground.inliers >= DOMINANT):
-        return error
+        return error, 0.0
     try:
         seen = _fitted(samples, lambda n: np.ones(len(n), dtype=bool), params)
     except DegenerateError:
         seen = None
     if seen is None or seen.inliers < DOMINANT:
         remedy = "where the ground is a known surface, state its depth by ground_frame.reference_height"
-        return DegenerateError(error.code, error.message, remedy=remedy)
+        return DegenerateError(error.code, error.message, remedy=remedy), 0.0
     up = ", ".join(f"{v + 0.0:.2f}" for v in seen.up)
     message = f"{error.message}; the plane that it shows has its normal at [{up}] in the camera's frame"
-    return DegenerateError(error.code, message, remedy="if that is the ground, state it as world.up in a manifest")
+    remedy = "if that is the ground, state it as world.up in a manifest"
+    return DegenerateError(error.code, message, remedy=remedy), seen.inliers
 
 
 def _on_ground(
@@ -223,6 +228,7 @@ def _on_ground(
         "cell_size": cell,
         "footprint": footprint,
         "ground_share": ground.inliers,
+        "ground_reach": ground.reach,
     }
 
 
@@ -239,7 +245,7 @@ def scene_plane(samples: Samples, params: GroundFrameParams) -> GroundPlane:
         plane = _fitted(samples, lambda n: np.asarray(-n @ view >= math.cos(math.radians(MAX_SLANT_DEG))), params)
         if plane.inliers >= DOMINANT:
             return plane
-    return GroundPlane(np.array([0.0, 0.0, -1.0]), 1.0 / max(float(np.median(rho)), 1e-9), 0.0)
+    return GroundPlane(np.array([0.0, 0.0, -1.0]), 1.0 / max(float(np.median(rho)), 1e-9))
 
 
 def stated_plane(reference: Sequence[float]) -> GroundPlane:
@@ -254,7 +260,7 @@ def stated_plane(reference: Sequence[float]) -> GroundPlane:
             "seen from the camera, which lies on it",
             remedy="set terrain.reference to [normal x, y, z, point x, y, z] (x right, y down, z ahead)",
         )
-    return GroundPlane(math.copysign(1.0, height) * normal / length, abs(height), 0.0)
+    return GroundPlane(math.copysign(1.0, height) * normal / length, abs(height))
 
 
 def _on_plane(reference: GroundPlane, samples: Samples, rig: Rig, params: GroundFrameParams) -> GroundFacts:
@@ -397,8 +403,9 @@ def ground_frame_stage(
     up: Sequence[float] | None = None,
     pitch: float | None = None,
     reference: str | Sequence[float] | None = None,
+    why: str | None = None,
 ) -> Bundle[GroundFacts]:
-    """Vertical and reference plane of a basic pair."""
+    """Vertical and reference plane of a basic pair; ``why``: the reason for a reference that is no ground."""
     facts = level(
         disparity["column_disparity"],
         disparity["row_disparity"],
@@ -408,4 +415,6 @@ def ground_frame_stage(
         VerticalHint(up, pitch),
         reference,
     )
+    if why is not None:
+        facts["why"] = why
     return Bundle({}, facts)

@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.pose_arrays import GROUND_PLANE
+from rille.stages.terrain.reference import MAX_TILT_DEG, MIN_REACH, MIN_SHARE, judge
+
+WALL = {"no_ground": "a wall", "plane": None, "ground_share": 0.0}
+OTHER = {**WALL, "other_share": 0.6}
+
+
+def ground(share: float = 0.2, reach: float = 3.0, height: float = 1.6, roll: float = 0.0, **facts: Any) -> Any:
+    """Facts of a pair whose plane may be ground by its attitude."""
+    c, s = math.cos(math.radians(roll)), math.sin(math.radians(roll))
+    T = RigidTransform([[c, s, 0], [0, 0, 1], [s, -c, 0]], [0.0, 0.0, 0.0]).to_list()
+    known = {"T_local_left": T, "source": GROUND_PLANE, "plane": [0.0, 0.0, -height]}
+    return {**known, "ground_share": share, "ground_reach": reach, **facts}
+
+
+@pytest.mark.parametrize(
+    ("levels", "shown"),
+    [
+        ([], False),
+        ([WALL, WALL], False),
+        ([ground()], False),  # a floor under shelves
+        ([ground(), WALL, WALL], False),
+        ([ground(MIN_SHARE)], True),
+        ([ground(reach=MIN_REACH)], True),  # a street between walls
+        ([ground(0.0)], True),  # stated
+        ([ground(source="attitude")], True),
+        ([ground(source="pitch", plane=[math.tan(math.radians(MAX_TILT_DEG + 1.0)), 0.0, -1.0])], False),
+        ([ground(), ground(height=1.5, roll=5.0)], True),  # of one vehicle
+        ([ground(), ground(height=1.0)], False),
+        ([ground(), ground(roll=15.0)], False),
+        ([ground(MIN_SHARE), WALL, WALL], True),
+        ([ground(MIN_SHARE), OTHER], False),
+        ([ground(MIN_SHARE), ground(MIN_SHARE), OTHER], True),
+    ],
+)
+def test_ground_is_what_pairs_show_with_evidence(levels: list[Any], shown: bool) -> None:
+    assert judge(levels, coarse=False).ground == shown
+
+
+def test_ground_too_far_for_the_rig_counts_where_a_cell_size_is_stated() -> None:
+    far = ground(MIN_SHARE, no_ground="too coarse")
+    assert [judge([far], coarse=coarse).ground for coarse in (False, True)] == [False, True]
+
+
+def test_the_reason_holds_the_figures() -> None:
+    why = judge([ground(0.29, 3.2), OTHER], coarse=False).why
+    assert [part for part in ("0 of 2", "1 another plane", "29%", "3.2 camera heights", "40%") if part not in why] == []
