@@ -42,6 +42,7 @@ from rille.stages.odometry.track import track_stage
 from rille.stages.terrain.ground_frame import SCENE, ground_frame_stage
 from rille.stages.terrain.locus.stage import locus_stage
 from rille.stages.terrain.merge import merge_stage
+from rille.stages.terrain.reference import judge
 from rille.stages.terrain.tile_index import Box, tile_lattice
 
 Args = Mapping[str, Any]
@@ -260,12 +261,13 @@ class Builder:
         return found, self.node(calibration_stage, f"calibration{which}", rig=found)
 
     def level(
-        self, frame: int, vertical: Args, known: Handle[CalibrationFacts], plane: Any = None
+        self, frame: int, vertical: Args, known: Handle[CalibrationFacts], plane: Args | None = None
     ) -> Handle[GroundFacts]:
-        """Vertical and reference plane of a pair: the ground, or another ``plane``; ``known`` is its rig."""
+        """Vertical and reference plane of a pair: the ground, or another ``plane`` (:func:`other_plane`); ``known`` is
+        its rig."""
         given = {"disparity": self.disparity(frame), "rig": known, **vertical}
         label = "ground_frame" if plane is None else "reference_plane"
-        return self.node(ground_frame_stage, f"{label}/{frame}", **given, reference=plane)
+        return self.node(ground_frame_stage, f"{label}/{frame}", **given, **(plane or {}))
 
     def pair(self, frame: int, level: Handle[GroundFacts], known: Handle[CalibrationFacts], first: Pair | None) -> Pair:
         """Local elevation model of a pair above its reference plane; ``known`` is its rig.
@@ -344,10 +346,10 @@ class Builder:
         return self.node(risk_stage, label, dem=list(dems), vehicle=self.given_vehicle)
 
 
-def other_plane(config: Any, levels: Series[Args], *, placed: bool) -> str | list[float] | None:
-    """The reference plane instead of the ground, as stage ``ground_frame`` takes it; None: the ground.
+def other_plane(config: Any, levels: Series[Any], *, placed: bool) -> Args | None:
+    """The reference plane instead of the ground, as arguments of stage ``ground_frame``; None: the ground.
 
-    ``levels``: of all pairs that are known, with the ground as reference. One that shows ground makes it a drive.
+    ``levels``: of all pairs that are known, with the ground as reference.
     ``placed``: the world has a place on Earth, so that its z is up.
 
     Raises
@@ -355,17 +357,19 @@ def other_plane(config: Any, levels: Series[Args], *, placed: bool) -> str | lis
     ConfigError
         Another plane is wanted of a world that has a place on Earth.
     """
-    wanted, coarse = config.terrain.reference, config.locus.cell_size is not None
+    wanted = config.terrain.reference
     if wanted is None:
-        shown = any("no_ground" not in facts or (coarse and facts["plane"]) for facts in levels)
-        return None if shown or placed or not levels else SCENE
+        verdict = judge(levels, coarse=config.locus.cell_size is not None)
+        return None if verdict.ground or placed or not levels else {"reference": SCENE, "why": verdict.why}
     if placed and wanted != "ground":
         raise ConfigError(
             "RIL-052",
             "distances from a plane that is no ground have no place on Earth",
             remedy="leave world.origin out, or terrain.reference",
         )
-    return list(wanted) if isinstance(wanted, tuple) else {"ground": None, "scene": SCENE}[wanted]
+    if wanted == "ground":
+        return None
+    return {"reference": list(wanted) if isinstance(wanted, tuple) else SCENE}
 
 
 def merge_tiles(

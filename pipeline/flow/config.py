@@ -70,7 +70,7 @@ class TerrainParams(Params):
         default=None,
         description="what elevations are measured from: ground; scene: the plane that most of the scene lies on; or "
         "the plane with a normal x, y, z through a point x, y, z [m] of the left camera's frame (x right, y down, z "
-        "ahead); not set: the ground, or the scene's plane where no pair shows ground",
+        "ahead); not set: the ground, or the scene's plane where too little speaks for ground",
     )
 
 

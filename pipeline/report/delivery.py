@@ -178,8 +178,9 @@ def _reference(view: RunView) -> Items:
     normal = ", ".join(f"{v + 0.0:.2f}" for v in first["T_local_left"][8:11])
     share = first["ground_share"]
     whose = f"the plane that {share:.0%} of the scene lies on" if share else "a plane, stated or across the view,"
+    reason = f"{first['why']}: " if "why" in first else ""
     why = (
-        f"elevations are distances from {whose} (normal [{normal}] in the first camera's frame, "
+        f"{reason}elevations are distances from {whose} (normal [{normal}] in the first camera's frame, "
         f"{metres(first['T_local_left'][11])} away), z points to the cameras; hazards and paths mean nothing there. If "
         "that is the ground, state its normal as world.up in a manifest"
     )

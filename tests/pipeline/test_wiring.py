@@ -16,6 +16,8 @@ HERE = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
 BOX = {"x0": 0.0, "y0": 0.0, "cell": 0.01, "rows": 4, "cols": 4}
 LEG = {"start": [0.0, 0.0, 0.0], "where": None, "reason": "", "left_m": 1.0, "way_m": 1.0}
 
+SEEN = {"ground_share": 0.6, "ground_reach": 4.0}
+
 FACTS: dict[str, dict[str, Any]] = {
     "frame_screening": {"asks": {"bridges": [], "sides": []}, "chain": [0, 1, 2], "lost": [], "unfit": []},
     "keyframes": {"basic": [0, 2], "segments": [[0, 1, 2]], "displacement": [1.0, 1.0], "match_rate": [1.0, 1.0]},
@@ -23,7 +25,7 @@ FACTS: dict[str, dict[str, Any]] = {
     "trajectory": {"pieces": [[0, 2]], "main": 0, "frames": [0, 1, 2], "positions": [[0, k, 0] for k in range(3)]},
     "radiometry": {"steps": {}},
     "tile_index": {"tiles": [(0, 0, 0, 0, 4, 4)], "box": BOX, "cell": 0.01},
-    "ground_frame": {"T_local_left": HERE},
+    "ground_frame": {"T_local_left": HERE, "plane": [0.0, 0.0, -1.0], "source": "attitude"} | SEEN,
     "locus": {"lattice": BOX},
     "mockup.drive": {"poses": [HERE, HERE]},
     "mockup.sense": {"up": [[0.0, 0.0, 1.0]] * 2, "odometry": [[0.0, 0.0, 0.0], [0.0, 0.05, 0.0]]},

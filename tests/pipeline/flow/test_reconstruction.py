@@ -21,6 +21,15 @@ from rille.stages.terrain.tile_index import Box
 
 FRAMES = 8
 
+WALL: Any = {"no_ground": "a wall", "plane": None}
+GROUND: Any = {
+    "plane": [0.0, 0.0, -1.0],
+    "T_local_left": [1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0, 0],
+    "source": "attitude",
+    "ground_share": 0.6,
+    "ground_reach": 4.0,
+}
+
 
 def lay_out(
     asked: list[dict[str, Any]],
@@ -48,7 +57,7 @@ def lay_out(
         go_on(*(SimpleNamespace(meta=facts) for _ in handles))
     for handles, go_on, _ in list(graph.expansions):
         if handles[0].label.startswith("ground_frame"):
-            go_on(*(SimpleNamespace(meta=ground or {}) for _ in handles))
+            go_on(*(SimpleNamespace(meta=ground or GROUND) for _ in handles))
     for handles, go_on, _ in list(graph.expansions):
         if handles[0].stage == "resect":
             go_on(*(SimpleNamespace(meta=(jumps or {}).get(h.label, {})) for h in handles))
@@ -90,7 +99,7 @@ def test_nothing_is_asked_of_a_vehicle_where_no_pair_sees_ground(sees_ground: bo
         {"chain": list(range(8)), "lost": [], "unfit": []},
         {"basic": [0, 4], "segments": [[0, 1, 2, 3, 4], [4, 5, 6, 7]]},
         {"frames": list(range(8)), "pieces": [[0, 7]], "main": 0, "positions": [[0, 0, k] for k in range(8)]},
-        ground={} if sees_ground else {"no_ground": "a wall", "plane": None},
+        ground=GROUND if sees_ground else WALL,
     )
     kind = "ground_frame" if sees_ground else "reference_plane"
     assert [level.label for level in products.level.values()] == [f"{kind}/0", f"{kind}/4"]
@@ -101,11 +110,11 @@ def test_nothing_is_asked_of_a_vehicle_where_no_pair_sees_ground(sees_ground: bo
 
 def test_a_plane_that_is_no_ground_has_no_place_on_earth() -> None:
     chosen = config.build({"terrain": {"reference": [0.0, 0.0, -1.0, 0.0, 0.0, 2.0]}})
-    assert other_plane(chosen, [], placed=False) == [0.0, 0.0, -1.0, 0.0, 0.0, 2.0]
+    assert other_plane(chosen, [], placed=False) == {"reference": [0.0, 0.0, -1.0, 0.0, 0.0, 2.0]}
     with raises("RIL-052"):
         other_plane(chosen, [], placed=True)
-    wall = [{"no_ground": "a wall", "plane": None}]
-    assert [other_plane(config.build(), wall, placed=placed) for placed in (False, True)] == [SCENE, None]
+    scene = {"reference": SCENE, "why": "0 of 1 pairs show ground"}
+    assert [other_plane(config.build(), [WALL], placed=placed) for placed in (False, True)] == [scene, None]
 
 
 def test_a_small_right_image_is_expected_to_take_the_room_of_a_left_one() -> None:
