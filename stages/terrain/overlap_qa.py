@@ -5,22 +5,23 @@ axes, which come from the poses (or the rig); and noise, which comes from the ma
 models' own standard deviations let expect. The factor between both models' grey values is a by-product
 (:mod:`rille.stages.terrain.radiometry`).
 
-Matching errors are alike over several cells, so the cells of an overlap are far fewer observations than their number.
-The plane is therefore fitted to medians of blocks of cells, by least squares with Tukey's biweight, and its covariance
-follows from the scatter of the blocks, not from any stated sigma.
+Matching errors are alike over several cells, so the cells of an overlap are far fewer observations than their number:
+of large overlaps each so many-th cell is read. The plane is fitted to medians of blocks of cells, by least squares
+with Tukey's biweight, and its covariance follows from the scatter of the blocks, not from any stated sigma.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Bools, Floats, Floats32
-from rille.stages.core.declare import Bundle, NoParams, raster, stage
+from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.terrain import DemFacts, OverlapFacts
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.numeric.least_squares import irls
@@ -31,15 +32,18 @@ BLOCKS = 49
 MIN_BLOCKS = 12
 """Fewest blocks from which three parameters and their errors are estimated."""
 MIN_CELLS = 100
+MAX_CELLS = 40_000
+"""Cells of an overlap that are compared, about: hundreds a block, so that the plane moves by half its sigma at most."""
 MIN_BLOCK_SIDE = 3
 """Cells."""
 MIN_BLOCK_SHARE = 0.25
 """Known share of a block's cells from which it counts."""
+START_ROUNDS = 8
+"""Of the least absolute deviations: a start needs no digits."""
 
-MAP_CELLS = 160
-"""Longest side of a stored map of differences; cells of larger ones are averaged."""
 USABLE_GREY = (8.0, 247.0)
 """Grey values that an exposure is read from: darker ones are noise, brighter ones saturated."""
+ARRAYS = ("elevation", "elevation_std", "ortho")
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ class SeamFit:
     """Plane ``bias + tilt . (xy - centre)`` in a difference of elevations, and what is left.
 
     ``centre`` (2,) m; ``plane`` (3,): bias m, tilt along x and y, rad; ``covariance`` (3, 3) of it; ``noise`` robust
-    standard deviation of the cells about the plane, m; ``systematic`` RMS of the plane over the cells, m; ``cells``.
+    standard deviation of the cells about the plane, m; ``systematic`` RMS of the plane over the cells, m.
     """
 
     centre: Floats
@@ -55,11 +59,6 @@ class SeamFit:
     covariance: Floats
     noise: float
     systematic: float
-    cells: int
-
-    def at(self, x: Floats, y: Floats) -> Floats:
-        """The plane's height at points."""
-        return np.asarray(self.plane[0] + self.plane[1] * (x - self.centre[0]) + self.plane[2] * (y - self.centre[1]))
 
 
 def fit_seam(difference: Floats, x: Floats, y: Floats) -> SeamFit | None:
@@ -75,28 +74,29 @@ def fit_seam(difference: Floats, x: Floats, y: Floats) -> SeamFit | None:
     SeamFit
         None where too few cells or blocks are defined.
     """
-    seen = np.isfinite(difference)
-    cells = int(seen.sum())
-    if cells < MIN_CELLS:
+    row, col = np.nonzero(np.isfinite(difference))
+    if len(row) < MIN_CELLS:
         return None
-    side = max(MIN_BLOCK_SIDE, math.ceil(math.sqrt(cells / BLOCKS)))
-    value, weight, bx, by = _blocks(difference, x, y, side)
+    z, places = difference[row, col], np.column_stack([x[col], y[row]])
+    side = max(MIN_BLOCK_SIDE, math.ceil(math.sqrt(len(row) / BLOCKS)))
+    across = difference.shape[1] // side + 1
+    value, weight, middle = _blocks(z, places, (row // side) * across + col // side, side * side)
     if len(value) < MIN_BLOCKS:
         return None
-    centre = np.array([np.average(bx, weights=weight), np.average(by, weights=weight)])
-    design = np.stack([np.ones_like(bx), bx - centre[0], by - centre[1]], axis=-1)
-    plane, covariance = _robust(design, value, weight)
-    surface = (plane[0] + plane[1] * (x[None] - centre[0]) + plane[2] * (y[:, None] - centre[1]))[seen]
-    noise = mad_sigma(difference[seen] - surface, 0.0)
-    return SeamFit(centre, plane, covariance, noise, math.sqrt(float(np.mean(surface**2))), cells)
+    centre = np.average(middle, axis=0, weights=weight)
+    plane, covariance = _robust(np.column_stack([np.ones(len(value)), middle - centre]), value, weight)
+    surface = plane[0] + (places - centre) @ plane[1:]
+    return SeamFit(centre, plane, covariance, mad_sigma(z - surface, 0.0), math.sqrt(float(np.mean(surface**2))))
 
 
 def _robust(design: Floats, value: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """Plane (3,) and its covariance: first by least absolute deviations, which gross errors do not capture."""
     floor = 1e-12 * float(np.abs(value).max(initial=0.0)) + 1e-300
-    start = irls(design, value, lambda r: weight / np.maximum(r, 0.01 * mad_sigma(r, 0.0) + floor))
-    scale = mad_sigma(value - design @ start, 0.0) + floor
-    plane = irls(design, value, lambda r: weight * bisquare(r / (TUKEY_BISQUARE * scale)), start=start)
+    absolute = irls(
+        design, value, lambda r: weight / np.maximum(r, 0.01 * mad_sigma(r, 0.0) + floor), rounds=START_ROUNDS
+    )
+    scale = mad_sigma(value - design @ absolute, 0.0) + floor
+    plane = irls(design, value, lambda r: weight * bisquare(r / (TUKEY_BISQUARE * scale)), start=absolute)
     residual = value - design @ plane
     u = np.minimum((residual / (TUKEY_BISQUARE * scale)) ** 2, 1.0)
     # Tukey's psi and its derivative: variance of an M-estimate, with three parameters taken from n blocks.
@@ -106,27 +106,21 @@ def _robust(design: Floats, value: Floats, weight: Floats) -> tuple[Floats, Floa
     return plane, variance * np.linalg.pinv((design * shares[:, None]).T @ design, hermitian=True)
 
 
-def _blocks(difference: Floats, x: Floats, y: Floats, side: int) -> tuple[Floats, Floats, Floats, Floats]:
-    """Median, known share, and mean x and y (n,) of each block of which enough is known."""
-    seen = np.isfinite(difference)
-    blocks, bx, by = (
-        _cut(np.where(seen, a, np.nan), side) for a in (difference, np.broadcast_to(x, seen.shape), y[:, None])
-    )
-    share = np.isfinite(blocks).mean(axis=-1)
-    good = share >= MIN_BLOCK_SHARE
-    return np.nanmedian(blocks[good], axis=-1), share[good], *(np.nanmean(b[good], axis=-1) for b in (bx, by))
+def _blocks(z: Floats, places: Floats, block: NDArray[np.intp], whole: int) -> tuple[Floats, Floats, Floats]:
+    """Median of z, known share, and mean x and y (n, 2) of each block of which enough is known.
+
+    ``block``: number of each cell's block; ``whole``: cells of a block.
+    """
+    count = np.bincount(block)
+    good = count >= MIN_BLOCK_SHARE * whole
+    ordered, first = z[np.lexsort((z, block))], (np.cumsum(count) - count)[good]
+    count = count[good]
+    median = 0.5 * (ordered[first + (count - 1) // 2] + ordered[first + count // 2])
+    return median, count / whole, np.stack([np.bincount(block, p)[good] / count for p in places.T], axis=-1)
 
 
-def _cut(values: Floats, side: int) -> Floats:
-    """Blocks (rows, cols, cells) of ``side`` x ``side`` cells; NaN beyond the border."""
-    rows, cols = (-(-n // side) for n in values.shape)
-    cut = [(0, rows * side - values.shape[0]), (0, cols * side - values.shape[1])]
-    padded = np.pad(values, cut, constant_values=np.nan)
-    return padded.reshape(rows, side, cols, side).swapaxes(1, 2).reshape(rows, cols, -1)
-
-
-def seam(dem: Bundle, other: Bundle) -> tuple[dict[str, Any], Floats32] | None:
-    """Facts of one seam, elevation of ``dem`` minus that of ``other``, and the (coarse) map of the difference.
+def seam(dem: Bundle, own: Mapping[str, Floats32], other: Bundle) -> dict[str, Any] | None:
+    """Facts of one seam, elevation of ``dem`` (arrays ``own``) minus that of ``other``.
 
     None where both share too little ground.
     """
@@ -135,74 +129,43 @@ def seam(dem: Bundle, other: Bundle) -> tuple[dict[str, Any], Floats32] | None:
     if common is None:
         return None
     windows = [lattice.window(common) for lattice in lattices]
-
-    def both(name: str) -> list[Floats]:
-        return [np.asarray(b.part(name, w), np.float64) for b, w in zip((dem, other), windows, strict=True)]
-
-    z = both("elevation")
-    difference = z[0] - z[1]
-    fit = fit_seam(difference, common.xs(), common.ys())
+    both = {name: (own[name][windows[0]], np.asarray(other.part(name, windows[1]))) for name in ARRAYS}
+    known = np.isfinite(both["elevation"][0]) & np.isfinite(both["elevation"][1])
+    step = max(1, math.ceil(math.sqrt(np.count_nonzero(known) / MAX_CELLS)))
+    each = np.s_[::step, ::step]
+    seen = known[each]
+    z, std, grey = ([values[each].astype(np.float64) for values in both[name]] for name in ARRAYS)
+    fit = fit_seam(z[0] - z[1], common.xs()[::step], common.ys()[::step])
     if fit is None:
         return None
-    seen = np.isfinite(difference)
-    expected = float(np.median(np.hypot(*both("elevation_std"))[seen]))
-    map_, step = _coarse(difference)
-    grey = both("ortho")
-    facts = {
+    return {
         "pair": int(dem.meta["pair"]),
         "other": int(other.meta["pair"]),
-        "cells": fit.cells,
-        "area": fit.cells * common.cell**2,
-        "centre": fit.centre.tolist(),
+        "cells": int(np.count_nonzero(known)),
         "bias": float(fit.plane[0]),
         "tilt": fit.plane[1:].tolist(),
         "covariance": fit.covariance.tolist(),
         "noise": fit.noise,
         "systematic": fit.systematic,
-        "expected": expected,
-        "log_ratio": _log_ratio(grey[0], grey[1], seen),
-        "map": {"bounds": common.bounds, "step": step * common.cell},
+        "expected": float(np.median(np.hypot(std[0][seen], std[1][seen]))),
+        "log_ratio": _log_ratio(grey[0][seen], grey[1][seen]),
     }
-    return facts, map_
 
 
-def _log_ratio(grey: Floats, other: Floats, seen: Bools) -> float | None:
+def _log_ratio(grey: Floats, other: Floats) -> float | None:
     """Median logarithm of the factor between the grey values; None where too few tell."""
-    (low, high), good = USABLE_GREY, seen
-    for values in (grey, other):
-        with np.errstate(invalid="ignore"):
-            good = good & (values > low) & (values < high)
-    if int(good.sum()) < MIN_CELLS:
+    low, high = USABLE_GREY
+    good = (np.fmin(grey, other) > low) & (np.fmax(grey, other) < high)
+    if np.count_nonzero(good) < MIN_CELLS:
         return None
     return float(np.median(np.log(grey[good] / other[good])))
 
 
-def _coarse(difference: Floats) -> tuple[Floats32, int]:
-    """Means of square blocks, so that no side is above :data:`MAP_CELLS`; and the side of a block."""
-    step = max(1, math.ceil(max(difference.shape) / MAP_CELLS))
-    blocks = _cut(difference, step)
-    count = np.isfinite(blocks).sum(axis=-1)
-    mean = np.nansum(blocks, axis=-1) / np.maximum(count, 1)
-    return np.where(count > 0, mean, np.nan).astype(np.float32), step
-
-
-@stage(
-    "overlap_qa",
-    version=2,
-    outputs=[
-        replace(
-            raster("difference_*", "m", "elevation minus that of the other, block means", frame="world"), optional=True
-        )
-    ],
-)
+@stage("overlap_qa", version=3)
 def overlap_qa_stage(
     params: NoParams, dem: Bundle[DemFacts], others: Sequence[Bundle[DemFacts]]
 ) -> Bundle[OverlapFacts]:
     """Difference of an elevation model from earlier ones that overlap: bias, tilt and noise apart."""
-    arrays, facts = {}, []
-    for other in sorted(others, key=lambda b: int(b.meta["pair"])):
-        compared = seam(dem, other)
-        if compared is not None:
-            facts.append(compared[0])
-            arrays[f"difference_{compared[0]['other']}"] = compared[1]
-    return Bundle(arrays, {"pair": int(dem.meta["pair"]), "seams": facts})
+    own = {name: np.asarray(dem[name]) for name in ARRAYS}
+    compared = [seam(dem, own, other) for other in sorted(others, key=lambda b: int(b.meta["pair"]))]
+    return Bundle({}, {"pair": int(dem.meta["pair"]), "seams": [facts for facts in compared if facts is not None]})

@@ -100,15 +100,11 @@ def test_exposure_is_read_from_the_same_cells() -> None:
     assert got == {k: pytest.approx(v, abs=0.005) for k, v in wanted.items()}
 
 
-def test_the_map_holds_the_difference() -> None:
-    dems = along(2, rows=400, cols=330, step=100, bias={4: 0.3})
-    (bundle,) = audited(dems)[0][1:]
+def test_of_a_large_overlap_some_cells_tell_as_much() -> None:
+    (bundle,) = audited(along(2, rows=400, cols=330, step=100, bias={4: 0.3}))[0][1:]
     (facts,) = bundle.meta["seams"]
-    drawn = bundle["difference_0"]
-    assert max(drawn.shape) <= 160
-    assert np.nanmedian(drawn) == pytest.approx(0.3, abs=1e-4)
-    x_min, x_max, _, _ = facts["map"]["bounds"]
-    assert drawn.shape[1] == math.ceil((x_max - x_min) / facts["map"]["step"] - 1e-9)
+    assert facts["cells"] > seam_stage.MAX_CELLS
+    assert facts["bias"] == pytest.approx(0.3, abs=1e-4)
 
 
 @pytest.mark.parametrize(("systematic", "sigma", "expected"), [(2.1, 0.1, True), (1.9, 0.01, False), (9.0, 1.0, False)])
