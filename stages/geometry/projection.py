@@ -55,14 +55,12 @@ def linearise(camera, x, along, pixel, j):  # type: ignore[no-untyped-def]
 
     ``x``, ``along``: three numbers each in the camera frame; ``pixel`` (2): where the point was seen.
     """
-    fx, fy = camera.fx, camera.fy
-    x, y, z = x
-    wx, wy, wz = along
-    u, v = x / z, y / z
-    kx, ky = fx / z, fy / z
+    z, w = x[2], along[2]
+    u, v = x[0] / z, x[1] / z
+    kx, ky = camera.fx / z, camera.fy / z
     j[0, 0], j[0, 1], j[0, 2] = kx, 0.0, -kx * u
     j[1, 0], j[1, 1], j[1, 2] = 0.0, ky, -ky * v
-    j[0, 3], j[0, 4], j[0, 5] = -kx * u * y, kx * (z + u * x), -kx * y
-    j[1, 3], j[1, 4], j[1, 5] = -ky * (z + v * y), ky * v * x, ky * x
-    j[0, 6], j[1, 6] = kx * (wx - u * wz), ky * (wy - v * wz)
-    j[0, 7], j[1, 7] = fx * u + camera.cx - pixel[0], fy * v + camera.cy - pixel[1]
+    j[0, 3], j[0, 4], j[0, 5] = -kx * u * x[1], kx * (z + u * x[0]), -kx * x[1]
+    j[1, 3], j[1, 4], j[1, 5] = -ky * (z + v * x[1]), ky * v * x[0], ky * x[0]
+    j[0, 6], j[1, 6] = kx * (along[0] - u * w), ky * (along[1] - v * w)
+    j[0, 7], j[1, 7] = camera.fx * u + camera.cx - pixel[0], camera.fy * v + camera.cy - pixel[1]

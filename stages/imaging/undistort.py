@@ -81,19 +81,19 @@ def undistort(image: AnyArray, lens: Lens, camera: Camera, valid: AnyArray | Non
     usable = np.isfinite(raw)
     if valid is not None:
         usable &= valid != 0
-    x, y = lens.maps(camera)
-    out, out_valid = np.zeros(x.shape, np.float32), np.zeros(x.shape, np.uint8)
-    # most images have no mask: then no pixel's neighbourhood need be looked up
-    _resample(raw, usable, bool(usable.all()), (x, y), weights(), out, out_valid)
+    maps = lens.maps(camera)
+    out, out_valid = np.zeros(maps[0].shape, np.float32), np.zeros(maps[0].shape, np.uint8)
+    _resample(raw, usable, maps, weights(), out, out_valid)
     # Kernels with negative weights overshoot at edges.
     return np.clip(out, 0.0, 255.0, out=out), out_valid
 
 
 @njit(cache=True, nogil=True)
-def _resample(image, usable, whole, maps, table, out, out_valid):  # type: ignore[no-untyped-def]
+def _resample(image, usable, maps, table, out, out_valid):  # type: ignore[no-untyped-def]
     """Separable weighted mean of the raw pixels about (column, row) of the maps, where all of them are usable."""
     column, row = maps
-    taps = table.shape[1]
+    # Most images have no mask: then no pixel's neighbourhood need be looked up.
+    taps, whole = table.shape[1], usable.all()
     before = taps // 2 - 1
     rows, cols = image.shape
     for i in range(out.shape[0]):

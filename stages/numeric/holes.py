@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -62,13 +63,11 @@ def close_into(
 
     ``rim``: share of the rim's range that is the standard deviation where it is not judged; 0.5 holds all of it.
     """
-    z, s = closed
-    filled = np.zeros(elevation.shape, dtype=np.uint8)
+    maps = _Maps(*closed, np.zeros(elevation.shape, dtype=np.uint8))
     cells = candidates(elevation, n, min_known)
     if len(cells) and max_gap > 0:
-        known = np.ascontiguousarray(elevation), np.ascontiguousarray(s)
-        _close(known, cells, (STEPS, *_rays(max_gap)), (n // 2 if judged else 0, rim), (z, s, filled))
-    return filled
+        _close(np.ascontiguousarray(elevation), cells, _rays(max_gap), _Trial(n // 2 if judged else 0, rim), maps)
+    return maps.filled
 
 
 def candidates(elevation: Floats32, n: int, min_known: float) -> NDArray[np.int64]:
@@ -83,76 +82,91 @@ STEPS = np.array([[0, 1], [1, 0], [1, 1], [1, -1]])
 """Rows and columns from a cell to the next one of its row, its column and its two diagonals."""
 
 
-def _rays(max_gap: float) -> tuple[NDArray[np.int64], Floats]:
-    """Cells that a gap may span along each of :data:`STEPS`, and the inverse distance to the k-th cell of each."""
+class _Rays(NamedTuple):
+    """``steps`` as :data:`STEPS`; along each of them, the cells ``reach`` that a gap may span, and the ``inverse``
+    distance to the k-th cell (4, k)."""
+
+    steps: NDArray[np.int64]
+    reach: NDArray[np.int64]
+    inverse: Floats
+
+
+class _Trial(NamedTuple):
+    """``window``: cells to either side within which known cells tell the error of a cell's lines, 0: none; ``rim``:
+    share of the rim's range that stands for it where they do not."""
+
+    window: int
+    rim: float
+
+
+class _Maps(NamedTuple):
+    """Maps (row, col) to be closed: elevation and its standard deviation, m, and flags of closed cells."""
+
+    elevation: Floats32
+    std: Floats32
+    filled: Bytes
+
+
+def _rays(max_gap: float) -> _Rays:
     # A step along a diagonal is longer: the gap is limited in distance, not in cells.
     units = np.sqrt((STEPS * STEPS).sum(axis=1).astype(np.float64))
     with np.errstate(divide="ignore"):
         inverse = 1.0 / (units[:, None] * np.arange(int(max_gap + 1e-9) + 2))
-    return (max_gap / units + 1e-9).astype(np.int64), inverse
+    return _Rays(STEPS, (max_gap / units + 1e-9).astype(np.int64), inverse)
 
 
 @njit(cache=True, nogil=True)
-def _close(known, cells, rays, trial, closed):  # type: ignore[no-untyped-def]
-    z_in, s_in = known
-    steps, reaches, inverse = rays
-    window, rim = trial
-    z, s, filled = closed
-    rows, cols = z_in.shape
-    lines = np.empty((4, 4), dtype=np.int64)
-    weights = np.empty((4, 2))
-    heights, noise = z_in.reshape(-1), s_in.reshape(-1)
+def _close(z, cells, rays, trial, maps):  # type: ignore[no-untyped-def]
+    """Close the ``cells`` that lie between known ones of ``z``."""
+    cols = z.shape[1]
+    lines, weights = np.empty((4, 4), dtype=np.int64), np.empty((4, 2))
     for at in cells:
         r, c = at // cols, at % cols
-        total = 0.0
-        weight = 0.0
-        worst = 0.0
+        total = weight = worst = 0.0
         low, high = np.inf, -np.inf
         used = 0
         for k in range(4):
-            dr, dc, reach = steps[k, 0], steps[k, 1], reaches[k]
-            step = dr * cols + dc
-            # of either side the cells inside the map
-            behind, ahead = (r, rows - 1 - r) if dr else (cols, cols)
-            if dc > 0:
-                behind, ahead = min(behind, c), min(ahead, cols - 1 - c)
-            elif dc < 0:
-                behind, ahead = min(behind, cols - 1 - c), min(ahead, c)
-            most, a = min(reach, behind), 1
-            while a <= most and math.isnan(heights[at - a * step]):
-                a += 1
-            if a > most:
-                continue
+            dr, dc, reach = rays.steps[k, 0], rays.steps[k, 1], rays.reach[k]
+            a = _to_known(z, (r, c), (-dr, -dc), reach)
             # a + b - 1 cells of the line are unknown
-            most, b = min(reach - a + 1, ahead), 1
-            while b <= most and math.isnan(heights[at + b * step]):
-                b += 1
-            if b > most:
+            b = _to_known(z, (r, c), (dr, dc), reach - a + 1) if a else 0
+            if not b:
                 continue
-            p, q = at - a * step, at + b * step
-            wa, wb = inverse[k, a], inverse[k, b]
-            total += wa * heights[p] + wb * heights[q]
-            weight += wa + wb
-            worst = max(worst, noise[p], noise[q])
-            low, high = min(low, heights[p], heights[q]), max(high, heights[p], heights[q])
+            p, q = (r - a * dr, c - a * dc), (r + b * dr, c + b * dc)
             lines[used, 0], lines[used, 1], lines[used, 2], lines[used, 3] = dr, dc, a, b
-            weights[used, 0], weights[used, 1] = wa, wb
+            weights[used, 0], weights[used, 1] = rays.inverse[k, a], rays.inverse[k, b]
+            total += weights[used, 0] * z[p] + weights[used, 1] * z[q]
+            weight += weights[used, 0] + weights[used, 1]
+            worst = max(worst, maps.std[p], maps.std[q])
+            low, high = min(low, z[p], z[q]), max(high, z[p], z[q])
             used += 1
-        if weight > 0.0:
-            z[r, c] = total / weight
-            # No cell that is interpolated is more certain than the least certain that it comes from.
-            s[r, c] = max(worst, rim * (high - low))
-            filled[r, c] = 1
-            if window > 0:
+        if used:
+            missed = math.nan
+            if trial.window > 0:
                 # Only heights that were known before: a closed hole proves nothing about interpolation.
-                missed = _missed(z_in, r, c, window, lines[:used], weights[:used], weight)
-                s[r, c] = max(worst, rim * (high - low) if math.isnan(missed) else missed)
+                missed = _missed(z, (r, c), trial.window, lines[:used], weights[:used])
+            maps.elevation[r, c], maps.filled[r, c] = total / weight, 1
+            # No cell that is interpolated is more certain than the least certain that it comes from.
+            maps.std[r, c] = max(worst, trial.rim * (high - low) if math.isnan(missed) else missed)
 
 
 @njit(cache=True, nogil=True)
-def _missed(z, r, c, window, lines, weights, weight):  # type: ignore[no-untyped-def]
-    """RMS by which the lines of a cell miss the known cells around it; NaN where too few of them tell."""
+def _to_known(z, cell, step, reach):  # type: ignore[no-untyped-def]
+    """Number of steps from a cell to the next known one, ``reach`` at most; 0: there is none."""
     rows, cols = z.shape
+    for k in range(1, reach + 1):
+        r, c = cell[0] + k * step[0], cell[1] + k * step[1]
+        if r < 0 or r >= rows or c < 0 or c >= cols:
+            return 0
+        if not math.isnan(z[r, c]):
+            return k
+    return 0
+
+
+@njit(cache=True, nogil=True)
+def _missed(z, cell, window, lines, weights):  # type: ignore[no-untyped-def]
+    """RMS by which the lines of a cell miss the known cells around it; NaN where too few of them tell."""
+    (rows, cols), (r, c), weight = z.shape, cell, weights.sum()
     square = 0.0
     trials = 0
     for p in range(max(r - window, 0), min(r + window + 1, rows)):
