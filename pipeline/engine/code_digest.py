@@ -109,6 +109,7 @@ def module_digests(module: str) -> dict[str, str]:
     return dict(_reachable(module))
 
 
+@cache
 def code_digest(module: str) -> str:
     """One digest of :func:`module_digests`."""
     return digest(module_digests(module))

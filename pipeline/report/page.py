@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.engine.runtime.private import private_folder
 from rille.pipeline.export.catalogue import listed
 from rille.pipeline.export.view import RunView
 from rille.pipeline.report.canvas import Figure
@@ -47,7 +48,7 @@ def render(
     view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure], files: Sequence[tuple[str, str, str]]
 ) -> str:
     """The page as text; ``files``: name, what it is, and what opens it."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from jinja2 import Environment, FileSystemBytecodeCache, PackageLoader, StrictUndefined
 
     env = Environment(
         loader=PackageLoader("rille.pipeline.report", "."),
@@ -57,6 +58,8 @@ def render(
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        # Compiling the page takes as long as looking up 500 artifacts.
+        bytecode_cache=FileSystemBytecodeCache(str(private_folder())),
     )
     env.filters |= {"quantity": quantity, "number": number, "metres": metres, "spans": spans}
     return env.get_template("template.html").render(

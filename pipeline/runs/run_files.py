@@ -54,14 +54,13 @@ def _make(graph: Graph, view: RunView, module: ModuleType, output: Output, made:
         made[output.name] = node
 
 
-def task_rows(graph: Graph, store: Store) -> tuple[TaskRow, ...]:
+def task_rows(graph: Graph) -> tuple[TaskRow, ...]:
     """One row a task, with the seconds that it took whenever it was computed."""
     rows = []
     for h in graph.nodes:
         seconds: float | None = h.took.seconds if h.status == "computed" else None
-        if h.status == "cached":
-            manifest = store.manifest(h.stage, h.key)
-            seconds = float(manifest["provenance"]["seconds"]) if manifest else None
+        if h.status == "cached" and h.ref is not None:
+            seconds = h.ref.seconds
         reason = " ".join(str(h.error).split()) if h.error is not None else h.reason
         rows.append(TaskRow(h.label, h.stage, h.status, seconds, reason))  # type: ignore[arg-type]
     return tuple(rows)

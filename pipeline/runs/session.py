@@ -247,7 +247,7 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> Item
             f"{opened.folder} was removed while the run was under way",
             remedy="run again: what was computed is in the cache",
         )
-    whole = opened.late(tasks=run_files.task_rows(opened.graph, opened.store), seconds=result.seconds)
+    whole = opened.late(tasks=run_files.task_rows(opened.graph), seconds=result.seconds)
     missing = run_files.write(opened.folder, whole, made, opened.store)
     total = (datetime.now(UTC) - opened.started).total_seconds()
     events.add_facts(opened.folder / "ledger.jsonl", total=total)

@@ -33,6 +33,12 @@ class _StoredArray(BaseModel, strict=True):
     sha256: str
 
 
+class _Provenance(BaseModel, strict=True):
+    """Entry that is read of how an artifact came to be."""
+
+    seconds: float = 0.0
+
+
 class _Manifest(BaseModel, strict=True):
     """Entries of a manifest."""
 
@@ -42,22 +48,23 @@ class _Manifest(BaseModel, strict=True):
     digest: str
     arrays: dict[Annotated[str, Field(pattern=r"^\w+$")], _StoredArray]
     meta: dict[str, Any]
-    provenance: dict[str, Any]
+    provenance: _Provenance
 
 
 @dataclass(frozen=True, slots=True)
 class Ref(Generic[F]):
     """A committed artifact: all that travels between tasks.
 
-    ``nbytes`` are bytes of the decoded arrays, ``stored`` those of the file.
+    ``nbytes`` are bytes of the decoded arrays, ``stored`` those of the file; ``seconds`` are those that its stage took.
     """
 
     key: str
     stage: str
     digest: str
     meta: F
-    nbytes: int = 0
-    stored: int = 0
+    nbytes: int
+    stored: int
+    seconds: float
 
     @property
     def path(self) -> str:
@@ -94,7 +101,8 @@ def read_manifest(archive: Archive, stage: str, key: str) -> Manifest:
 def reference(manifest: Manifest, stored: int = 0) -> Ref:
     """Reference to the artifact of a manifest, whose file has ``stored`` bytes."""
     nbytes = sum(map(_nbytes, manifest["arrays"].values()))
-    return Ref(manifest["key"], manifest["stage"], manifest["digest"], manifest["meta"], nbytes, stored)
+    seconds = manifest["provenance"].get("seconds", 0.0)
+    return Ref(manifest["key"], manifest["stage"], manifest["digest"], manifest["meta"], nbytes, stored, seconds)
 
 
 def _nbytes(about: Mapping[str, Any]) -> int:

@@ -22,6 +22,8 @@ FILES = {
     "stranger.py": "Y = 1\n",
 }
 
+CACHED = (code_digest._read, code_digest._file, code_digest._roots, code_digest._reachable, code_digest.code_digest)
+
 
 @pytest.fixture
 def package(tmp_path, monkeypatch):
@@ -36,12 +38,12 @@ def package(tmp_path, monkeypatch):
         text = (root / name).read_text()
         assert old in text
         (root / name).write_text(text.replace(old, new) if old else text + new)
-        for cached in (code_digest._read, code_digest._file, code_digest._roots, code_digest._reachable):
+        for cached in CACHED:
             cached.cache_clear()
         return code_digest.code_digest("own_toy.main")
 
     yield change
-    for cached in (code_digest._read, code_digest._file, code_digest._roots, code_digest._reachable):
+    for cached in CACHED:
         cached.cache_clear()
     assert not any(name.startswith("own_toy.") for name in sys.modules), "digesting must not import"
 

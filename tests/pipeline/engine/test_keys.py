@@ -127,7 +127,7 @@ def test_a_task_s_key_is_the_digest_of_its_recipe():
     spec = Spec(
         "toys.scale", 'scale/"0"', ScaleParams(offset=0.5), {"pair": 3, "at": [0.1, None], "a": {"z": 1, "b": 2}}
     )
-    one, other = (Ref(k * 64, "numbers", k * 64, {}) for k in "ab")
+    one, other = (Ref(k * 64, "numbers", k * 64, {}, 0, 0, 0.0) for k in "ab")
     for refs in ({"values": one}, {"values": other}, {"values": [one, other]}, {}):
         assert key_of(spec, refs) == digest(recipe(spec, refs))
     assert key_of(spec, {"values": one}) != key_of(spec, {"values": other})
