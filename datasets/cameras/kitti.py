@@ -73,8 +73,6 @@ def _rectified(fields: Fields, label: str) -> CalibratedCamera:
 
 def decompose(projection: NDArray[np.float64], name: str) -> tuple[NDArray[np.float64], RigidTransform]:
     """K (3, 3) and T_camera_reference of a projection matrix P = K [R | t]."""
-    from scipy.linalg import rq
-
     m = projection[:, :3]
     # written so that NaN-free but singular matrices are refused before anything divides by them
     if abs(np.linalg.det(m)) < 1e-9:
@@ -84,6 +82,8 @@ def decompose(projection: NDArray[np.float64], name: str) -> tuple[NDArray[np.fl
     if m[1, 0] == m[2, 0] == m[2, 1] == 0.0 and m[2, 2] > 0:
         k, r = m / m[2, 2], np.eye(3)
     else:
+        from scipy.linalg import rq  # not at once: of rectified cameras it is not needed
+
         k, r = rq(m * np.sign(np.linalg.det(m)))
         signs = np.sign(np.diag(k))
         k, r = k * signs, signs[:, None] * r

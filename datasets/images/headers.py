@@ -43,9 +43,9 @@ def read_header(file: BinaryIO) -> Header | None:
 
 def opened(file: BinaryIO) -> Any:
     """Pillow's image of a file of which the header alone is read, of any size; None where it is of another format."""
-    from PIL import Image
+    # Each reader enters its format; `Image.init` would import those of forty others.
+    from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, PpmImagePlugin, TiffImagePlugin  # noqa: F401
 
-    Image.init()
     start = file.read(16)
     file.seek(0)
     # Not by `Image.open`, which refuses by a limit of its own how many pixels are too many.

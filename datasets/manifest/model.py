@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from rille.datasets.georeference import Georeference, metric_crs
 from rille.datasets.text.reading import read_toml
@@ -46,9 +46,7 @@ TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
 
 class Table(Params):
-    """A table of the manifest; the text below each key is its description."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
+    """A table of the manifest; below each key stands its description."""
 
 
 class Images(Table):

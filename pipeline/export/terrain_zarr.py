@@ -16,11 +16,10 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numcodecs
 import numpy as np
-import xarray
 from numpy.typing import NDArray
 
 from rille.datasets.georeference import Georeference
@@ -32,6 +31,9 @@ from rille.stages.core.declare import Array, Bundle
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain import merge
 from rille.stages.terrain.shading import slope_deg
+
+if TYPE_CHECKING:
+    import xarray
 
 CONVENTIONS = "CF-1.11"
 CHUNK_CELLS = 512
@@ -55,6 +57,8 @@ def write_terrain(
     place : of the world frame, where it is known.
     facts : attributes of the whole group, e.g. ``title``, ``source``.
     """
+    import xarray
+
     where = {} if place is None else {f"georeference_{name}": value for name, value in place.to_dict().items()}
     about = {"Conventions": CONVENTIONS, "frame": FRAME, **facts, "cell_size_m": lattice.cell, **where}
     variables = {name: _variable(spec, values) for name, (spec, values) in arrays.items()}
@@ -71,6 +75,8 @@ def write_terrain(
 
 
 def _variable(spec: Array, values: NDArray[Any]) -> xarray.Variable:
+    import xarray
+
     about: dict[str, Any] = {
         "units": UNITS.get(spec.unit, spec.unit),
         "long_name": spec.long_name,
@@ -85,6 +91,8 @@ def _variable(spec: Array, values: NDArray[Any]) -> xarray.Variable:
 
 
 def _coordinates(lattice: Lattice) -> dict[str, xarray.Variable]:
+    import xarray
+
     half = 0.5 * lattice.cell
     # In GDAL's order, which is not that of affine.
     corner = lattice.x0 - half, lattice.cell, 0.0, lattice.y0 + half, 0.0, -lattice.cell

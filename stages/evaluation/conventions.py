@@ -13,7 +13,7 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from rille.stages.core.arrays import Floats
 from rille.stages.evaluation.accuracy_parts import angle, inverse, rms, square
@@ -33,7 +33,6 @@ ALIKE_FACTOR, ALIKE_SHARE, SIMPLE_FACTOR = 1.5, 0.005, 4.0
 MIN_TURN = 0.3
 # Factor of length from which on it is one of units, m: mm, cm, inches, feet, km.
 MIN_UNIT, UNITS = 2.0, (0.001, 0.01, 0.0254, 0.3048, 1000.0)
-AXES = Rotation.create_group("O").as_matrix()
 # Places, in (x, y, z, w) as read, of the true x, y, z and w.
 ORDERS = {
     "": [0, 1, 2, 3],
@@ -79,13 +78,13 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
     as_read, file = _misfit(P, Q, np.eye(3)), square(Q) @ inverse(mount)
     if as_read < MIN_MISFIT:
         return []
-    fits = []
+    fits, rotation = [], scipy.spatial.transform.Rotation
     for order, direction, mirror in product(ORDERS, DIRECTIONS, MIRRORS):
         # A file that begins with the identity has its quaternions in the right order.
         if not (order and angle(file[0]) < MIN_TURN):
             poses, M = file.copy(), MIRRORS[mirror]
-            quaternion = Rotation.from_matrix(file[:, :3, :3]).as_quat()[:, ORDERS[order]]
-            poses[:, :3, :3] = Rotation.from_quat(quaternion).as_matrix()
+            quaternion = rotation.from_matrix(file[:, :3, :3]).as_quat()[:, ORDERS[order]]
+            poses[:, :3, :3] = rotation.from_quat(quaternion).as_matrix()
             # The whole pose is inverted, or its rotation alone; or nothing.
             columns = slice((0, 4, 3)[DIRECTIONS.index(direction)])
             poses[:, :3, columns] = inverse(poses)[:, :3, columns]
@@ -113,7 +112,8 @@ def _fits(P: Floats, T: Floats, mount: Floats, words: list[str]) -> list[Reading
         unit = next((unit for unit in UNITS if abs(np.log(unit / ratio)) < 0.1), float(f"{ratio:.3g}"))
         words = [*words, f"its unit of length is {unit:g} m: state truth.unit = {unit:g}"]
         Q = np.concatenate([Q[:, :, :3], unit * Q[:, :, 3:]], axis=2)
-    for start in (np.eye(3), min(AXES, key=lambda B: _misfit(P, Q, B))):
+    group = scipy.spatial.transform.Rotation.create_group("O").as_matrix()
+    for start in (np.eye(3), min(group, key=lambda B: _misfit(P, Q, B))):
         turn = start
         for _ in range(10):
             # In turn: the world's rotation for this body, by the positions above all, and the body's for this world.

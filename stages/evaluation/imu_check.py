@@ -7,10 +7,11 @@ is seen: several S then fit, and gravity along an axis tells nothing of the othe
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import product
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from rille.stages.core.arrays import Floats
 
@@ -21,8 +22,13 @@ MIN_DISAGREEMENT, MAX_SHARE = 0.035, 0.3
 LARGEST_BIAS = 0.15
 # Of gravity against the normal of the ground: slopes are 15 degrees at most here.
 MIN_COSINE = np.cos(np.deg2rad(15.0))
-# The given axes come first.
-SIGNED_AXES = [np.eye(3), *(sign * turn for sign in (1.0, -1.0) for turn in Rotation.create_group("O").as_matrix())]
+
+
+@cache
+def signed_axes() -> list[Floats]:
+    """The signed exchanges (3, 3) of three axes; the given axes come first."""
+    turns = scipy.spatial.transform.Rotation.create_group("O").as_matrix()
+    return [np.eye(3), *(sign * turn for sign in (1.0, -1.0) for turn in turns)]
 
 
 def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) -> list[str]:
@@ -38,19 +44,19 @@ def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) ->
     if both.sum() <= MIN_STEPS:
         return []
     steps = (np.swapaxes(R[both][:-1], 1, 2) @ R[both][1:] for R in (images, sensor))
-    seen, sensed = (Rotation.from_matrix(step).as_rotvec() @ axes.T for step in steps)
+    seen, sensed = (scipy.spatial.transform.Rotation.from_matrix(step).as_rotvec() @ axes.T for step in steps)
 
     def apart(S: Floats, factor: float) -> float:
         return float(np.median(np.linalg.norm(factor * sensed @ S.T - seen, axis=1)))
 
     # A bias turns the sensor, too, and degrees would make it small.
     fast = np.median(np.linalg.norm(sensed, axis=1)) > MIN_DISAGREEMENT + LARGEST_BIAS * np.median(np.diff(times[both]))
-    readings = list(product((1.0, float(np.deg2rad(1.0))) if fast else (1.0,), SIGNED_AXES))
+    readings = list(product((1.0, float(np.deg2rad(1.0))) if fast else (1.0,), signed_axes()))
     off = [float(np.median(np.linalg.norm(factor * sensed @ S.T - seen, axis=1))) for factor, S in readings]
     if off[0] < MIN_DISAGREEMENT or min(off) > MAX_SHARE * off[0]:
         return []
     # A camera that hardly turns is fitted by all axes alike: those that are given come first.
-    given = [0.1 * off[0] * (S is SIGNED_AXES[0]) for _, S in readings]
+    given = [0.1 * off[0] * (S is signed_axes()[0]) for _, S in readings]
     best = int(np.argmin(np.subtract(off, given)))
     factor, S = readings[best]
     return [
@@ -74,8 +80,8 @@ def of_gravity(given: Floats, seen: Floats, axes: Floats) -> list[str]:
     axes : (3, 3) R_imu_left.
     """
     a, b = axes @ given, axes @ seen
-    fits = sorted((float(-b @ S @ a), k) for k, S in enumerate(SIGNED_AXES) if b @ S @ a > MIN_COSINE)
-    told = "; or ".join(dict.fromkeys(names(SIGNED_AXES[k]) for _, k in fits[:3]))
+    fits = sorted((float(-b @ S @ a), k) for k, S in enumerate(signed_axes()) if b @ S @ a > MIN_COSINE)
+    told = "; or ".join(dict.fromkeys(names(signed_axes()[k]) for _, k in fits[:3]))
     off = float(np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0))))
     return [
         f"the IMU contradicts the images: its up is {off:.0f} degrees off that of the ground which is seen; its x, y "

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.numeric.least_squares import irls
@@ -50,7 +50,7 @@ def fit_affinity(origin: Floats, moved: Floats, use: Bools, at: Floats) -> tuple
     common = common_similarity(p, q)
     # A point that is lost gets an affinity like any other, which nobody reads.
     at = np.nan_to_num(at)
-    _, near = cKDTree(p).query(at, k=min(NEIGHBOURS, len(p)))
+    _, near = scipy.spatial.cKDTree(p).query(at, k=min(NEIGHBOURS, len(p)))
     offset = p[near] - at[:, None]
     # What the common similarity leaves: the pull is then towards it, not towards no change.
     shift = (q - p)[near] - offset @ (common - np.eye(2)).T

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import math
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -14,6 +17,7 @@ from raising import raises
 
 from rille.datasets.georeference import Georeference
 from rille.datasets.images.files import Digests
+from rille.datasets.manifest import model
 from rille.datasets.manifest.model import Manifest, read_manifest
 from rille.datasets.manifest.opening import dotted, open_manifest
 from rille.datasets.protocol import Sequence
@@ -515,9 +519,14 @@ def test_missing_manifest(tmp_path):
 
 
 def test_every_key_is_described():
-    kinds = [Manifest, *(table for field in Manifest.model_fields.values() for table in tables(field.annotation))]
-    fields = [(kind, name, field) for kind in kinds for name, field in kind.model_fields.items()]
-    assert not [(k, name) for k, name, field in fields if field.description is None and not tables(field.annotation)]
+    kinds = [node for node in ast.parse(inspect.getsource(model)).body if isinstance(node, ast.ClassDef)]
+    entries = [(kind.name, key, below) for kind in kinds for key, below in pairwise([*kind.body, ast.Pass()])]
+    keys = [(kind, key.target.id, below) for kind, key, below in entries if isinstance(key, ast.AnnAssign)]
+    assert not [
+        (kind, key)
+        for kind, key, below in keys
+        if not isinstance(below, ast.Expr) and not tables(getattr(model, kind).model_fields[key].annotation)
+    ]
     assert {"rig.baseline", "cameras.left.fx", "vehicle.max_step", "times.rate_hz"} <= set(known_keys(Manifest))
 
 

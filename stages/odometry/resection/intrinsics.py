@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, NoParams, stage
@@ -92,7 +92,7 @@ def contribution(
 
     Both are those of the parabola at the segment's own minimum; 0 where the segment turns too little.
     """
-    turns = Rotation.from_matrix(state.R @ cameras.T_local_key.rotation).magnitude()
+    turns = scipy.spatial.transform.Rotation.from_matrix(state.R @ cameras.T_local_key.rotation).magnitude()
     if turns.max() < math.radians(MIN_TURN_DEG):
         return [(0.0, 0.0)] * len(NAMES)
 
