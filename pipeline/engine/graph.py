@@ -16,7 +16,7 @@ Order of creation is priority: what is created first runs first.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Generic
@@ -108,8 +108,28 @@ class Maybe:
     handles: Sequence[Handle]
 
 
-Wait = Handle | Maybe | Sequence[Handle]
+class Complete(frozenset[str]):
+    """Names of stages of which a flow will not lay out any more tasks: where nothing else is wanted, it ends there."""
+
+
+Awaited = Handle | Maybe | Sequence[Handle]
+"""What a flow may wait for."""
+
+Wait = Awaited | Complete
 """What a flow may yield."""
+
+
+@dataclass(frozen=True)
+class Cut:
+    """The part of a graph that is wanted: tasks, and everything that these need.
+
+    ``wants`` says of a node whether it is wanted for itself; ``stages`` are the names of the stages whose tasks must
+    all be laid out before that is known. No other task is computed than the wanted ones, those that they read, and
+    those that a flow waits for before it can lay out wanted ones.
+    """
+
+    stages: frozenset[str]
+    wants: Callable[[Handle], bool]
 
 
 def done(handle: Handle[F]) -> Generator[Wait, Any, Ref[F]]:
@@ -129,9 +149,14 @@ class Graph:
     expansions: list[tuple[list[Handle], Expansion, bool]] = field(default_factory=list)
     last: Callable[[], None] | None = None
     """Called once nothing else will be laid out: adds what reads all of it."""
+    cut: Cut | None = None
+    """What of it is wanted; None: all."""
+    asked: set[int] = field(default_factory=set)
+    """Numbers of the nodes that a cut graph computes, as far as it is known."""
     unfinished: int = 0
     """Flows that wait for something: where a plan ends with some, it does not know all tasks."""
     _labels: set[str] = field(default_factory=set)
+    _complete: set[str] = field(default_factory=set)
 
     def node(
         self,
@@ -173,24 +198,41 @@ class Graph:
         inputs = {name: args.pop(name) for name in stage.ports() if name in args}
         return self.node(stage, label, params, args, inputs=inputs)
 
-    def flow(self, steps: Generator[Wait, Any, None]) -> None:
+    def flow(self, steps: Generator[Wait, Any, None], lays: Collection[str] | None = None) -> None:
         """Run a generator on the client until it waits, and again when what it waits for is there.
 
         It yields a handle, a list of handles, or :class:`Maybe`, and gets a reference, or a list of references. Where
-        one will never be, ``MissingError`` is raised in it.
+        one will never be, ``MissingError`` is raised in it. :class:`Complete` it yields without waiting.
+
+        ``lays`` are the stages of the tasks that follow what it waits for (None: of any stage): where none of them is
+        wanted, it ends at its first wait.
         """
         self.unfinished += 1
-        self._go_on(steps, lambda: next(steps))
+        idle = self.cut is not None and lays is not None and self.cut.stages.isdisjoint(lays)
+        self._go_on(steps, lambda: next(steps), idle=idle)
 
-    def _go_on(self, steps: Generator[Wait, Any, None], step: Callable[[], Wait]) -> None:
+    def _wait(self, steps: Generator[Wait, Any, None], step: Callable[[], Wait]) -> Awaited | None:
+        """What a flow waits for next; None at its end, or where nothing that follows is wanted."""
         try:
             wanted = step()
+            while isinstance(wanted, Complete):
+                self._complete |= wanted
+                if self.cut is not None and self.cut.stages <= self._complete:
+                    return None
+                wanted = next(steps)
         except StopIteration:
-            self.unfinished -= 1
-            return
+            return None
+        return wanted
+
+    def _go_on(self, steps: Generator[Wait, Any, None], step: Callable[[], Wait], *, idle: bool = False) -> None:
+        try:
+            wanted = self._wait(steps, step)
         except MissingError as error:
             self.unfinished -= 1
             self.expansions.append((error.handles, lambda *_: None, False))  # the run's end says what it waited for
+            return
+        if wanted is None or idle:
+            self.unfinished -= 1
             return
         one, maybe = isinstance(wanted, Handle), isinstance(wanted, Maybe)
         several = wanted.handles if isinstance(wanted, Maybe) else wanted

@@ -79,8 +79,10 @@ class Progress:
         """The run has ended."""
 
     def total(self) -> int:
-        """Nodes known by now."""
-        return len(self.graph.nodes) if self.graph else 0
+        """Nodes that are known and wanted by now."""
+        if self.graph is None:
+            return 0
+        return len(self.graph.nodes if self.graph.cut is None else self.graph.asked)
 
 
 class Lines(Progress):

@@ -88,13 +88,14 @@ class Result:
     """Outcome of a run.
 
     Of a dry run: ``assumed`` are labels whose earlier result served to lay out what follows, ``unknown`` those that
-    hide it.
+    hide it. Of a cut graph: ``left_out`` counts by stage the known tasks that are not wanted.
     """
 
     counts: dict[str, Counts] = field(default_factory=dict)
     failures: list[Failure] = field(default_factory=list)
     assumed: list[str] = field(default_factory=list)
     unknown: list[str] = field(default_factory=list)
+    left_out: Counter[str] = field(default_factory=Counter)
     seconds: float = 0.0
     workers_started: bool = False
     interrupted: bool = False
@@ -198,6 +199,9 @@ class _Run:
         """Digests of artifacts that are computed again because they were damaged or gone, by number of the node."""
         hints = store.hints(graph.sequence)
         self.hints, self.known = hints, provenance.Known(hints, graph.choice)
+        self.seen = 0
+        """Nodes of a cut graph of which it is known whether they are wanted for themselves."""
+        self._ask()
 
     def go(self) -> Result:
         begin = time.perf_counter()
@@ -245,6 +249,22 @@ class _Run:
                 if number in self.in_flight:  # not if the run was stopped by one before
                     self._land(self.in_flight.pop(number), ended)
 
+    def _ask(self) -> None:
+        """Find what a cut graph asks for by now: wanted nodes, what flows wait for, and all that these need."""
+        cut, nodes = self.graph.cut, self.graph.nodes
+        if cut is None:
+            return
+        wanted = [h for h in nodes[self.seen :] if cut.wants(h)]
+        wanted += [h for handles, *_ in self.graph.expansions for h in handles]
+        self.seen = len(nodes)
+        while wanted:
+            handle = wanted.pop()
+            if handle.index not in self.graph.asked:
+                self.graph.asked.add(handle.index)
+                if handle.index < self.taken:
+                    heapq.heappush(self.again, handle.index)
+                wanted += handle.upstream()
+
     # -- what becomes of a node ---------------------------------------------------------------------------------
 
     def _take(self) -> bool:
@@ -261,7 +281,8 @@ class _Run:
             self._settle(self.graph.nodes[heapq.heappop(self.again)])
         elif self.taken < len(self.graph.nodes):
             self.taken += 1
-            self._settle(self.graph.nodes[self.taken - 1])
+            if self.graph.cut is None or self.taken - 1 in self.graph.asked:
+                self._settle(self.graph.nodes[self.taken - 1])
         else:
             return False
         return True
@@ -443,12 +464,14 @@ class _Run:
             if all(h.done or h.earlier or (holes and h.status in ("failed", "skipped")) for h in handles):
                 del self.graph.expansions[i]
                 self._expand(handles, flow)
+                self._ask()
                 return True
         last = self.graph.last
         if last is None or (self.graph.expansions and self.in_flight):
             return False
         self.graph.last = None
         last()
+        self._ask()
         return True
 
     def _expand(self, handles: list[Handle], flow: Expansion) -> None:
@@ -463,7 +486,10 @@ class _Run:
                 self._failed(Failure(f"plan after {_labels(handles)}", "", error, Failed.of(error).traceback))
 
     def _leave_out(self) -> None:
-        """Account for everything that was not even begun."""
+        """Account for everything that was not even begun; drop the nodes that a cut graph does not ask for."""
+        if self.graph.cut is not None:
+            self.result.left_out.update(h.stage for h in self.graph.nodes if h.index not in self.graph.asked)
+            self.graph.nodes[:] = [h for h in self.graph.nodes if h.index in self.graph.asked]
         for handle in self.graph.nodes:
             if handle.status == "pending":
                 missing = next((h for h in handle.upstream() if h.status in MISSING), None)

@@ -47,7 +47,7 @@ def of_trajectory(make: Builder, frames: Sequence[int]) -> Steps:
     poses = [None if pose is None else pose.to_list() for pose in true]
     known = make.node(truth_stage, "truth", poses=poses, source=s.truth_source, frames=list(frames))
     if p.crosscheck is not None:
-        make.graph.flow(_of_crosscheck(make, p.crosscheck, known))
+        make.graph.flow(_of_crosscheck(make, p.crosscheck, known), lays=("accuracy",))
     found = yield from done(p.trajectory)
     pieces, main = found.meta["pieces"], found.meta["main"]
     for number in range(len(pieces)):

@@ -48,7 +48,7 @@ from typing import Any
 
 import numpy as np
 
-from rille.pipeline.engine.graph import Handle, Maybe, Wait, done
+from rille.pipeline.engine.graph import Complete, Handle, Maybe, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow import assessment
 from rille.pipeline.flow.builders import Builder, Pair, Segment, centre, merge_tiles, other_plane
@@ -123,9 +123,11 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     if make.config.crosscheck.enabled and len(whole) > 1:
         # What is laid out first runs first: its windows take longest of all tasks.
         p.crosscheck = another_program(make, whole)
+    yield Complete(("features", "crosscheck", "crosscheck_join"))
 
     # Frames that the trajectory goes through, and which of them are basic pairs.
     found = yield from screened(make, whole)
+    yield Complete(("image_quality", "swap_check", "frame_screening"))
     # From here on a frame is known by its place in the chain; `frames` keep the numbers of the sequence.
     chain = list(found.meta["chain"])
     missing = [{"frame": f, "cause": why} for f, why in make.sequence.lost.items() if f in frames]
@@ -136,6 +138,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     if chosen is None:
         return
     basic = [chain[i] for i in chosen.meta["basic"]]
+    yield Complete(("keyframes", "synchrony", "rig", "calibration"))
 
     # At each basic pair, the rover's stop: local elevation model, hazards and path.
     pairs = yield from basic_pairs(make, rigs)
@@ -149,7 +152,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     p.tracks, p.resections = [s.track for s in segments], [s.resection for s in segments]
     p.refined = refined(make, pairs, segments)
     if p.refined:
-        flow(checked_intrinsics(make, pairs[basic[0]]))
+        flow(checked_intrinsics(make, pairs[basic[0]]), lays=())
     p.trajectory = make.node(
         trajectory_stage,
         "trajectory",
@@ -160,7 +163,9 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         steps=steps_of(make, chosen),
         lost=lost or None,
     )
-    flow(assessment.of_trajectory(make, frames))
+    flow(assessment.of_trajectory(make, frames), lays=("accuracy",))
+    yield Complete(("track", "resect", "refine", "intrinsics", "trajectory"))
+    yield Complete(("agreement", "position_accuracy", "accuracy", "truth"))
     posed = yield from done(p.trajectory)
 
     # The world is that of the largest unbroken piece: its models, straight on the world lattice.
@@ -171,6 +176,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory)
     size = {"side": TILE_CELLS, "margin": make.config.merge.margin}
     prints = [make.node(tile_index_stage, f"tile_index/{k}", dem=dem, **size) for k, dem in p.world_dem.items()]
+    yield Complete(("pose", "locus", "tile_index"))
     # A pair whose model failed is left out of the world: the others make a map with a hole.
     laid = yield Maybe(prints)
     footprints = [ref.meta for ref in laid if ref is not None and ref.meta["tiles"]]
@@ -184,8 +190,10 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     seams = list(p.seams.values())
     p.overlap_audit = make.node(overlap_audit_stage, "overlap_audit", seams=seams)
     centres = {str(f["pair"]): centre(f["box"]) for f in footprints if f["box"] is not None}
+    yield Complete(("overlap_qa", "overlap_audit"))
     levelled = yield from done(make.node(radiometry_stage, "radiometry", seams=seams, centres=centres))
     p.world_tiles = merge_tiles(make.node, footprints, p.world_dem, levelled.meta["steps"])
+    yield Complete(("radiometry", "merge"))
     if p.local_risk:
         p.world_risk = make.hazards("risk/world", p.world_tiles)
         p.world_path = make.node(path_stage, "path/world", risk=p.world_risk, use="world", heading=heading(posed.meta))
@@ -273,6 +281,7 @@ def simultaneous(
             unfit=sorted(chain.index(f) for f in unfit) or None,
             behind=behind or None,
         )
+        yield Complete(("motion", "step_table"))
         chosen = yield from done(p.keyframes)
         basic = [chain[i] for i in chosen.meta["basic"]]
         pooled = mode != "per_pair" and make.rig(spread(basic, RIG_PAIRS), which)
@@ -304,19 +313,23 @@ def basic_pairs(make: Builder, rigs: dict[int, Handle[CalibrationFacts]]) -> Gen
     p, pairs = make.products, dict[int, Pair]()
     verticals = {k: vertical(make, k) for k in rigs}
     p.level = {k: make.level(k, verticals[k], known) for k, known in rigs.items()}
+    for k in rigs:
+        p.disparity[k], p.orientations[k] = make.disparity(k), make.orientation(k)
+    yield Complete(("undistort", "pyramid", "orientation", *(() if make.config.locus.both else ("hfvm",))))
     judged = yield Maybe(list(p.level.values()))
     placed = make.sequence.georeference is not None
     plane = other_plane(make.config, [level.meta for level in judged if level is not None], placed=placed)
     if plane is not None:
         p.level = {k: make.level(k, verticals[k], known, plane) for k, known in rigs.items()}
+    yield Complete(("ground_frame",))
     for k, known in rigs.items():
-        p.disparity[k], p.orientations[k] = make.disparity(k), make.orientation(k)
         pair = pairs[k] = make.pair(k, p.level[k], known, pairs.get(next(iter(rigs))))
         p.local_dem[k] = pair.dem
         if plane is None:
             p.local_risk[k] = make.hazards(f"risk/local/{k}", [pair.dem])
             p.local_path[k] = make.node(path_stage, f"path/local/{k}", risk=p.local_risk[k], use="local")
-        make.graph.flow(assessment.of_pair(make, pair))
+        make.graph.flow(assessment.of_pair(make, pair), lays=("dem_accuracy",))
+    yield Complete(("hfvm",))
     return pairs
 
 
