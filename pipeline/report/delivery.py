@@ -48,6 +48,10 @@ def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
 def complete(accounted: Mapping[str, Any], view: RunView, figures: Sequence[Figure]) -> dict[str, Any]:
     """The lists of :func:`account` with what became of tasks and figures: all that a reader might take for granted."""
     done = ["every task was done"] if view.tasks else []
+    if view.part:
+        absent = [_item("part", f"Left out, as {view.part} asks", left_out(view.left_out))]
+        wrong = [item for item in accounted["missing"] if item["kind"] == "contradiction"]
+        return {"delivered": done, "absent": absent, "missing": [*wrong, *_failures(view), *_unmade(view)]}
     undrawn = [_item("figure", figure.title, figure.why) for figure in figures if figure.why]
     # What the images contradict comes first: it may be the cause of all that follows.
     missing = sorted(
@@ -55,6 +59,19 @@ def complete(accounted: Mapping[str, Any], view: RunView, figures: Sequence[Figu
     )
     absent = [item for item in accounted["absent"] if item["kind"] != "vehicle" or view.vehicle_source == UNSTATED]
     return {"delivered": [*done, *accounted["delivered"]], "absent": absent, "missing": missing}
+
+
+def left_out(stages: Mapping[str, int]) -> str:
+    """What a part of a run leaves out, in words; ``stages`` counts the tasks that are known by stage."""
+    known = f"{count(sum(stages.values()), 'known task')} ({some(sorted(stages), 40)}), " if stages else ""
+    return f"{known}all that would have followed, and the report's figures"
+
+
+def _unmade(view: RunView) -> Items:
+    """Stages and files that were wanted, and that this run does not have."""
+    made = {name for t in view.tasks for name in (t.stage, t.label.partition("/")[0], t.label.removeprefix("output/"))}
+    why = "this sequence has none, or a parameter switches it off"
+    return [_item("part", f"No {name}", why) for name in (*view.until, *view.only) if name not in made]
 
 
 def has_truth(view: RunView) -> list[bool]:

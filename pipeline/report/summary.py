@@ -52,7 +52,7 @@ def gather(view: RunView) -> dict[str, Any]:
 def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]) -> dict[str, Any]:
     """Everything that ``report.json`` holds, with what this run alone knows; the page has the same numbers."""
     outcome = delivery.complete(facts, view, figures)
-    complete = delivery.is_complete(outcome["missing"])
+    complete = delivery.is_complete(outcome["missing"]) and not view.part
     state = "Incomplete" if not complete else "Complete but for what is listed" if outcome["missing"] else "Complete"
     how = "wall clock, without writing the page; what is cached costs no time"
     clock = {"group": "Run", "truth": None, **metric("Time of this run's tasks", view.seconds, "s", how)}
@@ -63,7 +63,7 @@ def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]
         "command": view.command,
         "complete": complete,
         **facts,
-        "verdict": f"{state}: {facts['verdict']}",
+        "verdict": f"{state}: {f'a part of the reconstruction, {view.part}.' if view.part else facts['verdict']}",
         **outcome,
         "metrics": {**facts["metrics"], "wall_clock": clock},
         "stages": _stages(view),
