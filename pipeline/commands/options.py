@@ -97,12 +97,22 @@ class Options(Work):
     keep_going: Annotated[
         bool, flag("After a failure, finish all tasks that do not depend on it; the exit status is then 3.")
     ] = False
+    until: Annotated[tuple[str, ...], several("Compute a stage's tasks and what they need, nothing else")] = ()
+    only: Annotated[tuple[str, ...], several("Make a file, for example dem.tif, and what it needs, nothing else")] = ()
     runs: Runs = RUNS
     progress: Annotated[
         Literal["auto", "bar", "plain", "quiet"], Parameter(help="How progress is shown on stderr.")
     ] = "auto"
     quiet: Annotated[bool, flag("No progress; warnings and errors only.", "--quiet", "-q")] = False
     verbose: Annotated[bool, flag("Say where to watch dask at work.", "--verbose", "-v")] = False
+
+    def part(self) -> str:
+        """The options that choose a part of the run, as they are typed; empty: all of it."""
+        return " ".join([*(f"--until {name}" for name in self.until), *(f"--only {name}" for name in self.only)])
+
+    def command(self) -> str:
+        """The same, with the part of the run."""
+        return f"{super().command()} {plain(self.part())}".strip()
 
 
 @Parameter(name="*")
@@ -111,6 +121,8 @@ class DriveOptions(Options):
     """Options of a drive, which takes its frames itself."""
 
     frames: Annotated[None, Unparsed] = None
+    until: Annotated[tuple[str, ...], Unparsed] = ()
+    only: Annotated[tuple[str, ...], Unparsed] = ()
 
 
 def cache_folder(given: str | Path | None) -> Path:

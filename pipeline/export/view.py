@@ -59,6 +59,9 @@ class RunView:
     vehicle_source : who stated the vehicle's limits, in words.
     started : when, in words (ISO 8601, UTC).
     notes : further facts to repeat.
+    part : the options that chose a part of the run; empty: all of it.
+    until, only : of a part: the stages whose tasks, or the files, that it is to make.
+    left_out : of a part: the known tasks that were not wanted, by stage.
     """
 
     run_id: str
@@ -75,6 +78,10 @@ class RunView:
     vehicle_source: str = ""
     started: str = ""
     notes: tuple[str, ...] = ()
+    part: str = ""
+    until: tuple[str, ...] = ()
+    only: tuple[str, ...] = ()
+    left_out: Mapping[str, int] = field(default_factory=dict)
 
 
 class Part(SimpleNamespace):

@@ -32,11 +32,23 @@ def lay_out(graph: Graph, view: RunView, made: Made) -> None:
     """Add the task of each output, to ``made`` too, once it is known what became of all that it reads.
 
     They are the last ones of the graph, so whatever else can be computed goes first; an output whose artifacts are
-    there early is made early.
+    there early is made early. Of a part of a run: the files that are wanted, or that read nothing else than it has,
+    and the facts of what it has; no figures.
     """
-    for module in MODULES:
+    for module in MODULES if graph.cut is None else catalogue.MADE:
         for output in module.OUTPUTS:
-            graph.flow(_make(graph, view, module, output, made))
+            if graph.cut is None or _is_wanted(output, view, graph):
+                graph.flow(_make(graph, view, module, output, made))
+    if graph.cut is not None:
+        # Once it is known what the files need: the facts are those of what is there then.
+        graph.last = lambda: graph.flow(_make(graph, view, summary, *summary.OUTPUTS, made))
+
+
+def _is_wanted(output: Output, view: RunView, graph: Graph) -> bool:
+    read = handles(output, view)
+    if view.only:
+        return output.name in view.only
+    return bool(read) and all(handle.index in graph.asked for handle in read)
 
 
 def plan(graph: Graph, view: RunView) -> None:
@@ -48,7 +60,10 @@ def plan(graph: Graph, view: RunView) -> None:
 
 def _make(graph: Graph, view: RunView, module: ModuleType, output: Output, made: Made) -> Generator[Wait, Any, None]:
     # what was laid out last is there last: looked at first, it spares looking at all others
-    yield Maybe(handles(output, view)[::-1])
+    read = handles(output, view)[::-1]
+    if graph.cut is not None and output.name not in view.only:
+        read = [handle for handle in read if handle.index in graph.asked]
+    yield Maybe(read)
     node = add(graph, module, output, view)
     if node is not None:
         made[output.name] = node
@@ -78,7 +93,9 @@ def write(folder: Path, view: RunView, made: Made, store: Store) -> Items:
     frames = catalogue.describe([p.name for p in folder.iterdir()], view, vertical)
     atomic.write(folder / "frames.json", json.dumps(frames, indent=1) + "\n")
     (facts,) = _files(made["facts"], store).values()
-    figures = [FIGURE.validate_json(drawn) for o in gallery.OUTPUTS for drawn in _files(made[o.name], store).values()]
+    figures = [
+        FIGURE.validate_json(drawn) for o in gallery.OUTPUTS for drawn in _files(made.get(o.name), store).values()
+    ]
     return write_report(folder, view, json.loads(facts), figures)
 
 

@@ -24,7 +24,7 @@ from rille.pipeline.engine import events, memory, progress
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.code_digest import remember
 from rille.pipeline.engine.failures import reported
-from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.graph import Cut, Graph
 from rille.pipeline.engine.packages import installed
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.store.base import Store
@@ -33,7 +33,8 @@ from rille.pipeline.export.view import UNSTATED, RunView
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import Drive, dataflow
-from rille.pipeline.runs import roots
+from rille.pipeline.flow.products import Products
+from rille.pipeline.runs import part_of_run, roots
 from rille.pipeline.runs.input_checks import judge_rig
 from rille.stages.core.errors import ConfigError, RilleError
 
@@ -155,7 +156,7 @@ class _Opened:
 def perform(options: Options) -> tuple[int, Path]:
     """Run the whole chain; gives the exit code and the folder of the results."""
     # They import matplotlib, which a wrong option should not have to wait for.
-    from rille.pipeline.report.delivery import is_complete
+    from rille.pipeline.report.delivery import is_complete, left_out
     from rille.pipeline.runs import run_files
 
     opened = _open(options)
@@ -174,6 +175,8 @@ def perform(options: Options) -> tuple[int, Path]:
         print(f"rille: missing: {': '.join(word for word in (item['what'], item['why']) if word)}", file=sys.stderr)
     page = opened.folder / "report.html"
     print(f"{page}  computed {total.computed}, cached {total.cached}, missing {len(missing)}")
+    if opened.view.part:
+        print(f"left out, as {opened.view.part} asks: {left_out(result.left_out)}")
     if not result.ok:
         ledger = opened.folder / "ledger.jsonl"
         print(f"rille: {total.failed} failed, {total.skipped} left out; ledger: {ledger}", file=sys.stderr)
@@ -191,10 +194,12 @@ def _open(options: Options) -> _Opened:
         raise ConfigError("RIL-059", f"{sequence.name} is recorded, it cannot be driven", remedy="drive mockup-loop")
     header = f"# {options.command()}\n# rille reconstruct SEQ --config THIS_FILE uses the same parameters.\n\n"
     text = header + configuration.to_toml(config, sequence.parameters)
+    bare = RunView("", sequence, frames, Products(), (), config)
+    graph, store = Graph(cut=part_of_run.cut(options.until, options.only, bare)), Store(cache_folder(options.cache))
+    products, drive = dataflow(graph, sequence, config, frames)
+    # After the layout, which refuses what does not fit: then no folder is left behind.
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
     (folder / "config.toml").write_text(text, encoding="utf-8")
-    graph, store = Graph(), Store(cache_folder(options.cache))
-    products, drive = dataflow(graph, sequence, config, frames)
     view = RunView(
         run_id=folder.name,
         sequence=sequence,
@@ -208,6 +213,9 @@ def _open(options: Options) -> _Opened:
         vehicle_source=settled.vehicle_source,
         started=started.strftime("%Y-%m-%dT%H:%M:%SZ"),
         notes=sequence.notes,
+        part=options.part(),
+        until=options.until,
+        only=options.only,
     )
     return _Opened(options, settled, view, folder, started, store, graph, drive)
 
@@ -227,12 +235,13 @@ def _compute(opened: _Opened) -> driver.Result:
             ledger=opened.folder / "ledger.jsonl",
             progress=progress.make("quiet" if options.quiet else options.progress, verbose=options.verbose),
             memory_limit=memory_limit(options),
-            survey=lambda: lay_out(view.sequence, view.config, view.frames),
+            survey=lambda: lay_out(view.sequence, view.config, view.frames, opened.graph.cut),
         ),
     )
     trajectory = view.products.trajectory
     if not options.keep_going:
-        result.check(holes=view.sequence.simulation is not None or (trajectory is not None and trajectory.done))
+        posed = trajectory is not None and trajectory.done
+        result.check(holes=view.sequence.simulation is not None or posed or bool(view.part))
     return result
 
 
@@ -247,16 +256,17 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> Item
             f"{opened.folder} was removed while the run was under way",
             remedy="run again: what was computed is in the cache",
         )
-    whole = opened.late(tasks=run_files.task_rows(opened.graph), seconds=result.seconds)
+    tasks = run_files.task_rows(opened.graph)
+    whole = opened.late(tasks=tasks, seconds=result.seconds, left_out=result.left_out)
     missing = run_files.write(opened.folder, whole, made, opened.store)
     total = (datetime.now(UTC) - opened.started).total_seconds()
     events.add_facts(opened.folder / "ledger.jsonl", total=total)
     return missing
 
 
-def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Graph:
-    """The graph of a reconstruction as far as it is known beforehand."""
-    graph = Graph()
+def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...], cut: Cut | None = None) -> Graph:
+    """The graph of a reconstruction, or of a part of it, as far as it is known beforehand."""
+    graph = Graph(cut=cut)
     dataflow(graph, sequence, config, frames)
     return graph
 
@@ -275,7 +285,8 @@ def _all_read(opened: _Opened, arrived: int) -> int:
     # A drive that ended early did not come to the tasks that would have read it.
     if arrived != COMPLETE:
         return COMPLETE
-    lost = unread.unread(opened.settled.given, opened.view.config, opened.graph)
+    # What a part of a run does not read may be meant for the rest.
+    lost = [] if opened.view.part else unread.unread(opened.settled.given, opened.view.config, opened.graph)
     if lost:
         text = f"{unread.values(lost, opened.view.config)}: no task of this run read it"
         print(f"rille: error RIL-732: {text}: {unread.remedy(lost, opened.view.config)}", file=sys.stderr)

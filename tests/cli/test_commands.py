@@ -59,6 +59,20 @@ def test_reconstruct(place: Place, name: str, frames: int) -> None:
     assert said == [f"rille: missing: {m['what']}: {m['why']}" for m in listed]
 
 
+def test_a_part_of_a_run_computes_what_it_needs_and_says_what_it_leaves_out(place: Place, tmp_path: Path) -> None:
+    words = ["reconstruct", *MOCKUP, "--only", "trajectory.tum", "--runs", str(tmp_path)]
+    first, second = place.rille(*words), place.rille(*words)
+    assert (first.status, second.status) == (0, 0), first.err + second.err
+    assert re.fullmatch(r"left out, as --only trajectory.tum asks: \d+ known tasks \(.*locus.*\), .*", second.last)
+    run = tmp_path / "mockup-short" / "latest"
+    whole = place.runs("mockup-short")[0]
+    assert (run / "trajectory.tum").read_bytes() == (whole / "trajectory.tum").read_bytes()
+    assert not (run / "dem.tif").exists()
+    report = json.loads((run / "report.json").read_text())
+    assert not report["complete"]
+    assert [item["kind"] for item in report["absent"]] == ["part"]
+
+
 def test_reconstruct_says_how_it_goes(place: Place) -> None:
     plain = place.said["mockup"].err.splitlines()
     told = [line for line in plain if not line.startswith("rille: missing: ")]

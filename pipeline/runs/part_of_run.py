@@ -1,0 +1,75 @@
+"""A part of a reconstruction: the tasks of some stages (``--until``), or some files (``--only``)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Any
+
+from rille.pipeline.engine.graph import Cut
+from rille.pipeline.export import catalogue
+from rille.pipeline.export.view import RunView
+from rille.pipeline.flow import config
+from rille.pipeline.flow.products import Products
+from rille.stages.core.errors import ConfigError
+
+FLOWS = ("builders", "reconstruction", "assessment")
+"""Modules whose stages a reconstruction is made of."""
+
+MADE_BY = {
+    "trajectory": "trajectory",
+    "agreement": "agreement",
+    "accuracy": "accuracy",
+    "crosscheck_accuracy": "accuracy",
+    "world_tiles": "merge",
+    "world_risk": "risk",
+    "world_path": "path",
+}
+"""Stage of each product that files are made of; others are there before the trajectory is."""
+
+
+class _Reading(Products):
+    """Products, all empty, that note which of them are read."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.__dict__["read"] = set[str]()
+
+    def __getattribute__(self, name: str) -> Any:
+        if name in MADE_BY:
+            self.__dict__["read"].add(name)
+        return super().__getattribute__(name)
+
+
+def cut(until: Collection[str], only: Collection[str], view: RunView) -> Cut | None:
+    """Return what of a run's graph is wanted; None where that is all of it.
+
+    Parameters
+    ----------
+    until : names of stages.
+    only : names of files of a run, as :data:`rille.pipeline.export.catalogue.OUTPUTS` has them.
+    view : the run before it is laid out.
+
+    Raises
+    ------
+    ConfigError
+        There is no such stage, or no such file; both were given.
+    """
+    if until and only:
+        raise ConfigError("RIL-034", "--until and --only are both given", remedy="give one of them")
+    stages = set(config.stages(*FLOWS))
+    for name in sorted(set(until) - stages):
+        raise ConfigError("RIL-035", f"--until {name!r} is no stage", remedy=f"one of {', '.join(sorted(stages))}")
+    files = {output.name: output for output in catalogue.OUTPUTS if output.write is not None}
+    for name in sorted(set(only) - set(files)):
+        raise ConfigError("RIL-036", f"--only {name!r} is no file", remedy=f"one of {', '.join(files)}")
+    wanted = {*until, "output"}
+    if until:
+        return Cut(frozenset(until), lambda h: h.stage in wanted or h.label.partition("/")[0] in wanted)
+    if not only:
+        return None
+    empty = _Reading()
+    for name in only:
+        files[name].inputs(replace(view, products=empty))
+    behind = {MADE_BY[name] for name in empty.read} or {"trajectory"}
+    return Cut(frozenset(behind), lambda h: h.label.partition("/")[0] in wanted)
