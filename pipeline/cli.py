@@ -35,6 +35,7 @@ COMMANDS = {
     "check": "check:check",
     "init": "init:init",
     "calibrate": "calibrate:calibrate",
+    "rig": "rig:rig",
     "match": "match:match",
     "export": "export:export",
     "compare-dem": "compare_dem:compare_dem",

@@ -141,13 +141,16 @@ class RigSection(Table):
     """m; the right camera stands that far along the left one's x axis"""
     T_right_left: Pose | None = None
     """rows of [R | t], m: x_right = R x_left + t"""
+    file: str | None = None
+    """rig that `rille rig` has estimated; its relative orientation is used as it is, with rig.mode fixed"""
     unit: float = Field(default=1.0, gt=0)
     """m; length of one unit of the calibration files, 0.001 where they say mm"""
 
     @model_validator(mode="after")
     def _one_baseline(self) -> RigSection:
-        if self.baseline is not None and self.T_right_left is not None:
-            raise ValueError("baseline and T_right_left both state the baseline: remove one of them")
+        stated = [name for name in ("baseline", "T_right_left", "file") if getattr(self, name) is not None]
+        if len(stated) > 1:
+            raise ValueError(f"{' and '.join(stated)} both state the baseline: remove one of them")
         if self.baseline is not None and self.baseline <= 0:
             swapped = "where the right camera stands to the left, exchange images.left and images.right"
             raise ValueError(f"baseline = {self.baseline:g} m is not positive: give the distance; {swapped}")

@@ -59,7 +59,7 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
         disparity = _disparity(manifest.disparity, root, name, (base, pairs), digests)
         base = replace(base, disparity=disparity, notes=(*base.notes, note))
     motion = MotionReader(root, name, pairs, StatedMotion(base.times)).read(manifest)
-    world = manifest.world
+    world, pinned = manifest.world, {} if manifest.rig.file is None else {"rig.mode": "fixed"}
     pitch = None if world.pitch_deg is None else math.radians(world.pitch_deg)
     return replace(
         base,
@@ -77,7 +77,8 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
         georeference=world.place,
         masks={side: root / path for side, path in manifest.masks if path is not None},
         vehicle=manifest.vehicle,
-        defaults={**base.defaults, **dict(dotted(manifest.defaults))},
+        # A pinned rig is that of all pieces of a log: none of them may repair it for itself.
+        defaults={**base.defaults, **pinned, **dict(dotted(manifest.defaults))},
         notes=(*base.notes, *motion.notes, *manifest.notes),
         warnings=(*base.warnings, *motion.warnings),
     )

@@ -12,6 +12,7 @@ import numpy as np
 from rille.datasets.cameras import CalibratedCamera, read_cameras, rig_of
 from rille.datasets.cameras.model import of_size, parallel
 from rille.datasets.manifest.model import Cameras, Manifest, PinholeLens, RigSection
+from rille.datasets.text.reading import read_toml
 from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes
@@ -68,13 +69,18 @@ def read_optics(manifest: Manifest, root: Path, name: str, sizes: Sizes, rectifi
     left, right = (_rectified(camera, name) if rectified else camera for camera in raw)
     # Before anything compares lengths: the manifest's own are metres.
     left, right = (_scaled(camera, manifest.rig.unit) for camera in (left, right))
-    stated = manifest.world.up
-    up = None if stated is None else direction(stated, left.T_camera_reference)
-    left, right, lines = _placed(left, right, manifest.rig, name)
+    above = manifest.world.up
+    up = None if above is None else direction(above, left.T_camera_reference)
+    pinned = None if manifest.rig.file is None else _pinned(root / manifest.rig.file)
+    stated = _stated(manifest.rig) if pinned is None else pinned.T_right_left
+    left, right, lines = _placed(left, right, stated, name)
     try:
         rig, lenses = rig_of(left, right, sizes)
     except InputError as error:
         raise error.at(name) from error
+    if pinned is not None and (pinned.left, pinned.right) != (rig.left, rig.right):
+        text = f"{name}: rig.file: {manifest.rig.file} was estimated with other cameras, or images of another size"
+        raise InputError("RIL-021", text, remedy="estimate it from runs with this calibration")
     _check_baseline(rig.baseline, manifest.rig, name)
     if left.lens != raw[0].lens and manifest.images.rectified is None:
         text = f"{name}: the images are rectified by their name: their camera is P, without the distortion"
@@ -172,13 +178,12 @@ def direction(
 
 
 def _placed(
-    left: CalibratedCamera, right: CalibratedCamera, section: RigSection, name: str
+    left: CalibratedCamera, right: CalibratedCamera, stated: RigidTransform | None, name: str
 ) -> tuple[CalibratedCamera, CalibratedCamera, list[str]]:
     """Both cameras with poses in the left camera's frame: what the manifest says goes before what a file says."""
     of_files = None
     if left.T_camera_reference is not None and right.T_camera_reference is not None:
         of_files = right.T_camera_reference @ left.T_camera_reference.inverse()
-    stated = _stated(section)
     if stated is None and of_files is None:
         raise InputError(
             "RIL-241",
@@ -194,6 +199,16 @@ def _placed(
             lines.append(warning("RIL-693", text))
     placed = replace(left, T_camera_reference=RigidTransform.identity())
     return placed, replace(right, T_camera_reference=chosen), lines
+
+
+def _pinned(path: Path) -> Rig:
+    """The rig of a file that ``rille rig`` wrote."""
+    content = read_toml(path, "rig")
+    try:
+        return Rig.from_dict(content["rig"])
+    except (KeyError, TypeError, ValueError) as error:
+        text = f"{path} is no rig ({type(error).__name__}: {error})"
+        raise InputError("RIL-022", text, remedy="`rille rig RUN ... -o rig.toml` writes one") from error
 
 
 def _stated(section: RigSection) -> RigidTransform | None:

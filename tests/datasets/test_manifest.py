@@ -6,12 +6,14 @@ import ast
 import inspect
 import math
 import re
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import tomli_w
 from folders import CAMERAS, write_images, write_lines, write_sequence
 from raising import raises
 
@@ -106,6 +108,23 @@ def test_relative_pose_may_be_stated(tmp_path):
     rig = f"[rig]\nT_right_left = {np.round(T.matrix34, 15).tolist()}\n"
     s = opened(write_sequence(tmp_path, rig=rig))
     np.testing.assert_allclose(s.rig.T_right_left.matrix34, T.matrix34, atol=1e-12)
+
+
+def test_a_rig_that_is_pinned_is_used_as_it_is(tmp_path):
+    given = opened(write_sequence(tmp_path / "a")).rig
+    T = RigidTransform(rotation_exp([0.01, 0.0, 0.0]), np.array([-0.1, 0.001, 0.0]))
+    (tmp_path / "rig.toml").write_text(tomli_w.dumps({"rig": replace(given, T_right_left=T).to_dict()}))
+    manifest = write_sequence(tmp_path / "b", rig='[rig]\nfile = "../rig.toml"\n')
+    pinned = opened(manifest)
+    np.testing.assert_array_equal(pinned.rig.T_right_left.matrix34, T.matrix34)
+    assert pinned.defaults["rig.mode"] == "fixed"
+    other = given.to_dict() | {"left": given.left.to_dict() | {"fx": 61.0}}
+    (tmp_path / "rig.toml").write_text(tomli_w.dumps({"rig": other}))
+    with raises("RIL-021"):
+        opened(manifest)
+    (tmp_path / "rig.toml").write_text("a = 1\n")
+    with raises("RIL-022"):
+        opened(manifest)
 
 
 def test_distortion_gives_lenses(tmp_path):

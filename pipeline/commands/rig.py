@@ -1,0 +1,178 @@
+"""``rille rig``: one rig from the matches of several runs, for manifests to pin.
+
+Each run repairs its rig by its own images; pieces of one log then differ a little in theirs. Here the matches of all
+runs decide together which parameters depart from the calibration, as those of all pairs do in a run. The value of each
+is the mean of the runs' own estimates, weighted by their covariances.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tomli_w
+
+from rille.datasets.text.reading import read_toml
+from rille.datasets.text.warning import warning
+from rille.pipeline.commands.options import COMPLETE, RUNS, CacheFolder, Output, Runs, cache_folder, check_output
+from rille.pipeline.engine.failures import reported
+from rille.pipeline.engine.plain import warn
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.export.programs.run_artifacts import RunArtifacts
+from rille.pipeline.runs import lookup
+from rille.stages.calibration.parameter_selection import Parameter, decide
+from rille.stages.calibration.relative_orientation import MIN_MATCHES, PointPairs, adjust, solution
+from rille.stages.calibration.rig import RigParams
+from rille.stages.core.arrays import Floats
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.epipolar import NAMES, corrected
+from rille.stages.geometry.geometry import Rig
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Correction of a rig by the matches of one run: values and standard deviations (5,), radians."""
+
+    run: str
+    values: Floats
+    sigma: Floats
+
+
+@dataclass(frozen=True)
+class Joint:
+    """The rig of all runs, its parameters, their joint values (5,) in radians, and each run's own estimate."""
+
+    rig: Rig
+    parameters: tuple[Parameter, ...]
+    values: Floats
+    estimates: tuple[Estimate, ...]
+
+
+def rig(
+    run: str,
+    *more: str,
+    output: Annotated[Path, Output] = Path("rig.toml"),
+    runs: Runs = RUNS,
+    cache: CacheFolder = None,
+) -> int:
+    """Estimate one rig from several runs with one calibration; manifests pin it by `rig.file`.
+
+    Prints the correction of each parameter by each run, and by all. `rille reconstruct SEQ --until rig` computes what
+    is needed of a sequence.
+
+    Parameters
+    ----------
+    run
+        A run by name: SEQUENCE (its latest), SEQUENCE/ID, ID, latest (of all); or its folder.
+    more
+        Others.
+    output
+        TOML file to write.
+    """
+    check_output(output, ".toml")
+    store, matches, given = Store(cache_folder(cache)), dict[str, list[PointPairs]](), dict[str, Any]()
+    folders = list(dict.fromkeys(lookup.find(name, runs) for name in (run, *more)))
+    for folder in folders:
+        with lookup.reading(folder):
+            artifacts = RunArtifacts(folder, store)
+            given[lookup.name(folder)] = artifacts.one("rig").meta["given"]
+            matches[lookup.name(folder)] = list(_matches(artifacts))
+    other = next((name for name, one in given.items() if one != next(iter(given.values()))), None)
+    if other is not None:
+        text = f"run {other} has another calibration than {next(iter(given))}"
+        raise InputError("RIL-028", text, remedy="give runs of sequences with one calibration, and images of one size")
+    params = RigParams.model_validate(read_toml(folders[0] / "config.toml", "configuration").get("rig", {}))
+    found = joint(Rig.from_dict(next(iter(given.values()))), matches, params)
+    with reported("RIL-029", f"cannot write {output}", remedy="choose another --output"):
+        output.write_text(_toml(found), encoding="utf-8")
+    print("\n".join(_table(found)))
+    for line in disagreements(found, params.significance):
+        warn(line)
+    print(f"wrote        {output}\nnext         in the manifest of each sequence:")
+    print(f'\n[rig]\nfile = "{output.resolve()}"')
+    return COMPLETE
+
+
+def _matches(artifacts: RunArtifacts) -> Iterator[PointPairs]:
+    """Matches of the pairs of a run that have enough of them."""
+    for one in artifacts.all("orientation").values():
+        left, right = (np.asarray(one[side], dtype=np.float64) for side in ("left", "right"))
+        if len(left) >= MIN_MATCHES:
+            yield PointPairs(one.meta["pair"], left, right)
+
+
+def joint(given: Rig, matches: Mapping[str, Sequence[PointPairs]], params: RigParams) -> Joint:
+    """Return the rig of several runs: the given one, corrected where the matches of all together contradict it.
+
+    Parameters
+    ----------
+    matches : of each run, by its name.
+
+    Raises
+    ------
+    InputError
+        A run has no pair with enough matches.
+    """
+    empty = next((name for name, pairs in matches.items() if not pairs), None)
+    if empty is not None:
+        text = f"run {empty} has no pair with {MIN_MATCHES} matches"
+        raise InputError("RIL-030", text, remedy="leave it out, or choose more frames")
+    decision = decide(given, [pair for pairs in matches.values() for pair in pairs], params)
+    observed = [p.observed for p in decision.parameters]
+    priors, estimates, freed = params.priors(given), [], np.flatnonzero(decision.free())
+    normal, pull = np.zeros((len(freed), len(freed))), np.zeros(len(freed))
+    for name, pairs in matches.items():
+        fit = adjust(given, pairs, observed, priors, rival=False)
+        values, covariance, _ = solution(fit, observed, priors, rival=False)
+        values, covariance = values[: len(NAMES)], covariance[: len(NAMES), : len(NAMES)]
+        estimates.append(Estimate(name, values, np.sqrt(np.diag(covariance))))
+        inverse = np.linalg.inv(covariance[np.ix_(freed, freed)])
+        normal, pull = normal + inverse, pull + inverse @ values[freed]
+    values = np.zeros(len(NAMES))
+    values[freed] = np.linalg.solve(normal, pull)
+    return Joint(corrected(given, values), decision.parameters, values, tuple(estimates))
+
+
+def disagreements(found: Joint, significance: float) -> Iterator[str]:
+    """Lines on what runs estimate otherwise than all together, by more than ``significance`` standard deviations."""
+    for k, parameter in enumerate(found.parameters):
+        centre = parameter.asked if not parameter.freed else found.values[k]
+        for one in found.estimates if parameter.observed else ():
+            away = abs(one.values[k] - centre) / one.sigma[k]
+            if away > significance:
+                turn = math.degrees(one.values[k] - centre)
+                text = f"{parameter.name.replace('_', ' ')} of run {one.run} is {turn:+.3f} degrees off the others"
+                yield warning("RIL-025", f"{text}, {away:.0f} standard deviations: did the rig move between them?")
+
+
+def _table(found: Joint) -> Iterator[str]:
+    """Table of corrections, degrees, by parameter: of all runs together, and of each."""
+    names = [one.run.partition("/")[0] for one in found.estimates]
+    heads = names if len(set(names)) == len(names) else [one.run.rpartition("/")[2] for one in found.estimates]
+    yield "  ".join([f"{'degrees':17s}", *(f"{head:>17.17s}" for head in ["all", *heads])])
+    for k, p in enumerate(found.parameters):
+        value = found.values[k] if p.freed else p.asked
+        # Of what no image shows, an estimate is the prior.
+        own = [(one.values[k], one.sigma[k]) for one in found.estimates if p.observed]
+        each = [(value, p.sigma), *own]
+        cells = "  ".join(f"{math.degrees(v):+8.3f} +- {math.degrees(s):.3f}" for v, s in each)
+        yield f"{p.name.replace('_', ' '):17s}  {cells}  {'corrected' if p.freed else 'as given: ' + p.why}"
+
+
+def _toml(found: Joint) -> str:
+    """The file's text: the rig, and how it was estimated."""
+    runs = {
+        one.run: {
+            p.name: [math.degrees(v), math.degrees(s)]
+            for p, v, s in zip(found.parameters, one.values, one.sigma, strict=True)
+        }
+        for one in found.estimates
+    }
+    turned = dict(zip(NAMES, np.degrees(found.values).tolist(), strict=True))
+    content = {"rig": found.rig.to_dict(), "corrected_by_degrees": turned}
+    head = "# A rig for manifests: [rig] file = ... ; x_right = R x_left + t, metres, rows of [R | t].\n"
+    return head + tomli_w.dumps(content | {"estimates_degrees_and_sigma": runs})
