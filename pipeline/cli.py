@@ -36,6 +36,7 @@ COMMANDS = {
     "init": "init:init",
     "calibrate": "calibrate:calibrate",
     "rig": "rig:rig",
+    "mask": "mask:mask",
     "match": "match:match",
     "export": "export:export",
     "compare-dem": "compare_dem:compare_dem",

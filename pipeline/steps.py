@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rille.datasets import registry
 from rille.datasets.protocol import Sequence
@@ -101,6 +102,11 @@ class StereoPair:
     def right(self) -> xarray.DataArray:
         """Right image (row, col), as :attr:`left`."""
         return self._image("right")
+
+    def taken(self, camera: str) -> NDArray[Any]:
+        """Grey values (row, col) of an image as camera ``left`` or ``right`` took it, with its lens distortion."""
+        image = _computed(_builder(self, self.settings).taken(self.frame, camera), {}, self.sequence.drawn)
+        return np.array(image["image"])
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -74,6 +74,8 @@ WRONG = {
         ("other --frames 9:12", "RIL-057"),
         ("other --no-such-option", "RIL-001"),
     ],
+    "rig": [("", "RIL-001"), ("no-such-run", "RIL-067")],
+    "mask": [("", "RIL-001"), ("no-such-sequence", "RIL-276"), ("other", "RIL-906")],
     "init": [
         ("", "RIL-001"),
         ("no-such-folder", "RIL-193"),

@@ -1,0 +1,60 @@
+"""``rille mask``: draw masks of what keeps its place in a sequence's images, such as the vehicle's own body."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import numpy as np
+
+from rille.datasets.protocol import CAMERAS
+from rille.datasets.text.count import count
+from rille.pipeline.commands.options import COMPLETE, Output
+from rille.pipeline.engine.failures import reported
+from rille.pipeline.steps import open as open_sequence
+from rille.stages.core.errors import InputError
+from rille.stages.imaging.pyramid import grey
+from rille.stages.imaging.still import FEWEST, still
+
+MOST_IMAGES = 20
+"""Of a camera: more tell no more."""
+
+
+def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> int:
+    """Write masks of what keeps its place in the images, such as the vehicle's own body, for `[masks]` of a manifest.
+
+    Twenty images of each camera, spread over the sequence, are compared; where the vehicle stood, all keeps its place.
+    Beside each mask lies a picture to look at, with what the mask leaves out in red.
+
+    Parameters
+    ----------
+    seq
+        A name from `rille datasets list`, a folder or a manifest (.toml).
+    output
+        Folder to write to.
+    """
+    pairs = list(open_sequence(seq))
+    if len(pairs) < FEWEST:
+        text = f"{seq} has {count(len(pairs), 'pair')}, {FEWEST} are needed to see what keeps its place"
+        raise InputError("RIL-906", text, remedy="draw the mask by hand")
+    pairs = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, MOST_IMAGES).round().astype(int))]
+    written = []
+    for camera in CAMERAS:
+        images = [pair.taken(camera) for pair in pairs]
+        body = still(images)
+        if not body.any():
+            print(f"{camera:12s} nothing keeps its place in {len(images)} images")
+            continue
+        path = output / f"mask_{camera}.png"
+        seen = cv2.cvtColor(np.rint(grey(images[0])).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+        seen[body] = seen[body] // 2 + np.array([0, 0, 127], np.uint8)
+        for name, picture in ((path, np.where(body, 0, 255).astype(np.uint8)), (path.with_suffix(".look.png"), seen)):
+            with reported("RIL-907", f"{name} cannot be written", remedy="choose another --output", kind=InputError):
+                name.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+        print(f"{camera:12s} {100 * body.mean():.1f} % keeps its place in {len(images)} images: {path}")
+        written.append(f'{camera} = "{path.resolve()}"')
+    if written:
+        print("next         look at the .look.png; then in the manifest:\n\n[masks]")
+        print("\n".join(written))
+    return COMPLETE
