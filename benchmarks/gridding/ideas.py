@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rille.stages.geometry.surface import plane
-from rille.stages.terrain.locus import refinement, solve, stage
+from rille.stages.terrain.locus import refinement, solve, uncertainty
 from rille.stages.terrain.locus.solve import Matches
 from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
 
@@ -34,13 +34,12 @@ IDEAS: tuple[tuple[str, dict[str, Any], Changes], ...] = (
     ("limit of the residual", {"max_residual": 1e9}, {}),
     ("limit of back-matching", {"max_backmatch": 1e9}, {}),
     ("limit of the standard deviation", {"max_std": 1e9}, {}),
+    ("doubt beside hidden ground", {}, {(uncertainty, "HOLE"): 0.0}),
+    ("doubt where cells moved", {}, {(uncertainty, "MOVED"): 0.0}),
     ("coarse to fine search", {}, {(solve, "COARSE"): 1}),
 )
 """What is left out, in words, as parameters, and as constants of modules."""
-TWO_WAYS: tuple[tuple[str, dict[str, Any], Changes], ...] = (
-    ("both directions", {"both": False}, {}),
-    ("a standard deviation of their own", {"both": True}, {(stage, "from_both"): None}),
-)
+TWO_WAYS: tuple[tuple[str, dict[str, Any], Changes], ...] = (("both directions", {"both": False}, {}),)
 
 
 def table(half: str) -> None:
@@ -80,7 +79,7 @@ def _figures(given: tuple[Any, dict[str, Any]], params: dict[str, Any], changes:
     pair = MatchedPair(scene.left, forth, scene.right, back if chosen.both else None)
     try:
         for (module, name), value in changes.items():
-            setattr(module, name, _one_model if name == "from_both" else value)
+            setattr(module, name, value)
         dem = reconstruct(pair, scene.rig, scene.T_surface_left, plane(scene.lattice), scene.z_range, chosen)
     finally:
         for (module, name), value in before.items():
@@ -90,11 +89,6 @@ def _figures(given: tuple[Any, dict[str, Any]], params: dict[str, Any], changes:
     surest = np.argsort(std, kind="stable")[: round(SUREST * scene.judged.sum())]
     rms = [float(np.sqrt(np.mean(e**2))) for e in (error, error[surest])]
     return [*rms, known.sum() / scene.judged.sum(), float(np.mean(np.abs(error) < std))]
-
-
-def _one_model(elevation: Any, seen: Any, moved: Any, apart: Any, otherwise: Any) -> Any:
-    """The standard deviation that one direction has, for both."""
-    return refinement.standard_deviation(elevation, seen, otherwise.astype(np.float32))
 
 
 def _row(words: str, mine: list[list[float]], whole: list[list[float]]) -> None:

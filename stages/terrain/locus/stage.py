@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from rille.stages.core.arrays import Bools, Floats, Floats32
+from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Bundle, Memory, Params, raster, stage
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.core.validity import matched
@@ -41,9 +41,9 @@ from rille.stages.terrain.ground_frame import z_range as plane_z_range
 from rille.stages.terrain.locus.coverage import Limits, coverage
 from rille.stages.terrain.locus.empty import explain
 from rille.stages.terrain.locus.kernel import Dem
-from rille.stages.terrain.locus.refinement import refine, standard_deviation
+from rille.stages.terrain.locus.refinement import refine
 from rille.stages.terrain.locus.solve import Matches, PairArrays, SearchLimits, join, projections, solve
-from rille.stages.terrain.locus.uncertainty import from_both
+from rille.stages.terrain.locus.uncertainty import standard_deviation
 from rille.stages.terrain.locus.views import Views, views
 
 OWN_STD = 1.5  # times max_sigma: a cell's own standard deviation scatters about the typical one
@@ -147,7 +147,7 @@ def reconstruct(
         turned = Rig(rig.right, rig.left, rig.T_right_left.inverse())
         T_surface_right = T_surface_left @ rig.T_right_left.inverse()
         other = solve(PairArrays(back, right, turned, T_surface_right, limits), surface)
-        apart = out.elevation.astype(np.float64) - other.elevation
+        apart = out.elevation - other.elevation
         out = join(out, other)
     if seen is not None and (params.refine_steps or back is not None):
         _refine(out, seen, surface, params, apart)
@@ -174,17 +174,14 @@ def _views(image: ArrayLike, right: ArrayLike, rig: Rig, T_surface_left: RigidTr
     return views(*projections(rig, T_surface_left), images[0], images[1], T_surface_left.translation)
 
 
-def _refine(dem: Dem, views: Views, surface: Surface, params: LocusParams, apart: Floats | None) -> None:
+def _refine(dem: Dem, views: Views, surface: Surface, params: LocusParams, apart: Floats32 | None) -> None:
     """Refine a model in place: elevations, their standard deviations, grey values of the left image.
 
     ``apart``: (rows, cols) difference of both directions of matching, metres; None: there was one.
     """
     elevation, seen = refine(views, surface, dem.elevation, params.refine_steps)
-    if apart is None:
-        dem.elevation_std[...] = standard_deviation(elevation, seen, dem.elevation_std)
-    else:
-        moved = elevation.astype(np.float64) - dem.elevation
-        dem.elevation_std[...] = from_both(elevation, seen, moved, apart, dem.elevation_std.astype(np.float64))
+    moved = elevation - dem.elevation
+    dem.elevation_std[...] = standard_deviation(elevation, seen, moved, apart, dem.elevation_std)
     share = np.float32(params.refined_share)
     dem.elevation[...] = share * elevation + (np.float32(1.0) - share) * dem.elevation
     dem.ortho[...] = np.clip(seen.left, 0.0, 255.0)

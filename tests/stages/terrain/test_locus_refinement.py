@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy.ndimage
 from raising import raises
 from terrain_scenes import disparity, pitched, plane, smooth_noise, toed_in_rig
 
@@ -12,17 +11,11 @@ from rille.stages.geometry.surface import Surface
 from rille.stages.geometry.surface import plane as reference_plane
 from rille.stages.terrain.locus import views as locus_views
 from rille.stages.terrain.locus.kernel import Dem
-from rille.stages.terrain.locus.refinement import (
-    FACTOR,
-    FLOOR,
-    LEAST_CORRELATION,
-    UNKNOWN_BEND,
-    refine,
-    standard_deviation,
-)
+from rille.stages.terrain.locus.refinement import refine
 from rille.stages.terrain.locus.solve import ONE_SIDED, Matches, join
 from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
-from rille.stages.terrain.locus.views import OrthoPair, Views, look, views
+from rille.stages.terrain.locus.uncertainty import HOLE, standard_deviation
+from rille.stages.terrain.locus.views import Views, look, views
 
 RIG = toed_in_rig()
 T_LOCAL_LEFT = pitched(35.0, roll_deg=3.0)
@@ -219,53 +212,11 @@ def test_undefined_cells_stay_undefined_and_cast_doubt() -> None:
     elevation[30:34, 40:44] = np.nan
     found, seen = refine(through(), SURFACE, elevation, 2)
     np.testing.assert_array_equal(np.isfinite(found), np.isfinite(elevation))
-    part = np.full(elevation.shape, 1e-4)
-    std = standard_deviation(found, seen, part)
-    scale = seen.scale[29, 42]
-    assert std[29, 42] > 0.2 * UNKNOWN_BEND / scale / 7  # beside a hole: one of 49 cells would do
+    none = np.zeros(elevation.shape, np.float32)
+    std = standard_deviation(found, seen, none, None, none)
+    # Twelve of the 49 cells around it.
+    assert std[29, 42] > np.sqrt(HOLE * 12 / 49) / seen.scale[29, 42]
     assert std[29, 42] > 2.0 * std[10, 42]
-
-
-def rough() -> tuple[np.ndarray, OrthoPair]:
-    """Elevations with a cell that nobody saw, and random grey values there."""
-    rng = np.random.default_rng(11)
-    shape = (12, 15)
-    z, left, right = (rng.normal(size=shape).astype(np.float32) for _ in range(3))
-    z[5, 6] = np.nan
-    maps = dict.fromkeys(OrthoPair._fields, np.ones(shape, np.float32))
-    maps |= {"left": left, "right": left + right, "scale": rng.uniform(1.0, 2.0, shape).astype(np.float32)}
-    return z, OrthoPair(**maps)
-
-
-def test_the_standard_deviation_is_that_of_the_equation_in_plain_numpy() -> None:
-    z, seen = rough()
-    known, scale = np.isfinite(z), seen.scale
-    bend, step, products = np.zeros(z.shape), np.zeros(z.shape), np.zeros((3, *z.shape))
-    inner = np.zeros(z.shape, bool)
-    inner[1:-1, 1:-1] = True
-    for axis in (0, 1):
-        middle = np.moveaxis(z, axis, 0)
-        second = middle[:-2] - 2.0 * middle[1:-1] + middle[2:]
-        np.moveaxis(bend, axis, 0)[1:-1] += np.abs(second)
-        central = [0.5 * (np.roll(a, -1, axis) - np.roll(a, 1, axis)) for a in (z, seen.left, seen.right)]
-        step += central[0] ** 2
-        products += [central[1] * central[2], central[1] ** 2, central[2] ** 2]
-    bend[~np.isfinite(bend)] = (UNKNOWN_BEND / scale)[~np.isfinite(bend)]
-    whole = inner & np.isfinite(step) & known
-    step, products = np.where(whole, step, 0.0), np.where(whole, products, 0.0)
-
-    def total(a: np.ndarray, side: int) -> np.ndarray:
-        return scipy.ndimage.convolve(a.astype(float), np.ones((side, side)), mode="constant")
-
-    b2 = total(np.where(known, bend**2, 0.0), 7) / total(np.ones(z.shape), 7)
-    t2 = total(step, 7) / total(known, 7)
-    both, of_left, of_right = (total(a, 5) for a in products)
-    r = np.clip(both / np.sqrt(of_left * of_right), LEAST_CORRELATION, 1.0)
-    given = np.full(z.shape, 0.3)
-    expected = np.sqrt((FLOOR / scale) ** 2 + FACTOR**2 * (given**2 + b2 + t2) / r**2)
-    found = standard_deviation(z, seen, given)
-    np.testing.assert_allclose(found[known], expected[known], rtol=1e-4)
-    assert found[5, 6] == 0.3
 
 
 def test_the_result_does_not_depend_on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,12 +7,13 @@ from rille.stages.terrain.locus.uncertainty import (
     ALONE,
     APART,
     FLOOR,
+    HOLE,
     LEAST_GRADIENT,
     MOVED,
     REST,
     SHADE,
     STEP,
-    from_both,
+    standard_deviation,
 )
 from rille.stages.terrain.locus.views import OrthoPair
 
@@ -35,11 +36,11 @@ def ground(rise: float = RISE) -> tuple[np.ndarray, np.ndarray]:
 
 
 def uniform(value: float) -> np.ndarray:
-    return np.full(SHAPE, value)
+    return np.full(SHAPE, value, np.float32)
 
 
 def std(elevation: np.ndarray, seen: np.ndarray, moved: float = 0.0, apart: float | np.ndarray = 0.0) -> np.ndarray:
-    return from_both(elevation, OrthoPair(*seen), uniform(moved), uniform(1.0) * apart, uniform(0.5))
+    return standard_deviation(elevation, OrthoPair(*seen), uniform(moved), uniform(1.0) * apart, uniform(0.5))
 
 
 def expected(*, rise: float = RISE, grey: float = GREY, apart: float = 0.0, moved: float = 0.0) -> float:
@@ -102,7 +103,9 @@ def test_a_single_cell_speaks_for_itself() -> None:
     elevation[:20], elevation[21:], elevation[20, :25], elevation[20, 26:] = (np.nan,) * 4
     found = std(elevation, seen, moved=SHIFT, apart=np.nan)[20, 25]
     np.testing.assert_allclose(
-        found, np.sqrt(FLOOR**2 + (APART * ALONE) ** 2 + (MOVED * SCALE * SHIFT) ** 2) / SCALE, rtol=1e-3
+        found,
+        np.sqrt(FLOOR**2 + (APART * ALONE) ** 2 + (MOVED * SCALE * SHIFT) ** 2 + HOLE * 48 / 49) / SCALE,
+        rtol=1e-3,
     )
 
 
@@ -113,6 +116,12 @@ def test_where_one_direction_found_nothing_a_difference_is_supposed() -> None:
     np.testing.assert_allclose(found[20, 40], expected(apart=ALONE / SCALE), rtol=5e-3)
     np.testing.assert_allclose(found[20, 20], expected(apart=AWAY), rtol=5e-3)  # its neighbours have both
     np.testing.assert_allclose(found[20, 10], expected(apart=AWAY), rtol=5e-3)
+
+
+def test_one_direction_has_no_difference() -> None:
+    elevation, seen = ground()
+    one = standard_deviation(elevation, OrthoPair(*seen), uniform(0.0), None, uniform(0.5))
+    np.testing.assert_array_equal(one, std(elevation, seen))
 
 
 def test_cells_that_the_images_do_not_show_keep_theirs() -> None:
