@@ -46,7 +46,7 @@ from rille.stages.terrain.locus.solve import Matches, PairArrays, SearchLimits, 
 from rille.stages.terrain.locus.uncertainty import standard_deviation
 from rille.stages.terrain.locus.views import Views, views
 
-OWN_STD = 1.5  # times max_sigma: a cell's own standard deviation scatters about the typical one
+OWN_STD = 1.4  # times max_sigma: a cell's own standard deviation scatters about the typical one
 NO_LIMIT = {"max_sigma": None, "max_std": None}
 
 
@@ -67,7 +67,7 @@ class LocusParams(Params):
         "that is no ground ten times that of the median match",
     )
     max_std: float | None = Field(
-        None, gt=0, description="largest standard deviation [m] of a cell, by the matcher's; not set: 1.5 max_sigma"
+        None, gt=0, description="largest standard deviation [m] of a cell, by the matcher's; not set: 1.4 max_sigma"
     )
     sigma_disparity: float = Field(0.2, gt=0, description="standard deviation of a typical disparity [pixels]")
     max_residual: float = Field(0.5, gt=0, description="largest residual |p_l + d - p_r| of a solution [pixels]")
