@@ -4,7 +4,11 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
-PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+TOOLS  := $(VENV)/.tools
+# Python compiles what is imported, when it is first imported, also where the variable forbids it: compiling all takes
+# longer than the rest of the installation.
+unexport PYTHONDONTWRITEBYTECODE
+PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 # Requirements of a dependency group, one a line: `pip install --group` needs a newer pip than venv brings.
 GROUP  := $(BIN)/python -c 'import sys, tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["dependency-groups"][sys.argv[1]], sep="\n")'
 
@@ -23,14 +27,17 @@ BENCHMARKS := $(filter-out record,$(sort $(basename $(notdir $(wildcard benchmar
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
 
-install: $(VENV)/.compiled ## make .venv with rille and everything it needs, pinned, and compile the kernels
+install: $(VENV)/.compiled ## make .venv with rille and what a run needs, pinned, and compile the kernels
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "rille needs Python 3.11 or newer; say which with PYTHON=..." >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) -r <($(GROUP) dev)
-	@$(BIN)/python -m compileall -q rille pipeline stages datasets
+	$(PIP) -e .
+	@touch $@
+
+$(TOOLS): $(STAMP)
+	$(PIP) -e '.[all]' -r <($(GROUP) dev)
 	@touch $@
 
 # Without it, the first run compiles them.
@@ -41,25 +48,25 @@ reconstruct: $(STAMP) ## a sequence to terrain, trajectory, risk map, path and r
 	@$(BIN)/rille reconstruct "$(SEQ)" $(if $(FRAMES),--frames $(FRAMES)) $(if $(JOBS),--jobs $(JOBS)) \
 	  $(foreach s,$(SET),--set '$(s)') $(ARGS)
 
-test: $(STAMP) lint ## lint, types and the test suite (a few minutes on two cores)
+test: $(TOOLS) lint ## add all extras and the tools of the tests to .venv; lint, types and the test suite (a few minutes on two cores)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" $(ARGS)
 
 check: test torture ## everything, the slow checks too
 	$(BIN)/python -m pytest -m slow --ignore=tests/torture $(ARGS)
 
-torture: $(STAMP) ## kills, damage, full disks, races: what the engine endures, as a table (also part of check)
+torture: $(TOOLS) ## kills, damage, full disks, races: what the engine endures, as a table (also part of check)
 	$(BIN)/python -m pytest tests/torture $(ARGS)
 
-bench: $(STAMP) ## side-by-side measurements: every figure of the README; ONLY=matching: one of them, ARGS=--help: its options
+bench: $(TOOLS) ## side-by-side measurements: every figure of the README; ONLY=matching: one of them, ARGS=--help: its options
 	@$(if $(filter-out $(BENCHMARKS),$(ONLY)),echo "no such benchmark: $(filter-out $(BENCHMARKS),$(ONLY)); ONLY= any of: $(BENCHMARKS)" >&2; exit 2)
 	@for b in $(or $(ONLY),$(BENCHMARKS)); do echo "== $$b"; $(BIN)/python benchmarks/record.py $$b $(ARGS) || exit 1; done
 
-lint: $(STAMP) ## ruff and mypy
+lint: $(TOOLS) ## ruff and mypy
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-pages: $(STAMP) ## pages of docs/ that follow from the code: messages, parameters, outputs, blocks that are not run
+pages: $(TOOLS) ## pages of docs/ that follow from the code: messages, parameters, outputs, blocks that are not run
 	$(BIN)/rille params --markdown > docs/parameters.md
 	cd tests && for page in test_messages.py test_docs.py pipeline/export/test_output.py; do \
 	  PYTHONPATH=.:stages:pipeline ../$(BIN)/python $$page || exit 1; done
@@ -75,8 +82,8 @@ docs: $(VENV)/.docs ## the site in docs/_build, offline; the gallery and the tou
 docs-fast: ## the same without executing anything
 	@RILLE_DOCS_FAST=1 $(MAKE) --no-print-directory docs
 
-$(VENV)/.docs: $(STAMP)
-	$(PIP) -r <($(GROUP) dev) -r <($(GROUP) docs)
+$(VENV)/.docs: $(TOOLS)
+	$(PIP) -r <($(GROUP) docs)
 	@touch $@
 
 clean: ## remove caches of tools and build leftovers; keeps .venv, runs and artifacts

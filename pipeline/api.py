@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import tomli_w
 
 from rille.datasets.text.reading import TABLE, read_lines, read_text
+from rille.pipeline.engine.packages import require
 from rille.pipeline.steps import StereoSequence, check_place, check_sections
 from rille.stages.core.errors import ConfigError, InputError, RilleError
 
@@ -238,6 +239,7 @@ class Run:
         ConfigError
             It is not as Rille writes it.
         """
+        require("xarray", extra="xarray")
         import xarray
 
         from rille.pipeline.export.read_dem import check_group
@@ -266,6 +268,8 @@ class Run:
             It is not as Rille writes it.
         """
         import numpy as np
+
+        require("xarray", extra="xarray")
         import xarray
 
         with self._reading():

@@ -24,7 +24,7 @@ from rille.stages.core.errors import ConfigError, RilleError
 
 PACKAGES = (
     *("dask", "distributed", "google-crc32c", "llvmlite", "numba", "numcodecs", "numpy", "pydantic", "zarr"),
-    *("opencv-python-headless", "pycolmap", "pyogrio", "rasterio", "scipy"),
+    *("opencv-python-headless", "pycolmap", "rasterio", "scipy"),
 )
 """Distributions whose version must be the client's, and the kind of processor that they work for."""
 

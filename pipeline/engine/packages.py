@@ -31,7 +31,7 @@ HARMLESS = frozenset({"pydantic", "rille", "typing_extensions"})
 """What checks parameters, whose values are part of a key themselves; the engine, whose format is; and types."""
 
 NAMED = (
-    *("rille", "numpy", "numba", "scipy", "opencv-python-headless", "dask", "zarr", "rasterio", "pyogrio", "pycolmap"),
+    *("rille", "numpy", "numba", "scipy", "opencv-python-headless", "dask", "zarr", "rasterio", "pycolmap"),
     *("matplotlib", "jinja2"),
 )
 """Distributions that ``rille --version`` and reports name."""
@@ -40,7 +40,7 @@ CORE_NAMES = ("scipy_openblas_get_corename64_", "scipy_openblas_get_corename", "
 
 
 class MissingPackageError(RilleError):
-    """A package that a stage imports is not installed."""
+    """A package that a stage imports, or what was asked for needs, is not installed."""
 
 
 def versions(module: str) -> dict[str, str]:
@@ -60,6 +60,19 @@ def versions(module: str) -> dict[str, str]:
 def installed() -> dict[str, str]:
     """Versions for people: of Python and of :data:`NAMED`; no stage depends on this."""
     return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in NAMED}
+
+
+def require(package: str, *, extra: str) -> None:
+    """Refuse what needs a package that is not installed.
+
+    Raises
+    ------
+    MissingPackageError
+        The message has the extra of Rille that brings it.
+    """
+    if importlib.util.find_spec(package) is None:
+        remedy = f"pip install 'rille[{extra}]'"
+        raise MissingPackageError("RIL-531", f"package {package} is not installed", remedy=remedy)
 
 
 @cache

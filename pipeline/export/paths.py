@@ -1,9 +1,17 @@
-"""The path over the merged terrain as a file for GIS programs."""
+"""The path over the merged terrain as a file for GIS programs.
+
+A GeoPackage is a SQLite file with tables of agreed names (OGC 12-128r19), which Python writes by itself: GDAL's writer
+would be a second GDAL beside rasterio's, of 100 MB.
+"""
 
 from __future__ import annotations
 
+import sqlite3
 import struct
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +28,36 @@ LINE_Z, POINT_Z = 1002, 1001
 GPKG_DATE = "2000-01-01T00:00:00.000Z"
 """Written as time of change into every GeoPackage, so that equal paths make equal files."""
 
+SQLITE_VERSION = slice(96, 100)
+"""Bytes of a SQLite file that name the version of the library that wrote it, which nobody reads."""
+
+OWN_CRS = 100_000
+"""Number within a GeoPackage of a coordinate system that has none of the EPSG."""
+
+SCHEMA = """
+PRAGMA application_id = 0x47504B47;
+PRAGMA user_version = 10300;
+CREATE TABLE gpkg_spatial_ref_sys (
+  srs_name TEXT NOT NULL, srs_id INTEGER NOT NULL PRIMARY KEY, organization TEXT NOT NULL,
+  organization_coordsys_id INTEGER NOT NULL, definition TEXT NOT NULL, description TEXT);
+CREATE TABLE gpkg_contents (
+  table_name TEXT NOT NULL PRIMARY KEY, data_type TEXT NOT NULL, identifier TEXT UNIQUE, description TEXT DEFAULT '',
+  last_change DATETIME NOT NULL, min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE,
+  srs_id INTEGER REFERENCES gpkg_spatial_ref_sys(srs_id));
+CREATE TABLE gpkg_geometry_columns (
+  table_name TEXT NOT NULL UNIQUE REFERENCES gpkg_contents(table_name), column_name TEXT NOT NULL,
+  geometry_type_name TEXT NOT NULL, srs_id INTEGER NOT NULL REFERENCES gpkg_spatial_ref_sys(srs_id),
+  z TINYINT NOT NULL, m TINYINT NOT NULL, PRIMARY KEY (table_name, column_name));
+INSERT INTO gpkg_spatial_ref_sys VALUES ('undefined cartesian', -1, 'NONE', -1, 'undefined', NULL);
+INSERT INTO gpkg_spatial_ref_sys VALUES ('undefined geographic', 0, 'NONE', 0, 'undefined', NULL);
+"""
+
+WGS84 = 4326
+"""EPSG number of a system that each GeoPackage must define."""
+
+COLUMN_TYPES = {str: "TEXT", bool: "BOOLEAN", int: "INTEGER", float: "DOUBLE"}
+"""SQL type of the first of these types that a property is of."""
+
 
 def write_path(path: Path, planned: Bundle, place: Georeference | None = None) -> None:
     """Write a path as GeoPackage: layers ``path`` (line) and ``ends`` (start, target).
@@ -31,29 +69,67 @@ def write_path(path: Path, planned: Bundle, place: Georeference | None = None) -
         are properties of the line.
     place : of the world frame; the coordinates are then those of its CRS, else of the engineering CRS.
     """
-    import pyogrio
-    from pyogrio.raw import write
-
-    # SpatiaLite, which nothing here needs, would look for PROJ's data in the current folder.
-    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": GPKG_DATE, "SPATIALITE_LOAD": "NO"})
     facts = {"name": "path", "frame": FRAME, "axes": axes(place), "unit": "m", **planned.meta}
     facts = {name: value for name, value in facts.items() if isinstance(value, str | int | float)}
-    columns = [np.array([value], dtype=object if isinstance(value, str) else None) for value in facts.values()]
-    common = {"driver": "GPKG", "crs": ENGINEERING_CRS if place is None else place.crs}
     vertices = np.asarray(planned["path"]) if place is None else place.apply(np.asarray(planned["path"]))
-    line = np.array([_wkb(LINE_Z, vertices) if len(vertices) > 1 else None], dtype=object)
-    with atomic.replacing(path) as temporary:
-        write(temporary, line, columns, list(facts), layer="path", geometry_type="LineString Z", **common)
+    with closing(sqlite3.connect(":memory:")) as package:
+        package.executescript(SCHEMA)
+        crs = _enter_crs(package, place)
+        _add_layer(package, "path", LINE_Z, crs, [(vertices if len(vertices) > 1 else None, facts)])
         if len(vertices):
-            ends = np.array([_wkb(POINT_Z, vertices[at]) for at in (0, -1)], dtype=object)
-            names = [np.array(["start", "target"], dtype=object)]
-            write(temporary, ends, names, ["name"], layer="ends", geometry_type="Point Z", append=True, **common)
+            _add_layer(
+                package, "ends", POINT_Z, crs, [(vertices[0], {"name": "start"}), (vertices[-1], {"name": "target"})]
+            )
+        package.commit()
+        content = bytearray(package.serialize())
+    content[SQLITE_VERSION] = bytes(4)
+    atomic.write(path, bytes(content))
 
 
-def _wkb(kind: int, points: NDArray[np.float64]) -> bytes:
-    """Well-known binary, little-endian, of a point (3,) or a line (n, 3)."""
+def _enter_crs(package: sqlite3.Connection, place: Georeference | None) -> int:
+    """Number of the coordinate system within a GeoPackage, which holds it from now on."""
+    from rasterio.crs import CRS
+
+    row = "INSERT OR IGNORE INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, NULL)"
+    package.execute(row, ("WGS 84", WGS84, "EPSG", WGS84, CRS.from_epsg(WGS84).to_wkt()))
+    crs = None if place is None else CRS.from_user_input(place.crs)
+    number, wkt = (None, ENGINEERING_CRS) if crs is None else (crs.to_epsg(), crs.to_wkt())
+    number, owner = (OWN_CRS, "NONE") if number is None else (number, "EPSG")
+    package.execute(row, (wkt.split('"')[1], number, owner, number, wkt))
+    return number
+
+
+def _add_layer(
+    package: sqlite3.Connection,
+    name: str,
+    kind: int,
+    crs: int,
+    features: Sequence[tuple[NDArray[np.float64] | None, Mapping[str, Any]]],
+) -> None:
+    """Add a table of features, each with its points (n, 3) or (3,), or none, and its properties."""
+    kind_name = "LINESTRING" if kind == LINE_Z else "POINT"
+    properties = features[0][1]
+    types = {
+        key: next(sql for kind, sql in COLUMN_TYPES.items() if isinstance(v, kind)) for key, v in properties.items()
+    }
+    columns = "".join(f', "{key}" {sql}' for key, sql in types.items())
+    package.execute(f"CREATE TABLE {name} (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom {kind_name}{columns})")
+    places = [np.atleast_2d(points)[:, :2] for points, _ in features if points is not None]
+    spread = np.concatenate(places) if places else np.empty((0, 2))
+    extent = [*spread.min(axis=0).tolist(), *spread.max(axis=0).tolist()] if places else [None] * 4
+    contents = (name, "features", name, "", GPKG_DATE, *extent, crs)
+    package.execute("INSERT INTO gpkg_contents VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", contents)
+    package.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 1, 0)", (name, kind_name, crs))
+    for points, values in features:
+        row = (None if points is None else _geometry(kind, points, crs), *values.values())
+        package.execute(f"INSERT INTO {name} VALUES (NULL{', ?' * len(row)})", row)
+
+
+def _geometry(kind: int, points: NDArray[np.float64], crs: int) -> bytes:
+    """Well-known binary, little-endian, of a point (3,) or a line (n, 3), behind the header of a GeoPackage."""
+    header = struct.pack("<2sBBi", b"GP", 0, 1, crs)
     count = struct.pack("<I", len(points)) if kind == LINE_Z else b""
-    return struct.pack("<BI", 1, kind) + count + np.ascontiguousarray(points, dtype="<f8").tobytes()
+    return header + struct.pack("<BI", 1, kind) + count + np.ascontiguousarray(points, dtype="<f8").tobytes()
 
 
 OUTPUTS = (

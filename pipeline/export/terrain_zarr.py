@@ -16,7 +16,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numcodecs
 import numpy as np
@@ -31,9 +31,6 @@ from rille.stages.core.declare import Array, Bundle
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain import merge
 from rille.stages.terrain.shading import slope_deg
-
-if TYPE_CHECKING:
-    import xarray
 
 CONVENTIONS = "CF-1.11"
 CHUNK_CELLS = 512
@@ -57,42 +54,54 @@ def write_terrain(
     place : of the world frame, where it is known.
     facts : attributes of the whole group, e.g. ``title``, ``source``.
     """
-    import xarray
+    import zarr
 
     where = {} if place is None else {f"georeference_{name}": value for name, value in place.to_dict().items()}
     about = {"Conventions": CONVENTIONS, "frame": FRAME, **facts, "cell_size_m": lattice.cell, **where}
     variables = {name: _variable(spec, values) for name, (spec, values) in arrays.items()}
     others = [name for name in arrays if name not in ("elevation", "ortho", SLOPE.name)]
-    variables["elevation"].attrs |= {"positive": "up", "ancillary_variables": " ".join(others)}
-    data = xarray.Dataset(variables, _coordinates(lattice), about)
-    for variable in data.variables.values():
-        variable.encoding["chunks"] = tuple(min(n, CHUNK_CELLS) for n in variable.shape) or None
-        # Of the compressors, zlib is in every build of GDAL.
-        variable.encoding["compressors"] = [numcodecs.Zlib(level=1)]
+    variables["elevation"].attributes.update(positive="up", ancillary_variables=" ".join(others))
     # zarr says that readers of other languages may not know consolidated metadata.
     with atomic.replacing(path) as folder, warnings.catch_warnings(action="ignore"):
-        data.to_zarr(folder, mode="w", zarr_format=2, consolidated=True, write_empty_chunks=True)
+        group = zarr.create_group(folder, zarr_format=2, attributes=about)
+        for name, variable in (variables | _coordinates(lattice)).items():
+            group.create_array(
+                name,
+                data=variable.values,
+                chunks=tuple(min(n, CHUNK_CELLS) for n in variable.values.shape) or "auto",
+                compressors=numcodecs.Zlib(level=1),  # in every build of GDAL
+                fill_value=variable.unknown,
+                attributes={**variable.attributes, "_ARRAY_DIMENSIONS": list(variable.dims)},
+                config={"write_empty_chunks": True},
+            )
+        zarr.consolidate_metadata(group.store)
 
 
-def _variable(spec: Array, values: NDArray[Any]) -> xarray.Variable:
-    import xarray
+class _Variable(NamedTuple):
+    """Values with the names of their axes, attributes, and the value of a cell where nothing is known, if any."""
 
+    dims: tuple[str, ...]
+    values: NDArray[Any]
+    attributes: dict[str, Any]
+    unknown: float | None = None
+
+
+def _variable(spec: Array, values: NDArray[Any]) -> _Variable:
     about: dict[str, Any] = {
         "units": UNITS.get(spec.unit, spec.unit),
         "long_name": spec.long_name,
         "frame": spec.frame or "world",
         # GDAL's own attribute for the system of a zarr array.
         "_CRS": {"wkt": ENGINEERING_CRS},
+        "coordinates": "spatial_ref",
     }
     if spec.unit in UNITS:
         about["quantity"] = spec.unit
     unknown = np.nan if values.dtype.kind == "f" else int(spec.nodata) if spec.nodata else None
-    return xarray.Variable(("y", "x"), values, about, {"_FillValue": unknown})
+    return _Variable(("y", "x"), values, about, unknown)
 
 
-def _coordinates(lattice: Lattice) -> dict[str, xarray.Variable]:
-    import xarray
-
+def _coordinates(lattice: Lattice) -> dict[str, _Variable]:
     half = 0.5 * lattice.cell
     # In GDAL's order, which is not that of affine.
     corner = lattice.x0 - half, lattice.cell, 0.0, lattice.y0 + half, 0.0, -lattice.cell
@@ -103,10 +112,10 @@ def _coordinates(lattice: Lattice) -> dict[str, xarray.Variable]:
         "long_name": "Rille world frame (local metres)",
         "GeoTransform": " ".join(f"{v:.17g}" for v in corner),
     }
-    coordinates = {"spatial_ref": xarray.Variable((), np.int32(0), reference)}
+    coordinates = {"spatial_ref": _Variable((), np.array(0, np.int32), reference)}
     for axis, values, words in (("x", lattice.xs(), "right"), ("y", lattice.ys(), "ahead")):
         about = {"units": "m", "axis": axis.upper(), "long_name": f"{axis} of the cell centre, world frame, {words}"}
-        coordinates[axis] = xarray.Variable((axis,), values, about, {"_FillValue": None})
+        coordinates[axis] = _Variable((axis,), values, about)
     return coordinates
 
 

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyproj
 from numpy.typing import NDArray
 
 from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.failures import reported
+from rille.pipeline.engine.packages import require
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.colour import LUMA
 from rille.pipeline.export.programs.placed_pairs import PlacedPairs
@@ -81,9 +81,11 @@ def export(run: RunArtifacts, output: Path, choice: Thinning) -> str:
     InputError
         The run has no pair with a disparity and a pose, or the file cannot be written.
     """
+    from rasterio.crs import CRS
+
     place, made = _place(run.run), _Made()
     # LAS 1.4 knows the first version of WKT alone.
-    crs = pyproj.CRS(place.crs if place is not None else ENGINEERING_CRS).to_wkt("WKT1_GDAL")
+    crs = CRS.from_user_input(place.crs if place is not None else ENGINEERING_CRS).to_wkt(version="WKT1_GDAL")
     write = _write_laz if output.suffix == ".laz" else _write_ply
     with (
         reported("RIL-618", f"{output} cannot be written", remedy="name another file with -o", kind=InputError),
@@ -136,6 +138,7 @@ def _pairs(run: RunArtifacts, every: int, place: Georeference | None, made: _Mad
 
 def _write_laz(path: Path, parts: Iterator[Columns], crs: str) -> None:
     """LAS 1.4, point format 7, the CRS as WKT 1."""
+    require("laspy", extra="las")
     import laspy
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
