@@ -109,9 +109,10 @@ def _pair(scene: Scene, pair: int, width: int) -> Panel:
     band, sign = depth_band(view.sequence.rig)
     there = matched(np.asarray(bundle["validity"]))
     seen = np.full(there.shape, 96, np.uint8) if image is None else grey_bytes(np.asarray(image["image"]))
-    pictures, words = [_photo(seen, width)], [f"{there.mean():.0%} matched"]
+    photo = _photo(seen, width)
+    pictures, words = [photo], [f"{there.mean():.0%} matched"]
     if seen.shape[:2] == there.shape:
-        pictures.append(_photo(_matches(seen, sign * np.asarray(bundle[band]), there), width))
+        pictures.append(_matches(photo, sign * np.asarray(bundle[band]), there))
     dem = gather.terrain(view.bundle(view.products.local_dem.get(pair)), "elevation")
     if dem is not None:
         pictures.append(_elevations(dem, (), width))
@@ -159,7 +160,7 @@ def _column(pictures: Sequence[Image], alt: str, frame: int) -> Panel:
 def _photo(pixels: NDArray[np.uint8], width: int) -> Image:
     from PIL import Image
 
-    return _scaled(Image.fromarray(pixels).convert("RGBA"), width)
+    return _scaled(Image.fromarray(pixels), width).convert("RGBA")
 
 
 def _scaled(picture: Image, width: int) -> Image:
@@ -171,14 +172,19 @@ def _scaled(picture: Image, width: int) -> Image:
     return picture.resize(size, Image.Resampling.BOX if factor < 1 else Image.Resampling.NEAREST)
 
 
-def _matches(seen: NDArray[np.uint8], disparity: Floats, there: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Disparities in colour on the image; pixels that were not matched stay grey."""
+def _matches(photo: Image, disparity: Floats, there: NDArray[np.bool_]) -> Image:
+    """Disparities (row, col) in colour on the image; pixels that were not matched stay grey."""
+    from PIL import Image
+
     low, high = ranges.limits(np.where(there, disparity, np.nan))
+    # The pixel in the middle of each of the small picture's.
+    at = np.ix_(
+        *(((np.arange(n) + 0.5) * of / n).astype(int) for n, of in zip(photo.size[::-1], there.shape, strict=True))
+    )
     # The smaller the nearer a point is: turned round, so that blue is far.
-    colors = _colors((high - disparity) / max(high - low, 1e-9))
-    ground = seen if seen.ndim == 3 else np.repeat(seen[..., None], 3, axis=-1)
+    colors, ground = _colors((high - disparity[at]) / max(high - low, 1e-9)), np.asarray(photo.convert("RGB"))
     # Divided before multiplied: bytes would overflow the other way round.
-    return np.where(there[..., None], colors // 3 * 2 + ground // 3, ground)
+    return Image.fromarray(np.where(there[at][..., None], colors // 3 * 2 + ground // 3, ground)).convert("RGBA")
 
 
 def _elevations(dem: Terrain, lines: Sequence[StripLine], width: int) -> Image:
