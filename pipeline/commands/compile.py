@@ -49,4 +49,4 @@ def compile_kernels() -> int:
 
 
 def _kernels() -> set[str]:
-    return {path.name for path in kernels.folder().glob("*.nbc")}
+    return {str(path) for path in kernels.folder().glob("*/*.nbc")}

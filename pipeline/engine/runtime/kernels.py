@@ -9,7 +9,7 @@ for it (locators, events), a kernel
   (:mod:`rille.pipeline.engine.code_digest`), so that an edit compiles anew what it can change, and nothing else;
 - is compiled by one process at a time: the others wait, and load it;
 - has its checksum in a file beside it, which is compared before numba loads anything;
-- lies in :func:`rille.pipeline.engine.runtime.private.private_folder`, because loading one executes it.
+- lies in a folder of its function, in :func:`rille.pipeline.engine.runtime.private.private_folder`, because loading one executes it.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ UNUSED_DAYS = 30
 PATIENCE_SECONDS, PAUSE_SECONDS = 120.0, 0.02
 """Time that a process waits for another that compiles, and between two looks."""
 
-CHECKSUMS = TypeAdapter(dict[str, str])
-"""SHA-256 of a kernel's files by their names."""
+CHECKSUMS, CHECKSUMS_FILE = TypeAdapter(dict[str, str]), "checksums.json"
+"""SHA-256 of a kernel's files by their names; the file that holds them."""
 
 
 def use_own_folder() -> None:
@@ -67,10 +67,10 @@ def folder() -> Path:
 
 
 def unused() -> list[Path]:
-    """Files of kernels that no process asked for within :data:`UNUSED_DAYS`."""
+    """Folders of kernels that no process asked for within :data:`UNUSED_DAYS`."""
     limit, old = time.time() - 86400 * UNUSED_DAYS, []
     for path in sorted(folder().glob("*")):
-        with suppress(FileNotFoundError):  # numba renames a file as soon as it is written
+        with suppress(FileNotFoundError):  # another process clears up, too
             old += [path] if path.stat().st_mtime <= limit else []
     return old
 
@@ -83,7 +83,7 @@ class Locator:
 
         module = function.__module__
         code = (numba.__version__, module, function.__qualname__, code_digest(module), _content(function.__code__))
-        self._name = hashlib.sha256(repr(code).encode()).hexdigest()[:24]
+        self._folder = folder() / hashlib.sha256(repr(code).encode()).hexdigest()[:24]
 
     @classmethod
     def from_function(cls, function: Any, _: str) -> Locator | None:
@@ -98,42 +98,38 @@ class Locator:
     def ensure_cache_path(self) -> None:
         """Make the folder; numba saves a kernel next."""
         # For this user alone: whoever writes here runs code when a kernel is loaded.
-        folder().mkdir(mode=0o700, exist_ok=True)
+        for path in (folder(), self._folder):
+            path.mkdir(mode=0o700, exist_ok=True)
         COMPILING.saved.append(self)
 
     def get_cache_path(self) -> str:
         """Return the folder."""
-        return str(folder())
+        return str(self._folder)
 
     def get_source_stamp(self) -> str:
-        """Return what files of one name must share: their name says it all."""
+        """Return what files of one folder must share: its name says it all."""
         return ""
 
     def get_disambiguator(self) -> str:
-        """Return the part of the files' names that tells code apart."""
-        return self._name
+        """Return the part of the files' names that tells code apart: their folder does."""
+        return ""
 
     def note_checksums(self) -> None:
         """Write the checksums of the function's kernels."""
         with suppress(OSError):  # cleared away just now
-            write_hint(self._checksums(), {path.name: _sha256(path) for path in self._files()})
+            write_hint(self._folder / CHECKSUMS_FILE, {path.name: _sha256(path) for path in self._files()})
 
     def remove_damaged(self) -> None:
-        """Remove files that are not as they were saved; mark the others as used."""
-        noted = read_hint(self._checksums(), CHECKSUMS) or {}
-        with suppress(OSError):  # cleared away just now
+        """Remove files that are not as they were saved; mark the folder as used."""
+        noted = read_hint(self._folder / CHECKSUMS_FILE, CHECKSUMS) or {}
+        with suppress(OSError):  # there is none, or it was cleared away just now
             for path in self._files():
-                if noted.get(path.name) == _sha256(path):
-                    os.utime(path)
-                else:
+                if noted.get(path.name) != _sha256(path):
                     path.unlink()
-            os.utime(self._checksums())
+            os.utime(self._folder)
 
     def _files(self) -> list[Path]:
-        return [*folder().glob(f"*-{self._name}.*.nb[ic]")]
-
-    def _checksums(self) -> Path:
-        return folder() / f"{self._name}.json"
+        return [*self._folder.glob("*.nb[ic]")]
 
 
 def _content(code: CodeType) -> tuple[object, ...]:

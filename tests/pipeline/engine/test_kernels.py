@@ -88,7 +88,7 @@ def test_an_edit_beside_it_compiles_nothing_and_checkouts_share(checkout, tmp_pa
     (stages / "other.py").write_text("X = 1\n")
     (stages / "caller.py").write_text(f'"""Words."""\n\n# and a comment\n{CALLER}')
     assert said(start()) == ["43", "1"]
-    assert {path.parent for path in tmp_path.rglob("*.nbc")} == {tmp_path / "user" / "rille" / "kernels"}
+    assert {path.parent.parent for path in tmp_path.rglob("*.nbc")} == {tmp_path / "user" / "rille" / "kernels"}
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_an_edit_beside_it_compiles_nothing_and_checkouts_share(checkout, tmp_pa
 def test_a_damaged_kernel_is_compiled_anew(checkout, tmp_path, kind, damage):
     _, start = checkout("one")
     said(start())
-    for path in (tmp_path / "user/rille/kernels").glob(f"*.{kind}"):
+    for path in (tmp_path / "user/rille/kernels").glob(f"*/*.{kind}"):
         path.write_bytes(damage(path.read_bytes()))
     assert said(start()) == ["43", "0"]
     assert said(start()) == ["43", "1"]
@@ -124,11 +124,11 @@ def test_functions_of_others_stay_where_numba_keeps_them():
 
 def test_kernels_that_nothing_loads_are_cleared(tmp_path, monkeypatch):
     monkeypatch.setattr(kernels, "folder", lambda: tmp_path)
-    old, new = tmp_path / "old.nbc", tmp_path / "new.nbc"
+    old, new = tmp_path / "old", tmp_path / "new"
     for path in (old, new):
-        path.write_bytes(b"")
+        path.mkdir()
     os.utime(old, (0, 0))
-    (old.parent / "renamed-meanwhile").symlink_to("nowhere")
+    (old.parent / "cleared-meanwhile").symlink_to("nowhere")
     assert kernels.unused() == [old]
 
 
