@@ -85,4 +85,4 @@ def _execute_elsewhere(execute: Callable[[ModuleType], None], module: ModuleType
             stack.enter_context(chdir(private_folder()))
         execute(module)
     if module.__name__ == NUMBA_CONFIG:
-        module._config_fname = ""  # type: ignore[attr-defined]  # it is read again whenever a kernel is compiled
+        module.reload_config = lambda: None  # type: ignore[attr-defined]  # called whenever a kernel is compiled
