@@ -14,8 +14,12 @@ from rille.datasets.protocol import Positions
 from rille.pipeline.engine.graph import Handle
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
-TRUE = {"truth", "truth_dem/local", "truth_dem/world"}
+OF_DISPARITY = {"truth_disparity", "disparity_accuracy"}
+"""These hang on no pose."""
+
+TRUE = {"truth", "truth_dem/local", "truth_dem/world", "truth_disparity"}
 JUDGES = {"accuracy", "accuracy/crosscheck", "dem_accuracy/local", "dem_accuracy/world", "risk/truth", "path_check"}
+JUDGES |= {"disparity_accuracy"}
 PICTURES = {"scene", "image/left", "image/right"}
 """They were taken from true poses; all that is estimated is estimated from them."""
 
@@ -46,7 +50,7 @@ def test_another_truth_changes_what_judges_and_no_estimate(chain: Chain) -> None
     shift = RigidTransform(rotation_exp([0.01, -0.02, 0.03]), np.array([0.1, 0.2, -0.3]))
     moved = tuple(None if T is None else T @ shift for T in chain.sequence.truth)
     graph = chain.plan({}, replace(chain.sequence, truth=moved))
-    assert {group(label) for label in stale(graph)} == JUDGES | TRUE
+    assert {group(label) for label in stale(graph)} == (JUDGES | TRUE) - OF_DISPARITY
     without = chain.plan({}, replace(chain.sequence, truth=None, truth_dem=None, truth_disparity=None))
     assert stale(without) == set()
     lost = {group(h.label) for h in chain.base.nodes} - {group(h.label) for h in without.nodes}

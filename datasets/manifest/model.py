@@ -157,8 +157,8 @@ class RigSection(Table):
         return self
 
 
-class Disparity(Table):
-    """``[disparity]``: maps that another program made of the left images, in the place of the matcher's."""
+class DisparityMaps(Table):
+    """``[truth_disparity]``: true disparities of the left images, only to judge the matcher's."""
 
     left: str
     """pattern of the maps, one a pair, named or numbered as the left images are: .pfm, .tif or .npy of floating point
@@ -166,6 +166,11 @@ class Disparity(Table):
     sign: Literal["left-right", "right-left"] = "left-right"
     """left-right: values are the column in the left image minus that in the right one, the usual; right-left: the
     reverse"""
+
+
+class Disparity(DisparityMaps):
+    """``[disparity]``: maps that another program made of the left images, in the place of the matcher's."""
+
     sigma: Annotated[float, Field(gt=0)] | str | None = None
     """px; standard deviation of all values, or pattern of maps of it; estimated by default"""
 
@@ -303,6 +308,7 @@ class Manifest(Table):
     masks: Masks = Masks()
     times: Times | None = None
     truth: Truth | None = None
+    truth_disparity: DisparityMaps | None = None
     odometry: PoseFile | None = None
     attitude: Attitude | None = None
     imu: Imu | None = None

@@ -20,7 +20,15 @@ from rille.datasets.cameras.model import RECTIFIED
 from rille.datasets.images import disparities, files
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import ImagePair, common_headers, pair_up
-from rille.datasets.manifest.model import Cameras, Disparity, Images, Manifest, RigSection, read_manifest
+from rille.datasets.manifest.model import (
+    Cameras,
+    Disparity,
+    DisparityMaps,
+    Images,
+    Manifest,
+    RigSection,
+    read_manifest,
+)
 from rille.datasets.manifest.motion import MotionReader, StatedMotion
 from rille.datasets.manifest.rig import read_optics
 from rille.datasets.protocol import Sequence, Source
@@ -56,8 +64,11 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
     base, pairs = _of_bag(manifest, root, name) or _of_files(manifest, root, name, digests)
     if manifest.disparity is not None:
         note = f"disparities are those of {manifest.disparity.left}, made by another program, and checked"
-        disparity = _disparity(manifest.disparity, root, name, (base, pairs), digests)
+        disparity = _disparity("disparity", manifest.disparity, root, name, (base, pairs), digests)
         base = replace(base, disparity=disparity, notes=(*base.notes, note))
+    if manifest.truth_disparity is not None:
+        exact = _disparity("truth_disparity", manifest.truth_disparity, root, name, (base, pairs), digests)
+        base = replace(base, truth_disparity=exact)
     motion = MotionReader(root, name, pairs, StatedMotion(base.times)).read(manifest)
     world, pinned = manifest.world, {} if manifest.rig.file is None else {"rig.mode": "fixed"}
     pitch = None if world.pitch_deg is None else math.radians(world.pitch_deg)
@@ -132,20 +143,26 @@ def _of_bag(manifest: Manifest, root: Path, name: str) -> tuple[Sequence, tuple[
 
 
 def _disparity(
-    stated: Disparity, root: Path, name: str, found: tuple[Sequence, tuple[ImagePair, ...]], digests: files.Digests
+    key: str,
+    stated: DisparityMaps,
+    root: Path,
+    name: str,
+    found: tuple[Sequence, tuple[ImagePair, ...]],
+    digests: files.Digests,
 ) -> Callable[[int], Source]:
-    """Source of the disparity of a frame that another program made."""
+    """Source of the disparity of a frame that another program made, or of the true one; ``key``: the table's name."""
     sequence, pairs = found
     if sequence.lenses:
-        text = f"{name}: [disparity] needs images without distortion: maps are of undistorted, rectified images"
-        remedy = "give the images that the maps were made of (images.rectified = true), or leave [disparity] out"
+        text = f"{name}: [{key}] needs images without distortion: maps are of undistorted, rectified images"
+        remedy = f"give the images that the maps were made of (images.rectified = true), or leave [{key}] out"
         raise InputError("RIL-902", text, remedy=remedy)
     frames = [k for k, pair in enumerate(pairs) if not pair.absent]
     lefts = [pairs[k].left for k in frames]
-    maps = {"column_disparity": disparities.find(stated.left, root, lefts, f"{name}: disparity.left")}
-    sigma = stated.sigma if isinstance(stated.sigma, float) else None
-    if isinstance(stated.sigma, str):
-        maps["disparity_std"] = disparities.find(stated.sigma, root, lefts, f"{name}: disparity.sigma")
+    maps = {"column_disparity": disparities.find(stated.left, root, lefts, f"{name}: {key}.left")}
+    claimed = stated.sigma if isinstance(stated, Disparity) else None
+    sigma = claimed if isinstance(claimed, float) else None
+    if isinstance(claimed, str):
+        maps["disparity_std"] = disparities.find(claimed, root, lefts, f"{name}: {key}.sigma")
     size = sequence.rig.left.width, sequence.rig.left.height
     common = {"size": list(size), "sign": stated.sign, "sigma": sigma}
     for first, *_ in maps.values():

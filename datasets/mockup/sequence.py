@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -156,6 +157,11 @@ class Sources:
     rig: Rig
     inputs: Mapping[str, Source]
 
+    @cached_property
+    def given(self) -> dict[str, Any]:
+        """The rig as an argument, one object for all tasks."""
+        return self.rig.to_dict()
+
     def image(self, frame: int, camera: str, T_bed_camera: RigidTransform, sensor: RenderParams) -> Source:
         """Image of a true camera."""
         geometry = self.rig.left if camera == "left" else self.rig.right
@@ -169,12 +175,12 @@ class Sources:
 
     def disparity(self, frame: int, T_bed_left: RigidTransform) -> Source:
         """True disparity of a pair."""
-        args = {"frame": frame, "rig": self.rig.to_dict(), "T_bed_left": T_bed_left.to_list()}
+        args = {"frame": frame, "rig": self.given, "T_bed_left": T_bed_left.to_list()}
         return Source("rille.datasets.mockup.truth", NoParams(), args, inputs=self.inputs)
 
     def dem(self, lattice: Mapping[str, Any], T_bed_world: RigidTransform, lefts: Iterable[RigidTransform]) -> Source:
         """True elevations, and which of them the pairs at some places see."""
-        args = {"lattice": dict(lattice), "T_bed_world": T_bed_world.to_list(), "rig": self.rig.to_dict()}
+        args = {"lattice": dict(lattice), "T_bed_world": T_bed_world.to_list(), "rig": self.given}
         args["pairs"] = [T.to_list() for T in lefts]
         return Source("rille.datasets.mockup.truth_dem", NoParams(), args, inputs=self.inputs)
 

@@ -10,14 +10,14 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from rille.pipeline.export import paths, rasters, terrain_zarr, trajectories
+from rille.pipeline.export import accuracy, paths, rasters, terrain_zarr, trajectories
 from rille.pipeline.export.output import Output
 from rille.pipeline.export.trajectories import stamps
 from rille.pipeline.export.view import RunView
 from rille.pipeline.export.writers import FRAME, ON_PLANE, UNLEVELLED
 from rille.stages.geometry.pose_arrays import NO_VERTICAL, REFERENCE_PLANE
 
-MADE = (trajectories, rasters, terrain_zarr, paths)
+MADE = (trajectories, rasters, terrain_zarr, paths, accuracy)
 """Modules whose outputs are tasks."""
 
 OUTPUTS = (

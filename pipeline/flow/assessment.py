@@ -4,6 +4,7 @@
 
     trajectory (each unbroken piece), crosscheck --> accuracy, position_accuracy <-- truth
     trajectory, crosscheck ------------------------> agreement (it needs none)
+    hfvm ------------------------------------------> disparity_accuracy <-- truth
     locus (local), merge --------------------------> dem_accuracy <-- truth_dem (exact elevations)
     path ------------------------------------------> path_check <-- risk (of these)
 """
@@ -20,6 +21,7 @@ from rille.pipeline.flow.builders import Builder, Pair
 from rille.stages.evaluation.accuracy import accuracy_stage
 from rille.stages.evaluation.agreement import agreement_stage
 from rille.stages.evaluation.dem_accuracy import dem_accuracy_stage
+from rille.stages.evaluation.disparity_accuracy import disparity_accuracy_stage
 from rille.stages.evaluation.path_check import path_check_stage
 from rille.stages.evaluation.position_accuracy import position_accuracy_stage
 from rille.stages.evaluation.truth import truth_stage
@@ -75,7 +77,13 @@ def _of_crosscheck(make: Builder, joined: Handle[JoinFacts], known: Handle[Truth
 
 
 def of_pair(make: Builder, pair: Pair) -> Steps:
-    """The local elevation model of a pair."""
+    """The disparity of a pair, and its local elevation model."""
+    exact_disparity = make.sequence.truth_disparity
+    if exact_disparity is not None:
+        true = make.source(exact_disparity(pair.frame), f"truth_disparity/{pair.frame}")
+        make.products.disparity_accuracy[pair.frame] = make.node(
+            disparity_accuracy_stage, f"disparity_accuracy/{pair.frame}", disparity=pair.disparity, truth=true
+        )
     if make.sequence.truth_dem is None or _truth(make, pair.frame) is None:
         return
     level, dem = (yield from done(pair.level)), (yield from done(pair.dem))

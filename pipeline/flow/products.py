@@ -96,6 +96,7 @@ class Products:
     accuracy: Handle[AccuracyFacts] | None = None
     position_accuracy: Handle[AccuracyFacts] | None = None
     accuracy_pieces: dict[int, Handle[AccuracyFacts]] = field(default_factory=dict)
+    disparity_accuracy: dict[int, Handle[MetricsFacts]] = field(default_factory=dict)
     local_dem_accuracy: dict[int, Handle[DemAccuracyFacts]] = field(default_factory=dict)
     dem_accuracy: Handle[DemAccuracyFacts] | None = None
     truth_risk: Handle | None = None

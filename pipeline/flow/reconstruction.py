@@ -329,7 +329,7 @@ def basic_pairs(make: Builder, rigs: dict[int, Handle[CalibrationFacts]]) -> Gen
             p.local_risk[k] = make.hazards(f"risk/local/{k}", [pair.dem])
             p.local_path[k] = make.node(path_stage, f"path/local/{k}", risk=p.local_risk[k], use="local")
         make.graph.flow(assessment.of_pair(make, pair), lays=("dem_accuracy",))
-    yield Complete(("hfvm",))
+    yield Complete(("hfvm", "disparity_accuracy"))
     return pairs
 
 

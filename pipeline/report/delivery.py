@@ -250,6 +250,8 @@ def _truth(view: RunView) -> Items:
         return [_item("no truth", f"{len(gaps)} of {len(known)} frames have no truth", which(gaps))]
     none = view.sequence.truth is None and view.sequence.truth_positions is None
     owner = "the sequence has none" if none else "it has none for the chosen frames"
+    if view.products.disparity_accuracy:
+        return [_item("no truth", "No true poses", f"{owner}, so the trajectory is not assessed")]
     return [_item("no truth", "No truth", f"{owner}, so accuracy is not assessed")]
 
 

@@ -37,6 +37,20 @@ LABELS: Mapping[str, str] = {
 ABBREVIATIONS = ("ate", "rpe", "kitti")
 """Parts of those names that are written in capitals."""
 
+DISPARITY: Mapping[str, str] = {
+    "median": "Error of matched pixels, median",
+    "completeness": "Matched pixels of those with truth",
+    "bad_1": "bad-1, all pixels, filled",
+    "bad_1_matched": "bad-1, matched pixels",
+    "bad_2": "bad-2, all pixels, filled",
+    "bad_2_matched": "bad-2, matched pixels",
+    "bad_4": "bad-4, all pixels, filled",
+    "bad_4_matched": "bad-4, matched pixels",
+    "within_1_sigma": "Errors within 1 σ",
+    "within_2_sigma": "Errors within 2 σ",
+}
+"""Words for errors of disparities."""
+
 OF_DRIVE = {"path_length": "Length driven"}
 """The same for what is judged by the simulator."""
 
@@ -103,6 +117,7 @@ def _against_truth(view: RunView, frames: Rows, pairs: Rows) -> dict[str, Metric
         lost = figures.get(f"{prefix}frames_missing", {}).get("value", len(frames) - posed)
         share = f"{len(frames) - lost} of {len(frames)} frames{of_truth}"
         by_name |= {name: {**entry, "completeness": share} for name, entry in figures.items()}
+    by_name |= _disparity(view)
     group, truth = "Elevation against truth", "exact elevations of the scene"
     by_name |= {name: {"group": group, "truth": truth, **m} for name, m in _local_elevation(view, pairs).items()}
     merged = _assessed(view, p.dem_accuracy, "dem_merged_", group, truth)
@@ -113,6 +128,20 @@ def _against_truth(view: RunView, frames: Rows, pairs: Rows) -> dict[str, Metric
         by_name[name] = {**entry, "label": label, "completeness": of_seen}
     group, truth = "Path against truth", "risk map of the exact elevations"
     return by_name | _assessed(view, p.path_check, "path_check_", group, truth, {})
+
+
+def _disparity(view: RunView) -> dict[str, Metric]:
+    """Errors of the disparities, each the mean over the pairs; those of each pair are in ``accuracy.json``."""
+    pairs = [facts_of(view, handle).get("metrics") for handle in view.products.disparity_accuracy.values()]
+    judged = [figures for figures in pairs if figures]
+    by_name = {}
+    for name in judged[0] if judged else ():
+        values = [figures[name]["value"] for figures in judged if figures[name]["value"] is not None]
+        label, how = DISPARITY[name], f"{judged[0][name]['how'].partition(', ')[0]}: mean over pairs"
+        every = f"{len(values)} of {len(pairs)} pairs"
+        entry = metric(label, statistics.fmean(values) if values else None, judged[0][name]["unit"], how, every)
+        by_name[f"disparity_{name}"] = {"group": "Disparity against truth", "truth": "true disparities", **entry}
+    return by_name
 
 
 def _assessed(

@@ -30,13 +30,15 @@ def gather(view: RunView) -> dict[str, Any]:
     scene = Scene(view)
     frames, pairs = tables.frames(scene), tables.pairs(scene)
     assessed, figures = any(delivery.has_truth(view)), metrics(scene, frames, pairs)
+    maps = bool(view.products.disparity_accuracy)
+    source = view.sequence.truth_source if assessed else "true disparities" if maps else "no truth"
     return {
         "verdict": _verdict(view, frames, pairs, figures),
         **delivery.account(scene, frames, pairs),
         "warnings": find_warnings(scene, figures),
         "seams": _seams(view),
         "sequence": _sequence(view),
-        "truth": {"used": assessed, "source": view.sequence.truth_source if assessed else "no truth"},
+        "truth": {"used": assessed or maps, "source": source},
         "metrics": figures,
         "frames": frames,
         "pairs": pairs,
@@ -194,8 +196,14 @@ def _small_sigma(figures: Mapping[str, Any]) -> list[str]:
     ]
 
 
-AGAINST_TRUTH = ("trajectory_drift", "trajectory_position_drift", "trajectory_ate_rmse", "dem_merged_rmse")
-"""The one figure against truth that the verdict gives: the first of these that has a value."""
+AGAINST_TRUTH = {
+    "trajectory_drift": "drift",
+    "trajectory_position_drift": "drift",
+    "trajectory_ate_rmse": "RMSE",
+    "dem_merged_rmse": "RMSE",
+    "disparity_bad_2": "bad-2",
+}
+"""The one figure against truth that the verdict gives: the first of these that has a value; and its word."""
 
 
 def _verdict(view: RunView, frames: delivery.Rows, pairs: delivery.Rows, figures: Mapping[str, Any]) -> str:
@@ -206,9 +214,8 @@ def _verdict(view: RunView, frames: delivery.Rows, pairs: delivery.Rows, figures
     stops = delivery.local_paths(pairs)
     length = facts_of(view, view.products.world_path).get("length_m")
     errors = [
-        f"{'drift' if name.endswith('drift') else 'RMSE'} "
-        f"{quantity(_value(figures, name), figures[name]['unit'])} against truth"
-        for name in AGAINST_TRUTH
+        f"{word} {quantity(_value(figures, name), figures[name]['unit'])} against truth"
+        for name, word in AGAINST_TRUTH.items()
         if _value(figures, name) is not None
     ]
     parts = [
@@ -217,7 +224,7 @@ def _verdict(view: RunView, frames: delivery.Rows, pairs: delivery.Rows, figures
         f"{models} of {len(pairs)} elevation models",
         *([f"{stops[0]} of {stops[1]} local paths"] if stops[1] else []),
         _way_words(view, length),
-        *([] if any(delivery.has_truth(view)) else ["not assessed against truth"]),
+        *([] if errors or any(delivery.has_truth(view)) else ["not assessed against truth"]),
     ]
     first = "".join(f"{line}. " for line in delivery.contradictions(view)[:1])
     return first + ", ".join(parts) + "."
@@ -326,7 +333,8 @@ def _reads(run: RunView) -> tuple[object, ...]:
     return (
         *(p.contradictions, p.intrinsics, p.crosschecks, p.crosscheck, p.agreement, p.crosscheck_accuracy),
         *(p.trajectory, p.accuracy, p.position_accuracy, p.overlap_audit, p.rigs, p.resections, p.refined),
-        *(p.world_tiles, p.world_risk, p.world_path, p.dem_accuracy, p.path_check, p.drive, *tables.of_pairs(p)),
+        *(p.world_tiles, p.world_risk, p.world_path, p.dem_accuracy, p.path_check, p.drive),
+        *(p.disparity_accuracy, *tables.of_pairs(p)),
         *(config.vehicle, config.rig.significance, config.crosscheck.enabled),
         *(s.name, s.frames, s.frame_names, s.rig, s.truth, s.truth_source, s.truth_positions, s.warnings, s.notes),
         *(s.evaluation_window, s.georeference, s.times, s.up, s.attitude, s.imu_axes),

@@ -209,6 +209,16 @@ def test_a_manifest_names_maps(tmp_path, materialise, more, column, sigma):
     assert any("disp/*.npy" in note for note in s.notes)
 
 
+def test_true_maps_are_no_disparities_of_another_program(tmp_path, materialise):
+    sequence(tmp_path)
+    path = write_sequence(tmp_path, '[truth_disparity]\nleft = "disp/*.npy"\n')
+    s = open_manifest(path, Digests())
+    assert s.disparity is None
+    assert (materialise(s.truth_disparity(1))["column_disparity"] == -20).all()
+    with raises("RIL-223", "sigma"):
+        open_manifest(write_sequence(tmp_path, '[truth_disparity]\nleft = "disp/*.npy"\nsigma = 1\n'), Digests())
+
+
 def test_lost_frames_need_no_map(tmp_path, materialise):
     sequence(tmp_path)
     (tmp_path / "left" / "01.png").unlink()

@@ -1,0 +1,87 @@
+"""Disparities against truth, as stereo benchmarks judge them: errors and completeness, of matches and of all pixels.
+
+Columns alone are compared, which is all that truth of rectified images states. A matcher that leaves out what is hard
+errs less: so all pixels with truth are judged, too, those without a match filled in the usual way of Middlebury and
+KITTI, by the nearest match in their row, of two the background's.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rille.stages.core.arrays import Bools, Floats32
+from rille.stages.core.declare import Array, Bundle, NoParams, stage
+from rille.stages.core.validity import matched
+from rille.stages.evaluation.accuracy_parts import metric
+from rille.stages.facts.evaluation import Metric, MetricsFacts
+from rille.stages.facts.matching import DisparityFacts
+
+THRESHOLDS_PX = (1, 2, 4)
+"""An error beyond these counts as bad: bad-1, bad-2, bad-4."""
+
+SIGMAS = (1, 2)
+"""Standard deviations within which errors are counted."""
+
+
+def filled(column: Floats32, match: Bools) -> Floats32:
+    """Disparities (row, col), pixels right minus left, with every pixel that lacks a match filled along its row.
+
+    The cameras are parallel: of two matches the one with the greater value, the lesser disparity, is the background's.
+    A row without a match stays NaN.
+    """
+    cols = np.arange(column.shape[1])
+    before = np.maximum.accumulate(np.where(match, cols, -1), axis=1)
+    after = np.minimum.accumulate(np.where(match, cols, len(cols))[:, ::-1], axis=1)[:, ::-1]
+    sides = [
+        np.where(there, np.take_along_axis(column, np.where(there, at, 0), axis=1), -np.inf)
+        for at, there in ((before, before >= 0), (after, after < len(cols)))
+    ]
+    nearest = np.maximum(*sides)
+    return np.where(np.isfinite(nearest), nearest, np.nan).astype(np.float32)
+
+
+def disparity_accuracy(column: Floats32, match: Bools, sigma: Floats32, truth: Floats32) -> dict[str, Metric]:
+    """Metrics by name.
+
+    Parameters
+    ----------
+    column, truth : (row, col) pixels, right minus left; NaN unknown.
+    match : (row, col) pixels with a measured disparity.
+    sigma : (row, col) pixels, standard deviation that is claimed for it.
+    """
+    known = np.isfinite(truth)
+    both = known & match & np.isfinite(column)
+    error = np.abs(column - truth)[both]
+    every = np.abs(filled(column, both | (match & ~known)) - truth)[known]
+    of_matched, of_all = f"{error.size} matched of {every.size} pixels with truth", f"{every.size} pixels with truth"
+    claimed = sigma[both]
+    figures = {
+        "median": metric(float(np.median(error)) if error.size else None, "px", f"median error, {of_matched}"),
+        "completeness": metric(error.size / every.size if every.size else None, "1", f"share: {of_matched}"),
+    }
+    for limit in THRESHOLDS_PX:
+        words = f"share off by more than {limit} px, "
+        # Not "greater": where nothing is known the error is NaN, and bad.
+        worse = float(np.mean(~(every <= limit))) if every.size else None
+        figures[f"bad_{limit}"] = metric(worse, "1", f"{words}{of_all}, filled along rows where not matched")
+        worse = float(np.mean(error > limit)) if error.size else None
+        figures[f"bad_{limit}_matched"] = metric(worse, "1", words + of_matched)
+    for count in SIGMAS:
+        share = float(np.mean(error <= count * claimed)) if error.size else None
+        how = f"share within {count} standard deviation{'s' * (count > 1)} of the disparity, {of_matched}"
+        figures[f"within_{count}_sigma"] = metric(share, "1", how)
+    return figures
+
+
+@stage(
+    "disparity_accuracy",
+    outputs=[Array("error", ("row", "col"), "float32", "px", "column disparity minus truth", "nan", "left image")],
+)
+def disparity_accuracy_stage(
+    params: NoParams, disparity: Bundle[DisparityFacts], truth: Bundle
+) -> Bundle[MetricsFacts]:
+    """Disparities against truth: bad-1, bad-2 and bad-4 of all pixels and of the matched ones, and completeness."""
+    column, sigma = (np.asarray(disparity[name]) for name in ("column_disparity", "disparity_std"))
+    true, match = np.asarray(truth["column_disparity"]), matched(np.asarray(disparity["validity"]))
+    error = np.where(match, column - true, np.float32(np.nan))
+    return Bundle({"error": error}, {"metrics": disparity_accuracy(column, match, sigma, true)})
