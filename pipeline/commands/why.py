@@ -14,7 +14,7 @@ from rille.pipeline.engine.memory import words
 from rille.pipeline.engine.plain import brief, some
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import artifact_path
-from rille.pipeline.flow.config import stages
+from rille.pipeline.flow.config import build
 from rille.pipeline.runs import lookup
 
 SHORT_DIGITS = 12
@@ -118,12 +118,12 @@ def _inputs(row: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]]) -> It
 
 def _recipe(made: Mapping[str, Any]) -> Iterable[str]:
     """Parameters, arguments, code and environment of an artifact."""
-    past, name = made["provenance"], made["stage"]
-    defaults = stages()[name].params().model_dump(mode="json") if name in stages() else {}
+    past = made["provenance"]
+    section, defaults = _section(made["stage"], past["params"])
     for name, value in past["params"].items():
         differs = name in defaults and defaults[name] != value
         note = f"   (default: {brief(defaults[name], WIDTH)})" if differs else ""
-        yield f"parameter     {made['stage']}.{name} = {brief(value, WIDTH)}{note}"
+        yield f"parameter     {section}.{name} = {brief(value, WIDTH)}{note}"
     yield from (f"argument      {name} = {brief(value, WIDTH)}" for name, value in past["args"].items())
     code = sorted(past["code"])
     yield f"code          {digest(past['code'])[:SHORT_DIGITS]} of {len(code)} modules: {some(code, 6)}"
@@ -132,6 +132,17 @@ def _recipe(made: Mapping[str, Any]) -> Iterable[str]:
     when = datetime.fromtimestamp(past["started"], UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     host = past["host"]
     yield f"computed      {when}, Python {past['python']}, {host['name']} ({host['machine']}, {host['cpus']} cores)"
+
+
+def _section(stage: str, params: Mapping[str, Any]) -> tuple[str, Mapping[str, Any]]:
+    """Section of the configuration that a stage's parameters are set in, and its defaults.
+
+    Several stages share one, as those of a tile share the matcher's: then its keys are theirs.
+    """
+    known = build().model_dump(mode="json")
+    shared = (name for name, values in known.items() if values.keys() == params.keys())
+    section = stage if stage in known else next(shared, stage)
+    return section, known.get(section, {})
 
 
 def _since(run: Path, row: Mapping[str, Any], made: Mapping[str, Any], store: Store) -> Iterable[str]:

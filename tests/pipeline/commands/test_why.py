@@ -77,7 +77,7 @@ def test_many_inputs_are_counted_and_an_artifact_that_has_gone_is_said(tmp_path)
 
 
 def test_differences_from_the_programs_defaults_are_marked():
-    from rille.pipeline.flow.config import stages
+    from rille.pipeline.flow.config import build, stages
 
     made = {
         "stage": "locus",
@@ -94,6 +94,8 @@ def test_differences_from_the_programs_defaults_are_marked():
     lines = list(why._recipe(made))
     assert [line for line in lines if "default:" in line] == ["parameter     locus.max_residual = 0.7   (default: 0.5)"]
     assert "argument      pair = 3" in lines
+    shared = {"stage": "hfvm_given", "provenance": made["provenance"] | {"params": build().hfvm.model_dump(mode="json")}}
+    assert list(why._recipe(shared))[0].startswith("parameter     hfvm.preset = ")
 
 
 def test_names_that_are_not_there_are_answered_by_the_nearest(three):
