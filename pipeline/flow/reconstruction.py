@@ -63,7 +63,6 @@ from rille.stages.facts.odometry import (
     RefineFacts,
     ScreeningFacts,
     StepTableFacts,
-    TrajectoryFacts,
 )
 from rille.stages.facts.terrain import OverlapFacts, TileIndexFacts
 from rille.stages.imaging.image_quality import image_quality_stage
@@ -196,7 +195,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     yield Complete(("radiometry", "merge"))
     if p.local_risk:
         p.world_risk = make.hazards("risk/world", p.world_tiles)
-        p.world_path = make.node(path_stage, "path/world", risk=p.world_risk, use="world", heading=heading(posed.meta))
+        p.world_path = make.node(path_stage, "path/world", risk=p.world_risk, use="world")
     yield from assessment.of_world(make, [pairs[k] for k in there])
 
 
@@ -466,12 +465,3 @@ def spread(pairs: list[int], most: int) -> list[int]:
     """Choose at most ``most`` of the pairs, evenly spaced, beginning with the first."""
     # Minus twice: rounds the stride up, so that no more than `most` remain.
     return pairs[:: -(-len(pairs) // most)]
-
-
-def heading(trajectory: TrajectoryFacts) -> list[float]:
-    """Mean driving direction (dx, dy) in the world: from the first to the last position; ahead where it rests."""
-    ends = trajectory["pieces"][trajectory["main"]]
-    at = [trajectory["positions"][trajectory["frames"].index(frame)] for frame in ends]
-    (x0, y0, _), (x1, y1, _) = (position for position in at if position is not None)
-    dx, dy = x1 - x0, y1 - y0
-    return [dx, dy] if dx * dx + dy * dy > 0 else [0.0, 1.0]

@@ -12,12 +12,9 @@ from rille.stages.facts.evaluation import Metric, MetricsFacts
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning import grid8
-from rille.stages.planning.path_ground import Maps, PathMaps, PathPrices, RowGrid
+from rille.stages.planning.grid8 import search
+from rille.stages.planning.path_ground import UNIT, Maps, PathMaps, PathParams
 from rille.stages.planning.row_graph import UNREACHED
-
-UNIT = 1000
-"""Cost of a step along an axis: a step aside costs 1414."""
 
 
 def crossed_cells(path: Floats, lattice: Lattice) -> NDArray[np.int64]:
@@ -98,16 +95,14 @@ def shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> di
 
 
 def _shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> float | None:
-    prices = PathPrices(unit=vehicle.max_step, caution=0.0)
-    ground = PathMaps(maps, lattice, RowGrid.over(lattice, (0.0, 1.0)), vehicle, prices)
-    ways = ground.ways("middle")
-    first, last = (ground.grid.index((float(path[k, 0]), float(path[k, 1]))) for k in (0, -1))
+    ground = PathMaps(maps, lattice, vehicle, PathParams(p_certain_hazard=1.0))
+    first, last = ((int(r), int(c)) for r, c in np.rint(lattice.index(path[[0, -1], :2])))
+    ways, level = ground.ways("middle"), np.zeros(lattice.shape, np.int64)
     if not all(0 <= r < ways.shape[0] and 0 <= c < ways.shape[1] and ways[r, c] for r, c in (first, last)):
         return None
     # No heights and no tolls: the cost is the length alone.
-    level = np.zeros(ways.shape, np.int32)
-    cost, _ = grid8.cost_to_go(level, ways, last, first, UNIT, level.astype(np.int16))
-    return float(cost[first]) / UNIT * lattice.cell if cost[first] < UNREACHED else None
+    cost, _ = search(ground.terrain("middle", 1.0, 0.0)._replace(height=level, toll=level), first, last)
+    return float(cost[last]) * UNIT if cost[last] < UNREACHED else None
 
 
 @stage(

@@ -25,11 +25,6 @@ class PathFacts(Facts):
     blocking_y: float | None
     """m"""
     ended_by: str
-    beside_unknown: bool
-    target_row: int | None
-    reachable_targets: int
-    vertices: int
-    grid: dict[str, Any]
     frame: str
     length_m: float | None
     climb_m: float | None

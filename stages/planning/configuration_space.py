@@ -12,9 +12,9 @@ import math
 import cv2
 import numpy as np
 
-from rille.stages.core.arrays import Bools, Bytes, Floats32
+from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.numeric.extrema import octagon
+from rille.stages.numeric.extrema import running_max
 from rille.stages.planning.wheels import wheel_positions
 
 STRAIGHT, RIGHT, ACROSS, LEFT = 1, 2, 4, 8
@@ -57,79 +57,66 @@ class FreePlaces:
             outside of the map counts as such. None: none, and nothing outside.
         closed : cells on which its middle may not be, without a margin.
         """
-        self._half_cells = vehicle.half_length / cell, vehicle.half_width / cell
-        self._wheels = [_wheel_cells(vehicle, cell, dr, dc) for _, dr, dc in STEPS]
-        self._unknown = unknown
-        near, middle = (_grown(mask, vehicle.margin / cell) for mask in (wheel_hazard, body_hazard))
+        self._vehicle, self._cell, self._unknown = vehicle, cell, unknown
+        near, middle = (grown(mask, vehicle.margin / cell) for mask in (wheel_hazard, body_hazard))
         if closed is not None:
             middle |= closed
-        self._closed = [middle | _touching(near, wheels, outside=False) for wheels in self._wheels]
+        wheels = wheel_positions(vehicle)
+        self._closed = [middle | self._touching(near, wheels, step, outside=False) for step in STEPS]
 
     def ways(self, below: str = "middle") -> Bytes:
         """Directions (row, col) as bits in which it may, with ``below``, its "outline", its "wheels" or its "middle",
         on known ground."""
+        unknown, wheels = self._unknown, wheel_positions(self._vehicle)
+        half_cells = self._vehicle.half_length / self._cell, self._vehicle.half_width / self._cell
         out = np.zeros(self._closed[0].shape, np.uint8)
-        for (bit, *step), wheels, closed in zip(STEPS, self._wheels, self._closed, strict=True):
-            if self._unknown is not None and below == "outline":
-                closed = closed | _widened(self._unknown, *self._half_cells, (step[0], step[1]))
-            elif self._unknown is not None and below == "wheels":
-                closed = closed | _touching(self._unknown, wheels, outside=True)
-            out[~closed] |= np.uint8(bit)
+        for step, closed in zip(STEPS, self._closed, strict=True):
+            if unknown is not None and below == "outline":
+                closed = closed | widened(unknown, *half_cells, (step[1], step[2]))
+            elif unknown is not None and below == "wheels":
+                closed = closed | self._touching(unknown, wheels, step, outside=True)
+            out[~closed] |= np.uint8(step[0])
+        return out
+
+    def _touching(self, mask: Bools, points: Floats, step: tuple[int, int, int], *, outside: bool) -> Bools:
+        """Cells (row, col) from which one of the vehicle's points (n, 2), right and ahead of its middle, m, is on the
+        mask on a way along a step; cells off the map count as ``outside``."""
+        (rows, cols), (_, dr, dc) = mask.shape, step
+        unit = math.hypot(dr, dc) * self._cell
+        # Rows grow backwards and columns to the right, so that the vehicle's right is (dc, -dr) for a step (dr, dc).
+        cells = [(round((b * dr + a * dc) / unit), round((b * dc - a * dr) / unit)) for a, b in points]
+        border = max(abs(v) for cell in cells for v in cell)
+        padded, out = np.pad(mask, border, constant_values=outside), np.zeros_like(mask)
+        for r, c in cells:
+            out |= padded[border + r : border + r + rows, border + c : border + c + cols]
         return out
 
 
-def _wheel_cells(vehicle: Vehicle, cell: float, dr: int, dc: int) -> list[tuple[int, int]]:
-    """Row and column of the four wheels from the middle, cells, on a way along (dr, dc)."""
-    unit = math.hypot(dr, dc) * cell
-    # Rows grow backwards and columns to the right, so that the vehicle's right is (dc, -dr) for a step (dr, dc).
-    return [(round((b * dr + a * dc) / unit), round((b * dc - a * dr) / unit)) for a, b in wheel_positions(vehicle)]
-
-
-def _touching(mask: Bools, wheels: list[tuple[int, int]], *, outside: bool) -> Bools:
-    """Cells (row, col) from which a wheel stands on the mask; cells off the map count as ``outside``."""
-    rows, cols = mask.shape
-    border = max(abs(v) for wheel in wheels for v in wheel)
-    padded = np.pad(mask, border, constant_values=outside)
-    moved = [padded[border + r : border + r + rows, border + c : border + c + cols] for r, c in wheels]
-    return np.asarray(np.logical_or.reduce(moved))
-
-
-def _grown(mask: Bools, reach: float) -> Bools:
+def grown(mask: Bools, reach: float) -> Bools:
     """Cells within ``reach`` cells of the mask: an octagon that holds the circle."""
     # Rounded up: a margin that is a fraction of a cell too wide closes a way, one too narrow touches a hazard.
-    side, diagonal = octagon(math.ceil(reach - ROUNDING_CELLS))
-    return _dilated(mask, [(side, 0, 1), (side, 1, 0), (diagonal, 1, 1), (diagonal, 1, -1)], outside=False)
+    cells = math.ceil(reach - ROUNDING_CELLS)
+    return running_max(mask.astype(np.float32), cells) > 0 if cells > 0 else mask.copy()
 
 
-def _widened(mask: Bools, half_length: float, half_width: float, step: tuple[int, int]) -> Bools:
+def widened(mask: Bools, half_length: float, half_width: float, step: tuple[int, int]) -> Bools:
     """Cells from which a rectangle, cells, aligned with ``step`` (row, col), touches the mask or leaves the map."""
     # A size that is a whole number of steps may come out a rounding above it, and must not grow by a step.
     along, across = (max(0, math.ceil(v / math.hypot(*step) - ROUNDING_CELLS)) for v in (half_length, half_width))
-    lines = [(along, step[0], step[1]), (across, step[1], -step[0])]
+    lines = [_line(along, *step), _line(across, step[1], -step[0])]
     if step[0] and step[1]:
         # A diagonal line leaves every other cell out; three cells of a row close them.
-        lines.append((1, 0, 1))
-    return _dilated(mask, lines, outside=True)
-
-
-def _dilated(mask: Bools, lines: list[tuple[int, int, int]], *, outside: bool) -> Bools:
-    """The mask dilated by lines, one after the other: of so many steps (row, col) to either side; cells off the map
-    count as ``outside``."""
+        lines.append(_line(1, 0, 1))
     # A line may lead off the map and the next one back.
-    border = sum(n for n, _, _ in lines)
-    out = np.pad(mask, border, constant_values=outside)
-    for n, r, c in lines:
-        reached = 0
-        while reached < n:
-            # Lines of 2 k + 1 cells, moved by as many to either side, make a line three times as long.
-            step = min(2 * reached + 1, n - reached)
-            source, reached = out.copy(), reached + step
-            for i, j in ((step * r, step * c), (-step * r, -step * c)):
-                out[_from(i), _from(j)] |= source[_from(-i), _from(-j)]
-    rows, cols = mask.shape
-    return np.asarray(out[border : border + rows, border : border + cols])
+    border = sum(len(line) for line in lines)
+    out = np.pad(mask, border, constant_values=True).astype(np.uint8)
+    for line in lines:
+        out = cv2.dilate(out, line)
+    return out[border:-border, border:-border] > 0
 
 
-def _from(offset: int) -> slice:
-    """The part of an axis that an equal axis covers when it is moved by an offset."""
-    return slice(max(offset, 0), min(offset, 0) or None)
+def _line(n: int, row: int, col: int) -> Bytes:
+    """Kernel of the cells on a line of ``n`` steps (row, col) to either side."""
+    at, kernel = np.arange(-n, n + 1), np.zeros((2 * n + 1, 2 * n + 1), np.uint8)
+    kernel[n + row * at, n + col * at] = 1
+    return kernel

@@ -7,38 +7,33 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.core.arrays import Floats
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.measures import MEASURES
 from rille.stages.hazard.risk import CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning.path_ground import GROUNDS, Maps, RowGrid
-from rille.stages.planning.row_graph import Plan
-
-Ints = NDArray[np.int64]
+from rille.stages.planning.path_ground import Maps
+from rille.stages.planning.row_graph import Ints
 
 
 @dataclass(frozen=True)
 class Route:
     """A path and how it was found.
 
-    ``cells`` (vertex, 2) on ``grid`` and ``xyz`` (vertex, 3) metres, z the mean height under a wheel, both empty where
-    there is none; ``plan`` of the row graph, ``planner`` that gave the path, ``ground`` one of :data:`GROUNDS`;
-    ``cost`` (row, col) metres: from the start by rows, to the target by grid8; NaN where not reached.
-    ``span``: farthest and nearest row of the grid that are free somewhere. ``ended_by``: why a path goes no
-    farther; None where there is none.
+    ``cells`` (vertex, 2) of the lattice and ``xyz`` (vertex, 3) metres, z the mean height under a wheel, both empty
+    where there is none; ``planner`` that gave it, ``ground`` one of :data:`GROUNDS`. ``span``: farthest and nearest row
+    that are free somewhere. ``reason`` why there is no path, and ``blocking_row``, the first one that cannot be entered
+    by rows, None where there is a path; ``ended_by``: why a path goes no farther, None where there is none.
     """
 
     cells: Ints
     xyz: Floats
-    plan: Plan
-    grid: RowGrid
     planner: str
     ground: str
-    cost: Floats32
     span: tuple[int, int]
+    reason: str = ""
+    blocking_row: int | None = None
     ended_by: str | None = None
 
 
@@ -58,11 +53,11 @@ def ending(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle, p_certa
     """The one of :data:`ENDS` that holds most of the cells beyond a path's end: as wide as the vehicle and its margin,
     and as far ahead of its middle. Ground above the probability ``p_certain`` is uncertain, as is a hazard that
     standard deviations alone make one."""
-    cell, (dx, dy) = lattice.cell, route.grid.ahead
-    far, wide = (math.ceil((half + vehicle.margin) / cell) for half in (vehicle.half_length, vehicle.half_width))
-    ahead, right = (v * cell for v in np.meshgrid(np.arange(1, far + 2), np.arange(-wide, wide + 1)))
-    points = route.xyz[-1, :2] + np.stack([ahead * dx + right * dy, ahead * dy - right * dx], axis=-1)
-    at = np.rint(lattice.index(points)).astype(np.int64)
+    far, wide = (
+        math.ceil((half + vehicle.margin) / lattice.cell) for half in (vehicle.half_length, vehicle.half_width)
+    )
+    row, col = np.meshgrid(np.arange(1, far + 2), np.arange(-wide, wide + 1))
+    at = route.cells[-1] + np.stack([-row, col], axis=-1)
     inside = ((at >= 0) & (at < lattice.shape)).all(axis=-1)
     here = tuple(at[inside].T)
     risk, chance = maps["risk"][here], maps["p_hazard"][here] if "p_hazard" in maps else np.zeros(len(here[0]))
@@ -74,25 +69,20 @@ def ending(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle, p_certa
 
 def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> dict[str, Any]:
     """Facts of a route: length, climb, and the worst that it meets."""
-    plan, grid, xyz = route.plan, route.grid, route.xyz
+    xyz, row = route.xyz, route.blocking_row
     meta: dict[str, Any] = {
         "found": len(xyz) > 0,
         "planner": route.planner,
         "ground": route.ground,
-        "reason": plan.reason if len(xyz) else _why(plan, maps, vehicle),
-        "blocking_row": plan.blocking_row,
-        "blocking_y": None if plan.blocking_row is None else (grid.j0 - plan.blocking_row) * grid.cell,
+        "reason": route.reason if len(xyz) else _why(route.reason, maps, vehicle),
+        "blocking_row": row,
+        "blocking_y": None if row is None else (lattice.j0 - row) * lattice.cell,
         "ended_by": route.ended_by,
-        "beside_unknown": route.ground != GROUNDS[0],
-        "target_row": plan.target_row,
-        "reachable_targets": int(plan.reachable.sum()),
-        "vertices": len(xyz),
-        "grid": grid.to_dict(),
     }
     if len(xyz) == 0:
         others = ("length_m", "climb_m", "caution_share", "start", "target", "left_out_m")
         return meta | dict.fromkeys((*WORST, *others))
-    at = tuple(np.rint(lattice.index(xyz[:, :2])).astype(np.int64).T)
+    at = tuple(route.cells.T)
     steps, ends = np.diff(xyz, axis=0), route.cells[[0, -1], 0]
     worst = {name: float(of(maps[band][at])) if band in maps else None for name, (band, of) in WORST.items()}
     return (
@@ -103,20 +93,20 @@ def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> di
             "climb_m": float(np.maximum(steps[:, 2], 0.0).sum()),
             "caution_share": float((maps["risk"][at] == CAUTION).mean()),
             # Rows with known ground before the start and beyond the target.
-            "left_out_m": [float(rows) * grid.cell for rows in (route.span[1] - ends[0], ends[1] - route.span[0])],
+            "left_out_m": [float(rows) * lattice.cell for rows in (route.span[1] - ends[0], ends[1] - route.span[0])],
             "start": [float(v) for v in xyz[0]],
             "target": [float(v) for v in xyz[-1]],
         }
     )
 
 
-def _why(plan: Plan, maps: Maps, vehicle: Vehicle) -> str:
+def _why(reason: str, maps: Maps, vehicle: Vehicle) -> str:
     """Why there is no path; where hazards leave nothing to drive on, the limit that does the most."""
     risk = maps["risk"]
     judged = int((risk != UNKNOWN).sum())
     # Where something is free, the search's own reason says more than a count of hazards.
     if judged == 0 or (risk[risk != UNKNOWN] < HAZARDOUS).any():
-        return plan.reason
+        return reason
     counts = [int(((maps["reason"] & m.bit) > 0).sum()) for m in MEASURES]
     most, count = max(zip(MEASURES, counts, strict=True), key=lambda pair: pair[1])
     return (

@@ -208,7 +208,7 @@ def test_frames_posed_are_counted_alike_all_over_the_report(tmp_path: Path) -> N
 def test_no_path_names_the_row_that_blocks(tmp_path: Path) -> None:
     made = bundles()
     meta = {"found": False, "reason": "no way through", "blocking_row": 17, "blocking_y": 0.63}
-    meta |= {"target_row": 0, "length_m": None, "climb_m": None, "max_inclination": None}
+    meta |= {"length_m": None, "climb_m": None, "max_inclination": None}
     arrays = {**made["path"].arrays, "path": np.empty((0, 3))}
     made["path"] = made["local_path0"] = made["local_path4"] = Bundle(arrays, meta)
     facts, page_, _, _ = written(tmp_path, view(made))

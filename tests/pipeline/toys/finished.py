@@ -79,7 +79,6 @@ def bundles() -> dict[str, Bundle]:
     bands |= {"risk": risk, **dict.fromkeys(("reason", "filled"), np.zeros_like(risk))}
     rows = np.arange(ROWS - 1, 9, -1)
     path = np.column_stack([np.zeros(len(rows)), 0.8 - CELL * rows, np.full(len(rows), -0.18)])
-    cost = np.where(risk == 0, 0.001 * (ROWS - y), np.nan).astype(np.float32)
     sigma = np.where(np.isfinite(z), 5e-4, np.nan).astype(np.float32)
     dem = {"elevation": z, "elevation_std": sigma, "ortho": (z - z[30, 30] + 0.5) * 100}
     lattice = {"lattice": LATTICE}
@@ -88,7 +87,6 @@ def bundles() -> dict[str, Bundle]:
         "reason": "",
         "blocking_row": None,
         "blocking_y": None,
-        "target_row": 10,
         "length_m": 0.49,
         "climb_m": 0.004,
         "max_inclination": 0.1,
@@ -96,14 +94,13 @@ def bundles() -> dict[str, Bundle]:
         "least_clearance": 0.02,
         "max_p_hazard": 0.01,
         "ground": "outline",
-        "grid": {"ahead": [0.0, 1.0], "i0": -40, "j0": 80, "cell": CELL, "rows": ROWS, "cols": COLS},
     }
     poses = np.array([level_pose(i * STEP).matrix34 for i in FRAMES])
     count = np.where(np.isfinite(z), 2, 0).astype(np.uint16)
     made = {
         "tile": Bundle({**dem, "count": count, "spread": sigma, "source": np.zeros(z.shape, np.int32)}, lattice),
         "risk": Bundle(bands, lattice),
-        "path": Bundle({"path": path, "cost_to_go": cost, "reachable": (risk[10] == 0).astype(np.uint8)}, path_meta),
+        "path": Bundle({"path": path}, path_meta),
         "trajectory": Bundle(
             {
                 "poses": poses,

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from vehicles import SHORT
 
-from rille.stages.planning.configuration_space import ACROSS, STEPS, STRAIGHT, FreePlaces, _grown, _widened, distance
+from rille.stages.planning.configuration_space import ACROSS, STEPS, STRAIGHT, FreePlaces, distance, grown, widened
 
 CELL = 0.01
 
@@ -20,7 +20,7 @@ CELL = 0.01
 @given(seed=st.integers(0, 999), length=st.floats(0, 6), width=st.floats(0, 4))
 def test_a_rectangle_covers_what_lies_under_it(step: tuple[int, int], seed: int, length: float, width: float) -> None:
     mask = np.random.default_rng(seed).random((25, 27)) < 0.01
-    found = _widened(mask, length, width, step)
+    found = widened(mask, length, width, step)
     unit = math.hypot(*step)
     ahead, aside = np.array(step) / unit, np.array([step[1], -step[0]]) / unit
     for r, c in np.argwhere(mask):
@@ -40,11 +40,11 @@ def test_a_rectangle_covers_what_lies_under_it(step: tuple[int, int], seed: int,
 @given(seed=st.integers(0, 999), reach=st.floats(0, 9))
 def test_growing_covers_the_circle(seed: int, reach: float) -> None:
     mask = np.random.default_rng(seed).random((30, 31)) < 0.005
-    grown = _grown(mask, reach)
+    wide = grown(mask, reach)
     for r, c in np.argwhere(mask):
         away = np.hypot(*(np.stack(np.mgrid[:30, :31]) - np.array([r, c])[:, None, None]))
-        assert grown[away <= reach].all()
-    assert (grown | ~mask).all()
+        assert wide[away <= reach].all()
+    assert (wide | ~mask).all()
 
 
 @settings(max_examples=20, deadline=None)
@@ -100,11 +100,11 @@ def test_where_a_vehicle_may_stand_equals_a_look_at_every_wheel(seed: int, margi
     wheel, body, unknown = (rng.random((23, cols)) < 0.03 for _ in range(3))
     vehicle = SHORT.model_copy(update={"wheel_base": 0.07, "track": 0.05, "margin": margin})
     stand = FreePlaces(wheel, body, vehicle, CELL, unknown)
-    near, middle = _grown(wheel, margin / CELL), _grown(body, margin / CELL)
+    near, middle = grown(wheel, margin / CELL), grown(body, margin / CELL)
     found = {below: stand.ways(below) for below in ("outline", "wheels", "middle")}
     for bit, dr, dc in STEPS:
         unit = math.hypot(dr, dc)
-        outline = _widened(unknown, vehicle.half_length / CELL, vehicle.half_width / CELL, (dr, dc))
+        outline = widened(unknown, vehicle.half_length / CELL, vehicle.half_width / CELL, (dr, dc))
         for r in range(23):
             for c in range(cols):
                 at = [

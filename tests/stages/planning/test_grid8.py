@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from rille.stages.planning.grid8 import NEIGHBOURS, cost_to_go, parts, trace
-from rille.stages.planning.row_graph import UNREACHED
+from rille.stages.planning.grid8 import parts, search
+from rille.stages.planning.row_graph import NEIGHBOURS, UNREACHED, Terrain, trace
 
 UNIT = 7
+LENGTHS = np.array([UNIT if 0 in (dr, dc) else 10 for dr, dc, _ in NEIGHBOURS])
 
 
 def edges(height: np.ndarray, ways: np.ndarray, toll: np.ndarray) -> list[tuple[tuple[int, int], tuple[int, int], int]]:
@@ -42,38 +43,39 @@ def test_costs_equal_networkx_and_scipy(seed: int, rows: int, cols: int, blocked
     # Of few different heights and tolls, so that many paths cost the same.
     height, toll = (rng.integers(0, rng.integers(1, most), (rows, cols)) for most in (9, 3))
     ways = np.where(rng.random((rows, cols)) < blocked, 0, rng.integers(1, 16, (rows, cols))).astype(np.uint8)
-    target = int(rng.integers(rows)), int(rng.integers(cols))
-    cost, step = cost_to_go(height, ways, target, None, UNIT, toll)
+    start = int(rng.integers(rows)), int(rng.integers(cols))
+    cost, step = search(Terrain(height, ways, toll, LENGTHS), start)
     graph = nx.DiGraph()
-    graph.add_node(target)
+    graph.add_node(start)
     listed = edges(height, ways, toll)
-    graph.add_weighted_edges_from((b, a, w) for a, b, w in listed)  # to the target
-    expected = nx.single_source_dijkstra_path_length(graph, target)
+    graph.add_weighted_edges_from(listed)
+    expected = nx.single_source_dijkstra_path_length(graph, start)
     reached = {(int(r), int(c)): int(cost[r, c]) for r, c in np.argwhere(cost < UNREACHED)}
     assert reached == expected
     if listed:
-        i, j, w = zip(*((b[0] * cols + b[1], a[0] * cols + a[1], w) for a, b, w in listed), strict=True)
-        distance = dijkstra(csr_matrix((w, (i, j)), shape=(rows * cols,) * 2), indices=target[0] * cols + target[1])
+        i, j, w = zip(*((a[0] * cols + a[1], b[0] * cols + b[1], w) for a, b, w in listed), strict=True)
+        distance = dijkstra(csr_matrix((w, (i, j)), shape=(rows * cols,) * 2), indices=start[0] * cols + start[1])
         np.testing.assert_array_equal(np.where(cost < UNREACHED, cost, np.inf).ravel(), distance)
     weight = {(a, b): w for a, b, w in listed}
-    ahead: dict[tuple[int, int], list[tuple[int, tuple[int, int]]]] = {}
+    behind: dict[tuple[int, int], list[tuple[int, tuple[int, int]]]] = {}
     for a, b, w in listed:
-        if b in reached and reached[a] == reached[b] + w:
-            ahead.setdefault(a, []).append((reached[b], b))
-    for start in reached:
-        cells = [tuple(int(v) for v in cell) for cell in trace(step, start)]
-        assert cells[-1] == target
-        assert sum(weight[a, b] for a, b in pairwise(cells)) == cost[start]
+        if a in reached and reached[b] == reached[a] + w:
+            behind.setdefault(b, []).append((reached[a], a))
+    for target in reached:
+        cells = [tuple(int(v) for v in cell) for cell in trace(step, target)]
+        assert (cells[0], cells[-1]) == (start, target)
+        assert sum(weight[a, b] for a, b in pairwise(cells)) == cost[target]
         if start != target:
-            assert cells[1] == min(ahead[start])[1], "of equals the one nearer to the target, then that of lower index"
+            assert cells[-2] == min(behind[target])[1], (
+                "of equals the one nearer to the start, then that of lower index"
+            )
 
 
-def test_the_search_ends_at_the_start_and_its_cost_is_the_same() -> None:
-    rng = np.random.default_rng(2)
-    height, toll = rng.integers(0, 9, (60, 70)), np.zeros((60, 70), dtype=np.int64)
-    ways = np.full((60, 70), 15, dtype=np.uint8)
-    whole, _ = cost_to_go(height, ways, (50, 60), None, UNIT, toll)
-    part, step = cost_to_go(height, ways, (50, 60), (48, 55), UNIT, toll)
+def test_the_search_ends_at_the_target_and_its_cost_is_the_same() -> None:
+    height = np.random.default_rng(2).integers(0, 9, (60, 70))
+    terrain = Terrain(height, np.full((60, 70), 15, dtype=np.uint8), np.zeros((60, 70), dtype=np.int64), LENGTHS)
+    whole, _ = search(terrain, (50, 60))
+    part, step = search(terrain, (50, 60), (48, 55))
     assert part[48, 55] == whole[48, 55]
     assert (part == UNREACHED).sum() > 1000
     assert len(trace(step, (48, 55))) >= 6
@@ -83,7 +85,7 @@ def test_costs_of_a_large_map_equal_scipy() -> None:
     """So large that thousands of cells wait for their turn."""
     n = 400
     height, at = np.random.default_rng(6).integers(0, 30, (n, n)), np.arange(n * n).reshape(n, n)
-    cost, _ = cost_to_go(height, np.full((n, n), 15, np.uint8), (200, 200), None, UNIT, np.zeros_like(height))
+    cost, _ = search(Terrain(height, np.full((n, n), 15, np.uint8), np.zeros_like(height), LENGTHS), (200, 200))
     graph = []
     for length, here, there in (
         (7, np.s_[1:], np.s_[:-1]),
