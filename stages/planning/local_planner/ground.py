@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Bools, Floats, Floats32
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.planning.local_planner.clearance import Footing, Gaps
 from rille.stages.planning.local_planner.params import LocalPlannerParams
 from rille.stages.planning.local_planner.route import STEP_TURN, Piece, pieces
@@ -197,15 +197,6 @@ class Ground:
             if len(points):
                 return points
         return np.array([stand[:2]])
-
-    def on_map(self, cost: Floats) -> Floats32:
-        """Cost at the best heading on the cells of the map, NaN where it is not known."""
-        best = cost.min(axis=0)
-        xy = self.footing.lattice.xy()
-        row, col = (np.rint(v).astype(np.int64) for v in self.grid.index(xy[..., 0], xy[..., 1]))
-        inside = (row >= 0) & (col >= 0) & (row < self.grid.shape[0]) & (col < self.grid.shape[1])
-        shown = np.where(inside, best[np.where(inside, row, 0), np.where(inside, col, 0)], np.inf)
-        return np.where(np.isfinite(shown), shown, np.nan).astype(np.float32)
 
 
 class KnownFreeGround(Ground):

@@ -1,9 +1,7 @@
 """Views of a vehicle: the ground in view of its cameras, its memory, and the choice of the next view.
 
 The field of view follows from the geometry of the cameras alone; occlusion by stones is not modelled. The next view is
-of the ground at the first pose of the path that is not known to be free. Ground that is in view already from the
-present place, from the same side and no farther away, and is still unknown lies behind a stone or is the stone:
-looking again shows no more.
+of the ground at the first pose of the path that is not known to be free.
 """
 
 from __future__ import annotations
@@ -31,10 +29,6 @@ MIN_VIEW_SHARE = 0.9
 """Share of a set of points that must be in view for the set to count as in view."""
 STEP = math.radians(5.0)
 """Step [rad] between the turns that are tried."""
-SAME_SIDE = math.radians(25.0)
-"""Angle [rad] between two viewing directions below which both show the same of the ground that stones hide."""
-MAX_FARTHER = 1.25
-"""Ratio of distances up to which a nearer view shows no more than the earlier one."""
 
 
 @dataclass(frozen=True)
@@ -80,12 +74,6 @@ AHEAD = FieldOfView(np.array([[0.0, 1.0, 0.0]]))
 """All that is before the middle of the vehicle."""
 
 
-def bearing(points: Floats, stand: Stand) -> tuple[float, float]:
-    """Direction (rad, from x to y) and distance (m) from the middle of points (n, 2), m, to a place."""
-    x, y = points.mean(axis=0)
-    return math.atan2(stand[1] - y, stand[0] - x), math.hypot(stand[1] - y, stand[0] - x)
-
-
 @dataclass
 class PlannerMemory:
     """Earlier looks of a vehicle.
@@ -125,36 +113,17 @@ class PlannerMemory:
 
 @dataclass(frozen=True)
 class Target:
-    """Ground that has to be seen before the vehicle can go on.
-
-    Attributes
-    ----------
-    view : field of view of the cameras.
-    points : (n, 2) m, the ground.
-    present : direction (rad) and distance (m) of the vehicle, if it has the points in view; None: it has not.
-    """
+    """Ground that has to be seen before the vehicle can go on: ``points`` (n, 2), m; ``view``, the field of view of the
+    cameras."""
 
     ground: Ground
     view: FieldOfView
     points: Floats
-    present: tuple[float, float] | None
 
     @staticmethod
     def of(ground: Ground, way: Sequence[Piece], first: int, view: FieldOfView) -> Target:
         """Build for the first piece of a path that is not known to be free."""
-        points, stand = ground.lacking(way, first), (*ground.start, ground.heading)
-        return Target(ground, view, points, bearing(points, stand) if view.holds(points, stand) else None)
-
-    def shows(self, stand: Stand) -> bool:
-        """Whether the points are in view from a pose, and from another side or nearer than from the present one."""
-        if not self.view.holds(self.points, stand):
-            return False
-        if self.present is None:
-            return True
-        side, far = bearing(self.points, stand)
-        # The remainder, since two directions either side of due west differ by almost a full turn as numbers.
-        turned = abs(math.remainder(self.present[0] - side, 2 * math.pi))
-        return turned >= SAME_SIDE or self.present[1] > MAX_FARTHER * far
+        return Target(ground, view, ground.lacking(way, first))
 
     def turn(self, at: Point, heading: float, right: float, left: float) -> float | None:
         """Least turn (rad) on the spot, within bounds and where the wheels have room, after which it is in view."""
@@ -164,7 +133,7 @@ class Target:
             more = np.array([sign * k * STEP for k in range(1, 1 + math.floor(max(bound, 0.0) / STEP + 1e-9))])
             free = self.ground.free(np.full(more.shape, at[0]), np.full(more.shape, at[1]), heading + more)
             turns += more[np.logical_and.accumulate(free)].tolist()
-        return next((t for t in sorted(turns, key=abs) if self.shows((*at, heading + t))), None)
+        return next((t for t in sorted(turns, key=abs) if self.view.holds(self.points, (*at, heading + t))), None)
 
     def last_view(self, leg: Sequence[Piece], bound: float) -> tuple[float, float] | None:
         """Return the last position on a leg from which the target is in view, and the turn on the spot that shows it.

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Bools, Floats, Floats32
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.planning.local_planner.clearance import Footing
@@ -66,8 +66,7 @@ class Leg:
     ``closed``: looking did not help; ``where`` the way is not known to be free.
 
     ``way`` (vertex, 2) m to the goal, as it is planned; ``rest`` (vertex, 2) m of it after the leg, and ``rest_gear``
-    (piece,) how it is driven; ``cost`` (row, col) m to the goal at these prices at the best heading, NaN where it is
-    closed, or farther than the vehicle.
+    (piece,) how it is driven.
     """
 
     verdict: str
@@ -78,7 +77,6 @@ class Leg:
     way: Floats
     rest: Floats
     rest_gear: NDArray[np.int8]
-    cost: Floats32
     where: Point | None = None
 
 
@@ -114,38 +112,35 @@ def plan_leg(
     base = footing.vehicle.wheel_base
     left = math.hypot(goal[0] - start[0], goal[1] - start[1])
     if left <= params.tolerance * base:
-        nothing = np.full(footing.lattice.shape, np.nan, np.float32)
-        return _stay("goal", f"{1000 * left:.0f} mm from the goal", start, [], nothing)
+        return _stay("goal", f"{1000 * left:.0f} mm from the goal", start, [])
     ground = Ground(footing, start, heading, params, memory.closed)
     # Half of the tolerance, so that a vehicle that ends a little beside its place has reached the goal nevertheless.
     goals, cost, move = ground.search(goal, 0.5 * params.tolerance * base)
-    shown, least = ground.on_map(cost), ground.from_start(cost)
-    kept, price = list[Piece](), math.inf
+    kept, least, price = list[Piece](), ground.from_start(cost), math.inf
     if before is not None:
         kept, price = ground.again(_onward(before, start, heading, ground.grid.spacing))
     if not np.isfinite(min(least, price)):
         why = _why_closed(ground, goals, cost)
         turn = 0.0 if memory.looks >= params.max_looks else _free_turn(ground, memory.looks)
         if turn:
-            return _stay("look", f"{why}: looks around", start, [], shown, turn=turn)
-        return _stay("no path", why, start, [], shown)
+            return _stay("look", f"{why}: looks around", start, [], turn=turn)
+        return _stay("no path", why, start, [])
     # Without this the cheaper of two ways round a stone may change at each stop, and the vehicle goes to and fro.
     way = kept if kept and price <= (1.0 + params.replan_hysteresis) * least else ground.way(move)
     plan = _straight(ground, way)
     known = _known_pieces(plan)
     target = Target.of(ground, plan, known, view) if known < len(plan) else None
-    return _Plan(ground, way, plan, shown, target, can_look=memory.looks < params.max_looks).leg()
+    return _Plan(ground, way, plan, target, can_look=memory.looks < params.max_looks).leg()
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """A way to the goal, with straightened first metres ``pieces``; the cost to go (row, col); the ground that has to
-    be seen, None where all is known; whether the vehicle may look once more."""
+    """A way to the goal, with straightened first metres ``pieces``; the ground that has to be seen, None where all is
+    known; whether the vehicle may look once more."""
 
     ground: Ground
     way: Sequence[Piece]
     pieces: Sequence[Piece]
-    cost: Floats32
     target: Target | None
     can_look: bool
 
@@ -169,12 +164,12 @@ class _Plan:
         leg, turn = within_turn(leg, heading, bound)
         if not leg:
             reason = f"turns {math.degrees(turn):.0f} degrees to where it goes on"
-            return _stay("turn", reason, start, self.pieces, self.cost, turn=turn)
+            return _stay("turn", reason, start, self.pieces, turn=turn)
         end, turn = leg[-1], turn or facing
         if not turnable(end.b, end.heading, end.heading + turn, ground.clear):
             turn = 0.0
         rest = last_metres(self.pieces, length_of(leg))
-        return Leg("drive", "", *_line(leg, start), turn, vertices(self.way, start), *_line(rest, end.b), self.cost)
+        return Leg("drive", "", *_line(leg, start), turn, vertices(self.way, start), *_line(rest, end.b))
 
     def _look(self, widest: float) -> Leg | None:
         """A turn on the spot that shows the target; None: it was looked at too often, or is in view, or cannot be."""
@@ -186,14 +181,14 @@ class _Plan:
         bound = math.radians(self.ground.p.max_turn_deg)
         turn = max(-bound, min(bound, turn))
         reason = f"turns {math.degrees(turn):.0f} degrees to see the way"
-        return _stay("look", reason, self.ground.start, self.pieces, self.cost, turn=turn)
+        return _stay("look", reason, self.ground.start, self.pieces, turn=turn)
 
     def _closed(self) -> Leg:
         """The place that looking did not open."""
         way, start = self.way, self.ground.start
         x, y = way[min(_known_pieces(way), len(way) - 1)].cut(self.ground.grid.spacing).b
         reason = f"the ground at ({x:.3f}, {y:.3f}) m was looked at in vain"
-        return _stay("closed", reason, start, way, self.cost, where=(x, y))
+        return _stay("closed", reason, start, way, where=(x, y))
 
 
 def _straight(ground: Ground, way: Sequence[Piece]) -> list[Piece]:
@@ -222,13 +217,12 @@ def _stay(
     reason: str,
     start: Point,
     way: Sequence[Piece],
-    cost: Floats32,
     *,
     turn: float = 0.0,
     where: Point | None = None,
 ) -> Leg:
     """A leg on the spot."""
-    return Leg(verdict, reason, *_line([], start), turn, vertices(way, start), *_line(way, start), cost, where)
+    return Leg(verdict, reason, *_line([], start), turn, vertices(way, start), *_line(way, start), where)
 
 
 def _known_pieces(way: Sequence[Piece]) -> int:

@@ -127,7 +127,7 @@ class LegInputs(NamedTuple):
 
 @stage(
     "local_planner",
-    version=10,
+    version=11,
     outputs=[
         Array(
             "path",
@@ -143,7 +143,6 @@ class LegInputs(NamedTuple):
             "rest", ("rest_vertex", "xy"), "float64", "m", "vertices of what is left of it after the leg", frame="world"
         ),
         Array("rest_gear", ("rest_piece",), "int8", "1", "1 where that is driven ahead, -1 where it is driven back"),
-        Array("cost_to_go", ("row", "col"), "float32", "m", "price of the way from each cell to the goal", "nan"),
     ],
 )
 def local_planner_stage(
@@ -182,4 +181,4 @@ def local_planner_stage(
         "way_m": way_length(leg.way),
     }
     arrays: dict[str, NDArray[Any]] = {"path": leg.path, "gear": leg.gear, "way": leg.way}
-    return Bundle(arrays | {"rest": leg.rest, "rest_gear": leg.rest_gear, "cost_to_go": leg.cost}, meta)
+    return Bundle(arrays | {"rest": leg.rest, "rest_gear": leg.rest_gear}, meta)

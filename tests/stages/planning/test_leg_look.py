@@ -1,4 +1,4 @@
-"""Where a vehicle looks: what comes into view from there, by its cameras, and was not in view before."""
+"""Where a vehicle looks: what comes into view from there, by its cameras."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from leg_scenes import CAMERAS, GOAL, LATTICE, START, P, X, Y, ground
 
 from rille.stages.hazard.risk import UNKNOWN
 from rille.stages.planning.local_planner.ground import Ground
-from rille.stages.planning.local_planner.look import SAME_SIDE, STEP, Target
+from rille.stages.planning.local_planner.look import STEP, Target
 from rille.stages.planning.local_planner.route import Piece, first_metres
 
 FREE = Ground(ground(), START, 0.0, P)
 BOUND = math.radians(P.max_turn_deg)
 
 
-def target(points: list[tuple[float, float]], present: tuple[float, float] | None = None) -> Target:
-    return Target(FREE, CAMERAS, np.array(points), present)
+def target(points: list[tuple[float, float]]) -> Target:
+    return Target(FREE, CAMERAS, np.array(points))
 
 
 @pytest.mark.parametrize("side", [-0.15, 0.0, 0.2, 0.35])
@@ -45,24 +45,9 @@ def test_a_leg_is_driven_as_far_as_the_target_stays_in_view() -> None:
     assert target([(0.0, -0.1)]).last_view(leg, BOUND) is None
 
 
-def test_what_was_in_view_from_the_same_side_and_no_farther_is_not_shown_again() -> None:
-    point, side = (0.0, 0.3), -math.pi / 2  # seen from START
-    for present, shows in (
-        (None, True),
-        ((side, 0.3), False),
-        ((side, 0.2), False),
-        ((side, 0.5), True),
-        ((side + 0.9 * SAME_SIDE, 0.3), False),
-        ((side + 1.1 * SAME_SIDE, 0.3), True),
-        ((side - 2 * math.pi, 0.3), False),
-    ):
-        assert target([point], present).shows((*START, 0.0)) == shows, present
-
-
 def test_the_target_is_what_is_not_known_beneath_the_first_pose_that_is_not() -> None:
     spot = np.hypot(X - 0.04, Y - 0.4) < 0.015
     on = Ground(ground((spot, UNKNOWN)), START, 0.0, P)
     way = [Piece(START, (0.0, 0.33), 0.0, 1), Piece((0.0, 0.33), GOAL, 0.0, 1, known=False)]
     aim = Target.of(on, way, 1, CAMERAS)
     assert np.hypot(*(aim.points - (0.04, 0.4)).T).max() < 0.015
-    assert aim.present == pytest.approx((-math.pi / 2, 0.4), abs=0.12), "from where it stands"

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pointing_angles import rotation_from_angles
 
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
-from rille.stages.planning.local_planner.look import RIM_SHARE, FieldOfView, bearing
+from rille.stages.planning.local_planner.look import RIM_SHARE, FieldOfView
 
 LEFT = Camera(180.0, 175.0, 150.0, 125.0, 320, 240)
 RIGHT = Camera(190.0, 190.0, 159.5, 119.5, 320, 240)
@@ -48,9 +47,3 @@ def test_what_is_in_view_lies_in_both_images(toe: float, roll: float, stand: tup
     seen = FieldOfView.of(rig, T_vehicle_left).sees(points, stand)
     assert 20 < want.sum() < 1500
     assert (seen != want).sum() <= 1, "but for rounding at an edge"
-
-
-def test_points_are_seen_from_a_side_and_a_distance() -> None:
-    points = np.array([(0.0, 0.3), (0.02, 0.3), (-0.02, 0.3)])
-    assert bearing(points, (0.0, 0.0, 0.0)) == pytest.approx((-math.pi / 2, 0.3))
-    assert bearing(points, (0.3, 0.0, math.pi / 4)) == pytest.approx((-math.pi / 4, math.hypot(0.3, 0.3)))
