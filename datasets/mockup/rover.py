@@ -20,6 +20,7 @@ from rille.datasets.mockup.facts import DrivenFacts, SceneFacts
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, Params, stage
 from rille.stages.core.errors import InputError
+from rille.stages.facts.planning import LegFacts
 from rille.stages.geometry.geometry import RigidTransform, from_above, way_length
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.wheels import HeightGrid, Stand, stand
@@ -59,10 +60,16 @@ class RoverParams(Params):
     obstacle_aside: float = Field(0.0, description="distance of the obstacle to the right of the leg [m]")
 
 
-Pose = tuple[float, float, float]
-"""x, y (m) of the centre of the wheels, and heading (rad) to the left of y."""
+class Pose(NamedTuple):
+    """``x``, ``y`` (m) of the centre of the wheels, and ``heading`` (rad) to the left of y."""
 
-START: Pose = (0.0, 0.3, 0.0)
+    x: float
+    y: float
+    heading: float
+
+
+ORIGIN = Pose(0.0, 0.0, 0.0)
+START = Pose(0.0, 0.3, 0.0)
 """On the bed; the rover looks straight along it."""
 FRAME_TURN = math.radians(5.0)  # largest turn on the spot between two images
 
@@ -97,7 +104,7 @@ def _steps(believed: Pose, sent: SentLeg, p: RoverParams, rng: np.random.Generat
     slip = p.slip + p.slip_sigma * float(rng.standard_normal())
     drift = math.radians(p.heading_sigma_deg) * float(rng.standard_normal()) / max(way_length(sent.path), STEP)
     spin = 1.0 + p.turn_sigma * float(rng.standard_normal())
-    x, y, heading = believed
+    x, y, heading = believed.x, believed.y, believed.heading
 
     def rotate(by: float) -> Iterator[_Step]:
         n = math.ceil(abs(by) / STEP_TURN)
@@ -135,8 +142,8 @@ def drive_leg(
     if first is None:
         remedy = "set a larger bed (mockup.bed_width, mockup.bed_length) or a smaller vehicle"
         raise InputError("RIL-250", "the rover stands beside the bed", remedy=remedy)
-    x, y, heading = before
-    leg = DrivenLeg([first], [(0.0, 0.0, 0.0)])
+    x, y, heading = before.x, before.y, before.heading
+    leg = DrivenLeg([first], [ORIGIN])
     for step in _steps(believed, sent, p, rng):
         heading += step.turn
         x -= step.distance * math.sin(heading)
@@ -147,7 +154,7 @@ def drive_leg(
         leg.trail.append(placed)
         u, v, h = leg.wheels[-1]
         h += step.turned
-        leg.wheels.append((u - step.rolled * math.sin(h), v + step.rolled * math.cos(h), h))
+        leg.wheels.append(Pose(u - step.rolled * math.sin(h), v + step.rolled * math.cos(h), h))
     return leg
 
 
@@ -180,13 +187,22 @@ def bed_ground(scene: Bundle, vehicle: Vehicle, at: tuple[float, float], reach: 
     )
 
 
+class DriveInputs(NamedTuple):
+    """The bed; and of a leg, None at the start: where the rover truly stands, the estimated poses, and the leg."""
+
+    scene: Bundle[SceneFacts]
+    before: Bundle[DrivenFacts] | None = None
+    pose: Bundle | None = None
+    plan: Bundle[LegFacts] | None = None
+
+
 def true_and_believed(
     before: Bundle[DrivenFacts], row: int, pose: Bundle, T_vehicle_left: RigidTransform
 ) -> tuple[Pose, Pose]:
     """True pose of the vehicle on the bed before a leg, and its estimate in the frame of the reconstruction."""
     true = RigidTransform.from_matrix(np.asarray(before["vehicle"])[row])
     estimate = RigidTransform.from_matrix(np.asarray(pose["poses"])[-1]) @ T_vehicle_left.inverse()
-    return from_above(true), from_above(estimate)
+    return Pose(*from_above(true)), Pose(*from_above(estimate))
 
 
 @stage(
@@ -205,10 +221,7 @@ def true_and_believed(
 )
 def drive_stage(
     params: RoverParams,
-    scene: Bundle[SceneFacts],
-    before: Bundle[DrivenFacts] | None = None,
-    pose: Bundle | None = None,
-    plan: Bundle | None = None,
+    inputs: DriveInputs,
     *,
     vehicle: Vehicle,
     T_vehicle_left: RigidTransform,
@@ -216,11 +229,11 @@ def drive_stage(
     row: int = 0,
 ) -> Bundle[DrivenFacts]:
     """True motion of the simulated rover along one leg."""
-    start, believed, sent = START, (0.0, 0.0, 0.0), SentLeg(np.zeros((1, 2)), [], 0.0)
-    if before is not None and pose is not None and plan is not None:
-        start, believed = true_and_believed(before, row, pose, T_vehicle_left)
+    start, believed, sent, plan = START, ORIGIN, SentLeg(np.zeros((1, 2)), [], 0.0), inputs.plan
+    if inputs.before is not None and inputs.pose is not None and plan is not None:
+        start, believed = true_and_believed(inputs.before, row, inputs.pose, T_vehicle_left)
         sent = SentLeg(np.asarray(plan["path"])[:, :2], np.asarray(plan["gear"]).tolist(), float(plan.meta["turn"]))
-    ground = bed_ground(scene, vehicle, start[:2], way_length(sent.path) + REACH)
+    ground = bed_ground(inputs.scene, vehicle, start[:2], way_length(sent.path) + REACH)
     # The placement at the start is leg -1, and a seed must not be negative.
     rng = np.random.default_rng([params.seed, 70, 1 + leg])
     trail, turned = drive_leg(ground, vehicle, start, believed, sent, params, rng)

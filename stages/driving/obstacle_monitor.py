@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -213,6 +214,15 @@ def obstacle(points: Points, wheel: float, p: ObstacleMonitorParams) -> Obstacle
     return Obstacle(int(together[best]), raised[best])
 
 
+class MonitorInputs(NamedTuple):
+    """The last elevation model, the resected poses of a leg, the rig, and motions between pairs of its images."""
+
+    dem: Bundle[DemFacts]
+    resect: Bundle[ResectFacts]
+    rig: Bundle[CalibrationFacts]
+    motions: Sequence[Bundle[MotionFacts]]
+
+
 @stage(
     "obstacle_monitor",
     version=2,
@@ -223,27 +233,24 @@ def obstacle(points: Points, wheel: float, p: ObstacleMonitorParams) -> Obstacle
 )
 def obstacle_monitor_stage(
     params: ObstacleMonitorParams,
-    dem: Bundle[DemFacts],
-    resect: Bundle[ResectFacts],
-    rig: Bundle[CalibrationFacts],
-    motions: Sequence[Bundle[MotionFacts]],
+    inputs: MonitorInputs,
     *,
     vehicle: Vehicle,
     pairs: Sequence[tuple[int, int]],
     T_vehicle_left: RigidTransform,
 ) -> Bundle[StopFacts]:
     """Obstacles that the last elevation model does not know, seen on the way."""
-    camera = Rig.from_dict(rig.meta["rig"]).left
+    camera = Rig.from_dict(inputs.rig.meta["rig"]).left
     wheel = vehicle.wheel_diameter
-    lattice = Lattice.from_dict(dem.meta["lattice"])
-    surface = LastModel.of(np.asarray(dem["elevation"]), lattice, params.model_radius * wheel)
-    poses = np.asarray(resect["poses"])  # NaN where tracking was lost, which is for the stage safety to judge
+    lattice = Lattice.from_dict(inputs.dem.meta["lattice"])
+    surface = LastModel.of(np.asarray(inputs.dem["elevation"]), lattice, params.model_radius * wheel)
+    poses = np.asarray(inputs.resect["poses"])  # NaN where tracking was lost, which is for the stage safety to judge
     known = np.isfinite(poses).all(axis=(1, 2))
-    frames = [int(f["frame"]) for f in resect.meta["per_frame"]]
+    frames = [int(f["frame"]) for f in inputs.resect.meta["per_frame"]]
     raised = np.zeros(len(frames), np.int32)
     where = np.full((len(frames), 2), np.nan)
     stop, reason = None, ""
-    for (i, j), motion in zip(pairs, motions, strict=True):
+    for (i, j), motion in zip(pairs, inputs.motions, strict=True):
         if not (known[i] and known[j]):
             continue
         ok = matched(np.asarray(motion["validity"]))
