@@ -175,7 +175,7 @@ class Chain:
 
     def _match(self, pair: int) -> Bundle:
         left, right = (self._pyramid(pair, c) for c in ("left", "right"))
-        return self._stage("hfvm", {"pair": pair}, left=left, right=right)
+        return self._stage("hfvm", {}, left=left, right=right)
 
     def _calibration(self, basic: list[int]) -> Bundle:
         rig = self.sequence.rig.to_dict()

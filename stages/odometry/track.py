@@ -1,11 +1,11 @@
 """Tracking of interest points through the left frames of a segment (section 5.2.1).
 
-Source: Kolesnik, Paar, Bauer, Ulm (1999), section 5.2.1. Two iterations as there: coarse displacements of all pixels
-between successive frames (stage ``motion``) predict where an interest point went; feature vectors find it at full
-resolution. Two steps of ours follow: the affinity by which the surroundings of a point changed is fitted to the
-displacements of its neighbours, and the template of the frame in which the point was *born* is aligned under it
-(:mod:`rille.stages.odometry.affine_lk`). Errors do not accumulate along the chain, since each frame is measured against
-the first.
+Source: Kolesnik, Paar, Bauer, Ulm (1999), section 5.2.1. The first iteration is the paper's: coarse displacements of
+all pixels between successive frames (stage ``motion``) predict where an interest point went. In place of the second
+one, a search by feature vectors, the affinity by which the surroundings of a point changed is fitted to the
+displacements of its neighbours, and the template of the frame in which the point was *born* is aligned under it, there
+and back (:mod:`rille.stages.odometry.affine_lk`). Errors do not accumulate along the chain, since each frame is
+measured against the first.
 
 A point that is lost keeps its predicted position and may be found again. Buckets of the image that have run empty get
 new points at intermediate frames; such a point is looked up backwards in the key frame, where its coordinates are
@@ -28,20 +28,25 @@ from rille.stages.core.errors import InputError
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts, TrackFacts
 from rille.stages.imaging.pyramid import Pyramid
-from rille.stages.odometry.affine_lk import HALF, Templates, align
+from rille.stages.odometry.affine_lk import HALF, Aligned, Templates, align
 from rille.stages.odometry.displacements import NEIGHBOURS, LevelDisplacements, fit_affinity, known
 from rille.stages.odometry.exposure import levelled
 from rille.stages.odometry.moravec import clear_of_mask, interest_points
-from rille.stages.odometry.point_search import match_points
 
 BORDER = 8
-"""Pixels between an interest point and the image's edge: template, cubic interpolation and a search step."""
+"""Pixels between an interest point and the image's edge: template, cubic interpolation and a step of the alignment."""
+
+REACH_PX = 4.0
+"""Largest distance of a point from its prediction: one pixel of the coarse displacement map."""
+
+MIN_AREA = 0.1
+"""Area of a template over that in its first frame, below which it draws no texture."""
+
+MAX_RETURN_PX = 0.5
+"""Largest distance between a point and where its alignment there and back ends (4.3.3)."""
 
 AFFINITY_SIGMA = 0.1
 """Standard deviation of each element of a template's affinity about the one fitted to its neighbours."""
-
-MAX_SCALE = 2.0
-"""Change of scale since a point's first frame up to which that frame's template is used; beyond, the last frame's."""
 
 
 class TrackParams(Params):
@@ -58,11 +63,6 @@ class TrackParams(Params):
         gt=0,
         description="grey value noise [grey levels] of one image; patches whose contrast is below three times its "
         "effect get no point",
-    )
-    radius: int = Field(
-        4,
-        ge=1,
-        description="search radius [pixels] around the predicted position; 4: one pixel of the coarse displacement map",
     )
 
 
@@ -129,33 +129,19 @@ class _State:
 
 
 def _advance(state: _State, frames: Sequence[Pyramid], motion: LevelDisplacements, j: int, params: TrackParams) -> None:
-    """Find all points of frame j - 1 in frame j."""
-    predicted = state.expected + motion.at(state.expected)
-    # A template is drawn under the affinity of its surroundings, from the coarse displacements, which outliers do not
-    # pull.
-    smooth, _ = fit_affinity(state.expected, predicted, known(predicted), state.expected)
-    matched, _ = match_points(frames[j - 1], frames[j], state.expected, predicted, smooth, params.radius)
-    found = known(matched)
-    # A lost point goes on with the prediction, and may be found again from there.
-    state.expected = np.where(found[:, None], matched, predicted)
+    """Find all points of frame j - 1 in frame j; a lost one goes on with its prediction, and may be found again."""
+    state.expected = state.expected + motion.at(state.expected)
+    inside = known(state.expected)
     # Points of one birth share their first frame, so that an affinity is fitted to pairs of the same two frames.
     for birth in np.unique(state.birth):
-        group = np.flatnonzero((state.birth == birth) & found)
+        who = np.flatnonzero((state.birth == birth) & inside)
         then = state.points[:, birth]
-        affinity, _ = fit_affinity(then, matched, found & known(then), then[group])
-        # Singular values: the largest and the smallest stretch of the template, whatever the direction.
-        scale = np.linalg.svd(affinity, compute_uv=False)
-        near = (scale[:, 0] < MAX_SCALE) & (scale[:, 1] > 1.0 / MAX_SCALE)
-        # A template that is stretched beyond this has lost its detail or shows none: the last frame's then, at the
-        # price of drift.
-        for source, chosen in ((int(birth), near), (j - 1, ~near & known(state.points[group, j - 1]))):
-            who = group[chosen]
-            if who.size == 0:
-                continue
-            template = affinity[chosen] if source == birth else smooth[who]
-            place, error = _align(frames[source], frames[j], state.points[who, source], matched[who], template, params)
-            state.points[who, j], state.distance[who, j] = place, error
-            state.expected[who] = np.where(np.isfinite(place), place, state.expected[who])
+        # From the coarse displacements, which outliers do not pull.
+        affinity, _ = fit_affinity(then, state.expected, inside & known(then), then[who])
+        templates = Templates(then[who], state.expected[who], affinity)
+        place, error = _aligned(frames[int(birth)], frames[j], templates, params)
+        state.points[who, j], state.distance[who, j] = place, error
+        state.expected[who] = np.where(np.isfinite(place), place, state.expected[who])
 
 
 def _reseed(state: _State, frames: Sequence[Pyramid], j: int, params: TrackParams) -> _State:
@@ -169,31 +155,28 @@ def _reseed(state: _State, frames: Sequence[Pyramid], j: int, params: TrackParam
     if len(seeds) == 0 or len(here) < NEIGHBOURS:
         return state
     affinity, shift = fit_affinity(here, there, np.ones(len(here), bool), seeds)
-    matched, _ = match_points(frames[j], frames[0], seeds, seeds + shift, affinity, params.radius)
-    place, error = _align(frames[j], frames[0], seeds, matched, affinity, params)
+    place, error = _aligned(frames[j], frames[0], Templates(seeds, seeds + shift, affinity), params)
     new = _State.born(seeds, j, len(frames))
     new.points[:, 0], new.distance[:, 0] = place, error
     return state.and_also(new, known(place))
 
 
-def _align(
-    a: Pyramid, b: Pyramid, points: Floats, start: Floats, affinity: Floats, params: TrackParams
-) -> tuple[Floats, Floats]:
-    place, error = align(
-        a.images[0],
-        b.images[0],
-        Templates(points, start, affinity),
-        # A difference of two images has the noise of both.
-        noise=params.noise * 2.0**0.5,
-        spread=AFFINITY_SIGMA,
-        reach=2.0,
-    )
-    good = clear_of_mask(b.valid[0], place, HALF)
-    return np.where(good[:, None], place, np.nan), np.where(good, error, np.nan)
+def _aligned(a: Pyramid, b: Pyramid, templates: Templates, params: TrackParams) -> Aligned:
+    """Positions in ``b`` of points of ``a`` whose alignment back ends where they are; NaN of the others."""
+    # A difference of two images has the noise of both.
+    how = {"noise": params.noise * 2.0**0.5, "spread": AFFINITY_SIGMA, "reach": REACH_PX}
+    place, error = align(a.images[0], b.images[0], templates, **how)
+    good = np.flatnonzero(clear_of_mask(b.valid[0], place, HALF))
+    good = good[np.abs(np.linalg.det(templates.affinity[good])) > MIN_AREA]
+    back = Templates(place[good], templates.points[good], np.linalg.inv(templates.affinity[good]))
+    miss = align(b.images[0], a.images[0], back, **how).position - templates.points[good]
+    kept = np.isin(np.arange(len(place)), good[np.hypot(*miss.T) <= MAX_RETURN_PX])
+    return Aligned(np.where(kept[:, None], place, np.nan), np.where(kept, error, np.nan))
 
 
 @stage(
     "track",
+    version=2,
     outputs=[
         Array("points", ("point", "frame", "uv"), "float32", "px", "column and row of the point", nodata="nan"),
         Array("birth", ("point",), "int16", "1", "index of the frame that the template is from"),
