@@ -9,7 +9,7 @@ for it (locators, events), a kernel
   (:mod:`rille.pipeline.engine.code_digest`), so that an edit compiles anew what it can change, and nothing else;
 - is compiled by one process at a time: the others wait, and load it;
 - has its checksum in a file beside it, which is compared before numba loads anything;
-- lies in a folder of its function, in :func:`rille.pipeline.engine.runtime.private.private_folder`, because loading one executes it.
+- lies in a folder of its function (:func:`~rille.pipeline.engine.runtime.private.private_folder`): loading executes it.
 """
 
 from __future__ import annotations

@@ -94,8 +94,9 @@ def test_differences_from_the_programs_defaults_are_marked():
     lines = list(why._recipe(made))
     assert [line for line in lines if "default:" in line] == ["parameter     locus.max_residual = 0.7   (default: 0.5)"]
     assert "argument      pair = 3" in lines
-    shared = {"stage": "hfvm_given", "provenance": made["provenance"] | {"params": build().hfvm.model_dump(mode="json")}}
-    assert list(why._recipe(shared))[0].startswith("parameter     hfvm.preset = ")
+    params = build().hfvm.model_dump(mode="json")
+    shared = {"stage": "hfvm_given", "provenance": made["provenance"] | {"params": params}}
+    assert next(iter(why._recipe(shared))).startswith("parameter     hfvm.preset = ")
 
 
 def test_names_that_are_not_there_are_answered_by_the_nearest(three):
