@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,20 +15,23 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE, RUNS, Output, Runs
+from rille.pipeline.commands.options import COMPLETE, RUNS, Output, Runs, flag
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import DemFile, read_elevation
-from rille.pipeline.export.writers import ENGINEERING_CRS
+from rille.pipeline.export.writers import ENGINEERING_CRS, Meaning, write_bands
 from rille.pipeline.runs import lookup
 from rille.stages.core.errors import InputError
+from rille.stages.evaluation import dem_changes
 from rille.stages.evaluation import dem_comparison as evaluation
 from rille.stages.evaluation.dem_comparison import Grid
 
 Floats = NDArray[np.float64]
 SLOPES_DEG = np.array([0.0, 2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0])
 RANGE_BINS = 8
+SHOWN_CHANGES = 12
+"""Patches that are printed; all are in the JSON file."""
 WORDS = {"rmse": "RMSE", "nmad": "NMAD", "p95": "95 %", "bias": "bias", "median": "median"}
 
 
@@ -36,6 +40,7 @@ def compare_dem(
     b: str,
     *,
     align: Literal["none", "shift", "tilt", "rigid"] = "none",
+    changes: Annotated[bool, flag("List what rose or fell from B to A; writes OUTPUT.changes.tif, too.")] = False,
     output: Annotated[Path, Output] = Path("dem_comparison"),
     runs: Runs = RUNS,
 ) -> int:
@@ -61,12 +66,21 @@ def compare_dem(
     for line in figures["warnings"]:
         warn(line)
     _print(figures)
+    rasters: Mapping[str, NDArray[np.float32]] = {}
+    coarse = other if one.cell <= other.cell * (1.0 + 1e-9) else one
+    if changes:
+        rasters, figures["changes"] = changed(one, other, error)
+        print("\n".join(_change_table(figures["changes"])))
     # Either ending is understood as the name of both files.
     target = output.with_name(output.name.removesuffix(".png").removesuffix(".json"))
     with reported("RIL-614", f"{target} cannot be written", remedy="name others with -o", kind=InputError):
         atomic.write(target.with_name(target.name + ".json"), json.dumps(figures, indent=1, allow_nan=False) + "\n")
         draw(target.with_name(target.name + ".png"), figures, error)
-    print(f"{target}.png  {target}.json")
+        if rasters:
+            profile = {"driver": "COG", "crs": coarse.crs or None, "transform": coarse.transform}
+            meaning = Meaning("m", tags={"error": figures["error"]})
+            write_bands(target.with_name(target.name + ".changes.tif"), rasters, meaning, profile)
+    print(f"{target}.png  {target}.json" + (f"  {target}.changes.tif" if rasters else ""))
     return COMPLETE
 
 
@@ -156,6 +170,49 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
         bins = evaluation.binned(error, distance, np.linspace(0.0, far * (1.0 + 1e-9), RANGE_BINS + 1))
     figures["by_range"] = {"unit": unit, "bins": bins}
     return figures, error
+
+
+def changed(a: DemFile, b: DemFile, error: Floats) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:
+    """Rasters and list (JSON-able) of what rose or fell from B to A; ``error``: of :func:`measure`."""
+    grid = evaluation.common(_grid(a), _grid(b))[1]
+    sigma = [
+        np.zeros(error.shape) if one.sigma is None else evaluation.interpolate(_grid(one), grid.centres(), one.sigma)
+        for one in (a, b)
+    ]
+    deviation = dem_changes.standard_deviation(error, np.hypot(*sigma), np.hypot(*grid.slopes()), grid.cell)
+    found = dem_changes.changes(error, deviation, grid.cell)
+    places = [grid.matrix @ np.array([one.col, one.row, 1.0]) for one in found]
+    rows = [
+        {"x_m": float(x), "y_m": float(y), "cells": one.cells, "greatest_m": one.greatest, "area_m2": one.area}
+        | {"volume_m3": one.volume, "sigma_m3": one.sigma}
+        for one, (x, y) in zip(found, places, strict=True)
+    ]
+    total = {}
+    for way, sign in (("rose", 1), ("fell", -1)):
+        of = [one for one in found if sign * one.volume > 0]
+        sigma_m3 = float(np.sqrt(sum(one.sigma**2 for one in of)))
+        total[way] = {"volume_m3": sum(one.volume for one in of), "sigma_m3": sigma_m3}
+    how = (
+        f"patches of cells that differ one way by {dem_changes.BESIDE:g} standard deviations, one of them by "
+        f"{dem_changes.SURE:g}; standard deviations of both models and of a shift by {dem_changes.SHIFT_CELLS:g} "
+        "cells, scaled to the spread of all differences"
+    )
+    rasters = {"difference": error.astype(np.float32), "standard_deviation": deviation.astype(np.float32)}
+    return rasters, {"total": total, "patches": rows, "how": how}
+
+
+def _change_table(changes: Mapping[str, Any]) -> Iterator[str]:
+    """Lines on what rose or fell, the greatest volumes first."""
+    yield ""
+    for way, total in changes["total"].items():
+        yield f"{way:5s} {1e6 * total['volume_m3']:.4g} +- {1e6 * total['sigma_m3']:.2g} cm3"
+    for row in changes["patches"][:SHOWN_CHANGES]:
+        place = f"x {row['x_m']:.4f}, y {row['y_m']:.4f} m"
+        size = f"{1e4 * row['area_m2']:.4g} cm2, {1e3 * row['greatest_m']:+.3g} mm at most"
+        yield f"{place}: {size}, {1e6 * row['volume_m3']:+.4g} +- {1e6 * row['sigma_m3']:.2g} cm3"
+    more = len(changes["patches"]) - SHOWN_CHANGES
+    if more > 0:
+        yield f"and {more} smaller ones, in the JSON file"
 
 
 def _about(raster: DemFile) -> dict[str, Any]:

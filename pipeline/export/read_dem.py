@@ -46,7 +46,8 @@ class DemFile:
 
     ``values`` (rows, cols) metres, NaN unknown. ``transform`` maps (column, row), corners of cells at integers, to the
     CRS. ``crs`` WKT, empty where the file states none. ``viewpoints`` (n, 2) positions of the cameras in the CRS, where
-    they are known. ``warnings``: what is suspicious but possible.
+    they are known. ``sigma`` (rows, cols) standard deviation of the elevations, metres, likewise. ``warnings``: what is
+    suspicious but possible.
     """
 
     name: str
@@ -54,6 +55,7 @@ class DemFile:
     transform: Affine
     crs: str
     viewpoints: NDArray[np.float64] | None = None
+    sigma: NDArray[np.float64] | None = None
     warnings: tuple[str, ...] = ()
 
     @property
@@ -191,7 +193,11 @@ def _of_run(path: Path) -> DemFile:
     if not (path / "dem.tif").is_file():
         remedy = "give the folder of a finished run, RUNS/sequence/latest, or a GeoTIFF"
         raise InputError("RIL-635", f"{path} has no dem.tif", remedy=remedy)
-    return replace(read_raster(path / "dem.tif"), name=str(path), viewpoints=_cameras(path))
+    dem, beside = read_raster(path / "dem.tif"), path / "dem_sigma.tif"
+    sigma = read_raster(beside).values if beside.is_file() else None
+    # Another model's, of other cells, is none of this one.
+    sigma = sigma if sigma is not None and sigma.shape == dem.values.shape else None
+    return replace(dem, name=str(path), viewpoints=_cameras(path), sigma=sigma)
 
 
 def _cameras(run: Path) -> NDArray[np.float64] | None:

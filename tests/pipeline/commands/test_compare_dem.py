@@ -171,3 +171,23 @@ def test_one_clear_line_for_what_cannot_be_compared(tmp_path: Path, capsys: pyte
     assert "has no dem.tif" in refused(capsys, tmp_path / "folder", run)
     shutil.copy(run / "dem.tif", tmp_path / "same.tif")
     assert "too flat" not in refused(capsys, run, run, "--align", "nothing")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_changes_are_listed_with_their_places_and_volumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(5)
+    ground = 0.2 * rng.normal(size=(60, 80)).cumsum(0).cumsum(1) / 80 + 0.001 * rng.normal(size=(60, 80))
+    after = ground + 0.001 * rng.normal(size=ground.shape)
+    after[10:20, 30:40] += 0.05
+    before = tiff(tmp_path / "b.tif", ground, 0.1, 100.0, 50.0)
+    compare(tiff(tmp_path / "a.tif", after, 0.1, 100.0, 50.0), before, changes=True, output=tmp_path / "out")
+    patches = json.loads((tmp_path / "out.json").read_text())["changes"]["patches"]
+    assert len(patches) == 1
+    assert (patches[0]["x_m"], patches[0]["y_m"]) == pytest.approx((103.5, 48.5), abs=0.05)
+    assert patches[0]["volume_m3"] == pytest.approx(100 * 0.1**2 * 0.05, rel=0.05)
+    assert "rose" in capsys.readouterr().out
+    with rasterio.open(tmp_path / "out.changes.tif") as file:
+        assert file.descriptions == ("difference", "standard_deviation")
+        assert file.read(1)[15, 35] == pytest.approx(0.05, abs=0.005)
+    compare(before, before, changes=True, output=tmp_path / "same")
+    assert json.loads((tmp_path / "same.json").read_text())["changes"]["patches"] == []

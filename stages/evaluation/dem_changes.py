@@ -1,0 +1,107 @@
+"""What has changed between two elevation models of one place: where, by how much, and with which certainty.
+
+The standard deviation of a difference is that of both models, and what a remaining shift by a part of a cell makes on a
+slope; all of it is scaled so that it fits the spread of most differences, since most of the ground has not changed. A
+change is a patch of cells that differ one way by twice that, one of them at least by :data:`SURE` times. Its volume is
+that of the patch and of the cells about it, where it runs out; it has the errors of all of them, of which neighbours
+share a part: as large a part as they do where nothing has changed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from rille.stages.core.arrays import Bools, Floats
+from rille.stages.numeric.robust import mad_sigma
+
+SHIFT_CELLS = 0.25
+"""By which the models may still be shifted."""
+
+SURE, BESIDE = 5.0, 2.0
+"""Standard deviations that one cell of a change differs by, and all of its cells."""
+
+LEAST_CELLS = 6
+"""Smaller patches are what single matches make."""
+
+FOOT = 2
+"""Cells about a patch in which a change runs out, below what single cells tell."""
+
+BLOCK = 5
+"""Cells: side of the blocks whose means tell how far neighbours share their errors."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A patch of ground that rose or fell. ``row, col``: its middle; ``greatest``: difference, metres, of either sign;
+    ``area``, square metres; ``volume`` and its standard deviation ``sigma``, cubic metres, negative where it fell."""
+
+    row: float
+    col: float
+    cells: int
+    greatest: float
+    area: float
+    volume: float
+    sigma: float
+
+
+def standard_deviation(error: Floats, sigma: Floats, slope: Floats, cell: float) -> Floats:
+    """Standard deviation (rows, cols), metres, of differences where nothing has changed.
+
+    Parameters
+    ----------
+    error : (rows, cols) differences, metres, NaN unknown.
+    sigma : (rows, cols) standard deviation of the differences by the models' own account; 0 not known.
+    slope : (rows, cols) metres a metre.
+    cell : metres.
+    """
+    # What no model tells: with nothing of it, flat cells would have no error at all.
+    known = np.where(np.isfinite(sigma) & (sigma > 0), sigma, mad_sigma(error[np.isfinite(error)]))
+    expected = np.hypot(known, SHIFT_CELLS * cell * np.nan_to_num(slope))
+    usable = np.isfinite(error) & (expected > 0)
+    ratio = error[usable] / expected[usable]
+    # Where most cells are equal, as of copies, their spread scales nothing.
+    return np.asarray(expected * ((mad_sigma(ratio) if ratio.size else 0.0) or 1.0))
+
+
+def changes(error: Floats, deviation: Floats, cell: float) -> list[Change]:
+    """Changes, the greatest volume first, by differences and their :func:`standard_deviation`, both (rows, cols)."""
+    ratio = np.divide(error, deviation, out=np.zeros_like(error), where=np.isfinite(error) & (deviation > 0))
+    shared = _shared(ratio, np.abs(ratio) < BESIDE)
+    found = []
+    for sign in (1.0, -1.0):
+        label, number = scipy.ndimage.label(sign * ratio > BESIDE)
+        for k, (rows, cols) in enumerate(scipy.ndimage.find_objects(label, number), 1):
+            window = tuple(slice(max(one.start - FOOT, 0), one.stop + FOOT) for one in (rows, cols))
+            patch = label[window] == k
+            if patch.sum() >= LEAST_CELLS and (sign * ratio[window][patch]).max() > SURE:
+                patch = scipy.ndimage.binary_dilation(patch, iterations=FOOT) & np.isfinite(error[window])
+                found.append(_change(error[window], deviation[window], patch, cell, shared, window))
+    return sorted(found, key=lambda change: -abs(change.volume))
+
+
+def _change(
+    error: Floats, deviation: Floats, patch: Bools, cell: float, shared: float, window: tuple[slice, ...]
+) -> Change:
+    rows, cols = np.nonzero(patch)
+    difference, cells = error[patch], len(rows)
+    weight = np.abs(difference) / np.abs(difference).sum()
+    sigma = cell**2 * float(np.sqrt(shared * np.sum(deviation[patch] ** 2)))
+    middle = float(weight @ rows) + window[0].start, float(weight @ cols) + window[1].start
+    greatest = float(difference[np.argmax(np.abs(difference))])
+    return Change(*middle, cells, greatest, cells * cell**2, float(difference.sum()) * cell**2, sigma)
+
+
+def _shared(ratio: Floats, still: Bools) -> float:
+    """Variance of a sum of neighbouring errors over that of as many independent ones; 1 where too little is known."""
+    rows, cols = (n // BLOCK * BLOCK for n in ratio.shape)
+    blocks = [
+        a[:rows, :cols].reshape(rows // BLOCK, BLOCK, cols // BLOCK, BLOCK).swapaxes(1, 2).reshape(-1, BLOCK**2)
+        for a in (ratio, still & (ratio != 0))
+    ]
+    whole = blocks[0][blocks[1].all(axis=1)]
+    if len(whole) <= BLOCK or whole.var() == 0:
+        return 1.0
+    return max(1.0, BLOCK**2 * float(whole.mean(axis=1).var() / whole.var()))
