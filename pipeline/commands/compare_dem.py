@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,11 +21,11 @@ from rille.pipeline.commands.options import COMPLETE, RUNS, Output, Runs, flag
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.export.read_dem import DemFile, read_elevation
+from rille.pipeline.export.read_dem import DemFile, opened_raster, read_elevation
 from rille.pipeline.export.writers import ENGINEERING_CRS, Meaning, write_bands
 from rille.pipeline.runs import lookup
 from rille.stages.core.errors import InputError
-from rille.stages.evaluation import dem_changes
+from rille.stages.evaluation import dem_changes, place
 from rille.stages.evaluation import dem_comparison as evaluation
 from rille.stages.evaluation.dem_comparison import Grid
 
@@ -39,7 +41,7 @@ def compare_dem(
     a: str,
     b: str,
     *,
-    align: Literal["none", "shift", "tilt", "rigid"] = "none",
+    align: Literal["none", "shift", "tilt", "rigid", "place"] = "none",
     changes: Annotated[bool, flag("List what rose or fell from B to A; writes OUTPUT.changes.tif, too.")] = False,
     output: Annotated[Path, Output] = Path("dem_comparison"),
     runs: Runs = RUNS,
@@ -57,12 +59,20 @@ def compare_dem(
         Reference, likewise.
     align
         Move A onto B first: shift (x, y, z), tilt (z and two inclinations) or rigid (all six); the motion is printed.
+        place: two runs of one place in frames of their own; found by their ortho images, then rigid.
     output
         Files to write, without ending.
     """
-    one, other = (read_elevation(lookup.elevation(text, runs)) for text in (a, b))
+    paths = [lookup.elevation(text, runs) for text in (a, b)]
+    one, other = (read_elevation(path) for path in paths)
+    found = None
+    if align == "place":
+        motion, agreeing = place.place(*(_ortho(path) for path in paths))
+        found = {"motion_of_a": motion.tolist(), "keypoints": agreeing}
+        one, align = moved(one, motion), "rigid"
     check(one, other)
     figures, error = measure(one, other, align)
+    figures["place"] = found
     for line in figures["warnings"]:
         warn(line)
     _print(figures)
@@ -82,6 +92,24 @@ def compare_dem(
             write_bands(target.with_name(target.name + ".changes.tif"), rasters, meaning, profile)
     print(f"{target}.png  {target}.json" + (f"  {target}.changes.tif" if rasters else ""))
     return COMPLETE
+
+
+def _ortho(path: Path) -> place.Ortho:
+    """The ortho image of a run."""
+    if not path.is_dir():
+        raise InputError("RIL-908", f"{path} is no run: it has no ortho image", remedy="leave --align place out")
+    with opened_raster(path / "ortho.tif") as file:
+        bands, known, t = file.read(out_dtype="float32"), file.dataset_mask() != 0, file.transform
+    grey = bands.mean(axis=0)
+    t = t @ Affine.translation(0.5, 0.5)
+    return place.Ortho(grey, known & np.isfinite(grey), np.array([[t.a, t.b, t.c], [t.d, t.e, t.f]]))
+
+
+def moved(dem: DemFile, motion: Floats) -> DemFile:
+    """The model in another frame, by a motion (2, 3) of x, y."""
+    eyes = dem.viewpoints
+    eyes = None if eyes is None else eyes @ motion[:, :2].T + motion[:, 2]
+    return replace(dem, transform=Affine(*motion.ravel()) @ dem.transform, viewpoints=eyes)
 
 
 def check(a: DemFile, b: DemFile) -> None:
@@ -256,6 +284,10 @@ def _print(figures: dict[str, Any]) -> None:
     print(f"A  {figures['a']['path']}  {figures['a']['cell_m']:g} m cells")
     print(f"B  {figures['b']['path']}  {figures['b']['cell_m']:g} m cells, the reference")
     print(f"cells: {figures['resampling']}; errors are A minus B")
+    if figures["place"]:
+        (cos, _, x), (sin, _, y) = figures["place"]["motion_of_a"]
+        turn, agreeing = math.degrees(math.atan2(sin, cos)), figures["place"]["keypoints"]
+        print(f"place: A turned by {turn:.3f} degrees, moved by {x:.4f}, {y:.4f} m ({agreeing} keypoints)")
     if "alignment" in figures:
         aligned = figures["alignment"]
         moved = ", ".join(f"{k} {v:.6g} (sigma {aligned['sigma'][k]:.2g})" for k, v in aligned["motion_of_a"].items())

@@ -1,0 +1,58 @@
+"""One place in two frames: turn and shift by the ortho images; other places are refused."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from raising import raises
+
+from rille.stages.evaluation.place import Ortho, place
+
+
+def ground(seed):
+    """Grey texture (row, col) of several scales."""
+    rng = np.random.default_rng(seed)
+    octaves = [cv2.resize(rng.normal(size=(n, n)).astype(np.float32), (480, 480)) for n in (30, 60, 120, 240)]
+    return np.clip(128 + 25 * sum(octaves), 0, 255)
+
+
+def seen(image, matrix, cells=300):
+    """What cells (row, col) with this map to x, y show of a ground whose pixels are centimetres."""
+    to_pixels = 100.0 * matrix
+    grey = cv2.warpAffine(image, to_pixels, (cells, cells), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    known = cv2.warpAffine(np.ones_like(image), to_pixels, (cells, cells), flags=cv2.WARP_INVERSE_MAP) > 0.99
+    return Ortho(grey, known, matrix)
+
+
+def lattice(cell, turn_deg=0.0, x=0.0, y=0.0):
+    c, s = cell * math.cos(math.radians(turn_deg)), cell * math.sin(math.radians(turn_deg))
+    return np.array([[c, -s, x], [s, c, y]])
+
+
+@pytest.mark.parametrize("turn", [0.0, 25.0, 170.0])
+@pytest.mark.parametrize("cell", [0.01, 0.013])
+def test_turn_and_shift_are_found(turn, cell):
+    b = seen(ground(1), lattice(0.01, x=0.9, y=0.8))
+    # A's frame: turned and shifted against B's
+    motion = lattice(1.0, turn, 2.4, 2.2)
+    own = np.array([[cell, 0.0, -140 * cell], [0.0, cell, -150 * cell]])
+    there = motion[:, :2] @ own + np.column_stack([np.zeros((2, 2)), motion[:, 2]])
+    a = Ortho(*seen(ground(1), there)[:2], own)
+    found, agreeing = place(a, b)
+    middle = np.array([0.1, -0.05])
+    error = (found - motion)[:, :2] @ middle + (found - motion)[:, 2]
+    assert np.abs(error).max() < 0.5 * 0.01
+    assert np.linalg.det(found[:, :2]) == pytest.approx(1.0)
+    assert agreeing > 30
+
+
+def test_another_place_is_refused():
+    a, b = (seen(ground(seed), lattice(0.01)) for seed in (1, 2))
+    with raises("RIL-327", "one place"):
+        place(a, b)
+    blank = Ortho(np.full((50, 50), 90.0), np.ones((50, 50), bool), lattice(0.01))
+    with raises("RIL-327", "0 keypoints"):
+        place(blank, b)
