@@ -76,7 +76,7 @@ def lay_out(graph: Any, paths: dict[str, Path], shape: tuple[int, int]) -> dict[
     pyramids = {}
     for camera, path in paths.items():
         args = {"path": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "frame": 0}
-        args |= {"camera": camera, "width": shape[1], "height": shape[0], "depth": 8}
+        args |= {"camera": camera, "header": {"width": shape[1], "height": shape[0], "depth": 8}}
         image = graph.node("rille.datasets.images.files", f"image/{camera}", NoParams(), args)
         pyramids[camera] = graph.node(
             "rille.stages.imaging.pyramid", f"pyramid/{camera}", PyramidParams(), inputs={"image": image}

@@ -22,7 +22,7 @@ from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import RECTIFIED
 from rille.datasets.images import bag
 from rille.datasets.images.files import Digests, check_size
-from rille.datasets.images.headers import sizes_of
+from rille.datasets.images.headers import Header, sizes_of
 from rille.datasets.images.pairing import join, side_of
 from rille.datasets.imu import ImuRecord, Inertial, at_frames
 from rille.datasets.inspection import CALIBRATIONS, Findings, FoundImages, find_calibration
@@ -57,7 +57,7 @@ class TakenImage:
 
     at: int
     sha256: str
-    size: tuple[int, int, int]
+    size: Header
     frame: str
 
 
@@ -111,11 +111,9 @@ def open_bag(
 
     def image(number: int, camera: str) -> Source:
         one = taken[camera][number]
-        width, height, bits = one.size
-        args = {"sha256": one.sha256, "camera": camera, "frame": number}
-        args |= {"width": width, "height": height, "depth": bits}
-        hints = {"path": str(path), "topic": chosen[CAMERAS.index(camera)], "at": one.at}
-        return Source("rille.datasets.images.bag", NoParams(), args, hints=hints)
+        args = {"sha256": one.sha256, "camera": camera, "frame": number, "header": one.size._asdict()}
+        place = bag.Message(str(path), chosen[CAMERAS.index(camera)], one.at)
+        return Source("rille.datasets.images.bag", NoParams(), args, hints={"message": place._asdict()})
 
     return Sequence(
         name=derived_name(path.stem),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -80,15 +81,24 @@ def label(text: str, path: Path) -> list[CalibratedCamera]:
     if kind == "CAHVORE":
         f.numbers("MODEL_COMPONENT_7", 3)  # of near points alone
         linearity = _linearity(f)
-    return [_camera(f, path.stem, (c, a, h, v), (axis, radial, linearity))]
+    return [_camera(f, path.stem, _Model(c, a, h, v, axis, radial, linearity))]
 
 
-def _camera(
-    f: Fields, name: str, cahv: tuple[np.ndarray, ...], bending: tuple[np.ndarray, tuple, float]
-) -> CalibratedCamera:
+class _Model(NamedTuple):
+    """Components C, A, H, V (3,) of a camera; of its lens ``axis`` O, ``radial`` terms R and ``linearity``."""
+
+    c: np.ndarray
+    a: np.ndarray
+    h: np.ndarray
+    v: np.ndarray
+    axis: np.ndarray
+    radial: tuple[float, float, float]
+    linearity: float
+
+
+def _camera(f: Fields, name: str, model: _Model) -> CalibratedCamera:
     """Camera with its axes along A and along columns: x is the part of H across A."""
-    c, a, h, v = cahv
-    axis, radial, linearity = bending
+    a, h, v = model.a, model.h, model.v
     cx, cy = float(h @ a), float(v @ a)
     fx = float(np.linalg.norm(h - cx * a))
     if fx <= SKEW * abs(cx):
@@ -101,11 +111,11 @@ def _camera(
         raise f.error("RIL-953", "MODEL_COMPONENT_4", "mirrors the image", "give a model without mirroring")
     camera = f.camera("MODEL_COMPONENT_3", (fx, fy, cx, cy), UNKNOWN_SIZE)
     axes = np.array([x, y, a])
-    T_camera_reference = f.rigid("MODEL_COMPONENT_2", axes, -axes @ c)
-    if not any(radial) and linearity == 1.0 and abs(skew) <= SKEW * fy:
+    T_camera_reference = f.rigid("MODEL_COMPONENT_2", axes, -axes @ model.c)
+    if not any(model.radial) and model.linearity == 1.0 and abs(skew) <= SKEW * fy:
         lens = Lens(camera)
     else:
-        terms = (skew, *map(float, axes @ axis), *radial, linearity)
+        terms = (skew, *map(float, axes @ model.axis), *model.radial, model.linearity)
         lens = f.lens("MODEL_COMPONENT_5", camera, "cahvore", terms)
     return CalibratedCamera(name, lens, T_camera_reference)
 

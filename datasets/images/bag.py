@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from rille.datasets.facts import ImageFacts
 from rille.datasets.images import files
 from rille.datasets.images.files import Grey
+from rille.datasets.images.headers import Header
 from rille.datasets.text.reading import open_regular
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.core.errors import InputError, RilleError
@@ -40,6 +41,19 @@ LAYOUTS: Mapping[str, tuple[int, int, int | None]] = {
     },
 }
 """Samples a pixel, bits a sample and OpenCV's conversion to grey, by the encoding of ``sensor_msgs/msg/Image``."""
+
+
+class Message(NamedTuple):
+    """Where a message lies: ``path`` of the bag, ``topic``, and ``at``, the time when it was recorded, ns."""
+
+    path: str
+    topic: str
+    at: int
+
+    @staticmethod
+    def from_dict(d: Mapping[str, Any]) -> Message:
+        """Inverse of ``_asdict()``."""
+        return Message(**d)
 
 
 @contextmanager
@@ -73,22 +87,22 @@ def opened(path: Path) -> Iterator[Any]:
         ) from error
 
 
-def depth(message: Any, name: str) -> tuple[int, int, int]:
+def depth(message: Any, name: str) -> Header:
     """Width, height and bits of the image of a message."""
     if hasattr(message, "format"):
         found = files.decode(bytes(message.data), name)
-        return found.shape[1], found.shape[0], found.dtype.itemsize * 8
-    return int(message.width), int(message.height), _layout(message, name)[1]
+        return Header(found.shape[1], found.shape[0], found.dtype.itemsize * 8)
+    return Header(int(message.width), int(message.height), _layout(message, name)[1])
 
 
-def grey_of(message: Any, name: str, wanted: tuple[int, int, int]) -> Grey:
+def grey_of(message: Any, name: str, wanted: Header) -> Grey:
     """Grey image (row, col), uint8 or uint16, of a message.
 
     Parameters
     ----------
     message : ``sensor_msgs/msg/Image`` or ``CompressedImage``.
     name : what to call it in an error.
-    wanted : width, height and bits that it must have.
+    wanted : what it must have.
 
     Raises
     ------
@@ -99,7 +113,7 @@ def grey_of(message: Any, name: str, wanted: tuple[int, int, int]) -> Grey:
         return files.decode(bytes(message.data), name, wanted)
     samples, bits, conversion = _layout(message, name)
     rows, columns, step = int(message.height), int(message.width), int(message.step)
-    files.check_size((columns, rows, bits), wanted, name)
+    files.check_size(Header(columns, rows, bits), wanted, name)
     width = columns * samples * bits // 8
     # Rows may be padded to `step` bytes (sensor_msgs/msg/Image), and the message may hold fewer than it states.
     data = np.frombuffer(bytes(message.data), np.uint8)
@@ -126,24 +140,20 @@ def bag_image_stage(
     *,
     frame: int,
     camera: str,
-    path: str,
-    topic: str,
-    at: int,
+    message: Message,
     sha256: str,
-    width: int,
-    height: int,
-    depth: int,
+    header: Header,
     levels: tuple[int, int] | None = None,
 ) -> Bundle[ImageFacts]:
     """One image of a bag, checked and grey."""
-    name = f"frame {frame}, {camera} image of {path}"
-    with opened(Path(path)) as reader:
-        there = [c for c in reader.connections if c.topic == topic]
-        for connection, _, data in reader.messages(there, start=at, stop=at + 1) if there else ():
+    name = f"frame {frame}, {camera} image of {message.path}"
+    with opened(Path(message.path)) as reader:
+        there = [c for c in reader.connections if c.topic == message.topic]
+        for connection, _, data in reader.messages(there, start=message.at, stop=message.at + 1) if there else ():
             if hashlib.sha256(data).hexdigest() == sha256:
-                message = reader.deserialize(data, connection.msgtype)
+                content = reader.deserialize(data, connection.msgtype)
                 break
         else:
             raise InputError("RIL-944", f"{name} has changed since the run began", remedy="run the same command again")
-    image = spread(grey_of(message, name, (width, height, depth)), levels)
+    image = spread(grey_of(content, name, header), levels)
     return Bundle({"image": image, "valid": np.ones(image.shape, np.uint8)}, {"frame": frame, "camera": camera})

@@ -158,7 +158,7 @@ def decode_colour(
     grey: Grey = np.ascontiguousarray(image)
     if wanted is not None:
         # What was decoded counts: a header may say anything.
-        check_size((grey.shape[1], grey.shape[0], grey.dtype.itemsize * 8), wanted, name)
+        check_size(Header(grey.shape[1], grey.shape[0], grey.dtype.itemsize * 8), wanted, name)
     return grey, colour
 
 
@@ -242,16 +242,8 @@ class Digests:
 
 
 def image_source(path: Path, frame: int, camera: str, header: Header, digests: Digests) -> Source:
-    """Source of one file; ``header`` is the width, height and bits that it must have."""
-    width, height, depth = header
-    args = {
-        "sha256": digests.sha256(path),
-        "camera": camera,
-        "frame": frame,
-        "width": width,
-        "height": height,
-        "depth": depth,
-    }
+    """Source of one file; ``header`` is what it must have."""
+    args = {"sha256": digests.sha256(path), "camera": camera, "frame": frame, "header": header._asdict()}
     return Source("rille.datasets.images.files", NoParams(), args, hints={"path": str(path.resolve())})
 
 
@@ -294,15 +286,13 @@ def image_stage(
     camera: str,
     path: str,
     sha256: str,
-    width: int,
-    height: int,
-    depth: int,
+    header: Header,
     levels: tuple[int, int] | None = None,
 ) -> Bundle[ImageFacts]:
     """One image file, checked and grey."""
     name = f"frame {frame}, {camera} image {path}"
     data = read_unchanged(Path(path), sha256, name)
-    image, colour = decode_colour(data, name, (width, height, depth), levels)
+    image, colour = decode_colour(data, name, header, levels)
     meta: ImageFacts = {"frame": frame, "camera": camera}
     arrays: dict[str, NDArray[Any]] = {"image": image, "valid": np.ones(image.shape, np.uint8)}
     # The right image's colours would colour nothing: an ortho image is made of left ones.

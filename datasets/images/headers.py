@@ -6,14 +6,26 @@ decoder ever sees a file.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 from warnings import catch_warnings
 
 from rille.stages.geometry.geometry import Sizes
 
-Header = tuple[int, int, int]
-"""Width and height, pixels, and bits a sample as they are decoded, 8 or 16 (more where they are no integers)."""
+
+class Header(NamedTuple):
+    """Width and height, pixels, and bits a sample as they are decoded, 8 or 16 (more where they are no integers)."""
+
+    width: int
+    height: int
+    depth: int
+
+    @staticmethod
+    def from_dict(d: Mapping[str, int]) -> Header:
+        """Inverse of ``_asdict()``."""
+        return Header(**d)
+
 
 Headers = tuple[Header, Header]
 """Of the left and of the right images: two cameras need not be alike."""
@@ -37,7 +49,7 @@ def read_header(file: BinaryIO) -> Header | None:
         image = opened(file)
         if image is not None:
             bits = _bits(image)
-            return image.width, image.height, 8 if bits <= 8 else 16 if bits <= 16 else bits
+            return Header(image.width, image.height, 8 if bits <= 8 else 16 if bits <= 16 else bits)
     return None
 
 

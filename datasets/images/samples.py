@@ -54,7 +54,11 @@ def examined(sequence: Sequence) -> Sequence:
 
     def image(frame: int, camera: str) -> Source:
         source = sequence.image(frame, camera)
-        return replace(source, args={**source.args, "levels": chosen_levels}) if source.args["depth"] == 16 else source
+        return (
+            replace(source, args={**source.args, "levels": chosen_levels})
+            if source.args["header"]["depth"] == 16
+            else source
+        )
 
     return replace(sequence, image=image, warnings=(*sequence.warnings, *lines))
 

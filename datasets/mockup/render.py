@@ -58,13 +58,15 @@ def transform(T_dst_src: RigidTransform, points: NDArray[np.float64]) -> NDArray
 
 
 class _Bed(NamedTuple):
-    """Grids (row, col) of the bed: ``height`` m, ``sunlit`` and ``tint``; ``grid``: x0, y0 and cell, m; ``rise``: m
-    upwards a metre ahead; ``sun`` (3,) direction towards it."""
+    """Grids (row, col) of the bed: ``height`` m, ``sunlit`` and ``tint``; ``x0``, ``y0`` of their first cell and
+    ``cell``, m; ``rise``: m upwards a metre ahead; ``sun`` (3,) direction towards it."""
 
     height: NDArray[np.float32]
     sunlit: NDArray[np.uint8]
     tint: NDArray[np.uint8]
-    grid: tuple[float, float, float]
+    x0: float
+    y0: float
+    cell: float
     rise: float
     sun: NDArray[np.float64]
 
@@ -72,7 +74,7 @@ class _Bed(NamedTuple):
 @njit(cache=True, nogil=True)
 def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ignore[no-untyped-def]
     """Radiance (n,) of the hit points, NaN where a ray hit nothing; ``albedo``: its levels, the finest first."""
-    height, sunlit, tint, (x0, y0, cell), rise, sun = bed
+    height, cell, sun = bed.height, bed.cell, bed.sun
     n = directions.shape[0]
     out = np.full(n, np.nan, np.float32)
     for i in range(n):
@@ -82,7 +84,7 @@ def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ign
         dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         x, y = origin[0] + t * dx, origin[1] + t * dy
-        c, r = (x - x0) / cell, (y0 - y) / cell
+        c, r = (x - bed.x0) / cell, (bed.y0 - y) / cell
         vx, vy, vz = -dx / length, -dy / length, -dz / length
         minor = t * length * pixel_angle
         # slopes over the footprint, at least over one cell: what a pixel averages is not resolved
@@ -93,12 +95,12 @@ def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ign
         mu0 = max((sun[2] - gx * sun[0] - gy * sun[1]) / norm, 0.0)
         # A slope taken over the footprint may face away from a camera that sees the point: the cosine stays positive.
         mu = max((vz - gx * vx - gy * vy) / norm, 0.05)
-        lit = _bilinear(sunlit, r, c) / 255.0
+        lit = _bilinear(bed.sunlit, r, c) / 255.0
         # Lunar-Lambert: Lommel and Seeliger's law, which knows no limb darkening, mixed with Lambert's.
         direct = lit * (2.0 * LUNAR * mu0 / (mu0 + mu) + (1.0 - LUNAR) * mu0) if mu0 > 0.0 else 0.0
         # grain is draped over rocks, not projected from above, so that walls that face the drive are not streaked; a
         # slope's own rise drapes nothing, lest its far end lies beyond the grain
-        drape = (origin[2] + t * dz - rise * y) / cell
+        drape = (origin[2] + t * dz - bed.rise * y) / cell
         # footprint on the ground: an ellipse drawn out along the line of sight
         stretch = min(1.0 / mu, 8.0)
         taps = int(stretch + 0.5)
@@ -118,7 +120,7 @@ def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ign
             total += (1.0 - f) * _texel(albedo, low, tr, tc)
             total += f * _texel(albedo, low + 1, tr, tc)
         # 128 and 100 are the bytes that stand for 1 in the albedo and in the tint.
-        out[i] = total / taps / 128.0 * _bilinear(tint, r, c) / 100.0 * (direct + AMBIENT)
+        out[i] = total / taps / 128.0 * _bilinear(bed.tint, r, c) / 100.0 * (direct + AMBIENT)
     return out
 
 
@@ -160,7 +162,9 @@ def radiance(
         field.height,
         np.ascontiguousarray(scene["sunlit"][:]),
         np.ascontiguousarray(scene["tint"][:]),
-        (field.x0, field.y0, field.cell),
+        field.x0,
+        field.y0,
+        field.cell,
         math.tan(math.radians(light["slope_deg"])),
         np.array([math.cos(e) * math.sin(a), math.cos(e) * math.cos(a), math.sin(e)]),
     )

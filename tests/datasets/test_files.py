@@ -9,6 +9,7 @@ from raising import raises
 
 from rille.datasets.images import files
 from rille.datasets.images.files import Digests
+from rille.datasets.images.headers import Header
 from rille.stages.core.declare import NoParams, check_outputs
 from rille.stages.core.errors import InputError
 
@@ -110,7 +111,7 @@ def test_stage_gives_the_image_whole_and_declared(tmp_path, grey):
     for image, depth in ((grey, 8), (grey.astype(np.uint16) * 100, 16)):
         path = tmp_path / f"{depth}.png"
         path.write_bytes(encoded(image))
-        bundle = run(files.image_source(path, 3, "right", (50, 40, depth), Digests()))
+        bundle = run(files.image_source(path, 3, "right", Header(50, 40, depth), Digests()))
         np.testing.assert_array_equal(bundle["image"], image)
         assert bundle["valid"].all()
         assert bundle.meta == {"frame": 3, "camera": "right"}
@@ -120,8 +121,8 @@ def test_stage_refuses_other_sizes_and_changed_files(tmp_path, grey):
     path = tmp_path / "a.png"
     path.write_bytes(encoded(grey))
     with raises("RIL-176", "frame 3", "50 x 40", "51 x 40"):
-        run(files.image_source(path, 3, "left", (51, 40, 8), Digests()))
-    source = files.image_source(path, 3, "left", (50, 40, 8), Digests())
+        run(files.image_source(path, 3, "left", Header(51, 40, 8), Digests()))
+    source = files.image_source(path, 3, "left", Header(50, 40, 8), Digests())
     path.write_bytes(encoded(grey[::-1]))
     with raises("RIL-177"):
         run(source)
@@ -130,7 +131,7 @@ def test_stage_refuses_other_sizes_and_changed_files(tmp_path, grey):
 def test_paths_are_hints_and_content_is_the_identity(tmp_path, grey):
     for name in ("a.png", "b.png"):
         (tmp_path / name).write_bytes(encoded(grey))
-    a, b = (files.image_source(tmp_path / n, 0, "left", (50, 40, 8), Digests()) for n in ("a.png", "b.png"))
+    a, b = (files.image_source(tmp_path / n, 0, "left", Header(50, 40, 8), Digests()) for n in ("a.png", "b.png"))
     assert a.args == b.args
     assert a.hints != b.hints
 

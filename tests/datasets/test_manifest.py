@@ -209,7 +209,7 @@ def test_two_cameras_may_have_two_sizes_of_images(tmp_path):
     sequence = opened(manifest)
     assert [(c.width, c.height) for c in (sequence.rig.left, sequence.rig.right)] == [(64, 48), (32, 24)]
     taken = [sequence.image(0, camera).args for camera in ("left", "right")]
-    assert [(args["width"], args["height"]) for args in taken] == [(64, 48), (32, 24)]
+    assert [(args["header"]["width"], args["header"]["height"]) for args in taken] == [(64, 48), (32, 24)]
 
 
 def test_a_calibration_that_states_two_sizes_is_that_of_images_of_two_sizes(tmp_path):

@@ -38,7 +38,7 @@ def pyramids(graph, images):
     found = {}
     for camera, path in images.items():
         args = {"path": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "frame": 0}
-        args |= {"camera": camera, "width": SHAPE[1], "height": SHAPE[0], "depth": 8}
+        args |= {"camera": camera, "header": {"width": SHAPE[1], "height": SHAPE[0], "depth": 8}}
         image = graph.node("rille.datasets.images.files", f"image/{camera}", NoParams(), args)
         found[camera] = graph.node(
             "rille.stages.imaging.pyramid", f"pyramid/{camera}", PyramidParams(), inputs={"image": image}
