@@ -165,14 +165,7 @@ def _table(found: Joint) -> Iterator[str]:
 
 def _toml(found: Joint) -> str:
     """The file's text: the rig, and how it was estimated."""
-    runs = {
-        one.run: {
-            p.name: [math.degrees(v), math.degrees(s)]
-            for p, v, s in zip(found.parameters, one.values, one.sigma, strict=True)
-        }
-        for one in found.estimates
-    }
     turned = dict(zip(NAMES, np.degrees(found.values).tolist(), strict=True))
-    content = {"rig": found.rig.to_dict(), "corrected_by_degrees": turned}
+    content = {"runs": [one.run for one in found.estimates], "corrected_by_degrees": turned}
     head = "# A rig for manifests: [rig] file = ... ; x_right = R x_left + t, metres, rows of [R | t].\n"
-    return head + tomli_w.dumps(content | {"estimates_degrees_and_sigma": runs})
+    return head + tomli_w.dumps(content | {"rig": found.rig.to_dict()})

@@ -3,50 +3,40 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import RunView
-from rille.stages.core.declare import Bundle
+from rille.pipeline.export.view import RunView, part
 
 
-def _assessed(run: RunView) -> dict[str, Any]:
-    """What was compared with truth; it may lack any part."""
-    p = run.products
-    return {
-        "trajectory": p.accuracy or p.position_accuracy,
-        "disparity": p.disparity_accuracy,
-        "elevation": p.local_dem_accuracy,
-        "merged": p.dem_accuracy,
-        "path_check": p.path_check,
-        "source": run.sequence.truth_source,
-    }
-
-
-def _write(
-    path: Path,
-    *,
-    trajectory: Bundle | None = None,
-    disparity: Mapping[int, Bundle | None] | None = None,
-    elevation: Mapping[int, Bundle | None] | None = None,
-    merged: Bundle | None = None,
-    path_check: Bundle | None = None,
-    source: str = "",
-) -> None:
+def _write(path: Path, run: RunView) -> None:
     """Write the figures by what they judge; those of a pair by its frame. Nothing where nothing was compared."""
-    by_pair = {"disparity": disparity or {}, "elevation": elevation or {}}
-    found: dict[str, Any] = {
-        name: {str(pair): one.meta["metrics"] for pair, one in of.items() if one is not None}
+    p = run.products
+    by_pair = {"disparity": p.disparity_accuracy, "elevation": p.local_dem_accuracy}
+    whole = {"trajectory": p.accuracy or p.position_accuracy, "merged_elevation": p.dem_accuracy, "path": p.path_check}
+    figures: dict[str, Any] = {
+        name: {str(pair): bundle.meta["metrics"] for pair, one in of.items() if (bundle := run.bundle(one)) is not None}
         for name, of in by_pair.items()
     }
-    whole = {"trajectory": trajectory, "merged_elevation": merged, "path": path_check}
-    found |= {name: one.meta["metrics"] for name, one in whole.items() if one is not None}
-    found = {name: figures for name, figures in found.items() if figures}
-    if found:
-        text = json.dumps({"truth": source, **found}, indent=1, allow_nan=False)
+    figures |= {name: one.meta["metrics"] for name, of in whole.items() if (one := run.bundle(of)) is not None}
+    figures = {name: values for name, values in figures.items() if values}
+    if figures:
+        text = json.dumps({"truth": run.sequence.truth_source, **figures}, indent=1, allow_nan=False)
         path.write_text(text + "\n", encoding="utf-8")
+
+
+def _reads(run: RunView) -> tuple[object, ...]:
+    p = run.products
+    trajectory = p.accuracy, p.position_accuracy
+    return (
+        *trajectory,
+        p.disparity_accuracy,
+        p.local_dem_accuracy,
+        p.dem_accuracy,
+        p.path_check,
+        run.sequence.truth_source,
+    )
 
 
 OUTPUTS = (
@@ -55,7 +45,7 @@ OUTPUTS = (
         "errors against truth: of each pair's disparities and elevations, the trajectory, the merged map, the path",
         "any text editor, jq",
         _write,
-        _assessed,
+        lambda run: {"run": part(run, _reads)},
     ),
 )
 STAGE = stage("output.accuracy", "Errors against truth as a file", OUTPUTS)

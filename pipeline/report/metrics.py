@@ -37,20 +37,6 @@ LABELS: Mapping[str, str] = {
 ABBREVIATIONS = ("ate", "rpe", "kitti")
 """Parts of those names that are written in capitals."""
 
-DISPARITY: Mapping[str, str] = {
-    "median": "Error of matched pixels, median",
-    "completeness": "Matched pixels of those with truth",
-    "bad_1": "bad-1, all pixels, filled",
-    "bad_1_matched": "bad-1, matched pixels",
-    "bad_2": "bad-2, all pixels, filled",
-    "bad_2_matched": "bad-2, matched pixels",
-    "bad_4": "bad-4, all pixels, filled",
-    "bad_4_matched": "bad-4, matched pixels",
-    "within_1_sigma": "Errors within 1 σ",
-    "within_2_sigma": "Errors within 2 σ",
-}
-"""Words for errors of disparities."""
-
 OF_DRIVE = {"path_length": "Length driven"}
 """The same for what is judged by the simulator."""
 
@@ -137,7 +123,7 @@ def _disparity(view: RunView) -> dict[str, Metric]:
     by_name = {}
     for name in judged[0] if judged else ():
         values = [figures[name]["value"] for figures in judged if figures[name]["value"] is not None]
-        label, how = DISPARITY[name], f"{judged[0][name]['how'].partition(', ')[0]}: mean over pairs"
+        label, how = _label(name), f"{judged[0][name]['how'].partition('; ')[0]}: mean over pairs"
         every = f"{len(values)} of {len(pairs)} pairs"
         entry = metric(label, statistics.fmean(values) if values else None, judged[0][name]["unit"], how, every)
         by_name[f"disparity_{name}"] = {"group": "Disparity against truth", "truth": "true disparities", **entry}

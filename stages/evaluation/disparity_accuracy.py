@@ -53,17 +53,18 @@ def disparity_accuracy(column: Floats32, match: Bools, sigma: Floats32, truth: F
     both = known & match & np.isfinite(column)
     error = np.abs(column - truth)[both]
     every = np.abs(filled(column, both | (match & ~known)) - truth)[known]
-    of_matched, of_all = f"{error.size} matched of {every.size} pixels with truth", f"{every.size} pixels with truth"
+    of_matched = f"of the matched pixels; {error.size} of {every.size} with truth"
+    of_all = f"of all pixels, filled along rows where not matched; {every.size} with truth"
     claimed = sigma[both]
     figures = {
-        "median": metric(float(np.median(error)) if error.size else None, "px", f"median error, {of_matched}"),
-        "completeness": metric(error.size / every.size if every.size else None, "1", f"share: {of_matched}"),
+        "median": metric(float(np.median(error)) if error.size else None, "px", f"median error {of_matched}"),
+        "completeness": metric(error.size / every.size if every.size else None, "1", f"share {of_matched}"),
     }
     for limit in THRESHOLDS_PX:
         words = f"share off by more than {limit} px, "
         # Not "greater": where nothing is known the error is NaN, and bad.
         worse = float(np.mean(~(every <= limit))) if every.size else None
-        figures[f"bad_{limit}"] = metric(worse, "1", f"{words}{of_all}, filled along rows where not matched")
+        figures[f"bad_{limit}"] = metric(worse, "1", words + of_all)
         worse = float(np.mean(error > limit)) if error.size else None
         figures[f"bad_{limit}_matched"] = metric(worse, "1", words + of_matched)
     for count in SIGMAS:

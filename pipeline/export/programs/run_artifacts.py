@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
@@ -17,7 +18,7 @@ STOP = re.compile(r"risk/(\d{1,9})")
 
 
 def export_run(kind: str, run: Path, target: Path, store: Store) -> str:
-    """Write a run folder in a form, ``colmap`` or ``nav2``, as a folder; the line to print.
+    """Write a run folder in a form, such as ``colmap`` or ``nav2``, as a folder; the line to print.
 
     Raises
     ------
@@ -79,6 +80,13 @@ class RunArtifacts:
         """Risk map of the world; of a drive, what it knew at its last stop."""
         stops = [int(stop[1]) for name in self._rows if (stop := STOP.fullmatch(name))]
         return self.one(f"risk/{max(stops)}" if stops and "risk/world" not in self._rows else "risk/world")
+
+    def digests(self) -> Iterator[tuple[str, str]]:
+        """Label and SHA-256 of each file that a task of the run has read, as its artifact states it."""
+        for label, row in self._rows.items():
+            made = self._store.manifest(str(row["stage"]), str(row["key"])) if not row.get("inputs") else None
+            args = {} if made is None else made["provenance"]["args"]
+            yield from ((label, value) for value in (args.get("sha256"), *args.get("digests", {}).values()) if value)
 
     def _open(self, label: str) -> Bundle:
         row = self._rows[label]
