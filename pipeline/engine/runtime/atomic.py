@@ -34,11 +34,8 @@ def replacing(path: Path) -> Iterator[Path]:
     # beside it (GDAL does) are removed with the folder.
     apart.mkdir()
     try:
-        try:
+        with _named(path):
             yield apart / path.name
-        except OSError as error:
-            error.filename = error.filename or str(path)  # that of a write to a full disk has none
-            raise
         if path.is_dir() and not (apart / path.name).is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         if path.is_dir() and not path.is_symlink():
@@ -51,8 +48,14 @@ def replacing(path: Path) -> Iterator[Path]:
 
 def write(path: Path, data: bytes | str) -> None:
     """Replace a file (text is UTF-8). It is not flushed: for what may be lost, but not be half."""
-    with replacing(path) as temporary:
-        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = _beside(path)  # without a folder of its own, which takes ten times as long
+    try:
+        with _named(path):
+            temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def create(path: Path, content: bytes | memoryview) -> bool:
@@ -101,6 +104,16 @@ def remove(path: Path, modified: float) -> None:
         pass  # made anew meanwhile
     finally:
         aside.unlink()
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Name the file in errors of a block; that of a write to a full disk has no name."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
 
 
 def _beside(path: Path) -> Path:
