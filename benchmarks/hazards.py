@@ -149,7 +149,7 @@ def show_paths(scenes: list[dict[str, Any]], covers: list[float]) -> None:
     for cover in [*covers, None]:
         mine = [s for s in scenes if cover is None or s["cover"] == cover]
         for way in PLANNED:
-            found = [s["paths"][way] for s in mine if s["paths"][way]["path_length"] is not None]
+            found = [s["paths"][way] for s in mine if s["paths"][way].get("path_length") is not None]
             best = [p for p in found if p["length_ratio"] is not None]
             ratios = Ratios([(p["length_ratio"] * p["shortest_length"], p["shortest_length"]) for p in best])
             crossed = sum(p["crossed_cells"] for p in found)

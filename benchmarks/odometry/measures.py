@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from rille.stages.evaluation.accuracy import posed, trajectory_accuracy, umeyama
+from rille.stages.evaluation.accuracy import trajectory_accuracy
+from rille.stages.evaluation.rigid import posed, umeyama
 
 FIRST = 20
 """Frames of the shorter alignment: on a street some twenty metres, where odometry has not drifted yet."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rille.pipeline.export.view import RunView
 from rille.stages.core.declare import Bundle
-from rille.stages.evaluation import accuracy
+from rille.stages.evaluation import rigid
 from rille.stages.geometry.geometry import Rig
 
 Floats = NDArray[Any]
@@ -31,7 +31,7 @@ def by_frame(view: RunView, bundle: Bundle, name: str) -> Floats:
     """An array of an artifact with one row for each chosen frame, NaN where it has none."""
     values = np.asarray(bundle[name], dtype=np.float64)
     frames = list(bundle.meta.get("frames") or view.frames[: len(values)])
-    return accuracy.by_frame(values, frames, list(view.frames))
+    return rigid.by_frame(values, frames, list(view.frames))
 
 
 def chain(view: RunView) -> tuple[int, ...]:

@@ -119,12 +119,12 @@ def _truth(make: Builder, frame: int) -> RigidTransform | None:
 def _positions(make: Builder, true: Positions, frames: Sequence[int]) -> dict[str, Any]:
     """Arguments of the comparison with true positions: of the chosen frames, where rows are frames."""
     s = make.sequence
-    args, moments = true.to_dict(), None
+    truth, moments = true.to_dict(), None
     if true.times is None:
-        args["positions"] = [args["positions"][f] for f in frames]
+        truth["positions"] = [true.positions[f] for f in frames]
     elif s.times is not None:
         moments = [s.times[f] for f in frames]
-    return args | {"moments": moments, "frames": list(frames), "source": s.truth_source}
+    return {"truth": truth, "moments": moments, "frames": list(frames), "source": s.truth_source}
 
 
 def _truth_dem(

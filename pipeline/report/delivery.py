@@ -287,7 +287,7 @@ def _crosscheck_lost(scene: Scene) -> Items:
     reasons = [f"COLMAP has no pose of {which(lost)}"]
     if len(meta.get("pieces") or ()) > 1:
         reasons.append(f"its trajectory falls into {len(meta['pieces'])} pieces, each laid on ours by itself")
-    reasons += [str(w["reason"]) for w in meta.get("windows") or () if w.get("reason")]
+    reasons += meta.get("reasons") or ()
     what = f"{len(lost)} of {len(view.frames)} frames are not compared with another program"
     return [_item("crosscheck", what, "; ".join(dict.fromkeys(reasons)))]
 

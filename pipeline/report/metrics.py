@@ -23,7 +23,6 @@ LABELS: Mapping[str, str] = {
     "ate_rmse": "Absolute trajectory error, best fit",
     "rpe_translation_rmse": "Relative error, translation",
     "rpe_rotation_rmse": "Relative error, rotation",
-    "kitti_translation": "KITTI translation error",
     "scale_error": "Scale",
     "nees": "Squared error over the claimed one (NEES)",
     "frames_missing": "Frames without a pose in the world",
@@ -34,7 +33,7 @@ LABELS: Mapping[str, str] = {
 }
 """Words for names of assessing stages, in the order of the page; all others say by themselves what they are."""
 
-ABBREVIATIONS = ("ate", "rpe", "kitti")
+ABBREVIATIONS = ("ate", "rpe")
 """Parts of those names that are written in capitals."""
 
 OF_DRIVE = {"path_length": "Length driven"}

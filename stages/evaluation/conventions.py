@@ -3,7 +3,7 @@
 A pose of the file becomes another one by each reading (order of the quaternion, direction of the transform, a mirrored
 axis), by a unit of length, and by other axes of the body: a rotation B from the right, one of the 24 that exchange axes
 or the one that fits best. Readings are compared by what the best rotation and translation of the world leaves of
-positions and orientations together (:mod:`rille.stages.evaluation.pose_alignment`), over the extent of the trajectory.
+positions and orientations together (:mod:`rille.stages.evaluation.rigid`), over the extent of the trajectory.
 A drive that is straight or hardly turns is fitted by several readings alike: they are named together.
 """
 
@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
+from scipy.spatial.transform import Rotation
 
 from rille.stages.core.arrays import Floats
-from rille.stages.evaluation.accuracy_parts import angle, inverse, rms, square
-from rille.stages.evaluation.pose_alignment import align, moved, spread
+from rille.stages.evaluation.rigid import alignment, angle, compose, inverse, rms, spread
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
 
 MIN_FRAMES, MAX_FRAMES = 4, 50
@@ -33,6 +33,7 @@ ALIKE_FACTOR, ALIKE_SHARE, SIMPLE_FACTOR = 1.5, 0.005, 4.0
 MIN_TURN = 0.3
 # Factor of length from which on it is one of units, m: mm, cm, inches, feet, km.
 MIN_UNIT, UNITS = 2.0, (0.001, 0.01, 0.0254, 0.3048, 1000.0)
+AXES = Rotation.create_group("O").as_matrix()
 # Places, in (x, y, z, w) as read, of the true x, y, z and w.
 ORDERS = {
     "": [0, 1, 2, 3],
@@ -45,10 +46,10 @@ DIRECTIONS = (
     "its rotations lead from the world to the camera: negate qx, qy and qz, or transpose each R",
 )
 MIRRORS = {
-    "": np.eye(4),
-    "it is left-handed: negate x, qy and qz": np.diag([-1.0, 1.0, 1.0, 1.0]),
-    "it is left-handed: negate y, qx and qz": np.diag([1.0, -1.0, 1.0, 1.0]),
-    "it is left-handed: negate z, qx and qy": np.diag([1.0, 1.0, -1.0, 1.0]),
+    "": (1.0, 1.0, 1.0),
+    "it is left-handed: negate x, qy and qz": (-1.0, 1.0, 1.0),
+    "it is left-handed: negate y, qx and qz": (1.0, -1.0, 1.0),
+    "it is left-handed: negate z, qx and qy": (1.0, 1.0, -1.0),
 }
 
 
@@ -72,24 +73,25 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
     sigma : m, of the estimated positions.
     """
     chosen = np.linspace(0, len(estimate) - 1, min(len(estimate), MAX_FRAMES)).astype(int)
-    P, Q, mount = estimate[chosen], truth[chosen], square(T_body_left.matrix34[None])[0]
+    P, Q, mount = estimate[chosen], truth[chosen], T_body_left.matrix34
     if len(P) < MIN_FRAMES or spread(P) < max(MIN_EXTENT_SIGMAS * sigma, 1e-6) or spread(Q) < 1e-9:
         return []
-    as_read, file = _misfit(P, Q, np.eye(3)), square(Q) @ inverse(mount)
+    as_read, file = _misfit(P, Q), compose(Q, inverse(mount))
     if as_read < MIN_MISFIT:
         return []
-    fits, rotation = [], scipy.spatial.transform.Rotation
+    fits = []
     for order, direction, mirror in product(ORDERS, DIRECTIONS, MIRRORS):
         # A file that begins with the identity has its quaternions in the right order.
         if not (order and angle(file[0]) < MIN_TURN):
-            poses, M = file.copy(), MIRRORS[mirror]
-            quaternion = rotation.from_matrix(file[:, :3, :3]).as_quat()[:, ORDERS[order]]
-            poses[:, :3, :3] = rotation.from_quat(quaternion).as_matrix()
+            poses, signs = file.copy(), MIRRORS[mirror]
+            quaternion = Rotation.from_matrix(file[:, :, :3]).as_quat()[:, ORDERS[order]]
+            poses[:, :, :3] = Rotation.from_quat(quaternion).as_matrix()
             # The whole pose is inverted, or its rotation alone; or nothing.
             columns = slice((0, 4, 3)[DIRECTIONS.index(direction)])
-            poses[:, :3, columns] = inverse(poses)[:, :3, columns]
+            poses[:, :, columns] = inverse(poses)[:, :, columns]
             words = [word for word in (order, direction, mirror) if word]
-            fits += _fits(P, M @ poses @ M @ mount, mount, words)
+            # M R M and M t of a mirror M = diag(signs).
+            fits += _fits(P, compose(poses * np.outer(signs, [*signs, 1.0]), mount), mount, words)
     best, least = min(fit.misfit for fit in fits), min(fit.least for fit in fits)
     if best > MAX_SHARE * as_read:
         return []
@@ -105,39 +107,38 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
     ]
 
 
-def _fits(P: Floats, T: Floats, mount: Floats, words: list[str]) -> list[ReadingFit]:
-    """Unit and axes of the body by which a reading T (n, 4, 4) of the truth fits."""
-    Q, ratio, fits = T[:, :3], spread(P) / max(spread(T[:, :3]), 1e-12), []
+def _fits(P: Floats, Q: Floats, mount: Floats, words: list[str]) -> list[ReadingFit]:
+    """Unit and axes of the body by which a reading Q (n, 3, 4) of the truth fits."""
+    ratio, fits = spread(P) / max(spread(Q), 1e-12), []
     if not 1.0 / MIN_UNIT < ratio < MIN_UNIT:
         unit = next((unit for unit in UNITS if abs(np.log(unit / ratio)) < 0.1), float(f"{ratio:.3g}"))
         words = [*words, f"its unit of length is {unit:g} m: state truth.unit = {unit:g}"]
-        Q = np.concatenate([Q[:, :, :3], unit * Q[:, :, 3:]], axis=2)
-    group = scipy.spatial.transform.Rotation.create_group("O").as_matrix()
-    for start in (np.eye(3), min(group, key=lambda B: _misfit(P, Q, B))):
+        Q = Q * [1.0, 1.0, 1.0, unit]
+    for start in (np.eye(3), min(AXES, key=lambda B: _misfit(P, Q @ _turn(B)))):
         turn = start
         for _ in range(10):
             # In turn: the world's rotation for this body, by the positions above all, and the body's for this world.
-            R_world_truth, _ = align(_turned(Q, turn), P, 0.1)
+            R_world_truth = alignment(Q @ _turn(turn), P, 0.1)[:, :3]
             turn = orthonormal(np.einsum("nji,kj,nkl->il", Q[:, :, :3], R_world_truth, P[:, :, :3]))
         # An estimate that errs by some degrees fits a little better if turned by them: that is no other convention.
         axes = start if angle(start.T @ turn) < MIN_TURN else turn
         said, other = words, bool(angle(axes) > MIN_TURN)
         if other:
-            body = np.column_stack([mount[:3, :3] @ axes, mount[:3, 3]]).round(4) + 0.0
+            body = np.column_stack([mount[:, :3] @ axes, mount[:, 3]]).round(4) + 0.0
             said = [*words, f"its poses are those of a body with other axes: state truth.T_body_left = {body.tolist()}"]
         # Simple ones first: conventions of the file, then axes that are exchanged, then such as are turned.
         changes = len(said) + other + (axes is turn)
-        fits.append(ReadingFit(_misfit(P, Q, turn), _misfit(P, Q, axes), changes, " and ".join(said)))
+        fits.append(ReadingFit(_misfit(P, Q @ _turn(turn)), _misfit(P, Q @ _turn(axes)), changes, " and ".join(said)))
     return fits
 
 
-def _turned(Q: Floats, B: Floats) -> Floats:
-    """Poses (n, 3, 4) with the axes of the body turned by B (3, 3)."""
-    return np.concatenate([Q[:, :, :3] @ B, Q[:, :, 3:]], axis=2)
+def _turn(axes: Floats) -> Floats:
+    """Matrix (4, 4) that turns the axes of the body, from the right, by a rotation (3, 3)."""
+    return np.asarray(scipy.linalg.block_diag(axes, 1.0))
 
 
-def _misfit(P: Floats, Q: Floats, B: Floats) -> float:
-    """RMS misfit of poses Q (n, 3, 4), their bodies turned by B, after the best alignment with P, over P's extent."""
-    off = moved(_turned(Q, B), *align(_turned(Q, B), P, 1.0)) - P
+def _misfit(P: Floats, Q: Floats) -> float:
+    """RMS misfit of poses Q (n, 3, 4) after the best alignment with P, over P's extent."""
+    off = compose(alignment(Q, P, 1.0), Q) - P
     # A rotation counts by its angle: beside the extent, a lever as long.
     return float(np.hypot(rms(off[:, :, 3]) / spread(P), rms(off[:, :, :3].reshape(len(P), 9)) / np.sqrt(2.0)))

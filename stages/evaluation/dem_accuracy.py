@@ -8,17 +8,25 @@ doi:10.1016/j.isprsjprs.2009.02.003).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Bundle, NoParams, raster, stage
 from rille.stages.core.errors import InputError
-from rille.stages.evaluation.accuracy_parts import metric
 from rille.stages.evaluation.dem_comparison import figures
+from rille.stages.evaluation.metric import metric
 from rille.stages.facts.evaluation import DemAccuracyFacts, Metric
 from rille.stages.geometry.lattice import Lattice, mosaic
+
+ERRORS: Mapping[str, str] = {
+    "rmse": "RMS elevation error",
+    "nmad": "1.4826 times the median deviation from the median error",
+    "p95": "95 % of the errors are smaller",
+    "bias": "mean elevation error",
+}
+"""Descriptions of the figures of :func:`rille.stages.evaluation.dem_comparison.figures` that are stated."""
 
 
 def dem_accuracy(elevation: Floats32, truth: Floats32, judged: Bools) -> dict[str, Metric]:
@@ -30,18 +38,11 @@ def dem_accuracy(elevation: Floats32, truth: Floats32, judged: Bools) -> dict[st
     judged : (row, col) the cells that count: seen by both cameras, and in the window.
     """
     judged = judged & np.isfinite(truth)
-    wanted = int(judged.sum())
-    found = figures((elevation.astype(np.float64) - truth)[judged])
-    given = int(found["cells"])
-    how = f"{given} of {wanted} cells that both cameras see"
-    words = {
-        "rmse": "RMS elevation error",
-        "nmad": "1.4826 times the median deviation from the median error",
-        "p95": "95 % of the errors are smaller",
-        "bias": "mean elevation error",
-    }
-    return {name: metric(found.get(name), "m", f"{what}, {how}") for name, what in words.items()} | {
-        "completeness": metric(given / wanted if wanted else None, "1", f"share given: {how}")
+    wanted, error = int(judged.sum()), figures((elevation.astype(np.float64) - truth)[judged])
+    how = f"{error['cells']:.0f} of {wanted} cells that both cameras see"
+    share = metric(error["cells"] / wanted if wanted else None, "1", f"share given: {how}")
+    return {name: metric(error.get(name), "m", f"{what}, {how}") for name, what in ERRORS.items()} | {
+        "completeness": share
     }
 
 
@@ -50,11 +51,9 @@ def in_window(lattice: Lattice, window: Sequence[float] | None) -> Bools:
     if window is None:
         return np.ones(lattice.shape, dtype=bool)
     x_min, y_min, x_max, y_max = window
-    slack = 1e-6 * lattice.cell
-    x, y = lattice.xs(), lattice.ys()
-    inside_x = (x >= x_min - slack) & (x <= x_max + slack)
-    inside_y = (y >= y_min - slack) & (y <= y_max + slack)
-    return inside_y[:, None] & inside_x[None]
+    # A centre on the rim counts, whatever it was rounded to.
+    slack, x, y = 1e-6 * lattice.cell, lattice.xs(), lattice.ys()[:, None]
+    return (x >= x_min - slack) & (x <= x_max + slack) & (y >= y_min - slack) & (y <= y_max + slack)
 
 
 @stage("dem_accuracy", version=2, outputs=[raster("error", "m", "elevation minus truth")])

@@ -9,7 +9,7 @@ n . t + (q x n) . w (Rosenholm and Torlegard 1988; for shifts alone: Nuth and Ka
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -23,13 +23,14 @@ from rille.stages.terrain.shading import gradient
 
 Align = Literal["shift", "tilt", "rigid"]
 
-MEANS_FROM = 1.5  # ratio of cells from which the finer model's cells are averaged instead of interpolated
-LEAST_SHARE = 0.5  # of a coarse cell's area that the finer cells must know
+MIN_AVERAGED_RATIO = 1.5  # of cells, from which the finer model's cells are averaged instead of interpolated
+MIN_KNOWN_SHARE = 0.5  # of a coarse cell's area that the finer cells must know
 BORDER = 1e-6  # of a coarse cell: a centre nearer than this to a border lies on it
 FREE = {"shift": [0, 1, 2], "tilt": [2, 3, 4], "rigid": [0, 1, 2, 3, 4, 5]}  # of tx ty tz wx wy wz
-MOST_POINTS = 300_000  # that an alignment uses: six unknowns need no more
-ITERATIONS = 50
-WORST_CONDITION = 1e7  # of the normal matrix in units of cells: beyond, the terrain is flat for what is asked
+MAX_POINTS = 300_000  # that an alignment uses: six unknowns need no more
+MAX_ITERATIONS = 50
+SETTLED_CELLS = 1e-4  # step of an alignment that ends it
+MAX_CONDITION = 1e7  # of the normal matrix in units of cells: beyond, the terrain is flat for what is asked
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,8 @@ class Grid:
     def index(self, xy: Floats) -> Floats:
         """Fractional (row, col) (..., 2) of points (..., 2)."""
         # The matrix gives x, y of column and row; the order is turned round to index arrays.
-        found = (xy - self.matrix[:, 2]) @ np.linalg.inv(self.matrix[:, :2]).T
-        return np.asarray(found[..., ::-1])
+        col_row = (xy - self.matrix[:, 2]) @ np.linalg.inv(self.matrix[:, :2]).T
+        return np.asarray(col_row[..., ::-1])
 
     def slopes(self) -> Floats:
         """Gradient dz/dx, dz/dy (2, rows, cols) of the terrain, NaN unknown."""
@@ -96,7 +97,7 @@ def cell_means(fine: Grid, target: Grid) -> Floats:
         flat = np.ravel_multi_index((index[inside, 0], index[inside, 1]), shape)
         count += 0.25 * np.bincount(flat, minlength=size)
         total += 0.25 * np.bincount(flat, weights=values[inside], minlength=size)
-    enough = count >= LEAST_SHARE * (target.cell / fine.cell) ** 2 * (1.0 - 1e-9)
+    enough = count >= MIN_KNOWN_SHARE * (target.cell / fine.cell) ** 2 * (1.0 - 1e-9)
     return np.where(enough, total / np.where(enough, count, 1.0), np.nan).reshape(shape)
 
 
@@ -110,7 +111,7 @@ def common(a: Grid, b: Grid) -> tuple[Grid, Grid, str]:
     """
     target, fine, name = (b, a, "A") if a.cell <= b.cell * (1.0 + 1e-9) else (a, b, "B")
     ratio = target.cell / fine.cell
-    if ratio >= MEANS_FROM:
+    if ratio >= MIN_AVERAGED_RATIO:
         values = cell_means(fine, target)
         how = f"{name} averaged from {fine.cell:g} m to {target.cell:g} m (half of a cell's area known at least)"
     else:
@@ -132,8 +133,7 @@ def common(a: Grid, b: Grid) -> tuple[Grid, Grid, str]:
 class Alignment:
     """Motion of A onto B: x_b = rotation (x_a - centre) + centre + translation.
 
-    ``sigma`` of the free parameters (tx ty tz in m, wx wy wz in rad; 0 for those held). ``rms`` of the differences
-    before and after, metres, over the cells that took part.
+    ``sigma`` of the free parameters (tx ty tz in m, wx wy wz in rad; 0 for those held); ``points`` that took part.
     """
 
     rotation: Floats
@@ -142,7 +142,6 @@ class Alignment:
     sigma: Floats
     iterations: int
     points: int
-    rms: tuple[float, float]
 
     def apply(self, points: Floats) -> Floats:
         """Moved points (..., 3), metres."""
@@ -163,29 +162,29 @@ def align(a: Grid, b: Grid, kind: Align) -> Alignment:
         The terrain does not determine the motion (it is flat for what is asked), or it is not found.
     """
     points = np.concatenate([a.centres(), a.values[..., None]], axis=-1)[np.isfinite(a.values)]
-    points = points[:: max(1, len(points) // MOST_POINTS)]
+    points = points[:: max(1, len(points) // MAX_POINTS)]
     slopes, free = b.slopes(), FREE[kind]
     centre = points.mean(axis=0)
     # Units of a cell of motion at the terrain's extent, so that the condition compares like with like.
     unit = np.array([1.0] * 3 + [1.0 / max(float(np.std(points[:, :2])), a.cell)] * 3)[free] * a.cell
     start = _difference(b, slopes, points)[0]
     offset = float(np.median(start[np.isfinite(start)])) if np.isfinite(start).any() else 0.0
-    state = Alignment(np.eye(3), np.array([0.0, 0.0, -offset]), centre, np.zeros(6), 0, 0, (0.0, 0.0))
-    for iteration in range(1, ITERATIONS + 1):
+    state = Alignment(np.eye(3), np.array([0.0, 0.0, -offset]), centre, np.zeros(6), 0, 0)
+    for iteration in range(1, MAX_ITERATIONS + 1):
         step, sigma, used = _gauss_newton(b, slopes, points, state, free, unit)
         full, spread = np.zeros(6), np.zeros(6)
         full[free], spread[free] = step, sigma
         # Fifty products of rotations drift from a rotation by rounding.
         rotation = orthonormal(rotation_exp(full[3:]) @ state.rotation)
-        state = Alignment(rotation, state.translation + full[:3], centre, spread, iteration, used, (0.0, 0.0))
-        if np.abs(step / unit).max() < 1e-4:
-            return _with_rms(b, slopes, points, state, start)
+        state = Alignment(rotation, state.translation + full[:3], centre, spread, iteration, used)
+        if np.abs(step / unit).max() < SETTLED_CELLS:
+            return state
     # Cells at a border that come and go from step to step keep the motion from settling, but within its own errors.
     if (np.abs(step) < sigma).all():
-        return _with_rms(b, slopes, points, state, start)
+        return state
     raise DegenerateError(
         "RIL-324",
-        f"no alignment after {ITERATIONS} steps: the last one still moved by {np.abs(step / unit).max():.2g} cells",
+        f"no alignment after {MAX_ITERATIONS} steps: the last one still moved by {np.abs(step / unit).max():.2g} cells",
         remedy="choose fewer freedoms (tilt or shift), or bring the models closer first",
     )
 
@@ -218,22 +217,16 @@ def _gauss_newton(
     w = bisquare(r / (TUKEY_BISQUARE * scale))
     N = (J * w[:, None]).T @ J
     values = np.linalg.eigvalsh(N)
-    if not values[0] * WORST_CONDITION > values[-1]:
+    if not values[0] * MAX_CONDITION > values[-1]:
         raise DegenerateError(
             "RIL-326",
             f"the terrain is too flat to align by: condition {values[-1] / max(values[0], 1e-300):.1e}, "
-            f"more than {WORST_CONDITION:.0e}",
+            f"more than {MAX_CONDITION:.0e}",
             remedy="choose --align tilt, which flat terrain determines",
         )
     step = -np.linalg.solve(N, (J * w[:, None]).T @ r)
     variance = float((w * r * r).sum()) / max(float(w.sum()) - len(free), 1.0)
     return step * unit, np.sqrt(variance * np.diag(np.linalg.inv(N))) * unit, int(good.sum())
-
-
-def _with_rms(b: Grid, slopes: Floats, points: Floats, state: Alignment, before: Floats) -> Alignment:
-    after = _difference(b, slopes, state.apply(points))[0]
-    rms = tuple(float(np.sqrt(np.nanmean(e * e))) if np.isfinite(e).any() else float("nan") for e in (before, after))
-    return replace(state, rms=(rms[0], rms[1]))
 
 
 def errors(a: Grid, b: Grid, alignment: Alignment | None = None) -> Floats:
@@ -256,22 +249,20 @@ def figures(error: Floats) -> dict[str, float]:
     e = error[np.isfinite(error)]
     if not e.size:
         return {"cells": 0.0}
-    middle = float(np.median(e))
     return {
         "rmse": float(np.sqrt(np.mean(e * e))),
         "nmad": mad_sigma(e),
         "p95": float(np.percentile(np.abs(e), 95)),
         "bias": float(np.mean(e)),
-        "median": middle,
+        "median": float(np.median(e)),
         "cells": float(e.size),
     }
 
 
 def binned(error: Floats, by: Floats, edges: Floats) -> list[dict[str, float]]:
     """Figures of the errors whose ``by`` lies between neighbouring edges; empty bins are left out."""
-    found = []
-    for low, high in itertools.pairwise(edges):
-        inside = figures(error[(by >= low) & (by < high)])
-        if inside["cells"]:
-            found.append({"from": float(low), "to": float(high)} | inside)
-    return found
+    bins = [
+        {"from": float(low), "to": float(high)} | figures(error[(by >= low) & (by < high)])
+        for low, high in itertools.pairwise(edges)
+    ]
+    return [one for one in bins if one["cells"]]

@@ -18,7 +18,8 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
-from rille.stages.evaluation.accuracy_parts import inverse, metric, square
+from rille.stages.evaluation.metric import metric
+from rille.stages.evaluation.rigid import compose, inverse
 from rille.stages.facts.evaluation import DriveCheckFacts, Metric, TruthFacts
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry.geometry import way_length
@@ -34,40 +35,34 @@ def judged(drive: Bundle, row: int) -> dict[str, Floats]:
 def placements(parts: Sequence[Mapping[str, Floats]], vehicle: Mapping[str, Any]) -> dict[str, Metric]:
     """Violations by the true placements of all legs; each part has ``trail``, ``tilt``, ``clearance`` and ``step``."""
     tilt, clearance, step = (np.concatenate([p[name] for p in parts]) for name in ("tilt", "clearance", "step"))
+    struck, edges = int((clearance < 0).sum()), int((step > vehicle["max_step"]).sum())
+    tilted = int((tilt > math.radians(vehicle["max_slope_deg"])).sum())
+    length = sum(way_length(p["trail"][:, :, 3]) for p in parts)
     truly = "by the true placement of the wheels on the exact ground"
-    steepest, edge = math.radians(vehicle["max_slope_deg"]), vehicle["max_step"]
     return {
         "placements": metric(len(tilt), "placements", "of the vehicle along its true way that were judged"),
-        "clearance_violations": metric(int((clearance < 0).sum()), "placements", f"belly strikes the ground, {truly}"),
-        "tilt_violations": metric(int((tilt > steepest).sum()), "placements", f"tilt beyond max_slope_deg, {truly}"),
-        "step_violations": metric(
-            int((step > edge).sum()), "placements", f"a wheel on an edge above max_step, {truly}"
-        ),
+        "clearance_violations": metric(struck, "placements", f"belly strikes the ground, {truly}"),
+        "tilt_violations": metric(tilted, "placements", f"tilt beyond max_slope_deg, {truly}"),
+        "step_violations": metric(edges, "placements", f"a wheel on an edge above max_step, {truly}"),
         "least_clearance": metric(float(clearance.min()), "m", f"under the belly, {truly}"),
-        "greatest_tilt": metric(float(np.degrees(tilt.max())), "deg", truly),
+        "greatest_tilt": metric(math.degrees(tilt.max()), "deg", truly),
         "greatest_step": metric(float(step.max()), "m", f"under a wheel, {truly}"),
+        "path_length": metric(length, "m", "true path of the vehicle, seen from above"),
     }
-
-
-def way(parts: Sequence[Mapping[str, Floats]]) -> float:
-    """Length of the true way seen from above, m."""
-    return sum(way_length(p["trail"][:, :, 3]) for p in parts)
 
 
 def localisation(estimate: Floats, truth: Floats, length: float) -> tuple[Floats, dict[str, Metric]]:
     """Error (frame,) m of the poses (frame, 3, 4), NaN of a frame without one; and that of the last that has one."""
-    P, Q = square(estimate), square(truth)
-    error = np.linalg.norm(P[:, :3, 3] - (P[0] @ inverse(Q[0]) @ Q)[:, :3, 3], axis=1)
+    aligned = compose(estimate[0], compose(inverse(truth[0]), truth))
+    error = np.linalg.norm(estimate[:, :, 3] - aligned[:, :, 3], axis=1)
     # A drive that ends because tracking is lost has no pose at its last image.
-    known = np.flatnonzero(np.isfinite(error))
-    last = float(error[known[-1]]) if len(known) else math.nan
-    which = "last position" if len(known) and known[-1] == len(error) - 1 else "last position that is known"
-    first = "after making the first poses equal"
-    how = f"of the {which}, {first}"
+    known = error[np.isfinite(error)]
+    last = float(known[-1]) if len(known) else math.nan
+    how = "of the last position that is known, after making the first poses equal"
     return error, {
         "localisation_error": metric(last, "m", how),
         "localisation_share": metric(last / length if length > 0 else None, "1", f"{how}, over the length driven"),
-        "greatest_error": metric(float(np.fmax.reduce(error)), "m", f"of any position, {first}"),
+        "greatest_error": metric(float(np.fmax.reduce(error)), "m", "of any position, after making the first equal"),
     }
 
 
@@ -91,19 +86,17 @@ def drive_check_stage(
 ) -> Bundle[DriveCheckFacts]:
     """A drive against the truth: placements, localisation, length."""
     parts = [judged(drive, row) for drive, row in zip(drives, rows, strict=True)]
-    length, error = way(parts), np.zeros(0)
-    metrics = placements(parts, vehicle)
-    metrics["path_length"] = metric(length, "m", "true path of the vehicle, seen from above")
-    facts: DriveCheckFacts = {"metrics": metrics, "stops": len(parts), "path_exists": None, "with_margin": None}
+    figures, error = placements(parts, vehicle), np.zeros(0)
+    facts: DriveCheckFacts = {"metrics": figures, "stops": len(parts), "path_exists": None, "with_margin": None}
     if trajectory is not None and truth is not None:
         estimate, true = (np.asarray(one["poses"]) for one in (trajectory, truth))
-        error, found = localisation(estimate, true, length)
-        metrics |= found
+        error, located = localisation(estimate, true, figures["path_length"]["value"])
+        figures |= located
     if best is not None:
         shortest, margin = best.meta["shortest_m"], best.meta["shortest_margin_m"]
         room = "with the vehicle's margin" if margin else "within its limits, but without its margin"
         how = f"from start to goal over the risk map of the exact elevations, {room}"
-        metrics["shortest_length"] = metric(shortest, "m", how)
+        figures["shortest_length"] = metric(shortest, "m", how)
         facts["path_exists"] = shortest is not None
         facts["with_margin"] = bool(shortest is not None and margin > 0)
     T = np.concatenate([p["trail"] for p in parts])

@@ -46,9 +46,6 @@ def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) ->
     steps = (np.swapaxes(R[both][:-1], 1, 2) @ R[both][1:] for R in (images, sensor))
     seen, sensed = (scipy.spatial.transform.Rotation.from_matrix(step).as_rotvec() @ axes.T for step in steps)
 
-    def apart(S: Floats, factor: float) -> float:
-        return float(np.median(np.linalg.norm(factor * sensed @ S.T - seen, axis=1)))
-
     # A bias turns the sensor, too, and degrees would make it small.
     fast = np.median(np.linalg.norm(sensed, axis=1)) > MIN_DISAGREEMENT + LARGEST_BIAS * np.median(np.diff(times[both]))
     readings = list(product((1.0, float(np.deg2rad(1.0))) if fast else (1.0,), signed_axes()))

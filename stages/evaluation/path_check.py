@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
-from rille.stages.evaluation.accuracy_parts import metric
+from rille.stages.evaluation.metric import metric
 from rille.stages.facts.evaluation import Metric, MetricsFacts
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN
@@ -41,9 +41,7 @@ def path_check(path: Floats, risk: Bytes, lattice: Lattice) -> tuple[NDArray[np.
     truth = "in the risk map of the exact elevations, same vehicle"
     share = metric(float((risk == HAZARDOUS).mean()), "1", f"hazardous share of all cells {truth}")
     if len(path) == 0:
-        names = {"hazard_cells": "cells", "unknown_cells": "cells", "crossed_cells": "cells", "path_length": "m"}
-        none = {name: metric(None, unit, "not applicable: no path was found") for name, unit in names.items()}
-        return np.empty((0, 2), dtype=np.int64), none | {"hazardous_share": share}
+        return np.empty((0, 2), dtype=np.int64), {"hazardous_share": share}
     cells = crossed_cells(path, lattice)
     inside = ((cells >= 0) & (cells < lattice.shape)).all(axis=1)
     # What lies beyond the exact map counts as unknown, like its holes.
@@ -71,26 +69,19 @@ def shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> di
     path : (vertex, xyz) float64, metres, in the frame of the lattice; empty where no path was found.
     maps : arrays (row, col) of stage ``risk`` from the exact elevations.
     """
-    found, kept = None, vehicle.margin
-    for kept in (vehicle.margin, 0.0) if len(path) else ():
-        found = _shortest(path, maps, lattice, vehicle.model_copy(update={"margin": kept}))
-        if found is not None:
-            break
-    if found is None:
-        how = (
-            "not applicable: no path was found"
-            if len(path) == 0
-            else "none leads from one end of the path to the other"
-        )
-        return {"shortest_length": metric(None, "m", how), "length_ratio": metric(None, "1", how)}
-    room = "keeping the margin" if kept else "within the limits, but without the margin"
+    room, best = "keeping the margin", _shortest(path, maps, lattice, vehicle) if len(path) else None
+    if len(path) and best is None:
+        room = "within the limits, but without the margin"
+        best = _shortest(path, maps, lattice, vehicle.model_copy(update={"margin": 0.0}))
     how = f"shortest way between the path's ends over the risk map of the exact elevations, {room}, seen from above"
+    if best is None:
+        why = "none leads from one end of the path to the other" if len(path) else "no path was found"
+        return {"length_ratio": metric(why, "1", how)}
     length = float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum())
+    ratio = length / best if best > 0 else None
     return {
-        "shortest_length": metric(found, "m", how),
-        "length_ratio": metric(
-            length / found if found > 0 else None, "1", f"length of the path over that of the {how}"
-        ),
+        "shortest_length": metric(best, "m", how),
+        "length_ratio": metric(ratio, "1", f"length of the path over that of the {how}"),
     }
 
 
@@ -114,6 +105,6 @@ def path_check_stage(params: NoParams, path: Bundle, risk: Bundle) -> Bundle[Met
     """Planned path against the risk map of the exact elevations."""
     lattice = Lattice.from_dict(risk.meta["lattice"])
     vertices, maps = np.asarray(path["path"]), {name: np.asarray(risk[name]) for name in risk.arrays}
-    hit, metrics = path_check(vertices, maps["risk"], lattice)
-    metrics |= shortest(vertices, maps, lattice, Vehicle.model_validate(risk.meta["vehicle"]))
-    return Bundle({"hazard_cell": hit.astype(np.int32)}, {"metrics": metrics})
+    hit, figures = path_check(vertices, maps["risk"], lattice)
+    figures |= shortest(vertices, maps, lattice, Vehicle.model_validate(risk.meta["vehicle"]))
+    return Bundle({"hazard_cell": hit.astype(np.int32)}, {"metrics": figures})

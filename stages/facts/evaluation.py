@@ -1,6 +1,6 @@
 """Facts of the stages that compare results with the truth, or with another program's."""
 
-from typing import Any, NotRequired
+from typing import Any
 
 from rille.stages.core.declare import Facts
 
@@ -9,11 +9,10 @@ Metric = dict[str, Any]
 
 
 class TruthFacts(Facts):
-    """True poses: numbers of their ``frames`` (None: all), where they are from, and ``without_truth``."""
+    """True poses: numbers of their ``frames`` (None: all), and where they are from."""
 
     frames: list[int] | None
     source: str
-    without_truth: list[int]
 
 
 class AccuracyFacts(Facts):
@@ -48,17 +47,16 @@ class DriveCheckFacts(Facts):
 
 
 class WindowFacts(Facts):
-    """A window of the crosscheck: medians and counts of what COLMAP did, and ``reason`` where it has no model."""
+    """A window of the crosscheck: counts of what COLMAP did, and the ``reason`` where it has no model.
+
+    ``features`` is the median of an image, ``reprojection_px`` the mean error of an observation.
+    """
 
     frames: list[int]
     features: float
-    pairs: int
     pairs_verified: int
     models: int
-    points: int
-    observations: int
     reprojection_px: float | None
-    registered: int
     unregistered: list[int]
     reason: str
 
@@ -66,32 +64,26 @@ class WindowFacts(Facts):
 class JoinFacts(Facts):
     """The windows of the crosscheck, joined: ``pieces`` are lists of frames, ``longest`` the number of one (-1: none).
 
-    ``positions`` (x, y, z), m, or None, are of the longest; ``ties`` say by what the windows are joined.
+    ``positions`` (x, y, z), m, or None, are of the longest; ``reasons`` say why windows have no model.
     """
 
     frames: list[int]
-    registered: int
-    unregistered: list[int]
     longest: int
     pieces: list[list[int]]
-    ties: list[dict[str, Any]]
-    points: int
-    windows: list[dict[str, Any]]
+    reasons: list[str]
     positions: list[list[float] | None]
 
 
 class AgreementFacts(Facts):
-    """Disagreement with the crosscheck, the ``rule`` by which frames are flagged, and its limits."""
+    """Disagreement with the crosscheck over ``compared`` frames, the ``rule`` by which they are flagged, its limits.
+
+    ``limits`` by array, of angles in degrees; ``flagged`` are frames, and ``why``.
+    """
 
     frames: list[int]
     compared: int
-    not_compared: list[int]
     pieces: int
     metrics: dict[str, Metric]
     rule: str
     limits: dict[str, float | None]
-    limits_unit: dict[str, str]
     flagged: list[dict[str, Any]]
-    """Frame, and why."""
-    scale_ratio: NotRequired[float | None]
-    rmse_scaled_m: NotRequired[float | None]

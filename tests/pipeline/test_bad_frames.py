@@ -102,7 +102,7 @@ def test_a_bad_frame_is_lost_named_and_bridged(
     report = json.loads((folder / "report.json").read_text())
     assert any(says in line for line in report["warnings"])
     assert not report["complete"]
-    assert report["metrics"]["trajectory_ate_first_frame_rmse"]["value"] < 1e-3
+    assert report["metrics"]["trajectory_final_error"]["value"] < 1e-3
     assert (folder / "dem.tif").exists()
 
 

@@ -107,8 +107,8 @@ def test_consumers_survive_facts_that_are_not_there(tmp_path: Path) -> None:
 
 def test_a_broken_comparison_says_why(tmp_path: Path) -> None:
     made = bundles() | checks()
-    windows = [{"reason": ""}, {"reason": "no two images match (median 12 features an image)"}]
-    meta = {"pieces": [[0, 1, 2, 3], [4]], "unregistered": [5], "windows": windows}
+    reasons = ["no two images match (median 12 features an image)"]
+    meta = {"pieces": [[0, 1, 2, 3], [4]], "reasons": reasons}
     made["crosscheck"] = Bundle(made["crosscheck"].arrays, made["crosscheck"].meta | meta)
     facts, _, _, _ = written(tmp_path, view(made, products=checked()))
     (missing,) = facts["missing"]

@@ -9,9 +9,9 @@ import pytest
 from evo.core import metrics as evo_metrics
 from evo.core.trajectory import PosePath3D
 
-from rille.stages.core.declare import Bundle, check_outputs
-from rille.stages.evaluation.agreement import AgreementParams, _at_rest, agreement_stage, compare, flag
-from rille.stages.evaluation.pose_alignment import moved
+from rille.stages.core.declare import Bundle, NoParams, check_outputs
+from rille.stages.evaluation.agreement import agreement_stage, at_rest, compare, flag
+from rille.stages.evaluation.rigid import compose
 from rille.stages.geometry.geometry import rotation_exp
 
 RNG = np.random.default_rng
@@ -36,13 +36,21 @@ def noisy(poses: np.ndarray, seed: int, shift: float = 0.01, turn: float = 0.001
     return out
 
 
-def run(ours: np.ndarray, theirs: np.ndarray, piece: np.ndarray | None = None) -> Bundle:
+def moved(poses: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    return compose(np.column_stack([rotation, translation]), poses)
+
+
+def run(
+    ours: np.ndarray, theirs: np.ndarray, piece: np.ndarray | None = None, lines: np.ndarray | None = None
+) -> Bundle:
     piece = np.where(np.isfinite(theirs[:, 0, 0]), 0, -1) if piece is None else piece
     frames = list(range(10, 10 + len(ours)))
     pieces = [[f for f, p in zip(frames, piece, strict=True) if p == k] for k in range(int(piece.max()) + 1)]
-    other = Bundle({"piece_poses": theirs, "piece": piece.astype(np.int16)}, {"frames": frames, "pieces": pieces})
+    arrays = {"piece_poses": theirs, "piece": piece.astype(np.int16)}
+    arrays["line_distance"] = np.full(len(ours), 0.2) if lines is None else lines
+    other = Bundle(arrays, {"frames": frames, "pieces": pieces})
     out = agreement_stage.run(
-        AgreementParams(), {}, {"trajectory": Bundle({"poses": ours}, {"frames": frames}), "crosscheck": other}
+        NoParams(), {}, {"trajectory": Bundle({"poses": ours}, {"frames": frames}), "crosscheck": other}
     )
     check_outputs(agreement_stage, out)
     return out
@@ -52,11 +60,10 @@ def test_another_frame_of_reference_is_no_disagreement() -> None:
     ours = drive(20)
     out = run(ours, moved(ours, rotation_exp([0.4, -1.0, 2.0]), np.array([5.0, -3.0, 9.0])))
     assert out.meta["metrics"]["rmse"]["value"] == pytest.approx(0.0, abs=1e-9)
-    assert out.meta["scale_ratio"] == pytest.approx(1.0, abs=1e-12)
+    assert out.meta["metrics"]["scale_ratio"]["value"] == pytest.approx(1.0, abs=1e-12)
     assert out.meta["flagged"] == []
     assert np.isnan(out["step_distance"][0])
     np.testing.assert_allclose(out["poses"], ours, atol=1e-9)
-    np.testing.assert_allclose(out["position_crosscheck"], out["position"], atol=1e-9)
 
 
 def test_one_jump_is_flagged_at_its_frame_and_measured() -> None:
@@ -84,6 +91,15 @@ def test_one_turned_frame_is_flagged_by_rotation_alone() -> None:
     assert math.degrees(out["angle"][12]) == pytest.approx(math.degrees(0.05), abs=0.3)
 
 
+def test_a_frame_whose_images_do_not_fit_the_rig_is_flagged_although_its_pose_is_right() -> None:
+    ours = drive(20)
+    lines = np.where(np.arange(20) == 7, 5.0, 0.3)
+    out = run(ours, ours, lines=lines)
+    assert out.meta["flagged"] == [{"frame": 17, "why": ["left and right image do not fit the rig"]}]
+    # Of a rig that is wrong all over, all are far off: that is no reason for a single frame.
+    assert run(ours, ours, lines=6.0 + 0.1 * RNG(0).normal(size=20)).meta["flagged"] == []
+
+
 def test_noise_alone_is_not_flagged() -> None:
     ours = drive(60)
     assert [len(run(ours, noisy(ours, seed)).meta["flagged"]) for seed in range(5)] == [0] * 5
@@ -97,8 +113,9 @@ def test_the_limit_by_hand() -> None:
         "angle": 1e-6 * values,
         "step_distance": np.full(5, 3.0),
         "step_angle": values * np.nan,
+        "line_distance": 0.1 * values,
     }
-    flags, limits = flag(arrays, AgreementParams())
+    flags, limits = flag(arrays)
     assert limits["distance"] == pytest.approx(9.413)
     assert limits["angle"] == pytest.approx(math.radians(0.05))
     assert limits["step_distance"] == 6.0
@@ -112,8 +129,8 @@ def test_a_scale_shows_as_a_ratio() -> None:
     theirs = noisy(ours, 3)
     theirs[:, :, 3] /= 1.02
     out = run(ours, theirs)
-    assert out.meta["scale_ratio"] == pytest.approx(1.02, abs=1e-3)
-    assert out.meta["rmse_scaled_m"] < 0.03 < out.meta["metrics"]["rmse"]["value"]
+    assert out.meta["metrics"]["scale_ratio"]["value"] == pytest.approx(1.02, abs=1e-3)
+    assert out.meta["metrics"]["rmse_scaled"]["value"] < 0.03 < out.meta["metrics"]["rmse"]["value"]
 
 
 def test_rmse_is_near_evo_s_ate_and_never_below_it() -> None:
@@ -135,7 +152,6 @@ def test_missing_frames_are_named_and_steps_over_them_left_out() -> None:
     ours[8] = np.nan
     theirs[8] = drive(12)[8]
     out = run(ours, theirs)
-    assert out.meta["not_compared"] == [15, 18]
     assert out.meta["compared"] == 10
     assert np.flatnonzero(np.isnan(out["step_distance"])).tolist() == [0, 5, 6, 8, 9]
     # theirs is drawn wherever they have a pose
@@ -149,7 +165,7 @@ def test_each_piece_is_laid_on_ours_by_itself_and_a_lone_frame_not_at_all() -> N
     piece = np.array([0] * 5 + [1] * 7 + [2])
     out = run(ours, theirs, piece)
     assert out.meta["metrics"]["rmse"]["value"] == pytest.approx(0.0, abs=1e-9)
-    assert out.meta["not_compared"] == [22]
+    assert out.meta["compared"] == 12
     assert out.meta["pieces"] == 3
     assert np.isnan(out["step_distance"][5])
 
@@ -158,13 +174,13 @@ def test_each_piece_is_laid_on_ours_by_itself_and_a_lone_frame_not_at_all() -> N
 def test_a_camera_rests_within_ten_times_what_its_steps_differ_by(step: float, rests: bool) -> None:
     poses = np.tile(np.eye(3, 4), (40, 1, 1))
     poses[:, 0, 3] = np.where(np.arange(40) % 2, 1.0, -1.0)  # a metre from their mean
-    assert _at_rest(poses, np.array([np.nan] + [step] * 39)) == rests
+    assert at_rest(poses, np.full(39, step)) == rests
 
 
 def test_a_camera_at_rest_has_no_scale() -> None:
     ours = np.tile(np.eye(3, 4), (6, 1, 1))
     out = run(ours, moved(ours, rotation_exp([0.1, 0.2, 0.3]), np.ones(3)))
-    assert out.meta["scale_ratio"] is None
+    assert out.meta["metrics"]["scale_ratio"]["value"] is None
     assert out.meta["metrics"]["share"]["value"] is None
     np.testing.assert_allclose(out["angle"], 0.0, atol=1e-9)
 
@@ -175,9 +191,9 @@ def test_nothing_to_compare_is_a_fact() -> None:
     assert out.meta["compared"] == 0
     assert out.meta["metrics"]["rmse"]["value"] is None
     assert out.meta["limits"]["distance"] is None
-    arrays, facts = compare(ours, ours, np.full(4, -1))
+    arrays, scale, _ = compare(ours, ours, np.full(4, -1))
     assert np.isnan(arrays["distance"]).all()
-    assert facts["scale_ratio"] is None
+    assert scale is None
 
 
 def test_a_resting_camera_is_aligned_by_its_orientations() -> None:
@@ -187,7 +203,7 @@ def test_a_resting_camera_is_aligned_by_its_orientations() -> None:
     out = run(ours, theirs)
     # the mean of 20 noisy orientations on either side: a few 1e-4 rad in all, not the chance of the noise's shape
     assert out.meta["metrics"]["rmse_rotation"]["value"] < math.degrees(5e-4)
-    assert out.meta["scale_ratio"] is None
+    assert out.meta["metrics"]["scale_ratio"]["value"] is None
 
 
 def test_from_one_of_our_pieces_to_the_next_there_is_no_way() -> None:
@@ -196,7 +212,8 @@ def test_from_one_of_our_pieces_to_the_next_there_is_no_way() -> None:
     ours[10:] = moved(true[10:], true[10, :, :3].T, -true[10, :, :3].T @ true[10, :, 3])  # begins at its own origin
     frames = list(range(20))
     given = Bundle({"poses": ours, "piece": np.repeat([0, 1], 10).astype(np.int16)}, {"frames": frames})
-    other = Bundle({"piece_poses": true, "piece": np.zeros(20, np.int16)}, {"frames": frames, "pieces": [frames]})
-    metrics = agreement_stage.run(AgreementParams(), {}, {"trajectory": given, "crosscheck": other}).meta["metrics"]
+    arrays = {"piece_poses": true, "piece": np.zeros(20, np.int16), "line_distance": np.zeros(20)}
+    other = Bundle(arrays, {"frames": frames, "pieces": [frames]})
+    metrics = agreement_stage.run(NoParams(), {}, {"trajectory": given, "crosscheck": other}).meta["metrics"]
     assert metrics["rmse"]["value"] == pytest.approx(0.0, abs=1e-9)
     assert metrics["length"]["value"] == pytest.approx(18.0)

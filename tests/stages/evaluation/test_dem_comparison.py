@@ -154,7 +154,7 @@ def test_the_stated_deviations_are_those_of_least_squares() -> None:
 
 
 def test_of_a_large_model_points_all_over_it_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dem_comparison, "MOST_POINTS", 1000)
+    monkeypatch.setattr(dem_comparison, "MAX_POINTS", 1000)
     whole = terrain()
     found = align(Grid(whole.values + 0.1, whole.matrix), whole, "rigid")
     assert 500 < found.points < 2000

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rille.stages.evaluation.accuracy import posed
-from rille.stages.evaluation.pose_alignment import align, moved, spread
+from rille.stages.evaluation.rigid import alignment, compose, inverse, posed, spread
 from rille.stages.geometry.geometry import rotation_exp
 
 small = st.floats(-2.0, 2.0)
@@ -27,12 +26,10 @@ def test_a_known_motion_is_found_even_of_a_straight_drive_and_at_rest(
     turn: tuple[float, float, float], shift: tuple[float, float, float], step: float, share: float
 ) -> None:
     target = drive(5, step)
-    rotation = rotation_exp(turn)
-    source = moved(target, rotation.T, -rotation.T @ np.array(shift))
-    found = align(source, target, share)
-    np.testing.assert_allclose(found[0], rotation, atol=1e-9)
-    np.testing.assert_allclose(found[1], shift, atol=1e-9)
-    np.testing.assert_allclose(moved(source, *found), target, atol=1e-9)
+    motion = np.column_stack([rotation_exp(turn), shift])
+    source = compose(inverse(motion), target)
+    np.testing.assert_allclose(alignment(source, target, share), motion, atol=1e-9)
+    np.testing.assert_allclose(compose(motion, source), target, atol=1e-9)
 
 
 def test_the_share_decides_between_positions_and_orientations() -> None:
@@ -41,7 +38,8 @@ def test_the_share_decides_between_positions_and_orientations() -> None:
     source = target.copy()
     source[:, :, 3] = target[:, :, 3] @ rotation_exp([0.0, 0.1, 0.0])
     angle = {
-        share: np.arccos(np.clip((np.trace(align(source, target, share)[0]) - 1) / 2, -1, 1)) for share in (0.01, 50)
+        share: np.arccos(np.clip((np.trace(alignment(source, target, share)[:, :3]) - 1) / 2, -1, 1))
+        for share in (0.01, 50)
     }
     assert angle[0.01] == pytest.approx(0.1, abs=1e-3)
     assert angle[50] == pytest.approx(0.0, abs=1e-3)

@@ -1,0 +1,117 @@
+"""Sets of camera poses [R | t] (..., 3, 4): products, errors, lengths, and the motion that brings one set to another.
+
+Positions alone do not say how far a straight drive is rolled about its own line, nor anything of a resting camera's
+attitude. For an alignment by both, each pose counts as seven points: its centre, and the ends of three crossed rods of
+half length ``lever`` along its axes; the points are brought together by least squares (Umeyama 1991,
+doi:10.1109/34.88573, without scale).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rille.stages.core.arrays import Bools, Floats
+
+REST_LEVER_M = 1.0
+"""Lever of a camera at rest: far beyond the millimetres of its positions."""
+
+
+def posed(poses: Floats) -> Bools:
+    """Which of the poses (frame, 3, 4), or other matrices, are there, i.e. without NaN."""
+    return np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+
+
+def by_frame(values: Floats, frames: Sequence[int], wanted: Sequence[int]) -> Floats:
+    """Rows (frame, ...) of the wanted frames, of poses or covariances of ``frames``; NaN where there is none."""
+    row = {frame: k for k, frame in enumerate(frames)}
+    out = np.full((len(wanted), *values.shape[1:]), np.nan)
+    for k, frame in enumerate(wanted):
+        if frame in row:
+            out[k] = values[row[frame]]
+    return out
+
+
+def compose(a: Floats, b: Floats) -> Floats:
+    """Products a b (..., 3, 4) of rigid transforms."""
+    out = a[..., :3] @ b
+    out[..., 3] += a[..., 3]
+    return np.asarray(out)
+
+
+def inverse(T: Floats) -> Floats:
+    """Inverses (..., 3, 4) of rigid transforms."""
+    # The transpose instead of a general inverse: no rounding enters the rotation.
+    R = np.swapaxes(T[..., :3], -1, -2)
+    return np.concatenate([R, -R @ T[..., 3:]], axis=-1)
+
+
+def motion(poses: Floats, first: Any, last: Any) -> Floats:
+    """Motions (..., 3, 4) from frames ``first`` to ``last`` (indices or slices), in the earlier camera."""
+    return compose(inverse(poses[first]), poses[last])
+
+
+def relative_error(P: Floats, Q: Floats, first: Any, last: Any) -> Floats:
+    """Errors (..., 3, 4) of the motions of P (frame, 3, 4) against those of Q: ``motion(Q)^-1 motion(P)``."""
+    return compose(inverse(motion(Q, first, last)), motion(P, first, last))
+
+
+def angle(T: Floats) -> Floats:
+    """Rotation angles, radians, of transforms (..., 3, 3 or 4); exact for small angles, unlike acos of the trace."""
+    R = T[..., :3]
+    axis = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
+    return np.asarray(np.arctan2(np.linalg.norm(axis, axis=-1), np.trace(R, axis1=-2, axis2=-1) - 1.0))
+
+
+def angles_between(a: Floats, b: Floats) -> Floats:
+    """Rotation angles (n,), radians, between the orientations of poses (n, 3, 4) and (n, 3, 4)."""
+    return angle(np.swapaxes(a[..., :3], -1, -2) @ b[..., :3])
+
+
+def rms(vectors: Floats) -> float:
+    """Root of the mean squared length of vectors (n, k); NaN of none."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1)))) if len(vectors) else float("nan")
+
+
+def lengths_along(positions: Floats) -> Floats:
+    """Length (frame,), m, of the way from the first of positions (frame, 2 or 3), straight over gaps."""
+    # Interpolated over frames without a position, so that the way of every frame is a number to search in.
+    rows = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions[rows], axis=0), axis=1))])
+    return np.asarray(np.interp(np.arange(len(positions)), rows, lengths))
+
+
+def umeyama(source: Floats, target: Floats) -> tuple[Floats, Floats]:
+    """Rotation (k, k) and translation (k,) that bring points (n, k) nearest to others in the least-squares sense."""
+    a, b = source.mean(axis=0), target.mean(axis=0)
+    u, _, vt = np.linalg.svd((target - b).T @ (source - a))
+    # Else positions on a plane or a line may be fitted best by a reflection.
+    u[:, -1] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    rotation = u @ vt
+    return rotation, b - rotation @ a
+
+
+def spread(poses: Floats) -> float:
+    """RMS distance of the positions of poses (n, 3, 4) from their mean, metres."""
+    return rms(poses[:, :, 3] - poses[:, :, 3].mean(axis=0))
+
+
+def alignment(source: Floats, target: Floats, share: float) -> Floats:
+    """Motion (3, 4) that brings poses (n, 3, 4), from the left, nearest to others of the same frames.
+
+    ``share`` is the lever over the spread of the target's positions: how much orientations count beside positions.
+    A camera at rest has no spread but noise; infinity lets the orientations alone decide.
+    """
+    lever = share * spread(target)
+    if lever < 1e-6 or not np.isfinite(lever):
+        lever = REST_LEVER_M
+    return np.column_stack(umeyama(_points(source, lever), _points(target, lever)))
+
+
+def _points(poses: Floats, lever: float) -> Floats:
+    centre = poses[:, None, :, 3]
+    rods = lever * np.swapaxes(poses[:, :, :3], 1, 2)
+    # Both ends of each rod: their mean is the centre, so that rods pull no position aside.
+    return np.concatenate([centre, centre + rods, centre - rods], axis=1).reshape(-1, 3)
