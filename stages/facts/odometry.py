@@ -66,16 +66,13 @@ class TrackFacts(Facts):
 class ResectFacts(Facts):
     """Poses of a segment's frames.
 
-    ``per_frame``: frame, inliers, rms_px, and what else is known of each. ``without_coordinates`` counts landmarks,
-    ``moving_tracks`` those of the ``tracks`` that move. ``jump`` (column, row, px) and ``knocked``: the rig moved
-    before the pair at the segment's end.
+    ``per_frame``: frame, inliers, rms_px, and what else is known of each. ``without_coordinates`` counts landmarks.
+    ``jump`` (column, row, px) and ``knocked``: the rig moved before the pair at the segment's end.
     """
 
     per_frame: list[dict[str, Any]]
     without_coordinates: dict[str, int]
     """By cause."""
-    tracks: int
-    moving_tracks: int
     contradiction: NotRequired[str]
     jump: NotRequired[list[float]]
     knocked: NotRequired[str]

@@ -21,8 +21,8 @@ HALF = 5
 SIDE = 2 * HALF + 1
 STEPS = 15
 """Most steps before a template is given up; five are usual."""
-SETTLED = 0.01
-"""Step [pixels] below which a template has converged: a tenth of the error that remains."""
+SETTLED_PX = 0.01
+"""Step below which a template has converged: a tenth of the error that remains."""
 UNKNOWNS = 8
 """Shift (2), affinity (4), offset, gain."""
 MIN_TEXTURE = 1e-9
@@ -46,7 +46,16 @@ class Aligned(NamedTuple):
     error: Floats
 
 
-def align(a: Floats32, b: Floats32, templates: Templates, *, noise: float, spread: float, reach: float) -> Aligned:
+def align(
+    a: Floats32,
+    b: Floats32,
+    templates: Templates,
+    *,
+    noise: float,
+    spread: float,
+    reach: float,
+    settled: float = SETTLED_PX,
+) -> Aligned:
     """Positions in ``b`` of the templates around points of ``a``.
 
     Parameters
@@ -55,6 +64,7 @@ def align(a: Floats32, b: Floats32, templates: Templates, *, noise: float, sprea
     noise : grey levels, standard deviation of a difference.
     spread : standard deviation of an element of the affinity around the expected one.
     reach : pixels; a result farther than this from ``start`` is refused.
+    settled : step [pixels] below which a template has converged.
     """
     out = Aligned(np.full(templates.points.shape, np.nan), np.full(len(templates.points), np.nan))
     _align_all(
@@ -65,13 +75,14 @@ def align(a: Floats32, b: Floats32, templates: Templates, *, noise: float, sprea
         # affinity.
         (noise / spread) ** 2,
         float(reach),
+        settled,
         out,
     )
     return out
 
 
 @njit(cache=True, nogil=True)
-def _align_all(a, b, templates, ridge, reach, out):  # type: ignore[no-untyped-def]
+def _align_all(a, b, templates, ridge, reach, settled, out):  # type: ignore[no-untyped-def]
     patch, template = np.empty((SIDE + 2) ** 2), np.empty(SIDE * SIDE)
     descent, grey = np.empty((UNKNOWNS, SIDE * SIDE)), np.empty(SIDE * SIDE)
     for n in range(len(templates.points)):
@@ -104,7 +115,7 @@ def _align_all(a, b, templates, ridge, reach, out):  # type: ignore[no-untyped-d
             # Negated so that NaN, of a singular system, is refused as well.
             if not (abs(at[0] - start[0]) <= reach and abs(at[1] - start[1]) <= reach):
                 break
-            if max(abs(dx), abs(dy)) < SETTLED:
+            if max(abs(dx), abs(dy)) < settled:
                 out.position[n] = at
                 out.error[n] = np.sqrt(np.mean(grey**2))
                 break

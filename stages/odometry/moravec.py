@@ -23,6 +23,9 @@ from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 HALF = 2
 """Half the window: 5 x 5 pixels hold a corner of the finest feature kernels."""
+SIDE = 2 * HALF + 1
+BEFORE = (np.arange(SIDE**2) < SIDE**2 // 2).astype(np.uint8).reshape(SIDE, SIDE)
+"""Neighbours of a pixel that come before it in reading order."""
 
 
 def interest_operator(image: Floats32) -> Floats32:
@@ -87,8 +90,8 @@ def interest_points(
     response = interest_operator(image)
     # The expected sum of squared differences of pure noise is 2 sigma^2 for each of the 25 pixels.
     # Three times the expectation: the threshold is on a variance, so contrast must be 1.7 times the noise.
-    rows, cols = _peaks(response, 3.0 * 2.0 * (2 * HALF + 1) ** 2 * noise**2)
-    inner = _inside(valid, border)[rows, cols]
+    rows, cols = _peaks(response, 3.0 * 2.0 * SIDE**2 * noise**2)
+    inner = clear_of_mask(valid, np.stack([cols, rows], axis=-1), border)
     rows, cols = rows[inner], cols[inner]
     side = max(math.sqrt(image.shape[0] * image.shape[1] / max(count, 1)), 1.0)
     across = math.ceil(image.shape[1] / side)
@@ -112,33 +115,10 @@ def interest_points(
 
 def _peaks(response: Floats32, least: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows and columns of pixels above ``least``, and greatest of the 5 x 5 neighbourhood; of equal ones the first."""
-    side = 2 * HALF + 1
-    rows, cols = np.divmod(
-        np.flatnonzero((response > least) & (response == cv2.dilate(response, np.ones((side, side), np.uint8)))),
-        response.shape[1],
-    )
-    first = _first_of_equals(response, rows, cols)
+    greatest = response == cv2.dilate(response, np.ones((SIDE, SIDE), np.uint8))
+    rows, cols = np.divmod(np.flatnonzero(greatest & (response > least)), response.shape[1])
+    first = response[rows, cols] > cv2.dilate(response, BEFORE)[rows, cols]
     return rows[first], cols[first]
-
-
-@njit(cache=True, nogil=True)
-def _first_of_equals(response, rows, cols):  # type: ignore[no-untyped-def]
-    """Whether (n,) no neighbour before in reading order is as great. The border has no response: all of them exist."""
-    side = 2 * HALF + 1
-    first = np.ones(len(rows), np.bool_)
-    for n in range(len(rows)):
-        for k in range(side**2 // 2):
-            if response[rows[n] + k // side - HALF, cols[n] + k % side - HALF] == response[rows[n], cols[n]]:
-                first[n] = False
-    return first
-
-
-def _inside(valid: Bytes, border: int) -> Bools:
-    """Pixels at least ``border`` away from the image's edge and from anything unusable (Chebyshev distance)."""
-    side = 2 * border + 1
-    usable = (np.asarray(valid) != 0).astype(np.uint8)
-    eroded = cv2.erode(usable, np.ones((side, side), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    return np.asarray(eroded != 0)
 
 
 def clear_of_mask(valid: Bytes, points: Floats, border: int) -> Bools:

@@ -42,6 +42,9 @@ REACH_PX = 4.0
 MIN_AREA = 0.1
 """Area of a template over that in its first frame, below which it draws no texture."""
 
+SETTLED_BACK_PX = 0.1
+"""Step below which the alignment back has converged, a fifth of what it may miss by."""
+
 MAX_RETURN_PX = 0.5
 """Largest distance between a point and where its alignment there and back ends (4.3.3)."""
 
@@ -169,7 +172,7 @@ def _aligned(a: Pyramid, b: Pyramid, templates: Templates, params: TrackParams) 
     good = np.flatnonzero(clear_of_mask(b.valid[0], place, HALF))
     good = good[np.abs(np.linalg.det(templates.affinity[good])) > MIN_AREA]
     back = Templates(place[good], templates.points[good], np.linalg.inv(templates.affinity[good]))
-    miss = align(b.images[0], a.images[0], back, **how).position - templates.points[good]
+    miss = align(b.images[0], a.images[0], back, **how, settled=SETTLED_BACK_PX).position - templates.points[good]
     kept = np.isin(np.arange(len(place)), good[np.hypot(*miss.T) <= MAX_RETURN_PX])
     return Aligned(np.where(kept[:, None], place, np.nan), np.where(kept, error, np.nan))
 

@@ -36,8 +36,6 @@ from rille.stages.odometry.resection.robust_pose import (
     resect,
 )
 
-MIN_MOVING_SHARE = 0.3
-"""Share of the landmarks that agree with no pose, above which a warning is given."""
 CONTRADICTION = 2.0
 """Times the threshold from which on a landmark surely does not move as a pose says."""
 SECOND_SHARE = 0.2
@@ -148,8 +146,8 @@ def resect_segment(
 
 def _facts(frame: int, landmarks: int) -> dict[str, Any]:
     """Facts of a frame without a pose."""
-    none = {"condition": None, "disparity_bias_px": None, "errors_together": None}
-    return {"frame": frame, "landmarks": landmarks, "inliers": 0, "rms_px": None, "iterations": 0, **none}
+    none = {"rms_px": None, "disparity_bias_px": None, "errors_together": None}
+    return {"frame": frame, "landmarks": landmarks, "inliers": 0, **none}
 
 
 def _resect_frame(
@@ -222,19 +220,6 @@ def refuse_second_motion(points: SegmentPoints, j: int, posed: Resection, params
         if body
         else "leave out frames in which the camera stood, or cut off or mask what moves with it",
     )
-
-
-def moving_tracks(points: SegmentPoints, segment: SegmentPoses) -> tuple[int, int]:
-    """Count the landmarks that were found in two or more frames with a pose, and those of them that fit no pose.
-
-    A point that is tracked well and never fits is not fixed to the ground (the vehicle's own shadow, its wheels, other
-    moving things), or its coordinates are wrong (a match on the edge of a rock).
-    """
-    seen = points.known() & np.isfinite(segment.poses).all(axis=(1, 2))
-    seen[:, 0] = False
-    often = seen.sum(axis=1) >= 2
-    agrees = (segment.inlier != 0) & seen
-    return int(often.sum()), int((often & ~agrees.any(axis=1)).sum())
 
 
 def knocked(points: SegmentPoints, segment: SegmentPoses, after: Bundle, rig: Rig) -> tuple[str, list[float]] | None:
@@ -321,20 +306,7 @@ def resect_stage(
     segment = resect_segment(points, frames, params, reckoned)
     for fact in segment.facts[1:] if refused is not None else ():
         fact["lost"] = refused
-    count, moving = moving_tracks(points, segment)
-    warnings = []
-    if count and moving >= MIN_MOVING_SHARE * count:
-        warnings.append(
-            f"frames {frames[0]}-{frames[-1]}: {moving} of {count} tracked landmarks agree with no pose: does something"
-            " move in view (a shadow, a wheel)?"
-        )
-    meta: ResectFacts = {
-        "per_frame": segment.facts,
-        "without_coordinates": landmarks.lost,
-        "tracks": count,
-        "moving_tracks": moving,
-        "warnings": warnings,
-    }
+    meta: ResectFacts = {"per_frame": segment.facts, "without_coordinates": landmarks.lost}
     if inputs.after is not None and inputs.rig_after is not None:
         jumped = knocked(points, segment, inputs.after, Rig.from_dict(inputs.rig_after.meta["rig"]))
         if jumped is not None:

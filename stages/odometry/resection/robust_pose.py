@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -48,6 +48,7 @@ from rille.stages.odometry.resection.pnp import (
     PoseCovariance,
     back_projection,
     bias_information,
+    huber_weights,
     normal_equations,
     pose_covariance,
 )
@@ -108,13 +109,6 @@ class ResectParams(Params):
         description="largest standard deviation of the camera position over the landmarks' median distance; beyond, "
         "the pose counts as degenerate",
     )
-    min_share: float = Field(
-        0.15,
-        ge=0,
-        le=1,
-        description="share of a frame's landmarks that must agree with its pose; 0.05 agree with a wrong pose by "
-        "chance, since all are searched near their predictions",
-    )
 
 
 @dataclass(frozen=True)
@@ -124,9 +118,8 @@ class Resection:
     ``T_local_left``; ``covariance`` (6, 6) of (position m, rotation rad) in the local frame, without what is shared;
     ``shared`` (6, 7): pose errors per standard deviation of what all segments have in common; ``inlier`` (n,);
     ``residual`` (n,) back-projection error, pixels, of every landmark (NaN: behind the camera); ``bias`` of the
-    disparities, pixels;
-    ``condition`` of the normal matrix with unit diagonal; ``together``: how many times as far as independent errors the
-    mean errors of image blocks scatter (variance), see :func:`scatter_of_blocks`.
+    disparities, pixels; ``together``: how many times as far as independent errors the mean errors of image blocks
+    scatter (variance), see :func:`scatter_of_blocks`.
     """
 
     T_local_left: RigidTransform
@@ -135,8 +128,6 @@ class Resection:
     inlier: Bools
     residual: Floats
     bias: float
-    iterations: int
-    condition: float
     together: float
 
     @property
@@ -149,8 +140,6 @@ class Resection:
         return {
             "inliers": int(self.inlier.sum()),
             "rms_px": float(np.sqrt(np.mean(self.residual[self.inlier] ** 2))),
-            "iterations": self.iterations,
-            "condition": self.condition,
             "disparity_bias_px": self.bias,
             "errors_together": self.together,
         }
@@ -184,18 +173,23 @@ def resect(
     obs = observations(landmarks, pixels, camera, params)
     predictions = [Pose.of(T.inverse()) for T in starts]
     pose, near = _robust_start(obs, predictions, params, frame)
-    posed = _without_inconsistent(obs, pose, near, params, where)
-    agree = int(posed.active.sum())
-    if agree < params.min_share * len(pixels):
-        raise DegenerateError(
-            "RIL-419",
-            f"{where}: only {agree} of {len(pixels)} landmarks agree with one pose",
-            remedy="look at the image; or lower resect.min_share",
-        )
-    errors = back_projection(obs, posed.pose)
-    _not_by_chance(errors, agree, params, where)
-    _not_collinear(landmarks.position[posed.active], where)
-    return _result(obs, posed, errors, camera, params, where)
+    pose, active = _without_inconsistent(obs, pose, near, params, where)
+    errors = back_projection(obs, pose)
+    _not_by_chance(errors, params, where)
+    _not_collinear(landmarks.position[active], where)
+    depth = float(np.median(obs.landmarks[active] @ pose.R[2] + pose.t[2]))
+    measured, stated = _certainty(errors, active, depth, params, where)
+    covariance, shared = frame_errors(measured, stated, pose.R, depth)
+    weight = huber_weights(errors.norm, active)[active]
+    return Resection(
+        RigidTransform(pose.R, pose.t).inverse(),
+        covariance,
+        shared,
+        active,
+        np.where(np.isfinite(errors.norm), errors.pixels, np.nan),
+        float(pose.bias),
+        scatter_of_blocks(obs.pixels[active], errors.error[active], weight, camera),
+    )
 
 
 def observations(landmarks: Landmarks, pixels: Floats, camera: Camera, params: ResectParams) -> Observations:
@@ -236,17 +230,11 @@ def _sampled(obs: Observations, threshold: float, seed: int) -> list[Pose]:
     return [] if answer is None else [Pose.of(RigidTransform.from_matrix(answer["cam_from_world"].matrix()))]
 
 
-class _Posed(NamedTuple):
-    """An adjusted pose, the landmarks (n,) that agree with it, and the steps of all adjustments."""
-
-    pose: Pose
-    active: Bools
-    steps: int
-
-
-def _without_inconsistent(obs: Observations, pose: Pose, active: Bools, params: ResectParams, where: str) -> _Posed:
-    """The paper's rule: adjust, remove the most inconsistent, again until all are under the threshold."""
-    bound, steps = params.threshold / params.pixel_sigma, 0
+def _without_inconsistent(
+    obs: Observations, pose: Pose, active: Bools, params: ResectParams, where: str
+) -> tuple[Pose, Bools]:
+    """Pose and landmarks (n,) that agree, by the paper's rule: adjust, remove the most inconsistent, and again."""
+    bound = params.threshold / params.pixel_sigma
     while True:
         count = int(active.sum())
         enough(
@@ -254,8 +242,7 @@ def _without_inconsistent(obs: Observations, pose: Pose, active: Bools, params: 
             f"{where}: too few landmarks: {count} agree with one pose",
             "raise resect.threshold or choose basic pairs closer",
         )
-        minimum = levenberg_marquardt(PoseAdjustment(obs, active, params.bias_sigma), pose, MAX_STEPS, 1e-3)
-        pose, steps = minimum.state, steps + minimum.steps
+        pose = levenberg_marquardt(PoseAdjustment(obs, active, params.bias_sigma), pose, MAX_STEPS, 1e-3).state
         usable = _first_order(obs, pose, params)
         if (active & ~usable).any():
             active = active & usable
@@ -265,8 +252,7 @@ def _without_inconsistent(obs: Observations, pose: Pose, active: Bools, params: 
         if beyond == 0:
             # Only the last adjustment needs the full accuracy.
             problem = PoseAdjustment(obs, active, params.bias_sigma)
-            minimum = levenberg_marquardt(problem, pose, MAX_STEPS, 1e-10)
-            return _Posed(minimum.state, active, steps + minimum.steps)
+            return levenberg_marquardt(problem, pose, MAX_STEPS, 1e-10).state, active
         active = active.copy()
         # Not all of them at once: the worst pull the pose, and others agree once these are gone.
         active[np.argsort(-norm, kind="stable")[: math.ceil(beyond / REMOVED_SHARE)]] = False
@@ -282,15 +268,14 @@ def _first_order(obs: Observations, pose: Pose, params: ResectParams) -> Bools:
     return np.asarray(obs.sigma * np.sqrt((obs.per_pixel**2).sum(1)) <= params.max_depth_ratio * depth)
 
 
-def _result(
-    obs: Observations, posed: _Posed, errors: Errors, camera: Camera, params: ResectParams, where: str
-) -> Resection:
-    pose, active = posed.pose, posed.active
+def _certainty(
+    errors: Errors, active: Bools, depth: float, params: ResectParams, where: str
+) -> tuple[PoseCovariance, PoseCovariance]:
+    """Covariances of a pose by the errors found, and by the larger of those and the stated ones."""
     normal, prior = normal_equations(errors, active), bias_information(params.bias_sigma)
     # A posteriori variance factor: the errors found, not the ones expected, set the scale.
     squares = (normal.weight[active] * errors.norm[active] ** 2).sum()
     factor = max(float(squares / (2 * active.sum() - 6)), 1e-12)
-    depth = float(np.median(obs.landmarks[active] @ pose.R[2] + pose.t[2]))
     expected = pose_covariance(normal.matrix, prior)
     position_sigma = float(np.sqrt(np.trace(expected.noise[:3, :3]) + (expected.by_bias[:3] ** 2).sum()))
     if position_sigma > params.max_position_ratio * depth:
@@ -300,20 +285,7 @@ def _result(
             f" by {position_sigma:.2g} m (condition {expected.condition:.1e})",
             remedy="they are too far, too few or in one direction: set track.points higher or use nearer texture",
         )
-    measured = pose_covariance(normal.matrix / factor, prior)
-    stated = pose_covariance(normal.matrix / max(factor, 1.0), prior)
-    covariance, shared = frame_errors(measured, stated, pose.R, depth)
-    return Resection(
-        RigidTransform(pose.R, pose.t).inverse(),
-        covariance,
-        shared,
-        active,
-        np.where(np.isfinite(errors.norm), errors.pixels, np.nan),
-        float(pose.bias),
-        posed.steps,
-        stated.condition,
-        scatter_of_blocks(obs.pixels[active], errors.error[active], normal.weight[active], camera),
-    )
+    return pose_covariance(normal.matrix / factor, prior), pose_covariance(normal.matrix / max(factor, 1.0), prior)
 
 
 def frame_errors(
@@ -373,7 +345,7 @@ def enough(count: int, what: str, remedy: str) -> None:
         raise DegenerateError("RIL-421", f"{what}, {MIN_LANDMARKS} are needed", remedy=remedy)
 
 
-def _not_by_chance(errors: Errors, agree: int, params: ResectParams, where: str) -> None:
+def _not_by_chance(errors: Errors, params: ResectParams, where: str) -> None:
     """Refuse a pose that as many landmarks may agree with though none was found where it is.
 
     Any three landmarks fix a pose. Where the others were found by mistake, anywhere in what tracking searches, each
@@ -398,7 +370,7 @@ def _not_by_chance(errors: Errors, agree: int, params: ResectParams, where: str)
     if alarms > MAX_FALSE_ALARMS:
         raise DegenerateError(
             "RIL-720",
-            f"{where}: {agree} of {n} landmarks agree with one pose, which as many may do by chance",
+            f"{where}: {count} of {n} landmarks agree with one pose, which as many may do by chance",
             remedy="set track.points higher, or choose frames that are closer to each other",
         )
 
