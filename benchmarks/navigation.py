@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import sys
 from pathlib import Path
@@ -28,6 +29,8 @@ HEADINGS = (
     "drift, %",
     "RMSE 20 frames, mm",
     "RMSE, mm",
+    "NEES",
+    "NEES, mount left out",
     "ms a frame",
     "of processor",
     "tracking",
@@ -40,7 +43,8 @@ PRESETS = {"default": [], "navigation": ["keyframes.preset=navigation"]}
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequences", nargs="*", help="names, folders or manifests with truth")
-    parser.add_argument("--frames", type=int, help="the first so many frames only")
+    parser.add_argument("--first", type=int, default=0, help="frame to begin with")
+    parser.add_argument("--frames", type=int, help="so many frames only")
     parser.add_argument("--rounds", type=int, default=2, help="timed rounds (default 2)")
     parser.add_argument("--preset", action="append", choices=list(PRESETS), help="may be repeated (default: all)")
     parser.add_argument("--no-colmap", action="store_true", help="leave out COLMAP, which takes minutes")
@@ -75,7 +79,7 @@ def by_default() -> list[str]:
 def compare(name: str, given: argparse.Namespace) -> list[dict[str, Any]]:
     """Figures of every method on one sequence."""
     from odometry import chain, colmap, opencv
-    from odometry.measures import judge
+    from odometry.measures import claims, judge
 
     from rille.datasets.registry import open_sequence
     from rille.pipeline.flow import config as configuration
@@ -85,7 +89,9 @@ def compare(name: str, given: argparse.Namespace) -> list[dict[str, Any]]:
     if sequence.truth is None:
         raise SystemExit(f"navigation.py: {name} has no truth to be judged by")
     say(f"{name}: images")
-    images = chain.Images(sequence, range(min(given.frames or sequence.frames, sequence.frames)))
+    images = chain.Images(
+        sequence, range(given.first, min(given.first + (given.frames or sequence.frames), sequence.frames))
+    )
     truth = chain.truth(images)
 
     def rille(preset: str) -> Any:
@@ -106,7 +112,10 @@ def compare(name: str, given: argparse.Namespace) -> list[dict[str, Any]]:
             figures = chain.times(done, len(images.frames))
             old = found.get(method)
             if old is None or number == 1 or figures["processor"] < old["processor"]:
-                found[method] = {"sequence": name, "method": method, **judge(done.poses, truth), **figures}
+                figures |= judge(done.poses, truth)
+                if done.covariance is not None:
+                    figures |= claims(done.poses, done.covariance, truth)
+                found[method] = {"sequence": name, "method": method, **figures}
     return list(found.values())
 
 
@@ -118,7 +127,7 @@ def table(name: str, frames: int, found: list[dict[str, Any]]) -> None:
     print("|---" * len(HEADINGS) + "|")
     for f in found:
         lengths = [1e3 * f["one_frame"], f["drift"], 1e3 * f["rmse_first"], 1e3 * f["rmse"]]
-        shown = [f"{v:.3g}" for v in lengths]
+        shown = [f"{v:.3g}" for v in [*lengths, f.get("nees", math.nan), f.get("nees_mounted", math.nan)]]
         shown += [f"{f[key]:.0f}" for key in ("wall", "processor", "tracking", "matching")]
         print(
             f"| {f['method']} | {f['lost']:.0f} | {' | '.join(shown)} | {f['processor'] / found[0]['processor']:.2f} |"

@@ -14,6 +14,7 @@ from scipy import ndimage
 
 from rille.datasets.images.misalign import MisalignParams
 from rille.stages.core.declare import Bundle
+from rille.stages.geometry.geometry import RigidTransform, cross_matrix, rotation_exp
 from rille.stages.geometry.lattice import Lattice
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
@@ -21,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import gaps
 from driving.ratios import Ratios, wilson
 from gridding.mesh import rasterise
+from odometry.measures import claims
 from odometry.measures import judge as judge_odometry
 from stereo.measures import Found, fill, judge, locking
 from stereo.misalignment import conditions, knocked
@@ -128,6 +130,25 @@ def test_navigation_figures_of_a_stretched_drive() -> None:
     # Positions on a line, one centimetre too far apart each: after alignment of the means k - 9.5 centimetres.
     assert figures["rmse_first"] == pytest.approx(0.01 * np.std(np.arange(20)))
     assert figures["rmse"] == pytest.approx(0.01 * np.std(np.arange(30)))
+
+
+def test_claims_are_judged_apart_from_how_the_truth_is_mounted() -> None:
+    """A walk of a camera whose single motions err as is stated; its truth is of a body turned by 3 degrees."""
+    rng = np.random.default_rng(3)
+    sigma, mount = np.repeat([3e-3, 1e-3], 3), RigidTransform(rotation_exp([0.02, 0.05, 0.0]), np.array([0.1, 0, 0]))
+    at = made = RigidTransform.identity()
+    truth, poses, covariance = [at @ mount.inverse()], [made], [np.zeros((6, 6))]
+    for k in range(1, 40):
+        step = RigidTransform(rotation_exp(rng.normal(0, 0.2, 3)), rng.normal(0, 0.3, 3))
+        off = sigma * rng.standard_normal(6)
+        at, made = at @ step, made @ step @ RigidTransform(rotation_exp(off[3:]), off[:3])
+        truth, poses = [*truth, at @ mount.inverse()], [*poses, made]
+        lever = np.eye(6)
+        lever[:3, 3:] = -cross_matrix(poses[k].translation - poses[k - 1].translation)
+        covariance.append(lever @ covariance[-1] @ lever.T + np.diag(sigma**2))
+    figures = claims(*(np.array(v) for v in ([p.matrix34 for p in poses], covariance, [p.matrix34 for p in truth])))
+    assert figures["nees"] > 10
+    assert 0.3 < figures["nees_mounted"] < 2.5
 
 
 def test_gaps_error_and_sigma_are_those_of_the_gap_alone() -> None:
