@@ -1,7 +1,7 @@
 """What each idea of the local planner gains: drives on exact elevations with one idea switched off at a time.
 
-    benchmarks/planner_ablation.py --seeds 41:61     beds to choose by
-    benchmarks/planner_ablation.py --seeds 61:81     beds to judge by
+    benchmarks/planner_ablation.py --seeds 61:81     beds to choose by
+    benchmarks/planner_ablation.py --seeds 41:61     beds to judge by
 
 The drives are those of ``benchmarks/exact_loop.py``: exact maps of the ground in view, exact legs. Ways are compared on
 the beds whose goals the planner reaches with the idea and without it. Drives are kept in ``--out``, so that a run that
@@ -26,7 +26,7 @@ PARAMETERS = {"cost of doubtful ground": "local_planner.uncertainty_cost=1"}
 
 def replacements() -> dict[str, tuple[Any, str, Any]]:
     """Ideas that a replaced attribute switches off: object, name, replacement."""
-    from rille.stages.planning.local_planner import ground, policy
+    from rille.stages.planning.local_planner import clearance, ground, policy
     from rille.stages.planning.local_planner.clearance import Footing
     from rille.stages.planning.local_planner.look import Target
 
@@ -42,13 +42,15 @@ def replacements() -> dict[str, tuple[Any, str, Any]]:
         "legs that end in view of the next ground": (Target, "last_view", lambda *_: None),
         "turns to see": (Target, "turn", lambda *_: None),
         "cost beside hazards": (ground, "PROXIMITY_COST", 0.0),
+        "cost of unseen spots narrower than a wheel": (clearance, "_opened", lambda mask, *_: mask),
+        "cost of caution and doubted ground": (ground, "CAUTION_COST", 1e-9),
         "lower cost of ground seen from afar": (ground, "FAR_COST", float("inf")),
     }
 
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", default="41:61", help="FIRST:END of the beds (default 41:61)")
+    parser.add_argument("--seeds", default="61:81", help="FIRST:END of the beds (default 61:81)")
     parser.add_argument("--cover", type=float, default=0.1, help="rock cover (default 0.1)")
     parser.add_argument("--idea", action="append", help="only these; may be repeated")
     parser.add_argument("--out", type=Path, default=Path("planner-ablation.jsonl"), help="one line a drive, appended")

@@ -35,6 +35,15 @@ from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.vehicle import Vehicle
 
+REACH_WHEELS = 10.0
+"""Distance ahead of the vehicle's centre that is watched [wheel diameters]."""
+SIDE_MARGIN_WHEELS = 0.5
+"""Distance to either side of the wheels that is watched [wheel diameters]."""
+MODEL_RADIUS_WHEELS = 0.5
+"""A point is compared with the greatest height of the model within this radius [wheel diameters]."""
+DISPLACEMENT_STD = 0.5
+"""Standard deviation of a displacement [pixels of its pyramid level]."""
+
 
 class ObstacleMonitorParams(Params):
     """Parameters of the stage ``obstacle_monitor``; lengths in wheel diameters suit any scale."""
@@ -50,24 +59,10 @@ class ObstacleMonitorParams(Params):
         description="largest turn [degrees] between two compared images; at 7 and 8 degrees points seemed to rise "
         "above ground that the model had right",
     )
-    reach: float = Field(
-        10.0, gt=0, description="distance ahead of the vehicle's centre that is watched [wheel diameters]"
-    )
-    side_margin: float = Field(
-        0.5, ge=0, description="distance to either side of the wheels that is watched [wheel diameters]"
-    )
     min_rise: float = Field(
         0.25, gt=0, description="rise over the model from which a point counts as raised [wheel diameters]"
     )
-    sigma_displacement: float = Field(
-        0.5, gt=0, description="standard deviation of a displacement [pixels of the displacements' level]"
-    )
     sigmas: float = Field(2.0, gt=0, description="standard deviations that a rise must exceed, too")
-    model_radius: float = Field(
-        0.5,
-        ge=0,
-        description="a point is compared with the greatest height of the model within this radius [wheel diameters]",
-    )
     min_points: int = Field(
         8, ge=1, description="raised points within one wheel diameter from which on they are an obstacle"
     )
@@ -144,8 +139,10 @@ def look(
     T_now = view.now.inverse()
     T_vehicle_local = T_vehicle_left @ T_now
     ahead = T_vehicle_local.apply(surface.points)
-    wide = 0.5 * vehicle.track + p.side_margin * wheel
-    near = (np.abs(ahead[:, 0]) <= wide) & (ahead[:, 1] > 0.5 * vehicle.wheel_base) & (ahead[:, 1] <= p.reach * wheel)
+    wide = 0.5 * vehicle.track + SIDE_MARGIN_WHEELS * wheel
+    near = (
+        (np.abs(ahead[:, 0]) <= wide) & (ahead[:, 1] > 0.5 * vehicle.wheel_base) & (ahead[:, 1] <= REACH_WHEELS * wheel)
+    )
     cells = surface.points[near]
     pixel, cells, first = _seen(view, cells, camera)
     displacement = np.stack([view.column[pixel[:, 1], pixel[:, 0]], view.row[pixel[:, 1], pixel[:, 0]]], axis=1)
@@ -163,7 +160,7 @@ def look(
         # derivative grows beyond use.
         t = np.clip(np.nan_to_num(t), -0.5, 0.8)
     left_over = target - camera.project(T_now.apply(cells + t[:, None] * to_camera))
-    error = p.sigma_displacement * 2.0**view.level
+    error = DISPLACEMENT_STD * 2.0**view.level
     # A displacement across the epipolar line is a wrong match, not another depth.
     along = np.hypot(left_over[:, 0], left_over[:, 1]) <= 3.0 * error
     q = cells + t[:, None] * to_camera
@@ -243,7 +240,7 @@ def obstacle_monitor_stage(
     camera = Rig.from_dict(inputs.rig.meta["rig"]).left
     wheel = vehicle.wheel_diameter
     lattice = Lattice.from_dict(inputs.dem.meta["lattice"])
-    surface = LastModel.of(np.asarray(inputs.dem["elevation"]), lattice, params.model_radius * wheel)
+    surface = LastModel.of(np.asarray(inputs.dem["elevation"]), lattice, MODEL_RADIUS_WHEELS * wheel)
     poses = np.asarray(inputs.resect["poses"])  # NaN where tracking was lost, which is for the stage safety to judge
     known = np.isfinite(poses).all(axis=(1, 2))
     frames = [int(f["frame"]) for f in inputs.resect.meta["per_frame"]]

@@ -54,22 +54,17 @@ class Gaps(NamedTuple):
 
 
 class Hazards(NamedTuple):
-    """Maps (row, col) of :mod:`rille.stages.hazard.risk`: classes; reason bits, without which every hazard is one to a
-    wheel; probabilities of a hazard, without which each is certain."""
+    """Maps (row, col) of hazards, and of how well the ground is known.
+
+    ``risk``: classes of :mod:`rille.stages.hazard.risk`; ``reason`` bits, without which every hazard is one to a wheel;
+    ``p_hazard``, without which each is certain. ``unknown``: cells on which the vehicle may not stand because too
+    little is known; None: those of the unknown class. ``glanced``: unknown cells that were seen from afar. ``doubted``:
+    cells that cost as much as a hazard by sigma alone that is driven on.
+    """
 
     risk: Bytes
     reason: NDArray[np.uint16] | None = None
     p_hazard: Floats32 | None = None
-
-
-class KnownGround(NamedTuple):
-    """How well the ground is known, masks (row, col).
-
-    ``unknown``: cells on which the vehicle may not stand because too little is known; None: those of the unknown class.
-    ``glanced``: unknown cells that were seen from afar. ``doubted``: cells that cost as much as a hazard by sigma alone
-    that is driven on.
-    """
-
     unknown: Bools | None = None
     glanced: Bools | None = None
     doubted: Bools | None = None
@@ -133,7 +128,6 @@ class Footing:
         hazards: Hazards,
         lattice: Lattice,
         vehicle: Vehicle,
-        known: KnownGround | None = None,
         *,
         p_certain: float = 0.5,
         p_traversable: float = 0.0,
@@ -143,12 +137,12 @@ class Footing:
 
         A hazard is proven where it is not one by its standard deviation alone, and at least as probable as
         ``p_certain``. Where it is one by its standard deviation alone and less probable than ``p_traversable``, the
-        ground is doubted, if it is not unknown. So is ground within a quarter of a wheel of the doubted cells of
-        ``known``, where a wheel's edge touches.
+        ground is doubted, if it is not unknown. So is ground within a quarter of a wheel of the doubted cells,
+        where a wheel's edge touches.
         """
-        risk, cell, known = hazards.risk, lattice.cell, known or KnownGround()
+        risk, cell = hazards.risk, lattice.cell
         hazardous = risk == HAZARDOUS
-        unknown = risk == UNKNOWN if known.unknown is None else known.unknown
+        unknown = risk == UNKNOWN if hazards.unknown is None else hazards.unknown
         bits = np.full(risk.shape, WHEEL_BITS) if hazards.reason is None else hazards.reason
         doubtful = hazardous & ((bits & DOUBT_BIT) > 0)
         # Without probabilities every hazard that is none by sigma alone is proven.
@@ -159,8 +153,8 @@ class Footing:
             dared = doubtful & (hazards.p_hazard < p_traversable)
             doubtful &= ~dared
             cost_class[dared & ~unknown] = DOUBTED_GROUND
-        if known.doubted is not None:
-            beside = distance(known.doubted, cell) <= 0.25 * vehicle.wheel_diameter
+        if hazards.doubted is not None:
+            beside = distance(hazards.doubted, cell) <= 0.25 * vehicle.wheel_diameter
             cost_class[beside & ~unknown] = DOUBTED_GROUND
         masks = likely, doubtful, proven
         wheels, body = (
@@ -173,7 +167,7 @@ class Footing:
         straddle = Straddle.of(void, bounds, vehicle, _belly(vehicle), cell)
         unseen, frontier = distance(unknown, cell), distance(wide, cell)
         maps = FootingMaps(wheels, body, unseen, frontier, cost_class, straddle)
-        return Footing(lattice, vehicle, maps, known.glanced)
+        return Footing(lattice, vehicle, maps, hazards.glanced)
 
     def gaps(self, x: Floats, y: Floats, heading: Floats) -> Gaps:
         """Compute the distances at poses: x, y (m) and heading (rad to the left of y), arrays of one shape."""

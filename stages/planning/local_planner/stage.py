@@ -22,7 +22,7 @@ from rille.stages.geometry.geometry import Rig, RigidTransform, from_above, way_
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.classification import HAZARDOUS, UNKNOWN, UNSEEN_BIT
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning.local_planner.clearance import Footing, Hazards, KnownGround
+from rille.stages.planning.local_planner.clearance import Footing, Hazards
 from rille.stages.planning.local_planner.look import FieldOfView, PlannerMemory, Stand
 from rille.stages.planning.local_planner.params import LocalPlannerParams
 from rille.stages.planning.local_planner.policy import Before, Leg, plan_leg, shortest
@@ -31,6 +31,7 @@ from rille.stages.terrain.occlusion_bounds import Bounds
 Point = tuple[float, float]
 
 
+HAZARD_MAPS = ("risk", "reason", "p_hazard")
 P_COSTLY = 0.06
 """Probability of a hazard from which near ground is doubted; on simulated beds all edges that the map missed lay on
 ground of 0.07 and more."""
@@ -59,7 +60,7 @@ def next_leg(
 ) -> Leg:
     """The next leg on the ground seen so far; the other parameters are those of
     :func:`rille.stages.planning.local_planner.policy.plan_leg`."""
-    hazards, known = seen_so_far(seen.near, seen.far)
+    hazards = seen_so_far(seen.near, seen.far)
     meta = seen.near.meta
     lattice, vehicle = Lattice.from_dict(meta["lattice"]), Vehicle.model_validate(meta["vehicle"])
     for p_certain in params.p_certain_hazard:
@@ -67,7 +68,6 @@ def next_leg(
             hazards,
             lattice,
             vehicle,
-            known,
             p_certain=p_certain,
             p_traversable=params.p_max_traversable,
             bounds=seen.bounds,
@@ -84,7 +84,7 @@ def shortest_way(
     """Length (m) of the shortest way where all is known, and the margin (m) that it keeps: the vehicle's, or none where
     the margin, which is for what a vehicle does not know, closes every way. None: there is no way."""
     lattice, vehicle = Lattice.from_dict(risk.meta["lattice"]), Vehicle.model_validate(risk.meta["vehicle"])
-    hazards = Hazards(*(np.asarray(risk[name]) for name in Hazards._fields))
+    hazards = Hazards(*(np.asarray(risk[name]) for name in HAZARD_MAPS))
     for margin in (vehicle.margin, 0.0):
         bare = vehicle.model_copy(update={"margin": margin})
         allowed = Footing.of(
@@ -96,21 +96,20 @@ def shortest_way(
     return None, None
 
 
-def seen_so_far(near: Bundle, far: Bundle | None) -> tuple[Hazards, KnownGround]:
+def seen_so_far(near: Bundle, far: Bundle | None) -> Hazards:
     """Hazards of a map of which only near ground is driven on, and how well each cell is known."""
-    names = Hazards._fields
-    maps = [np.asarray(near[name]) for name in names]
+    maps = [np.asarray(near[name]) for name in HAZARD_MAPS]
     unknown, glanced = maps[0] == UNKNOWN, None
     if far is not None:
         # At the rim of the near ground a window is cut off, which widens the doubt. All of it was seen from afar, which
         # counts where it is clearly free.
         chance = np.asarray(far["p_hazard"])
         cut = unknown | (((maps[1] & UNSEEN_BIT) != 0) & (chance < P_CLEAR))
-        maps = [np.where(cut, np.asarray(far[name]), seen) for name, seen in zip(names, maps, strict=True)]
+        maps = [np.where(cut, np.asarray(far[name]), seen) for name, seen in zip(HAZARD_MAPS, maps, strict=True)]
         # Written so that NaN, of which nothing is known, stays unknown.
         unknown &= ~(maps[2] < P_CLEAR)
         glanced = unknown & (maps[0] < HAZARDOUS)
-    return Hazards(*maps), KnownGround(unknown, glanced, maps[2] >= P_COSTLY)
+    return Hazards(maps[0], maps[1], maps[2], unknown, glanced, maps[2] >= P_COSTLY)
 
 
 class LegInputs(NamedTuple):

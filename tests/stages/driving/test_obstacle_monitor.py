@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import Validity
 from rille.stages.driving.obstacle_monitor import (
+    MODEL_RADIUS_WHEELS,
     LastModel,
     Obstacle,
     ObstacleMonitorParams,
@@ -76,7 +77,7 @@ def surface(block: tuple[float, float, float, float] | None = None) -> LastModel
     if block is not None:
         xy = LATTICE.xy()
         z[(np.abs(xy[..., 0] - block[0]) < block[2]) & (np.abs(xy[..., 1] - block[1]) < block[2])] = block[3]
-    return LastModel.of(z, LATTICE, P.model_radius * ROVER.wheel_diameter)
+    return LastModel.of(z, LATTICE, MODEL_RADIUS_WHEELS * ROVER.wheel_diameter)
 
 
 def found(v: ViewPair, s: LastModel) -> Obstacle | None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import CAUTION, HAZARDOUS, REASONS, SAFE, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning.local_planner.clearance import DOUBTED_GROUND, Footing, Hazards, KnownGround
+from rille.stages.planning.local_planner.clearance import DOUBTED_GROUND, Footing, Hazards
 
 ROVER = Vehicle(
     wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01
@@ -141,7 +141,7 @@ def test_what_is_hazardous_by_sigma_alone_and_improbable_is_doubted_ground() -> 
 def test_ground_within_a_quarter_of_a_wheel_of_doubted_ground_is_dear() -> None:
     risk = np.full(LATTICE.shape, SAFE, np.uint8)
     unknown = Y > 0.2
-    footing = Footing.of(Hazards(risk), LATTICE, ROVER, KnownGround(unknown, doubted=X > 0.059))
+    footing = Footing.of(Hazards(risk, unknown=unknown, doubted=X > 0.059), LATTICE, ROVER)
     assert np.array_equal(
         footing.maps.cost_class == DOUBTED_GROUND, (X > 0.054) & ~unknown
     )  # a cell of 5 mm beside it, not the next

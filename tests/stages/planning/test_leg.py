@@ -14,7 +14,7 @@ from raising import raises
 
 from rille.stages.core.declare import Bundle
 from rille.stages.hazard.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
-from rille.stages.planning.local_planner.clearance import Footing, Hazards, KnownGround
+from rille.stages.planning.local_planner.clearance import Footing, Hazards
 from rille.stages.planning.local_planner.ground import CLOSED_WHEELBASES, FAR_COST, Ground
 from rille.stages.planning.local_planner.look import AHEAD as ANYWHERE
 from rille.stages.planning.local_planner.look import FieldOfView, PlannerMemory, Stand
@@ -274,7 +274,7 @@ def test_doubtful_ground_is_dear_where_it_will_not_be_seen_from_nearer() -> None
     def cost(y: float, kind: int) -> float:
         band = np.abs(Y - y) < 0.03
         risk = np.where(band, np.uint8(kind), free)
-        footing = Footing.of(Hazards(risk), LATTICE, ROVER, KnownGround(doubted=band if kind == SAFE else None))
+        footing = Footing.of(Hazards(risk, doubted=band if kind == SAFE else None), LATTICE, ROVER)
         return Ground(footing, START, 0.0, P).again(way)[1]
 
     assert cost(0.2, SAFE) > 1.05 * cost(0.5, SAFE)
@@ -301,7 +301,7 @@ def test_the_shadow_of_a_stone_is_gone_round_farther_than_ground_that_nobody_loo
 def test_no_wheel_is_driven_over_doubtful_ground_that_can_be_gone_round() -> None:
     free = np.full(LATTICE.shape, SAFE, np.uint8)
     doubted = np.hypot(X + 0.5 * ROVER.track, Y - 0.15) < 0.011
-    footing = Footing.of(Hazards(free), LATTICE, ROVER, KnownGround(doubted=doubted))
+    footing = Footing.of(Hazards(free, doubted=doubted), LATTICE, ROVER)
     leg = plan_leg(footing, AT, GOAL, P)
     assert leg.verdict == "drive"
     for piece in through(leg.path, leg.gear, 0.0):
@@ -310,7 +310,7 @@ def test_no_wheel_is_driven_over_doubtful_ground_that_can_be_gone_round() -> Non
         assert footing.gaps(x, y, np.full(50, piece.heading)).doubted.max() == 0
     # where there is no room to go round, it is driven over
     risk = np.where(np.abs(X) > 0.075, np.uint8(HAZARDOUS), free)
-    between = plan_leg(Footing.of(Hazards(risk), LATTICE, ROVER, KnownGround(doubted=doubted)), AT, GOAL, P)
+    between = plan_leg(Footing.of(Hazards(risk, doubted=doubted), LATTICE, ROVER), AT, GOAL, P)
     assert between.path[-1, 1] > 0.15
 
 
@@ -321,7 +321,8 @@ def test_at_the_rim_of_what_is_near_only_what_is_clearly_free_from_afar_counts(c
         return Bundle({name: np.full((2, 2), value) for name, value in maps.items()}, {})
 
     near = seen(HAZARDOUS, REASONS["slope"] | REASONS["uncertain"] | REASONS["unseen"], 0.45)
-    (classes, _, found), known = seen_so_far(near, seen(SAFE, 0, chance))
+    known = seen_so_far(near, seen(SAFE, 0, chance))
+    classes, found = known.risk, known.p_hazard
     assert (classes == kind).all()
     assert found == pytest.approx(0.45 if kind == HAZARDOUS else chance)
     assert known.unknown is not None
@@ -334,7 +335,7 @@ def test_ground_seen_from_afar_alone_is_planned_over_rather_than_unseen_one_and_
     free = np.full(LATTICE.shape, SAFE, np.uint8)
 
     def planned(risk: np.ndarray, p: LocalPlannerParams = P) -> Leg:
-        footing = Footing.of(Hazards(risk), LATTICE, ROVER, KnownGround(unknown, glanced))
+        footing = Footing.of(Hazards(risk, unknown=unknown, glanced=glanced), LATTICE, ROVER)
         return plan_leg(footing, AT, GOAL, p)
 
     leg = planned(free)
