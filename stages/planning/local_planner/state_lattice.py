@@ -67,12 +67,6 @@ class PoseGrid:
         c, s = math.cos(self.heading), math.sin(self.heading)
         return self.middle[0] + c * right - s * ahead, self.middle[1] + s * right + c * ahead
 
-    def index(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Fractional rows and columns of points, metres."""
-        c, s = math.cos(self.heading), math.sin(self.heading)
-        dx, dy = x - self.middle[0], y - self.middle[1]
-        return self.origin[0] - (c * dy - s * dx) / self.spacing, self.origin[1] + (c * dx + s * dy) / self.spacing
-
 
 @dataclass(frozen=True)
 class PoseGraph:

@@ -109,10 +109,11 @@ def test_the_grid_lies_through_the_start_and_covers_the_map(x: float, y: float, 
     assert np.hypot(*(np.array(grid.xy(at[0], at[1])) - (x, y))) < 1e-12
     ahead = np.array(grid.xy(at[0] - 1, at[1])) - (x, y)
     assert ahead == pytest.approx([-0.03 * math.sin(heading), 0.03 * math.cos(heading)], abs=1e-12)
-    xy = lattice.xy()
-    row, col = grid.index(xy[..., 0], xy[..., 1])
-    assert row.min() >= 0
-    assert col.min() >= 0
-    assert row.max() <= grid.shape[0] - 1
-    assert col.max() <= grid.shape[1] - 1
-    assert np.abs(np.array(grid.xy(row, col)) - xy.transpose(2, 0, 1)).max() < 1e-12
+    x0, x1, y0, y1 = lattice.bounds
+    rows, cols = (np.array([-0.5, n - 0.5]) for n in grid.shape)
+    sides = np.array([grid.xy(r, c) for r in rows for c in cols])
+    c, s = math.cos(heading), math.sin(heading)
+    corners = np.array([(x, y) for x in (x0, x1) for y in (y0, y1)])
+    inward = np.array([[c, -s], [s, c]])
+    assert ((corners @ inward).min(axis=0) >= (sides @ inward).min(axis=0)).all()
+    assert ((corners @ inward).max(axis=0) <= (sides @ inward).max(axis=0)).all()
