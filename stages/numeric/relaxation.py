@@ -101,21 +101,23 @@ def _shear(start, power, pull, bends, keep, out):  # type: ignore[no-untyped-def
     """Fill the equations from arrays (rows, cols); what is NaN in the start stays 0."""
     (across, down), (rows, cols) = bends, start.shape
     four, none = np.float32(4.0), np.float32(0.0)
+    # Arrays are taken out of their tuple before the loop: each time costs an atomic count of references.
+    at, by_row, by_column, goal, inverse = out.at, out.across, out.down, out.goal, out.inverse
     for r in range(rows):
         for c in range(cols):
             if not np.isfinite(start[r, c]):
                 continue
             t, i = r + c + BORDER, r + BORDER
-            out.at[t, i], out.across[t, i], out.down[t, i] = start[r, c], across[r, c], down[r, c]
+            at[t, i], by_row[t, i], by_column[t, i] = start[r, c], across[r, c], down[r, c]
             if not keep[r, c]:
                 continue
-            out.goal[t, i] = power[r, c] * start[r, c] + pull[r, c]
+            goal[t, i] = power[r, c] * start[r, c] + pull[r, c]
             # Of the bend about the cell, and of those that end there.
             weight = power[r, c] + four * (across[r, c] + down[r, c])
             weight += (across[r, c - 1] if c > 0 else none) + (across[r, c + 1] if c + 1 < cols else none)
             weight += (down[r - 1, c] if r > 0 else none) + (down[r + 1, c] if r + 1 < rows else none)
             if weight > 0.0:
-                out.inverse[t, i] = np.float32(1.0) / weight
+                inverse[t, i] = np.float32(1.0) / weight
 
 
 @njit(cache=True, nogil=True)

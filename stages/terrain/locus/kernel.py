@@ -30,7 +30,7 @@ from rille.stages.core.arrays import Floats, Floats32
 MIN_DEPTH = 1e-9  # metres, projective depth: excludes the camera's own plane
 STEP_PX = 1.0  # search step: disparity is bilinear between pixels, so nothing hides in a shorter one
 MAX_STEPS = 4096.0  # of one locus: more than the diagonal of a 12 megapixel image
-MARGIN_STEPS = 2.0  # that the interval handed down from the coarse level is widened by
+MARGIN_STEPS = 1.0  # that the interval handed down from the coarse level is widened by
 SOLVED_PX = 1e-3  # |s| of a solution: a two-hundredth of the disparity's usual noise
 MAX_TURNS = 16  # of regula falsi
 

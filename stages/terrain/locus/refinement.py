@@ -35,10 +35,8 @@ FARTHEST = 1.0
 
 MEAN_SIDE = 15
 """Side [cells] of the window of the local mean; brightness varies more slowly."""
-MEAN_ROUNDS = 1
 RESIDUAL = 10.0
 """Difference [grey levels] that halves a cell's weight, well above camera noise."""
-LEAST_WEIGHT = 0.1
 
 
 def refine(views: Views, surface: Surface, elevation: Floats32, steps: int) -> tuple[Floats32, OrthoPair]:
@@ -89,12 +87,11 @@ def _level(seen: OrthoPair, gain: float) -> None:
 
 def _misfit(seen: OrthoPair, keep: Bools) -> tuple[Floats32, Floats32]:
     """Weight of each cell's equation, and difference of both images without its local mean; zero where not kept."""
-    rest = np.where(keep, seen.left - seen.right, np.float32(0.0))
-    weight = misfit = keep.astype(np.float32)
-    for _ in range(MEAN_ROUNDS + 1):
-        mean = window_sum32(weight * rest, MEAN_SIDE) / np.maximum(window_sum32(weight, MEAN_SIDE), LEAST_WEIGHT)
-        misfit = np.where(keep, rest - mean, np.float32(0.0))
-        # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once.
-        weight = keep / (np.float32(1.0) + np.square(misfit / np.float32(RESIDUAL)))
-    # A cell smaller than a pixel brings no more than its share of the pixel.
-    return np.where(keep, weight * np.fmin(seen.area, 1.0), np.float32(0.0)), misfit
+    none = np.float32(0.0)
+    rest = np.where(keep, seen.left - seen.right, none)
+    mean = window_sum32(rest, MEAN_SIDE) / np.maximum(window_sum32(keep, MEAN_SIDE), np.float32(1.0))
+    misfit = np.where(keep, rest - mean, none)
+    # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once. A cell smaller
+    # than a pixel brings no more than its share of the pixel.
+    weight = np.fmin(seen.area, 1.0) / (np.float32(1.0) + np.square(misfit / np.float32(RESIDUAL)))
+    return np.where(keep, weight, none), misfit

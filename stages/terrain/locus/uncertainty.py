@@ -23,11 +23,14 @@ matched, 77 and 95 % with both. The disparity's own standard deviation brings no
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from rille.stages.core.arrays import Bools, Floats, Floats32
+import numpy as np
+from numpy.typing import NDArray
+
+from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.numeric.robust import mad_sigma
-from rille.stages.numeric.windows import window_sum32
+from rille.stages.numeric.windows import window_room, window_sum32
 from rille.stages.terrain.locus.views import OrthoPair
 
 FLOOR = 0.03
@@ -48,6 +51,8 @@ LEAST_GRADIENT = 1.0
 """Squared grey levels a pixel, of each cell: so that a blank wall is not divided by."""
 STEP_SIDE, NEAR_SIDE, HOLE_SIDE, MEAN_SIDE = 3, 5, 7, 15
 """Cells: sides of the windows of t, of most others, of u, and of the local mean that differences go without."""
+NOISE_STRIDE = 4
+"""Each so many-th cell says how much both images differ: some ten thousand do."""
 
 
 def standard_deviation(
@@ -67,24 +72,35 @@ def standard_deviation(
     known = np.isfinite(elevation) & np.isfinite(seen.scale)
     if not known.any():
         return otherwise
+    none, near = np.float32(0.0), _count(known, NEAR_SIDE)
     scale = np.where(known, seen.scale, np.float32(1.0))
-    rest = np.where(known, seen.left - seen.right, np.float32(0.0))
-    rest = np.where(known, rest - _mean(rest, known, MEAN_SIDE), np.float32(0.0))
+    rest = np.where(known, seen.left - seen.right, none)
+    rest = np.where(known, rest - _mean(rest, MEAN_SIDE, _count(known, MEAN_SIDE)), none)
     # About 0: the local mean is gone already.
-    noise = mad_sigma(rest[known], 0.0)
-    grey = np.maximum(_mean(np.where(known, seen.left, 0.0), known, NEAR_SIDE), max(noise, 1.0))
-    variance = FLOOR**2 + STEP * _mean(_steps(elevation, scale, known), known, STEP_SIDE)
-    variance += REST * _mean(np.square(rest), known, NEAR_SIDE) / _gradients(seen, scale, known)
-    variance += np.square(SHADE * noise / grey)
-    variance += MOVED**2 * _mean(np.where(known, np.square(scale * moved), 0.0), known, NEAR_SIDE)
-    variance += HOLE * (1.0 - _mean(known, np.ones(known.shape, bool), HOLE_SIDE))
+    noise = mad_sigma(rest[known][::NOISE_STRIDE], 0.0)
+    moves = np.where(known, np.square(scale * moved), none)
+    grey = np.maximum(_mean(np.where(known, seen.left, none), NEAR_SIDE, near), max(noise, 1.0))
+    variance = FLOOR**2 + REST * _mean(np.square(rest), NEAR_SIDE, near) / _gradients(seen, scale, known)
+    variance += np.square(SHADE * noise / grey) + MOVED**2 * _mean(moves, NEAR_SIDE, near)
+    variance += STEP * _mean(_steps(elevation, scale, known), STEP_SIDE, _count(known, STEP_SIDE))
+    variance += HOLE * (1.0 - _mean(known, HOLE_SIDE, window_room(known.shape, HOLE_SIDE)))
     if apart is not None:
         both = known & np.isfinite(apart)
-        differ = _mean(np.where(both, np.square(scale * apart), 0.0), both, NEAR_SIDE)
-        variance += APART**2 * np.where(window_sum32(both, NEAR_SIDE) < 1.0, ALONE**2, differ)
+        differ = _mean(np.where(both, np.square(scale * apart), none), NEAR_SIDE, _count(both, NEAR_SIDE))
+        variance += APART**2 * np.where(window_sum32(both, NEAR_SIDE) < 1.0, np.float32(ALONE**2), differ)
     # Differences of running sums may fall below zero by their rounding.
     std = np.sqrt(np.maximum(variance, FLOOR**2)) / scale
     return np.where(known, std, otherwise).astype(np.float32)
+
+
+def _count(known: Bools, side: int) -> Floats32:
+    """Number of known cells of each window, at least 1."""
+    return np.maximum(window_sum32(known, side), np.float32(1.0))
+
+
+def _mean(values: Floats32 | Bools, side: int, count: NDArray[Any]) -> Floats32:
+    """Mean over a window of ``count`` cells of values that are 0 elsewhere."""
+    return np.asarray(window_sum32(values, side) / count, np.float32)
 
 
 def _gradients(seen: OrthoPair, scale: Floats32, known: Bools) -> Floats32:
@@ -103,8 +119,3 @@ def _steps(elevation: Floats32, scale: Floats32, known: Bools) -> Floats32:
     steps = np.square(0.5 * scale[inner]) * (across**2 + down**2)
     out[inner] = np.where(np.isfinite(steps) & known[inner], steps, 0.0)
     return out
-
-
-def _mean(values: Floats | Floats32 | Bools, known: Bools, side: int) -> Floats32:
-    """Mean over the known cells of a window of values that are 0 elsewhere."""
-    return np.asarray(window_sum32(values, side) / np.maximum(window_sum32(known, side), 1.0), np.float32)

@@ -82,16 +82,20 @@ def look(views: Views, surface: Surface, elevation: Floats | Floats32) -> OrthoP
 @njit(cache=True, nogil=True, error_model="numpy")
 def _look(block, z, views, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` of the rows of a block."""
-    feet, rows, cols = block.feet, block.feet.shape[0], block.feet.shape[1]
-    (P, spline), (P_right, spline_right), centre = views.left, views.right, views.centre
-    P, P_right = projection_rows(P), projection_rows(P_right)
+    # Arrays are taken out of their tuples before the loops: each time costs an atomic count of references.
+    feet, normals, (rows, cols) = block.feet, block.normals, block.feet.shape[:2]
+    left, right, left_slope, right_slope, scale, area = (
+        out.left, out.right, out.left_slope, out.right_slope, out.scale, out.area,
+    )  # fmt: skip
+    spline, spline_right, centre = views.left.spline, views.right.spline, views.centre
+    P, P_right = projection_rows(views.left.projection), projection_rows(views.right.projection)
     for r in range(block.start, block.stop):
         i = r - block.first
         below = i + 1 if i + 1 < rows else i - 1
         for c in range(cols):
             if not np.isfinite(z[r, c]):
                 continue
-            foot, normal = vector(feet, i, c), vector(block.normals, i, c)
+            foot, normal = vector(feet, i, c), vector(normals, i, c)
             height = float(z[r, c])
             point = (
                 foot[0] + height * normal[0],
@@ -105,18 +109,18 @@ def _look(block, z, views, out):  # type: ignore[no-untyped-def]
                 continue
             grey, gx, gy = value_and_gradient(spline, at[0], at[1])
             u, v = _motion(P, at, normal)
-            out.left[r, c], out.left_slope[r, c] = grey, gx * u + gy * v
+            left[r, c], left_slope[r, c] = grey, gx * u + gy * v
             grey, gx, gy = value_and_gradient(spline_right, at_right[0], at_right[1])
             u, v = _motion(P_right, at_right, normal)
-            out.right[r, c], out.right_slope[r, c] = grey, gx * u + gy * v
+            right[r, c], right_slope[r, c] = grey, gx * u + gy * v
             # Along the left ray the left image stays: what the right one moves by is disparity.
             part = 1.0 / toward
             u, v = _motion(P_right, at_right, (ray[0] * part, ray[1] * part, ray[2] * part))
-            out.scale[r, c], out.area[r, c] = math.sqrt(u * u + v * v), 1.0
+            scale[r, c], area[r, c] = math.sqrt(u * u + v * v), 1.0
             if rows > 1 and cols > 1:
                 down = _motion(P, at, _step(foot, vector(feet, below, c)))
                 across = _motion(P, at, _step(foot, vector(feet, i, c + 1 if c + 1 < cols else c - 1)))
-                out.area[r, c] = abs(down[0] * across[1] - across[0] * down[1])
+                area[r, c] = abs(down[0] * across[1] - across[0] * down[1])
 
 
 @njit(cache=True, nogil=True)
