@@ -136,7 +136,7 @@ def decode_colour(
         raise InputError("RIL-170", f"{name} {damage}", remedy=COPY_AGAIN)
     header = _sound(read_header(BytesIO(data)), name)
     if wanted is not None:
-        check_size((*header[:2], wanted[2]), wanted, name)
+        check_size(header._replace(depth=wanted.depth), wanted, name)
     image, complaint = _unpacked(data)
     if image is None:
         raise InputError("RIL-763", f"{name} cannot be decoded", remedy=COPY_AGAIN)
