@@ -17,9 +17,8 @@ shares are tried: none under its outline, else none under its wheels, else none 
 where the elevation model is narrower than the vehicle, as beside the cameras; the result says so (``ground``).
 
 An elevation model is fan-shaped and ragged: the first and last rows with a free cell hold a few, which may lead
-nowhere. So a start that is not given lies within one vehicle length of the first row, where the path and the way to its
-start from the middle of that row are cheapest together; a target that is not given is, within one vehicle length of the
-farthest row that is reached, the cell nearest to that row's middle.
+nowhere. So a start that is not given is, of the free cells within one vehicle length of the first row that lead on, the
+one nearest to that row's middle; the target likewise at the farthest row that is reached.
 
 Where no path by rows comes within one vehicle length of the last row, ``auto`` goes, in any direction, as far as
 connected ground leads from the first rows: that is a path if it leads at least one vehicle length ahead, and
@@ -53,6 +52,9 @@ from rille.stages.planning.row_graph import UNREACHED, Cell, Ints, sweep, trace
 __all__ = ["PathParams", "Route", "describe", "find_path", "path_stage"]
 
 Ends = tuple[Point | None, Point | None]
+
+START_COST = 1e3
+"""Cost of a metre [m of climb] by which a path by rows begins beside its place, more than that of any ground."""
 
 BY_ROWS = "hazardous or unknown ground closes the whole width"
 AHEAD = "no ground that is known and safe leads a vehicle's length ahead"
@@ -139,13 +141,13 @@ class _Search:
                     cost, steps = search(ground.terrain(below, 1.0, 0.0), nearest_middle(starts, near), target)
                 reached = cost < UNREACHED
                 top, bottom = row_span(reached)
+                blocking = top - 1 if by_rows else blocking
+                # As far as it leads for a stop; a mission's path need not end in the very last corner.
+                zone = reached[: top + 1 + (slack if by_rows or self.stretch else 0)]
+                far_enough = top <= far + slack if by_rows else bottom - top >= length
+                end = nearest_middle(zone, top) if far_enough else None
                 if target is not None:
                     end = target if reached[target] else None
-                elif by_rows:
-                    blocking = top - 1
-                    end = nearest_middle(reached[: top + slack + 1], top) if top <= far + slack else None
-                else:
-                    end = nearest_middle(reached[: top + 1], top) if bottom - top >= length else None
                 if end is not None:
                     cells = trace(steps, end)
                     return Route(cells, ground.xyz(cells), planner, below, span)
@@ -207,11 +209,11 @@ def _away(cells: NDArray[np.intp], row: int, col: int, cell: float) -> float:
 
 
 def first_costs(starts: Bools, row: int, cell: float) -> Ints:
-    """Cost (row, col) of starting at a cell, :data:`UNREACHED` where that is not permitted: each metre along rows and
-    columns from the middle of a row costs a metre of climb."""
+    """Cost (row, col) of starting at a cell, :data:`UNREACHED` where that is not permitted: by :data:`START_COST` for
+    each metre along rows and columns from the middle of a row."""
     rows, cols = (np.arange(n) for n in starts.shape)
     moves = np.abs(rows - row)[:, None] + np.abs(cols - len(cols) // 2)
-    return np.where(starts, moves * round(cell / UNIT), UNREACHED)
+    return np.where(starts, moves * round(START_COST * cell / UNIT), UNREACHED)
 
 
 def row_span(cells: Bools) -> tuple[int, int]:
