@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.lattice import Lattice
@@ -21,40 +21,26 @@ from rille.stages.geometry.lattice import Lattice
 class Surface:
     """Grid of ``rows`` x ``cols`` cells on a reference surface.
 
-    ``locate(rows, cols)`` gives feet (n, 3) in metres and unit normals (n, 3) of cells (n,), in one frame; it is
-    called for a few rows at a time, so that a large surface never lies in memory as a whole. ``grid(rows, cols)`` gives
-    the same for rows (r,) x columns (c,) as (r, c, 3), contiguous, where that takes less time.
+    ``block(rows, cols)`` gives feet (r, c, 3) in metres and unit normals (r, c, 3), contiguous, of the cells at
+    ``rows`` (r,) x ``cols`` (c,), in one frame; it is called for a few rows at a time, so that a large surface never
+    lies in memory as a whole.
     """
 
     rows: int
     cols: int
-    locate: Callable[[Floats, Floats], tuple[Floats, Floats]]
-    grid: Callable[[Floats, Floats], tuple[Floats, Floats]] | None = None
-
-    def block(self, rows: ArrayLike, cols: ArrayLike) -> tuple[Floats, Floats]:
-        """Feet and normals (r, c, 3), contiguous, of the cells at ``rows`` (r,) x ``cols`` (c,)."""
-        if self.grid is not None:
-            return self.grid(np.asarray(rows, np.float64), np.asarray(cols, np.float64))
-        r, c = np.meshgrid(np.asarray(rows, np.float64), np.asarray(cols, np.float64), indexing="ij")
-        feet, normals = self.locate(r.ravel(), c.ravel())
-        shape = (*r.shape, 3)
-        return np.ascontiguousarray(feet.reshape(shape)), np.ascontiguousarray(normals.reshape(shape))
+    block: Callable[[NDArray[np.intp], NDArray[np.intp]], tuple[Floats, Floats]]
 
 
 def plane(lattice: Lattice) -> Surface:
     """The plane z = 0 of the lattice's frame; elevation is z."""
     xs, ys = lattice.xs(), lattice.ys()
 
-    def locate(rows: Floats, cols: Floats) -> tuple[Floats, Floats]:
-        feet = np.stack([xs[cols.astype(np.intp)], ys[rows.astype(np.intp)], np.zeros(rows.size)], axis=-1)
-        return feet, np.broadcast_to([0.0, 0.0, 1.0], feet.shape)
-
-    def grid(rows: Floats, cols: Floats) -> tuple[Floats, Floats]:
+    def block(rows: NDArray[np.intp], cols: NDArray[np.intp]) -> tuple[Floats, Floats]:
         # Whole rows at once: filling (r, c, 3) by its last axis takes several times as long.
         line, up = np.zeros((cols.size, 3)), np.zeros((cols.size, 3))
-        line[:, 0], up[:, 2] = xs[cols.astype(np.intp)], 1.0
+        line[:, 0], up[:, 2] = xs[cols], 1.0
         feet, normals = (np.broadcast_to(v, (rows.size, cols.size, 3)).copy() for v in (line, up))
-        feet[..., 1] = ys[rows.astype(np.intp)][:, None]
+        feet[..., 1] = ys[rows][:, None]
         return feet, normals
 
-    return Surface(lattice.rows, lattice.cols, locate, grid)
+    return Surface(lattice.rows, lattice.cols, block)

@@ -320,8 +320,9 @@ def test_a_reference_surface_of_ones_own() -> None:
     lattice = Lattice.snap((-0.2, 0.2, -0.2, 0.3), 0.01)
 
     def own(rows: np.ndarray, cols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x, y = lattice.xs()[cols.astype(int)], lattice.ys()[rows.astype(int)]
-        return foot + np.outer(x, across) + np.outer(y, along), np.tile(normal, (rows.size, 1))
+        x, y = lattice.xs()[cols][:, None], lattice.ys()[rows][:, None, None]
+        feet = foot + x * across + y * along
+        return feet, np.broadcast_to(normal, feet.shape).copy()
 
     surface = Surface(lattice.rows, lattice.cols, own)
     found = reconstruct(pair(*maps), RIG, T_LOCAL_LEFT, surface, (-0.1, 0.2), PARAMS)

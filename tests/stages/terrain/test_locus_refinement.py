@@ -115,11 +115,11 @@ def test_derivatives_are_those_of_finite_differences() -> None:
 def test_derivatives_along_tilted_normals_are_those_of_finite_differences() -> None:
     normal, dz = np.array([0.2, -0.3, 1.0]) / np.sqrt(1.13), 1e-4
 
-    def locate(rows: np.ndarray, cols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        feet = np.dstack([LATTICE.xy(), TRUTH])[rows.astype(int), cols.astype(int)]
-        return feet - 0.01 * normal, np.broadcast_to(normal, feet.shape)
+    def block(rows: np.ndarray, cols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        feet = np.dstack([LATTICE.xy(), TRUTH])[np.ix_(rows, cols)]
+        return feet - 0.01 * normal, np.broadcast_to(normal, feet.shape).copy()
 
-    surface = Surface(*LATTICE.shape, locate)
+    surface = Surface(*LATTICE.shape, block)
     low, seen, high = (look(through(), surface, np.full(LATTICE.shape, 0.01 + k * dz)) for k in (-1, 0, 1))
     known = np.isfinite(low.left + high.left)
     assert known.mean() > 0.9
