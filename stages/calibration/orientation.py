@@ -74,7 +74,7 @@ def orient(rig: Rig, matches: PointPairs, params: RelativeParams) -> tuple[dict[
     arrays : ``residual_before``, ``residual_after`` (pixels), ``weight`` (n,) float32.
     facts : ``matches``; ``parameters``, one mapping a parameter (name, value, asked, sigma, unit, observed, freed,
         why); ``row_offset`` (pixels) and ``roll_deg`` by which the images contradict the given rig; ``words``;
-        ``residual_before_px``, ``residual_after_px`` (RMS) and ``median_before_px``, ``median_after_px``, inliers.
+        ``residual_before_px``, ``residual_after_px`` (RMS of inliers).
     """
     count = len(matches.left)
     before, _ = distances(rig, np.zeros(RIG), matches.left, matches.right)
@@ -88,15 +88,12 @@ def orient(rig: Rig, matches: PointPairs, params: RelativeParams) -> tuple[dict[
     inlier = weight > 0
     facts = {
         "matches": count,
-        "outliers": int(np.count_nonzero(~inlier)),
         "parameters": [p.to_dict() for p in decision.parameters],
         "row_offset": float(np.median(before[inlier])),
         "roll_deg": math.degrees(decision.parameters[2].asked),
         "words": misalignment(rig, float(np.median(before[inlier])), decision),
         "residual_before_px": rms(before, weight),
         "residual_after_px": rms(after, weight),
-        "median_before_px": float(np.median(np.abs(before[inlier]))),
-        "median_after_px": float(np.median(np.abs(after[inlier]))),
     }
     return _arrays(before, after, weight), facts
 

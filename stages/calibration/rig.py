@@ -170,7 +170,6 @@ def _residuals(given: Rig, rig: Rig, pairs: Sequence[PointPairs], decision: Deci
     for name, used in (("before", given), ("after", rig)):
         d = np.concatenate([distances(used, np.zeros(RIG), m.left, m.right)[0] for m in pairs])
         found[f"residual_{name}_px"] = rms(d, weights)
-        found[f"median_{name}_px"] = float(np.median(np.abs(d[weights > 0])))
     return found
 
 

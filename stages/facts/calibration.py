@@ -20,15 +20,12 @@ class OrientationFacts(Facts):
     parameters: list[dict[str, Any]]
     """Name, value, asked, sigma, unit, observed, freed, why, of each parameter."""
     words: str
-    outliers: NotRequired[int]
     row_offset: NotRequired[float]
     """Median distance from the epipolar line, px, along rows."""
     roll_deg: NotRequired[float]
     residual_before_px: NotRequired[float]
     residual_after_px: NotRequired[float]
     """RMS of inliers."""
-    median_before_px: NotRequired[float]
-    median_after_px: NotRequired[float]
 
 
 class RigFacts(Facts):
@@ -49,9 +46,7 @@ class RigFacts(Facts):
     """Pair, values and sigma by name, degrees, of what is observed."""
     residual_before_px: NotRequired[float]
     residual_after_px: NotRequired[float]
-    """RMS of inliers; of the same points the medians."""
-    median_before_px: NotRequired[float]
-    median_after_px: NotRequired[float]
+    """RMS of inliers."""
     pairs: NotRequired[int]
     matches: NotRequired[int]
     suspects: NotRequired[list[int]]

@@ -42,8 +42,8 @@ REACH_PX = 4.0
 MIN_AREA = 0.1
 """Area of a template over that in its first frame, below which it draws no texture."""
 
-SETTLED_BACK_PX = 0.1
-"""Step below which the alignment back has converged, a fifth of what it may miss by."""
+SETTLED_BACK_PX = 0.03
+"""Step below which the alignment back has converged: a fraction of what it may miss by."""
 
 MAX_RETURN_PX = 0.5
 """Largest distance between a point and where its alignment there and back ends (4.3.3)."""

@@ -38,7 +38,7 @@ from rille.stages.geometry.geometry import RigidTransform, cross_matrix, level_r
 from rille.stages.geometry.pose_arrays import COVARIANCE, NO_VERTICAL, POSES
 
 
-class SegmentPoses(NamedTuple):
+class ChainLink(NamedTuple):
     """Poses (frames, 3, 4) T_local_left of a segment, key frame first, NaN of a lost frame.
 
     ``covariance`` (frames, 6, 6), and the root ``shared`` (frames, 6, k) of the part of it that all segments share.
@@ -64,7 +64,7 @@ class Chained:
     piece: NDArray[np.int16]
 
 
-def chain(segments: Sequence[SegmentPoses], levels: Sequence[RigidTransform]) -> Chained:
+def chain(segments: Sequence[ChainLink], levels: Sequence[RigidTransform]) -> Chained:
     """Compose the poses of segments into one trajectory.
 
     Where the last frame of a segment is lost, the next segment begins a new piece in the local frame of its own key.
@@ -287,7 +287,7 @@ def trajectory_stage(
     """Poses of all left frames in the world frame."""
     level = [RigidTransform.from_matrix(b.meta["T_local_left"]) for b in levels]
     posed: Sequence[Bundle] = refined or segments
-    chained = [SegmentPoses(*(np.asarray(b[name]) for name in SegmentPoses._fields)) for b in posed]
+    chained = [ChainLink(*(np.asarray(b[name]) for name in ChainLink._fields)) for b in posed]
     facts = _facts(segments) or [{"frame": frames[0], "inliers": 0}]
     causes = {int(f["frame"]): str(f["cause"]) for f in lost}
     causes |= {int(f["frame"]): str(f["lost"]) for f in facts if "lost" in f}

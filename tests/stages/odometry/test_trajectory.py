@@ -5,7 +5,7 @@ from raising import raises
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
-from rille.stages.odometry.resection.trajectory import SegmentPoses, chain, trajectory_stage
+from rille.stages.odometry.resection.trajectory import ChainLink, chain, trajectory_stage
 
 NONE = np.zeros((9, 6, 2))
 """Nothing is shared."""
@@ -29,7 +29,7 @@ def test_scan_equals_composition_by_hand_whatever_the_tilt_of_the_local_frames()
     for (a, b), T_local_key in zip(cuts, levels, strict=True):
         local = [T_local_key @ truth[a].inverse() @ truth[i] for i in range(a, b + 1)]
         poses = np.array([T.matrix34 for T in local])
-        segments.append(SegmentPoses(poses, np.zeros((b - a + 1, 6, 6)), NONE[: b - a + 1]))
+        segments.append(ChainLink(poses, np.zeros((b - a + 1, 6, 6)), NONE[: b - a + 1]))
     found = chain(segments, levels)
     poses, covariance, segment = found.poses, found.covariance, found.segment
     assert not found.piece.any()
@@ -45,7 +45,7 @@ def test_a_segment_of_another_local_frame_is_refused():
     T = level(rng)
     with raises("RIL-451", "segment 0"):
         poses = np.array([level(rng).matrix34, pose(rng).matrix34])
-        chain([SegmentPoses(poses, np.zeros((2, 6, 6)), NONE[:2])], [T])
+        chain([ChainLink(poses, np.zeros((2, 6, 6)), NONE[:2])], [T])
     with raises("RIL-450"):
         chain([], [])
 
@@ -64,7 +64,7 @@ def test_covariance_is_that_of_sampled_trajectories():
     local = [np.array([T.matrix34, (T @ pose(rng, 0.5)).matrix34]) for T in levels]
     spread = np.diag([2e-3, 1e-3, 3e-3, 1e-3, 2e-3, 5e-4]) ** 2
     covs = [np.array([np.zeros((6, 6)), spread])] * 3
-    found = chain([SegmentPoses(p, c, NONE[:2]) for p, c in zip(local, covs, strict=True)], levels)
+    found = chain([ChainLink(p, c, NONE[:2]) for p, c in zip(local, covs, strict=True)], levels)
     mean, covariance = found.poses, found.covariance
     samples = []
     for _ in range(1500):
@@ -72,7 +72,7 @@ def test_covariance_is_that_of_sampled_trajectories():
         for poses in local:
             d = np.sqrt(np.diag(spread)) * rng.standard_normal(6)
             T = RigidTransform(rotation_exp(d[3:]) @ poses[1][:, :3], poses[1][:, 3] + d[:3])
-            noisy.append(SegmentPoses(np.array([poses[0], T.matrix34]), covs[0], NONE[:2]))
+            noisy.append(ChainLink(np.array([poses[0], T.matrix34]), covs[0], NONE[:2]))
         end = chain(noisy, levels).poses[-1]
         turn = end[:, :3] @ mean[-1][:, :3].T
         w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
@@ -149,7 +149,7 @@ def test_what_segments_share_adds_up_and_what_they_do_not_adds_squared():
     shared[1, 2, 0] = 2e-3
     own = np.zeros((2, 6, 6))
     own[1, 2, 2] = 3e-3**2
-    one = SegmentPoses(np.array([start, step]), own + shared @ np.swapaxes(shared, 1, 2), shared)
+    one = ChainLink(np.array([start, step]), own + shared @ np.swapaxes(shared, 1, 2), shared)
     found = chain([one] * 4, [RigidTransform.identity()] * 4)
     np.testing.assert_allclose(found.covariance[:, 2, 2], [k * 3e-3**2 + (k * 2e-3) ** 2 for k in range(5)], atol=1e-15)
 
