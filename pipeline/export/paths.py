@@ -114,11 +114,9 @@ def _add_layer(
     }
     columns = "".join(f', "{key}" {sql}' for key, sql in types.items())
     package.execute(f"CREATE TABLE {name} (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom {kind_name}{columns})")
-    places = [np.atleast_2d(points)[:, :2] for points, _ in features if points is not None]
-    spread = np.concatenate(places) if places else np.empty((0, 2))
-    extent = [*spread.min(axis=0).tolist(), *spread.max(axis=0).tolist()] if places else [None] * 4
-    contents = (name, "features", name, "", GPKG_DATE, *extent, crs)
-    package.execute("INSERT INTO gpkg_contents VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", contents)
+    # Without an extent, which readers of so few features find by themselves.
+    contents = "INSERT INTO gpkg_contents VALUES (?, 'features', ?, '', ?, NULL, NULL, NULL, NULL, ?)"
+    package.execute(contents, (name, name, GPKG_DATE, crs))
     package.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 1, 0)", (name, kind_name, crs))
     for points, values in features:
         row = (None if points is None else _geometry(kind, points, crs), *values.values())
