@@ -223,7 +223,7 @@ def changed(a: DemFile, b: DemFile, error: Floats) -> tuple[dict[str, NDArray[np
     how = (
         f"patches of cells that differ one way by {dem_changes.BESIDE:g} standard deviations, one of them by "
         f"{dem_changes.SURE:g}; standard deviations of both models and of a shift by {dem_changes.SHIFT_CELLS:g} "
-        "cells, scaled to the spread of all differences"
+        "cells, scaled up where most differences spread more"
     )
     rasters = {"difference": error.astype(np.float32), "standard_deviation": deviation.astype(np.float32)}
     return rasters, {"total": total, "patches": rows, "how": how}

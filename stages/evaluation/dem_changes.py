@@ -1,7 +1,7 @@
 """What has changed between two elevation models of one place: where, by how much, and with which certainty.
 
 The standard deviation of a difference is that of both models, and what a remaining shift by a part of a cell makes on a
-slope; all of it is scaled so that it fits the spread of most differences, since most of the ground has not changed. A
+slope; all of it is scaled up where most differences spread more, since most of the ground has not changed. A
 change is a patch of cells that differ one way by twice that, one of them at least by :data:`SURE` times. Its volume is
 that of the patch and of the cells about it, where it runs out; it has the errors of all of them, of which neighbours
 share a part: as large a part as they do where nothing has changed.
@@ -20,7 +20,7 @@ from rille.stages.numeric.robust import mad_sigma
 SHIFT_CELLS = 0.25
 """By which the models may still be shifted."""
 
-SURE, BESIDE = 5.0, 2.0
+SURE, BESIDE = 4.0, 2.0
 """Standard deviations that one cell of a change differs by, and all of its cells."""
 
 LEAST_CELLS = 6
@@ -62,8 +62,8 @@ def standard_deviation(error: Floats, sigma: Floats, slope: Floats, cell: float)
     expected = np.hypot(known, SHIFT_CELLS * cell * np.nan_to_num(slope))
     usable = np.isfinite(error) & (expected > 0)
     ratio = error[usable] / expected[usable]
-    # Where most cells are equal, as of copies, their spread scales nothing.
-    return np.asarray(expected * ((mad_sigma(ratio) if ratio.size else 0.0) or 1.0))
+    # Two models may have errors in common; what they state is not undercut for that.
+    return np.asarray(expected * max(mad_sigma(ratio) if ratio.size else 1.0, 1.0))
 
 
 def changes(error: Floats, deviation: Floats, cell: float) -> list[Change]:
