@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from rille.pipeline.export.view import RunView, part
 def _write(path: Path, run: RunView) -> None:
     """Write the figures by what they judge; those of a pair by its frame. Nothing where nothing was compared."""
     p = run.products
-    by_pair: dict[str, dict[int, Any]] = {"disparity": p.disparity_accuracy, "elevation": p.local_dem_accuracy}
+    by_pair: dict[str, Mapping[int, Any]] = {"disparity": p.disparity_accuracy, "elevation": p.local_dem_accuracy}
     whole = {"trajectory": p.accuracy or p.position_accuracy, "merged_elevation": p.dem_accuracy, "path": p.path_check}
     figures: dict[str, Any] = {
         name: {str(pair): bundle.meta["metrics"] for pair, one in of.items() if (bundle := run.bundle(one)) is not None}
