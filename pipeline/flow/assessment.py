@@ -47,7 +47,7 @@ def of_trajectory(make: Builder, frames: Sequence[int]) -> Steps:
     if all(pose is None for pose in true):
         return
     poses = [None if pose is None else pose.to_list() for pose in true]
-    known = make.node(truth_stage, "truth", poses=poses, source=s.truth_source, frames=list(frames))
+    known = make.node(truth_stage, "truth", poses=poses, frames=list(frames))
     if p.crosscheck is not None:
         make.graph.flow(_of_crosscheck(make, p.crosscheck, known), lays=("accuracy",))
     found = yield from done(p.trajectory)
@@ -124,7 +124,7 @@ def _positions(make: Builder, true: Positions, frames: Sequence[int]) -> dict[st
         truth["positions"] = [true.positions[f] for f in frames]
     elif s.times is not None:
         moments = [s.times[f] for f in frames]
-    return {"truth": truth, "moments": moments, "frames": list(frames), "source": s.truth_source}
+    return {"truth": truth, "moments": moments, "frames": list(frames)}
 
 
 def _truth_dem(

@@ -485,7 +485,7 @@ class Drive:
             self._check({})
             return
         poses = [list(self.true[f]) for f in self.posed]
-        true = make.node(truth_stage, "truth", poses=poses, source=self.sequence.truth_source, frames=list(self.posed))
+        true = make.node(truth_stage, "truth", poses=poses, frames=list(self.posed))
         p.accuracy = make.node(accuracy_stage, "accuracy", trajectory=p.trajectory, truth=true)
         level = yield from done(self.pairs[0].level)
         T_left_local = RigidTransform.from_matrix(level.meta["T_local_left"]).inverse()

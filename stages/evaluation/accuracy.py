@@ -165,14 +165,13 @@ def accuracy_stage(
     mount: RigidTransform | None = None,
 ) -> Bundle[AccuracyFacts]:
     """Trajectory against truth: ATE, RPE, drift, scale, NEES."""
-    given = list(trajectory.meta["frames"])
-    wanted = given if truth.meta["frames"] is None else list(truth.meta["frames"])
+    given, wanted = trajectory.meta["frames"], truth.meta["frames"]
     estimate, true = rigid.by_frame(world_poses(trajectory, piece), given, wanted), np.asarray(truth["poses"])
     claimed = None
     if "covariance" in trajectory.arrays:
         claimed = rigid.by_frame(np.asarray(trajectory["covariance"]), given, wanted)
     arrays, figures = trajectory_accuracy(estimate, true, claimed)
-    facts: AccuracyFacts = {"metrics": figures, "frames": wanted, "truth": truth.meta["source"]}
+    facts: AccuracyFacts = {"metrics": figures, "frames": wanted}
     both = posed(estimate) & posed(true)
     if claimed is not None and both.any():
         sigma = math.sqrt(np.nanmean(np.trace(claimed[both, :3, :3], axis1=1, axis2=2)))

@@ -23,7 +23,6 @@ from pydantic import Field
 from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Memory, Params, stage
 from rille.stages.evaluation.features import PIXEL_CENTRE, UNIT_BYTES
-from rille.stages.evaluation.rigid import posed
 from rille.stages.facts.evaluation import WindowFacts
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Camera, Rig
@@ -262,24 +261,16 @@ def crosscheck_stage(
     with pycolmap.Database.open(":memory:") as database:
         verified = _write_frames(database, _write_rig(database, rig), features)
         models = _models(database, verified)
-    count, reason = float(np.median([len(f["points"]) for f in features])), ""
+    poses, reprojection, reason = np.full((len(frames), 3, 4), np.nan), None, ""
     if models:
         # Models of one window do not share a frame of reference; what the others hold is left to the neighbouring
         # windows.
         best = max(models, key=lambda m: m.num_reg_frames())
         poses, reprojection = _read(best, len(frames)), float(best.compute_mean_reprojection_error())
+    elif verified:
+        reason = f"{len(verified)} image pairs match, but left and right start no model"
     else:
-        poses, reprojection = np.full((len(frames), 3, 4), np.nan), None
+        count = np.median([len(f["points"]) for f in features])
         reason = f"no two images match (median {count:.0f} features an image)"
-        if verified:
-            reason = f"{len(verified)} image pairs match, but left and right start no model"
-    meta: WindowFacts = {
-        "frames": list(frames),
-        "features": count,
-        "pairs_verified": len(verified),
-        "models": len(models),
-        "reprojection_px": reprojection,
-        "unregistered": [f for f, ok in zip(frames, posed(poses), strict=True) if not ok],
-        "reason": reason,
-    }
+    meta: WindowFacts = {"frames": list(frames), "reprojection_px": reprojection, "reason": reason}
     return Bundle({"poses": poses, "line_distance": _line_distances(rig, features, verified)}, meta)

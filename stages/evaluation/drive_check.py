@@ -87,7 +87,7 @@ def drive_check_stage(
     """A drive against the truth: placements, localisation, length."""
     parts = [judged(drive, row) for drive, row in zip(drives, rows, strict=True)]
     figures, error = placements(parts, vehicle), np.zeros(0)
-    facts: DriveCheckFacts = {"metrics": figures, "stops": len(parts), "path_exists": None, "with_margin": None}
+    facts: DriveCheckFacts = {"metrics": figures, "path_exists": None, "with_margin": None}
     if trajectory is not None and truth is not None:
         estimate, true = (np.asarray(one["poses"]) for one in (trajectory, truth))
         error, located = localisation(estimate, true, figures["path_length"]["value"])

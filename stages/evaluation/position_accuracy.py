@@ -356,7 +356,6 @@ def position_accuracy_stage(
     frames: list[int],
     truth: Mapping[str, Any],
     moments: Sequence[float | None] | None,
-    source: str,
 ) -> Bundle[AccuracyFacts]:
     """Trajectory against positions without rotation, of a frame and a clock of their own."""
     poses = by_frame(world_poses(trajectory), trajectory.meta["frames"], frames)
@@ -367,6 +366,5 @@ def position_accuracy_stage(
     compared = position_accuracy(poses, given, at, upright)
     whole = np.full((len(frames), 3), np.nan)
     whole[:, : compared.truth.shape[1]] = compared.truth
-    facts: AccuracyFacts = {"metrics": compared.metrics, "frames": frames, "truth": source}
-    facts["warnings"] = compared.warnings
+    facts: AccuracyFacts = {"metrics": compared.metrics, "frames": frames, "warnings": compared.warnings}
     return Bundle({"position": poses[:, :, 3].copy(), "position_truth": whole}, facts)

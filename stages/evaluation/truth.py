@@ -21,8 +21,8 @@ from rille.stages.facts.evaluation import TruthFacts
     ],
 )
 def truth_stage(
-    params: NoParams, *, poses: Sequence[Sequence[float] | None], frames: Sequence[int] | None = None, source: str = ""
+    params: NoParams, *, poses: Sequence[Sequence[float] | None], frames: Sequence[int]
 ) -> Bundle[TruthFacts]:
-    """True poses of the left camera, for assessment only."""
+    """True poses of the left camera in these frames, for assessment only."""
     known = np.array([pose or [np.nan] * 12 for pose in poses], dtype=np.float64).reshape(-1, 3, 4)
-    return Bundle({"poses": known}, {"frames": None if frames is None else list(frames), "source": source})
+    return Bundle({"poses": known}, {"frames": list(frames)})

@@ -9,18 +9,16 @@ Metric = dict[str, Any]
 
 
 class TruthFacts(Facts):
-    """True poses: numbers of their ``frames`` (None: all), and where they are from."""
+    """True poses: numbers of their ``frames``."""
 
-    frames: list[int] | None
-    source: str
+    frames: list[int]
 
 
 class AccuracyFacts(Facts):
-    """``metrics`` by name, the ``frames`` that were compared, and where the ``truth`` is from."""
+    """``metrics`` by name, and the ``frames`` that were compared."""
 
     metrics: dict[str, Metric]
     frames: list[int]
-    truth: str
 
 
 class DemAccuracyFacts(Facts):
@@ -38,26 +36,18 @@ class MetricsFacts(Facts):
 
 
 class DriveCheckFacts(Facts):
-    """``metrics`` by name, of ``stops`` stops, and whether the exact map has a path (None: not asked)."""
+    """``metrics`` by name, and whether the exact map has a path (None: not asked), and one with the margin."""
 
     metrics: dict[str, Metric]
-    stops: int
     path_exists: bool | None
     with_margin: bool | None
 
 
 class WindowFacts(Facts):
-    """A window of the crosscheck: counts of what COLMAP did, and the ``reason`` where it has no model.
-
-    ``features`` is the median of an image, ``reprojection_px`` the mean error of an observation.
-    """
+    """A window of the crosscheck: mean error of an observation, and the ``reason`` where COLMAP has no model."""
 
     frames: list[int]
-    features: float
-    pairs_verified: int
-    models: int
     reprojection_px: float | None
-    unregistered: list[int]
     reason: str
 
 

@@ -89,7 +89,7 @@ def test_poses_are_metric_and_repeat_bit_by_bit(scene: Any) -> None:
     for name, array in out.arrays.items():
         np.testing.assert_array_equal(array, again[name])
     assert out.meta == again.meta
-    assert out.meta["unregistered"] == []
+    assert posed(out["poses"]).all()
     assert out["line_distance"].max() < 0.5
     np.testing.assert_allclose(out["poses"][0], np.eye(3, 4), atol=1e-12)
     true = np.array([(poses[0].inverse() @ T).matrix34 for T in poses])
@@ -116,8 +116,6 @@ def test_without_a_stereo_pair_nothing_has_a_scale(scene: Any) -> None:
     _, images = scene
     covered = [bundle(np.zeros((240, 320), np.uint8))] * len(images["right"])
     found = run({"left": images["left"], "right": covered}, [0, 1, 2, 3])
-    assert found.meta["pairs_verified"] >= 3
-    assert found.meta["models"] == 0
     assert not posed(found["poses"]).any()
     assert "left and right start no model" in found.meta["reason"]
 
@@ -128,7 +126,6 @@ def test_a_frame_that_fits_nowhere_is_listed_and_the_rest_stays(scene: Any) -> N
     left, right = list(inputs["left"]), list(inputs["right"])
     left[2], right[2] = bundle(noise[0]), bundle(noise[1])
     out = run({"left": left, "right": right}, [0, 1, 2, 3])
-    assert out.meta["unregistered"] == [2]
     assert posed(out["poses"]).tolist() == [True, True, False, True]
     assert np.isnan(out["line_distance"][2])
 
@@ -154,7 +151,6 @@ def test_a_window_without_a_model_is_a_fact(kind: str) -> None:
     ]
     out = run({"left": images[:2], "right": images[2:]}, [0, 1])
     assert np.isnan(out["poses"]).all()
-    assert out.meta["unregistered"] == [0, 1]
     assert "no two images" in out.meta["reason"]
     assert out.meta["reprojection_px"] is None
 
@@ -213,4 +209,4 @@ def test_devon_island_is_registered_throughout(data_dir: Any) -> None:
         inputs[side] = [bundle(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in files]
     n = len(inputs["left"])
     out = crosscheck_stage.run(PARAMS, {"frames": list(range(n)), "rig": rig.to_dict()}, inputs)
-    assert (n, out.meta["unregistered"]) == (10, [])
+    assert posed(out["poses"]).sum() == n == 10

@@ -155,7 +155,7 @@ def test_stage():
     known = truth(2, 0.7)
     frames = list(range(len(MOMENTS)))
     rows = {"positions": known.positions.tolist(), "times": known.times.tolist(), "max_gap": 0.2, "lever_arm": None}
-    args = {"truth": rows, "moments": MOMENTS.tolist(), "frames": frames, "source": "gnss"}
+    args = {"truth": rows, "moments": MOMENTS.tolist(), "frames": frames}
     out = position_accuracy_stage.run(
         NoParams(),
         args,
