@@ -20,7 +20,7 @@ from rille.stages.numeric.robust import mad_sigma
 SHIFT_CELLS = 0.25
 """By which the models may still be shifted."""
 
-SURE, BESIDE = 4.0, 2.0
+SURE, BESIDE = 5.0, 2.0
 """Standard deviations that one cell of a change differs by, and all of its cells."""
 
 LEAST_CELLS = 6
