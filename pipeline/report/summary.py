@@ -224,7 +224,7 @@ def _verdict(view: RunView, frames: delivery.Rows, pairs: delivery.Rows, figures
         f"{models} of {len(pairs)} elevation models",
         *([f"{stops[0]} of {stops[1]} local paths"] if stops[1] else []),
         _way_words(view, length),
-        *([] if errors or any(delivery.has_truth(view)) else ["not assessed against truth"]),
+        *([] if view.products.disparity_accuracy or any(delivery.has_truth(view)) else ["not assessed against truth"]),
     ]
     first = "".join(f"{line}. " for line in delivery.contradictions(view)[:1])
     return first + ", ".join(parts) + "."

@@ -53,12 +53,15 @@ def disparity_accuracy(column: Floats32, match: Bools, sigma: Floats32, truth: F
     both = known & match & np.isfinite(column)
     error = np.abs(column - truth)[both]
     every = np.abs(filled(column, both | (match & ~known)) - truth)[known]
-    of_matched = f"of the matched pixels; {error.size} of {every.size} with truth"
-    of_all = f"of all pixels, filled along rows where not matched; {every.size} with truth"
+    counts = f"{error.size} of {every.size} pixels with truth"
+    of_matched = f"of the matched pixels; {counts}"
+    of_all = f"of all pixels, filled along rows where not matched; {every.size} pixels with truth"
     claimed = sigma[both]
     figures = {
         "median": metric(float(np.median(error)) if error.size else None, "px", f"median error {of_matched}"),
-        "completeness": metric(error.size / every.size if every.size else None, "1", f"share {of_matched}"),
+        "completeness": metric(
+            error.size / every.size if every.size else None, "1", f"share that is matched; {counts}"
+        ),
     }
     for limit in THRESHOLDS_PX:
         words = f"share off by more than {limit} px, "
