@@ -93,6 +93,7 @@ def remember() -> None:
     _memory.save()
 
 
+@cache
 def package_of(module: str) -> str:
     """Package that a module belongs to: ``rille.stages`` of one of Rille's own, else the first part of its name."""
     return ".".join(module.split(".")[: 2 if module.startswith("rille.") else 1])
@@ -153,8 +154,8 @@ def _reachable(module: str) -> tuple[tuple[str, str], ...]:
     queue = [module]
     while queue:
         name = queue.pop()
-        path = _file(name)
-        if name in found or path is None or package_of(name) not in own:
+        # The package first: of modules of others no file is looked for.
+        if name in found or package_of(name) not in own or (path := _file(name)) is None:
             continue
         source = _read(name, path)
         found[name] = source.sha256
@@ -171,9 +172,10 @@ def _other_languages(name: str, path: Path) -> dict[str, str]:
     return {f"{name}/{source.name}": hashlib.sha256(source.read_bytes()).hexdigest() for source in sources}
 
 
-def _parents(name: str) -> list[str]:
+@cache
+def _parents(name: str) -> tuple[str, ...]:
     parts = name.split(".")
-    return [".".join(parts[:n]) for n in range(1, len(parts))]
+    return tuple(".".join(parts[:n]) for n in range(1, len(parts)))
 
 
 @cache
