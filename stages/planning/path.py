@@ -18,7 +18,7 @@ where the elevation model is narrower than the vehicle, as beside the cameras; t
 
 An elevation model is fan-shaped and ragged: the first and last rows with a free cell hold a few, which may lead
 nowhere. So a start that is not given is, of the free cells within one vehicle length of the first row that lead on, the
-one nearest to that row's middle; the target likewise at the farthest row that is reached.
+one nearest to that row's middle; the target likewise at the last row.
 
 Where no path by rows comes within one vehicle length of the last row, ``auto`` goes, in any direction, as far as
 connected ground leads from the first rows: that is a path if it leads at least one vehicle length ahead, and
@@ -141,11 +141,12 @@ class _Search:
                     cost, steps = search(ground.terrain(below, 1.0, 0.0), nearest_middle(starts, near), target)
                 reached = cost < UNREACHED
                 top, bottom = row_span(reached)
-                blocking = top - 1 if by_rows else blocking
-                # As far as it leads for a stop; a mission's path need not end in the very last corner.
-                zone = reached[: top + 1 + (slack if by_rows or self.stretch else 0)]
-                far_enough = top <= far + slack if by_rows else bottom - top >= length
-                end = nearest_middle(zone, top) if far_enough else None
+                if by_rows:
+                    blocking, row, limit, leads = top - 1, far, far + slack, top <= far + slack
+                else:
+                    # As far as it leads for a stop; a mission's path need not end in the very last corner.
+                    row, limit, leads = top, top + (slack if self.stretch else 0), bottom - top >= length
+                end = nearest_middle(reached[: limit + 1], row) if leads else None
                 if target is not None:
                     end = target if reached[target] else None
                 if end is not None:
