@@ -18,8 +18,8 @@ FIGURES = {
         "trajectory_ate_rmse": 0.00385,  # metres
         "trajectory_rpe_translation_rmse": 0.0105,  # metres
         "matched": 0.787,
-        "mapped_area": 206,  # square metres
-        "elevation_sigma": 0.0467,  # metres
+        "mapped_area": 274,  # square metres
+        "elevation_sigma": 0.0240,  # metres
         "overlap_median": 0.00499,  # metres, between elevation models
     },
     "devon_island": {  # without truth; its rig is off, and is repaired
