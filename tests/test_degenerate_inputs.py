@@ -43,11 +43,12 @@ ELSEWHERE = {
         "calibration.swap_check",
         "calibration.synchrony",
         "evaluation.position_accuracy",
+        "hfvm.given",
         "imaging.undistort",
         "terrain.map_localization",
     ),
 }
-"""Stages that need a lens, positions, a map or a doubt: tested beside their own modules."""
+"""Stages that need a lens, positions, a map, disparities or a doubt: tested beside their own modules."""
 
 AMOUNTS = {"nothing": 0, "one": 1, "few": 3}
 POINTS = ("point", "block", "match", "vertex")
