@@ -57,8 +57,8 @@ def claims(estimate: Any, covariance: Any, truth: Any) -> dict[str, float]:
     """Squared error of the poses over the stated variance, per degree of freedom (NEES); of what ``truth`` has its own.
 
     ``nees``: first poses made equal. ``nees_mounted``: besides, the constant turn and lever arm between the camera and
-    the body that the truth is of, which no image shows, are fitted to the motions between frames and left out. An exact
-    truth has none.
+    the body that the truth is of, which no image shows, are fitted to the motions between frames and left out. An
+    exact truth has none.
     """
     mount = _mount(estimate, truth)
     known = np.flatnonzero(posed(estimate) & posed(truth))
