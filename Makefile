@@ -37,7 +37,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 $(TOOLS): $(STAMP)
-	$(PIP) -e '.[all]' -r <($(GROUP) dev)
+	$(PIP) -e '.[robots]' -r <($(GROUP) dev)
 	@touch $@
 
 # Without it, the first run compiles them.

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import tomli_w
 
 from rille.datasets.text.reading import TABLE, read_lines, read_text
-from rille.pipeline.engine.packages import require
 from rille.pipeline.steps import StereoSequence, check_place, check_sections
 from rille.stages.core.errors import ConfigError, InputError, RilleError
 
@@ -239,7 +238,6 @@ class Run:
         ConfigError
             It is not as Rille writes it.
         """
-        require("xarray", extra="xarray")
         import xarray
 
         from rille.pipeline.export.read_dem import check_group
@@ -268,8 +266,6 @@ class Run:
             It is not as Rille writes it.
         """
         import numpy as np
-
-        require("xarray", extra="xarray")
         import xarray
 
         with self._reading():

@@ -32,7 +32,6 @@ from numpy.typing import NDArray
 
 from rille.datasets import registry
 from rille.datasets.protocol import Sequence
-from rille.pipeline.engine.packages import require
 from rille.pipeline.engine.runtime.environment import prepare_environment
 from rille.stages.core.declare import Bundle, Stage
 from rille.stages.core.errors import ConfigError, InputError
@@ -119,7 +118,6 @@ class StereoPair:
         return config.merge(vehicle, config.expand(source.defaults))
 
     def _image(self, camera: str) -> xarray.DataArray:
-        require("xarray", extra="xarray")
         import xarray
 
         image = _computed(_builder(self, self.settings).image(self.frame, camera), {}, self.sequence.drawn)
@@ -267,7 +265,6 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
     >>> bool(cloud.sizes["point"] > 10000), round(float(cloud.position[:, 2].median()), 1)
     (True, 0.4)
     """
-    require("xarray", extra="xarray")
     import xarray
 
     from rille.stages.terrain.points import colours
@@ -543,7 +540,6 @@ def _bundle(data: xarray.Dataset, stage: Stage, variable: str, maker: str) -> Bu
 
 def _dataset(stage: Stage, result: Bundle, settings: Settings) -> xarray.Dataset:
     """Arrays with the dimensions, units and words that the stage declares, and coordinates of their lattice."""
-    require("xarray", extra="xarray")
     import xarray
 
     from rille.pipeline.engine.store.cf_coordinates import DIMS, coordinates, lattice_of

@@ -62,19 +62,6 @@ def installed() -> dict[str, str]:
     return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in NAMED}
 
 
-def require(package: str, *, extra: str) -> None:
-    """Refuse what needs a package that is not installed.
-
-    Raises
-    ------
-    MissingPackageError
-        The message has the extra of Rille that brings it.
-    """
-    if importlib.util.find_spec(package) is None:
-        remedy = f"pip install 'rille[{extra}]'"
-        raise MissingPackageError("RIL-531", f"package {package} is not installed", remedy=remedy)
-
-
 @cache
 def version(distribution: str) -> str:
     """Exact installed version of a distribution, with the kind of processor that it works for, if that matters."""

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.failures import reported
-from rille.pipeline.engine.packages import require
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.colour import LUMA
 from rille.pipeline.export.programs.placed_pairs import PlacedPairs
@@ -138,7 +137,6 @@ def _pairs(run: RunArtifacts, every: int, place: Georeference | None, made: _Mad
 
 def _write_laz(path: Path, parts: Iterator[Columns], crs: str) -> None:
     """LAS 1.4, point format 7, the CRS as WKT 1."""
-    require("laspy", extra="las")
     import laspy
     from laspy.vlrs.known import WktCoordinateSystemVlr
 

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.pipeline.engine.failures import reported
-from rille.pipeline.engine.packages import require
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import DemFile, opened_raster, read_elevation
 from rille.stages.core.errors import InputError
@@ -58,7 +57,6 @@ def write_glb(path: Path, terrain: DemFile, ortho: Layer) -> str:
     metres from the middle of the terrain, which the scene's ``extras`` name: as 32-bit floats, eastings would jump by
     decimetres. Above :data:`MAX_FACES` triangles every second, third ... cell is left out.
     """
-    require("trimesh", extra="mesh")
     import trimesh
 
     step, (vertices, faces, uv) = 1, _mesh(terrain, 1)

@@ -56,12 +56,6 @@ def test_packages_come_from_the_imports_of_all_that_is_reached(tmp_path, monkeyp
         packages.versions("own_kit.main")
 
 
-def test_what_a_missing_package_serves_is_refused_with_the_extra_that_brings_it():
-    packages.require("numpy", extra="las")
-    with raises("RIL-531", "no_such_package", "pip install 'rille[las]'"):
-        packages.require("no_such_package", extra="las")
-
-
 KINDS = """
 from rille.pipeline.engine.packages import version
 print([version(name) for name in ("numpy", "scipy", "opencv-python-headless")])
