@@ -113,7 +113,7 @@ def test_failures_are_told_by_cause_with_the_tasks_that_depend_on_them():
 
 
 def test_what_the_images_contradict_is_told_before_what_failed():
-    view = SimpleNamespace(tasks=failed("locus/local/1", "no ground at -0.1"), vehicle_source="")
+    view = SimpleNamespace(tasks=failed("locus/local/1", "no ground at -0.1"), vehicle_source="", part="")
     view.tasks += failed("locus/local/2", "no ground at 0.25")
     found = {"missing": [{"kind": "contradiction", "what": "two motions", "why": ""}], "absent": [], "delivered": []}
     told = delivery.complete(found, view, [])["missing"]
