@@ -11,7 +11,7 @@ from fuzzing import LONGEST, within
 
 from rille.datasets.cameras import read_cameras
 from rille.datasets.images import files
-from rille.datasets.images.headers import read_header
+from rille.datasets.images.headers import Header, read_header
 from rille.datasets.registry import open_sequence
 from rille.datasets.text import reading
 from rille.datasets.text.reading import Search, read_bytes, read_lines, read_toml
@@ -157,7 +157,7 @@ def test_an_image_is_never_unpacked_beyond_its_bounds(tmp_path, monkeypatch):
     refused("RIL-762", files.common_header, [tmp_path / "a.png"])
     (tmp_path / "b.png").write_bytes(png(640, 480))
     data = (tmp_path / "b.png").read_bytes()
-    refused("RIL-176", files.decode, data, "b.png", (64, 48, 8))
+    refused("RIL-176", files.decode, data, "b.png", Header(64, 48, 8))
     refused("RIL-176", files.common_header, [tmp_path / "b.png", tmp_path / "a.png"])
 
 

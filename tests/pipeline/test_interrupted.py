@@ -13,7 +13,7 @@ def test_ctrl_c_says_what_the_documents_say(monkeypatch, capsys):
     def interrupted(options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(session, "reconstruct", interrupted)
+    monkeypatch.setattr(session, "perform", interrupted)
     assert cli._run(["reconstruct", "mockup-short"]) == 130
     assert capsys.readouterr().err == "rille: interrupted; the same command resumes from here\n"
 

@@ -33,7 +33,8 @@ def test_only_the_number_of_new_kernels_is_said(
 
     def perform(options: Any) -> tuple[int, Path]:
         print("a run's own words")
-        (kernels / f"{options.verb}.nbc").touch()
+        (kernels / "function").mkdir(exist_ok=True)
+        (kernels / "function" / f"{options.verb}.nbc").touch()
         options.runs.mkdir(exist_ok=True)
         folders.append(options.runs.parent)
         return 3, options.runs  # a drive that does not reach its goal
