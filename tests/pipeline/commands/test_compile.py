@@ -75,10 +75,10 @@ def test_a_run_finds_its_kernels_compiled(tmp_path: Path) -> None:
         return done.stdout
 
     compiled = [int(n) for n in re.findall(r"compiled: (\d+)", rille("compile") + rille("compile"))]
-    assert compiled[0] > 150
+    assert compiled[0] > 100
     assert compiled[1] == 0
     assert [p.name for p in tmp_path.iterdir()] == ["own"]
     folder = tmp_path / "own" / "rille" / "kernels"
-    before = len(list(folder.iterdir()))
+    before = len(list(folder.glob("*/*.nbc")))
     rille("reconstruct", "mockup-short", "--quiet")
-    assert len(list(folder.iterdir())) - before <= 2
+    assert len(list(folder.glob("*/*.nbc"))) - before <= 2
