@@ -190,9 +190,9 @@ def _small_sigma(figures: Mapping[str, Any]) -> list[str]:
     if nees is None or nees <= SIGMA_OFF**2:
         return []
     return [
-        f"the standard deviations of the poses are about {number(math.sqrt(nees), 2)} times too small against the "
-        "truth: do not weigh by them; what the merged map says of σ and of the probability of a hazard holds for the "
-        "shape of the ground, not for where it lies"
+        f"the poses are off the truth by about {number(math.sqrt(nees), 2)} times their standard deviations: these are "
+        "too small, or the truth has a turn or errors of its own; until that is known do not weigh by them; what the "
+        "merged map says of σ and of the probability of a hazard holds for the shape of the ground, not for where it lies"
     ]
 
 

@@ -15,9 +15,9 @@ them has both; 0 where there was one direction.
 
 The factors are those of a fit by non-negative least squares to the squared errors of pairs of the simulator (both
 directions, preset ``accurate``, seeds 2 and 3, 22 November 2026), rounded; HOLE, without which cells of one direction
-look too certain beside hidden ground, was chosen on the seeds 1 to 3 on 27 November 2026. Of the seeds 4 to 6, which
-had no part in it, 72 % of the errors are below one and 93 % below two standard deviations where one direction was
-matched, 77 and 95 % with both. The disparity's own standard deviation brings nothing besides.
+look too certain beside hidden ground, was chosen on 27 November 2026 with figures of the seeds 1 to 6 at hand: 72 % of
+their errors are below one and 93 % below two standard deviations where one direction was matched, 77 and 95 % with
+both. The disparity's own standard deviation brings nothing besides.
 ``benchmarks/surest.py`` prints such shares.
 """
 

@@ -134,7 +134,9 @@ def test_the_verdict_gives_one_figure_against_truth(figures, told):
     assert f"{told} against truth" in verdict
 
 
-@pytest.mark.parametrize(("nees", "told"), [(None, []), (8.9, []), (850.0, ["about 29 times too small"])])
+@pytest.mark.parametrize(
+    ("nees", "told"), [(None, []), (8.9, []), (850.0, ["about 29 times their standard deviations"])]
+)
 def test_standard_deviations_that_truth_contradicts_are_warned_of(nees, told):
     found = summary._small_sigma({"trajectory_nees": {"value": nees}})
     assert len(found) == len(told)
