@@ -192,7 +192,7 @@ def _small_sigma(figures: Mapping[str, Any]) -> list[str]:
     return [
         f"the poses are off the truth by about {number(math.sqrt(nees), 2)} times their standard deviations: these are "
         "too small, or the truth has a turn or errors of its own; until that is known do not weigh by them; what the "
-        "merged map says of σ and of the probability of a hazard holds for the shape of the ground, not for where it lies"
+        "merged map says of σ and of the probability of a hazard holds for the shape of the ground, not for its place"
     ]
 
 

@@ -202,7 +202,7 @@ def test_standard_deviations_are_not_judged_by_truth_that_was_misread(warnings, 
     metrics = made["accuracy"].meta["metrics"] | {"nees": {"value": 850.0, "unit": "", "how": ""}}
     made["accuracy"] = Bundle({}, {"metrics": metrics, "warnings": warnings})
     lines = summary.gather(view(made))["warnings"]
-    assert sum("standard deviations of the poses" in line for line in lines) == told
+    assert sum("times their standard deviations" in line for line in lines) == told
 
 
 @pytest.mark.parametrize(("source", "told"), [(UNSTATED, True), ("user", False)])
