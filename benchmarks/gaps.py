@@ -71,15 +71,13 @@ def trajectory(folder: Path, frames: tuple[int, ...], cache: Path) -> Any:
     from rille.pipeline.engine.store.base import Store
     from rille.pipeline.flow import config
     from rille.pipeline.flow.closed_loop import dataflow
-    from rille.stages.evaluation import truth
-    from rille.stages.terrain.locus import stage as locus
 
     class Odometry(Graph):
         """Leaves out elevation models, truth, and what would follow from them."""
 
         def node(self, stage: Any, *args: Any, **more: Any) -> Handle:
             handle = super().node(stage, *args, **more)
-            if stage in (locus, truth) or any(h not in self.nodes for h in handle.upstream()):
+            if handle.stage in ("locus", "truth") or any(h not in self.nodes for h in handle.upstream()):
                 self.nodes.remove(handle)
             return handle
 
