@@ -298,70 +298,95 @@ void EXPORT(edges)(const Pair *pair, const int16_t *grey, const int32_t *shift, 
 /* ---- paths ---- */
 
 enum { MOST = 8, NONE = 32767, UNIT = 4, OUTSIDE = 8000 }; /* candidates; costs: none, of a byte step, outside */
-typedef struct { int16_t *u, *v, *cost; } Candidates;      /* MOST of each pixel */
+typedef struct { int32_t *shift; int16_t *cost; } Candidates; /* MOST of each pixel */
 typedef struct { int32_t compact, small, large; float grey; } PathCosts;
+typedef struct { Eight shift; int32_t count; } List; /* beyond `count` the first displacement is repeated */
 
-/* Candidates of every pixel, each once: the own displacement, those a pixel beside it, those around, those of the coarser
-   level; all but the first lead into the right image. `compact`: words of both images' compact features. */
-void EXPORT(candidates)(const Pair *pair, const uint64_t *const compact[2], const int32_t *maps, const Parents *up,
-                        PathCosts costs, Candidates out) {
+/* Append a displacement that leads into the right image and is not there yet. */
+static inline void append(const Image *right, int32_t x, int32_t y, int32_t shift, List *list) {
+  const Eight order = {0, 1, 2, 3, 4, 5, 6, 7};
+  int32_t xr = x + (int16_t)shift, yr = y + (shift >> 16);
+  if (xr < 0 || yr < 0 || xr >= right->cols || yr >= right->rows) return;
+  Eight tried = (Eight){} + shift;
+  if (any(SAME(list->shift, tried))) return;
+  list->shift = PICK(SAME(order, (Eight){} + list->count), tried, list->shift);
+  list->count++;
+}
+/* Candidates of a pixel: the own displacement, those a pixel beside it, those around, those of the coarser level. */
+static List candidates_of(const Pair *pair, const int32_t *maps, const Parents *up, int32_t x, int32_t y) {
   static const int8_t around[12][2] = {{0, -1}, {0, 1}, {-1, 0}, {1, 0}, {-3, -3}, {-3, 3}, {3, -3}, {3, 3},
                                        {0, -8}, {0, 8}, {-8, 0}, {8, 0}};
-  static const int8_t beside[5][2] = {{0, 0}, {0, -1}, {0, 1}, {-1, 0}, {1, 0}};
-  int32_t rows = pair->left.rows, cols = pair->left.cols, right_rows = pair->right.rows, right_cols = pair->right.cols;
+  static const int8_t beside[4][2] = {{0, -1}, {0, 1}, {-1, 0}, {1, 0}};
+  int32_t rows = pair->left.rows, cols = pair->left.cols, shift = maps[(int64_t)y * cols + x];
+  Shift own = unpack(shift);
+  List list = {(Eight){} + shift, 1};
+  for (int n = 0; n < 4; n++) append(&pair->right, x, y, pack(own.u + beside[n][1], own.v + beside[n][0]), &list);
+  for (int n = 0; n < 12 && list.count < MOST; n++) {
+    int64_t j = within(y + around[n][0], rows), i = within(x + around[n][1], cols);
+    append(&pair->right, x, y, maps[j * cols + i], &list);
+  }
+  for (int n = 0; up->rows && n < 9 && list.count < MOST; n++) {
+    int64_t k = (int64_t)within(y / 2 + n / 3 - 1, up->rows) * up->cols + within(x / 2 + n % 3 - 1, up->cols);
+    append(&pair->right, x, y, pack(2 * up->u[k], 2 * up->v[k]), &list);
+  }
+  return list;
+}
+/* What four displacements cost for their distance from the line of a pixel. */
+static inline Four off_lines(Line line, double share, Four u, Four v) {
+  typedef double Doubles __attribute__((vector_size(32)));
+  Doubles off = __builtin_convertvector(u, Doubles) * line.a + __builtin_convertvector(v, Doubles) * line.b + line.c;
+  off = share * (Doubles)((Square)off & INT64_MAX);
+  Doubles most = (Doubles){} + 2 * OUTSIDE;
+  return __builtin_convertvector((Doubles)PICK((Square)(off < most), (Square)off, (Square)most), Four);
+}
+/* Candidates of every pixel, each once, and their costs; all but the first lead into the right image. `compact`: words of
+   both images' compact features. */
+void EXPORT(candidates)(const Pair *pair, const uint64_t *const compact[2], const int32_t *maps, const Parents *up,
+                        PathCosts costs, Candidates out) {
+  const Eight order = {0, 1, 2, 3, 4, 5, 6, 7};
+  int32_t cols = pair->left.cols, right_cols = pair->right.cols;
   double share = (UNIT + costs.compact) * pair->band.cost;
-  for (int32_t y = 0; y < rows; y++) {
+  for (int32_t y = 0; y < pair->left.rows; y++) {
     for (int32_t x = 0; x < cols; x++) {
-      int64_t i = (int64_t)y * cols + x, at = i * MOST;
+      int64_t i = (int64_t)y * cols + x;
       Line line = unit_line(&pair->band, x + pair->x0, y + pair->y0);
-      Shift own = unpack(maps[i]);
-      int32_t count = 0;
-      for (int n = 0; n < 17 + (up->rows > 0 ? 9 : 0) && count < MOST; n++) {
-        Shift s;
-        if (n < 5) {
-          s = (Shift){own.u + beside[n][1], own.v + beside[n][0]};
-        } else if (n < 17) {
-          s = unpack(maps[(int64_t)within(y + around[n - 5][0], rows) * cols + within(x + around[n - 5][1], cols)]);
-        } else {
-          int32_t j = within(y / 2 + (n - 17) / 3 - 1, up->rows), k = within(x / 2 + (n - 17) % 3 - 1, up->cols);
-          s = (Shift){2 * up->u[(int64_t)j * up->cols + k], 2 * up->v[(int64_t)j * up->cols + k]};
-        }
-        int32_t xr = x + s.u, yr = y + s.v, inside = xr >= 0 && yr >= 0 && xr < right_cols && yr < right_rows;
-        int32_t known = n > 0 && !inside;
-        for (int k = 0; k < count; k++) known |= out.u[at + k] == s.u && out.v[at + k] == s.v;
-        if (known) continue;
-        int64_t to = (int64_t)yr * right_cols + xr;
-        int32_t cost = OUTSIDE;
-        if (inside) {
-          cost = UNIT * distance(pair->left.words[i], pair->right.words[to]);
-          cost += costs.compact * distance(compact[0][i], compact[1][to]);
-        }
-        double off = share * fabs((double)line.a * s.u + (double)line.b * s.v + line.c);
-        cost += (int32_t)(off < 2 * OUTSIDE ? off : 2 * OUTSIDE);
-        /* Leaves room below NONE for the greatest step, 10000. */
-        out.u[at + count] = (int16_t)s.u, out.v[at + count] = (int16_t)s.v;
-        out.cost[at + count++] = (int16_t)(cost < 2 * OUTSIDE ? cost : 2 * OUTSIDE);
-      }
-      for (; count < MOST; count++) out.u[at + count] = out.v[at + count] = 0, out.cost[at + count] = NONE;
+      List list = candidates_of(pair, maps, up, x, y);
+      Eight u = columns(list.shift), v = list.shift >> 16, xr = u + x, yr = v + y;
+      Eight inside = below(xr, right_cols) & below(yr, pair->right.rows), at = (yr * right_cols + xr) & inside;
+      Square own = (Square){} + pair->left.words[i], own_compact = (Square){} + compact[0][i];
+      Eight cost = UNIT * distances((Words){own, own}, words_at(pair->right.words, at));
+      cost += costs.compact * distances((Words){own_compact, own_compact}, words_at(compact[1], at));
+      Four low = off_lines(line, share, first_half(u), first_half(v));
+      Four high = off_lines(line, share, second_half(u), second_half(v));
+      cost = PICK(inside, cost, (Eight){} + OUTSIDE) + __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7);
+      /* Leaves room below NONE for the greatest step, 10000. */
+      cost = PICK(order < list.count, least_of(cost, (Eight){} + 2 * OUTSIDE), (Eight){} + NONE);
+      Numbers narrow = __builtin_convertvector(cost, Numbers);
+      memcpy(out.shift + i * MOST, &list.shift, sizeof list.shift);
+      memcpy(out.cost + i * MOST, &narrow, sizeof narrow);
     }
   }
 }
-static inline Eight widened(const int16_t *numbers) {
-  return (Eight){numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5], numbers[6], numbers[7]};
+static inline Eight costs_at(const int16_t *cost) {
+  Numbers narrow;
+  memcpy(&narrow, cost, sizeof narrow);
+  return __builtin_convertvector(narrow, Eight);
+}
+static inline Eight ints_from(const int32_t *numbers) {
+  Eight ints;
+  memcpy(&ints, numbers, sizeof ints);
+  return ints;
 }
 /* Costs of a pixel's candidates from those of the pixel before on a path:
    cost + min over m (before[m] + min(small |difference to m|, far)) - min over m before[m]. */
-static inline Eight path_step(Candidates all, int64_t at, int64_t from, const int32_t *before, int32_t small, int32_t far) {
-  Eight u = widened(all.u + at), v = widened(all.v + at), top = (Eight){} + far;
+static inline Eight path_step(Eight shift, Eight cost, const int32_t *from, const int32_t *before, int32_t small, int32_t far) {
+  Eight top = (Eight){} + far;
   int32_t least = before[0];
   for (int m = 1; m < MOST; m++) least = before[m] < least ? before[m] : least;
   Eight best = top + least;
-  for (int m = 0; m < MOST; m++) {
-    Eight du = u - all.u[from + m], dv = v - all.v[from + m];
-    Eight gap = PICK(du < 0, -du, du) + PICK(dv < 0, -dv, dv);
-    best = least_of(best, before[m] + least_of(small * gap, top));
-  }
-  return least_of(widened(all.cost + at) + best - least, (Eight){} + NONE);
+  for (int m = 0; m < MOST; m++)
+    best = least_of(best, before[m] + least_of(small * apart(shift, (Eight){} + from[m]), top));
+  return least_of(cost + best - least, (Eight){} + NONE);
 }
 /* Add to `total` the costs along three directions: from the upper left, above, the upper right; `backward`: their
    opposites. `room`: 6 rows of MOST numbers a pixel. */
@@ -374,22 +399,22 @@ void EXPORT(sweep)(int32_t rows, int32_t cols, Candidates all, const float *grey
     int32_t y = backward ? rows - 1 - row : row, j = y - s;
     for (int32_t x = 0; x < cols; x++) {
       int64_t at = ((int64_t)y * cols + x) * MOST;
+      Eight shift = ints_from(all.shift + at), sum = ints_from(total + at);
       for (int d = 0; d < 3; d++) {
         int32_t i = x + s * (d - 1);
-        Eight cost = widened(all.cost + at), sum;
+        Eight cost = costs_at(all.cost + at);
         if (j >= 0 && j < rows && i >= 0 && i < cols) {
           float change = fabsf(grey[(int64_t)y * cols + x] - grey[(int64_t)j * cols + i]);
           float jump = (float)costs.large / (1.0f + change / costs.grey), small = (float)(2 * costs.small);
           int64_t from = ((int64_t)j * cols + i) * MOST;
           /* Small differences cost less than jumps even where the grey step is greatest. */
           int32_t far = (int32_t)(jump > small ? jump : small);
-          cost = path_step(all, at, from, before + ((int64_t)d * cols + i) * MOST, costs.small, far);
+          cost = path_step(shift, cost, all.shift + from, before + ((int64_t)d * cols + i) * MOST, costs.small, far);
         }
         memcpy(after + ((int64_t)d * cols + x) * MOST, &cost, sizeof cost);
-        memcpy(&sum, total + at, sizeof sum);
         sum += cost;
-        memcpy(total + at, &sum, sizeof sum);
       }
+      memcpy(total + at, &sum, sizeof sum);
     }
     int32_t *other = before;
     before = after, after = other;
@@ -400,6 +425,6 @@ void EXPORT(choose)(Candidates all, const int32_t *total, int64_t pixels, int32_
   for (int64_t i = 0; i < pixels; i++) {
     int64_t at = i * MOST, best = at;
     for (int64_t k = at + 1; k < at + MOST; k++) best = all.cost[k] != NONE && total[k] < total[best] ? k : best;
-    maps[i] = pack(all.u[best], all.v[best]);
+    maps[i] = all.shift[best];
   }
 }

@@ -41,10 +41,8 @@ class _Field(Structure):
     _fields_ = (("shift", c_void_p), ("cost", c_void_p))
 
 
-class _Three(Structure):
-    """Columns, rows, and a third array: ``Fine`` and ``Candidates`` of the C code."""
-
-    _fields_ = (("u", c_void_p), ("v", c_void_p), ("third", c_void_p))
+class _Fine(Structure):
+    _fields_ = (("u", c_void_p), ("v", c_void_p), ("distance", c_void_p))
 
 
 class _Parents(Structure):
@@ -66,11 +64,11 @@ class _PathCosts(Structure):
 _ARGUMENTS: dict[str, tuple[Any, ...]] = {
     "search": (POINTER(_Pair), POINTER(_Parents), _Shift, _Field, c_void_p),
     "propagate": (POINTER(_Pair), _Field, _Smoothing, c_int32, c_void_p, c_void_p),
-    "sums": (POINTER(_Pair), c_void_p, c_void_p, c_void_p, _Three),
+    "sums": (POINTER(_Pair), c_void_p, c_void_p, c_void_p, _Fine),
     "edges": (POINTER(_Pair), c_void_p, c_void_p, c_void_p, POINTER(_EdgeRule), c_void_p),
-    "candidates": (POINTER(_Pair), POINTER(c_void_p * 2), c_void_p, POINTER(_Parents), _PathCosts, _Three),
-    "sweep": (c_int32, c_int32, _Three, c_void_p, _PathCosts, c_int32, c_void_p, c_void_p),
-    "choose": (_Three, c_void_p, c_int64, c_void_p),
+    "candidates": (POINTER(_Pair), POINTER(c_void_p * 2), c_void_p, POINTER(_Parents), _PathCosts, _Field),
+    "sweep": (c_int32, c_int32, _Field, c_void_p, _PathCosts, c_int32, c_void_p, c_void_p),
+    "choose": (_Field, c_void_p, c_int64, c_void_p),
 }
 
 
@@ -99,8 +97,8 @@ def _field(field: Field, pair: Pair) -> _Field:
     return _Field(*(_at(array, np.int32, pair.left.shape) for array in field))
 
 
-def _three(found: Candidates) -> _Three:
-    return _Three(*(_at(array, np.int16, found.u.shape) for array in found))
+def _listed(found: Candidates) -> _Field:
+    return _Field(_at(found.shift, np.int32), _at(found.cost, np.int16, found.shift.shape))
 
 
 class Library:
@@ -139,7 +137,7 @@ class Library:
         shape = pair.left.shape
         out = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
         given = _at(u, np.int16, shape), _at(v, np.int16, shape), _at(wanted, np.uint8, shape)
-        self._call("sums", _pair(pair), *given, _Three(*(array.ctypes.data for array in out)))
+        self._call("sums", _pair(pair), *given, _Fine(*(array.ctypes.data for array in out)))
         return out
 
     def edges(self, pair: Pair, grey: AnyArray, shift: AnyArray, wanted: AnyArray, rule: EdgeRule) -> AnyArray:
@@ -159,9 +157,9 @@ class Library:
     ) -> Candidates:
         """Candidates of each pixel and their costs, see ``reference.candidates``."""
         shape = pair.left.shape
-        found = Candidates(*(np.empty((*shape, CANDIDATES), np.int16) for _ in range(3)))
+        found = Candidates(np.empty((*shape, CANDIDATES), np.int32), np.empty((*shape, CANDIDATES), np.int16))
         words = (c_void_p * 2)(_at(compact[0], np.uint64, shape), _at(compact[1], np.uint64, pair.right.shape))
-        given = _at(shift, np.int32, shape), _parents(up), _PathCosts(*costs), _three(found)
+        given = _at(shift, np.int32, shape), _parents(up), _PathCosts(*costs), _listed(found)
         self._call("candidates", _pair(pair), words, *given)
         return found
 
@@ -175,9 +173,9 @@ class Library:
             backward,
             _at(total, np.int32, found.cost.shape),
         )
-        self._call("sweep", rows, cols, _three(found), *given, room.ctypes.data)
+        self._call("sweep", rows, cols, _listed(found), *given, room.ctypes.data)
 
     def choose(self, found: Candidates, total: AnyArray, shift: AnyArray) -> None:
         """Write the candidates of least total to ``shift``, see ``reference.choose``."""
         given = _at(total, np.int32, found.cost.shape), shift.size, _at(shift, np.int32, found.cost.shape[:2])
-        self._call("choose", _three(found), *given)
+        self._call("choose", _listed(found), *given)

@@ -75,10 +75,12 @@ class PathCosts(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """Candidates of each pixel, (row, col, :data:`CANDIDATES`) int16: columns, rows, and matching cost."""
+    """Candidates of each pixel, (row, col, :data:`CANDIDATES`): packed displacements, int32, and costs, int16.
 
-    u: AnyArray
-    v: AnyArray
+    Where there are fewer the first is repeated, at cost :data:`NONE`.
+    """
+
+    shift: AnyArray
     cost: AnyArray
 
 

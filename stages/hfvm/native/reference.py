@@ -547,7 +547,7 @@ def candidates(
     shift : (row, col) int32 packed displacements.
     up : columns and rows of displacement of the coarser level, int16, or None.
     """
-    found = Candidates(*(np.empty((*shift.shape, CANDIDATES), np.int16) for _ in range(3)))
+    found = Candidates(np.empty((*shift.shape, CANDIDATES), np.int32), np.empty((*shift.shape, CANDIDATES), np.int16))
     none = np.zeros((0, 0), np.int16)
     _candidates(pair, compact, shift, up or (none, none), costs.compact, found)
     return found
@@ -586,7 +586,7 @@ def _candidates(pair, compact, shift, up, share, found):  # type: ignore[no-unty
                 # Each once: there is room for few, and equal ones would take it from others.
                 known = n > 0 and not inside
                 for k in range(count):
-                    known |= (found.u[y, x, k] == u) & (found.v[y, x, k] == v)
+                    known |= found.shift[y, x, k] == pack(u, v)
                 if known or count == CANDIDATES:
                     continue
                 cost = np.int64(OUTSIDE)
@@ -596,10 +596,10 @@ def _candidates(pair, compact, shift, up, share, found):  # type: ignore[no-unty
                 off = abs(np.float64(line[0]) * u + np.float64(line[1]) * v + np.float64(line[2]))
                 cost += np.int64(min((UNIT + share) * pair.mu * off, 2.0 * OUTSIDE))
                 # Leaves room below NONE for the greatest step, 10000.
-                found.u[y, x, count], found.v[y, x, count], found.cost[y, x, count] = u, v, min(cost, 2 * OUTSIDE)
+                found.shift[y, x, count], found.cost[y, x, count] = pack(u, v), min(cost, 2 * OUTSIDE)
                 count += 1
             for k in range(count, CANDIDATES):
-                found.u[y, x, k], found.v[y, x, k], found.cost[y, x, k] = 0, 0, NONE
+                found.shift[y, x, k], found.cost[y, x, k] = shift[y, x], NONE
 
 
 def sweep(found: Candidates, grey: AnyArray, costs: PathCosts, backward: bool, total: AnyArray) -> None:
@@ -621,7 +621,8 @@ def _sweep(found, grey, costs, backward, total):  # type: ignore[no-untyped-def]
         y = rows - 1 - row if backward else row
         for x in range(cols):
             for k in range(CANDIDATES):
-                here[0, k, x], here[1, k, x], here[2, k, x] = found.u[y, x, k], found.v[y, x, k], found.cost[y, x, k]
+                shift = found.shift[y, x, k]
+                here[0, k, x], here[1, k, x], here[2, k, x] = columns(shift), rows_of(shift), found.cost[y, x, k]
         for d in range(3):
             after[d] = here[2]
             # Columns that have a pixel before them on the path, ``side`` columns away.
@@ -690,4 +691,4 @@ def _choose(found, total, shift):  # type: ignore[no-untyped-def]
                 # Strictly less: the pixel's own displacement comes first and wins ties.
                 if found.cost[y, x, k] != NONE and total[y, x, k] < total[y, x, best]:
                     best = k
-            shift[y, x] = pack(np.int64(found.u[y, x, best]), np.int64(found.v[y, x, best]))
+            shift[y, x] = found.shift[y, x, best]

@@ -123,7 +123,7 @@ def test_path_costs_are_those_of_the_definition(seed):
     grey = rng.uniform(0, 255, shape[:2]).astype(np.float32)
     total = np.zeros(shape, np.int32)
     for backward in (False, True):
-        reference.sweep(Candidates(cu, cv, cost), grey, PathCosts(8, 36, 240, 10.0), backward, total)
+        reference.sweep(Candidates(pack_map(cu, cv), cost), grey, PathCosts(8, 36, 240, 10.0), backward, total)
     there = cost != NONE
     np.testing.assert_array_equal(total[there], brute_force(cu, cv, cost, grey, 36, 240, 10.0)[there])
 
@@ -161,7 +161,8 @@ def test_candidates_and_their_costs_are_those_of_the_definition(mu, with_up):
     f = rng.normal(0, 1, (3, 3))
     lines = epipolar.lines(f, left.shape)
     given = (a.compact, b.compact), pack_map(*maps), None if up is None else tuple(up), COSTS
-    cu, cv, cost = reference.candidates(Pair(a.words, b.words, f, mu), *given)
+    shift, cost = reference.candidates(Pair(a.words, b.words, f, mu), *given)
+    cu, cv = unpacked(shift)
 
     def apart(word, other):
         return int(np.abs(bytes_of(word).astype(int) - bytes_of(other)).sum())
