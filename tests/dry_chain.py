@@ -55,6 +55,7 @@ FACTS: dict[str, dict[str, Any]] = {
     "trajectory": {**POSITIONS, "pieces": [[0, 4]], "main": 0},
     "crosscheck_join": {**POSITIONS, "pieces": [list(FRAMES)], "longest": 0},
     "intrinsics": {},
+    "moving": {"share": 0.0},
     "radiometry": {"steps": {"2": 3}},
 }
 

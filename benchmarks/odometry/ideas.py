@@ -65,8 +65,8 @@ IDEAS = (
     Idea("no random samples", name="odometry.resection.robust_pose._sampled", function=lambda *given: []),
     Idea(
         "second motions not looked for",
-        name="odometry.resection.resect.refuse_second_motion",
-        function=lambda *given: None,
+        name="odometry.resection.resect.moving_by_themselves",
+        function=lambda *given: np.zeros(0, np.intp),
     ),
     Idea("rig as it is given", ("rig.mode=fixed",)),
     Idea("no smooth error beside the rig", name="calibration.parameter_selection.SYSTEMATIC_PX", function=0.001),

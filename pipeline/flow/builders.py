@@ -29,13 +29,14 @@ from rille.stages.core.declare import F, NoParams, Params, Stage
 from rille.stages.core.errors import ConfigError
 from rille.stages.facts.calibration import CalibrationFacts, OrientationFacts, RigFacts, SwapFacts, SynchronyFacts
 from rille.stages.facts.imaging import PyramidFacts
-from rille.stages.facts.odometry import MotionFacts, ResectFacts, TrackFacts, TrajectoryFacts
+from rille.stages.facts.odometry import MotionFacts, MovingFacts, ResectFacts, TrackFacts, TrajectoryFacts
 from rille.stages.facts.terrain import DemFacts, GroundFacts, MergeFacts, TileIndexFacts
 from rille.stages.hazard.risk import risk_stage
 from rille.stages.hfvm.stage import hfvm_stage
 from rille.stages.imaging.pyramid import pyramid_stage
 from rille.stages.imaging.undistort import undistort_stage
 from rille.stages.odometry.motion import motion_stage
+from rille.stages.odometry.resection.moving import moving_stage
 from rille.stages.odometry.resection.pose import pose_stage
 from rille.stages.odometry.resection.resect import resect_stage
 from rille.stages.odometry.track import track_stage
@@ -289,11 +290,16 @@ class Builder:
         return Pair(frame, self.disparity(frame), known, level, dem)
 
     def world_model(
-        self, pair: Pair, first: Pair, row: int, trajectory: Handle[TrajectoryFacts]
+        self,
+        pair: Pair,
+        first: Pair,
+        row: int,
+        trajectory: Handle[TrajectoryFacts],
+        moving: Handle[MovingFacts] | None = None,
     ) -> tuple[Handle, Handle[DemFacts]]:
         """Pose and elevations of a pair straight on the world lattice: the pose in this row of the trajectory.
 
-        The frame of pair ``first`` is the world.
+        The frame of pair ``first`` is the world; what is ``moving`` is left out.
         """
         at = self.node(pose_stage, f"pose/{pair.frame}", trajectory=trajectory, row=row)
         # Row 0 of the artifact of `pose`, which holds one: so an elevation model depends on its own pose alone, and
@@ -301,7 +307,7 @@ class Builder:
         known = {"rig": pair.rig, "level": pair.level, "reference": first.level, "trajectory": at, "local": pair.dem}
         label = f"locus/world/{pair.frame}"
         return at, self.node(
-            locus_stage, label, **self._seen(pair.frame), **known, pair=pair.frame, frame="world", row=0
+            locus_stage, label, **self._seen(pair.frame), **known, moving=moving, pair=pair.frame, frame="world", row=0
         )
 
     def _seen(self, frame: int) -> dict[str, Handle | None]:
@@ -338,6 +344,17 @@ class Builder:
             **(more or {}),
         )
         return Segment(tuple(frames), tracked, posed)
+
+    def moving(self, segments: Series[Segment], pairs: Mapping[int, Pair]) -> dict[int, Handle[MovingFacts]]:
+        """What moved by itself in each basic pair, by the next frame; in the last one by the frame before."""
+        out = {}
+        for segment in segments:
+            for places, back in ((segment.frames[:2], False), (segment.frames[-2:], True)):
+                key = pairs.get(places[-1] if back else places[0])
+                if len(places) == 2 and key is not None:
+                    seen = {"disparity": key.disparity, "rig": key.rig, "motion": self.motion(*places)}
+                    out[key.frame] = seen | {"segment": segment.resection, "back": back}
+        return {pair: self.node(moving_stage, f"moving/{pair}", **known) for pair, known in out.items()}
 
     # -- the world ----------------------------------------------------------------------------------------------
 

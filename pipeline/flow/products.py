@@ -18,6 +18,7 @@ from rille.stages.facts.evaluation import (
 from rille.stages.facts.odometry import (
     IntrinsicsFacts,
     KeyframesFacts,
+    MovingFacts,
     RefineFacts,
     ResectFacts,
     ScreeningFacts,
@@ -86,6 +87,7 @@ class Products:
     resections: list[Handle[ResectFacts]] = field(default_factory=list)
     refined: list[Handle[RefineFacts]] = field(default_factory=list)
     intrinsics: Handle[IntrinsicsFacts] | None = None
+    moving: dict[int, Handle[MovingFacts]] = field(default_factory=dict)
     world_dem: dict[int, Handle[DemFacts]] = field(default_factory=dict)
     seams: dict[int, Handle[OverlapFacts]] = field(default_factory=dict)
     overlap_audit: Handle[AuditFacts] | None = None

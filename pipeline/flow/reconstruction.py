@@ -11,6 +11,7 @@
                     |       +-> rig -> calibration -------+-----+-> locus (local frame; pyramids)         |
                     |           (pooled; into the frame,  |           +-> risk, path (local)              |
                     |            locus and resect)        +-> locus (world lattice) <- pose (pair) <------+
+                    |                                           |     <- moving (pair) <- motion, disparity, resect
                     |                                           +-> tile_index (pair): which world tiles it touches
                     |                                           +-> overlap_qa (pair, earlier ones)
                     |                                           |     +-> overlap_audit; radiometry -+
@@ -170,12 +171,13 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     # The world is that of the largest unbroken piece: its models, straight on the world lattice.
     start, end = posed.meta["pieces"][posed.meta["main"]]
     # Pairs of other pieces have poses in frames of their own: nothing says where they lie in this world.
+    p.moving = make.moving(segments, pairs) if make.config.moving.enabled else {}
     there = [k for k in basic if start <= k <= end and posed.meta["positions"][row[k]] and k not in moved]
     for k in there:
-        _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory)
+        _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory, p.moving.get(k))
     size = {"side": TILE_CELLS, "margin": make.config.merge.margin}
     prints = [make.node(tile_index_stage, f"tile_index/{k}", dem=dem, **size) for k, dem in p.world_dem.items()]
-    yield Complete(("pose", "locus", "tile_index"))
+    yield Complete(("moving", "pose", "locus", "tile_index"))
     # A pair whose model failed is left out of the world: the others make a map with a hole.
     laid = yield Maybe(prints)
     footprints = [ref.meta for ref in laid if ref is not None and ref.meta["tiles"]]

@@ -224,6 +224,23 @@ SAID_LACKING = 0.1
 """Share of the matched pixels from which on it is said that limits keep them off the map."""
 
 
+def moved(view: RunView) -> list[str]:
+    """What moved by itself, in one line for the run."""
+    shares = {pair: float(facts_of(view, one).get("share", 0.0)) for pair, one in view.products.moving.items()}
+    pairs = [pair for pair, share in shares.items() if share >= SAID_MOVED]
+    if not pairs:
+        return []
+    most = max(pairs, key=lambda pair: shares[pair])
+    return [
+        f"{len(pairs)} of {len(shares)} pairs show something that moves by itself, pair {most} the most: "
+        f"{shares[most]:.0%} of its image. The world's terrain is made without it; models of single pairs hold it."
+    ]
+
+
+SAID_MOVED = 0.02
+"""Share of an image that moves by itself from which on that is said; errors of displacements come to less."""
+
+
 def _path(view: RunView) -> Items:
     drive = view.products.drive
     if drive is not None:

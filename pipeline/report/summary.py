@@ -43,7 +43,7 @@ def gather(view: RunView) -> dict[str, Any]:
         "frames": frames,
         "pairs": pairs,
         "vehicle": view.config.vehicle.model_dump(mode="json"),
-        "notes": [*view.sequence.notes, *delivery.coverage(view), *given_numbers(view)],
+        "notes": [*view.sequence.notes, *delivery.coverage(view), *delivery.moved(view), *given_numbers(view)],
         "rig": _rig(scene),
         "crosscheck": _crosscheck(scene),
         "path": _path(scene),
@@ -333,7 +333,7 @@ def _reads(run: RunView) -> tuple[object, ...]:
     return (
         *(p.contradictions, p.intrinsics, p.crosschecks, p.crosscheck, p.agreement, p.crosscheck_accuracy),
         *(p.trajectory, p.accuracy, p.position_accuracy, p.overlap_audit, p.rigs, p.resections, p.refined),
-        *(p.world_tiles, p.world_risk, p.world_path, p.dem_accuracy, p.path_check, p.drive),
+        *(p.moving, p.world_tiles, p.world_risk, p.world_path, p.dem_accuracy, p.path_check, p.drive),
         *(p.disparity_accuracy, *tables.of_pairs(p)),
         *(config.vehicle, config.rig.significance, config.crosscheck.enabled),
         *(s.name, s.frames, s.frame_names, s.rig, s.truth, s.truth_source, s.truth_positions, s.warnings, s.notes),

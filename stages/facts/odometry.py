@@ -110,3 +110,9 @@ class TrajectoryFacts(Facts):
     in_world: int
     lost: list[dict[str, Any]]
     """Frame, cause, and the frames between which it is bridged."""
+
+
+class MovingFacts(Facts):
+    """``share`` of the left image's pixels that moved by themselves."""
+
+    share: float

@@ -9,15 +9,16 @@ interpolation and is more exact. Coordinates are those of the local frame, with 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Bools, Floats
+from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import Validity
-from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.odometry.displacements import known
 
 MAX_DISPARITY_STEP_PX = 1.0
@@ -50,6 +51,24 @@ class Landmarks:
     def take(self, which: NDArray[np.intp]) -> Landmarks:
         """Some of them."""
         return Landmarks(self.position[which], self.per_pixel[which], self.sigma[which], self.lost)
+
+
+class SegmentPoints(NamedTuple):
+    """Points of a segment: where they are in its frames, their landmarks, and the key frame's camera.
+
+    ``tracks`` (n, frames, 2) column, row, NaN lost, key frame first; ``landmarks`` of the same n points in the local
+    frame, NaN none; ``T_local_key`` pose of the key frame.
+    """
+
+    tracks: Floats32
+    landmarks: Landmarks
+    camera: Camera
+    T_local_key: RigidTransform
+
+    def known(self) -> Bools:
+        """Which points (n, frames) have coordinates and were found."""
+        coordinates = np.asarray(np.isfinite(self.landmarks.position).all(1))
+        return np.asarray(np.isfinite(self.tracks).all(2)) & coordinates[:, None]
 
 
 def landmarks_of(

@@ -15,16 +15,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
+from rille.stages.core.arrays import Bytes, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, stage
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.odometry import ResectFacts, TrackFacts
 from rille.stages.facts.terrain import GroundFacts
-from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
-from rille.stages.odometry.resection.landmarks import Landmarks, landmarks_of, matches_at
-from rille.stages.odometry.resection.pnp import Pose, back_projection
+from rille.stages.odometry.resection.landmarks import SegmentPoints, landmarks_of, matches_at
 from rille.stages.odometry.resection.robust_pose import (
     MIN_LANDMARKS,
     MORE_POINTS,
@@ -32,25 +31,13 @@ from rille.stages.odometry.resection.robust_pose import (
     Resection,
     ResectParams,
     enough,
-    observations,
     resect,
 )
+from rille.stages.odometry.resection.two_motions import AmbiguousError, moving_by_themselves
 
-CONTRADICTION = 2.0
-"""Times the threshold from which on a landmark surely does not move as a pose says."""
-SECOND_SHARE = 0.2
-"""Share of the landmarks from which on a second motion puts the first in doubt: a vehicle ahead has less."""
-BODY_SHARE = 0.1
-"""The same where the landmarks that do not move in the image are all nearer, as the vehicle's own body is."""
 MIN_JUMP_PX = 1.0
 """Median departure [pixels] of a basic pair's disparities from the pair's before from which on the rig was knocked;
 of sound rigs it stays below 0.2."""
-STILL_PX = 0.5
-"""Median displacement [pixels] below which landmarks do not move in the image."""
-
-
-class AmbiguousError(DegenerateError):
-    """Two motions have large support: which is the camera's, the landmarks do not tell."""
 
 
 @dataclass(frozen=True)
@@ -77,24 +64,6 @@ class SegmentPoses:
         )
 
 
-class SegmentPoints(NamedTuple):
-    """Points of a segment: where they are in its frames, their landmarks, and the key frame's camera.
-
-    ``tracks`` (n, frames, 2) column, row, NaN lost, key frame first; ``landmarks`` of the same n points in the local
-    frame, NaN none; ``T_local_key`` pose of the key frame.
-    """
-
-    tracks: Floats32
-    landmarks: Landmarks
-    camera: Camera
-    T_local_key: RigidTransform
-
-    def known(self) -> Bools:
-        """Which points (n, frames) have coordinates and were found."""
-        coordinates = np.asarray(np.isfinite(self.landmarks.position).all(1))
-        return np.asarray(np.isfinite(self.tracks).all(2)) & coordinates[:, None]
-
-
 def resect_segment(
     points: SegmentPoints,
     frames: Sequence[int],
@@ -116,8 +85,10 @@ def resect_segment(
     out.facts.append(_facts(frames[0], int(known[:, 0].sum())) | {"inliers": int(known[:, 0].sum()), "rms_px": 0.0})
     last, together = key, list[float]()
     doubt: AmbiguousError | None = None
+    trusted = np.ones(len(known), bool)
     for j in range(1, len(frames)):
-        use = np.flatnonzero(known[:, j])
+        # What once moved by itself is no landmark: seen longer than others, or standing for a while, it might prevail.
+        use = np.flatnonzero(known[:, j] & trusted)
         facts = _facts(frames[j], use.size)
         out.facts.append(facts)
         predicted = None if reckoned is None else reckoned[j]
@@ -127,6 +98,11 @@ def resect_segment(
                 raise doubt
             starts = [last] if predicted is None else [last, key @ predicted]
             posed = _resect_frame(points, j, use, starts, params, frames[j])
+            others = moving_by_themselves(points, j, trusted, posed, params, frames[j])
+            if others.size:
+                trusted[others] = False
+                use = np.flatnonzero(known[:, j] & trusted)
+                posed = _resect_frame(points, j, use, starts, params, frames[j])
         except DegenerateError as error:
             facts["lost"] = error.message.removeprefix(f"frame {frames[j]}: ")
             if isinstance(error, AmbiguousError) and not doubt:
@@ -136,7 +112,7 @@ def resect_segment(
         last = posed.T_local_left
         out.poses[j], out.covariance[j], out.shared[j] = last.matrix34, posed.covariance, posed.shared
         out.inlier[use, j], out.residual[use, j] = posed.inlier, posed.residual
-        facts |= posed.facts()
+        facts |= posed.facts() | ({} if trusted.all() else {"moving": int((known[:, j] & ~trusted).sum())})
         together.append(posed.together)
     # One frame's figure scatters by a fifth, a segment's frames share their landmarks.
     out.covariance[:] *= max(1.0, float(np.mean(together))) if together else 1.0
@@ -166,60 +142,7 @@ def _resect_frame(
         MORE_POINTS,
     )
     pixels = points.tracks[use, j].astype(np.float64)
-    posed = resect(points.landmarks.take(use), pixels, points.camera, starts, params, frame)
-    refuse_second_motion(points, j, posed, params, frame)
-    return posed
-
-
-def refuse_second_motion(points: SegmentPoints, j: int, posed: Resection, params: ResectParams, frame: int) -> None:
-    """Refuse the pose of a frame where many of the landmarks that it leaves agree with another pose.
-
-    Either the camera moves and part of the view goes with it (the vehicle's own body), or it stands and part of the
-    view moves: the images are alike. Landmarks that fit both poses, as those at infinity, speak for neither.
-
-    Parameters
-    ----------
-    j : place of the frame in the segment.
-    posed : by those that have coordinates and were found in this frame.
-
-    Raises
-    ------
-    AmbiguousError
-        Two motions have large support.
-    """
-    camera, key = points.camera, points.T_local_key
-    seen = points.known()[:, 1 : j + 1]
-    # Of all that were seen: those at rest in the image stay in view while the others leave it.
-    total, use = int(seen.any(1).sum()), np.flatnonzero(seen[:, -1])
-    known, pixels = points.landmarks.take(use), points.tracks[use, j].astype(np.float64)
-    errors = back_projection(observations(known, pixels, camera, params), Pose.of(posed.T_local_left.inverse()))
-    left = np.flatnonzero(errors.norm > CONTRADICTION * params.threshold / params.pixel_sigma)
-    if len(left) < max(MIN_LANDMARKS, BODY_SHARE * total):
-        return
-    try:
-        # A part of the view that does not move in the image has the key's pose.
-        other = resect(known.take(left), pixels[left], camera, [posed.T_local_left, key], params, frame)
-    except DegenerateError:
-        return
-    before = key.inverse().apply(known.position)
-    shift = np.sqrt(((camera.project(before) - pixels) ** 2).sum(1))
-    parts = [(np.flatnonzero(posed.inlier), posed), (left[other.inlier], other)]
-    (still, rest), (moving, motion) = sorted(parts, key=lambda part: float(np.median(shift[part[0]])))
-    stays = bool(np.median(shift[still]) < STILL_PX)
-    body = stays and bool(np.quantile(before[still, 2], 0.9) < np.quantile(before[moving, 2], 0.1))
-    # The smaller part may be all that shows the motion only where the larger one is the vehicle itself.
-    if len(parts[1][0]) < (BODY_SHARE if body and rest is posed else SECOND_SHARE) * total:
-        return
-    moved = [float(np.linalg.norm(one.T_local_left.translation - key.translation)) for one in (rest, motion)]
-    raise AmbiguousError(
-        "RIL-770",
-        f"two motions: {len(still)} of {total} landmarks ({len(still) / total:.0%}) "
-        f"{'do not move in the image' if stays else f'moved by {moved[0]:.3g} m'}, "
-        f"{len(moving)} ({len(moving) / total:.0%}) moved by {moved[1]:.3g} m",
-        remedy="the still ones are the nearest: cut the vehicle's own body off the images, or mask it"
-        if body
-        else "leave out frames in which the camera stood, or cut off or mask what moves with it",
-    )
+    return resect(points.landmarks.take(use), pixels, points.camera, starts, params, frame)
 
 
 def knocked(points: SegmentPoints, segment: SegmentPoses, after: Bundle, rig: Rig) -> tuple[str, list[float]] | None:

@@ -28,7 +28,7 @@ from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.core.validity import matched
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.imaging import PyramidFacts
-from rille.stages.facts.odometry import TrajectoryFacts
+from rille.stages.facts.odometry import MovingFacts, TrajectoryFacts
 from rille.stages.facts.terrain import DemFacts, GroundFacts
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
@@ -283,7 +283,7 @@ _FRAME = "local or world (meta: frame)"
 class LocusInputs(NamedTuple):
     """Ports: ``disparity`` and images of the pair, its ``rig`` and reference plane (``level``), disparity of the right
     image (``back``), and the plane of the first pair (``reference``), whose cells serve all. In the world: the
-    ``trajectory``, and the pair's ``local`` model."""
+    ``trajectory``, the pair's ``local`` model, and the pixels that are ``moving``, which are left out."""
 
     disparity: Bundle
     rig: Bundle[CalibrationFacts]
@@ -294,6 +294,7 @@ class LocusInputs(NamedTuple):
     reference: Bundle[GroundFacts] | None = None
     trajectory: Bundle[TrajectoryFacts] | None = None
     local: Bundle[DemFacts] | None = None
+    moving: Bundle[MovingFacts] | None = None
 
 
 @stage(
@@ -312,6 +313,8 @@ def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: i
     rig, level, trajectory = Rig.from_dict(inputs.rig.meta["rig"]), inputs.level.meta, inputs.trajectory
     T_local_left = RigidTransform.from_matrix(level["T_local_left"])
     matches = _matches(inputs.disparity, params)
+    if inputs.moving is not None:
+        matches.usable[np.asarray(inputs.moving["moving"]) != 0] = False
     seen: PlaneView | None = None
     # One cell for the whole run: that which suits the first basic pair, where that pair is connected.
     reference = (inputs.reference or inputs.level).meta

@@ -1,0 +1,135 @@
+"""Pixels of a basic pair that moved by themselves: what the still scene and the camera's motion do not explain.
+
+A point with a known distance has a place in the next left image that follows from the camera's motion alone. Where the
+measured displacement (stage ``motion``) leads elsewhere, by more than both are uncertain by, over a connected part of
+the image, something moved: a vehicle, a person, their shadow. The world's model is made without such pixels.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from pydantic import Field
+
+from rille.stages.core.arrays import Bools, Floats
+from rille.stages.core.declare import Array, Bundle, Params, stage
+from rille.stages.core.validity import matched
+from rille.stages.facts.calibration import CalibrationFacts
+from rille.stages.facts.odometry import MotionFacts, MovingFacts
+from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.odometry.resection.landmarks import triangulated
+
+DISPARITY_SIGMA_PX = 0.3
+"""Standard deviation of a disparity, with what a coarse pixel holds of relief."""
+SIGMAS = 3.0
+"""Times that by which a place may be off."""
+GROWN = 2
+"""Coarse pixels by which a moving part is widened: its border is blurred by the windows of the matcher."""
+
+
+class MovingParams(Params):
+    """Parameters of the stage ``moving``."""
+
+    enabled: bool = Field(True, description="leave what moves by itself out of the world's terrain")
+    limit: float = Field(
+        1.5,
+        gt=0,
+        description="departure of a displacement from that of the still scene, in pixels of the displacements' level, "
+        "from which on something moved",
+    )
+    smallest: float = Field(
+        0.002, gt=0, le=1, description="share of the image that a moving part has at least; smaller ones are errors"
+    )
+
+
+def departures(
+    disparity: Bundle, motion: Bundle[MotionFacts], rig: Rig, T_b_a: RigidTransform, *, back: bool
+) -> Floats:
+    """How far (row, col) each pixel of the coarse grid moved otherwise than the still scene, in its pixels.
+
+    Less the uncertainty of the scene's own place; NaN where the disparity or the displacement is not known.
+
+    Parameters
+    ----------
+    disparity : of the pair.
+    motion : displacements from left image a to b, on the grid of a coarse level.
+    T_b_a : motion of the camera.
+    back : the pair is that of image b and not of a.
+    """
+    scale = 2.0 ** motion.meta["level"]
+    shift = np.stack([np.asarray(motion[name], np.float64) for name in ("column_disparity", "row_disparity")], -1)
+    shift[~matched(np.asarray(motion["validity"]))] = np.nan
+    shape = shift.shape[:2]
+    cells = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), -1).reshape(-1, 2)
+    here = np.asarray((cells + 0.5) * scale - 0.5, np.float64)
+    points = triangulated(
+        here, here + _coarse(disparity, shape), rig, RigidTransform.identity(), np.full(len(here), DISPARITY_SIGMA_PX)
+    )
+    to = T_b_a.inverse() if back else T_b_a
+    there, farther = (
+        rig.left.project(to.apply(points.position + share * points.per_pixel)) for share in (0.0, DISPARITY_SIGMA_PX)
+    )
+    # From a pair of image b the still scene leads to its place in a, whose displacement must lead back.
+    measured = _at(shift, (there + 0.5) / scale - 0.5) if back else shift.reshape(-1, 2)
+    off = np.linalg.norm(there + measured - here if back else here + measured - there, axis=1)
+    return np.asarray((off - SIGMAS * np.linalg.norm(farther - there, axis=1)).reshape(shape) / scale)
+
+
+def _coarse(disparity: Bundle, shape: tuple[int, int]) -> Floats:
+    """Disparities (n, 2) at the pixels of a coarse grid, row by row: that of the pixel in the middle; NaN unmatched."""
+    good = matched(np.asarray(disparity["validity"]))
+    rows, cols = (
+        np.minimum((np.arange(n) + 0.5) * m / n, m - 1).astype(np.intp) for n, m in zip(shape, good.shape, strict=True)
+    )
+    maps = [
+        np.where(good, np.asarray(disparity[name]), np.nan)[np.ix_(rows, cols)]
+        for name in ("column_disparity", "row_disparity")
+    ]
+    return np.stack(maps, -1).reshape(-1, 2)
+
+
+def _at(shift: Floats, places: Floats) -> Floats:
+    """Displacements (n, 2) of the nearest pixels to places (n, 2) column, row of the grid; NaN outside."""
+    rows, cols = shift.shape[:2]
+    known = np.asarray(np.isfinite(places).all(1))
+    x, y = np.rint(np.where(known[:, None], places, -1.0)).astype(np.intp).T
+    inside = (x >= 0) & (y >= 0) & (x < cols) & (y < rows)
+    return np.where(inside[:, None], shift[np.where(inside, y, 0), np.where(inside, x, 0)], np.nan)
+
+
+def moving(off: Floats, params: MovingParams) -> Bools:
+    """Pixels (row, col) of connected parts that depart, each a little widened."""
+    with np.errstate(invalid="ignore"):
+        departs = (off > params.limit).astype(np.uint8)
+    # Single rows and corners are errors of the displacements; what is left after opening is a surface.
+    opened = cv2.morphologyEx(departs, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
+    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= params.smallest * off.size]
+    side = 2 * GROWN + 1
+    return np.asarray(cv2.dilate(np.isin(labels, large).astype(np.uint8), np.ones((side, side), np.uint8)) != 0)
+
+
+@stage(
+    "moving",
+    outputs=[Array("moving", ("row", "col"), "uint8", "1", "left pixel that moved by itself", "0", "left image")],
+)
+def moving_stage(
+    params: MovingParams,
+    disparity: Bundle,
+    rig: Bundle[CalibrationFacts],
+    motion: Bundle[MotionFacts],
+    segment: Bundle,
+    *,
+    back: bool = False,
+) -> Bundle[MovingFacts]:
+    """Pixels of a basic pair's left image that moved by themselves to the next image; ``back``: from the one before."""
+    shape = np.shape(disparity["validity"])
+    poses = np.asarray(segment["poses"])[-2:] if back else np.asarray(segment["poses"])[:2]
+    out = np.zeros(shape, np.uint8)
+    if len(poses) == 2 and np.isfinite(poses).all():
+        a, b = (RigidTransform.from_matrix(pose) for pose in poses)
+        off = departures(disparity, motion, Rig.from_dict(rig.meta["rig"]), b.inverse() @ a, back=back)
+        parts = moving(off, params).astype(np.uint8)
+        out = cv2.resize(parts, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST)
+    share = float(out.mean())
+    return Bundle({"moving": out}, {"share": share})

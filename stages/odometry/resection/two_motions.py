@@ -1,0 +1,122 @@
+"""Two motions in view: which is the camera's, and which landmarks move by themselves.
+
+Landmarks of a vehicle ahead, of a passing lorry, or of the own body agree with another pose than those of the scene.
+The scene is the part that lies beside the other in the image, mostly, and goes on behind it. Where that holds of
+neither, the images do not tell which of the two the camera moves against, and the frame has no pose.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rille.stages.core.arrays import Bools, Floats
+from rille.stages.core.errors import DegenerateError
+from rille.stages.odometry.resection.landmarks import SegmentPoints
+from rille.stages.odometry.resection.pnp import Pose, back_projection
+from rille.stages.odometry.resection.robust_pose import MIN_LANDMARKS, Resection, ResectParams, observations, resect
+
+CONTRADICTION = 2.0
+"""Times the threshold from which on a landmark surely does not move as a pose says."""
+SECOND_SHARE = 0.2
+"""Share of the landmarks from which on a second motion puts the first in doubt: a vehicle ahead has less."""
+BODY_SHARE = 0.1
+"""The same where the landmarks that do not move in the image are all nearer, as the vehicle's own body is."""
+STILL_PX = 0.5
+"""Median displacement [pixels] below which landmarks do not move in the image."""
+BESIDE_SHARE = 0.5
+"""Share of its landmarks that the scene has in columns of the image beside what moves; with a lorry before the camera
+0.7 to 0.9, of parts that lie about alike 0.1."""
+BEHIND = 1.5
+"""Times the distance of the far landmarks of what moves that the scene's far ones have; with that lorry 5 to 7."""
+
+
+class AmbiguousError(DegenerateError):
+    """Two motions have large support: which is the camera's, the landmarks do not tell."""
+
+
+class _Part(NamedTuple):
+    """Landmarks that agree with one pose: rows in use, pixels, distances in the key frame (m); and that pose."""
+
+    rows: NDArray[np.intp]
+    pixels: Floats
+    depth: Floats
+    pose: Resection
+
+
+def moving_by_themselves(
+    points: SegmentPoints, j: int, trusted: Bools, posed: Resection, params: ResectParams, frame: int
+) -> NDArray[np.intp]:
+    """Rows of the landmarks that move otherwise than the scene, where many do; none where nearly all have one motion.
+
+    Landmarks that fit both poses, as those at infinity, speak for neither.
+
+    Parameters
+    ----------
+    j : place of the frame in the segment.
+    trusted : which points (n,) do not move by themselves, as far as is known; ``posed`` is of those that are seen.
+
+    Raises
+    ------
+    AmbiguousError
+        Two motions have large support, and of neither the place says that it is the scene.
+    """
+    camera, key = points.camera, points.T_local_key
+    # Of all that were seen: those at rest in the image stay in view while the others leave it.
+    seen = points.known()[:, 1 : j + 1] & trusted[:, None]
+    total, use = int(seen.any(1).sum()), np.flatnonzero(seen[:, -1])
+    known, pixels = points.landmarks.take(use), points.tracks[use, j].astype(np.float64)
+    observed = observations(known, pixels, camera, params)
+
+    def contradict(pose: Resection) -> Bools:
+        errors = back_projection(observed, Pose.of(pose.T_local_left.inverse()))
+        return errors.norm > CONTRADICTION * params.threshold / params.pixel_sigma
+
+    left = np.flatnonzero(contradict(posed))
+    if len(left) < max(MIN_LANDMARKS, BODY_SHARE * total):
+        return left[:0]
+    try:
+        # A part of the view that does not move in the image has the key's pose.
+        other = resect(known.take(left), pixels[left], camera, [posed.T_local_left, key], params, frame)
+    except DegenerateError:
+        return left[:0]
+    before = key.inverse().apply(known.position)
+    shift = np.sqrt(((camera.project(before) - pixels) ** 2).sum(1))
+    rows = np.flatnonzero(posed.inlier), left[other.inlier]
+    if len(rows[1]) < BODY_SHARE * total:
+        return left[:0]
+    parts = [_Part(at, pixels[at], before[at, 2], pose) for at, pose in zip(rows, (posed, other), strict=True)]
+    still, moving = sorted(parts, key=lambda part: float(np.median(shift[part.rows])))
+    stays = bool(np.median(shift[still.rows]) < STILL_PX)
+    body = stays and bool(np.quantile(still.depth, 0.9) < np.quantile(moving.depth, 0.1))
+    for scene, rest in (parts, parts[::-1]):
+        alone = rest.rows[contradict(scene.pose)[rest.rows]]
+        if len(alone) and _is_scene(scene, pixels[alone], before[alone, 2]):
+            return use[alone]
+    # The smaller part may be all that shows the motion only where the larger one is the vehicle itself.
+    if len(parts[1].rows) < (BODY_SHARE if body and still.pose is posed else SECOND_SHARE) * total:
+        return left[:0]
+    moved = [float(np.linalg.norm(part.pose.T_local_left.translation - key.translation)) for part in (still, moving)]
+    counts = len(still.rows), len(moving.rows)
+    raise AmbiguousError(
+        "RIL-770",
+        f"two motions: {counts[0]} of {total} landmarks ({counts[0] / total:.0%}) "
+        f"{'do not move in the image' if stays else f'moved by {moved[0]:.3g} m'}, "
+        f"{counts[1]} ({counts[1] / total:.0%}) moved by {moved[1]:.3g} m",
+        remedy="the still ones are the nearest: cut the vehicle's own body off the images, or mask it"
+        if body
+        else "leave out frames in which the camera stood, or cut off or mask what moves with it",
+    )
+
+
+def _is_scene(part: _Part, pixels: Floats, depth: Floats) -> bool:
+    """Whether most of a part lies beside the rest in the image, and goes on behind it.
+
+    ``pixels`` (n, 2) and ``depth`` (n,), m, of those of the rest that contradict the part's pose.
+    """
+    left, right = np.quantile(pixels[:, 0], (0.05, 0.95))
+    beside = float(np.mean((part.pixels[:, 0] < left) | (part.pixels[:, 0] > right)))
+    behind = np.quantile(part.depth, 0.9) > BEHIND * np.quantile(depth, 0.9)
+    return bool(behind) and beside >= BESIDE_SHARE
