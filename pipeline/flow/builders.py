@@ -36,7 +36,6 @@ from rille.stages.hfvm.stage import hfvm_stage
 from rille.stages.imaging.pyramid import pyramid_stage
 from rille.stages.imaging.undistort import undistort_stage
 from rille.stages.odometry.motion import motion_stage
-from rille.stages.odometry.resection.moving import moving_stage
 from rille.stages.odometry.resection.pose import pose_stage
 from rille.stages.odometry.resection.resect import resect_stage
 from rille.stages.odometry.track import track_stage
@@ -344,17 +343,6 @@ class Builder:
             **(more or {}),
         )
         return Segment(tuple(frames), tracked, posed)
-
-    def moving(self, segments: Series[Segment], pairs: Mapping[int, Pair]) -> dict[int, Handle[MovingFacts]]:
-        """What moved by itself in each basic pair, by the next frame; in the last one by the frame before."""
-        out = {}
-        for segment in segments:
-            for places, back in ((segment.frames[:2], False), (segment.frames[-2:], True)):
-                key = pairs.get(places[-1] if back else places[0])
-                if len(places) == 2 and key is not None:
-                    seen = {"disparity": key.disparity, "rig": key.rig, "motion": self.motion(*places)}
-                    out[key.frame] = seen | {"segment": segment.resection, "back": back}
-        return {pair: self.node(moving_stage, f"moving/{pair}", **known) for pair, known in out.items()}
 
     # -- the world ----------------------------------------------------------------------------------------------
 

@@ -61,6 +61,7 @@ from rille.stages.facts.calibration import CalibrationFacts, RigFacts
 from rille.stages.facts.evaluation import JoinFacts
 from rille.stages.facts.odometry import (
     KeyframesFacts,
+    MovingFacts,
     RefineFacts,
     ScreeningFacts,
     StepTableFacts,
@@ -70,6 +71,7 @@ from rille.stages.imaging.image_quality import image_quality_stage
 from rille.stages.odometry.frame_screening import frame_screening_stage
 from rille.stages.odometry.keyframes import keyframes_stage
 from rille.stages.odometry.resection.intrinsics import intrinsics_stage
+from rille.stages.odometry.resection.moving import moving_stage
 from rille.stages.odometry.resection.refine import refine_stage
 from rille.stages.odometry.resection.resect import MIN_JUMP_PX
 from rille.stages.odometry.resection.trajectory import trajectory_stage
@@ -171,7 +173,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     # The world is that of the largest unbroken piece: its models, straight on the world lattice.
     start, end = posed.meta["pieces"][posed.meta["main"]]
     # Pairs of other pieces have poses in frames of their own: nothing says where they lie in this world.
-    p.moving = make.moving(segments, pairs) if make.config.moving.enabled else {}
+    p.moving = moving_parts(make, segments, pairs) if make.config.moving.enabled else {}
     there = [k for k in basic if start <= k <= end and posed.meta["positions"][row[k]] and k not in moved]
     for k in there:
         _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory, p.moving.get(k))
@@ -405,6 +407,25 @@ def refined(make: Builder, pairs: Mapping[int, Pair], segments: list[Segment]) -
                 rig=key.rig,
             )
         )
+    return out
+
+
+def moving_parts(make: Builder, segments: list[Segment], pairs: Mapping[int, Pair]) -> dict[int, Handle[MovingFacts]]:
+    """What moves by itself in each basic pair, by the next frame; in the last one by the frame before."""
+    out = dict[int, Handle[MovingFacts]]()
+    for segment in segments:
+        for places, back in ((segment.frames[:2], False), (segment.frames[-2:], True)):
+            key = pairs.get(places[-1] if back else places[0])
+            if len(places) == 2 and key is not None and (not back or places[-1] == segments[-1].frames[-1]):
+                out[key.frame] = make.node(
+                    moving_stage,
+                    f"moving/{key.frame}",
+                    disparity=key.disparity,
+                    rig=key.rig,
+                    motion=make.motion(*places),
+                    segment=segment.resection,
+                    back=back,
+                )
     return out
 
 
