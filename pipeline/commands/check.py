@@ -29,7 +29,7 @@ from rille.pipeline.runs.input_checks import Finding
 from rille.pipeline.runs.session import settings
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.epipolar import beyond_infinity, inverse_depth
-from rille.stages.imaging.image_quality import Look, look
+from rille.stages.imaging.image_quality import ImageFigures, look
 
 Steps = Generator[Wait, Any, None]
 
@@ -128,7 +128,7 @@ class Inspection:
 
     def _images(self) -> Steps:
         """Open every image: sizes, repetitions, exposure, sharpness."""
-        looks: dict[str, dict[int, Look]] = {camera: {} for camera in CAMERAS}
+        looks: dict[str, dict[int, ImageFigures]] = {camera: {} for camera in CAMERAS}
         digests: dict[str, dict[int, str]] = {camera: {} for camera in CAMERAS}
         sizes, errors = set(), list[RilleError]()
         images = {(frame, camera): self.make.taken(frame, camera) for frame in self.frames for camera in CAMERAS}

@@ -15,7 +15,7 @@ from rille.pipeline.engine.failures import reported
 from rille.pipeline.steps import open as open_sequence
 from rille.stages.core.errors import InputError
 from rille.stages.imaging.pyramid import grey
-from rille.stages.imaging.still import FEWEST, still
+from rille.stages.imaging.still import MIN_IMAGES, still
 
 MOST_IMAGES = 20
 """Of a camera: more tell no more."""
@@ -35,8 +35,8 @@ def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> int:
         Folder to write to.
     """
     pairs = list(open_sequence(seq))
-    if len(pairs) < FEWEST:
-        text = f"{seq} has {count(len(pairs), 'pair')}, {FEWEST} are needed to see what keeps its place"
+    if len(pairs) < MIN_IMAGES:
+        text = f"{seq} has {count(len(pairs), 'pair')}, {MIN_IMAGES} are needed to see what keeps its place"
         raise InputError("RIL-906", text, remedy="draw the mask by hand")
     pairs = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, MOST_IMAGES).round().astype(int))]
     written = []

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from rille.datasets.protocol import Positions, Rows
 from rille.stages.geometry.geometry import Rig, RigidTransform
-from rille.stages.geometry.scale import ALIKE
-from rille.stages.imaging.image_quality import Look
+from rille.stages.geometry.scale import MAX_ALIKE_SCALE
+from rille.stages.imaging.image_quality import ImageFigures
 
 Floats = NDArray[np.float64]
 Level = Literal["OK", "WARN", "FAIL"]
@@ -52,7 +52,7 @@ LIMITS = {
         Fault("RIL-640", "baselines to the left", most=0.5, remedy="swap left and right"),  # of the right camera
         # Outside, lengths in another unit are likelier than such a rig.
         InputLimit("RIL-641", "baseline, m", least=0.01, most=5.0, remedy="is the baseline in metres?"),
-        InputLimit("RIL-642", "ratio of the focal lengths", most=ALIKE, remedy="two different lenses?"),
+        InputLimit("RIL-642", "ratio of the focal lengths", most=MAX_ALIKE_SCALE, remedy="two different lenses?"),
     ),
     "times": (
         Fault("RIL-643", "steps back", most=0, remedy="correct the times"),
@@ -151,7 +151,7 @@ def judge_rig(rig: Rig) -> Finding:
     ratios = right.fx / left.fx, right.fx / left.fx * left.width / right.width
     unlike = min(max(ratio, 1 / ratio) for ratio in ratios)
     words = f"baseline {b:g} m, focal length {left.fx:g} px, {left.width} x {left.height}"
-    if (right.width, right.height) != (left.width, left.height) or unlike > ALIKE:
+    if (right.width, right.height) != (left.width, left.height) or unlike > MAX_ALIKE_SCALE:
         words += f", right {right.fx:g} px, {right.width} x {right.height}"
     words += f"; the right camera stands {x:g} m to the left" if x > 0 else ""
     figures = {"baselines to the left": x / b, "baseline, m": b, "ratio of the focal lengths": unlike}
@@ -224,7 +224,7 @@ def judge_up(up: Sequence[tuple[float, float, float] | None] | None, frames: Seq
     return judge("up", words, {"known": len(known), "y in the images": y})
 
 
-def judge_looks(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Finding]:
+def judge_looks(looks: Mapping[str, Mapping[int, ImageFigures]], names: Sequence[str]) -> list[Finding]:
     """Exposure and sharpness of all images, by camera and frame."""
     opened = {camera: of for camera, of in looks.items() if of}
     out = [bad for camera, of in opened.items() for bad in _camera(camera, of, names) if bad.level != "OK"]
@@ -244,7 +244,7 @@ def judge_looks(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -
     return out
 
 
-def _camera(camera: str, looks: Mapping[int, Look], names: Sequence[str]) -> Iterator[Finding]:
+def _camera(camera: str, looks: Mapping[int, ImageFigures], names: Sequence[str]) -> Iterator[Finding]:
     """Findings on the images of one camera."""
     at = [names[k] for k in looks]
     blank = np.flatnonzero(_figure(looks, "deviation") < MIN_DEVIATION_GREY)
@@ -266,7 +266,7 @@ def _camera(camera: str, looks: Mapping[int, Look], names: Sequence[str]) -> Ite
     yield judge("sharpness", f"{blurred} {camera} images are blurred, {worst}", {"blurred": blurred})
 
 
-def _figure(looks: Mapping[int, Look], name: str) -> Floats:
+def _figure(looks: Mapping[int, ImageFigures], name: str) -> Floats:
     return np.array([getattr(look, name) for look in looks.values()], dtype=np.float64)
 
 

@@ -28,10 +28,10 @@ from rille.stages.core.arrays import Floats
 
 Vector = tuple[float, float, float]
 
-STEPS = 30
+MAX_NEWTON_STEPS = 30
 """Newton steps; they double the digits from a start that is right to some percent."""
 
-SOLVED = 1e-14
+SOLVED_RAD = 1e-14
 """Radians, and shares of a radius, at which Newton's method ends."""
 
 
@@ -90,13 +90,13 @@ class Bending:
         if not any(self.pupil):
             return angle
         _, e1, e2 = self.pupil
-        for _ in range(STEPS):
+        for _ in range(MAX_NEWTON_STEPS):
             sine, cosine, shift = np.sin(angle), np.cos(angle), _even(self.pupil, angle)
             slope = 2.0 * e1 * angle + 4.0 * e2 * angle**3
             miss = along * sine - far * cosine - (angle - sine) * shift
             step = miss / (along * cosine + far * sine - (1.0 - cosine) * shift - (angle - sine) * slope)
             angle = angle - step
-            if not (np.abs(step) > SOLVED).any():
+            if not (np.abs(step) > SOLVED_RAD).any():
                 break
         return angle
 
@@ -119,11 +119,11 @@ class Bending:
             return bent
         r0, r1, r2 = self.radial
         chi = bent / (1.0 + r0)
-        for _ in range(STEPS):
+        for _ in range(MAX_NEWTON_STEPS):
             square = chi * chi
             step = ((1.0 + _even(self.radial, chi)) * chi - bent) / (1 + r0 + 3 * r1 * square + 5 * r2 * square**2)
             chi = chi - step
-            if not (np.abs(step) > SOLVED * np.maximum(1.0, np.abs(chi))).any():
+            if not (np.abs(step) > SOLVED_RAD * np.maximum(1.0, np.abs(chi))).any():
                 break
         solved = np.abs((1.0 + _even(self.radial, chi)) * chi - bent) < 1e-12 * np.maximum(1.0, bent)
         return np.where(solved & (chi >= 0), chi, np.nan)

@@ -25,10 +25,10 @@ from rille.stages.geometry.geometry import Rig, RigidTransform, cross_matrix, le
 NAMES = ("pitch", "yaw", "roll", "baseline_across", "baseline_forward")
 """The five parameters of a correction, in the order of every vector of them."""
 
-MAJORITY = 0.5
+MIN_EXCHANGED_SHARE = 0.5
 """Share of the matches that must fit the rig with its sides exchanged, and twice as many as the given one."""
 
-STEP = 1e-6
+DIFFERENCE_STEP_RAD = 1e-6
 """Radians: step of the central differences of depth."""
 
 
@@ -135,10 +135,10 @@ def depth_sensitivity(rig: Rig, left: Floats, right: Floats) -> Floats:
     slopes = np.empty((len(left), 5))
     for i in range(5):
         step = np.zeros(5)
-        step[i] = STEP
+        step[i] = DIFFERENCE_STEP_RAD
         ahead, _ = inverse_depth(corrected(rig, step), left, right - left)
         behind, _ = inverse_depth(corrected(rig, -step), left, right - left)
-        slopes[:, i] = (ahead - behind) / (2 * STEP)
+        slopes[:, i] = (ahead - behind) / (2 * DIFFERENCE_STEP_RAD)
     # In pixels of disparity, which stereo measures alike near and far.
     scaled = slopes / per_pixel[:, None]
     weighted = np.einsum("ni,nj->ij", scaled, scaled)
@@ -162,7 +162,7 @@ def fits(rig: Rig, left: Floats, right: Floats, tolerance: float) -> float:
 
 def exchanged(as_given: float, other_way: float) -> bool:
     """Whether left and right are exchanged, by the share of matches that fit the rig as given and the other way."""
-    return other_way > MAJORITY and other_way > 2.0 * as_given
+    return other_way > MIN_EXCHANGED_SHARE and other_way > 2.0 * as_given
 
 
 def _centre(rig: Rig, correction: Floats) -> tuple[Floats, Floats]:

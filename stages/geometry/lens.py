@@ -41,19 +41,14 @@ COUNTS: Mapping[str, tuple[int, ...]] = {
 }
 """How many coefficients each model takes."""
 
-LEAST_FOCAL = 0.7
+MIN_FOCAL_SHARE = 0.7
 """A fisheye's ideal camera keeps at least this share of its focal length, so half of the pixels at the centre."""
 
 SOLVED_PX = 1e-6
 """Raw pixels by which the inverse may miss: far below what any match resolves."""
 
-REFINEMENTS = 10
-"""Newton steps of the inverse; they double the digits, and the start is right to a pixel."""
 
-NEGLIGIBLE = 1e-12
-"""Coefficient that moves no point of any image, and whose root lies beyond all of them."""
-
-CHUNK = 65536
+CHUNK_POINTS = 65536
 """Points at a time: OpenCV's projection also writes its Jacobian, 30 numbers a point."""
 
 
@@ -91,7 +86,7 @@ class Lens:
 
         It has the raw focal length, so that the centre keeps its resolution, except for a fisheye: there the pinhole's
         edges are far inside the raw image, and the focal length is shortened until the middle of each raw edge is seen,
-        but no further than to ``LEAST_FOCAL`` of itself. What lies beyond (more than 60 degrees off the axis) is lost.
+        but no further than to :data:`MIN_FOCAL_SHARE`. What lies beyond (more than 60 degrees off the axis) is lost.
         """
         c = self.camera
         if self.model != "fisheye" and not (self.model == "cahvore" and self._bending.linearity < 1):
@@ -102,7 +97,7 @@ class Lens:
         room = np.array([c.cx, w - c.cx, c.cy, h - c.cy])
         # an edge without ideal position is 90 degrees off the axis or more
         ratio = np.where(np.isfinite(far), room / np.maximum(far, 1e-9), 0.0)
-        factor = float(np.clip(ratio.min(), LEAST_FOCAL, 1.0))
+        factor = float(np.clip(ratio.min(), MIN_FOCAL_SHARE, 1.0))
         return replace(c, fx=factor * c.fx, fy=factor * c.fy)
 
     @cached_property
@@ -162,7 +157,7 @@ class Lens:
         rays = np.column_stack([self._start(raw), np.ones(len(raw))])
         with np.errstate(all="ignore"):
             todo = np.arange(len(raw))
-            for _ in range(REFINEMENTS):
+            for _ in range(10):  # steps of Newton double the digits, and the start is right to a pixel
                 here = self._project(rays[todo])
                 unsolved = ~(np.hypot(*(here - raw[todo]).T) < SOLVED_PX)
                 todo, here = todo[unsolved], here[unsolved]
@@ -195,18 +190,18 @@ class Lens:
     def _project(self, rays: Floats) -> Floats:
         k, d = self.camera.matrix, np.array(self.coefficients)
         raw = np.empty((len(rays), 2))
-        for at in range(0, len(rays), CHUNK):
-            part = np.ascontiguousarray(rays[at : at + CHUNK])
+        for at in range(0, len(rays), CHUNK_POINTS):
+            part = np.ascontiguousarray(rays[at : at + CHUNK_POINTS])
             if self.model == "cahvore":
                 bent = self._bending.bend(part)
-                raw[at : at + CHUNK] = self.camera.project(bent)
-                raw[at : at + CHUNK, 1] += self.coefficients[0] * bent[:, 0] / bent[:, 2]
+                raw[at : at + CHUNK_POINTS] = self.camera.project(bent)
+                raw[at : at + CHUNK_POINTS, 1] += self.coefficients[0] * bent[:, 0] / bent[:, 2]
                 continue
             if self.model == "fisheye":
                 out = cv2.fisheye.distortPoints(part[None, :, :2].copy(), k, d)
             else:
                 out = cv2.projectPoints(part, np.zeros(3), np.zeros(3), k, d)[0]
-            raw[at : at + CHUNK] = out.reshape(-1, 2)
+            raw[at : at + CHUNK_POINTS] = out.reshape(-1, 2)
         return raw
 
     def _start(self, raw: Floats) -> Floats:
@@ -246,6 +241,7 @@ def _points(points: ArrayLike) -> Floats:
 
 def _first_root(in_square: Polynomial) -> float:
     """Least r > 0 where a polynomial in r squared vanishes; infinite where it does not."""
-    roots = in_square.trim(NEGLIGIBLE).roots()
+    # A smaller coefficient moves no point of any image, and its root lies beyond all of them.
+    roots = in_square.trim(1e-12).roots()
     real = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(1.0, np.abs(roots))) & (roots.real > 0)]
     return math.sqrt(float(real.min())) if real.size else math.inf

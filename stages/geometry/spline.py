@@ -15,40 +15,40 @@ from numpy.typing import ArrayLike
 
 from rille.stages.core.arrays import Floats32
 
-RADIUS = 10
+TAPS_RADIUS_PX = 10
 """Pixels to either side that a coefficient depends on; what is cut off is about a thousandth of a grey level."""
 
 POLE = math.sqrt(3.0) - 2.0
-TAPS = np.float32(math.sqrt(3.0) * POLE ** np.arange(RADIUS + 1))
+TAPS = np.float32(math.sqrt(3.0) * POLE ** np.arange(TAPS_RADIUS_PX + 1))
 """The inverse of the filter 1/6, 4/6, 1/6, from the middle to one side."""
 
 
 def coefficients(image: ArrayLike) -> Floats32:
     """Coefficients (row, col) float32 of the cubic spline through the pixels of an image (row, col).
 
-    The image goes on mirrored at its borders. Those of a window are the image's to the bit, :data:`RADIUS` pixels in
-    from where it is cut.
+    The image goes on mirrored at its borders. Those of a window are the image's to the bit, :data:`TAPS_RADIUS_PX`
+    pixels in from where it is cut.
     """
     grey = np.asarray(image, np.float32)
-    mirrored = cv2.copyMakeBorder(grey, *4 * (RADIUS,), cv2.BORDER_REFLECT_101)
+    mirrored = cv2.copyMakeBorder(grey, *4 * (TAPS_RADIUS_PX,), cv2.BORDER_REFLECT_101)
     along = np.empty((mirrored.shape[0], grey.shape[1]), np.float32)
-    found = np.empty(grey.shape, np.float32)
-    _filter(mirrored, RADIUS, 1, TAPS, along)
-    _filter(along, RADIUS * grey.shape[1], grey.shape[1], TAPS, found)
-    return found
+    out = np.empty(grey.shape, np.float32)
+    _filter(mirrored, TAPS_RADIUS_PX, 1, TAPS, along)
+    _filter(along, TAPS_RADIUS_PX * grey.shape[1], grey.shape[1], TAPS, out)
+    return out
 
 
 @njit(cache=True, nogil=True)
 def _filter(image, first, step, taps, out):  # type: ignore[no-untyped-def]
-    """``out`` (row, col) from an ``image`` with :data:`RADIUS` pixels more to both sides, ``step`` pixels apart in
-    reading order; ``first``: where the first pixel of ``out`` stands in it."""
+    """``out`` (row, col) from an ``image`` with :data:`TAPS_RADIUS_PX` pixels more to both sides, ``step`` pixels apart
+    in reading order; ``first``: where the first pixel of ``out`` stands in it."""
     flat, width, cols = image.reshape(-1), image.shape[1], out.shape[1]
     for y in range(out.shape[0]):
         at, total = first + y * width, out[y]
         middle = flat[at : at + cols]
         for x in range(cols):
             total[x] = taps[0] * middle[x]
-        for k in range(1, RADIUS + 1):
+        for k in range(1, TAPS_RADIUS_PX + 1):
             before, behind = flat[at - k * step : at - k * step + cols], flat[at + k * step : at + k * step + cols]
             for x in range(cols):
                 total[x] += taps[k] * (before[x] + behind[x])

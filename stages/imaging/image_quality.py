@@ -20,17 +20,17 @@ from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.imaging import QualityFacts
 from rille.stages.imaging.pyramid import grey
 
-LOW, HIGH = 2.0, 253.0
+MAX_DARK_GREY, MIN_BRIGHT_GREY = 2.0, 253.0
 """Grey values at which an 8-bit image is taken as clipped."""
 
-BANDS = (0.25, 0.5, 0.75)
+STRIP_HEIGHTS = (0.25, 0.5, 0.75)
 """Of the height: where the strips lie whose sharpness stands for the image's."""
-STRIP = 32
+STRIP_ROWS = 32
 """Rows of a strip: some ten thousand pixels, and thrice what the wider blur reaches."""
 
 
 @dataclass(frozen=True)
-class Look:
+class ImageFigures:
     """One image in figures: mean grey 0..255, deviation, shares of dark and bright clipped pixels, sharpness.
 
     ``detail`` is what lies between two and four pixels, RMS over the deviation: where even that is gone, noise alone
@@ -45,14 +45,14 @@ class Look:
     detail: float = 0.0
 
 
-def look(image: NDArray[Any], valid: Bytes) -> Look:
+def look(image: NDArray[Any], valid: Bytes) -> ImageFigures:
     """Figures of an image (row, col); ``valid`` not zero where usable."""
     level = grey(image)
     values = level[(valid != 0) & np.isfinite(level)]
     if not values.size:
-        return Look(math.nan, 0.0, 0.0, 0.0, math.nan)
-    clipped = float((values <= LOW).mean()), float((values >= HIGH).mean())
-    return Look(float(values.mean()), float(values.std()), *clipped, *texture(image, valid))
+        return ImageFigures(math.nan, 0.0, 0.0, 0.0, math.nan)
+    clipped = float((values <= MAX_DARK_GREY).mean()), float((values >= MIN_BRIGHT_GREY).mean())
+    return ImageFigures(float(values.mean()), float(values.std()), *clipped, *texture(image, valid))
 
 
 def texture(image: NDArray[Any], valid: Bytes) -> tuple[float, float]:
@@ -81,18 +81,20 @@ def texture(image: NDArray[Any], valid: Bytes) -> tuple[float, float]:
 def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
     """Mean and deviation (grey), sharpness (None: none to tell) and detail of strips of an image, and its digest."""
     rows = image.shape[0]
-    first = sorted({int(np.clip(share * rows - STRIP / 2, 0, max(rows - STRIP, 0))) for share in BANDS})
-    found = [texture(image[r : r + STRIP], valid[r : r + STRIP]) for r in first]
-    sharp = [s for s, _ in found if math.isfinite(s)]
+    first = sorted(
+        {int(np.clip(share * rows - STRIP_ROWS / 2, 0, max(rows - STRIP_ROWS, 0))) for share in STRIP_HEIGHTS}
+    )
+    textures = [texture(image[r : r + STRIP_ROWS], valid[r : r + STRIP_ROWS]) for r in first]
+    sharp = [s for s, _ in textures if math.isfinite(s)]
     # A quarter of the pixels tells mean and deviation well enough.
-    some = grey(np.ascontiguousarray(image[::2, ::2]))
-    mask = ((valid[::2, ::2] != 0) & np.isfinite(some)).astype(np.uint8)
-    (mean,), (deviation,) = (a.ravel() for a in cv2.meanStdDev(some, mask=mask))
+    thinned = grey(np.ascontiguousarray(image[::2, ::2]))
+    mask = ((valid[::2, ::2] != 0) & np.isfinite(thinned)).astype(np.uint8)
+    (mean,), (deviation,) = (a.ravel() for a in cv2.meanStdDev(thinned, mask=mask))
     return {
         "mean": float(mean) if mask.any() else None,
         "deviation": float(deviation),
         "sharpness": float(np.median(sharp)) if sharp else None,
-        "detail": float(np.median([d for _, d in found])),
+        "detail": float(np.median([d for _, d in textures])),
         "digest": hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest(),
     }
 
@@ -100,5 +102,5 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
 @stage("image_quality")
 def image_quality_stage(params: NoParams, left: Bundle, right: Bundle, *, frame: int) -> Bundle[QualityFacts]:
     """Grey values and sharpness of a pair, before anything is matched."""
-    seen = [glance(np.asarray(one["image"]), np.asarray(one["valid"])) for one in (left, right)]
-    return Bundle({}, {"frame": frame, "left": seen[0], "right": seen[1]})
+    glances = [glance(np.asarray(image["image"]), np.asarray(image["valid"])) for image in (left, right)]
+    return Bundle({}, {"frame": frame, "left": glances[0], "right": glances[1]})

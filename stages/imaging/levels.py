@@ -13,10 +13,13 @@ Levels = tuple[int, int]
 """Black and gain: samples become ``(sample - black) * gain``; those beyond the range are clipped."""
 
 WHITE = 65535
-SHARE, FULL = 1 / 8, 1 / 4
-"""Shares of the range below which it is spread: from dark to bright; up to the brightest, as of a camera of 14 bits."""
+MAX_SPAN_SHARE = 1 / 8
+"""Share of the range, from dark to bright, up to which samples are spread."""
 
-SMOOTH = 0.5
+MAX_TOP_SHARE = 1 / 4
+"""Share of the range, up to the brightest sample, up to which samples are spread, as of a camera of 14 bits."""
+
+MIN_SMOOTH_SHARE = 0.5
 """Share of the deviation that means of 4 x 4 pixels keep at least; of noise alone they keep a quarter."""
 
 
@@ -30,7 +33,7 @@ def levels_of(images: Iterable[AnyArray]) -> Levels | None:
         return None
     dark, bright = (int(f(np.percentile(image, q) for image in deep)) for f, q in ((min, 0.5), (max, 99.5)))
     span, top = max(bright - dark, 1), max(int(image.max()) for image in deep)
-    if span > SHARE * WHITE and top > FULL * WHITE:
+    if span > MAX_SPAN_SHARE * WHITE and top > MAX_TOP_SHARE * WHITE:
         return None
     gain = 1 << (WHITE // (2 * span)).bit_length() - 1
     # Their middle becomes that of the range, but black stays black.
@@ -51,4 +54,4 @@ def words(levels: Levels) -> str:
 
 
 def _shows(image: AnyArray) -> bool:
-    return bool(cv2.blur(image.astype(np.float32), (4, 4)).std() > SMOOTH * image.std())
+    return bool(cv2.blur(image.astype(np.float32), (4, 4)).std() > MIN_SMOOTH_SHARE * image.std())

@@ -2,8 +2,8 @@
 
 Pixel centres are at integers, so column ``x`` of level 0 lies at ``x_n = (x + 0.5) / 2**n - 0.5`` on level n. Odd sizes
 are completed by repeating the last row or column. A coarse pixel is valid if at least three of its four pixels are
-(:data:`MOST`); its value is the mean of the valid ones. A black frame, as warping an image leaves, is no part of it
-(:func:`frame`); there two of four are enough (:data:`HALF`).
+(:data:`MIN_VALID`); its value is the mean of the valid ones. A black frame, as warping an image leaves, is no part of
+it (:func:`frame`); there two of four are enough (:data:`MIN_VALID_AT_FRAME`).
 """
 
 from __future__ import annotations
@@ -37,14 +37,23 @@ class PyramidParams(Params):
     )
 
 
-FRAME_LEAST, FRAME_LENGTH, FRAME_DEPTH = 8, 0.1, 0.1
-"""Pixels and share of a side that a black frame touches at least, and share of the shorter side that it reaches in."""
+MIN_FRAME_PX = 8
+"""Pixels of a side that a black frame touches at least."""
 
-MOST, HALF = np.float32(3.0), np.float32(2.0)
-"""Valid pixels of four that make a coarse pixel valid. With three, a frame one pixel wide doubles its width, in pixels
-of the image, from level to level. With two, pixels that are half outside of a warped image draw matches astray."""
+MIN_FRAME_SHARE = 0.1
+"""Share of a side that a black frame touches at least."""
 
-MIXED = 0.8
+MAX_FRAME_DEPTH_SHARE = 0.1
+"""Share of the shorter side that a black frame reaches in."""
+
+MIN_VALID = np.float32(3.0)
+"""Valid pixels of four that make a coarse pixel valid. A frame one pixel wide doubles its width so, in pixels of the
+image, from level to level."""
+
+MIN_VALID_AT_FRAME = np.float32(2.0)
+"""The same where the image has a black frame: pixels that are half outside of a warped image draw matches astray."""
+
+MAX_MIXED_SHARE = 0.8
 """Share of the brightness beyond them that the pixels beside a frame have at most, where they are mixed with black."""
 
 
@@ -169,8 +178,8 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
         levels, side = levels + 1, (side + 1) // 2
     if not (whole and valid is None and black is None):
         level = np.where(mask, level, np.float32(0.0))
-    found = halved(level, mask.view(np.uint8), levels, MOST if black is None else HALF)
-    return Pyramid(found.images, found.valid, noise.standard_deviation(found.images, found.valid))
+    pyramid = halved(level, mask.view(np.uint8), levels, MIN_VALID if black is None else MIN_VALID_AT_FRAME)
+    return Pyramid(pyramid.images, pyramid.valid, noise.standard_deviation(pyramid.images, pyramid.valid))
 
 
 def frame(image: Floats32, valid: Bools) -> Bools | None:
@@ -182,28 +191,28 @@ def frame(image: Floats32, valid: Bools) -> Bools | None:
     """
     dark = (image == 0) & valid
     sides: tuple[Any, ...] = (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1])
-    least = [max(FRAME_LENGTH * dark[side].size, FRAME_LEAST) for side in sides]
+    least = [max(MIN_FRAME_SHARE * dark[side].size, MIN_FRAME_PX) for side in sides]
     if all(np.count_nonzero(dark[side]) < n for side, n in zip(sides, least, strict=True)):
         return None
     count, label = cv2.connectedComponents(dark.view(np.uint8), connectivity=4)
-    deep = int(np.ceil(FRAME_DEPTH * min(image.shape)))
+    deep = int(np.ceil(MAX_FRAME_DEPTH_SHARE * min(image.shape)))
     inside = np.unique(label[deep:-deep, deep:-deep])
-    found, touched = np.zeros(image.shape, bool), np.zeros(image.shape, bool)
+    framed, touched = np.zeros(image.shape, bool), np.zeros(image.shape, bool)
     for side, n in zip(sides, least, strict=True):
         long = np.bincount(label[side], minlength=count) >= n
         long[0] = long[inside] = False
-        found |= long[label]
+        framed |= long[label]
         touched[side] |= long.any()
-    if not found.any():
+    if not framed.any():
         return None
-    one, two = (cv2.dilate(found.view(np.uint8), np.ones((k, k), np.uint8)).view(bool) for k in (3, 5))
-    beside, farther = image[one & ~found], image[two & ~one]
-    if farther.size and np.median(beside) < MIXED * np.median(farther):
-        found = one | touched
-    return found
+    near, far = (cv2.dilate(framed.view(np.uint8), np.ones((k, k), np.uint8)).view(bool) for k in (3, 5))
+    beside, farther = image[near & ~framed], image[far & ~near]
+    if farther.size and np.median(beside) < MAX_MIXED_SHARE * np.median(farther):
+        framed = near | touched
+    return framed
 
 
-def halved(image: Floats32, mask: Mask, levels: int, least: np.float32 = MOST) -> Pyramid:
+def halved(image: Floats32, mask: Mask, levels: int, least: np.float32 = MIN_VALID) -> Pyramid:
     """Pyramid of so many levels of a float32 image (0 where masked) and its mask; ``least`` of four make one valid.
 
     Of a window that starts and ends where a pixel of the top level does, it is a part of the image's pyramid.
@@ -226,18 +235,18 @@ def _means(image, mask, least, coarse, valid):  # type: ignore[no-untyped-def]
     for y in range(coarse.shape[0]):
         a, b = image[2 * y], image[min(2 * y + 1, rows - 1)]
         p, q = mask[2 * y], mask[min(2 * y + 1, rows - 1)]
-        found, usable = coarse[y], valid[y]
+        means, usable = coarse[y], valid[y]
         for x in range(cols // 2):
             i, k = np.uint64(2 * x), np.uint64(2 * x + 1)
             # Counted in float32, the type of the sums: a mix of types would keep the loop from becoming vector code.
             count = (np.float32(p[i]) + np.float32(p[k])) + (np.float32(q[i]) + np.float32(q[k]))
-            found[x] = (a[i] + a[k] + b[i] + b[k]) / max(count, one) if count >= least else nil
+            means[x] = (a[i] + a[k] + b[i] + b[k]) / max(count, one) if count >= least else nil
             usable[x] = count >= least
         if cols % 2:
             x, i = cols // 2, cols - 1
             # The last column stands for a repeated one.
             count = np.float32(2 * (p[i] + q[i]))
-            found[x] = (a[i] + a[i] + b[i] + b[i]) / max(count, one) if count >= least else nil
+            means[x] = (a[i] + a[i] + b[i] + b[i]) / max(count, one) if count >= least else nil
             usable[x] = count >= least
 
 

@@ -19,18 +19,18 @@ from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import AnyArray
 from rille.stages.imaging.pyramid import grey
 
-WINDOW = 15
+WINDOW_SIDE_PX = 15
 """Pixels: side of the windows."""
 
-KEPT = 0.75
+MIN_KEPT_VARIANCE_SHARE = 0.75
 """Share of the variance that is kept on a still part. In eleven frames of a street with a bonnet: 1 on it, and above
 this on a tenth of the street, its sky; in twenty of a street without: .64 at most; in ten of a rover: above it on a sky
 that grows dark upwards."""
 
-LEAST_AREA = 0.002
+MIN_AREA_SHARE = 0.002
 """Share of the image: smaller parts, and those that do not reach its border, are no body."""
 
-FEWEST = 5
+MIN_IMAGES = 5
 """Images: of fewer the mean keeps too much of any scene."""
 
 
@@ -39,14 +39,14 @@ def still(images: Sequence[AnyArray]) -> Bools:
     evened = np.stack([_evened(grey(image)) for image in images])
     share = _variance(evened.mean(axis=0)) / np.maximum(np.mean([_variance(image) for image in evened], axis=0), 1e-9)
     # What has no texture between still parts belongs to them, thin still things do not.
-    window = np.ones((WINDOW, WINDOW), np.uint8)
-    parts = (share > KEPT).view(np.uint8)
+    window = np.ones((WINDOW_SIDE_PX, WINDOW_SIDE_PX), np.uint8)
+    parts = (share > MIN_KEPT_VARIANCE_SHARE).view(np.uint8)
     for operation in (cv2.MORPH_CLOSE, cv2.MORPH_OPEN):
         parts = cv2.morphologyEx(parts, operation, window)
     number, label = cv2.connectedComponents(parts, connectivity=4)
     border = np.unique(np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]]))
     area = np.bincount(label.ravel(), minlength=number)
-    body = [n for n in border if n > 0 and area[n] >= LEAST_AREA * label.size]
+    body = [n for n in border if n > 0 and area[n] >= MIN_AREA_SHARE * label.size]
     # A window that is half on the body may show the scene.
     return np.asarray(cv2.dilate(np.isin(label, body).view(np.uint8), window) != 0)
 
@@ -58,5 +58,7 @@ def _evened(image: Floats32) -> Floats32:
 
 def _variance(image: Floats32) -> Floats32:
     """Variance in the window around each pixel (row, col)."""
-    mean, square = (cv2.blur(a, (WINDOW, WINDOW), borderType=cv2.BORDER_REPLICATE) for a in (image, image * image))
+    mean, square = (
+        cv2.blur(a, (WINDOW_SIDE_PX, WINDOW_SIDE_PX), borderType=cv2.BORDER_REPLICATE) for a in (image, image * image)
+    )
     return np.asarray(np.maximum(square - mean * mean, np.float32(0.0)))

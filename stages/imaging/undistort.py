@@ -21,10 +21,10 @@ from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import Lens
 from rille.stages.imaging.pyramid import grey
 
-PHASES = 4096
+PHASES_PER_PX = 4096
 """Positions between two pixels that weights are tabulated for; the nearest one is taken."""
 
-REACH = 3
+KERNEL_REACH_PX = 3
 """Pixels that the kernel reaches to each side. Six taps displace texture of a period of 6 pixels by at most 0.004
 pixels; Lanczos' eight keep the finest contrast and displace smooth texture by up to 0.011."""
 
@@ -38,9 +38,9 @@ def _cubic(d: Floats) -> Floats:
 
 
 def weights() -> Floats32:
-    """Weights (phase, tap): phase i is i / ``PHASES`` past the tap in the middle's left half; each row sums to 1."""
-    phase = np.arange(PHASES + 1) / PHASES
-    table = _cubic(np.abs(phase[:, None] - np.arange(1 - REACH, REACH + 1)))
+    """Weights (phase, tap): phase i is i / ``PHASES_PER_PX`` past the tap in the middle's left half; rows sum to 1."""
+    phase = np.arange(PHASES_PER_PX + 1) / PHASES_PER_PX
+    table = _cubic(np.abs(phase[:, None] - np.arange(1 - KERNEL_REACH_PX, KERNEL_REACH_PX + 1)))
     return np.asarray(table / table.sum(axis=1, keepdims=True), dtype=np.float32)
 
 
@@ -103,8 +103,8 @@ def _resample(image, usable, maps, table, out, out_valid):  # type: ignore[no-un
             if not (x >= before and x < cols - before - 1 and y >= before and y < rows - before - 1):
                 continue
             left, top = int(x), int(y)
-            wx = table[int((x - np.float32(left)) * np.float32(PHASES) + np.float32(0.5))]
-            wy = table[int((y - np.float32(top)) * np.float32(PHASES) + np.float32(0.5))]
+            wx = table[int((x - np.float32(left)) * np.float32(PHASES_PER_PX) + np.float32(0.5))]
+            wy = table[int((y - np.float32(top)) * np.float32(PHASES_PER_PX) + np.float32(0.5))]
             left, top = left - before, top - before
             if not whole and not usable[top : top + taps, left : left + taps].all():
                 continue

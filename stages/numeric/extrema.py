@@ -16,7 +16,7 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats32
 
-NOTHING = np.float32(-np.inf)
+UNKNOWN_HEIGHT = np.float32(-np.inf)
 """Stands where no cell is known: every height is above it."""
 
 
@@ -59,9 +59,9 @@ def _above_zero(high: Floats32, depth: Floats32) -> Floats32:
 
 
 def _padded(surface: Floats32, by: int) -> Floats32:
-    """The surface with a border; the border and the unknown are :data:`NOTHING`."""
-    z = np.where(np.isnan(surface), NOTHING, surface)
-    padded: Floats32 = cv2.copyMakeBorder(z, by, by, by, by, cv2.BORDER_CONSTANT, value=float(NOTHING))
+    """The surface with a border; the border and the unknown are :data:`UNKNOWN_HEIGHT`."""
+    z = np.where(np.isnan(surface), UNKNOWN_HEIGHT, surface)
+    padded: Floats32 = cv2.copyMakeBorder(z, by, by, by, by, cv2.BORDER_CONSTANT, value=float(UNKNOWN_HEIGHT))
     return padded
 
 
@@ -75,7 +75,7 @@ def _widened(z: Floats32, side: int, diagonal: int) -> Floats32:
     for window in (np.ones((2 * side + 1, 2 * side + 1), dtype=np.uint8), line, line[:, ::-1].copy()):
         if window.size > 1:
             # OpenCV's own border would repeat the edge; the padding must stay unknown.
-            z = cv2.dilate(z, window, borderType=cv2.BORDER_CONSTANT, borderValue=float(NOTHING))
+            z = cv2.dilate(z, window, borderType=cv2.BORDER_CONSTANT, borderValue=float(UNKNOWN_HEIGHT))
     return z
 
 

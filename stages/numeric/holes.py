@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Bytes, Floats, Floats32
 from rille.stages.numeric.windows import window_count
 
-LEAST_TRIALS = 8
+MIN_TRIALS = 8
 """Known cells nearby that must tell the error of an interpolation; with fewer, half the range of its rim stands in."""
 
 
@@ -78,12 +78,12 @@ def candidates(elevation: Floats32, n: int, min_known: float) -> NDArray[np.int6
     return np.flatnonzero(unknown & (window_count(~unknown, n) >= min_known * n * n))
 
 
-STEPS = np.array([[0, 1], [1, 0], [1, 1], [1, -1]])
+RAY_STEPS = np.array([[0, 1], [1, 0], [1, 1], [1, -1]])
 """Rows and columns from a cell to the next one of its row, its column and its two diagonals."""
 
 
 class _Rays(NamedTuple):
-    """``steps`` as :data:`STEPS`; along each of them, the cells ``reach`` that a gap may span, and the ``inverse``
+    """``steps`` as :data:`RAY_STEPS`; along each of them, the cells ``reach`` that a gap may span, and the ``inverse``
     distance to the k-th cell (4, k)."""
 
     steps: NDArray[np.int64]
@@ -109,10 +109,10 @@ class _Maps(NamedTuple):
 
 def _rays(max_gap: float) -> _Rays:
     # A step along a diagonal is longer: the gap is limited in distance, not in cells.
-    units = np.sqrt((STEPS * STEPS).sum(axis=1).astype(np.float64))
+    units = np.sqrt((RAY_STEPS * RAY_STEPS).sum(axis=1).astype(np.float64))
     with np.errstate(divide="ignore"):
         inverse = 1.0 / (units[:, None] * np.arange(int(max_gap + 1e-9) + 2))
-    return _Rays(STEPS, (max_gap / units + 1e-9).astype(np.int64), inverse)
+    return _Rays(RAY_STEPS, (max_gap / units + 1e-9).astype(np.int64), inverse)
 
 
 @njit(cache=True, nogil=True)
@@ -184,4 +184,4 @@ def _missed(z, cell, window, lines, weights):  # type: ignore[no-untyped-def]
             if not math.isnan(total):
                 square += (total / weight - z[p, q]) ** 2
                 trials += 1
-    return math.sqrt(square / trials) if trials >= LEAST_TRIALS else math.nan
+    return math.sqrt(square / trials) if trials >= MIN_TRIALS else math.nan

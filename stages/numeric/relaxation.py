@@ -22,11 +22,11 @@ from numba import njit
 
 from rille.stages.core.arrays import Bools, Floats32
 
-OVERSHOOT = 1.7
+OVERRELAXATION = 1.7
 """Factor on each step, which stays convergent below 2."""
 BORDER = 2
 """Diagonals and rows of nothing around: a second difference reaches two cells far."""
-BEHIND = 3
+SWEEP_LAG_DIAGONALS = 3
 """Diagonals that a sweep keeps behind the one before it."""
 
 
@@ -135,9 +135,9 @@ def _sweeps(equations, cols, sweeps):  # type: ignore[no-untyped-def]
     diagonals = equations.at.shape[0] - 2 * BORDER
     rows = diagonals + 1 - cols
     sums = np.empty(rows, np.float32)
-    for turn in range(diagonals + BEHIND * (sweeps - 1)):
+    for turn in range(diagonals + SWEEP_LAG_DIAGONALS * (sweeps - 1)):
         for k in range(sweeps):
-            t = turn - BEHIND * k
+            t = turn - SWEEP_LAG_DIAGONALS * k
             if 0 <= t < diagonals:
                 _relax_diagonal(equations, t + BORDER, max(0, t + 1 - cols) + BORDER, min(rows, t + 1) + BORDER, sums)
 
@@ -146,7 +146,7 @@ def _sweeps(equations, cols, sweeps):  # type: ignore[no-untyped-def]
 def _relax_diagonal(equations, t, i, j, sums):  # type: ignore[no-untyped-def]
     """Relax the cells of rows i to j of diagonal t; ``sums``: room for a number each."""
     at, across, down = equations.at, equations.across, equations.down
-    two, overshoot, n = np.float32(2.0), np.float32(OVERSHOOT), j - i
+    two, overshoot, n = np.float32(2.0), np.float32(OVERRELAXATION), j - i
     # What the second differences along the row, then the column want the cell to be, times their weights: as their
     # second end, their middle and their first end.
     before, weight, behind = across[t - 1, i:j], across[t, i:j], across[t + 1, i:j]

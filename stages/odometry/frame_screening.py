@@ -28,7 +28,7 @@ from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.facts.calibration import SwapFacts
 from rille.stages.facts.imaging import QualityFacts
 from rille.stages.facts.odometry import MotionFacts, ScreeningFacts
-from rille.stages.imaging.image_quality import HIGH, LOW
+from rille.stages.imaging.image_quality import MAX_DARK_GREY, MIN_BRIGHT_GREY
 from rille.stages.odometry.keyframes import LEAST_BLOCKS
 from rille.stages.odometry.steps import Step, changes_of, steps_of
 
@@ -160,7 +160,15 @@ def _usual(values: Sequence[float | None]) -> float:
 
 def _uniform(seen: Mapping[str, Any], side: str) -> str:
     mean = seen["mean"]
-    kind = "empty" if mean is None else "black" if mean <= LOW else "white" if mean >= HIGH else "uniform"
+    kind = (
+        "empty"
+        if mean is None
+        else "black"
+        if mean <= MAX_DARK_GREY
+        else "white"
+        if mean >= MIN_BRIGHT_GREY
+        else "uniform"
+    )
     return f"{kind} {side} image (grey values deviate by {seen['deviation']:.1f} levels)"
 
 

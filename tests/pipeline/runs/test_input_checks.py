@@ -11,7 +11,7 @@ import pytest
 from rille.datasets.protocol import Positions
 from rille.pipeline.runs import input_checks
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
-from rille.stages.imaging.image_quality import Look, look
+from rille.stages.imaging.image_quality import ImageFigures, look
 
 CAMERA = Camera(500.0, 500.0, 160.0, 120.0, 320, 240)
 
@@ -118,16 +118,16 @@ def test_sharpness_falls_with_blur_and_not_with_contrast():
     assert blurred < input_checks.MIN_SHARPNESS_RATIO * sharp
 
 
-def looks(left: list[Look], right: list[Look]):
+def looks(left: list[ImageFigures], right: list[ImageFigures]):
     return {"left": dict(enumerate(left)), "right": dict(enumerate(right))}
 
 
-GOOD = Look(100.0, 40.0, 0.0, 0.0, 1.0)
+GOOD = ImageFigures(100.0, 40.0, 0.0, 0.0, 1.0)
 NAMES = [f"f{k}" for k in range(5)]
 
 
-def changed(**values: float) -> Look:
-    return Look(**{**GOOD.__dict__, **values})
+def changed(**values: float) -> ImageFigures:
+    return ImageFigures(**{**GOOD.__dict__, **values})
 
 
 def test_good_images_give_two_lines():

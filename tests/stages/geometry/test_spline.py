@@ -4,24 +4,26 @@ import numpy as np
 import pytest
 from scipy import interpolate, ndimage
 
-from rille.stages.geometry.spline import RADIUS, coefficients, slopes, weights
+from rille.stages.geometry.spline import TAPS_RADIUS_PX, coefficients, slopes, weights
 
 
 @pytest.mark.parametrize("shape", [(40, 50), (3, 60), (1, 7)])
 def test_coefficients_are_those_of_scipy(shape):
     image = np.random.default_rng(0).uniform(0, 255, shape).astype(np.float32)
-    # SciPy's recursion has no end; what is cut off here is |pole|^(RADIUS + 1) of 255 grey levels in either direction.
+    # SciPy's recursion has no end; what is cut off here is |pole|^(radius + 1) of 255 grey levels in either direction.
     expected = ndimage.spline_filter(image.astype(np.float64), 3, mode="mirror")
     np.testing.assert_allclose(coefficients(image), expected, atol=2e-3)
 
 
 def test_a_window_has_the_coefficients_of_the_image():
     image = np.random.default_rng(1).uniform(0, 255, (70, 83)).astype(np.float32)
-    inner = slice(RADIUS, -RADIUS)
+    inner = slice(TAPS_RADIUS_PX, -TAPS_RADIUS_PX)
     window = coefficients(image[11:62, 9:80])[inner, inner]
     np.testing.assert_array_equal(window, coefficients(image)[11:62, 9:80][inner, inner])
     # Where the image ends, a window that ends there is the image's, too.
-    np.testing.assert_array_equal(coefficients(image[:40])[:-RADIUS], coefficients(image)[: 40 - RADIUS])
+    np.testing.assert_array_equal(
+        coefficients(image[:40])[:-TAPS_RADIUS_PX], coefficients(image)[: 40 - TAPS_RADIUS_PX]
+    )
 
 
 @pytest.mark.parametrize("t", [0.0, 0.25, 0.7, 1.0])

@@ -8,7 +8,7 @@ from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import Lens
 from rille.stages.imaging import undistort
-from rille.stages.imaging.undistort import PHASES, REACH, weights
+from rille.stages.imaging.undistort import KERNEL_REACH_PX, PHASES_PER_PX, weights
 
 RAW = Camera(230.0, 229.0, 184.0, 124.0, 376, 240)
 LENSES = {
@@ -75,9 +75,9 @@ def test_principal_point_a_quarter_pixel_further_right():
 def test_weights_sum_to_one_keep_pixels_and_reproduce_cubic_polynomials():
     table = weights()
     np.testing.assert_allclose(table.sum(axis=1), 1, atol=1e-6)
-    np.testing.assert_allclose(table[0], np.eye(2 * REACH)[REACH - 1], atol=1e-7)
-    np.testing.assert_allclose(table[PHASES], np.eye(2 * REACH)[REACH], atol=1e-7)
-    taps, phase = np.arange(1.0 - REACH, REACH + 1), np.arange(PHASES + 1) / PHASES
+    np.testing.assert_allclose(table[0], np.eye(2 * KERNEL_REACH_PX)[KERNEL_REACH_PX - 1], atol=1e-7)
+    np.testing.assert_allclose(table[PHASES_PER_PX], np.eye(2 * KERNEL_REACH_PX)[KERNEL_REACH_PX], atol=1e-7)
+    taps, phase = np.arange(1.0 - KERNEL_REACH_PX, KERNEL_REACH_PX + 1), np.arange(PHASES_PER_PX + 1) / PHASES_PER_PX
     for n in range(4):
         np.testing.assert_allclose(table.astype(np.float64) @ taps**n, phase**n, atol=1e-5)
 
