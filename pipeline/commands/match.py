@@ -22,6 +22,7 @@ from rille.pipeline.export.writers import read_disparity, write_confidence, writ
 from rille.pipeline.flow import config as configuration
 from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.core.validity import Validity, has, matched, matched_back
+from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX
 from rille.stages.imaging import levels
 
 MIN_PIXELS_OF_BAR = 1_000_000
@@ -178,7 +179,7 @@ def _check_outputs(left: Path, right: Path, output: Path, confidence: Path | Non
 
 
 def warnings(result: Any, left: NDArray[Any], right: NDArray[Any]) -> Iterator[str]:
-    """Signs that two matched images do not fit, one line each with its figure; ``result``: their ``Disparity``."""
+    """Signs that two matched images do not fit, one line each with its figure; ``result``: their ``StereoMatches``."""
     from rille.stages.hfvm import sanity
 
     share, blank = float(matched(result.validity).mean()), float(has(result.validity, Validity.NO_TEXTURE).mean())
@@ -202,13 +203,13 @@ def warnings(result: Any, left: NDArray[Any], right: NDArray[Any]) -> Iterator[s
         yield warning("RIL-702", text)
     elif (judged := sanity.judge(left, right, result, ok)) is not None:
         on_lines, repeated = judged
-        if on_lines < sanity.RIGID:
+        if on_lines < sanity.MIN_RIGID_SHARE:
             text = (
-                f"only {100 * on_lines:.0f} % of the matches lie within {sanity.NEAR:.0f} px of one epipolar geometry: "
-                "wrong matches, things that move, or a lens that distorts: look at them first"
+                f"only {100 * on_lines:.0f} % of the matches lie within {MAX_LINE_DISTANCE_PX:.0f} px of one epipolar "
+                "geometry: wrong matches, things that move, or a lens that distorts: look at them first"
             )
             yield warning("RIL-703", text)
-        if repeated > sanity.REPEATED:
+        if repeated > sanity.MAX_REPEATED_SHARE:
             text = (
                 f"{100 * repeated:.0f} % of the matches look as well elsewhere on their epipolar line: on a repeating "
                 "pattern they may be off by a period: look at them first"

@@ -54,7 +54,7 @@ def side(tiling: Tiling, params: HfvmParams, pyramid: PyramidParams, shapes: tup
     if not presets.local(params) or tiling.tile == 0:
         return None
     # Tiles start from the maps of level 1, which the decisions on brightness and alignment precede.
-    if min(_levels(pyramid, shape) - _half(params) for shape in shapes) <= coarse.COARSE:
+    if min(_levels(pyramid, shape) - _half(params) for shape in shapes) <= coarse.COARSE_LEVEL:
         return None
     chosen = tiling.tile
     if chosen is None:

@@ -25,6 +25,9 @@ from rille.stages.geometry.geometry import Rig, RigidTransform, cross_matrix, le
 NAMES = ("pitch", "yaw", "roll", "baseline_across", "baseline_forward")
 """The five parameters of a correction, in the order of every vector of them."""
 
+MAX_LINE_DISTANCE_PX = 2.0
+"""A match this near its epipolar line lies on it."""
+
 MIN_EXCHANGED_SHARE = 0.5
 """Share of the matches that must fit the rig with its sides exchanged, and twice as many as the given one."""
 

@@ -22,16 +22,19 @@ from rille.stages.hfvm.windows import Shape, Window, thinned
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
 
-SAMPLES, LEAST = 4000, 100
-"""Pixels that a polynomial is fitted to at most, and that it needs at least."""
+MAX_FIT_PIXELS = 4000
+"""Pixels that a polynomial is fitted to at most."""
 
-DARK, SATURATED = 4.0, 250.0
+MIN_FIT_PIXELS = 100
+"""Pixels that a polynomial needs at least."""
+
+MIN_GREY, MAX_GREY = 4.0, 250.0
 """Grey levels between which pixels are used for the ratio."""
 
-SCATTER, ITERATIONS = 0.05, 8
-"""Least scatter of the logarithms of matched grey values, and steps of the robust fit."""
+MIN_LOG_SCATTER = 0.05
+"""Least scatter of the logarithms of matched grey values."""
 
-NOTABLE = 0.1
+MIN_LOG_RATIO = 0.1
 """Logarithm of the ratio that must be reached somewhere in the image for it to be corrected."""
 
 
@@ -69,24 +72,24 @@ def _brighter(g: Floats, shape: Shape, read: Callable[[Window], Grey], level: in
 
 def guess(left: Image, right: Image, level: int) -> Floats:
     """Ratio of the polynomials that either image's own brightness follows at a level; zeros of dark or tiny images."""
-    found = []
+    polynomials = []
     for image in (left, right):
         layer = image.layers[level]
-        y, x = np.nonzero((layer.valid != 0) & (layer.grey > DARK))
-        if len(y) < LEAST:
+        y, x = np.nonzero((layer.valid != 0) & (layer.grey > MIN_GREY))
+        if len(y) < MIN_FIT_PIXELS:
             return np.zeros(7)
-        found.append(_fit(terms(x, y, level, image.shapes[0]), np.log(layer.grey[y, x].astype(np.float64))))
-    return found[0] - found[1]
+        polynomials.append(_fit(terms(x, y, level, image.shapes[0]), np.log(layer.grey[y, x].astype(np.float64))))
+    return polynomials[0] - polynomials[1]
 
 
 def matched(left: Image, right: Image, state: State) -> Floats | None:
     """Ratio of the grey values of the consistent matches of a level; None where they are too few."""
-    y, x = thinned(state.left_ok, SAMPLES)
+    y, x = thinned(state.left_ok, MAX_FIT_PIXELS)
     p, q = x + state.left.u[y, x].astype(np.int64), y + state.left.v[y, x].astype(np.int64)
     a, b = left.layers[state.level].grey[y, x], right.layers[state.level].grey[q, p]
-    # At DARK one grey level is a quarter of the value, five times SCATTER; at the top values are clipped.
-    good = (np.minimum(a, b) > DARK) & (np.maximum(a, b) < SATURATED)
-    if np.count_nonzero(good) < LEAST:
+    # At MIN_GREY one grey level is a quarter of the value, five times MIN_LOG_SCATTER; at the top values are clipped.
+    good = (np.minimum(a, b) > MIN_GREY) & (np.maximum(a, b) < MAX_GREY)
+    if np.count_nonzero(good) < MIN_FIT_PIXELS:
         return None
     # Places of the right image, since that is the one to be multiplied.
     basis = terms(p[good], q[good], state.level, right.shapes[0])
@@ -98,11 +101,11 @@ def _fit(basis: Floats, target: Floats) -> Floats:
 
     def weigh(off: AnyArray) -> AnyArray:
         # 1.5 times the median magnitude is about the standard deviation of normal scatter.
-        return cauchy(off, max(SCATTER, 1.5 * typical(off)))
+        return cauchy(off, max(MIN_LOG_SCATTER, 1.5 * typical(off)))
 
     # Terms that the matches leave open stay near zero instead of growing outside of them.
     hold = 1e-3 * target.size * np.eye(len(basis))
-    return irls(basis.T, target, weigh, hold, np.zeros(len(basis)), ITERATIONS)
+    return irls(basis.T, target, weigh, hold, np.zeros(len(basis)), rounds=8)
 
 
 def greatest(ratio: Floats) -> float:

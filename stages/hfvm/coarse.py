@@ -11,17 +11,17 @@ from rille.stages.hfvm import brightness, plane, start, viewpoint
 from rille.stages.hfvm.image import Image
 from rille.stages.hfvm.level import State, Views, descend, sample
 
-COARSE = 2
+COARSE_LEVEL = 2
 """Level whose matches decide on brightness, alignment by a plane, and turned views."""
 
-TOO_FEW = 0.45
+MIN_UPRIGHT_SHARE = 0.45
 """Share of consistent pixels below which the images may be turned: chance alone makes up to .23 of them so, with preset
 ``accurate``, which smooths more, up to .40."""
 
-ENOUGH, CORRECTIONS = 0.85, 2
-"""Share of consistent pixels from which on no other brightness is guessed, and how often matches correct it."""
+MIN_EVEN_SHARE = 0.85
+"""Share of consistent pixels from which on no other brightness is guessed."""
 
-LEFT_OVER = 0.95
+MIN_KEPT_SHARE = 0.95
 """Share of the consistent pixels that must stay so when brightness is corrected by them: a few change anyway."""
 
 
@@ -39,7 +39,7 @@ class Coarse:
     right: Image
     ratio: Floats | None = None
     alignment: plane.Matrix | None = None
-    prior: start.Prior | None = None
+    prior: start.PriorDisparities | None = None
 
     def with_threads(self, threads: int) -> Coarse:
         """The same, to be matched on by so many threads."""
@@ -55,26 +55,26 @@ class Coarse:
     def anew(self, matched: Image, **changed: object) -> Coarse:
         """Coarse levels of another right image, and other facts changed."""
         views = replace(self.views, right=matched)
-        return replace(self, views=views, state=descend(views, COARSE, None, self.state.near_sign), **changed)  # type: ignore[arg-type]
+        return replace(self, views=views, state=descend(views, COARSE_LEVEL, None, self.state.near_sign), **changed)  # type: ignore[arg-type]
 
 
 def even(coarse: Coarse) -> Coarse:
     """Brightness ratio of both images undone in the right one, first by a guess where little matches."""
     left, right = coarse.views.left, coarse.right
-    if coarse.state.share < ENOUGH:
-        guess = brightness.guess(left, right, min(COARSE + 2, coarse.views.levels - 1))
-        if brightness.greatest(guess) > brightness.NOTABLE:
+    if coarse.state.share < MIN_EVEN_SHARE:
+        guess = brightness.guess(left, right, min(COARSE_LEVEL + 2, coarse.views.levels - 1))
+        if brightness.greatest(guess) > brightness.MIN_LOG_RATIO:
             other = brightness.levelled(right, guess)
             tried = coarse.anew(other, right=other, ratio=guess)
             coarse = tried if tried.state.share > coarse.state.share else coarse
-    for _ in range(CORRECTIONS):
+    for _ in range(2):  # matches correct the ratio, and those of the corrected image once more
         ratio = brightness.matched(left, right, coarse.state)
         before = 0.0 if coarse.ratio is None else coarse.ratio
-        if ratio is None or brightness.greatest(ratio - before) <= brightness.NOTABLE:
+        if ratio is None or brightness.greatest(ratio - before) <= brightness.MIN_LOG_RATIO:
             break
         other = brightness.levelled(right, ratio)
         tried = coarse.anew(other, right=other, ratio=ratio)
-        if tried.state.share < LEFT_OVER * coarse.state.share:
+        if tried.state.share < MIN_KEPT_SHARE * coarse.state.share:
             break
         coarse = tried
     return coarse
@@ -96,7 +96,7 @@ def turn(coarse: Coarse) -> Coarse:
     """The right image turned and scaled by keypoints, where hardly a pixel matches and that helps."""
     # A plane may also be fitted to the few matches that chance makes.
     sizes = coarse.views.left.shapes[0], coarse.right.shapes[0]
-    few = coarse.state.share <= TOO_FEW or (coarse.alignment is None and other_size(*sizes))
+    few = coarse.state.share <= MIN_UPRIGHT_SHARE or (coarse.alignment is None and other_size(*sizes))
     h = viewpoint.find(coarse.views.left, coarse.right) if few and coarse.prior is None else None
     if h is None:
         return coarse
@@ -108,9 +108,9 @@ def turn(coarse: Coarse) -> Coarse:
 Step = Callable[[Coarse], Coarse]
 
 
-def begin(views: Views, steps: tuple[Step, ...], prior: start.Prior | None = None) -> Coarse:
+def begin(views: Views, steps: tuple[Step, ...], prior: start.PriorDisparities | None = None) -> Coarse:
     """The coarse levels of two images as they are, down to level 1 or, of small images, to the top."""
-    coarse = Coarse(views, descend(views, COARSE), views.right, prior=prior)
+    coarse = Coarse(views, descend(views, COARSE_LEVEL), views.right, prior=prior)
     for step in steps:
         coarse = step(coarse)
     return replace(coarse, state=descend(coarse.views, 1, coarse.state))

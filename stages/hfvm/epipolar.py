@@ -26,20 +26,19 @@ Matrix = NDArray[np.float64]
 
 NO_BAND: Matrix = np.zeros((3, 3))
 
-SIGMA = 0.5
+MATCH_SIGMA_PX = 0.5
 """Pixels: deviation of an integer match from its line."""
 
-PRIOR = np.array([0.2, 0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.5])
+TERM_SIGMAS = np.array([0.2, 0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.5])
 """Deviations of the eight free terms (x', x'x, x'y, y'x, y'y, x, y, 1) in half image sides."""
 
-SHARP = 0.2
+SHARP_SPREAD_PX = 0.2
 """Pixels: median distance of sub-pixel matches from their lines in an ideal rig; beyond it the band is softened."""
 
 MIN_MATCHES = 40
-LEAST_NORMAL = np.float32(1e-12)
-"""Length below which a normal is none: there is no band."""
 
-ITERATIONS = 10
+MIN_NORMAL = np.float32(1e-12)
+"""Length below which a normal is none: there is no band."""
 
 
 def fit_points(
@@ -64,10 +63,10 @@ def fit_points(
     right_mid = (0.5 * (right_shape[1] - 1), 0.5 * (right_shape[0] - 1))
     p = np.stack([(x - left_mid[0]) / scale, (y - left_mid[1]) / scale])
     q = np.stack([(x + u - right_mid[0]) / scale, (y + v - right_mid[1]) / scale])
-    rows = _solve(p, q, SIGMA / scale)
+    rows = _solve(p, q, MATCH_SIGMA_PX / scale)
     f, _, spread = rows
-    if spread * scale > SIGMA:
-        cols = _solve(p[::-1], q[::-1], SIGMA / scale)
+    if spread * scale > MATCH_SIGMA_PX:
+        cols = _solve(p[::-1], q[::-1], MATCH_SIGMA_PX / scale)
         swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         f, spread = (rows[0], rows[2]) if rows[1] <= cols[1] else (swap @ cols[0] @ swap, cols[2])
     to_left = np.array([[1 / scale, 0.0, -left_mid[0] / scale], [0.0, 1 / scale, -left_mid[1] / scale], [0, 0, 1.0]])
@@ -91,9 +90,9 @@ def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float
         spread = max(sigma, 2.0 * middle if first else min(0.5 * spread, 1.5 * middle + sigma))
         return cauchy(residual, spread) / sigma**2
 
-    g = irls(terms.T, -yr, weigh, np.diag(PRIOR**-2.0), prior, ITERATIONS)
+    g = irls(terms.T, -yr, weigh, np.diag(TERM_SIGMAS**-2.0), prior, rounds=10)
     residual = g @ terms + yr
-    cost = float(np.sum(np.log1p((residual / sigma) ** 2)) + np.sum(((g - prior) / PRIOR) ** 2))
+    cost = float(np.sum(np.log1p((residual / sigma) ** 2)) + np.sum(((g - prior) / TERM_SIGMAS) ** 2))
     f = np.array([[g[1], g[2], g[0]], [g[3], g[4], 1.0], [g[5], g[6], g[7]]])
     return f, cost, typical(residual)
 
@@ -136,9 +135,9 @@ def lines(f: Matrix, shape: tuple[int, ...]) -> NDArray[np.float32]:
 
     Zeros where ``f`` is zero.
     """
-    found = np.empty((*shape, 3), np.float32)
-    _lines(f, found)
-    return found
+    out = np.empty((*shape, 3), np.float32)
+    _lines(f, out)
+    return out
 
 
 def moved(f: Matrix, left: tuple[int, int], right: tuple[int, int]) -> Matrix:
@@ -159,10 +158,10 @@ def unit_line(f, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _lines(f, found):  # type: ignore[no-untyped-def]
-    for j in range(found.shape[0]):
-        for i in range(found.shape[1]):
-            found[j, i, 0], found[j, i, 1], found[j, i, 2] = unit_line(f, np.float64(i), np.float64(j))
+def _lines(f, out):  # type: ignore[no-untyped-def]
+    for j in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            out[j, i, 0], out[j, i, 1], out[j, i, 2] = unit_line(f, np.float64(i), np.float64(j))
 
 
 @njit(cache=True, nogil=True)
@@ -193,7 +192,7 @@ def line(terms, x, length):  # type: ignore[no-untyped-def]
     """
     a, b = terms[0] + terms[1] * x, terms[2] + terms[3] * x
     c = terms[4] + x * (terms[5] + x * terms[6])
-    scale = length / max(np.sqrt(a * a + b * b), LEAST_NORMAL)
+    scale = length / max(np.sqrt(a * a + b * b), MIN_NORMAL)
     return a * scale, b * scale, c * scale
 
 
@@ -213,10 +212,10 @@ def on_line(line, along):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def lines_at(f, x, y):  # type: ignore[no-untyped-def]
     """As :func:`lines`, of single pixels (n,): (3, n) float32."""
-    found = np.empty((3, len(x)), np.float32)
+    out = np.empty((3, len(x)), np.float32)
     for n in range(len(x)):
-        found[0, n], found[1, n], found[2, n] = unit_line(f, np.float64(x[n]), np.float64(y[n]))
-    return found
+        out[0, n], out[1, n], out[2, n] = unit_line(f, np.float64(x[n]), np.float64(y[n]))
+    return out
 
 
 def along_rows(f: Matrix, shape: tuple[int, ...]) -> bool:

@@ -32,10 +32,10 @@ NORMALISATIONS = (4.0, 4.0, 2.0, 2.0, 8.0, 8.0, 1.0, 56.0)
 PAPER_WEIGHTS = (2.0, 2.0, 3.0, 3.0, 3.0, 3.0, 10.0, 4.0)
 """Weights w of Table 1."""
 
-RADIUS = 6
+RADIUS_PX = 6
 """Pixels: reach of the widest kernel; images are completed by repeating their edge."""
 
-VARIANCE_RADIUS = 2
+VARIANCE_RADIUS_PX = 2
 """Pixels; the paper gives no window for the variance, 5 x 5 is our choice."""
 
 STEPS_PER_UNIT = 2.0
@@ -59,14 +59,14 @@ def planes(image: ArrayLike) -> Planes:
     cols = [_convolve(a, k, -2) for k in (HIGH_PASS, BAND_PASS, WIDE_BAND_PASS)]
     # From the middle of the range: the difference of squares below then loses fewer digits.
     centred = a - np.float32(128.0)
-    box = (1,) * (2 * VARIANCE_RADIUS + 1)
+    box = (1,) * (2 * VARIANCE_RADIUS_PX + 1)
     mean = _convolve(_convolve(centred, box, -1), box, -2) / np.float32(len(box) ** 2)
     square = _convolve(_convolve(centred * centred, box, -1), box, -2) / np.float32(len(box) ** 2)
     # Rounding may leave the variance of a flat window below zero.
     deviation = np.sqrt(np.maximum(square - mean * mean, 0))
     smooth = _shift_sum(a, GAUSSIAN)
-    found = [rows[0], cols[0], rows[1], cols[1], rows[2], cols[2], deviation, smooth]
-    return np.stack([f / np.float32(d) for f, d in zip(found, n, strict=True)]).astype(np.float32)
+    responses = [rows[0], cols[0], rows[1], cols[1], rows[2], cols[2], deviation, smooth]
+    return np.stack([f / np.float32(d) for f, d in zip(responses, n, strict=True)]).astype(np.float32)
 
 
 def _convolve(a: AnyArray, kernel: tuple[int, ...], axis: int) -> AnyArray:
@@ -104,7 +104,7 @@ def pack(image: AnyArray, weights: tuple[float, ...]) -> tuple[Words, Planes]:
     return words, deviation
 
 
-BAND = 64
+BAND_ROWS = 64
 """Rows that are completed at their edges together."""
 
 
@@ -112,13 +112,13 @@ BAND = 64
 def _pack_all(image, scale, words, deviation):  # type: ignore[no-untyped-def]
     """Features of a whole image, completed by repeating its edge."""
     rows, cols = image.shape
-    room = np.empty((BAND + 2 * RADIUS, cols + 2 * RADIUS), np.float32)
-    for start in range(0, rows, BAND):
-        size = min(BAND, rows - start) + 2 * RADIUS
+    room = np.empty((BAND_ROWS + 2 * RADIUS_PX, cols + 2 * RADIUS_PX), np.float32)
+    for start in range(0, rows, BAND_ROWS):
+        size = min(BAND_ROWS, rows - start) + 2 * RADIUS_PX
         for j in range(size):
-            row, out = image[min(max(start + j - RADIUS, 0), rows - 1)], room[j]
-            out[:RADIUS], out[RADIUS + cols :] = row[0], row[cols - 1]
-            copy_line(row, out[RADIUS:])
+            row, out = image[min(max(start + j - RADIUS_PX, 0), rows - 1)], room[j]
+            out[:RADIUS_PX], out[RADIUS_PX + cols :] = row[0], row[cols - 1]
+            copy_line(row, out[RADIUS_PX:])
         pack_rows(room[:size], start, scale, words, deviation)
 
 
@@ -133,22 +133,22 @@ def _byte(value, scale):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def pack_rows(a, start, scale, words, deviation):  # type: ignore[no-untyped-def]
-    """Table 1 by sums of fixed order, for rows from ``start`` on, RADIUS more of which ``a`` holds on every side.
+    """Table 1 by sums of fixed order, for rows from ``start`` on, RADIUS_PX more of which ``a`` holds on every side.
 
     No fast maths: bytes must not depend on the CPU.
     """
-    rows, cols = a.shape[0] - 2 * RADIUS, words.shape[1]
-    width = cols + 2 * RADIUS
+    rows, cols = a.shape[0] - 2 * RADIUS_PX, words.shape[1]
+    width = cols + 2 * RADIUS_PX
     sums = np.empty(width, np.float32)
     squares = np.empty(width, np.float32)
     two, three, five, eight = np.float32(2.0), np.float32(3.0), np.float32(5.0), np.float32(8.0)
     for y in range(rows):
-        r = a[y : y + 2 * RADIUS + 1]
-        found, sigma = words[start + y], deviation[start + y]
+        r = a[y : y + 2 * RADIUS_PX + 1]
+        row_words, sigma = words[start + y], deviation[start + y]
         for x in range(width):
             s = np.float32(0.0)
             q = np.float32(0.0)
-            for k in range(RADIUS - VARIANCE_RADIUS, RADIUS + VARIANCE_RADIUS + 1):
+            for k in range(RADIUS_PX - VARIANCE_RADIUS_PX, RADIUS_PX + VARIANCE_RADIUS_PX + 1):
                 # From the middle of the range: ``f6`` subtracts two squares that would otherwise agree in most digits.
                 c = r[k, x] - np.float32(128.0)
                 s += c
@@ -156,7 +156,7 @@ def pack_rows(a, start, scale, words, deviation):  # type: ignore[no-untyped-def
             sums[x] = s
             squares[x] = q
         for x in range(cols):
-            m = x + RADIUS
+            m = x + RADIUS_PX
             f0 = (two * (r[6, m + 2] - r[6, m - 2]) + (r[6, m + 1] - r[6, m - 1])) * np.float32(0.25)
             f1 = (two * (r[8, m] - r[4, m]) + (r[7, m] - r[5, m])) * np.float32(0.25)
             f2 = ((r[6, m + 3] - r[6, m - 3]) - (r[6, m + 1] - r[6, m - 1])) * np.float32(0.5)
@@ -189,7 +189,7 @@ def pack_rows(a, start, scale, words, deviation):  # type: ignore[no-untyped-def
                 + (r[5, m - 2] + r[5, m + 2] + r[7, m - 2] + r[7, m + 2])
             ) / np.float32(56.0)
             sigma[x] = f6
-            found[x] = (
+            row_words[x] = (
                 _byte(f0, scale[0])
                 | (_byte(f1, scale[1]) << np.uint64(8))
                 | (_byte(f2, scale[2]) << np.uint64(16))
@@ -218,7 +218,7 @@ def distance(a, b):  # type: ignore[no-untyped-def]
 NEIGHBOURS = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 """Rows and columns to the neighbour of each byte, lowest byte first."""
 
-COMPACT_SCALE = np.float32(8.0)
+COMPACT_STEPS = np.float32(8.0)
 """Byte steps per root of a grey level: the greatest step, 255, just fills a byte."""
 
 
@@ -252,7 +252,7 @@ def _compact(framed, words):  # type: ignore[no-untyped-def]
             word = np.uint64(0)
             for k in range(len(NEIGHBOURS)):
                 step = framed[y + 1 + NEIGHBOURS[k][0], x + 1 + NEIGHBOURS[k][1]] - framed[y + 1, x + 1]
-                root = COMPACT_SCALE * np.sqrt(abs(step))
+                root = COMPACT_STEPS * np.sqrt(abs(step))
                 byte = min(max(middle + (root if step > 0 else -root), np.float32(0.0)), top)
                 word |= np.uint64(byte) << np.uint64(8 * k)
             words[y, x] = word

@@ -18,27 +18,27 @@ from rille.stages.geometry import spline
 from rille.stages.geometry.scale import effective
 from rille.stages.hfvm import epipolar, fill, lucas_kanade, plane, relief, textureless, uncertainty
 from rille.stages.hfvm.image import Image, Layer
-from rille.stages.hfvm.level import FIT_SAMPLES, Map
+from rille.stages.hfvm.level import MAX_FIT_MATCHES, Map
 from rille.stages.hfvm.lucas_kanade import local_mean
-from rille.stages.hfvm.native.problem import Pair
+from rille.stages.hfvm.native.problem import LevelPair
 from rille.stages.hfvm.native.solver import solver
 from rille.stages.hfvm.params import HfvmParams
-from rille.stages.hfvm.validation import FAILED, backmatch, isolated, lands, lonely
+from rille.stages.hfvm.validation import FAILED_PX, backmatch, isolated, lands, lonely
 from rille.stages.hfvm.windows import Shape, Window, thinned
 from rille.stages.numeric.windows import window_count, window_room
 
 Results = Mapping[str, AnyArray]
 
-NOISE_PIXELS = 9
-"""Pixels that denoising takes means of. It divides the residuals' variance by as many; no match is placed better."""
+SUPPORT_SIDE_PX = 25
+"""Pixels: side of the neighbourhood that bears out a pixel without texture. Chosen, as the shares below, with five
+pairs (motorcycle, Baby1, Cloth1, Lampshade1, Midd1): of what is borne out 98 to 100 % are within 2 px, of all that is
+consistent without texture 14 to 100 %."""
 
-SUPPORT, SUPPORT_CONSISTENT, SUPPORT_TEXTURED = 25, 0.9, 0.3
-"""Pixels: side of the neighbourhood that bears out a pixel without texture, and least shares of it that are consistent
-and that are matches. Chosen with five pairs (motorcycle, Baby1, Cloth1, Lampshade1, Midd1): of what is borne out 98 to
-100 % are within 2 px, of all that is consistent without texture 14 to 100 %."""
+MIN_CONSISTENT_SHARE = 0.9
+"""Least share of that neighbourhood that is consistent."""
 
-MARGIN = 24
-"""Pixels that a refined displacement depends on to either side: sums and means, and two Lucas-Kanade steps."""
+MIN_MATCHED_SHARE = 0.3
+"""Least share of that neighbourhood that is matched."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +78,9 @@ class Work:
         u, v = plane.decompose(self.alignment, u, v, self.shape, a.x0, a.y0)
         return u - np.float32(b.x0 - a.x0), v - np.float32(b.y0 - a.y0)
 
-    def images(self) -> lucas_kanade.Images:
+    def images(self) -> lucas_kanade.SplineImages:
         """What refinement compares."""
-        return lucas_kanade.Images(self.a.grey, spline.coefficients(self.right.grey), self.right.valid)
+        return lucas_kanade.SplineImages(self.a.grey, spline.coefficients(self.right.grey), self.right.valid)
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ Step = Callable[[Work, Fine], Fine]
 
 def subpixel(work: Work) -> Fine:
     """Fractions of a pixel from distances summed over 5 x 5 pixels, and means of like neighbours (4.3.2)."""
-    pair = Pair(work.a.words, work.b.words, epipolar.NO_BAND, 0.0)
+    pair = LevelPair(work.a.words, work.b.words, epipolar.NO_BAND, 0.0)
     u, v, distance = solver.sums(pair, work.left.u, work.left.v, np.ones(work.left.u.shape, np.uint8))
     u, v = local_mean(u, v, np.ones(u.shape, bool), 2, 2)
     zeros = np.zeros(u.shape, np.float32)
@@ -126,11 +126,11 @@ def check(work: Work, fine: Fine) -> Fine:
     # Back from the right whole displacements suffice.
     u, v = (a.astype(np.float32) for a in (work.back.u, work.back.v))
     back = local_mean(u, v, np.ones(u.shape, bool), 2, 2)
-    error = np.full(fine.u.shape, FAILED, np.float32)
+    error = np.full(fine.u.shape, FAILED_PX, np.float32)
     backmatch(fine.u, fine.v, back, work.b.valid, error)
     validity = np.zeros(fine.u.shape, np.uint8)
     # A masked pixel is no part of the image, so it counts as outside.
-    outside = (error >= FAILED) | (work.a.valid == 0)
+    outside = (error >= FAILED_PX) | (work.a.valid == 0)
     mark(validity, outside, Validity.OUT_OF_IMAGE)
     mark(validity, ~outside & (error > p.backmatch), Validity.BACKMATCH_FAILED)
     mark(validity, fine.distance > p.threshold, Validity.OVER_THRESHOLD)
@@ -146,7 +146,8 @@ def refine(work: Work, fine: Fine) -> Fine:
     u, v, rest, per_noise = lucas_kanade.refine(work.images(), work.to_right, (fine.u, fine.v), keep, steps)
     removed = work.noise[0] ** 2, work.noise[1] ** 2
     alike, variance = lucas_kanade.surroundings(rest, work.a.deviation, keep, removed)
-    noise = per_noise * (variance * np.float32(NOISE_PIXELS) if any(removed) else variance)
+    # Denoising takes means of nine pixels: it divides the residuals' variance by as many; no match is placed better.
+    noise = per_noise * (variance * np.float32(9) if any(removed) else variance)
     validity = fine.against(keep & (alike < work.params.correlation), Validity.OVER_THRESHOLD)
     return replace(fine, u=u, v=v, noise=noise, validity=validity)
 
@@ -175,32 +176,32 @@ def blanks(work: Work, fine: Fine) -> Fine:
     Among failures, as on a wall without any texture, consistent pixels are chance.
     """
     keep, blank = fine.keep, fine.validity == Validity.NO_TEXTURE
-    room = window_room(keep.shape, SUPPORT)
-    around = window_count(keep | blank, SUPPORT), window_count(keep, SUPPORT)
-    blank &= (around[0] >= SUPPORT_CONSISTENT * room) & (around[1] >= SUPPORT_TEXTURED * room)
-    noise = np.where(blank, np.float32((uncertainty.BLANK / uncertainty.NOISE) ** 2), fine.noise)
+    room = window_room(keep.shape, SUPPORT_SIDE_PX)
+    around = window_count(keep | blank, SUPPORT_SIDE_PX), window_count(keep, SUPPORT_SIDE_PX)
+    blank &= (around[0] >= MIN_CONSISTENT_SHARE * room) & (around[1] >= MIN_MATCHED_SHARE * room)
+    noise = np.where(blank, np.float32((uncertainty.BLANK_STD_PX / uncertainty.NOISE_FACTOR) ** 2), fine.noise)
     return replace(fine, validity=np.where(blank, np.uint8(0), fine.validity), noise=noise)
 
 
-def lines(found: Results, shapes: tuple[Shape, Shape]) -> epipolar.Matrix | None:
+def lines(results: Results, shapes: tuple[Shape, Shape]) -> epipolar.Matrix | None:
     """Fundamental matrix of the refined matches (``u, v, validity``) of a whole image; None: they follow no lines."""
-    y, x = thinned(found["validity"] == 0, FIT_SAMPLES)
-    fitted = epipolar.fit_points(x, y, found["u"][y, x], found["v"][y, x], *shapes)
+    y, x = thinned(results["validity"] == 0, MAX_FIT_MATCHES)
+    fitted = epipolar.fit_points(x, y, results["u"][y, x], results["v"][y, x], *shapes)
     # Negated, so that NaN is refused as well.
-    if fitted is None or not fitted[1] <= epipolar.SHARP:
+    if fitted is None or not fitted[1] <= epipolar.SHARP_SPREAD_PX:
         return None
     return epipolar.oriented(fitted[0], shapes[0])
 
 
-def planes(images: tuple[Image, Image], found: Results, f: epipolar.Matrix, near_sign: float) -> textureless.Planes:
+def planes(images: tuple[Image, Image], results: Results, f: epipolar.Matrix, near_sign: float) -> textureless.Planes:
     """Planes of the left image's textureless regions: what no window tells, a whole region does."""
-    left, right = (image.layers[textureless.LEVEL] for image in images)
+    left, right = (image.layers[textureless.REGION_LEVEL] for image in images)
     rows, cols = left.shape
     unmatched = np.ones((2 * rows, 2 * cols), bool)
-    unmatched[: found["u"].shape[0], : found["u"].shape[1]] = found["validity"] != 0
+    unmatched[: results["u"].shape[0], : results["u"].shape[1]] = results["validity"] != 0
     none = (unmatched[::2, ::2] & unmatched[::2, 1::2]) & (unmatched[1::2, ::2] & unmatched[1::2, 1::2])
-    y, x = thinned(found["validity"] == 0, FIT_SAMPLES)
-    along = epipolar.along_line(epipolar.lines_at(f, x, y), found["u"][y, x], found["v"][y, x])
+    y, x = thinned(results["validity"] == 0, MAX_FIT_MATCHES)
+    along = epipolar.along_line(epipolar.lines_at(f, x, y), results["u"][y, x], results["v"][y, x])
     return textureless.find(left, right, f, none, along, -near_sign)
 
 
@@ -217,16 +218,16 @@ class Ending:
 
 
 def complete(
-    found: Results, valid: AnyArray, window: Window, params: HfvmParams, ending: Ending
+    results: Results, valid: AnyArray, window: Window, params: HfvmParams, ending: Ending
 ) -> dict[str, AnyArray]:
-    """Arrays of :class:`~rille.stages.hfvm.stage.Disparity` of a window: matches, filled pixels, standard deviations.
+    """Arrays of :class:`~rille.stages.hfvm.stage.StereoMatches` of a window: matched and filled, standard deviations.
 
     Parameters
     ----------
-    found : arrays of :class:`Fine` by name, displacements in the whole image.
+    results : arrays of :class:`Fine` by name, displacements in the whole image.
     valid : (row, col) mask of the left image.
     """
-    u, v, validity, error, distance = (found[name].copy() for name in ("u", "v", "validity", "error", "distance"))
+    u, v, validity, error, distance = (results[name].copy() for name in ("u", "v", "validity", "error", "distance"))
     keep = validity == 0
     region, on_plane = np.zeros(keep.shape, np.int8), np.zeros(keep.shape, bool)
     plane_std = np.zeros(keep.shape, np.float32)
@@ -237,7 +238,7 @@ def complete(
         u, v = np.where(region != 0, plane_u, u), np.where(region != 0, plane_v, v)
         on_plane = region > 0
         # What was found about another displacement does not apply.
-        error[on_plane], distance[on_plane], validity[on_plane] = FAILED, -1.0, 0
+        error[on_plane], distance[on_plane], validity[on_plane] = FAILED_PX, -1.0, 0
     beside, matches = region < 0, keep | on_plane
     # Matches with too few agreeing neighbours are too uncertain to count as measured, but remain the best guess.
     alone = lonely(matches, params.min_support)
@@ -245,7 +246,7 @@ def complete(
     filled = (alone | beside).astype(np.uint8)
     fill.rows(u, v, matches | beside, params.fill_reach, ending.near_sign or -1.0, filled)
     matches &= ~alone
-    std = uncertainty.standard_deviation(found["noise"], u, keep & ~alone)
+    std = uncertainty.standard_deviation(results["noise"], u, keep & ~alone)
     std[on_plane & matches] = plane_std[on_plane & matches]
     # A masked pixel is no part of the image, so it is not filled either.
     filled[(valid == 0) | matches] = 0
@@ -259,8 +260,8 @@ def complete(
     mark(validity, matches, Validity.MATCHED)
     mark(validity, filled != 0, Validity.INTERPOLATED)
     unknown = ~matches & (filled == 0)
-    # FAILED and -1 are for comparisons; what is published says NaN.
-    for array, none in ((u, unknown), (v, unknown), (error, error >= FAILED), (distance, distance < 0)):
+    # FAILED_PX and -1 are for comparisons; what is published says NaN.
+    for array, none in ((u, unknown), (v, unknown), (error, error >= FAILED_PX), (distance, distance < 0)):
         np.copyto(array, np.float32(np.nan), where=none)
     return {
         "column_disparity": u,

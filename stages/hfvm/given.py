@@ -24,7 +24,7 @@ from rille.stages.facts.matching import DisparityFacts
 from rille.stages.hfvm import brightness, finest, presets, start, uncertainty
 from rille.stages.hfvm.finest import Ending, Work
 from rille.stages.hfvm.image import view
-from rille.stages.hfvm.level import FREE, Map, State, Views, one_way
+from rille.stages.hfvm.level import FREE_BAND, Map, State, Views, one_way
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS, facts
 from rille.stages.hfvm.validation import lands
@@ -35,8 +35,8 @@ NEAR_SIGN = -1.0
 """Between parallel cameras nearer things have lesser column displacements (see ``level.State``)."""
 
 
-def check(left: Pyramid, right: Pyramid, given: start.Prior, params: HfvmParams) -> dict[str, AnyArray]:
-    """Arrays of :class:`~rille.stages.hfvm.stage.Disparity` of given displacements, of which columns are kept.
+def check(left: Pyramid, right: Pyramid, given: start.PriorDisparities, params: HfvmParams) -> dict[str, AnyArray]:
+    """Arrays of :class:`~rille.stages.hfvm.stage.StereoMatches` of given displacements, of which columns are kept.
 
     ``params``: thresholds of the checks; those of preset ``paper`` have other units, and the default's are taken.
     """
@@ -46,32 +46,34 @@ def check(left: Pyramid, right: Pyramid, given: start.Prior, params: HfvmParams)
     there = Map(np.rint(u).astype(np.int16), np.zeros(u.shape, np.int16))
     a, b = view(left, params), view(right, params)
     inside = lands(np.rint(u), zeros, known, right.valid[0])
-    ratio = brightness.matched(a, b, State(0, there, there, inside, inside, FREE, NEAR_SIGN))
-    if ratio is not None and brightness.greatest(ratio) > brightness.NOTABLE:
+    ratio = brightness.matched(a, b, State(0, there, there, inside, inside, FREE_BAND, NEAR_SIGN))
+    if ratio is not None and brightness.greatest(ratio) > brightness.MIN_LOG_RATIO:
         b = brightness.levelled(b, ratio)
     back = _way_back(Views(a, b, params, presets.recipe_of(params).steps), given)
-    one, other = a.layers[0], b.layers[0]
-    work = Work(one, other, other, there, back, params, None, (a.noise, b.noise), one.shape)
+    left_layer, right_layer = a.layers[0], b.layers[0]
+    work = Work(left_layer, right_layer, right_layer, there, back, params, None, (a.noise, b.noise), left_layer.shape)
     fine = finest.check(work, replace(finest.subpixel(work), u=u))
     fine = replace(fine, validity=fine.against(~known, Validity.OVER_THRESHOLD))
     fine = finest.refine(work, fine)
     # Scaled as the noise will be.
-    moved = ((fine.u - u) / np.float32(uncertainty.NOISE)) ** 2
+    moved = ((fine.u - u) / np.float32(uncertainty.NOISE_FACTOR)) ** 2
     fine = replace(fine, u=u, noise=fine.noise + moved)
     for step in (finest.landing, finest.speckles, finest.blanks):
         fine = step(work, fine)
     results = asdict(fine)
-    ending = Ending(NEAR_SIGN, None, finest.lines(results, (one.shape, other.shape)), None, one.shape)
-    return finest.complete(results, one.valid, whole(one.shape), params, ending)
+    ending = Ending(
+        NEAR_SIGN, None, finest.lines(results, (left_layer.shape, right_layer.shape)), None, left_layer.shape
+    )
+    return finest.complete(results, left_layer.valid, whole(left_layer.shape), params, ending)
 
 
-def _way_back(views: Views, given: start.Prior) -> Map:
+def _way_back(views: Views, given: start.PriorDisparities) -> Map:
     """Displacements of the right image, matched at the finest level near the given ones."""
     above = None
     if views.levels > 1:
         left, right = (_nothing(image.shapes[1]) for image in (views.left, views.right))
         unknown = np.zeros(left.u.shape, bool), np.zeros(right.u.shape, bool)
-        above = start.impose(views, State(1, left, right, *unknown, FREE, NEAR_SIGN), given).reverse()
+        above = start.impose(views, State(1, left, right, *unknown, FREE_BAND, NEAR_SIGN), given).reverse()
     return one_way(views.reverse(), 0, above, -NEAR_SIGN, views.steps.rounds[1])
 
 

@@ -24,7 +24,7 @@ from rille.stages.imaging.pyramid import Pyramid
 Grey = tuple[AnyArray, AnyArray]
 """Grey values (row, col) float32, of masked pixels from the next valid level above, and mask uint8, 1 = usable."""
 
-EXCESS = 2.5
+NOISE_VARIANCE_RATIO = 2.5
 """The variance of nine pixels of white noise reaches 2.5 times its expectation in one of two hundred places; all others
 are averaged alike. A texture of random dots, which looks like noise, then still matches where it is shifted by a
 fraction of a pixel: .87 and more of it, with 1 as little as .07. Bad-2 of noisy pairs is alike from 1 to 2.5."""
@@ -152,28 +152,28 @@ def lee(image: AnyArray, noise: float) -> Floats32:
 
     With mean m and variance s^2 of the 3 x 3 pixels around it and noise of standard deviation n, a grey value a becomes
 
-        m + max(0, 1 - EXCESS n^2 / s^2) (a - m)
+        m + max(0, 1 - NOISE_VARIANCE_RATIO n^2 / s^2) (a - m)
 
     (J.-S. Lee (1980), Digital image enhancement and noise filtering by use of local statistics, IEEE Transactions on
-    Pattern Analysis and Machine Intelligence 2, 165-168; there EXCESS is 1.)
+    Pattern Analysis and Machine Intelligence 2, 165-168; there NOISE_VARIANCE_RATIO is 1.)
     """
-    found = np.empty(image.shape, np.float32)
-    _lee(np.pad(image, 1, mode="edge"), np.float32(EXCESS * noise * noise), found)
-    return found
+    out = np.empty(image.shape, np.float32)
+    _lee(np.pad(image, 1, mode="edge"), np.float32(NOISE_VARIANCE_RATIO * noise * noise), out)
+    return out
 
 
 @njit(cache=True, nogil=True)
-def _lee(image, excess, found):  # type: ignore[no-untyped-def]
+def _lee(image, excess, denoised):  # type: ignore[no-untyped-def]
     middle, ninth, nil = np.float32(128.0), np.float32(1.0 / 9.0), np.float32(0.0)
     least = np.float32(MIN_VARIANCE)
     sums, squares = np.empty(image.shape[1], np.float32), np.empty(image.shape[1], np.float32)
-    for y in range(found.shape[0]):
-        above, here, below, out = image[y], image[y + 1], image[y + 2], found[y]
+    for y in range(denoised.shape[0]):
+        above, here, below, out = image[y], image[y + 1], image[y + 2], denoised[y]
         for x in range(image.shape[1]):
             # From the middle of the range: the difference of squares below then loses fewer digits.
             a, b, c = above[x] - middle, here[x] - middle, below[x] - middle
             sums[x], squares[x] = a + b + c, a * a + b * b + c * c
-        for x in range(found.shape[1]):
+        for x in range(denoised.shape[1]):
             mean = (sums[x] + sums[x + 1] + sums[x + 2]) * ninth
             variance = max((squares[x] + squares[x + 1] + squares[x + 2]) * ninth - mean * mean, least)
             gain = max(variance - excess, nil) / variance

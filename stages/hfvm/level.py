@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm import epipolar, fill
 from rille.stages.hfvm.image import Image, Layer
-from rille.stages.hfvm.native.problem import EdgeRule, Field, Pair, PathCosts, Smoothing, pack_map, unpacked
-from rille.stages.hfvm.native.reference import EDGE_RADIUS, exhaustive
+from rille.stages.hfvm.native.problem import EdgeRule, Field, LevelPair, PathCosts, Smoothing, pack_map, unpacked
+from rille.stages.hfvm.native.reference import exhaustive
 from rille.stages.hfvm.native.solver import solver
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.plane import Sample
@@ -26,14 +26,14 @@ from rille.stages.hfvm.validation import agree
 from rille.stages.hfvm.windows import thinned
 from rille.stages.numeric.threads import side_by_side
 
-FIT_SAMPLES = 500
+MAX_FIT_MATCHES = 500
 """Matches that a band or plane is fitted to; more change nothing that matters and cost time."""
 
-PATHS = PathCosts(compact=8, small=36, large=240, grey=10.0)
+PATH_COSTS = PathCosts(compact=8, small=36, large=240, grey=10.0)
 """Costs of propagation along paths: larger ``compact``: depth edges less fattened; ``small``: smoother; ``large``:
 fewer depth steps; ``grey``: depth steps follow image edges less."""
 
-EDGES = EdgeRule(reach=4, apart=4, grey=16, far=100, own=9, other=10, near=0)
+EDGE_RULE = EdgeRule(reach=4, apart=4, grey=16, far=100, own=9, other=10, near=0)
 """Placement of depth edges. Features put an edge a few pixels too far out: ``reach``. With displacements ``apart`` by 2
 the errors among the matched were 6 % fewer still, and the time doubled: slopes count then, too. What is hidden differs
 by any amount: ``far``. Of weak evidence none changes: ``own`` against ``other``; a farther one need only cost less:
@@ -41,10 +41,6 @@ with the ratio for it, too, bad-2 after filling was 1 % more on both halves of t
 matched 8 %. Windows of 5 to 9 pixels, ``far`` of 70 to 200, ``grey`` of 16 to 32 and a reach of 4 to 8 differ by less
 than 3 %.
 """
-
-REACH = 2 * 4 + 2 + EDGES.reach + EDGE_RADIUS + 2
-"""Pixels that a displacement of the finest level depends on to either side: four rounds of propagation, two pixels
-each, half a median and a parent's neighbours, and the placement of depth edges; features come on top."""
 
 
 class Map(NamedTuple):
@@ -66,7 +62,7 @@ class Band:
         return Band(np.ascontiguousarray(self.f.T), self.mu)
 
 
-FREE = Band(epipolar.NO_BAND, 0.0)
+FREE_BAND = Band(epipolar.NO_BAND, 0.0)
 
 
 @dataclass(frozen=True)
@@ -108,16 +104,16 @@ class Look:
     params: HfvmParams
 
     @property
-    def pair(self) -> Pair:
+    def pair(self) -> LevelPair:
         """What the solver takes."""
-        return Pair(self.a.words, self.b.words, self.band.f, self.band.mu)
+        return LevelPair(self.a.words, self.b.words, self.band.f, self.band.mu)
 
 
 Step = Callable[[Look, Field], Field]
 
 
 @dataclass(frozen=True)
-class Steps:
+class LevelSteps:
     """What is done at a level: steps of every level, and further ones of the finest.
 
     ``rounds``: limits of the propagation at the finest level, from left to right, and from right to left, which serves
@@ -136,7 +132,7 @@ class Views:
     left: Image
     right: Image
     params: HfvmParams
-    steps: Steps
+    steps: LevelSteps
     threads: int = 1
 
     def reverse(self) -> Views:
@@ -149,27 +145,27 @@ class Views:
         return min(len(self.left.layers), len(self.right.layers))
 
 
-def search(look: Look, found: Field) -> Field:
+def search(look: Look, field: Field) -> Field:
     """Best displacements around the predictions; at the top around none (4.3.1, Eq. 2 and 3)."""
     p = look.params
     if look.up is not None:
-        solver.search(look.pair, (look.up.u, look.up.v), (p.search_columns, p.search_rows), found)
-        return found
+        solver.search(look.pair, (look.up.u, look.up.v), (p.search_columns, p.search_rows), field)
+        return field
     rows, cols = np.maximum(look.a.words.shape, look.b.words.shape)
-    exhaustive(look.pair, (int(np.ceil(p.top_columns * cols)), int(np.ceil(p.top_rows * rows))), found)
-    return found
+    exhaustive(look.pair, (int(np.ceil(p.top_columns * cols)), int(np.ceil(p.top_rows * rows))), field)
+    return field
 
 
-def propagate(look: Look, found: Field) -> Field:
+def propagate(look: Look, field: Field) -> Field:
     """Displacements improved by the neighbours'."""
     # Row displacements are found on the coarser levels, where trying them costs little. On the finest level, which
     # costs most, a single round only tries jumps: the search has just tried the neighbouring columns.
     beside = 2 if look.level > 0 else 1 if look.rounds > 1 else 0
-    solver.propagate(look.pair, found, Smoothing(look.params.smoothness, look.rounds, beside))
-    return found
+    solver.propagate(look.pair, field, Smoothing(look.params.smoothness, look.rounds, beside))
+    return field
 
 
-def paths(look: Look, found: Field) -> Field:
+def paths(look: Look, field: Field) -> Field:
     """Displacements chosen by costs gathered along paths from the borders of the image.
 
     A pixel's candidates are its own displacement and those a pixel beside it, those of near and farther pixels, and
@@ -177,20 +173,20 @@ def paths(look: Look, found: Field) -> Field:
     there, smoothness included; so evidence travels over weak texture as far as it must, and stops at depth edges.
     """
     up = None if look.up is None else (look.up.u, look.up.v)
-    listed = solver.candidates(look.pair, (look.a.compact, look.b.compact), found.shift, up, PATHS)
+    listed = solver.candidates(look.pair, (look.a.compact, look.b.compact), field.shift, up, PATH_COSTS)
     total = np.zeros(listed.cost.shape, np.int32)
     for backward in (False, True):
-        solver.sweep(listed, look.a.grey, PATHS, backward, total)
-    solver.choose(listed, total, found.shift)
-    return found
+        solver.sweep(listed, look.a.grey, PATH_COSTS, backward, total)
+    solver.choose(listed, total, field.shift)
+    return field
 
 
-def median(look: Look, found: Field) -> Field:
+def median(look: Look, field: Field) -> Field:
     """Plain median of 3 x 3 pixels: before the check of consistency, where an outlier of one map refutes the other."""
-    return Field(pack_map(*(cv2.medianBlur(plane, 3) for plane in unpacked(found.shift))), found.cost)
+    return Field(pack_map(*(cv2.medianBlur(plane, 3) for plane in unpacked(field.shift))), field.cost)
 
 
-def edges(look: Look, found: Field) -> Field:
+def edges(look: Look, field: Field) -> Field:
     """Depth edges placed anew: near one a pixel chooses between the displacements on both sides, by small windows.
 
     Each candidate d of a pixel p costs
@@ -201,10 +197,10 @@ def edges(look: Look, found: Field) -> Field:
     since they mostly lie on its surface. Adaptive support weights: Yoon and Kweon (2006), doi:10.1109/TPAMI.2006.70.
     """
     wanted = (look.a.deviation >= look.params.texture) & (look.a.valid != 0)
-    pair = Pair(look.a.compact, look.b.compact, epipolar.NO_BAND, 0.0)
-    rule = EDGES._replace(near=int(look.near_sign))
+    pair = LevelPair(look.a.compact, look.b.compact, epipolar.NO_BAND, 0.0)
+    rule = EDGE_RULE._replace(near=int(look.near_sign))
     grey = np.rint(look.a.grey).astype(np.int16)
-    return Field(solver.edges(pair, grey, found.shift, wanted.view(np.uint8), rule), found.cost)
+    return Field(solver.edges(pair, grey, field.shift, wanted.view(np.uint8), rule), field.cost)
 
 
 def match_level(views: Views, level: int, above: State | None, near_sign: float = 0.0) -> State:
@@ -217,7 +213,7 @@ def match_level(views: Views, level: int, above: State | None, near_sign: float 
     )
     a, b = views.left.layers[level].valid, views.right.layers[level].valid
     ok = agree(left, right, a, b, views.params.backmatch), agree(right, left, b, a, views.params.backmatch)
-    return with_band(views, State(level, left, right, *ok, FREE, known))
+    return with_band(views, State(level, left, right, *ok, FREE_BAND, known))
 
 
 def one_way(views: Views, level: int, above: State | None, near_sign: float, fine_rounds: int) -> Map:
@@ -225,13 +221,13 @@ def one_way(views: Views, level: int, above: State | None, near_sign: float, fin
     ``fine_rounds`` at the finest; ``above`` None: the top."""
     up = None if above is None else hand_down(above, views.params)
     rounds = min(views.params.rounds, fine_rounds if level == 0 else views.steps.rounds[0] + level)
-    band = FREE if above is None else above.band
+    band = FREE_BAND if above is None else above.band
     a, b = views.left.layers[level], views.right.layers[level]
     look = Look(level, a, b, up, band, near_sign, rounds, views.params)
-    found = Field(np.empty(a.words.shape, np.int32), np.empty(a.words.shape, np.int32))
+    field = Field(np.empty(a.words.shape, np.int32), np.empty(a.words.shape, np.int32))
     for step in (*views.steps.every, *(views.steps.finest if level == 0 and above is not None else ())):
-        found = step(look, found)
-    return Map(*unpacked(found.shift))
+        field = step(look, field)
+    return Map(*unpacked(field.shift))
 
 
 def hand_down(state: State, params: HfvmParams) -> Map:
@@ -244,12 +240,12 @@ def hand_down(state: State, params: HfvmParams) -> Map:
 
 
 def sample(views: Views, state: State) -> Sample:
-    """About :data:`FIT_SAMPLES` evenly strided consistent matches of a level, with fractions of a pixel."""
-    y, x = thinned(state.left_ok, FIT_SAMPLES)
+    """About :data:`MAX_FIT_MATCHES` evenly strided consistent matches of a level, with fractions of a pixel."""
+    y, x = thinned(state.left_ok, MAX_FIT_MATCHES)
     wanted = np.zeros(state.left_ok.shape, np.uint8)
     wanted[y, x] = 1
     a, b = views.left.layers[state.level], views.right.layers[state.level]
-    pair = Pair(a.words, b.words, epipolar.NO_BAND, 0.0)
+    pair = LevelPair(a.words, b.words, epipolar.NO_BAND, 0.0)
     u, v, _ = solver.sums(pair, state.left.u, state.left.v, wanted)
     return Sample(x, y, u[y, x], v[y, x])
 
@@ -259,12 +255,12 @@ def with_band(views: Views, state: State) -> State:
     if views.params.band == 0 or state.level == 0:
         return state
     s, shapes = sample(views, state), (state.left.u.shape, state.right.u.shape)
-    found = epipolar.fit_points(*s, *shapes)
-    if found is None:
+    fit = epipolar.fit_points(*s, *shapes)
+    if fit is None:
         return state
-    f, spread = found
+    f, spread = fit
     # Where lenses bend the lines, or the fit is poor, the band gives way.
-    mu = views.params.band * min(1.0, epipolar.SHARP / max(spread, 1e-9)) ** 2
+    mu = views.params.band * min(1.0, epipolar.SHARP_SPREAD_PX / max(spread, 1e-9)) ** 2
     # Found once, by the first level that has a band; finer ones keep it.
     sign = state.near_sign or epipolar.near_sign(f, s.u, *shapes)
     return replace(state, band=Band(epipolar.finer(f), mu), near_sign=sign)

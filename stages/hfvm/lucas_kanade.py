@@ -23,21 +23,21 @@ from rille.stages.numeric.windows import window_sum32
 Frame = Callable[[AnyArray, AnyArray], tuple[AnyArray, AnyArray]]
 """Displacements to the right image of those in the frame in which steps are taken, both (row, col) float32 pixels."""
 
-RADIUS = 2
+WINDOW_RADIUS_PX = 2
 """Pixels: the windows are 5 x 5; larger ones have less noise, and smooth small relief away."""
 
-NOISE = 8.0
+ASSUMED_NOISE_VARIANCE = 8.0
 """Assumed noise, squared grey levels per pixel: it shortens steps where texture is weak."""
 
-PLANES = 10
+SUM_PLANES = 10
 
-CORRELATION_SIDE = 9
+CORRELATION_SIDE_PX = 9
 """Pixels: fewer do not tell correlated noise from texture."""
 
-FARTHEST = 1.5
+MAX_CORRECTION_PX = 1.5
 """Pixels: a correction beyond this is a jump to something else."""
 
-NOISE_TEXTURE = 0.4
+NOISE_TEXTURE_RATIO = 0.4
 """Local deviation for each grey level of noise that was removed from the left image, up to which it may be noise alone,
 of which denoising leaves about .3."""
 
@@ -52,7 +52,7 @@ class Refined(NamedTuple):
     per_noise: AnyArray
 
 
-class Images(NamedTuple):
+class SplineImages(NamedTuple):
     """Grey values of the left image, coefficients of the right one's cubic spline (float32), right mask (uint8)."""
 
     left: AnyArray
@@ -60,7 +60,9 @@ class Images(NamedTuple):
     valid: AnyArray
 
 
-def refine(images: Images, to_right: Frame, start: tuple[AnyArray, AnyArray], keep: AnyArray, steps: int) -> Refined:
+def refine(
+    images: SplineImages, to_right: Frame, start: tuple[AnyArray, AnyArray], keep: AnyArray, steps: int
+) -> Refined:
     """Displacements without the perspective bias, in the frame in which they are given.
 
     Parameters
@@ -154,12 +156,12 @@ def spline_value(coefficients, at, width, t, s):  # type: ignore[no-untyped-def]
 def _products(images, now, keep, y, out):  # type: ignore[no-untyped-def]
     """Row ``y`` of the planes whose window sums a step needs, zero where a pixel takes no part.
 
-    ``out`` (PLANES, radius + col + radius): count, gx, gy, r, gx gx, gx gy, gy gy, gx r, gy r, r r, with the gradient
-    of the left image. Reach: a pixel.
+    ``out`` (SUM_PLANES, radius + col + radius): count, gx, gy, r, gx gx, gx gy, gy gy, gx r, gy r, r r, with the
+    gradient of the left image. Reach: a pixel.
     """
     left, spline, valid = images.left, images.spline, images.valid
     (rows, cols), (rrows, rcols) = left.shape, spline.shape
-    (u, v), radius = now, RADIUS
+    (u, v), radius = now, WINDOW_RADIUS_PX
     if y < 0 or y >= rows:
         out[:] = np.float32(0.0)
         return
@@ -204,22 +206,22 @@ def _step(images, now, keep, new):  # type: ignore[no-untyped-def]
     afresh, so nothing adds up. Reach: the window's radius, and of the left image a pixel more.
     """
     rows, cols = keep.shape
-    size = 2 * RADIUS + 1
-    fresh = np.zeros((PLANES, cols + 2 * RADIUS), np.float32)
-    ring = np.zeros((size, PLANES, cols), np.float32)
-    total = np.empty((PLANES, cols), np.float32)
+    size = 2 * WINDOW_RADIUS_PX + 1
+    fresh = np.zeros((SUM_PLANES, cols + 2 * WINDOW_RADIUS_PX), np.float32)
+    ring = np.zeros((size, SUM_PLANES, cols), np.float32)
+    total = np.empty((SUM_PLANES, cols), np.float32)
     # From above the image on: the ring must hold all rows of the first window before that is solved.
-    for y in range(-RADIUS, rows):
-        _products(images, now, keep, y + RADIUS, fresh)
-        for k in range(PLANES):
-            part, out = fresh[k], ring[(y + RADIUS) % size, k]
+    for y in range(-WINDOW_RADIUS_PX, rows):
+        _products(images, now, keep, y + WINDOW_RADIUS_PX, fresh)
+        for k in range(SUM_PLANES):
+            part, out = fresh[k], ring[(y + WINDOW_RADIUS_PX) % size, k]
             one, two, three, four = part[1 : 1 + cols], part[2 : 2 + cols], part[3 : 3 + cols], part[4:]
             for x in range(cols):
                 out[x] = (part[x] + (one[x] + two[x])) + (three[x] + four[x])
         if y < 0:
             continue
-        first = y + RADIUS + 1
-        for k in range(PLANES):
+        first = y + WINDOW_RADIUS_PX + 1
+        for k in range(SUM_PLANES):
             one, two, three = ring[first % size, k], ring[(first + 1) % size, k], ring[(first + 2) % size, k]
             four, five, out = ring[(first + 3) % size, k], ring[(first + 4) % size, k], total[k]
             for x in range(cols):
@@ -232,7 +234,7 @@ def _solve(s, keep, y, now, new):  # type: ignore[no-untyped-def]
     """Steps of row ``y`` from the window sums."""
     u, v = now[0][y], now[1][y]
     new_u, new_v, energy, per_noise = new[0][y], new[1][y], new[2][y], new[3][y]
-    noise, least = np.float32(NOISE), np.float32(0.5 * (2 * RADIUS + 1) ** 2)
+    noise, least = np.float32(ASSUMED_NOISE_VARIANCE), np.float32(0.5 * (2 * WINDOW_RADIUS_PX + 1) ** 2)
     one, nil, far = np.float32(1.0), np.float32(0.0), np.float32(np.inf)
     count, sum_gx, sum_gy, sum_r = s[0], s[1], s[2], s[3]
     sum_gx_gx, sum_gx_gy, sum_gy_gy, sum_gx_r, sum_gy_r, sum_r_r = s[4], s[5], s[6], s[7], s[8], s[9]
@@ -263,7 +265,7 @@ def _solve(s, keep, y, now, new):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _take_back(start, first, new, last):  # type: ignore[no-untyped-def]
     """Start displacements and residuals where steps led far or away from a fit."""
-    (u, v), (new_u, new_v), farthest = start, new, np.float32(FARTHEST)
+    (u, v), (new_u, new_v), farthest = start, new, np.float32(MAX_CORRECTION_PX)
     for y in range(u.shape[0]):
         for x in range(u.shape[1]):
             du, dv = new_u[y, x] - u[y, x], new_v[y, x] - v[y, x]
@@ -288,23 +290,23 @@ def surroundings(
     known = keep & (rest < np.inf)
     nil = np.float32(0.0)
     planes = np.where(known, rest, nil), np.where(known, deviation * deviation, nil), known.astype(np.float32)
-    sums = tuple(window_sum32(plane, CORRELATION_SIDE) for plane in planes)
-    found, around = np.empty_like(rest), np.empty_like(rest)
-    _correlation(sums, (np.float32(noise[0]), np.float32(noise[0] + noise[1])), found, around)
-    return found, around
+    sums = tuple(window_sum32(plane, CORRELATION_SIDE_PX) for plane in planes)
+    correlation, around = np.empty_like(rest), np.empty_like(rest)
+    _correlation(sums, (np.float32(noise[0]), np.float32(noise[0] + noise[1])), correlation, around)
+    return correlation, around
 
 
 @njit(cache=True, nogil=True)
-def _correlation(sums, noise, found, around):  # type: ignore[no-untyped-def]
+def _correlation(sums, noise, correlation, around):  # type: ignore[no-untyped-def]
     one, two, least, nil = np.float32(1.0), np.float32(2.0), np.float32(1e-6), np.float32(0.0)
     own, both = noise
-    texture = np.float32(NOISE_TEXTURE * NOISE_TEXTURE)
-    for y in range(found.shape[0]):
+    texture = np.float32(NOISE_TEXTURE_RATIO * NOISE_TEXTURE_RATIO)
+    for y in range(correlation.shape[0]):
         differ, power, count = sums[0][y], sums[1][y], sums[2][y]
-        for x in range(found.shape[1]):
+        for x in range(correlation.shape[1]):
             with_noise = one - differ[x] / max(two * power[x], least)
             difference, signal = max(differ[x] - both * count[x], nil), power[x] - own * count[x]
             textured = power[x] > texture * own * count[x]
             without = one - difference / max(two * signal, least) if textured else with_noise
-            found[y, x] = max(with_noise, without) if power[x] > 0 else one
+            correlation[y, x] = max(with_noise, without) if power[x] > 0 else one
             around[y, x] = differ[x] / max(count[x], one)

@@ -35,14 +35,16 @@ class How(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Found:
-    """Arrays of :class:`rille.stages.hfvm.stage.Disparity` by name, and whether the right image was aligned."""
+class MatchResult:
+    """Arrays of :class:`rille.stages.hfvm.stage.StereoMatches` by name, and whether the right image was aligned."""
 
     arrays: Mapping[str, AnyArray]
     aligned: bool
 
 
-def match(left: Pyramid, right: Pyramid, params: HfvmParams, prior: start.Prior | None, how: How) -> Found:
+def match(
+    left: Pyramid, right: Pyramid, params: HfvmParams, prior: start.PriorDisparities | None, how: How
+) -> MatchResult:
     """Dense displacements from the left image to the right one (4.3), step by step."""
     recipe = recipe_of(params)
     if halves(recipe, left.levels, right.levels):
@@ -57,13 +59,13 @@ def match(left: Pyramid, right: Pyramid, params: HfvmParams, prior: start.Prior 
     pair = pair.with_threads(how.threads if len(windows) == 1 else 1)
     how.tell(0.15, "fine levels")
     fine = {w: partial(tiles.fine, pair, recipe.refinement, w) for w in windows}  # 4.3.4, 4.3.2, 4.3.3
-    found = tiles.put_together(fine, left.shape, how.threads)
+    arrays = tiles.put_together(fine, left.shape, how.threads)
     how.tell(0.9, "filling")
-    ending = tiles.ending(pair, found, recipe.planes)
-    final = {w: partial(tiles.final, pair, w, found, ending) for w in windows}  # 4.3.4
-    return Found(tiles.put_together(final, left.shape, how.threads), pair.alignment is not None)
+    ending = tiles.ending(pair, arrays, recipe.planes)
+    final = {w: partial(tiles.final, pair, w, arrays, ending) for w in windows}  # 4.3.4
+    return MatchResult(tiles.put_together(final, left.shape, how.threads), pair.alignment is not None)
 
 
-def enlarged(found: Found, left: Pyramid, right: Pyramid) -> Found:
+def enlarged(result: MatchResult, left: Pyramid, right: Pyramid) -> MatchResult:
     """Results of half the resolution at the full one: each displacement, doubled, for 2 x 2 pixels."""
-    return Found(enlarge.doubled(found.arrays, left.valid[0], right.shape, (0, 0)), found.aligned)
+    return MatchResult(enlarge.doubled(result.arrays, left.valid[0], right.shape, (0, 0)), result.aligned)

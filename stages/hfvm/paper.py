@@ -23,11 +23,11 @@ from rille.stages.hfvm.finest import Ending, complete
 from rille.stages.hfvm.level import Map
 from rille.stages.hfvm.native.reference import linear
 from rille.stages.hfvm.params import HfvmParams
-from rille.stages.hfvm.validation import FAILED, agree, backmatch
+from rille.stages.hfvm.validation import FAILED_PX, agree, backmatch
 from rille.stages.hfvm.windows import whole
 from rille.stages.imaging.pyramid import Pyramid
 
-BINS = 16
+OFFSET_BINS = 16
 
 _HALF = (0.0, 0.0587, 0.1219, 0.1889, 0.2573, 0.3222, 0.3799, 0.4265, 0.5)
 DEFAULT_TABLE: tuple[float, ...] = (*(-v for v in _HALF[:0:-1]), *_HALF)
@@ -35,15 +35,15 @@ DEFAULT_TABLE: tuple[float, ...] = (*(-v for v in _HALF[:0:-1]), *_HALF)
 
 
 def learn(offsets: ArrayLike) -> tuple[float, ...]:
-    """Table of ``BINS + 1`` even offsets at found offsets -0.5 ... 0.5, out of a sample of found offsets.
+    """Table of ``OFFSET_BINS + 1`` even offsets at found offsets -0.5 ... 0.5, out of a sample of found offsets.
 
     The histogram is made symmetric: the sign of an offset is a matter of which image is the left one.
     """
-    found = np.clip(np.asarray(offsets, dtype=np.float64).ravel(), -0.5, 0.5)
-    counts, _ = np.histogram(found, bins=BINS, range=(-0.5, 0.5))
+    clipped = np.clip(np.asarray(offsets, dtype=np.float64).ravel(), -0.5, 0.5)
+    counts, _ = np.histogram(clipped, bins=OFFSET_BINS, range=(-0.5, 0.5))
     counts = counts + counts[::-1]
     if counts.sum() == 0:
-        return tuple(i / BINS - 0.5 for i in range(BINS + 1))
+        return tuple(i / OFFSET_BINS - 0.5 for i in range(OFFSET_BINS + 1))
     share = np.cumsum(counts) / counts.sum()
     return (-0.5, *(round(float(s) - 0.5, 4) for s in share))
 
@@ -54,7 +54,7 @@ def even(offsets: ArrayLike, table: tuple[float, ...] = DEFAULT_TABLE) -> NDArra
     return np.asarray(np.interp(np.asarray(offsets), knots, np.asarray(table)), dtype=np.float32)
 
 
-class Matches(NamedTuple):
+class IntegerMatches(NamedTuple):
     """Displacements of one direction (row, col), int16; least distance, float32, -1 outside; and offsets of fractions
     of a pixel, columns and rows (row, col, 2)."""
 
@@ -74,7 +74,7 @@ class Around(NamedTuple):
 
 
 def match(left: Pyramid, right: Pyramid, params: HfvmParams, tell: Callable[[float, str], None]) -> dict[str, AnyArray]:
-    """Arrays of :class:`rille.stages.hfvm.stage.Disparity`."""
+    """Arrays of :class:`rille.stages.hfvm.stage.StereoMatches`."""
     above: list[Map] = []
     levels = min(left.levels, right.levels)
     for n in range(levels - 1, -1, -1):
@@ -113,9 +113,9 @@ def _finish(
         offset = even(there.offset)
         fine.append((maps[k].u + offset[..., 0], maps[k].v + offset[..., 1], there.distance))
     u, v, distance = fine[0]
-    error, validity = np.full(u.shape, FAILED, np.float32), np.zeros(u.shape, np.uint8)
+    error, validity = np.full(u.shape, FAILED_PX, np.float32), np.zeros(u.shape, np.uint8)
     backmatch(u, v, fine[1][:2], valid[1], error)
-    outside = (error >= FAILED) | (valid[0] == 0)
+    outside = (error >= FAILED_PX) | (valid[0] == 0)
     mark(validity, outside, Validity.OUT_OF_IMAGE)
     mark(validity, ~outside & (error > params.backmatch), Validity.BACKMATCH_FAILED)
     mark(validity, distance > params.threshold, Validity.OVER_THRESHOLD)
@@ -132,7 +132,7 @@ def _finish(
     return complete(arrays, valid[0], whole(shape), params, Ending(-1.0, None, None, None, shape))
 
 
-def _one_way(a: AnyArray, b: AnyArray, centre: Map | None, params: HfvmParams) -> Matches:
+def _one_way(a: AnyArray, b: AnyArray, centre: Map | None, params: HfvmParams) -> IntegerMatches:
     """Displacements from one image to the other: at the top around none, in a large area (4.3.4)."""
     if centre is not None:
         return _search(a, b, centre, (params.search_columns, params.search_rows))
@@ -142,12 +142,12 @@ def _one_way(a: AnyArray, b: AnyArray, centre: Map | None, params: HfvmParams) -
     return _search(a, b, Map(nothing, nothing), reach)
 
 
-def _search(a: AnyArray, b: AnyArray, centre: Map, reach: tuple[int, int]) -> Matches:
+def _search(a: AnyArray, b: AnyArray, centre: Map, reach: tuple[int, int]) -> IntegerMatches:
     shape = a.shape[:2]
     u, v = np.empty(shape, np.int16), np.empty(shape, np.int16)
-    found = Matches(u, v, np.empty(shape, np.float32), np.empty((*shape, 2), np.float32))
-    search(a, b, Around(centre.u, centre.v, *reach), found)
-    return found
+    matches = IntegerMatches(u, v, np.empty(shape, np.float32), np.empty((*shape, 2), np.float32))
+    search(a, b, Around(centre.u, centre.v, *reach), matches)
+    return matches
 
 
 def _double(up: Map, shape: tuple[int, ...]) -> Map:
@@ -178,7 +178,7 @@ def _eq1(f, g):  # type: ignore[no-untyped-def]
 def search(left, right, around, out):  # type: ignore[no-untyped-def]
     """Best match of every pixel in the search area around its centre (Eq. 2, Eq. 3).
 
-    ``left, right``: vectors (row, col, 8) of the images. ``out`` (:class:`Matches`): distance by Eq. 1, -1 where
+    ``left, right``: vectors (row, col, 8) of the images. ``out`` (:class:`IntegerMatches`): distance by Eq. 1, -1 where
     nothing lies inside; linear sub-pixel offsets by 4.3.2, 0 at the border of the image. Of equal distances the first
     in row, column order wins.
     """

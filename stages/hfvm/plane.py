@@ -40,28 +40,27 @@ class Sample(NamedTuple):
     v: AnyArray
 
 
-ITERATIONS = 15
-
 MIN_MATCHES = 60
 
-KERNEL = 2
+KERNEL_REACH_PX = 2
 """Pixels that the cubic kernel reaches beyond a place."""
 
-MIN_SHARE = 0.6
+MIN_EXPLAINED_SHARE = 0.6
 """Least share of the coarse matches that the plane must explain."""
 
-WIDEST = 1e6
-"""Half image sides: no error is greater."""
 
-MIN_DISTORTION, MAX_DISTORTION = 0.2, 3.0
-"""Shear or stretch, pixels per pixel, from which on images are aligned. Beyond the other the plane is no ground but a
-bad fit; views turned by 180 degrees have 2, and more if scaled."""
+MIN_DISTORTION = 0.2
+"""Shear or stretch, pixels per pixel, from which on images are aligned."""
 
-TOLERANCE = 1.0
+MAX_DISTORTION = 3.0
+"""Shear or stretch, pixels per pixel, from which on the plane is no ground but a bad fit; views turned by 180 degrees
+have 2, and more if scaled."""
+
+PLANE_TOLERANCE_PX = 1.0
 """Pixels of the coarse level: a match within twice this belongs to the plane; at this distance it has a quarter of the
 weight."""
 
-MARGIN = 1.0 / 16.0
+MARGIN_WIDTH_SHARE = 1.0 / 16.0
 """Share of the width added around the aligned image, for what stands out of the plane."""
 
 
@@ -70,10 +69,10 @@ def find(sample: Sample, level: int, shapes: Sequence[Shape]) -> Matrix | None:
 
     ``shapes``: of the left image's levels.
     """
-    found = fit_points(sample, shapes[level], TOLERANCE)
-    if found is None or found[1] < MIN_SHARE:
+    fit = fit_points(sample, shapes[level], PLANE_TOLERANCE_PX)
+    if fit is None or fit[1] < MIN_EXPLAINED_SHARE:
         return None
-    h = to_level_0(found[0], level)
+    h = to_level_0(fit[0], level)
     shear = distortion(h, (shapes[0][0], shapes[0][1]))
     return h if MIN_DISTORTION <= shear < MAX_DISTORTION else None
 
@@ -95,9 +94,9 @@ def _resampled(layer: Layer, h: Matrix, above: Layer | None, window: Window) -> 
     source = _source(h, window, layer.shape)
     grey, mask = layer.read(source)
     # The edge is repeated for the kernel: of the few pixels of a coarse level none may be lost.
-    grey, mask = np.pad(grey, KERNEL, mode="edge"), np.pad(mask, KERNEL)
+    grey, mask = np.pad(grey, KERNEL_REACH_PX, mode="edge"), np.pad(mask, KERNEL_REACH_PX)
     image, valid = np.empty(window.shape, np.float32), np.empty(window.shape, np.uint8)
-    there = translation(KERNEL - source.x0, KERNEL - source.y0)
+    there = translation(KERNEL_REACH_PX - source.x0, KERNEL_REACH_PX - source.y0)
     warp(grey, mask, there @ h @ translation(window.x0, window.y0), image, valid)
     seen = valid != 0
     if seen.all():
@@ -168,7 +167,7 @@ def _compose(g, u, v, first, out):  # type: ignore[no-untyped-def]
 
 def margin(left_shape: tuple[int, ...]) -> int:
     """Pixels added on every side of the aligned image: whole ones of the sixth level, too."""
-    return int(np.ceil(MARGIN * left_shape[1] / 32.0)) * 32
+    return int(np.ceil(MARGIN_WIDTH_SHARE * left_shape[1] / 32.0)) * 32
 
 
 def translation(x: float, y: float | None = None) -> Matrix:
@@ -216,13 +215,13 @@ def _solve(p: AnyArray, d: AnyArray, tolerance: float) -> tuple[Matrix, AnyArray
         error = np.hypot(*residual.reshape(2, -1))
         # The first fit is of all alike; then start as wide as the matches scatter, and narrow onto the dominant plane.
         if math.isinf(spread):
-            spread = WIDEST
+            spread = 1e6  # half image sides: no error is greater
             return np.ones(len(target))
         spread = max(tolerance, min(1.5 * typical(error), 0.7 * spread))
         # Squared Cauchy weights: other surfaces, off by many pixels, must not drag the plane along.
         return np.tile(cauchy(error, spread) ** 2, 2)
 
-    h = irls(terms.T, target, weigh, 1e-6 * len(one) * np.eye(8), rounds=ITERATIONS)
+    h = irls(terms.T, target, weigh, 1e-6 * len(one) * np.eye(8), rounds=15)
     error = np.hypot(*(h @ terms - target).reshape(2, -1))
     return np.append(h, 0.0).reshape(3, 3) + np.eye(3), error
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from rille.stages.hfvm import coarse, finest, level
-from rille.stages.hfvm.level import Steps
+from rille.stages.hfvm.level import LevelSteps
 from rille.stages.hfvm.params import HfvmParams
 
 
@@ -17,7 +17,7 @@ class Recipe:
     ``half``: images are matched at half their resolution.
     """
 
-    steps: Steps
+    steps: LevelSteps
     begin: tuple[coarse.Step, ...]
     refinement: tuple[finest.Step, ...]
     planes: bool = True
@@ -29,19 +29,19 @@ class Recipe:
         def kept(steps: tuple) -> tuple:
             return tuple(step for step in steps if step.__name__ not in without)
 
-        steps = Steps(kept(self.steps.every), kept(self.steps.finest), self.steps.rounds)
+        steps = LevelSteps(kept(self.steps.every), kept(self.steps.finest), self.steps.rounds)
         refinement = kept(self.refinement)
         return Recipe(steps, kept(self.begin), refinement, self.planes and "planes" not in without, self.half)
 
 
 DEFAULT = Recipe(
-    Steps((level.search, level.propagate, level.median), (level.edges,), rounds=(2, 2)),
+    LevelSteps((level.search, level.propagate, level.median), (level.edges,), rounds=(2, 2)),
     (coarse.even, coarse.known, coarse.align, coarse.turn),
     (finest.check, finest.refine, finest.landing, finest.speckles, finest.blanks),
 )
 FAST = replace(DEFAULT, planes=False, half=True)
 ACCURATE = Recipe(
-    Steps((level.search, level.propagate, level.paths, level.median), (level.edges,), rounds=(4, 4)),
+    LevelSteps((level.search, level.propagate, level.paths, level.median), (level.edges,), rounds=(4, 4)),
     (coarse.even, coarse.known, coarse.align, coarse.turn),
     (finest.check, finest.refine, finest.smooth, finest.landing, finest.speckles, finest.blanks),
 )

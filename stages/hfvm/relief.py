@@ -21,44 +21,45 @@ from numba import njit
 from rille.stages.core.declare import AnyArray
 from rille.stages.geometry.spline import slopes, weights
 from rille.stages.hfvm import epipolar
-from rille.stages.hfvm.lucas_kanade import FARTHEST, Images
+from rille.stages.hfvm.lucas_kanade import MAX_CORRECTION_PX, SplineImages
 from rille.stages.hfvm.windows import thinned
+from rille.stages.numeric.relaxation import OVERRELAXATION
 from rille.stages.numeric.windows import window_sum
 
-MEAN_SIDE = 9
+MEAN_SIDE_PX = 9
 """Pixels: window of the local mean; brightness varies more slowly."""
-MEAN_ROUNDS = 2
-"""Weightings of the mean: what lies across an edge counts for little, and one round does not yet tell it apart."""
 
-LEAST_WEIGHT = 0.1
+MIN_MEAN_WEIGHT = 0.1
 """Pixels: least weight of a mean; windows with less have no pixel that takes part."""
 
-RESIDUAL = 10.0
+HALVING_RESIDUAL_GREY = 10.0
 """Grey levels: residual that halves a pixel's weight, well above camera noise."""
 
-LINE = 1000.0
+LINE_STIFFNESS = 1000.0
 """Squared grey levels for a pixel off the line: more than the strongest texture says."""
 
-SHARP = 0.05
+TRUSTED_SPREAD_PX = 0.05
 """Pixels: median distance from the lines up to which they are trusted fully; beyond it by its inverse square."""
 
-FIT_SAMPLES = 4000
-SWEEPS = 10
-OVERSHOOT = 1.7
-"""Factor on each Gauss-Seidel step (successive over-relaxation), which stays convergent below 2."""
+MAX_FIT_MATCHES = 4000
 
-STIFFNESS, BEND = 2000.0, 0.05
-"""Cost, squared grey levels, of a bend of one pixel (larger: smoother, small relief lost), and second difference,
-pixels, beyond which the stiffness gives way to an edge."""
+BEND_STIFFNESS = 2000.0
+"""Cost, squared grey levels, of a bend of one pixel; larger: smoother, small relief lost."""
 
-SOFT_STIFFNESS, SOFT_BEND = 0.15, 2.0
-"""Factors on stiffness and bend in the first, soft half of the steps."""
+MAX_BEND_PX = 0.05
+"""Second difference, pixels, beyond which the stiffness gives way to an edge."""
 
-STEPS = 4
+SOFT_STIFFNESS_FACTOR = 0.15
+"""Factor on the stiffness in the first, soft half of the steps."""
+
+SOFT_BEND_FACTOR = 2.0
+"""Factor on the greatest bend in the first, soft half of the steps."""
+
+RELIEF_STEPS = 4
 """Four steps instead of seven: the median error of the judged half is .165 px instead of .160."""
 
 
-def fit(images: Images, u: AnyArray, v: AnyArray, keep: AnyArray) -> tuple[AnyArray, AnyArray]:
+def fit(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Displacements of the relief that fits best.
 
     Parameters
@@ -68,17 +69,20 @@ def fit(images: Images, u: AnyArray, v: AnyArray, keep: AnyArray) -> tuple[AnyAr
 
     Notes
     -----
-    A pixel that is led farther than :data:`rille.stages.hfvm.lucas_kanade.FARTHEST` from where it started stays there.
-    Only the way along its line counts: a match that was found rows off its line is on the same thing more often than
-    not, and the lines know its row.
+    A pixel that is led farther than :data:`rille.stages.hfvm.lucas_kanade.MAX_CORRECTION_PX` from where it started
+    stays there. Only the way along its line counts: a match that was found rows off its line is on the same thing more
+    often than not, and the lines know its row.
     """
     start_u, start_v = u, v
     u, v = np.where(keep, u, np.float32(0)), np.where(keep, v, np.float32(0))
     lines, trust = _lines(u, v, keep, images.spline.shape)
-    holds = lines * np.float32(np.sqrt(LINE * trust))
-    for step in range(STEPS):
-        soft = step < STEPS // 2
-        stiffness, bend = STIFFNESS * (SOFT_STIFFNESS if soft else 1.0), BEND * (SOFT_BEND if soft else 1.0)
+    holds = lines * np.float32(np.sqrt(LINE_STIFFNESS * trust))
+    for step in range(RELIEF_STEPS):
+        soft = step < RELIEF_STEPS // 2
+        stiffness, bend = (
+            BEND_STIFFNESS * (SOFT_STIFFNESS_FACTOR if soft else 1.0),
+            MAX_BEND_PX * (SOFT_BEND_FACTOR if soft else 1.0),
+        )
         grey = _grey(images, u, v, keep)
         stiff, normal = np.zeros((2, *u.shape), np.float32), np.zeros((5, *u.shape), np.float32)
         _stiffness(u, v, keep, np.float32(bend), np.float32(stiffness), stiff)
@@ -86,21 +90,22 @@ def fit(images: Images, u: AnyArray, v: AnyArray, keep: AnyArray) -> tuple[AnyAr
         u, v = _solve(normal, stiff, u, v)
     if trust > 0:
         start_u, start_v = _feet(lines, trust, start_u, start_v, keep)
-    good = keep & (np.hypot(u - start_u, v - start_v) <= FARTHEST)
+    good = keep & (np.hypot(u - start_u, v - start_v) <= MAX_CORRECTION_PX)
     return np.where(good, u, start_u), np.where(good, v, start_v)
 
 
-def _grey(images: Images, u: AnyArray, v: AnyArray, keep: AnyArray) -> AnyArray:
+def _grey(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> AnyArray:
     """Planes (4, row, col): weight of each pixel, gradient (x, y) of the warped right image, difference of the images
     free of its local mean; weight 0 where a pixel does not take part."""
     planes = np.zeros((4, *u.shape), np.float32)
     _warped(images, u, v, keep, planes)
     known, _, _, rest = planes
     mean, weight = np.zeros_like(rest), known
-    # The first mean is of equal weights, hence one more.
-    for _ in range(MEAN_ROUNDS + 1):
-        mean = window_sum(weight * rest, MEAN_SIDE) / np.maximum(window_sum(weight, MEAN_SIDE), LEAST_WEIGHT)
-        weight = known / (np.float32(1.0) + ((rest - mean) * np.float32(1.0 / RESIDUAL)) ** 2)
+    # The first mean is of equal weights; what lies across an edge then counts for little, but one weighting does not
+    # yet tell it apart.
+    for _ in range(3):
+        mean = window_sum(weight * rest, MEAN_SIDE_PX) / np.maximum(window_sum(weight, MEAN_SIDE_PX), MIN_MEAN_WEIGHT)
+        weight = known / (np.float32(1.0) + ((rest - mean) * np.float32(1.0 / HALVING_RESIDUAL_GREY)) ** 2)
     planes[0] = weight
     planes[3] -= mean
     return planes
@@ -140,11 +145,11 @@ def _warped(images, u, v, keep, out):  # type: ignore[no-untyped-def]
 
 def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int]) -> tuple[AnyArray, float]:
     """Epipolar lines (row, col, 3) fitted to the matches, and how far to trust them, 0..1; 0 where not determined."""
-    y, x = thinned(keep, FIT_SAMPLES)
-    found = epipolar.fit_points(x, y, u[y, x], v[y, x], keep.shape, right_shape)
-    if found is None:
+    y, x = thinned(keep, MAX_FIT_MATCHES)
+    fit = epipolar.fit_points(x, y, u[y, x], v[y, x], keep.shape, right_shape)
+    if fit is None:
         return np.zeros((*u.shape, 3), np.float32), 0.0
-    return epipolar.lines(found[0], u.shape), min(1.0, (SHARP / max(found[1], 1e-9)) ** 2)
+    return epipolar.lines(fit[0], u.shape), min(1.0, (TRUSTED_SPREAD_PX / max(fit[1], 1e-9)) ** 2)
 
 
 def _off(lines: AnyArray, u: AnyArray, v: AnyArray) -> AnyArray:
@@ -207,7 +212,7 @@ def _normal(grey, u, v, holds, keep, stiff, out):  # type: ignore[no-untyped-def
 
 
 def _solve(normal: AnyArray, stiff: AnyArray, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Displacements after :data:`SWEEPS` Gauss-Seidel sweeps; zeros stand for the neighbours of the border."""
+    """Displacements after ten Gauss-Seidel sweeps; zeros stand for the neighbours of the border."""
     u, v, across, down = (np.pad(a, 2) for a in (u, v, *stiff))
     _sweep(normal, across, down, u, v)
     return np.ascontiguousarray(u[2:-2, 2:-2]), np.ascontiguousarray(v[2:-2, 2:-2])
@@ -221,8 +226,8 @@ def _sweep(normal, across, down, u, v):  # type: ignore[no-untyped-def]
     twice, and as either end. ``su``, ``sv``: the weighted values that they want.
     """
     _, rows, cols = normal.shape
-    two, overshoot = np.float32(2.0), np.float32(OVERSHOOT)
-    for _ in range(SWEEPS):
+    two, overshoot = np.float32(2.0), np.float32(OVERRELAXATION)
+    for _ in range(10):
         for y in range(rows):
             minor_v, cross, minor_u, p, q = normal[0, y], normal[1, y], normal[2, y], normal[3, y], normal[4, y]
             k, k_up, k_own, k_down = across[y + 2], down[y + 1, 2:], down[y + 2, 2:], down[y + 3, 2:]

@@ -19,40 +19,54 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
+from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
 
-LEAST, SAMPLES, PATCHES = 100, 2000, 150
-"""Matches that a judgement needs at least, those that the lines are fitted to, and those whose likeness is sought."""
+MIN_MATCHES = 100
+"""Matches that a judgement needs at least."""
 
-NEAR = 2.0
-"""Pixels: a match this near its epipolar line lies on it."""
+MAX_FIT_MATCHES = 2000
+"""Matches that the lines are fitted to."""
 
-PATCH, REACH, APART = 8, 64, 8
-"""Pixels: half side of a patch, how far from its match a likeness is sought, and how far from it one counts."""
+MAX_PATCHES = 150
+"""Matches whose likeness is sought."""
 
-ALIKE, WORSE = 0.7, 0.05
-"""Least correlation of a match whose patch says anything, and by how much less a likeness may correlate."""
 
-RIGID = 0.75
+PATCH_RADIUS_PX = 8
+"""Pixels: half side of a patch."""
+
+SEARCH_REACH_PX = 64
+"""Pixels: how far from its match a likeness is sought."""
+
+MIN_APART_PX = 8
+"""Pixels: how far from its match a likeness counts."""
+
+MIN_CORRELATION = 0.7
+"""Least correlation of a match whose patch says anything."""
+
+MAX_CORRELATION_LOSS = 0.05
+"""By how much less than the match a likeness may correlate."""
+
+MIN_RIGID_SHARE = 0.75
 """Share of matches on their lines below which a pair is doubtful. Right pairs reach .98; one through unrectified lenses
 .82; photographs of a chess board, matched in part, .71 to .97."""
 
-REPEATED = 0.5
+MAX_REPEATED_SHARE = 0.5
 """Share of matches that look as well elsewhere above which a pair is doubtful. Right pairs reach .34, a board .86."""
 
 Places = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-def judge(left: AnyArray, right: AnyArray, found: Any, matched: NDArray[np.bool_]) -> tuple[float, float] | None:
+def judge(left: AnyArray, right: AnyArray, disparity: Any, matched: NDArray[np.bool_]) -> tuple[float, float] | None:
     """Shares of the matches that lie on their lines, and that look as well elsewhere; None: too few to tell.
 
     Parameters
     ----------
     left, right : (row, col) grey images.
-    found : their :class:`~rille.stages.hfvm.stage.Disparity`; ``matched`` (row, col): which of it to judge.
+    disparity : their :class:`~rille.stages.hfvm.stage.StereoMatches`; ``matched`` (row, col): which of it to judge.
     """
-    places = sample(found.column_disparity, found.row_disparity, matched)
+    places = sample(disparity.column_disparity, disparity.row_disparity, matched)
     if places is None:
         return None
     f = lines(places)
@@ -61,17 +75,17 @@ def judge(left: AnyArray, right: AnyArray, found: Any, matched: NDArray[np.bool_
 
 def sample(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> Places | None:
     """Evenly strided matches: left and right pixels (n, 2), column and row; None where there are too few."""
-    found = np.flatnonzero(matched)
-    if len(found) < LEAST:
+    indices = np.flatnonzero(matched)
+    if len(indices) < MIN_MATCHES:
         return None
-    y, x = np.unravel_index(_strided(found, SAMPLES), matched.shape)
+    y, x = np.unravel_index(_strided(indices, MAX_FIT_MATCHES), matched.shape)
     left = np.stack([x, y], 1).astype(np.float64)
     return left, left + np.stack([column[y, x], row[y, x]], 1)
 
 
 def lines(places: Places) -> NDArray[np.float64] | None:
     """Fundamental matrix that most matches agree on; None where there is none."""
-    f, _ = cv2.findFundamentalMat(*places, cv2.USAC_MAGSAC, 0.5 * NEAR, 0.999, 5000)
+    f, _ = cv2.findFundamentalMat(*places, cv2.USAC_MAGSAC, 0.5 * MAX_LINE_DISTANCE_PX, 0.999, 5000)
     return None if f is None or f.shape != (3, 3) else np.asarray(f, np.float64)
 
 
@@ -79,10 +93,10 @@ def on_their_lines(places: Places, f: NDArray[np.float64] | None) -> float:
     """Share of the matches that lie near their epipolar line; 0 where there are no lines."""
     if f is None:
         return 0.0
-    one = np.ones((len(places[0]), 1))
-    line = np.hstack([places[0], one]) @ f.T
-    distance = np.abs(np.sum(line * np.hstack([places[1], one]), axis=1)) / np.hypot(line[:, 0], line[:, 1])
-    return float(np.mean(distance <= NEAR))
+    ones = np.ones((len(places[0]), 1))
+    line = np.hstack([places[0], ones]) @ f.T
+    distance = np.abs(np.sum(line * np.hstack([places[1], ones]), axis=1)) / np.hypot(line[:, 0], line[:, 1])
+    return float(np.mean(distance <= MAX_LINE_DISTANCE_PX))
 
 
 def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.float64] | None) -> float:
@@ -93,31 +107,31 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
     left, right : (row, col) grey images.
     """
     a, b = (np.ascontiguousarray(image, np.float32) for image in (left, right))
-    keep = _inside(places[0], a.shape, PATCH) & _inside(places[1], b.shape, PATCH)
-    chosen = _strided(np.flatnonzero(keep), PATCHES)
-    told = []
+    keep = _inside(places[0], a.shape, PATCH_RADIUS_PX) & _inside(places[1], b.shape, PATCH_RADIUS_PX)
+    chosen = _strided(np.flatnonzero(keep), MAX_PATCHES)
+    looks_alike = []
     for (x, y), (p, q) in zip(*(np.rint(side[chosen]).astype(int) for side in places), strict=True):
-        patch = a[y - PATCH : y + PATCH + 1, x - PATCH : x + PATCH + 1]
-        y0, x0 = max(q - REACH - PATCH, 0), max(p - REACH - PATCH, 0)
-        around = b[y0 : q + REACH + PATCH + 1, x0 : p + REACH + PATCH + 1]
+        patch = a[y - PATCH_RADIUS_PX : y + PATCH_RADIUS_PX + 1, x - PATCH_RADIUS_PX : x + PATCH_RADIUS_PX + 1]
+        y0, x0 = max(q - SEARCH_REACH_PX - PATCH_RADIUS_PX, 0), max(p - SEARCH_REACH_PX - PATCH_RADIUS_PX, 0)
+        around = b[y0 : q + SEARCH_REACH_PX + PATCH_RADIUS_PX + 1, x0 : p + SEARCH_REACH_PX + PATCH_RADIUS_PX + 1]
         score = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
         j, i = np.indices(score.shape)
-        j, i = j + y0 + PATCH, i + x0 + PATCH
+        j, i = j + y0 + PATCH_RADIUS_PX, i + x0 + PATCH_RADIUS_PX
         # The match has been rounded, so that its peak may lie beside it.
         own = float(score[np.hypot(j - q, i - p) <= 2].max())
-        if not np.isfinite(own) or own < ALIKE:
+        if not np.isfinite(own) or own < MIN_CORRELATION:
             continue
         # Without lines the row through the match stands in.
         line = (0.0, 1.0, -float(q)) if f is None else f @ (x, y, 1.0)
-        here = np.abs(line[0] * i + line[1] * j + line[2]) <= NEAR * np.hypot(line[0], line[1])
-        elsewhere = score[here & (np.hypot(j - q, i - p) >= APART)]
-        told.append(elsewhere.size > 0 and float(elsewhere.max()) >= own - WORSE)
-    return float(np.mean(told)) if len(told) >= LEAST // 4 else 0.0
+        here = np.abs(line[0] * i + line[1] * j + line[2]) <= MAX_LINE_DISTANCE_PX * np.hypot(line[0], line[1])
+        elsewhere = score[here & (np.hypot(j - q, i - p) >= MIN_APART_PX)]
+        looks_alike.append(elsewhere.size > 0 and float(elsewhere.max()) >= own - MAX_CORRELATION_LOSS)
+    return float(np.mean(looks_alike)) if len(looks_alike) >= MIN_MATCHES // 4 else 0.0
 
 
-def _strided(found: AnyArray, most: int) -> AnyArray:
+def _strided(indices: AnyArray, most: int) -> AnyArray:
     """At most so many of the given ones, evenly strided from the first to the last."""
-    return found[np.linspace(0, len(found) - 1, min(most, len(found))).astype(np.intp)]
+    return indices[np.linspace(0, len(indices) - 1, min(most, len(indices))).astype(np.intp)]
 
 
 def _inside(places: AnyArray, shape: tuple[int, ...], margin: int) -> NDArray[np.bool_]:
@@ -125,15 +139,14 @@ def _inside(places: AnyArray, shape: tuple[int, ...], margin: int) -> NDArray[np
     return np.asarray(((np.rint(places) >= margin) & (np.rint(places) <= last)).all(axis=1))
 
 
-FOCAL = 0.5, 3.0
-"""Bounds of the focal length in image widths: fields of view of 90 and 19 degrees."""
+MIN_FOCAL_WIDTHS = 0.5
+"""Least focal length in image widths: a field of view of 90 degrees."""
 
-SWAP_ITERATIONS = 8
-MARGIN = 1.0
+MAX_FOCAL_WIDTHS = 3.0
+"""Greatest focal length in image widths: a field of view of 19 degrees."""
+
+BOUND_MARGIN_PX = 1.0
 """Pixels: displacements that are no more than this beyond the bound prove nothing."""
-
-NEARLY_ALL = 10.0
-"""Percentile of displacements that has to lie beyond the bound."""
 
 
 def swapped(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> bool:
@@ -144,19 +157,20 @@ def swapped(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> bool
     column, row : (row, col) disparities, pixels, right minus left.
     matched : (row, col) bool, which to trust.
     """
-    found = np.flatnonzero(matched)
-    if len(found) < LEAST:
+    indices = np.flatnonzero(matched)
+    if len(indices) < MIN_MATCHES:
         return False
-    found = found[:: 1 + len(found) // SAMPLES]
-    y, x = np.unravel_index(found, matched.shape)
-    u, v = (np.asarray(a).reshape(-1)[found].astype(np.float64) for a in (column, row))
+    indices = indices[:: 1 + len(indices) // MAX_FIT_MATCHES]
+    y, x = np.unravel_index(indices, matched.shape)
+    u, v = (np.asarray(a).reshape(-1)[indices].astype(np.float64) for a in (column, row))
     width = matched.shape[1]
     k, sigma = _keystone((x - 0.5 * (width - 1)) / width, (y - 0.5 * (matched.shape[0] - 1)) / width, u, v)
     # In units of the image width k is D in pixels for a focal length of one width.
     most = k + 3.0 * sigma
     # A keystone may be negative: then the short focal length gives the upper bound.
-    bound = max(most * FOCAL[0] ** 2, most * FOCAL[1] ** 2)
-    return bool(np.percentile(u, NEARLY_ALL) > bound + MARGIN)
+    bound = max(most * MIN_FOCAL_WIDTHS**2, most * MAX_FOCAL_WIDTHS**2)
+    # Nine in ten lie beyond the bound: gross mismatches may not.
+    return bool(np.percentile(u, 10.0) > bound + BOUND_MARGIN_PX)
 
 
 def _keystone(x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray) -> tuple[float, float]:
@@ -176,7 +190,7 @@ def _keystone(x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray) -> tuple[float
 
     # A flat scene has no depth, whose terms are zero: without a hold the matrix would be singular.
     hold = 1e-9 * len(x) * np.eye(terms.shape[1])
-    solution = irls(terms, v, weigh, hold, np.zeros(terms.shape[1]), SWAP_ITERATIONS)
+    solution = irls(terms, v, weigh, hold, np.zeros(terms.shape[1]), rounds=8)
     weight = weigh(terms @ solution - v)
     normal = (terms * weight[:, None]).T @ terms + hold
     return float(solution[0]), spread * float(np.sqrt(np.linalg.inv(normal)[0, 0]))

@@ -26,13 +26,13 @@ from rille.stages.core.declare import AnyArray, Array, Bundle, Memory, stage
 from rille.stages.core.validity import Mask, counts
 from rille.stages.facts.matching import DisparityFacts
 from rille.stages.hfvm import matcher, paper, start
-from rille.stages.hfvm.matcher import Found, How
+from rille.stages.hfvm.matcher import How, MatchResult
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.presets import WHOLE
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
-__all__ = ["OUTPUTS", "Disparity", "HfvmParams", "facts", "hfvm_stage", "match", "match_pyramids"]
+__all__ = ["OUTPUTS", "HfvmParams", "StereoMatches", "facts", "hfvm_stage", "match", "match_pyramids"]
 
 Map = NDArray[np.float32]
 
@@ -40,7 +40,7 @@ HOW = How()
 
 
 @dataclass(frozen=True)
-class Disparity:
+class StereoMatches:
     """Disparity vectors of the left image, right minus left: ``x_right = x_left + column_disparity``.
 
     All arrays are (row, col) of the left image. ``column_disparity, row_disparity``: float32 pixels, NaN undefined;
@@ -70,7 +70,7 @@ def match(
     valid: tuple[AnyArray | None, AnyArray | None] = (None, None),
     prior: tuple[AnyArray, AnyArray] | None = None,
     how: How = HOW,
-) -> Disparity:
+) -> StereoMatches:
     """Dense disparity vectors from ``left`` to ``right``, searched in two dimensions.
 
     Parameters
@@ -99,15 +99,15 @@ def match(
 
 
 def match_pyramids(
-    left: Pyramid, right: Pyramid, params: HfvmParams, prior: start.Prior | None = None, how: How = HOW
-) -> Disparity:
+    left: Pyramid, right: Pyramid, params: HfvmParams, prior: start.PriorDisparities | None = None, how: How = HOW
+) -> StereoMatches:
     """Match two image pyramids as :func:`match` does."""
     if params.preset in WHOLE:
-        found = Found(paper.match(left, right, params, how.tell), False)
+        result = MatchResult(paper.match(left, right, params, how.tell), False)
     else:
-        found = matcher.match(left, right, params, prior, how)
-    arrays: dict[str, Any] = dict(found.arrays)
-    return Disparity(**arrays, aligned=found.aligned)
+        result = matcher.match(left, right, params, prior, how)
+    arrays: dict[str, Any] = dict(result.arrays)
+    return StereoMatches(**arrays, aligned=result.aligned)
 
 
 def facts(arrays: Mapping[str, AnyArray], params: HfvmParams, aligned: bool, usable: int) -> DisparityFacts:

@@ -19,19 +19,19 @@ from rille.stages.core.errors import InputError
 from rille.stages.hfvm import plane
 from rille.stages.hfvm.level import Map, State, Views
 
-MOST = 16000
+MAX_DISPLACEMENT_PX = 16000
 """Pixels: displacements of a level are 16-bit and doubled from level to level."""
 
 
 @dataclass(frozen=True)
-class Prior:
+class PriorDisparities:
     """Column and row displacements (row, col) of level 0, float32 pixels, NaN unknown."""
 
     u: AnyArray
     v: AnyArray
 
 
-def check(prior: tuple[AnyArray, AnyArray] | None, shape: tuple[int, ...]) -> Prior | None:
+def check(prior: tuple[AnyArray, AnyArray] | None, shape: tuple[int, ...]) -> PriorDisparities | None:
     """Prior of two arrays; what is not finite or absurdly great counts as unknown.
 
     Raises
@@ -51,18 +51,18 @@ def check(prior: tuple[AnyArray, AnyArray] | None, shape: tuple[int, ...]) -> Pr
     return _bounded(u, v)
 
 
-def _bounded(u: AnyArray, v: AnyArray) -> Prior:
+def _bounded(u: AnyArray, v: AnyArray) -> PriorDisparities:
     # NaN is not less, and so unknown as well.
-    known = (np.abs(u) < MOST) & (np.abs(v) < MOST)
-    return Prior(np.where(known, u, np.float32(np.nan)), np.where(known, v, np.float32(np.nan)))
+    known = (np.abs(u) < MAX_DISPLACEMENT_PX) & (np.abs(v) < MAX_DISPLACEMENT_PX)
+    return PriorDisparities(np.where(known, u, np.float32(np.nan)), np.where(known, v, np.float32(np.nan)))
 
 
-def halved(prior: Prior | None) -> Prior | None:
+def halved(prior: PriorDisparities | None) -> PriorDisparities | None:
     """The prior at half the resolution."""
-    return None if prior is None else Prior(0.5 * prior.u[::2, ::2], 0.5 * prior.v[::2, ::2])
+    return None if prior is None else PriorDisparities(0.5 * prior.u[::2, ::2], 0.5 * prior.v[::2, ::2])
 
 
-def aligned(prior: Prior | None, h: plane.Matrix | None) -> Prior | None:
+def aligned(prior: PriorDisparities | None, h: plane.Matrix | None) -> PriorDisparities | None:
     """The prior towards the aligned right image: see :func:`rille.stages.hfvm.plane.decompose`."""
     if prior is None or h is None:
         return prior
@@ -70,7 +70,7 @@ def aligned(prior: Prior | None, h: plane.Matrix | None) -> Prior | None:
     return _bounded(*plane.decompose(h, prior.u, prior.v, prior.u.shape))
 
 
-def impose(views: Views, state: State, prior: Prior | None) -> State:
+def impose(views: Views, state: State, prior: PriorDisparities | None) -> State:
     """State of the same level with the prior's displacements in both directions where they are known.
 
     At level 0 (images too small for coarser ones) the whole range has been searched, and nothing is imposed.
@@ -86,7 +86,9 @@ def impose(views: Views, state: State, prior: Prior | None) -> State:
     return replace(state, left=left, right=right, left_ok=left_ok, right_ok=right_ok)
 
 
-def _coarse(prior: Prior, level: int, shape: tuple[int, ...]) -> tuple[AnyArray, AnyArray, NDArray[np.bool_]]:
+def _coarse(
+    prior: PriorDisparities, level: int, shape: tuple[int, ...]
+) -> tuple[AnyArray, AnyArray, NDArray[np.bool_]]:
     """Displacements of a level: medians of the known ones of each block, whole pixels of that level."""
     side = 2**level
     maps = []

@@ -4,9 +4,9 @@ Where an image shows next to nothing, a pixel's own match is chance. Distances o
 are least at the right displacement more often than at any other. So at level 1, in each large region without matches
 and texture:
 
-1. along its epipolar line each pixel takes the displacement with the least sum over :data:`SIDE` x :data:`SIDE` pixels
-   of the region, of all displacements that were matched and of farther ones (:data:`BEYOND`), and a fraction of a
-   pixel by the sums on both sides;
+1. along its epipolar line each pixel takes the displacement with the least sum over a window of the region, of all
+   displacements that were matched and of farther ones (:data:`RANGE_BEYOND_SHARE`), and a fraction of a pixel by the
+   sums on both sides;
 2. a plane is fitted robustly: the displacement along the line is a linear function of column and row. The more a
    window's sum exceeds that of its best displacement for all others, the more it counts;
 3. if clearly more windows agree with the plane than would by chance, pixels are matched at its displacement whose
@@ -17,8 +17,8 @@ A window has a vote if most displacements leave it inside the right image, and i
 windows that any displacement leads to the same right pixel, one with the same displacement is the most alike. What the
 right image hides, such as the strip beside a near thing, has no match, and takes what belongs to another. Windows to
 which two displacements are equal (a black or an overexposed sky) have no vote either. A window whose best displacement
-is one of the last two on either side does not agree. Nearly half of a region (:data:`VOTING`) must have a vote: what
-lies between a near thing and the image's border may be hidden in the right image.
+is one of the last two on either side does not agree. Nearly half of a region (:data:`MIN_VOTING_SHARE`) must have a
+vote: what lies between a near thing and the image's border may be hidden in the right image.
 
 Chosen with motorcycle, Baby1, Cloth1, Lampshade1 and Midd1, as they are and with the right image degraded: on the wall
 of Midd1, three eighths of the image, wide windows are right for four in ten pixels, matches for two. That matches must
@@ -39,56 +39,60 @@ from numpy.typing import NDArray
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm import epipolar, plane
 from rille.stages.hfvm.image import Layer
-from rille.stages.hfvm.uncertainty import BLANK
-from rille.stages.hfvm.wide_search import RADIUS, SIDE, Pair, excess, search
+from rille.stages.hfvm.uncertainty import BLANK_STD_PX
+from rille.stages.hfvm.wide_search import WINDOW_RADIUS_PX, WINDOW_SIDE_PX, WordPair, excess, search
 from rille.stages.hfvm.windows import Window
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import MAD_TO_SIGMA, cauchy
 
-LEVEL = 1
+REGION_LEVEL = 1
 """Halving once halves noise, and a quarter of the pixels is to be searched."""
 
-DEVIATION = 1.0
+MAX_DEVIATION_GREY = 1.0
 """Grey levels of local deviation below which a pixel of the level may belong to a region."""
 
-LEAST = 6 * SIDE * SIDE
+MIN_REGION_PX = 6 * WINDOW_SIDE_PX * WINDOW_SIDE_PX
 """Least size of a region, and of the part of it that has a vote, pixels of the level."""
 
-MOST = 127
+MAX_REGIONS = 127
 """Regions of an image; their numbers fit a byte with a sign."""
 
-BEYOND = 0.5, 4
-"""Share of the range of the matched displacements that is searched beyond its far end, and pixels of the level: a wall
-is often farther than all else."""
+RANGE_BEYOND_SHARE = 0.5
+"""Share of the range of the matched displacements that is searched beyond its far end: a wall is often farther than all
+else."""
 
-NEAR, TOLERANCE = 1.25, 2.5
-"""Pixels of the level: the plane is that with the most votes nearer than the one (with the other tilted planes were
-chosen); windows agree with it that are nearer than the other. No whole numbers, as displacements are."""
+RANGE_BEYOND_PX = 4
+"""Pixels of the level that are searched beyond that."""
 
-STEEPEST = NEAR / RADIUS
+MAX_VOTE_DISTANCE_PX = 1.25
+"""Pixels of the level: the plane is that with the most votes nearer than this; with twice of it tilted planes were
+chosen. No whole number, as displacements are."""
+
+MAX_AGREE_DISTANCE_PX = 2.5
+"""Pixels of the level: windows agree with the plane that are nearer than this. No whole number, either."""
+
+MAX_SLOPE = MAX_VOTE_DISTANCE_PX / WINDOW_RADIUS_PX
 """Displacements a pixel: across the windows of a steeper plane no displacement is right."""
 
-VOTING = 0.45
+MIN_VOTING_SHARE = 0.45
 """Share of a region's pixels that must have a vote. The wall of Midd1 has .47 and more in all degradations but noise; a
 wall of Monopoly that is largely hidden at most .39, and where blocks of a JPEG image of Lampshade1 agree .44."""
 
-SEEN = 0.5
+MIN_SEEN_SHARE = 0.5
 """Share of the displacements that leave a window with a vote inside the right image."""
 
-SURE = 6.0
+MIN_CHANCE_SIGMAS = 6.0
 """Standard deviations by which more windows agree than by chance: of a range of 40 displacements at each of three
 corners there are some 10^5 different planes, and the best one is taken."""
 
-ALIKE = 0.95
+ALIKE_QUANTILE = 0.95
 """Share of the agreeing windows that speak no more against the plane than a window may whose pixel is matched."""
 
-SAMPLES = 1000
+MAX_FIT_WINDOWS = 1000
 """Displacements that a plane is fitted to."""
 
-TRIALS = 500
+PLANE_TRIALS = 500
 """Planes that are tried: where four in ten windows are right, 32 of them are."""
-
-ITERATIONS = 10
 
 
 class Planes(NamedTuple):
@@ -132,55 +136,55 @@ def find(
     far_sign : sign of the column displacement of far things against near ones; 0 unknown.
     """
     label, terms = np.zeros(left.shape, np.int8), list[list[float]]()
-    up = plane.finer(LEVEL)
+    up = plane.finer(REGION_LEVEL)
     coarse = up.T @ f @ up
     steps = _steps(along, far_sign if epipolar.along_rows(coarse, left.shape) else 0.0)
-    for window, region in _regions(unmatched & (left.deviation < DEVIATION) & (left.valid != 0)):
-        images = Pair(left.words, right.words, right.valid, window)
+    for window, region in _regions(unmatched & (left.deviation < MAX_DEVIATION_GREY) & (left.valid != 0)):
+        images = WordPair(left.words, right.words, right.valid, window)
         lines = epipolar.lines(epipolar.moved(coarse, *2 * ((window.x0, window.y0),)), region.shape)
-        found = search(images, region, lines, steps)
-        usable = (found.tried >= SEEN * len(steps)) & (found.distinct > 0)
-        y, x = np.nonzero(usable & found.mutual)
-        if len(y) < max(LEAST, VOTING * np.count_nonzero(region)):
+        best = search(images, region, lines, steps)
+        usable = (best.tried >= MIN_SEEN_SHARE * len(steps)) & (best.distinct > 0)
+        y, x = np.nonzero(usable & best.mutual)
+        if len(y) < max(MIN_REGION_PX, MIN_VOTING_SHARE * np.count_nonzero(region)):
             continue
-        votes, step = found.distinct[y, x].astype(np.float64), found.best[y, x].astype(np.float64)
+        votes, step = best.distinct[y, x].astype(np.float64), best.best[y, x].astype(np.float64)
         g, error = _fit(x + window.x0, y + window.y0, step, votes)
         rows, cols = np.indices(region.shape)
         on_plane = (g[0] + g[1] * (cols + window.x0) + g[2] * (rows + window.y0)).astype(np.float32)
-        more = excess(images, region, lines, on_plane, found.least)
+        more = excess(images, region, lines, on_plane, best.least)
         inner = (steps[1] + 0.5 < step) & (step < steps[-2] - 0.5)
-        agree = (error <= TOLERANCE) & inner & np.isfinite(more[y, x])
-        if _sure(agree, votes, found.tried[y, x]):
+        agree = (error <= MAX_AGREE_DISTANCE_PX) & inner & np.isfinite(more[y, x])
+        if _sure(agree, votes, best.tried[y, x]):
             terms.append(_at_level_0(g, error[agree]))
-            alike = more <= np.quantile(more[y[agree], x[agree]], ALIKE)
+            alike = more <= np.quantile(more[y[agree], x[agree]], ALIKE_QUANTILE)
             # What has another match of its own is not of this plane.
-            label[window.slices][region & ~(usable & found.mutual)] = -len(terms)
+            label[window.slices][region & ~(usable & best.mutual)] = -len(terms)
             label[window.slices][usable & alike] = len(terms)
     return Planes(label, terms, f)
 
 
 def _sure(agree: AnyArray, votes: AnyArray, tried: AnyArray) -> bool:
     """Whether clearly more windows agree than would by chance of the steps ``tried`` in each."""
-    chance = np.average(2 * TOLERANCE / tried, weights=votes)
+    chance = np.average(2 * MAX_AGREE_DISTANCE_PX / tried, weights=votes)
     # Windows that do not overlap and are equally distinct would have to be as many to tell as much.
-    windows = votes.sum() ** 2 / np.sum(votes**2) / SIDE**2
+    windows = votes.sum() ** 2 / np.sum(votes**2) / WINDOW_SIDE_PX**2
     spread = np.sqrt(chance * (1 - chance) / windows)
-    return bool(np.average(agree, weights=votes) >= chance + SURE * spread)
+    return bool(np.average(agree, weights=votes) >= chance + MIN_CHANCE_SIGMAS * spread)
 
 
 def _at_level_0(g: AnyArray, error: AnyArray) -> list[float]:
     """Terms of a plane in pixels of level 0, and the standard deviation of steps with this ``error``."""
     # Pixel x of the level is (x + 1/2) 2^level - 1/2 of level 0, where displacements are 2^level as long.
-    scale = 2.0**LEVEL
+    scale = 2.0**REGION_LEVEL
     middle = 0.5 / scale - 0.5
-    std = np.hypot(scale * MAD_TO_SIGMA * epipolar.typical(error), BLANK)
+    std = np.hypot(scale * MAD_TO_SIGMA * epipolar.typical(error), BLANK_STD_PX)
     return [float(t) for t in (scale * (g[0] + middle * (g[1] + g[2])), g[1], g[2], std)]
 
 
 def _steps(along: AnyArray, far_sign: float) -> AnyArray:
     """Displacements along the lines that are tried, pixels of the level; ``far_sign``: of farther ones, 0 unknown."""
-    low, high = np.quantile(along, (0.005, 0.995)) * 0.5**LEVEL
-    beyond = BEYOND[0] * (high - low) + BEYOND[1]
+    low, high = np.quantile(along, (0.005, 0.995)) * 0.5**REGION_LEVEL
+    beyond = RANGE_BEYOND_SHARE * (high - low) + RANGE_BEYOND_PX
     # Those at the ends do not count.
     low, high = low - (2 if far_sign > 0 else beyond), high + (2 if far_sign < 0 else beyond)
     return np.arange(np.floor(low), np.ceil(high) + 1, dtype=np.float32)
@@ -192,8 +196,8 @@ def _regions(weak: NDArray[np.bool_]) -> Iterator[tuple[Window, NDArray[np.bool_
     opened = cv2.morphologyEx(weak.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, number, about, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
     sizes = about[1:, cv2.CC_STAT_AREA]
-    for n in np.argsort(-sizes, kind="stable")[:MOST]:
-        if sizes[n] < LEAST:
+    for n in np.argsort(-sizes, kind="stable")[:MAX_REGIONS]:
+        if sizes[n] < MIN_REGION_PX:
             return
         x, y, wide, high, _ = (int(k) for k in about[n + 1])
         window = Window(y, y + high, x, x + wide)
@@ -207,25 +211,27 @@ def _fit(x: AnyArray, y: AnyArray, step: AnyArray, votes: AnyArray) -> tuple[Any
     numbers, so that their sums are exact.
     """
     terms, rng = np.stack([np.ones(len(x)), x, y]), np.random.default_rng(0)
-    some = rng.choice(len(x), min(SAMPLES, len(x)), replace=False)
-    t, d, weight = np.ascontiguousarray(terms[:, some]), step[some], votes[some]
-    three = rng.choice(len(some), (TRIALS, 3), p=weight / weight.sum())
+    sample = rng.choice(len(x), min(MAX_FIT_WINDOWS, len(x)), replace=False)
+    t, d, weight = np.ascontiguousarray(terms[:, sample]), step[sample], votes[sample]
+    three = rng.choice(len(sample), (PLANE_TRIALS, 3), p=weight / weight.sum())
     # The hold gives a plane, which has few votes, to three windows on a line, and to one that was drawn twice.
     planes = np.linalg.solve(t.T[three] + 1e-6 * np.eye(3), d[three][..., None])[..., 0]
     # Should all be steep, the flat one is left.
-    planes = np.vstack([[np.median(d), 0.0, 0.0], planes[(np.abs(planes[:, 1:]) <= STEEPEST).all(axis=1)]])
+    planes = np.vstack([[np.median(d), 0.0, 0.0], planes[(np.abs(planes[:, 1:]) <= MAX_SLOPE).all(axis=1)]])
     g = planes[np.argmax(_support(planes, t, d, weight.astype(np.int64)))]
-    g = irls(t.T, d, lambda error: weight * cauchy(error, NEAR) ** 2, 1e-6 * np.eye(3), g, ITERATIONS)
+    g = irls(t.T, d, lambda error: weight * cauchy(error, MAX_VOTE_DISTANCE_PX) ** 2, 1e-6 * np.eye(3), g, rounds=10)
     return g, np.abs(g @ terms - step)
 
 
 @njit(cache=True, nogil=True)
 def _support(planes, terms, step, votes):  # type: ignore[no-untyped-def]
     """Votes (n,) of the steps that are near each plane; whole numbers, which are added up several at once."""
-    found = np.zeros(len(planes), np.int64)
+    totals = np.zeros(len(planes), np.int64)
     one, x, y, nothing = terms[0], terms[1], terms[2], np.int64(0)
     for n in range(len(planes)):
         a, b, c = planes[n, 0], planes[n, 1], planes[n, 2]
         for k in range(len(step)):
-            found[n] += votes[k] if abs(a * one[k] + b * x[k] + c * y[k] - step[k]) <= NEAR else nothing
-    return found
+            totals[n] += (
+                votes[k] if abs(a * one[k] + b * x[k] + c * y[k] - step[k]) <= MAX_VOTE_DISTANCE_PX else nothing
+            )
+    return totals

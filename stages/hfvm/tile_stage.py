@@ -50,18 +50,18 @@ def mosaic(parts: Sequence[Bundle], name: str, windows: Sequence[Window], window
             f"image of {windows[-1].x1} x {windows[-1].y1} pixels does not have the size that its camera states",
             remedy="correct the camera's width and height",
         )
-    found: AnyArray | None = None
+    out: AnyArray | None = None
     for part, own in zip(parts, windows, strict=False):
-        both = Window(
+        overlap = Window(
             *(f(a, b) for f, a, b in ((max, own.y0, window.y0), (min, own.y1, window.y1))),
             *(f(a, b) for f, a, b in ((max, own.x0, window.x0), (min, own.x1, window.x1))),
         )
-        if both.y0 < both.y1 and both.x0 < both.x1:
-            values = np.asarray(part.raster(name)[both.inside(own)])
-            found = np.empty(window.shape, values.dtype) if found is None else found
-            found[both.inside(window)] = values
-    assert found is not None
-    return found
+        if overlap.y0 < overlap.y1 and overlap.x0 < overlap.x1:
+            values = np.asarray(part.raster(name)[overlap.inside(own)])
+            out = np.empty(window.shape, values.dtype) if out is None else out
+            out[overlap.inside(window)] = values
+    assert out is not None
+    return out
 
 
 class TileInputs(NamedTuple):
@@ -87,7 +87,7 @@ class Task:
     def half(self) -> bool:
         """Whether the pair is matched at half its resolution."""
         recipe = presets.recipe_of(self.params)
-        return presets.halves(recipe, *(int(one.meta["levels"]) for one in self.given[:2]))
+        return presets.halves(recipe, *(int(pyramid.meta["levels"]) for pyramid in self.given[:2]))
 
     @cached_property
     def recipe(self) -> presets.Recipe:
@@ -98,7 +98,7 @@ class Task:
     def views(self) -> Views:
         """Both images at that resolution."""
         params, first = (presets.halved(self.params), 1) if self.half else (self.params, 0)
-        left, right = (view(opened(one).above(first), params) for one in self.given[:2])
+        left, right = (view(opened(bundle).above(first), params) for bundle in self.given[:2])
         return Views(left, right, params, presets.recipe_of(params).steps)
 
     @property
@@ -157,8 +157,8 @@ def _fine(task: Task) -> Bundle[TileFacts]:
 
 
 def _ending(task: Task) -> Bundle[TileFacts]:
-    found = task.fine(whole(task.shape), ("u", "v", "validity"))
-    ending = tiles.ending(task.pair, found, task.recipe.planes)
+    arrays = task.fine(whole(task.shape), ("u", "v", "validity"))
+    ending = tiles.ending(task.pair, arrays, task.recipe.planes)
     meta: TileFacts = {"f": None if ending.f is None else ending.f.tolist(), "terms": None}
     if ending.planes is None:
         return Bundle({}, meta)

@@ -25,14 +25,14 @@ from rille.stages.numeric.threads import side_by_side
 
 Call = Callable[[], dict[str, AnyArray]]
 
-HALO = 64
+HALO_PX = 64
 """Pixels around a tile: 48 that a displacement depends on (rounds, edges, features, sums, refinement), and room for
 patches of 40 pixels."""
 
-MARGIN = 40
+TARGET_MARGIN_PX = 40
 """Pixels around the places in the right image that the predictions of a tile lead to: search, rounds, features."""
 
-NEAR = 16
+FILL_MARGIN_PX = 16
 """Pixels around a window that its filling and standard deviations depend on, besides the reach along rows."""
 
 
@@ -40,7 +40,7 @@ def fine(pair: Coarse, refinement: tuple[finest.Step, ...], window: Window) -> d
     """Arrays of :class:`~rille.stages.hfvm.finest.Fine` of a window of the left image; displacements to the whole
     matched image."""
     views, shape = pair.views, pair.views.left.shapes[0]
-    outer = window.grow(HALO, HALO, shape)
+    outer = window.grow(HALO_PX, HALO_PX, shape)
     state, target = _around(pair, outer)
     a, b = views.left.cut(outer), views.right.cut(target)
     if state.level > 0:
@@ -68,7 +68,7 @@ def _around(pair: Coarse, outer: Window) -> tuple[State, Window]:
     own = Map(left.u[above.slices], left.v[above.slices])
     y0, y1 = (at + 2 * int(f(own.v)) for at, f in ((outer.y0, np.min), (outer.y1, np.max)))
     x0, x1 = (at + 2 * int(f(own.u)) for at, f in ((outer.x0, np.min), (outer.x1, np.max)))
-    target = _bounded(Window(y0, y1, x0, x1), shape, MARGIN)
+    target = _bounded(Window(y0, y1, x0, x1), shape, TARGET_MARGIN_PX)
     there = target.parent()
     du, dv = (outer.x0 - target.x0) // 2, (outer.y0 - target.y0) // 2
     other = Map(right.u[there.slices], right.v[there.slices])
@@ -86,30 +86,30 @@ def _landing(work: Work, shape: Shape) -> Window:
     # Relative to the window that stands there until this one is known.
     x, y = x - a.x0 + work.right.window.x0, y - a.y0 + work.right.window.y0
     ends = Window(*(int(n) for n in (np.nanmin(y), np.nanmax(y) + 1, np.nanmin(x), np.nanmax(x) + 1)))
-    return _bounded(ends, shape, MARGIN)
+    return _bounded(ends, shape, TARGET_MARGIN_PX)
 
 
-def ending(pair: Coarse, found: Mapping[str, AnyArray], with_planes: bool) -> Ending:
+def ending(pair: Coarse, arrays: Mapping[str, AnyArray], with_planes: bool) -> Ending:
     """What the matches of the whole image tell its windows: their epipolar lines, and planes without texture."""
     views, sign = pair.views, pair.state.near_sign
     # Without a band rows are free: they are not to be set by lines.
-    free = views.params.band == 0 or views.levels <= textureless.LEVEL
-    f = None if free else finest.lines(found, (views.left.shapes[0], views.right.shapes[0]))
-    planes = finest.planes((views.left, views.right), found, f, sign) if f is not None and with_planes else None
+    free = views.params.band == 0 or views.levels <= textureless.REGION_LEVEL
+    f = None if free else finest.lines(arrays, (views.left.shapes[0], views.right.shapes[0]))
+    planes = finest.planes((views.left, views.right), arrays, f, sign) if f is not None and with_planes else None
     return Ending(sign, pair.alignment, f, planes, views.left.shapes[0])
 
 
 def around(pair: Coarse, window: Window) -> Window:
     """Window that :func:`final` needs the arrays of."""
-    return window.grow(NEAR, NEAR + pair.views.params.fill_reach, pair.views.left.shapes[0])
+    return window.grow(FILL_MARGIN_PX, FILL_MARGIN_PX + pair.views.params.fill_reach, pair.views.left.shapes[0])
 
 
-def final(pair: Coarse, window: Window, found: Mapping[str, AnyArray], ending: Ending) -> dict[str, AnyArray]:
+def final(pair: Coarse, window: Window, fine_arrays: Mapping[str, AnyArray], ending: Ending) -> dict[str, AnyArray]:
     """Arrays of the disparities of a window, from those of :func:`fine` of the window around it, or of the image."""
     outer, params = around(pair, window), pair.views.params
-    if found["u"].shape != outer.shape:
-        found = {name: array[outer.slices] for name, array in found.items()}
-    arrays = finest.complete(found, pair.views.left.layers[0].cut(outer).valid, outer, params, ending)
+    if fine_arrays["u"].shape != outer.shape:
+        fine_arrays = {name: array[outer.slices] for name, array in fine_arrays.items()}
+    arrays = finest.complete(fine_arrays, pair.views.left.layers[0].cut(outer).valid, outer, params, ending)
     return {name: np.ascontiguousarray(a[window.inside(outer)]) for name, a in arrays.items()}
 
 

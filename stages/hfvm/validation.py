@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from rille.stages.core.declare import AnyArray
 from rille.stages.numeric.windows import window_count, window_room
 
-FAILED = np.float32(1e9)
+FAILED_PX = np.float32(1e9)
 """Back-matching error where there is nothing to match back from."""
 
-CHANCE = 16
+CHANCE_SIZE_FACTOR = 16
 """Times the size of an isolated patch: none of chance is as large (measured on blurred noise: up to 8 times)."""
 
-CROWD = 9
+CROWD_SIDE_PX = 9
 """Pixels: side of the neighbourhood in which matches support each other, about that of the features."""
 
-OUTSIDE = -32768
+NO_PATCH = -32768
 """Displacement of pixels that are in no patch."""
 
 
@@ -30,14 +30,14 @@ def agree(own: Any, other: Any, own_valid: AnyArray, other_valid: AnyArray, limi
 
     ``own, other``: maps, ``u`` and ``v`` int16.
     """
-    found = np.zeros(own.u.shape, bool)
-    _agree(own, other, own_valid, other_valid, np.float32(limit * limit), found)
-    return found
+    agreeing = np.zeros(own.u.shape, bool)
+    _agree(own, other, own_valid, other_valid, np.float32(limit * limit), agreeing)
+    return agreeing
 
 
 @njit(cache=True, nogil=True)
-def _agree(own, other, own_valid, other_valid, most, found):  # type: ignore[no-untyped-def]
-    rows, cols = found.shape
+def _agree(own, other, own_valid, other_valid, most, agreeing):  # type: ignore[no-untyped-def]
+    rows, cols = agreeing.shape
     brows, bcols = np.uint64(other_valid.shape[0]), np.uint64(other_valid.shape[1])
     for y in range(rows):
         for x in range(cols):
@@ -45,15 +45,15 @@ def _agree(own, other, own_valid, other_valid, most, found):  # type: ignore[no-
             i, j = np.uint64(x + np.int64(own.u[y, x])), np.uint64(y + np.int64(own.v[y, x]))
             if own_valid[y, x] and i < bcols and j < brows and other_valid[j, i]:
                 du, dv = np.int64(own.u[y, x]) + other.u[j, i], np.int64(own.v[y, x]) + other.v[j, i]
-                found[y, x] = du * du + dv * dv <= most
+                agreeing[y, x] = du * du + dv * dv <= most
 
 
 @njit(cache=True, nogil=True)
 def backmatch(u, v, right, right_valid, error):  # type: ignore[no-untyped-def]
     """Distance |l - l'| of each left pixel after matching to the right and back (4.3.3), pixels.
 
-    ``error`` comes as FAILED and stays so outside the right image and on its masked pixels. The right map, columns and
-    rows of displacement, is read at the nearest pixel.
+    ``error`` comes as FAILED_PX and stays so outside the right image and on its masked pixels. The right map, columns
+    and rows of displacement, is read at the nearest pixel.
     """
     ru, rv = right
     last_x, last_y, half = np.float32(ru.shape[1] - 1), np.float32(ru.shape[0] - 1), np.float32(0.5)
@@ -66,28 +66,28 @@ def backmatch(u, v, right, right_valid, error):  # type: ignore[no-untyped-def]
             i, j = np.int64(xr + half), np.int64(yr + half)
             if right_valid[j, i]:
                 du, dv = u[y, x] + ru[j, i], v[y, x] + rv[j, i]
-                error[y, x] = min(np.sqrt(du * du + dv * dv), FAILED)
+                error[y, x] = min(np.sqrt(du * du + dv * dv), FAILED_PX)
 
 
 @njit(cache=True, nogil=True)
 def lands(u, v, keep, right_valid):  # type: ignore[no-untyped-def]
     """Pixels (bool) of ``keep`` whose displacement ends on a usable pixel of the right image."""
-    found, half = np.zeros(keep.shape, np.bool_), np.float32(0.5)
+    landing, half = np.zeros(keep.shape, np.bool_), np.float32(0.5)
     rows, cols = right_valid.shape
     for y in range(u.shape[0]):
         for x in range(u.shape[1]):
             # Half a pixel beyond the outermost centres is still on the image.
             xr, yr = np.float32(x) + u[y, x] + half, np.float32(y) + v[y, x] + half
             if keep[y, x] and 0 < xr < cols and 0 < yr < rows:
-                found[y, x] = right_valid[np.int64(yr), np.int64(xr)] != 0
-    return found
+                landing[y, x] = right_valid[np.int64(yr), np.int64(xr)] != 0
+    return landing
 
 
 def lonely(keep: AnyArray, share: float) -> NDArray[np.bool_]:
-    """Pixels of ``keep`` in whose neighbourhood (CROWD x CROWD, clipped at the border) less than ``share`` is kept."""
+    """Pixels of ``keep`` around which (:data:`CROWD_SIDE_PX`, clipped at the border) less than ``share`` is kept."""
     if share <= 0:
         return np.zeros(keep.shape, dtype=bool)
-    return np.asarray(keep & (window_count(keep, CROWD) < share * window_room(keep.shape, CROWD)))
+    return np.asarray(keep & (window_count(keep, CROWD_SIDE_PX) < share * window_room(keep.shape, CROWD_SIDE_PX)))
 
 
 def isolated(u: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
@@ -103,8 +103,8 @@ def isolated(u: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
     """
     if size <= 1:
         return np.zeros(keep.shape, dtype=bool)
-    # In a small image patches of CHANCE times the size may not fit: an eighth of it is enough.
-    suspect = _in_small_patches(u, keep, max(size, min(CHANCE * size, keep.size // 8)))
+    # In a small image patches of CHANCE_SIZE_FACTOR times the size may not fit: an eighth of it is enough.
+    suspect = _in_small_patches(u, keep, max(size, min(CHANCE_SIZE_FACTOR * size, keep.size // 8)))
     # The smaller patches are among these, and most matches are not.
     small = _in_small_patches(u, suspect, size)
     all_of_them = np.count_nonzero(keep)
@@ -114,6 +114,6 @@ def isolated(u: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
 
 def _in_small_patches(u: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
     """Pixels of ``keep`` that are in a patch of fewer than ``size``."""
-    plane = np.where(keep, u, np.int16(OUTSIDE))
-    cv2.filterSpeckles(plane, OUTSIDE, size - 1, 1)
-    return np.asarray(keep & (plane == OUTSIDE))
+    plane = np.where(keep, u, np.int16(NO_PATCH))
+    cv2.filterSpeckles(plane, NO_PATCH, size - 1, 1)
+    return np.asarray(keep & (plane == NO_PATCH))

@@ -17,23 +17,26 @@ from rille.stages.hfvm import plane
 from rille.stages.hfvm.image import Image
 from rille.stages.hfvm.windows import Shape
 
-SIDE = 1024
+MAX_SIDE_PX = 1024
 """Pixels: keypoints are looked for at the finest level whose longer side is at most this."""
 
-CONTRAST = 0.02
+MIN_CONTRAST = 0.02
 """Least contrast of a keypoint; half of OpenCV's default, for sand and haze."""
 
-MOST = 4000
+MAX_KEYPOINTS = 4000
 """Keypoints of an image: comparing all with all takes this many squared."""
 
-AMBIGUOUS = 0.8
+MAX_DISTANCE_RATIO = 0.8
 """The nearest keypoint must be nearer by this factor than the second nearest (Lowe 2004)."""
 
-TOLERANCE = 0.01
+MAX_RELIEF_SHARE = 0.01
 """Share of the longer side by which a keypoint may stand off the dominant surface: what relief does to it."""
 
-FEWEST, LEAST_SHARE = 15, 0.2
-"""Keypoints that must agree, and their share of the unambiguous ones; unrelated images and other suns reach 6."""
+MIN_AGREEING = 15
+"""Keypoints that must agree; in unrelated images and under other suns 6 do."""
+
+MIN_AGREEING_SHARE = 0.2
+"""Share of the unambiguous keypoints that must agree."""
 
 
 def find(left: Image, right: Image) -> plane.Matrix | None:
@@ -41,26 +44,30 @@ def find(left: Image, right: Image) -> plane.Matrix | None:
     levels = [_level(view) for view in (left, right)]
     (p, a), (q, b) = (_keypoints(view, level) for view, level in zip((left, right), levels, strict=True))
     first, second = _alike(a, b)
-    if len(first) < FEWEST:
+    if len(first) < MIN_AGREEING:
         return None
-    limit = TOLERANCE * max(right.shapes[levels[1]])
+    limit = MAX_RELIEF_SHARE * max(right.shapes[levels[1]])
     h, agree = cv2.findHomography(p[first], q[second], cv2.USAC_MAGSAC, limit, maxIters=5000, confidence=0.999)
-    if h is None or agree.sum() < max(FEWEST, LEAST_SHARE * len(first)) or not _upright(h, left.shapes[levels[0]]):
+    if (
+        h is None
+        or agree.sum() < max(MIN_AGREEING, MIN_AGREEING_SHARE * len(first))
+        or not _upright(h, left.shapes[levels[0]])
+    ):
         return None
     # Images of unlike size are looked at on levels of their own, so each side has its own scale.
     return np.asarray(plane.finer(levels[1]) @ h @ np.linalg.inv(plane.finer(levels[0])), dtype=np.float64)
 
 
 def _level(view: Image) -> int:
-    """Finest level whose longer side is at most :data:`SIDE`, else the coarsest."""
-    return next((n for n, shape in enumerate(view.shapes) if max(shape) <= SIDE), len(view.shapes) - 1)
+    """Finest level whose longer side is at most :data:`MAX_SIDE_PX`, else the coarsest."""
+    return next((n for n, shape in enumerate(view.shapes) if max(shape) <= MAX_SIDE_PX), len(view.shapes) - 1)
 
 
 def _keypoints(view: Image, level: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Columns and rows (n, 2) of keypoints, pixels of the level, and their descriptors (n, 128) of length one."""
     layer = view.layers[level]
     grey = np.clip(np.rint(layer.grey), 0, 255).astype(np.uint8)
-    sift = cv2.SIFT_create(nfeatures=MOST, contrastThreshold=CONTRAST)  # type: ignore[attr-defined]  # not in the stubs
+    sift = cv2.SIFT_create(nfeatures=MAX_KEYPOINTS, contrastThreshold=MIN_CONTRAST)  # type: ignore[attr-defined]  # not in the stubs
     points, histograms = sift.detectAndCompute(grey, (layer.valid != 0).astype(np.uint8))
     if not points:
         return np.empty((0, 2), np.float32), np.empty((0, 128), np.float32)
@@ -76,7 +83,7 @@ def _alike(a: AnyArray, b: AnyArray) -> tuple[NDArray[np.intp], NDArray[np.intp]
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     back = [m.trainIdx for (m,) in matcher.knnMatch(b, a, k=1)]
     near = matcher.knnMatch(a, b, k=2)
-    kept = [m for m, n in near if m.distance < AMBIGUOUS * n.distance and back[m.trainIdx] == m.queryIdx]
+    kept = [m for m, n in near if m.distance < MAX_DISTANCE_RATIO * n.distance and back[m.trainIdx] == m.queryIdx]
     return np.array([m.queryIdx for m in kept], np.intp), np.array([m.trainIdx for m in kept], np.intp)
 
 

@@ -1,7 +1,7 @@
 """Search in wide windows along epipolar lines: for what no small window tells.
 
-Of each pixel of a region the step along its line is found whose distances of features, summed over a window of
-:data:`SIDE` x :data:`SIDE` pixels of the region, are least; by how much; and whether the match is mutual.
+Of each pixel of a region the step along its line is found whose distances of features, summed over a square window of
+the region, are least; by how much; and whether the match is mutual.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from rille.stages.hfvm.features import distance
 from rille.stages.hfvm.windows import Window
 from rille.stages.numeric.windows import window_count, window_sum32
 
-RADIUS = 6
-SIDE = 2 * RADIUS + 1
+WINDOW_RADIUS_PX = 6
+WINDOW_SIDE_PX = 2 * WINDOW_RADIUS_PX + 1
 """Side of the window, pixels."""
 
-CAP = 60
+MAX_DISTANCE = 60
 """Greatest distance of two features [byte steps]: about three times that of noise."""
 
-APART = 2
+MIN_DISTINCT_STEPS = 2
 """Steps from the best one to those that it must be distinct from."""
 
 
-class Pair(NamedTuple):
+class WordPair(NamedTuple):
     """Features of both images and mask of the right one, (row, col); ``window``: where the region lies in the left."""
 
     left: AnyArray
@@ -45,8 +45,8 @@ class Searched(NamedTuple):
 
     ``tried``: int32, steps that leave all of its window inside the right image. ``best, least``: float32, the step with
     the least sum of distances over the window, moved by a fraction, and that sum. ``distinct``: float32, by how much
-    the sum of each step more than :data:`APART` from the best one exceeds it, 0 where there is none. ``mutual``: bool,
-    whether no step so far from it leads a window more alike to the same pixel.
+    the sum of each step more than :data:`MIN_DISTINCT_STEPS` from the best one exceeds it, 0 where there is none.
+    ``mutual``: bool, whether no step so far from it leads a window more alike to the same pixel.
     """
 
     tried: AnyArray
@@ -67,7 +67,7 @@ class Best(NamedTuple):
     ahead: AnyArray
 
 
-def search(images: Pair, region: NDArray[np.bool_], lines: AnyArray, steps: AnyArray) -> Searched:
+def search(images: WordPair, region: NDArray[np.bool_], lines: AnyArray, steps: AnyArray) -> Searched:
     """Search for the best step along the line of each pixel of a region.
 
     Parameters
@@ -78,9 +78,9 @@ def search(images: Pair, region: NDArray[np.bool_], lines: AnyArray, steps: AnyA
     """
     rows, cols = images.valid.shape
     best, tried = np.zeros(region.shape, np.float32), np.zeros(region.shape, np.int32)
-    found = Best(best, *np.full((5, *region.shape), np.inf, np.float32))
+    searched = Best(best, *np.full((5, *region.shape), np.inf, np.float32))
     previous, passed = np.full((2, *region.shape), np.inf, np.float32)
-    size = np.maximum(window_count(region, SIDE), 1)
+    size = np.maximum(window_count(region, WINDOW_SIDE_PX), 1)
     claims = np.full((2, rows, cols), np.inf, np.float32)
     last: deque[AnyArray] = deque()
     for step in steps:
@@ -88,17 +88,17 @@ def search(images: Pair, region: NDArray[np.bool_], lines: AnyArray, steps: AnyA
         total = _sums(images, region, lines, at)
         tried += np.isfinite(total)
         _claim(total / size, lines, step, (images.window.x0, images.window.y0), claims)
-        if len(last) > APART:
+        if len(last) > MIN_DISTINCT_STEPS:
             np.minimum(passed, last.popleft(), out=passed)
         last.append(total)
-        _keep(total, step, previous, passed, found)
+        _keep(total, step, previous, passed, searched)
         previous = total
-    rival = np.minimum(found.behind, found.ahead)
-    distinct = np.subtract(rival, found.least, out=np.zeros_like(rival), where=np.isfinite(rival))
+    rival = np.minimum(searched.behind, searched.ahead)
+    distinct = np.subtract(rival, searched.least, out=np.zeros_like(rival), where=np.isfinite(rival))
     mutual = np.zeros_like(region)
-    _claimed(found.least, lines, best, (images.window.x0, images.window.y0), claims[1], mutual)
-    fraction = _fraction(found.before, found.least, found.after)
-    return Searched(tried, best + fraction, found.least, distinct, mutual)
+    _claimed(searched.least, lines, best, (images.window.x0, images.window.y0), claims[1], mutual)
+    fraction = _fraction(searched.before, searched.least, searched.after)
+    return Searched(tried, best + fraction, searched.least, distinct, mutual)
 
 
 def _fraction(before: AnyArray, least: AnyArray, after: AnyArray) -> AnyArray:
@@ -112,7 +112,7 @@ def _fraction(before: AnyArray, least: AnyArray, after: AnyArray) -> AnyArray:
     return np.divide(0.5 * fall, rise, out=np.zeros_like(least), where=rise > 0)
 
 
-def excess(images: Pair, region: NDArray[np.bool_], lines: AnyArray, at: AnyArray, least: AnyArray) -> AnyArray:
+def excess(images: WordPair, region: NDArray[np.bool_], lines: AnyArray, at: AnyArray, least: AnyArray) -> AnyArray:
     """By how much a pixel's distance, mean of the window, exceeds that of the window's ``least`` sum at other steps.
 
     ``at``: steps (row, col) float32. Infinite where a step leads out of the
@@ -120,7 +120,7 @@ def excess(images: Pair, region: NDArray[np.bool_], lines: AnyArray, at: AnyArra
     """
     sums = _sums(images, region, lines, at)
     more = np.subtract(sums, least, out=np.full_like(sums, np.inf), where=np.isfinite(sums) & np.isfinite(least))
-    return np.asarray(more / np.maximum(window_count(region, SIDE), 1))
+    return np.asarray(more / np.maximum(window_count(region, WINDOW_SIDE_PX), 1))
 
 
 class Words(NamedTuple):
@@ -138,15 +138,15 @@ class Distances(NamedTuple):
     outside: AnyArray
 
 
-def _sums(images: Pair, region: NDArray[np.bool_], lines: AnyArray, at: AnyArray) -> AnyArray:
+def _sums(images: WordPair, region: NDArray[np.bool_], lines: AnyArray, at: AnyArray) -> AnyArray:
     """Sum (row, col) of the distances of a region's pixels in each window, float32; infinite outside of the region and
     where one of them leads out of the right image."""
     cost, outside = np.zeros(region.shape, np.float32), np.zeros(region.shape, np.uint8)
     left = np.ascontiguousarray(images.left[images.window.slices])
     place = images.window.x0, images.window.y0
     _distances(Words(left, images.right, images.valid), region, lines, at, place, Distances(cost, outside))
-    total = window_sum32(cost, SIDE)
-    total[(cv2.dilate(outside, np.ones((SIDE, SIDE), np.uint8)) != 0) | ~region] = np.inf
+    total = window_sum32(cost, WINDOW_SIDE_PX)
+    total[(cv2.dilate(outside, np.ones((WINDOW_SIDE_PX, WINDOW_SIDE_PX), np.uint8)) != 0) | ~region] = np.inf
     return total
 
 
@@ -167,7 +167,7 @@ def _distances(words, region, lines, at, place, out):  # type: ignore[no-untyped
                 j, i = _end(lines[y, x], at[y, x], x + place[0], y + place[1])
                 out.outside[y, x] = i < 0 or i >= cols or j < 0 or j >= rows or not words.valid[j, i]
                 if not out.outside[y, x]:
-                    out.cost[y, x] = min(distance(words.left[y, x], words.right[j, i]), CAP)
+                    out.cost[y, x] = min(distance(words.left[y, x], words.right[j, i]), MAX_DISTANCE)
 
 
 @njit(cache=True, nogil=True)
@@ -188,14 +188,15 @@ def _claimed(least, lines, best, place, steps, mutual):  # type: ignore[no-untyp
         for x in range(least.shape[1]):
             if least[y, x] < np.inf:
                 j, i = _end(lines[y, x], best[y, x], x + place[0], y + place[1])
-                mutual[y, x] = abs(steps[j, i] - best[y, x]) <= APART
+                mutual[y, x] = abs(steps[j, i] - best[y, x]) <= MIN_DISTINCT_STEPS
 
 
 @njit(cache=True, nogil=True)
 def _keep(total, step, previous, passed, best):  # type: ignore[no-untyped-def]
     """Update ``best`` (:class:`Best`) with the sums of one more step.
 
-    ``previous``: the sums of the step before; ``passed``: the least of all steps more than APART behind this one.
+    ``previous``: the sums of the step before; ``passed``: the least of all steps more than :data:`MIN_DISTINCT_STEPS`
+    behind this one.
     """
     for y in range(total.shape[0]):
         for x in range(total.shape[1]):
@@ -205,5 +206,5 @@ def _keep(total, step, previous, passed, best):  # type: ignore[no-untyped-def]
                 best.behind[y, x], best.ahead[y, x] = passed[y, x], np.inf
             elif step - best.step[y, x] == 1:
                 best.after[y, x] = total[y, x]
-            elif step - best.step[y, x] > APART:
+            elif step - best.step[y, x] > MIN_DISTINCT_STEPS:
                 best.ahead[y, x] = min(best.ahead[y, x], total[y, x])

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from rille.stages.hfvm.brightness import DARK, LEAST, NOTABLE, SAMPLES, SATURATED
+from rille.stages.hfvm.brightness import MAX_FIT_PIXELS, MAX_GREY, MIN_FIT_PIXELS, MIN_GREY, MIN_LOG_RATIO
 from rille.stages.hfvm.windows import thinned
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.odometry.displacements import LevelDisplacements
@@ -27,12 +27,14 @@ def levelled(frames: Sequence[Pyramid], motions: Sequence[LevelDisplacements]) -
     """
     steps = [log_ratio(a, b, motion) for (a, b), motion in zip(pairwise(frames), motions, strict=True)]
     total = np.cumsum([0.0, *steps])
-    return [_brighter(frame, -log) if abs(log) > NOTABLE else frame for frame, log in zip(frames, total, strict=True)]
+    return [
+        _brighter(frame, -log) if abs(log) > MIN_LOG_RATIO else frame for frame, log in zip(frames, total, strict=True)
+    ]
 
 
 def log_ratio(a: Pyramid, b: Pyramid, motion: LevelDisplacements) -> float:
     """Logarithm of the factor by which frame b is brighter than a: median over the displacements; 0 of too few."""
-    y, x = thinned(np.isfinite(motion.column), SAMPLES)
+    y, x = thinned(np.isfinite(motion.column), MAX_FIT_PIXELS)
     # Centres of the level's pixels, to the nearest pixel of the images; of odd sizes the last one lies outside.
     here = (np.stack([x, y]) + 0.5) * 2.0**motion.level - 0.5
     there = here + np.stack([motion.column[y, x], motion.row[y, x]])
@@ -42,9 +44,9 @@ def log_ratio(a: Pyramid, b: Pyramid, motion: LevelDisplacements) -> float:
     (px, py), (qx, qy) = p[:, inside], q[:, inside]
     before, after = a.images[0][py, px], b.images[0][qy, qx]
     # Clipped grey values tell no factor, and in the dark a grey level is a quarter of the value.
-    good = (np.minimum(before, after) > DARK) & (np.maximum(before, after) < SATURATED)
+    good = (np.minimum(before, after) > MIN_GREY) & (np.maximum(before, after) < MAX_GREY)
     good &= (a.valid[0][py, px] != 0) & (b.valid[0][qy, qx] != 0)
-    if np.count_nonzero(good) < LEAST:
+    if np.count_nonzero(good) < MIN_FIT_PIXELS:
         return 0.0
     return float(np.median(np.log(after[good] / before[good])))
 

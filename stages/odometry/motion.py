@@ -26,8 +26,8 @@ from rille.stages.facts.odometry import MotionFacts
 from rille.stages.geometry.geometry import Camera
 from rille.stages.hfvm import epipolar, fill
 from rille.stages.hfvm.image import view
-from rille.stages.hfvm.level import Steps, Views, descend, median, propagate, search
-from rille.stages.hfvm.native.problem import Pair
+from rille.stages.hfvm.level import LevelSteps, Views, descend, median, propagate, search
+from rille.stages.hfvm.native.problem import LevelPair
 from rille.stages.hfvm.native.solver import solver
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.presets import DEFAULT
@@ -117,10 +117,10 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     )
     # At a coarse level no level is finest: all have the same rounds. At level 0 the matcher's own figures hold.
     rounds = (params.rounds, params.rounds) if level else DEFAULT.steps.rounds
-    views = Views(view(a, hp), view(b, hp), hp, Steps((search, propagate, median), (), rounds))
+    views = Views(view(a, hp), view(b, hp), hp, LevelSteps((search, propagate, median), (), rounds))
     state, layers = descend(views, 0), (views.left.layers[0], views.right.layers[0])
     validity = np.zeros(state.left.u.shape, np.uint8)
-    pair = Pair(layers[0].words, layers[1].words, epipolar.NO_BAND, 0.0)
+    pair = LevelPair(layers[0].words, layers[1].words, epipolar.NO_BAND, 0.0)
     u, v, distance = solver.sums(pair, state.left.u, state.left.v, np.ones_like(validity))
     scale = np.float32(2.0**level)
     mark(validity, a.valid[0] == 0, Validity.OUT_OF_IMAGE)

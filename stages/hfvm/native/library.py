@@ -12,7 +12,7 @@ from numpy.typing import DTypeLike
 
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm.native import build
-from rille.stages.hfvm.native.problem import CANDIDATES, Candidates, EdgeRule, Field, Pair, PathCosts, Smoothing
+from rille.stages.hfvm.native.problem import CANDIDATES, Candidates, EdgeRule, Field, LevelPair, PathCosts, Smoothing
 
 LANES = 8
 """Pixels that the C code looks at together: lists of a row have as much room beyond their end."""
@@ -81,7 +81,7 @@ def _at(array: AnyArray, kind: DTypeLike, shape: tuple[int, ...] | None = None) 
     return int(array.ctypes.data)
 
 
-def _pair(pair: Pair) -> _Pair:
+def _pair(pair: LevelPair) -> _Pair:
     images = [_Image(_at(words, np.uint64), *words.shape) for words in (pair.left, pair.right)]
     band = _Band((c_double * 9)(*np.asarray(pair.f, np.float64).ravel()), pair.mu)
     return _Pair(*images, band, pair.x0, pair.y0, pair.ahead_x, pair.ahead_y)
@@ -93,12 +93,12 @@ def _parents(up: tuple[AnyArray, AnyArray] | None) -> _Parents:
     return _Parents(*(_at(array, np.int16, up[0].shape) for array in up), *up[0].shape)
 
 
-def _field(field: Field, pair: Pair) -> _Field:
+def _field(field: Field, pair: LevelPair) -> _Field:
     return _Field(*(_at(array, np.int32, pair.left.shape) for array in field))
 
 
-def _listed(found: Candidates) -> _Field:
-    return _Field(_at(found.shift, np.int32), _at(found.cost, np.int16, found.shift.shape))
+def _listed(listed: Candidates) -> _Field:
+    return _Field(_at(listed.shift, np.int32), _at(listed.cost, np.int16, listed.shift.shape))
 
 
 class Library:
@@ -119,12 +119,12 @@ class Library:
     def _call(self, name: str, *arguments: Any) -> None:
         getattr(self, f"_{name}")(*arguments)
 
-    def search(self, pair: Pair, up: tuple[AnyArray, AnyArray], reach: tuple[int, int], out: Field) -> None:
+    def search(self, pair: LevelPair, up: tuple[AnyArray, AnyArray], reach: tuple[int, int], out: Field) -> None:
         """Write the best displacements around those of the coarser level, see ``reference.search``."""
         room = np.empty((up[0].shape[0] + 2, up[0].shape[1] + 2), np.int32)
         self._call("search", _pair(pair), _parents(up), _Shift(*reach), _field(out, pair), room.ctypes.data)
 
-    def propagate(self, pair: Pair, field: Field, smoothing: Smoothing) -> None:
+    def propagate(self, pair: LevelPair, field: Field, smoothing: Smoothing) -> None:
         """Improve displacements in place by those of the neighbours, see ``reference.propagate``."""
         dirty = np.empty(pair.left.shape, np.uint8)
         room = np.empty(3 * (pair.left.shape[1] + LANES), np.int32)
@@ -132,7 +132,7 @@ class Library:
         given = _field(field, pair), how, smoothing.rounds, dirty.ctypes.data, room.ctypes.data
         self._call("propagate", _pair(pair), *given)
 
-    def sums(self, pair: Pair, u: AnyArray, v: AnyArray, wanted: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
+    def sums(self, pair: LevelPair, u: AnyArray, v: AnyArray, wanted: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Displacements with fractions of a pixel, and distances, see ``reference.sums``."""
         shape = pair.left.shape
         out = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
@@ -140,7 +140,7 @@ class Library:
         self._call("sums", _pair(pair), *given, _Fine(*(array.ctypes.data for array in out)))
         return out
 
-    def edges(self, pair: Pair, grey: AnyArray, shift: AnyArray, wanted: AnyArray, rule: EdgeRule) -> AnyArray:
+    def edges(self, pair: LevelPair, grey: AnyArray, shift: AnyArray, wanted: AnyArray, rule: EdgeRule) -> AnyArray:
         """Displacements with depth edges placed anew, see ``reference.edges``."""
         shape, out = pair.left.shape, shift.copy()
         given = _at(grey, np.int16, shape), _at(shift, np.int32, shape), _at(wanted, np.uint8, shape)
@@ -149,7 +149,7 @@ class Library:
 
     def candidates(
         self,
-        pair: Pair,
+        pair: LevelPair,
         compact: tuple[AnyArray, AnyArray],
         shift: AnyArray,
         up: tuple[AnyArray, AnyArray] | None,
@@ -157,25 +157,25 @@ class Library:
     ) -> Candidates:
         """Candidates of each pixel and their costs, see ``reference.candidates``."""
         shape = pair.left.shape
-        found = Candidates(np.empty((*shape, CANDIDATES), np.int32), np.empty((*shape, CANDIDATES), np.int16))
+        listed = Candidates(np.empty((*shape, CANDIDATES), np.int32), np.empty((*shape, CANDIDATES), np.int16))
         words = (c_void_p * 2)(_at(compact[0], np.uint64, shape), _at(compact[1], np.uint64, pair.right.shape))
-        given = _at(shift, np.int32, shape), _parents(up), _PathCosts(*costs), _listed(found)
+        given = _at(shift, np.int32, shape), _parents(up), _PathCosts(*costs), _listed(listed)
         self._call("candidates", _pair(pair), words, *given)
-        return found
+        return listed
 
-    def sweep(self, found: Candidates, grey: AnyArray, costs: PathCosts, backward: bool, total: AnyArray) -> None:
+    def sweep(self, listed: Candidates, grey: AnyArray, costs: PathCosts, backward: bool, total: AnyArray) -> None:
         """Add the costs along three directions to ``total``, see ``reference.sweep``."""
-        rows, cols, _ = found.cost.shape
+        rows, cols, _ = listed.cost.shape
         room = np.empty(6 * cols * CANDIDATES, np.int32)
         given = (
             _at(grey, np.float32, (rows, cols)),
             _PathCosts(*costs),
             backward,
-            _at(total, np.int32, found.cost.shape),
+            _at(total, np.int32, listed.cost.shape),
         )
-        self._call("sweep", rows, cols, _listed(found), *given, room.ctypes.data)
+        self._call("sweep", rows, cols, _listed(listed), *given, room.ctypes.data)
 
-    def choose(self, found: Candidates, total: AnyArray, shift: AnyArray) -> None:
+    def choose(self, listed: Candidates, total: AnyArray, shift: AnyArray) -> None:
         """Write the candidates of least total to ``shift``, see ``reference.choose``."""
-        given = _at(total, np.int32, found.cost.shape), shift.size, _at(shift, np.int32, found.cost.shape[:2])
-        self._call("choose", _listed(found), *given)
+        given = _at(total, np.int32, listed.cost.shape), shift.size, _at(shift, np.int32, listed.cost.shape[:2])
+        self._call("choose", _listed(listed), *given)

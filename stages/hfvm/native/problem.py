@@ -9,7 +9,7 @@ import numpy as np
 from rille.stages.core.declare import AnyArray
 
 
-class Pair(NamedTuple):
+class LevelPair(NamedTuple):
     """Feature vectors of two images, or of windows of them, and the epipolar band.
 
     ``left, right``: (row, col) uint64. ``f``: (3, 3) float64, fundamental matrix of the images, zeros without a band;

@@ -18,7 +18,7 @@ from rille.stages.hfvm.native.problem import (
     Candidates,
     EdgeRule,
     Field,
-    Pair,
+    LevelPair,
     PathCosts,
     Smoothing,
     unpacked,
@@ -33,8 +33,11 @@ SHARP = 3.0
 TRUNCATION = 2
 """Pixels: beyond this a step to a neighbour costs no more, so that depth edges stay."""
 
-COLUMNS, MOST_STRIPS = 8, 512
-"""Columns that are searched together, and room for the strips of a pixel: 5 centres, 17 rows, 3 pieces each."""
+COLUMNS = 8
+"""Columns that are searched together."""
+
+MAX_STRIPS = 512
+"""Room for the strips of a pixel: 5 centres, 17 rows, 3 pieces each."""
 
 SUM_RADIUS = 2
 """Pixels: reach of the windows over which distances are summed."""
@@ -48,8 +51,11 @@ TOP_RADIUS = 1
 UNSEEN = np.iinfo(np.int32).max
 """More than any cost of the top level."""
 
-UNIT, OUTSIDE = 4, 8000
-"""Cost of a byte step on a path, and of a candidate that leads out of the other image: that of unlike pixels."""
+UNIT = 4
+"""Cost of a byte step on a path."""
+
+OUTSIDE = 8000
+"""Cost of a candidate that leads out of the other image: that of unlike pixels."""
 
 BESIDE = ((0, 0), (0, -1), (0, 1), (-1, 0), (1, 0))
 """Rows and columns added to a pixel's own displacement on a path."""
@@ -87,7 +93,7 @@ def _off_line(line, u, v):  # type: ignore[no-untyped-def]
 # -- the top level -----------------------------------------------------------------------------------------------------
 
 
-def exhaustive(pair: Pair, reach: tuple[int, int], out: Field) -> None:
+def exhaustive(pair: LevelPair, reach: tuple[int, int], out: Field) -> None:
     """Write the displacements within ``reach`` (columns, rows) whose distance, summed over 3 x 3 pixels, is least.
 
     Null prediction and large search area (4.3.4), for the top level. Mean over the window's pixels that both images
@@ -155,7 +161,7 @@ def _exhaustive(left, right, reach_x, reach_y, out):  # type: ignore[no-untyped-
 # -- search ------------------------------------------------------------------------------------------------------------
 
 
-def search(pair: Pair, up: tuple[AnyArray, AnyArray], reach: tuple[int, int], out: Field) -> None:
+def search(pair: LevelPair, up: tuple[AnyArray, AnyArray], reach: tuple[int, int], out: Field) -> None:
     """Write the best displacements around the doubled ones of the coarse parent and of the pixels beside it.
 
     The four pixels of a parent try the same, and share the line of their middle: along the row through each centre, and
@@ -197,7 +203,7 @@ def _search(pair, centres, reach, out):  # type: ignore[no-untyped-def]
     left, right, shift, costs = pair.left, pair.right, out.shift, out.cost
     near, best, least = np.empty(5, np.int32), np.empty(4, np.int32), np.empty(4, np.int64)
     (rows, cols), (right_rows, right_cols) = left.shape, right.shape
-    strips, words = np.empty((MOST_STRIPS, 5), np.int64), np.empty(4, np.uint64)
+    strips, words = np.empty((MAX_STRIPS, 5), np.int64), np.empty(4, np.uint64)
     for j in range(1, centres.shape[0] - 1):
         terms = epipolar.row_terms(pair.f, pair.y0 + 2 * (j - 1) + 0.5)
         for i in range(1, centres.shape[1] - 1):
@@ -272,7 +278,7 @@ def _rectangles(near, reach, soft, strips):  # type: ignore[no-untyped-def]
 # -- propagation -------------------------------------------------------------------------------------------------------
 
 
-def propagate(pair: Pair, field: Field, smoothing: Smoothing) -> None:
+def propagate(pair: LevelPair, field: Field, smoothing: Smoothing) -> None:
     """Improve displacements in place: each pixel tries its neighbours' and those beside its own.
 
     Cost: that of the displacement + smoothness times the sum over the four neighbours of min(|du| + |dv|, 2); beyond
@@ -370,7 +376,7 @@ def _roughness(shift, near):  # type: ignore[no-untyped-def]
 # -- fractions of a pixel ----------------------------------------------------------------------------------------------
 
 
-def sums(pair: Pair, u: AnyArray, v: AnyArray, wanted: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
+def sums(pair: LevelPair, u: AnyArray, v: AnyArray, wanted: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
     """Displacements with fractions of a pixel, and distances, from distances summed over 5 x 5 pixels (paper, 4.3.2).
 
     Only where ``wanted`` is not zero and the window, moved by a pixel, lies inside both images; elsewhere the
@@ -452,7 +458,7 @@ def _sums(pair, maps, wanted, out):  # type: ignore[no-untyped-def]
 # -- depth edges -------------------------------------------------------------------------------------------------------
 
 
-def edges(pair: Pair, grey: AnyArray, shift: AnyArray, wanted: AnyArray, rule: EdgeRule) -> AnyArray:
+def edges(pair: LevelPair, grey: AnyArray, shift: AnyArray, wanted: AnyArray, rule: EdgeRule) -> AnyArray:
     """Packed displacements (row, col) int32, depth edges placed anew, see :mod:`rille.stages.hfvm.level`.
 
     Parameters
@@ -529,7 +535,7 @@ def _window_cost(pair, grey, y, x, u, v, rule):  # type: ignore[no-untyped-def]
 
 
 def candidates(
-    pair: Pair,
+    pair: LevelPair,
     compact: tuple[AnyArray, AnyArray],
     shift: AnyArray,
     up: tuple[AnyArray, AnyArray] | None,
@@ -547,10 +553,10 @@ def candidates(
     shift : (row, col) int32 packed displacements.
     up : columns and rows of displacement of the coarser level, int16, or None.
     """
-    found = Candidates(np.empty((*shift.shape, CANDIDATES), np.int32), np.empty((*shift.shape, CANDIDATES), np.int16))
+    listed = Candidates(np.empty((*shift.shape, CANDIDATES), np.int32), np.empty((*shift.shape, CANDIDATES), np.int16))
     none = np.zeros((0, 0), np.int16)
-    _candidates(pair, compact, shift, up or (none, none), costs.compact, found)
-    return found
+    _candidates(pair, compact, shift, up or (none, none), costs.compact, listed)
+    return listed
 
 
 @njit(cache=True, nogil=True, forceinline=True)
@@ -559,7 +565,7 @@ def _inside(index, size):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _candidates(pair, compact, shift, up, share, found):  # type: ignore[no-untyped-def]
+def _candidates(pair, compact, shift, up, share, listed):  # type: ignore[no-untyped-def]
     rows, cols = shift.shape
     us, vs = np.empty(26, np.int64), np.empty(26, np.int64)
     for y in range(rows):
@@ -586,7 +592,7 @@ def _candidates(pair, compact, shift, up, share, found):  # type: ignore[no-unty
                 # Each once: there is room for few, and equal ones would take it from others.
                 known = n > 0 and not inside
                 for k in range(count):
-                    known |= found.shift[y, x, k] == pack(u, v)
+                    known |= listed.shift[y, x, k] == pack(u, v)
                 if known or count == CANDIDATES:
                     continue
                 cost = np.int64(OUTSIDE)
@@ -596,20 +602,20 @@ def _candidates(pair, compact, shift, up, share, found):  # type: ignore[no-unty
                 off = abs(np.float64(line[0]) * u + np.float64(line[1]) * v + np.float64(line[2]))
                 cost += np.int64(min((UNIT + share) * pair.mu * off, 2.0 * OUTSIDE))
                 # Leaves room below NONE for the greatest step, 10000.
-                found.shift[y, x, count], found.cost[y, x, count] = pack(u, v), min(cost, 2 * OUTSIDE)
+                listed.shift[y, x, count], listed.cost[y, x, count] = pack(u, v), min(cost, 2 * OUTSIDE)
                 count += 1
             for k in range(count, CANDIDATES):
-                found.shift[y, x, k], found.cost[y, x, k] = shift[y, x], NONE
+                listed.shift[y, x, k], listed.cost[y, x, k] = shift[y, x], NONE
 
 
-def sweep(found: Candidates, grey: AnyArray, costs: PathCosts, backward: bool, total: AnyArray) -> None:
+def sweep(listed: Candidates, grey: AnyArray, costs: PathCosts, backward: bool, total: AnyArray) -> None:
     """Add to ``total`` (row, col, :data:`CANDIDATES`) int32 the costs along three directions: from the upper left,
     above, the upper right; ``backward``: their opposites. ``grey``: (row, col) float32."""
-    _sweep(found, grey, costs, backward, total)
+    _sweep(listed, grey, costs, backward, total)
 
 
 @njit(cache=True, nogil=True)
-def _sweep(found, grey, costs, backward, total):  # type: ignore[no-untyped-def]
+def _sweep(listed, grey, costs, backward, total):  # type: ignore[no-untyped-def]
     """Row by row over planes of one candidate each, which makes vectors; float32 holds these integers."""
     rows, cols = grey.shape
     # Of the row and of the row before it: columns, rows, costs of the candidates.
@@ -621,8 +627,8 @@ def _sweep(found, grey, costs, backward, total):  # type: ignore[no-untyped-def]
         y = rows - 1 - row if backward else row
         for x in range(cols):
             for k in range(CANDIDATES):
-                shift = found.shift[y, x, k]
-                here[0, k, x], here[1, k, x], here[2, k, x] = columns(shift), rows_of(shift), found.cost[y, x, k]
+                shift = listed.shift[y, x, k]
+                here[0, k, x], here[1, k, x], here[2, k, x] = columns(shift), rows_of(shift), listed.cost[y, x, k]
         for d in range(3):
             after[d] = here[2]
             # Columns that have a pixel before them on the path, ``side`` columns away.
@@ -677,18 +683,18 @@ def _step(candidates, path, small, room):  # type: ignore[no-untyped-def]
             out[x] = min(cost[x] + out[x] - least[x], np.float32(NONE))
 
 
-def choose(found: Candidates, total: AnyArray, shift: AnyArray) -> None:
+def choose(listed: Candidates, total: AnyArray, shift: AnyArray) -> None:
     """Write the packed displacements of least total to ``shift``; the first of equal ones."""
-    _choose(found, total, shift)
+    _choose(listed, total, shift)
 
 
 @njit(cache=True, nogil=True)
-def _choose(found, total, shift):  # type: ignore[no-untyped-def]
+def _choose(listed, total, shift):  # type: ignore[no-untyped-def]
     for y in range(shift.shape[0]):
         for x in range(shift.shape[1]):
             best = 0
             for k in range(1, CANDIDATES):
                 # Strictly less: the pixel's own displacement comes first and wins ties.
-                if found.cost[y, x, k] != NONE and total[y, x, k] < total[y, x, best]:
+                if listed.cost[y, x, k] != NONE and total[y, x, k] < total[y, x, best]:
                     best = k
-            shift[y, x] = found.shift[y, x, best]
+            shift[y, x] = listed.shift[y, x, best]

@@ -13,9 +13,9 @@ from rille.stages.hfvm.native.library import Library
 def _native() -> Library | None:
     """The solver in C; compiled anew where there is none of these sources. None: it cannot be compiled or loaded."""
     path = build.binary()
-    found = path if path.is_file() else build.compiled()
+    binary = path if path.is_file() else build.compiled()
     try:
-        return None if found is None else Library(str(found))
+        return None if binary is None else Library(str(binary))
     except OSError:
         return None
 

@@ -4,22 +4,22 @@ import numpy as np
 import pytest
 
 from rille.stages.hfvm.features import compact
-from rille.stages.hfvm.level import EDGES
-from rille.stages.hfvm.native.problem import Pair, pack_map, unpacked
+from rille.stages.hfvm.level import EDGE_RULE
+from rille.stages.hfvm.native.problem import LevelPair, pack_map, unpacked
 from rille.stages.hfvm.native.reference import EDGE_RADIUS as RADIUS
 from rille.stages.hfvm.native.solver import solver
 
 ROWS, COLS = 40, 60
 
 
-REACH, GREY, FAR, BETTER = EDGES.reach, EDGES.grey, EDGES.far, (EDGES.own, EDGES.other)
+REACH, GREY, FAR, BETTER = EDGE_RULE.reach, EDGE_RULE.grey, EDGE_RULE.far, (EDGE_RULE.own, EDGE_RULE.other)
 AROUND = tuple((j * k, i * k) for k in (REACH // 2, REACH) for j, i in ((1, 0), (-1, 0), (0, 1), (0, -1)))
 
 
 def place(left, right, maps, wanted, at, near_sign):
     """Displacements with depth edges placed anew."""
-    words = Pair(compact(left), compact(right), np.zeros((3, 3)), 0.0, ahead_x=at[0], ahead_y=at[1])
-    rule = EDGES._replace(near=int(near_sign))
+    words = LevelPair(compact(left), compact(right), np.zeros((3, 3)), 0.0, ahead_x=at[0], ahead_y=at[1])
+    rule = EDGE_RULE._replace(near=int(near_sign))
     return unpacked(solver.edges(words, np.rint(left).astype(np.int16), pack_map(*maps), wanted.view(np.uint8), rule))
 
 
@@ -35,7 +35,7 @@ def by_the_equation(left, right, u, v, wanted, at, near_sign):
             tried = [(int(u[y, x]), int(v[y, x]))]
             for j, i in AROUND:
                 one = int(u[y + j, x + i]), int(v[y + j, x + i])
-                if all(max(abs(one[0] - p), abs(one[1] - q)) >= EDGES.apart for p, q in tried):
+                if all(max(abs(one[0] - p), abs(one[1] - q)) >= EDGE_RULE.apart for p, q in tried):
                     tried.append(one)
             if len(tried) == 1 or not wanted[y, x]:
                 continue

@@ -93,7 +93,7 @@ def test_distance_of_words_is_the_sum_of_absolute_byte_differences():
 
 def test_words_of_rows_are_those_of_the_whole():
     image = (255 * np.random.default_rng(4).random((20, 22))).astype(np.float32)
-    r = features.RADIUS
+    r = features.RADIUS_PX
     words, deviation = np.empty((8, 10), np.uint64), np.empty((8, 10), np.float32)
     scale = np.asarray(WEIGHTS, np.float32) * np.float32(features.STEPS_PER_UNIT)
     features.pack_rows(image, 0, scale, words, deviation)

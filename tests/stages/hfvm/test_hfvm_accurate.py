@@ -12,10 +12,19 @@ from rille.stages.geometry.spline import coefficients
 from rille.stages.hfvm import epipolar, relief
 from rille.stages.hfvm.features import compact
 from rille.stages.hfvm.image import Layer
-from rille.stages.hfvm.level import FREE, Look, Map, paths
-from rille.stages.hfvm.lucas_kanade import Images
+from rille.stages.hfvm.level import FREE_BAND, Look, Map, paths
+from rille.stages.hfvm.lucas_kanade import SplineImages
 from rille.stages.hfvm.native import reference
-from rille.stages.hfvm.native.problem import CANDIDATES, NONE, Candidates, Field, Pair, PathCosts, pack_map, unpacked
+from rille.stages.hfvm.native.problem import (
+    CANDIDATES,
+    NONE,
+    Candidates,
+    Field,
+    LevelPair,
+    PathCosts,
+    pack_map,
+    unpacked,
+)
 from rille.stages.hfvm.params import PRESETS, HfvmParams
 from rille.stages.hfvm.stage import match
 from rille.stages.hfvm.validation import lonely
@@ -34,7 +43,7 @@ def view(image):
 
 def propagated(left, right, start, up=None):
     """Displacements of two images improved along paths."""
-    look = Look(1, view(left), view(right), None if up is None else Map(*up), FREE, 0.0, 1, ACC)
+    look = Look(1, view(left), view(right), None if up is None else Map(*up), FREE_BAND, 0.0, 1, ACC)
     nothing = np.zeros(left.shape, np.int32)
     return unpacked(paths(look, Field(pack_map(*start), nothing)).shift)
 
@@ -161,7 +170,7 @@ def test_candidates_and_their_costs_are_those_of_the_definition(mu, with_up):
     f = rng.normal(0, 1, (3, 3))
     lines = epipolar.lines(f, left.shape)
     given = (a.compact, b.compact), pack_map(*maps), None if up is None else tuple(up), COSTS
-    shift, cost = reference.candidates(Pair(a.words, b.words, f, mu), *given)
+    shift, cost = reference.candidates(LevelPair(a.words, b.words, f, mu), *given)
     cu, cv = unpacked(shift)
 
     def apart(word, other):
@@ -225,7 +234,7 @@ def slanted(noise):
 
 
 def fitted(left, right, start, keep):
-    return relief.fit(Images(left, coefficients(right), np.ones(right.shape, np.uint8)), *start, keep)
+    return relief.fit(SplineImages(left, coefficients(right), np.ones(right.shape, np.uint8)), *start, keep)
 
 
 def test_relief_restores_a_slanted_plane():

@@ -221,7 +221,7 @@ def test_prior_that_a_plane_leads_beyond_all_bounds_is_unknown():
     ends = np.full((64, 64), 15900.0, np.float32)
     led = start.aligned(start.check((ends, 0 * ends), ends.shape), horizon)
     assert led is not None
-    np.testing.assert_array_less(np.abs(led.u[np.isfinite(led.u)]), start.MOST)
+    np.testing.assert_array_less(np.abs(led.u[np.isfinite(led.u)]), start.MAX_DISPLACEMENT_PX)
     near = start.aligned(start.check((0 * ends, 0 * ends), ends.shape), horizon)
     assert near is not None
     assert np.isfinite(near.u).all()

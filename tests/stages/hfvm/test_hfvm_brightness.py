@@ -7,7 +7,7 @@ from matching_scenes import pair, seen
 from rille.stages.core.validity import matched
 from rille.stages.hfvm import brightness
 from rille.stages.hfvm.image import view as image_of
-from rille.stages.hfvm.level import FREE, Map, State
+from rille.stages.hfvm.level import FREE_BAND, Map, State
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
 from rille.stages.hfvm.windows import Window
@@ -24,7 +24,7 @@ def view(image):
 def state(level, u, ok):
     """Matches of a level along its rows."""
     matches = Map(u, np.zeros(u.shape, np.int16))
-    return State(level, matches, matches, ok, ok, FREE, 0.0)
+    return State(level, matches, matches, ok, ok, FREE_BAND, 0.0)
 
 
 def logarithm(shape, level=0):
@@ -101,4 +101,4 @@ def test_equal_light_is_left_alone():
     ok = np.zeros(shape, bool)
     ok[:, 6:] = True
     found = brightness.matched(*views, state(level, u, ok))
-    assert brightness.greatest(found) < brightness.NOTABLE
+    assert brightness.greatest(found) < brightness.MIN_LOG_RATIO

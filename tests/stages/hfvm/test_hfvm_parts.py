@@ -18,7 +18,7 @@ from rille.stages.hfvm.level import Map
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.plane import Sample
 from rille.stages.hfvm.stage import match
-from rille.stages.hfvm.validation import FAILED, agree, backmatch, isolated
+from rille.stages.hfvm.validation import FAILED_PX, agree, backmatch, isolated
 from rille.stages.hfvm.windows import Window
 from rille.stages.imaging.pyramid import PyramidParams, build
 
@@ -29,7 +29,7 @@ def zeros(*shape):
 
 class TestConsistency:
     def backmatch(self, lu, lv, ru, rv, valid=None):
-        error = np.full(lu.shape, FAILED, np.float32)
+        error = np.full(lu.shape, FAILED_PX, np.float32)
         valid = np.ones(ru.shape, np.uint8) if valid is None else valid
         backmatch(lu, lv, (ru, rv), valid, error)
         return error
@@ -41,13 +41,13 @@ class TestConsistency:
         error = self.backmatch(lu, lv, ru, rv)
         # 0 -> 1 -> 0; 1 -> 2 -> -1: two off; 2.5: nearest is 3 (half rounds up), -1 + 0.5; 3 leaves
         np.testing.assert_allclose(error[0, :3], [0, 2, 0.5])
-        assert error[0, 3] == FAILED
+        assert error[0, 3] == FAILED_PX
 
     def test_rows_count_and_masked_targets_fail(self):
         lu, lv = zeros(2, 2), zeros(2, 2)
         lv[0] = 1
         error = self.backmatch(lu, lv, zeros(2, 2), zeros(2, 2), np.array([[1, 1], [1, 0]], np.uint8))
-        np.testing.assert_array_equal(error, [[1, FAILED], [0, FAILED]])
+        np.testing.assert_array_equal(error, [[1, FAILED_PX], [0, FAILED_PX]])
 
     @settings(max_examples=30, deadline=None)
     @given(st.integers(0, 10**6))
@@ -215,7 +215,7 @@ class TestPlane:
 
 def refined(left, right, start, keep, steps=1):
     """Result of Lucas-Kanade steps towards all of a right image, usable everywhere."""
-    images = lucas_kanade.Images(left, coefficients(right), np.ones(right.shape, np.uint8))
+    images = lucas_kanade.SplineImages(left, coefficients(right), np.ones(right.shape, np.uint8))
     return lucas_kanade.refine(images, lambda u, v: (u, v), start, keep, steps)
 
 
@@ -347,7 +347,7 @@ def test_a_patch_without_texture_on_a_textured_wall_is_matched_with_a_larger_dev
     np.testing.assert_allclose(found.column_disparity[inside], -12, atol=0.5)
     around = found.disparity_std[20:60, 40:180]
     more = np.nanmin(found.disparity_std[inside]) ** 2 - np.nanmedian(around) ** 2
-    assert more > 0.99 * uncertainty.BLANK**2
+    assert more > 0.99 * uncertainty.BLANK_STD_PX**2
 
 
 def test_a_spline_is_scipys_between_pixels():

@@ -6,7 +6,7 @@ import pytest
 from rille.stages.hfvm import epipolar, paper
 from rille.stages.hfvm.level import Map
 from rille.stages.hfvm.native import reference
-from rille.stages.hfvm.native.problem import FAR, Field, Pair, Smoothing, pack_map, unpacked
+from rille.stages.hfvm.native.problem import FAR, Field, LevelPair, Smoothing, pack_map, unpacked
 
 ROWS, COLS = 11, 13
 
@@ -110,7 +110,7 @@ def test_descend_finds_the_first_of_the_best_around_its_centres(mu, reach_x, rea
     up_u[2:], up_v[2:] = up_u[2:] // 2 + 1, 0
     f = some_band(4)
     out = Field(*np.zeros((2, ROWS, COLS), np.int32))
-    reference.search(Pair(left, right, f, mu, X0, Y0), (up_u, up_v), (reach_x, reach_y), out)
+    reference.search(LevelPair(left, right, f, mu, X0, Y0), (up_u, up_v), (reach_x, reach_y), out)
     found_u, found_v = unpacked(out.shift)
     for y, x in np.ndindex(ROWS, COLS):
         j, i = y // 2, x // 2
@@ -165,7 +165,7 @@ def test_propagation_equals_slow_numpy_over_several_rounds(mu, beside, monkeypat
     for rounds in (1, 3):
         expected = slow_checkerboard(left, right, u, v, f, mu, 2, rounds, beside)
         field = Field(pack_map(u, v), costs(left, right, u, v, f, mu))
-        reference.propagate(Pair(left, right, f, mu, X0, Y0), field, Smoothing(2, rounds, beside))
+        reference.propagate(LevelPair(left, right, f, mu, X0, Y0), field, Smoothing(2, rounds, beside))
         found = unpacked(field.shift)
         np.testing.assert_array_equal(found, expected)
         assert (found[0] != u).any()
@@ -186,7 +186,7 @@ def test_exhaustive_search_finds_a_two_dimensional_shift_and_prefers_the_short_o
     big = words((20, 24), 9)
     left, right = big[4:16, 6:18], big[2:14, 3:15]
     none, out = np.zeros((3, 3)), Field(*np.zeros((2, 12, 12), np.int32))
-    reference.exhaustive(Pair(left, right, none, 0.0), (6, 6), out)
+    reference.exhaustive(LevelPair(left, right, none, 0.0), (6, 6), out)
     u, v = unpacked(out.shift)
     assert (u[:9, :8] == 3).all()
     assert (v[:9, :8] == 2).all()
@@ -194,7 +194,7 @@ def test_exhaustive_search_finds_a_two_dimensional_shift_and_prefers_the_short_o
         assert out.cost[y, x] == sad(left[y, x], right[y + v[y, x], x + u[y, x]])
     flat = np.zeros((5, 5), np.uint64)
     out = Field(*np.full((2, 5, 5), 99, np.int32))
-    reference.exhaustive(Pair(flat, flat, none, 0.0), (3, 3), out)
+    reference.exhaustive(LevelPair(flat, flat, none, 0.0), (3, 3), out)
     assert (out.shift == 0).all()
 
 
@@ -205,7 +205,7 @@ def test_summed_distances_against_numpy():
     u[5:7], v[5:7] = 1, 0
     wanted = np.ones((12, 14), np.uint8)
     wanted[5, 5] = 0
-    fine_u, fine_v, d = reference.sums(Pair(left, right, np.zeros((3, 3)), 0.0), u, v, wanted)
+    fine_u, fine_v, d = reference.sums(LevelPair(left, right, np.zeros((3, 3)), 0.0), u, v, wanted)
 
     def total(y, x, du, dv):
         return sum(sad(left[y + j, x + i], right[y + j + dv, x + i + du]) for j in range(-2, 3) for i in range(-2, 3))

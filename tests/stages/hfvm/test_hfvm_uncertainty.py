@@ -9,13 +9,13 @@ from rille.stages.geometry.spline import coefficients
 from rille.stages.hfvm import lucas_kanade
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
-from rille.stages.hfvm.uncertainty import FLOOR, neighbours, standard_deviation
+from rille.stages.hfvm.uncertainty import FLOOR_PX, neighbours, standard_deviation
 
 
 def per_noise(left, right):
     """Variance of undisplaced columns for a unit of variance of the grey levels."""
     nothing, keep = np.zeros(left.shape, np.float32), np.ones(left.shape, bool)
-    images = lucas_kanade.Images(left, coefficients(right), np.ones(right.shape, np.uint8))
+    images = lucas_kanade.SplineImages(left, coefficients(right), np.ones(right.shape, np.uint8))
     return lucas_kanade.refine(images, lambda u, v: (u, v), (nothing, nothing), keep, 1).per_noise
 
 
@@ -25,7 +25,7 @@ def test_noise_part_is_the_inverse_structure_tensor_of_the_window():
     window = np.s_[y - 2 : y + 3, x - 2 : x + 3]
     gy, gx = np.gradient(image.astype(np.float64))
     g = np.stack([gx[window].ravel(), gy[window].ravel()])
-    tensor = 25 * np.cov(g, bias=True) + 25 * lucas_kanade.NOISE * np.eye(2)
+    tensor = 25 * np.cov(g, bias=True) + 25 * lucas_kanade.ASSUMED_NOISE_VARIANCE * np.eye(2)
     assert per_noise(image, image)[y, x] == pytest.approx(np.linalg.inv(tensor)[0, 0], rel=1e-4)
 
 
@@ -77,7 +77,7 @@ def test_undefined_exactly_where_nothing_was_matched():
     left, right, *_ = pair(lambda x, y: (-8.0, 1.0), noise=3.0)
     found = match(left, right)
     np.testing.assert_array_equal(np.isfinite(found.disparity_std), matched(found.validity))
-    assert np.nanmin(found.disparity_std) >= FLOOR
+    assert np.nanmin(found.disparity_std) >= FLOOR_PX
 
 
 def test_no_kept_pixel_gives_no_number_and_no_warning():
@@ -88,7 +88,7 @@ def test_no_kept_pixel_gives_no_number_and_no_warning():
 
 def beyond_floor(std):
     """What a standard deviation has beside the floor, which no pixel shows."""
-    return np.sqrt(max(float(std) ** 2 - FLOOR**2, 0.0))
+    return np.sqrt(max(float(std) ** 2 - FLOOR_PX**2, 0.0))
 
 
 def test_edges_along_the_rows_leave_the_column_uncertain():

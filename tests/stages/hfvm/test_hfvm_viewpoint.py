@@ -65,7 +65,7 @@ def test_a_plane_fitted_to_chance_matches_does_not_rule_out_a_turn(monkeypatch):
 def test_keypoints_tell_the_homography_at_full_resolution():
     left, right, u, v = turned(75, 1.2)
     views = [view(build(cv2.resize(image, None, fx=4, fy=4), PyramidParams()), HfvmParams()) for image in (left, right)]
-    assert max(views[1].shapes[0]) > viewpoint.SIDE
+    assert max(views[1].shapes[0]) > viewpoint.MAX_SIDE_PX
     h = viewpoint.find(*views)
     x, y, _ = h @ (4 * 100 + 1.5, 4 * 80 + 1.5, 1) / (h[2] @ (4 * 100 + 1.5, 4 * 80 + 1.5, 1))
     np.testing.assert_allclose((x, y), (4 * (100 + u[80, 100]) + 1.5, 4 * (80 + v[80, 100]) + 1.5), atol=1.0)

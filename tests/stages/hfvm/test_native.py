@@ -11,7 +11,7 @@ import pytest
 from rille.pipeline.engine.code_digest import module_digests
 from rille.stages.hfvm.native import build, reference
 from rille.stages.hfvm.native.library import Library
-from rille.stages.hfvm.native.problem import FAR, EdgeRule, Field, Pair, PathCosts, Smoothing, pack_map
+from rille.stages.hfvm.native.problem import FAR, EdgeRule, Field, LevelPair, PathCosts, Smoothing, pack_map
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no compiler")
 
@@ -38,7 +38,7 @@ def some_pair(sizes, rng, mu, levels=6):
     left, right = (words(size, rng, levels) for size in sizes)
     f = np.array([[1e-4, 0.02, 0.1], [0.01, 1e-3, 1.0], [0.03, -1.0, 0.4]]) + rng.normal(0, 1e-3, (3, 3))
     place = {"x0": 6, "y0": 4, "ahead_x": int(rng.integers(-1, 2)), "ahead_y": int(rng.integers(-1, 2))}
-    return Pair(left, right, f if mu else np.zeros((3, 3)), mu, **place)
+    return LevelPair(left, right, f if mu else np.zeros((3, 3)), mu, **place)
 
 
 def some_maps(shape, rng, reach=4):

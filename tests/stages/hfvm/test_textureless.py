@@ -10,7 +10,7 @@ from rille.stages.hfvm.matcher import How
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
 from rille.stages.hfvm.textureless import Planes
-from rille.stages.hfvm.wide_search import APART, CAP, SIDE, Pair, search
+from rille.stages.hfvm.wide_search import MAX_DISTANCE, MIN_DISTINCT_STEPS, WINDOW_SIDE_PX, WordPair, search
 from rille.stages.hfvm.windows import Window, whole
 
 ROWS, COLS = 220, 300
@@ -156,12 +156,15 @@ def test_search_and_its_definition_agree():
     region[2:24, 3:36] = True
     region[10:14, 12:20] = False
     lines = epipolar.lines(np.array([[0, 0, 0], [0, 0, 1.0], [0, -1.0, -1.0]]), window.shape)
-    found = search(Pair(words, others, valid, window), region, lines, steps)
+    found = search(WordPair(words, others, valid, window), region, lines, steps)
     a, b = (w.view(np.uint8).reshape(*w.shape, 8).astype(int) for w in (words, others))
     inside_region = np.argwhere(region)
     sums, sizes = np.full((*region.shape, len(steps)), np.inf), np.zeros(region.shape)
     for y, x in inside_region:
-        around = np.s_[max(y - SIDE // 2, 0) : y + SIDE // 2 + 1, max(x - SIDE // 2, 0) : x + SIDE // 2 + 1]
+        around = np.s_[
+            max(y - WINDOW_SIDE_PX // 2, 0) : y + WINDOW_SIDE_PX // 2 + 1,
+            max(x - WINDOW_SIDE_PX // 2, 0) : x + WINDOW_SIDE_PX // 2 + 1,
+        ]
         j, i = (p[around][region[around]] for p in np.indices(region.shape))
         sizes[y, x] = len(j)
         for n, step in enumerate(steps.astype(int)):
@@ -169,7 +172,7 @@ def test_search_and_its_definition_agree():
             if (q < 0).any() or (q >= 40).any() or (p < 0).any() or (p >= 60).any() or not valid[q, p].all():
                 continue
             apart = np.abs(a[j + window.y0, i + window.x0] - b[q, p]).sum(axis=1)
-            sums[y, x, n] = np.minimum(apart, CAP).sum()
+            sums[y, x, n] = np.minimum(apart, MAX_DISTANCE).sum()
     claims = {}
     for n, step in enumerate(steps.astype(int)):
         for y, x in inside_region:
@@ -184,9 +187,9 @@ def test_search_and_its_definition_agree():
         fraction = 0.5 * (before - after) / rise if np.isfinite(rise) and rise > 0 else 0.0
         assert found.best[y, x] == pytest.approx(steps[k] + fraction, abs=1e-5)
         assert found.least[y, x] == sums[y, x, k]
-        rival = min(total for n, total in enumerate(sums[y, x]) if abs(n - k) > APART)
+        rival = min(total for n, total in enumerate(sums[y, x]) if abs(n - k) > MIN_DISTINCT_STEPS)
         assert found.distinct[y, x] == (rival - sums[y, x, k] if np.isfinite(rival) else 0)
-        assert found.mutual[y, x] == (abs(claims[y, x + int(steps[k])][1] - steps[k]) <= APART)
+        assert found.mutual[y, x] == (abs(claims[y, x + int(steps[k])][1] - steps[k]) <= MIN_DISTINCT_STEPS)
     assert not found.mutual[found.tried == 0].any()
     tried = found.tried[region]
     assert set(tried) >= {0, 5, len(steps)}
