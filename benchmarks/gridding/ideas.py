@@ -26,17 +26,17 @@ Changes = Mapping[tuple[Any, str], Any]
 IDEAS: tuple[tuple[str, dict[str, Any], Changes], ...] = (
     ("refinement by both images", {"refine_steps": 0}, {}),
     ("second step of it", {"refine_steps": 1}, {}),
-    ("edges in it", {}, {(refinement, "BEND"): 1e9}),
-    ("smoothness in it", {}, {(refinement, "STIFFNESS"): 40.0}),
-    ("weights against highlights", {}, {(refinement, "RESIDUAL"): 1e9}),
-    ("a window for the local mean", {}, {(refinement, "MEAN_SIDE"): 151}),
+    ("edges in it", {}, {(refinement, "MAX_BEND_PX"): 1e9}),
+    ("smoothness in it", {}, {(refinement, "BEND_STIFFNESS"): 40.0}),
+    ("weights against highlights", {}, {(refinement, "HALVING_RESIDUAL_GREY"): 1e9}),
+    ("a window for the local mean", {}, {(refinement, "MEAN_SIDE_CELLS"): 151}),
     ("limit of a jump", {"max_jump": 1e9}, {}),
     ("limit of the residual", {"max_residual": 1e9}, {}),
     ("limit of back-matching", {"max_backmatch": 1e9}, {}),
     ("limit of the standard deviation", {"max_std": 1e9}, {}),
-    ("doubt beside hidden ground", {}, {(uncertainty, "HOLE"): 0.0}),
-    ("doubt where cells moved", {}, {(uncertainty, "MOVED"): 0.0}),
-    ("coarse to fine search", {}, {(solve, "COARSE"): 1}),
+    ("doubt beside hidden ground", {}, {(uncertainty, "HOLE_VARIANCE_PX2"): 0.0}),
+    ("doubt where cells moved", {}, {(uncertainty, "MOVE_FACTOR"): 0.0}),
+    ("coarse to fine search", {}, {(solve, "COARSE_CELLS"): 1}),
 )
 """What is left out, in words, as parameters, and as constants of modules."""
 TWO_WAYS: tuple[tuple[str, dict[str, Any], Changes], ...] = (("both directions", {"both": False}, {}),)

@@ -20,14 +20,11 @@ from rille.stages.geometry.geometry import Camera
 from rille.stages.numeric.windows import window_sum
 from rille.stages.terrain.points import PairPoints
 
-SIDE = 11
+NORMAL_SIDE_PX = 11
 """Pixels: side of the window that a normal is fitted to."""
 
-LEAST_SHARE = 0.3
+MIN_MATCHED_SHARE = 0.3
 """Of the window's pixels, that must be matched."""
-
-LEAST_DETERMINANT = 1e-6
-"""Of the rays' covariance over that of a window full of matches: below it they lie on a line, which has no normal."""
 
 
 @dataclass(frozen=True)
@@ -66,18 +63,21 @@ def _planes(position: Floats32) -> tuple[Floats32, Floats32]:
     rho = np.where(known, 1.0 / np.where(known, depth, 1.0), 0.0)
     rays = [np.where(known, position[..., k] * rho, 0.0) for k in range(2)]
     # From the window's own middle, so that the squares below keep their digits.
-    count = np.maximum(window_sum(known, SIDE), 1.0)
-    x, y, r = (window_sum(a, SIDE) / count for a in (*rays, rho))
+    count = np.maximum(window_sum(known, NORMAL_SIDE_PX), 1.0)
+    x, y, r = (window_sum(a, NORMAL_SIDE_PX) / count for a in (*rays, rho))
 
     def covariance(a: Floats, b: Floats, mean_a: Floats, mean_b: Floats) -> Floats:
-        return window_sum(a * b, SIDE) / count - mean_a * mean_b
+        return window_sum(a * b, NORMAL_SIDE_PX) / count - mean_a * mean_b
 
     xx, yy = covariance(rays[0], rays[0], x, x), covariance(rays[1], rays[1], y, y)
     xy, xr, yr = covariance(rays[0], rays[1], x, y), covariance(rays[0], rho, x, r), covariance(rays[1], rho, y, r)
     rr = covariance(rho, rho, r, r)
     determinant = xx * yy - xy * xy
     full = np.nanmax(determinant, initial=0.0)
-    usable = known & (count >= LEAST_SHARE * SIDE * SIDE) & (determinant > LEAST_DETERMINANT * full)
+    usable = (
+        # Rays that lie on a line have no normal: their covariance is far below that of a full window.
+        known & (count >= MIN_MATCHED_SHARE * NORMAL_SIDE_PX * NORMAL_SIDE_PX) & (determinant > 1e-6 * full)
+    )
     inverse = 1.0 / np.where(usable, determinant, 1.0)
     nx, ny = (xr * yy - yr * xy) * inverse, (yr * xx - xr * xy) * inverse
     n = np.stack([nx, ny, r - nx * x - ny * y], axis=-1)

@@ -87,20 +87,18 @@ def fit_plane(
 
         theta = irls(rays, rho, biweight, start=theta)
         expected = rays @ theta
-        on = (expected > HORIZON * sigma) & (np.abs(rho - expected) < tolerance)
+        on = (expected > MIN_HORIZON_SIGMAS * sigma) & (np.abs(rho - expected) < tolerance)
         # theta = -n / h: its length is one over the height.
         share, length = float(np.mean(on)), float(np.linalg.norm(theta))
-        if share >= MIN_SHARE and bool(allowed(-theta[None] / length)[0]):
+        if share >= MIN_GROUND_SHARE and bool(allowed(-theta[None] / length)[0]):
             reach = length * float(np.quantile(_length(rays[on]) / expected[on], 0.9))
             return GroundPlane(-theta / length, 1.0 / length, share, reach)
     raise NoGroundError("RIL-343", "the disparity shows no ground plane below the camera")
 
 
 MIN_POINTS = 100
-MIN_SHARE = 0.05
-HORIZON = 5.0  # standard deviations of an inverse depth below which it agrees with any plane, and is not counted
-SCORED = 1200  # points, about, that planes are compared on: the best one is then fitted to all
-HYPOTHESES = 1000  # an all-ground sample of three is among them (p > .999) where a fifth of the pixels are ground
+MIN_GROUND_SHARE = 0.05
+MIN_HORIZON_SIGMAS = 5.0  # an inverse depth of fewer of its sigmas agrees with any plane, and is not counted
 
 
 def _consensus(
@@ -112,7 +110,8 @@ def _consensus(
     rng: np.random.Generator,
 ) -> Floats | None:
     """The allowed plane of most agreement among planes through three points; None: none is allowed."""
-    triples = rng.integers(0, rays.shape[0], size=(HYPOTHESES, 3))
+    # An all-ground sample of three is among a thousand (p > .999) where a fifth of the pixels are ground.
+    triples = rng.integers(0, rays.shape[0], size=(1000, 3))
     volume = np.abs(np.linalg.det(rays[triples]))
     # Three rays that lie nearly in one plane with the camera do not fix the ground.
     triples = triples[volume > 1e-3 * np.ptp(rays[:, 0]) * np.ptp(rays[:, 1])]
@@ -123,8 +122,9 @@ def _consensus(
     theta = theta[allowed(-theta / length)]
     if not len(theta):
         return None
-    totals, some = np.empty(len(theta)), slice(None, None, max(1, len(rays) // SCORED))
-    _totals(theta, rays[some], rho[some], HORIZON * sigma[some], tolerance[some] ** -2.0, totals)
+    # Planes are compared on some 1200 points; the best one is then fitted to all.
+    totals, scored = np.empty(len(theta)), slice(None, None, max(1, len(rays) // 1200))
+    _totals(theta, rays[scored], rho[scored], MIN_HORIZON_SIGMAS * sigma[scored], tolerance[scored] ** -2.0, totals)
     return np.asarray(theta[int(np.argmax(totals))], dtype=np.float64)
 
 
@@ -207,18 +207,17 @@ def view_matches(samples: Samples, rig: Rig, T_local_left: RigidTransform, sigma
     A depth 1/rho with the error sigma / rho^2 moves a point along its ray r by as much of r, and the elevation by that
     part of it which is along the plane's normal. ``sigma_d``: pixels of disparity that ``sigma`` stands for.
     """
-    rays, rho, sigma = (values[samples.rho > NEAREST_SIGMAS * samples.sigma] for values in samples)
+    rays, rho, sigma = (values[samples.rho > MIN_DEPTH_SIGMAS * samples.sigma] for values in samples)
     points = rays / rho[:, None]
     slant, toward = _length(points), np.abs(rays @ T_local_left.rotation[2])
     across = slant / coarser_focal(rig)
     along = across * _length(rays) / np.maximum(toward, 1e-3)
     slope = sigma_d * rho**2 / (sigma * np.maximum(toward, 1e-3))
-    return PlaneView(T_local_left.apply(points), slant, along, across, slope, STRAY)
+    return PlaneView(T_local_left.apply(points), slant, along, across, slope, stray=0.005)
 
 
-NEAREST_SIGMAS = 3.0
+MIN_DEPTH_SIGMAS = 3.0
 """Standard deviations of an inverse depth above 0 from which on a match is not infinitely far."""
-STRAY = 0.005
 
 
 def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> PlaneView:
@@ -236,8 +235,8 @@ def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> Plane
     here = _meet(rig, R_local_left, plane, pixels)
     right = rig.right.project(rig.T_right_left.apply(here @ R_local_left))
     with np.errstate(invalid="ignore"):
-        both = ((right >= 0) & (right <= [rig.right.width - 1, rig.right.height - 1])).all(-1)
-    pixels, here = pixels[both], here[both]
+        in_both = ((right >= 0) & (right <= [rig.right.width - 1, rig.right.height - 1])).all(-1)
+    pixels, here = pixels[in_both], here[in_both]
     steps = [_meet(rig, R_local_left, plane, pixels + step) - here for step in ([0.5, 0.0], [0.0, 0.5])]
     jacobian = 2.0 * np.stack(steps, axis=-1)[:, :2]
     slope = _elevation_slope(rig, R_local_left, plane, here)

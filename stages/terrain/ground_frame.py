@@ -30,7 +30,7 @@ from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.core.validity import matched_back
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.terrain import GroundFacts
-from rille.stages.geometry.epipolar import exchanged, fits, inverse_depth
+from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX, exchanged, fits, inverse_depth
 from rille.stages.geometry.geometry import Rig, RigidTransform, level_rotation
 from rille.stages.geometry.pose_arrays import GROUND_PLANE, NO_VERTICAL, REFERENCE_PLANE
 from rille.stages.geometry.scale import coarser_focal
@@ -51,21 +51,18 @@ SCENE = "scene"
 
 
 DEFAULT_RANGE_CELLS = 6.0  # of the footprint in meta; the stage locus has its own parameter
-SAMPLES = 5000  # matched pixels that the plane is fitted to: three parameters need no more
+MAX_FIT_PIXELS = 5000  # matched pixels that the plane is fitted to: three parameters need no more
 
-MARGIN = 0.05  # share of the camera's height that the range of elevations is widened by: a low rock, a kerb
+RELIEF_MARGIN_SHARE = 0.05  # of the camera's height, that the range of elevations is widened by: a low rock, a kerb
 
 
-BEYOND = 3.0  # standard deviations that a match lies beyond infinity, which no noise explains
-NEAR = 2.0  # pixels: distance to its epipolar line at which a match fits a rig
-NEAREST = 0.05  # share of the matches that may be nearer than what counts as nearest: gross mismatches
-UNSEEN = 20.0  # baselines; distance that stands for what is not seen at all
+BEYOND_INFINITY_SIGMAS = 3.0  # standard deviations that a match lies beyond infinity, which no noise explains
+NEAREST_SHARE = 0.05  # of the matches, that may be nearer than what counts as nearest: gross mismatches
 
-DOMINANT = 0.3  # share of the matches from which a plane may be the reference, though its tilt is beyond the limits
-SWAPPED = 0.5  # share of such matches: nearly all where left and right are swapped
+MIN_DOMINANT_SHARE = 0.3  # of the matches, from which a plane may be the reference, though tilted beyond the limits
 
 MAX_SLANT_DEG = 65.0  # between the view and a scene plane's normal: what is seen along the plane makes no map
-WORST_SIGMA = 10.0  # times the median one: a match that is so uncertain brings a hundredth of the median one's weight
+MAX_SIGMA_RATIO = 10.0  # to the median one: a match so uncertain brings a hundredth of the median one's weight
 
 
 class GroundFrameParams(Params):
@@ -162,7 +159,7 @@ def level(
         "tilt": None,
         "relief": None,
         "z_range": None,
-        "cell_size": _cell_without_ground(rho[rho > BEYOND * sigma], rig),
+        "cell_size": _cell_without_ground(rho[rho > BEYOND_INFINITY_SIGMAS * sigma], rig),
         "footprint": None,
         "ground_share": 0.0,
         "no_ground": str(why),
@@ -173,7 +170,7 @@ def level(
         with suppress(DegenerateError):
             # The images may show ground where the given vertical has none: then one of the two is wrong.
             facts["seen_up"] = _fitted(samples, lambda n: _allowed(n, None, params), params).up.tolist()
-    if ground is not None and isinstance(why, CoarseGroundError) and ground.inliers >= DOMINANT:
+    if ground is not None and isinstance(why, CoarseGroundError) and ground.inliers >= MIN_DOMINANT_SHARE:
         # Larger cells than those that suit the rig may still make a map.
         plane, everywhere = _local_plane(ground, R_local_left), [-math.inf, math.inf] * 2
         points = (rays[rho > 0] / rho[rho > 0, None]) @ R_local_left.T
@@ -192,13 +189,13 @@ def _explained(
 ) -> tuple[DegenerateError, float]:
     """Why there is no ground, or none that is seen well enough, with the remedy of that cause; and the share of the
     samples on another plane, 0 where none dominates."""
-    if not isinstance(error, NoGroundError) or (ground is not None and ground.inliers >= DOMINANT):
+    if not isinstance(error, NoGroundError) or (ground is not None and ground.inliers >= MIN_DOMINANT_SHARE):
         return error, 0.0
     try:
         seen = _fitted(samples, lambda n: np.ones(len(n), dtype=bool), params)
     except DegenerateError:
         seen = None
-    if seen is None or seen.inliers < DOMINANT:
+    if seen is None or seen.inliers < MIN_DOMINANT_SHARE:
         remedy = "where the ground is a known surface, state its depth by ground_frame.reference_height"
         return DegenerateError(error.code, error.message, remedy=remedy), 0.0
     up = ", ".join(f"{v + 0.0:.2f}" for v in seen.up)
@@ -243,7 +240,7 @@ def scene_plane(samples: Samples, params: GroundFrameParams) -> GroundPlane:
     view = rays.mean(axis=0) / np.linalg.norm(rays.mean(axis=0))
     with suppress(NoGroundError):
         plane = _fitted(samples, lambda n: np.asarray(-n @ view >= math.cos(math.radians(MAX_SLANT_DEG))), params)
-        if plane.inliers >= DOMINANT:
+        if plane.inliers >= MIN_DOMINANT_SHARE:
             return plane
     return GroundPlane(np.array([0.0, 0.0, -1.0]), 1.0 / max(float(np.median(rho)), 1e-9))
 
@@ -274,9 +271,9 @@ def _on_plane(reference: GroundPlane, samples: Samples, rig: Rig, params: Ground
     if not len(view.slant):
         raise NoGroundError("RIL-392", "all matches may as well be infinitely far: no surface can be measured")
     cell = rounded_cell(float(np.median(np.sqrt(view.along * view.across))))
-    max_sigma = float(f"{WORST_SIGMA * np.median(params.sigma_disparity / view.slope):.2g}")
+    max_sigma = float(f"{MAX_SIGMA_RATIO * np.median(params.sigma_disparity / view.slope):.2g}")
     footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, params.sigma_disparity, max_sigma)
-    relief = _spread(view.xyz, [0.0, 0.0, 0.0], footprint, MARGIN * reference.height)
+    relief = _spread(view.xyz, [0.0, 0.0, 0.0], footprint, RELIEF_MARGIN_SHARE * reference.height)
     return {
         "T_local_left": T_local_left.to_list(),
         "source": REFERENCE_PLANE,
@@ -294,7 +291,8 @@ def _on_plane(reference: GroundPlane, samples: Samples, rig: Rig, params: Ground
 
 def _cell_without_ground(rho: Floats, rig: Rig) -> float:
     """Cell size, m, by what is seen instead, inverse depths ``rho`` (n,): a pixel at twice the nearest distance."""
-    near = 1.0 / float(np.quantile(rho, 1.0 - NEAREST)) if rho.size else UNSEEN * rig.baseline
+    # Where nothing is seen at all, 20 baselines stand for the distance.
+    near = 1.0 / float(np.quantile(rho, 1.0 - NEAREST_SHARE)) if rho.size else 20.0 * rig.baseline
     return rounded_cell(2.0 * near / coarser_focal(rig))
 
 
@@ -314,7 +312,7 @@ def sampled(maps: tuple[NDArray[Any], NDArray[Any]], usable: Bools, rig: Rig, si
         raise DegenerateError(
             "RIL-377", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
         )
-    step = max(1, int(math.sqrt(column.size / (2 * SAMPLES))))
+    step = max(1, int(math.sqrt(column.size / (2 * MAX_FIT_PIXELS))))
     r, c = np.nonzero(usable[::step, ::step])
     r, c = r * step, c * step
     pixels = np.stack([c, r], axis=-1).astype(np.float64)
@@ -323,16 +321,17 @@ def sampled(maps: tuple[NDArray[Any], NDArray[Any]], usable: Bools, rig: Rig, si
     sigma = per_pixel * sigma_disparity
     if len(pixels) >= MIN_POINTS:
         # Before the ground is fitted: exchanged images show none, and that message would mislead.
-        _refuse_swapped(rig, pixels, pixels + disparity, float(np.mean(rho < -BEYOND * sigma)))
+        _refuse_swapped(rig, pixels, pixels + disparity, float(np.mean(rho < -BEYOND_INFINITY_SIGMAS * sigma)))
     return Samples(rig.left.rays(pixels), rho, sigma)
 
 
 def _refuse_swapped(rig: Rig, left: Floats, right: Floats, beyond: float) -> None:
     """Parallel cameras see everything ``beyond`` infinity (share) with their sides exchanged, others on wrong lines."""
     remedy = "check left/right order, they seem swapped, and the sign of the baseline"
-    if beyond > SWAPPED:
+    # Nearly all do where left and right are swapped.
+    if beyond > 0.5:
         raise DegenerateError("RIL-375", f"{beyond:.0%} of the matches lie beyond infinity", remedy=remedy)
-    as_given, other_way = fits(rig, left, right, NEAR), fits(rig, right, left, NEAR)
+    as_given, other_way = fits(rig, left, right, MAX_LINE_DISTANCE_PX), fits(rig, right, left, MAX_LINE_DISTANCE_PX)
     if exchanged(as_given, other_way):
         raise DegenerateError(
             "RIL-781",
@@ -374,7 +373,7 @@ def _relief(
     points: Floats, plane: list[float], extent: list[float], height: float, params: GroundFrameParams
 ) -> list[float]:
     """Robust lowest and highest terrain against the plane within the extent, metres, as far as ground reaches."""
-    low, high = _spread(points, plane, extent, MARGIN * height)
+    low, high = _spread(points, plane, extent, RELIEF_MARGIN_SHARE * height)
     # Below, nothing is known that deep but mismatches; above, walls and crowns.
     return [max(low, -height), min(high, (1.0 + params.ceiling) * height)]
 

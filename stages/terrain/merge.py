@@ -42,16 +42,13 @@ from rille.stages.geometry.lattice import Lattice, Window
 from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
 from rille.stages.numeric.holes import close_holes
 from rille.stages.terrain.merge_kernel import CellMaps, Rule, Stack, merge_cells
-from rille.stages.terrain.radiometry import STEP
+from rille.stages.terrain.radiometry import LOG_GAIN_STEP
 
-ALIKE = 0.8
-"""Found with the simulator's models at their true poses on 21 November 2026: with it 70 % of the merged errors are
-below one standard deviation."""
 RESIDUAL_SCALE_PX = 0.1
 """Residual that halves a model's weight: the error of a good disparity."""
 MIN_KNOWN_SHARE = 0.5
 """Of the ground around a cell, for it to be closed."""
-SHARPNESS = 8  # exponent of the ortho image's weights: the best image, but without a visible seam
+ORTHO_WEIGHT_EXPONENT = 8  # exponent of the ortho image's weights: the best image, but without a visible seam
 STRIP_BYTES = 1 << 26
 """Bytes of the models that are in memory at once: 64 MiB are all of a usual tile, and a part where dozens meet."""
 
@@ -59,8 +56,10 @@ STRIP_BYTES = 1 << 26
 class MergeParams(Params):
     """Parameters of the stage ``merge``."""
 
+    # Chosen with the simulator's models at their true poses on 21 November 2026: with it 70 % of the merged errors are
+    # below one standard deviation.
     alike: float = Field(
-        ALIKE,
+        0.8,
         ge=0,
         le=1,
         description="correlation of two models' errors at one cell, beyond those of their poses",
@@ -124,7 +123,7 @@ def footprint(elevation: Floats32, x: Floats, y: Floats, centre: Floats, angle: 
 
 
 @dataclass(frozen=True)
-class Layer:
+class ModelLayer:
     """One pair's model on ``lattice``, whose arrays (rows, cols) are read part by part: ``part(name, window)``.
 
     The arrays are those of :class:`rille.stages.terrain.locus.solve.Dem`, NaN undefined. ``gain``: factor of its grey
@@ -158,7 +157,7 @@ class Merged:
     relief_std: Floats32
 
 
-def merge(layers: Sequence[Layer], tile: Lattice, params: MergeParams) -> Merged:
+def merge(layers: Sequence[ModelLayer], tile: Lattice, params: MergeParams) -> Merged:
     """Merge elevation models on a tile of their common lattice.
 
     The result does not depend, in any bit, on the order of the layers, nor on where tiles begin.
@@ -190,7 +189,7 @@ def merge(layers: Sequence[Layer], tile: Lattice, params: MergeParams) -> Merged
     return out
 
 
-def _merge_strip(layers: Sequence[Layer], strip: Lattice, params: MergeParams, out: Merged, rows: slice) -> None:
+def _merge_strip(layers: Sequence[ModelLayer], strip: Lattice, params: MergeParams, out: Merged, rows: slice) -> None:
     """Merge the lines of one strip into ``out``."""
     present = [layer for layer in layers if strip.intersection(layer.lattice) is not None]
     if not present:
@@ -216,12 +215,12 @@ def _merge_strip(layers: Sequence[Layer], strip: Lattice, params: MergeParams, o
         out.count[rows],
         best,
     )
-    rule = Rule(RESIDUAL_SCALE_PX, SHARPNESS, params.alike, worst)
+    rule = Rule(RESIDUAL_SCALE_PX, ORTHO_WEIGHT_EXPONENT, params.alike, worst)
     merge_cells(stack, strip.xs(), strip.ys(), rule, maps)
     out.source[rows] = np.array([*(layer.pair for layer in present), -1])[best]
 
 
-def _stacked(layers: Sequence[Layer], strip: Lattice, name: str) -> Floats32:
+def _stacked(layers: Sequence[ModelLayer], strip: Lattice, name: str) -> Floats32:
     out = np.full((len(layers), *strip.shape), np.nan, dtype=np.float32)
     for target, layer in zip(out, layers, strict=True):
         common = strip.intersection(layer.lattice)
@@ -297,9 +296,9 @@ def merge_stage(
     layers = []
     for dem in dems:
         pair, own = dem.meta["pair"], Lattice.from_dict(dem.meta["lattice"])
-        gain = math.exp(STEP * steps.get(str(pair), 0))
+        gain = math.exp(LOG_GAIN_STEP * steps.get(str(pair), 0))
         part = dem.part if params.max_footprint is None else _fine(dem, own, params.max_footprint)
-        layers.append(Layer(pair, own, part, gain, Placed.of(dem.meta)))
+        layers.append(ModelLayer(pair, own, part, gain, Placed.of(dem.meta)))
     merged = merge(layers, lattice, params)
     meta: MergeFacts = {
         "lattice": lattice.to_dict(),

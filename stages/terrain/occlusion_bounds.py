@@ -27,7 +27,7 @@ from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain.merge import footprint
 
-STEP = 0.5
+SIGHT_STEP_CELLS = 0.5
 """Cells from point to point of a line of sight."""
 
 
@@ -81,8 +81,8 @@ def _below(z, row, col, height, out):  # type: ignore[no-untyped-def]
                 continue
             dr, dc = row - r, col - c
             far = math.hypot(dr, dc)
-            for k in range(1, int(far / STEP)):
-                part = k * STEP / far
+            for k in range(1, int(far / SIGHT_STEP_CELLS)):
+                part = k * SIGHT_STEP_CELLS / far
                 i, j = math.floor(r + part * dr + 0.5), math.floor(c + part * dc + 0.5)
                 if i == r and j == c:
                     continue
@@ -119,9 +119,9 @@ def occlusion_bounds_stage(
         part = own.intersection(lattice)
         if part is None:
             continue
-        found = ceiling(seen + k * std, own, centre)[own.window(part)]
+        highest = ceiling(seen + k * std, own, centre)[own.window(part)]
         here = lattice.window(part)
-        least[here] = np.fmin(least[here], found)
+        least[here] = np.fmin(least[here], highest)
     bounds, unknown = Bounds.of(z, k * s, least), np.isnan(z)
     shares = {"unknown": float(unknown.mean()), "bounded": float((unknown & np.isfinite(least)).mean())}
     meta: BoundsFacts = {"lattice": lattice.to_dict(), "frame": "world", "shares": shares}

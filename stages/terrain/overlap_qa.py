@@ -27,19 +27,15 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
 
-BLOCKS = 49
+TARGET_BLOCKS = 49
 """Approximate number of blocks of an overlap; each is wider than errors are alike."""
 MIN_BLOCKS = 12
 """Fewest blocks from which three parameters and their errors are estimated."""
 MIN_CELLS = 100
 MAX_CELLS = 40_000
 """Cells of an overlap that are compared, about: hundreds a block, so that the plane moves by half its sigma at most."""
-MIN_BLOCK_SIDE = 3
-"""Cells."""
 MIN_BLOCK_SHARE = 0.25
 """Known share of a block's cells from which it counts."""
-START_ROUNDS = 8
-"""Of the least absolute deviations: a start needs no digits."""
 
 USABLE_GREY = (8.0, 247.0)
 """Grey values that an exposure is read from: darker ones are noise, brighter ones saturated."""
@@ -78,7 +74,8 @@ def fit_seam(difference: Floats, x: Floats, y: Floats) -> SeamFit | None:
     if len(row) < MIN_CELLS:
         return None
     z, places = difference[row, col], np.column_stack([x[col], y[row]])
-    side = max(MIN_BLOCK_SIDE, math.ceil(math.sqrt(len(row) / BLOCKS)))
+    # At least three cells wide.
+    side = max(3, math.ceil(math.sqrt(len(row) / TARGET_BLOCKS)))
     across = difference.shape[1] // side + 1
     value, weight, middle = _blocks(z, places, (row // side) * across + col // side, side * side)
     if len(value) < MIN_BLOCKS:
@@ -92,9 +89,8 @@ def fit_seam(difference: Floats, x: Floats, y: Floats) -> SeamFit | None:
 def _robust(design: Floats, value: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """Plane (3,) and its covariance: first by least absolute deviations, which gross errors do not capture."""
     floor = 1e-12 * float(np.abs(value).max(initial=0.0)) + 1e-300
-    absolute = irls(
-        design, value, lambda r: weight / np.maximum(r, 0.01 * mad_sigma(r, 0.0) + floor), rounds=START_ROUNDS
-    )
+    # Few rounds: a start needs no digits.
+    absolute = irls(design, value, lambda r: weight / np.maximum(r, 0.01 * mad_sigma(r, 0.0) + floor), rounds=8)
     scale = mad_sigma(value - design @ absolute, 0.0) + floor
     plane = irls(design, value, lambda r: weight * bisquare(r / (TUKEY_BISQUARE * scale)), start=absolute)
     residual = value - design @ plane
@@ -129,12 +125,12 @@ def seam(dem: Bundle, own: Mapping[str, Floats32], other: Bundle) -> dict[str, A
     if common is None:
         return None
     windows = [lattice.window(common) for lattice in lattices]
-    both = {name: (own[name][windows[0]], np.asarray(other.part(name, windows[1]))) for name in ARRAYS}
-    known = np.isfinite(both["elevation"][0]) & np.isfinite(both["elevation"][1])
+    shared = {name: (own[name][windows[0]], np.asarray(other.part(name, windows[1]))) for name in ARRAYS}
+    known = np.isfinite(shared["elevation"][0]) & np.isfinite(shared["elevation"][1])
     step = max(1, math.ceil(math.sqrt(np.count_nonzero(known) / MAX_CELLS)))
     each = np.s_[::step, ::step]
     seen = known[each]
-    z, std, grey = ([values[each].astype(np.float64) for values in both[name]] for name in ARRAYS)
+    z, std, grey = ([values[each].astype(np.float64) for values in shared[name]] for name in ARRAYS)
     fit = fit_seam(z[0] - z[1], common.xs()[::step], common.ys()[::step])
     if fit is None:
         return None

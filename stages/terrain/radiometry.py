@@ -3,7 +3,8 @@
 Each pair of overlapping models says by what factor one is brighter than the other (stage ``overlap_qa``). The factors
 g of all models follow by least squares on their logarithms,
 
-    sum over seams of (log g_b - log g_a + log(grey_b / grey_a) - v . (c_b - c_a))^2 + PULL * sum over models (log g)^2
+    sum over seams of (log g_b - log g_a + log(grey_b / grey_a) - v . (c_b - c_a))^2
+    + FADING_WEIGHT * sum over models (log g)^2
 
 with the models' centres c. The gradient v takes up what is the same at every step: ground looks darker or brighter from
 near than from afar (fall-off of the lens, light), which is no exposure and would pile up along the way. The second term
@@ -21,14 +22,10 @@ from pydantic import Field
 from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.facts.terrain import OverlapFacts, RadiometryFacts
 
-STEP = 0.01
+LOG_GAIN_STEP = 0.01
 """Step of log g: half a step is 0.6 of 128 grey values."""
-PULL = 0.05
-"""Weight of the second term: a lasting change fades by 1/e over sqrt(1 / PULL) = 4.5 models of a chain."""
-ACROSS = 0.01
-"""Share of the displacements' sum of squares below which a direction tells no gradient: sway is not the way."""
-MOST = 0.7
-"""Greatest size of log g, a factor of 2: beyond it is not exposure."""
+FADING_WEIGHT = 0.05
+"""Weight of the second term: a lasting change fades by 1/e over sqrt(1 / FADING_WEIGHT) = 4.5 models of a chain."""
 
 
 class RadiometryParams(Params):
@@ -59,10 +56,12 @@ def level(centres: Mapping[int, Sequence[float]], ratios: Sequence[tuple[int, in
     values = np.column_stack([np.tile([-1.0, 1.0], (len(ordered), 1)), -moved]).ravel()
     design = coo_array((values, (rows, cols)), shape=(len(ordered), n + 2)).tocsc()
     wanted = -np.array([ratio for _, _, ratio in ordered])
-    small = ACROSS * max(float((moved**2).sum()), 1e-9)
-    ridge = diags_array(np.array([PULL] * n + [small] * 2))
+    # A direction in which the cameras hardly move tells no gradient: sway is not the way.
+    small = 0.01 * max(float((moved**2).sum()), 1e-9)
+    ridge = diags_array(np.array([FADING_WEIGHT] * n + [small] * 2))
     solved = spsolve((design.T @ design + ridge).tocsc(), design.T @ wanted)[:n]
-    steps = np.rint(np.clip(solved, -MOST, MOST) / STEP).astype(int)
+    # Beyond a factor of 2 it is not exposure.
+    steps = np.rint(np.clip(solved, -0.7, 0.7) / LOG_GAIN_STEP).astype(int)
     return {pair: int(steps[i]) for pair, i in at.items() if steps[i]}
 
 
@@ -78,5 +77,5 @@ def radiometry_stage(
         if seam["log_ratio"] is not None
     ]
     steps = level({int(pair): centre for pair, centre in centres.items()}, ratios) if params.level else {}
-    found = {str(pair): n for pair, n in sorted(steps.items())}
-    return Bundle({}, {"step": STEP, "steps": found, "seams": len(ratios)})
+    steps_by_pair = {str(pair): n for pair, n in sorted(steps.items())}
+    return Bundle({}, {"step": LOG_GAIN_STEP, "steps": steps_by_pair, "seams": len(ratios)})

@@ -3,10 +3,10 @@
 A plane that may be ground by its attitude is in many a scene: a floor under shelves, a table. A pair shows *ground* if
 
 - the vertical is known, and the plane is level but for :data:`MAX_TILT_DEG`; or
-- the ground is stated, or holds :data:`MIN_SHARE` of the pair's matched pixels; or
-- it is open ground, seen as far as :data:`MIN_REACH` camera heights; or
+- the ground is stated, or holds :data:`MIN_REFERENCE_SHARE` of the pair's matched pixels; or
+- it is open ground, seen as far as :data:`MIN_REACH_HEIGHTS` camera heights; or
 - another pair shows the same plane: its normal turned by at most :data:`MAX_TURN_DEG` in the camera's frame, and the
-  camera's height alike to :data:`MAX_HEIGHT_CHANGE`. A vehicle carries its cameras so.
+  camera's height alike to :data:`MAX_HEIGHT_CHANGE_SHARE`. A vehicle carries its cameras so.
 
 Pairs that show ground must outnumber those whose matched pixels lie on another plane.
 
@@ -28,40 +28,40 @@ from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.pose_arrays import GROUND_PLANE, NO_VERTICAL
 
 MAX_TILT_DEG = 10.0
-MIN_SHARE = 0.4
-MIN_REACH = 5.0
+MIN_REFERENCE_SHARE = 0.4
+MIN_REACH_HEIGHTS = 5.0
 MAX_TURN_DEG = 10.0
-MAX_HEIGHT_CHANGE = 0.25
-STATED = 0.0
+MAX_HEIGHT_CHANGE_SHARE = 0.25
+STATED_SHARE = 0.0
 """Share of the matched pixels of ground that is stated (``ground_frame.reference_height``), not seen."""
 
 
-class Verdict(NamedTuple):
+class GroundVerdict(NamedTuple):
     """Whether elevations are heights above ``ground``, and ``why``, in words."""
 
     ground: bool
     why: str
 
 
-def judge(levels: Sequence[GroundFacts], *, coarse: bool) -> Verdict:
+def judge(levels: Sequence[GroundFacts], *, coarse: bool) -> GroundVerdict:
     """Whether the pairs of a run show ground.
 
     ``coarse``: a cell size is stated, so that ground counts which is too far away for cells that suit the rig.
     """
     planes = [_Plane.of(facts) for facts in levels if facts["plane"] and ("no_ground" not in facts or coarse)]
-    shown = [one for one in planes if one.is_ground or sum(map(one.is_same, planes)) > 1]
+    shown = [plane for plane in planes if plane.is_ground or sum(map(plane.is_same, planes)) > 1]
     others = sum("other_share" in facts for facts in levels)
     why = f"{len(shown)} of {len(levels)} pairs show ground"
     if others:
         why += f", {others} another plane"
     if planes and not shown:
-        best = max(planes, key=lambda one: one.share)
+        best = max(planes, key=lambda plane: plane.share)
         why += (
             f"; a level plane holds {best.share:.0%} of the matched pixels and is seen as far as {best.reach:.1f} "
-            f"camera heights, where {MIN_SHARE:.0%} or {MIN_REACH:g} heights, a known vertical or another pair with "
-            "the same plane would show ground (terrain.reference=ground takes it for that)"
+            f"camera heights, where {MIN_REFERENCE_SHARE:.0%} or {MIN_REACH_HEIGHTS:g} heights, a known vertical or "
+            "another pair with the same plane would show ground (terrain.reference=ground takes it for that)"
         )
-    return Verdict(len(shown) > others, why)
+    return GroundVerdict(len(shown) > others, why)
 
 
 class _Plane(NamedTuple):
@@ -84,11 +84,11 @@ class _Plane(NamedTuple):
         share, reach = facts["ground_share"], facts["ground_reach"]
         is_known = facts["source"] not in (GROUND_PLANE, NO_VERTICAL)
         is_level = is_known and float(normal[2]) >= math.cos(math.radians(MAX_TILT_DEG))
-        is_ground = is_level or share >= MIN_SHARE or reach >= MIN_REACH or share == STATED
+        is_ground = is_level or share >= MIN_REFERENCE_SHARE or reach >= MIN_REACH_HEIGHTS or share == STATED_SHARE
         return _Plane(up, -z * float(normal[2]), is_ground, share, reach)
 
     def is_same(self, other: _Plane) -> bool:
         """Whether another pair shows the same plane."""
         turn = float(self.up @ other.up)
         change = abs(self.height - other.height) / max(self.height, other.height)
-        return turn >= math.cos(math.radians(MAX_TURN_DEG)) and change <= MAX_HEIGHT_CHANGE
+        return turn >= math.cos(math.radians(MAX_TURN_DEG)) and change <= MAX_HEIGHT_CHANGE_SHARE

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from rille.stages.core.arrays import Bytes, Floats, Floats32
 from rille.stages.core.errors import InputError
 
-LEAST = 6  # of nine cells: the plane has three unknowns, and twice as many do not lie on two lines only
 WEIGHT = (1.0, 2.0, 1.0)
 
 
@@ -58,7 +57,8 @@ def gradient(elevation: ArrayLike, cell: float) -> Floats:
     xx, xy, yy = xx - sx * sx / safe, xy - sx * sy / safe, yy - sy * sy / safe
     xz, yz = xz - sx * sz / safe, yz - sy * sz / safe
     det = xx * yy - xy * xy
-    good = known & (count >= LEAST) & (det > 1e-9)
+    # Of nine cells six do not lie on two lines only, and the plane has three unknowns.
+    good = known & (count >= 6) & (det > 1e-9)
     det = np.where(good, det, 1.0)
     slopes = np.stack([(yy * xz - xy * yz) / det, (xx * yz - xy * xz) / det]) / cell
     return np.where(good, slopes, np.nan)

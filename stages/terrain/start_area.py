@@ -15,7 +15,7 @@ from rille.stages.facts.terrain import DemFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 
-NOBODY = -1
+NO_PAIR = -1
 """Pair number of a model that no pair made."""
 
 
@@ -67,4 +67,4 @@ def start_area_stage(
         "residual": np.where(known, np.float32(0.0), np.float32(np.nan)),
         "ortho": np.full(elevation.shape, np.nan, np.float32),
     }
-    return Bundle(arrays, {"lattice": lattice.to_dict(), "frame": "world", "pair": NOBODY})
+    return Bundle(arrays, {"lattice": lattice.to_dict(), "frame": "world", "pair": NO_PAIR})

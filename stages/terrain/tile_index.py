@@ -31,7 +31,7 @@ def footprint(defined: Bools, lattice: Lattice, side: int, margin: int = 0) -> d
     side : cells; side of a tile.
     margin : cells around a tile that count as its own: what its result may depend on. The box is cut to the tile.
     """
-    found = {}
+    boxes = {}
     # Lines count downwards, against y, as rows do.
     first_col, first_line = lattice.i0, -lattice.j0
     for ty in range((first_line - margin) // side, (first_line + lattice.rows - 1 + margin) // side + 1):
@@ -43,8 +43,8 @@ def footprint(defined: Bools, lattice: Lattice, side: int, margin: int = 0) -> d
                 lines, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
                 top, height = _extent(lines + first_line + rows.start, ty * side, side)
                 left, width = _extent(columns + first_col + cols.start, tx * side, side)
-                found[tx, ty] = (left, top, width, height)
-    return found
+                boxes[tx, ty] = (left, top, width, height)
+    return boxes
 
 
 def _span(tile: int, side: int, margin: int, first: int, count: int) -> slice:

@@ -14,13 +14,6 @@ from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.geometry.lattice import MAX_CELLS, Lattice
 from rille.stages.terrain.ground import PlaneView
 
-NEARLY_ALL = 0.95
-"""Of the matched pixels that wider limits bring in."""
-ROOM = 1.05
-"""Factor on limits, for what is rounded."""
-SIGMAS = 3.0
-"""Standard deviations, besides a cell, within which a point lies on the surface."""
-
 
 class Limits(NamedTuple):
     """``z_range`` of the search, m; largest standard deviation, m, of a cell (``std``) and by a typical disparity of a
@@ -52,7 +45,8 @@ def coverage(
     inside = searched & (x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max)
     row, col = np.rint(lattice.index(view.xyz[inside, :2])).astype(np.intp).clip(0, np.array(lattice.shape) - 1).T
     elevation, std = (values[row, col].astype(np.float64) for values in surface)
-    on = np.abs(elevation - z[inside]) <= SIGMAS * std + lattice.cell
+    # Within three standard deviations and a cell.
+    on = np.abs(elevation - z[inside]) <= 3.0 * std + lattice.cell
     shares = {
         "outside": 1.0 - np.count_nonzero(inside) / len(z),
         "unsure": np.count_nonzero(on & (std > limits.std)) / len(z),
@@ -62,8 +56,8 @@ def coverage(
     if not on.any():
         return facts
     # Cells that are too unsure ask for a higher limit in proportion.
-    sigma = max(_most(std[on]) * limits.sigma / limits.std, _most(sigma_d / view.slope[searched]))
-    cells = _most(view.along[searched] / lattice.cell)
+    sigma = max(_upper_quantile(std[on]) * limits.sigma / limits.std, _upper_quantile(sigma_d / view.slope[searched]))
+    cells = _upper_quantile(view.along[searched] / lattice.cell)
     needs = {"locus.max_sigma": (sigma, limits.sigma), "locus.max_range_cells": (cells, limits.range_cells)}
     wider = {name: need for name, (need, limit) in needs.items() if need > limit}
     if wider:
@@ -77,6 +71,6 @@ def coverage(
     return facts
 
 
-def _most(values: Floats) -> float:
-    """What nearly all of the values do not exceed, with some room."""
-    return ROOM * float(np.quantile(values, NEARLY_ALL))
+def _upper_quantile(values: Floats) -> float:
+    """What nearly all of the values do not exceed, with some room for what is rounded."""
+    return 1.05 * float(np.quantile(values, 0.95))

@@ -9,11 +9,7 @@ from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.surface import Surface
 
-SAMPLES = 64
-"""Cells along either side of the surface, and elevations, that are looked at."""
-
-
-FEW = 400
+MIN_CELLS = 400
 """Cells of a surface, 20 x 20, below which their size is the likely reason."""
 
 
@@ -26,7 +22,11 @@ def explain(
     ----------
     rig, T_surface_left, surface, z_range, usable : as Locus got them.
     """
-    pick = [np.unique(np.linspace(0, n - 1, SAMPLES).astype(np.intp)) for n in (surface.rows, surface.cols)]
+    pick = [
+        # At most 64 cells along either side are looked at.
+        np.unique(np.linspace(0, n - 1, 64).astype(np.intp))
+        for n in (surface.rows, surface.cols)
+    ]
     feet, normals = surface.block(*pick)
     z = np.linspace(*z_range, 9)[:, None, None, None]
     points = T_surface_left.inverse().apply(feet + z * normals)
@@ -55,7 +55,7 @@ def explain(
             remedy="look at the disparity's validity: exposure, focus, left/right order; or raise locus.max_backmatch",
         )
     cells = surface.rows * surface.cols
-    if cells < FEW:
+    if cells < MIN_CELLS:
         return DegenerateError(
             "RIL-390",
             f"no cell could be reconstructed, and there are {cells} only ({surface.rows} x {surface.cols}): they are "

@@ -27,12 +27,11 @@ from numba import njit
 
 from rille.stages.core.arrays import Floats, Floats32
 
-MIN_DEPTH = 1e-9  # metres, projective depth: excludes the camera's own plane
-STEP_PX = 1.0  # search step: disparity is bilinear between pixels, so nothing hides in a shorter one
+MIN_DEPTH_M = 1e-9  # metres, projective depth: excludes the camera's own plane
+SEARCH_STEP_PX = 1.0  # search step: disparity is bilinear between pixels, so nothing hides in a shorter one
 MAX_STEPS = 4096.0  # of one locus: more than the diagonal of a 12 megapixel image
 MARGIN_STEPS = 1.0  # that the interval handed down from the coarse level is widened by
 SOLVED_PX = 1e-3  # |s| of a solution: a two-hundredth of the disparity's usual noise
-MAX_TURNS = 16  # of regula falsi
 
 
 class PairCameras(NamedTuple):
@@ -122,7 +121,7 @@ class Mismatch(NamedTuple):
     y: float
 
 
-class Steps(NamedTuple):
+class SearchSteps(NamedTuple):
     """Points of a line that are tried: Z = bottom + k dz, k <= ``most``, ``dz`` a pixel at most.
 
     The search begins at k = ``first``; it goes below ``last`` only through free space.
@@ -222,7 +221,7 @@ def _inside(line, w, h, span):  # type: ignore[no-untyped-def]
     span = _bound(w * line.a2 - line.a0, w * line.b2 - line.b0, span)
     span = _bound(line.a1, line.b1, span)
     span = _bound(h * line.a2 - line.a1, h * line.b2 - line.b1, span)
-    return _bound(line.a2 - MIN_DEPTH, line.b2, span)
+    return _bound(line.a2 - MIN_DEPTH_M, line.b2, span)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -244,7 +243,7 @@ def fastest(line, span):  # type: ignore[no-untyped-def]
     """
     speed = 0.0
     for z in span:
-        part = 1.0 / max(line.a2 + z * line.b2, MIN_DEPTH)
+        part = 1.0 / max(line.a2 + z * line.b2, MIN_DEPTH_M)
         x, y = (line.a0 + z * line.b0) * part, (line.a1 + z * line.b1) * part
         dx, dy = (line.b0 - x * line.b2) * part, (line.b1 - y * line.b2) * part
         speed = max(speed, dx * dx + dy * dy)
@@ -253,13 +252,13 @@ def fastest(line, span):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def steps_of(lines, span, start):  # type: ignore[no-untyped-def]
-    """:class:`Steps` of a cell on the visible ``span`` of Z, searched from the interval ``start``, both (low, high)."""
+    """:class:`SearchSteps` of a cell on the visible ``span`` of Z, from the interval ``start``, both (low, high)."""
     bottom, top = span
     speed = math.sqrt(max(fastest(lines.left, span), fastest(lines.right, span)))
-    count = max(1.0, min(np.ceil(speed * (top - bottom) / STEP_PX), MAX_STEPS))
+    count = max(1.0, min(np.ceil(speed * (top - bottom) / SEARCH_STEP_PX), MAX_STEPS))
     dz = (top - bottom) / count
     first = max(0.0, min(count, np.ceil((start[1] - bottom) / dz) + MARGIN_STEPS))
-    return Steps(bottom, dz, int(count), int(first), np.floor((start[0] - bottom) / dz) - MARGIN_STEPS)
+    return SearchSteps(bottom, dz, int(count), int(first), np.floor((start[0] - bottom) / dz) - MARGIN_STEPS)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -270,7 +269,9 @@ def mismatch(lines, z, epipole, disparity):  # type: ignore[no-untyped-def]
     part, part_right = 1.0 / w, 1.0 / w_right
     x, y = (left.a0 + z * left.b0) * part, (left.a1 + z * left.b1) * part
     rows, cols = disparity.shape[:2]
-    if not (w >= MIN_DEPTH and w_right >= MIN_DEPTH and x >= 0.0 and y >= 0.0 and x < cols - 1.0 and y < rows - 1.0):
+    if not (
+        w >= MIN_DEPTH_M and w_right >= MIN_DEPTH_M and x >= 0.0 and y >= 0.0 and x < cols - 1.0 and y < rows - 1.0
+    ):
         return Mismatch(np.nan, np.nan, np.nan, np.nan, np.nan)
     c, r = np.uint32(x), np.uint32(y)  # unsigned: not counted from the end, so no check at each use
     fx, fy, d = x - c, y - r, disparity
@@ -327,7 +328,7 @@ def root(lines, bracket, epipole, disparity):  # type: ignore[no-untyped-def]
     side = 0
     z = (z0 * s1 - z1 * s0) / (s1 - s0)
     at = mismatch(lines, z, epipole, disparity)
-    for _ in range(MAX_TURNS):
+    for _ in range(16):  # turns of regula falsi at most
         # Negated, so that NaN ends it as well.
         if not at.s * at.s >= SOLVED_PX * SOLVED_PX * at.power:
             break

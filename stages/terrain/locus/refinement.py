@@ -22,24 +22,23 @@ from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.geometry.surface import Surface
 from rille.stages.numeric.relaxation import bend_weights, relax
 from rille.stages.numeric.windows import window_sum32
-from rille.stages.terrain.locus.views import OrthoPair, Views, look
+from rille.stages.terrain.locus.views import OrthoPair, SurfaceViews, look
 
-STIFFNESS = 4000.0
+BEND_STIFFNESS = 4000.0
 """Squared grey levels for a bend of a pixel of disparity: strong against noise, weak against texture; the error is flat
 from 2000 to 16000."""
-BEND = 0.05
+MAX_BEND_PX = 0.05
 """Second difference [pixels of disparity] beyond which stiffness gives way to an edge."""
-SWEEPS = 20
-FARTHEST = 1.0
+MAX_CHANGE_PX = 1.0
 """Largest total change [pixels of disparity] of a cell: beyond it, the images match at another place."""
 
-MEAN_SIDE = 15
+MEAN_SIDE_CELLS = 15
 """Side [cells] of the window of the local mean; brightness varies more slowly."""
-RESIDUAL = 10.0
+HALVING_RESIDUAL_GREY = 10.0
 """Difference [grey levels] that halves a cell's weight, well above camera noise."""
 
 
-def refine(views: Views, surface: Surface, elevation: Floats32, steps: int) -> tuple[Floats32, OrthoPair]:
+def refine(views: SurfaceViews, surface: Surface, elevation: Floats32, steps: int) -> tuple[Floats32, OrthoPair]:
     """Elevations that fit both images best, and what the images show there.
 
     Parameters
@@ -60,10 +59,10 @@ def refine(views: Views, surface: Surface, elevation: Floats32, steps: int) -> t
         keep = np.isfinite(seen.scale)
         weight, rest = _misfit(seen, keep)
         slope = np.where(keep, seen.right_slope - seen.left_slope, np.float32(0.0))
-        bends = bend_weights(z, seen.scale, BEND, STIFFNESS)
-        moved = relax(z, weight * slope * slope, weight * slope * rest, bends, keep, SWEEPS)
+        bends = bend_weights(z, seen.scale, MAX_BEND_PX, BEND_STIFFNESS)
+        moved = relax(z, weight * slope * slope, weight * slope * rest, bends, keep, sweeps=20)
         # About the start, not the last step: many small steps could otherwise wander to another likeness.
-        reach = FARTHEST / seen.scale
+        reach = MAX_CHANGE_PX / seen.scale
         z = np.where(keep, np.clip(moved, elevation - reach, elevation + reach), elevation)
         seen = look(views, surface, z)
         _level(seen, gain)
@@ -89,9 +88,9 @@ def _misfit(seen: OrthoPair, keep: Bools) -> tuple[Floats32, Floats32]:
     """Weight of each cell's equation, and difference of both images without its local mean; zero where not kept."""
     none = np.float32(0.0)
     rest = np.where(keep, seen.left - seen.right, none)
-    mean = window_sum32(rest, MEAN_SIDE) / np.maximum(window_sum32(keep, MEAN_SIDE), np.float32(1.0))
+    mean = window_sum32(rest, MEAN_SIDE_CELLS) / np.maximum(window_sum32(keep, MEAN_SIDE_CELLS), np.float32(1.0))
     misfit = np.where(keep, rest - mean, none)
     # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once. A cell smaller
     # than a pixel brings no more than its share of the pixel.
-    weight = np.fmin(seen.area, 1.0) / (np.float32(1.0) + np.square(misfit / np.float32(RESIDUAL)))
+    weight = np.fmin(seen.area, 1.0) / (np.float32(1.0) + np.square(misfit / np.float32(HALVING_RESIDUAL_GREY)))
     return np.where(keep, weight, none), misfit

@@ -16,10 +16,10 @@ from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.scale import of_rig
 from rille.stages.geometry.surface import Surface
 from rille.stages.terrain.locus.kernel import BlockCells, Dem, Observed, PairCameras, search
+from rille.stages.terrain.locus.views import BLOCK_ROWS
 
-COARSE = 8  # cells that a coarse cell is wide: a 64th of the cells search the whole range
-BLOCK_ROWS = 32  # rows of cells in one kernel call, so that a large surface stays small in memory
-ONE_SIDED = 2.0  # matched one way alone: errors of such cells are two to three times as large
+COARSE_CELLS = 8  # cells that a coarse cell is wide: a 64th of the cells search the whole range
+ONE_SIDED_STD_FACTOR = 2.0  # matched one way alone: errors of such cells are two to three times as large
 
 
 @dataclass(frozen=True)
@@ -89,14 +89,14 @@ class PairArrays:
 def solve(task: PairArrays, surface: Surface) -> Dem:
     """Every cell of a surface from one disparity map, coarse to fine: a few coarse cells search the whole range."""
     # The last row and column as well, so that every cell lies between coarse ones.
-    rows, cols = (np.unique(np.append(np.arange(0, n, COARSE), n - 1)) for n in (surface.rows, surface.cols))
+    rows, cols = (np.unique(np.append(np.arange(0, n, COARSE_CELLS), n - 1)) for n in (surface.rows, surface.cols))
     coarse, out = _undefined(rows.size, cols.size), _undefined(surface.rows, surface.cols)
     task.cells(*surface.block(rows, cols), *task.z_range, coarse)
     cols = np.arange(surface.cols)
-    lowest, highest = (v[:, cols // COARSE + 1] for v in _around(coarse.elevation))
+    lowest, highest = (v[:, cols // COARSE_CELLS + 1] for v in _around(coarse.elevation))
     for start in range(0, surface.rows, BLOCK_ROWS):
         rows = np.arange(start, min(start + BLOCK_ROWS, surface.rows))
-        near = rows // COARSE + 1
+        near = rows // COARSE_CELLS + 1
         block = Dem(*(array[start : start + rows.size] for array in out))
         task.cells(*surface.block(rows, cols), lowest[near], highest[near], block)
     return out
@@ -110,15 +110,15 @@ def join(a: Dem, b: Dem) -> Dem:
     """Elevations read from left to right and from right to left: their weighted mean where both are.
 
     Its variance is the product of both standard deviations (they share the images: no gain) and the square of their
-    difference. What only one direction gave is most often beside an occlusion, and :data:`ONE_SIDED` times as
-    uncertain as it looks. The grey value is that of ``a``.
+    difference. What only one direction gave is most often beside an occlusion, and :data:`ONE_SIDED_STD_FACTOR` times
+    as uncertain as it looks. The grey value is that of ``a``.
     """
     za, zb, sa, sb = (v.astype(np.float64) for v in (a.elevation, b.elevation, a.elevation_std, b.elevation_std))
     only_a = np.isfinite(za)
     both = only_a & np.isfinite(zb)
     share = sb**2 / (sa**2 + sb**2)
     z = np.where(both, zb + share * (za - zb), np.where(only_a, za, zb))
-    std = np.where(both, np.sqrt(sa * sb + (za - zb) ** 2), ONE_SIDED * np.where(only_a, sa, sb))
+    std = np.where(both, np.sqrt(sa * sb + (za - zb) ** 2), ONE_SIDED_STD_FACTOR * np.where(only_a, sa, sb))
     residual = np.where(only_a, a.residual, b.residual)
     return Dem(z.astype(np.float32), std.astype(np.float32), residual, a.ortho)
 

@@ -44,9 +44,9 @@ from rille.stages.terrain.locus.kernel import Dem
 from rille.stages.terrain.locus.refinement import refine
 from rille.stages.terrain.locus.solve import Matches, PairArrays, SearchLimits, join, projections, solve
 from rille.stages.terrain.locus.uncertainty import standard_deviation
-from rille.stages.terrain.locus.views import Views, views
+from rille.stages.terrain.locus.views import SurfaceViews, views
 
-OWN_STD = 1.4  # times max_sigma: a cell's own standard deviation scatters about the typical one
+OWN_STD_FACTOR = 1.4  # times max_sigma: a cell's own standard deviation scatters about the typical one
 NO_LIMIT = {"max_sigma": None, "max_std": None}
 
 
@@ -164,7 +164,7 @@ def leave_out_unsure(dem: Dem, greatest: float | None) -> None:
             np.copyto(array, np.nan, where=unsure)
 
 
-def _views(image: ArrayLike, right: ArrayLike, rig: Rig, T_surface_left: RigidTransform) -> Views:
+def _views(image: ArrayLike, right: ArrayLike, rig: Rig, T_surface_left: RigidTransform) -> SurfaceViews:
     """Both images as they see the surface."""
     images = [np.ascontiguousarray(a, np.float32) for a in (image, right)]
     if images[1].shape != (rig.right.height, rig.right.width):
@@ -174,7 +174,7 @@ def _views(image: ArrayLike, right: ArrayLike, rig: Rig, T_surface_left: RigidTr
     return views(*projections(rig, T_surface_left), images[0], images[1], T_surface_left.translation)
 
 
-def _refine(dem: Dem, views: Views, surface: Surface, params: LocusParams, apart: Floats32 | None) -> None:
+def _refine(dem: Dem, views: SurfaceViews, surface: Surface, params: LocusParams, apart: Floats32 | None) -> None:
     """Refine a model in place: elevations, their standard deviations, grey values of the left image.
 
     ``apart``: (rows, cols) difference of both directions of matching, metres; None: there was one.
@@ -193,7 +193,7 @@ def greatest_std(params: LocusParams, measured: bool) -> float | None:
         return params.max_std
     if params.max_sigma is None:
         return None
-    return OWN_STD * params.max_sigma if measured else params.max_sigma
+    return OWN_STD_FACTOR * params.max_sigma if measured else params.max_sigma
 
 
 def local_lattice(view: PlaneView, cell: float, params: LocusParams) -> Lattice:

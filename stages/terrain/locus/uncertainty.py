@@ -2,7 +2,8 @@
 
 A sum of variances, each of which can be seen on the ground itself. With s the pixels of disparity a metre of elevation,
 
-    (s sigma_Z)^2 = FLOOR^2 + STEP t^2 + REST r^2 / I + (SHADE N / g)^2 + (MOVED m)^2 + HOLE u + (APART d)^2
+    (s sigma_Z)^2 = FLOOR_PX^2 + STEP_FACTOR t^2 + REST_FACTOR r^2 / I + (SHADE_FACTOR N / g)^2
+                    + (MOVE_FACTOR m)^2 + HOLE_VARIANCE_PX2 u + (DIFFERENCE_FACTOR d)^2
 
 t: the step of Z from cell to cell (RMS of 3 x 3 cells), since a position that is wrong by a part of a cell is an
 elevation that is wrong by as much of its step. r: what both images still differ by (RMS of 5 x 5 cells), I: the sum of
@@ -10,14 +11,14 @@ the squared gradients there, so that r^2 / I is what least squares expects of su
 the whole pair (robust), g: the grey value. In a shadow the gradients found are those of noise; what contrast there can
 be, brightness says. m: how far the refinement moved the cells (RMS of 5 x 5 cells): what the disparity and the ground
 disagree about, neither is sure of. u: the unknown share of 7 x 7 cells; a matching window beside hidden ground is the
-mean of two surfaces. d: the difference of both directions of matching (RMS of 5 x 5 cells), :data:`ALONE` where none of
-them has both; 0 where there was one direction.
+mean of two surfaces. d: the difference of both directions of matching (RMS of 5 x 5 cells),
+:data:`ONE_SIDED_DIFFERENCE_PX` where none of them has both; 0 where there was one direction.
 
 The factors are those of a fit by non-negative least squares to the squared errors of pairs of the simulator (both
-directions, preset ``accurate``, seeds 2 and 3, 22 November 2026), rounded; HOLE, without which cells of one direction
-look too certain beside hidden ground, was chosen on 27 November 2026 with figures of the seeds 1 to 6 at hand: 72 % of
-their errors are below one and 93 % below two standard deviations where one direction was matched, 77 and 95 % with
-both. The disparity's own standard deviation brings nothing besides.
+directions, preset ``accurate``, seeds 2 and 3, 22 November 2026), rounded; HOLE_VARIANCE_PX2, without which cells of
+one direction look too certain beside hidden ground, was chosen on 27 November 2026 with figures of the seeds 1 to 6 at
+hand: 72 % of their errors are below one and 93 % below two standard deviations where one direction was matched, 77 and
+95 % with both. The disparity's own standard deviation brings nothing besides.
 ``benchmarks/surest.py`` prints such shares.
 """
 
@@ -31,28 +32,31 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.numeric.robust import mad_sigma
 from rille.stages.numeric.windows import window_room, window_sum32
+from rille.stages.terrain.locus.refinement import MEAN_SIDE_CELLS
 from rille.stages.terrain.locus.views import OrthoPair
 
-FLOOR = 0.03
+FLOOR_PX = 0.03
 """Pixels of disparity."""
-STEP = 0.5
+STEP_FACTOR = 0.5
 """Of the squared step: a position is uncertain by 0.7 cells."""
-REST = 0.5
+REST_FACTOR = 0.5
 """Of r^2 / I."""
-SHADE = 1.9
+SHADE_FACTOR = 1.9
 """Of noise over grey value: what is left of the ground's contrast in the dark."""
-MOVED = 1.7
-HOLE = 0.12
+MOVE_FACTOR = 1.7
+HOLE_VARIANCE_PX2 = 0.12
 """Squared pixels of disparity where all ground around is unknown."""
-APART = 0.87
-ALONE = 0.2
+DIFFERENCE_FACTOR = 0.87
+ONE_SIDED_DIFFERENCE_PX = 0.2
 """Pixels of disparity: difference of both directions where only one of them found something."""
-LEAST_GRADIENT = 1.0
+MIN_GRADIENT_POWER = 1.0
 """Squared grey levels a pixel, of each cell: so that a blank wall is not divided by."""
-STEP_SIDE, NEAR_SIDE, HOLE_SIDE, MEAN_SIDE = 3, 5, 7, 15
-"""Cells: sides of the windows of t, of most others, of u, and of the local mean that differences go without."""
-NOISE_STRIDE = 4
-"""Each so many-th cell says how much both images differ: some ten thousand do."""
+STEP_SIDE_CELLS = 3
+"""Side of the window of t."""
+NEAR_SIDE_CELLS = 5
+"""Side of the windows of most others."""
+HOLE_SIDE_CELLS = 7
+"""Side of the window of u."""
 
 
 def standard_deviation(
@@ -72,24 +76,28 @@ def standard_deviation(
     known = np.isfinite(elevation) & np.isfinite(seen.scale)
     if not known.any():
         return otherwise
-    none, near = np.float32(0.0), _count(known, NEAR_SIDE)
+    none, near = np.float32(0.0), _count(known, NEAR_SIDE_CELLS)
     scale = np.where(known, seen.scale, np.float32(1.0))
     rest = np.where(known, seen.left - seen.right, none)
-    rest = np.where(known, rest - _mean(rest, MEAN_SIDE, _count(known, MEAN_SIDE)), none)
-    # About 0: the local mean is gone already.
-    noise = mad_sigma(rest[known][::NOISE_STRIDE], 0.0)
+    rest = np.where(known, rest - _mean(rest, MEAN_SIDE_CELLS, _count(known, MEAN_SIDE_CELLS)), none)
+    # About 0: the local mean is gone already. Every fourth cell, some ten thousand, says as much as all.
+    noise = mad_sigma(rest[known][::4], 0.0)
     moves = np.where(known, np.square(scale * moved), none)
-    grey = np.maximum(_mean(np.where(known, seen.left, none), NEAR_SIDE, near), max(noise, 1.0))
-    variance = FLOOR**2 + REST * _mean(np.square(rest), NEAR_SIDE, near) / _gradients(seen, scale, known)
-    variance += np.square(SHADE * noise / grey) + MOVED**2 * _mean(moves, NEAR_SIDE, near)
-    variance += STEP * _mean(_steps(elevation, scale, known), STEP_SIDE, _count(known, STEP_SIDE))
-    variance += HOLE * (1.0 - _mean(known, HOLE_SIDE, window_room(known.shape, HOLE_SIDE)))
+    grey = np.maximum(_mean(np.where(known, seen.left, none), NEAR_SIDE_CELLS, near), max(noise, 1.0))
+    variance = FLOOR_PX**2 + REST_FACTOR * _mean(np.square(rest), NEAR_SIDE_CELLS, near) / _gradients(
+        seen, scale, known
+    )
+    variance += np.square(SHADE_FACTOR * noise / grey) + MOVE_FACTOR**2 * _mean(moves, NEAR_SIDE_CELLS, near)
+    variance += STEP_FACTOR * _mean(_steps(elevation, scale, known), STEP_SIDE_CELLS, _count(known, STEP_SIDE_CELLS))
+    variance += HOLE_VARIANCE_PX2 * (1.0 - _mean(known, HOLE_SIDE_CELLS, window_room(known.shape, HOLE_SIDE_CELLS)))
     if apart is not None:
         both = known & np.isfinite(apart)
-        differ = _mean(np.where(both, np.square(scale * apart), none), NEAR_SIDE, _count(both, NEAR_SIDE))
-        variance += APART**2 * np.where(window_sum32(both, NEAR_SIDE) < 1.0, np.float32(ALONE**2), differ)
+        differ = _mean(np.where(both, np.square(scale * apart), none), NEAR_SIDE_CELLS, _count(both, NEAR_SIDE_CELLS))
+        variance += DIFFERENCE_FACTOR**2 * np.where(
+            window_sum32(both, NEAR_SIDE_CELLS) < 1.0, np.float32(ONE_SIDED_DIFFERENCE_PX**2), differ
+        )
     # Differences of running sums may fall below zero by their rounding.
-    std = np.sqrt(np.maximum(variance, FLOOR**2)) / scale
+    std = np.sqrt(np.maximum(variance, FLOOR_PX**2)) / scale
     return np.where(known, std, otherwise).astype(np.float32)
 
 
@@ -107,7 +115,9 @@ def _gradients(seen: OrthoPair, scale: Floats32, known: Bools) -> Floats32:
     """Sum of the squared gradients around each cell, squared grey levels a pixel of disparity."""
     slope = (seen.right_slope - seen.left_slope) / scale
     power = np.where(known, np.square(slope) * np.minimum(seen.area, 1.0), np.float32(0.0))
-    return np.maximum(window_sum32(power, NEAR_SIDE), np.float32(0.0)) + np.float32(LEAST_GRADIENT * NEAR_SIDE**2)
+    return np.maximum(window_sum32(power, NEAR_SIDE_CELLS), np.float32(0.0)) + np.float32(
+        MIN_GRADIENT_POWER * NEAR_SIDE_CELLS**2
+    )
 
 
 def _steps(elevation: Floats32, scale: Floats32, known: Bools) -> Floats32:

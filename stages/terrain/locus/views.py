@@ -17,7 +17,7 @@ from rille.stages.geometry.spline import coefficients, value_and_gradient
 from rille.stages.geometry.surface import Surface
 from rille.stages.terrain.locus.kernel import dot, projection_rows, vector
 
-BLOCK_ROWS = 32  # rows of cells in one call, so that a large surface's feet stay small in memory
+BLOCK_ROWS = 32  # rows of cells in one kernel call, so that a large surface stays small in memory
 
 
 class View(NamedTuple):
@@ -27,7 +27,7 @@ class View(NamedTuple):
     spline: Floats32
 
 
-class Views(NamedTuple):
+class SurfaceViews(NamedTuple):
     """Views of both cameras, and the left one's centre in the frame of the surface, m."""
 
     left: View
@@ -60,14 +60,14 @@ class _Block(NamedTuple):
     stop: int
 
 
-def views(left: Floats, right: Floats, left_image: Floats32, right_image: Floats32, centre: Floats) -> Views:
+def views(left: Floats, right: Floats, left_image: Floats32, right_image: Floats32, centre: Floats) -> SurfaceViews:
     """Views of two images (row, col), grey values, by their projections; ``centre`` of the left camera, m."""
-    return Views(
+    return SurfaceViews(
         View(left, coefficients(left_image)), View(right, coefficients(right_image)), np.asarray(centre, np.float64)
     )
 
 
-def look(views: Views, surface: Surface, elevation: Floats | Floats32) -> OrthoPair:
+def look(views: SurfaceViews, surface: Surface, elevation: Floats | Floats32) -> OrthoPair:
     """What both images show at the elevations (rows, cols) of the cells, metres, NaN unknown."""
     out = OrthoPair(*np.full((len(OrthoPair._fields), surface.rows, surface.cols), np.nan, np.float32))
     z, cols = np.ascontiguousarray(elevation), np.arange(surface.cols)

@@ -18,14 +18,14 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.terrain_zarr import write_terrain
 from rille.stages.core.declare import Bundle
 from rille.stages.terrain import merge
-from rille.stages.terrain.merge import Layer, MergeParams
+from rille.stages.terrain.merge import MergeParams, ModelLayer
 
 
 def arrays() -> dict:
     z = elevation()
     model = {"elevation": z, "elevation_std": np.full_like(z, 0.01), "residual": np.zeros_like(z)}
     model["ortho"] = np.full_like(z, 90)
-    layer = Layer(4, LATTICE, lambda name, window: model[name][window])
+    layer = ModelLayer(4, LATTICE, lambda name, window: model[name][window])
     found = vars(merge.merge([layer], LATTICE, MergeParams()))
     return {spec.name: (spec, found[spec.name]) for spec in merge.merge_stage.outputs if spec.name in found}
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rille.stages.geometry.geometry import Camera
-from rille.stages.terrain.camera_products import SIDE, camera_products
+from rille.stages.terrain.camera_products import NORMAL_SIDE_PX, camera_products
 from rille.stages.terrain.points import PairPoints
 
 CAMERA = Camera(200.0, 210.0, 50.0, 38.0, 100, 80)
@@ -37,8 +37,11 @@ def test_a_plane_has_its_normal_and_no_roughness(normal: tuple[float, float, flo
     np.testing.assert_array_equal(np.isfinite(found.distance), keep)
     np.testing.assert_allclose(found.distance[keep], (np.linalg.norm(rays(), axis=2) * depth)[keep], rtol=1e-5)
     known = np.isfinite(found.roughness)
-    inner = keep[SIDE:-SIDE, SIDE:-SIDE] & (depth > 0)[SIDE:-SIDE, SIDE:-SIDE]
-    assert known[SIDE:-SIDE, SIDE:-SIDE][inner].mean() > 0.95
+    inner = (
+        keep[NORMAL_SIDE_PX:-NORMAL_SIDE_PX, NORMAL_SIDE_PX:-NORMAL_SIDE_PX]
+        & (depth > 0)[NORMAL_SIDE_PX:-NORMAL_SIDE_PX, NORMAL_SIDE_PX:-NORMAL_SIDE_PX]
+    )
+    assert known[NORMAL_SIDE_PX:-NORMAL_SIDE_PX, NORMAL_SIDE_PX:-NORMAL_SIDE_PX][inner].mean() > 0.95
     np.testing.assert_allclose(found.normal[known], np.broadcast_to(normal, (known.sum(), 3)), atol=2e-3)
     assert found.roughness[known].max() < 1e-3
 

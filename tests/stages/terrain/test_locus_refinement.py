@@ -12,10 +12,10 @@ from rille.stages.geometry.surface import plane as reference_plane
 from rille.stages.terrain.locus import views as locus_views
 from rille.stages.terrain.locus.kernel import Dem
 from rille.stages.terrain.locus.refinement import refine
-from rille.stages.terrain.locus.solve import ONE_SIDED, Matches, join
+from rille.stages.terrain.locus.solve import ONE_SIDED_STD_FACTOR, Matches, join
 from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
-from rille.stages.terrain.locus.uncertainty import HOLE, standard_deviation
-from rille.stages.terrain.locus.views import Views, look, views
+from rille.stages.terrain.locus.uncertainty import HOLE_VARIANCE_PX2, standard_deviation
+from rille.stages.terrain.locus.views import SurfaceViews, look, views
 
 RIG = toed_in_rig()
 T_LOCAL_LEFT = pitched(35.0, roll_deg=3.0)
@@ -51,7 +51,7 @@ LEFT = photograph(RIG.left, T_LOCAL_LEFT)
 RIGHT = photograph(RIG.right, T_LOCAL_LEFT @ RIG.T_right_left.inverse())
 
 
-def through(left: np.ndarray = LEFT, right: np.ndarray = RIGHT) -> Views:
+def through(left: np.ndarray = LEFT, right: np.ndarray = RIGHT) -> SurfaceViews:
     T_left_local = T_LOCAL_LEFT.inverse()
     projections = RIG.left.matrix @ T_left_local.matrix34, RIG.right.matrix @ (RIG.T_right_left @ T_left_local).matrix34
     return views(*projections, left, right, T_LOCAL_LEFT.translation)
@@ -215,7 +215,7 @@ def test_undefined_cells_stay_undefined_and_cast_doubt() -> None:
     none = np.zeros(elevation.shape, np.float32)
     std = standard_deviation(found, seen, none, None, none)
     # Twelve of the 49 cells around it.
-    assert std[29, 42] > np.sqrt(HOLE * 12 / 49) / seen.scale[29, 42]
+    assert std[29, 42] > np.sqrt(HOLE_VARIANCE_PX2 * 12 / 49) / seen.scale[29, 42]
     assert std[29, 42] > 2.0 * std[10, 42]
 
 
@@ -250,7 +250,9 @@ def test_both_directions_are_joined_by_hand() -> None:
     # Weights 100 and 25; variance .1 x .2 + .3^2.
     np.testing.assert_allclose(found.elevation, [[1.06, 1.0, 2.0, nan]], rtol=1e-6)
     np.testing.assert_allclose(
-        found.elevation_std, [[np.sqrt(0.02 + 0.09), 0.1 * ONE_SIDED, 0.3 * ONE_SIDED, nan]], rtol=1e-6
+        found.elevation_std,
+        [[np.sqrt(0.02 + 0.09), 0.1 * ONE_SIDED_STD_FACTOR, 0.3 * ONE_SIDED_STD_FACTOR, nan]],
+        rtol=1e-6,
     )
     np.testing.assert_allclose(found.residual, [[0.1, 0.1, 0.1, nan]], rtol=1e-6)
 

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from rille.stages.terrain.locus.uncertainty import (
-    ALONE,
-    APART,
-    FLOOR,
-    HOLE,
-    LEAST_GRADIENT,
-    MOVED,
-    REST,
-    SHADE,
-    STEP,
+    DIFFERENCE_FACTOR,
+    FLOOR_PX,
+    HOLE_VARIANCE_PX2,
+    MIN_GRADIENT_POWER,
+    MOVE_FACTOR,
+    ONE_SIDED_DIFFERENCE_PX,
+    REST_FACTOR,
+    SHADE_FACTOR,
+    STEP_FACTOR,
     standard_deviation,
 )
 from rille.stages.terrain.locus.views import OrthoPair
@@ -46,8 +46,16 @@ def std(elevation: np.ndarray, seen: np.ndarray, moved: float = 0.0, apart: floa
 def expected(*, rise: float = RISE, grey: float = GREY, apart: float = 0.0, moved: float = 0.0) -> float:
     """By hand: the chequerboard's median difference is its height, its local mean nearly nothing."""
     noise = 1.4826 * NOISE
-    variance = FLOOR**2 + STEP * (SCALE * rise) ** 2 + REST * NOISE**2 / (25 * (CONTRAST**2 * AREA + LEAST_GRADIENT))
-    variance += (SHADE * noise / grey) ** 2 + (APART * SCALE * apart) ** 2 + (MOVED * SCALE * moved) ** 2
+    variance = (
+        FLOOR_PX**2
+        + STEP_FACTOR * (SCALE * rise) ** 2
+        + REST_FACTOR * NOISE**2 / (25 * (CONTRAST**2 * AREA + MIN_GRADIENT_POWER))
+    )
+    variance += (
+        (SHADE_FACTOR * noise / grey) ** 2
+        + (DIFFERENCE_FACTOR * SCALE * apart) ** 2
+        + (MOVE_FACTOR * SCALE * moved) ** 2
+    )
     return float(np.sqrt(variance) / SCALE)
 
 
@@ -88,7 +96,7 @@ def test_in_the_dark_contrast_is_at_most_the_noise() -> None:
 def test_what_both_images_show_alike_is_no_difference() -> None:
     elevation, seen = ground(rise=0.0)
     seen[0] = seen[1] = np.random.default_rng(1).uniform(50.0, 150.0, SHAPE)
-    np.testing.assert_allclose(std(elevation, seen), FLOOR / SCALE, rtol=1e-3)
+    np.testing.assert_allclose(std(elevation, seen), FLOOR_PX / SCALE, rtol=1e-3)
 
 
 def test_a_single_cell_speaks_for_itself() -> None:
@@ -98,13 +106,19 @@ def test_a_single_cell_speaks_for_itself() -> None:
     apart = uniform(np.nan)
     apart[20, 25] = AWAY
     np.testing.assert_allclose(
-        std(elevation, seen, apart=apart)[20, 25], np.hypot(FLOOR / SCALE, APART * AWAY), rtol=1e-3
+        std(elevation, seen, apart=apart)[20, 25], np.hypot(FLOOR_PX / SCALE, DIFFERENCE_FACTOR * AWAY), rtol=1e-3
     )
     elevation[:20], elevation[21:], elevation[20, :25], elevation[20, 26:] = (np.nan,) * 4
     found = std(elevation, seen, moved=SHIFT, apart=np.nan)[20, 25]
     np.testing.assert_allclose(
         found,
-        np.sqrt(FLOOR**2 + (APART * ALONE) ** 2 + (MOVED * SCALE * SHIFT) ** 2 + HOLE * 48 / 49) / SCALE,
+        np.sqrt(
+            FLOOR_PX**2
+            + (DIFFERENCE_FACTOR * ONE_SIDED_DIFFERENCE_PX) ** 2
+            + (MOVE_FACTOR * SCALE * SHIFT) ** 2
+            + HOLE_VARIANCE_PX2 * 48 / 49
+        )
+        / SCALE,
         rtol=1e-3,
     )
 
@@ -113,7 +127,7 @@ def test_where_one_direction_found_nothing_a_difference_is_supposed() -> None:
     apart = uniform(AWAY)
     apart[:, 20:] = np.nan
     found = std(*ground(), apart=apart)
-    np.testing.assert_allclose(found[20, 40], expected(apart=ALONE / SCALE), rtol=5e-3)
+    np.testing.assert_allclose(found[20, 40], expected(apart=ONE_SIDED_DIFFERENCE_PX / SCALE), rtol=5e-3)
     np.testing.assert_allclose(found[20, 20], expected(apart=AWAY), rtol=5e-3)  # its neighbours have both
     np.testing.assert_allclose(found[20, 10], expected(apart=AWAY), rtol=5e-3)
 
@@ -139,4 +153,4 @@ def test_cells_that_the_images_do_not_show_keep_theirs() -> None:
 def test_images_without_noise_or_contrast_leave_the_rest() -> None:
     elevation, seen = ground(rise=0.0)
     seen[1], seen[5] = seen[0], 0.0
-    np.testing.assert_allclose(std(elevation, seen)[20, 25], FLOOR / SCALE, rtol=1e-3)
+    np.testing.assert_allclose(std(elevation, seen)[20, 25], FLOOR_PX / SCALE, rtol=1e-3)

@@ -71,7 +71,7 @@ def test_two_models_of_any_standard_deviations_by_the_equations() -> None:
     share = weight / weight.sum(axis=0)
     mean = (share * z).sum(axis=0)
     alone, together = ((share * std) ** 2).sum(axis=0), (share * std).sum(axis=0) ** 2
-    sharp = (weight / weight.max(axis=0)) ** merge_stage.SHARPNESS
+    sharp = (weight / weight.max(axis=0)) ** merge_stage.ORTHO_WEIGHT_EXPONENT
     np.testing.assert_allclose(merged.elevation, mean, rtol=1e-5)
     np.testing.assert_allclose(merged.relief_std, np.sqrt(alone), rtol=1e-5)
     np.testing.assert_allclose(merged.elevation_std**2, (1 - PARAMS.alike) * alone + PARAMS.alike * together, rtol=1e-5)

@@ -6,7 +6,7 @@ import pytest
 
 from rille.stages.core.declare import Bundle
 from rille.stages.terrain import radiometry as stage
-from rille.stages.terrain.radiometry import PULL, STEP, RadiometryParams, level
+from rille.stages.terrain.radiometry import FADING_WEIGHT, LOG_GAIN_STEP, RadiometryParams, level
 
 CHAIN = {4 * k: (0.02 * (k % 2), 0.3 * k) for k in range(12)}
 
@@ -21,11 +21,12 @@ def ratios(log_grey: dict[int, float], gradient: float = 0.0) -> list[tuple[int,
 
 
 def worst_seam(steps: dict[int, int], seams: list[tuple[int, int, float]]) -> float:
-    return max(abs(r + STEP * (steps.get(b, 0) - steps.get(a, 0))) for a, b, r in seams)
+    return max(abs(r + LOG_GAIN_STEP * (steps.get(b, 0) - steps.get(a, 0))) for a, b, r in seams)
 
 
-# of a jump on four seams the second term leaves PULL / (4 + PULL), one per cent; and each end is rounded by half a step
-LEFT = 0.3 * PULL / 4 + STEP
+# of a jump on four seams the second term leaves a weight w / (4 + w), one per cent; and each end is rounded by half a
+# step
+LEFT = 0.3 * FADING_WEIGHT / 4 + LOG_GAIN_STEP
 
 
 def test_one_model_that_was_exposed_longer_is_darkened() -> None:

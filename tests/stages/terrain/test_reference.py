@@ -7,7 +7,7 @@ import pytest
 
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.pose_arrays import GROUND_PLANE
-from rille.stages.terrain.reference import MAX_TILT_DEG, MIN_REACH, MIN_SHARE, judge
+from rille.stages.terrain.reference import MAX_TILT_DEG, MIN_REACH_HEIGHTS, MIN_REFERENCE_SHARE, judge
 
 WALL = {"no_ground": "a wall", "plane": None, "ground_share": 0.0}
 OTHER = {**WALL, "other_share": 0.6}
@@ -28,17 +28,17 @@ def ground(share: float = 0.2, reach: float = 3.0, height: float = 1.6, roll: fl
         ([WALL, WALL], False),
         ([ground()], False),  # a floor under shelves
         ([ground(), WALL, WALL], False),
-        ([ground(MIN_SHARE)], True),
-        ([ground(reach=MIN_REACH)], True),  # a street between walls
+        ([ground(MIN_REFERENCE_SHARE)], True),
+        ([ground(reach=MIN_REACH_HEIGHTS)], True),  # a street between walls
         ([ground(0.0)], True),  # stated
         ([ground(source="attitude")], True),
         ([ground(source="pitch", plane=[math.tan(math.radians(MAX_TILT_DEG + 1.0)), 0.0, -1.0])], False),
         ([ground(), ground(height=1.5, roll=5.0)], True),  # of one vehicle
         ([ground(), ground(height=1.0)], False),
         ([ground(), ground(roll=15.0)], False),
-        ([ground(MIN_SHARE), WALL, WALL], True),
-        ([ground(MIN_SHARE), OTHER], False),
-        ([ground(MIN_SHARE), ground(MIN_SHARE), OTHER], True),
+        ([ground(MIN_REFERENCE_SHARE), WALL, WALL], True),
+        ([ground(MIN_REFERENCE_SHARE), OTHER], False),
+        ([ground(MIN_REFERENCE_SHARE), ground(MIN_REFERENCE_SHARE), OTHER], True),
     ],
 )
 def test_ground_is_what_pairs_show_with_evidence(levels: list[Any], shown: bool) -> None:
@@ -46,7 +46,7 @@ def test_ground_is_what_pairs_show_with_evidence(levels: list[Any], shown: bool)
 
 
 def test_ground_too_far_for_the_rig_counts_where_a_cell_size_is_stated() -> None:
-    far = ground(MIN_SHARE, no_ground="too coarse")
+    far = ground(MIN_REFERENCE_SHARE, no_ground="too coarse")
     assert [judge([far], coarse=coarse).ground for coarse in (False, True)] == [False, True]
 
 

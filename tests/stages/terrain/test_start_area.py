@@ -8,7 +8,7 @@ import pytest
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.terrain.start_area import NOBODY, StartAreaParams, start_area_stage
+from rille.stages.terrain.start_area import NO_PAIR, StartAreaParams, start_area_stage
 
 CELL, RADIUS, WHEEL = 0.01, 0.2, 0.03
 STANDS = RigidTransform(rotation_exp([0.25, -0.1, 0.7]), np.array([1.0, -2.0, 0.4]))
@@ -25,7 +25,7 @@ def test_its_cells_lie_in_the_vehicles_own_ground_plane() -> None:
     lattice = Lattice.from_dict(out.meta["lattice"])
     xy, z = lattice.xy(), out["elevation"]
     known = np.hypot(xy[..., 0] - 1.0, xy[..., 1] + 2.0) <= RADIUS
-    assert (lattice.cell, out.meta["pair"]) == (CELL, NOBODY)
+    assert (lattice.cell, out.meta["pair"]) == (CELL, NO_PAIR)
     assert known.sum() == pytest.approx(np.pi * (RADIUS / CELL) ** 2, rel=0.02), "the whole disk"
     np.testing.assert_array_equal(np.isfinite(z), known)
     from_vehicle = STANDS.inverse().apply(np.column_stack([xy[known], z[known]]))
