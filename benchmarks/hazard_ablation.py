@@ -32,7 +32,7 @@ def replacements() -> dict[str, tuple[Any, str, Any]]:
     ideas: dict[str, tuple[Any, str, Any]] = {
         "median of fine cells": (measures, "MIN_FINE_CELLS", NEVER),
         "doubt by hidden ground": (classification, "HIDDEN_STEPS", 0.0),
-        "higher probability at the limit": (classification, "LIFT", (*classification.LIFT[:2], 0.0)),
+        "higher probability at the limit": (classification, "LIFT", 0.0),
     }
     for measure in measures.MEASURES:
         rest = tuple(m for m in measures.MEASURES if m is not measure)

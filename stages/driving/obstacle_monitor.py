@@ -41,8 +41,6 @@ SIDE_MARGIN_WHEELS = 0.5
 """Distance to either side of the wheels that is watched [wheel diameters]."""
 MODEL_RADIUS_WHEELS = 0.5
 """A point is compared with the greatest height of the model within this radius [wheel diameters]."""
-DISPLACEMENT_STD = 0.5
-"""Standard deviation of a displacement [pixels of its pyramid level]."""
 
 
 class ObstacleMonitorParams(Params):
@@ -160,7 +158,8 @@ def look(
         # derivative grows beyond use.
         t = np.clip(np.nan_to_num(t), -0.5, 0.8)
     left_over = target - camera.project(T_now.apply(cells + t[:, None] * to_camera))
-    error = DISPLACEMENT_STD * 2.0**view.level
+    # Half a pixel of the pyramid's level.
+    error = 0.5 * 2.0**view.level
     # A displacement across the epipolar line is a wrong match, not another depth.
     along = np.hypot(left_over[:, 0], left_over[:, 1]) <= 3.0 * error
     q = cells + t[:, None] * to_camera

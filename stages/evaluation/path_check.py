@@ -13,7 +13,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.grid8 import search
-from rille.stages.planning.path_ground import UNIT, Maps, PathMaps, PathParams
+from rille.stages.planning.path_ground import COST_UNIT_M, Maps, PathMaps, PathParams
 from rille.stages.planning.row_graph import UNREACHED
 
 
@@ -93,7 +93,7 @@ def _shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> f
         return None
     # No heights and no tolls: the cost is the length alone.
     cost, _ = search(ground.terrain("middle", 1.0, 0.0)._replace(height=level, toll=level), first, last)
-    return float(cost[last]) * UNIT if cost[last] < UNREACHED else None
+    return float(cost[last]) * COST_UNIT_M if cost[last] < UNREACHED else None
 
 
 @stage(

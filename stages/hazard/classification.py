@@ -41,16 +41,22 @@ HIDDEN_STEPS = 0.5
 """Steps of the vehicle by which unknown ground widens the doubt of a measure, where all of the wheel's window, or of
 the ground below the vehicle, is unknown: the measure does not hold what is hidden there."""
 
-STEPS, FARTHEST = 64, 16.0
-"""Table of F: steps a unit of excess, and the excess where it ends."""
+STEPS_PER_EXCESS = 64
+"""Steps of the table of F a unit of excess."""
 
-STUDENT_FREEDOM = 3.0
-"""Degrees of freedom of Student's t."""
+MAX_EXCESS = 16.0
+"""Excess where the table of F ends."""
 
-LIFT = (-0.4, 0.6, 0.8)
-"""Excess from which and width over which t is raised, and by how much: a measure found at its limit is more often above
-it than below, since a matcher smooths relief away more often than it makes some. Fitted with the noise of
-:mod:`rille.stages.hazard.measures`; F stays a rising function."""
+LIFT = 0.8
+"""What t is raised by: a measure at its limit is more often above it than below, since a matcher smooths relief away
+more often than it makes some. Fitted, as where it begins, with the noise of :mod:`rille.stages.hazard.measures`; F
+stays a rising function."""
+
+LIFT_START_EXCESS = -0.4
+"""Excess from which t is raised."""
+
+LIFT_WIDTH_EXCESS = 0.6
+"""Excess over which the rise of t grows to the whole of it."""
 
 MIN_RELATIVE_STD = 1e-12
 """Smallest standard deviation of a measure, as a share of its limit: the excess of exact elevations is then finite."""
@@ -157,7 +163,7 @@ def _judge_blocks(
     # In proportion to the unknown share, and of a step, since anything higher shows at the rim of the known ground.
     hidden = np.float32(HIDDEN_STEPS * vehicle.max_step) * np.stack([1.0 - np.minimum(share, 1.0), patchy])
     doubt = np.hypot(noise, hidden)
-    load, excess = np.zeros_like(share), np.full_like(share, -FARTHEST)
+    load, excess = np.zeros_like(share), np.full_like(share, -MAX_EXCESS)
     over = np.zeros(share.shape, np.uint16)
     for m in on_blocks:
         value, limit = values[m.name], Limit.of(m, terrain, sigmas)
@@ -183,9 +189,10 @@ def _band(m: Measure, values: Floats32, most: float) -> Floats32:
 @cache
 def _table() -> Floats32:
     """F (entry,) at steps of the excess."""
-    t = np.arange(-FARTHEST * STEPS, FARTHEST * STEPS + 1) / STEPS
-    start, width, lift = LIFT
-    chance = scipy.special.stdtr(STUDENT_FREEDOM, t + lift * np.clip((t - start) / width, 0.0, 1.0))
+    t = np.arange(-MAX_EXCESS * STEPS_PER_EXCESS, MAX_EXCESS * STEPS_PER_EXCESS + 1) / STEPS_PER_EXCESS
+    raised = np.clip((t - LIFT_START_EXCESS) / LIFT_WIDTH_EXCESS, 0.0, 1.0)
+    # Three degrees of freedom.
+    chance = scipy.special.stdtr(3.0, t + LIFT * raised)
     # Beyond the ends of the table the probability counts as certain, whatever the tails of Student's t.
     chance[0], chance[-1] = 0.0, 1.0
     return np.asarray(chance, dtype=np.float32)
@@ -214,7 +221,12 @@ def _classify(limits, blocks, cells, n, rules, table):  # type: ignore[no-untype
                         load = max(load, own)
                         excess = max(excess, above * (per_noise[k] if above > 0 else per_doubt[k]))
                         over |= limit.bit if own > 1 else NO_BITS
-                    p = table[int(math.floor(min(max(excess, -FARTHEST), FARTHEST) * STEPS) + FARTHEST * STEPS)]
+                    p = table[
+                        int(
+                            math.floor(min(max(excess, -MAX_EXCESS), MAX_EXCESS) * STEPS_PER_EXCESS)
+                            + MAX_EXCESS * STEPS_PER_EXCESS
+                        )
+                    ]
                     known = not math.isnan(cells.closed[r, c])
                     reason = blocks.flags[i, j]
                     if cells.filled[r, c]:

@@ -60,7 +60,7 @@ REASONS = BITS | {"unknown": UNKNOWN_BIT, "filled": FILLED_BIT, "uncertain": DOU
 because of sigma; some of the ground that is looked at is unknown."""
 
 
-RIM = 1.0 / math.sqrt(12.0)
+RIM_STD_SHARE = 1.0 / math.sqrt(12.0)
 """Standard deviation of a height that lies anywhere within a range, of that range."""
 
 
@@ -137,7 +137,7 @@ def risk_map(
     elevation = np.where(unknown, np.nan, elevation).astype(np.float32)
     z, s = elevation.copy(), np.where(np.isfinite(elevation_std), elevation_std, 0.0).astype(np.float32)
     gap, side = p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell)
-    filled = close_into((z, s), elevation, gap, side, p.min_known, rim=RIM)
+    filled = close_into((z, s), elevation, gap, side, p.min_known, rim=RIM_STD_SHARE)
     rules = Rules(p.sigmas, p.caution, p.max_p, p.min_known)
     classes = classify(HazardInput(elevation, z, s, cell, vehicle, window), filled, rules)
     return classes | {"filled": filled, "elevation": z}
@@ -174,9 +174,9 @@ def window_cells(side: float, cell: float) -> int:
 )
 def risk_stage(params: RiskParams, dem: Sequence[Bundle], *, vehicle: Vehicle = DEFAULT_VEHICLE) -> Bundle[RiskFacts]:
     """Safe, caution, hazard and unknown cells by seven measures against a vehicle's limits."""
-    lattices = [Lattice.from_dict(one.meta["lattice"]) for one in dem]
+    lattices = [Lattice.from_dict(bundle.meta["lattice"]) for bundle in dem]
     whole = union(lattices)
-    z = mosaic([(part, one["elevation"]) for part, one in zip(lattices, dem, strict=True)], np.nan, whole)
+    z = mosaic([(part, bundle["elevation"]) for part, bundle in zip(lattices, dem, strict=True)], np.nan, whole)
     # Slopes and steps compare a cell with the ground around it, so the error that all of it shares does not count.
     names = [next((n for n in ("relief_std", "elevation_std") if n in d.arrays), None) for d in dem]
     stds = [(part, d[name]) for part, d, name in zip(lattices, dem, names, strict=True) if name is not None]

@@ -19,8 +19,8 @@ from rille.stages.planning.wheels import wheel_positions
 
 STRAIGHT, RIGHT, ACROSS, LEFT = 1, 2, 4, 8
 """Bits of the directions: along columns; to row 0 and greater columns; along rows; to row 0 and smaller columns."""
-ALL = STRAIGHT | RIGHT | ACROSS | LEFT
-STEPS = ((STRAIGHT, -1, 0), (RIGHT, -1, 1), (ACROSS, 0, 1), (LEFT, -1, -1))
+ALL_DIRECTIONS = STRAIGHT | RIGHT | ACROSS | LEFT
+DIRECTED_STEPS = ((STRAIGHT, -1, 0), (RIGHT, -1, 1), (ACROSS, 0, 1), (LEFT, -1, -1))
 """Bit, row and column of one step in each direction."""
 ROUNDING_CELLS = 1e-9
 """Cells by which rounding alone may make a whole number of cells larger."""
@@ -62,7 +62,7 @@ class FreePlaces:
         if closed is not None:
             middle |= closed
         wheels = wheel_positions(vehicle)
-        self._closed = [middle | self._touching(near, wheels, step, outside=False) for step in STEPS]
+        self._closed = [middle | self._touching(near, wheels, step, outside=False) for step in DIRECTED_STEPS]
 
     def ways(self, below: str = "middle") -> Bytes:
         """Directions (row, col) as bits in which it may, with ``below``, its "outline", its "wheels" or its "middle",
@@ -70,7 +70,7 @@ class FreePlaces:
         unknown, wheels = self._unknown, wheel_positions(self._vehicle)
         half_cells = self._vehicle.half_length / self._cell, self._vehicle.half_width / self._cell
         out = np.zeros(self._closed[0].shape, np.uint8)
-        for step, closed in zip(STEPS, self._closed, strict=True):
+        for step, closed in zip(DIRECTED_STEPS, self._closed, strict=True):
             if unknown is not None and below == "outline":
                 closed = closed | widened(unknown, *half_cells, (step[1], step[2]))
             elif unknown is not None and below == "wheels":

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes
 from rille.stages.numeric.heap import grown, pop, push
-from rille.stages.planning.row_graph import NEIGHBOURS, UNREACHED, Cell, Ints, Terrain
+from rille.stages.planning.row_graph import NEIGHBOURS, UNREACHED, Cell, GridCosts, Ints
 
 
-def search(terrain: Terrain, start: Cell, target: Cell | None = None) -> tuple[Ints, NDArray[np.int8]]:
+def search(terrain: GridCosts, start: Cell, target: Cell | None = None) -> tuple[Ints, NDArray[np.int8]]:
     """Least cost (row, col) int64 from the start, :data:`UNREACHED` where no step leads; and the last step there, an
     index into :data:`NEIGHBOURS`, -1 at the start and where not reached. The search ends at ``target``; None: when the
     cost of every cell is final."""

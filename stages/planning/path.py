@@ -45,7 +45,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN, check_size
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.grid8 import search
-from rille.stages.planning.path_ground import GROUNDS, UNIT, Maps, PathMaps, PathParams, Point
+from rille.stages.planning.path_ground import COST_UNIT_M, GROUNDS, Maps, PathMaps, PathParams, Point
 from rille.stages.planning.path_words import GOAL, Route, describe, ending, hazard_words
 from rille.stages.planning.row_graph import UNREACHED, Cell, Ints, sweep, trace
 
@@ -214,7 +214,7 @@ def first_costs(starts: Bools, row: int, cell: float) -> Ints:
     each metre along rows and columns from the middle of a row."""
     rows, cols = (np.arange(n) for n in starts.shape)
     moves = np.abs(rows - row)[:, None] + np.abs(cols - len(cols) // 2)
-    return np.where(starts, moves * round(START_COST * cell / UNIT), UNREACHED)
+    return np.where(starts, moves * round(START_COST * cell / COST_UNIT_M), UNREACHED)
 
 
 def row_span(cells: Bools) -> tuple[int, int]:

@@ -19,7 +19,7 @@ from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.numeric.windows import window_mean
 from rille.stages.planning.configuration_space import FreePlaces
 from rille.stages.planning.grid8 import parts
-from rille.stages.planning.row_graph import NEIGHBOURS, Cell, Ints, Terrain
+from rille.stages.planning.row_graph import NEIGHBOURS, Cell, GridCosts, Ints
 
 Maps = Mapping[str, NDArray[Any]]
 Point = tuple[float, float]
@@ -30,10 +30,8 @@ GROUNDS = {"outline": 1.0, "wheels": 0.75, "middle": 0.5}
 Unknown ground under the belly may touch it, so the weight is lower by a quarter; unknown ground under a wheel may tip
 the vehicle, so it is lower by half.
 """
-UNIT = 1e-6
+COST_UNIT_M = 1e-6
 """m of climb that cost one."""
-HEIGHT_STEP = 0.02
-"""Smallest height difference that costs, as a share of the vehicle's ``max_step``."""
 Planner = Literal["rows", "grid8", "auto"]
 
 
@@ -82,7 +80,7 @@ class PathParams(Params):
 class PathMaps:
     """The maps of a planner.
 
-    ``stand`` (row, col) float32 m, mean height under a wheel; ``height`` the same in whole numbers of :data:`UNIT`, 0
+    ``stand`` (row, col) float32 m, mean height under a wheel; ``height`` the same in numbers of :data:`COST_UNIT_M`, 0
     where closed; ``toll`` (row, col) in the same unit, of entering caution and doubtful ground; ``closed`` (row, col):
     where the vehicle's middle may not be.
     """
@@ -101,10 +99,13 @@ class PathMaps:
         self.closed = (risk >= HAZARDOUS) | (
             chance > np.float32(params.p_certain_hazard if params.p_certain_hazard < 1 else np.inf)
         )
-        step = HEIGHT_STEP * vehicle.max_step
+        # Smaller height differences cost nothing.
+        step = 0.02 * vehicle.max_step
         steps = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(step))
-        self.height: Ints = np.rint(steps.astype(np.float64) * (step / UNIT)).astype(np.int64)
-        caution, doubt = (price * lattice.cell / UNIT for price in (params.caution_cost, params.uncertainty_cost))
+        self.height: Ints = np.rint(steps.astype(np.float64) * (step / COST_UNIT_M)).astype(np.int64)
+        caution, doubt = (
+            price * lattice.cell / COST_UNIT_M for price in (params.caution_cost, params.uncertainty_cost)
+        )
         # NaN, which is unknown and closed, costs nothing.
         self.toll: Ints = np.rint(np.float32(doubt) * np.nan_to_num(chance)).astype(np.int64)
         self.toll = self.toll + np.where(risk == CAUTION, round(caution), 0)
@@ -120,12 +121,12 @@ class PathMaps:
             self._ways[below] = self._places.ways(below)
         return self._ways[below]
 
-    def terrain(self, below: str, price: float, free: float) -> Terrain:
+    def terrain(self, below: str, price: float, free: float) -> GridCosts:
         """Costs of steps on a ground; a metre of way costs ``price`` metres of climb, but ``free`` cells of each step
         cost nothing."""
         cells = np.array([math.hypot(dr, dc) - free for dr, dc, _ in NEIGHBOURS])
-        lengths = np.rint(price * cells * self.lattice.cell / UNIT).astype(np.int64)
-        return Terrain(self.height, self.ways(below), self.toll, lengths)
+        lengths = np.rint(price * cells * self.lattice.cell / COST_UNIT_M).astype(np.int64)
+        return GridCosts(self.height, self.ways(below), self.toll, lengths)
 
     def xyz(self, cells: Ints) -> Floats:
         """Points (vertex, 3), metres, of cells (vertex, 2)."""

@@ -29,11 +29,11 @@ NEIGHBOURS = (
     (1, 0, STRAIGHT), (0, -1, ACROSS), (0, 1, ACROSS), (1, -1, RIGHT), (1, 1, LEFT),
 )  # fmt: skip
 """Row, column and direction of the eight steps to a neighbour; the first three lead to the next row."""
-AHEAD = 3
+STEPS_AHEAD = 3
 """Number of the steps that lead to the next row, in order of preference."""
 
 
-class Terrain(NamedTuple):
+class GridCosts(NamedTuple):
     """Costs of steps from cell to cell, whole numbers of one unit.
 
     ``height`` (row, col), of which a difference of one costs one; ``ways`` (row, col) bits of the directions in which
@@ -47,7 +47,7 @@ class Terrain(NamedTuple):
     lengths: Ints
 
 
-def sweep(terrain: Terrain, first: Ints) -> tuple[Ints, NDArray[np.int8]]:
+def sweep(terrain: GridCosts, first: Ints) -> tuple[Ints, NDArray[np.int8]]:
     """Least cost (row, col) int64 of every cell by steps ahead, :data:`UNREACHED` where none leads; and the last step
     there, an index into :data:`NEIGHBOURS`, -1 at starts and where not reached. ``first`` (row, col): cost of starting
     at a cell, :data:`UNREACHED` where that is not permitted."""
@@ -62,7 +62,7 @@ def _sweep(terrain, cost, step):  # type: ignore[no-untyped-def]
     rows, cols = height.shape
     for r in range(rows - 2, -1, -1):
         for c in range(cols):
-            for k in range(AHEAD):
+            for k in range(STEPS_AHEAD):
                 _, dc, way = NEIGHBOURS[k]
                 b = c - dc
                 if b < 0 or b >= cols or not ways[r, c] & ways[r + 1, b] & way or cost[r + 1, b] >= UNREACHED:

@@ -22,9 +22,6 @@ from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.hazard.vehicle import Vehicle
 
-BELLY_POINTS = 9
-"""Samples along either side of the belly."""
-
 
 @dataclass(frozen=True)
 class HeightGrid:
@@ -145,7 +142,8 @@ def measured(ground: HeightGrid, x: Floats, y: Floats, heading: Floats, vehicle:
     rise = 0.5 * (z[:, 0] + z[:, 1] - z[:, 2] - z[:, 3]) / vehicle.wheel_base
     lean = 0.5 * (z[:, 1] + z[:, 3] - z[:, 0] - z[:, 2]) / vehicle.track
     middle = z.mean(axis=1)
-    half = np.linspace(-0.5, 0.5, BELLY_POINTS)
+    # Nine samples along either side.
+    half = np.linspace(-0.5, 0.5, 9)
     across, along = np.meshgrid(half * (vehicle.track - 0.2 * vehicle.wheel_diameter), half * vehicle.wheel_base)
     belly = np.stack([across.ravel(), along.ravel()], axis=1)
     plane = middle[:, None] + lean[:, None] * belly[:, 0] + rise[:, None] * belly[:, 1]

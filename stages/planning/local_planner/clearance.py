@@ -27,9 +27,6 @@ from rille.stages.planning.local_planner.underbody import Straddle, clears, stan
 from rille.stages.planning.wheels import wheel_positions
 from rille.stages.terrain.occlusion_bounds import Bounds
 
-MIN_UNKNOWN_CELLS = 0.5
-"""Nearer than this a point of the belly lies in an unknown cell."""
-
 CAUTION_GROUND, DOUBTED_GROUND = 1, 2
 """Classes of ground that costs more than its length; 0: any other."""
 
@@ -70,7 +67,7 @@ class Hazards(NamedTuple):
     doubted: Bools | None = None
 
 
-class Fields(NamedTuple):
+class ClearanceFields(NamedTuple):
     """Distances (row, col), m, to hazards that are none by sigma alone, to those that are, and to proven ones."""
 
     likely: Floats32
@@ -87,8 +84,8 @@ class FootingMaps(NamedTuple):
     pass.
     """
 
-    wheels: Fields
-    body: Fields
+    wheels: ClearanceFields
+    body: ClearanceFields
     unknown: Floats32
     frontier: Floats32
     cost_class: Bytes
@@ -158,7 +155,7 @@ class Footing:
             cost_class[beside & ~unknown] = DOUBTED_GROUND
         masks = likely, doubtful, proven
         wheels, body = (
-            Fields(*(distance(mask & ((bits & which) > 0), cell) for mask in masks))
+            ClearanceFields(*(distance(mask & ((bits & which) > 0), cell) for mask in masks))
             for which in (WHEEL_BITS, BODY_BITS)
         )
         wide = _opened(unknown, 0.5 * vehicle.wheel_diameter, cell)
@@ -181,7 +178,8 @@ class Footing:
         poses, parts = _Poses(at, np.cos(turn), np.sin(turn)), _Parts(*points, f(vehicle.margin), f(cell), f(radius))
         _gaps(poses, parts, self.maps, out)
         for distances in (out.unknown, out.frontier):
-            distances -= MIN_UNKNOWN_CELLS * cell
+            # Nearer than half a cell a point of the belly lies in an unknown cell.
+            distances -= 0.5 * cell
         return Gaps(*(a.reshape(np.shape(x)) for a in out))
 
     def beneath(self, mask: Bools, stand: tuple[float, float, float]) -> Floats:

@@ -30,8 +30,6 @@ DOUBT_WEIGHT = 60
 """Ratio of the cost of doubted ground to that of caution ground: one wheel on it more than triples the cost."""
 PROXIMITY_COST = 0.5
 """Added to the cost of a metre at the margin of a hazard; it falls to 0 at twice the margin."""
-PARTS = 5
-"""Parts of a vehicle that stand on ground: its wheels and its middle."""
 HERE_WHEELBASES = 0.3
 """Radius around the start pose within which a cell is accepted if its clearance is not below that of the start."""
 NEAR_WHEELBASES = 3.0
@@ -100,7 +98,8 @@ class Ground:
         # Likely hazards, and gaps narrower than a wheel, which are the shadows of stones, remain when seen from nearer.
         stays = (gaps.gap <= self.vehicle.margin) | ((gaps.unknown <= 0) & (gaps.frontier > 0))
         unknown = np.where(stays, np.maximum(self.p.uncertainty_cost, unknown), unknown)
-        caution = CAUTION_COST * ((gaps.caution + DOUBT_WEIGHT * gaps.doubted) / PARTS)
+        # Of the five parts that stand on ground: the wheels and the middle.
+        caution = CAUTION_COST * ((gaps.caution + DOUBT_WEIGHT * gaps.doubted) / 5)
         # Far doubts cost no more than unknown ground.
         fades = (self._away(x, y) > NEAR_WHEELBASES) & ~stays
         caution = np.where(fades, np.minimum(caution, self.p.unknown_cost - 1.0), caution)

@@ -27,7 +27,7 @@ RIM_SHARE = 0.04
 and the vehicle does not stand exactly level."""
 MIN_VIEW_SHARE = 0.9
 """Share of a set of points that must be in view for the set to count as in view."""
-STEP = math.radians(5.0)
+TURN_STEP = math.radians(5.0)
 """Step [rad] between the turns that are tried."""
 
 
@@ -130,7 +130,9 @@ class Target:
         turns = [0.0]
         for sign, bound in ((1.0, left), (-1.0, right)):
             # Outwards until the wheels have no room: a stone that blocks the turn blocks all beyond.
-            more = np.array([sign * k * STEP for k in range(1, 1 + math.floor(max(bound, 0.0) / STEP + 1e-9))])
+            more = np.array(
+                [sign * k * TURN_STEP for k in range(1, 1 + math.floor(max(bound, 0.0) / TURN_STEP + 1e-9))]
+            )
             free = self.ground.free(np.full(more.shape, at[0]), np.full(more.shape, at[1]), heading + more)
             turns += more[np.logical_and.accumulate(free)].tolist()
         return next((t for t in sorted(turns, key=abs) if self.view.holds(self.points, (*at, heading + t))), None)

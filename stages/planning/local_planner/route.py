@@ -17,7 +17,7 @@ Clear = Callable[[Floats, Floats, Floats], bool]
 """Whether the vehicle may be at all of the poses x, y (m), heading (rad)."""
 
 STEP_TURN = math.radians(5.0)
-NOTHING = 1e-9
+MIN_LENGTH_M = 1e-9
 """m; a shorter piece is what rounding leaves over, and has no heading."""
 
 
@@ -112,7 +112,7 @@ def first_metres(way: Sequence[Piece], length: float) -> list[Piece]:
     """The first ``length`` metres of a way."""
     out: list[Piece] = []
     for piece in way:
-        if length <= NOTHING:
+        if length <= MIN_LENGTH_M:
             break
         out.append(piece.cut(length) if piece.length > length else piece)
         length -= piece.length
@@ -123,7 +123,7 @@ def last_metres(way: Sequence[Piece], length: float) -> list[Piece]:
     """Return the rest of a path after its first ``length`` metres."""
     out: list[Piece] = []
     for piece in way:
-        if length >= piece.length - NOTHING:
+        if length >= piece.length - MIN_LENGTH_M:
             length -= piece.length
             continue
         out.append(replace(piece, a=piece.cut(length).b) if length > 0 else piece)

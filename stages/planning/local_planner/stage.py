@@ -32,10 +32,10 @@ Point = tuple[float, float]
 
 
 HAZARD_MAPS = ("risk", "reason", "p_hazard")
-P_COSTLY = 0.06
+MIN_DOUBTED_PROBABILITY = 0.06
 """Probability of a hazard from which near ground is doubted; on simulated beds all edges that the map missed lay on
 ground of 0.07 and more."""
-P_CLEAR = 0.02
+MAX_CLEAR_PROBABILITY = 0.02
 """Probability of a hazard below which ground seen from afar alone may be driven on; of such places for a wheel 0.005 %
 had an edge that the map missed, of all places 0.37 %."""
 
@@ -104,12 +104,12 @@ def seen_so_far(near: Bundle, far: Bundle | None) -> Hazards:
         # At the rim of the near ground a window is cut off, which widens the doubt. All of it was seen from afar, which
         # counts where it is clearly free.
         chance = np.asarray(far["p_hazard"])
-        cut = unknown | (((maps[1] & UNSEEN_BIT) != 0) & (chance < P_CLEAR))
+        cut = unknown | (((maps[1] & UNSEEN_BIT) != 0) & (chance < MAX_CLEAR_PROBABILITY))
         maps = [np.where(cut, np.asarray(far[name]), seen) for name, seen in zip(HAZARD_MAPS, maps, strict=True)]
         # Written so that NaN, of which nothing is known, stays unknown.
-        unknown &= ~(maps[2] < P_CLEAR)
+        unknown &= ~(maps[2] < MAX_CLEAR_PROBABILITY)
         glanced = unknown & (maps[0] < HAZARDOUS)
-    return Hazards(maps[0], maps[1], maps[2], unknown, glanced, maps[2] >= P_COSTLY)
+    return Hazards(maps[0], maps[1], maps[2], unknown, glanced, maps[2] >= MIN_DOUBTED_PROBABILITY)
 
 
 class LegInputs(NamedTuple):

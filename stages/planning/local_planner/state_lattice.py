@@ -26,12 +26,12 @@ from rille.stages.planning.local_planner.clearance import Footing, Gaps
 Prices = Callable[[Gaps, Floats, Floats], tuple[Bools, Floats]]
 """Of poses by their gaps, x and y (m): whether they may be driven on what is known, and the price of a metre."""
 
-HALF = 8
-STEPS = np.array([(-1, 0), (-2, -1), (-1, -1), (-1, -2), (0, -1), (1, -2), (1, -1), (2, -1)])
-STEPS = np.concatenate([STEPS, -STEPS])
+HALF_TURN_HEADINGS = 8
+HEADING_STEPS = np.array([(-1, 0), (-2, -1), (-1, -1), (-1, -2), (0, -1), (1, -2), (1, -1), (2, -1)])
+HEADING_STEPS = np.concatenate([HEADING_STEPS, -HEADING_STEPS])
 """Row and column of one step along each heading, from ahead to the left."""
-ANGLES = np.mod(np.arctan2(-STEPS[:, 1], -STEPS[:, 0]), 2 * np.pi)
-LENGTHS = np.hypot(STEPS[:, 0], STEPS[:, 1])
+HEADING_ANGLES = np.mod(np.arctan2(-HEADING_STEPS[:, 1], -HEADING_STEPS[:, 0]), 2 * np.pi)
+STEP_LENGTHS = np.hypot(HEADING_STEPS[:, 0], HEADING_STEPS[:, 1])
 AHEAD, BACK, TO_LEFT, TO_RIGHT = 0, 1, 2, 3
 
 
@@ -84,13 +84,17 @@ class PoseGraph:
     def of(footing: Footing, grid: PoseGrid, prices: Prices) -> PoseGraph:
         """Compute the costs on a map; a vehicle covers the same ground backwards, so headings within 180 degrees do."""
         row, col = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in grid.shape), indexing="ij")
-        price, known = (np.empty((3, HALF, *grid.shape), kind) for kind in (np.float64, np.bool_))
-        for k in range(HALF):
+        price, known = (np.empty((3, HALF_TURN_HEADINGS, *grid.shape), kind) for kind in (np.float64, np.bool_))
+        for k in range(HALF_TURN_HEADINGS):
             # Of all 16 headings: the turn to the left of the eighth ends at the ninth.
-            after = ANGLES[k + 1]
-            dr, dc = 0.5 * STEPS[k]
+            after = HEADING_ANGLES[k + 1]
+            dr, dc = 0.5 * HEADING_STEPS[k]
             for where, (r, c, angle) in enumerate(
-                ((0.0, 0.0, ANGLES[k]), (dr, dc, ANGLES[k]), (0.0, 0.0, 0.5 * (ANGLES[k] + after)))
+                (
+                    (0.0, 0.0, HEADING_ANGLES[k]),
+                    (dr, dc, HEADING_ANGLES[k]),
+                    (0.0, 0.0, 0.5 * (HEADING_ANGLES[k] + after)),
+                )
             ):
                 x, y = grid.xy(row + r, col + c)
                 gaps = footing.gaps(x, y, np.full(x.shape, grid.heading + angle))
@@ -109,12 +113,12 @@ class PoseGraph:
         back : cost of a metre driven back; a metre ahead costs 1.
         whole : search all poses; else end at the start.
         """
-        size = (2 * HALF, *self.grid.shape)
+        size = (2 * HALF_TURN_HEADINGS, *self.grid.shape)
         cost, move = np.full(size, np.inf), np.full(size, -1, np.int8)
         r, c = self.grid.origin
         end = -1 if whole else r * size[2] + c
-        angles = np.mod(np.diff(np.append(ANGLES, 2 * np.pi)), 2 * np.pi)
-        moves = _Moves(STEPS, LENGTHS * self.grid.spacing, angles * turn_price, back)
+        angles = np.mod(np.diff(np.append(HEADING_ANGLES, 2 * np.pi)), 2 * np.pi)
+        moves = _Moves(HEADING_STEPS, STEP_LENGTHS * self.grid.spacing, angles * turn_price, back)
         _search(_Costs(self.pose, self.step, self.turn), goals, moves, end, cost, move)
         return cost, move
 
@@ -123,18 +127,18 @@ class PoseGraph:
         at, out = (0, *self.grid.origin), []
         while True:
             k, r, c = at
-            m = int(move[k % (2 * HALF), r, c])
+            m = int(move[k % (2 * HALF_TURN_HEADINGS), r, c])
             out.append((k, r, c, m))
             if m < 0:
                 return out
-            dr, dc = (int(v) for v in STEPS[k % (2 * HALF)])
+            dr, dc = (int(v) for v in HEADING_STEPS[k % (2 * HALF_TURN_HEADINGS)])
             at = {AHEAD: (k, r + dr, c + dc), BACK: (k, r - dr, c - dc), TO_LEFT: (k + 1, r, c)}.get(m, (k - 1, r, c))
 
 
 def angle_of(k: int) -> float:
     """Angle (rad) of a heading that is counted on over full turns."""
-    turns, rest = divmod(k, 2 * HALF)
-    return 2 * math.pi * turns + float(ANGLES[rest])
+    turns, rest = divmod(k, 2 * HALF_TURN_HEADINGS)
+    return 2 * math.pi * turns + float(HEADING_ANGLES[rest])
 
 
 class _Costs(NamedTuple):

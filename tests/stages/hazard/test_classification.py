@@ -9,9 +9,9 @@ from vehicles import MODEL
 from rille.stages.hazard.classification import (
     CAUTION,
     DOUBT_BIT,
-    FARTHEST,
     HAZARDOUS,
-    STEPS,
+    MAX_EXCESS,
+    STEPS_PER_EXCESS,
     UNKNOWN,
     Rules,
     _table,
@@ -96,5 +96,7 @@ def test_the_probability_rises_from_0_to_1_and_is_a_half_near_the_limit() -> Non
     table = _table()
     assert (np.diff(table) >= 0).all()
     assert (table[0], table[-1]) == (0.0, 1.0)
-    assert table[int((FARTHEST - 0.4) * STEPS)] == pytest.approx(0.358, abs=0.01)  # Student's t with 3 degrees
-    assert table[int(FARTHEST * STEPS)] == pytest.approx(0.69, abs=0.01)
+    assert table[int((MAX_EXCESS - 0.4) * STEPS_PER_EXCESS)] == pytest.approx(
+        0.358, abs=0.01
+    )  # Student's t with 3 degrees
+    assert table[int(MAX_EXCESS * STEPS_PER_EXCESS)] == pytest.approx(0.69, abs=0.01)

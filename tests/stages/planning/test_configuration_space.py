@@ -10,7 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from vehicles import SHORT
 
-from rille.stages.planning.configuration_space import ACROSS, STEPS, STRAIGHT, FreePlaces, distance, grown, widened
+from rille.stages.planning.configuration_space import (
+    ACROSS,
+    DIRECTED_STEPS,
+    STRAIGHT,
+    FreePlaces,
+    distance,
+    grown,
+    widened,
+)
 
 CELL = 0.01
 
@@ -102,7 +110,7 @@ def test_where_a_vehicle_may_stand_equals_a_look_at_every_wheel(seed: int, margi
     stand = FreePlaces(wheel, body, vehicle, CELL, unknown)
     near, middle = grown(wheel, margin / CELL), grown(body, margin / CELL)
     found = {below: stand.ways(below) for below in ("outline", "wheels", "middle")}
-    for bit, dr, dc in STEPS:
+    for bit, dr, dc in DIRECTED_STEPS:
         unit = math.hypot(dr, dc)
         outline = widened(unknown, vehicle.half_length / CELL, vehicle.half_width / CELL, (dr, dc))
         for r in range(23):

@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from rille.stages.planning.grid8 import parts, search
-from rille.stages.planning.row_graph import NEIGHBOURS, UNREACHED, Terrain, trace
+from rille.stages.planning.row_graph import NEIGHBOURS, UNREACHED, GridCosts, trace
 
 UNIT = 7
 LENGTHS = np.array([UNIT if 0 in (dr, dc) else 10 for dr, dc, _ in NEIGHBOURS])
@@ -44,7 +44,7 @@ def test_costs_equal_networkx_and_scipy(seed: int, rows: int, cols: int, blocked
     height, toll = (rng.integers(0, rng.integers(1, most), (rows, cols)) for most in (9, 3))
     ways = np.where(rng.random((rows, cols)) < blocked, 0, rng.integers(1, 16, (rows, cols))).astype(np.uint8)
     start = int(rng.integers(rows)), int(rng.integers(cols))
-    cost, step = search(Terrain(height, ways, toll, LENGTHS), start)
+    cost, step = search(GridCosts(height, ways, toll, LENGTHS), start)
     graph = nx.DiGraph()
     graph.add_node(start)
     listed = edges(height, ways, toll)
@@ -73,7 +73,7 @@ def test_costs_equal_networkx_and_scipy(seed: int, rows: int, cols: int, blocked
 
 def test_the_search_ends_at_the_target_and_its_cost_is_the_same() -> None:
     height = np.random.default_rng(2).integers(0, 9, (60, 70))
-    terrain = Terrain(height, np.full((60, 70), 15, dtype=np.uint8), np.zeros((60, 70), dtype=np.int64), LENGTHS)
+    terrain = GridCosts(height, np.full((60, 70), 15, dtype=np.uint8), np.zeros((60, 70), dtype=np.int64), LENGTHS)
     whole, _ = search(terrain, (50, 60))
     part, step = search(terrain, (50, 60), (48, 55))
     assert part[48, 55] == whole[48, 55]
@@ -85,7 +85,7 @@ def test_costs_of_a_large_map_equal_scipy() -> None:
     """So large that thousands of cells wait for their turn."""
     n = 400
     height, at = np.random.default_rng(6).integers(0, 30, (n, n)), np.arange(n * n).reshape(n, n)
-    cost, _ = search(Terrain(height, np.full((n, n), 15, np.uint8), np.zeros_like(height), LENGTHS), (200, 200))
+    cost, _ = search(GridCosts(height, np.full((n, n), 15, np.uint8), np.zeros_like(height), LENGTHS), (200, 200))
     graph = []
     for length, here, there in (
         (7, np.s_[1:], np.s_[:-1]),

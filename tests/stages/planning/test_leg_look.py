@@ -10,7 +10,7 @@ from leg_scenes import CAMERAS, GOAL, LATTICE, START, P, X, Y, ground
 
 from rille.stages.hazard.risk import UNKNOWN
 from rille.stages.planning.local_planner.ground import Ground
-from rille.stages.planning.local_planner.look import STEP, Target
+from rille.stages.planning.local_planner.look import TURN_STEP, Target
 from rille.stages.planning.local_planner.route import Piece, first_metres
 
 FREE = Ground(ground(), START, 0.0, P)
@@ -29,7 +29,7 @@ def test_it_turns_no_more_than_it_must(side: float) -> None:
     assert CAMERAS.sees(aim.points, (*START, turn)).all()
     if turn != 0.0:
         assert math.copysign(1.0, turn) == math.copysign(1.0, -side)
-        assert not CAMERAS.sees(aim.points, (*START, turn - math.copysign(STEP, turn))).any()
+        assert not CAMERAS.sees(aim.points, (*START, turn - math.copysign(TURN_STEP, turn))).any()
     assert aim.turn(START, 0.0, 0.0, 0.0) == (0.0 if turn == 0.0 else None)
 
 
@@ -40,7 +40,9 @@ def test_a_leg_is_driven_as_far_as_the_target_stays_in_view() -> None:
         assert seen is not None
         y = first_metres(leg, seen[0])[-1].b[1]
         assert CAMERAS.sees(np.array(points), (0.0, y, seen[1])).all()
-        beyond = [CAMERAS.sees(np.array(points), (0.0, y + 2.1 * LATTICE.cell, k * STEP)).all() for k in range(-8, 9)]
+        beyond = [
+            CAMERAS.sees(np.array(points), (0.0, y + 2.1 * LATTICE.cell, k * TURN_STEP)).all() for k in range(-8, 9)
+        ]
         assert not any(beyond)
     assert target([(0.0, -0.1)]).last_view(leg, BOUND) is None
 

@@ -24,7 +24,7 @@ from rille.stages.planning.local_planner.route import (
 from rille.stages.planning.local_planner.state_lattice import (
     AHEAD,
     BACK,
-    STEPS,
+    HEADING_STEPS,
     TO_LEFT,
     TO_RIGHT,
     PoseGraph,
@@ -140,7 +140,7 @@ def graph_but(what: str, k: int) -> PoseGraph:
 
 @pytest.mark.parametrize("k", range(8))
 def test_a_stretch_is_unknown_whichever_way_it_is_driven(k: int) -> None:
-    a, b = (2, 2), (2 + int(STEPS[k][0]), 2 + int(STEPS[k][1]))
+    a, b = (2, 2), (2 + int(HEADING_STEPS[k][0]), 2 + int(HEADING_STEPS[k][1]))
     for heading, begin, move, end in ((k, a, AHEAD, b), (k, b, BACK, a), (k + 8, b, AHEAD, a), (k + 8, a, BACK, b)):
         moves = [(heading, *begin, move), (heading, *end, -1)]
         known = {what: [piece.known for piece in pieces(graph_but(what, k), moves)] for what in ("", "step", "pose")}
@@ -151,7 +151,7 @@ def test_a_stretch_is_unknown_whichever_way_it_is_driven(k: int) -> None:
 @pytest.mark.parametrize("k", [0, 6, 7, 15])
 def test_a_turn_over_unknown_ground_makes_what_follows_unknown(k: int) -> None:
     for first, turn, then in ((k, TO_LEFT, k + 1), (k + 1, TO_RIGHT, k)):
-        dr, dc = (int(v) for v in STEPS[then % 16])
+        dr, dc = (int(v) for v in HEADING_STEPS[then % 16])
         moves = [(first, 2, 2, turn), (then, 2, 2, AHEAD), (then, 2 + dr, 2 + dc, AHEAD), (then, 2, 2, -1)]
         for what, known in (("", [True, True]), ("turn", [False, True])):
             assert [piece.known for piece in pieces(graph_but(what, k), moves)] == known

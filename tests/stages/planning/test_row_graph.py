@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from rille.stages.planning.configuration_space import ALL, LEFT, RIGHT, STRAIGHT
-from rille.stages.planning.row_graph import AHEAD, NEIGHBOURS, UNREACHED, Terrain, sweep, trace
+from rille.stages.planning.configuration_space import ALL_DIRECTIONS, LEFT, RIGHT, STRAIGHT
+from rille.stages.planning.row_graph import NEIGHBOURS, STEPS_AHEAD, UNREACHED, GridCosts, sweep, trace
 
 
-def terrain(height: np.ndarray, ways: np.ndarray, sideways: int = 0, toll: np.ndarray | int = 0) -> Terrain:
+def terrain(height: np.ndarray, ways: np.ndarray, sideways: int = 0, toll: np.ndarray | int = 0) -> GridCosts:
     lengths = np.array([sideways if dc else 0 for _, dc, _ in NEIGHBOURS])
-    return Terrain(height.astype(np.int64), ways, np.zeros(height.shape, np.int64) + toll, lengths)
+    return GridCosts(height.astype(np.int64), ways, np.zeros(height.shape, np.int64) + toll, lengths)
 
 
 def starting(shape: tuple[int, int], *cells: tuple[int, int]) -> np.ndarray:
@@ -42,7 +42,7 @@ def edges(
 
 def every_way(free: np.ndarray) -> np.ndarray:
     """Directions as bits: all of them where a cell is free."""
-    return np.where(free, np.uint8(ALL), np.uint8(0))
+    return np.where(free, np.uint8(ALL_DIRECTIONS), np.uint8(0))
 
 
 def test_five_by_five_by_hand() -> None:
@@ -109,7 +109,7 @@ def test_costs_equal_networkx_and_scipy(seed: int, rows: int, cols: int, blocked
 
 
 def test_a_path_begins_where_its_start_and_its_way_cost_least() -> None:
-    flat, ways = np.zeros((4, 5), dtype=np.int64), np.full((4, 5), ALL, np.uint8)
+    flat, ways = np.zeros((4, 5), dtype=np.int64), np.full((4, 5), ALL_DIRECTIONS, np.uint8)
     first = starting((4, 5), (3, 0), (2, 3))
     first[2, 3] = 1
     cost, step = sweep(terrain(flat, ways, 2), first)
@@ -130,5 +130,5 @@ def test_an_edge_is_used_where_both_ends_allow_its_direction() -> None:
 
 
 def test_steps_ahead_lead_to_the_next_row() -> None:
-    assert [dr for dr, _, _ in NEIGHBOURS[:AHEAD]] == [-1, -1, -1]
+    assert [dr for dr, _, _ in NEIGHBOURS[:STEPS_AHEAD]] == [-1, -1, -1]
     assert len({(dr, dc) for dr, dc, _ in NEIGHBOURS}) == 8

@@ -12,7 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.planning.local_planner.state_lattice import ANGLES, STEPS, PoseGraph, PoseGrid, angle_of
+from rille.stages.planning.local_planner.state_lattice import (
+    HEADING_ANGLES,
+    HEADING_STEPS,
+    PoseGraph,
+    PoseGrid,
+    angle_of,
+)
 
 
 def networked(graph: PoseGraph, turn_price: float, back: float) -> networkx.DiGraph:
@@ -23,7 +29,7 @@ def networked(graph: PoseGraph, turn_price: float, back: float) -> networkx.DiGr
         for r in range(rows):
             for c in range(cols):
                 out.add_node((k, r, c))
-                i, j = r + int(STEPS[k][0]), c + int(STEPS[k][1])
+                i, j = r + int(HEADING_STEPS[k][0]), c + int(HEADING_STEPS[k][1])
                 if 0 <= i < rows and 0 <= j < cols:
                     middle = graph.step[k, r, c] if k < 8 else graph.step[k - 8, i, j]
                     price = max(graph.pose[k % 8, r, c], graph.pose[k % 8, i, j], middle)
@@ -34,7 +40,7 @@ def networked(graph: PoseGraph, turn_price: float, back: float) -> networkx.DiGr
                 left = (k + 1) % 16
                 price = max(graph.pose[k % 8, r, c], graph.pose[left % 8, r, c], graph.turn[k % 8, r, c])
                 if math.isfinite(price):
-                    turn = (ANGLES[left] - ANGLES[k]) % (2 * math.pi)
+                    turn = (HEADING_ANGLES[left] - HEADING_ANGLES[k]) % (2 * math.pi)
                     out.add_edge((k, r, c), (left, r, c), weight=price * turn * turn_price)
                     out.add_edge((left, r, c), (k, r, c), weight=price * turn * turn_price)
     return out
@@ -85,19 +91,23 @@ def test_prices_are_those_of_a_pose_of_half_a_step_ahead_and_of_half_a_turn_to_t
     )
     row, col = np.indices(grid.shape).astype(float)
     for k in range(8):
-        half_turn = 0.5 * (math.remainder(ANGLES[k + 1] - ANGLES[k], 2 * math.pi))
-        for what, (dr, dc), turn in (("pose", (0, 0), 0.0), ("step", 0.5 * STEPS[k], 0.0), ("turn", (0, 0), half_turn)):
+        half_turn = 0.5 * (math.remainder(HEADING_ANGLES[k + 1] - HEADING_ANGLES[k], 2 * math.pi))
+        for what, (dr, dc), turn in (
+            ("pose", (0, 0), 0.0),
+            ("step", 0.5 * HEADING_STEPS[k], 0.0),
+            ("turn", (0, 0), half_turn),
+        ):
             found = [getattr(graph, what)[k] for graph in (x, y, heading)]
             np.testing.assert_allclose(found[:2], grid.xy(row + dr, col + dc), atol=1e-12)
-            np.testing.assert_allclose(found[2], 0.4 + ANGLES[k] + turn)
+            np.testing.assert_allclose(found[2], 0.4 + HEADING_ANGLES[k] + turn)
 
 
 def test_headings_go_once_round_to_the_left() -> None:
-    assert np.diff(ANGLES).min() > math.radians(18)
-    assert math.degrees(ANGLES[2]) == pytest.approx(45.0)
-    assert STEPS[4].tolist() == [0, -1]
-    assert angle_of(18) == pytest.approx(2 * math.pi + ANGLES[2])
-    assert angle_of(-2) == pytest.approx(-ANGLES[2])
+    assert np.diff(HEADING_ANGLES).min() > math.radians(18)
+    assert math.degrees(HEADING_ANGLES[2]) == pytest.approx(45.0)
+    assert HEADING_STEPS[4].tolist() == [0, -1]
+    assert angle_of(18) == pytest.approx(2 * math.pi + HEADING_ANGLES[2])
+    assert angle_of(-2) == pytest.approx(-HEADING_ANGLES[2])
 
 
 @settings(max_examples=30, deadline=None)
