@@ -17,7 +17,7 @@ SIZE = (240, 320)
 
 @dataclass(frozen=True)
 class ArrayLayer:
-    """A model to merge, its arrays (rows, cols) in memory; see :class:`rille.stages.terrain.merge.Layer`."""
+    """A model to merge, its arrays (rows, cols) in memory; see :class:`rille.stages.terrain.merge.ModelLayer`."""
 
     pair: int
     lattice: Lattice
