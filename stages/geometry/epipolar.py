@@ -28,9 +28,6 @@ NAMES = ("pitch", "yaw", "roll", "baseline_across", "baseline_forward")
 MAX_LINE_DISTANCE_PX = 2.0
 """A match this near its epipolar line lies on it."""
 
-MIN_EXCHANGED_SHARE = 0.5
-"""Share of the matches that must fit the rig with its sides exchanged, and twice as many as the given one."""
-
 DIFFERENCE_STEP_RAD = 1e-6
 """Radians: step of the central differences of depth."""
 
@@ -165,7 +162,8 @@ def fits(rig: Rig, left: Floats, right: Floats, tolerance: float) -> float:
 
 def exchanged(as_given: float, other_way: float) -> bool:
     """Whether left and right are exchanged, by the share of matches that fit the rig as given and the other way."""
-    return other_way > MIN_EXCHANGED_SHARE and other_way > 2.0 * as_given
+    # Most of the matches fit the other way, and twice as many as the given one.
+    return other_way > 0.5 and other_way > 2.0 * as_given
 
 
 def _centre(rig: Rig, correction: Floats) -> tuple[Floats, Floats]:

@@ -13,9 +13,6 @@ from rille.stages.geometry.geometry import Rig
 MAX_ALIKE_SCALE = 1.2
 """Scale up to which two cameras, or a slanted view, count as alike: it adds a fifth of a pixel to an error at most."""
 
-MIN_OTHER_SIZE_RATIO = 1.3
-"""Ratio of the images' widths or heights from which on they may show things so unlike in size that none matches."""
-
 
 def alike(scale: float) -> bool:
     """Whether a scale, of either image against the other, is none to speak of."""
@@ -40,4 +37,5 @@ def coarser_focal(rig: Rig) -> float:
 
 def other_size(a: tuple[int, ...], b: tuple[int, ...]) -> bool:
     """Whether images of two shapes may show things in unlike size, with no calibration to tell."""
-    return any(max(m, n) > MIN_OTHER_SIZE_RATIO * min(m, n) for m, n in zip(a, b, strict=True))
+    # From this ratio on they may show things so unlike in size that none matches.
+    return any(max(m, n) > 1.3 * min(m, n) for m, n in zip(a, b, strict=True))

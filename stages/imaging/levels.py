@@ -19,9 +19,6 @@ MAX_SPAN_SHARE = 1 / 8
 MAX_TOP_SHARE = 1 / 4
 """Share of the range, up to the brightest sample, up to which samples are spread, as of a camera of 14 bits."""
 
-MIN_SMOOTH_SHARE = 0.5
-"""Share of the deviation that means of 4 x 4 pixels keep at least; of noise alone they keep a quarter."""
-
 
 def levels_of(images: Iterable[AnyArray]) -> Levels | None:
     """Levels for all images of a sequence by some of them; None where they use their range, or show nothing but noise.
@@ -54,4 +51,5 @@ def words(levels: Levels) -> str:
 
 
 def _shows(image: AnyArray) -> bool:
-    return bool(cv2.blur(image.astype(np.float32), (4, 4)).std() > MIN_SMOOTH_SHARE * image.std())
+    # Means of 4 x 4 pixels keep a quarter of the deviation of noise alone.
+    return bool(cv2.blur(image.astype(np.float32), (4, 4)).std() > 0.5 * image.std())

@@ -53,9 +53,6 @@ image, from level to level."""
 MIN_VALID_AT_FRAME = np.float32(2.0)
 """The same where the image has a black frame: pixels that are half outside of a warped image draw matches astray."""
 
-MAX_MIXED_SHARE = 0.8
-"""Share of the brightness beyond them that the pixels beside a frame have at most, where they are mixed with black."""
-
 
 @dataclass(frozen=True)
 class Pyramid:
@@ -207,7 +204,8 @@ def frame(image: Floats32, valid: Bools) -> Bools | None:
         return None
     near, far = (cv2.dilate(framed.view(np.uint8), np.ones((k, k), np.uint8)).view(bool) for k in (3, 5))
     beside, farther = image[near & ~framed], image[far & ~near]
-    if farther.size and np.median(beside) < MAX_MIXED_SHARE * np.median(farther):
+    # Pixels that are mixed with black are darker than those beyond them.
+    if farther.size and np.median(beside) < 0.8 * np.median(farther):
         framed = near | touched
     return framed
 

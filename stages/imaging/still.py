@@ -27,9 +27,6 @@ MIN_KEPT_VARIANCE_SHARE = 0.75
 this on a tenth of the street, its sky; in twenty of a street without: .64 at most; in ten of a rover: above it on a sky
 that grows dark upwards."""
 
-MIN_AREA_SHARE = 0.002
-"""Share of the image: smaller parts, and those that do not reach its border, are no body."""
-
 MIN_IMAGES = 5
 """Images: of fewer the mean keeps too much of any scene."""
 
@@ -46,7 +43,8 @@ def still(images: Sequence[AnyArray]) -> Bools:
     number, label = cv2.connectedComponents(parts, connectivity=4)
     border = np.unique(np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]]))
     area = np.bincount(label.ravel(), minlength=number)
-    body = [n for n in border if n > 0 and area[n] >= MIN_AREA_SHARE * label.size]
+    # Smaller parts, and those that do not reach the image's border, are no body.
+    body = [n for n in border if n > 0 and area[n] >= 0.002 * label.size]
     # A window that is half on the body may show the scene.
     return np.asarray(cv2.dilate(np.isin(label, body).view(np.uint8), window) != 0)
 

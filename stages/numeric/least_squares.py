@@ -67,10 +67,6 @@ def levenberg_marquardt(problem: Problem[X, N], state: X, iterations: int, toler
     return Minimum(state, first, now.cost, steps)
 
 
-SETTLED_SHARE = 1e-9
-"""Change of the unknowns over their size below which a fit has settled: of a height of metres, nanometres."""
-
-
 def irls(
     design: Floats,
     target: Floats,
@@ -107,7 +103,8 @@ def irls(
     for _ in range(rounds):
         weighted = np.swapaxes(design * weigh(np.sqrt((rest**2).sum(-1)))[..., None], -1, -2)
         last, x = x, np.linalg.solve(weighted @ design + held, weighted @ y + held @ first)
-        if np.abs(x - last).max() <= SETTLED_SHARE * np.abs(x).max():
+        # Of a height of metres, nanometres.
+        if np.abs(x - last).max() <= 1e-9 * np.abs(x).max():
             break
         rest = y - design @ x
     return x if several else x[..., 0]
