@@ -21,9 +21,6 @@ MIN_UPRIGHT_SHARE = 0.45
 MIN_EVEN_SHARE = 0.85
 """Share of consistent pixels from which on no other brightness is guessed."""
 
-MIN_KEPT_SHARE = 0.95
-"""Share of the consistent pixels that must stay so when brightness is corrected by them: a few change anyway."""
-
 
 @dataclass(frozen=True)
 class Coarse:
@@ -74,7 +71,8 @@ def even(coarse: Coarse) -> Coarse:
             break
         other = brightness.levelled(right, ratio)
         tried = coarse.anew(other, right=other, ratio=ratio)
-        if tried.state.share < MIN_KEPT_SHARE * coarse.state.share:
+        # Of the consistent pixels a few change anyway.
+        if tried.state.share < 0.95 * coarse.state.share:
             break
         coarse = tried
     return coarse

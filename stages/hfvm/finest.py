@@ -42,7 +42,7 @@ MIN_MATCHED_SHARE = 0.3
 
 
 @dataclass(frozen=True)
-class Work:
+class FinestWork:
     """Windows of both images at the finest level, and their matches.
 
     ``b``: the right image as it was matched, ``right``: as it is; two names of one unless ``alignment``, the homography
@@ -108,10 +108,10 @@ class Fine:
         return validity
 
 
-Step = Callable[[Work, Fine], Fine]
+Step = Callable[[FinestWork, Fine], Fine]
 
 
-def subpixel(work: Work) -> Fine:
+def subpixel(work: FinestWork) -> Fine:
     """Fractions of a pixel from distances summed over 5 x 5 pixels, and means of like neighbours (4.3.2)."""
     pair = LevelPair(work.a.words, work.b.words, epipolar.NO_BAND, 0.0)
     u, v, distance = solver.sums(pair, work.left.u, work.left.v, np.ones(work.left.u.shape, np.uint8))
@@ -120,7 +120,7 @@ def subpixel(work: Work) -> Fine:
     return Fine(u, v, np.zeros(u.shape, np.uint8), zeros, distance, zeros)
 
 
-def check(work: Work, fine: Fine) -> Fine:
+def check(work: FinestWork, fine: Fine) -> Fine:
     """Reasons against each pixel: matching back (4.3.3), distance, texture."""
     p = work.params
     # Back from the right whole displacements suffice.
@@ -138,7 +138,7 @@ def check(work: Work, fine: Fine) -> Fine:
     return replace(fine, error=error, validity=validity)
 
 
-def refine(work: Work, fine: Fine) -> Fine:
+def refine(work: FinestWork, fine: Fine) -> Fine:
     """Displacements without the perspective bias, by mean-free Lucas-Kanade steps; what does not correlate goes."""
     keep = fine.keep
     # An image that a plane has aligned is sheared, and takes a step more.
@@ -152,25 +152,25 @@ def refine(work: Work, fine: Fine) -> Fine:
     return replace(fine, u=u, v=v, noise=noise, validity=validity)
 
 
-def smooth(work: Work, fine: Fine) -> Fine:
+def smooth(work: FinestWork, fine: Fine) -> Fine:
     """A piecewise smooth relief fitted to all matches along their epipolar lines."""
     u, v = work.from_right(*relief.fit(work.images(), *work.to_right(fine.u, fine.v), fine.keep))
     return replace(fine, u=u, v=v)
 
 
-def landing(work: Work, fine: Fine) -> Fine:
+def landing(work: FinestWork, fine: Fine) -> Fine:
     """Reasons against pixels whose match is not in the right image."""
     there = lands(*work.to_right(fine.u, fine.v), fine.keep, work.right.valid)
     return replace(fine, validity=fine.against(fine.keep & ~there, Validity.OUT_OF_IMAGE))
 
 
-def speckles(work: Work, fine: Fine) -> Fine:
+def speckles(work: FinestWork, fine: Fine) -> Fine:
     """Reasons against pixels in small isolated patches, most of which are errors."""
     small = isolated(work.left.u, fine.keep, work.params.speckle)
     return replace(fine, validity=fine.against(small, Validity.SPECKLE))
 
 
-def blanks(work: Work, fine: Fine) -> Fine:
+def blanks(work: FinestWork, fine: Fine) -> Fine:
     """Pixels without texture count as matched where nearly all around are consistent, and enough of them are matches.
 
     Among failures, as on a wall without any texture, consistent pixels are chance.

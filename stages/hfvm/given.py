@@ -22,7 +22,7 @@ from rille.stages.core.declare import AnyArray, Bundle, Memory, stage
 from rille.stages.core.validity import Validity, matched
 from rille.stages.facts.matching import DisparityFacts
 from rille.stages.hfvm import brightness, finest, presets, start, uncertainty
-from rille.stages.hfvm.finest import Ending, Work
+from rille.stages.hfvm.finest import Ending, FinestWork
 from rille.stages.hfvm.image import view
 from rille.stages.hfvm.level import FREE_BAND, Map, State, Views, one_way
 from rille.stages.hfvm.params import HfvmParams
@@ -51,7 +51,9 @@ def check(left: Pyramid, right: Pyramid, given: start.PriorDisparities, params: 
         b = brightness.levelled(b, ratio)
     back = _way_back(Views(a, b, params, presets.recipe_of(params).steps), given)
     left_layer, right_layer = a.layers[0], b.layers[0]
-    work = Work(left_layer, right_layer, right_layer, there, back, params, None, (a.noise, b.noise), left_layer.shape)
+    work = FinestWork(
+        left_layer, right_layer, right_layer, there, back, params, None, (a.noise, b.noise), left_layer.shape
+    )
     fine = finest.check(work, replace(finest.subpixel(work), u=u))
     fine = replace(fine, validity=fine.against(~known, Validity.OVER_THRESHOLD))
     fine = finest.refine(work, fine)

@@ -29,9 +29,6 @@ NOISE_VARIANCE_RATIO = 2.5
 are averaged alike. A texture of random dots, which looks like noise, then still matches where it is shifted by a
 fraction of a pixel: .87 and more of it, with 1 as little as .07. Bad-2 of noisy pairs is alike from 1 to 2.5."""
 
-MIN_VARIANCE = 1e-3
-"""Squared grey levels: what rounding may leave of the variance of a flat window, or take from it."""
-
 
 @dataclass(frozen=True)
 class Layer:
@@ -165,7 +162,8 @@ def lee(image: AnyArray, noise: float) -> Floats32:
 @njit(cache=True, nogil=True)
 def _lee(image, excess, denoised):  # type: ignore[no-untyped-def]
     middle, ninth, nil = np.float32(128.0), np.float32(1.0 / 9.0), np.float32(0.0)
-    least = np.float32(MIN_VARIANCE)
+    # What rounding may leave of the variance of a flat window, or take from it, squared grey levels.
+    least = np.float32(1e-3)
     sums, squares = np.empty(image.shape[1], np.float32), np.empty(image.shape[1], np.float32)
     for y in range(denoised.shape[0]):
         above, here, below, out = image[y], image[y + 1], image[y + 2], denoised[y]

@@ -29,9 +29,6 @@ from rille.stages.numeric.windows import window_sum
 MEAN_SIDE_PX = 9
 """Pixels: window of the local mean; brightness varies more slowly."""
 
-MIN_MEAN_WEIGHT = 0.1
-"""Pixels: least weight of a mean; windows with less have no pixel that takes part."""
-
 HALVING_RESIDUAL_GREY = 10.0
 """Grey levels: residual that halves a pixel's weight, well above camera noise."""
 
@@ -49,11 +46,6 @@ BEND_STIFFNESS = 2000.0
 MAX_BEND_PX = 0.05
 """Second difference, pixels, beyond which the stiffness gives way to an edge."""
 
-SOFT_STIFFNESS_FACTOR = 0.15
-"""Factor on the stiffness in the first, soft half of the steps."""
-
-SOFT_BEND_FACTOR = 2.0
-"""Factor on the greatest bend in the first, soft half of the steps."""
 
 RELIEF_STEPS = 4
 """Four steps instead of seven: the median error of the judged half is .165 px instead of .160."""
@@ -79,10 +71,7 @@ def fit(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> tuple
     holds = lines * np.float32(np.sqrt(LINE_STIFFNESS * trust))
     for step in range(RELIEF_STEPS):
         soft = step < RELIEF_STEPS // 2
-        stiffness, bend = (
-            BEND_STIFFNESS * (SOFT_STIFFNESS_FACTOR if soft else 1.0),
-            MAX_BEND_PX * (SOFT_BEND_FACTOR if soft else 1.0),
-        )
+        stiffness, bend = BEND_STIFFNESS * (0.15 if soft else 1.0), MAX_BEND_PX * (2.0 if soft else 1.0)
         grey = _grey(images, u, v, keep)
         stiff, normal = np.zeros((2, *u.shape), np.float32), np.zeros((5, *u.shape), np.float32)
         _stiffness(u, v, keep, np.float32(bend), np.float32(stiffness), stiff)
@@ -104,7 +93,8 @@ def _grey(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> Any
     # The first mean is of equal weights; what lies across an edge then counts for little, but one weighting does not
     # yet tell it apart.
     for _ in range(3):
-        mean = window_sum(weight * rest, MEAN_SIDE_PX) / np.maximum(window_sum(weight, MEAN_SIDE_PX), MIN_MEAN_WEIGHT)
+        # Windows with less than a tenth of a pixel's weight have no pixel that takes part.
+        mean = window_sum(weight * rest, MEAN_SIDE_PX) / np.maximum(window_sum(weight, MEAN_SIDE_PX), 0.1)
         weight = known / (np.float32(1.0) + ((rest - mean) * np.float32(1.0 / HALVING_RESIDUAL_GREY)) ** 2)
     planes[0] = weight
     planes[3] -= mean

@@ -139,16 +139,6 @@ def _inside(places: AnyArray, shape: tuple[int, ...], margin: int) -> NDArray[np
     return np.asarray(((np.rint(places) >= margin) & (np.rint(places) <= last)).all(axis=1))
 
 
-MIN_FOCAL_WIDTHS = 0.5
-"""Least focal length in image widths: a field of view of 90 degrees."""
-
-MAX_FOCAL_WIDTHS = 3.0
-"""Greatest focal length in image widths: a field of view of 19 degrees."""
-
-BOUND_MARGIN_PX = 1.0
-"""Pixels: displacements that are no more than this beyond the bound prove nothing."""
-
-
 def swapped(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> bool:
     """Whether left and right image of a stereo rig must have been swapped; False also where nobody can know.
 
@@ -167,10 +157,11 @@ def swapped(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> bool
     k, sigma = _keystone((x - 0.5 * (width - 1)) / width, (y - 0.5 * (matched.shape[0] - 1)) / width, u, v)
     # In units of the image width k is D in pixels for a focal length of one width.
     most = k + 3.0 * sigma
-    # A keystone may be negative: then the short focal length gives the upper bound.
-    bound = max(most * MIN_FOCAL_WIDTHS**2, most * MAX_FOCAL_WIDTHS**2)
-    # Nine in ten lie beyond the bound: gross mismatches may not.
-    return bool(np.percentile(u, 10.0) > bound + BOUND_MARGIN_PX)
+    # Fields of view of 90 and 19 degrees: .5 and 3 image widths. A keystone may be negative: then the short focal
+    # length gives the upper bound.
+    bound = max(most * 0.5**2, most * 3.0**2)
+    # Nearly all have to lie beyond the bound, and a pixel beyond it proves nothing.
+    return bool(np.percentile(u, 10.0) > bound + 1.0)
 
 
 def _keystone(x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray) -> tuple[float, float]:

@@ -5,8 +5,7 @@ are least at the right displacement more often than at any other. So at level 1,
 and texture:
 
 1. along its epipolar line each pixel takes the displacement with the least sum over a window of the region, of all
-   displacements that were matched and of farther ones (:data:`RANGE_BEYOND_SHARE`), and a fraction of a pixel by the
-   sums on both sides;
+   displacements that were matched and of farther ones, and a fraction of a pixel by the sums on both sides;
 2. a plane is fitted robustly: the displacement along the line is a linear function of column and row. The more a
    window's sum exceeds that of its best displacement for all others, the more it counts;
 3. if clearly more windows agree with the plane than would by chance, pixels are matched at its displacement whose
@@ -54,15 +53,6 @@ MAX_DEVIATION_GREY = 1.0
 MIN_REGION_PX = 6 * WINDOW_SIDE_PX * WINDOW_SIDE_PX
 """Least size of a region, and of the part of it that has a vote, pixels of the level."""
 
-MAX_REGIONS = 127
-"""Regions of an image; their numbers fit a byte with a sign."""
-
-RANGE_BEYOND_SHARE = 0.5
-"""Share of the range of the matched displacements that is searched beyond its far end: a wall is often farther than all
-else."""
-
-RANGE_BEYOND_PX = 4
-"""Pixels of the level that are searched beyond that."""
 
 MAX_VOTE_DISTANCE_PX = 1.25
 """Pixels of the level: the plane is that with the most votes nearer than this; with twice of it tilted planes were
@@ -78,21 +68,12 @@ MIN_VOTING_SHARE = 0.45
 """Share of a region's pixels that must have a vote. The wall of Midd1 has .47 and more in all degradations but noise; a
 wall of Monopoly that is largely hidden at most .39, and where blocks of a JPEG image of Lampshade1 agree .44."""
 
-MIN_SEEN_SHARE = 0.5
-"""Share of the displacements that leave a window with a vote inside the right image."""
-
 MIN_CHANCE_SIGMAS = 6.0
 """Standard deviations by which more windows agree than by chance: of a range of 40 displacements at each of three
 corners there are some 10^5 different planes, and the best one is taken."""
 
 ALIKE_QUANTILE = 0.95
 """Share of the agreeing windows that speak no more against the plane than a window may whose pixel is matched."""
-
-MAX_FIT_WINDOWS = 1000
-"""Displacements that a plane is fitted to."""
-
-PLANE_TRIALS = 500
-"""Planes that are tried: where four in ten windows are right, 32 of them are."""
 
 
 class Planes(NamedTuple):
@@ -143,7 +124,8 @@ def find(
         images = WordPair(left.words, right.words, right.valid, window)
         lines = epipolar.lines(epipolar.moved(coarse, *2 * ((window.x0, window.y0),)), region.shape)
         best = search(images, region, lines, steps)
-        usable = (best.tried >= MIN_SEEN_SHARE * len(steps)) & (best.distinct > 0)
+        # Half of the displacements leave a window with a vote inside the right image.
+        usable = (best.tried >= 0.5 * len(steps)) & (best.distinct > 0)
         y, x = np.nonzero(usable & best.mutual)
         if len(y) < max(MIN_REGION_PX, MIN_VOTING_SHARE * np.count_nonzero(region)):
             continue
@@ -184,7 +166,8 @@ def _at_level_0(g: AnyArray, error: AnyArray) -> list[float]:
 def _steps(along: AnyArray, far_sign: float) -> AnyArray:
     """Displacements along the lines that are tried, pixels of the level; ``far_sign``: of farther ones, 0 unknown."""
     low, high = np.quantile(along, (0.005, 0.995)) * 0.5**REGION_LEVEL
-    beyond = RANGE_BEYOND_SHARE * (high - low) + RANGE_BEYOND_PX
+    # Half of the range beyond its far end, and some pixels: a wall is often farther than all else.
+    beyond = 0.5 * (high - low) + 4
     # Those at the ends do not count.
     low, high = low - (2 if far_sign > 0 else beyond), high + (2 if far_sign < 0 else beyond)
     return np.arange(np.floor(low), np.ceil(high) + 1, dtype=np.float32)
@@ -196,7 +179,8 @@ def _regions(weak: NDArray[np.bool_]) -> Iterator[tuple[Window, NDArray[np.bool_
     opened = cv2.morphologyEx(weak.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, number, about, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
     sizes = about[1:, cv2.CC_STAT_AREA]
-    for n in np.argsort(-sizes, kind="stable")[:MAX_REGIONS]:
+    # Their numbers fit a byte with a sign.
+    for n in np.argsort(-sizes, kind="stable")[:127]:
         if sizes[n] < MIN_REGION_PX:
             return
         x, y, wide, high, _ = (int(k) for k in about[n + 1])
@@ -211,9 +195,11 @@ def _fit(x: AnyArray, y: AnyArray, step: AnyArray, votes: AnyArray) -> tuple[Any
     numbers, so that their sums are exact.
     """
     terms, rng = np.stack([np.ones(len(x)), x, y]), np.random.default_rng(0)
-    sample = rng.choice(len(x), min(MAX_FIT_WINDOWS, len(x)), replace=False)
+    # A plane is fitted to a thousand windows at most.
+    sample = rng.choice(len(x), min(1000, len(x)), replace=False)
     t, d, weight = np.ascontiguousarray(terms[:, sample]), step[sample], votes[sample]
-    three = rng.choice(len(sample), (PLANE_TRIALS, 3), p=weight / weight.sum())
+    # Of 500 planes 32 are right where four in ten windows are.
+    three = rng.choice(len(sample), (500, 3), p=weight / weight.sum())
     # The hold gives a plane, which has few votes, to three windows on a line, and to one that was drawn twice.
     planes = np.linalg.solve(t.T[three] + 1e-6 * np.eye(3), d[three][..., None])[..., 0]
     # Should all be steep, the flat one is left.

@@ -18,7 +18,7 @@ import numpy as np
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm import epipolar, finest, textureless
 from rille.stages.hfvm.coarse import Coarse
-from rille.stages.hfvm.finest import Ending, Work
+from rille.stages.hfvm.finest import Ending, FinestWork
 from rille.stages.hfvm.level import Band, Map, State, hand_down, match_level
 from rille.stages.hfvm.windows import Shape, Window, whole
 from rille.stages.numeric.threads import side_by_side
@@ -46,7 +46,7 @@ def fine(pair: Coarse, refinement: tuple[finest.Step, ...], window: Window) -> d
     if state.level > 0:
         state = match_level(replace(views, left=a, right=b), 0, state)  # 4.3.4: search, propagate, check, band
     left, right, noise = a.layers[0], b.layers[0], (views.left.noise, views.right.noise)
-    work = Work(left, right, right, state.left, state.right, views.params, pair.alignment, noise, shape)
+    work = FinestWork(left, right, right, state.left, state.right, views.params, pair.alignment, noise, shape)
     if pair.alignment is not None:
         work = replace(work, right=pair.right.layers[0].cut(_landing(work, pair.right.shapes[0])))
     result = finest.subpixel(work)  # 4.3.2
@@ -78,7 +78,7 @@ def _around(pair: Coarse, outer: Window) -> tuple[State, Window]:
     return State(1, *maps, left_ok, right_ok, Band(f, state.band.mu), state.near_sign), target
 
 
-def _landing(work: Work, shape: Shape) -> Window:
+def _landing(work: FinestWork, shape: Shape) -> Window:
     """Window of the right image, as it is and of ``shape``, that the matches of a window lead to."""
     a = work.a.window
     u, v = work.to_right(work.left.u.astype(np.float32), work.left.v.astype(np.float32))

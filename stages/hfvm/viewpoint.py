@@ -29,9 +29,6 @@ MAX_KEYPOINTS = 4000
 MAX_DISTANCE_RATIO = 0.8
 """The nearest keypoint must be nearer by this factor than the second nearest (Lowe 2004)."""
 
-MAX_RELIEF_SHARE = 0.01
-"""Share of the longer side by which a keypoint may stand off the dominant surface: what relief does to it."""
-
 MIN_AGREEING = 15
 """Keypoints that must agree; in unrelated images and under other suns 6 do."""
 
@@ -46,7 +43,8 @@ def find(left: Image, right: Image) -> plane.Matrix | None:
     first, second = _alike(a, b)
     if len(first) < MIN_AGREEING:
         return None
-    limit = MAX_RELIEF_SHARE * max(right.shapes[levels[1]])
+    # What relief does to a keypoint's place on the dominant surface.
+    limit = 0.01 * max(right.shapes[levels[1]])
     h, agree = cv2.findHomography(p[first], q[second], cv2.USAC_MAGSAC, limit, maxIters=5000, confidence=0.999)
     if (
         h is None
