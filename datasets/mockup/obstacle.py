@@ -15,7 +15,7 @@ from rille.datasets.mockup.rover import RoverParams, true_and_believed
 from rille.stages.core.declare import Bundle, stage
 from rille.stages.geometry.geometry import RigidTransform
 
-HEIGHT = 0.015  # m, of the stone; a wheel's radius
+STONE_HEIGHT_M = 0.015  # m, of the stone; a wheel's radius
 
 
 def on_path(path: np.ndarray, way: float, aside: float) -> tuple[float, float]:
@@ -33,10 +33,10 @@ def lay(scene: Bundle, x: float, y: float) -> dict[str, Any]:
     """Arrays of the scene with a round stone of profile 1 - q^4, whose radius is 1.2 times its height."""
     arrays: dict[str, Any] = {name: np.asarray(scene[name]) for name in scene.arrays}
     z, lattice = np.array(arrays["height"]), scene.meta["lattice"]
-    q = bed.distance(lattice, z.shape, lattice["cell"], x, y) / (1.2 * HEIGHT)
+    q = bed.distance(lattice, z.shape, lattice["cell"], x, y) / (1.2 * STONE_HEIGHT_M)
     inside = q < 1.0
     ground = float(np.median(z[inside])) if inside.any() else 0.0
-    z[inside] = np.maximum(z[inside], ground + HEIGHT * (1.0 - q[inside] ** 4))
+    z[inside] = np.maximum(z[inside], ground + STONE_HEIGHT_M * (1.0 - q[inside] ** 4))
     arrays["height"] = z
     arrays["tint"] = np.where(inside, np.uint8(120), arrays["tint"])
     # Shadows are part of the scene, not of the image: the stone casts one, and may stand in another.

@@ -11,8 +11,6 @@ from rille.datasets.mockup.rover import RoverParams
 from rille.stages.core.declare import Array, Bundle, stage
 from rille.stages.geometry.lattice import Lattice
 
-SIGMA = 0.002  # m, of the map's elevations
-
 
 @stage(
     "mockup.overview",
@@ -32,5 +30,6 @@ def overview_stage(params: RoverParams, scene: Bundle[SceneFacts], *, cell: floa
         for far in (at["y0"] - lattice.ys(), lattice.xs() - at["x0"])
     )
     out = np.lib.stride_tricks.sliding_window_view(z, (n, n))[np.ix_(row, col)].mean(axis=(2, 3))
-    out += SIGMA * np.random.default_rng([params.seed, 72]).standard_normal(out.shape)
+    # The map's elevations err by 2 mm.
+    out += 0.002 * np.random.default_rng([params.seed, 72]).standard_normal(out.shape)
     return Bundle({"elevation": out.astype(np.float32)}, {"lattice": lattice.to_dict(), "frame": "bed"})

@@ -14,9 +14,6 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
 
-NUDGE = 1e-7
-"""Cells: how far a ray is pushed over a block's border; 1e-10 m on a 1 mm grid."""
-
 
 @dataclass(frozen=True)
 class HeightField:
@@ -110,7 +107,8 @@ def _cast(height, pyramid, origins, directions):  # type: ignore[no-untyped-def]
                 continue
             t = max(t, (highest - oz) / dz)
         speed = max(abs(dc), abs(dr))
-        eps = NUDGE / speed if speed > 0.0 else 0.0
+        # Pushed over a block's border by a part of a cell: 1e-10 m on a grid of 1 mm.
+        eps = 1e-7 / speed if speed > 0.0 else 0.0
         level, nudge = top, 0.0
         # A vertical ray stays in its cell, and leaves it at infinity.
         while t - nudge <= end and t < np.inf:

@@ -19,24 +19,19 @@ from rille.datasets.facts import ImageFacts
 from rille.datasets.mockup.facts import SceneFacts
 from rille.datasets.mockup.params import RenderParams
 from rille.datasets.mockup.raycast import HeightField
-from rille.datasets.mockup.scene import MIPS, height_field
+from rille.datasets.mockup.scene import ALBEDO_LEVELS, height_field
 from rille.datasets.protocol import CAMERAS
 from rille.stages.core.declare import Array, Bundle, Memory, stage
 from rille.stages.geometry.geometry import Camera, RigidTransform
 
-LUNAR = 0.6
+MCEWEN_L = 0.6
 """McEwen's L near 70 degrees of phase angle, the usual one here."""
-EMISSION = 0.31
+EMISSION_COSINE = 0.31
 """Cosine of the emission angle for which the exposure is set: ground seen 18 degrees below the horizon."""
-AMBIENT = 0.05
+AMBIENT_LIGHT = 0.05
 """Stray light of the room, relative to the lamp on a surface that faces it."""
-BACKGROUND = 9.0
-"""Grey level of the dark room behind the bed."""
 LEVEL_GREY = 112.0
 """Grey level of sunlit level ground; shadows and vignetting bring the mean of a picture to about 100."""
-BLUR = 0.6  # standard deviation of the optics' point spread, pixels
-RIGHT_GAIN = 0.97  # sensitivity of the right camera over that of the left; no two are equal
-VIGNETTING = 0.1  # relative loss of light in the image corners
 
 
 def camera_rays(camera: Camera, T_bed_camera: RigidTransform, sampling: int = 1) -> NDArray[np.float64]:
@@ -97,7 +92,7 @@ def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ign
         mu = max((vz - gx * vx - gy * vy) / norm, 0.05)
         lit = _bilinear(bed.sunlit, r, c) / 255.0
         # Lunar-Lambert: Lommel and Seeliger's law, which knows no limb darkening, mixed with Lambert's.
-        direct = lit * (2.0 * LUNAR * mu0 / (mu0 + mu) + (1.0 - LUNAR) * mu0) if mu0 > 0.0 else 0.0
+        direct = lit * (2.0 * MCEWEN_L * mu0 / (mu0 + mu) + (1.0 - MCEWEN_L) * mu0) if mu0 > 0.0 else 0.0
         # grain is draped over rocks, not projected from above, so that walls that face the drive are not streaked; a
         # slope's own rise drapes nothing, lest its far end lies beyond the grain
         drape = (origin[2] + t * dz - bed.rise * y) / cell
@@ -120,7 +115,7 @@ def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ign
             total += (1.0 - f) * _texel(albedo, low, tr, tc)
             total += f * _texel(albedo, low + 1, tr, tc)
         # 128 and 100 are the bytes that stand for 1 in the albedo and in the tint.
-        out[i] = total / taps / 128.0 * _bilinear(bed.tint, r, c) / 100.0 * (direct + AMBIENT)
+        out[i] = total / taps / 128.0 * _bilinear(bed.tint, r, c) / 100.0 * (direct + AMBIENT_LIGHT)
     return out
 
 
@@ -155,7 +150,7 @@ def radiance(
     origin = T_bed_camera.translation
     distance = field.cast(origin[None, :], rays)
     # Copies, lest some levels are read-only and others not: one type for all.
-    albedo = tuple(np.array(scene[f"albedo_{k}"][:], order="C") for k in range(MIPS))
+    albedo = tuple(np.array(scene[f"albedo_{k}"][:], order="C") for k in range(ALBEDO_LEVELS))
     light = scene.meta["scene"]
     e, a = math.radians(light["sun_elevation_deg"]), math.radians(light["sun_azimuth_deg"])
     bed = _Bed(
@@ -199,13 +194,17 @@ def render_stage(
     rng = np.random.default_rng([params.seed, 50, frame, CAMERAS.index(camera)])
     mu0 = math.sin(math.radians(scene.meta["scene"]["sun_elevation_deg"]))
     # Radiance of level ground of mean albedo, seen as the camera's axis sees it.
-    flat = 2.0 * LUNAR * mu0 / (mu0 + EMISSION) + (1.0 - LUNAR) * mu0 + AMBIENT
+    flat = 2.0 * MCEWEN_L * mu0 / (mu0 + EMISSION_COSINE) + (1.0 - MCEWEN_L) * mu0 + AMBIENT_LIGHT
     gain = LEVEL_GREY / flat * params.exposure * (1.0 + params.exposure_jitter * float(rng.standard_normal()))
-    gain *= RIGHT_GAIN if camera == "right" else 1.0
-    samples = np.where(np.isnan(blocks), np.float32(BACKGROUND), blocks * np.float32(gain))
-    grey = scipy.ndimage.gaussian_filter(samples.astype(np.float64).mean(axis=(1, 3)), BLUR, mode="nearest")
+    # No two cameras are equally sensitive.
+    gain *= 0.97 if camera == "right" else 1.0
+    # Behind the bed the room is dark.
+    samples = np.where(np.isnan(blocks), np.float32(9.0), blocks * np.float32(gain))
+    # The optics' point spread.
+    grey = scipy.ndimage.gaussian_filter(samples.astype(np.float64).mean(axis=(1, 3)), 0.6, mode="nearest")
     y, x = np.ogrid[-1.0 : 1.0 : geometry.height * 1j, -1.0 : 1.0 : geometry.width * 1j]
-    grey = grey * (1.0 - VIGNETTING * (x * x + y * y) / 2.0)
+    # A tenth of the light is lost in the corners.
+    grey = grey * (1.0 - 0.1 * (x * x + y * y) / 2.0)
     # Noise arises in the sensor, behind the optics: it is neither blurred nor vignetted, and white.
     noisy = grey + params.noise * rng.standard_normal(grey.shape)
     image = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)

@@ -25,11 +25,9 @@ from rille.stages.geometry.geometry import RigidTransform, from_above, way_lengt
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.wheels import HeightGrid, Stand, stand
 
-STEP = 0.005
+STEP_M = 0.005
 """m; the drive is simulated, and its placements are recorded, in steps of this length."""
 STEP_TURN = math.radians(2.5)
-REACH = 0.3
-"""m; ground around a leg that may be touched on it, beyond its length."""
 
 
 class RoverParams(Params):
@@ -60,7 +58,7 @@ class RoverParams(Params):
     obstacle_aside: float = Field(0.0, description="distance of the obstacle to the right of the leg [m]")
 
 
-class Pose(NamedTuple):
+class RoverPose(NamedTuple):
     """``x``, ``y`` (m) of the centre of the wheels, and ``heading`` (rad) to the left of y."""
 
     x: float
@@ -68,8 +66,8 @@ class Pose(NamedTuple):
     heading: float
 
 
-ORIGIN = Pose(0.0, 0.0, 0.0)
-START = Pose(0.0, 0.3, 0.0)
+ORIGIN = RoverPose(0.0, 0.0, 0.0)
+START = RoverPose(0.0, 0.3, 0.0)
 """On the bed; the rover looks straight along it."""
 FRAME_TURN = math.radians(5.0)  # largest turn on the spot between two images
 
@@ -96,13 +94,13 @@ class DrivenLeg(NamedTuple):
     """``trail``, how the vehicle stood on the way; ``wheels``, its x, y (m) and heading (rad) as they turned."""
 
     trail: list[Stand]
-    wheels: list[Pose]
+    wheels: list[RoverPose]
 
 
-def _steps(believed: Pose, sent: SentLeg, p: RoverParams, rng: np.random.Generator) -> Iterator[_Step]:
+def _steps(believed: RoverPose, sent: SentLeg, p: RoverParams, rng: np.random.Generator) -> Iterator[_Step]:
     """Steps of a leg, with the rover's errors."""
     slip = p.slip + p.slip_sigma * float(rng.standard_normal())
-    drift = math.radians(p.heading_sigma_deg) * float(rng.standard_normal()) / max(way_length(sent.path), STEP)
+    drift = math.radians(p.heading_sigma_deg) * float(rng.standard_normal()) / max(way_length(sent.path), STEP_M)
     spin = 1.0 + p.turn_sigma * float(rng.standard_normal())
     x, y, heading = believed.x, believed.y, believed.heading
 
@@ -113,7 +111,7 @@ def _steps(believed: Pose, sent: SentLeg, p: RoverParams, rng: np.random.Generat
     for vertex, sign in zip(sent.path[1:], sent.gear, strict=True):
         dx, dy = sign * (vertex[0] - x), sign * (vertex[1] - y)
         way, towards = math.hypot(dx, dy), math.atan2(-dx, dy)
-        n = max(1, math.ceil(way / STEP))
+        n = max(1, math.ceil(way / STEP_M))
         rolled = sign * way / n
         # remainder() gives the shorter way round, -pi to pi.
         yield from rotate(math.remainder(towards - heading, 2 * math.pi))
@@ -125,8 +123,8 @@ def _steps(believed: Pose, sent: SentLeg, p: RoverParams, rng: np.random.Generat
 def drive_leg(
     ground: HeightGrid,
     vehicle: Vehicle,
-    before: Pose,
-    believed: Pose,
+    before: RoverPose,
+    believed: RoverPose,
     sent: SentLeg,
     p: RoverParams,
     rng: np.random.Generator,
@@ -154,7 +152,7 @@ def drive_leg(
         leg.trail.append(placed)
         u, v, h = leg.wheels[-1]
         h += step.turned
-        leg.wheels.append(Pose(u - step.rolled * math.sin(h), v + step.rolled * math.cos(h), h))
+        leg.wheels.append(RoverPose(u - step.rolled * math.sin(h), v + step.rolled * math.cos(h), h))
     return leg
 
 
@@ -198,11 +196,11 @@ class DriveInputs(NamedTuple):
 
 def true_and_believed(
     before: Bundle[DrivenFacts], row: int, pose: Bundle, T_vehicle_left: RigidTransform
-) -> tuple[Pose, Pose]:
+) -> tuple[RoverPose, RoverPose]:
     """True pose of the vehicle on the bed before a leg, and its estimate in the frame of the reconstruction."""
     true = RigidTransform.from_matrix(np.asarray(before["vehicle"])[row])
     estimate = RigidTransform.from_matrix(np.asarray(pose["poses"])[-1]) @ T_vehicle_left.inverse()
-    return Pose(*from_above(true)), Pose(*from_above(estimate))
+    return RoverPose(*from_above(true)), RoverPose(*from_above(estimate))
 
 
 @stage(
@@ -233,7 +231,8 @@ def drive_stage(
     if inputs.before is not None and inputs.pose is not None and plan is not None:
         start, believed = true_and_believed(inputs.before, row, inputs.pose, T_vehicle_left)
         sent = SentLeg(np.asarray(plan["path"])[:, :2], np.asarray(plan["gear"]).tolist(), float(plan.meta["turn"]))
-    ground = bed_ground(inputs.scene, vehicle, start[:2], way_length(sent.path) + REACH)
+    # Ground beside the leg may be touched, too.
+    ground = bed_ground(inputs.scene, vehicle, start[:2], way_length(sent.path) + 0.3)
     # The placement at the start is leg -1, and a seed must not be negative.
     rng = np.random.default_rng([params.seed, 70, 1 + leg])
     trail, turned = drive_leg(ground, vehicle, start, believed, sent, params, rng)

@@ -17,14 +17,14 @@ from rille.datasets.mockup.params import SceneParams
 from rille.datasets.mockup.raycast import HeightField
 from rille.stages.core.declare import Array, Bundle, stage
 
-MIPS = 7
+ALBEDO_LEVELS = 7
 """Levels of the albedo: 0.5 mm texels up to 32 mm, more than any footprint on the bed."""
 
 
 Disk = tuple[float, float, float]
 """x, y and radius of a disk on the bed, metres."""
 
-EDGE = 0.06
+PAD_EDGE_M = 0.06
 """m; over which the pad passes into the ground around it."""
 
 
@@ -64,7 +64,7 @@ def build_scene(p: SceneParams, pad: Disk | None = None, blank: Disk | None = No
         far = distance(lattice, height.shape, p.cell, x, y)
         if not (far <= radius).any():  # beside the bed, or less than a cell: no ground has a height to take
             continue
-        weight = np.clip((radius + EDGE - far) / EDGE, 0.0, 1.0)
+        weight = np.clip((radius + PAD_EDGE_M - far) / PAD_EDGE_M, 0.0, 1.0)
         # Smoothstep: the slope has no kink at either end of the edge.
         weight = weight * weight * (3.0 - 2.0 * weight)
         level = np.median((height - slope)[far <= radius])
@@ -73,7 +73,7 @@ def build_scene(p: SceneParams, pad: Disk | None = None, blank: Disk | None = No
         if disk is blank:
             bare = x, y + level, radius  # the grain is draped: what lies at a height has that of as much farther ahead
     arrays: dict[str, Any] = {"height": height, "sunlit": terrain.sunlit(height, p), "tint": tint}
-    for k in range(MIPS):
+    for k in range(ALBEDO_LEVELS):
         arrays[f"albedo_{k}"] = texture
         if bare is not None:
             x, y, radius = bare

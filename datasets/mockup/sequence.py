@@ -26,15 +26,12 @@ from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.hazard.vehicle import Vehicle
 
-FIRST_Y = -0.1
+FIRST_Y_M = -0.1
 """m, y of the first position in the bed frame: the near edge of the bed lies below the first images."""
 
 TRUTH_SOURCE = "the simulator's own poses: exact"
 
-CAMERA_FORWARD = 0.05
-"""m; distance of a driven rover's cameras ahead of the centre of its wheels."""
-
-WINDOW = (-0.3, 0.4, 0.3, 0.7)
+EVALUATION_WINDOW_M = (-0.3, 0.4, 0.3, 0.7)
 """m, evaluation window of a basic pair: 600 x 300 mm about where the optical axes cross (0.55 m ahead)."""
 
 
@@ -85,7 +82,7 @@ def body_poses(p: MockupParams) -> list[RigidTransform]:
     offsets = np.cumsum(steps, axis=0)
     # The drive is centred across the bed, whichever way it drifts.
     offsets[:, 0] -= 0.5 * (offsets[:, 0].min() + offsets[:, 0].max())
-    offsets[:, 1] += FIRST_Y - min(offsets[:, 1].min(), 0.0)
+    offsets[:, 1] += FIRST_Y_M - min(offsets[:, 1].min(), 0.0)
     shakes = np.deg2rad(p.jitter_deg) * np.random.default_rng([p.seed, 60]).standard_normal((p.frames, 3))
     swings = np.deg2rad(p.roll_swing_deg) * (np.arange(p.frames) % 2 - 0.5)
     T_bed_plane = RigidTransform(rotation_exp([np.deg2rad(p.slope_deg), 0.0, 0.0]), np.zeros(3))
@@ -118,7 +115,7 @@ def _check_on_bed(p: MockupParams, poses: list[RigidTransform]) -> None:
     """Refuse a drive that leaves the bed."""
     for k, pose in enumerate(poses):
         x, y, _ = pose.translation
-        # Not y < 0: a drive begins before the near edge (FIRST_Y).
+        # Not y < 0: a drive begins before the near edge (FIRST_Y_M).
         if abs(x) > 0.5 * p.bed_width or y > p.bed_length:
             raise ConfigError(
                 "RIL-253",
@@ -211,7 +208,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         vehicle=vehicle_at_scale(),
         truth_dem=dem,
         truth_disparity=lambda frame: sources.disparity(frame, lefts[frame]),
-        evaluation_window=WINDOW,
+        evaluation_window=EVALUATION_WINDOW_M,
         defaults={"keyframes.rule": "stride", "keyframes.stride": 4, "locus.cell_size": 0.001},
         notes=(
             f"simulated at 1:10 with seed {p.seed}; lengths are those of the model",
@@ -239,7 +236,8 @@ def vehicle_at_scale() -> Vehicle:
 def mockup_loop(p: MockupParams, rover: RoverParams, name: str = "mockup-loop") -> Sequence:
     """The sequence of a rover that is driven: one pair at the start, the others come about on the way."""
     sources = Sources(true_rig(p), {})
-    T_vehicle_body = RigidTransform(np.eye(3), np.array([0.0, CAMERA_FORWARD, p.camera_height]))
+    # The cameras stand 5 cm ahead of the centre of the wheels.
+    T_vehicle_body = RigidTransform(np.eye(3), np.array([0.0, 0.05, p.camera_height]))
     T_vehicle_left = T_vehicle_body @ mount(p, "left")
     T_left_right = sources.rig.T_right_left.inverse()
     mounted = {"T_vehicle_left": T_vehicle_left.to_list()}

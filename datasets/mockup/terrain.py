@@ -21,19 +21,10 @@ OCTAVES = (0.5, 0.25, 0.125, 0.0625, 0.03125, 0.015625, 0.0078125, 0.00390625)
 HURST = 0.85
 """Amplitude ~ wavelength^HURST: natural terrain is self-affine with 0.7-0.9 (e.g. Rosenburg 2011, LOLA)."""
 
-SPLINE_RMS = 0.479
-"""RMS of unit white noise after smoothing with the two-dimensional cubic B-spline."""
-
-LEAST_ROCK, WIDEST_ROCK = 0.004, 0.11
-LEAST_CRATER, WIDEST_CRATER = 0.025, 0.35
+MIN_ROCK_M, MAX_ROCK_M = 0.004, 0.11
+MIN_CRATER_M, MAX_CRATER_M = 0.025, 0.35
 SUN_DIAMETER_DEG = 1.5  # of a studio lamp some metres away, with soft edges of its shadows
-SUNLIT = -1e9  # m: the ceiling of the shade where there is none
-WIDEST_COVER_ROCK = 0.15
-"""Widest rock of a stated cover, metres: 1.5 m at full scale."""
-FULL_SCALE = 10.0
-"""Metres of Mars or Moon to a metre of the bed, for the law of the rocks' sizes."""
-TRIES = 300
-"""Places tried for one rock; at a cover of 0.3 one in a thousand finds none."""
+NO_CEILING_M = -1e9  # m: the ceiling of the shade where there is none
 
 
 def stream(seed: int, part: int) -> np.random.Generator:
@@ -48,7 +39,8 @@ def add_octave(out: Floats32, spacing: float, amplitude: float, rng: np.random.G
     grid = rng.standard_normal([int(n / spacing) + 5 for n in out.shape], dtype=np.float32)
     first_row, first_col = (np.floor(np.arange(n) / spacing).astype(int) for n in out.shape)
     row_weights, col_weights = (_spline_weights(np.arange(n) / spacing) for n in out.shape)
-    scale = amplitude / SPLINE_RMS
+    # RMS of unit white noise after smoothing with the two-dimensional cubic B-spline.
+    scale = amplitude / 0.479
     # Row by row: a bed's albedo is large. Sums are written out, not as matrix products: the same bits from any BLAS.
     for row, i in enumerate(first_row):
         line = _weighted(row_weights[:, row], grid[i : i + 4])
@@ -114,8 +106,8 @@ def add_craters(height: Floats32, p: SceneParams) -> None:
     rng = stream(p.seed, 1)
     area = (height.shape[0] * p.cell) * (height.shape[1] * p.cell)
     # The parameter counts those above 0.1 m: by D^-2 the number above the least one is larger by this factor.
-    count = p.craters * area * (0.1 / LEAST_CRATER) ** 2
-    for diameter in _sizes(rng, count, LEAST_CRATER, WIDEST_CRATER):
+    count = p.craters * area * (0.1 / MIN_CRATER_M) ** 2
+    for diameter in _sizes(rng, count, MIN_CRATER_M, MAX_CRATER_M):
         *place, age = rng.random(3)
         window, dx, dy = _patch(height, p.cell, place, 1.5 * diameter)
         # Age 0 is the oldest crater, which is the shallowest.
@@ -165,7 +157,7 @@ def _scattered(p: SceneParams, area: float) -> Iterator[_Rock]:
     """Rocks anywhere, so many to a square metre; they may lie over each other."""
     rng = stream(p.seed, 2)
     # The parameter counts those above 30 mm.
-    for diameter in _sizes(rng, p.rocks * area * (0.03 / LEAST_ROCK) ** 2, LEAST_ROCK, WIDEST_ROCK):
+    for diameter in _sizes(rng, p.rocks * area * (0.03 / MIN_ROCK_M) ** 2, MIN_ROCK_M, MAX_ROCK_M):
         x, y, turn, b, *others = rng.random(8)
         yield _Rock(diameter, 0.65 + 0.35 * b, np.array([turn, *others]), [np.array([x, y])])
 
@@ -177,7 +169,8 @@ def _beside_each_other(p: SceneParams, cover: float, area: float) -> Iterator[_R
         b, *draws = rng.random(6)
         aspect = 0.65 + 0.35 * b
         # The ellipse has the area of a circle of that diameter.
-        places = (rng.random(2) for _ in range(TRIES))
+        # At a cover of 0.3 one rock in a thousand finds no place.
+        places = (rng.random(2) for _ in range(300))
         yield _Rock(diameter / np.sqrt(aspect), aspect, np.array(draws), places)
 
 
@@ -187,8 +180,10 @@ def cover_sizes(rng: np.random.Generator, cover: float, area: float) -> NDArray[
     The law is that of Golombek and Rapp (1997), doi:10.1029/96JE03319: the share under rocks wider than D metres falls
     with exp(-q D), q = 1.79 + 0.152 / cover, at full scale. Sizes are drawn one from each equal part of the numbers.
     """
-    q = (1.79 + 0.152 / cover) * FULL_SCALE
-    d = np.geomspace(LEAST_ROCK, WIDEST_COVER_ROCK, 2000)
+    # Ten metres of Mars or Moon are one of the bed.
+    q = (1.79 + 0.152 / cover) * 10.0
+    # The widest rock has 1.5 m at full scale.
+    d = np.geomspace(MIN_ROCK_M, 0.15, 2000)
     covered = np.exp(-q * d[0]) - np.exp(-q * d)
     middle = np.sqrt(d[1:] * d[:-1])
     number = np.concatenate([[0.0], np.cumsum(np.diff(covered) / (0.25 * np.pi * middle**2))])
@@ -277,10 +272,10 @@ def _count_lit(height: Floats32, out: NDArray[np.uint8], across: float, phase: f
     a row the line is rounded to nodes, since interpolation would wear narrow shadows off.
     """
     width = height.shape[1]
-    shade = np.full(width, SUNLIT)
+    shade = np.full(width, NO_CEILING_M)
     for k, line in enumerate(height):
         shift = int(np.floor(k * across + phase)) - int(np.floor((k - 1) * across + phase))
-        ceiling = np.full(width, SUNLIT)
+        ceiling = np.full(width, NO_CEILING_M)
         ceiling[max(shift, 0) : width + min(shift, 0)] = shade[max(-shift, 0) : width + min(-shift, 0)] - drop
         arrives = line >= ceiling
         out[k] += arrives

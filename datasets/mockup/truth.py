@@ -12,9 +12,6 @@ from rille.datasets.mockup.scene import height_field
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 
-TOLERANCE = 1e-5
-"""m: a point is hidden when its line of sight ends more than this in front of it; far below any truth's use."""
-
 SEEN, HIDDEN, OUTSIDE, NO_BED = 0, 1, 2, 3
 
 
@@ -42,7 +39,8 @@ def visible(
     t = field.contact(T_bed_camera.translation[None, :], directions)
     length = np.sqrt((directions**2).sum(axis=1))
     # a ray that just misses the point it aims at has grazed it: seen; one that comes in through the bed's side: hidden
-    free[inside] = ~((1.0 - t) * length > TOLERANCE)
+    # A line of sight that ends this far in front of a point, in metres, hides it; far below any truth's use.
+    free[inside] = ~((1.0 - t) * length > 1e-5)
     return pixels, inside, free
 
 

@@ -10,7 +10,16 @@ import pytest
 from raising import raises
 
 from rille.datasets.mockup.obstacle import on_path
-from rille.datasets.mockup.rover import FRAME_TURN, ORIGIN, Pose, RoverParams, SentLeg, bed_ground, drive_leg, images_at
+from rille.datasets.mockup.rover import (
+    FRAME_TURN,
+    ORIGIN,
+    RoverParams,
+    RoverPose,
+    SentLeg,
+    bed_ground,
+    drive_leg,
+    images_at,
+)
 from rille.datasets.mockup.sequence import vehicle_at_scale
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import heading_of
@@ -23,7 +32,7 @@ X, Y = np.meshgrid(np.arange(-0.5, 0.501, 0.004), np.arange(0.5, -0.501, -0.004)
 FLAT = HeightGrid.of(0.0 * X, -0.5, 0.5, 0.004, VEHICLE.wheel_diameter)
 
 
-def driven(p: RoverParams, turn: float = 0.0, seed: int = 0, believed: Pose = ORIGIN):
+def driven(p: RoverParams, turn: float = 0.0, seed: int = 0, believed: RoverPose = ORIGIN):
     return drive_leg(FLAT, VEHICLE, ORIGIN, believed, SentLeg(PATH, [1, 1], turn), p, np.random.default_rng(seed))
 
 
@@ -42,7 +51,7 @@ def test_slip_shortens_the_way_and_not_what_the_wheels_say() -> None:
 
 
 def test_a_wrong_belief_of_the_heading_turns_the_way() -> None:
-    d = driven(EXACT, believed=Pose(0.0, 0.0, math.pi / 2))
+    d = driven(EXACT, believed=RoverPose(0.0, 0.0, math.pi / 2))
     assert d.trail[-1].T_ground_vehicle.translation == pytest.approx([0.2, -0.1, 0.0], abs=1e-12)
 
 
@@ -84,7 +93,7 @@ def test_a_piece_that_is_driven_back_is_driven_back() -> None:
 def test_beside_the_bed_it_is_not_placed() -> None:
     with raises("RIL-250"):
         drive_leg(
-            FLAT, VEHICLE, Pose(0.5, 0.0, 0.0), ORIGIN, SentLeg(PATH, [1, 1], 0.0), EXACT, np.random.default_rng(0)
+            FLAT, VEHICLE, RoverPose(0.5, 0.0, 0.0), ORIGIN, SentLeg(PATH, [1, 1], 0.0), EXACT, np.random.default_rng(0)
         )
 
 
@@ -93,7 +102,9 @@ def test_far_from_the_bed_it_is_not_placed(at: tuple[float, float]) -> None:
     lattice = {"x0": -0.5, "y0": 0.5, "cell": 0.004}
     ground = bed_ground(Bundle({"height": FLAT.height}, {"lattice": lattice}), VEHICLE, at, 0.3)
     with raises("RIL-250"):
-        drive_leg(ground, VEHICLE, Pose(*at, 0.0), ORIGIN, SentLeg(PATH, [1, 1], 0.0), EXACT, np.random.default_rng(0))
+        drive_leg(
+            ground, VEHICLE, RoverPose(*at, 0.0), ORIGIN, SentLeg(PATH, [1, 1], 0.0), EXACT, np.random.default_rng(0)
+        )
 
 
 def test_a_place_along_and_beside_a_path() -> None:

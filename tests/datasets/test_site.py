@@ -9,7 +9,7 @@ import pytest
 
 from rille.datasets.mockup.params import SceneParams
 from rille.datasets.mockup.render import radiance
-from rille.datasets.mockup.scene import EDGE, build_scene, height_field
+from rille.datasets.mockup.scene import PAD_EDGE_M, build_scene, height_field
 from rille.stages.geometry.geometry import Camera, RigidTransform
 
 PAD = (0.0, 0.3, 0.15)
@@ -27,9 +27,9 @@ def test_the_pad_is_cut_along_the_ground(slope_deg: float) -> None:
     above = height - rise * y[:, None]
     assert np.ptp(above[far <= PAD[2]]) < 1e-6
     # beside it lies the relief alone: a level pad on 8 degrees would end in a wall of 21 mm, more where it is larger
-    ring = above[(far > PAD[2]) & (far <= PAD[2] + EDGE)]
+    ring = above[(far > PAD[2]) & (far <= PAD[2] + PAD_EDGE_M)]
     assert np.ptp(ring) < 5.0 * p.relief
-    outside = far > PAD[2] + EDGE
+    outside = far > PAD[2] + PAD_EDGE_M
     assert np.array_equal(height[outside], np.asarray(scene["height"])[outside])
 
 
