@@ -26,7 +26,7 @@ _EARLIER = TypeAdapter(dict[str, tuple[float, float]])
 FILE = "seconds.json"
 
 
-class Estimate:
+class TimeEstimate:
     """Estimates the seconds left of one run; ``opened`` are the stages of the tasks that are laid out first."""
 
     def __init__(self, opened: Iterable[str], earlier: Earlier, jobs: int) -> None:
@@ -73,7 +73,7 @@ def recall(hints: Path) -> dict[str, tuple[float, float]]:
     return read_hint(hints / FILE, _EARLIER) or {}
 
 
-def remember(hints: Path, estimate: Estimate) -> None:
+def remember(hints: Path, estimate: TimeEstimate) -> None:
     """Leave the figures of a run for the next one."""
     if estimate.computed:
         write_hint(hints / FILE, recall(hints) | estimate.summary())

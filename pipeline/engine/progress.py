@@ -9,7 +9,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, TextIO
 
-from rille.pipeline.engine.estimate import Earlier, Estimate
+from rille.pipeline.engine.estimate import Earlier, TimeEstimate
 from rille.pipeline.engine.plain import plain, raw
 from rille.stages.core.errors import ConfigError
 
@@ -46,14 +46,14 @@ class Progress:
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stderr
         self.graph: Graph | None = None
-        self.estimate = Estimate([], {}, 1)
+        self.estimate = TimeEstimate([], {}, 1)
         self.seen = 0
         self.done = 0
 
     def open(self, graph: Graph, earlier: Earlier, jobs: int) -> None:
         """The run begins: begin the estimate with the tasks that are laid out; the graph may still grow."""
         self.graph, self.seen = graph, len(graph.nodes)
-        self.estimate = Estimate([h.stage for h in graph.nodes], earlier, max(jobs, 1))
+        self.estimate = TimeEstimate([h.stage for h in graph.nodes], earlier, max(jobs, 1))
 
     def detail(self, text: str) -> None:
         """A word for who asks for more of them."""
@@ -179,7 +179,7 @@ def summary(result: Result) -> str:
     return f"{', '.join(parts)} in {result.seconds:.1f} s"
 
 
-def to_go(estimate: Estimate) -> str:
+def to_go(estimate: TimeEstimate) -> str:
     """``, about 42 s left``; empty where nothing is known."""
     left = estimate.left()
     return "" if left is None else f", about {clock(left)} left"

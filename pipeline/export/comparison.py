@@ -16,7 +16,7 @@ from rille.stages.evaluation.agreement import carried
 
 
 @dataclass(frozen=True)
-class Comparison:
+class CrosscheckComparison:
     """Our trajectory and that of the crosscheck, one row a chosen frame, NaN where either has no pose.
 
     ``poses`` (frame, 3, 4): the crosscheck's left cameras in our world, NaN where ours is in a piece apart.
@@ -53,7 +53,7 @@ class Comparison:
         }
 
 
-def compare(view: RunView, agreement: Bundle) -> Comparison:
+def compare(view: RunView, agreement: Bundle) -> CrosscheckComparison:
     """Frame by frame against the crosscheck, of its agreement with the trajectory."""
     poses = by_frame(view, agreement, "poses")
     registered = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
@@ -61,7 +61,7 @@ def compare(view: RunView, agreement: Bundle) -> Comparison:
     if trajectory is not None:  # other pieces lie in frames of their own, and so do the frames lost behind them
         piece = np.nan_to_num(by_frame(view, trajectory, "piece"), nan=-1).astype(np.int64)
         poses[carried(piece) != trajectory.meta["main"]] = np.nan
-    return Comparison(
+    return CrosscheckComparison(
         frames=view.frames,
         poses=poses,
         registered=registered,

@@ -209,7 +209,7 @@ def coverage(view: RunView) -> list[str]:
     maps = {pair: facts_of(view, dem).get("coverage", {}) for pair, dem in view.products.local_dem.items()}
     lacking = {pair: facts["outside"] + facts["unsure"] for pair, facts in maps.items() if facts.get("settings")}
     pair = max(lacking, key=lambda k: lacking[k], default=-1)
-    if lacking.get(pair, 0.0) < SAID_LACKING:
+    if lacking.get(pair, 0.0) < MIN_LACKING_SHARE:
         return []
     facts, size = maps[pair], [metres(v) for v in maps[pair]["size"]]
     settings = " ".join(f"--set {name}={value:g}" for name, value in facts["settings"].items())
@@ -220,7 +220,7 @@ def coverage(view: RunView) -> list[str]:
     ]
 
 
-SAID_LACKING = 0.1
+MIN_LACKING_SHARE = 0.1
 """Share of the matched pixels from which on it is said that limits keep them off the map."""
 
 

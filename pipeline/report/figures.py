@@ -22,8 +22,6 @@ Extent = tuple[float, float, float, float]
 
 MAX_MARKERS = 80
 """Frames of a curve above which no frame has a marker of its own: they would touch."""
-CELLS_OF_IMAGE = 24
-"""Cells along the longer side of the image in which residuals are averaged."""
 
 
 def metres_or_mm(values: Floats) -> tuple[float, str]:
@@ -105,7 +103,8 @@ def raster(values: Floats, label: str, alt: str, *, extent: Extent | None = None
 
 def medians(points: Floats, values: Floats, size: tuple[int, int]) -> Floats:
     """Medians (row, col) of values (n,) at points (n, 2) column, row, in cells of an image of ``size`` (cols, rows)."""
-    cell = max(size) / CELLS_OF_IMAGE
+    # Residuals are averaged in 24 cells along the longer side.
+    cell = max(size) / 24
     cols, rows = (max(1, round(n / cell)) for n in size)
     at = np.clip((points * [cols / size[0], rows / size[1]]).astype(int), 0, [cols - 1, rows - 1])
     index, grid = at[:, 1] * cols + at[:, 0], np.full(rows * cols, np.nan)

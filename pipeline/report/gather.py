@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rille.pipeline.export import ranges
 from rille.pipeline.export.artifacts import Floats, used_rig
 from rille.pipeline.export.artifacts import by_frame as rows
-from rille.pipeline.export.comparison import Comparison, compare
+from rille.pipeline.export.comparison import CrosscheckComparison, compare
 from rille.pipeline.export.rasters import whole
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow.products import Stop
@@ -31,7 +31,7 @@ WORLD = ("elevation", "elevation_std", "spread", "count", "source", "ortho")
 
 
 @dataclass(frozen=True)
-class Terrain:
+class WorldTerrain:
     """Arrays (row, col) of an elevation model, and the lattice they lie on."""
 
     lattice: Lattice
@@ -120,17 +120,17 @@ class Scene:
         self.view = view
 
     @cached_property
-    def world(self) -> Terrain | None:
+    def world(self) -> WorldTerrain | None:
         """Merged terrain, put together of its tiles."""
         tiles = [b for b in map(self.view.bundle, self.view.products.world_tiles) if b is not None]
         if not tiles:
             return None
         names = [name for name in WORLD if all(name in tile.arrays for tile in tiles)]
         lattice = union(Lattice.from_dict(tile.meta["lattice"]) for tile in tiles)
-        return Terrain(lattice, {name: whole(tiles, name)[1] for name in names})
+        return WorldTerrain(lattice, {name: whole(tiles, name)[1] for name in names})
 
     @cached_property
-    def risk(self) -> Terrain | None:
+    def risk(self) -> WorldTerrain | None:
         """Risk map of the merged terrain."""
         return terrain(self.view.bundle(self.view.products.world_risk), "risk", "reason", "p_hazard", "inclination")
 
@@ -145,7 +145,7 @@ class Scene:
         return trajectory(self.view)
 
     @cached_property
-    def comparison(self) -> Comparison | None:
+    def comparison(self) -> CrosscheckComparison | None:
         """The trajectory against that of another program; None where there is no comparison."""
         agreement = self.view.bundle(self.view.products.agreement)
         return None if agreement is None else compare(self.view, agreement)
@@ -178,12 +178,12 @@ def vertices(path: Bundle | None) -> Floats | None:
     return points if points is not None and len(points) else None
 
 
-def terrain(bundle: Bundle | None, *names: str) -> Terrain | None:
+def terrain(bundle: Bundle | None, *names: str) -> WorldTerrain | None:
     """Arrays of one artifact with a lattice."""
     if bundle is None or "lattice" not in bundle.meta:
         return None
     arrays = {name: np.asarray(bundle[name]) for name in names if name in bundle.arrays}
-    return Terrain(Lattice.from_dict(bundle.meta["lattice"]), arrays)
+    return WorldTerrain(Lattice.from_dict(bundle.meta["lattice"]), arrays)
 
 
 def trajectory(view: RunView) -> Track:
@@ -211,12 +211,12 @@ def _truth_in_world(view: RunView, poses: Floats) -> Floats | None:
     NaN in gaps; None where no frame has both.
     """
     true = [None if view.sequence.truth is None else view.sequence.truth[frame] for frame in view.frames]
-    both = (
+    placed = (
         (RigidTransform.from_matrix(p), t)
         for p, t in zip(poses, true, strict=True)
         if t is not None and np.isfinite(p).all()
     )
-    estimate, first = next(both, (None, None))
+    estimate, first = next(placed, (None, None))
     if estimate is None or first is None:
         return None
     T_world_truth = estimate @ first.inverse()

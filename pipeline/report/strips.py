@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rille.pipeline.export import artifacts, ranges
 from rille.pipeline.report import canvas, gather
 from rille.pipeline.report.canvas import Block, Panel
-from rille.pipeline.report.gather import Scene, Terrain
+from rille.pipeline.report.gather import Scene, WorldTerrain
 from rille.pipeline.report.words import metres
 from rille.stages.core.validity import matched
 from rille.stages.evaluation.features import grey_bytes
@@ -76,7 +76,7 @@ def depth_band(rig: Rig) -> tuple[str, int]:
     return band, 1 if along >= 0 else -1
 
 
-def risk_picture(risk: Terrain, lines: Sequence[StripLine], width: int) -> Image:
+def risk_picture(risk: WorldTerrain, lines: Sequence[StripLine], width: int) -> Image:
     """Classes of a risk map in their colours, and lines on them; ``width`` in pixels."""
     from PIL import Image
 
@@ -187,7 +187,7 @@ def _matches(photo: Image, disparity: Floats, there: NDArray[np.bool_]) -> Image
     return Image.fromarray(np.where(there[at][..., None], colors // 3 * 2 + ground // 3, ground)).convert("RGBA")
 
 
-def _elevations(dem: Terrain, lines: Sequence[StripLine], width: int) -> Image:
+def _elevations(dem: WorldTerrain, lines: Sequence[StripLine], width: int) -> Image:
     from PIL import Image
 
     elevation = dem.arrays["elevation"]
@@ -201,7 +201,7 @@ def _colors(share: Floats) -> NDArray[np.uint8]:
     return np.asarray(canvas.ramp("viridis")[np.clip(np.nan_to_num(share) * 255, 0, 255).astype(np.uint8)])
 
 
-def _with_lines(picture: Image, ground: Terrain, lines: Sequence[StripLine], width: int) -> Image:
+def _with_lines(picture: Image, ground: WorldTerrain, lines: Sequence[StripLine], width: int) -> Image:
     """A picture of all cells, scaled to ``width``, with lines that have a white casing."""
     from PIL import ImageDraw
 

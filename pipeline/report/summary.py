@@ -21,7 +21,7 @@ from rille.pipeline.report.words import metres, number, quantity
 from rille.stages.evaluation import imu_check
 from rille.stages.odometry.resection.trajectory import world_poses
 
-FORMAT = 2
+REPORT_FORMAT = 2
 """Raised when the meaning of a key of report.json changes."""
 
 
@@ -59,7 +59,7 @@ def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]
     how = "wall clock, without writing the page; what is cached costs no time"
     clock = {"group": "Run", "truth": None, **metric("Time of this run's tasks", view.seconds, "s", how)}
     return {
-        "format": FORMAT,
+        "format": REPORT_FORMAT,
         "run": view.run_id,
         "started": view.started,
         "command": view.command,
@@ -132,14 +132,14 @@ def given_numbers(view: RunView) -> list[str]:
     return [line + "."]
 
 
-NOTHING_COMMON = 50.0
+MAX_COMMON_PERCENT = 50.0
 """RMS disagreement of two trajectories [per cent of the length] from which on they have nothing in common. Of a camera
 at rest, whose length is noise, it stays below."""
 
 
 def _unlike(figures: Mapping[str, Any]) -> list[str]:
     """Trajectory and crosscheck are not alike anywhere: no frame then stands out."""
-    if (_value(figures, "agreement_share") or 0.0) <= NOTHING_COMMON:
+    if (_value(figures, "agreement_share") or 0.0) <= MAX_COMMON_PERCENT:
         return []
     rmse, length = (metres(_value(figures, name)) for name in ("agreement_rmse", "agreement_length"))
     return [f"trajectory and COLMAP have nothing in common: {rmse} RMS over {length}; one is wrong"]
@@ -180,14 +180,14 @@ def _imu(view: RunView) -> list[str]:
     return lines
 
 
-SIGMA_OFF = 3.0
+MAX_SIGMA_RATIO = 3.0
 """Factor by which errors exceed their standard deviations from which on it is said."""
 
 
 def _small_sigma(figures: Mapping[str, Any]) -> list[str]:
     """The standard deviations of the positions are not to be weighed by, where truth says so."""
     nees = _value(figures, "trajectory_nees")
-    if nees is None or nees <= SIGMA_OFF**2:
+    if nees is None or nees <= MAX_SIGMA_RATIO**2:
         return []
     return [
         f"the poses are off the truth by about {number(math.sqrt(nees), 2)} times their standard deviations: these are "
@@ -316,16 +316,16 @@ def _sequence(view: RunView) -> dict[str, Any]:
 
 def _stages(view: RunView) -> dict[str, dict[str, Any]]:
     """By stage: tasks computed and cached in this run; seconds of the former, and of all when they were computed."""
-    found: dict[str, dict[str, Any]] = {}
+    by_stage: dict[str, dict[str, Any]] = {}
     for t in view.tasks:
         zero = {"computed": 0, "cached": 0, "failed": 0, "skipped": 0, "seconds": 0.0, "seconds_when_computed": 0.0}
-        row = found.setdefault(t.stage, zero)
+        row = by_stage.setdefault(t.stage, zero)
         row[t.status] += 1
         row["seconds"] += (t.seconds or 0.0) if t.status == "computed" else 0.0
         row["seconds_when_computed"] += t.seconds or 0.0
-    for row in found.values():
+    for row in by_stage.values():
         row["seconds"], row["seconds_when_computed"] = round(row["seconds"], 3), round(row["seconds_when_computed"], 3)
-    return found
+    return by_stage
 
 
 def _reads(run: RunView) -> tuple[object, ...]:

@@ -19,7 +19,7 @@ from rille.pipeline.export import colour, ranges
 from rille.pipeline.export.artifacts import Floats
 from rille.pipeline.report import canvas, gather, strips
 from rille.pipeline.report.canvas import Block
-from rille.pipeline.report.gather import Scene, Terrain
+from rille.pipeline.report.gather import Scene, WorldTerrain
 from rille.pipeline.report.strips import StripLine
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import mosaic
@@ -31,12 +31,8 @@ Bytes = NDArray[np.uint8]
 
 MAX_CELLS = 350_000
 """Cells of the map; three pictures of these and the ortho image are about 2 MB in the page."""
-HEIGHT_STEPS = 65534
-"""Steps of a height; 0 is undefined."""
 BYTE_STEPS = 254
 """Steps of a value of one byte; 0 is undefined."""
-STILL_WIDTH_PIXELS = 800
-"""Of the picture that stands where no script runs."""
 
 
 def block(scene: Scene) -> Block | None:
@@ -45,7 +41,8 @@ def block(scene: Scene) -> Block | None:
     if risk is None and layers is None:
         return None
     lines = [] if scene.path is None else [StripLine(scene.path, canvas.MARK)]
-    still = [] if risk is None else [strips.risk_picture(risk, lines, STILL_WIDTH_PIXELS)]
+    # Stands where no script runs.
+    still = [] if risk is None else [strips.risk_picture(risk, lines, 800)]
     return Block(tuple(strips.panel(picture, "Risk map seen from above") for picture in still), data=layers)
 
 
@@ -61,7 +58,8 @@ def data(scene: Scene) -> dict[str, Any] | None:
     step = max(1, math.ceil(math.sqrt(world.arrays["elevation"].size / MAX_CELLS)))
     z = world.arrays["elevation"][::step, ::step]
     low, high = float(np.nanmin(z)), float(np.nanmax(z))
-    height = _steps(z, low, max(high - low, 1e-9), HEIGHT_STEPS)
+    # Of two bytes; 0 is undefined.
+    height = _steps(z, low, max(high - low, 1e-9), 65534)
     sigma, sigmas = _ratios(_plane(world, "elevation_std", step))
     risk, reason, p_hazard = (_of_risk(scene, name, missing)[::step, ::step] for name, missing in _RISK)
     # The class takes two bits of its byte: six are left for the number of models.
@@ -100,7 +98,7 @@ def data(scene: Scene) -> dict[str, Any] | None:
 _RISK = (("risk", UNKNOWN), ("reason", 0), ("p_hazard", np.nan))
 
 
-def _plane(world: Terrain, name: str, step: int) -> Floats:
+def _plane(world: WorldTerrain, name: str, step: int) -> Floats:
     values = world.arrays.get(name)
     return np.full_like(world.arrays["elevation"], np.nan)[::step, ::step] if values is None else values[::step, ::step]
 
@@ -138,7 +136,7 @@ def _picture(*planes: NDArray[Any]) -> str:
     return canvas.compressed(picture, "png", compress_level=6)
 
 
-def _ortho(scene: Scene, world: Terrain, step: int) -> str:
+def _ortho(scene: Scene, world: WorldTerrain, step: int) -> str:
     """The ortho image, grey or coloured, as a picture with loss."""
     from PIL import Image
 

@@ -61,10 +61,10 @@ def spread(values: Any) -> str:
 
 def spans(numbers: list[int]) -> str:
     """``[1, 2, 3, 7]`` to ``1-3, 7``."""
-    found: list[list[int]] = []
+    ranges: list[list[int]] = []
     for n in numbers:
-        if found and n == found[-1][1] + 1:
-            found[-1][1] = n
+        if ranges and n == ranges[-1][1] + 1:
+            ranges[-1][1] = n
         else:
-            found.append([n, n])
-    return ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in found)
+            ranges.append([n, n])
+    return ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in ranges)

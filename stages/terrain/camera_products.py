@@ -46,12 +46,12 @@ class CameraProducts:
     roughness: Floats32
 
 
-def camera_products(found: PairPoints, camera: Camera) -> CameraProducts:
+def camera_products(points: PairPoints, camera: Camera) -> CameraProducts:
     """Rasters of a pair's points, of every pixel (``every`` = 1)."""
     shape = camera.height, camera.width
-    column, row = found.pixel.T
+    column, row = points.pixel.T
     position, sigma = np.full((*shape, 3), np.nan, np.float32), np.full(shape, np.nan, np.float32)
-    position[row, column], sigma[row, column] = found.position, found.sigma_along
+    position[row, column], sigma[row, column] = points.position, points.sigma_along
     normal, roughness = _planes(position)
     return CameraProducts(position, np.linalg.norm(position, axis=2).astype(np.float32), sigma, normal, roughness)
 

@@ -9,7 +9,7 @@ from toys.finished import Page, bundles, view, written
 
 from rille.pipeline.export.view import UNSTATED, TaskRow
 from rille.pipeline.report import delivery, page, summary, terrain_map, words
-from rille.pipeline.report.gather import Terrain
+from rille.pipeline.report.gather import WorldTerrain
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import REASONS, RiskParams
@@ -241,7 +241,7 @@ def test_the_profile_shows_the_inclination_that_was_judged():
     inclination[1, 1] = np.nan
     centres = lattice.xy()
     path = np.array([[*centres[2, 3], 0.5], [*centres[1, 1], 0.6], [centres[0, 0][0] - 5.0, 0.0, 0.7]])
-    risk = Terrain(lattice, {"inclination": inclination})
+    risk = WorldTerrain(lattice, {"inclination": inclination})
     found = terrain_map._path(SimpleNamespace(path=path, risk=risk))
     assert found[0] == [*path[0], round(float(np.degrees(inclination[2, 3])), 2)]
     assert [row[3] for row in found[1:]] == [None, None]
