@@ -7,7 +7,6 @@ to fill in. A manifest with missing entries cannot be opened; the error names th
 from __future__ import annotations
 
 import glob
-import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable
@@ -24,7 +23,7 @@ from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import unread
 from rille.datasets.images.pairing import SIDES, ImagePair, common_headers, natural, pair_up, side_of, stamp_of
 from rille.datasets.poses import names_positions, read_positions
-from rille.datasets.text.reading import Search, read_lines
+from rille.datasets.text.reading import Search, is_file, read_lines
 from rille.stages.core.errors import InputError, RilleError
 from rille.stages.geometry.geometry import Sizes
 
@@ -116,7 +115,7 @@ def inspect(folder: Path) -> Findings:
     """
     if not folder.is_dir():
         raise InputError("RIL-193", f"{folder} is no folder", remedy="name a folder that holds images of two cameras")
-    there = list(_files(folder, Search()))
+    there = _files(folder)
     paths = [p for p in there if p.suffix.lower() in (*SUFFIXES, *CALIBRATIONS, *TABLES)]
     for path in paths:
         _writable(_relative(path, folder))
@@ -150,13 +149,10 @@ def inspect(folder: Path) -> Findings:
     return found
 
 
-def _files(folder: Path, search: Search, depth: int = 0) -> Iterable[Path]:
+def _files(folder: Path) -> list[Path]:
     """Files below a folder in natural order, hidden ones left out."""
-    entries = sorted((e for e in search.entries(folder) if not e.name.startswith(".")), key=lambda e: natural(e.name))
-    yield from (Path(e.path) for e in entries if os.path.isfile(e))
-    if depth < DEPTH:
-        for inner in (e for e in entries if e.is_dir(follow_symlinks=False)):
-            yield from _files(Path(inner.path), search, depth + 1)
+    entries = (e for _, entries in Search().below(folder, DEPTH, links=True) for e in entries)
+    return sorted((Path(e.path) for e in entries if is_file(e.path)), key=lambda path: natural(str(path)))
 
 
 def _writable(name: str) -> None:
@@ -189,11 +185,12 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     if not both:
         named = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
         remedy = "name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand"
-        for path in images[:1]:
+        for path in images[: 0 if any(named) else 1]:
             with suppress(InputError):
                 width, height, _ = common_header([path])
                 remedy = f"{SPLIT}; else {remedy}" if width >= 2 * height else remedy
         text = f"{folder} holds {len(images)} images, {named[0]} named as left and {named[1]} as right: no pairs"
+        text += "" if images else f" ({DEPTH} folders deep)"
         raise InputError("RIL-194", text, remedy=remedy)
     # Most pairs first; of as many, the surest token (SIDES).
     key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0]))

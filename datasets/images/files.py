@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.facts import ImageFacts
-from rille.datasets.images.headers import Header, opened, read_header
+from rille.datasets.images.headers import Header, opened, orientation, read_header
 from rille.datasets.images.kinds import KINDS, kind_of
 from rille.datasets.protocol import Source
 from rille.datasets.text.reading import open_regular, read_bytes
@@ -27,7 +27,7 @@ from rille.stages.imaging.levels import Levels, spread
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it says on stderr, an error says here
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".ppm", ".bmp")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".jfif", ".tif", ".tiff", ".pgm", ".ppm", ".pnm", ".bmp")
 """Kinds of image that are looked for where no pattern is given."""
 
 MOST_PIXELS = 160_000_000
@@ -36,10 +36,10 @@ MOST_PIXELS = 160_000_000
 MOST_BYTES = 2**29
 """Of one image file."""
 
-FEWER_BITS = "save it with 8 or 16 bits a sample"
+FEWER_BITS = "save it with 8 or 16 bits a sample, without sign"
 COPY_AGAIN = "copy the file again, or remove it"
 
-PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+PNG, JPEG, TIFF = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", (b"II", b"MM")
 """How files begin."""
 
 PADDING = 16
@@ -94,11 +94,26 @@ def _unpacked(data: bytes) -> tuple[NDArray[Any] | None, str]:
 
 
 def _decoded(data: bytes) -> NDArray[Any] | None:
+    # Netpbm's text may end with its last number, OpenCV wants something behind it.
+    data = data + b"\n" if data[:2] in (b"P2", b"P3") else data
     try:
         # Unchanged: 16 bits stay 16, and no orientation tag turns the image away from its calibration.
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         return None
+    # But OpenCV turns a TIFF by its tag whatever it is asked for.
+    return (
+        image if image is None or not data.startswith(TIFF) else _turned_back(image, orientation(opened(BytesIO(data))))
+    )
+
+
+def _turned_back(image: NDArray[Any], tag: int) -> NDArray[Any]:
+    """The image as it is stored, of one that was turned by the tag of its orientation."""
+    if tag in (6, 8):
+        return np.rot90(image, 1 if tag == 6 else -1)
+    if tag in (5, 7):
+        image = image.swapaxes(0, 1)
+    return image[:: -1 if tag in (3, 4, 7) else 1, :: -1 if tag in (2, 3, 7) else 1]
 
 
 def decode(data: bytes, name: str, wanted: Header | None = None) -> Grey:

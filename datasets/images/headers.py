@@ -33,8 +33,11 @@ Headers = tuple[Header, Header]
 FORMATS = ("PNG", "JPEG", "TIFF", "PPM", "BMP")
 """Pillow's names of the formats."""
 
-BITS_PER_SAMPLE = 258
-"""TIFF tag."""
+WIDTH, HEIGHT, BITS_PER_SAMPLE = 256, 257, 258
+"""TIFF tags."""
+
+ORIENTATION = 0x0112
+"""EXIF's tag: 1 as stored, 3 upside down, 6 and 8 turned by a quarter, others mirrored."""
 
 
 def sizes_of(headers: Headers) -> Sizes:
@@ -49,7 +52,9 @@ def read_header(file: BinaryIO) -> Header | None:
         image = opened(file)
         if image is not None:
             bits = _bits(image)
-            return Header(image.width, image.height, 8 if bits <= 8 else 16 if bits <= 16 else bits)
+            # Pillow exchanges width and height where a tag says that the image is turned.
+            width, height = (image.tag_v2[k] for k in (WIDTH, HEIGHT)) if image.format == "TIFF" else image.size
+            return Header(width, height, 8 if bits <= 8 else 16 if bits <= 16 else bits)
     return None
 
 
@@ -63,6 +68,15 @@ def opened(file: BinaryIO) -> Any:
     # Not by `Image.open`, which refuses by a limit of its own how many pixels are too many.
     fits = (Image.OPEN[name] for name in FORMATS)
     return next((factory(file, "") for factory, accepts in fits if accepts is None or accepts(start)), None)
+
+
+def orientation(image: Any) -> int:
+    """EXIF's orientation of an image of Pillow; 1 where it states none."""
+    # Of a damaged tag: whatever the parsers of three formats come upon.
+    with catch_warnings(action="ignore"), suppress(Exception):
+        # Pillow decodes a whole PNG in search of what it does not have.
+        return int(image.getexif().get(ORIENTATION, 1)) if image.format != "PNG" or "exif" in image.info else 1
+    return 1
 
 
 def _bits(image: Any) -> int:

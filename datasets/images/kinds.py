@@ -13,6 +13,11 @@ KINDS: dict[str, tuple[str, str]] = {
         ".mp4 .m4v .mov .avi .mkv .webm .mpg .mpeg .mjpeg .h264 .h265 .hevc",
         "take its images out, a folder a camera: mkdir left; ffmpeg -i FILE left/%06d.png",
     ),
+    "stereo image": (
+        ".mpo .jps .pns",
+        "take its views apart, a folder a camera: of .mpo exiftool -b -MPImage2 FILE; of others, whose right view comes"
+        " first, magick FILE -crop 2x1@",
+    ),
     "ZED recording": (".svo .svo2", "export left and right images with the ZED SDK (its sample svo_export)"),
     "bag": (".bag .mcap .db3", "give it instead of the folder: rille check FILE (of ROS 2, its folder)"),
     "array": (
@@ -21,7 +26,7 @@ KINDS: dict[str, tuple[str, str]] = {
         " FILES",
     ),
     "image": (
-        ".webp .jp2 .j2k .exr .hdr .heic .heif .avif .jxl .gif .tga .dng .nef .cr2 .cr3 .arw .raf .orf .rw2",
+        ".webp .jp2 .j2k .pbm .pam .exr .hdr .heic .heif .avif .jxl .gif .tga .dng .nef .cr2 .cr3 .arw .raf .orf .rw2",
         "convert them: magick mogrify -format png FILES",
     ),
     "image without a header": (

@@ -11,17 +11,26 @@ from warnings import catch_warnings
 import numpy as np
 from PIL import Image
 
+from rille.datasets.images.headers import orientation
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.text.warning import warning
 from rille.stages.core.declare import AnyArray, declared
 from rille.stages.core.errors import InputError, RilleError
 from rille.stages.imaging import levels
 
+FORMATS = ("JPEG", "TIFF", "PNG")
+"""Pillow's names of formats that have tags, and may hold several images."""
+
+EXCHANGE = 'python -c "import sys, cv2; [cv2.imwrite(f, cv2.imread(f, -1).byteswap()) for f in sys.argv[1:]]"'
+
 LOOKED_AT = 3
 """Frames, spread over the sequence; `rille check` looks at all."""
 
-ORIENTATION = 0x0112
-"""EXIF's tag: 1 as stored, 3 upside down, 6 and 8 turned by a quarter, others mirrored."""
+ROUGH = 0.5
+"""Mean difference of neighbouring samples in their standard deviations: of noise 1.1, of ordinary images 0.1 to 0.3."""
+
+PART = 254
+"""TIFF's tag of images that are a smaller copy, or a mask, of another one."""
 
 BLOCK = 16
 """Cells of 2 x 2 pixels along a side of a block whose four phases are compared."""
@@ -37,13 +46,21 @@ def examined(sequence: Sequence) -> Sequence:
     Raises
     ------
     InputError
-        The images of the two cameras have unlike EXIF orientations.
+        The images of the two cameras have unlike EXIF orientations, samples whose bytes are exchanged, or several
+        images a file.
     """
     there = [k for k in range(sequence.frames) if k not in sequence.lost]
     chosen = there[:: max(1, -(-len(there) // LOOKED_AT))]
     sources = {camera: [sequence.image(k, camera) for k in chosen] for camera in CAMERAS}
     images = {camera: [image for source in of for image in _images(source)] for camera, of in sources.items()}
+    _refuse_several(sources)
     lines = _orientations(sources)
+    for camera in [camera for camera, of in images.items() if of and all(map(swapped, of))]:
+        raise InputError(
+            "RIL-830",
+            f"the samples of 16 bits of the {camera} images have their bytes in the wrong order",
+            remedy=f"exchange them: {EXCHANGE} FILES",
+        )
     for camera in [camera for camera, of in images.items() if of and mosaic(of[0])]:
         text = f"{camera} images are a mosaic of colours (Bayer): convert them, as by cv2.cvtColor, COLOR_BayerRGGB2BGR"
         lines.append(warning("RIL-826", text))
@@ -70,6 +87,37 @@ def _images(source: Source) -> list[AnyArray]:
         assert stage is not None
         return [np.asarray(stage.run(source.params, {**source.args, **source.hints}, {})["image"])]
     return []
+
+
+def swapped(image: AnyArray) -> bool:
+    """Whether a grey image (row, col) of 16 bits is noise, and an image with the bytes of its samples exchanged."""
+    if image.dtype != np.uint16 or not image.std() or image.shape[1] < 2:
+        return False
+    rough = [float(np.abs(np.diff(a, axis=1)).mean() / a.std()) for a in map(np.float64, (image, image.byteswap()))]
+    return rough[0] > ROUGH > 2 * rough[1]
+
+
+def _refuse_several(sources: Mapping[str, list[Source]]) -> None:
+    """Refuse files that hold several images of one size, as stacks and both views of a stereo camera."""
+    for source in (source for of in sources.values() for source in of):
+        count = _count(source)
+        if count > 1:
+            text = f"{source.hints['path']} holds {count} images, and one is read of each file"
+            raise InputError("RIL-831", text, remedy="take them apart, a folder a camera: magick FILE left/%06d.png")
+
+
+def _count(source: Source) -> int:
+    """How many images of the size of the first one a file holds, apart from masks; 1 where it cannot be read."""
+    with (
+        catch_warnings(action="ignore"),
+        suppress(Exception),  # of a damaged directory: whatever the parsers come upon
+        Image.open(source.hints["path"], formats=FORMATS) as image,
+    ):
+        size, count = image.size, getattr(image, "n_frames", 1)
+        if count > 1:
+            image.seek(1)
+        return count if image.size == size and not getattr(image, "tag_v2", {}).get(PART, 0) else 1
+    return 1
 
 
 def mosaic(image: AnyArray) -> bool:
@@ -107,11 +155,6 @@ def _orientations(sources: Mapping[str, list[Source]]) -> list[str]:
 
 def _orientation(source: Source) -> int:
     """EXIF's orientation of an image file; 1 where it states none."""
-    with (
-        catch_warnings(action="ignore"),
-        suppress(Exception),  # of a damaged tag: whatever the parsers of three formats come upon
-        Image.open(source.hints["path"], formats=("JPEG", "TIFF", "PNG")) as image,
-    ):
-        # Pillow decodes a whole PNG in search of what it does not have.
-        return int(image.getexif().get(ORIENTATION, 1)) if image.format != "PNG" or "exif" in image.info else 1
+    with suppress(Exception), Image.open(source.hints["path"], formats=FORMATS) as image:
+        return orientation(image)
     return 1

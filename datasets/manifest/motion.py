@@ -115,8 +115,8 @@ class MotionReader:
     def stamps_of_file(self, path: Path) -> Sequence[tuple[str, int] | None]:
         """Time stamp of each pair as text, and the line that it stands in."""
         text = enumerate(read_lines(path, "times"), start=1)
-        rows = [(k, re.split(r"[,;\s]+", line.strip().strip(","))) for k, line in text]
-        rows = [(k, words) for k, words in rows if words[0] and words[0][0] in "0123456789.+-"]
+        rows = [(k, re.split(r"[,;\s]+", line.replace('"', " ").strip(", \t"))) for k, line in text]
+        rows = [(k, words) for k, words in rows if re.match(r"[-+.\d]|(nan|inf)$", words[0], re.I)]
         # Tables may list more images than there are pairs, in any order: names decide where all are found.
         by_name = {Path(words[1]).stem: (words[0], k) for k, words in rows if len(words) > 1}
         stems = [pair.left.stem for pair in self.pairs]

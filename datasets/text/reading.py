@@ -45,13 +45,16 @@ BETWEEN = re.compile(r'[\s;:=\[\]()"]+|,\s')
 COMMA, POINT = re.compile(r"[-+]?(\d+),(\d+)([eE][-+]?\d+)?"), re.compile(r"\d\.\d")
 """What stands between numbers, and numbers with a decimal comma and with a point."""
 
+LISTED = re.compile(r"\d,\d+,\s")
+"""A number with a decimal comma in a list of numbers, between which there are blanks."""
+
 SAMPLE = 200
 """Lines that show how a file writes its numbers."""
 
 MILLISECONDS = 10**12
 """Stamps that are larger have no fraction."""
-LFS = b"version https://git-lfs.github.com/spec/"
-"""How a file begins that Git LFS left in place of its content."""
+POINTERS = (b"version https://git-lfs.github.com/spec/", b"/annex/objects/")
+"""How files begin that Git LFS and git-annex left in place of their content."""
 
 WILD = re.compile(r"[*?\[]")
 
@@ -66,7 +69,7 @@ def open_regular(path: Path, what: str, most: int) -> BufferedReader:
     Raises
     ------
     InputError
-        It cannot be opened, is a folder, a pipe or a device, is larger, or is a pointer of Git LFS.
+        It cannot be opened, is a folder, a pipe or a device, is larger, or is a pointer of Git LFS or git-annex.
     """
     try:
         status = path.stat()
@@ -75,19 +78,30 @@ def open_regular(path: Path, what: str, most: int) -> BufferedReader:
             raise OSError(0, "it is a folder" if stat.S_ISDIR(status.st_mode) else "it is a pipe or a device")
         if status.st_size <= most:
             file = path.open("rb")
-            if not file.peek(len(LFS)).startswith(LFS):
+            if not file.peek(len(POINTERS[0])).startswith(POINTERS):
                 return file
             file.close()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error  # a path with a zero byte
+        reason = f"it is a link to {os.readlink(path)}, which is missing" if is_broken(path) else reason
         raise InputError(
             "RIL-138", f"{what} {path} cannot be read: {reason}", remedy="check the path and its rights"
         ) from error
     if status.st_size <= most:
-        text = f"{what} {path} is a pointer of Git LFS; its content is elsewhere"
-        raise InputError("RIL-820", text, remedy="fetch it: git lfs pull")
+        text = f"{what} {path} is a pointer of Git LFS or git-annex; its content is elsewhere"
+        raise InputError("RIL-820", text, remedy="fetch it: git lfs pull, or git annex get")
     size = f"{status.st_size / 1e6:.1f} MB, at most {most / 1e6:g} MB are read"
     raise InputError("RIL-139", f"{what} {path} is too large: {size}", remedy="check that it is the right file")
+
+
+def is_broken(path: str | Path) -> bool:
+    """Whether a path is a link to something that is missing."""
+    return os.path.islink(path) and not os.path.exists(path)
+
+
+def is_file(path: str | Path) -> bool:
+    """Whether a path is a file, or a broken link: reading it says so."""
+    return os.path.isfile(path) or is_broken(path)
 
 
 def read_bytes(path: Path, what: str, most: int) -> bytes:
@@ -150,7 +164,9 @@ def refuse_decimal_commas(lines: list[str], path: Path, cause: Exception | None 
     words = [(k, word) for k, line in sample for word in BETWEEN.split(line)]
     commas = [(k, word) for k, word in words if COMMA.fullmatch(word)]
     points = sum(POINT.search(word) is not None for _, word in words)
-    if len(commas) > points or any(word in str(cause) for _, word in commas):
+    # In a list of YAML, of which each number has become two.
+    counted = getattr(cause, "code", "") == "RIL-116" and any(LISTED.search(line) for line in lines[:SAMPLE])
+    if len(commas) > points or (counted and commas) or any(word in str(cause) for _, word in commas):
         text = f"{path}: decimal commas, such as {commas[0][1]} in line {commas[0][0]}, are not read"
         remedy = "write decimal points (LC_NUMERIC=C for the program that wrote them)"
         raise InputError("RIL-813", text, remedy=remedy) from cause
@@ -222,12 +238,28 @@ class Search:
             raise InputError("RIL-750", text, remedy="name the folder of the images, not one far above it")
         return found
 
-    def folders(self, top: Path) -> list[Path]:
-        """The folder and all below it; links are not followed."""
-        found = [top]
-        for folder in found:  # grows on the way
-            found += [Path(e.path) for e in self.entries(folder) if e.is_dir(follow_symlinks=False)]
-        return found
+    def below(
+        self, top: Path, depth: int = MOST_ENTRIES, *, links: bool = False, hidden: bool = False
+    ) -> Iterator[tuple[Path, list[os.DirEntry[str]]]]:
+        """The folder and those at most ``depth`` below it with their entries, each once.
+
+        Parameters
+        ----------
+        links : whether links are followed, which may lead back.
+        hidden : whether hidden folders and entries count.
+        """
+        level, entered = [top], {os.path.realpath(top)}
+        for _ in range(depth + 1):
+            inner = []
+            for folder in level:
+                entries = [e for e in self.entries(folder) if hidden or not e.name.startswith(".")]
+                yield folder, entries
+                inner += [Path(e.path) for e in entries if e.is_dir(follow_symlinks=links)]
+            places = {os.path.realpath(path): path for path in reversed(inner)}
+            level = [places[place] for place in reversed(places) if place not in entered]
+            entered |= places.keys()
+            if not level:
+                return
 
     def matching(self, root: Path, pattern: str) -> list[Path]:
         """Files whose path below ``root`` matches a pattern; ``**`` stands for any folders.
@@ -245,14 +277,16 @@ class Search:
         places = [root]
         for part in above:
             if part == "**":
-                places = [place for top in places for place in self.folders(top)]
+                places = [place for top in places for place, _ in self.below(top)]
             elif WILD.search(part):
                 places = [path for place in places for path in self._named(place, part) if os.path.isdir(path)]
             else:
                 # os.path, here and below: pathlib raises where a name is longer than the system allows.
                 places = [place / part for place in places if os.path.isdir(place / part)]
             places = list(dict.fromkeys(places))
-        return [path for place in places for path in self._named(place, last) if os.path.isfile(path)]
+        return [path for place in places for path in self._named(place, last) if is_file(path)]
 
     def _named(self, folder: Path, pattern: str) -> list[Path]:
-        return [Path(e.path) for e in self.entries(folder) if fnmatch.fnmatchcase(e.name, pattern)]
+        """What a pattern names, of hidden ones (as macOS adds to archives) nothing unless it begins with a dot."""
+        entries = (e for e in self.entries(folder) if pattern.startswith(".") or not e.name.startswith("."))
+        return [Path(e.path) for e in entries if fnmatch.fnmatchcase(e.name, pattern)]

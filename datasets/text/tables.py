@@ -109,6 +109,6 @@ def read_table(path: Path, what: str) -> TextTable:
 
 
 def split(text: str, separator: str | None) -> tuple[str, ...]:
-    """Cells of a line; a separator at its end makes no cell."""
-    cells = [cell.strip() for cell in text.split(separator)]
+    """Cells of a line without their quotes; a separator at its end makes no cell."""
+    cells = [cell.strip().strip("\"'").strip() for cell in text.split(separator)]
     return tuple(cells[:-1] if separator and len(cells) > 1 and not cells[-1] else cells)

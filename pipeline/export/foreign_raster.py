@@ -15,30 +15,41 @@ from typing import Any
 
 from rille.datasets.text.reading import open_regular
 
-GRID = ".asc"
-"""Ending of an ESRI ASCII grid; what has another one is read as a TIFF."""
+TIFF = (b"II", b"MM")
+"""How a TIFF begins; what begins otherwise is read as an ESRI ASCII grid."""
 
 ALONE = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
 """GDAL's settings by which masks, overviews and notes beside a file are not looked for."""
 
 
 @contextmanager
-def open_raster(path: Path, driver: str = "GTiff") -> Iterator[Any]:
-    """A raster, open for reading by ``driver``: ``GTiff`` or ``AAIGrid``.
+def _quiet() -> Iterator[None]:
+    """Without what rasterio prints of GDAL's complaints that quote bytes which are no UTF-8."""
+    before, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+
+
+@contextmanager
+def open_raster(path: Path) -> Iterator[Any]:
+    """A GeoTIFF or ESRI ASCII grid, open for reading.
 
     Raises
     ------
     rasterio.errors.RasterioError
-        It cannot be read by that driver.
+        It cannot be read.
     InputError
         It is a pipe or a device, on which GDAL would wait for ever.
     """
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning
 
-    open_regular(path, "raster", sys.maxsize).close()
+    with open_regular(path, "raster", sys.maxsize) as head:
+        driver = "GTiff" if head.peek(2).startswith(TIFF) else "AAIGrid"
     with warnings.catch_warnings():
         # Whoever needs a place refuses the file in a line of their own.
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.Env(**ALONE), rasterio.open(path, driver=driver) as file:
+        with _quiet(), rasterio.Env(**ALONE), rasterio.open(path, driver=driver) as file:
             yield file

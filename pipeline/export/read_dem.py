@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from rille.datasets.text.reading import TABLE, Search, read_lines, read_text
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.memory import free, words
-from rille.pipeline.export.foreign_raster import GRID, open_raster
+from rille.pipeline.export.foreign_raster import open_raster
 from rille.stages.core.errors import InputError
 
 MAX_CELLS = 500_000_000
@@ -34,6 +35,9 @@ MAX_AXIS_CELLS = 10_000_000
 
 MAX_WALL_M, MAX_STEP_CELLS = 1500.0, 300.0
 """Metres and cells; nothing on Earth rises more upright over less than a cell."""
+
+USUAL_MARKS, MAX_BANK_CELLS = (0.0, -1.0, -99.0, -999.0, 255.0, 999.0), 30.0
+"""Values that often mark what is unknown, and cells by which ground may rise from one of them everywhere at once."""
 
 OURS = "give a run as Rille writes it"
 
@@ -99,7 +103,8 @@ def _without_marks(dem: DemFile) -> DemFile:
 
     Such a value is the least or the greatest, and nothing lies between it and the others for more than ground can rise
     within a cell: by a height that no wall has, or, of a value that several cells have, by as much as would be nearly
-    upright and more than all others extend. Seas, quarries and plateaus have slopes around, or are nearer.
+    upright and more than all others extend. Seas, quarries and plateaus have slopes around, or are nearer. A usual mark
+    is one at a tenth of that, if its cells are scattered; a sea below a cliff stays, with a warning.
     """
     values = dem.values
     least, most = np.nanmin(values, initial=np.inf), np.nanmax(values, initial=-np.inf)
@@ -112,10 +117,16 @@ def _without_marks(dem: DemFile) -> DemFile:
     gap, mark = max((low - least, least), (most - high, most))
     marked = values == mark
     several, apart = marked.sum() > 1, gap > high - low
-    if not ((gap > MAX_WALL_M and (several or apart)) or (gap > MAX_STEP_CELLS * dem.cell and several and apart)):
-        return dem
-    text = f"{dem.name}: {mark:.9g} in {marked.sum()} cells is no elevation, the others are {low:.6g} to {high:.6g} m"
-    line = warning("RIL-725", f"{text}: taken as unknown; state it in the file, as NODATA")
+    usual = apart and gap > MAX_BANK_CELLS * dem.cell and mark in USUAL_MARKS
+    inner = ndimage.binary_erosion(marked, np.ones((3, 3)), border_value=1)
+    steep = gap > MAX_STEP_CELLS * dem.cell and several and apart
+    text = (
+        f"{dem.name}: {mark:.9g} in {marked.sum()} cells {{}}, the others are {low:.6g} to {high:.6g} m: taken as {{}}"
+    )
+    if not (steep or (gap > MAX_WALL_M and (several or apart)) or (usual and 2 * inner.sum() < marked.sum())):
+        doubt = text.format("may be no elevation", "one; if it marks what is unknown, state it in the file, as NODATA")
+        return replace(dem, warnings=(*dem.warnings, warning("RIL-726", doubt))) if usual else dem
+    line = warning("RIL-725", text.format("is no elevation", "unknown; state it in the file, as NODATA"))
     # There may be another such value.
     return _without_marks(replace(dem, values=np.where(marked, np.nan, values), warnings=(*dem.warnings, line)))
 
@@ -132,11 +143,11 @@ def opened_raster(path: Path) -> Iterator[Any]:
     from rasterio.errors import RasterioError
 
     try:
-        with open_raster(path, "AAIGrid" if path.suffix.lower() == GRID else "GTiff") as file:
+        with open_raster(path) as file:
             _check_cells(path, file.shape, path.stat().st_size)
             yield file
     except RasterioError as error:
-        remedy = "give a GeoTIFF, or an ESRI ASCII grid"
+        remedy = "give a GeoTIFF, or an ESRI ASCII grid as text without a byte order mark"
         raise InputError("RIL-629", f"{path} cannot be read as a raster ({error})", remedy=remedy) from error
 
 
@@ -232,7 +243,7 @@ def check_group(path: Path) -> None:
     from zarr.storage import LocalStore
 
     search = Search()
-    for entry in (entry for folder in search.folders(path) for entry in search.entries(folder)):
+    for entry in (entry for _, entries in search.below(path, hidden=True) for entry in entries):
         if not (entry.is_file() or entry.is_dir()):
             raise InputError("RIL-723", f"{entry.path} is no regular file", remedy=OURS)
     for name, array in zarr.open_group(store=LocalStore(path, read_only=True), mode="r").arrays():

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from io import BytesIO
+
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from raising import raises
 
 from rille.datasets.images import files
@@ -31,6 +34,26 @@ def test_lossless_kinds_round_trip(tmp_path, grey, kind):
         back = files.read_grey(path)
         assert back.dtype == image.dtype
         np.testing.assert_array_equal(back, image)
+
+
+@pytest.mark.parametrize("tag", range(1, 9))
+def test_no_orientation_turns_an_image(grey, tag):
+    exif = Image.Exif()
+    exif[0x0112] = tag
+    for kind in ("TIFF", "PNG", "JPEG"):
+        for image in (grey, np.dstack([grey] * 3)):
+            file = BytesIO()
+            smooth = cv2.GaussianBlur(image, (0, 0), 4)
+            Image.fromarray(smooth).save(file, kind, exif=exif, quality=100)
+            back = files.decode(file.getvalue(), "x", Header(50, 40, 8))
+            assert np.abs(back.astype(int) - (smooth if smooth.ndim == 2 else smooth[..., 0])).max() <= 3
+
+
+@pytest.mark.parametrize("end", ["\n", "", " \r\n"])
+def test_netpbm_as_text_may_end_with_its_last_number(grey, end):
+    for kind, image in (("P2", grey), ("P3", np.dstack([grey] * 3))):
+        text = f"{kind}\n# a comment\n50 40\n255\n{' '.join(map(str, image.ravel()))}{end}"
+        np.testing.assert_array_equal(files.decode(text.encode(), "x"), grey)
 
 
 def test_jpeg_is_read(tmp_path):

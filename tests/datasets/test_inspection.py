@@ -13,6 +13,7 @@ from rille.datasets.images.files import Digests
 from rille.datasets.inspection import find_views, inspect, pattern, table_kind
 from rille.datasets.manifest.opening import open_manifest
 from rille.datasets.manifest.text import manifest_text, needs
+from rille.datasets.registry import open_sequence
 from rille.datasets.text.names import derived_name
 from rille.stages.core.errors import InputError
 
@@ -383,6 +384,37 @@ def test_a_pair_of_pointers_of_git_lfs_is_said(tmp_path):
     found = inspect(tmp_path)
     assert "git lfs pull" in found.views.trouble
     assert [line.split(" is a pointer")[0].split("/")[-1] for line in found.unread] == ["rig.yaml", "imu.csv"]
+
+
+def test_folders_that_are_links_are_looked_into_once(tmp_path):
+    write_images(tmp_path / "far", both("{side}/{name}.png", ["1", "2"]))
+    for side in ("left", "right"):
+        (tmp_path / "here" / "deep").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "here" / side).symlink_to(tmp_path / "far" / side)
+        (tmp_path / "here" / "deep" / side).symlink_to(tmp_path / "here")
+    found = inspect(tmp_path / "here").views
+    assert (found.left, found.right, found.pairs) == ("left/*.png", "right/*.png", 2)
+
+
+def test_what_archives_of_a_mac_add_is_passed_over(tmp_path):
+    names = both("{side}/{name}.png", ["1", "2", "3"])
+    write_images(tmp_path, names)
+    for name in names:
+        for place in (tmp_path, tmp_path / "__MACOSX"):
+            path = (place / name).with_name(f"._{Path(name).name}")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(b"\0\5\26\7\0\2\0\0Mac OS X")
+    found = inspect(tmp_path).views
+    assert (found.left, found.pairs, found.trouble) == ("left/*.png", 3, "")
+    (tmp_path / "calib.txt").write_text("P0: 60 0 31 0 0 60 23 0 0 0 1 0\nP1: 60 0 31 -6 0 60 23 0 0 0 1 0\n")
+    assert open_sequence(str(tmp_path)).frames == 3
+
+
+def test_a_link_to_nothing_is_named(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    for side in ("left", "right"):
+        (tmp_path / side / "3.png").symlink_to("../.git/annex/objects/x.png")
+    assert "left/3.png cannot be read: it is a link to" in inspect(tmp_path).views.trouble
 
 
 def test_pairing_by_time_stamps_is_proposed(tmp_path):

@@ -253,6 +253,8 @@ def test_times_of_a_file_in_order_or_by_name(tmp_path):
     assert opened(path).times == (0.0, 0.5, 1.0)
     write_lines(tmp_path / "t.txt", ["# stamp file", "9.0 99.png", "10.0 00.png", "10.5 01.png", "11.0 02.png"])
     assert opened(path).times == (10.0, 10.5, 11.0)
+    write_lines(tmp_path / "t.txt", ['"name";"time"', '"1.5"', '"2.5"', '"3.5"'])
+    assert opened(path).times == (1.5, 2.5, 3.5)
 
 
 def test_times_of_names(tmp_path):
@@ -268,6 +270,8 @@ def test_times_of_names(tmp_path):
         (["0.0", "0.5"], ("RIL-229", "t.txt")),
         (["1500000000.0", "1500000000500000000", "1500000001000000000"], ("RIL-292", "t.txt")),
         (["0.0", "0.5", "0.5"], ("RIL-293", "t.txt")),
+        (["0.0", "NaN", "0.5"], ("RIL-291", "line 2")),
+        (["# Nantes", "0.0", "0.1", "inf"], ("RIL-291", "line 4")),
     ],
 )
 def test_bad_times(tmp_path, lines, expected):

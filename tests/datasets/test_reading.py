@@ -188,14 +188,18 @@ def test_other_formats_reach_no_decoder(tmp_path, name, monkeypatch):
     refused("RIL-171", files.read_grey, tmp_path / name)
 
 
-POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
+POINTERS = (
+    b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n",
+    b"/annex/objects/MD5E-s9--a.png\n",
+)
 
 
+@pytest.mark.parametrize("pointer", POINTERS)
 @pytest.mark.parametrize("name", ["a.png", "calib.yaml", "poses.txt", "drive.bag", "drive.mcap", "drive/d.mcap"])
-def test_pointers_of_git_lfs_are_named(tmp_path, name):
+def test_pointers_are_named(tmp_path, name, pointer):
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
-    path.write_bytes(POINTER)
+    path.write_bytes(pointer)
     read = {"png": files.read_grey, "yaml": read_cameras, "txt": lambda p: read_lines(p, "table")}.get(
         name.split(".")[1]
     )
@@ -204,6 +208,21 @@ def test_pointers_of_git_lfs_are_named(tmp_path, name):
         return
     (path.parent / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
     refused("RIL-820", open_sequence, str(path.parent if "/" in name else path))
+
+
+def test_links_that_lead_nowhere_are_said(tmp_path):
+    (tmp_path / "calib.yaml").symlink_to(tmp_path / "absent")
+    assert "a link to" in refused("RIL-138", read_cameras, tmp_path / "calib.yaml")
+    assert Search().matching(tmp_path, "*.yaml") == [tmp_path / "calib.yaml"]
+
+
+@pytest.mark.parametrize("row", ["[353,5, 353,5, 300,9, 91,5]", "[ 353,5, 353, 300,9, 91 ]"])
+def test_decimal_commas_in_lists_of_a_calibration(tmp_path, row):
+    head = "cam0:\n  camera_model: pinhole\n  distortion_model: none\n  rates: [1.0, 0.5, 0.5, 0.5]\n"
+    (tmp_path / "chain.yaml").write_text(f"{head}  resolution: [640,480]\n  intrinsics: {row}\n")
+    refused("RIL-813", read_cameras, tmp_path / "chain.yaml")
+    (tmp_path / "chain.yaml").write_text(f"{head}  resolution: [640,480]\n  intrinsics: [353, 353, 300]\n")
+    refused("RIL-116", read_cameras, tmp_path / "chain.yaml")
 
 
 # -- searches ----------------------------------------------------------------------------------------------------------
@@ -225,10 +244,12 @@ def test_patterns_find_what_they_name(tmp_path):
         "**/none",
     )
     for pattern in patterns:
-        expected = {p.resolve() for p in tmp_path.glob(pattern) if p.is_file()}
+        shown = (p for p in tmp_path.glob(pattern) if not any(part.startswith(".") for part in p.parts if part != ".."))
+        expected = {p.resolve() for p in shown if p.is_file()}
         assert {p.resolve() for p in Search().matching(tmp_path, pattern)} == expected, pattern
     too_long = "a" * 5000  # no system allows such a name
     assert Search().matching(tmp_path, f"{too_long}/*.png") == Search().matching(tmp_path, too_long) == []
+    assert Search().matching(tmp_path, ".left/*.png") == [tmp_path / ".left" / "4.png"]
     for pattern in ("", "/left/*.png", "left/"):
         refused("RIL-216", Search().matching, tmp_path, pattern)
 

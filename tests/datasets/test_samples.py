@@ -9,7 +9,7 @@ from folders import write_sequence
 from PIL import Image
 from raising import raises
 
-from rille.datasets.images.samples import mosaic
+from rille.datasets.images.samples import mosaic, swapped
 from rille.datasets.registry import open_sequence
 
 
@@ -109,3 +109,38 @@ def test_images_of_few_bits_open_with_one_scale_for_both_cameras(tmp_path):
 
     out = image_stage.run(sources[3].params, {**sources[3].args, **sources[3].hints}, {})["image"]
     np.testing.assert_array_equal(out, (given["right", 1].astype(int) - black) * gain)
+
+
+@pytest.mark.parametrize("ending", ["png", "tif", "pgm"])
+@pytest.mark.parametrize("gain", [1, 16, 200])
+def test_samples_with_their_bytes_exchanged_are_refused(tmp_path, ending, gain):
+    path = write_sequence(tmp_path, frames=2)
+    path.write_text(path.read_text().replace(".png", f".{ending}"))
+    for swap, code in ((False, ""), (True, "RIL-830")):
+        for k, image in enumerate(sorted(tmp_path.glob("*/*.png"))):
+            samples = cv2.GaussianBlur(coloured(k)[..., 0], (0, 0), 2).astype(np.uint16) * gain + 3
+            cv2.imwrite(str(image.with_suffix(f".{ending}")), samples.byteswap() if swap else samples)
+        # Of fewer bits than eight no byte is exchanged with another.
+        if code and gain > 1:
+            with raises(code, "byteswap"):
+                open_sequence(str(path))
+        else:
+            assert open_sequence(str(path)).frames == 2
+
+
+@pytest.mark.parametrize("spread", [3, 300, 20_000])
+def test_noise_has_no_order_of_bytes(spread):
+    noise = np.random.default_rng(0).normal(30_000, spread, (60, 80)).clip(0, 65535)
+    assert not swapped(noise.astype(np.uint16))
+    assert not swapped(np.full((9, 9), 7, np.uint16))
+
+
+def test_files_that_hold_several_images_are_refused(tmp_path):
+    path = write_sequence(tmp_path, frames=1)
+    path.write_text(path.read_text().replace("left/*.png", "left/*.tif"))
+    images = [Image.new("L", (64, 48), shade) for shade in (90, 120)]
+    images[0].save(tmp_path / "left" / "00.tif", save_all=True, append_images=images[1:])
+    with raises("RIL-831", "2 images"):
+        open_sequence(str(path))
+    images[0].save(tmp_path / "left" / "00.tif", save_all=True, append_images=[Image.new("L", (32, 24))])
+    assert open_sequence(str(path)).frames == 1  # a preview

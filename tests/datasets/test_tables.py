@@ -21,6 +21,7 @@ def table(tmp_path, text, encoding="utf-8"):
         "#time [s], a ,B\n1,2,3\n4,5,6\n",
         "time [s],a,B\r\n1,2,3\r\n\r\n4,5,6",
         "# a file\n# by a program\ntime [s];a;B\n1;2;3\n4;5;6\n",
+        '"time [s]","a","B"\n"1","2","3"\n"4","5","6"\n',
         "time [s],a,B\n1,2,3,\n# a remark\n4,5,6,\n",
     ],
 )

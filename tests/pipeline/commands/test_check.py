@@ -131,6 +131,15 @@ def test_one_image_for_both_sides_fails(tmp_path, capsys):
     assert any("one image in 2 pairs" in text for text in lines)
 
 
+def test_blank_images_are_not_taken_for_one_image(tmp_path, capsys):
+    path = folder(tmp_path / "wall", frames=3)
+    for side in ("left", "right"):
+        cv2.imwrite(str(path / side / "001.png"), np.full_like(cv2.imread(str(path / side / "001.png"), 0), 255))
+    _, lines = run(path, capsys)
+    assert sum("RIL-650" in text for text in lines) == 2
+    assert not any("RIL-671" in text for text in lines)
+
+
 def test_frames_are_chosen_and_warnings_repeated(tmp_path, capsys):
     sequence = replace(open_sequence(str(folder(tmp_path / "wall"))), warnings=("the baseline is odd",))
     assert look(sequence, tmp_path / "cache", frames=(1, 3)) == 0

@@ -125,7 +125,24 @@ def test_what_is_only_flat_or_far_stays(tmp_path, shape, cell):
     values = shape(hills(0.0)).astype(np.float32)
     found = read_elevation(tiff(tmp_path / "dem.tif", values, cell))
     assert (found.values == values).all()
-    assert not found.warnings
+    # A cliff of 200 m within a metre, upright all along the sea, is doubted.
+    doubted = [shape is cliff_over_a_sea and cell == 1.0]
+    assert ["RIL-726" in line for line in found.warnings] == [one for one in doubted if one]
+
+
+@pytest.mark.parametrize(("mark", "kind"), [(0.0, "float32"), (-1, "int16"), (255, "uint8"), (-99.0, "float64")])
+def test_a_usual_mark_in_scattered_cells_is_no_elevation(tmp_path, mark, kind):
+    values = hills(100.0)
+    values[::7, ::5] = mark
+    found = read_elevation(tiff(tmp_path / "dem.tif", values.astype(kind), 0.5))
+    assert np.isnan(found.values).sum() == 9 * 16
+    assert [line.split(":")[0] for line in found.warnings] == ["RIL-725"]
+
+
+@pytest.mark.parametrize("ending", ["txt", "grd", "ASC"])
+def test_an_ascii_grid_is_known_by_its_content(tmp_path, ending):
+    path = asc(tmp_path / "dem.asc", hills(100.0)).rename(tmp_path / f"dem.{ending}")
+    assert np.isfinite(read_elevation(path).values).all()
 
 
 def test_a_box_in_a_simulated_bed_stays(tmp_path):
