@@ -44,12 +44,15 @@ def open_raster(path: Path) -> Iterator[Any]:
         It is a pipe or a device, on which GDAL would wait for ever.
     """
     import rasterio
-    from rasterio.errors import NotGeoreferencedWarning
+    from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
 
     with open_regular(path, "raster", sys.maxsize) as head:
         driver = "GTiff" if head.peek(2).startswith(TIFF) else "AAIGrid"
     with warnings.catch_warnings():
         # Whoever needs a place refuses the file in a line of their own.
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with _quiet(), rasterio.Env(**ALONE), rasterio.open(path, driver=driver) as file:
-            yield file
+        try:
+            with _quiet(), rasterio.Env(**ALONE), rasterio.open(path, driver=driver) as file:
+                yield file
+        except UnicodeDecodeError as error:
+            raise RasterioIOError("a text in it is not UTF-8") from error

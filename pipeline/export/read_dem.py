@@ -221,11 +221,11 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
     lines, text = read_lines(paths[0], "trajectory"), read_text(paths[1], "frames.json", TABLE)
     try:
         poses, facts = np.loadtxt(lines, ndmin=2), json.loads(text).get("georeference")
-    except ValueError:
+        centres = poses[:, [3, 7, 11]][np.isfinite(poses[:, 3])]
+        if facts is not None:
+            centres = Georeference(facts["crs"], tuple(facts["origin"]), facts["azimuth"]).apply(centres)
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
-    centres = poses[:, [3, 7, 11]][np.isfinite(poses[:, 3])]
-    if facts is not None:
-        centres = Georeference(facts["crs"], tuple(facts["origin"]), facts["azimuth"]).apply(centres)
     return np.asarray(centres[:, :2], np.float64)
 
 

@@ -23,7 +23,7 @@ from rille.pipeline.cli import main
 from rille.pipeline.engine.runtime.hints import read_hint
 from rille.pipeline.export import read_dem
 from rille.pipeline.export.output import unpack
-from rille.pipeline.export.programs import colmap
+from rille.pipeline.export.programs import colmap, rocrate
 from rille.pipeline.export.read_dem import read_elevation
 from rille.stages.core.declare import Bundle
 
@@ -225,6 +225,34 @@ def test_a_pipe_in_a_run_is_not_waited_for(tmp_path: Path, name: str) -> None:
     if name == "frames.json":
         with raises("RIL-138"):
             colmap._names(folder)
+
+
+@pytest.mark.parametrize("content", [DEEP, "{", "5", '{"georeference": 5}', '{"georeference": {"crs": "EPSG:32633"}}'])
+def test_a_run_whose_frames_are_none_has_no_cameras(tmp_path: Path, content: str) -> None:
+    folder = finished(tmp_path / "run")
+    (folder / "frames.json").write_text(content)
+    assert read_elevation(folder).viewpoints is None
+
+
+@pytest.mark.parametrize("text", [DEEP, '{"@graph":' * 50_000, "5", '{"@graph": [5]}', '{"@graph": [{"@id": "#run"}]}'])
+def test_a_crate_that_is_none(tmp_path: Path, text: str) -> None:
+    (tmp_path / rocrate.METADATA).write_text(text)
+    with raises("RIL-023"):
+        rocrate.read(tmp_path)
+
+
+def test_a_raster_whose_text_is_not_utf8(tmp_path: Path) -> None:
+    path = tmp_path / "dem.tif"
+    about = {
+        "dtype": "float32",
+        "crs": 'LOCAL_CS["abcdefgh",UNIT["metre",1]]',
+        "transform": Affine(0.5, 0, 0, 0, -0.5, 0),
+    }
+    with rasterio.open(path, "w", "GTiff", 4, 4, 1, **about) as file:
+        file.write(np.ones((1, 4, 4), np.float32))
+    path.write_bytes(path.read_bytes().replace(b"abcdefgh", b"abc\xb1\xffgh\x80"))
+    with raises("RIL-629"):
+        read_elevation(path)
 
 
 @pytest.mark.parametrize("name", ["dem.tif", "dem.asc"])

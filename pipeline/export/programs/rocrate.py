@@ -146,7 +146,7 @@ def read(folder: Path) -> Crate:
         digests = {str(name): str(entities[name]["sha256"]) for name in results if name not in RENDERED}
         if any(PurePath(name).is_absolute() or ".." in PurePath(name).parts for name in digests):
             raise ValueError("a file lies outside of it")
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         text = f"{path} describes no run of Rille ({type(error).__name__}: {error})"
         raise InputError("RIL-023", text, remedy="`rille export RUN --to rocrate` writes one") from error
     return Crate(folder, sequence, options, digests)
