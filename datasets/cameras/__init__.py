@@ -49,7 +49,7 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
 """Text formats: how each is recognised, and its reader."""
 
 NESTED: tuple[tuple[Entries, Callable[[Fields, Path], list[CalibratedCamera]]], ...] = (
-    (lambda f: any(left[0] in f and right[0] in f for left, right in opencv.SIDES), opencv.stereo),
+    (lambda f: bool(opencv.sides(f)), opencv.stereo),
     (has("Camera.fx", "Camera1.fx"), slam.orbslam),
     (lambda f: any(isinstance(f.values[key], dict) for key in f.values if slam.CAMERA.fullmatch(key)), slam.kalibr),
     (lambda f: "intrinsics" in f and has("T_BS", "distortion_coefficients")(f), slam.sensor),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,17 +17,12 @@ from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
 
-SIDES = (
-    (("M1", "D1"), ("M2", "D2")),
-    (("K1", "D1"), ("K2", "D2")),
-    (("K1", "dist1"), ("K2", "dist2")),
-    (("cameraMatrix1", "distCoeffs1"), ("cameraMatrix2", "distCoeffs2")),
-    (("camera_matrix_1", "distortion_coefficients_1"), ("camera_matrix_2", "distortion_coefficients_2")),
-    (("camera_matrix_left", "dist_coeffs_left"), ("camera_matrix_right", "dist_coeffs_right")),
-    (("left_camera_matrix", "left_distortion_coefficients"), ("right_camera_matrix", "right_distortion_coefficients")),
-    (("LEFT.K", "LEFT.D"), ("RIGHT.K", "RIGHT.D")),
-)
-"""Keys of camera matrix and distortion of the left and of the right camera, as programs name them."""
+KEY = re.compile(r"(?:(left|right|l|r)[._ ]?)?([a-z._ ]+?)[._ ]?(left|right|l|r|[12])?", re.I)
+"""A key of one side, which stands before or behind what it is."""
+
+MATRIX = re.compile(r"m|k|cm|mtx|matrix|cam(era)?(matrix|mtx)|intrinsics?(matrix)?")
+DISTORTION_OF_SIDE = re.compile(r"d|dist(ortion)?(coeff?s?|coefficients)?")
+"""What programs call camera matrix and distortion of one side, in small letters alone."""
 
 SINGLE = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K")
 DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D")
@@ -41,14 +38,29 @@ HEIGHTS = ("image_height", "image_Height", "height", "LEFT.height", "Camera.heig
 ROTATIONS, TRANSLATIONS = ("R", "rotation_matrix"), ("T", "translation_vector")
 
 
+def sides(f: Fields) -> list[tuple[str, str]]:
+    """Keys of camera matrix and distortion of the left and of the right camera; empty where not both have a matrix."""
+    found: dict[tuple[bool, bool], str] = {}
+    for key, value in f.values.items():
+        parts = KEY.fullmatch(key)
+        side = (parts[1] or parts[3] or "").lower() if parts else ""
+        if parts is None or not side or not isinstance(value, Mapping | list):  # k1 may be a coefficient
+            continue
+        what = re.sub("[._ ]", "", parts[2]).lower()
+        matrix = MATRIX.fullmatch(what) is not None
+        if matrix or DISTORTION_OF_SIDE.fullmatch(what):
+            found.setdefault((side in ("right", "r", "2"), matrix), key)
+    whole = {(False, True), (True, True)} <= found.keys()
+    return [(found[right, True], found.get((right, False), "distortion")) for right in (False, True)] if whole else []
+
+
 def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
     """Both cameras of OpenCV's stereo samples: M1 D1 M2 D2, R T with ``x_right = R x_left + T``.
 
     R and T may stand in ``extrinsics.yml`` beside ``intrinsics.yml``, as the sample program writes them. Files with
     LEFT.R and RIGHT.P (rectification, as ORB-SLAM2 keeps it) are read too.
     """
-    sides = next((left, right) for left, right in SIDES if left[0] in f and right[0] in f)
-    lenses = [_lens(f, *keys, _size(f, str(k))) for k, keys in enumerate(sides, start=1)]
+    lenses = [_lens(f, *keys, _size(f, str(k))) for k, keys in enumerate(sides(f), start=1)]
     poses: tuple[RigidTransform | None, RigidTransform | None]
     if "RIGHT.P" in f and "LEFT.R" in f:
         poses = _unrectified(f, "LEFT.R", "LEFT.P"), _unrectified(f, "RIGHT.R", "RIGHT.P")

@@ -91,6 +91,34 @@ def test_opencv_model_by_the_count_of_coefficients(tmp_path, values, model, kept
     assert camera.T_camera_reference is None
 
 
+@pytest.mark.parametrize(
+    ("matrix", "distortion"),
+    [
+        ("K{n}", "dist{n}"),
+        ("cameraMatrix{n}", "distCoeffs{n}"),
+        ("camera_matrix_{side}", "dist_coeffs_{side}"),
+        ("{side}_camera_matrix", "{side}_distortion_coefficients"),
+        ("{SIDE}.K", "{SIDE}.D"),
+        ("cameraMatrix{Side}", "distCoeffs{Side}"),
+        ("mtx{L}", "dist{L}"),
+        ("K_{l}", "d_{l}"),
+        ("{Side}CameraMatrix", "{Side}DistCoeffs"),
+        ("intrinsic_matrix_{side}", "distortion_{side}"),
+        ("CM{n}", "D{n}"),
+    ],
+)
+def test_both_cameras_by_whatever_name(tmp_path, matrix, distortion):
+    text = f"R: {numbers(ROTATION)}\nT: {numbers(SHIFT)}\nimage_size: [{SIZE[0]}, {SIZE[1]}]\n"
+    for n, side, f in ((2, "right", 510.0), (1, "left", 500.0)):
+        words = {"n": n, "side": side, "SIDE": side.upper(), "Side": side.title(), "l": side[0], "L": side[0].upper()}
+        text += f"{matrix.format(**words)}: {numbers(np.array([[f, 0, 320], [0, f, 240], [0, 0, 1]]))}\n"
+        text += f"{distortion.format(**words)}: {numbers([0.1 * n, 0, 0, 0])}\n"
+    left, right = read_cameras(written(tmp_path, text, "rig.yml"))
+    assert (left.lens.camera.fx, right.lens.camera.fx) == (500, 510)
+    assert (left.lens.coefficients[0], right.lens.coefficients[0]) == (0.1, 0.2)
+    np.testing.assert_allclose(right.T_camera_reference.translation, SHIFT)
+
+
 def test_opencv_sample_keeps_the_relative_pose_in_a_second_file(tmp_path):
     inner = "".join(
         f"{key}: {numbers(values)}\n"
