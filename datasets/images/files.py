@@ -21,9 +21,9 @@ from rille.datasets.images.headers import Header, opened, orientation, read_head
 from rille.datasets.images.kinds import KINDS, kind_of
 from rille.datasets.protocol import Source
 from rille.datasets.text.reading import open_regular, read_bytes
-from rille.stages.core.declare import Array, Bundle, NoParams, stage
+from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
-from rille.stages.imaging.levels import Levels, spread
+from rille.stages.imaging.levels import Levels, spread, swapped
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it says on stderr, an error says here
 
@@ -38,6 +38,7 @@ MOST_BYTES = 2**29
 
 FEWER_BITS = "save it with 8 or 16 bits a sample, without sign"
 COPY_AGAIN = "copy the file again, or remove it"
+EXCHANGE = 'python -c "import sys, cv2; [cv2.imwrite(f, cv2.imread(f, -1).byteswap()) for f in sys.argv[1:]]"'
 
 PNG, JPEG, TIFF = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", (b"II", b"MM")
 """How files begin."""
@@ -196,6 +197,19 @@ def _sound(header: Header | None, name: str) -> Header:
 def read_grey(path: Path) -> Grey:
     """Grey image (row, col), uint8 or uint16, of a file (see :func:`decode`)."""
     return decode(read_bytes(path, "image", MOST_BYTES), str(path))
+
+
+def refuse_swapped(images: Sequence[AnyArray], name: str) -> None:
+    """Refuse grey images, called ``name``, the bytes of whose samples of 16 bits are exchanged in all of them.
+
+    Raises
+    ------
+    InputError
+        They are.
+    """
+    if images and all(map(swapped, images)):
+        text = f"the samples of 16 bits of {name} have their bytes in the wrong order"
+        raise InputError("RIL-830", text, remedy=f"exchange them: {EXCHANGE} FILES")
 
 
 def common_header(paths: Sequence[Path]) -> Header:

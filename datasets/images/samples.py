@@ -11,6 +11,7 @@ from warnings import catch_warnings
 import numpy as np
 from PIL import Image
 
+from rille.datasets.images import files
 from rille.datasets.images.headers import orientation
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.text.warning import warning
@@ -21,13 +22,8 @@ from rille.stages.imaging import levels
 FORMATS = ("JPEG", "TIFF", "PNG")
 """Pillow's names of formats that have tags, and may hold several images."""
 
-EXCHANGE = 'python -c "import sys, cv2; [cv2.imwrite(f, cv2.imread(f, -1).byteswap()) for f in sys.argv[1:]]"'
-
 LOOKED_AT = 3
 """Frames, spread over the sequence; `rille check` looks at all."""
-
-ROUGH = 0.5
-"""Mean difference of neighbouring samples in their standard deviations: of noise 1.1, of ordinary images 0.1 to 0.3."""
 
 PART = 254
 """TIFF's tag of images that are a smaller copy, or a mask, of another one."""
@@ -55,12 +51,8 @@ def examined(sequence: Sequence) -> Sequence:
     images = {camera: [image for source in of for image in _images(source)] for camera, of in sources.items()}
     _refuse_several(sources)
     lines = _orientations(sources)
-    for camera in [camera for camera, of in images.items() if of and all(map(swapped, of))]:
-        raise InputError(
-            "RIL-830",
-            f"the samples of 16 bits of the {camera} images have their bytes in the wrong order",
-            remedy=f"exchange them: {EXCHANGE} FILES",
-        )
+    for camera, of in images.items():
+        files.refuse_swapped(of, f"the {camera} images")
     for camera in [camera for camera, of in images.items() if of and mosaic(of[0])]:
         text = f"{camera} images are a mosaic of colours (Bayer): convert them, as by cv2.cvtColor, COLOR_BayerRGGB2BGR"
         lines.append(warning("RIL-826", text))
@@ -87,14 +79,6 @@ def _images(source: Source) -> list[AnyArray]:
         assert stage is not None
         return [np.asarray(stage.run(source.params, {**source.args, **source.hints}, {})["image"])]
     return []
-
-
-def swapped(image: AnyArray) -> bool:
-    """Whether a grey image (row, col) of 16 bits is noise, and an image with the bytes of its samples exchanged."""
-    if image.dtype != np.uint16 or not image.std() or image.shape[1] < 2:
-        return False
-    rough = [float(np.abs(np.diff(a, axis=1)).mean() / a.std()) for a in map(np.float64, (image, image.byteswap()))]
-    return rough[0] > ROUGH > 2 * rough[1]
 
 
 def _refuse_several(sources: Mapping[str, list[Source]]) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from cyclopts import Parameter
 from numpy.typing import NDArray
 
-from rille.datasets.images.files import read_grey
+from rille.datasets.images.files import read_grey, refuse_swapped
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE, HOLES, Assignments, Output, check_output, flag
 from rille.pipeline.engine.failures import reported
@@ -132,6 +132,7 @@ def match(
     _check_outputs(left, right, output, confidence)
     # Images and the prior are checked before the matcher is imported, which takes seconds.
     images = read_grey(left), read_grey(right)
+    refuse_swapped(images, f"{left} and {right}")
     used = levels.levels_of(images)
     levelled = [] if used is None else [warning("RIL-705", levels.words(used))]
     images = levels.spread(images[0], used), levels.spread(images[1], used)

@@ -21,6 +21,8 @@ from rille.stages.evaluation.rigid import alignment, angle, compose, inverse, rm
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
 
 MIN_FRAMES, MAX_FRAMES = 4, 50
+# Share of the extent of a trajectory below which its truth is at rest.
+MIN_SHARE = 1e-6
 # Extent of a trajectory over the standard deviation of its positions, below which the camera is as good as at rest.
 MIN_EXTENT_SIGMAS = 5.0
 # Misfit over the extent, as read, up to which the estimate's own errors explain it; and the share of it that another
@@ -31,8 +33,8 @@ MIN_MISFIT, MAX_SHARE = 0.02, 0.4
 ALIKE_FACTOR, ALIKE_SHARE, SIMPLE_FACTOR = 1.5, 0.005, 4.0
 # Least turn of a body against the camera, radians: an estimate's own errors look like smaller ones.
 MIN_TURN = 0.3
-# Factor of length from which on it is one of units, m: mm, cm, inches, feet, km.
-MIN_UNIT, UNITS = 2.0, (0.001, 0.01, 0.0254, 0.3048, 1000.0)
+# Factor of length from which on it is no error of the estimate; units, m: mm, cm, inches, feet, yards, km.
+MIN_UNIT, UNITS = 1.3, (0.001, 0.01, 0.0254, 0.3048, 0.9144, 1000.0)
 AXES = Rotation.create_group("O").as_matrix()
 # Places, in (x, y, z, w) as read, of the true x, y, z and w.
 ORDERS = {
@@ -74,8 +76,10 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
     """
     chosen = np.linspace(0, len(estimate) - 1, min(len(estimate), MAX_FRAMES)).astype(int)
     P, Q, mount = estimate[chosen], truth[chosen], T_body_left.matrix34
-    if len(P) < MIN_FRAMES or spread(P) < max(MIN_EXTENT_SIGMAS * sigma, 1e-6) or spread(Q) < 1e-9:
+    if len(P) < MIN_FRAMES or spread(P) < max(MIN_EXTENT_SIGMAS * sigma, 1e-6):
         return []
+    if spread(Q) < MIN_SHARE * spread(P):
+        return [f"the truth rests, the trajectory extends {spread(P):.3g} m: is it the right file, and does it go on?"]
     as_read, file = _misfit(P, Q), compose(Q, inverse(mount))
     if as_read < MIN_MISFIT:
         return []
@@ -99,7 +103,8 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
     alike = [fit for fit in fits if fit.least <= ALIKE_FACTOR * least + ALIKE_SHARE and fit.misfit <= most]
     simple = [fit for fit in alike if fit.changes == min(fit.changes for fit in alike)]
     best = min(fit.misfit for fit in simple)
-    told = list(dict.fromkeys(fit.words for fit in simple if fit.misfit <= ALIKE_FACTOR * best + ALIKE_SHARE))
+    simple = [fit for fit in sorted(simple) if fit.misfit <= ALIKE_FACTOR * best + ALIKE_SHARE]
+    told = list(dict.fromkeys(fit.words for fit in simple))
     return [
         f"the truth fits the trajectory far better by another convention ({100 * best:.2g} % of its extent are left, "
         f"{100 * as_read:.3g} % as read): {'; or: '.join(told)}"
@@ -112,7 +117,8 @@ def _fits(P: Floats, Q: Floats, mount: Floats, words: list[str]) -> list[Reading
     ratio, fits = spread(P) / max(spread(Q), 1e-12), []
     if not 1.0 / MIN_UNIT < ratio < MIN_UNIT:
         unit = next((unit for unit in UNITS if abs(np.log(unit / ratio)) < 0.1), float(f"{ratio:.3g}"))
-        words = [*words, f"its unit of length is {unit:g} m: state truth.unit = {unit:g}"]
+        doubt = "" if unit in UNITS else ", unless its clock runs otherwise, or the rig's baseline is wrong"
+        words = [*words, f"its unit of length is {unit:g} m: state truth.unit = {unit:g}{doubt}"]
         Q = Q * [1.0, 1.0, 1.0, unit]
     for start in (np.eye(3), min(AXES, key=lambda B: _misfit(P, Q @ _turn(B)))):
         turn = start
@@ -126,8 +132,8 @@ def _fits(P: Floats, Q: Floats, mount: Floats, words: list[str]) -> list[Reading
         if other:
             body = np.column_stack([mount[:, :3] @ axes, mount[:, 3]]).round(4) + 0.0
             said = [*words, f"its poses are those of a body with other axes: state truth.T_body_left = {body.tolist()}"]
-        # Simple ones first: conventions of the file, then axes that are exchanged, then such as are turned.
-        changes = len(said) + other + (axes is turn)
+        # Simple ones first: conventions of the file and axes that are exchanged, then axes that are turned.
+        changes = len(said) + (axes is turn)
         fits.append(ReadingFit(_misfit(P, Q @ _turn(turn)), _misfit(P, Q @ _turn(axes)), changes, " and ".join(said)))
     return fits
 

@@ -9,7 +9,7 @@ from folders import write_sequence
 from PIL import Image
 from raising import raises
 
-from rille.datasets.images.samples import mosaic, swapped
+from rille.datasets.images.samples import mosaic
 from rille.datasets.registry import open_sequence
 
 
@@ -126,13 +126,6 @@ def test_samples_with_their_bytes_exchanged_are_refused(tmp_path, ending, gain):
                 open_sequence(str(path))
         else:
             assert open_sequence(str(path)).frames == 2
-
-
-@pytest.mark.parametrize("spread", [3, 300, 20_000])
-def test_noise_has_no_order_of_bytes(spread):
-    noise = np.random.default_rng(0).normal(30_000, spread, (60, 80)).clip(0, 65535)
-    assert not swapped(noise.astype(np.uint16))
-    assert not swapped(np.full((9, 9), 7, np.uint16))
 
 
 def test_files_that_hold_several_images_are_refused(tmp_path):

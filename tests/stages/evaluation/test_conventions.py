@@ -108,6 +108,35 @@ def test_good_truth_is_never_doubted(turn, frames):
         assert better_reading(noise, rest, RigidTransform.identity(), 0.01) == []
 
 
+@pytest.mark.parametrize("axes", [np.diag([1.0, -1, -1]), np.diag([-1.0, 1, -1]), np.diag([-1.0, -1, 1])])
+def test_axes_of_graphics_are_named_where_the_camera_hardly_turns(axes):
+    """They look like another order of the quaternion, or like inverted poses."""
+    true = drive(7, 0.02)
+    (line,) = better_reading(
+        estimated(true, 8), poses(true[:, :, :3] @ axes, true[:, :, 3]), RigidTransform.identity(), 0.01
+    )
+    assert f"{(axes + 0.0).tolist()[1]}"[1:-1] in line
+    assert "T_body_left" in line
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.6, 2.4])
+def test_lengths_of_no_usual_unit_may_be_those_of_a_clock(factor):
+    true = drive(9)
+    (line,) = better_reading(
+        estimated(true, 10), poses(true[:, :, :3], factor * true[:, :, 3]), RigidTransform.identity(), 0.01
+    )
+    assert "truth.unit" in line
+    assert "its clock" in line
+
+
+def test_truth_that_rests_is_said():
+    true = drive(11)
+    (line,) = better_reading(
+        estimated(true, 12), poses(true[:, :, :3], 0.0 * true[:, :, 3] + 5.0), RigidTransform.identity(), 0.01
+    )
+    assert "the truth rests" in line
+
+
 def test_what_a_straight_drive_cannot_tell_apart_is_named_together():
     """Backwards: the axis of the drive may be mirrored, or the poses are those of the world."""
     along, upright = np.outer(np.arange(12), [0, 0, 1.0]), np.broadcast_to(np.eye(3), (12, 3, 3))

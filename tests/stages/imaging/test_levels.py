@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rille.stages.imaging.levels import levels_of, spread
+from rille.stages.imaging.levels import levels_of, spread, swapped
 
 
 def scene(low, high, seed=3):
@@ -50,3 +50,10 @@ def test_one_scale_holds_for_dark_and_bright_images():
     dark, bright = scene(100, 900), scene(100, 3600, 4)
     levels = levels_of([dark, bright])
     assert spread(dark, levels).max() < spread(bright, levels).max() / 2
+
+
+@pytest.mark.parametrize("spread", [3, 300, 20_000])
+def test_noise_has_no_order_of_bytes(spread):
+    noise = np.random.default_rng(0).normal(30_000, spread, (60, 80)).clip(0, 65535)
+    assert not swapped(noise.astype(np.uint16))
+    assert not swapped(np.full((9, 9), 7, np.uint16))
