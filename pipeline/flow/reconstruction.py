@@ -170,11 +170,12 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     yield Complete(("agreement", "position_accuracy", "accuracy", "truth"))
     posed = yield from done(p.trajectory)
 
-    # The world is that of the largest unbroken piece: its models, straight on the world lattice.
+    # The world is that of the largest piece: its models, straight on the world lattice.
     start, end = posed.meta["pieces"][posed.meta["main"]]
-    # Pairs of other pieces have poses in frames of their own: nothing says where they lie in this world.
+    world = set(posed.meta.get("world", range(start, end + 1)))
     p.moving = moving_parts(make, segments, pairs) if make.config.moving.enabled else {}
-    there = [k for k in basic if start <= k <= end and posed.meta["positions"][row[k]] and k not in moved]
+    # Pairs of other pieces have poses in frames of their own: nothing says where they lie in this world.
+    there = [k for k in basic if k in world and posed.meta["positions"][row[k]] and k not in moved]
     for k in there:
         _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory, p.moving.get(k))
     size = {"side": TILE_CELLS, "margin": make.config.merge.margin}

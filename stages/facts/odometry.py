@@ -94,8 +94,23 @@ class IntrinsicsFacts(Facts):
     contradiction: NotRequired[str]
 
 
+class FactorsFacts(Facts):
+    """Measured motions between frames.
+
+    Each of the ``factors`` has the numbers of two frames, ``from`` and ``to``; ``pose``, twelve numbers of T_from_to
+    (left cameras, m); ``covariance``, 36 numbers of (position m, rotation rad) in the frame of the first; and perhaps
+    ``source``, in words.
+    """
+
+    factors: list[dict[str, Any]]
+
+
 class TrajectoryFacts(Facts):
-    """Poses of all frames in the world, which is that of piece number ``main``."""
+    """Poses of all frames in the world, which is that of piece number ``main``.
+
+    Where it was adjusted (stage ``adjust``) a piece need not be a range: ``world`` are the frames of the main one.
+    ``excess`` is then the factor by which the chain's errors exceed the covariances that were stated for it.
+    """
 
     frames: list[int]
     inliers: list[int]
@@ -110,6 +125,8 @@ class TrajectoryFacts(Facts):
     in_world: int
     lost: list[dict[str, Any]]
     """Frame, cause, and the frames between which it is bridged."""
+    world: NotRequired[list[int]]
+    excess: NotRequired[float]
 
 
 class MovingFacts(Facts):

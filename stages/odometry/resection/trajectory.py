@@ -206,7 +206,7 @@ def _spread(found: Chained, at: NDArray[np.intp], count: int) -> Chained:
     return Chained(poses, covariance, segment, piece)
 
 
-def _account(frames: list[int], piece: NDArray[np.int16], causes: Mapping[int, str]) -> dict[str, Any]:
+def account(frames: list[int], piece: NDArray[np.int16], causes: Mapping[int, str]) -> dict[str, Any]:
     """Pieces, how many frames have a pose and how many in the world, lost frames with their causes; in words."""
     posed = np.flatnonzero(piece >= 0)
     pieces = [
@@ -248,7 +248,8 @@ def _moved(frames: list[int], steps: Sequence[tuple[float | None, float]]) -> di
     }
 
 
-def _without_vertical(pieces: Sequence[Sequence[int]], verticals: Sequence[str]) -> list[str]:
+def without_vertical(pieces: Sequence[Sequence[int]], verticals: Sequence[str]) -> list[str]:
+    """Lines on the pieces whose vertical is not known."""
     return [
         f"nothing tells of the vertical at frames {a}-{b}: their world is that of camera {a}, whose own up is z"
         for (a, b), source in zip(pieces, verticals, strict=True)
@@ -300,8 +301,8 @@ def trajectory_stage(
     found = _spread(chain(chained, level), at, len(frames))
     keys = [row[int(b.meta["per_frame"][0]["frame"])] for b in segments] or [int(at[0])]
     found, verticals = _with_verticals(found, keys, levels)
-    account = _account(frames, found.piece, causes)
-    account["warnings"] += _without_vertical(account["pieces"], verticals)
+    counted = account(frames, found.piece, causes)
+    counted["warnings"] += without_vertical(counted["pieces"], verticals)
     inliers = {int(f["frame"]): int(f["inliers"]) for f in facts}
     meta: TrajectoryFacts = {
         "frames": frames,
@@ -309,7 +310,7 @@ def trajectory_stage(
         # Facts are JSON, which has no NaN.
         "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in found.poses],
         "verticals": verticals,
-        **account,  # type: ignore[typeddict-item]
+        **counted,  # type: ignore[typeddict-item]
     }
     arrays: dict[str, AnyArray] = {
         "poses": found.poses,

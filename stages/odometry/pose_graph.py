@@ -1,0 +1,284 @@
+"""Pose graph: the poses at which many measured motions between frames contradict each other least.
+
+A factor measures the pose ``T_a_b`` of one node in the frame of another, with a covariance in the frame of ``a``, or
+some components of it alone. Errors that many factors share are unknowns of their own (``sources``), whose standard
+deviation is 1: what all segments share so adds up over a chain, and a closed loop may still correct it.
+
+Two things are not known beforehand. Which of the doubtful factors are false: each is a measurement, or says nothing,
+being then anywhere within a stated range; ``bound`` is the squared length of its whitened error from which on the
+second is more probable. That choice is made by graduated non-convexity (Yang et al. 2020,
+doi:10.1109/LRA.2020.2965893): first all count, then the cost is bent towards a truncated one. And by which factor k the
+chain's own errors exceed their covariances: that k is taken under which the measurements are most probable (restricted
+likelihood: Patterson and Thompson 1971, doi:10.1093/biomet/58.3.545). Smaller than 1 it is never.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from rille.stages.core.arrays import Bools, Floats
+from rille.stages.geometry.geometry import cross_matrix, rotation_exp, rotation_log
+from rille.stages.numeric.least_squares import levenberg_marquardt
+
+EXCESS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+"""Factors k that are tried: on recorded sequences errors were up to 30 times those stated."""
+MIN_GAIN = 6.63
+"""Twice the logarithm of likelihood that a k above 1 must gain: chi-squared of one degree of freedom at 1 %."""
+MAX_ROUNDS, GRADUATION = 60, 1.4
+"""Of graduated non-convexity, and the factor by which it is undone from round to round."""
+STEPS, FEW_STEPS = 30, 3
+"""Steps of a whole adjustment, and of one round."""
+BLOCK_COLUMNS = 600
+"""Columns of the inverse that are computed together."""
+
+
+@dataclass(frozen=True)
+class Factors:
+    """Measured poses ``T_a_b`` of m pairs of nodes.
+
+    ``ends`` (m, 2) nodes a, b; ``poses`` (m, 3, 4), m; ``root`` (m, 6, 6) root W of the information ``W^T W`` of
+    (position m, rotation rad) in the frame of a, rows of zeros where nothing is measured; ``shared`` (m, 6, q) errors
+    per standard deviation of the sources; ``lever`` (m, 3), m, of the point in the frame of b whose position is
+    measured; ``bound`` (m,) of squared whitened errors, infinite: the factor belongs to the chain.
+    """
+
+    ends: NDArray[np.intp]
+    poses: Floats
+    root: Floats
+    shared: Floats
+    lever: Floats
+    bound: Floats
+
+    @staticmethod
+    def joined(parts: Sequence[Factors]) -> Factors:
+        """All of them, the sources of each part being its own."""
+        names, width = ("ends", "poses", "root", "lever", "bound"), sum(part.shared.shape[2] for part in parts)
+        shared, column = [], 0
+        for part in parts:
+            more = part.shared.shape[2]
+            shared.append(np.pad(part.shared, ((0, 0), (0, 0), (column, width - column - more))))
+            column += more
+        return Factors(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names}, shared=np.vstack(shared))
+
+    def take(self, chosen: NDArray[np.intp]) -> Factors:
+        """Those with these numbers."""
+        return Factors(**{name: value[chosen] for name, value in vars(self).items()})
+
+    @property
+    def doubtful(self) -> Bools:
+        """Which (m,) are no part of the chain."""
+        return np.isfinite(self.bound)
+
+
+def root_of(covariance: Floats) -> Floats:
+    """Roots W (..., 6, 6) of the inverses of covariances: ``W^T W C = 1``."""
+    # Metres and radians differ by orders: scaled to correlations the factorisation stays exact.
+    sigma = np.sqrt(np.einsum("...ii->...i", covariance))
+    unit = covariance / (sigma[..., :, None] * sigma[..., None, :])
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(unit)) / sigma[..., None, :])
+
+
+def bound_of(covariance: Floats, extent: float) -> Floats:
+    """Squared whitened errors (...,) from which on anywhere within ``extent`` (m, and all rotations) is as probable."""
+    sigma = np.sqrt(np.einsum("...ii->...i", covariance))
+    spread = np.array([extent] * 3 + [np.pi] * 3)
+    unit = covariance / (sigma[..., :, None] * sigma[..., None, :])
+    log_volume = 2.0 * np.log(spread / (np.sqrt(2.0 * np.pi) * sigma)).sum(-1) - np.linalg.slogdet(unit)[1]
+    return np.asarray(np.maximum(log_volume, scipy.stats.chi2.ppf(0.99, 6)))
+
+
+class GraphState(NamedTuple):
+    """Poses (n, 3, 3) and positions (n, 3), m, of the nodes, and the sources (q,) in standard deviations."""
+
+    R: Floats
+    C: Floats
+    sources: Floats
+
+    @staticmethod
+    def of(poses: Floats, sources: int) -> GraphState:
+        """Poses (n, 3, 4) as they are, no source in error."""
+        return GraphState(poses[:, :, :3].copy(), poses[:, :, 3].copy(), np.zeros(sources))
+
+    @property
+    def poses(self) -> Floats:
+        """Poses (n, 3, 4)."""
+        return np.concatenate([self.R, self.C[:, :, None]], axis=2)
+
+
+class GraphEquations(NamedTuple):
+    """Normal equations of a graph at a state."""
+
+    cost: float
+    matrix: scipy.sparse.csc_array
+    gradient: Floats
+
+
+@dataclass(frozen=True)
+class PoseGraph:
+    """Factors between ``nodes`` nodes of which the first is ``held``, with a weight (m,) each.
+
+    ``excess`` is the factor k on the errors of the chain, and of its first ``common`` sources.
+    """
+
+    factors: Factors
+    nodes: int
+    held: int
+    weight: Floats
+    excess: float = 1.0
+    common: int = 0
+
+    @cached_property
+    def _columns(self) -> NDArray[np.intp]:
+        """Column of the first unknown of each node, behind the last for the one that is held."""
+        free = np.arange(self.nodes) - (np.arange(self.nodes) > self.held)
+        return np.asarray(np.where(np.arange(self.nodes) == self.held, self.unknowns, 6 * free), dtype=np.intp)
+
+    @property
+    def unknowns(self) -> int:
+        """Of poses and sources."""
+        return 6 * (self.nodes - 1) + int(self.factors.shared.shape[2])
+
+    @cached_property
+    def _scale(self) -> Floats:
+        """On whitened errors (m,): the chain's are those of k times the sigma."""
+        return np.asarray(np.where(self.factors.doubtful, np.sqrt(self.weight), 1.0 / self.excess))
+
+    @cached_property
+    def _prior(self) -> Floats:
+        """Information (q,) of the sources."""
+        sources = np.arange(self.factors.shared.shape[2])
+        return np.asarray(np.where(sources < self.common, self.excess**-2.0, 1.0))
+
+    def errors(self, state: GraphState) -> Floats:
+        """Whitened errors (m, 6) of the factors, before weights."""
+        off = self._difference(state)[0] - self.factors.shared @ state.sources
+        return np.asarray(np.einsum("mij,mj->mi", self.factors.root, off))
+
+    def _difference(self, state: GraphState) -> tuple[Floats, Floats, Floats]:
+        """Errors (m, 6) in the frame of a, sources and all; in the world ways (m, 3) from a to b, and levers."""
+        f = self.factors
+        a, b = f.ends.T
+        back, lever = np.swapaxes(state.R[a], 1, 2), np.einsum("mij,mj->mi", state.R[b], f.lever)
+        way = state.C[b] + lever - state.C[a]
+        position = np.einsum("mij,mj->mi", back, way) - f.poses[:, :, 3]
+        rotation = rotation_log(back @ state.R[b] @ np.swapaxes(f.poses[:, :, :3], 1, 2))
+        return np.concatenate([position, rotation], axis=1), way, lever
+
+    def normal(self, state: GraphState) -> GraphEquations:
+        """Normal equations of the weighted factors and of the sources' own information."""
+        f, (off, way, lever) = self.factors, self._difference(state)
+        root = self._scale[:, None, None] * f.root
+        white = np.einsum("mij,mj->mi", root, off - f.shared @ state.sources)
+        back = np.swapaxes(state.R[f.ends[:, 0]], 1, 2)
+        of_a, of_b = np.zeros((2, len(off), 6, 6))
+        # The vector of a rotation that is in error changes by that of the turn up to half their product.
+        of_b[:, :3, :3], of_b[:, 3:, 3:] = back, (np.eye(3) - 0.5 * cross_matrix(off[:, 3:])) @ back
+        of_a[:] = -of_b
+        of_a[:, :3, 3:], of_b[:, :3, 3:] = back @ cross_matrix(way), -back @ cross_matrix(lever)
+        jacobian = root @ np.concatenate([of_a, of_b, -f.shared], axis=2)
+        sources = 6 * (self.nodes - 1) + np.arange(f.shared.shape[2])
+        nodes = (self._columns[f.ends][:, :, None] + np.arange(6)).reshape(len(off), 12)
+        columns = np.concatenate([nodes, np.broadcast_to(sources, (len(off), len(sources)))], axis=1)
+        rows = np.broadcast_to(np.arange(6 * len(off)).reshape(-1, 6, 1), jacobian.shape)
+        placed = jacobian.reshape(-1), (rows.reshape(-1), np.repeat(columns, 6, axis=0).reshape(-1))
+        # The held node's columns lie behind the unknowns and are cut off.
+        J = scipy.sparse.csr_array(placed, shape=(6 * len(off), self.unknowns + 6))[:, : self.unknowns]
+        own = np.concatenate([np.zeros(6 * (self.nodes - 1)), self._prior])
+        gradient = J.T @ white.reshape(-1)
+        gradient[sources] += self._prior * state.sources
+        cost = 0.5 * float((white**2).sum() + (self._prior * state.sources**2).sum())
+        return GraphEquations(cost, scipy.sparse.csc_array(J.T @ J + scipy.sparse.diags_array(own)), gradient)
+
+    def ahead(self, state: GraphState, normal: GraphEquations, damping: float) -> GraphState:
+        """State after one step, the diagonal enlarged by ``damping`` times itself."""
+        damped = normal.matrix + scipy.sparse.diags_array(damping * normal.matrix.diagonal())
+        step = -_factorised(damped).solve(normal.gradient)
+        nodes = np.insert(step[: 6 * (self.nodes - 1)].reshape(-1, 6), self.held, 0.0, axis=0)
+        sources = state.sources + step[6 * (self.nodes - 1) :]
+        return GraphState(rotation_exp(nodes[:, 3:]) @ state.R, state.C + nodes[:, :3], sources)
+
+    def covariance(self, state: GraphState) -> Floats:
+        """Covariances (n, 6, 6) of (position m, rotation rad) against the held node."""
+        solver, size = _factorised(self.normal(state).matrix), self.unknowns
+        out = np.zeros((self.nodes, 6, 6))
+        free = np.flatnonzero(np.arange(self.nodes) != self.held)
+        for part in np.split(free, range(BLOCK_COLUMNS // 6, len(free), BLOCK_COLUMNS // 6)):
+            at = self._columns[part]
+            unit = np.zeros((size, 6 * len(part)))
+            unit[(at[:, None] + np.arange(6)).reshape(-1), np.arange(6 * len(part))] = 1.0
+            inverse = solver.solve(unit)
+            for k, (node, first) in enumerate(zip(part, at, strict=True)):
+                block = inverse[first : first + 6, 6 * k : 6 * k + 6]
+                out[node] = 0.5 * (block + block.T)
+        return out
+
+
+def _factorised(matrix: scipy.sparse.csc_array) -> scipy.sparse.linalg.SuperLU:
+    """Factors of a symmetric positive definite matrix."""
+    return scipy.sparse.linalg.splu(
+        scipy.sparse.csc_matrix(matrix), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
+
+
+class Adjusted(NamedTuple):
+    """A graph with the weights (0 or 1) and the excess that were found, its state, and how improbable it all is.
+
+    ``surprise`` is minus twice the logarithm of the likelihood, up to what is the same for all excesses.
+    """
+
+    graph: PoseGraph
+    state: GraphState
+    surprise: float
+
+    @property
+    def kept(self) -> Bools:
+        """Which factors (m,) count."""
+        return self.graph.weight > 0
+
+
+def adjust(graph: PoseGraph, start: GraphState) -> Adjusted:
+    """The graph adjusted with the excess that explains its factors best, without those that contradict."""
+    tried = [_decided(replace(graph, excess=k), start) for k in EXCESS]
+    best = min(tried, key=lambda one: one.surprise)
+    return best if best.surprise < tried[0].surprise - MIN_GAIN else tried[0]
+
+
+def _decided(graph: PoseGraph, state: GraphState) -> Adjusted:
+    """Which of the doubtful factors count, by graduated non-convexity, and the state that follows."""
+    doubtful, bound = graph.factors.doubtful, graph.factors.bound
+    state = levenberg_marquardt(graph, state, STEPS).state
+    squared = (graph.errors(state) ** 2).sum(1)
+    # Where the cost is convex at first; nothing is to be undone where all factors agree.
+    worst = float((squared[doubtful] / bound[doubtful]).max(initial=0.0))
+    mu = 1.0 / max(2.0 * worst - 1.0, 1e-9)
+    for _ in range(MAX_ROUNDS):
+        if worst <= 1.0 or mu > 1e6:
+            break
+        with np.errstate(divide="ignore", invalid="ignore"):
+            between = np.sqrt(bound / squared * mu * (mu + 1.0)) - mu
+        weight = np.where(doubtful, np.clip(np.where(squared > 0, between, 1.0), 0.0, 1.0), 1.0)
+        graph = replace(graph, weight=weight)
+        state = levenberg_marquardt(graph, state, FEW_STEPS).state
+        squared = (graph.errors(state) ** 2).sum(1)
+        if np.isin(weight, (0.0, 1.0)).all():
+            break
+        mu *= GRADUATION
+    graph = replace(graph, weight=np.where(doubtful, np.where(squared <= bound, 1.0, 0.0), 1.0))
+    end = levenberg_marquardt(graph, state, STEPS)
+    return Adjusted(graph, end.state, _surprise(graph, end.state))
+
+
+def _surprise(graph: PoseGraph, state: GraphState) -> float:
+    """Minus twice the logarithm of the restricted likelihood; a factor that is left out costs its bound."""
+    normal = graph.normal(state)
+    diagonal = np.abs(_factorised(normal.matrix).U.diagonal())
+    chained = 6 * int((~graph.factors.doubtful).sum()) + graph.common
+    left_out = float(graph.factors.bound[graph.factors.doubtful & (graph.weight == 0)].sum())
+    return float(2.0 * normal.cost + np.log(diagonal).sum() + 2.0 * chained * np.log(graph.excess) + left_out)

@@ -1,0 +1,218 @@
+"""The trajectory adjusted to what else is known between its frames, such as places that are seen again.
+
+The chain of segments (:mod:`rille.stages.odometry.resection.trajectory`) is a pose graph without loops: each frame is
+measured from the key frame of its segment, with errors of its own and with those that all segments share. Factors
+between other frames close loops in it, or join pieces between which the chain is broken; then all poses are adjusted
+together (:mod:`rille.stages.odometry.pose_graph`). A factor that contradicts the others is left out and named.
+
+Pieces that factors join become one piece, in the frame of the first of them. Pieces without factors stay bit by bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rille.stages.core.arrays import Bools, Floats
+from rille.stages.core.declare import AnyArray, Bundle, NoParams, stage
+from rille.stages.core.errors import InputError
+from rille.stages.facts.odometry import FactorsFacts, RefineFacts, ResectFacts, TrajectoryFacts
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.odometry.pose_graph import Adjusted, Factors, GraphState, PoseGraph, adjust, bound_of, root_of
+from rille.stages.odometry.resection.trajectory import Chained, account, trajectory_stage, without_vertical
+
+
+def chain_factors(segments: Sequence[Bundle], numbers: Sequence[Sequence[int]], row: Mapping[int, int]) -> Factors:
+    """Factors from the key frame of each segment to its other frames.
+
+    Parameters
+    ----------
+    segments : poses, covariances and shared errors in the frame of the key's pair.
+    numbers : of the frames of each segment, the key first.
+    row : node of each frame that has a pose.
+    """
+    ends, poses, covariances, shared = list[list[int]](), list[Floats](), list[Floats](), list[Floats]()
+    for bundle, frames in zip(segments, numbers, strict=True):
+        key = RigidTransform.from_matrix(bundle["poses"][0])
+        turn = np.kron(np.eye(2), key.rotation.T)
+        for k, frame in enumerate(frames[1:], start=1):
+            if frame not in row or frames[0] not in row or not np.isfinite(bundle["poses"][k]).all():
+                continue
+            common = bundle["shared"][k]
+            ends.append([row[frames[0]], row[frame]])
+            poses.append((key.inverse() @ RigidTransform.from_matrix(bundle["poses"][k])).matrix34)
+            covariances.append(turn @ (bundle["covariance"][k] - common @ common.T) @ turn.T)
+            shared.append(turn @ common)
+    count = len(ends)
+    return Factors(
+        np.array(ends, np.intp).reshape(-1, 2),
+        np.array(poses).reshape(-1, 3, 4),
+        root_of(np.array(covariances).reshape(-1, 6, 6)),
+        np.array(shared).reshape(count, 6, -1) if count else np.zeros((0, 6, 0)),
+        np.zeros((count, 3)),
+        np.full(count, np.inf),
+    )
+
+
+def stated_factors(given: Sequence[Mapping[str, Any]], row: Mapping[int, int], extent: float) -> Factors:
+    """Factors as facts state them (``from``, ``to``, ``pose``, ``covariance``); ``row`` is the node of each frame.
+
+    Parameters
+    ----------
+    extent : m; anywhere within it a false factor may be.
+
+    Raises
+    ------
+    InputError
+        A covariance is not positive definite.
+    """
+    covariance = np.array([one["covariance"] for one in given], dtype=np.float64).reshape(-1, 6, 6)
+    for one, matrix in zip(given, covariance, strict=True):
+        # Also of NaN, which no comparison holds of.
+        if not np.linalg.eigvalsh(matrix).min() > 0.0:
+            text = (
+                f"the covariance of the motion from frame {one['from']} to frame {one['to']} is not positive definite"
+            )
+            raise InputError("RIL-452", text, remedy="give that of (position m, rotation rad), symmetric")
+    return Factors(
+        np.array([[row[one["from"]], row[one["to"]]] for one in given], np.intp).reshape(-1, 2),
+        np.array([one["pose"] for one in given], dtype=np.float64).reshape(-1, 3, 4),
+        root_of(covariance),
+        np.zeros((len(given), 6, 0)),
+        np.zeros((len(given), 3)),
+        bound_of(covariance, extent),
+    )
+
+
+class Joined(NamedTuple):
+    """Poses (n, 3, 4) in a common frame as far as factors join them, and the piece (n,) of each."""
+
+    poses: Floats
+    piece: NDArray[np.int16]
+
+
+def join(poses: Floats, piece: NDArray[np.int16], factors: Factors) -> Joined:
+    """Pieces laid together by the factors between them, each by the one that most others agree with.
+
+    Parameters
+    ----------
+    poses, piece : (n, 3, 4) and (n,), each piece in a frame of its own.
+    """
+    poses, piece = poses.copy(), piece.copy()
+    while True:
+        between = factors.take(np.flatnonzero(piece[factors.ends[:, 0]] != piece[factors.ends[:, 1]]))
+        if not len(between.ends):
+            return Joined(poses, piece)
+        first = piece[between.ends].min()
+        other = next(int(pair.max()) for pair in piece[between.ends] if pair.min() == first)
+        here = between.take(np.flatnonzero((np.sort(piece[between.ends], axis=1) == [first, other]).all(1)))
+        moved = [_moved(poses, piece == other, ends, pose) for ends, pose in zip(here.ends, here.poses, strict=True)]
+        graph = PoseGraph(here, len(poses), 0, np.ones(len(here.ends)))
+        costs = [
+            float(np.minimum((graph.errors(GraphState.of(p, here.shared.shape[2])) ** 2).sum(1), here.bound).sum())
+            for p in moved
+        ]
+        poses, piece = moved[int(np.argmin(costs))], np.where(piece == other, first, piece)
+
+
+def _moved(poses: Floats, rows: Bools, ends: NDArray[np.intp], pose: Floats) -> Floats:
+    """Poses (n, 3, 4), those of some rows moved as one so that a factor with one end in them holds."""
+    a, b = (RigidTransform.from_matrix(poses[k]) for k in ends)
+    measured = RigidTransform.from_matrix(pose)
+    move = a @ measured @ b.inverse() if rows[ends[1]] else b @ measured.inverse() @ a.inverse()
+    out = poses.copy()
+    out[rows] = [(move @ RigidTransform.from_matrix(T)).matrix34 for T in poses[rows]]
+    return out
+
+
+def _left_out(one: Mapping[str, Any], adjusted: Floats) -> str:
+    """Line on a factor that contradicts: by how much it departs from the adjusted poses (2, 3, 4) of its ends."""
+    a, b = (RigidTransform.from_matrix(T) for T in adjusted)
+    off = RigidTransform.from_matrix(one["pose"]).inverse() @ a.inverse() @ b
+    turn = math.degrees(math.acos(min(1.0, max(-1.0, 0.5 * (np.trace(off.rotation) - 1.0)))))
+    return (
+        f"the motion from frame {one['from']} to frame {one['to']} ({one.get('source', 'stated')}) contradicts the "
+        f"others by {np.linalg.norm(off.translation):.2g} m and {turn:.2g} degrees: it is left out"
+    )
+
+
+@stage("adjust", outputs=trajectory_stage.outputs)
+def adjust_stage(
+    params: NoParams,
+    trajectory: Bundle[TrajectoryFacts],
+    segments: Sequence[Bundle[ResectFacts]],
+    refined: Sequence[Bundle[RefineFacts]] = (),
+    loops: Sequence[Bundle[FactorsFacts]] = (),
+) -> Bundle[TrajectoryFacts]:
+    """Poses of all left frames, adjusted to motions between other frames than those of the chain."""
+    frames = trajectory.meta["frames"]
+    chained = Chained(*(np.array(trajectory[name]) for name in ("poses", "covariance", "segment", "piece")))
+    posed = np.flatnonzero(chained.piece >= 0)
+    row = {frames[k]: node for node, k in enumerate(posed)}
+    numbers = [[int(f["frame"]) for f in bundle.meta["per_frame"]] for bundle in segments]
+    chain = chain_factors(refined or segments, numbers, row)
+    extent = float(np.ptp(chained.poses[posed, :, 3], axis=0).max()) + 1.0
+    given = [one for bundle in loops for one in bundle.meta["factors"] if one["from"] in row and one["to"] in row]
+    stated = stated_factors(given, row, extent)
+    joined = join(chained.poses[posed], chained.piece[posed], stated)
+    out, lines, excess = chained, list[str](), 1.0
+    for piece in np.unique(joined.piece):
+        nodes = np.flatnonzero(joined.piece == piece)
+        inside = np.flatnonzero(np.isin(stated.ends, nodes).all(1))
+        if not inside.size:
+            continue
+        graph = _graph(nodes, chain, stated.take(inside))
+        done = adjust(graph, GraphState.of(joined.poses[nodes], graph.factors.shared.shape[2]))
+        excess = max(excess, done.graph.excess)
+        out = _written(out, posed[nodes], done)
+        for k in inside[~done.kept[-len(inside) :]]:
+            ends = np.searchsorted(nodes, stated.ends[k])
+            lines.append(_left_out(given[k], done.state.poses[ends]))
+    return _bundle(trajectory, out, lines, excess)
+
+
+def _graph(nodes: NDArray[np.intp], chain: Factors, more: Factors) -> PoseGraph:
+    """Graph of some nodes, numbered anew from 0, which is held; its sources are first those of the chain."""
+    inside = np.flatnonzero(np.isin(chain.ends, nodes).all(1))
+    factors = Factors.joined([chain.take(inside), more])
+    factors = replace(factors, ends=np.searchsorted(nodes, factors.ends))
+    return PoseGraph(factors, len(nodes), 0, np.ones(len(factors.ends)), common=chain.shared.shape[2])
+
+
+def _written(out: Chained, rows: NDArray[np.intp], done: Adjusted) -> Chained:
+    """The trajectory with the adjusted poses in these rows, which are one piece now."""
+    poses, covariance, piece = out.poses.copy(), out.covariance.copy(), out.piece.copy()
+    poses[rows], covariance[rows] = done.state.poses, done.graph.covariance(done.state)
+    piece[rows] = piece[rows].min()
+    return replace(out, poses=poses, covariance=covariance, piece=piece)
+
+
+def _bundle(before: Bundle[TrajectoryFacts], out: Chained, lines: list[str], excess: float) -> Bundle[TrajectoryFacts]:
+    """Arrays and facts as of stage ``trajectory``."""
+    kept, number = np.unique(out.piece[out.piece >= 0], return_inverse=True)
+    piece = out.piece.copy()
+    piece[piece >= 0] = number
+    frames = before.meta["frames"]
+    facts = account(frames, piece, {int(one["frame"]): one["cause"] for one in before.meta["lost"]})
+    verticals = [before.meta["verticals"][k] for k in kept]
+    meta: TrajectoryFacts = {
+        **before.meta,
+        **facts,  # type: ignore[typeddict-item]
+        "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in out.poses],
+        "verticals": verticals,
+        "world": [frame for frame, k in zip(frames, piece, strict=True) if k == facts["main"]],
+        "excess": excess,
+        "warnings": [*facts["warnings"], *without_vertical(facts["pieces"], verticals), *lines],
+    }
+    arrays: dict[str, AnyArray] = {
+        "poses": out.poses,
+        "covariance": out.covariance,
+        "segment": out.segment,
+        "piece": piece,
+    }
+    return Bundle(arrays, meta)
