@@ -63,9 +63,8 @@ def spoil(good: Path, folder: Path, first: int, gap: int) -> int:
     return count
 
 
-def trajectory(folder: Path, frames: tuple[int, ...], cache: Path) -> Any:
-    """The trajectory of some frames of a folder, without elevation models; None where there is none."""
-    from rille.datasets.registry import open_sequence
+def trajectory_of(sequence: Any, frames: tuple[int, ...], cache: Path, settings: dict[str, Any] | None = None) -> Any:
+    """The trajectory of some frames of a sequence, without elevation models; None where there is none."""
     from rille.pipeline.engine.graph import Graph, Handle
     from rille.pipeline.engine.run import RunOptions, run
     from rille.pipeline.engine.store.base import Store
@@ -82,8 +81,8 @@ def trajectory(folder: Path, frames: tuple[int, ...], cache: Path) -> Any:
             return handle
 
     graph, store = Odometry(), Store(cache)
-    settings = config.build({"crosscheck": {"enabled": False}})
-    products, _ = dataflow(graph, open_sequence(str(folder)), settings, frames)
+    chosen = config.build({"crosscheck": {"enabled": False}, **(settings or {})})
+    products, _ = dataflow(graph, sequence, chosen, frames)
     run(graph, store, RunOptions(executor="inline"))
     handle = products.trajectory
     return None if handle is None or handle.ref is None else store.open(handle.ref)
@@ -105,11 +104,13 @@ def judge(found: Any, truth: Any, before: int, behind: int, first: int) -> dict[
 
 def case(good: Path, truth: Any, gap: int, place: int, cache: Path) -> dict[str, Any]:
     """One row."""
+    from rille.datasets.registry import open_sequence
+
     with tempfile.TemporaryDirectory(prefix="gaps-") as scratch:
         folder = Path(scratch) / "street"
         behind = place + spoil(good, folder, place, gap)
         frames = tuple(range(place - GOOD, behind + GOOD))
-        found = trajectory(folder, frames, cache)
+        found = trajectory_of(open_sequence(str(folder)), frames, cache)
         return {"pieces": 0} if found is None else judge(found, truth, place - 1, behind, frames[0])
 
 

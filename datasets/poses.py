@@ -124,7 +124,7 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
     """
     if format not in ("auto", "csv"):
         return None
-    table = read_table(path, "file of true positions" if columns else "pose file")
+    table = read_table(path, "file of positions" if columns else "pose file")
     stated = {meaning: _column(table, column) for meaning, column in columns.items()}
     # A column that the user assigns to one axis is not another axis by its name: { x = "x", y = "z" } leaves no height.
     meant = {meaning: k for meaning, k in _meanings(table).items() if k not in stated.values()} | stated
@@ -134,7 +134,7 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
     if len(known) < 2:
         names = ", ".join(table.header) or f"{table.columns} without names"
         text = f"{table.name}: its columns ({names}) do not say which are x and y in metres"
-        remedy = 'name them in the manifest: [truth] columns = { time = "NAME", x = "NAME", y = "NAME" }, or numbers'
+        remedy = 'name them in the manifest: columns = { time = "NAME", x = "NAME", y = "NAME" }, or numbers'
         raise InputError("RIL-805", text, remedy=remedy)
     times = times_of(table, meant["time"]) if "time" in meant else None
     rows = table.numbers([meant[axis] for axis in POSITION if axis in meant])
@@ -161,7 +161,7 @@ def _column(table: TextTable, stated: str | int) -> int:
         return table.header.index(stated.strip().lower())
     if isinstance(stated, int) and 1 <= stated <= table.columns:
         return stated - 1
-    text = f"{table.name}: truth.columns: there is no column {stated!r} of {', '.join(table.header) or table.columns}"
+    text = f"{table.name}: columns: there is no column {stated!r} of {', '.join(table.header) or table.columns}"
     raise InputError("RIL-806", text, remedy="give a name of its first line, or a number from 1")
 
 
@@ -190,7 +190,7 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
         if {"x", "y"} <= set(meant):
             lacking = ", ".join(q for q in QUATERNION if q not in meant)
             text = f"{table.name}: its columns {', '.join(table.header)} are positions without a rotation ({lacking})"
-            remedy = "add qw, qx, qy, qz or roll_deg, pitch_deg, yaw_deg; positions alone serve as [truth] only"
+            remedy = "add qw, qx, qy, qz or roll_deg, pitch_deg, yaw_deg; positions alone are [positions] or [truth]"
             raise InputError("RIL-801", text, remedy=remedy)
     form = format if format != "auto" else "euroc" if table.commas else "tum"
     order = ORDERED.get(form, ())

@@ -42,6 +42,8 @@ def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
 Vector = tuple[float, float, float]
 Direction = Annotated[Vector, AfterValidator(_direction)]
 PoseFormat = Literal["auto", "kitti", "tum", "euroc", "csv"]
+Columns = dict[Literal["time", "x", "y", "z"], str | int]
+PositiveFloat = Annotated[float, Field(gt=0)]
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
 
@@ -205,7 +207,7 @@ class Times(Table):
 
 
 class PoseFile(Table):
-    """``[odometry]``, and the base of ``[truth]``: poses of the left camera or of a body that carries it."""
+    """Base of ``[odometry]`` and ``[truth]``: poses of the left camera or of a body that carries it."""
 
     file: str
     """poses, one a pair, or with times"""
@@ -223,10 +225,43 @@ class PoseFile(Table):
     """words: where the poses come from"""
 
 
+class Odometry(PoseFile):
+    """``[odometry]``: dead reckoning; it predicts, and where it says how good it is it is a measurement, too."""
+
+    drift: float | None = Field(default=None, gt=0, lt=1)
+    """standard deviation of a way as a share of it, e.g. 0.02; with turn_deg: the trajectory is adjusted to the
+    odometry, which joins its pieces"""
+    turn_deg: float | None = Field(default=None, gt=0)
+    """degrees for each metre of way; standard deviation of the rotation"""
+
+    @model_validator(mode="after")
+    def _both_or_none(self) -> Odometry:
+        if (self.drift is None) != (self.turn_deg is None):
+            raise ValueError(f"{'turn_deg' if self.turn_deg is None else 'drift'} is missing: give both, or neither")
+        return self
+
+
+class PositionFile(Table):
+    """``[positions]``: where an antenna (GNSS) or a prism was; the trajectory is adjusted to them."""
+
+    file: str
+    """table of time and position, x and y in the plane in metres (easting, northing), and perhaps z up"""
+    sigma: PositiveFloat | tuple[PositiveFloat, PositiveFloat, PositiveFloat]
+    """m; standard deviation of each coordinate, or of x, y and z"""
+    lever_arm: Vector = (0.0, 0.0, 0.0)
+    """m; where the antenna or prism is in the left camera's frame: x right, y down, z ahead"""
+    columns: Columns = Field(default={})
+    """names or numbers (from 1) of the columns, as for truth; names that are clear need none"""
+    unit: float = Field(default=1.0, gt=0)
+    """m; length of one unit of the file"""
+    time_offset: float = 0.0
+    """s; added to the file's times so that they are those of the images; what is left of it is estimated"""
+
+
 class Truth(PoseFile):
     """``[truth]``: poses, or positions alone, which are compared after a rigid fit in the plane."""
 
-    columns: dict[Literal["time", "x", "y", "z"], str | int] = Field(default={})
+    columns: Columns = Field(default={})
     """names or numbers (from 1) of the columns of positions alone, e.g. { time = "gps s", x = "E", y = "N" }; x and y
     span the ground, y left of x seen from above, z is up; names that are clear need none"""
     lever_arm: Vector | None = None
@@ -245,6 +280,9 @@ class Attitude(Table):
     """rows of [R | t]: from the left camera's frame to the sensor's"""
     up: Direction | None = None
     """direction of up in the sensor's reference; none: not used as such"""
+    sigma_deg: float | None = Field(default=None, gt=0)
+    """degrees; standard deviation of the rotation from frame to frame and of up; with it the trajectory is adjusted to
+    them"""
     max_gap: float = Field(default=0.5, gt=0)
     """s; attitudes are interpolated over no longer gap"""
     time_offset: float = 0.0
@@ -258,6 +296,8 @@ class Imu(Table):
     """table of time, rates (rad/s) about x y z and accelerations (m/s2) along them"""
     T_imu_left: Pose
     """rows of [R | t]: from the left camera's frame to the IMU's"""
+    sigma_deg: float | None = Field(default=None, gt=0)
+    """degrees; as for attitude"""
     time_offset: float = 0.0
     """s; added to the file's times so that they are those of the images"""
 
@@ -309,7 +349,8 @@ class Manifest(Table):
     times: Times | None = None
     truth: Truth | None = None
     truth_disparity: DisparityMaps | None = None
-    odometry: PoseFile | None = None
+    odometry: Odometry | None = None
+    positions: PositionFile | None = None
     attitude: Attitude | None = None
     imu: Imu | None = None
     world: World = World()

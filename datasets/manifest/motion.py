@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from rille.datasets.images.pairing import ImagePair, ends, stamp_of
 from rille.datasets.imu import at_frames, read_imu
-from rille.datasets.manifest.model import Attitude, Imu, Manifest, PoseFile, Times, Truth
+from rille.datasets.manifest.model import Attitude, Imu, Manifest, PoseFile, PositionFile, Times, Truth
 from rille.datasets.manifest.rig import direction
-from rille.datasets.poses import coverage, interpolate, read_poses, read_positions
+from rille.datasets.poses import coverage, interpolate, read_poses, read_positions, refuse_apart
 from rille.datasets.protocol import Positions, Rows, rows_of
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.times import seconds
@@ -41,6 +42,7 @@ class StatedMotion:
     attitude: tuple[Rows | None, ...] | None = None
     imu_axes: Rows | None = None
     up: Ups | None = None
+    priors: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -63,7 +65,7 @@ class MotionReader:
     motion: StatedMotion
 
     def read(self, manifest: Manifest) -> StatedMotion:
-        """Everything that the tables ``times``, ``truth``, ``odometry``, ``attitude`` and ``imu`` state.
+        """Everything that the tables ``times``, ``truth``, ``odometry``, ``positions``, ``attitude``, ``imu`` state.
 
         Raises
         ------
@@ -75,11 +77,19 @@ class MotionReader:
         if manifest.truth is not None:
             self.truth(manifest.truth)
         if manifest.odometry is not None:
-            self.motion.odometry = self.poses(manifest.odometry, "odometry")
+            odometry, priors = manifest.odometry, self.motion.priors
+            self.motion.odometry = self.poses(odometry, "odometry")
+            if odometry.drift is not None and odometry.turn_deg is not None:
+                priors["odometry"] = {"drift": odometry.drift, "turn": math.radians(odometry.turn_deg)}
+        if manifest.positions is not None:
+            self.motion.priors["positions"] = self.measured(manifest.positions)
         if manifest.attitude is not None:
             self.attitude(manifest.attitude)
         if manifest.imu is not None:
             self.imu(manifest.imu)
+        sensor = manifest.attitude or manifest.imu
+        if sensor is not None and sensor.sigma_deg is not None:
+            self.motion.priors |= {key: {"sigma": math.radians(sensor.sigma_deg)} for key in ("attitude", "up")}
         return self.motion
 
     def times(self, section: Times) -> tuple[float, ...]:
@@ -199,6 +209,31 @@ class MotionReader:
         times = None if at is None else tuple(t + section.time_offset for t in at)
         scaled = tuple(tuple(section.unit * v for v in row) for row in rows)
         return Positions(scaled, times, section.max_gap, section.lever_arm)
+
+    def measured(self, section: PositionFile) -> dict[str, Any]:
+        """Positions that are measurements, in metres, at times (s) of the images' clock; numbers of pairs without it.
+
+        Raises
+        ------
+        InputError
+            The file holds no positions, or has no times and not one row a pair, or no time in common with the pairs.
+        """
+        columns = {str(meaning): column for meaning, column in section.columns.items()}
+        table = read_positions(self.root / section.file, "auto", columns)
+        if table is None:
+            text = f"{self.name}: positions.file: {section.file} holds poses, or columns without names"
+            raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")
+        rows = [[section.unit * v for v in row] for row in table.positions]
+        if table.times is not None and self.motion.times is not None:
+            times = [t + section.time_offset for t in table.times]
+            refuse_apart(times, self.motion.times, table.name)
+        elif len(rows) == len(self.pairs):
+            times = list(self.motion.times or range(len(rows)))
+        else:
+            text = f"{self.name}: positions.file: {section.file} has {len(rows)} positions for {len(self.pairs)} pairs"
+            raise InputError("RIL-456", f"{text}, and not both have times", remedy=NEEDS_TIMES)
+        sigma = [section.sigma] * 3 if isinstance(section.sigma, float) else list(section.sigma)
+        return {"positions": rows, "times": times, "sigma": sigma, "lever": list(section.lever_arm)}
 
     def attitude(self, section: Attitude) -> None:
         """Rotations of a sensor, and the vertical where the file's reference is known to have one."""

@@ -84,6 +84,7 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
         attitude=motion.attitude or base.attitude,
         imu_axes=motion.imu_axes,
         odometry=motion.odometry or base.odometry,
+        priors=motion.priors,
         pitch=pitch,
         georeference=world.place,
         masks={side: root / path for side, path in manifest.masks if path is not None},

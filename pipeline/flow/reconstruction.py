@@ -27,12 +27,14 @@ whose rows the rig does not explain go through ``synchrony`` (right images of ot
 basic, and ``keyframes`` chooses anew. ``resect`` compares each basic pair with the one before: behind a rig that was
 knocked nothing is posed.
 
-A segment needs landmarks only relative to its own basic pair, so all segments are resected and refined in parallel,
-and ``trajectory`` chains them; ``intrinsics`` asks all of them for an error of the cameras. Locus then runs a second
-time, directly on the shared world lattice, so nothing is resampled. With ``locus.both`` it reads the disparities of
-both images (``hfvm/back``). What depends on data (which pairs are basic, how far the world reaches) follows as results
-arrive: ``reconstruction`` is a generator that yields tasks and goes on with their results. Ports of single stages are
-in ``builders``, the leaves in ``assessment``; outputs are added last, by :mod:`rille.pipeline.runs.run_files`.
+A segment needs landmarks only relative to its own basic pair, so all segments are resected and refined in parallel, and
+``trajectory`` chains them; ``intrinsics`` asks all of them for an error of the cameras. Where other sensors are
+measurements (dead reckoning, GNSS, attitude) all poses are adjusted to them together: ``adjust``. Locus then runs a
+second time, directly on the shared world lattice, so nothing is resampled. With ``locus.both`` it reads the disparities
+of both images (``hfvm/back``). What depends on data (which pairs are basic, how far the world reaches) follows as
+results arrive: ``reconstruction`` is a generator that yields tasks and goes on with their results. Ports of single
+stages are in ``builders``, the leaves in ``assessment``; outputs are added last, by
+:mod:`rille.pipeline.runs.run_files`.
 
 The world is divided into fixed tiles. The task of a tile reads only the models that have a cell in it. If a pair is
 added or gets another pose, only the tiles that its model touches, or touched before, are merged again.
@@ -67,9 +69,11 @@ from rille.stages.facts.odometry import (
     StepTableFacts,
 )
 from rille.stages.facts.terrain import OverlapFacts, TileIndexFacts
+from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.imaging.image_quality import image_quality_stage
 from rille.stages.odometry.frame_screening import frame_screening_stage
 from rille.stages.odometry.keyframes import keyframes_stage
+from rille.stages.odometry.resection.adjust import adjust_stage
 from rille.stages.odometry.resection.intrinsics import intrinsics_stage
 from rille.stages.odometry.resection.moving import moving_stage
 from rille.stages.odometry.resection.refine import refine_stage
@@ -165,8 +169,18 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         steps=steps_of(make, chosen),
         lost=lost or None,
     )
+    known = sensors(make, frames)
+    if known and segments:
+        p.trajectory = make.node(
+            adjust_stage,
+            "adjust",
+            trajectory=p.trajectory,
+            segments=p.resections,
+            refined=p.refined or None,
+            priors=known,
+        )
     flow(assessment.of_trajectory(make, frames), lays=("accuracy",))
-    yield Complete(("track", "resect", "refine", "intrinsics", "trajectory"))
+    yield Complete(("track", "resect", "refine", "intrinsics", "trajectory", "adjust"))
     yield Complete(("agreement", "position_accuracy", "accuracy", "truth"))
     posed = yield from done(p.trajectory)
 
@@ -387,6 +401,23 @@ def dead_reckoning(make: Builder, segment: list[int]) -> dict[str, Any]:
         return {}
     poses = [known[f] for f in segment]
     return {"prediction": [None if T is None else (key.inverse() @ T).to_list() for T in poses]}
+
+
+def sensors(make: Builder, frames: Series[int]) -> dict[str, Any]:
+    """What other sensors say of the chosen frames, and how good they are; empty where none is a measurement."""
+    s = make.sequence
+    if not s.priors:
+        return {}
+    said: dict[str, Any] = {name: dict(fact) for name, fact in s.priors.items()}
+    rows = {"odometry": ("poses", s.odometry), "attitude": ("rotations", s.attitude), "up": ("directions", s.up)}
+    for name, (key, known) in rows.items():
+        if name in said and known is None:
+            del said[name]
+        elif name in said and known is not None:
+            one = [known[f] for f in frames]
+            said[name][key] = [v.to_list() if isinstance(v, RigidTransform) else v for v in one]
+    times = list(frames) if s.times is None else [s.times[f] for f in frames]
+    return {**said, "times": times, "timed": s.times is not None}
 
 
 def refined(make: Builder, pairs: Mapping[int, Pair], segments: list[Segment]) -> list[Handle[RefineFacts]]:

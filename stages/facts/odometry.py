@@ -109,7 +109,8 @@ class TrajectoryFacts(Facts):
     """Poses of all frames in the world, which is that of piece number ``main``.
 
     Where it was adjusted (stage ``adjust``) a piece need not be a range: ``world`` are the frames of the main one.
-    ``excess`` is then the factor by which the chain's errors exceed the covariances that were stated for it.
+    ``excess`` is then the factor by which the chain's errors exceed the covariances that were stated for it, and
+    ``priors`` tells of each other sensor whether it was used, of how many measurements were left out, and its clock.
     """
 
     frames: list[int]
@@ -127,6 +128,7 @@ class TrajectoryFacts(Facts):
     """Frame, cause, and the frames between which it is bridged."""
     world: NotRequired[list[int]]
     excess: NotRequired[float]
+    priors: NotRequired[dict[str, Any]]
 
 
 class MovingFacts(Facts):

@@ -27,11 +27,11 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import cross_matrix, rotation_exp, rotation_log
 from rille.stages.numeric.least_squares import levenberg_marquardt
 
-EXCESS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+EXCESS = (1.0, 3.0, 10.0, 30.0)
 """Factors k that are tried: on recorded sequences errors were up to 30 times those stated."""
 MIN_GAIN = 6.63
 """Twice the logarithm of likelihood that a k above 1 must gain: chi-squared of one degree of freedom at 1 %."""
-MAX_ROUNDS, GRADUATION = 60, 1.4
+MAX_ROUNDS, GRADUATION = 40, 2.0
 """Of graduated non-convexity, and the factor by which it is undone from round to round."""
 STEPS, FEW_STEPS = 30, 3
 """Steps of a whole adjustment, and of one round."""
@@ -85,13 +85,15 @@ def root_of(covariance: Floats) -> Floats:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(unit)) / sigma[..., None, :])
 
 
-def bound_of(covariance: Floats, extent: float) -> Floats:
-    """Squared whitened errors (...,) from which on anywhere within ``extent`` (m, and all rotations) is as probable."""
+def bound_of(covariance: Floats, spread: Sequence[float]) -> Floats:
+    """Squared whitened errors (...,) from which on a false factor, anywhere within ``spread`` (k,), is more probable.
+
+    It is never less than one in a hundred true factors exceeds; ``covariance`` (..., k, k) is of what is measured.
+    """
     sigma = np.sqrt(np.einsum("...ii->...i", covariance))
-    spread = np.array([extent] * 3 + [np.pi] * 3)
     unit = covariance / (sigma[..., :, None] * sigma[..., None, :])
     log_volume = 2.0 * np.log(spread / (np.sqrt(2.0 * np.pi) * sigma)).sum(-1) - np.linalg.slogdet(unit)[1]
-    return np.asarray(np.maximum(log_volume, scipy.stats.chi2.ppf(0.99, 6)))
+    return np.asarray(np.maximum(log_volume, scipy.stats.chi2.ppf(0.99, len(spread))))
 
 
 class GraphState(NamedTuple):
@@ -219,6 +221,12 @@ class PoseGraph:
                 out[node] = 0.5 * (block + block.T)
         return out
 
+    def source_sigmas(self, state: GraphState) -> Floats:
+        """Standard deviations (q,) of the sources, which were 1 before anything was measured."""
+        first, count = 6 * (self.nodes - 1), self.factors.shared.shape[2]
+        inverse = _factorised(self.normal(state).matrix).solve(np.eye(self.unknowns, count, -first))
+        return np.asarray(np.sqrt(inverse[first:].diagonal()))
+
 
 def _factorised(matrix: scipy.sparse.csc_array) -> scipy.sparse.linalg.SuperLU:
     """Factors of a symmetric positive definite matrix."""
@@ -243,9 +251,9 @@ class Adjusted(NamedTuple):
         return self.graph.weight > 0
 
 
-def adjust(graph: PoseGraph, start: GraphState) -> Adjusted:
+def adjust(graph: PoseGraph, start: GraphState, excesses: Sequence[float] = EXCESS) -> Adjusted:
     """The graph adjusted with the excess that explains its factors best, without those that contradict."""
-    tried = [_decided(replace(graph, excess=k), start) for k in EXCESS]
+    tried = [_decided(replace(graph, excess=k), start) for k in excesses]
     best = min(tried, key=lambda one: one.surprise)
     return best if best.surprise < tried[0].surprise - MIN_GAIN else tried[0]
 

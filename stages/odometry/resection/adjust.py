@@ -23,7 +23,8 @@ from rille.stages.core.declare import AnyArray, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
 from rille.stages.facts.odometry import FactorsFacts, RefineFacts, ResectFacts, TrajectoryFacts
 from rille.stages.geometry.geometry import RigidTransform
-from rille.stages.odometry.pose_graph import Adjusted, Factors, GraphState, PoseGraph, adjust, bound_of, root_of
+from rille.stages.odometry.pose_graph import Adjusted, Factors, GraphState, PoseGraph, bound_of, root_of
+from rille.stages.odometry.resection.priors import Sensors
 from rille.stages.odometry.resection.trajectory import Chained, account, trajectory_stage, without_vertical
 
 
@@ -85,7 +86,7 @@ def stated_factors(given: Sequence[Mapping[str, Any]], row: Mapping[int, int], e
         root_of(covariance),
         np.zeros((len(given), 6, 0)),
         np.zeros((len(given), 3)),
-        bound_of(covariance, extent),
+        bound_of(covariance, [extent] * 3 + [math.pi] * 3),
     )
 
 
@@ -148,8 +149,10 @@ def adjust_stage(
     segments: Sequence[Bundle[ResectFacts]],
     refined: Sequence[Bundle[RefineFacts]] = (),
     loops: Sequence[Bundle[FactorsFacts]] = (),
+    *,
+    priors: Mapping[str, Any] | None = None,
 ) -> Bundle[TrajectoryFacts]:
-    """Poses of all left frames, adjusted to motions between other frames than those of the chain."""
+    """Poses of all left frames, adjusted to places seen again and to what other sensors say."""
     frames = trajectory.meta["frames"]
     chained = Chained(*(np.array(trajectory[name]) for name in ("poses", "covariance", "segment", "piece")))
     posed = np.flatnonzero(chained.piece >= 0)
@@ -159,40 +162,45 @@ def adjust_stage(
     extent = float(np.ptp(chained.poses[posed, :, 3], axis=0).max()) + 1.0
     given = [one for bundle in loops for one in bundle.meta["factors"] if one["from"] in row and one["to"] in row]
     stated = stated_factors(given, row, extent)
-    joined = join(chained.poses[posed], chained.piece[posed], stated)
+    sensors = Sensors.of(priors or {}, posed)
+    sensors.believe(chained.poses[posed], chained.piece[posed])
+    relative = [sensor.factors(0.0, extent) for sensor in sensors.relative]
+    joined = join(chained.poses[posed], chained.piece[posed], Factors.joined([stated, *relative]))
+    poses, piece = sensors.laid(*joined)
     out, lines, excess = chained, list[str](), 1.0
-    for piece in np.unique(joined.piece):
-        nodes = np.flatnonzero(joined.piece == piece)
-        inside = np.flatnonzero(np.isin(stated.ends, nodes).all(1))
-        if not inside.size:
+    for number in np.unique(piece):
+        nodes = np.flatnonzero(piece == number)
+        own, mine = _within(chain, nodes), _within(stated, nodes)
+        done = sensors.adjusted(poses[nodes], nodes, [own, mine], extent)
+        if done is None:
             continue
-        graph = _graph(nodes, chain, stated.take(inside))
-        done = adjust(graph, GraphState.of(joined.poses[nodes], graph.factors.shared.shape[2]))
         excess = max(excess, done.graph.excess)
         out = _written(out, posed[nodes], done)
-        for k in inside[~done.kept[-len(inside) :]]:
+        kept = done.kept[len(own.ends) : len(own.ends) + len(mine.ends)]
+        for k in np.flatnonzero(np.isin(stated.ends, nodes).all(1))[~kept]:
             ends = np.searchsorted(nodes, stated.ends[k])
             lines.append(_left_out(given[k], done.state.poses[ends]))
-    return _bundle(trajectory, out, lines, excess)
+    return _bundle(trajectory, out, [*lines, *sensors.lines], {"excess": excess, "priors": sensors.facts})
 
 
-def _graph(nodes: NDArray[np.intp], chain: Factors, more: Factors) -> PoseGraph:
-    """Graph of some nodes, numbered anew from 0, which is held; its sources are first those of the chain."""
-    inside = np.flatnonzero(np.isin(chain.ends, nodes).all(1))
-    factors = Factors.joined([chain.take(inside), more])
-    factors = replace(factors, ends=np.searchsorted(nodes, factors.ends))
-    return PoseGraph(factors, len(nodes), 0, np.ones(len(factors.ends)), common=chain.shared.shape[2])
+def _within(factors: Factors, nodes: NDArray[np.intp]) -> Factors:
+    """The factors between some nodes, which are numbered anew."""
+    inside = factors.take(np.flatnonzero(np.isin(factors.ends, nodes).all(1)))
+    return replace(inside, ends=np.searchsorted(nodes, inside.ends))
 
 
 def _written(out: Chained, rows: NDArray[np.intp], done: Adjusted) -> Chained:
     """The trajectory with the adjusted poses in these rows, which are one piece now."""
     poses, covariance, piece = out.poses.copy(), out.covariance.copy(), out.piece.copy()
-    poses[rows], covariance[rows] = done.state.poses, done.graph.covariance(done.state)
+    # The place of positions and of the vertical is a node behind the frames.
+    poses[rows], covariance[rows] = done.state.poses[:-1], done.graph.covariance(done.state)[:-1]
     piece[rows] = piece[rows].min()
     return replace(out, poses=poses, covariance=covariance, piece=piece)
 
 
-def _bundle(before: Bundle[TrajectoryFacts], out: Chained, lines: list[str], excess: float) -> Bundle[TrajectoryFacts]:
+def _bundle(
+    before: Bundle[TrajectoryFacts], out: Chained, lines: list[str], more: Mapping[str, Any]
+) -> Bundle[TrajectoryFacts]:
     """Arrays and facts as of stage ``trajectory``."""
     kept, number = np.unique(out.piece[out.piece >= 0], return_inverse=True)
     piece = out.piece.copy()
@@ -206,7 +214,7 @@ def _bundle(before: Bundle[TrajectoryFacts], out: Chained, lines: list[str], exc
         "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in out.poses],
         "verticals": verticals,
         "world": [frame for frame, k in zip(frames, piece, strict=True) if k == facts["main"]],
-        "excess": excess,
+        **more,
         "warnings": [*facts["warnings"], *without_vertical(facts["pieces"], verticals), *lines],
     }
     arrays: dict[str, AnyArray] = {
