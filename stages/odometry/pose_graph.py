@@ -4,12 +4,11 @@ A factor measures the pose ``T_a_b`` of one node in the frame of another, with a
 some components of it alone. Errors that many factors share are unknowns of their own (``sources``), whose standard
 deviation is 1: what all segments share so adds up over a chain, and a closed loop may still correct it.
 
-Two things are not known beforehand. Which of the doubtful factors are false: each is a measurement, or says nothing,
-being then anywhere within a stated range; ``bound`` is the squared length of its whitened error from which on the
-second is more probable. That choice is made by graduated non-convexity (Yang et al. 2020,
-doi:10.1109/LRA.2020.2965893): first all count, then the cost is bent towards a truncated one. And by which factor k the
-chain's own errors exceed their covariances: that k is taken under which the measurements are most probable (restricted
-likelihood: Patterson and Thompson 1971, doi:10.1093/biomet/58.3.545). Smaller than 1 it is never.
+Two things are not known beforehand. Which of the doubtful factors are false: those whose whitened error exceeds a
+``bound`` once the others hold, by graduated non-convexity (Yang et al. 2020, doi:10.1109/LRA.2020.2965893): first all
+count, then the cost is bent towards a truncated one. And by which factor k the chain's own errors exceed their
+covariances: it is the least under which most factors agree, or a larger one under which these are much more probable
+(restricted likelihood: Patterson and Thompson 1971, doi:10.1093/biomet/58.3.545). Smaller than 1 it is never.
 """
 
 from __future__ import annotations
@@ -29,8 +28,13 @@ from rille.stages.numeric.least_squares import levenberg_marquardt
 
 EXCESS = (1.0, 3.0, 10.0, 30.0)
 """Factors k that are tried: on recorded sequences errors were up to 30 times those stated."""
+MAJORITY = 0.7
+"""Share of the doubtful factors that have to agree."""
+MAX_SURPRISE = 10.0
+"""Twice the logarithm of likelihood that each component of a factor may cost before it is believed to be false: false
+ones are found anywhere within some hundred standard deviations."""
 MIN_GAIN = 6.63
-"""Twice the logarithm of likelihood that a k above 1 must gain: chi-squared of one degree of freedom at 1 %."""
+"""Twice the logarithm of likelihood that a larger k must gain: chi-squared of one degree of freedom at 1 %."""
 MAX_ROUNDS, GRADUATION = 40, 2.0
 """Of graduated non-convexity, and the factor by which it is undone from round to round."""
 STEPS, FEW_STEPS = 30, 3
@@ -46,7 +50,7 @@ class Factors:
     ``ends`` (m, 2) nodes a, b; ``poses`` (m, 3, 4), m; ``root`` (m, 6, 6) root W of the information ``W^T W`` of
     (position m, rotation rad) in the frame of a, rows of zeros where nothing is measured; ``shared`` (m, 6, q) errors
     per standard deviation of the sources; ``lever`` (m, 3), m, of the point in the frame of b whose position is
-    measured; ``bound`` (m,) of squared whitened errors, infinite: the factor belongs to the chain.
+    measured; ``bound`` (m,) of squared whitened errors, infinite: the factor is not doubted, as those of the chain.
     """
 
     ends: NDArray[np.intp]
@@ -85,15 +89,9 @@ def root_of(covariance: Floats) -> Floats:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(unit)) / sigma[..., None, :])
 
 
-def bound_of(covariance: Floats, spread: Sequence[float]) -> Floats:
-    """Squared whitened errors (...,) from which on a false factor, anywhere within ``spread`` (k,), is more probable.
-
-    It is never less than one in a hundred true factors exceeds; ``covariance`` (..., k, k) is of what is measured.
-    """
-    sigma = np.sqrt(np.einsum("...ii->...i", covariance))
-    unit = covariance / (sigma[..., :, None] * sigma[..., None, :])
-    log_volume = 2.0 * np.log(spread / (np.sqrt(2.0 * np.pi) * sigma)).sum(-1) - np.linalg.slogdet(unit)[1]
-    return np.asarray(np.maximum(log_volume, scipy.stats.chi2.ppf(0.99, len(spread))))
+def bound_of(components: int) -> float:
+    """Squared length of the whitened error of so many components that one in a hundred true factors exceeds."""
+    return float(scipy.special.chdtri(components, 0.01))
 
 
 class GraphState(NamedTuple):
@@ -236,14 +234,10 @@ def _factorised(matrix: scipy.sparse.csc_array) -> scipy.sparse.linalg.SuperLU:
 
 
 class Adjusted(NamedTuple):
-    """A graph with the weights (0 or 1) and the excess that were found, its state, and how improbable it all is.
-
-    ``surprise`` is minus twice the logarithm of the likelihood, up to what is the same for all excesses.
-    """
+    """A graph with the weights (0 or 1) and the excess that were found, and its state."""
 
     graph: PoseGraph
     state: GraphState
-    surprise: float
 
     @property
     def kept(self) -> Bools:
@@ -252,10 +246,30 @@ class Adjusted(NamedTuple):
 
 
 def adjust(graph: PoseGraph, start: GraphState, excesses: Sequence[float] = EXCESS) -> Adjusted:
-    """The graph adjusted with the excess that explains its factors best, without those that contradict."""
-    tried = [_decided(replace(graph, excess=k), start) for k in excesses]
-    best = min(tried, key=lambda one: one.surprise)
-    return best if best.surprise < tried[0].surprise - MIN_GAIN else tried[0]
+    """The graph adjusted without the factors that contradict, its chain loosened by what explains the others best."""
+    doubtful = graph.factors.doubtful
+    if not doubtful.any():
+        return _settled(graph, start)
+    strict = first = _decided(replace(graph, excess=excesses[0]), start)
+    for k in excesses[1:]:
+        if first.kept[doubtful].mean() >= MAJORITY:
+            break
+        first = _decided(replace(graph, excess=k), start)
+    if first.kept[doubtful].mean() < MAJORITY:
+        return strict
+    looser = [_settled(replace(first.graph, excess=k), first.state) for k in excesses if k > first.graph.excess]
+    best = min([first, *looser], key=_surprise)
+    best = best if _surprise(best) < _surprise(first) - MIN_GAIN else first
+    more = doubtful & best.kept & ~strict.kept
+    rows = int((graph.factors.root[more] != 0).any(2).sum())
+    if _surprise(best) > _surprise(strict) + MAX_SURPRISE * rows:
+        return strict
+    return best if best is first else _decided(replace(graph, excess=best.graph.excess), start)
+
+
+def _settled(graph: PoseGraph, state: GraphState) -> Adjusted:
+    """The graph adjusted with its weights as they are."""
+    return Adjusted(graph, levenberg_marquardt(graph, state, STEPS).state)
 
 
 def _decided(graph: PoseGraph, state: GraphState) -> Adjusted:
@@ -279,14 +293,12 @@ def _decided(graph: PoseGraph, state: GraphState) -> Adjusted:
             break
         mu *= GRADUATION
     graph = replace(graph, weight=np.where(doubtful, np.where(squared <= bound, 1.0, 0.0), 1.0))
-    end = levenberg_marquardt(graph, state, STEPS)
-    return Adjusted(graph, end.state, _surprise(graph, end.state))
+    return _settled(graph, state)
 
 
-def _surprise(graph: PoseGraph, state: GraphState) -> float:
-    """Minus twice the logarithm of the restricted likelihood; a factor that is left out costs its bound."""
-    normal = graph.normal(state)
+def _surprise(done: Adjusted) -> float:
+    """Minus twice the logarithm of the restricted likelihood, up to what is the same for all excesses."""
+    graph, normal = done.graph, done.graph.normal(done.state)
     diagonal = np.abs(_factorised(normal.matrix).U.diagonal())
     chained = 6 * int((~graph.factors.doubtful).sum()) + graph.common
-    left_out = float(graph.factors.bound[graph.factors.doubtful & (graph.weight == 0)].sum())
-    return float(2.0 * normal.cost + np.log(diagonal).sum() + 2.0 * chained * np.log(graph.excess) + left_out)
+    return float(2.0 * normal.cost + np.log(diagonal).sum() + 2.0 * chained * np.log(graph.excess))

@@ -60,12 +60,8 @@ def chain_factors(segments: Sequence[Bundle], numbers: Sequence[Sequence[int]], 
     )
 
 
-def stated_factors(given: Sequence[Mapping[str, Any]], row: Mapping[int, int], extent: float) -> Factors:
+def stated_factors(given: Sequence[Mapping[str, Any]], row: Mapping[int, int]) -> Factors:
     """Factors as facts state them (``from``, ``to``, ``pose``, ``covariance``); ``row`` is the node of each frame.
-
-    Parameters
-    ----------
-    extent : m; anywhere within it a false factor may be.
 
     Raises
     ------
@@ -86,7 +82,7 @@ def stated_factors(given: Sequence[Mapping[str, Any]], row: Mapping[int, int], e
         root_of(covariance),
         np.zeros((len(given), 6, 0)),
         np.zeros((len(given), 3)),
-        bound_of(covariance, [extent] * 3 + [math.pi] * 3),
+        np.full(len(given), bound_of(6)),
     )
 
 
@@ -159,19 +155,18 @@ def adjust_stage(
     row = {frames[k]: node for node, k in enumerate(posed)}
     numbers = [[int(f["frame"]) for f in bundle.meta["per_frame"]] for bundle in segments]
     chain = chain_factors(refined or segments, numbers, row)
-    extent = float(np.ptp(chained.poses[posed, :, 3], axis=0).max()) + 1.0
     given = [one for bundle in loops for one in bundle.meta["factors"] if one["from"] in row and one["to"] in row]
-    stated = stated_factors(given, row, extent)
+    stated = stated_factors(given, row)
     sensors = Sensors.of(priors or {}, posed)
     sensors.believe(chained.poses[posed], chained.piece[posed])
-    relative = [sensor.factors(0.0, extent) for sensor in sensors.relative]
+    relative = [sensor.factors(0.0) for sensor in sensors.relative]
     joined = join(chained.poses[posed], chained.piece[posed], Factors.joined([stated, *relative]))
     poses, piece = sensors.laid(*joined)
     out, lines, excess = chained, list[str](), 1.0
     for number in np.unique(piece):
         nodes = np.flatnonzero(piece == number)
         own, mine = _within(chain, nodes), _within(stated, nodes)
-        done = sensors.adjusted(poses[nodes], nodes, [own, mine], extent)
+        done = sensors.adjusted(poses[nodes], nodes, [own, mine])
         if done is None:
             continue
         excess = max(excess, done.graph.excess)

@@ -22,7 +22,16 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp, rotation_log
-from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, adjust, bound_of
+from rille.stages.odometry.pose_graph import (
+    EXCESS,
+    MAJORITY,
+    Adjusted,
+    Factors,
+    GraphState,
+    PoseGraph,
+    adjust,
+    bound_of,
+)
 
 OFFSET_SIGMA_S = 0.5
 """Of a sensor's clock against the camera's, before anything is known of it."""
@@ -44,8 +53,8 @@ MAX_SIGMA_SHARE = 0.3
 """Of the standard deviation that a clock's offset had before, up to which it is determined."""
 MIN_LATE_S = 0.005
 """Offset of a clock that is not worth a word."""
-MAX_LEFT_OUT = 0.3
-"""Share of a sensor's measurements; where more contradict, none is believed."""
+MANY_LEFT_OUT = 0.05
+"""Share of a sensor's measurements from which on those that were left out are worth a word."""
 REMEDY = {
     "odometry": "correct T_body_left, unit or time_offset, or raise drift and turn_deg",
     "attitude": "correct T_body_left (T_imu_left), the order of its columns or time_offset, or raise sigma_deg",
@@ -54,8 +63,6 @@ REMEDY = {
 }
 MIN_FIXES = 3
 """Positions of a piece from which on it is laid on them."""
-NEVER = 1e12
-"""Bound of a factor that is no measurement, and is never left out."""
 MAX_GAP_STEPS = 3.0
 """Median steps of the camera over which its way is interpolated to the time of a position."""
 
@@ -102,12 +109,11 @@ class RelativePrior:
         """Poses (n, 3, 4) of the nodes by the sensor ``shift`` seconds later."""
         return (self.poses if self.times is None else resampled(self.poses, self.times, shift))[self.rows]
 
-    def factors(self, shift: float, extent: float, own: Floats | None = None) -> Factors:
+    def factors(self, shift: float, own: Floats | None = None) -> Factors:
         """Factors from each node to the next that has a pose ``shift`` seconds later; the last source is the clock.
 
         Parameters
         ----------
-        extent : m; anywhere within it a false factor may be.
         own : poses (n, 3, 4) by the camera, whose motion an offset of the clock shows in; None: in nothing.
         """
         poses = self.at(shift)
@@ -122,7 +128,7 @@ class RelativePrior:
             early, late = (between(resampled(own, times, s), a, b) for s in (-half, half))
             turned = rotation_log(late[:, :, :3] @ np.swapaxes(early[:, :, :3], 1, 2))
             clock = np.nan_to_num(np.concatenate([late[:, :, 3] - early[:, :, 3], turned], axis=1)) / (2.0 * half)
-        root, used, spread = np.zeros((count, 6, 6)), slice(3, 6), [math.pi] * 3
+        root, used = np.zeros((count, 6, 6)), slice(3, 6)
         if not self.drift:
             sigma, shared = np.full((count, 3), self.turn), OFFSET_SIGMA_S * clock[:, :, None]
         else:
@@ -131,10 +137,9 @@ class RelativePrior:
             scale = np.concatenate([self.drift * motion[:, :, 3], np.zeros((count, 3))], axis=1)
             turns = np.concatenate([np.zeros((count, 3, 3)), self.turn * way[:, None, None] * np.eye(3)], axis=1)
             shared = np.concatenate([scale[:, :, None], turns, OFFSET_SIGMA_S * clock[:, :, None]], axis=2)
-            spread = [extent] * 3 + [math.pi] * 3
         root[:, used, used] = np.eye(sigma.shape[1]) / sigma[:, None, :]
         shared[:, : used.start] = 0.0
-        bound = bound_of(np.eye(sigma.shape[1]) * sigma[:, None, :] ** 2, spread)
+        bound = np.full(count, bound_of(sigma.shape[1]))
         return Factors(np.stack([a, b], axis=1), motion, root, shared, np.zeros((count, 3)), bound)
 
     def contradiction(self, poses: Floats, piece: NDArray[np.int16]) -> str:
@@ -308,7 +313,7 @@ def position_contradiction(fixes: Fixes, sigma: Floats, piece: NDArray[np.int16]
     return ""
 
 
-def position_factors(fixes: Fixes, laid: PlaneFit, prior: PositionPrior, extent: float) -> Factors:
+def position_factors(fixes: Fixes, laid: PlaneFit, prior: PositionPrior) -> Factors:
     """Factors of positions in the place, the node behind all others; their only source is the clock."""
     count, heights = len(fixes.nodes), np.isfinite(fixes.positions[:, 2])
     poses = np.tile(np.eye(3, 4), (count, 1, 1))
@@ -319,7 +324,7 @@ def position_factors(fixes: Fixes, laid: PlaneFit, prior: PositionPrior, extent:
     shared = np.zeros((count, 6, 1))
     shared[:, :3, 0] = OFFSET_SIGMA_S * fixes.velocity
     ends = np.stack([np.full(count, -1), fixes.nodes], axis=1)
-    bound = np.full(count, bound_of(np.diag(prior.sigma**2), [extent + float(prior.sigma.max())] * 3))
+    bound = np.where(heights, bound_of(3), bound_of(2))
     return Factors(ends, poses, root, shared, np.tile(prior.lever, (count, 1)), bound)
 
 
@@ -335,7 +340,7 @@ def vertical_factors(up: Floats, sigma: float, poses: Floats) -> Factors:
     T = np.concatenate([rotation_exp(turn) @ R, np.zeros((len(nodes), 3, 1))], axis=2)
     root = np.zeros((len(nodes), 6, 6))
     root[:, [3, 4], [3, 4]] = 1.0 / sigma
-    bound = np.full(len(nodes), bound_of(sigma**2 * np.eye(2), [math.pi] * 2))
+    bound = np.full(len(nodes), bound_of(2))
     ends = np.stack([np.full(len(nodes), -1), nodes], axis=1)
     return Factors(ends, T, root, np.zeros((len(nodes), 6, 0)), np.zeros((len(nodes), 3)), bound)
 
@@ -343,7 +348,7 @@ def vertical_factors(up: Floats, sigma: float, poses: Floats) -> Factors:
 def anchor(pose: Floats) -> Factors:
     """What is known of the place beforehand, by the pose (3, 4) of node 0: it is about upright in the world."""
     root = np.diag([1e-3] * 3 + [1.0 / VERTICAL_SIGMA] * 2 + [0.1])[None]
-    none = np.zeros((1, 6, 0)), np.zeros((1, 3)), np.full(1, NEVER)
+    none = np.zeros((1, 6, 0)), np.zeros((1, 3)), np.full(1, np.inf)
     return Factors(np.array([[-1, 0]]), pose[None], root, *none)
 
 
@@ -428,7 +433,7 @@ class Sensors:
         self.fit, poses, piece = found
         return poses, piece
 
-    def adjusted(self, poses: Floats, nodes: NDArray[np.intp], parts: list[Factors], extent: float) -> Adjusted | None:
+    def adjusted(self, poses: Floats, nodes: NDArray[np.intp], parts: list[Factors]) -> Adjusted | None:
         """A piece adjusted to its chain and stated factors (the ``parts``) and to the sensors; None: nothing to adjust.
 
         Parameters
@@ -441,7 +446,7 @@ class Sensors:
         done = None
         # Clocks first, by which what is left of the errors then tells more of the chain's.
         for excesses in ((1.0,), (1.0,), EXCESS, EXCESS, EXCESS):
-            groups = self._groups(poses, nodes, clocks, extent)
+            groups = self._groups(poses, nodes, clocks)
             if not groups and not len(parts[1].ends):
                 return None
             factors = Factors.joined([*parts, *groups.values(), anchor(poses[0])])
@@ -457,19 +462,15 @@ class Sensors:
         self._account(clocks, done.state.poses[-1])
         return done
 
-    def _groups(
-        self, poses: Floats, nodes: NDArray[np.intp], clocks: Mapping[str, Clock], extent: float
-    ) -> dict[str, Factors]:
+    def _groups(self, poses: Floats, nodes: NDArray[np.intp], clocks: Mapping[str, Clock]) -> dict[str, Factors]:
         """Factors of each sensor that says something of these nodes, by clocks as they are known."""
         groups, times = dict[str, Factors](), self.times[nodes]
         for one in self.relative:
-            groups[one.name] = replace(one, rows=one.rows[nodes]).factors(
-                clocks.get(one.name, Clock()).late, extent, poses
-            )
+            groups[one.name] = replace(one, rows=one.rows[nodes]).factors(clocks.get(one.name, Clock()).late, poses)
         if self.positions is not None and self.fit is not None:
             same = np.zeros(len(nodes), np.int16)
             fixes = fixes_of(self.positions, poses, same, times, clocks.get("positions", Clock()).late)
-            groups["positions"] = position_factors(fixes, self.fit, self.positions, extent)
+            groups["positions"] = position_factors(fixes, self.fit, self.positions)
             if not self.timed:
                 groups["positions"].shared[:] = 0.0
         groups["up"] = vertical_factors(self.up[nodes], self.up_sigma, poses)
@@ -482,7 +483,7 @@ class Sensors:
             kept = done.kept[first : first + len(factors.ends)]
             first += len(kept)
             self.facts[name] = {"used": True, "measurements": len(kept), "left_out": int((~kept).sum())}
-            if np.mean(kept) < 1.0 - MAX_LEFT_OUT:
+            if np.mean(kept) < MAJORITY:
                 refused = True
                 self._refuse(name, f"{(~kept).sum()} of its {len(kept)} measurements contradict the others")
                 self.relative = [sensor for sensor in self.relative if sensor.name != name]
@@ -518,7 +519,8 @@ class Sensors:
                     f"is taken into account: add {-clock.late:.3f} to its time_offset"
                 )
         for name, fact in self.facts.items():
-            if fact.get("left_out"):
+            # One in a hundred is to be expected.
+            if fact.get("left_out", 0) > MANY_LEFT_OUT * fact.get("measurements", 0):
                 count = f"{fact['left_out']} of {fact['measurements']}"
                 self.lines.append(f"[{name}] {count} of its measurements contradict the others and are left out")
         if self.fit is not None and self.positions is not None:

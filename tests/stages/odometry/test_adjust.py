@@ -1,13 +1,12 @@
 """The pose graph against a dense solver, closed forms and sampling; loops that are true, false, or join pieces."""
 
 import numpy as np
-import pytest
 import scipy
 from raising import raises
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
-from rille.stages.odometry.pose_graph import Factors, GraphState, PoseGraph, adjust, bound_of, root_of
+from rille.stages.odometry.pose_graph import Factors, GraphState, PoseGraph, adjust, root_of
 from rille.stages.odometry.resection.adjust import adjust_stage
 from rille.stages.odometry.resection.trajectory import trajectory_stage
 
@@ -230,9 +229,3 @@ def test_an_impossible_covariance_is_refused():
     segments, before = run_of(ring(), np.random.default_rng(8))
     with raises("RIL-452", "frame 0", "frame 11"):
         adjusted(segments, before, motion(0, 11, RigidTransform.identity(), -LOOP))
-
-
-@pytest.mark.parametrize("extent", [10.0, 100.0])
-def test_a_bound_grows_with_where_a_false_factor_may_be(extent):
-    near, far = ([e] * 3 + [np.pi] * 3 for e in (extent, 10 * extent))
-    assert bound_of(LOOP, far) == pytest.approx(bound_of(LOOP, near) + 6 * np.log(10))

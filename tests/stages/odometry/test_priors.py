@@ -1,0 +1,157 @@
+"""Other sensors beside a simulated chain: right ones join pieces and tell their clocks, wrong ones are noticed."""
+
+import numpy as np
+import pytest
+from test_adjust import errors, run_of
+
+from rille.stages.core.declare import NoParams
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
+from rille.stages.odometry.resection.adjust import adjust_stage
+from rille.stages.odometry.resection.priors import resampled
+
+TIMES = 0.1 * np.arange(31)
+BASE = {"times": TIMES.tolist(), "timed": True}
+AXES = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+TURNED = rotation_exp([0.0, np.deg2rad(10.0), 0.0])
+
+
+def winding(turn=0.6, change=0.5):
+    """Poses T_world_left of a drive, about 1 m a frame; ``turn`` rad to either side, ``change`` of the speed."""
+    poses, place = [], np.zeros(3)
+    for t in TIMES:
+        heading = turn * np.sin(2.5 * t)
+        R = rotation_exp([0, 0, heading]) @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+        poses.append(RigidTransform(R, place))
+        place = place + (1 + change * np.sin(2.1 * t)) * np.array([-np.sin(heading), np.cos(heading), 0.02])
+    return poses
+
+
+def late_by(truth, late):
+    poses = resampled(np.array([T.matrix34 for T in truth]), TIMES, -late)
+    return [RigidTransform.from_matrix(T) if np.isfinite(T).all() else None for T in poses]
+
+
+def odometry(truth, rng, late=0.0, mount=None, scale=1.0):
+    M, now, last, poses = np.eye(3) if mount is None else mount, RigidTransform.identity(), None, []
+    drift, turn = 1 + 0.02 * rng.standard_normal(), 0.005 * rng.standard_normal(3)
+    for T in late_by(truth, late):
+        if T is not None and last is not None:
+            step = last.inverse() @ T
+            way = np.linalg.norm(step.translation)
+            turned = rotation_exp(way * (turn + 0.005 * rng.standard_normal(3)))
+            moved = drift * step.translation + 0.02 * way * rng.standard_normal(3)
+            now = now @ RigidTransform(step.rotation @ turned, scale * moved)
+        last = T
+        poses.append(T and RigidTransform(M.T @ now.rotation @ M, M.T @ now.translation).to_list())
+    return {**BASE, "odometry": {"poses": poses, "drift": 0.02, "turn": 0.005}}
+
+
+def gnss(truth, rng, sigma=0.3, late=0.0, jump=0.0, lever=(0.0, 0.0, 0.0)):
+    antenna = np.array([T.translation + T.rotation @ lever for T in truth])
+    points = np.stack([np.interp(TIMES - late, TIMES, axis) for axis in antenna.T], axis=1)
+    points += sigma * rng.standard_normal(points.shape)
+    points[12:18, 0] += jump
+    points = points @ rotation_exp([0, 0, 1.0]).T + [4.5e5, 5.4e6, 300.0]
+    given = {"positions": points.tolist(), "times": TIMES.tolist(), "sigma": [sigma] * 3, "lever": [0.0] * 3}
+    return {**BASE, "positions": given}
+
+
+def adjusted(segments, trajectory, priors):
+    return adjust_stage.run(NoParams(), {"priors": priors}, {"trajectory": trajectory, "segments": segments})
+
+
+def nees(out, truth):
+    e = errors(out, truth)
+    rows = np.flatnonzero(np.isfinite(e).all(1))[1:]
+    return np.mean([e[k] @ np.linalg.solve(out["covariance"][k], e[k]) for k in rows]) / 6
+
+
+@pytest.mark.parametrize("sensor", [odometry, gnss])
+def test_a_sensor_joins_pieces_within_its_errors(sensor):
+    truth, rng = winding(), np.random.default_rng(1)
+    segments, before = run_of(truth, rng, lost=set(range(12, 19)))
+    assert len(before.meta["pieces"]) == 2
+    out = adjusted(segments, before, sensor(truth, rng))
+    assert out.meta["pieces"] == [[0, 30]]
+    assert not [line for line in out.meta["warnings"] if line.startswith("[")]
+    assert np.nanmax(np.linalg.norm(errors(out, truth)[:, :3], axis=1)) < 1.5
+    assert 0.2 < nees(out, truth) < 3.0
+
+
+@pytest.mark.parametrize("sensor", [odometry, gnss])
+def test_a_clock_that_is_late_is_found_and_stated(sensor):
+    truth, rng = winding(), np.random.default_rng(2)
+    segments, before = run_of(truth, rng)
+    out = adjusted(segments, before, sensor(truth, rng, late=0.2))
+    (fact,) = (f for name, f in out.meta["priors"].items() if name != "place")
+    assert fact["late_s"] == pytest.approx(0.2, abs=max(0.02, 3 * fact["late_sigma_s"]))
+    assert [line for line in out.meta["warnings"] if "time_offset" in line]
+    assert np.linalg.norm(errors(out, truth)[:, :3], axis=1).max() < 0.4
+
+
+def test_a_clock_that_no_motion_shows_is_said_not_to_be_determined():
+    truth, rng = winding(turn=0.0, change=0.0), np.random.default_rng(3)
+    segments, before = run_of(truth, rng)
+    out = adjusted(segments, before, gnss(truth, rng))
+    assert not out.meta["priors"]["positions"]["clock_determined"]
+    assert [line for line in out.meta["warnings"] if "not determined" in line]
+
+
+def rotations(truth, M):
+    R = [(M.T @ T.rotation @ M).tolist() for T in truth]
+    return {**BASE, "attitude": {"rotations": R, "sigma": 0.003}}
+
+
+def mirrored(truth, rng):
+    given = gnss(truth, rng)
+    given["positions"]["positions"] = [[y, x, z] for x, y, z in given["positions"]["positions"]]
+    return given
+
+
+WRONG = {
+    "turned": (lambda truth, rng: odometry(truth, rng, mount=TURNED), ("turned by 9", "T_body_left")),
+    "axes": (lambda truth, rng: odometry(truth, rng, mount=AXES), ("T_body_left",)),
+    "unit": (lambda truth, rng: odometry(truth, rng, scale=1.3), ("multiplied by 0.7", "unit")),
+    "attitude turned": (
+        lambda truth, rng: rotations(truth, rotation_exp([0.2, 0, 0])),
+        ("turned by 1",),
+    ),
+    "mirrored": (mirrored, ("x and y are exchanged",)),
+    "lever arm": (lambda truth, rng: gnss(truth, rng, sigma=0.05, lever=(2.0, 0.0, 0.0)), ("lever_arm",)),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_sensor_is_named_and_not_believed(case):
+    make, facts = WRONG[case]
+    truth, rng = winding(), np.random.default_rng(4)
+    segments, before = run_of(truth, rng)
+    out = adjusted(segments, before, make(truth, rng))
+    (line,) = (line for line in out.meta["warnings"] if line.startswith("["))
+    assert [fact for fact in ("not used", *facts) if fact not in line] == []
+    np.testing.assert_allclose(out["poses"], before["poses"], atol=1e-9)
+
+
+def test_positions_that_are_off_for_a_while_are_left_out():
+    truth, rng = winding(), np.random.default_rng(5)
+    segments, before = run_of(truth, rng)
+    out = adjusted(segments, before, gnss(truth, rng, sigma=0.1, jump=2.0))
+    assert out.meta["priors"]["positions"]["left_out"] == 6
+    assert np.linalg.norm(errors(out, truth)[:, :3], axis=1).max() < 0.3
+
+
+def test_positions_say_where_the_world_lies():
+    truth, rng = winding(), np.random.default_rng(6)
+    segments, before = run_of(truth, rng)
+    place = adjusted(segments, before, gnss(truth, rng, sigma=0.02)).meta["priors"]["place"]
+    np.testing.assert_allclose(place["origin"], [4.5e5, 5.4e6, 300.0], atol=0.1)
+    assert place["azimuth_deg"] == pytest.approx(360 - np.rad2deg(1.0), abs=1.0)
+
+
+def test_the_vertical_holds_a_chain_upright():
+    truth, rng = winding(), np.random.default_rng(7)
+    segments, before = run_of(truth, rng)
+    up = [(T.rotation.T @ rotation_exp(0.002 * rng.standard_normal(3))[2]).tolist() for T in truth]
+    out = adjusted(segments, before, {**BASE, "up": {"directions": up, "sigma": 0.002}})
+    tilt = [np.linalg.norm(errors(one, truth)[:, 3:5], axis=1).max() for one in (before, out)]
+    assert tilt[1] < 0.7 * tilt[0]
