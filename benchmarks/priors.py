@@ -108,7 +108,7 @@ class Simulated:
 
 def solved(sequence: Any, frames: tuple[int, ...], cache: Path) -> Any:
     """The trajectory of a sequence, without elevation models; None where there is none."""
-    from benchmarks.gaps import trajectory_of
+    from gaps import trajectory_of
 
     return trajectory_of(sequence, frames, cache, {"keyframes": {"preset": "navigation"}})
 
@@ -169,7 +169,7 @@ def main() -> int:
         quality, off = (0.5, np.deg2rad(0.3)), 2.0
     else:
         settings = {"frames": 31, "image_width": 285, "image_height": 260, "focal_length": 300, "seed": given.seed}
-        sequence = open_sequence("mockup", {"mockup": settings | {"turn_deg": 4.0}})
+        sequence = open_sequence("mockup", {"mockup": settings | {"jitter_deg": 4.0}})
         quality, off = (0.005, np.deg2rad(5.0)), 0.2
     truth, frames = list(sequence.truth), tuple(range(sequence.frames))
     times = np.array(sequence.times if sequence.times is not None else 0.1 * np.arange(sequence.frames))

@@ -555,3 +555,72 @@ def test_every_key_is_described():
 
 def test_nested_defaults_become_dotted():
     assert dotted({"a": {"b": {"c": 1}, "d": 2}, "e.f": 3}) == [("a.b.c", 1), ("a.d", 2), ("e.f", 3)]
+
+
+# -- other sensors as measurements -------------------------------------------------------------------------------------
+
+TIMED = "[times]\nrate_hz = 1.0\n"
+
+
+def test_sensors_say_how_good_they_are(tmp_path):
+    write_lines(tmp_path / "gnss.csv", ["time,E,N,h", "0,1000,2000,5", "0.5,1100,2000,6", "2.5,1200,2000,7"])
+    write_lines(tmp_path / "wheels.tum", [tum(k, 0.1 * k) for k in range(3)])
+    write_lines(tmp_path / "ahrs.csv", ["t,roll_deg,pitch_deg,yaw_deg", *(f"{k},0,0,{k}" for k in range(3))])
+    text = """
+[positions]
+file = "gnss.csv"
+columns = { z = "h" }
+sigma = [0.1, 0.2, 0.3]
+lever_arm = [1, 2, 3]
+unit = 0.01
+time_offset = 0.25
+[odometry]
+file = "wheels.tum"
+drift = 0.02
+turn_deg = 1.0
+[attitude]
+file = "ahrs.csv"
+up = [0, 0, 1]
+sigma_deg = 0.5
+"""
+    priors = opened(write_sequence(tmp_path, TIMED + text)).priors
+    assert priors["positions"] == {
+        "positions": [[10.0, 20.0, 0.05], [11.0, 20.0, 0.06], [12.0, 20.0, 0.07]],
+        "times": [0.25, 0.75, 2.75],
+        "sigma": [0.1, 0.2, 0.3],
+        "lever": [1.0, 2.0, 3.0],
+    }
+    assert priors["odometry"] == {"drift": 0.02, "turn": pytest.approx(math.radians(1.0))}
+    assert priors["attitude"] == priors["up"] == {"sigma": pytest.approx(math.radians(0.5))}
+
+
+def test_without_standard_deviations_sensors_are_no_measurements(tmp_path):
+    write_lines(tmp_path / "wheels.tum", [tum(k, 0.1 * k) for k in range(3)])
+    s = opened(write_sequence(tmp_path, TIMED + '[odometry]\nfile = "wheels.tum"\n'))
+    assert s.odometry is not None
+    assert s.priors == {}
+
+
+@pytest.mark.parametrize(
+    ("more", "lines", "expected"),
+    [
+        ("sigma = 0.5", [tum(k, k) for k in range(3)], ("RIL-453", "p.txt", "columns = ")),
+        ("sigma = 0.5", ["x,y", "1,2", "2,3"], ("RIL-456", "2 positions for 3 pairs")),
+        ("sigma = 0.5", ["time,x,y", "100,1,2", "101,2,3"], ("RIL-269", "100.000")),
+        ("sigma = 0.5", ["lat,lon,when", "50.1,8.2,0", "50.1,8.3,1"], ("RIL-805", "lat")),
+        ('sigma = 0.5\ncolumns = { x = "E" }', ["time,x,y", "0,1,2"], ("RIL-806", "'E'")),
+        ("sigma = 0.5", ["time,x,y", "0,1,?", "1,2,3"], ("RIL-284", "line 2")),
+        ("", ["time,x,y", "0,1,2", "1,2,3"], ("RIL-223", "positions", "sigma")),
+    ],
+)
+def test_positions_that_cannot_be_used(tmp_path, more, lines, expected):
+    write_lines(tmp_path / "p.txt", lines)
+    code, *facts = expected
+    with raises(code, *facts):
+        opened(write_sequence(tmp_path, f'{TIMED}[positions]\nfile = "p.txt"\n{more}\n'))
+
+
+def test_a_drift_alone_is_refused(tmp_path):
+    write_lines(tmp_path / "p.txt", [tum(k, k) for k in range(3)])
+    with raises("RIL-223", "turn_deg"):
+        opened(write_sequence(tmp_path, f'{TIMED}[odometry]\nfile = "p.txt"\ndrift = 0.02\n'))

@@ -175,6 +175,8 @@ def adjust_stage(
         for k in np.flatnonzero(np.isin(stated.ends, nodes).all(1))[~kept]:
             ends = np.searchsorted(nodes, stated.ends[k])
             lines.append(_left_out(given[k], done.state.poses[ends]))
+    if excess > 1.0:
+        lines.append(f"the camera's own errors are about {excess:.0f} times those stated: all covariances grow by that")
     return _bundle(trajectory, out, [*lines, *sensors.lines], {"excess": excess, "priors": sensors.facts})
 
 

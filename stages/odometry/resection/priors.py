@@ -49,7 +49,7 @@ HELD = 0.02
 """Weight of the identity against the data where Q is sought: along a straight way a roll does not show."""
 MIN_SIGMAS = 3.0
 """Standard deviations from which on a departure is one of the whole sensor."""
-MAX_SIGMA_SHARE = 0.3
+MAX_SIGMA_SHARE = 0.1
 """Of the standard deviation that a clock's offset had before, up to which it is determined."""
 MIN_LATE_S = 0.005
 """Offset of a clock that is not worth a word."""
@@ -500,7 +500,9 @@ class Sensors:
             first += factors.shared.shape[2]
             if self.timed and name != "up":
                 late = before.get(name, Clock()).late + OFFSET_SIGMA_S * float(done.state.sources[first - 1])
-                clocks[name] = Clock(late, OFFSET_SIGMA_S * float(sigmas[first - 1]))
+                clock = Clock(late, OFFSET_SIGMA_S * float(sigmas[first - 1]))
+                # Taken over where nothing shows it, it would wander from one adjustment to the next.
+                clocks[name] = clock if clock.determined else clock._replace(late=0.0)
         return clocks
 
     def _account(self, clocks: Mapping[str, Clock], place: Floats) -> None:
