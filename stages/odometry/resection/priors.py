@@ -33,6 +33,8 @@ from rille.stages.odometry.pose_graph import (
     bound_of,
 )
 
+LEVER_SIGMA_M = 0.05
+"""Of each component of a lever arm that is stated."""
 OFFSET_SIGMA_S = 0.5
 """Of a sensor's clock against the camera's, before anything is known of it."""
 MIN_STEP_SHARE = 0.05
@@ -55,6 +57,13 @@ MIN_LATE_S = 0.005
 """Offset of a clock that is not worth a word."""
 MANY_LEFT_OUT = 0.05
 """Share of a sensor's measurements from which on those that were left out are worth a word."""
+MAX_SHARED_SIGMAS = 4.0
+"""Standard deviations of what all measurements of a sensor share, from which on it is wrong."""
+SHARED_ERRORS = {
+    "odometry": ("scale", "turn about x", "turn about y", "turn about z"),
+    "positions": ("lever arm along x", "lever arm along y", "lever arm along z"),
+}
+"""Sources of each sensor before that of its clock, in the left camera's frame."""
 REMEDY = {
     "odometry": "correct T_body_left, unit or time_offset, or raise drift and turn_deg",
     "attitude": "correct T_body_left (T_imu_left), the order of its columns or time_offset, or raise sigma_deg",
@@ -194,9 +203,10 @@ def departure(own: Floats, said: Floats, allowed: float, what: str) -> tuple[flo
 
 @dataclass(frozen=True)
 class PositionPrior:
-    """Positions (k, 3), m, of an antenna, NaN heights where there are none, at ``times`` (k,), s.
+    """Positions (k, 3), m, of an antenna at ``times`` (k,), s.
 
-    ``sigma`` (3,), m, along x, y and z; ``lever`` (3,), m, of the antenna in the left camera's frame.
+    ``sigma`` (3,), m, along x, y and z, infinite where there are no heights; ``lever`` (3,), m, of the antenna in the
+    left camera's frame.
     """
 
     positions: Floats
@@ -207,9 +217,10 @@ class PositionPrior:
     @staticmethod
     def of(given: Mapping[str, Any]) -> PositionPrior:
         """Of the arguments of stage ``adjust``."""
-        rows = np.array(given["positions"], dtype=np.float64)
-        rows = np.pad(rows, ((0, 0), (0, 3 - rows.shape[1])), constant_values=np.nan)
-        return PositionPrior(rows, *(np.array(given[name], dtype=np.float64) for name in ("times", "sigma", "lever")))
+        rows, times, sigma, lever = (np.array(given[n], np.float64) for n in ("positions", "times", "sigma", "lever"))
+        lacking = 3 - rows.shape[1]
+        sigma[3 - lacking :] = np.inf
+        return PositionPrior(np.pad(rows, ((0, 0), (0, lacking))), times, sigma, lever)
 
 
 @dataclass(frozen=True)
@@ -244,88 +255,71 @@ def fixes_of(prior: PositionPrior, poses: Floats, piece: NDArray[np.int16], time
     return Fixes(near[usable], moved[usable], antenna[near[usable]], velocity[usable])
 
 
-@dataclass(frozen=True)
-class PlaneFit:
-    """A turn ``c`` (a complex number of length 1, times the scale that fits) and ``shift`` (3,), m, of positions."""
-
-    c: complex
-    shift: Floats
-    error: float
-
-    def turn(self) -> Floats:
-        """The turn as a rotation (3, 3)."""
-        return rotation_exp([0.0, 0.0, math.atan2(self.c.imag, self.c.real)])
-
-    def apply(self, positions: Floats) -> Floats:
-        """Positions (k, 3) turned and shifted, without the scale; a height that is NaN stays so."""
-        plane = positions[:, :2] @ self.turn()[:2, :2].T
-        return np.concatenate([plane, positions[:, 2:]], axis=1) + self.shift
-
-
-def fit_plane(positions: Floats, antenna: Floats) -> PlaneFit:
-    """Positions (k, 3) turned about the vertical and shifted to the antenna's (k, 3)."""
+def fit_plane(positions: Floats, antenna: Floats) -> RigidTransform:
+    """How positions (k, 3) are turned about the vertical and shifted to the antenna's (k, 3)."""
     centre, origin = antenna.mean(0), positions.mean(0)
     a, b = (v[:, 0] + 1j * v[:, 1] for v in (positions - origin, antenna - centre))
-    c = complex((np.conj(a) * b).sum() / max((np.abs(a) ** 2).sum(), 1e-12)) or 1.0 + 0.0j
-    turned = PlaneFit(c, np.zeros(3), 0.0)
-    error = float(np.sqrt((np.abs(b - c / abs(c) * a) ** 2).mean()))
-    return PlaneFit(c, np.nan_to_num(centre - turned.apply(origin[None])[0]), error)
+    R = rotation_exp([0.0, 0.0, float(np.angle((np.conj(a) * b).sum()))])
+    return RigidTransform(R, centre - R @ origin)
 
 
-def placed(fixes: Fixes, poses: Floats, piece: NDArray[np.int16]) -> tuple[PlaneFit, Floats, NDArray[np.int16]] | None:
+def placed(
+    fixes: Fixes, poses: Floats, piece: NDArray[np.int16]
+) -> tuple[RigidTransform, Floats, NDArray[np.int16]] | None:
     """Positions laid on the first piece that has enough of them, and the other such pieces on these positions.
 
     Returns
     -------
     How the positions are laid, and the poses (n, 3, 4) and pieces (n,) then; None where no piece has enough.
     """
-    mine = piece[fixes.nodes]
-    there = [int(k) for k in np.unique(mine) if (mine == k).sum() >= MIN_FIXES]
-    if not there:
+    first, *others = enough(fixes, piece) or (-1,)
+    if first < 0:
         return None
-    poses, piece = poses.copy(), piece.copy()
-    first, *others = there
+    poses, piece, mine = poses.copy(), piece.copy(), piece[fixes.nodes]
     laid = fit_plane(fixes.positions[mine == first], fixes.antenna[mine == first])
     for k in others:
-        fit = fit_plane(fixes.antenna[mine == k], laid.apply(fixes.positions[mine == k]))
+        move = fit_plane(fixes.antenna[mine == k], laid.apply(fixes.positions[mine == k]))
         rows = piece == k
-        turn = RigidTransform.from_matrix(np.column_stack([fit.turn(), fit.shift]))
-        poses[rows] = [(turn @ RigidTransform.from_matrix(T)).matrix34 for T in poses[rows]]
+        poses[rows] = [(move @ RigidTransform.from_matrix(T)).matrix34 for T in poses[rows]]
         piece[rows] = first
     return laid, poses, piece
 
 
+def enough(fixes: Fixes, piece: NDArray[np.int16]) -> list[int]:
+    """Numbers of the pieces that have enough positions to be laid on them."""
+    return [int(k) for k, count in enumerate(np.bincount(piece[fixes.nodes])) if count >= MIN_FIXES]
+
+
 def position_contradiction(fixes: Fixes, sigma: Floats, piece: NDArray[np.int16]) -> str:
-    """Why the camera's own way contradicts positions in the plane; empty: it does not."""
-    for k in np.unique(piece[fixes.nodes]):
+    """Why the camera's own way in the plane contradicts the shape of the positions; empty: it does not."""
+    for k in enough(fixes, piece):
         mine = piece[fixes.nodes] == k
-        if mine.sum() < MIN_FIXES:
-            continue
-        said, own = fixes.positions[mine], fixes.antenna[mine]
-        fit, mirrored = fit_plane(said, own), fit_plane(said * [1.0, -1.0, 1.0], own)
-        extent = float(np.sqrt(((own - own.mean(0))[:, :2] ** 2).sum(1).mean()))
-        allowed = CAMERA_SHARE * extent + MIN_SIGMAS * float(np.hypot(*sigma[:2]))
-        if fit.error > allowed and mirrored.error < 0.5 * fit.error:
-            return f"they fit {mirrored.error:.2g} instead of {fit.error:.2g} m if x and y are exchanged"
-        if fit.error > allowed:
-            unit = f"; their lengths fit the camera's times {abs(fit.c):.3g}" if abs(abs(fit.c) - 1.0) > 0.2 else ""
-            return f"they depart from the camera's way by {fit.error:.2g} m, where {allowed:.2g} m is possible{unit}"
+        own = (fixes.antenna[mine] - fixes.antenna[mine].mean(0)) * [1.0, 1.0, 0.0]
+        said = fit_plane(fixes.positions[mine], own).apply(fixes.positions[mine]) * [1.0, 1.0, 0.0]
+        extent = math.sqrt(float((own**2).sum(1).mean()))
+        _, why = departure(own, said, CAMERA_SHARE + MIN_SIGMAS * float(np.hypot(*sigma[:2])) / extent, "ways")
+        if why:
+            return why
     return ""
 
 
-def position_factors(fixes: Fixes, laid: PlaneFit, prior: PositionPrior) -> Factors:
-    """Factors of positions in the place, the node behind all others; their only source is the clock."""
-    count, heights = len(fixes.nodes), np.isfinite(fixes.positions[:, 2])
-    poses = np.tile(np.eye(3, 4), (count, 1, 1))
-    poses[:, :, 3] = np.nan_to_num(laid.apply(fixes.positions))
-    root = np.zeros((count, 6, 6))
+def position_factors(fixes: Fixes, laid: RigidTransform, prior: PositionPrior, poses: Floats) -> Factors:
+    """Factors of positions in the place, the node behind all others; sources are three of the lever arm, and the clock.
+
+    Parameters
+    ----------
+    poses : (n, 3, 4) of the nodes.
+    """
+    count, turns = len(fixes.nodes), poses[fixes.nodes, :, :3]
+    measured = np.tile(np.eye(3, 4), (count, 1, 1))
+    measured[:, :, 3] = laid.apply(fixes.positions)
+    root, shared = np.zeros((count, 6, 6)), np.zeros((count, 6, 4))
     root[:, [0, 1, 2], [0, 1, 2]] = 1.0 / prior.sigma
-    root[~heights, 2, 2] = 0.0
-    shared = np.zeros((count, 6, 1))
-    shared[:, :3, 0] = OFFSET_SIGMA_S * fixes.velocity
+    # The arm that is stated less the true one.
+    shared[:, :3, :3], shared[:, :3, 3] = LEVER_SIGMA_M * turns, OFFSET_SIGMA_S * fixes.velocity
     ends = np.stack([np.full(count, -1), fixes.nodes], axis=1)
-    bound = np.where(heights, bound_of(3), bound_of(2))
-    return Factors(ends, poses, root, shared, np.tile(prior.lever, (count, 1)), bound)
+    bound = np.full(count, bound_of(int(np.isfinite(prior.sigma).sum())))
+    return Factors(ends, measured, root, shared, np.tile(prior.lever, (count, 1)), bound)
 
 
 def vertical_factors(up: Floats, sigma: float, poses: Floats) -> Factors:
@@ -379,7 +373,7 @@ class Sensors:
     times: Floats
     timed: bool
     lines: list[str] = field(default_factory=list)
-    fit: PlaneFit | None = None
+    fit: RigidTransform | None = None
     facts: dict[str, Any] = field(default_factory=dict)
 
     @staticmethod
@@ -454,7 +448,7 @@ class Sensors:
             graph = PoseGraph(replace(factors, ends=ends), len(nodes) + 1, 0, np.ones(len(ends)), common=common)
             start = GraphState.of(np.concatenate([poses, np.eye(3, 4)[None]]), factors.shared.shape[2])
             done = adjust(graph, start, excesses)
-            if excesses == EXCESS and not self._refused(groups, done, count):
+            if excesses == EXCESS and not self._refused(groups, done, count, columns):
                 break
             clocks = self._clocks(groups, clocks, done, columns)
         assert done is not None
@@ -470,22 +464,35 @@ class Sensors:
         if self.positions is not None and self.fit is not None:
             same = np.zeros(len(nodes), np.int16)
             fixes = fixes_of(self.positions, poses, same, times, clocks.get("positions", Clock()).late)
-            groups["positions"] = position_factors(fixes, self.fit, self.positions)
+            groups["positions"] = position_factors(fixes, self.fit, self.positions, poses)
             if not self.timed:
-                groups["positions"].shared[:] = 0.0
+                groups["positions"].shared[:, :, 3] = 0.0
         groups["up"] = vertical_factors(self.up[nodes], self.up_sigma, poses)
         return {name: factors for name, factors in groups.items() if len(factors.ends)}
 
-    def _refused(self, groups: Mapping[str, Factors], done: Adjusted, first: int) -> bool:
-        """Whether a sensor was left out for most of what it says."""
+    def _refused(self, groups: Mapping[str, Factors], done: Adjusted, first: int, column: int) -> bool:
+        """Whether a sensor is not believed: most was left out, or what all share is far off its standard deviation.
+
+        Parameters
+        ----------
+        first, column : number of the first factor and of the first source of the sensors.
+        """
         refused = False
         for name, factors in groups.items():
             kept = done.kept[first : first + len(factors.ends)]
-            first += len(kept)
+            # Clocks are found, whatever they are: the last source is no error.
+            shared = done.state.sources[column : max(column + factors.shared.shape[2] - 1, column)]
+            first, column = first + len(kept), column + factors.shared.shape[2]
+            worst = int(np.argmax(np.abs(shared))) if len(shared) else -1
             self.facts[name] = {"used": True, "measurements": len(kept), "left_out": int((~kept).sum())}
+            why = ""
             if np.mean(kept) < MAJORITY:
+                why = f"{(~kept).sum()} of its {len(kept)} measurements contradict the others"
+            elif worst >= 0 and abs(shared[worst]) > MAX_SHARED_SIGMAS:
+                why = f"its {SHARED_ERRORS[name][worst]} is off by {abs(shared[worst]):.0f} standard deviations"
+            if why:
                 refused = True
-                self._refuse(name, f"{(~kept).sum()} of its {len(kept)} measurements contradict the others")
+                self._refuse(name, why)
                 self.relative = [sensor for sensor in self.relative if sensor.name != name]
                 self.positions = None if name == "positions" else self.positions
                 self.up = np.full_like(self.up, np.nan) if name == "up" else self.up
@@ -526,8 +533,7 @@ class Sensors:
                 count = f"{fact['left_out']} of {fact['measurements']}"
                 self.lines.append(f"[{name}] {count} of its measurements contradict the others and are left out")
         if self.fit is not None and self.positions is not None:
-            back = self.fit.turn().T
-            origin = back @ (-place[:, :3].T @ place[:, 3] - self.fit.shift)
-            ahead = back @ place[:, :3].T @ [0.0, 1.0, 0.0]
+            there = (RigidTransform.from_matrix(place) @ self.fit).inverse()
+            origin, ahead = there.translation, there.rotation[:, 1]
             azimuth = math.degrees(math.atan2(ahead[0], ahead[1])) % 360.0
             self.facts["place"] = {"origin": origin.tolist(), "azimuth_deg": azimuth}

@@ -189,7 +189,7 @@ def test_a_chain_whose_errors_exceed_its_covariances_takes_them_times_a_factor()
         segments, before = run_of(truth, rng, excess=10.0)
         loops = [seen(truth, a, b, rng) for a, b in ((0, 11), (1, 10), (2, 9), (3, 8), (0, 6), (5, 11))]
         out = adjusted(segments, before, *loops)
-        assert not out.meta["warnings"]
+        assert not [line for line in out.meta["warnings"] if "left out" in line]
         e = errors(out, truth)[1:]
         found.append(out.meta["excess"])
         nees.append(np.mean(np.einsum("fi,fij,fj->f", e, np.linalg.inv(out["covariance"][1:]), e)) / 6)

@@ -116,8 +116,11 @@ WRONG = {
         lambda truth, rng: rotations(truth, rotation_exp([0.2, 0, 0])),
         ("turned by 1",),
     ),
-    "mirrored": (mirrored, ("x and y are exchanged",)),
-    "lever arm": (lambda truth, rng: gnss(truth, rng, sigma=0.05, lever=(2.0, 0.0, 0.0)), ("lever_arm",)),
+    "mirrored": (mirrored, ("axes are exchanged", "columns")),
+    "lever arm": (
+        lambda truth, rng: gnss(truth, rng, sigma=0.05, lever=(2.0, 0.0, 0.0)),
+        ("lever_arm",),
+    ),
 }
 
 
