@@ -417,7 +417,7 @@ def sensors(make: Builder, frames: Series[int]) -> dict[str, Any]:
             one = [known[f] for f in frames]
             said[name][key] = [v.to_list() if isinstance(v, RigidTransform) else v for v in one]
     times = list(frames) if s.times is None else [s.times[f] for f in frames]
-    return {**said, "times": times, "timed": s.times is not None}
+    return {**said, "times": times, "timed": s.times is not None, "georeferenced": s.georeference is not None}
 
 
 def refined(make: Builder, pairs: Mapping[int, Pair], segments: list[Segment]) -> list[Handle[RefineFacts]]:

@@ -46,7 +46,7 @@ WINDOWS = 16
 CAMERA_SHARE = 0.05
 """Error of the camera's own ways that no sensor is doubted for."""
 MIN_TURN = math.radians(1.0)
-"""RMS turn of the camera below which an attitude is not tested: noise has any axis."""
+"""RMS turn of the camera below which an attitude is not tested, noise having any axis; and what its own may err."""
 HELD = 0.02
 """Weight of the identity against the data where Q is sought: along a straight way a roll does not show."""
 MIN_SIGMAS = 3.0
@@ -339,6 +339,19 @@ def vertical_factors(up: Floats, sigma: float, poses: Floats) -> Factors:
     return Factors(ends, T, root, np.zeros((len(nodes), 6, 0)), np.zeros((len(nodes), 3)), bound)
 
 
+def vertical_contradiction(up: Floats, sigma: float, poses: Floats, piece: NDArray[np.int16]) -> str:
+    """Why the camera's turns contradict the direction of up (n, 3) in its frame; empty: they do not."""
+    for k in np.unique(piece[np.isfinite(up).all(1)]):
+        rows = np.flatnonzero((piece == k) & np.isfinite(up).all(1))
+        above = np.einsum("nij,nj->ni", poses[rows, :, :3], up[rows])
+        mean = above.mean(0) / np.linalg.norm(above.mean(0))
+        off = math.sqrt(float((np.cross(above, mean) ** 2).sum(1).mean()))
+        if off > MIN_TURN + MIN_SIGMAS * sigma:
+            allowed = math.degrees(MIN_TURN + MIN_SIGMAS * sigma)
+            return f"in the world it wanders by {math.degrees(off):.1f} degrees, where {allowed:.1f} are possible"
+    return ""
+
+
 def anchor(pose: Floats) -> Factors:
     """What is known of the place beforehand, by the pose (3, 4) of node 0: it is about upright in the world."""
     root = np.diag([1e-3] * 3 + [1.0 / VERTICAL_SIGMA] * 2 + [0.1])[None]
@@ -363,7 +376,8 @@ class Sensors:
     """Other sensors of a trajectory whose ``times`` (n,) are those of its nodes; ``lines`` collects what is noticed.
 
     ``up`` (n, 3) is the direction of up in the left cameras, NaN of none, with its ``up_sigma``, rad. ``timed``: times
-    are seconds, so that clocks are compared. ``fit``: how positions are laid on the world. ``facts`` of each sensor.
+    are seconds, so that clocks are compared; ``georeferenced``: the world has a place on Earth. ``fit`` lays positions
+    on the world. ``facts`` of each sensor.
     """
 
     relative: list[RelativePrior]
@@ -372,6 +386,7 @@ class Sensors:
     up_sigma: float
     times: Floats
     timed: bool
+    georeferenced: bool
     lines: list[str] = field(default_factory=list)
     fit: RigidTransform | None = None
     facts: dict[str, Any] = field(default_factory=dict)
@@ -397,21 +412,23 @@ class Sensors:
             relative.append(RelativePrior("attitude", poses, rows, clock, 0.0, given["attitude"]["sigma"]))
         positions = PositionPrior.of(given["positions"]) if "positions" in given else None
         up, up_sigma = stacked("up", "directions", (3,))[rows], float(given.get("up", {}).get("sigma", 1.0))
-        return Sensors(relative, positions, up, up_sigma, times[rows], timed)
+        return Sensors(relative, positions, up, up_sigma, times[rows], timed, bool(given.get("georeferenced", False)))
 
     def believe(self, poses: Floats, piece: NDArray[np.int16]) -> None:
         """Leave out the sensors that contradict the camera's own chain (n, 3, 4), and say so."""
         why = {sensor.name: sensor.contradiction(poses, piece) for sensor in self.relative}
-        self.relative = [sensor for sensor in self.relative if not why[sensor.name]]
         if self.positions is not None:
             fixes = fixes_of(self.positions, poses, piece, self.times, 0.0)
             why["positions"] = position_contradiction(fixes, self.positions.sigma, piece)
-            self.positions = None if why["positions"] else self.positions
+        why["up"] = vertical_contradiction(self.up, self.up_sigma, poses, piece)
         for name, reason in why.items():
             if reason:
                 self._refuse(name, reason)
 
     def _refuse(self, name: str, reason: str) -> None:
+        self.relative = [sensor for sensor in self.relative if sensor.name != name]
+        self.positions = None if name == "positions" else self.positions
+        self.up = np.full_like(self.up, np.nan) if name == "up" else self.up
         self.facts[name] = {"used": False, "why": reason}
         self.lines.append(f"[{name}] contradicts the images and is not used: {reason}: {REMEDY[name]}")
 
@@ -422,7 +439,6 @@ class Sensors:
         found = placed(fixes_of(self.positions, poses, piece, self.times, 0.0), poses, piece)
         if found is None:
             self._refuse("positions", f"no piece has {MIN_FIXES} of them")
-            self.positions = None
             return poses, piece
         self.fit, poses, piece = found
         return poses, piece
@@ -493,9 +509,6 @@ class Sensors:
             if why:
                 refused = True
                 self._refuse(name, why)
-                self.relative = [sensor for sensor in self.relative if sensor.name != name]
-                self.positions = None if name == "positions" else self.positions
-                self.up = np.full_like(self.up, np.nan) if name == "up" else self.up
         return refused
 
     def _clocks(
@@ -537,3 +550,7 @@ class Sensors:
             origin, ahead = there.translation, there.rotation[:, 1]
             azimuth = math.degrees(math.atan2(ahead[0], ahead[1])) % 360.0
             self.facts["place"] = {"origin": origin.tolist(), "azimuth_deg": azimuth}
+            if not self.georeferenced:
+                where = ", ".join(f"{v:.2f}" for v in origin)
+                text = f"[positions] in their frame world.origin is [{where}] and world.azimuth_deg is {azimuth:.2f}"
+                self.lines.append(f"{text}: state these with world.crs, and maps lie there")

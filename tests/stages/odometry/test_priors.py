@@ -10,7 +10,7 @@ from rille.stages.odometry.resection.adjust import adjust_stage
 from rille.stages.odometry.resection.priors import resampled
 
 TIMES = 0.1 * np.arange(31)
-BASE = {"times": TIMES.tolist(), "timed": True}
+BASE = {"times": TIMES.tolist(), "timed": True, "georeferenced": True}
 AXES = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 TURNED = rotation_exp([0.0, np.deg2rad(10.0), 0.0])
 
@@ -108,7 +108,14 @@ def mirrored(truth, rng):
     return given
 
 
+def tilted(truth, rng):
+    """Up of a sensor that is rolled by 10 degrees."""
+    roll = rotation_exp([0.0, 0.0, np.deg2rad(10.0)])
+    return {**BASE, "up": {"directions": [(roll @ T.rotation.T[:, 2]).tolist() for T in truth], "sigma": 0.005}}
+
+
 WRONG = {
+    "vertical": (tilted, ("T_body_left",)),
     "turned": (lambda truth, rng: odometry(truth, rng, mount=TURNED), ("turned by 9", "T_body_left")),
     "axes": (lambda truth, rng: odometry(truth, rng, mount=AXES), ("T_body_left",)),
     "unit": (lambda truth, rng: odometry(truth, rng, scale=1.3), ("multiplied by 0.7", "unit")),
@@ -146,7 +153,9 @@ def test_positions_that_are_off_for_a_while_are_left_out():
 def test_positions_say_where_the_world_lies():
     truth, rng = winding(), np.random.default_rng(6)
     segments, before = run_of(truth, rng)
-    place = adjusted(segments, before, gnss(truth, rng, sigma=0.02)).meta["priors"]["place"]
+    out = adjusted(segments, before, {**gnss(truth, rng, sigma=0.02), "georeferenced": False})
+    place = out.meta["priors"]["place"]
+    assert [line for line in out.meta["warnings"] if "world.origin" in line and "world.azimuth_deg" in line]
     np.testing.assert_allclose(place["origin"], [4.5e5, 5.4e6, 300.0], atol=0.1)
     assert place["azimuth_deg"] == pytest.approx(360 - np.rad2deg(1.0), abs=1.0)
 
