@@ -80,7 +80,10 @@ def catalogue() -> list[tuple[str, str]]:
 
 
 def open_sequence(
-    name_or_path: str, overrides: Mapping[str, Mapping[str, Any]] | None = None, memory: Path | None = None
+    name_or_path: str,
+    overrides: Mapping[str, Mapping[str, Any]] | None = None,
+    memory: Path | None = None,
+    digests: Digests | None = None,
 ) -> Sequence:
     """A sequence by built-in name or by path.
 
@@ -90,6 +93,7 @@ def open_sequence(
     overrides : parameters by section: ``{"mockup": {"seed": 3}}`` for the mockups, ``{"misalign": {"rows": 3}}`` for
         any sequence.
     memory : file that keeps the digests of image files from run to run.
+    digests : in its place, what knows the files of a sequence whose images are still arriving.
 
     Raises
     ------
@@ -108,7 +112,7 @@ def open_sequence(
         sequence = mockup(_section("mockup", MockupParams, {**preset, **given}), name_or_path)
     else:
         _none_left(sections, name_or_path)
-        sequence = _opened(name_or_path, Digests(memory))
+        sequence = _opened(name_or_path, digests or Digests(memory))
     return misalign(sequence, warp)
 
 

@@ -22,6 +22,7 @@ from rille.pipeline.engine.plain import plain_output, raw
 
 COMMANDS = {
     "reconstruct": "reconstruct:reconstruct",
+    "watch": "watch:watch",
     "drive": "reconstruct:drive",
     "plan": "plan:plan",
     "graph": "graph:graph",

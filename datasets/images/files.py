@@ -243,6 +243,9 @@ class Digests:
     a memo, so that a line that does not parse is passed over.
     """
 
+    growing = False
+    """Whether images are still arriving: those without a partner are left out, and so are rows of tables for more."""
+
     def __init__(self, memory: Path | None = None) -> None:
         self._memory = memory
         self._known: dict[str, str] = {}
@@ -251,6 +254,10 @@ class Digests:
                 digest, _, key = line.partition(" ")
                 if len(digest) == 64:
                     self._known[key] = digest
+
+    def whole(self, path: Path) -> bool:
+        """Whether an image file may be taken; one that somebody still writes may not."""
+        return True
 
     def sha256(self, path: Path) -> str:
         """Hexadecimal digest of the file's bytes."""

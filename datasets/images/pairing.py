@@ -149,6 +149,7 @@ def pair_up(
     rule: str = "auto",
     *,
     gaps: bool = False,
+    growing: bool = False,
     tolerance: float | None = None,
     warnings: list[str] | None = None,
 ) -> tuple[ImagePair, ...]:
@@ -162,6 +163,7 @@ def pair_up(
         differ, and number where the names of the two cameras have nothing in common.
     gaps : images that are paired by name and have no partner make a pair of which a file is absent, as long as they
         are fewer than the whole pairs.
+    growing : images behind the last pair, by name or number, are left out: their partners are still to come.
     tolerance : s; how far the stamps of a pair may be apart; None: see :func:`join`.
     warnings : takes lines on what is left out or apart.
 
@@ -197,6 +199,8 @@ def pair_up(
         shared = {without_side(path.stem, 0) for path in left} & {without_side(path.stem, 1) for path in right}
         rule = "name" if shared else "number"
     by_key = _by_key(left, 0, rule), _by_key(right, 1, rule)
+    if growing:
+        by_key = _up_to_last_pair(*by_key)
     shared, present = set(by_key[0]) & set(by_key[1]), set(by_key[0]) | set(by_key[1])
     if gaps and rule == "name" and 2 * len(shared) > len(present):
         return _with_gaps(by_key)
@@ -224,6 +228,15 @@ def _by_key(paths: Sequence[Path], side: int, rule: str) -> dict[str, Path]:
             raise InputError("RIL-258", text, remedy="narrow the patterns, or choose another images.pair")
         by_key[key] = path
     return by_key
+
+
+def _up_to_last_pair(left: dict[str, Path], right: dict[str, Path]) -> tuple[dict[str, Path], dict[str, Path]]:
+    """The images whose key is not behind that of the last pair; all of them where there is no pair."""
+    last = max((natural(key) for key in left if key in right), default=None)
+    if last is None:
+        return left, right
+    cut = [{key: path for key, path in ours.items() if natural(key) <= last} for ours in (left, right)]
+    return cut[0], cut[1]
 
 
 def _two_clocks(

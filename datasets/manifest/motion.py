@@ -57,12 +57,14 @@ class MotionReader:
     name : the manifest's, for errors.
     pairs : of images; of some a file may be absent.
     motion : what has been read so far; times come first, by which the others are interpolated.
+    growing : images are still arriving, so that a table may have rows for more of them.
     """
 
     root: Path
     name: str
     pairs: Sequence[ImagePair]
     motion: StatedMotion
+    growing: bool = False
 
     def read(self, manifest: Manifest) -> StatedMotion:
         """Everything that the tables ``times``, ``truth``, ``odometry``, ``positions``, ``attitude``, ``imu`` state.
@@ -124,7 +126,10 @@ class MotionReader:
 
     def stamps_of_file(self, path: Path) -> Sequence[tuple[str, int] | None]:
         """Time stamp of each pair as text, and the line that it stands in."""
-        text = enumerate(read_lines(path, "times"), start=1)
+        lines = read_lines(path, "times")
+        if self.growing and not path.read_bytes().endswith(b"\n"):  # whoever writes it has not come to the line's end
+            del lines[-1:]
+        text = enumerate(lines, start=1)
         rows = [(k, re.split(r"[,;\s]+", line.replace('"', " ").strip(", \t"))) for k, line in text]
         rows = [(k, words) for k, words in rows if re.match(r"[-+.\d]|(nan|inf)$", words[0], re.I)]
         # Tables may list more images than there are pairs, in any order: names decide where all are found.
@@ -132,6 +137,7 @@ class MotionReader:
         stems = [pair.left.stem for pair in self.pairs]
         if by_name and all(stem in by_name for stem in stems):
             return [by_name[stem] for stem in stems]
+        rows = list(self.arrived(rows))
         if len(rows) not in self.counts():
             absent = next((stem for stem in stems if stem not in by_name), "")
             more = f", none of {absent}" if by_name else ""
@@ -143,6 +149,10 @@ class MotionReader:
     def counts(self) -> set[int]:
         """Numbers of rows that a file may have: one a pair, or one for each pair with both images."""
         return {len(self.pairs), sum(not pair.absent for pair in self.pairs)}
+
+    def arrived(self, rows: Sequence[Row]) -> Sequence[Row]:
+        """The rows without those for images that are still to come."""
+        return rows[: len(self.pairs)] if self.growing else rows
 
     def one_a_pair(self, rows: Sequence[Row]) -> Sequence[Row | None]:
         """One row a pair; where there are rows for whole pairs alone (:meth:`counts`), None for the others."""
@@ -163,8 +173,8 @@ class MotionReader:
             moved = replace(timed, poses=poses, times=tuple(t + section.time_offset for t in timed.times))
             poses = interpolate(moved, self.motion.times, section.max_gap)
             self.motion.warnings += coverage(poses, self.motion.times, f"{table} ({path.name})")
-        elif len(poses) in self.counts():
-            poses = tuple(self.one_a_pair(poses))
+        elif len(self.arrived(poses)) in self.counts():
+            poses = tuple(self.one_a_pair(self.arrived(poses)))
         else:
             text = f"{self.name}: {table}.file: {path} has {len(poses)} poses for {len(self.pairs)} pairs"
             raise InputError("RIL-230", text, remedy="give one a pair, or poses with times")
@@ -197,6 +207,7 @@ class MotionReader:
             raise InputError("RIL-802", text, remedy="remove T_body_left, or give poses")
         spacing = float(np.median(np.diff(at))) if at is not None and len(at) > 1 else 0.0
         if self.motion.times is None or at is None:
+            rows = tuple(self.arrived(rows))
             if len(rows) != len(self.pairs):
                 text = f"has {len(rows)} positions for {len(self.pairs)} pairs, and not both have times"
                 remedy = "give one a pair, or times of both ([times] of the pairs)"

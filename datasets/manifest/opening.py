@@ -69,7 +69,7 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
     if manifest.truth_disparity is not None:
         exact = _disparity("truth_disparity", manifest.truth_disparity, root, name, (base, pairs), digests)
         base = replace(base, truth_disparity=exact)
-    motion = MotionReader(root, name, pairs, StatedMotion(base.times)).read(manifest)
+    motion = MotionReader(root, name, pairs, StatedMotion(base.times), growing=digests.growing).read(manifest)
     world, pinned = manifest.world, {} if manifest.rig.file is None else {"rig.mode": "fixed"}
     pitch = None if world.pitch_deg is None else math.radians(world.pitch_deg)
     return replace(
@@ -106,7 +106,7 @@ def _of_files(
 ) -> tuple[Sequence, tuple[ImagePair, ...]]:
     """Images and cameras of a manifest that names files."""
     lines: list[str] = []
-    pairs = find_pairs(manifest.images, root, name, lines)
+    pairs = find_pairs(manifest.images, root, name, lines, digests)
     headers = common_headers(pairs)
     names = (os.path.relpath(path, root.parent) for path in (pairs[0].left, pairs[0].right))
     optics = read_optics(manifest, root, name, sizes_of(headers), _are_rectified(manifest.images, names))
@@ -210,7 +210,9 @@ def root_folder(text: str, path: Path) -> Path:
     return root
 
 
-def find_pairs(images: Images, root: Path, name: str, lines: list[str]) -> tuple[ImagePair, ...]:
+def find_pairs(
+    images: Images, root: Path, name: str, lines: list[str], digests: files.Digests
+) -> tuple[ImagePair, ...]:
     """The pairs that the patterns find; where files are paired by name, some may lack one (``ImagePair.absent``).
 
     Parameters
@@ -230,6 +232,7 @@ def find_pairs(images: Images, root: Path, name: str, lines: list[str]) -> tuple
             raise error.at(f"{name}: images.{side}") from error
         if pattern.endswith("*"):  # of any kind: then what is no image may lie beside the images
             paths = [path for path in paths if path.suffix.lower() in files.SUFFIXES] or paths
+        paths = [path for path in paths if digests.whole(path)]
         if not paths:
             text = f"{name}: images.{side} = {pattern!r} finds no file in {root}"
             raise InputError("RIL-217", text, remedy="correct the pattern or root")
@@ -241,7 +244,13 @@ def find_pairs(images: Images, root: Path, name: str, lines: list[str]) -> tuple
         )
     try:
         return pair_up(
-            found["left"], found["right"], images.pair, gaps=True, tolerance=images.tolerance, warnings=lines
+            found["left"],
+            found["right"],
+            images.pair,
+            gaps=True,
+            growing=digests.growing,
+            tolerance=images.tolerance,
+            warnings=lines,
         )
     except InputError as error:
         raise error.at(name) from error

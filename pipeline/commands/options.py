@@ -105,6 +105,8 @@ class Options(Work):
     ] = "auto"
     quiet: Annotated[bool, flag("No progress; warnings and errors only.", "--quiet", "-q")] = False
     verbose: Annotated[bool, flag("Say where to watch dask at work.", "--verbose", "-v")] = False
+    kept: Annotated[Any, Unparsed] = None
+    """:class:`~rille.pipeline.engine.workers.Kept` of several runs, one after another."""
 
     def part(self) -> str:
         """The options that choose a part of the run, as they are typed; empty: all of it."""
@@ -123,6 +125,18 @@ class DriveOptions(Options):
     frames: Annotated[None, Unparsed] = None
     until: Annotated[tuple[str, ...], Unparsed] = ()
     only: Annotated[tuple[str, ...], Unparsed] = ()
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class WatchOptions(Options):
+    """Those of a run, and when the watch ends."""
+
+    frames: Annotated[str | None, Unparsed] = None
+    until_idle: Annotated[
+        float | None, Parameter(help="End when nothing has arrived for so many seconds; by default at Ctrl-C.")
+    ] = None
+    count: Annotated[int | None, Parameter(help="End when so many pairs have arrived.")] = None
 
 
 def cache_folder(given: str | Path | None) -> Path:

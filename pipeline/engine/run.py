@@ -43,7 +43,7 @@ from rille.pipeline.engine.store.base import GoneError, NonDeterministicError, S
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import CodeChangedError, Outcome
-from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, check, light, make
+from rille.pipeline.engine.workers import Call, Died, Ended, Failed, Kept, NotBegun, Workers, check, light, make
 from rille.stages.core.errors import DegenerateError, RilleError
 
 MAX_HEALS = 3
@@ -146,6 +146,7 @@ class RunOptions:
     progress : receives every step of the run.
     memory_limit : bytes that this process and its workers may take together; None is what is free here.
     survey : lays the same graph out anew, to look ahead: what cannot fit into memory is refused before anything runs.
+    kept : workers of runs before and after this one; None: those of this run end with it.
     """
 
     executor: Any = "dask"
@@ -157,6 +158,7 @@ class RunOptions:
     progress: Progress = field(default_factory=Progress)
     memory_limit: float | None = None
     survey: Callable[[], Graph] | None = None
+    kept: Kept | None = None
 
 
 _DEFAULTS = RunOptions()
@@ -356,7 +358,8 @@ class _Run:
         jobs = self.budget.workers(self.jobs, self.largest)
         name = kind if isinstance(kind, str) else kind.scheduler.address
         self.ledger.run(executor=name, jobs=jobs)
-        workers = make(kind, jobs, self.store.root, self.budget.limit)
+        begin = make if self.options.kept is None else self.options.kept.make
+        workers = begin(kind, jobs, self.store.root, self.budget.limit)
         self.result.workers_started = True
         if pages := getattr(workers, "pages", ""):
             self.progress.detail(pages)

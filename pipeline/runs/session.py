@@ -77,12 +77,17 @@ class Settled:
     given: tuple[str, ...]
 
 
-def settings(options: Settings) -> Settled:
-    """Open a sequence and determine its configuration: defaults, presets, file and options of the user."""
+def configured(options: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What the user has set, by section: of the sequence, and of the stages."""
     read = configuration.read_toml(options.config) if options.config else {}
     # Over the file: --set is said now, --config may be old.
     configuration.merge(read, configuration.parse_assignments(options.assignments))
-    for_dataset, for_stages = configuration.split_dataset(read)
+    return configuration.split_dataset(read)
+
+
+def settings(options: Settings) -> Settled:
+    """Open a sequence and determine its configuration: defaults, presets, file and options of the user."""
+    for_dataset, for_stages = configured(options)
     if options.opened is None:
         sequence = open_sequence(options.sequence, for_dataset, cache_folder(options.cache) / "files.json")
     elif for_dataset:
@@ -236,6 +241,7 @@ def _compute(opened: _Opened) -> driver.Result:
             progress=progress.make("quiet" if options.quiet else options.progress, verbose=options.verbose),
             memory_limit=memory_limit(options),
             survey=lambda: lay_out(view.sequence, view.config, view.frames, opened.graph.cut),
+            kept=options.kept,
         ),
     )
     trajectory = view.products.trajectory

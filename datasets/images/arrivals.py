@@ -1,0 +1,75 @@
+"""Image files that are still being written: which of them are whole."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from rille.datasets.images.files import MOST_BYTES, Digests, decode
+from rille.datasets.text.reading import read_bytes
+from rille.stages.core.errors import InputError
+
+SETTLE_SECONDS = 0.5
+"""Time for which size and modification time of a file must rest before it is looked into."""
+
+WRITTEN = "is still being written"
+
+
+@dataclass
+class _Seen:
+    """A file as it was seen last; ``trouble`` says why it is not whole, empty: it is."""
+
+    size: int
+    changed_ns: int
+    since: float
+    trouble: str = WRITTEN
+
+
+class Arrivals(Digests):
+    """Files of a sequence whose images arrive: a file counts once it rests and decodes.
+
+    Attributes
+    ----------
+    changed : when a file was last seen to be new or different, by the monotonic clock, s.
+    """
+
+    growing = True
+
+    def __init__(self, memory: Path | None = None) -> None:
+        super().__init__(memory)
+        self.changed = time.monotonic()
+        self._seen: dict[Path, _Seen] = {}
+
+    def whole(self, path: Path) -> bool:
+        """Whether the file has rested and decodes; one that changes is looked into anew."""
+        try:
+            status = path.stat()
+        except OSError:  # it has gone since the folder was listed
+            return False
+        now, seen = time.monotonic(), self._seen.get(path)
+        if seen is None or (seen.size, seen.changed_ns) != (status.st_size, status.st_mtime_ns):
+            self.changed = now
+            self._seen[path] = _Seen(status.st_size, status.st_mtime_ns, now)
+            return False
+        if seen.trouble == WRITTEN and now - seen.since >= SETTLE_SECONDS:
+            seen.trouble = _damage(path)
+        return not seen.trouble
+
+    def first_seen(self, path: Path) -> float:
+        """When the file was first seen as it is now, by the monotonic clock, s."""
+        return self._seen[path].since
+
+    def troubles(self) -> list[str]:
+        """Why files that are there are not whole, one line each."""
+        there = ((path, seen.trouble) for path, seen in self._seen.items() if seen.trouble and path.exists())
+        return [f"{path} {WRITTEN}" if trouble == WRITTEN else trouble for path, trouble in there]
+
+
+def _damage(path: Path) -> str:
+    """Why an image cannot be decoded, in words; empty: it can."""
+    try:
+        decode(read_bytes(path, "image", MOST_BYTES), str(path))
+    except InputError as error:
+        return error.message
+    return ""

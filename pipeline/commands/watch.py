@@ -1,0 +1,223 @@
+"""``rille watch``: a sequence whose images are still arriving, reconstructed again and again out of the cache."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import sys
+import time
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple, TextIO
+
+from rille.datasets.images.arrivals import Arrivals
+from rille.datasets.protocol import CAMERAS, Sequence, Source
+from rille.datasets.registry import open_sequence
+from rille.pipeline.commands.complaints import complain
+from rille.pipeline.commands.options import HOLES, INTERRUPTED, WatchOptions, cache_folder
+from rille.pipeline.engine.plain import some
+from rille.pipeline.engine.workers import Kept
+from rille.pipeline.flow import config as configuration
+from rille.pipeline.runs import session
+from rille.stages.core.errors import ConfigError, InputError, RilleError
+
+UPDATED = ("trajectory.tum", "trajectory.kitti", "dem.tif", "dem_sigma.tif", "risk.tif", "path.gpkg")
+"""Files that each update makes; all others, COLMAP's trajectory and the figures follow at the end."""
+
+LOOK_SECONDS, LOOK_SHARE = 0.25, 0.2
+"""Time between two looks at the folder, and share of the time that looking takes at most."""
+
+PATIENCE_SECONDS = 10.0
+"""Time for which a pair between others is waited for; then it counts as lost until it is there."""
+
+MORE_MAY_COME = ("RIL-217", "RIL-229", "RIL-230", "RIL-256", "RIL-259", "RIL-803", "RIL-822")
+"""Codes of what is wrong with a sequence of which files have yet to arrive."""
+
+
+_OPTIONS = WatchOptions()
+
+
+def watch(seq: str, *, options: WatchOptions = _OPTIONS) -> int:
+    """Reconstruct a sequence while its images arrive: trajectory, terrain, risk and path grow with it.
+
+    The end is a whole run of all that has arrived, with the results of `rille reconstruct`, to the bit.
+
+    Parameters
+    ----------
+    seq
+        A folder or a manifest of image files. A file is taken once it is whole.
+    """
+    configuration.build(session.configured(options)[1])  # a wrong parameter should not wait for the first pair
+    kept, arrivals = Kept(), Arrivals(cache_folder(options.cache) / "files.json")
+    watched = _Watched(replace(options, sequence=seq, kept=kept), arrivals, _Once(sys.stderr))
+    try:
+        return watched.to_the_end()
+    except KeyboardInterrupt:
+        last = f"the last result is {watched.folder}" if watched.folder else "there is no result yet"
+        print(f"rille: interrupted; {last}; `rille reconstruct {seq}` computes the rest", file=sys.stderr)
+        return INTERRUPTED
+    finally:
+        kept.close()
+
+
+class _Once:
+    """Stream that writes each line once: every update has the same warnings."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream, self._line, self._said = stream, "", set[str]()
+
+    def write(self, text: str) -> int:
+        """Write the lines that are whole by now and new."""
+        *lines, self._line = (self._line + text).split("\n")
+        for line in lines:
+            if line not in self._said:
+                self._said.add(line)
+                self._stream.write(f"{line}\n")
+        return len(text)
+
+    def flush(self) -> None:
+        """Write what the stream behind holds back."""
+        self._stream.flush()
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._stream, name)
+
+
+class _Seen(NamedTuple):
+    """A sequence as it is by now; ``frames`` of it may be taken, and ``files`` are the digests of their images."""
+
+    sequence: Sequence
+    frames: int
+    files: dict[Path, str]
+
+
+@dataclass
+class _Watched:
+    """What has been seen of a sequence, and taken; ``folder`` of the last results, ``once`` for what updates say."""
+
+    options: WatchOptions
+    arrivals: Arrivals
+    once: _Once
+    folder: Path | None = None
+    taken: _Seen | None = None
+    gaps: dict[str, float] = field(default_factory=dict)
+    """When it was first seen, by the monotonic clock, that a frame between others is missing, by its name."""
+
+    def to_the_end(self) -> int:
+        """Update until nothing is to be waited for, and reconstruct everything; the exit code."""
+        while True:
+            begin = time.monotonic()
+            seen, took = self.look(), time.monotonic() - begin
+            if seen is not None and self.is_more(seen):
+                self.update(seen)
+            elif self.is_over(seen):
+                return self.finish()
+            else:
+                time.sleep(max(LOOK_SECONDS, took / LOOK_SHARE))
+
+    def look(self) -> _Seen | None:
+        """Open the sequence as far as it has arrived; None where that is not enough to open it.
+
+        Raises
+        ------
+        InputError
+            It cannot be opened, whatever else may arrive.
+        ConfigError
+            Its images are no files.
+        """
+        try:
+            sequence = open_sequence(self.options.sequence, digests=self.arrivals)
+        except InputError as error:
+            if self.taken is None and error.code not in MORE_MAY_COME:
+                raise
+            self.say(f"waiting: {error.message}")
+            return None
+        now = time.monotonic()
+        names = {sequence.frame_names[k]: k for k in sequence.lost}
+        self.gaps = {name: self.gaps.get(name, now) for name in names}
+        frames = min((names[n] for n, t in self.gaps.items() if now - t < PATIENCE_SECONDS), default=sequence.frames)
+        if frames < sequence.frames:
+            self.say(f"waiting: {sequence.lost[frames]}")
+        images = [_image(sequence.image(k, c)) for k in range(frames) if k not in sequence.lost for c in CAMERAS]
+        return _Seen(sequence, frames, {Path(image.hints["path"]): image.args["sha256"] for image in images})
+
+    def is_more(self, seen: _Seen) -> bool:
+        """Whether there is something new, and nothing less than before: what is written anew will be there again."""
+        before = self.taken
+        return bool(seen.files) and (before is None or (seen.frames >= before.frames and seen.files != before.files))
+
+    def is_over(self, seen: _Seen | None) -> bool:
+        """Whether no more is to be waited for."""
+        idle, count = self.options.until_idle, self.options.count
+        enough = count is not None and seen is not None and len(seen.files) >= 2 * count
+        return enough or (idle is not None and time.monotonic() - self.arrivals.changed >= idle)
+
+    def update(self, seen: _Seen) -> None:
+        """Reconstruct what may be taken; an error is printed, and more is waited for."""
+        before, self.taken = {} if self.taken is None else self.taken.files, seen
+        replaced = [path.name for path, digest in seen.files.items() if before.get(path, digest) != digest]
+        if replaced:
+            self.say(f"written anew, so that what depends on it is computed anew: {some(replaced, 6)}")
+        part = not (self.options.until or self.options.only)
+        options = replace(self.options, quiet=True, only=UPDATED if part else self.options.only)
+        try:
+            with redirect_stderr(self.once):
+                _, line = self.run(options, seen)
+        except ConfigError:
+            raise
+        except RilleError as error:
+            complain(error)
+            return
+        since = time.monotonic() - max(self.arrivals.first_seen(path) for path in seen.files)
+        print(f"{len(seen.files) // 2} pairs, {since:.1f} s after the last file: {line}", flush=True)
+
+    def finish(self) -> int:
+        """Reconstruct all that has arrived, as ``rille reconstruct`` does; the exit code."""
+        left_out = []
+        self.arrivals.growing = False
+        try:
+            sequence = open_sequence(self.options.sequence, digests=self.arrivals)
+        except InputError as error:
+            if self.taken is None:
+                raise
+            # A run refuses images without a partner, or a table with more rows: not all has arrived.
+            self.arrivals.growing = True
+            sequence = open_sequence(self.options.sequence, digests=self.arrivals)
+            left_out = [error.message]
+        code, line = self.run(self.options, _Seen(sequence, sequence.frames, {}))
+        print(line)
+        left_out += self.arrivals.troubles()
+        if left_out:
+            self.say(f"not all has arrived: {'; '.join(left_out)}")
+        return max(code, HOLES) if left_out else code
+
+    def run(self, options: WatchOptions, seen: _Seen) -> tuple[int, str]:
+        """Exit code and closing line of a run, whose folder takes the place of that of the run before."""
+        frames = None if seen.frames == seen.sequence.frames else f"0:{seen.frames}"
+        with redirect_stdout(io.StringIO()) as said:
+            code, folder = session.perform(replace(options, opened=seen.sequence, frames=frames))
+        if self.folder is not None:
+            shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder = folder
+        return code, said.getvalue().partition("\n")[0]
+
+    def say(self, text: str) -> None:
+        """Print a line on stderr, if it was not printed before."""
+        print(f"rille: {text}", file=self.once, flush=True)
+
+
+def _image(source: Source) -> Source:
+    """The source of the image file behind a source.
+
+    Raises
+    ------
+    ConfigError
+        There is none.
+    """
+    while "image" in source.inputs:
+        source = source.inputs["image"]
+    if source.module != "rille.datasets.images.files":
+        remedy = "give a folder or a manifest of image files"
+        raise ConfigError("RIL-087", "the images of this sequence do not arrive as files", remedy=remedy)
+    return source
