@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from rille.pipeline.commands.complaints import complain
 from rille.pipeline.commands.options import COMPLETE, FAILED, HOLES, USAGE
+from rille.pipeline.engine import events
+from rille.pipeline.engine.failures import translated
+from rille.pipeline.runs.lookup import LEDGER
 
 SEVERITY = (COMPLETE, HOLES, USAGE, FAILED)
 """Exit codes, the least severe first."""
@@ -19,12 +23,14 @@ STATES = {COMPLETE: "complete", HOLES: "with holes", USAGE: "refused", FAILED: "
 
 
 class Ended(NamedTuple):
-    """What became of a sequence: exit code, folder of its run if it has one, and seconds that it took."""
+    """What became of a sequence: exit code, folder of its run, seconds that it took; and the code of an error where it
+    has no folder."""
 
     sequence: str
     code: int
     folder: Path | None
     seconds: float
+    error: str = ""
 
 
 def each(sequences: Sequence[str], one: Callable[[str], tuple[int, Path | None]], *, keep_going: bool) -> list[Ended]:
@@ -32,12 +38,13 @@ def each(sequences: Sequence[str], one: Callable[[str], tuple[int, Path | None]]
     ended = []
     for number, sequence in enumerate(sequences, 1):
         print(f"rille: {sequence} ({number} of {len(sequences)})", file=sys.stderr)
-        begin = time.monotonic()
+        begin, wrong = time.monotonic(), ""
         try:
             code, folder = one(sequence)
         except Exception as error:  # a fault of the program in one sequence is none of the others
-            code, folder = complain(error), None
-        ended.append(Ended(sequence, code, folder, time.monotonic() - begin))
+            code, folder, known = complain(error), None, translated(error)
+            wrong = "RIL-999" if known is None else known.code
+        ended.append(Ended(sequence, code, folder, time.monotonic() - begin, wrong))
         if code in (USAGE, FAILED) and not keep_going:
             break
     return ended
@@ -49,24 +56,31 @@ def worst(ended: Sequence[Ended]) -> int:
 
 
 def table(ended: Sequence[Ended], sequences: Sequence[str]) -> str:
-    """A line for each sequence: state, share of frames with a pose, drift, what is missing, time, folder of the run."""
+    """A line for each sequence: state, share of frames with a pose, drift, what is missing, tasks, time, and the folder
+    of its run or the code of its error."""
     width = max(map(len, ("sequence", *sequences)))
-    lines = [f"{'sequence':{width}s}  {'state':10s} {'posed':>6s} {'drift':>8s} {'missing':>7s} {'seconds':>8s}  run"]
-    for sequence, code, folder, seconds in ended:
-        posed, drift, missing = _figures(folder)
-        state, where = STATES[code], "" if folder is None else str(folder)
-        line = f"{sequence:{width}s}  {state:10s} {posed:>6s} {drift:>8s} {missing:>7s} {seconds:8.1f}  {where}"
-        lines.append(line.rstrip())
+
+    def line(name: str, state: str, figures: Sequence[str], end: str) -> str:
+        widths = (6, 8, 7, 8, 6, 8)
+        words = " ".join(f"{figure:>{w}s}" for figure, w in zip(figures, widths, strict=True))
+        return f"{name:{width}s}  {state:10s} {words}  {end}".rstrip()
+
+    lines = [line("sequence", "state", ("posed", "drift", "missing", "computed", "cached", "seconds"), "run")]
+    for one in ended:
+        end = one.error if one.folder is None else str(one.folder)
+        lines.append(line(one.sequence, STATES[one.code], (*_figures(one.folder), f"{one.seconds:.1f}"), end))
     lines += [f"{sequence:{width}s}  not begun" for sequence in sequences[len(ended) :]]
     return "\n".join(lines)
 
 
-def _figures(folder: Path | None) -> tuple[str, str, str]:
-    """Frames with a pose, drift and number of what is missing, as the report of a run states them."""
+def _figures(folder: Path | None) -> tuple[str, str, str, str, str]:
+    """Frames with a pose, drift, number of what is missing, and tasks that were computed and that were cached."""
     if folder is None:
-        return "", "", ""
+        return "", "", "", "", ""
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     drift = report["metrics"].get("trajectory_drift", {}).get("value")
     frames = report["frames"]
     share = f"{100 * sum(frame['posed'] for frame in frames) / len(frames):.0f} %" if frames else ""
-    return share, "" if drift is None else f"{drift:.3g} %", str(len(report["missing"]))
+    tasks = Counter(row["status"] for row in events.read(folder / LEDGER))
+    missing, computed, cached = len(report["missing"]), tasks["computed"], tasks["cached"]
+    return share, "" if drift is None else f"{drift:.3g} %", str(missing), str(computed), str(cached)

@@ -53,7 +53,8 @@ def test_what_cannot_be_run_ends_the_others_unless_they_shall_go_on(capsys):
     ended = run(names, keep_going=False)
     assert [one.sequence for one in ended] == ["holes", "none"]
     assert "RIL-276" in capsys.readouterr().err
-    assert batch.table(ended, names).splitlines()[-1].split() == ["whole", "not", "begun"]
+    rows = [row.split() for row in batch.table(ended, names).splitlines()]
+    assert rows[-2:] == [["none", "refused", "0.0", "RIL-276"], ["whole", "not", "begun"]]
 
 
 def test_an_interrupt_ends_the_command():
@@ -68,5 +69,9 @@ def test_figures_are_those_of_the_report(tmp_path):
     frames = [{"posed": True}, {"posed": False}, {"posed": True}, {"posed": True}]
     report = {"metrics": {"trajectory_drift": {"value": 0.71234}}, "frames": frames, "missing": [{}, {}]}
     (tmp_path / "report.json").write_text(json.dumps(report))
+    rows = [
+        {"label": label, "status": status} for label, status in (("a", "cached"), ("b", "computed"), ("c", "cached"))
+    ]
+    (tmp_path / "ledger.jsonl").write_text("\n".join(map(json.dumps, rows)))
     row = batch.table([batch.Ended("street", HOLES, tmp_path, 12.34)], ["street"]).splitlines()[1]
-    assert row.split() == ["street", "with", "holes", "75", "%", "0.712", "%", "2", "12.3", str(tmp_path)]
+    assert row.split() == ["street", "with", "holes", "75", "%", "0.712", "%", "2", "1", "2", "12.3", str(tmp_path)]
