@@ -206,13 +206,16 @@ class Run:
 
     @property
     def missing(self) -> list[Mapping[str, str]]:
-        """What could not be delivered: of each ``what`` it is, and ``why``."""
+        """What could not be delivered: of each ``what`` it is, ``why``, and its ``kind``, a word for programs."""
         with self._reading():
             return list(self.report["missing"])
 
     @property
     def tasks(self) -> list[Mapping[str, Any]]:
-        """Rows of the ledger, one a task: ``label``, ``stage``, ``status``, ``reason``, ``seconds`` and more."""
+        """Rows of the ledger, one a task: ``label``, ``stage``, ``status``; ``key`` and ``digest`` of its result.
+
+        A task that this run computed has ``seconds`` and more of what it took, and ``reason``: why it was not cached.
+        """
         from rille.pipeline.engine import events
         from rille.pipeline.runs.lookup import LEDGER
 

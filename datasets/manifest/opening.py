@@ -68,7 +68,8 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
         base = replace(base, disparity=disparity, notes=(*base.notes, note))
     if manifest.truth_disparity is not None:
         exact = _disparity("truth_disparity", manifest.truth_disparity, root, name, (base, pairs), digests)
-        base = replace(base, truth_disparity=exact)
+        note = f"true disparities are those of {manifest.truth_disparity.left}; they only judge"
+        base = replace(base, truth_disparity=exact, notes=(*base.notes, note))
     motion = MotionReader(root, name, pairs, StatedMotion(base.times), growing=digests.growing).read(manifest)
     world, pinned = manifest.world, {} if manifest.rig.file is None else {"rig.mode": "fixed"}
     pitch = None if world.pitch_deg is None else math.radians(world.pitch_deg)

@@ -110,6 +110,7 @@ class Inspection:
         for frame, why in self.lost.items():
             self.say(judge.judge("images", f"frame {s.frame_names[frame]}: {why}", {"lost": 1}))
         self.say(*(Finding("", line, "input", "WARN") for line in s.warnings))  # it begins with its code
+        self.say(*(Finding("", line, "input") for line in s.notes))
         self.say(judge.judge_rig(s.rig))
         self.say(judge.judge_times(None if s.times is None else [s.times[k] for k in self.frames]))
         self.say(judge.judge_truth(s.truth, self.frames, s.truth_positions))

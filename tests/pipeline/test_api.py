@@ -47,6 +47,11 @@ def test_it_gives_the_digests_of_the_command_line(run: rille.Run) -> None:
     assert len(digests(run.folder)) > 30
 
 
+def test_each_public_name_stands_in_the_reference() -> None:
+    reference = (Path(__file__).parents[2] / "docs/reference/api.md").read_text(encoding="utf-8")
+    assert not [name for name in rille.__all__ if f":: {name}" not in reference and f"rille.{name}" not in reference]
+
+
 def test_terrain_and_trajectory_have_coordinates_and_units(run: rille.Run) -> None:
     assert run.complete, run.report["missing"]
     terrain = run.terrain

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.georeference import Georeference
+from rille.datasets.text.count import count
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.colour import LUMA
@@ -92,7 +93,7 @@ def export(run: RunArtifacts, output: Path, choice: Thinning) -> str:
     ):
         write(temporary, made.counted(map(choice.of, _pairs(run, choice.every, place, made))), crs)
     unplaced = f", {made.unplaced} without a pose are left out" if made.unplaced else ""
-    return f"{made.points} points of {made.pairs} pairs{unplaced}"
+    return f"{count(made.points, 'point')} of {count(made.pairs, 'pair')}{unplaced}"
 
 
 @dataclass

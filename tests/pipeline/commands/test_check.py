@@ -141,11 +141,13 @@ def test_blank_images_are_not_taken_for_one_image(tmp_path, capsys):
 
 
 def test_frames_are_chosen_and_warnings_repeated(tmp_path, capsys):
-    sequence = replace(open_sequence(str(folder(tmp_path / "wall"))), warnings=("the baseline is odd",))
+    whole = open_sequence(str(folder(tmp_path / "wall")))
+    sequence = replace(whole, warnings=("the baseline is odd",), notes=("a mask leaves out 9 %",))
     assert look(sequence, tmp_path / "cache", frames=(1, 3)) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "2 of 4 pairs" in line(lines, "sequence")
     assert "WARN  input         the baseline is odd" in lines
+    assert "OK    input         a mask leaves out 9 %" in lines
     assert "from frame 001 to 003" in line(lines, "motion")
 
 
