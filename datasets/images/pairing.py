@@ -17,7 +17,7 @@ from rille.datasets.images.headers import Headers
 from rille.datasets.text.count import count
 from rille.datasets.text.times import seconds
 from rille.datasets.text.warning import warning
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import IncompleteError, InputError
 
 STAMP = re.compile(r"(?<!\d)[1-9]\d{9}(?:[_-]\d{9}|\d*(?:\.\d+)?)(?!\d)")
 """Seconds since 1970 have ten digits, their fractions more; frame numbers have fewer, or zeros in front."""
@@ -184,7 +184,7 @@ def pair_up(
     if rule == "order" or (rule == "auto" and len(left) == len(right) == 1):
         if len(left) != len(right):
             remedy = "remove what is too many, or pair by name or number"
-            raise InputError("RIL-256", f"{both} cannot be paired by order", remedy=remedy)
+            raise IncompleteError("RIL-256", f"{both} cannot be paired by order", remedy=remedy)
         pairs = _named(list(zip(left, right, strict=True)))
         lines += _two_clocks(pairs, *times, tolerance) if all(times) and len(pairs) > 1 else []
         return pairs
@@ -192,7 +192,9 @@ def pair_up(
         if joined is None or not joined.places:
             why = f"the nearest are {joined.apart:.4g} s apart" if joined else "not each has its own"
             remedy = 'state images.tolerance (s), or, of two clocks, images.pair = "order"'
-            raise InputError("RIL-822", f"{both} make no pairs by the time stamps in their names: {why}", remedy=remedy)
+            raise IncompleteError(
+                "RIL-822", f"{both} make no pairs by the time stamps in their names: {why}", remedy=remedy
+            )
         lines += joined.lines("RIL-821")
         return _named([(left[i], right[j]) for i, j in joined.places])
     if rule == "auto":
@@ -209,7 +211,7 @@ def pair_up(
         more = f" (and {len(alone) - 1} more)" if len(alone) > 1 else ""
         text = f"{alone[0]} has no partner by {rule}{more}; {both}"
         remedy = "add the missing image, narrow the patterns, or choose another images.pair"
-        raise InputError("RIL-259", text, remedy=remedy)
+        raise IncompleteError("RIL-259", text, remedy=remedy)
     return _named([(path, by_key[1][key]) for key, path in by_key[0].items()])
 
 

@@ -19,7 +19,7 @@ from rille.datasets.poses import coverage, interpolate, read_poses, read_positio
 from rille.datasets.protocol import Positions, Rows, rows_of
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.times import seconds
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import IncompleteError, InputError
 from rille.stages.geometry.geometry import RigidTransform
 
 Poses = tuple[RigidTransform | None, ...]
@@ -143,7 +143,7 @@ class MotionReader:
             more = f", none of {absent}" if by_name else ""
             which = ends([pair.left for pair in self.pairs])
             problem = f"{path} has {len(rows)} times for {len(self.pairs)} pairs ({which}){more}"
-            raise InputError("RIL-229", problem, remedy="give one line a pair, or lines of time and file name")
+            raise IncompleteError("RIL-229", problem, remedy="give one line a pair, or lines of time and file name")
         return self.one_a_pair([(words[0], k) for k, words in rows])
 
     def counts(self) -> set[int]:
@@ -177,7 +177,7 @@ class MotionReader:
             poses = tuple(self.one_a_pair(self.arrived(poses)))
         else:
             text = f"{self.name}: {table}.file: {path} has {len(poses)} poses for {len(self.pairs)} pairs"
-            raise InputError("RIL-230", text, remedy="give one a pair, or poses with times")
+            raise IncompleteError("RIL-230", text, remedy="give one a pair, or poses with times")
         if section.T_body_left is None:
             return poses
         T_body_left = RigidTransform.from_matrix(section.T_body_left)
@@ -211,7 +211,7 @@ class MotionReader:
             if len(rows) != len(self.pairs):
                 text = f"has {len(rows)} positions for {len(self.pairs)} pairs, and not both have times"
                 remedy = "give one a pair, or times of both ([times] of the pairs)"
-                raise InputError("RIL-803", where.format("file") + text, remedy=remedy)
+                raise IncompleteError("RIL-803", where.format("file") + text, remedy=remedy)
             at = None
         elif spacing > section.max_gap:
             text = f"has positions {spacing:.4g} s apart, more than {section.max_gap:g} s: nothing would be compared"

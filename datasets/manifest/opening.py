@@ -35,7 +35,7 @@ from rille.datasets.protocol import Sequence, Source
 from rille.datasets.text.names import derived_name
 from rille.datasets.text.reading import Search, read_bytes
 from rille.stages.core.declare import NoParams
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import IncompleteError, InputError
 
 VARIABLE = re.compile(r"\$\{(\w+)\}")
 
@@ -236,7 +236,7 @@ def find_pairs(
         paths = [path for path in paths if digests.whole(path)]
         if not paths:
             text = f"{name}: images.{side} = {pattern!r} finds no file in {root}"
-            raise InputError("RIL-217", text, remedy="correct the pattern or root")
+            raise IncompleteError("RIL-217", text, remedy="correct the pattern or root")
         found[side] = paths
     both = sorted(set(found["left"]) & set(found["right"]))
     if both:

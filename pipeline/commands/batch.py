@@ -23,7 +23,7 @@ STATES = {COMPLETE: "complete", HOLES: "with holes", USAGE: "refused", FAILED: "
 
 
 class Ended(NamedTuple):
-    """What became of a sequence: exit code, folder of its run, seconds that it took; and the code of an error where it
+    """What became of a sequence: exit code, folder of its run, seconds that it took; and the code or kind of an error where it
     has no folder."""
 
     sequence: str
@@ -43,7 +43,7 @@ def each(sequences: Sequence[str], one: Callable[[str], tuple[int, Path | None]]
             code, folder = one(sequence)
         except Exception as error:  # a fault of the program in one sequence is none of the others
             code, folder, known = complain(error), None, translated(error)
-            wrong = "RIL-999" if known is None else known.code
+            wrong = type(error).__name__ if known is None else known.code
         ended.append(Ended(sequence, code, folder, time.monotonic() - begin, wrong))
         if code in (USAGE, FAILED) and not keep_going:
             break

@@ -20,7 +20,7 @@ from rille.pipeline.engine.plain import some
 from rille.pipeline.engine.workers import Kept
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.runs import session
-from rille.stages.core.errors import ConfigError, InputError, RilleError
+from rille.stages.core.errors import ConfigError, IncompleteError, InputError, RilleError
 
 UPDATED = ("trajectory.tum", "trajectory.kitti", "dem.tif", "dem_sigma.tif", "risk.tif", "path.gpkg")
 """Files that each update makes; all others, COLMAP's trajectory and the figures follow at the end."""
@@ -30,10 +30,6 @@ LOOK_SECONDS, LOOK_SHARE = 0.25, 0.2
 
 PATIENCE_SECONDS = 10.0
 """Time for which a pair between others is waited for; then it counts as lost until it is there."""
-
-MORE_MAY_COME = ("RIL-217", "RIL-229", "RIL-230", "RIL-256", "RIL-259", "RIL-803", "RIL-822")
-"""Codes of what is wrong with a sequence of which files have yet to arrive."""
-
 
 _OPTIONS = WatchOptions()
 
@@ -129,7 +125,7 @@ class _Watched:
         try:
             sequence = open_sequence(self.options.sequence, digests=self.arrivals)
         except InputError as error:
-            if self.taken is None and error.code not in MORE_MAY_COME:
+            if self.taken is None and not isinstance(error, IncompleteError):
                 raise
             self.say(f"waiting: {error.message}")
             return None

@@ -44,6 +44,10 @@ class InputError(RilleError, ValueError):
     """An input file or sequence cannot be used as it is."""
 
 
+class IncompleteError(InputError):
+    """Files make no sequence as they are: some are not there or lack a partner. Of one that arrives, more may come."""
+
+
 class DegenerateError(RilleError, ArithmeticError):
     """The data do not determine the answer (too few landmarks, no texture, no baseline ...)."""
 
