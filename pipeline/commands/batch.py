@@ -23,8 +23,10 @@ STATES = {COMPLETE: "complete", HOLES: "with holes", USAGE: "refused", FAILED: "
 
 
 class Ended(NamedTuple):
-    """What became of a sequence: exit code, folder of its run, seconds that it took; and the code or kind of an error where it
-    has no folder."""
+    """What became of a sequence: exit code, folder of its run, and seconds that it took.
+
+    Where there is no folder, ``error`` is the code or the kind of the error.
+    """
 
     sequence: str
     code: int
