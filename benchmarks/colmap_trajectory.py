@@ -42,7 +42,7 @@ def written(sequence: Any, frames: range, folder: Path) -> None:
     import numpy as np
     from odometry.chain import Images
 
-    from rille.stages.evaluation.features import grey_bytes
+    from rille.stages.imaging.features import grey_bytes
 
     images = Images(sequence, frames)
     for side in SIDES:

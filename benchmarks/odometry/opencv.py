@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rille.stages.evaluation.features import grey_bytes
+from rille.stages.imaging.features import grey_bytes
 
 from .chain import Clock, Images, Navigated
 

@@ -58,7 +58,6 @@ from rille.pipeline.flow.builders import Builder, Pair, Segment, centre, merge_t
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.evaluation.crosscheck import crosscheck_stage, windows
 from rille.stages.evaluation.crosscheck_join import crosscheck_join_stage
-from rille.stages.evaluation.features import features_stage
 from rille.stages.facts.calibration import CalibrationFacts, RigFacts
 from rille.stages.facts.evaluation import JoinFacts
 from rille.stages.facts.odometry import (
@@ -70,6 +69,7 @@ from rille.stages.facts.odometry import (
 )
 from rille.stages.facts.terrain import OverlapFacts, TileIndexFacts
 from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.imaging.features import features_stage
 from rille.stages.imaging.image_quality import image_quality_stage
 from rille.stages.odometry.frame_screening import frame_screening_stage
 from rille.stages.odometry.keyframes import keyframes_stage

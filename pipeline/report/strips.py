@@ -20,8 +20,8 @@ from rille.pipeline.report.canvas import Block, Panel
 from rille.pipeline.report.gather import Scene, WorldTerrain
 from rille.pipeline.report.words import metres
 from rille.stages.core.validity import matched
-from rille.stages.evaluation.features import grey_bytes
 from rille.stages.geometry.geometry import Rig
+from rille.stages.imaging.features import grey_bytes
 
 if TYPE_CHECKING:
     from PIL.Image import Image

@@ -1,7 +1,7 @@
 """Camera poses by another program, for comparison: structure from motion by COLMAP over a window of stereo frames.
 
 Nothing of the chain enters. Verification of matches, registration, triangulation and bundle adjustment are pycolmap's
-(Schönberger & Frahm 2016, doi:10.1109/CVPR.2016.445), features OpenCV's (:mod:`rille.stages.evaluation.features`). What
+(Schönberger & Frahm 2016, doi:10.1109/CVPR.2016.445), features OpenCV's (:mod:`rille.stages.imaging.features`). What
 both share is the given calibration: the two cameras are one rig whose relative pose and intrinsics are held, so that
 the scale is metric. A model begins with the two images of one frame, whose baseline is known. Of its own, COLMAP begins
 with any two: at the scale that they then have by chance the rig's baseline may seem to be nothing, and the model grows
@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, Memory, Params, stage
-from rille.stages.evaluation.features import PIXEL_CENTRE, UNIT_BYTES
 from rille.stages.facts.evaluation import WindowFacts
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Camera, Rig
+from rille.stages.imaging.features import PIXEL_CENTRE, match
 
 SPAN = 3
 """Following frames that each frame is matched with, in both cameras."""
@@ -38,9 +38,6 @@ MIN_START_ANGLE_DEG = 0.1
 
 SEED = 0
 """Of COLMAP's random sampling."""
-
-MAX_RATIO, MAX_DISTANCE = 0.8, 0.7
-"""COLMAP's limits of a match: angle to the nearest descriptor over that to the second, and that angle, radians."""
 
 ADJUSTED_GROWTH, ADJUSTED_IMAGES = 1.4, 4
 """Factor in frames or points by which a model grows before all of it is adjusted again; and images that are adjusted
@@ -70,35 +67,6 @@ def windows(frames: Sequence[int], params: CrosscheckParams) -> list[list[int]]:
     count = max(1, math.ceil((len(frames) - OVERLAP) / (params.window - OVERLAP)))
     edges = [k * (len(frames) - OVERLAP) // count for k in range(count + 1)]
     return [list(frames[a : b + OVERLAP]) for a, b in itertools.pairwise(edges)]
-
-
-def match(a: Floats32, b: Floats32) -> NDArray[np.uint32]:
-    """Indices (m, 2) of matching descriptors (n, 128), bytes: nearest in both directions, clearly before the second.
-
-    Products of bytes summed over 128 stay below 2**24 and are thus exact in float32, in any order of summation; a
-    matrix product is some ten times faster than COLMAP's loops.
-    """
-    if min(len(a), len(b)) == 0:
-        return np.zeros((0, 2), np.uint32)
-    # All descriptors have nearly the same length, so the greatest product is the least angle.
-    forward = _nearest(a @ b.T)
-    rows = np.flatnonzero(forward >= 0)
-    wanted, place = np.unique(forward[rows], return_inverse=True)
-    backward = _nearest(b[wanted] @ a.T)
-    rows = rows[backward[place] == rows]
-    return np.stack([rows, forward[rows]], axis=1).astype(np.uint32)
-
-
-def _nearest(products: Floats32) -> NDArray[np.intp]:
-    """Column of the nearest descriptor of each row, -1 where there is no clear one; spoils ``products``."""
-    rows = np.arange(len(products))
-    best = products.argmax(axis=1)
-    first = products[rows, best]
-    # Below any product of bytes: the second best is then the maximum of what is left.
-    products[rows, best] = -1.0
-    second = np.maximum(products.max(axis=1), 0.0)
-    near, next_near = (np.arccos(np.minimum(p / UNIT_BYTES**2, 1.0)) for p in (first, second))
-    return np.where((near <= MAX_DISTANCE) & (near < MAX_RATIO * next_near), best, -1)
 
 
 def image_pairs(frames: int) -> list[tuple[int, int]]:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from rille.datasets.text.reading import TABLE, read_text
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.stages.core.declare import Bundle
-from rille.stages.evaluation.features import PIXEL_CENTRE
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.imaging.features import PIXEL_CENTRE
 from rille.stages.odometry.resection.landmarks import matches_at
 from rille.stages.odometry.resection.trajectory import world_poses
 

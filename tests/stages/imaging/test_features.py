@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from rille.stages.core.declare import Bundle, check_outputs
-from rille.stages.evaluation import features
-from rille.stages.evaluation.crosscheck import match
-from rille.stages.evaluation.features import extract, features_stage, grey_bytes
+from rille.stages.imaging import features
+from rille.stages.imaging.features import extract, features_stage, grey_bytes, match
 
 
 def texture(rows: int, cols: int) -> np.ndarray:
