@@ -74,6 +74,9 @@ class MockupParams(SceneParams, RenderParams):
     )
     forward: float = Field(0.03, ge=-0.5, le=0.5, description="motion ahead per frame [m] (section 7.4)")
     sideways: float = Field(0.015, ge=-0.5, le=0.5, description="motion to the right per frame [m] (section 7.4)")
+    turn_deg: float = Field(
+        0.0, ge=-45.0, le=45.0, description="turn to the left per frame [degrees]; 360 over the frames: a closed way"
+    )
     roll_deg: float = Field(0.0, ge=-30.0, le=30.0, description="constant roll to the right [degrees]")
     roll_swing_deg: float = Field(
         0.0, ge=0.0, le=60.0, description="roll from frame to frame [degrees], right and left in turn"

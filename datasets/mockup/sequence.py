@@ -76,20 +76,30 @@ def mount(p: MockupParams, camera: str) -> RigidTransform:
 
 
 def body_poses(p: MockupParams) -> list[RigidTransform]:
-    """T_bed_body of every frame: equal steps on the mean plane, with roll and jitter."""
-    steps = np.full((p.frames, 2), [p.sideways, p.forward])
+    """T_bed_body of every frame: equal steps of the body on the mean plane, with turns, roll and jitter."""
+    turns = np.deg2rad(p.turn_deg) * np.arange(p.frames)
+    # Each step leads where the body heads half-way: of a constant turn these are chords of one circle.
+    ahead = turns - 0.5 * np.deg2rad(p.turn_deg)
+    steps = np.column_stack(
+        [
+            p.sideways * np.cos(ahead) - p.forward * np.sin(ahead),
+            p.sideways * np.sin(ahead) + p.forward * np.cos(ahead),
+        ]
+    )
     steps[0] = 0.0
     offsets = np.cumsum(steps, axis=0)
     # The drive is centred across the bed, whichever way it drifts.
     offsets[:, 0] -= 0.5 * (offsets[:, 0].min() + offsets[:, 0].max())
-    offsets[:, 1] += FIRST_Y_M - min(offsets[:, 1].min(), 0.0)
+    # One that turns looks to all sides, and is centred along the bed as well.
+    middle = 0.5 * (p.bed_length - offsets[:, 1].min() - offsets[:, 1].max())
+    offsets[:, 1] += middle if p.turn_deg else FIRST_Y_M - min(offsets[:, 1].min(), 0.0)
     shakes = np.deg2rad(p.jitter_deg) * np.random.default_rng([p.seed, 60]).standard_normal((p.frames, 3))
     swings = np.deg2rad(p.roll_swing_deg) * (np.arange(p.frames) % 2 - 0.5)
     T_bed_plane = RigidTransform(rotation_exp([np.deg2rad(p.slope_deg), 0.0, 0.0]), np.zeros(3))
     poses = []
-    for (x, y), (pitch, roll, heading), swing in zip(offsets, shakes, swings, strict=True):
+    for (x, y), turn, (pitch, roll, heading), swing in zip(offsets, turns, shakes, swings, strict=True):
         rotation = (
-            rotation_exp([0.0, 0.0, heading])
+            rotation_exp([0.0, 0.0, turn + heading])
             @ rotation_exp([pitch, 0.0, 0.0])
             @ rotation_exp([0.0, math.radians(p.roll_deg) + roll + swing, 0.0])
         )

@@ -33,6 +33,7 @@ from rille.stages.facts.odometry import MotionFacts, MovingFacts, ResectFacts, T
 from rille.stages.facts.terrain import DemFacts, GroundFacts, MergeFacts, TileIndexFacts
 from rille.stages.hazard.risk import risk_stage
 from rille.stages.hfvm.stage import hfvm_stage
+from rille.stages.imaging.features import features_stage
 from rille.stages.imaging.pyramid import pyramid_stage
 from rille.stages.imaging.undistort import undistort_stage
 from rille.stages.odometry.motion import motion_stage
@@ -190,6 +191,11 @@ class Builder:
         """Image pyramid."""
         return self.node(pyramid_stage, f"pyramid/{camera}/{frame}", image=self.image(frame, camera))
 
+    @once
+    def features(self, frame: int, camera: str) -> Handle:
+        """SIFT features."""
+        return self.node(features_stage, f"features/{camera}/{frame}", image=self.image(frame, camera))
+
     # -- what two images show -----------------------------------------------------------------------------------
 
     @once
@@ -300,7 +306,8 @@ class Builder:
 
         The frame of pair ``first`` is the world; what is ``moving`` is left out.
         """
-        at = self.node(pose_stage, f"pose/{pair.frame}", trajectory=trajectory, row=row)
+        chained = self.products.chained and {"chained": self.products.chained, "local": pair.dem}
+        at = self.node(pose_stage, f"pose/{pair.frame}", trajectory=trajectory, row=row, **(chained or {}))
         # Row 0 of the artifact of `pose`, which holds one: so an elevation model depends on its own pose alone, and
         # stays in the cache when only other poses move.
         known = {"rig": pair.rig, "level": pair.level, "reference": first.level, "trajectory": at, "local": pair.dem}

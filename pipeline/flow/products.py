@@ -18,6 +18,7 @@ from rille.stages.facts.evaluation import (
 from rille.stages.facts.odometry import (
     IntrinsicsFacts,
     KeyframesFacts,
+    LoopFacts,
     MovingFacts,
     RefineFacts,
     ResectFacts,
@@ -92,6 +93,9 @@ class Products:
     seams: dict[int, Handle[OverlapFacts]] = field(default_factory=dict)
     overlap_audit: Handle[AuditFacts] | None = None
     world_tiles: list[Handle[MergeFacts]] = field(default_factory=list)
+    loops: list[Handle[LoopFacts]] = field(default_factory=list)
+    chained: Handle[TrajectoryFacts] | None = None
+    """The trajectory before it was adjusted to loops; None: it was not."""
     trajectory: Handle[TrajectoryFacts] | None = None
     world_risk: Handle | None = None
     world_path: Handle | None = None

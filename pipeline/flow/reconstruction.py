@@ -18,6 +18,7 @@
                     |                                           +-> merge (world tile) <-------------+
                     |                                                 +-> risk, path (mission)
                     +-> features (image) -> crosscheck (window) -> crosscheck_join -> agreement <- trajectory
+                               +-> loops (block of pairs) -> loop (pair) -> adjust -> trajectory, where places return
     leaves:  accuracy (trajectory, crosscheck), position_accuracy, dem_accuracy (local and merged DEM), path_check
     outputs: rasters, tracks, tables, figures: a task each; then report.html and report.json around them
 
@@ -62,20 +63,36 @@ from rille.stages.facts.calibration import CalibrationFacts, RigFacts
 from rille.stages.facts.evaluation import JoinFacts
 from rille.stages.facts.odometry import (
     KeyframesFacts,
-    MovingFacts,
-    RefineFacts,
-    ScreeningFacts,
-    StepTableFacts,
-)
-from rille.stages.facts.terrain import OverlapFacts, TileIndexFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.imaging.features import features_stage
 from rille.stages.imaging.image_quality import image_quality_stage
 from rille.stages.odometry.frame_screening import frame_screening_stage
 from rille.stages.odometry.keyframes import keyframes_stage
+from rille.stages.odometry.places import places_stage
 from rille.stages.odometry.resection.adjust import adjust_stage
 from rille.stages.odometry.resection.intrinsics import intrinsics_stage
+from rille.stages.odometry.resection.loop import loop_stage
 from rille.stages.odometry.resection.moving import moving_stage
+    RefineFacts,
+    ScreeningFacts,
+    StepTableFacts,
+)
+from rille.stages.facts.terrain import OverlapFacts, TileIndexFacts
+    known = sensors(make, frames)
+    p.loops = yield from seen_again(make, [pair for k, pair in pairs.items() if k not in moved])
+    if segments and (known or p.loops):
+        p.chained = p.trajectory
+        p.trajectory = make.node(
+            adjust_stage,
+            "trajectory/adjusted",
+            trajectory=p.chained,
+            segments=p.resections,
+            refined=p.refined or None,
+            loops=p.loops or None,
+            priors=known or None,
+        )
+    flow(assessment.of_trajectory(make, frames), lays=("accuracy",))
+    yield Complete(("track", "resect", "refine", "intrinsics", "trajectory", "features", "loops", "loop", "adjust"))
 from rille.stages.odometry.resection.refine import refine_stage
 from rille.stages.odometry.resection.resect import MIN_JUMP_PX
 from rille.stages.odometry.resection.trajectory import trajectory_stage
@@ -100,6 +117,9 @@ SUSPECTS = 12
 
 TABLE_FRAMES = 100
 """Motions that one table of steps holds."""
+
+PLACES_FRAMES = 500
+"""Frames whose basic pairs are looked for in earlier ones together: blocks that are read by all later blocks."""
 
 Steps = Generator[Wait, Any, None]
 Facts = Mapping[str, Any]
@@ -129,7 +149,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     if make.config.crosscheck.enabled and len(whole) > 1:
         # What is laid out first runs first: its windows take longest of all tasks.
         p.crosscheck = another_program(make, whole)
-    yield Complete(("features", "crosscheck", "crosscheck_join"))
+    yield Complete(("crosscheck", "crosscheck_join"))
 
     # Frames that the trajectory goes through, and which of them are basic pairs.
     found = yield from screened(make, whole)
@@ -170,17 +190,20 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         lost=lost or None,
     )
     known = sensors(make, frames)
-    if known and segments:
+    p.loops = yield from seen_again(make, [pair for k, pair in pairs.items() if k not in moved])
+    if segments and (known or p.loops):
+        p.chained = p.trajectory
         p.trajectory = make.node(
             adjust_stage,
-            "adjust",
-            trajectory=p.trajectory,
+            "trajectory/adjusted",
+            trajectory=p.chained,
             segments=p.resections,
             refined=p.refined or None,
-            priors=known,
+            loops=p.loops or None,
+            priors=known or None,
         )
     flow(assessment.of_trajectory(make, frames), lays=("accuracy",))
-    yield Complete(("track", "resect", "refine", "intrinsics", "trajectory", "adjust"))
+    yield Complete(("track", "resect", "refine", "intrinsics", "trajectory", "features", "loops", "loop", "adjust"))
     yield Complete(("agreement", "position_accuracy", "accuracy", "truth"))
     posed = yield from done(p.trajectory)
 
@@ -470,13 +493,41 @@ def checked_intrinsics(make: Builder, key: Pair) -> Generator[Wait, Any, None]:
         p.contradictions.append(p.intrinsics)
 
 
+def seen_again(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[Handle[LoopFacts]]]:
+    """Motions to basic pairs from earlier ones that show the same place; none where no place is seen again."""
+    if not make.config.loops.enabled or len(pairs) <= make.config.loops.apart:
+        return []
+    of, blocks = {pair.frame: pair for pair in pairs}, list[Handle[PlacesFacts]]()
+    # Cut by frame numbers: where a pair is left out, the other blocks keep theirs.
+    for number, group in groupby(of, lambda frame: frame // PLACES_FRAMES):
+        here = list(group)
+        features = [make.features(frame, "left") for frame in here]
+        blocks.append(make.node(places_stage, f"loops/{number}", features=features, earlier=list(blocks), pairs=here))
+    laid: list[Ref[PlacesFacts]] = yield list(blocks)
+    compared = []
+    for block in laid:
+        for frame, earlier in zip(block.meta["pairs"], block.meta["candidates"], strict=True):
+            alike = [of[k] for k in (frame, *earlier)]
+            if not earlier:
+                continue
+            compared.append(
+                make.node(
+                    loop_stage,
+                    f"loop/{frame}",
+                    features=[make.features(pair.frame, "left") for pair in alike],
+                    disparities=[pair.disparity for pair in alike],
+                    rigs=[pair.rig for pair in alike],
+                    pairs=[frame, *earlier],
+                )
+            )
+    seen = yield Maybe(compared)
+    known = [one for one, ref in zip(compared, seen, strict=True) if ref is not None]
+    return known if any(ref is not None and ref.meta["factors"] for ref in seen) else []
+
+
 def another_program(make: Builder, whole: list[int]) -> Handle[JoinFacts]:
     """Structure from motion by another program, in windows; it knows nothing of our trajectory, nor we of its."""
-    features = {
-        (f, camera): make.node(features_stage, f"features/{camera}/{f}", image=make.image(f, camera))
-        for f in whole
-        for camera in ("left", "right")
-    }
+    features = {(f, camera): make.features(f, camera) for f in whole for camera in ("left", "right")}
     parts = [
         make.node(
             crosscheck_stage,

@@ -48,6 +48,7 @@ def gather(view: RunView) -> dict[str, Any]:
         "crosscheck": _crosscheck(scene),
         "path": _path(scene),
         "drive": _drive(scene),
+        **tables.loops(scene),
     }
 
 
@@ -332,7 +333,8 @@ def _reads(run: RunView) -> tuple[object, ...]:
     p, s, config = run.products, run.sequence, run.config
     return (
         *(p.contradictions, p.intrinsics, p.crosschecks, p.crosscheck, p.agreement, p.crosscheck_accuracy),
-        *(p.trajectory, p.accuracy, p.position_accuracy, p.overlap_audit, p.rigs, p.resections, p.refined),
+        *(p.loops, p.chained, p.trajectory, p.accuracy, p.position_accuracy, p.overlap_audit),
+        *(p.rigs, p.resections, p.refined),
         *(p.moving, p.world_tiles, p.world_risk, p.world_path, p.dem_accuracy, p.path_check, p.drive),
         *(p.disparity_accuracy, *tables.of_pairs(p)),
         *(config.vehicle, config.rig.significance, config.crosscheck.enabled),

@@ -10,6 +10,7 @@ from rille.pipeline.export.artifacts import chain
 from rille.pipeline.flow.products import Products
 from rille.pipeline.report import gather
 from rille.pipeline.report.gather import facts_of
+from rille.stages.odometry.resection.loop import closure
 
 Row = dict[str, Any]
 
@@ -47,6 +48,22 @@ def frames(scene: gather.Scene) -> list[Row]:
     if rows and rows[0]["in_world"]:  # the first frame is the world's origin: nothing was resected
         rows[0]["rms_px"] = rows[0]["segment"] = None
     return rows
+
+
+def loops(scene: gather.Scene) -> dict[str, list[Row]]:
+    """One row a place seen again, and one a pair of frames that look alike and are no such place; none without any."""
+    p, bundle = scene.view.products, scene.view.bundle
+    chained, adjusted, seen = bundle(p.chained), bundle(p.trajectory), [bundle(handle) for handle in p.loops]
+    if chained is None or adjusted is None:
+        return {}
+    facts = [one.meta for one in seen if one is not None]
+    rows = [
+        {**{key: f[key] for key in ("from", "to", "source")}, **closure(f, chained, adjusted)._asdict()}
+        for meta in facts
+        for f in meta["factors"]
+        if all(np.isfinite(adjusted["poses"][adjusted.meta["frames"].index(f[end])]).all() for end in ("from", "to"))
+    ]
+    return {"loops": rows, "loops_refused": [row for meta in facts for row in meta["refused"]]}
 
 
 def of_pairs(p: Products) -> tuple[object, ...]:

@@ -105,6 +105,19 @@ class FactorsFacts(Facts):
     factors: list[dict[str, Any]]
 
 
+class LoopFacts(FactorsFacts):
+    """Motions to a basic pair from earlier ones; ``refused`` are frames that look alike, and the ``reason``."""
+
+    refused: list[dict[str, Any]]
+
+
+class PlacesFacts(Facts):
+    """Numbers of a block's basic ``pairs``, and for each the earlier ones that are most alike, ``candidates``."""
+
+    pairs: list[int]
+    candidates: list[list[int]]
+
+
 class TrajectoryFacts(Facts):
     """Poses of all frames in the world, which is that of piece number ``main``.
 

@@ -73,6 +73,16 @@ def test_steps_are_30_mm_ahead_and_15_mm_to_the_right():
     np.testing.assert_allclose(steps, np.tile([0.015, 0.03, 0.0], (39, 1)), atol=1e-12)
 
 
+def test_turns_of_a_whole_circle_close_the_way():
+    p = MockupParams(frames=81, turn_deg=4.5, sideways=0.01, forward=0.03)
+    poses = seq.body_poses(p)
+    np.testing.assert_allclose(poses[-1].matrix34, poses[0].matrix34, atol=1e-12)
+    steps = np.diff([T.translation for T in poses], axis=0)
+    np.testing.assert_allclose(np.linalg.norm(steps, axis=1), np.hypot(0.01, 0.03))
+    middle = np.mean([T.translation[:2] for T in poses[:-1]], axis=0)
+    np.testing.assert_allclose(middle, [0.0, 0.5 * p.bed_length], atol=0.01)
+
+
 def test_drive_beyond_the_bed_is_refused():
     with raises("RIL-253"):
         seq.mockup(MockupParams(frames=200))

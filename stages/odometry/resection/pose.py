@@ -1,15 +1,35 @@
-"""One frame's pose out of the trajectory: what stands on it is recomputed only where this pose has changed."""
+"""One frame's pose out of the trajectory: what stands on it is recomputed only where this pose has changed.
+
+A trajectory that is adjusted to a place seen again moves all poses, most of them by less than shows in a map. Where an
+elevation model would move by at most a quarter of a cell, anywhere in it, its pose stays that of the chain, covariance
+and all: so the model, and world tiles of such models alone, are those of the run without that place.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
 from rille.stages.core.declare import Bundle, Facts, NoParams, stage
 from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.odometry import TrajectoryFacts
+from rille.stages.facts.terrain import DemFacts
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.pose_arrays import COVARIANCE, POSES
+
+MAX_MOVE_CELLS = 0.25
+"""Cells that a model may lie off its adjusted place."""
+
+
+def greatest_move(before: RigidTransform, after: RigidTransform, local: DemFacts) -> float:
+    """Cells by which the farthest corner of an elevation model moves in the world with its camera's pose."""
+    lattice, T_local_left = Lattice.from_dict(local["lattice"]), RigidTransform.from_matrix(local["T_frame_left"])
+    x0, x1, y0, y1 = lattice.bounds
+    corners = T_local_left.inverse().apply(list(product((x0, x1), (y0, y1), local["z_range"])))
+    return float(np.linalg.norm(after.apply(corners) - before.apply(corners), axis=1).max() / lattice.cell)
 
 
 @stage(
@@ -20,9 +40,20 @@ from rille.stages.geometry.pose_arrays import COVARIANCE, POSES
         replace(COVARIANCE, frame="world", nodata="", optional=True),
     ],
 )
-def pose_stage(params: NoParams, trajectory: Bundle[TrajectoryFacts], *, row: int) -> Bundle[Facts]:
+def pose_stage(
+    params: NoParams,
+    trajectory: Bundle[TrajectoryFacts],
+    chained: Bundle[TrajectoryFacts] | None = None,
+    local: Bundle[DemFacts] | None = None,
+    *,
+    row: int,
+) -> Bundle[Facts]:
     """Pose of one left frame in the world frame."""
     if not np.isfinite(trajectory["poses"][row]).all():
         raise DegenerateError("RIL-711", f"row {row} of the trajectory has no pose", remedy="choose other frames")
-    kept = [name for name in ("poses", "covariance") if name in trajectory.arrays]
-    return Bundle({name: np.asarray(trajectory[name])[row : row + 1].copy() for name in kept}, {})
+    used = trajectory
+    if chained is not None and local is not None:
+        before, after = (RigidTransform.from_matrix(one["poses"][row]) for one in (chained, trajectory))
+        used = chained if greatest_move(before, after, local.meta) <= MAX_MOVE_CELLS else trajectory
+    kept = [name for name in ("poses", "covariance") if name in used.arrays]
+    return Bundle({name: np.asarray(used[name])[row : row + 1].copy() for name in kept}, {})
