@@ -63,6 +63,14 @@ from rille.stages.facts.calibration import CalibrationFacts, RigFacts
 from rille.stages.facts.evaluation import JoinFacts
 from rille.stages.facts.odometry import (
     KeyframesFacts,
+    LoopFacts,
+    MovingFacts,
+    PlacesFacts,
+    RefineFacts,
+    ScreeningFacts,
+    StepTableFacts,
+)
+from rille.stages.facts.terrain import OverlapFacts, TileIndexFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.imaging.features import features_stage
 from rille.stages.imaging.image_quality import image_quality_stage
@@ -73,26 +81,6 @@ from rille.stages.odometry.resection.adjust import adjust_stage
 from rille.stages.odometry.resection.intrinsics import intrinsics_stage
 from rille.stages.odometry.resection.loop import loop_stage
 from rille.stages.odometry.resection.moving import moving_stage
-    RefineFacts,
-    ScreeningFacts,
-    StepTableFacts,
-)
-from rille.stages.facts.terrain import OverlapFacts, TileIndexFacts
-    known = sensors(make, frames)
-    p.loops = yield from seen_again(make, [pair for k, pair in pairs.items() if k not in moved])
-    if segments and (known or p.loops):
-        p.chained = p.trajectory
-        p.trajectory = make.node(
-            adjust_stage,
-            "trajectory/adjusted",
-            trajectory=p.chained,
-            segments=p.resections,
-            refined=p.refined or None,
-            loops=p.loops or None,
-            priors=known or None,
-        )
-    flow(assessment.of_trajectory(make, frames), lays=("accuracy",))
-    yield Complete(("track", "resect", "refine", "intrinsics", "trajectory", "features", "loops", "loop", "adjust"))
 from rille.stages.odometry.resection.refine import refine_stage
 from rille.stages.odometry.resection.resect import MIN_JUMP_PX
 from rille.stages.odometry.resection.trajectory import trajectory_stage
