@@ -72,7 +72,6 @@ from rille.stages.facts.odometry import (
 )
 from rille.stages.facts.terrain import OverlapFacts, TileIndexFacts
 from rille.stages.geometry.geometry import RigidTransform
-from rille.stages.imaging.features import features_stage
 from rille.stages.imaging.image_quality import image_quality_stage
 from rille.stages.odometry.frame_screening import frame_screening_stage
 from rille.stages.odometry.keyframes import keyframes_stage
