@@ -129,12 +129,17 @@ class MapFixFacts(Facts):
     T_global_local: list[float]
     source: str
     std: NotRequired[list[float]]
-    """x, y, m, and heading, rad."""
+    """x, y, z, m, and rotation about them, rad."""
     covariance: NotRequired[list[list[float]]]
+    """6 x 6."""
     overlap: NotRequired[float]
     rms: NotRequired[float]
     """m"""
+    explained: NotRequired[float]
+    """Share of the model's relief that the differences leave out."""
     cells: NotRequired[int]
+    independent: NotRequired[float]
+    """Of the cells, by their correlation."""
     other: NotRequired[Json | None]
-    """The next best place and its chi2."""
+    """The next best place (x, y, heading) and by how much its chi2 is larger."""
     ambiguous: NotRequired[bool]

@@ -1,18 +1,30 @@
-"""A first pose in a global map: the first local elevation model laid on a coarse global one (section 5.1).
+"""Where an elevation model lies in a coarser map: by their relief, without a start that is near.
 
-The local model is level (stage ``ground_frame``), so four numbers place it: x, y, heading and z. Around a rough prior
-of the first three every placement is tried whose steps the coarse cells resolve; z is the median difference at each.
-The score is the mean truncated square of the differences in units of their expected error, over the cells that
-overlap. The best placement is refined by Gauss-Newton on the slopes of the global map; its covariance is that of the
-adjustment, with the errors that the differences show and one independent cell a correlation length. The next best
-placement that is no neighbour tells how ambiguous the answer is. The prior bounds the search and decides nothing
-else."""
+The model is level, or nearly so: x, y, z, heading and a small tilt place it. It is averaged over blocks as wide as the
+map's cells, for single cells would differ from the map by their relief and not by a wrong place.
+
+1. Every place and heading is tried that a coarse version of map and model tells apart. The score is the mean square of
+   the height differences about their own plane, which takes out height and tilt. With weights w of the model's blocks
+   and k of the map's known cells, all sums over a place are correlations of w, w z, k, k h and moments of w with each
+   other (masked registration: Padfield 2012, doi:10.1109/TIP.2011.2181402), which the fast Fourier transform gives for
+   all places of a heading at once.
+2. The best places that are no neighbours are each refined on the map itself by Gauss-Newton with Huber's weights. The
+   slopes are those of the model, whose noise is less than the map's: noise in slopes would count as relief and make the
+   covariance too small. The tilt has a prior, ``sigma_tilt_deg``.
+3. Neighbouring differences are correlated, the more so at a wrong place. With r their correlation at a distance of one
+   cell, n cells count for n ((1 - r) / (1 + r))^2 independent ones, in the covariance, too. The chi2 by which a place
+   is worse than the best one is this number times the logarithm of the ratio of their mean squares, so that no standard
+   deviation of the map has to be known.
+
+The given surroundings bound the answer and decide nothing else: the search reaches farther, so that a better place
+beside them is no secret."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -23,98 +35,285 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.facts.terrain import DemFacts, MapFixFacts
-from rille.stages.geometry.geometry import RigidTransform, rotation_exp
+from rille.stages.geometry.geometry import RigidTransform, cross_matrix, rotation_exp
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.numeric.robust import huber_weight
+from rille.stages.numeric.robust import huber_weight, mad_sigma
+from rille.stages.terrain.shading import gradient
 
-TRUNCATION_SIGMAS = 3.0
-"""Height difference beyond which it costs no more: outliers."""
 MIN_CELLS = 30
-"""Cells of the global map that the local model must cover."""
-CORRELATION_CELLS = 2.0
-"""Correlation length of height differences."""
-MIN_CHI2_GAP = 9.0
-"""Difference of chi2 to the second best place, below which the answer is ambiguous."""
-SLOPE_STEP = 1e-3
-"""Of a cell: half the way that slopes are taken over."""
-MIN_KNOWN = 6
-"""Points that the map must know for a place to be compared."""
+"""Cells of the map that the model must cover."""
+MIN_BLOCK_SHARE = 0.3
+"""Of a block's area that the model must know."""
+MAX_CELLS = 10_000
+"""Cells of the map within the model: a finer map is averaged first."""
+MIN_SEARCHED_CELLS = 100
+"""Cells of the model in the coarsest version that is searched: fewer tell too little."""
+MAX_TRIES, MAX_TRIES_AT_ALL = 3e6, 2e8
+"""Headings times cells: above, a coarser version is searched where there is one; and what is refused."""
+PLACES = 8
+"""Best places that are refined."""
+NEIGHBOURS = 3
+"""Steps of the search, within which a place is a neighbour: it belongs to the same valley."""
+MORE_TURN = math.radians(20.0)
+"""By which the search turns farther than the answer may; it reaches farther by the radius of the model."""
+MIN_CHI2_GAP = 30.0
+"""Difference of chi2 to the second best place, below which the answer is ambiguous: a fifth of the least one of right
+places, four times the greatest one in maps of other ground (benchmarks/localize.py, seeds 1 to 3)."""
+HUBER_SIGMAS = 1.5
+MAX_ALIKE = 0.95
+"""Correlation of neighbouring differences that is believed at most."""
 MIN_EIGENVALUE = 1e-6
 """Of the normal matrix scaled to a diagonal of ones: below, something is not determined."""
-MAX_ROUNDS = 20
+MAX_ROUNDS, SETTLED_CELLS = 12, 1e-3
+"""Of Gauss-Newton, and the step that ends it."""
 
 
 class MapLocalizationParams(Params):
     """Parameters of the stage ``map_localization``."""
 
     reach: float = Field(3.0, gt=0, description="search range to either side of the prior [its standard deviations]")
-    sigma_height: float = Field(
-        0.15, gt=0, description="standard deviation of a height difference to the global map [its cells]"
+    sigma_tilt_deg: float = Field(
+        0.5, gt=0, description="standard deviation of the model's vertical about each axis [degrees]"
     )
     min_overlap: float = Field(0.5, gt=0, le=1, description="least share of the local model that the global map covers")
 
 
 @dataclass(frozen=True)
-class Prior:
-    """Rough place of the local frame: x, y (m) and heading (rad, to the left), with standard deviations."""
+class Around:
+    """What is searched: origins of the model within ``distance`` of x, y, m, and headings (to the left) within ``turn``
+    of ``heading``, rad."""
 
     x: float
     y: float
     heading: float
-    sigma: float
-    sigma_heading: float
+    distance: float
+    turn: float
 
 
 @dataclass(frozen=True)
 class Fix:
-    """``place`` x, y (m), heading (rad), z (m) of the local frame; ``covariance`` (4, 4) of them.
+    """``pose``: T_map_model; ``covariance`` (6, 6) of its position, m, and rotation, rad, about the map's axes.
 
-    ``overlap`` share; ``other``: the next best placement (x, y, heading) and by how much its chi2 is larger, None where
-    the search has only one minimum.
+    ``overlap``: share of the model that the map knows; ``rms`` of the height differences, m; ``explained``: share of
+    the model's relief (variance about its plane) that they leave out; ``cells`` compared, ``independent`` of them;
+    ``other``: x, y, heading of the next best place and by how much its chi2 is larger, None where there is one place.
     """
 
-    place: Floats
+    pose: RigidTransform
     covariance: Floats
     overlap: float
     rms: float
+    explained: float
     cells: int
-    other: tuple[Floats, float] | None
+    independent: float
+    other: tuple[Floats, float] | None = None
+
+    @property
+    def heading(self) -> float:
+        """To the left, rad."""
+        return math.atan2(self.pose.rotation[1, 0], self.pose.rotation[0, 0])
+
+    @property
+    def doubt(self) -> str:
+        """The place that fits nearly as well, in words; empty where there is none."""
+        if self.other is None or self.other[1] >= MIN_CHI2_GAP:
+            return ""
+        (ox, oy, _), chi2 = self.other
+        x, y, _ = self.pose.translation
+        fits = "fits better than" if chi2 < 0.0 else "fits nearly as well as"
+        return (
+            f"({ox:.2f}, {oy:.2f}) m {fits} ({x:.2f}, {y:.2f}) m (chi2 larger by {chi2:.1f}, {MIN_CHI2_GAP:g} wanted)"
+        )
+
+    def facts(self) -> MapFixFacts:
+        """The same, as plain values."""
+        return {
+            "T_global_local": self.pose.to_list(),
+            "source": "aligned to the global map",
+            "std": np.sqrt(np.diag(self.covariance)).tolist(),
+            "covariance": self.covariance.tolist(),
+            "overlap": self.overlap,
+            "rms": self.rms,
+            "explained": self.explained,
+            "cells": self.cells,
+            "independent": self.independent,
+            "other": None if self.other is None else {"place": self.other[0].tolist(), "chi2": self.other[1]},
+            "ambiguous": bool(self.doubt),
+        }
 
 
-def thin(elevation: NDArray[np.floating], lattice: Lattice, cell: float) -> Floats:
-    """Points (n, 3) of a model, m: means over blocks as wide as the global map's cells."""
+class Blocks(NamedTuple):
+    """Means over blocks of a model: ``points`` (n, 3), m, ``normals`` (n, 3) of the ground there, z = 1, NaN unknown;
+    ``at`` (n,): number of each in an array of ``shape`` (rows, columns)."""
+
+    points: Floats
+    normals: Floats
+    at: NDArray[np.int64]
+    shape: tuple[int, int]
+
+
+def thin(elevation: NDArray[np.floating], lattice: Lattice, cell: float) -> Blocks:
+    """Blocks of a model, as wide as the cells of a map."""
     z = np.asarray(elevation, np.float64)
-    xy = lattice.xy()
     known = np.isfinite(z)
-    # Means as coarse as the map: single cells would differ from it by their relief, not by a wrong place.
-    block = np.floor(xy[known] / cell + 0.5).astype(np.int64)
-    _, index = np.unique(block, axis=0, return_inverse=True)
-    index = index.reshape(-1)
-    count = np.bincount(index)
-    sums = [np.bincount(index, values) for values in (xy[known][:, 0], xy[known][:, 1], z[known])]
-    full = count >= 0.3 * (cell / lattice.cell) ** 2
-    return np.stack([s / count for s in sums], axis=1)[full]
+    row, col = (np.floor(axis / cell + 0.5).astype(np.int64) for axis in (-lattice.ys(), lattice.xs()))
+    shape = int(row[-1] - row[0]) + 1, int(col[-1] - col[0]) + 1
+    index = ((row - row[0])[:, None] * shape[1] + (col - col[0]))[known]
+    count = np.bincount(index, minlength=shape[0] * shape[1])
+    full = count >= max(1.0, MIN_BLOCK_SHARE * (cell / lattice.cell) ** 2)
+    xyz = (*np.moveaxis(lattice.xy()[known], -1, 0), z[known])
+    points = np.stack([np.bincount(index, values, minlength=len(count))[full] / count[full] for values in xyz], axis=1)
+    mean = np.full(shape, np.nan)
+    mean.reshape(-1)[full] = points[:, 2]
+    slopes = gradient(mean, cell).reshape(2, -1)[:, full]
+    return Blocks(points, np.stack([*-slopes, np.ones(len(points))], axis=1), np.flatnonzero(full), shape)
 
 
 @dataclass(frozen=True)
 class GlobalMap:
-    """Heights (row, col) on ``lattice``, m, NaN unknown, bilinear between the cells' centres."""
+    """Heights (row, col), m, NaN unknown, bilinear between cells, whose centres are at x0 + col * cell,
+    y0 - row * cell."""
 
     heights: Floats
-    lattice: Lattice
+    x0: float
+    y0: float
+    cell: float
 
     def at(self, x: Floats, y: Floats) -> Floats:
         """Height (...), m, at x, y (...), m; NaN outside and beside unknown cells."""
-        rows, cols = (self.lattice.y0 - y) / self.lattice.cell, (x - self.lattice.x0) / self.lattice.cell
+        rows, cols = (self.y0 - y) / self.cell, (x - self.x0) / self.cell
         return np.asarray(scipy.ndimage.map_coordinates(self.heights, [rows, cols], order=1, cval=np.nan))
 
-    def slopes(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Slopes along x and y within the bilinear cells."""
-        step = SLOPE_STEP * self.lattice.cell
-        return (
-            (self.at(x + step, y) - self.at(x - step, y)) / (2.0 * step),
-            (self.at(x, y + step) - self.at(x, y - step)) / (2.0 * step),
+    def halved(self) -> GlobalMap:
+        """The same with cells twice as wide, means of those of four cells that are known, two at least."""
+        rows, cols = (n // 2 for n in self.heights.shape)
+        four = self.heights[: 2 * rows, : 2 * cols].reshape(rows, 2, cols, 2)
+        count = np.isfinite(four).sum(axis=(1, 3))
+        mean = np.where(count >= 2, np.nansum(four, axis=(1, 3)) / np.maximum(count, 1), np.nan)
+        half = 0.5 * self.cell
+        return GlobalMap(mean, self.x0 + half, self.y0 - half, 2.0 * self.cell)
+
+    def within(self, x: float, y: float, distance: float) -> GlobalMap:
+        """The part within a distance of a place along either axis; it may be empty."""
+        rows, cols = self.heights.shape
+        row, col = (self.y0 - y) / self.cell, (x - self.x0) / self.cell
+        first, last = (
+            [min(max(round(at + side * distance / self.cell), 0), n) for at, n in ((row, rows), (col, cols))]
+            for side in (-1, 1)
         )
+        part = self.heights[first[0] : last[0], first[1] : last[1]]
+        return replace(self, heights=part, x0=self.x0 + first[1] * self.cell, y0=self.y0 - first[0] * self.cell)
+
+
+def fix(
+    elevation: NDArray[np.floating], lattice: Lattice, ground: GlobalMap, around: Around, params: MapLocalizationParams
+) -> Fix:
+    """Place a model (row, col), m, on a map.
+
+    Raises
+    ------
+    DegenerateError
+        The model covers too few cells, or the map is too flat to tell.
+    InputError
+        Nowhere within the search the map knows enough of the ground that the model shows, or the search is too wide.
+    """
+    area = int(np.isfinite(elevation).sum()) * lattice.cell**2
+    while ground.cell < (1 - 1e-6) * lattice.cell or area > MAX_CELLS * ground.cell**2:
+        ground = ground.halved()
+    blocks = thin(elevation, lattice, ground.cell)
+    if len(blocks.points) < MIN_CELLS:
+        raise DegenerateError(
+            "RIL-337",
+            f"the model covers {len(blocks.points)} cells of the map, {MIN_CELLS} are needed",
+            remedy="give a finer map, or a model of more ground",
+        )
+    middle = blocks.points.mean(axis=0)
+    far = float(np.hypot(*(blocks.points - middle)[:, :2].T).max())
+    wide = replace(around, distance=around.distance + far, turn=min(around.turn + MORE_TURN, math.pi))
+    ground = ground.within(wide.x, wide.y, wide.distance + far + math.hypot(*middle[:2]) + 2.0 * ground.cell)
+    coarse = ground
+    while _tries(coarse, far, wide) > MAX_TRIES and area > 4 * MIN_SEARCHED_CELLS * coarse.cell**2:
+        coarse = coarse.halved()
+    if (tries := _tries(coarse, far, wide)) > MAX_TRIES_AT_ALL:
+        text = f"the map is too large to be searched: {tries:.1g} places and headings, at most {MAX_TRIES_AT_ALL:.0g}"
+        raise InputError("RIL-840", text, remedy="name a start, or one that is nearer")
+    fine = thin(elevation, lattice, max(0.5 * coarse.cell, lattice.cell))
+    rough = thin(elevation, lattice, coarse.cell)
+    near, fits = NEIGHBOURS * coarse.cell, list[_Fit]()
+    for start in _search(fine.points - middle, coarse, wide, middle, params.min_overlap):
+        fit = _refined(rough, coarse, middle, start, near, params)
+        fit = fit and _refined(blocks, ground, middle, fit.state, near, params)
+        fits += [fit] if fit else []
+    inside = [fit for fit in fits if _beyond(fit.state, around, middle, far) <= near]
+    best = min(inside, key=lambda fit: fit.square, default=None)
+    if best is None or _condition(best.normal) < MIN_EIGENVALUE:
+        raise DegenerateError(
+            "RIL-339",
+            "the map or the model is too flat to tell the position, or nothing near the start fits",
+            remedy="give a finer map, another start, or a model of more ground",
+        )
+    placed = _placed(best, blocks, middle, math.radians(params.sigma_tilt_deg))
+    rivals = [fit for fit in fits if _apart(fit.state, best.state, far) > near]
+    if not rivals:  # all of the best starts led to one place: what is worse than they are is no rival
+        return placed
+    other = min(rivals, key=lambda fit: fit.square)
+    chi2 = placed.independent * math.log(max(other.square, 1e-24) / max(best.square, 1e-24))
+    return replace(placed, other=(np.array([*_origin(other.state, middle), other.state[5]]), chi2))
+
+
+def _origin(state: Floats, middle: Floats) -> Floats:
+    """x, y of the model's origin."""
+    return np.asarray(state[:2] - np.array(_turned(middle[None], state[5]))[:, 0])
+
+
+def _apart(a: Floats, b: Floats, far: float) -> float:
+    """Distance, m, of two places, or of the farthest points of a model that is turned from one to the other."""
+    return max(math.hypot(*(a - b)[:2]), abs(math.remainder(a[5] - b[5], 2.0 * math.pi)) * far)
+
+
+def _beyond(state: Floats, around: Around, middle: Floats, far: float) -> float:
+    """Distance, m, of a place from what is searched, likewise."""
+    x, y = _origin(state, middle)
+    turned = abs(math.remainder(state[5] - around.heading, 2.0 * math.pi))
+    return max(math.hypot(x - around.x, y - around.y) - around.distance, (turned - around.turn) * far)
+
+
+def _tries(ground: GlobalMap, far: float, around: Around) -> float:
+    """Headings and cells of a search, with those that correlations add."""
+    edge = 2.0 * far / ground.cell
+    rows, cols = ground.heights.shape
+    return float((2.0 * around.turn * far / ground.cell + 1.0) * (rows + edge) * (cols + edge))
+
+
+def _search(points: Floats, ground: GlobalMap, around: Around, middle: Floats, min_overlap: float) -> Iterator[Floats]:
+    """Best places that are no neighbours, the best first: x, y, z (NaN: not known), two tilts and heading of the
+    model's ``middle``."""
+    # Turns that move the farthest point by one cell: finer steps find no other place.
+    step = ground.cell / float(np.hypot(*points[:, :2].T).max())
+    count = math.ceil(around.turn / step)
+    headings = around.heading + step * np.arange(-count, count + 1, dtype=np.float64)
+    rows, cols = ground.heights.shape
+    x, y = ground.x0 + ground.cell * np.arange(cols), ground.y0 - ground.cell * np.arange(rows)
+    scores = np.full((len(headings), len(y), len(x)), np.inf, np.float32)
+    best_overlap = 0.0
+    for k, (score, overlap) in enumerate(_scores(points, ground, headings)):
+        dx, dy = _turned(middle[None], headings[k])
+        inside = np.hypot(x - dx - around.x, (y - dy - around.y)[:, None]) <= around.distance + ground.cell
+        best_overlap = max(best_overlap, float(np.max(overlap, where=inside, initial=0.0)))
+        scores[k] = np.where(inside & (overlap >= min_overlap), score, np.inf)
+    if best_overlap < min_overlap:
+        raise InputError(
+            "RIL-338",
+            f"the map knows at most {best_overlap:.0%} of the ground of the model around ({around.x:.2f}, "
+            f"{around.y:.2f}) m, {min_overlap:.0%} are needed",
+            remedy="give a map that covers the start, or a better start",
+        )
+    for _ in range(PLACES):
+        at = np.unravel_index(int(np.argmin(scores)), scores.shape)
+        if not np.isfinite(scores[at]):
+            return
+        yield np.array([x[at[2]], y[at[1]], np.nan, 0.0, 0.0, headings[at[0]]])
+        scores[tuple(slice(max(k - NEIGHBOURS, 0), k + NEIGHBOURS + 1) for k in at)] = np.inf
 
 
 def _turned(points: Floats, heading: float) -> tuple[Floats, Floats]:
@@ -123,139 +322,128 @@ def _turned(points: Floats, heading: float) -> tuple[Floats, Floats]:
     return c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]
 
 
-def _scores(points: Floats, ground: GlobalMap, axes: Sequence[Floats], bound: float) -> tuple[Floats, Floats]:
-    """Truncated mean square of the height differences at each place (heading, y, x), and the share that is known.
-
-    ``axes``: headings, y and x that are tried.
-    """
-    scores, overlaps = np.full((2, *(len(axis) for axis in axes)), np.inf)
-    for h, heading in enumerate(axes[0]):
-        dx, dy = _turned(points, heading)
-        for i, y in enumerate(axes[1]):
-            x, y_all = np.broadcast_arrays(axes[2][:, None] + dx, y + dy)
-            # NaN is sorted last. The height of the local frame on the map is not known: the median takes it out.
-            differences = np.sort(ground.at(x, y_all) - points[:, 2], axis=1)
-            count = np.isfinite(differences).sum(axis=1)
-            halves = np.maximum(np.stack([count - 1, count], axis=1) // 2, 0) % len(points)
-            middle = np.take_along_axis(differences, halves, axis=1).mean(axis=1)
-            # Truncated: a rock that the coarse map does not hold counts no more than the bound.
-            off = np.minimum((differences - middle[:, None]) ** 2, bound**2)
-            overlaps[h, i] = count / len(points)
-            scores[h, i] = np.where(count >= MIN_KNOWN, np.nansum(off, axis=1) / np.maximum(count, 1), np.inf)
-    return scores, overlaps
-
-
-def fix(points: Floats, ground: GlobalMap, prior: Prior, params: MapLocalizationParams) -> Fix:
-    """Place the points of a local model on a global map.
-
-    Parameters
-    ----------
-    points : (n, 3) of :func:`thin`, local frame, m.
-    Raises
-    ------
-    DegenerateError
-        The local model covers too few cells, or the map is too flat to tell.
-    InputError
-        Nowhere around the prior the map knows enough of the ground that the local model shows.
-    """
-    if len(points) < MIN_CELLS:
-        raise DegenerateError(
-            "RIL-337",
-            f"the local model covers {len(points)} cells of the global map, {MIN_CELLS} are needed",
-            remedy="give a finer global map, or a first pair that sees farther",
-        )
-    cell = ground.lattice.cell
-    sigma = params.sigma_height * cell
-    far = float(np.hypot(points[:, 0], points[:, 1]).max())
-    # Half a cell, and turns that move the farthest point by one cell: finer steps find no other minimum.
-    shifts = _around(params.reach * prior.sigma, 0.5 * cell)
-    turns = _around(params.reach * prior.sigma_heading, cell / far)
-    axes = prior.heading + turns, prior.y + shifts, prior.x + shifts
-    scores, overlaps = _scores(points, ground, axes, TRUNCATION_SIGMAS * sigma)
-    enough = overlaps >= params.min_overlap
-    if not enough.any():
-        raise InputError(
-            "RIL-338",
-            f"the global map knows at most {overlaps.max():.0%} of the ground of the first model around the prior "
-            f"({prior.x:.2f}, {prior.y:.2f}) m, {params.min_overlap:.0%} are needed",
-            remedy="give a map that covers the start, or a better prior",
-        )
-    scores[~enough] = np.inf
-    independent = max(1.0, len(points) / CORRELATION_CELLS**2)
-    found = _refined(points, ground, _place(axes, int(np.argmin(scores))), params)
-    # By the errors found, and as many independent cells as there are correlation lengths.
-    covariance = found.covariance * max(1.0, found.cells / independent)
-    return replace(found, covariance=covariance, other=_other(scores, axes, independent / sigma**2))
+def _scores(points: Floats, ground: GlobalMap, headings: Floats) -> Iterator[tuple[Floats, Floats]]:
+    """Of each heading: mean square (row, col), m2, of the differences about their plane, with the middle of the model
+    at each cell, and the share of the model that the map knows there."""
+    far = math.ceil(float(np.hypot(*points[:, :2].T).max()) / ground.cell) + 1
+    side, (rows, cols) = 2 * far + 1, ground.heights.shape
+    known = np.isfinite(ground.heights)
+    # Less their mean, since squares of heights above the sea would leave no digits for the relief.
+    mean = np.sum(ground.heights, where=known) / max(known.sum(), 1)
+    heights = np.where(known, ground.heights - mean, 0.0)
+    shape = [scipy.fft.next_fast_len(n + 2 * far, real=True) for n in (rows, cols)]
+    maps = np.zeros((3, *shape))
+    maps[:, far : far + rows, far : far + cols] = known, heights, heights**2
+    k, h, hh = scipy.fft.rfft2(maps)
+    v, u = np.mgrid[-1.0 : 1.0 : side * 1j, -1.0 : 1.0 : side * 1j]
+    moments = np.stack([np.ones((side, side)), u, v, u * u, u * v, v * v])
+    for heading in headings:
+        x, y = _turned(points, heading)
+        at = (far - np.rint(y / ground.cell).astype(int)) * side + far + np.rint(x / ground.cell).astype(int)
+        count = np.bincount(at, minlength=side * side)
+        z = (np.bincount(at, points[:, 2], side * side) / np.maximum(count, 1)).reshape(side, side)
+        w = (count > 0).reshape(side, side)
+        # Conjugates: correlations, not convolutions.
+        model = np.conj(scipy.fft.rfft2(np.stack([*(w * moments), *(z * moments[:3]), z * z]), shape))
+        products = [
+            *(k * model[:6]),
+            *(h * model[:3] - k * model[6:9]),
+            hh * model[0] - 2 * h * model[6] + k * model[9],
+        ]
+        n, su, sv, uu, uv, vv, d, du, dv, dd = scipy.fft.irfft2(np.stack(products), shape)[:, :rows, :cols]
+        overlap, n = n / w.sum(), np.maximum(n, 1.0)
+        uu, uv, vv = uu - su * su / n, uv - su * sv / n, vv - sv * sv / n
+        du, dv = du - su * d / n, dv - sv * d / n
+        plane = (du * du * vv - 2 * du * dv * uv + dv * dv * uu) / np.maximum(uu * vv - uv * uv, 1e-9)
+        yield np.maximum((dd - d * d / n - plane) / n, 0.0), overlap
 
 
-def _around(reach: float, step: float) -> Floats:
-    """Multiples of a step up to a reach to either side."""
-    n = math.ceil(reach / step)
-    return np.asarray(step * np.arange(-n, n + 1, dtype=np.float64))
+class _Fit(NamedTuple):
+    """``state``: x, y, z, two tilts and heading of the middle; mean ``square`` of the differences, m2; the differences
+    (n,), NaN unknown, and the normal matrix (6, 6) of their weighted slopes."""
+
+    state: Floats
+    square: float
+    differences: Floats
+    normal: Floats
 
 
-def _place(axes: Sequence[Floats], index: int) -> Floats:
-    """x, y and heading of a place, by its number among the scores."""
-    at = np.unravel_index(index, [len(axis) for axis in axes])
-    return np.array([axis[k] for axis, k in zip(axes, at, strict=True)][::-1])
+def _rotation(state: Floats) -> Floats:
+    return np.asarray(rotation_exp([*state[3:5], 0.0]) @ rotation_exp([0.0, 0.0, state[5]]))
 
 
-def _other(scores: Floats, axes: Sequence[Floats], weight: float) -> tuple[Floats, float] | None:
-    """The least of the local minima that do not touch the best one's valley, and its chi2 above the best."""
-    best = np.unravel_index(int(np.argmin(scores)), scores.shape)
-    low = scores == scipy.ndimage.minimum_filter(scores, 3, mode="constant", cval=np.inf)
-    # Farther off than three steps: nearer minima belong to the same valley.
-    away = np.max(np.abs(np.indices(scores.shape) - np.reshape(best, (3, 1, 1, 1))), axis=0) > 3
-    low &= away & np.isfinite(scores)
-    if not low.any():
-        return None
-    number = int(np.argmin(np.where(low, scores, np.inf)))
-    return _place(axes, number), float((scores.flat[number] - scores[best]) * weight)
+def _condition(normal: Floats) -> float:
+    """Least eigenvalue of a normal matrix scaled to a diagonal of ones."""
+    scale = np.sqrt(np.diag(normal)) + 1e-12
+    return float(np.linalg.eigvalsh(normal / np.outer(scale, scale))[0])
 
 
-def _refined(points: Floats, ground: GlobalMap, start: Floats, params: MapLocalizationParams) -> Fix:
-    """Gauss-Newton on x, y, heading and z with Huber's weights; the covariance is that of independent points."""
-    cell = ground.lattice.cell
-    bound = TRUNCATION_SIGMAS * params.sigma_height * cell / 2.0
-    # Height first: Huber's weights would take a wrong one for outliers everywhere.
-    place = np.append(start, 0.0)
-    place[3] = -float(np.nanmedian(_differences(points, ground, place)[0]))
+def _refined(
+    blocks: Blocks, ground: GlobalMap, middle: Floats, start: Floats, near: float, params: MapLocalizationParams
+) -> _Fit | None:
+    """Gauss-Newton with Huber's weights, no farther than ``near``, m; None where the model leaves the map at once."""
+    state, tilt, fit = start.copy(), math.radians(params.sigma_tilt_deg), None
     for _ in range(MAX_ROUNDS):
-        r, J = _differences(points, ground, place)
-        weight = huber_weight(np.abs(r), bound)
+        turn = _rotation(state)
+        q, normals = (blocks.points - middle) @ turn.T, blocks.normals @ turn.T
+        above = q[:, 2] - ground.at(state[0] + q[:, 0], state[1] + q[:, 1])
+        known = np.isfinite(above) & np.isfinite(normals[:, 2])
+        if known.sum() < max(0.5 * params.min_overlap * len(above), MIN_CELLS / 2):
+            return fit
+        state[2] = -np.median(above[known]) if np.isnan(state[2]) else state[2]
+        r, n = (above + state[2])[known], normals[known] / normals[known][:, 2:]
+        J = np.concatenate([n, np.cross(q[known], n)], axis=1)
+        sigma = max(mad_sigma(r), 1e-12)
+        weight = huber_weight(np.abs(r), HUBER_SIGMAS * sigma)
         normal = J.T @ (weight[:, None] * J)
-        scale = np.sqrt(np.diag(normal)) + 1e-12
-        if np.linalg.eigvalsh(normal / np.outer(scale, scale))[0] < MIN_EIGENVALUE:
-            raise DegenerateError(
-                "RIL-339",
-                "the global map is too flat around the start to tell the position",
-                remedy="hand the pose in, or give a finer map",
-            )
-        step = -np.linalg.solve(normal, J.T @ (weight * r))
-        place = place + step
-        if np.abs(step[:2]).max() < 1e-4 * cell:
+        fit = _Fit(state, float((weight * r**2).sum() / weight.sum()), np.full(len(above), np.nan), normal)
+        fit.differences[known] = r
+        prior = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 0.0]) * (sigma / tilt) ** 2
+        if _condition(normal + prior) < MIN_EIGENVALUE:
+            return fit
+        step = -np.linalg.solve(normal + prior, J.T @ (weight * r) + prior @ state)
+        # At most a cell: farther, the slopes are others.
+        size = float(np.abs(step[:2]).max()) / ground.cell
+        state = state + step / max(size, 1.0)
+        if size < SETTLED_CELLS or math.hypot(*(state - start)[:2]) > near:
             break
-    rms = float(np.sqrt((weight * r**2).sum() / max(weight.sum(), 1e-12)))
-    return Fix(place, np.linalg.inv(normal) * rms**2, len(r) / len(points), rms, len(r), None)
+    return fit
 
 
-def _differences(points: Floats, ground: GlobalMap, place: Floats) -> tuple[Floats, Floats]:
-    """Local minus global heights (m,) of the points that the map knows, and derivatives (m, 4) by x, y, heading, z."""
-    dx, dy = _turned(points, place[2])
-    x, y = place[0] + dx, place[1] + dy
-    gx, gy = ground.slopes(x, y)
-    difference = points[:, 2] + place[3] - ground.at(x, y)
-    known = np.isfinite(difference) & np.isfinite(gx) & np.isfinite(gy)
-    slopes = np.stack([-gx, -gy, gx * dy - gy * dx, np.ones(len(points))], axis=1)
-    return difference[known], slopes[known]
+def _placed(best: _Fit, blocks: Blocks, middle: Floats, sigma_tilt: float) -> Fix:
+    """The best fit as the pose of the model's origin, with its covariance."""
+    cells = int(np.isfinite(best.differences).sum())
+    independent = _independent(best.differences, blocks)
+    turn = _rotation(best.state)
+    information = best.normal * independent / (cells * max(best.square, 1e-24))
+    information += np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 0.0]) / sigma_tilt**2
+    lever = np.eye(6)
+    lever[:3, 3:] = cross_matrix(turn @ middle)
+    design = np.column_stack([blocks.points[:, :2] - middle[:2], np.ones(len(blocks.points))])
+    relief = blocks.points[:, 2] - design @ np.linalg.lstsq(design, blocks.points[:, 2], rcond=None)[0]
+    return Fix(
+        RigidTransform(turn, best.state[:3] - turn @ middle),
+        lever @ np.linalg.inv(information) @ lever.T,
+        cells / len(blocks.points),
+        math.sqrt(best.square),
+        1.0 - best.square / max(float(np.mean(relief**2)), 1e-24),
+        cells,
+        independent,
+    )
 
 
-def _transform(x: float, y: float, heading: float, z: float) -> list[float]:
-    """T_global_local of a place (m, rad), 12 numbers."""
-    return RigidTransform(rotation_exp([0.0, 0.0, heading]), np.array([x, y, z])).to_list()
+def _independent(differences: Floats, blocks: Blocks) -> float:
+    """Number of independent differences: by the correlation of neighbours, along either axis."""
+    field = np.full(blocks.shape, np.nan)
+    field.reshape(-1)[blocks.at] = differences - np.nanmean(differences)
+    products = np.concatenate([(field[1:] * field[:-1]).ravel(), (field[:, 1:] * field[:, :-1]).ravel()])
+    products = products[np.isfinite(products)]
+    alike = float(products.mean() / np.nanmean(field**2)) if products.size else 0.0
+    alike = min(max(alike, 0.0), MAX_ALIKE)
+    return float(np.isfinite(differences).sum()) * ((1.0 - alike) / (1.0 + alike)) ** 2
 
 
-@stage("map_localization")
+@stage("map_localization", version=2)
 def map_localization_stage(
     params: MapLocalizationParams,
     dem: Bundle[DemFacts] | None = None,
@@ -267,33 +455,15 @@ def map_localization_stage(
 ) -> Bundle[MapFixFacts]:
     """First pose in a global map, by aligning the first elevation model or as handed in."""
     if pose is not None:
-        x, y, heading, z = (float(pose[k]) for k in (0, 1, 3, 2))
-        return Bundle({}, {"T_global_local": _transform(x, y, heading, z), "source": "handed in"})
+        known = RigidTransform(rotation_exp([0.0, 0.0, pose[3]]), np.array(pose[:3], dtype=np.float64))
+        return Bundle({}, {"T_global_local": known.to_list(), "source": "handed in"})
     assert dem is not None
     assert global_map is not None
-    ground = GlobalMap(
-        np.asarray(global_map["elevation"], dtype=np.float64), Lattice.from_dict(global_map.meta["lattice"])
-    )
-    points = thin(np.asarray(dem["elevation"]), Lattice.from_dict(dem.meta["lattice"]), ground.lattice.cell)
-    found = fix(points, ground, Prior(*prior, *prior_sigma), params)
-    std = np.sqrt(np.diag(found.covariance))
-    meta: MapFixFacts = {
-        "T_global_local": _transform(*found.place),
-        "source": "aligned to the global map",
-        "std": [float(v) for v in std],
-        "covariance": found.covariance.tolist(),
-        "overlap": found.overlap,
-        "rms": found.rms,
-        "cells": found.cells,
-        "other": None if found.other is None else {"place": found.other[0].tolist(), "chi2": found.other[1]},
-    }
-    ambiguous = found.other is not None and found.other[1] < MIN_CHI2_GAP
-    meta["ambiguous"] = ambiguous
-    if found.other is not None and ambiguous:
-        ox, oy, _ = found.other[0]
-        meta["warnings"] = [
-            f"the first pose in the global map is ambiguous: ({ox:.2f}, {oy:.2f}) m fits nearly as well as "
-            f"({found.place[0]:.2f}, {found.place[1]:.2f}) m (chi2 larger by {found.other[1]:.1f}, "
-            f"{MIN_CHI2_GAP:g} wanted)"
-        ]
+    lattice = Lattice.from_dict(global_map.meta["lattice"])
+    ground = GlobalMap(np.asarray(global_map["elevation"], np.float64), lattice.x0, lattice.y0, lattice.cell)
+    around = Around(*prior, *(params.reach * sigma for sigma in prior_sigma))
+    placed = fix(np.asarray(dem["elevation"]), Lattice.from_dict(dem.meta["lattice"]), ground, around, params)
+    meta = placed.facts()
+    if placed.doubt:
+        meta["warnings"] = [f"the first pose in the global map is ambiguous: {placed.doubt}"]
     return Bundle({}, meta)
