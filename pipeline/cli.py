@@ -41,6 +41,8 @@ COMMANDS = {
     "match": "match:match",
     "export": "export:export",
     "compare-dem": "compare_dem:compare_dem",
+    "localize": "localize:localize",
+    "merge": "merge:merge",
     "datasets": "datasets:app",
     "cache": "cache:app",
 }

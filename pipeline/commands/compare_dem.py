@@ -21,7 +21,7 @@ from rille.pipeline.commands.options import COMPLETE, RUNS, Output, Runs, flag
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.export.read_dem import DemFile, opened_raster, read_elevation
+from rille.pipeline.export.read_dem import DemFile, read_elevation, read_ortho
 from rille.pipeline.export.writers import ENGINEERING_CRS, Meaning, write_bands
 from rille.pipeline.runs import lookup
 from rille.stages.core.errors import InputError
@@ -67,9 +67,13 @@ def compare_dem(
     one, other = (read_elevation(path) for path in paths)
     found = None
     if align == "place":
-        motion, agreeing = place.place(*(_ortho(path) for path in paths))
-        found = {"motion_of_a": motion.tolist(), "keypoints": agreeing}
-        one, align = moved(one, motion), "rigid"
+        files = [path for path in paths if not path.is_dir()]
+        if files:
+            text = f"{files[0]} is no run: it has no ortho image"
+            raise InputError("RIL-908", text, remedy="leave --align place out")
+        placed = place.place(*(read_ortho(path / "ortho.tif")[0] for path in paths))
+        found = {"motion_of_a": placed.motion.tolist(), "keypoints": placed.agreeing}
+        one, align = moved(one, placed.motion), "rigid"
     check(one, other)
     figures, error = measure(one, other, align)
     figures["place"] = found
@@ -94,17 +98,6 @@ def compare_dem(
     return COMPLETE
 
 
-def _ortho(path: Path) -> place.Ortho:
-    """The ortho image of a run."""
-    if not path.is_dir():
-        raise InputError("RIL-908", f"{path} is no run: it has no ortho image", remedy="leave --align place out")
-    with opened_raster(path / "ortho.tif") as file:
-        bands, known, t = file.read(out_dtype="float32"), file.dataset_mask() != 0, file.transform
-    grey = bands.mean(axis=0)
-    t = t @ Affine.translation(0.5, 0.5)
-    return place.Ortho(grey, known & np.isfinite(grey), np.array([[t.a, t.b, t.c], [t.d, t.e, t.f]]))
-
-
 def moved(dem: DemFile, motion: Floats) -> DemFile:
     """The model in another frame, by a motion (2, 3) of x, y."""
     eyes = dem.viewpoints
@@ -120,10 +113,10 @@ def check(a: DemFile, b: DemFile) -> None:
     InputError
         Their CRS differ, or their outlines do not overlap.
     """
-    if a.crs and b.crs and not _same_crs(a.crs, b.crs):
+    if a.crs and b.crs and not same_crs(a.crs, b.crs):
         raise InputError(
             "RIL-615",
-            f"{a.name} is in {_crs_name(a.crs)}, {b.name} in {_crs_name(b.crs)}",
+            f"{a.name} is in {crs_name(a.crs)}, {b.name} in {crs_name(b.crs)}",
             remedy="bring one to the other's system first, e.g. with gdalwarp -t_srs",
         )
     x0, x1, y0, y1 = a.extent
@@ -137,11 +130,17 @@ def check(a: DemFile, b: DemFile) -> None:
         )
 
 
-def _same_crs(a: str, b: str) -> bool:
-    return a == b or CRS.from_wkt(a) == CRS.from_wkt(b) or {_crs_name(a), _crs_name(b)} == {_crs_name(ENGINEERING_CRS)}
+def same_crs(a: str, b: str) -> bool:
+    """Whether two systems (WKT, or as users write them) are one."""
+    return (
+        a == b
+        or CRS.from_user_input(a) == CRS.from_user_input(b)
+        or {crs_name(a), crs_name(b)} == {crs_name(ENGINEERING_CRS)}
+    )
 
 
-def _crs_name(wkt: str) -> str:
+def crs_name(wkt: str) -> str:
+    """Name of a system (WKT)."""
     return wkt.split('"')[1] if '"' in wkt else wkt
 
 
@@ -245,7 +244,7 @@ def _change_table(changes: Mapping[str, Any]) -> Iterator[str]:
 
 def _about(raster: DemFile) -> dict[str, Any]:
     rows, cols = raster.values.shape
-    return {"path": raster.name, "rows": rows, "cols": cols, "cell_m": raster.cell, "crs": _crs_name(raster.crs)}
+    return {"path": raster.name, "rows": rows, "cols": cols, "cell_m": raster.cell, "crs": crs_name(raster.crs)}
 
 
 def _alignment(alignment: evaluation.Alignment, kind: str) -> dict[str, Any]:
@@ -273,7 +272,7 @@ def _range(target: Grid, a: DemFile, b: DemFile) -> tuple[Floats | None, str]:
     """Horizontal distance (rows, cols) from the nearest camera, and its unit; None (and why) where none is known."""
     cameras = a.viewpoints if a.viewpoints is not None else b.viewpoints
     unit = "m, from the nearest position of the left camera"
-    if cameras is None and _crs_name(ENGINEERING_CRS) in (_crs_name(a.crs), _crs_name(b.crs)):
+    if cameras is None and crs_name(ENGINEERING_CRS) in (crs_name(a.crs), crs_name(b.crs)):
         cameras, unit = np.zeros((1, 2)), "m, from the frame's origin (the first left camera)"
     if cameras is None or not len(cameras):
         return None, "no camera is known: give the folder of a run for A or B"

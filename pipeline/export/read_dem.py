@@ -20,6 +20,7 @@ from rille.datasets.text.warning import warning
 from rille.pipeline.engine.memory import free, words
 from rille.pipeline.export.foreign_raster import open_raster
 from rille.stages.core.errors import InputError
+from rille.stages.evaluation.place import Ortho
 
 MAX_CELLS = 500_000_000
 """Of an elevation model, which is read whole."""
@@ -40,6 +41,8 @@ USUAL_MARKS, MAX_BANK_CELLS = (0.0, -1.0, -99.0, -999.0, 255.0, 999.0), 30.0
 """Values that often mark what is unknown, and cells by which ground may rise from one of them everywhere at once."""
 
 OURS = "give a run as Rille writes it"
+
+NO_PLACE = "give a raster that says itself where its cells are"
 
 METRE = ("m", "metre", "metres", "meter", "meters")
 
@@ -164,8 +167,7 @@ def read_raster(path: Path) -> DemFile:
         values = file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
         crs, transform, unit = file.crs, file.transform, file.units[0]
     if transform == Affine.identity():
-        remedy = "give a raster that says itself where its cells are"
-        raise InputError("RIL-630", f"{path} has no geotransform", remedy=remedy)
+        raise InputError("RIL-630", f"{path} has no geotransform", remedy=NO_PLACE)
     # Lengths of the cell's sides, not a and e: a raster may be turned.
     across, down = np.hypot(transform.a, transform.d), np.hypot(transform.b, transform.e)
     if not (0.0 < abs(transform.determinant) < math.inf and np.isclose(across, down, rtol=1e-6, atol=0.0)):
@@ -179,6 +181,30 @@ def read_raster(path: Path) -> DemFile:
     doubt = warning("RIL-962", f"{path} states no unit of its elevations: taken as metres")
     wkt = "" if crs is None else crs.to_wkt(version="WKT2_2019")
     return DemFile(str(path), values, transform, wkt, warnings=() if unit else (doubt,))
+
+
+def read_ortho(path: Path) -> tuple[Ortho, str]:
+    """Image of the ground, the mean of the bands of a GeoTIFF, and its CRS (WKT), empty where it states none.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, has no geotransform, no known cell, or is not in metres.
+    """
+    with opened_raster(path) as file:
+        grey, known = file.read(out_dtype="float32").mean(axis=0), file.dataset_mask() != 0
+        t, crs = file.transform, file.crs
+    if t == Affine.identity():
+        raise InputError("RIL-630", f"{path} has no geotransform", remedy=NO_PLACE)
+    if crs is not None:
+        _metric_crs(path, crs)
+    known &= np.isfinite(grey)
+    if not known.any():
+        raise InputError("RIL-856", f"{path} has no known cell", remedy="give another image")
+    t = t @ Affine.translation(0.5, 0.5)
+    return Ortho(grey, known, np.array([[t.a, t.b, t.c], [t.d, t.e, t.f]])), "" if crs is None else crs.to_wkt(
+        version="WKT2_2019"
+    )
 
 
 def _check_cells(path: Path, shape: tuple[int, ...], stored: int) -> None:

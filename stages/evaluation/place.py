@@ -25,6 +25,15 @@ NEAR_CELLS = 2.0
 FEWEST, MOST_SCALE = 12, 0.03
 """Matches that must agree, and departure of their scale from 1."""
 
+MAX_RATIO, MIN_CONTRAST = 1.5, 16.0
+"""Of cells, above which the finer image is averaged; and of grey values: paler images are stretched."""
+
+FILL_CELLS = 4.0
+"""Width of the surroundings that unknown cells take their grey value from."""
+
+RIVAL_SHARE = 0.5
+"""Of the matches that agree: when as many agree on another place, both are possible."""
+
 
 class Ortho(NamedTuple):
     """Grey image (row, col), which of its cells are known, and the map (2, 3) from (col, row, 1) to x, y, metres."""
@@ -34,48 +43,96 @@ class Ortho(NamedTuple):
     matrix: Floats
 
 
-def place(a: Ortho, b: Ortho) -> tuple[Floats, int]:
-    """Motion (2, 3) from x, y of A to those of B, a turn and a shift, and how many matches agree on it.
+class Placed(NamedTuple):
+    """``motion`` (2, 3) from x, y of A to those of B, a turn and a shift, on which ``agreeing`` matches agree.
+
+    ``sigma`` (3,): standard deviations of the shift of their ``middle`` (2,), in B, m, and of the turn, rad.
+    """
+
+    motion: Floats
+    agreeing: int
+    middle: Floats
+    sigma: Floats
+
+
+def place(a: Ortho, b: Ortho) -> Placed:
+    """Where A lies in B.
 
     Raises
     ------
     DegenerateError
-        Too few matches agree: the images show other places, or another light.
+        Too few matches agree: the images show other places, or another light; or half as many agree on another place.
     """
-    (here, one), (there, other) = _described(a), _described(b)
-    agreeing, motion = 0, None
-    if len(here) and len(there):
-        matches = cv2.BFMatcher().knnMatch(one, other, k=2)
-        pairs = [first for first, *second in matches if second and first.distance < RATIO * second[0].distance]
-        if len(pairs) >= FEWEST:
-            p, q = here[[m.queryIdx for m in pairs]], there[[m.trainIdx for m in pairs]]
-            near = NEAR_CELLS * max(_cell(a), _cell(b))
-            motion, used = cv2.estimateAffinePartial2D(p, q, method=cv2.RANSAC, ransacReprojThreshold=near)
-            agreeing = 0 if motion is None else int(used.sum())
+    near = NEAR_CELLS * max(_cell(a), _cell(b))
+    (here, one), (there, other) = _described(a, _cell(b)), _described(b, _cell(a))
+    p, q = _alike(here, one, there, other)
+    motion, used = _agreed(p, q, near)
+    agreeing = int(used.sum())
     scale = 1.0 if motion is None else math.hypot(motion[0, 0], motion[1, 0])
     if motion is None or agreeing < FEWEST or abs(scale - 1.0) > MOST_SCALE:
         text = f"the ortho images do not show one place: {agreeing} keypoints agree, at a scale of {scale:.3f}"
         raise DegenerateError("RIL-327", text, remedy="compare models in one frame, or of one place in one light")
     # A turn alone, about the middle of the matches that agree.
     turn = motion[:, :2] / scale
-    middle = p[used.ravel() != 0].mean(axis=0)
-    return np.column_stack([turn, motion[:, :2] @ middle + motion[:, 2] - turn @ middle]), agreeing
+    start = p[used].mean(axis=0)
+    middle = motion[:, :2] @ start + motion[:, 2]
+    elsewhere, rival = _agreed(p[~used], q[~used], near)
+    away = 0.0 if elsewhere is None else float(np.linalg.norm(elsewhere[:, :2] @ start + elsewhere[:, 2] - middle))
+    if rival.sum() > RIVAL_SHARE * agreeing and away > 2.0 * near:
+        text = f"the ortho image fits two places: {agreeing} and {rival.sum()} keypoints agree, {away:.3g} m apart"
+        raise DegenerateError("RIL-841", text, remedy="give images of more ground, or a start")
+    arm = p[used] - start
+    spread = float(np.sqrt(np.mean((q[used] - middle - arm @ turn.T) ** 2)))
+    sigma = spread / np.sqrt([agreeing, agreeing, float((arm**2).sum())])
+    return Placed(np.column_stack([turn, middle - turn @ start]), agreeing, middle, sigma)
+
+
+def _alike(here: Floats, one: AnyArray, there: Floats, other: AnyArray) -> tuple[Floats, Floats]:
+    """Places (n, 2) in both images of keypoints that are alike."""
+    matches = cv2.BFMatcher().knnMatch(one, other, k=2) if len(here) and len(there) else []
+    pairs = [first for first, *second in matches if second and first.distance < RATIO * second[0].distance]
+    index = np.array([(m.queryIdx, m.trainIdx) for m in pairs], dtype=np.intp).reshape(-1, 2)
+    return here[index[:, 0]], there[index[:, 1]]
+
+
+def _agreed(p: Floats, q: Floats, near: float) -> tuple[Floats | None, Bools]:
+    """Similarity (2, 3) on which most matches agree within ``near`` metres, and which of them do."""
+    if len(p) < FEWEST:
+        return None, np.zeros(len(p), dtype=bool)
+    # OpenCV reckons with 24 binary digits: eastings and northings would lose the centimetres.
+    a, b = p.mean(axis=0), q.mean(axis=0)
+    motion, used = cv2.estimateAffinePartial2D(p - a, q - b, method=cv2.RANSAC, ransacReprojThreshold=near)
+    if motion is None:
+        return None, np.zeros(len(p), dtype=bool)
+    return np.column_stack([motion[:, :2], motion[:, 2] + b - motion[:, :2] @ a]), used.ravel() != 0
 
 
 def _cell(image: Ortho) -> float:
     return float(np.sqrt(abs(np.linalg.det(image.matrix[:, :2]))))
 
 
-def _described(image: Ortho) -> tuple[Floats, AnyArray]:
-    """Places x, y (n, 2) of keypoints, metres, and descriptors (n, 128)."""
-    grey = np.clip(np.nan_to_num(image.grey), 0, 255).astype(np.uint8)
-    # Beside unknown cells the edge of what is known is no texture.
-    mask = cv2.erode(image.known.astype(np.uint8), np.ones((9, 9), np.uint8))
+def _described(image: Ortho, other: float) -> tuple[Floats, AnyArray]:
+    """Places x, y (n, 2) of keypoints, metres, and descriptors (n, 128); in an image no finer than ``other``, m."""
+    grey, known, matrix = np.nan_to_num(image.grey), image.known.astype(np.float32), image.matrix
+    ratio = other / _cell(image)
+    if ratio > MAX_RATIO:
+        rows, cols = (max(1, round(n / ratio)) for n in grey.shape)
+        step = np.diag([grey.shape[1] / cols, grey.shape[0] / rows])
+        shares = cv2.resize(known, (cols, rows), interpolation=cv2.INTER_AREA)
+        sums = cv2.resize(np.where(image.known, grey, 0), (cols, rows), interpolation=cv2.INTER_AREA)
+        grey, known = sums / np.maximum(shares, 1e-6), (shares > 0.5).astype(np.float32)
+        matrix = np.column_stack([matrix[:, :2] @ step, matrix @ [*(0.5 * (np.diag(step) - 1.0)), 1.0]])
+    low, high = np.percentile(grey[known > 0], (1, 99)) if known.any() else (0.0, 255.0)
+    if low < 0 or high > 255 or high - low < MIN_CONTRAST:  # of other units, or pale
+        grey = (grey - low) * (255.0 / max(high - low, 1e-12))
+    # The edge of what is known is no texture: unknown cells get what is around them.
+    around = [cv2.GaussianBlur(v.astype(np.float32), (0, 0), FILL_CELLS) for v in (np.where(known > 0, grey, 0), known)]
+    grey = np.where(known > 0, grey, around[0] / np.maximum(around[1], 1e-6))
     # Without it keypoints lie a part of a cell off their places.
     sift = cv2.SIFT.create(KEYPOINTS, enable_precise_upscale=True)
-    points, descriptors = sift.detectAndCompute(grey, mask)
+    points, descriptors = sift.detectAndCompute(np.clip(grey, 0, 255).astype(np.uint8), known.astype(np.uint8))
     if descriptors is None:
         return np.empty((0, 2)), np.empty((0, 128), np.float32)
     at = np.array([point.pt for point in points])
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
-    return at @ image.matrix[:, :2].T + image.matrix[:, 2], root
+    return at @ matrix[:, :2].T + matrix[:, 2], root

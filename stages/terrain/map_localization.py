@@ -413,7 +413,9 @@ def _refined(
 def _placed(best: _Fit, blocks: Blocks, middle: Floats, sigma_tilt: float) -> Fix:
     """The best fit as the pose of the model's origin, with its covariance."""
     cells = int(np.isfinite(best.differences).sum())
-    independent = _independent(best.differences, blocks)
+    field = np.full(blocks.shape, np.nan)
+    field.reshape(-1)[blocks.at] = best.differences
+    independent = independent_cells(field)
     turn = _rotation(best.state)
     information = best.normal * independent / (cells * max(best.square, 1e-24))
     information += np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 0.0]) / sigma_tilt**2
@@ -432,15 +434,14 @@ def _placed(best: _Fit, blocks: Blocks, middle: Floats, sigma_tilt: float) -> Fi
     )
 
 
-def _independent(differences: Floats, blocks: Blocks) -> float:
-    """Number of independent differences: by the correlation of neighbours, along either axis."""
-    field = np.full(blocks.shape, np.nan)
-    field.reshape(-1)[blocks.at] = differences - np.nanmean(differences)
+def independent_cells(field: Floats) -> float:
+    """Number of independent values of a field (row, col), NaN unknown: by the correlation of neighbours."""
+    field = field - np.nanmean(field)
     products = np.concatenate([(field[1:] * field[:-1]).ravel(), (field[:, 1:] * field[:, :-1]).ravel()])
-    products = products[np.isfinite(products)]
-    alike = float(products.mean() / np.nanmean(field**2)) if products.size else 0.0
+    products, square = products[np.isfinite(products)], float(np.nanmean(field**2))
+    alike = float(products.mean()) / max(square, 1e-30) if products.size else 0.0
     alike = min(max(alike, 0.0), MAX_ALIKE)
-    return float(np.isfinite(differences).sum()) * ((1.0 - alike) / (1.0 + alike)) ** 2
+    return float(np.isfinite(field).sum()) * ((1.0 - alike) / (1.0 + alike)) ** 2
 
 
 @stage("map_localization", version=2)

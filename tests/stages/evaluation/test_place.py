@@ -41,12 +41,40 @@ def test_turn_and_shift_are_found(turn, cell):
     own = np.array([[cell, 0.0, -140 * cell], [0.0, cell, -150 * cell]])
     there = motion[:, :2] @ own + np.column_stack([np.zeros((2, 2)), motion[:, 2]])
     a = Ortho(*seen(ground(1), there)[:2], own)
-    found, agreeing = place(a, b)
+    found, agreeing, centre, sigma = place(a, b)
     middle = np.array([0.1, -0.05])
     error = (found - motion)[:, :2] @ middle + (found - motion)[:, 2]
     assert np.abs(error).max() < 0.5 * 0.01
     assert np.linalg.det(found[:, :2]) == pytest.approx(1.0)
     assert agreeing > 30
+    off = (found - motion)[:, :2] @ np.linalg.inv(motion[:, :2]) @ (centre - motion[:, 2]) + (found - motion)[:, 2]
+    assert np.abs(off).max() < 5.0 * sigma[0] + 1e-4  # keypoints next to each other err alike
+
+
+def test_eastings_and_northings_lose_no_digits():
+    a, b = seen(ground(1), lattice(0.01)), seen(ground(1), lattice(0.01, x=0.4, y=0.3))
+    far = np.array([[0.0, 0.0, 500000.0], [0.0, 0.0, 5200000.0]])
+    found = place(a, b._replace(matrix=b.matrix + far)).motion
+    assert np.abs(found - far - lattice(1.0)).max() < 0.005
+
+
+def test_a_much_coarser_image_in_other_units_is_compared_at_its_own_cells():
+    a = seen(ground(1), lattice(0.01))
+    fine = seen(ground(1), lattice(0.01), cells=480).grey
+    coarse = fine.reshape(160, 3, 160, 3).mean(axis=(1, 3))
+    b = Ortho(40.0 * coarse + 7000.0, np.ones(coarse.shape, bool), lattice(0.03, x=0.01, y=0.01))
+    assert np.abs(place(a, b).motion - lattice(1.0)).max() < 0.01
+
+
+def test_an_image_that_fits_two_places_is_refused():
+    a = seen(ground(1), lattice(0.01), cells=150)
+    b = seen(ground(1), lattice(0.01), cells=150)
+    twice = np.concatenate([b.grey, b.grey], axis=1)
+    # Of twins a keypoint's second best match is as good as its best: noise tells half of them apart.
+    twice[:, :150] += np.random.default_rng(4).normal(0, 12, (150, 150)) * (np.indices((150, 150))[0] % 50 < 25)
+    twice[:, 150:] += np.random.default_rng(5).normal(0, 12, (150, 150)) * (np.indices((150, 150))[0] % 50 >= 25)
+    with raises("RIL-841", "two places"):
+        place(a, Ortho(twice, np.ones(twice.shape, bool), b.matrix))
 
 
 def test_another_place_is_refused():

@@ -1,0 +1,380 @@
+"""``rille localize RUN DEM``: where the terrain of a run lies in a map, with covariance, or that this is ambiguous."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from affine import Affine
+from cyclopts import Parameter
+from cyclopts.validators import Number
+from rasterio.crs import CRS
+
+from rille.datasets.georeference import Georeference
+from rille.pipeline import api
+from rille.pipeline.commands.compare_dem import crs_name, same_crs
+from rille.pipeline.commands.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder
+from rille.pipeline.commands.run_terrain import Terrain
+from rille.pipeline.engine.failures import reported
+from rille.pipeline.engine.plain import warn
+from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.export.paths import write_path
+from rille.pipeline.export.programs.run_artifacts import RunArtifacts
+from rille.pipeline.export.read_dem import DemFile, read_elevation, read_ortho
+from rille.pipeline.export.writers import write_trajectory_tum
+from rille.pipeline.runs import lookup
+from rille.stages.core.arrays import Floats
+from rille.stages.core.declare import AnyArray, Bundle
+from rille.stages.core.errors import ConfigError, DegenerateError, InputError
+from rille.stages.evaluation.place import Ortho, Placed, place
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
+from rille.stages.terrain.map_localization import MIN_CHI2_GAP, Around, GlobalMap, MapLocalizationParams, fix
+from rille.stages.terrain.shading import hillshade
+
+TURN_DEG = 20.0
+"""Degrees to either side of a given heading that are searched."""
+SENSOR_TILT_DEG, GROUND_TILT_DEG = 0.5, 5.0
+"""Standard deviation, degrees, of a vertical that a sensor gives, and of one that is that of the ground."""
+ORTHO_CELLS = 10.0
+"""Cells of the map within which elevations and ortho images must agree on a place."""
+FACTS = ("overlap", "rms", "explained", "cells", "independent")
+"""Of a fit, for the JSON file."""
+NAMES = ("x_m", "y_m", "z_m", "about_x_deg", "about_y_deg", "yaw_deg")
+PICTURE_CELLS = 1500
+"""Cells of a map along either side of the picture."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Area:
+    """What of a map is searched.
+
+    Parameters
+    ----------
+    near
+        About where the world's origin is: x,y or x,y,yaw in the map's coordinates, metres, and degrees to the left from
+        the map's x axis to that of the world; everywhere by default.
+    within
+        Distance from there that is searched, metres; all of the map by default.
+    """
+
+    near: str | None = None
+    within: Annotated[float | None, Parameter(validator=Number(gt=0))] = None
+
+    def around(self) -> Around | None:
+        """The same in numbers; None: everywhere.
+
+        Raises
+        ------
+        ConfigError
+            It is no place.
+        """
+        if self.near is None:
+            if self.within is not None:
+                raise ConfigError("RIL-846", "--within without --near", remedy="say near what: --near x,y")
+            return None
+        try:
+            x, y, *yaw = (float(word) for word in self.near.split(","))
+            if len(yaw) > 1 or not np.isfinite([x, y, *yaw]).all():
+                raise ValueError
+        except ValueError:
+            text = f"--near {self.near!r} is not x,y or x,y,yaw"
+            raise ConfigError("RIL-847", text, remedy="write e.g. --near 612.5,88.0,30") from None
+        turn = math.radians(TURN_DEG) if yaw else math.pi
+        return Around(x, y, math.radians(sum(yaw)), math.inf if self.within is None else self.within, turn)
+
+
+@dataclass(frozen=True)
+class Found:
+    """``pose`` T_map_world with its covariance (6, 6): position, m, and rotation, rad; infinite: not found.
+
+    ``doubt`` in words, empty where there is none; ``other`` x, y of the next best place, if any; ``about``: lines on
+    how it was found; ``facts`` on that for the JSON file.
+    """
+
+    pose: RigidTransform
+    covariance: Floats
+    about: tuple[str, ...]
+    facts: Mapping[str, Any]
+    other: Floats | None = None
+    doubt: str = ""
+
+    @property
+    def numbers(self) -> dict[str, tuple[float, float]]:
+        """What was found, by name, with its standard deviation: position, tilts about the map's axes, yaw."""
+        R, sigma = self.pose.rotation, np.sqrt(np.diag(self.covariance))
+        tilts = np.degrees(rotation_log(R @ rotation_exp([0.0, 0.0, -_yaw(self.pose)])))[:2]
+        values = *self.pose.translation, *tilts, math.degrees(_yaw(self.pose))
+        sigmas = *sigma[:3], *np.degrees(sigma[3:])
+        return {
+            name: (float(value), float(s)) for name, value, s in zip(NAMES, values, sigmas, strict=True) if s < math.inf
+        }
+
+
+_EVERYWHERE = Area()
+
+
+def localize(
+    run: Run,
+    dem: Path | None = None,
+    *,
+    ortho: Path | None = None,
+    area: Area = _EVERYWHERE,
+    output: Annotated[Path, Output] = Path("localization"),
+    runs: Runs = RUNS,
+    cache: CacheFolder = None,
+) -> int:
+    """Find where the terrain of a run lies in an elevation model or an ortho image of a larger area.
+
+    Prints the place of the run's world frame with standard deviations, and the next best place. If that fits nearly as
+    well, the answer is "ambiguous" and the exit status 3. Writes OUTPUT.json, OUTPUT.png and, unless it is ambiguous,
+    trajectory and path in the map's coordinates: OUTPUT.tum, OUTPUT.gpkg.
+
+    Parameters
+    ----------
+    dem
+        Elevation model: GeoTIFF or ESRI ASCII grid in metres, as fine as the run's or up to 20 times coarser.
+    ortho
+        Ortho image, GeoTIFF; beside an elevation model, or instead of it: z is then not found.
+    output
+        Files to write, without ending.
+    """
+    if dem is None and ortho is None:
+        raise ConfigError("RIL-844", "no map is given", remedy="name an elevation model, or --ortho IMAGE")
+    folder = lookup.find(run, runs)
+    around, terrain = area.around(), Terrain.of(folder)
+    image, system = (None, "") if ortho is None else read_ortho(ortho)
+    model = None if dem is None else read_elevation(dem)
+    systems = {str(dem): "" if model is None else model.crs, str(ortho): system}
+    crs = next((wkt for wkt in systems.values() if wkt), "")
+    if terrain.place is not None:
+        systems[f"run {terrain.name}"] = CRS.from_user_input(terrain.place.crs).to_wkt(version="WKT2_2019")
+    _check_systems({name: wkt for name, wkt in systems.items() if wkt})
+    found, why = None, ""
+    try:
+        found = _found(terrain, model, image, around)
+        why = found.doubt
+    except DegenerateError as error:
+        why = f"{error.code}: {error}"
+    target, written = output.with_name(output.name.removesuffix(".json").removesuffix(".png")), [".json", ".png"]
+    facts = {"run": terrain.name, "dem": dem and str(dem), "ortho": ortho and str(ortho), "crs": crs}
+    with reported("RIL-845", f"{target} cannot be written", remedy="name others with -o", kind=InputError):
+        text = json.dumps({**facts, "ambiguous": bool(why), "why": why, **_facts(found)}, indent=1, allow_nan=False)
+        atomic.write(target.with_name(target.name + ".json"), text + "\n")
+        _draw(target.with_name(target.name + ".png"), terrain, found, _background(model, image))
+        if found is not None and not why:
+            written += _export(folder, found, target, crs, Store(cache_folder(cache)))
+    print("\n".join([f"ambiguous    {why}", *(found.about if found else ())] if why else _lines(found, crs)))
+    print("wrote        " + "  ".join(f"{target}{ending}" for ending in written))
+    return HOLES if why else COMPLETE
+
+
+def _check_systems(systems: Mapping[str, str]) -> None:
+    for first, name in pairwise(systems):
+        if not same_crs(systems[first], systems[name]):
+            text = f"{first} is in {crs_name(systems[first])}, {name} in {crs_name(systems[name])}"
+            remedy = "bring the map to the other's system first, e.g. with gdalwarp -t_srs"
+            raise InputError("RIL-848", text, remedy=remedy)
+
+
+def _found(terrain: Terrain, model: DemFile | None, image: Ortho | None, around: Around | None) -> Found:
+    """Place by the ortho images, where there is one; then by the elevations, where there are some.
+
+    Raises
+    ------
+    DegenerateError
+        They tell none.
+    """
+    by_ortho = None
+    if image is not None:
+        if around is not None and around.distance < math.inf:
+            image = image._replace(known=image.known & _in_reach(image, terrain, around))
+        try:
+            by_ortho = _by_ortho(place(terrain.image, image))
+        except DegenerateError as error:
+            if model is None:
+                raise
+            warn(f"{error.code}: {error}; by the elevations alone")
+    if model is None:
+        assert by_ortho is not None
+        return by_ortho
+    for line in model.warnings:
+        warn(line)
+    if by_ortho is None:
+        return _by_elevations(terrain, model, around)
+    x, y, _ = by_ortho.pose.translation
+    about = Around(float(x), float(y), _yaw(by_ortho.pose), ORTHO_CELLS * model.cell, math.radians(TURN_DEG))
+    found = _by_elevations(terrain, model, about)
+    return replace(found, about=(*found.about, *by_ortho.about), facts={**found.facts, **by_ortho.facts})
+
+
+def _yaw(pose: RigidTransform) -> float:
+    return math.atan2(pose.rotation[1, 0], pose.rotation[0, 0])
+
+
+def _in_reach(image: Ortho, terrain: Terrain, around: Around) -> AnyArray:
+    """Cells (row, col) of an image that the terrain may cover."""
+    row, col = np.indices(image.known.shape)
+    x, y = np.tensordot(image.matrix, np.stack([col, row, np.ones_like(row)]), axes=1)
+    return np.asarray(np.hypot(x - around.x, y - around.y) <= around.distance + terrain.radius)
+
+
+def _by_ortho(placed: Placed) -> Found:
+    """The place that keypoints agree on; neither height nor tilt."""
+    turn, shift = placed.motion[:, :2], placed.motion[:, 2]
+    heading = math.atan2(turn[1, 0], turn[0, 0])
+    pose = RigidTransform(rotation_exp([0.0, 0.0, heading]), np.array([*shift, 0.0]))
+    # The middle of the matches is known; the origin may be far from it.
+    arm, kept = shift - placed.middle, np.ix_([0, 1, 5], [0, 1, 5])
+    lever = np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]], [0.0, 0.0, 1.0]])
+    covariance = np.diag(np.full(6, math.inf))
+    covariance[kept] = lever @ np.diag(placed.sigma**2) @ lever.T
+    return Found(pose, covariance, (f"ortho        {placed.agreeing} keypoints agree",), {"keypoints": placed.agreeing})
+
+
+def _by_elevations(terrain: Terrain, model: DemFile, around: Around | None) -> Found:
+    """The place that elevations tell."""
+    # A raster may be turned or mirrored: the search is in a frame along its rows.
+    values, t = model.values, model.transform @ Affine.translation(0.5, 0.5)
+    if t.determinant > 0:
+        values, t = values[::-1], t @ Affine.translation(0, len(values) - 1) @ Affine.scale(1, -1)
+    to_map = RigidTransform(rotation_exp([0.0, 0.0, math.atan2(t.d, t.a)]), np.array([t.c, t.f, 0.0]))
+    rows, cols = values.shape
+    middle = 0.5 * model.cell * (cols - 1), 0.5 * model.cell * (1 - rows)
+    everywhere = math.hypot(*middle) + terrain.radius
+    x, y, heading, distance, turn = *middle, 0.0, everywhere, math.pi
+    if around is not None:
+        x, y, _ = to_map.inverse().apply([around.x, around.y, 0.0])
+        heading, turn = around.heading - _yaw(to_map), around.turn
+        distance = min(around.distance, everywhere + math.hypot(middle[0] - x, middle[1] - y))
+    tilt = SENSOR_TILT_DEG if terrain.vertical == "attitude" else GROUND_TILT_DEG
+    placed = fix(
+        terrain.elevation,
+        terrain.lattice,
+        GlobalMap(values, 0.0, 0.0, model.cell),
+        Around(float(x), float(y), heading, distance, turn),
+        MapLocalizationParams.model_validate({"sigma_tilt_deg": tilt}),
+    )
+    pose, both = to_map @ placed.pose, np.kron(np.eye(2), to_map.rotation)
+    facts = {name: value for name, value in placed.facts().items() if name in FACTS}
+    doubt, other, rival = "", None, "no other place"
+    if placed.other is not None:
+        other, chi2 = to_map.apply([*placed.other[0][:2], 0.0])[:2], placed.other[1]
+        facts["other"] = {"x_m": other[0], "y_m": other[1], "chi2": chi2, "wanted": MIN_CHI2_GAP}
+        there, here = (f"({point[0]:.2f}, {point[1]:.2f}) m" for point in (other, pose.translation))
+        rival = f"next best place {there}: chi2 larger by {chi2:.0f}, {MIN_CHI2_GAP:g} wanted"
+        doubt = f"{there} fits {'better than' if chi2 < 0 else 'nearly as well as'} {here}" if placed.doubt else ""
+    about = (
+        f"fit          {placed.cells} cells ({placed.independent:.0f} independent), {placed.overlap:.0%} of the "
+        f"terrain; RMS {placed.rms:.3g} m, {max(placed.explained, 0.0):.0%} of the relief explained",
+        f"ambiguity    {rival}",
+    )
+    return Found(pose, both @ placed.covariance @ both.T, about, facts, other, doubt)
+
+
+def _facts(found: Found | None) -> dict[str, Any]:
+    """Facts of a place for the JSON file."""
+    if found is None:
+        return {}
+    known = np.isfinite(np.diag(found.covariance))
+    return {
+        "T_map_world": found.pose.to_list(),
+        "place": {name: value for name, (value, _) in found.numbers.items()},
+        "sigma": {name: sigma for name, (_, sigma) in found.numbers.items()},
+        "covariance_m_rad": found.covariance[np.ix_(known, known)].tolist(),
+        **found.facts,
+    }
+
+
+def _lines(found: Found | None, crs: str) -> Iterator[str]:
+    """What is printed of a place."""
+    assert found is not None
+    yield f"place        of the world's origin{f' in {crs_name(crs)}' if crs else ''}, yaw to the left"
+    for name, (value, sigma) in found.numbers.items():
+        word, _, unit = name.rpartition("_")
+        digits = min(6, max(0, 1 - math.floor(math.log10(max(sigma, 1e-6)))))
+        yield f"  {word:10s} {value:.{digits}f} +- {sigma:.{digits}f} {unit}"
+    yield from found.about
+
+
+def _export(folder: Path, found: Found, target: Path, crs: str, store: Store) -> list[str]:
+    """Write trajectory and path in the map's coordinates; gives the endings."""
+    written, words = [], f"of the map{f', {crs_name(crs)}' if crs else ''}: T_map_world of {target.name}.json"
+    if (folder / "trajectory.kitti").exists():
+        known = api.Run(folder).trajectory
+        turned, there = found.pose.rotation @ known["rotation"].values, found.pose.apply(known["position"].values)
+        poses = np.concatenate([turned, there[..., None]], axis=2)
+        write_trajectory_tum(target.with_name(target.name + ".tum"), poses, known["time"].values.tolist(), words)
+        written.append(".tum")
+    try:
+        with lookup.reading(folder):
+            planned = RunArtifacts(folder, store).find("path/world")
+    except InputError as error:
+        warn(f"{error.code}: {error}; no path is written")
+        return written
+    if planned is not None:
+        moved = Bundle({"path": found.pose.apply(np.asarray(planned["path"]))}, {**planned.meta, "frame": words})
+        frame = Georeference(crs, (0.0, 0.0, 0.0), 0.0) if crs else None
+        write_path(target.with_name(target.name + ".gpkg"), moved, frame)
+        written.append(".gpkg")
+    return written
+
+
+def _background(model: DemFile | None, image: Ortho | None) -> Ortho:
+    """Picture of a map, thinned out."""
+    if model is None:
+        assert image is not None
+        picture = image
+    else:
+        t = model.transform @ Affine.translation(0.5, 0.5)
+        shade = hillshade(model.values, model.cell)
+        picture = Ortho(shade, shade > 0, np.array([[t.a, t.b, t.c], [t.d, t.e, t.f]]))
+    step = math.ceil(max(picture.grey.shape) / PICTURE_CELLS)
+    matrix = picture.matrix @ np.diag([step, step, 1.0])
+    return Ortho(picture.grey[::step, ::step], picture.known[::step, ::step], matrix)
+
+
+def _draw(path: Path, terrain: Terrain, found: Found | None, background: Ortho) -> None:
+    """The whole map with the place, and, enlarged, the map and the run's terrain laid on it."""
+    from matplotlib.figure import Figure
+    from matplotlib.transforms import Affine2D
+
+    def show(axis: Any, picture: Ortho, **how: Any) -> None:
+        shown = axis.imshow(np.where(picture.known, picture.grey, np.nan), interpolation="nearest", **how)
+        shown.set_transform(Affine2D(np.vstack([picture.matrix, [0, 0, 1]])) + axis.transData)
+
+    figure = Figure(figsize=(15, 5.2), layout="constrained")
+    whole, here, laid = axes = figure.subplots(1, 3)
+    rows, cols = background.grey.shape
+    low, high = np.percentile(background.grey[background.known], (1, 99))
+    corners = background.matrix @ [[-0.5, cols, -0.5, cols], [-0.5, -0.5, rows, rows], [1, 1, 1, 1]]
+    for axis, title in zip(axes, ("map", "map, enlarged", "the run's terrain laid on it"), strict=True):
+        show(axis, background, cmap="gray", vmin=low, vmax=high)
+        axis.set(title=title, aspect="equal", xlim=(corners[0].min(), corners[0].max()))
+        axis.set(xlabel="x, m", ylabel="y, m", ylim=(corners[1].min(), corners[1].max()))
+    if found is not None:
+        x0, x1, y0, y1 = terrain.lattice.bounds
+        outline = found.pose.apply([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0], [x0, y0, 0]])[:, :2]
+        whole.plot(*outline.T, color="tab:orange", label="the run's terrain")
+        whole.plot(*found.pose.translation[:2], "o", color="tab:orange", label="its origin")
+        if found.other is not None:
+            whole.plot(*found.other, "x", color="tab:blue", label="its origin, next best place")
+        whole.legend(fontsize=8)
+        shade, to_map = hillshade(terrain.elevation, terrain.lattice.cell), found.pose.rotation[:2, :2]
+        own = to_map @ terrain.image.matrix + np.column_stack([np.zeros((2, 2)), found.pose.translation[:2]])
+        show(laid, Ortho(shade, shade > 0, own), cmap="copper", zorder=3)
+        edge = 0.15 * float(np.ptp(outline, axis=0).max())
+        least, most = outline.min(axis=0) - edge, outline.max(axis=0) + edge
+        for axis in (here, laid):
+            axis.set(xlim=(least[0], most[0]), ylim=(least[1], most[1]))
+    if found is None or found.doubt:
+        figure.suptitle("no place is found" if found is None else "AMBIGUOUS: one of several places", color="tab:red")
+    with atomic.replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110, metadata={"Software": None})

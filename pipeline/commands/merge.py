@@ -1,0 +1,241 @@
+"""``rille merge RUN RUN``: the terrains of several runs of one place as one, in the world frame of the first."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+
+from rille.datasets.georeference import Georeference
+from rille.datasets.text.warning import warning
+from rille.pipeline.commands.compare_dem import same_crs
+from rille.pipeline.commands.options import COMPLETE, RUNS, Output, Run, Runs
+from rille.pipeline.commands.run_terrain import Terrain
+from rille.pipeline.engine.failures import reported
+from rille.pipeline.engine.plain import warn
+from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.export.writers import Meaning, write_raster
+from rille.pipeline.runs import lookup
+from rille.stages.core.arrays import Floats
+from rille.stages.core.errors import ConfigError, DegenerateError, InputError
+from rille.stages.evaluation import dem_comparison, place
+from rille.stages.evaluation.dem_comparison import Alignment, Grid
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
+from rille.stages.geometry.lattice import Lattice, union
+from rille.stages.terrain.map_localization import independent_cells
+from rille.stages.terrain.merge import EXACT, Layer, MergeParams, Placed
+from rille.stages.terrain.merge import merge as merge_layers
+from rille.stages.terrain.shading import gradient
+
+MAX_CELL_RATIO = 1.5
+"""Of two runs' cells: coarser ones would be interpolated between, finer ones left out."""
+AGREEING_SIGMAS = 3.0
+"""Of a motion, within which georeferences are believed: lattices that fit are then not resampled."""
+ROUNDS = 4
+"""In which the point of a tilted model above a cell is found: its height moves it by less each time."""
+
+
+@dataclass(frozen=True)
+class Session:
+    """Terrain of a run and its registration: ``pose`` T_first_world, standard deviations ``sigma`` (6,) of x, y, z, m,
+    and of turns about them, rad, at ``centre`` (3,), m, and its facts for the JSON file."""
+
+    terrain: Terrain
+    pose: RigidTransform
+    sigma: Floats
+    centre: Floats
+    facts: Mapping[str, Any]
+
+    def covered(self, cell: float) -> Lattice:
+        """What of the first run's lattice it may cover."""
+        x0, x1, y0, y1 = self.terrain.lattice.bounds
+        x, y, _ = self.pose.apply([[x, y, self.level] for x in (x0, x1) for y in (y0, y1)]).T
+        return Lattice.snap((x.min(), x.max(), y.min(), y.max()), cell)
+
+    @property
+    def level(self) -> float:
+        """Middle elevation of its terrain in its own frame, m."""
+        return float(np.nanmedian(self.terrain.elevation))
+
+
+def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RUNS) -> int:
+    """Merge the terrains of several runs of one place: dem.tif, dem_sigma.tif and ortho.tif in the first run's frame.
+
+    Runs with georeferences in one system are laid by these, others by their ortho images; then elevations decide, with
+    stated standard deviations, which those of the merged terrain contain. Prints how far the runs differ.
+
+    Parameters
+    ----------
+    more
+        Others.
+    output
+        Folder to write.
+    """
+    folders = [lookup.find(name, runs) for name in (run, *more)]
+    if len(set(folders)) < 2:
+        raise ConfigError("RIL-849", "one run alone is merged with nothing", remedy="name two runs of one place")
+    first, *others = (Terrain.of(folder) for folder in dict.fromkeys(folders))
+    sessions = [_registered(first, other) for other in others]
+    lattice = union([first.lattice, *(one.covered(first.lattice.cell) for one in sessions)])
+    own = {"elevation": first.elevation, "elevation_std": first.sigma, "ortho": first.ortho}
+    layers = [_layer(0, first.lattice, own)]
+    layers += [_laid(number, first, one) for number, one in enumerate(sessions, start=1)]
+    merged = merge_layers(layers, lattice, MergeParams.model_validate({}))
+    height = merged.elevation if first.place is None else merged.elevation + first.place.origin[2]
+    with reported("RIL-850", f"{output} cannot be written", remedy="name another folder with -o", kind=InputError):
+        output.mkdir(parents=True, exist_ok=True)
+        for name, band, values, unit in (
+            ("dem.tif", "elevation", height, "m"),
+            ("dem_sigma.tif", "elevation_std", merged.elevation_std, "m"),
+            ("ortho.tif", "ortho", merged.ortho, ""),
+        ):
+            write_raster(output / name, {band: np.asarray(values, np.float32)}, lattice, Meaning(unit), first.place)
+        facts = {"frame_of": first.name, "runs": [dict(one.facts) for one in sessions]}
+        atomic.write(output / "merge.json", json.dumps(facts, indent=1) + "\n")
+    for one in sessions:
+        print(_line(one))
+    known = np.isfinite(merged.elevation)
+    print(
+        f"{output}: dem.tif, dem_sigma.tif, ortho.tif, merge.json: {int(known.sum())} cells of {lattice.cell:g} m, "
+        f"{int((merged.count > 1).sum())} of several runs"
+    )
+    return COMPLETE
+
+
+def _grid(terrain: Terrain) -> Grid:
+    return Grid(terrain.elevation, terrain.image.matrix)
+
+
+def _registered(first: Terrain, other: Terrain) -> Session:
+    """Lay a run on the first one.
+
+    Raises
+    ------
+    DegenerateError
+        Their ortho images show no place that both share, or several.
+    InputError
+        Their cells are too unlike, or they have no ground in common.
+    """
+    ratio = other.lattice.cell / first.lattice.cell
+    if not 1.0 / MAX_CELL_RATIO < ratio < MAX_CELL_RATIO:
+        raise InputError(
+            "RIL-851",
+            f"cells of {other.name} are {other.lattice.cell:g} m wide, of {first.name} {first.lattice.cell:g} m",
+            remedy=f"run one again with --set locus.cell_size={first.lattice.cell:g}",
+        )
+    a, b = first.place, other.place
+    if a is not None and b is not None:
+        if not same_crs(a.crs, b.crs):
+            text = f"{other.name} is in {b.crs}, {first.name} in {a.crs}"
+            raise InputError("RIL-852", text, remedy="state the georeferences of both sequences in one system")
+        how, start, rough = "georeferences", _in_system(a).inverse() @ _in_system(b), np.zeros(3)
+    else:
+        placed = place.place(other.image, first.image)
+        heading = math.atan2(placed.motion[1, 0], placed.motion[0, 0])
+        start = RigidTransform(rotation_exp([0.0, 0.0, heading]), np.array([*placed.motion[:, 2], 0.0]))
+        how, rough = f"ortho images, {placed.agreeing} keypoints", placed.sigma
+    turn = start.rotation[:2, :2]
+    own = other.image.matrix
+    moved = np.column_stack([turn @ own[:, :2], turn @ own[:, 2] + start.translation[:2]])
+    # The place is level: so far it turns about the vertical alone.
+    one, two, _ = dem_comparison.common(Grid(other.elevation + start.translation[2], moved), _grid(first))
+    alignment = _aligned(one, two)
+    if alignment is None:
+        if a is None or b is None:
+            text = f"{other.name} and {first.name} have too little ground in common to be laid on each other"
+            raise DegenerateError("RIL-853", text, remedy="choose runs that share more ground")
+        text = f"elevations do not tell how {other.name} lies: it is as the georeferences state, without a sigma"
+        warn(warning("RIL-855", text))
+        centre = np.array([*np.nanmean(one.centres()[np.isfinite(one.values)], axis=0), np.nanmedian(one.values)])
+        alignment = Alignment(np.eye(3), np.zeros(3), centre, np.zeros(6), 0, 0)
+    error = dem_comparison.errors(one, two, alignment)
+    cells = int(np.isfinite(error).sum())
+    # Errors of neighbours are alike: there are fewer than cells.
+    sigma = alignment.sigma * math.sqrt(cells / max(independent_cells(error), 1.0)) if cells else alignment.sigma
+    sigma = np.where(sigma > 0, sigma, [rough[0], rough[1], 0.0, 0.0, 0.0, rough[2]])
+    motion = np.array([*alignment.translation, *rotation_log(alignment.rotation)])
+    if how == "georeferences" and (np.abs(motion) <= AGREEING_SIGMAS * sigma).all():
+        alignment = replace(alignment, rotation=np.eye(3), translation=np.zeros(3))
+    R, centre = alignment.rotation, alignment.centre
+    pose = RigidTransform(R, centre + alignment.translation - R @ centre) @ start
+    facts = {
+        "run": other.name,
+        "by": how,
+        "T_first_world": pose.to_list(),
+        "sigma_m_rad": sigma.tolist(),
+        "overlap": dem_comparison.figures(error),
+    }
+    return Session(other, pose, sigma, centre + alignment.translation, facts)
+
+
+def _in_system(place: Georeference) -> RigidTransform:
+    """T_system_world of a georeference."""
+    return RigidTransform(rotation_exp([0.0, 0.0, -place.azimuth]), np.array(place.origin))
+
+
+def _aligned(one: Grid, two: Grid) -> Alignment | None:
+    """Small motion of the first grid onto the second; height and tilt alone where the terrain tells no more."""
+    for kind in ("rigid", "tilt"):
+        try:
+            return dem_comparison.align(one, two, kind)
+        except DegenerateError:
+            continue
+    return None
+
+
+def _layer(
+    number: int, lattice: Lattice, arrays: Mapping[str, Floats], gain: float = 1.0, pose: Placed = EXACT
+) -> Layer:
+    """A layer of the merge; its residuals are in its standard deviations already."""
+    parts = {name: values.astype(np.float32) for name, values in arrays.items()}
+    parts["residual"] = np.zeros(lattice.shape, np.float32)
+    return Layer(number, lattice, lambda name, window: parts[name][window], gain, pose)
+
+
+def _laid(number: int, first: Terrain, session: Session) -> Layer:
+    """The terrain of a run on the first one's lattice, interpolated once, with the sigma of where it lies."""
+    terrain, lattice, pose = session.terrain, session.covered(first.lattice.cell), session.pose
+    grid, back, xy = _grid(terrain), session.pose.inverse(), lattice.xy()
+    z = np.full(lattice.shape, float(pose.apply([0.0, 0.0, session.level])[2]))
+    for _ in range(ROUNDS):
+        own = back.apply(np.concatenate([xy, z[..., None]], axis=-1))[..., :2]
+        there = dem_comparison.interpolate(grid, own)
+        height = pose.apply(np.concatenate([own, there[..., None]], axis=-1))[..., 2]
+        z = np.where(np.isfinite(height), height, z)
+    slopes = np.nan_to_num(gradient(height, lattice.cell))
+    arm, sigma = xy - session.centre[:2], session.sigma
+    sideways = (slopes[0] * np.hypot(sigma[0], sigma[5] * arm[..., 1])) ** 2
+    sideways += (slopes[1] * np.hypot(sigma[1], sigma[5] * arm[..., 0])) ** 2
+    std = np.sqrt(dem_comparison.interpolate(grid, own, terrain.sigma) ** 2 + sideways)
+    ortho = dem_comparison.interpolate(grid, own, terrain.ortho)
+    common = lattice.intersection(first.lattice)
+    gain = 1.0
+    if common is not None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.log(first.ortho[first.lattice.window(common)] / ortho[lattice.window(common)])
+        gain = math.exp(float(np.median(ratio[np.isfinite(ratio)]))) if np.isfinite(ratio).any() else 1.0
+    placed = Placed(session.centre[:2], np.diag([sigma[2], sigma[3], sigma[4]]) ** 2)
+    return _layer(number, lattice, {"elevation": height, "elevation_std": std, "ortho": ortho}, gain, placed)
+
+
+def _line(one: Session) -> str:
+    """How a run was laid, and how far it differs."""
+    x, y, z = one.pose.translation
+    yaw = math.degrees(math.atan2(one.pose.rotation[1, 0], one.pose.rotation[0, 0]))
+    overlap, sigma = one.facts["overlap"], one.sigma
+    place_ = (
+        f"{one.terrain.name}: at {x:.4g}, {y:.4g}, {z:.4g} m, turned by {yaw:.3f} degrees (sigma "
+        f"{1e3 * sigma[0]:.2g}, {1e3 * sigma[1]:.2g}, {1e3 * sigma[2]:.2g} mm, {math.degrees(sigma[5]):.2g} degrees; "
+        f"by {one.facts['by']})"
+    )
+    if not overlap["cells"]:
+        return f"{place_}; no ground in common"
+    return (
+        f"{place_}; {overlap['cells']:.0f} cells in common: median {1e3 * overlap['median']:+.2g} mm, NMAD "
+        f"{1e3 * overlap['nmad']:.2g} mm, 95 % {1e3 * overlap['p95']:.2g} mm"
+    )

@@ -1,0 +1,80 @@
+"""The merged terrain of a finished run, as commands read it that lay runs on maps or on each other."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rille.datasets.georeference import Georeference
+from rille.datasets.text.reading import TABLE, read_text
+from rille.pipeline.api import Run
+from rille.pipeline.runs import lookup
+from rille.stages.core.arrays import Floats
+from rille.stages.core.errors import InputError
+from rille.stages.evaluation.place import Ortho
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Merged terrain of a run: elevations, their standard deviations, m, and grey values (row, col) on ``lattice``.
+
+    ``place`` of the world frame, where the run has one; ``vertical``: source of the world's vertical.
+    """
+
+    name: str
+    elevation: Floats
+    sigma: Floats
+    ortho: Floats
+    lattice: Lattice
+    place: Georeference | None
+    vertical: str
+
+    @staticmethod
+    def of(folder: Path) -> Terrain:
+        """Read it from the folder of a run.
+
+        Raises
+        ------
+        InputError
+            The run has none, or its elevations are none of ground.
+        """
+        run, name = Run(folder), lookup.name(folder)
+        terrain = run.terrain
+        with lookup.reading(folder):
+            frames = json.loads(read_text(run.file("frames.json"), "frames.json", TABLE))["frames_of_reference"]
+            vertical = frames["world"].get("vertical", "")
+            about = terrain.attrs
+            rows, cols = terrain["elevation"].shape
+            lattice = Lattice(float(terrain.x[0]), float(terrain.y[0]), float(about["cell_size_m"]), rows, cols)
+            names = "elevation", "elevation_std", "ortho"
+            elevation, sigma, ortho = (np.asarray(terrain[key], np.float64) for key in names)
+            place = None
+            if "georeference_crs" in about:
+                east, north, height = about["georeference_origin"]
+                place = Georeference(about["georeference_crs"], (east, north, height), about["georeference_azimuth"])
+        if vertical == REFERENCE_PLANE:
+            text = f"elevations of run {name} are distances from a plane that is no ground"
+            raise InputError("RIL-842", text, remedy="run it with --set terrain.reference=ground")
+        if not np.isfinite(elevation).any():
+            text = f"the terrain of run {name} has no known cell"
+            raise InputError("RIL-843", text, remedy="its report says what is missing")
+        return Terrain(name, elevation, sigma, ortho, lattice, place, vertical)
+
+    @property
+    def image(self) -> Ortho:
+        """The ortho image in the world frame."""
+        at = self.lattice
+        matrix = np.array([[at.cell, 0.0, at.x0], [0.0, -at.cell, at.y0]])
+        return Ortho(self.ortho.astype(np.float32), np.isfinite(self.ortho), matrix)
+
+    @property
+    def radius(self) -> float:
+        """Distance, m, of the farthest corner from the world's origin."""
+        x0, x1, y0, y1 = self.lattice.bounds
+        return math.hypot(max(-x0, x1), max(-y0, y1))
