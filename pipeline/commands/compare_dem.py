@@ -132,11 +132,8 @@ def check(a: DemFile, b: DemFile) -> None:
 
 def same_crs(a: str, b: str) -> bool:
     """Whether two systems (WKT, or as users write them) are one."""
-    return (
-        a == b
-        or CRS.from_user_input(a) == CRS.from_user_input(b)
-        or {crs_name(a), crs_name(b)} == {crs_name(ENGINEERING_CRS)}
-    )
+    own = crs_name(ENGINEERING_CRS)
+    return a == b or {crs_name(a), crs_name(b)} == {own} or CRS.from_user_input(a) == CRS.from_user_input(b)
 
 
 def crs_name(wkt: str) -> str:
