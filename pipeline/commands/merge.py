@@ -28,7 +28,7 @@ from rille.stages.evaluation.dem_comparison import Alignment, Grid
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
 from rille.stages.geometry.lattice import Lattice, union
 from rille.stages.terrain.map_localization import independent_cells
-from rille.stages.terrain.merge import EXACT, Layer, MergeParams, Placed
+from rille.stages.terrain.merge import EXACT, MergeParams, ModelLayer, Placed
 from rille.stages.terrain.merge import merge as merge_layers
 from rille.stages.terrain.shading import gradient
 
@@ -190,14 +190,14 @@ def _aligned(one: Grid, two: Grid) -> Alignment | None:
 
 def _layer(
     number: int, lattice: Lattice, arrays: Mapping[str, Floats], gain: float = 1.0, pose: Placed = EXACT
-) -> Layer:
+) -> ModelLayer:
     """A layer of the merge; its residuals are in its standard deviations already."""
     parts = {name: values.astype(np.float32) for name, values in arrays.items()}
     parts["residual"] = np.zeros(lattice.shape, np.float32)
-    return Layer(number, lattice, lambda name, window: parts[name][window], gain, pose)
+    return ModelLayer(number, lattice, lambda name, window: parts[name][window], gain, pose)
 
 
-def _laid(number: int, first: Terrain, session: Session) -> Layer:
+def _laid(number: int, first: Terrain, session: Session) -> ModelLayer:
     """The terrain of a run on the first one's lattice, interpolated once, with the sigma of where it lies."""
     terrain, lattice, pose = session.terrain, session.covered(first.lattice.cell), session.pose
     grid, back, xy = _grid(terrain), session.pose.inverse(), lattice.xy()
