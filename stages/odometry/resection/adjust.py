@@ -23,7 +23,7 @@ from rille.stages.core.declare import AnyArray, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
 from rille.stages.facts.odometry import FactorsFacts, RefineFacts, ResectFacts, TrajectoryFacts
 from rille.stages.geometry.geometry import RigidTransform
-from rille.stages.odometry.pose_graph import Adjusted, Factors, GraphState, PoseGraph, bound_of, root_of
+from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, bound_of, root_of
 from rille.stages.odometry.resection.priors import Sensors
 from rille.stages.odometry.resection.trajectory import Chained, account, trajectory_stage, without_vertical
 
@@ -117,6 +117,23 @@ def join(poses: Floats, piece: NDArray[np.int16], factors: Factors) -> Joined:
         poses, piece = moved[int(np.argmin(costs))], np.where(piece == other, first, piece)
 
 
+def supported(poses: Floats, piece: NDArray[np.int16], factors: Factors) -> Bools:
+    """Which factors (m,) are within a piece, or agree about with another one between the same two pieces.
+
+    Within a piece the chain contradicts a place that is taken for another; between two pieces nothing but a second one.
+    """
+    pieces = np.sort(piece[factors.ends], axis=1)
+    out = np.asarray(pieces[:, 0] == pieces[:, 1])
+    for k in np.flatnonzero(~out):
+        here = factors.take(np.flatnonzero((pieces == pieces[k]).all(1)))
+        laid = _moved(poses, piece == pieces[k, 1], factors.ends[k], factors.poses[k])
+        errors = PoseGraph(here, len(poses), 0, np.ones(len(here.ends))).errors(
+            GraphState.of(laid, here.shared.shape[2])
+        )
+        out[k] = ((errors**2).sum(1) <= EXCESS[-1] ** 2 * here.bound).sum() > 1
+    return out
+
+
 def _moved(poses: Floats, rows: Bools, ends: NDArray[np.intp], pose: Floats) -> Floats:
     """Poses (n, 3, 4), those of some rows moved as one so that a factor with one end in them holds."""
     a, b = (RigidTransform.from_matrix(poses[k]) for k in ends)
@@ -157,12 +174,16 @@ def adjust_stage(
     chain = chain_factors(refined or segments, numbers, row)
     given = [one for bundle in loops for one in bundle.meta["factors"] if one["from"] in row and one["to"] in row]
     stated = stated_factors(given, row)
+    sure = supported(chained.poses[posed], chained.piece[posed], stated)
+    alone = [one for one, used in zip(given, sure, strict=True) if not used]
+    given, stated = [one for one, used in zip(given, sure, strict=True) if used], stated.take(np.flatnonzero(sure))
     sensors = Sensors.of(priors or {}, posed)
     sensors.believe(chained.poses[posed], chained.piece[posed])
     relative = [sensor.factors(0.0) for sensor in sensors.relative]
     joined = join(chained.poses[posed], chained.piece[posed], Factors.joined([stated, *relative]))
     poses, piece = sensors.laid(*joined)
-    out, lines, excess = chained, list[str](), 1.0
+    out, excess = chained, 1.0
+    lines = [f"frames {one['from']} and {one['to']} alone link their pieces, which are not joined" for one in alone]
     for number in np.unique(piece):
         nodes = np.flatnonzero(piece == number)
         own, mine = _within(chain, nodes), _within(stated, nodes)

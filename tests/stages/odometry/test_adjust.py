@@ -213,11 +213,23 @@ def test_factors_join_pieces_into_the_frame_of_the_first():
     np.testing.assert_array_equal(out["poses"][0], before["poses"][0])
 
 
+def test_a_link_that_no_other_agrees_with_joins_no_pieces():
+    """Within a piece the chain contradicts a wrong place; between two pieces nothing would."""
+    truth, rng = ring(), np.random.default_rng(6)
+    segments, before = run_of(truth, rng, lost={6})
+    wrong = seen(truth, 1, 10, rng)
+    wrong["pose"][3] += 40.0
+    for links in ([seen(truth, 0, 11, rng)], [seen(truth, 0, 11, rng), wrong]):
+        out = adjusted(segments, before, *links)
+        assert out.meta["pieces"] == before.meta["pieces"]
+        assert len([line for line in out.meta["warnings"] if "alone link" in line]) == len(links)
+
+
 def test_a_piece_that_nothing_joins_stays_as_it_is():
     truth, rng = ring(16), np.random.default_rng(7)
     segments, before = run_of(truth, rng, lost={6, 12})
     assert len(before.meta["pieces"]) == 3
-    out = adjusted(segments, before, seen(truth, 1, 14, rng))
+    out = adjusted(segments, before, seen(truth, 1, 14, rng), seen(truth, 2, 13, rng))
     assert out.meta["pieces"] == [[0, 15], [6, 11]]
     assert out.meta["main"] == 0
     assert out.meta["world"] == [0, 1, 2, 3, 4, 5, 12, 13, 14, 15]
