@@ -56,6 +56,8 @@ FACTS: dict[str, dict[str, Any]] = {
     "crosscheck_join": {**POSITIONS, "pieces": [list(FRAMES)], "longest": 0},
     "intrinsics": {},
     "moving": {"share": 0.0},
+    "loops": {"pairs": list(BASIC), "candidates": [[], [], [0]]},
+    "loop": {"factors": [], "refused": []},
     "radiometry": {"steps": {"2": 3}},
 }
 
@@ -143,7 +145,7 @@ def short(settings: dict[str, dict[str, Any]]) -> Sequence:
     mockup = {"frames": len(FRAMES), **settings.get("mockup", {})}
     sequence = open_sequence("mockup-short", {**settings, "mockup": mockup})
     lens = {c: Lens(getattr(sequence.rig, c), "radtan", (-0.1, 0.01, 0.0, 0.0)) for c in ("left", "right")}
-    return replace(sequence, lenses=lens, defaults={**sequence.defaults, "hfvm.preset": "default"})
+    return replace(sequence, lenses=lens, defaults={**sequence.defaults, "hfvm.preset": "default", "loops.apart": 2})
 
 
 def candidates(kind: Any, value: Any) -> Iterator[Any]:

@@ -154,6 +154,11 @@ def opened_raster(path: Path) -> Iterator[Any]:
         raise InputError("RIL-629", f"{path} cannot be read as a raster ({error})", remedy=remedy) from error
 
 
+def _check_place(path: Path, transform: Affine) -> None:
+    if transform == Affine.identity():
+        raise InputError("RIL-630", f"{path} has no geotransform", remedy=NO_PLACE)
+
+
 def read_raster(path: Path) -> DemFile:
     """First band of a GeoTIFF, or an ESRI ASCII grid.
 
@@ -166,8 +171,7 @@ def read_raster(path: Path) -> DemFile:
         # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
         values = file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
         crs, transform, unit = file.crs, file.transform, file.units[0]
-    if transform == Affine.identity():
-        raise InputError("RIL-630", f"{path} has no geotransform", remedy=NO_PLACE)
+    _check_place(path, transform)
     # Lengths of the cell's sides, not a and e: a raster may be turned.
     across, down = np.hypot(transform.a, transform.d), np.hypot(transform.b, transform.e)
     if not (0.0 < abs(transform.determinant) < math.inf and np.isclose(across, down, rtol=1e-6, atol=0.0)):
@@ -194,8 +198,7 @@ def read_ortho(path: Path) -> tuple[Ortho, str]:
     with opened_raster(path) as file:
         grey, known = file.read(out_dtype="float32").mean(axis=0), file.dataset_mask() != 0
         t, crs = file.transform, file.crs
-    if t == Affine.identity():
-        raise InputError("RIL-630", f"{path} has no geotransform", remedy=NO_PLACE)
+    _check_place(path, t)
     if crs is not None:
         _metric_crs(path, crs)
     known &= np.isfinite(grey)

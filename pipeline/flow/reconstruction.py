@@ -136,7 +136,8 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     if make.config.crosscheck.enabled and len(whole) > 1:
         # What is laid out first runs first: its windows take longest of all tasks.
         p.crosscheck = another_program(make, whole)
-    yield Complete(("crosscheck", "crosscheck_join"))
+    # Features also tell places that are seen again; where the crosscheck is wanted, it has them all.
+    yield Complete(("crosscheck", "crosscheck_join", *(("features",) if make.config.crosscheck.enabled else ())))
 
     # Frames that the trajectory goes through, and which of them are basic pairs.
     found = yield from screened(make, whole)

@@ -75,6 +75,9 @@ WRONG = {
         ("other --no-such-option", "RIL-001"),
     ],
     "rig": [("", "RIL-001"), ("no-such-run", "RIL-067")],
+    "localize": [("", "RIL-001"), ("no-such-run map.tif", "RIL-067"), ("runs/other/latest", "RIL-844")],
+    "merge": [("", "RIL-001"), ("no-such-run runs/other/latest", "RIL-067")],
+    "watch": [("", "RIL-001"), ("no-such-sequence", "RIL-276"), ("other --count many", "RIL-001")],
     "mask": [("", "RIL-001"), ("no-such-sequence", "RIL-276"), ("other", "RIL-906")],
     "init": [
         ("", "RIL-001"),

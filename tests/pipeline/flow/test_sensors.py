@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
-from dry_chain import FRAMES, Chain, group, laid_out
+from dry_chain import FRAMES, Chain, laid_out
 
 from rille.stages.geometry.geometry import RigidTransform
 
@@ -18,12 +18,12 @@ def chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
 def test_odometry_alone_predicts_and_with_its_errors_it_adjusts(chain: Chain) -> None:
     count = chain.sequence.frames
     predicting = replace(chain.sequence, odometry=(RigidTransform.identity(),) * count)
-    assert "adjust" not in {group(h.label) for h in chain.plan({}, predicting).nodes}
+    assert "adjust" not in {h.stage for h in chain.plan({}, predicting).nodes}
     measuring = replace(predicting, priors={"odometry": {"drift": 0.02, "turn": 0.01}, "up": {"sigma": 0.01}})
     nodes = {h.label: h for h in chain.plan({}, replace(measuring, up=None)).nodes}
-    known = nodes["adjust"].spec.args["priors"]
+    known = nodes["trajectory/adjusted"].spec.args["priors"]
     assert len(known["odometry"]["poses"]) == len(known["times"]) == len(FRAMES)
     assert "up" not in known
-    assert {up.label for up in nodes["adjust"].upstream()} >= {"trajectory", "resect/0", "refine/0"}
+    assert {up.label for up in nodes["trajectory/adjusted"].upstream()} >= {"trajectory", "resect/0", "refine/0"}
     # What stands on poses stands on the adjusted ones.
-    assert "adjust" in {up.label for up in nodes["agreement"].upstream()}
+    assert "trajectory/adjusted" in {up.label for up in nodes["agreement"].upstream()}

@@ -46,8 +46,8 @@ def test_of_each_stage_a_part_has_all_tasks_and_all_that_they_read(chain: Chain)
         ("motion", {"hfvm", "features", "keyframes", "locus", "trajectory"}),
         ("features", {"crosscheck", "motion", "hfvm", "trajectory"}),
         ("hfvm", {"features", "ground_frame", "locus", "track", "trajectory"}),
-        ("trajectory", {"features", "intrinsics", "locus", "accuracy", "agreement", "merge"}),
-        ("merge", {"features", "intrinsics", "accuracy", "dem_accuracy", "path", "risk"}),
+        ("trajectory", {"crosscheck", "intrinsics", "locus", "accuracy", "agreement", "merge"}),
+        ("merge", {"crosscheck", "intrinsics", "accuracy", "dem_accuracy", "path", "risk"}),
     ],
 )
 def test_what_a_stage_does_not_need_is_left_out(chain: Chain, until: str, without: set[str]) -> None:
@@ -60,7 +60,7 @@ def test_what_a_stage_does_not_need_is_left_out(chain: Chain, until: str, withou
 def test_a_file_is_made_of_what_it_reads_alone(chain: Chain) -> None:
     graph, _ = part(chain, only=("trajectory.tum",))
     assert {h.label for h in graph.nodes if h.label.startswith("output/")} == {"output/trajectory.tum", "output/facts"}
-    assert {"locus", "features", "merge", "accuracy"}.isdisjoint(h.stage for h in graph.nodes)
+    assert {"locus", "crosscheck", "merge", "accuracy"}.isdisjoint(h.stage for h in graph.nodes)
 
 
 def test_the_files_of_a_stage_are_those_that_read_nothing_else(chain: Chain) -> None:
