@@ -76,7 +76,7 @@ WRONG = {
     ],
     "rig": [("", "RIL-001"), ("no-such-run", "RIL-067")],
     "localize": [("", "RIL-001"), ("no-such-run map.tif", "RIL-067"), ("runs/other/latest", "RIL-844")],
-    "merge": [("", "RIL-001"), ("no-such-run runs/other/latest", "RIL-067")],
+    "merge": [("", "RIL-001"), ("no-such-run runs/other/latest -o one", "RIL-067")],
     "watch": [("", "RIL-001"), ("no-such-sequence", "RIL-276"), ("other --count many", "RIL-001")],
     "mask": [("", "RIL-001"), ("no-such-sequence", "RIL-276"), ("other", "RIL-906")],
     "init": [
