@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from scipy.spatial.transform import Rotation
 
 from rille.stages.core.arrays import Floats
 from rille.stages.evaluation.rigid import alignment, angle, compose, inverse, rms, spread
@@ -35,7 +34,6 @@ ALIKE_FACTOR, ALIKE_SHARE, SIMPLE_FACTOR = 1.5, 0.005, 4.0
 MIN_TURN = 0.3
 # Factor of length from which on it is no error of the estimate; units, m: mm, cm, inches, feet, yards, km.
 MIN_UNIT, UNITS = 1.3, (0.001, 0.01, 0.0254, 0.3048, 0.9144, 1000.0)
-AXES = Rotation.create_group("O").as_matrix()
 # Places, in (x, y, z, w) as read, of the true x, y, z and w.
 ORDERS = {
     "": [0, 1, 2, 3],
@@ -88,8 +86,9 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
         # A file that begins with the identity has its quaternions in the right order.
         if not (order and angle(file[0]) < MIN_TURN):
             poses, signs = file.copy(), MIRRORS[mirror]
-            quaternion = Rotation.from_matrix(file[:, :, :3]).as_quat()[:, ORDERS[order]]
-            poses[:, :, :3] = Rotation.from_quat(quaternion).as_matrix()
+            kind = scipy.spatial.transform.Rotation
+            quaternion = kind.from_matrix(file[:, :, :3]).as_quat()[:, ORDERS[order]]
+            poses[:, :, :3] = kind.from_quat(quaternion).as_matrix()
             # The whole pose is inverted, or its rotation alone; or nothing.
             columns = slice((0, 4, 3)[DIRECTIONS.index(direction)])
             poses[:, :, columns] = inverse(poses)[:, :, columns]
@@ -120,7 +119,11 @@ def _fits(P: Floats, Q: Floats, mount: Floats, words: list[str]) -> list[Reading
         doubt = "" if unit in UNITS else ", unless its clock runs otherwise, or the rig's baseline is wrong"
         words = [*words, f"its unit of length is {unit:g} m: state truth.unit = {unit:g}{doubt}"]
         Q = Q * [1.0, 1.0, 1.0, unit]
-    for start in (np.eye(3), min(AXES, key=lambda B: _misfit(P, Q @ _turn(B)))):
+    exchanges = scipy.spatial.transform.Rotation.create_group("O").as_matrix()
+    for start in (
+        np.eye(3),
+        min(exchanges, key=lambda B: _misfit(P, Q @ _turn(B))),
+    ):
         turn = start
         for _ in range(10):
             # In turn: the world's rotation for this body, by the positions above all, and the body's for this world.

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
@@ -174,7 +174,11 @@ def find_offset(moments: Floats, estimate: Floats, truth: TruePositions, upright
     ends = [worse[above - 1] if above > 0 else 0, worse[above] if above < len(worse) else -1]
     ended = [bool(limit < errors[k] < np.inf) for k in ends]
     low, high = (
-        float(brentq(lambda offset: error(offset) - limit, value, tried[k], xtol=SAME_TIME_S) if end else tried[k])
+        float(
+            scipy.optimize.brentq(lambda offset: error(offset) - limit, value, tried[k], xtol=SAME_TIME_S)
+            if end
+            else tried[k]
+        )
         for k, end in zip(ends, ended, strict=True)
     )
     determined = all(ended) and high - low < MAX_RANGE_SHARE * np.ptp(tried[np.isfinite(errors)])
