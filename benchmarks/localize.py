@@ -28,7 +28,7 @@ from rille.datasets.mockup.scene import build_scene
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.geometry import RigidTransform, from_above, rotation_exp, rotation_log
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.terrain.map_localization import Around, Fix, GlobalMap, MapLocalizationParams, fix
+from rille.stages.terrain.map_localization import Fix, GlobalMap, MapLocalizationParams, SearchArea, fix
 
 STEP, CELL, ERROR_M = 5, 0.001, 0.002
 DISTANCE_M, TURN = 2.0, math.radians(10.0)
@@ -82,7 +82,7 @@ def sought(one: Stop, ground: GlobalMap, rng: np.random.Generator) -> tuple[Fix 
     x, y, heading = from_above(one.pose)
     far, way = DISTANCE_M * math.sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * math.pi)
     start = x + far * math.cos(way), y + far * math.sin(way), heading + TURN * rng.uniform(-1.0, 1.0)
-    around = Around(*start, DISTANCE_M, TURN)
+    around = SearchArea(*start, DISTANCE_M, TURN)
     begin = time.process_time()
     try:
         found = fix(one.elevation, one.lattice, ground, around, MapLocalizationParams())

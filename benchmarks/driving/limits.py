@@ -19,7 +19,7 @@ from rille.stages.geometry.geometry import from_above
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.local_planner.route import length_of, pieces, straightened
-from rille.stages.planning.local_planner.state_lattice import PoseGraph, PoseGrid
+from rille.stages.planning.local_planner.state_lattice import LatticeGraph, PoseGrid
 from rille.stages.planning.wheels import HeightGrid, measured
 
 Floats = NDArray[np.float64]
@@ -61,7 +61,7 @@ def shortest_within_limits(bed: ExactBed, goal: tuple[float, float], params: Any
     def price(free: Any, *pose: Floats) -> tuple[Mask, Floats]:
         return free, np.where(free, 1.0, np.inf)
 
-    graph = PoseGraph.of(limits, grid, price)  # type: ignore[arg-type]
+    graph = LatticeGraph.of(limits, grid, price)  # type: ignore[arg-type]
     px, py = grid.places()
     goals = np.hypot(px - gx, py - gy) <= 0.5 * params.tolerance * vehicle.wheel_base
     cost, move = graph.search(goals, 0.0, 1.0)

@@ -33,9 +33,9 @@ from rille.pipeline.runs import lookup
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray, Bundle
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
-from rille.stages.evaluation.place import Ortho, Placed, place
+from rille.stages.evaluation.place import Ortho, PlacedImage, place
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
-from rille.stages.terrain.map_localization import MIN_CHI2_GAP, Around, GlobalMap, MapLocalizationParams, fix
+from rille.stages.terrain.map_localization import MIN_CHI2_GAP, GlobalMap, MapLocalizationParams, SearchArea, fix
 from rille.stages.terrain.shading import hillshade
 
 TURN_DEG = 20.0
@@ -68,7 +68,7 @@ class Area:
     near: str | None = None
     within: Annotated[float | None, Parameter(validator=Number(gt=0))] = None
 
-    def around(self) -> Around | None:
+    def around(self) -> SearchArea | None:
         """The same in numbers; None: everywhere.
 
         Raises
@@ -88,11 +88,11 @@ class Area:
             text = f"--near {self.near!r} is not x,y or x,y,yaw"
             raise ConfigError("RIL-847", text, remedy="write e.g. --near 612.5,88.0,30") from None
         turn = math.radians(TURN_DEG) if yaw else math.pi
-        return Around(x, y, math.radians(sum(yaw)), math.inf if self.within is None else self.within, turn)
+        return SearchArea(x, y, math.radians(sum(yaw)), math.inf if self.within is None else self.within, turn)
 
 
 @dataclass(frozen=True)
-class Found:
+class Localization:
     """``pose`` T_map_world with its covariance (6, 6): position, m, and rotation, rad; infinite: not found.
 
     ``doubt`` in words, empty where there is none; ``other`` x, y of the next best place, if any; ``about``: lines on
@@ -184,7 +184,7 @@ def _check_systems(systems: Mapping[str, str]) -> None:
             raise InputError("RIL-848", text, remedy=remedy)
 
 
-def _found(terrain: Terrain, model: DemFile | None, image: Ortho | None, around: Around | None) -> Found:
+def _found(terrain: Terrain, model: DemFile | None, image: Ortho | None, around: SearchArea | None) -> Localization:
     """Place by the ortho images, where there is one; then by the elevations, where there are some.
 
     Raises
@@ -210,7 +210,7 @@ def _found(terrain: Terrain, model: DemFile | None, image: Ortho | None, around:
     if by_ortho is None:
         return _by_elevations(terrain, model, around)
     x, y, _ = by_ortho.pose.translation
-    about = Around(float(x), float(y), _yaw(by_ortho.pose), ORTHO_CELLS * model.cell, math.radians(TURN_DEG))
+    about = SearchArea(float(x), float(y), _yaw(by_ortho.pose), ORTHO_CELLS * model.cell, math.radians(TURN_DEG))
     found = _by_elevations(terrain, model, about)
     return replace(found, about=(*found.about, *by_ortho.about), facts={**found.facts, **by_ortho.facts})
 
@@ -219,14 +219,14 @@ def _yaw(pose: RigidTransform) -> float:
     return math.atan2(pose.rotation[1, 0], pose.rotation[0, 0])
 
 
-def _in_reach(image: Ortho, terrain: Terrain, around: Around) -> AnyArray:
+def _in_reach(image: Ortho, terrain: Terrain, around: SearchArea) -> AnyArray:
     """Cells (row, col) of an image that the terrain may cover."""
     row, col = np.indices(image.known.shape)
     x, y = np.tensordot(image.matrix, np.stack([col, row, np.ones_like(row)]), axes=1)
     return np.asarray(np.hypot(x - around.x, y - around.y) <= around.distance + terrain.radius)
 
 
-def _by_ortho(placed: Placed) -> Found:
+def _by_ortho(placed: PlacedImage) -> Localization:
     """The place that keypoints agree on; neither height nor tilt."""
     turn, shift = placed.motion[:, :2], placed.motion[:, 2]
     heading = math.atan2(turn[1, 0], turn[0, 0])
@@ -236,10 +236,12 @@ def _by_ortho(placed: Placed) -> Found:
     lever = np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]], [0.0, 0.0, 1.0]])
     covariance = np.diag(np.full(6, math.inf))
     covariance[kept] = lever @ np.diag(placed.sigma**2) @ lever.T
-    return Found(pose, covariance, (f"ortho        {placed.agreeing} keypoints agree",), {"keypoints": placed.agreeing})
+    return Localization(
+        pose, covariance, (f"ortho        {placed.agreeing} keypoints agree",), {"keypoints": placed.agreeing}
+    )
 
 
-def _by_elevations(terrain: Terrain, model: DemFile, around: Around | None) -> Found:
+def _by_elevations(terrain: Terrain, model: DemFile, around: SearchArea | None) -> Localization:
     """The place that elevations tell."""
     # A raster may be turned or mirrored: the search is in a frame along its rows.
     values, t = model.values, model.transform @ Affine.translation(0.5, 0.5)
@@ -259,7 +261,7 @@ def _by_elevations(terrain: Terrain, model: DemFile, around: Around | None) -> F
         terrain.elevation,
         terrain.lattice,
         GlobalMap(values, 0.0, 0.0, model.cell),
-        Around(float(x), float(y), heading, distance, turn),
+        SearchArea(float(x), float(y), heading, distance, turn),
         MapLocalizationParams.model_validate({"sigma_tilt_deg": tilt}),
     )
     pose, both = to_map @ placed.pose, np.kron(np.eye(2), to_map.rotation)
@@ -276,10 +278,10 @@ def _by_elevations(terrain: Terrain, model: DemFile, around: Around | None) -> F
         f"terrain; RMS {placed.rms:.3g} m, {max(placed.explained, 0.0):.0%} of the relief explained",
         f"ambiguity    {rival}",
     )
-    return Found(pose, both @ placed.covariance @ both.T, about, facts, other, doubt)
+    return Localization(pose, both @ placed.covariance @ both.T, about, facts, other, doubt)
 
 
-def _facts(found: Found | None) -> dict[str, Any]:
+def _facts(found: Localization | None) -> dict[str, Any]:
     """Facts of a place for the JSON file."""
     if found is None:
         return {}
@@ -293,7 +295,7 @@ def _facts(found: Found | None) -> dict[str, Any]:
     }
 
 
-def _lines(found: Found | None, crs: str) -> Iterator[str]:
+def _lines(found: Localization | None, crs: str) -> Iterator[str]:
     """What is printed of a place."""
     assert found is not None
     yield f"place        of the world's origin{f' in {crs_name(crs)}' if crs else ''}, yaw to the left"
@@ -304,7 +306,7 @@ def _lines(found: Found | None, crs: str) -> Iterator[str]:
     yield from found.about
 
 
-def _export(folder: Path, found: Found, target: Path, crs: str, store: Store) -> list[str]:
+def _export(folder: Path, found: Localization, target: Path, crs: str, store: Store) -> list[str]:
     """Write trajectory and path in the map's coordinates; gives the endings."""
     written, words = [], f"of the map{f', {crs_name(crs)}' if crs else ''}: T_map_world of {target.name}.json"
     if (folder / "trajectory.kitti").exists():
@@ -341,7 +343,7 @@ def _background(model: DemFile | None, image: Ortho | None) -> Ortho:
     return Ortho(picture.grey[::step, ::step], picture.known[::step, ::step], matrix)
 
 
-def _draw(path: Path, terrain: Terrain, found: Found | None, background: Ortho) -> None:
+def _draw(path: Path, terrain: Terrain, found: Localization | None, background: Ortho) -> None:
     """The whole map with the place, and, enlarged, the map and the run's terrain laid on it."""
     from matplotlib.figure import Figure
     from matplotlib.transforms import Affine2D

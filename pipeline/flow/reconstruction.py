@@ -177,19 +177,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         steps=steps_of(make, chosen),
         lost=lost or None,
     )
-    known = sensors(make, frames)
-    p.loops = yield from seen_again(make, [pair for k, pair in pairs.items() if k not in moved])
-    if segments and (known or p.loops):
-        p.chained = p.trajectory
-        p.trajectory = make.node(
-            adjust_stage,
-            "trajectory/adjusted",
-            trajectory=p.chained,
-            segments=p.resections,
-            refined=p.refined or None,
-            loops=p.loops or None,
-            priors=known or None,
-        )
+    yield from adjusted(make, frames, [pair for k, pair in pairs.items() if k not in moved])
     flow(assessment.of_trajectory(make, frames), lays=("accuracy",))
     yield Complete(("track", "resect", "refine", "intrinsics", "trajectory", "features", "loops", "loop", "adjust"))
     yield Complete(("agreement", "position_accuracy", "accuracy", "truth"))
@@ -429,6 +417,24 @@ def sensors(make: Builder, frames: Series[int]) -> dict[str, Any]:
             said[name][key] = [v.to_list() if isinstance(v, RigidTransform) else v for v in one]
     times = list(frames) if s.times is None else [s.times[f] for f in frames]
     return {**said, "times": times, "timed": s.times is not None, "georeferenced": s.georeference is not None}
+
+
+def adjusted(make: Builder, frames: Series[int], pairs: list[Pair]) -> Steps:
+    """Adjust the trajectory to places that are seen again and to other sensors, where there are any."""
+    p, known = make.products, sensors(make, frames)
+    p.loops = yield from seen_again(make, pairs)
+    if not p.resections or not (known or p.loops):
+        return
+    p.chained = p.trajectory
+    p.trajectory = make.node(
+        adjust_stage,
+        "trajectory/adjusted",
+        trajectory=p.chained,
+        segments=p.resections,
+        refined=p.refined or None,
+        loops=p.loops or None,
+        priors=known or None,
+    )
 
 
 def refined(make: Builder, pairs: Mapping[int, Pair], segments: list[Segment]) -> list[Handle[RefineFacts]]:

@@ -43,7 +43,7 @@ class Ortho(NamedTuple):
     matrix: Floats
 
 
-class Placed(NamedTuple):
+class PlacedImage(NamedTuple):
     """``motion`` (2, 3) from x, y of A to those of B, a turn and a shift, on which ``agreeing`` matches agree.
 
     ``sigma`` (3,): standard deviations of the shift of their ``middle`` (2,), in B, m, and of the turn, rad.
@@ -55,7 +55,7 @@ class Placed(NamedTuple):
     sigma: Floats
 
 
-def place(a: Ortho, b: Ortho) -> Placed:
+def place(a: Ortho, b: Ortho) -> PlacedImage:
     """Where A lies in B.
 
     Raises
@@ -84,7 +84,7 @@ def place(a: Ortho, b: Ortho) -> Placed:
     arm = p[used] - start
     spread = float(np.sqrt(np.mean((q[used] - middle - arm @ turn.T) ** 2)))
     sigma = spread / np.sqrt([agreeing, agreeing, float((arm**2).sum())])
-    return Placed(np.column_stack([turn, middle - turn @ start]), agreeing, middle, sigma)
+    return PlacedImage(np.column_stack([turn, middle - turn @ start]), agreeing, middle, sigma)
 
 
 def _alike(here: Floats, one: AnyArray, there: Floats, other: AnyArray) -> tuple[Floats, Floats]:

@@ -79,7 +79,7 @@ class MapLocalizationParams(Params):
 
 
 @dataclass(frozen=True)
-class Around:
+class SearchArea:
     """What is searched: origins of the model within ``distance`` of x, y, m, and headings (to the left) within ``turn``
     of ``heading``, rad."""
 
@@ -142,7 +142,7 @@ class Fix:
         }
 
 
-class Blocks(NamedTuple):
+class ModelBlocks(NamedTuple):
     """Means over blocks of a model: ``points`` (n, 3), m, ``normals`` (n, 3) of the ground there, z = 1, NaN unknown;
     ``at`` (n,): number of each in an array of ``shape`` (rows, columns)."""
 
@@ -152,8 +152,8 @@ class Blocks(NamedTuple):
     shape: tuple[int, int]
 
 
-def thin(elevation: NDArray[np.floating], lattice: Lattice, cell: float) -> Blocks:
-    """Blocks of a model, as wide as the cells of a map."""
+def thin(elevation: NDArray[np.floating], lattice: Lattice, cell: float) -> ModelBlocks:
+    """ModelBlocks of a model, as wide as the cells of a map."""
     z = np.asarray(elevation, np.float64)
     known = np.isfinite(z)
     row, col = (np.floor(axis / cell + 0.5).astype(np.int64) for axis in (-lattice.ys(), lattice.xs()))
@@ -166,7 +166,7 @@ def thin(elevation: NDArray[np.floating], lattice: Lattice, cell: float) -> Bloc
     mean = np.full(shape, np.nan)
     mean.reshape(-1)[full] = points[:, 2]
     slopes = gradient(mean, cell).reshape(2, -1)[:, full]
-    return Blocks(points, np.stack([*-slopes, np.ones(len(points))], axis=1), np.flatnonzero(full), shape)
+    return ModelBlocks(points, np.stack([*-slopes, np.ones(len(points))], axis=1), np.flatnonzero(full), shape)
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,11 @@ class GlobalMap:
 
 
 def fix(
-    elevation: NDArray[np.floating], lattice: Lattice, ground: GlobalMap, around: Around, params: MapLocalizationParams
+    elevation: NDArray[np.floating],
+    lattice: Lattice,
+    ground: GlobalMap,
+    around: SearchArea,
+    params: MapLocalizationParams,
 ) -> Fix:
     """Place a model (row, col), m, on a map.
 
@@ -271,21 +275,23 @@ def _apart(a: Floats, b: Floats, far: float) -> float:
     return max(math.hypot(*(a - b)[:2]), abs(math.remainder(a[5] - b[5], 2.0 * math.pi)) * far)
 
 
-def _beyond(state: Floats, around: Around, middle: Floats, far: float) -> float:
+def _beyond(state: Floats, around: SearchArea, middle: Floats, far: float) -> float:
     """Distance, m, of a place from what is searched, likewise."""
     x, y = _origin(state, middle)
     turned = abs(math.remainder(state[5] - around.heading, 2.0 * math.pi))
     return max(math.hypot(x - around.x, y - around.y) - around.distance, (turned - around.turn) * far)
 
 
-def _tries(ground: GlobalMap, far: float, around: Around) -> float:
+def _tries(ground: GlobalMap, far: float, around: SearchArea) -> float:
     """Headings and cells of a search, with those that correlations add."""
     edge = 2.0 * far / ground.cell
     rows, cols = ground.heights.shape
     return float((2.0 * around.turn * far / ground.cell + 1.0) * (rows + edge) * (cols + edge))
 
 
-def _search(points: Floats, ground: GlobalMap, around: Around, middle: Floats, min_overlap: float) -> Iterator[Floats]:
+def _search(
+    points: Floats, ground: GlobalMap, around: SearchArea, middle: Floats, min_overlap: float
+) -> Iterator[Floats]:
     """Best places that are no neighbours, the best first: x, y, z (NaN: not known), two tilts and heading of the
     model's ``middle``."""
     # Turns that move the farthest point by one cell: finer steps find no other place.
@@ -379,7 +385,7 @@ def _condition(normal: Floats) -> float:
 
 
 def _refined(
-    blocks: Blocks, ground: GlobalMap, middle: Floats, start: Floats, near: float, params: MapLocalizationParams
+    blocks: ModelBlocks, ground: GlobalMap, middle: Floats, start: Floats, near: float, params: MapLocalizationParams
 ) -> _Fit | None:
     """Gauss-Newton with Huber's weights, no farther than ``near``, m; None where the model leaves the map at once."""
     state, tilt, fit = start.copy(), math.radians(params.sigma_tilt_deg), None
@@ -410,7 +416,7 @@ def _refined(
     return fit
 
 
-def _placed(best: _Fit, blocks: Blocks, middle: Floats, sigma_tilt: float) -> Fix:
+def _placed(best: _Fit, blocks: ModelBlocks, middle: Floats, sigma_tilt: float) -> Fix:
     """The best fit as the pose of the model's origin, with its covariance."""
     cells = int(np.isfinite(best.differences).sum())
     field = np.full(blocks.shape, np.nan)
@@ -462,7 +468,7 @@ def map_localization_stage(
     assert global_map is not None
     lattice = Lattice.from_dict(global_map.meta["lattice"])
     ground = GlobalMap(np.asarray(global_map["elevation"], np.float64), lattice.x0, lattice.y0, lattice.cell)
-    around = Around(*prior, *(params.reach * sigma for sigma in prior_sigma))
+    around = SearchArea(*prior, *(params.reach * sigma for sigma in prior_sigma))
     placed = fix(np.asarray(dem["elevation"]), Lattice.from_dict(dem.meta["lattice"]), ground, around, params)
     meta = placed.facts()
     if placed.doubt:

@@ -86,14 +86,14 @@ def stated_factors(given: Sequence[Mapping[str, Any]], row: Mapping[int, int]) -
     )
 
 
-class Joined(NamedTuple):
+class JoinedPieces(NamedTuple):
     """Poses (n, 3, 4) in a common frame as far as factors join them, and the piece (n,) of each."""
 
     poses: Floats
     piece: NDArray[np.int16]
 
 
-def join(poses: Floats, piece: NDArray[np.int16], factors: Factors) -> Joined:
+def join(poses: Floats, piece: NDArray[np.int16], factors: Factors) -> JoinedPieces:
     """Pieces laid together by the factors between them, each by the one that most others agree with.
 
     Parameters
@@ -104,7 +104,7 @@ def join(poses: Floats, piece: NDArray[np.int16], factors: Factors) -> Joined:
     while True:
         between = factors.take(np.flatnonzero(piece[factors.ends[:, 0]] != piece[factors.ends[:, 1]]))
         if not len(between.ends):
-            return Joined(poses, piece)
+            return JoinedPieces(poses, piece)
         first = piece[between.ends].min()
         other = next(int(pair.max()) for pair in piece[between.ends] if pair.min() == first)
         here = between.take(np.flatnonzero((np.sort(piece[between.ends], axis=1) == [first, other]).all(1)))

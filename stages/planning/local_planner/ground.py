@@ -18,7 +18,7 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.planning.local_planner.clearance import Footing, Gaps
 from rille.stages.planning.local_planner.params import LocalPlannerParams
 from rille.stages.planning.local_planner.route import STEP_TURN, Piece, pieces
-from rille.stages.planning.local_planner.state_lattice import PoseGraph, PoseGrid
+from rille.stages.planning.local_planner.state_lattice import LatticeGraph, PoseGrid
 
 Point = tuple[float, float]
 
@@ -66,7 +66,7 @@ class Ground:
         self.unknown_here = min(0.0, float(here.unknown[0]) - 1.5 * self.cell)
         spacing = max(p.spacing * self.vehicle.wheel_diameter, self.cell)
         self.grid = PoseGrid.over(footing.lattice, start, heading, spacing)
-        self.graph = PoseGraph.of(footing, self.grid, self._price)
+        self.graph = LatticeGraph.of(footing, self.grid, self._price)
 
     def _split(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Bools, Bools]:
         """Poses that may be driven, and poses that may be planned through; margins are shortened by ``slack`` metres.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
-from rille.stages.planning.local_planner.state_lattice import AHEAD, BACK, PoseGraph, angle_of
+from rille.stages.planning.local_planner.state_lattice import AHEAD, BACK, LatticeGraph, angle_of
 
 Clear = Callable[[Floats, Floats, Floats], bool]
 """Whether the vehicle may be at all of the poses x, y (m), heading (rad)."""
@@ -44,7 +44,7 @@ class Piece:
         return Piece(self.a, b, self.heading, self.gear, self.known)
 
 
-def pieces(graph: PoseGraph, moves: Sequence[tuple[int, int, int, int]]) -> list[Piece]:
+def pieces(graph: LatticeGraph, moves: Sequence[tuple[int, int, int, int]]) -> list[Piece]:
     """Steps of a way as pieces; a turn over unknown ground makes the piece after it unknown."""
     out: list[Piece] = []
     grid, (pose, step, turn), sure = graph.grid, graph.known, True

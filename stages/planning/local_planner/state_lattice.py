@@ -69,7 +69,7 @@ class PoseGrid:
 
 
 @dataclass(frozen=True)
-class PoseGraph:
+class LatticeGraph:
     """Cost of a metre (heading within 180 degrees, row, col) at each pose (``pose``), half a step ahead of it
     (``step``) and half way to the next heading on the left (``turn``); infinite where closed. ``known``: three masks of
     the same shape, of the poses, steps and turns that lie on known ground."""
@@ -81,7 +81,7 @@ class PoseGraph:
     known: tuple[Bools, Bools, Bools]
 
     @staticmethod
-    def of(footing: Footing, grid: PoseGrid, prices: Prices) -> PoseGraph:
+    def of(footing: Footing, grid: PoseGrid, prices: Prices) -> LatticeGraph:
         """Compute the costs on a map; a vehicle covers the same ground backwards, so headings within 180 degrees do."""
         row, col = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in grid.shape), indexing="ij")
         price, known = (np.empty((3, HALF_TURN_HEADINGS, *grid.shape), kind) for kind in (np.float64, np.bool_))
@@ -99,7 +99,7 @@ class PoseGraph:
                 x, y = grid.xy(row + r, col + c)
                 gaps = footing.gaps(x, y, np.full(x.shape, grid.heading + angle))
                 known[where, k], price[where, k] = prices(gaps, x, y)
-        return PoseGraph(grid, price[0], price[1], price[2], (known[0], known[1], known[2]))
+        return LatticeGraph(grid, price[0], price[1], price[2], (known[0], known[1], known[2]))
 
     def search(
         self, goals: Bools, turn_price: float, back: float, *, whole: bool = False
@@ -142,7 +142,7 @@ def angle_of(k: int) -> float:
 
 
 class _Costs(NamedTuple):
-    """Those of :class:`PoseGraph`."""
+    """Those of :class:`LatticeGraph`."""
 
     pose: Floats
     step: Floats

@@ -27,7 +27,7 @@ from rille.stages.planning.local_planner.state_lattice import (
     HEADING_STEPS,
     TO_LEFT,
     TO_RIGHT,
-    PoseGraph,
+    LatticeGraph,
     PoseGrid,
 )
 
@@ -129,13 +129,13 @@ def test_what_rounding_leaves_over_is_no_piece() -> None:
     assert [piece.a for piece in last_metres(way, 0.1 - 1e-15)] == [(0.0, 0.1)]
 
 
-def graph_but(what: str, k: int) -> PoseGraph:
+def graph_but(what: str, k: int) -> LatticeGraph:
     """Five places by five, all of which is known but the pose, step or turn ``k`` of the middle one."""
     known = {name: np.ones((8, 5, 5), bool) for name in ("pose", "step", "turn")}
     known.get(what, np.ones((8, 5, 5), bool))[k % 8, 2, 2] = False
     price = np.ones((8, 5, 5))
     grid = PoseGrid((0.0, 0.0), 0.0, 0.1, (5, 5), (2, 2))
-    return PoseGraph(grid, price, price, price, (known["pose"], known["step"], known["turn"]))
+    return LatticeGraph(grid, price, price, price, (known["pose"], known["step"], known["turn"]))
 
 
 @pytest.mark.parametrize("k", range(8))

@@ -15,13 +15,13 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.planning.local_planner.state_lattice import (
     HEADING_ANGLES,
     HEADING_STEPS,
-    PoseGraph,
+    LatticeGraph,
     PoseGrid,
     angle_of,
 )
 
 
-def networked(graph: PoseGraph, turn_price: float, back: float) -> networkx.DiGraph:
+def networked(graph: LatticeGraph, turn_price: float, back: float) -> networkx.DiGraph:
     """The same graph, edge by edge from its words."""
     out = networkx.DiGraph()
     rows, cols = graph.grid.shape
@@ -55,7 +55,7 @@ def test_costs_are_those_of_networkx(seed: int, rows: int, cols: int) -> None:
     ]
     origin = int(rng.integers(rows)), int(rng.integers(cols))
     known = tuple(np.isfinite(p) for p in prices)
-    graph = PoseGraph(PoseGrid((0.0, 0.0), 0.0, 0.5, (rows, cols), origin), *prices, known)
+    graph = LatticeGraph(PoseGrid((0.0, 0.0), 0.0, 0.5, (rows, cols), origin), *prices, known)
     goals = np.zeros((rows, cols), bool)
     goal = int(rng.integers(rows)), int(rng.integers(cols))
     goals[goal] = True
@@ -86,7 +86,7 @@ class Asked:
 def test_prices_are_those_of_a_pose_of_half_a_step_ahead_and_of_half_a_turn_to_the_left() -> None:
     grid = PoseGrid((0.3, -0.2), 0.4, 0.05, (4, 5), (2, 1))
     x, y, heading = (
-        PoseGraph.of(Asked(), grid, lambda gaps, x, y, which=which: (x == x, gaps[which]))  # type: ignore[arg-type]
+        LatticeGraph.of(Asked(), grid, lambda gaps, x, y, which=which: (x == x, gaps[which]))  # type: ignore[arg-type]
         for which in range(3)
     )
     row, col = np.indices(grid.shape).astype(float)

@@ -13,12 +13,12 @@ from raising import raises
 
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.terrain.map_localization import Around, Fix, GlobalMap, MapLocalizationParams, fix, thin
+from rille.stages.terrain.map_localization import Fix, GlobalMap, MapLocalizationParams, SearchArea, fix, thin
 
 Floats = NDArray[np.float64]
 CELL = 0.04
 TRUE = (0.31, -0.22, math.radians(12.0), 0.07)
-AROUND = Around(0.25, -0.2, 0.0, 0.3, math.radians(24.0))
+AROUND = SearchArea(0.25, -0.2, 0.0, 0.3, math.radians(24.0))
 PARAMS = MapLocalizationParams()
 Scene = tuple[Floats, Lattice, GlobalMap]
 
@@ -56,7 +56,7 @@ def error(found: Fix) -> Floats:
     return np.array([*(found.pose.translation - [x, y, z]), found.heading - heading])
 
 
-def unsure(z: Floats, local: Lattice, ground: GlobalMap, around: Around) -> bool:
+def unsure(z: Floats, local: Lattice, ground: GlobalMap, around: SearchArea) -> bool:
     """Whether no place is given, or with doubt."""
     try:
         return bool(fix(z, local, ground, around, PARAMS).doubt)
@@ -75,7 +75,7 @@ def test_the_place_is_found_within_the_curvature_of_the_cells() -> None:
 
 @pytest.mark.parametrize("heading", [0.0, math.pi])
 def test_the_place_is_found_in_all_of_the_map_at_any_heading(heading: float) -> None:
-    found = fix(*scene(hills, noise=0.003), Around(0.0, 0.0, heading, 1.5, math.pi), PARAMS)
+    found = fix(*scene(hills, noise=0.003), SearchArea(0.0, 0.0, heading, 1.5, math.pi), PARAMS)
     assert np.abs(error(found)[:2]).max() < 0.25 * CELL
     assert not found.doubt
 
@@ -135,7 +135,7 @@ def test_a_better_place_beside_the_search_is_no_secret() -> None:
 def test_a_model_of_other_ground_has_no_place() -> None:
     z, local, _ = scene(hills)
     other = scene(lambda x, y: hills(-x - 3.0, y + 1.7), noise=0.003)[2]
-    assert unsure(z, local, other, Around(0.0, 0.0, 0.0, 1.5, math.pi))
+    assert unsure(z, local, other, SearchArea(0.0, 0.0, 0.0, 1.5, math.pi))
 
 
 def test_a_map_elsewhere_is_refused_with_the_share_that_it_knows() -> None:
@@ -164,4 +164,10 @@ def test_a_handful_of_cells_is_no_model() -> None:
 def test_a_search_without_end_is_refused() -> None:
     z, local, _ = scene(hills)
     with raises("RIL-840"):
-        fix(z, local, GlobalMap(np.zeros((9000, 9000)), 0.0, 0.0, CELL), Around(180.0, -180.0, 0.0, 400.0, 3.0), PARAMS)
+        fix(
+            z,
+            local,
+            GlobalMap(np.zeros((9000, 9000)), 0.0, 0.0, CELL),
+            SearchArea(180.0, -180.0, 0.0, 400.0, 3.0),
+            PARAMS,
+        )
