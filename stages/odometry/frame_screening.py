@@ -1,9 +1,9 @@
 """Find the frames whose images do not show the motion: these are *lost*, and the trajectory bridges them.
 
-A frame is lost if its left image is uniform, if left and right are exchanged, or if it matches neither the frame before
-nor the frame after it while those two match each other. A lost frame has no pose; tracking goes from the last good
-frame to the next one (a *bridge*). If those two do not match each other either, the frame is not to blame (the camera
-may have jumped): it is kept, and resection decides.
+A frame is lost if its left image is uniform, if left and right are exchanged or not of one time, or if it matches
+neither the frame before nor the frame after it while those two match each other. A lost frame has no pose; tracking
+goes from the last good frame to the next one (a *bridge*). If those two do not match each other either, the frame is
+not to blame (the camera may have jumped): it is kept, and resection decides.
 
 A pair is *unfit* as basic pair if one of its images is uniform, blurred, or a copy of the other image or of the one
 before. It may get a pose, but no elevation model is made of it.
@@ -40,6 +40,11 @@ QUIET = 0.25
 """Quantile of the changes that counts as usual: one exchanged frame changes three steps, half of a short sequence."""
 
 
+SIMULTANEOUS_SHARE = 0.6
+"""Share of its matches that fit the rig, of the best share of any frame that was tested, below which left and right of
+a frame are not of one time: on a street .24 to .40 of the matches fit then, of simultaneous images .96 to .99."""
+
+
 class FrameScreeningParams(Params):
     """When a frame counts as lost, or as unfit to be basic."""
 
@@ -66,7 +71,7 @@ class FrameScreeningParams(Params):
         4.0,
         gt=0,
         description="change of the displacements between two steps, both in pixels and in multiples of the lower "
-        "quartile, from which on the frames there are tested for swapped left and right images",
+        "quartile, from which on the frames there are tested for images that are swapped or not of one time",
     )
 
 
@@ -101,9 +106,12 @@ def judge(
     """
     out = Judgement()
     _see(out, frames, qualities, params)
+    best = max((facts["as_given"] for facts in sides.values() if "as_given" in facts), default=0.0)
     for f in frames:
         if f in sides and sides[f]["swapped"]:
             out.lost.setdefault(f, _swapped(sides[f]))
+        elif f in sides and sides[f].get("as_given", best) < SIMULTANEOUS_SHARE * best:
+            out.lost.setdefault(f, _of_two_times(sides[f]["as_given"], best))
     doubted = set(jumps) | _neighbours(frames, {f for f in out.lost if f in sides})
     out.asks["sides"] = [f for f in frames if f in doubted and f not in sides and f not in out.lost]
     chain = [f for f in frames if f not in out.lost]
@@ -177,6 +185,10 @@ def _swapped(facts: Mapping[str, Any]) -> str:
         f"left and right are swapped ({facts['exchanged']:.0%} of its matches fit the rig with the sides exchanged,"
         f" {facts['as_given']:.0%} as given)"
     )
+
+
+def _of_two_times(fit: float, best: float) -> str:
+    return f"left and right are not of one time ({fit:.0%} of its matches fit the rig, of other frames {best:.0%})"
 
 
 def _unmatched(why: str, before: float, after: float) -> str:

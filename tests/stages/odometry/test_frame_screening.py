@@ -112,6 +112,16 @@ def test_exchanged_sides_are_looked_for_at_jumps_and_beside_each_other():
     assert not found({}, jumps=[3], sides={3: looked}).lost
 
 
+def test_frames_whose_left_image_is_of_another_time_are_lost_beside_frames_that_fit_the_rig():
+    fits, apart = ({"swapped": False, "as_given": share, "exchanged": 0.08} for share in (0.97, 0.35))
+    tested = {2: fits, 3: apart, 4: fits}
+    out = found({(2, 4): 0.6}, jumps=[3], sides=tested)
+    assert list(out.lost) == [3]
+    assert "not of one time (35%" in out.lost[3]
+    # a rig that fits no frame speaks against itself, not against a frame
+    assert not found({}, jumps=[3], sides=dict.fromkeys((2, 3, 4), apart)).lost
+
+
 def test_the_stage_asks_then_answers():
     frames = list(range(5))
     blind = motion(shift(0.0), unmatched=lambda x, y: x > 20)
