@@ -8,12 +8,13 @@ to search.
 
 from __future__ import annotations
 
+from heapq import heappop, heappush
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes
-from rille.stages.numeric.heap import grown, pop, push
 from rille.stages.planning.row_graph import NEIGHBOURS, UNREACHED, Cell, GridCosts, Ints
 
 
@@ -32,12 +33,10 @@ def search(terrain: GridCosts, start: Cell, target: Cell | None = None) -> tuple
 def _search(terrain, first, last, cost, step):  # type: ignore[no-untyped-def]
     height, ways, toll = terrain.height, terrain.ways, terrain.toll
     rows, cols = height.shape
-    keys, nodes, size = np.empty(1024, dtype=np.int64), np.empty(1024, dtype=np.int64), 1
-    keys[0], nodes[0] = 0, first
     cost[first // cols, first % cols] = 0
-    while size:
-        key, node = keys[0], nodes[0]
-        size = pop(keys, nodes, size)
+    heap = [(np.int64(0), np.int64(first))]
+    while heap:
+        key, node = heappop(heap)
         r, c = node // cols, node % cols
         # A cell that was reached more cheaply later is in the heap twice: the dearer entry is skipped.
         if key > cost[r, c]:
@@ -53,10 +52,7 @@ def _search(terrain, first, last, cost, step):  # type: ignore[no-untyped-def]
             # Not at equal cost: what was reached first stays, so that ties do not hang on the heap's layout.
             if total < cost[i, j]:
                 cost[i, j], step[i, j] = total, k
-                if size == keys.shape[0]:
-                    keys, nodes = grown(keys), grown(nodes)
-                push(keys, nodes, size, total, i * cols + j)
-                size += 1
+                heappush(heap, (total, i * cols + j))
 
 
 def parts(ways: Bytes) -> tuple[NDArray[np.int32], Ints]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from heapq import heappop, heappush
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,6 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.numeric.heap import grown, pop, push
 from rille.stages.planning.local_planner.clearance import Footing, Gaps
 
 Prices = Callable[[Gaps, Floats, Floats], tuple[Bools, Floats]]
@@ -163,19 +163,13 @@ class _Moves(NamedTuple):
 def _search(prices, goals, moves, end, cost, move):  # type: ignore[no-untyped-def]
     rows, cols = goals.shape
     area = rows * cols
-    keys, nodes, size = np.empty(4096, np.float64), np.empty(4096, np.int64), 0
-    for k in range(16):
-        for r in range(rows):
-            for c in range(cols):
-                if goals[r, c] and prices.pose[k % 8, r, c] < np.inf:
-                    cost[k, r, c] = 0.0
-                    if size == keys.shape[0]:
-                        keys, nodes = grown(keys), grown(nodes)
-                    push(keys, nodes, size, 0.0, k * area + r * cols + c)
-                    size += 1
-    while size:
-        key, node = keys[0], nodes[0]
-        size = pop(keys, nodes, size)
+    heap = [(0.0, np.int64(0)) for _ in range(0)]  # none yet, of this type
+    for k, r, c in np.ndindex(16, rows, cols):
+        if goals[r, c] and prices.pose[k % 8, r, c] < np.inf:
+            cost[k, r, c] = 0.0
+            heappush(heap, (0.0, k * area + r * cols + c))
+    while heap:
+        key, node = heappop(heap)
         k, r, c = node // area, node % area // cols, node % cols
         # Reached more cheaply since it was pushed: this entry is out of date.
         if key > cost[k, r, c]:
@@ -204,7 +198,4 @@ def _search(prices, goals, moves, end, cost, move):  # type: ignore[no-untyped-d
             total = key + scale * price
             if total < cost[before, i, j]:
                 cost[before, i, j], move[before, i, j] = total, m
-                if size == keys.shape[0]:
-                    keys, nodes = grown(keys), grown(nodes)
-                push(keys, nodes, size, total, before * area + i * cols + j)
-                size += 1
+                heappush(heap, (total, before * area + i * cols + j))
