@@ -32,7 +32,6 @@ VEHICLE = {p for p in PARAMETERS if p.startswith("vehicle.")} - {"vehicle.name"}
 
 ARGUMENTS: dict[str, set[str]] = {
     "risk": VEHICLE,
-    "tile_index": {"merge.max_hole"},
 }
 """Stages that get parameters of another section as arguments."""
 

@@ -191,8 +191,9 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     there = [k for k in basic if k in world and posed.meta["positions"][row[k]] and k not in moved]
     for k in there:
         _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory, p.moving.get(k))
-    size = {"side": TILE_CELLS, "margin": make.config.merge.margin}
-    prints = [make.node(tile_index_stage, f"tile_index/{k}", dem=dem, **size) for k, dem in p.world_dem.items()]
+    prints = [
+        make.node(tile_index_stage, f"tile_index/{k}", dem=dem, side=TILE_CELLS) for k, dem in p.world_dem.items()
+    ]
     yield Complete(("moving", "pose", "locus", "tile_index"))
     # A pair whose model failed is left out of the world: the others make a map with a hole.
     laid = yield Maybe(prints)

@@ -109,7 +109,7 @@ def unread(keys: Iterable[str], config: Params, graph: Graph) -> list[str]:
 
 
 def values(keys: Iterable[str], config: Params) -> str:
-    """``track.points = 300, merge.max_hole = 2``."""
+    """``track.points = 300, merge.alike = 0.5``."""
     words = []
     for key in keys:
         section, _, name = key.partition(".")

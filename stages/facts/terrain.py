@@ -71,13 +71,12 @@ class DemFacts(Facts):
 
 
 class MergeFacts(Facts):
-    """Merged tile: its ``pairs``, the ``defined`` share of its cells, and how many were ``filled``."""
+    """Merged tile: its ``pairs``, and the ``defined`` share of its cells."""
 
     lattice: Json
     frame: str
     pairs: list[int]
     defined: float
-    filled: int
     reference: NotRequired[str]
     """There where elevations are distances from a plane that is no ground."""
 

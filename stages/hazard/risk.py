@@ -21,7 +21,6 @@ height.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -48,7 +47,7 @@ from rille.stages.hazard.classification import (
 )
 from rille.stages.hazard.measures import BITS, MEASURES, HazardInput, window_reach
 from rille.stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
-from rille.stages.numeric.holes import close_into
+from rille.stages.numeric.holes import close_holes
 
 __all__ = ["BITS", "CAUTION", "DOUBT_BIT", "HAZARDOUS", "REASONS", "SAFE", "UNKNOWN", "UNKNOWN_BIT", "risk_map"]
 
@@ -58,10 +57,6 @@ CLASSES = {"safe": SAFE, "caution": CAUTION, "hazardous": HAZARDOUS, "unknown": 
 REASONS = BITS | {"unknown": UNKNOWN_BIT, "filled": FILLED_BIT, "uncertain": DOUBT_BIT, "unseen": UNSEEN_BIT}
 """Bits of ``reason``: a measure over its limit; too little known to judge; elevation interpolated; over a limit only
 because of sigma; some of the ground that is looked at is unknown."""
-
-
-RIM_STD_SHARE = 1.0 / math.sqrt(12.0)
-"""Standard deviation of a height that lies anywhere within a range, of that range."""
 
 
 class RiskParams(Params):
@@ -135,9 +130,9 @@ def risk_map(
     window = p.window * vehicle.wheel_diameter
     unknown = np.isinf(elevation) | np.isinf(elevation_std)
     elevation = np.where(unknown, np.nan, elevation).astype(np.float32)
-    z, s = elevation.copy(), np.where(np.isfinite(elevation_std), elevation_std, 0.0).astype(np.float32)
+    std = np.where(np.isfinite(elevation_std), elevation_std, 0.0).astype(np.float32)
     gap, side = p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell)
-    filled = close_into((z, s), elevation, gap, side, p.min_known, rim=RIM_STD_SHARE)
+    z, s, filled = close_holes(elevation, std, gap, side, p.min_known)
     rules = Rules(p.sigmas, p.caution, p.max_p, p.min_known)
     classes = classify(HazardInput(elevation, z, s, cell, vehicle, window), filled, rules)
     return classes | {"filled": filled, "elevation": z}

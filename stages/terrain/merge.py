@@ -30,25 +30,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from rille.stages.core.arrays import Bytes, Floats, Floats32
+from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.core.declare import Bundle, Memory, Params, raster, stage
 from rille.stages.core.errors import InputError
 from rille.stages.facts.terrain import DemFacts, MergeFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice, Window
 from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
-from rille.stages.numeric.holes import close_holes
-from rille.stages.terrain.merge_kernel import CellMaps, Rule, Stack, merge_cells
+from rille.stages.terrain.merge_kernel import Merged, Stack, merge_cells
 from rille.stages.terrain.radiometry import LOG_GAIN_STEP
 
-RESIDUAL_SCALE_PX = 0.1
-"""Residual that halves a model's weight: the error of a good disparity."""
-MIN_KNOWN_SHARE = 0.5
-"""Of the ground around a cell, for it to be closed."""
-ORTHO_WEIGHT_EXPONENT = 8  # exponent of the ortho image's weights: the best image, but without a visible seam
 STRIP_BYTES = 1 << 26
 """Bytes of the models that are in memory at once: 64 MiB are all of a usual tile, and a part where dozens meet."""
 
@@ -70,17 +63,6 @@ class MergeParams(Params):
     max_footprint: float | None = Field(
         None, gt=0, description="largest ground [m] that a pixel may cover along the range; not set: no limit"
     )
-    max_hole: int = Field(0, ge=0, le=64, description="width of the widest hole [cells] that is closed and flagged")
-
-    @property
-    def hole_window(self) -> int:
-        """Side of the window, cells, odd, that a hole's surroundings are judged by: a hole's width to either side."""
-        return 2 * self.max_hole + 3
-
-    @property
-    def margin(self) -> int:
-        """Cells around a tile that its closed holes depend on."""
-        return self.hole_window // 2 + self.max_hole + 1 if self.max_hole else 0
 
 
 @dataclass(frozen=True)
@@ -137,26 +119,6 @@ class ModelLayer:
     pose: Placed = EXACT
 
 
-@dataclass(frozen=True)
-class Merged:
-    """Result (rows, cols) on the tile.
-
-    ``elevation``, ``elevation_std`` and ``relief_std`` (of the weighted mean, see the module), ``spread`` (standard
-    deviation of the models about it; 0 for one model) in metres, NaN undefined; ``count`` of models; ``source`` pair
-    of the greatest weight, -1 none; ``ortho`` grey value; ``filled`` 1 where a small hole was closed (count 0, source
-    -1).
-    """
-
-    elevation: Floats32
-    elevation_std: Floats32
-    spread: Floats32
-    count: NDArray[np.uint16]
-    source: NDArray[np.int32]
-    ortho: Floats32
-    filled: Bytes
-    relief_std: Floats32
-
-
 def merge(layers: Sequence[ModelLayer], tile: Lattice, params: MergeParams) -> Merged:
     """Merge elevation models on a tile of their common lattice.
 
@@ -171,84 +133,41 @@ def merge(layers: Sequence[ModelLayer], tile: Lattice, params: MergeParams) -> M
     pairs = [layer.pair for layer in ordered]
     if len(set(pairs)) != len(pairs):
         raise InputError("RIL-399", f"two elevation models of one pair among {pairs}", remedy="merge each pair once")
-    m = params.margin
-    grown = Lattice.at(tile.i0 - m, tile.j0 + m, tile.cell, tile.rows + 2 * m, tile.cols + 2 * m) if m else tile
-    ordered = [layer for layer in ordered if grown.intersection(layer.lattice) is not None]
-    out = _empty(grown)
+    ordered = [layer for layer in ordered if tile.intersection(layer.lattice) is not None]
+    others = {"count": (0, np.uint16), "source": (-1, np.int32)}
+    out = Merged._make(np.full(tile.shape, *others.get(name, (np.nan, np.float32))) for name in Merged._fields)
+    worst = math.inf if params.max_std_cells is None else params.max_std_cells * tile.cell
     # Four maps of four bytes a cell and model.
-    lines = max(1, STRIP_BYTES // (16 * max(len(ordered), 1) * grown.cols))
-    for start in range(0, grown.rows if ordered else 0, lines):
-        rows = slice(start, min(start + lines, grown.rows))
-        strip = Lattice.at(grown.i0, grown.j0 - start, grown.cell, rows.stop - start, grown.cols)
-        _merge_strip(ordered, strip, params, out, rows)
-    if m:
-        _close(out, params)
-        inside = grown.window(tile)
-        # Copies, for views would keep the margins in memory as long as the result.
-        out = Merged(**{name: values[inside].copy() for name, values in vars(out).items()})
+    lines = max(1, STRIP_BYTES // (16 * max(len(ordered), 1) * tile.cols))
+    for start in range(0, tile.rows, lines):
+        strip = Lattice.at(tile.i0, tile.j0 - start, tile.cell, min(lines, tile.rows - start), tile.cols)
+        rows = slice(start, start + strip.rows)
+        present = [layer for layer in ordered if strip.intersection(layer.lattice) is not None]
+        if present:
+            part = Merged._make(values[rows] for values in out)
+            merge_cells(_stacked(present, strip), strip.xs(), strip.ys(), params.alike, worst, part)
     return out
 
 
-def _merge_strip(layers: Sequence[ModelLayer], strip: Lattice, params: MergeParams, out: Merged, rows: slice) -> None:
-    """Merge the lines of one strip into ``out``."""
-    present = [layer for layer in layers if strip.intersection(layer.lattice) is not None]
-    if not present:
-        return
-    poses = [layer.pose for layer in present]
-    stack = Stack(
-        _stacked(present, strip, "elevation"),
-        _stacked(present, strip, "elevation_std"),
-        _stacked(present, strip, "residual"),
-        _stacked(present, strip, "ortho"),
-        np.array([layer.gain for layer in present]),
-        np.array([pose.centre for pose in poses]),
-        np.array([pose.covariance for pose in poses]),
-    )
-    worst = math.inf if params.max_std_cells is None else params.max_std_cells * strip.cell
-    best = np.full(strip.shape, -1, dtype=np.int64)
-    maps = CellMaps(
-        out.elevation[rows],
-        out.elevation_std[rows],
-        out.spread[rows],
-        out.ortho[rows],
-        out.relief_std[rows],
-        out.count[rows],
-        best,
-    )
-    rule = Rule(RESIDUAL_SCALE_PX, ORTHO_WEIGHT_EXPONENT, params.alike, worst)
-    merge_cells(stack, strip.xs(), strip.ys(), rule, maps)
-    out.source[rows] = np.array([*(layer.pair for layer in present), -1])[best]
-
-
-def _stacked(layers: Sequence[ModelLayer], strip: Lattice, name: str) -> Floats32:
-    out = np.full((len(layers), *strip.shape), np.nan, dtype=np.float32)
-    for target, layer in zip(out, layers, strict=True):
+def _stacked(layers: Sequence[ModelLayer], strip: Lattice) -> Stack:
+    """Read a strip of the models."""
+    maps = np.full((4, len(layers), *strip.shape), np.nan, dtype=np.float32)
+    for k, layer in enumerate(layers):
         common = strip.intersection(layer.lattice)
         assert common is not None
-        target[strip.window(common)] = layer.part(name, layer.lattice.window(common))
-    return out
-
-
-def _close(merged: Merged, params: MergeParams) -> None:
-    """Close the small holes in place; their grey value stays undefined."""
-    gap, window = float(params.max_hole), params.hole_window
-    stds = merged.elevation_std, merged.relief_std
-    closed = [close_holes(merged.elevation, std, gap, window, MIN_KNOWN_SHARE, judged=True) for std in stds]
-    for std, (z, sigma, filled) in zip(stds, closed, strict=True):
-        merged.elevation[...], std[...], merged.filled[...] = z, sigma, filled
-
-
-def _empty(tile: Lattice) -> Merged:
-    nan = np.full(tile.shape, np.nan, np.float32)
-    return Merged(
-        elevation=nan,
-        elevation_std=nan.copy(),
-        spread=nan.copy(),
-        count=np.zeros(tile.shape, np.uint16),
-        source=np.full(tile.shape, -1, np.int32),
-        ortho=nan.copy(),
-        filled=np.zeros(tile.shape, np.uint8),
-        relief_std=nan.copy(),
+        here, there = strip.window(common), layer.lattice.window(common)
+        for target, name in zip(maps, ("elevation", "elevation_std", "residual", "ortho"), strict=True):
+            target[k][here] = layer.part(name, there)
+    z, sigma, residual, ortho = maps
+    return Stack(
+        z,
+        sigma,
+        residual,
+        ortho,
+        np.array([layer.pair for layer in layers]),
+        np.array([layer.gain for layer in layers]),
+        np.array([layer.pose.centre for layer in layers]),
+        np.array([layer.pose.covariance for layer in layers]),
     )
 
 
@@ -280,7 +199,6 @@ def _fine(dem: Bundle, lattice: Lattice, most: float) -> Callable[[str, Window],
         raster("source", "1", "pair of the greatest weight", "int32", "-1", "world"),
         raster("ortho", "grey", "grey value, 0..255", "float32", "nan", "world"),
         raster("relief_std", "m", "standard deviation of the elevation against that around", "float32", "nan", "world"),
-        raster("filled", "1", "1 where a small hole was closed by interpolation", "uint8", "", "world"),
     ],
     memory=Memory(lower=("locus.cell_size",)),
 )
@@ -305,8 +223,7 @@ def merge_stage(
         "frame": "world",
         "pairs": sorted(layer.pair for layer in layers),
         "defined": float(np.mean(merged.count > 0)),
-        "filled": int(merged.filled.sum()),
     }
     if any("reference" in dem.meta for dem in dems):
         meta["reference"] = REFERENCE_PLANE
-    return Bundle(vars(merged), meta)
+    return Bundle(merged._asdict(), meta)

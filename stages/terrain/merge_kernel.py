@@ -7,7 +7,7 @@ precision, so equal input gives equal bits wherever a strip begins.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -16,45 +16,44 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.numeric.robust import MAD_TO_SIGMA, TUKEY_BISQUARE, bisquare
 
+RESIDUAL_SCALE_PX = 0.1
+"""Residual that halves a model's weight: the error of a good disparity."""
+ORTHO_WEIGHT_EXPONENT = 8
+"""Of the ortho image's weights: the best image, but without a visible seam."""
+
 
 class Stack(NamedTuple):
     """Models (n, rows, cols) float32, NaN undefined: elevations, their standard deviations, residuals, grey values.
 
-    ``gain`` (n,) of the grey values; ``centre`` (n, 2) and ``pose`` (n, 3, 3): where each camera stands, m, and the
-    covariance of its height and its rotations about x and y.
+    ``pair`` (n,) numbers of the models; ``gain`` (n,) of the grey values; ``centre`` (n, 2) and ``pose`` (n, 3, 3):
+    where each camera stands, m, and the covariance of its height and its rotations about x and y.
     """
 
     z: Floats32
     sigma: Floats32
     residual: Floats32
     ortho: Floats32
+    pair: NDArray[np.int64]
     gain: Floats
     centre: Floats
     pose: Floats
 
 
-class Rule(NamedTuple):
-    """``scale`` of the residuals, pixels; ``sharpness``: exponent of the grey values' weights; ``alike``: correlation
-    of two models' errors; ``worst``: greatest standard deviation but for the poses, m."""
+class Merged(NamedTuple):
+    """Maps (rows, cols) of merged cells.
 
-    scale: float
-    sharpness: float
-    alike: float
-    worst: float
-
-
-class CellMaps(NamedTuple):
-    """Maps (rows, cols) of the merged cells: ``elevation``, its standard deviation ``std`` (poses included),
-    ``spread``, ``ortho`` and ``relief_std``, float32; ``used``: number of models that count; ``best``: index of the
-    one of greatest weight, -1 none."""
+    ``elevation``, ``elevation_std`` and ``relief_std`` (of the weighted mean, see
+    :mod:`rille.stages.terrain.merge`), ``spread`` (standard deviation of the models about it; 0 for one model) in
+    metres, NaN undefined; ``count`` of models; ``source`` pair of the greatest weight, -1 none; ``ortho`` grey value.
+    """
 
     elevation: Floats32
-    std: Floats32
+    elevation_std: Floats32
     spread: Floats32
+    count: NDArray[np.uint16]  # type: ignore[assignment]  # in place of a tuple's own count
+    source: NDArray[np.int32]
     ortho: Floats32
     relief_std: Floats32
-    used: NDArray[np.integer[Any]]
-    best: NDArray[np.int64]
 
 
 class _Cell(NamedTuple):
@@ -70,10 +69,11 @@ class _Cell(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def merge_cells(stack, x, y, rule, out):  # type: ignore[no-untyped-def]
+def merge_cells(stack, x, y, alike, worst, out):  # type: ignore[no-untyped-def]
     """Merge a stack of models; weights and equations are those of :mod:`rille.stages.terrain.merge`.
 
-    ``x`` (cols,), ``y`` (rows,) of the cells, m; ``out``: the :class:`CellMaps` to fill, NaN and -1 before.
+    ``x`` (cols,), ``y`` (rows,) of the cells, m; ``alike``: correlation of two models' errors; ``worst``: greatest
+    standard deviation but for the poses, m; ``out``: the :class:`Merged` to fill, NaN, 0 and -1 before.
     """
     count, rows, cols = stack.z.shape
     floats = np.empty((5, count))
@@ -81,20 +81,21 @@ def merge_cells(stack, x, y, rule, out):  # type: ignore[no-untyped-def]
     apart, order = np.empty(count), np.empty(count, np.int64)
     for r in range(rows):
         for c in range(cols):
-            known = _gather(stack, r, c, (x[c], y[r]), rule.scale, cell)
+            known = _gather(stack, r, c, (x[c], y[r]), cell)
             # Of two models that contradict each other none is the outlier.
             if known >= 3:
                 _reweigh(cell, apart, order, known)
             if known:
-                _average(cell, known, rule, r, c, out)
+                _average(cell, known, alike, worst, (r, c), stack.pair, out)
 
 
 @njit(cache=True, nogil=True)
-def _gather(stack, r, c, place, scale, cell):  # type: ignore[no-untyped-def]
+def _gather(stack, r, c, place, cell):  # type: ignore[no-untyped-def]
     """Number of models that know a cell at ``place`` (x, y), m, which are put into ``cell``."""
     n = 0
     for k in range(stack.z.shape[0]):
-        z, sigma, residual = stack.z[k, r, c], float(stack.sigma[k, r, c]), float(stack.residual[k, r, c]) / scale
+        z, sigma = stack.z[k, r, c], float(stack.sigma[k, r, c])
+        residual = float(stack.residual[k, r, c]) / RESIDUAL_SCALE_PX
         if not (math.isfinite(z) and sigma > 0.0 and residual >= 0.0):
             continue
         weight = 1.0 / (sigma * sigma * (1.0 + residual * residual))
@@ -145,7 +146,7 @@ def _median(values, weight, order, n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _average(cell, n, rule, r, c, out):  # type: ignore[no-untyped-def]
+def _average(cell, n, alike, worst, at, pair, out):  # type: ignore[no-untyped-def]
     """Weighted means of the ``n`` models that know a cell; nothing where they are too uncertain."""
     total = top = mean = apart = together = placed = grey = greys = spread = 0.0
     used, best = 0, -1
@@ -163,16 +164,16 @@ def _average(cell, n, rule, r, c, out):  # type: ignore[no-untyped-def]
         # Poses drift together, so that their errors do not average out.
         placed += share * cell.pose[i]
         if cell.weight[i] > 0.0 and math.isfinite(cell.grey[i]):
-            sharp = (cell.weight[i] / top) ** rule.sharpness
+            sharp = (cell.weight[i] / top) ** ORTHO_WEIGHT_EXPONENT
             grey += sharp * cell.grey[i]
             greys += sharp
     for i in range(n):
         spread += cell.weight[i] / total * (cell.z[i] - mean) ** 2
     # Unrelated errors (alike = 0) average out; errors of one cause (alike = 1) add up as if there were one model.
-    variance = apart + rule.alike * (together * together - apart)
+    variance = apart + alike * (together * together - apart)
     # The limit is on the models' own errors, without the poses' part.
-    if math.sqrt(variance) <= rule.worst:
-        out.elevation[r, c], out.std[r, c] = mean, math.sqrt(variance + placed * placed)
-        out.spread[r, c], out.relief_std[r, c] = math.sqrt(spread), math.sqrt(apart)
-        out.ortho[r, c] = grey / greys if greys > 0.0 else math.nan
-        out.used[r, c], out.best[r, c] = used, best
+    if math.sqrt(variance) <= worst:
+        out.elevation[at], out.elevation_std[at] = mean, math.sqrt(variance + placed * placed)
+        out.spread[at], out.relief_std[at] = math.sqrt(spread), math.sqrt(apart)
+        out.ortho[at] = grey / greys if greys > 0.0 else math.nan
+        out.count[at], out.source[at] = used, pair[best]

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools
 from rille.stages.core.declare import Bundle, NoParams, stage
@@ -22,41 +21,20 @@ Box = tuple[int, int, int, int]
 """First column, first line, columns and lines, cells of the infinite lattice (lines count downwards)."""
 
 
-def footprint(defined: Bools, lattice: Lattice, side: int, margin: int = 0) -> dict[Tile, Box]:
-    """Tiles that have a defined cell, and the box of the defined cells in each.
-
-    Parameters
-    ----------
-    defined : (rows, cols) on ``lattice``.
-    side : cells; side of a tile.
-    margin : cells around a tile that count as its own: what its result may depend on. The box is cut to the tile.
-    """
+def footprint(defined: Bools, lattice: Lattice, side: int) -> dict[Tile, Box]:
+    """Tiles of ``side`` cells that have a defined cell (rows, cols) of a lattice, and the box of those in each."""
     boxes = {}
     # Lines count downwards, against y, as rows do.
     first_col, first_line = lattice.i0, -lattice.j0
-    for ty in range((first_line - margin) // side, (first_line + lattice.rows - 1 + margin) // side + 1):
-        rows = _span(ty, side, margin, first_line, lattice.rows)
-        for tx in range((first_col - margin) // side, (first_col + lattice.cols - 1 + margin) // side + 1):
-            cols = _span(tx, side, margin, first_col, lattice.cols)
-            inside = defined[rows, cols]
-            if inside.any():
-                lines, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
-                top, height = _extent(lines + first_line + rows.start, ty * side, side)
-                left, width = _extent(columns + first_col + cols.start, tx * side, side)
-                boxes[tx, ty] = (left, top, width, height)
+    for ty in range(first_line // side, (first_line + lattice.rows - 1) // side + 1):
+        for tx in range(first_col // side, (first_col + lattice.cols - 1) // side + 1):
+            row, col = max(ty * side - first_line, 0), max(tx * side - first_col, 0)
+            inside = defined[row : (ty + 1) * side - first_line, col : (tx + 1) * side - first_col]
+            lines, columns = (np.flatnonzero(inside.any(axis=axis)).tolist() for axis in (1, 0))
+            if lines:
+                size = columns[-1] - columns[0] + 1, lines[-1] - lines[0] + 1
+                boxes[tx, ty] = (first_col + col + columns[0], first_line + row + lines[0], *size)
     return boxes
-
-
-def _span(tile: int, side: int, margin: int, first: int, count: int) -> slice:
-    start = max(tile * side - margin - first, 0)
-    return slice(start, max(min((tile + 1) * side + margin - first, count), start))
-
-
-def _extent(where: NDArray[np.intp], tile: int, side: int) -> tuple[int, int]:
-    """Start and length of what is there, cut to the tile; of what is there in the margin alone, a bare edge cell."""
-    low = min(max(int(where[0]), tile), tile + side - 1)
-    high = max(min(int(where[-1]), tile + side - 1), low)
-    return low, high - low + 1
 
 
 def tile_lattice(boxes: Iterable[Box], cell: float) -> Lattice:
@@ -68,15 +46,10 @@ def tile_lattice(boxes: Iterable[Box], cell: float) -> Lattice:
 
 
 @stage("tile_index")
-def tile_index_stage(params: NoParams, dem: Bundle[DemFacts], *, side: int, margin: int) -> Bundle[TileIndexFacts]:
+def tile_index_stage(params: NoParams, dem: Bundle[DemFacts], *, side: int) -> Bundle[TileIndexFacts]:
     """Tiles of the world that an elevation model touches."""
     lattice = Lattice.from_dict(dem.meta["lattice"])
-    defined = np.isfinite(dem["elevation"])
-    tiles = footprint(defined, lattice, side, margin)
-    rows, cols = (np.flatnonzero(defined.any(axis=axis)) for axis in (1, 0))
-    box = None
-    if rows.size:
-        shape = int(rows[-1] - rows[0]) + 1, int(cols[-1] - cols[0]) + 1
-        box = Lattice.at(lattice.i0 + int(cols[0]), lattice.j0 - int(rows[0]), lattice.cell, *shape).to_dict()
+    tiles = footprint(np.isfinite(dem["elevation"]), lattice, side)
+    box = tile_lattice(tiles.values(), lattice.cell).to_dict() if tiles else None
     listed = [[*tile, *tiles[tile]] for tile in sorted(tiles)]
     return Bundle({}, {"pair": dem.meta["pair"], "cell": lattice.cell, "box": box, "tiles": listed})

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from toys import dem
 
 from rille.pipeline.engine import events
@@ -28,18 +27,16 @@ def run(
     places: dict[int, tuple[int, int]],
     *,
     steps: dict[str, int] | None = None,
-    params: MergeParams | None = None,
     executor: str = "inline",
 ) -> tuple[set[str], dict[str, str], dict[str, Any]]:
     """Labels of the tiles merged by this run, digest of each tile, and all nodes by label."""
-    graph, merging = Graph(), params or MergeParams()
+    graph, merging = Graph(), MergeParams()
 
     def node(stage: Any, label: str, **given: Any) -> Any:
         return graph.call(stage, label, merging if stage is merge_stage else NoParams(), **given)
 
     dems = {k: node(dem.STAGE, f"dem/{k}", pair=k, i0=i, j0=j) for k, (i, j) in places.items()}
-    cut = {"side": SIDE, "margin": merging.margin}
-    prints = [node(tile_index_stage, f"tile_index/{k}", dem=model, **cut) for k, model in dems.items()]
+    prints = [node(tile_index_stage, f"tile_index/{k}", dem=model, side=SIDE) for k, model in dems.items()]
 
     def follow() -> Iterator[Any]:
         found: Any = yield prints
@@ -85,32 +82,7 @@ def test_an_exposure_costs_the_tiles_of_its_model(cache: Path) -> None:
     assert again == touched(PLACES[12])
 
 
-@pytest.mark.parametrize("hole", [0, 2])
-def test_order_of_models_and_number_of_workers_change_no_bit(tmp_path: Path, hole: int) -> None:
-    params = MergeParams(max_hole=hole)
-    first = run(tmp_path / "a", PLACES, params=params)[1]
+def test_order_of_models_and_number_of_workers_change_no_bit(tmp_path: Path) -> None:
+    first = run(tmp_path / "a", PLACES)[1]
     backwards = dict(reversed(PLACES.items()))
-    assert run(tmp_path / "b", backwards, params=params, executor="dask")[1] == first
-
-
-def test_closed_holes_do_not_see_the_cut_into_tiles(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same world cut otherwise is the same, to the bit, though holes lie across the cuts."""
-    from rille.stages.geometry.lattice import Lattice, mosaic
-
-    all_ = Lattice.at(-20, 10, 0.5, 70, 90)
-
-    def world(side: int) -> dict[str, np.ndarray]:
-        monkeypatch.setattr(f"{__name__}.SIDE", side)
-        _, digests, nodes = run(cache / str(side), PLACES, params=MergeParams(max_hole=3))
-        bundles = [Store(cache / str(side)).open(nodes[label].ref) for label in digests]
-        lattices = [Lattice.from_dict(b.meta["lattice"]) for b in bundles]
-        none = {"count": 0, "source": -1, "filled": 0}
-        return {
-            name: mosaic([(at, b[name]) for at, b in zip(lattices, bundles, strict=True)], none.get(name, np.nan), all_)
-            for name in ("elevation", "elevation_std", "count", "filled")
-        }
-
-    small, large = world(16), world(400)
-    assert large["filled"].sum() > 0
-    for name, values in large.items():
-        assert small[name].tobytes() == values.tobytes(), name
+    assert run(tmp_path / "b", backwards, executor="dask")[1] == first

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import distance_transform_cdt, gaussian_filter
+from scipy.ndimage import distance_transform_cdt
 
 from rille.stages.numeric.holes import candidates, close_holes
 
@@ -27,7 +27,7 @@ def test_a_square_hole_is_closed_up_to_the_width_given(width: int, closed: bool)
         np.testing.assert_allclose(out, truth, atol=1e-6)
         assert filled.sum() == width**2
         np.testing.assert_array_equal(std[filled == 0], np.float32(0.1))
-        assert (std[filled == 1] >= 0.1).all()  # or half the range of the rim, which slopes
+        assert (std[filled == 1] >= 0.1).all()  # or that of a height in the range of the rim, which slopes
     else:
         inside = np.zeros_like(filled)
         inside[8 : 8 + width, 8 : 8 + width] = 1
@@ -68,42 +68,6 @@ def test_closing_is_bounded(seed: int, share: float, gap: float) -> None:
     if filled.any():
         assert np.nanmin(z) <= out[filled == 1].min()
         assert out[filled == 1].max() <= np.nanmax(z)
-
-
-def rough(seed: int) -> np.ndarray:
-    """Ground whose interpolation misses it by something: smooth over three cells."""
-    rng = np.random.default_rng(seed)
-    z = gaussian_filter(rng.normal(size=(150, 150)), 3.0)
-    return (z / z.std()).astype(np.float32)
-
-
-def test_sigma_of_a_closed_cell_is_by_how_much_it_misses_the_ground() -> None:
-    """The rim's own sigma is far less; the interpolation's error is found on the ground around the hole."""
-    truth = rough(4)
-    z = truth.copy()
-    for r in range(8, 140, 14):
-        for c in range(8, 140, 14):
-            z[r : r + 1 + r % 5, c : c + 1 + c % 4] = np.nan
-    rim = np.full_like(z, 0.01)
-    out, std, filled = close_holes(z, rim, 5.0, 13, 0.5, judged=True)
-    same, by_range, flags = close_holes(z, rim, 5.0, 13, 0.5)
-    np.testing.assert_array_equal(out, same)
-    np.testing.assert_array_equal(filled, flags)
-    there = filled == 1
-    score = (out - truth)[there] / std[there]
-    assert there.sum() > 300
-    assert 0.6 < np.sqrt(np.mean(score**2)) < 1.2
-    assert (by_range[there] >= 0.01).all()
-    assert np.sqrt(np.mean(((out - truth)[there] / by_range[there]) ** 2)) < 1.2
-    np.testing.assert_array_equal(std[~there & ~np.isnan(z)], rim[~there & ~np.isnan(z)])
-
-
-def test_where_nothing_tells_the_error_half_the_rims_range_stands_in() -> None:
-    z = np.full((3, 5), np.nan, dtype=np.float32)
-    z[1, 1], z[1, 3] = 1.0, 3.0
-    _, std, filled = close_holes(z, np.full_like(z, 0.1), 1.0, 3, 0.1, judged=True)
-    assert filled[1, 2] == 1
-    assert std[1, 2] == 1.0
 
 
 @settings(max_examples=20, deadline=None)

@@ -13,7 +13,8 @@ from terrain_scenes import ArrayLayer
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.geometry.lattice import Lattice, mosaic
 from rille.stages.terrain import merge as merge_stage
-from rille.stages.terrain.merge import EXACT, RESIDUAL_SCALE_PX, Merged, MergeParams, Placed, footprint, merge
+from rille.stages.terrain.merge import EXACT, MergeParams, Placed, footprint, merge
+from rille.stages.terrain.merge_kernel import ORTHO_WEIGHT_EXPONENT, RESIDUAL_SCALE_PX, Merged
 
 TILE = Lattice.at(0, 0, 0.1, 4, 5)
 PARAMS = MergeParams()
@@ -45,7 +46,7 @@ def noisy(count: int, seed: int = 0) -> list[ArrayLayer]:
 
 
 def arrays(merged: Merged) -> list[np.ndarray]:
-    return list(vars(merged).values())
+    return list(merged)
 
 
 def test_two_models_by_hand() -> None:
@@ -71,7 +72,7 @@ def test_two_models_of_any_standard_deviations_by_the_equations() -> None:
     share = weight / weight.sum(axis=0)
     mean = (share * z).sum(axis=0)
     alone, together = ((share * std) ** 2).sum(axis=0), (share * std).sum(axis=0) ** 2
-    sharp = (weight / weight.max(axis=0)) ** merge_stage.ORTHO_WEIGHT_EXPONENT
+    sharp = (weight / weight.max(axis=0)) ** ORTHO_WEIGHT_EXPONENT
     np.testing.assert_allclose(merged.elevation, mean, rtol=1e-5)
     np.testing.assert_allclose(merged.relief_std, np.sqrt(alone), rtol=1e-5)
     np.testing.assert_allclose(merged.elevation_std**2, (1 - PARAMS.alike) * alone + PARAMS.alike * together, rtol=1e-5)
@@ -342,37 +343,3 @@ def test_exposures_are_levelled_and_stay_grey_values() -> None:
     np.testing.assert_allclose(merged["ortho"], 50 * (1 + np.exp(0.2)), rtol=1e-5)
     merged = merge_stage.merge_stage.run(PARAMS, args | {"exposure": {"0": 99, "4": 99}}, {"dems": bundles})
     np.testing.assert_allclose(merged["ortho"], 255.0)
-
-
-def test_small_holes_are_closed_on_request_only_and_large_ones_stay() -> None:
-    tile = Lattice.at(0, 0, 0.1, 30, 40)
-    one = layer(0, 1.0, lattice=tile)
-    one.elevation[5:7, 5:7] = np.nan
-    one.elevation[12:24, 20:34] = np.nan
-    plain = merge([one], tile, PARAMS)
-    assert not plain.filled.any()
-    closed = merge([one], tile, MergeParams(max_hole=3))
-    assert closed.filled[5:7, 5:7].all()
-    assert not closed.filled[15:21, 24:30].any()
-    np.testing.assert_allclose(closed.elevation[5:7, 5:7], 1.0)
-    assert (closed.count[closed.filled == 1] == 0).all()
-    assert (closed.source[closed.filled == 1] == -1).all()
-    known = np.isfinite(plain.elevation)
-    assert np.array_equal(closed.elevation[known], plain.elevation[known])
-
-
-@pytest.mark.parametrize("max_hole", [1, 3, 6])
-@pytest.mark.parametrize("share", [0.2, 0.45])
-def test_closed_holes_do_not_depend_on_where_tiles_begin(max_hole: int, share: float) -> None:
-    rng = np.random.default_rng(max_hole)
-    whole, params = Lattice.at(0, 0, 0.1, 60, 70), MergeParams(max_hole=max_hole)
-    z = rng.normal(size=whole.shape)
-    block = np.ones((min(max_hole, 3),) * 2, bool)
-    z[np.kron(rng.random(whole.shape) < share, block)[:60, :70]] = np.nan
-    one = layer(0, z, std=rng.uniform(0.1, 0.2, whole.shape), lattice=whole)
-    merged = merge([one], whole, params)
-    assert merged.filled.any()
-    for i0, j0, rows, cols in ((0, 0, 60, 33), (33, 0, 60, 37), (20, -25, 12, 30), (5, -7, 3, 3)):
-        tile = Lattice.at(i0, j0, 0.1, rows, cols)
-        for part, values in zip(arrays(merge([one], tile, params)), arrays(merged), strict=True):
-            np.testing.assert_array_equal(part, values[whole.window(tile)])

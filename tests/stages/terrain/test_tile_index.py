@@ -23,12 +23,6 @@ def test_by_hand() -> None:
     assert footprint(np.zeros(lattice.shape, dtype=bool), lattice, 10) == {}
 
 
-def test_a_margin_adds_tiles_but_no_box_leaves_its_tile() -> None:
-    lattice = Lattice.at(9, -5, 0.5, 1, 1)
-    found = footprint(np.ones((1, 1), dtype=bool), lattice, 10, margin=1)
-    assert found == {(0, 0): (9, 5, 1, 1), (1, 0): (10, 5, 1, 1)}
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.integers(-40, 40), st.integers(-40, 40), st.integers(1, 30), st.integers(0, 2**32 - 1))
 def test_every_cell_lies_in_the_box_of_its_tile_and_nothing_else_is_there(i0: int, j0: int, n: int, seed: int) -> None:
@@ -52,13 +46,11 @@ def test_the_stage_gives_tiles_and_the_box_of_all_cells() -> None:
     z = np.full(lattice.shape, np.nan, np.float32)
     z[2, 3] = z[4, 4] = 1.0
     dem = Bundle({"elevation": z}, {"pair": 7, "lattice": lattice.to_dict()})
-    meta = stage.tile_index_stage.run(NoParams(), {"side": 4, "margin": 0}, {"dem": dem}).meta
+    meta = stage.tile_index_stage.run(NoParams(), {"side": 4}, {"dem": dem}).meta
     assert meta["pair"] == 7
     assert meta["tiles"] == [[0, 0, 3, 2, 1, 1], [1, 1, 4, 4, 1, 1]]
     box = Lattice.from_dict(meta["box"])
     assert (box.i0, box.j0, box.rows, box.cols) == (3, -2, 3, 2)
-    empty = stage.tile_index_stage.run(
-        NoParams(), {"side": 4, "margin": 0}, {"dem": Bundle({"elevation": z * np.nan}, dem.meta)}
-    )
+    empty = stage.tile_index_stage.run(NoParams(), {"side": 4}, {"dem": Bundle({"elevation": z * np.nan}, dem.meta)})
     assert (empty.meta["tiles"], empty.meta["box"]) == ([], None)
     assert tile_lattice([(0, 0, 2, 1), (-1, 3, 1, 1)], 0.1).bounds == pytest.approx((-0.15, 0.15, -0.35, 0.05))
