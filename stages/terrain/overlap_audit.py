@@ -2,7 +2,7 @@
 
 A seam says that one of two models is off, not which. A model that is off itself has an error in all its seams, each of
 its neighbours in one of theirs. So a model contradicts its neighbours where more than half of its seams stand out: the
-RMS of their bias and tilt is beyond what the sigma of a cell allows, and beyond chance.
+RMS of their bias and tilt is beyond what the sigma of a cell, and the noise about the plane, allow.
 """
 
 from __future__ import annotations
@@ -20,8 +20,6 @@ from rille.stages.facts.terrain import AuditFacts, OverlapFacts
 
 Facts = Mapping[str, Any]
 
-MAX_CHI2 = 21.11
-"""Chi-square with three degrees of freedom that chance exceeds once in ten thousand."""
 MAX_NAMED = 3
 """Models that a warning names."""
 MAX_LISTED = 500
@@ -37,10 +35,8 @@ class OverlapAuditParams(Params):
 
 
 def stands_out(seam: Facts, allowed_sigmas: float) -> bool:
-    """Whether bias and tilt of a seam are beyond the sigma of a cell, and beyond chance."""
-    plane = np.array([seam["bias"], *seam["tilt"]])
-    chi2 = float(plane @ np.linalg.pinv(np.array(seam["covariance"]), hermitian=True) @ plane)
-    return bool(seam["systematic"] > allowed_sigmas * seam["expected"] and chi2 > MAX_CHI2)
+    """Whether bias and tilt of a seam are beyond the sigma of a cell, and beyond its noise."""
+    return bool(seam["systematic"] > allowed_sigmas * max(seam["expected"], seam["noise"]))
 
 
 def audit(seams: Sequence[Facts], allowed_sigmas: float) -> list[dict[str, Any]]:
@@ -101,7 +97,7 @@ def overlap_audit_stage(params: OverlapAuditParams, seams: Sequence[Bundle[Overl
     models = audit(every, params.allowed_sigmas)
     bad = [m for m in models if m["contradicts"]]
     ranked = sorted(every, key=lambda s: (-s["systematic"] / max(s["expected"], 1e-12), s["pair"], s["other"]))
-    kept = ("pair", "other", "cells", "bias", "tilt", "covariance", "noise", "systematic", "expected")
+    kept = ("pair", "other", "cells", "bias", "tilt", "noise", "systematic", "expected")
     facts: AuditFacts = {
         "models": models,
         "seam_count": len(ranked),
