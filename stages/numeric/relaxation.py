@@ -7,15 +7,10 @@ The field f (rows, cols) minimises, with the second differences f_xx along rows 
 where ``power`` and ``pull`` are what the data say of each cell about its start f_0, and ``across`` and ``down`` the
 weights of the bends (:func:`bend_weights`), 0 where a neighbour is unknown.
 
-A cell shares second differences with two cells to each side of its row and of its column, so the cells of one diagonal
-(row + column) do not depend on each other. A sweep goes from diagonal to diagonal, which is the order of reading to
-the bit. A diagonal is a line in memory here, so its cells are computed as vectors, and the next sweep follows a few
-diagonals behind, while they are in the cache.
+A sweep takes the cells in the order of reading.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -25,20 +20,7 @@ from rille.stages.core.arrays import Bools, Floats32
 OVERRELAXATION = 1.7
 """Factor on each step, which stays convergent below 2."""
 BORDER = 2
-"""Diagonals and rows of nothing around: a second difference reaches two cells far."""
-SWEEP_LAG_DIAGONALS = 3
-"""Diagonals that a sweep keeps behind the one before it."""
-
-
-class _Equations(NamedTuple):
-    """Arrays (diagonal, row) with a border: the field ``at``, the weights ``across`` and ``down``, ``goal``
-    power f_0 + pull, and ``inverse`` 1 over all weights of a cell, 0 where it does not move."""
-
-    at: Floats32
-    across: Floats32
-    down: Floats32
-    goal: Floats32
-    inverse: Floats32
+"""Cells of nothing around: a second difference reaches two cells far."""
 
 
 @njit(cache=True, nogil=True)
@@ -87,81 +69,37 @@ def relax(
         return start
     # About the mean, so that single precision is enough.
     middle = np.nanmean(start)
-    rows, cols = start.shape
-    equations = _Equations(*np.zeros((len(_Equations._fields), rows + cols - 1 + 2 * BORDER, rows + 2 * BORDER), "f4"))
-    _shear(start - middle, power, pull, bends, keep, equations)
-    _sweeps(equations, cols, sweeps)
-    out = start.copy()
-    _read(equations.at, middle, keep, out)
-    return out
+    inner = np.s_[BORDER:-BORDER, BORDER:-BORDER]
+    field, across, down = (np.pad(a, BORDER) for a in (np.nan_to_num(start - middle), *bends))
+    # Of the bend about the cell, and of those that end there.
+    weight = power + 4 * (across + down)[inner] + across[inner[0], 1:-3] + across[inner[0], 3:-1]
+    weight += down[1:-3, inner[1]] + down[3:-1, inner[1]]
+    inverse = np.divide(1, weight, out=np.zeros_like(weight), where=keep & (weight > 0))
+    _sweep(field, across, down, power * field[inner] + pull, inverse, sweeps)
+    return np.where(keep, field[inner] + middle, start)
 
 
 @njit(cache=True, nogil=True)
-def _shear(start, power, pull, bends, keep, out):  # type: ignore[no-untyped-def]
-    """Fill the equations from arrays (rows, cols); what is NaN in the start stays 0."""
-    (across, down), (rows, cols) = bends, start.shape
-    four, none = np.float32(4.0), np.float32(0.0)
-    # Arrays are taken out of their tuple before the loop: each time costs an atomic count of references.
-    at, by_row, by_column, goal, inverse = out.at, out.across, out.down, out.goal, out.inverse
-    for r in range(rows):
-        for c in range(cols):
-            if not np.isfinite(start[r, c]):
-                continue
-            t, i = r + c + BORDER, r + BORDER
-            at[t, i], by_row[t, i], by_column[t, i] = start[r, c], across[r, c], down[r, c]
-            if not keep[r, c]:
-                continue
-            goal[t, i] = power[r, c] * start[r, c] + pull[r, c]
-            # Of the bend about the cell, and of those that end there.
-            weight = power[r, c] + four * (across[r, c] + down[r, c])
-            weight += (across[r, c - 1] if c > 0 else none) + (across[r, c + 1] if c + 1 < cols else none)
-            weight += (down[r - 1, c] if r > 0 else none) + (down[r + 1, c] if r + 1 < rows else none)
-            if weight > 0.0:
-                inverse[t, i] = np.float32(1.0) / weight
+def _sweep(field, across, down, goal, inverse, sweeps):  # type: ignore[no-untyped-def]
+    """Relax a field in place; it and the weights of the bends have a border.
 
-
-@njit(cache=True, nogil=True)
-def _read(at, middle, keep, out):  # type: ignore[no-untyped-def]
-    """Fill the cells that move from the field of the equations."""
-    for r in range(out.shape[0]):
-        for c in range(out.shape[1]):
-            if keep[r, c]:
-                out[r, c] = at[r + c + BORDER, r + BORDER] + middle
-
-
-@njit(cache=True, nogil=True)
-def _sweeps(equations, cols, sweeps):  # type: ignore[no-untyped-def]
-    """Relax a field of a number of columns in place."""
-    diagonals = equations.at.shape[0] - 2 * BORDER
-    rows = diagonals + 1 - cols
-    sums = np.empty(rows, np.float32)
-    for turn in range(diagonals + SWEEP_LAG_DIAGONALS * (sweeps - 1)):
-        for k in range(sweeps):
-            t = turn - SWEEP_LAG_DIAGONALS * k
-            if 0 <= t < diagonals:
-                _relax_diagonal(equations, t + BORDER, max(0, t + 1 - cols) + BORDER, min(rows, t + 1) + BORDER, sums)
-
-
-@njit(cache=True, nogil=True)
-def _relax_diagonal(equations, t, i, j, sums):  # type: ignore[no-untyped-def]
-    """Relax the cells of rows i to j of diagonal t; ``sums``: room for a number each."""
-    at, across, down = equations.at, equations.across, equations.down
-    two, overshoot, n = np.float32(2.0), np.float32(OVERRELAXATION), j - i
-    # What the second differences along the row, then the column want the cell to be, times their weights: as their
-    # second end, their middle and their first end.
-    before, weight, behind = across[t - 1, i:j], across[t, i:j], across[t + 1, i:j]
-    far, left, right, beyond = at[t - 2, i:j], at[t - 1, i:j], at[t + 1, i:j], at[t + 2, i:j]
-    goal = equations.goal[t, i:j]
-    for m in range(n):
-        sums[m] = goal[m] + before[m] * (two * left[m] - far[m]) + behind[m] * (two * right[m] - beyond[m])
-        sums[m] += two * weight[m] * (left[m] + right[m])
-    before, weight, behind = down[t - 1, i - 1 : j - 1], down[t, i:j], down[t + 1, i + 1 : j + 1]
-    far, above, below = at[t - 2, i - 2 : j - 2], at[t - 1, i - 1 : j - 1], at[t + 1, i + 1 : j + 1]
-    beyond = at[t + 2, i + 2 : j + 2]
-    for m in range(n):
-        sums[m] += before[m] * (two * above[m] - far[m]) + behind[m] * (two * below[m] - beyond[m])
-        sums[m] += two * weight[m] * (above[m] + below[m])
-    own, inverse = at[t, i:j], equations.inverse[t, i:j]
-    for m in range(n):
-        moved = own[m] + overshoot * (inverse[m] * sums[m] - own[m])
-        own[m] = moved if inverse[m] > 0.0 else own[m]
+    ``goal`` (rows, cols): power f_0 + pull; ``inverse``: 1 over all weights of a cell, 0 where it does not move.
+    """
+    two, overshoot = np.float32(2.0), np.float32(OVERRELAXATION)
+    for _ in range(sweeps):
+        for r in range(goal.shape[0]):
+            i = r + BORDER
+            above, row, below = field[i - 1], field[i], field[i + 1]
+            for c in range(goal.shape[1]):
+                if not inverse[r, c] > 0.0:
+                    continue
+                j = c + BORDER
+                # What the second differences along the row, then the column want the cell to be, times their weights:
+                # as their second end, their first end and their middle.
+                total = across[i, j - 1] * (two * row[j - 1] - row[j - 2])
+                total += across[i, j + 1] * (two * row[j + 1] - row[j + 2])
+                total += two * across[i, j] * (row[j - 1] + row[j + 1])
+                total += down[i - 1, j] * (two * above[j] - field[i - 2, j])
+                total += down[i + 1, j] * (two * below[j] - field[i + 2, j])
+                total += two * down[i, j] * (above[j] + below[j])
+                row[j] += overshoot * (inverse[r, c] * (goal[r, c] + total) - row[j])
