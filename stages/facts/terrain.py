@@ -18,15 +18,10 @@ class GroundFacts(Facts):
     """3 x 4 numbers, row by row."""
     source: str
     """Of the vertical; ``none``: unknown, z is the camera's own up; ``reference plane``: z is its normal."""
-    ground_height: float | None
-    """z of the ground below the camera, m, negative."""
     plane: list[float] | None
     """(a, b, c) of z = c + a x + b y."""
-    tilt: float | None
-    """Of the ground, rad."""
     relief: list[float] | None
     """Lowest and highest terrain against the plane, m."""
-    z_range: list[float] | None
     cell_size: float
     """m, that suits the rig."""
     footprint: list[float] | None

@@ -49,18 +49,15 @@ from rille.stages.terrain.ground import (
 SCENE = "scene"
 """Instead of a stated reference plane: the scene's own."""
 
-
+MAX_TILT_DEG = 30.0  # largest slope of the ground, and largest roll of an unknown attitude
+MIN_PITCH_DEG, MAX_PITCH_DEG = -20.0, 75.0  # downward pitch of a rig whose attitude is unknown
+MAX_RELIEF_SHARE = 0.02  # largest distance of ground from the plane, of the camera's height
+RELIEF_MARGIN_SHARE = 0.05  # of the camera's height, that the range of elevations is widened by: a low rock, a kerb
+MAX_HEIGHTS = 2.0  # greatest elevation above the ground that is searched, camera heights
 DEFAULT_RANGE_CELLS = 6.0  # of the footprint in meta; the stage locus has its own parameter
 MAX_FIT_PIXELS = 5000  # matched pixels that the plane is fitted to: three parameters need no more
-
-RELIEF_MARGIN_SHARE = 0.05  # of the camera's height, that the range of elevations is widened by: a low rock, a kerb
-
-
 BEYOND_INFINITY_SIGMAS = 3.0  # standard deviations that a match lies beyond infinity, which no noise explains
-NEAREST_SHARE = 0.05  # of the matches, that may be nearer than what counts as nearest: gross mismatches
-
 MIN_DOMINANT_SHARE = 0.3  # of the matches, from which a plane may be the reference, though tilted beyond the limits
-
 MAX_SLANT_DEG = 65.0  # between the view and a scene plane's normal: what is seen along the plane makes no map
 MAX_SIGMA_RATIO = 10.0  # to the median one: a match so uncertain brings a hundredth of the median one's weight
 
@@ -68,29 +65,10 @@ MAX_SIGMA_RATIO = 10.0  # to the median one: a match so uncertain brings a hundr
 class GroundFrameParams(Params):
     """Parameters of the stage ``ground_frame``."""
 
-    max_tilt_deg: float = Field(
-        30.0, gt=0, lt=90, description="largest slope of the ground, and largest roll of an unknown attitude [degrees]"
-    )
-    min_pitch_deg: float = Field(
-        -20.0, gt=-90, lt=90, description="smallest downward pitch [degrees] of a rig whose attitude is unknown"
-    )
-    max_pitch_deg: float = Field(
-        75.0, gt=-90, lt=90, description="largest downward pitch [degrees] of a rig whose attitude is unknown"
-    )
-    relief: float = Field(
-        0.02,
-        gt=0,
-        lt=1,
-        description="largest distance of ground from the plane, as a share of the camera's height",
-    )
-    ceiling: float = Field(
-        1.0, ge=0, description="greatest elevation that is searched, above the camera, in camera heights"
-    )
     reference_height: float | None = Field(
         None, gt=0, description="depth [m] of a plane below the camera that stands for ground which is not seen"
     )
     sigma_disparity: float = Field(0.2, gt=0, description="standard deviation of a disparity [pixels]")
-    seed: int = Field(1999, ge=0, description="seed of the random samples of the ground plane")
 
 
 class VerticalHint(NamedTuple):
@@ -131,34 +109,31 @@ def level(
     maps = np.asarray(column_disparity), np.asarray(row_disparity)
     samples = sampled(maps, usable, rig, params.sigma_disparity)
     if reference is not None:
-        stated = scene_plane(samples, params) if isinstance(reference, str) else stated_plane(reference)
-        return _on_plane(stated, samples, rig, params)
+        stated = scene_plane(samples) if isinstance(reference, str) else stated_plane(reference)
+        return _on_plane(stated, samples, rig, params.sigma_disparity)
     known_up, source = _given_vertical(vertical or VerticalHint())
     rays, rho, sigma = samples
     ground = None
     try:
-        ground = _fitted(samples, lambda n: _allowed(n, known_up, params), params)
+        ground = _fitted(samples, lambda n: _allowed(n, known_up))
         R_local_left = level_rotation(ground.up if known_up is None else known_up)
-        return _on_ground(ground, R_local_left, samples, rig, params, source or GROUND_PLANE)
+        return _on_ground(ground, R_local_left, samples, rig, params.sigma_disparity, source or GROUND_PLANE)
     except DegenerateError as error:
-        why, other_share = _explained(error, samples, ground, params)
+        why, other_share = _explained(error, samples, ground)
     up = np.array([0.0, -1.0, 0.0]) if known_up is None else known_up
     # No ground is seen: odometry, which needs none, still gets a frame.
     source, R_local_left = source or NO_VERTICAL, level_rotation(up)
     try:
         if params.reference_height is not None:
             stated = GroundPlane(up, params.reference_height)
-            return _on_ground(stated, R_local_left, samples, rig, params, source)
+            return _on_ground(stated, R_local_left, samples, rig, params.sigma_disparity, source)
     except DegenerateError as error:
         why = error
     facts: GroundFacts = {
         "T_local_left": RigidTransform(R_local_left, np.zeros(3)).to_list(),
         "source": source,
-        "ground_height": None,
         "plane": None,
-        "tilt": None,
         "relief": None,
-        "z_range": None,
         "cell_size": _cell_without_ground(rho[rho > BEYOND_INFINITY_SIGMAS * sigma], rig),
         "footprint": None,
         "ground_share": 0.0,
@@ -169,30 +144,28 @@ def level(
     if known_up is not None:
         with suppress(DegenerateError):
             # The images may show ground where the given vertical has none: then one of the two is wrong.
-            facts["seen_up"] = _fitted(samples, lambda n: _allowed(n, None, params), params).up.tolist()
+            facts["seen_up"] = _fitted(samples, lambda n: _allowed(n, None)).up.tolist()
     if ground is not None and isinstance(why, CoarseGroundError) and ground.inliers >= MIN_DOMINANT_SHARE:
         # Larger cells than those that suit the rig may still make a map.
         plane, everywhere = _local_plane(ground, R_local_left), [-math.inf, math.inf] * 2
         points = (rays[rho > 0] / rho[rho > 0, None]) @ R_local_left.T
-        facts["plane"], facts["relief"] = plane, _relief(points, plane, everywhere, ground.height, params)
+        facts["plane"], facts["relief"] = plane, _relief(points, plane, everywhere, ground.height)
         facts["ground_share"], facts["ground_reach"] = ground.inliers, ground.reach
     return facts
 
 
-def _fitted(samples: Samples, allowed: Callable[[Floats], Bools], params: GroundFrameParams) -> GroundPlane:
+def _fitted(samples: Samples, allowed: Callable[[Floats], Bools]) -> GroundPlane:
     """The ground plane that the samples show, with a normal that is allowed."""
-    return fit_plane(*samples, allowed, params.relief, np.random.default_rng(params.seed))
+    return fit_plane(*samples, allowed, MAX_RELIEF_SHARE, np.random.default_rng(1999))
 
 
-def _explained(
-    error: DegenerateError, samples: Samples, ground: GroundPlane | None, params: GroundFrameParams
-) -> tuple[DegenerateError, float]:
+def _explained(error: DegenerateError, samples: Samples, ground: GroundPlane | None) -> tuple[DegenerateError, float]:
     """Why there is no ground, or none that is seen well enough, with the remedy of that cause; and the share of the
     samples on another plane, 0 where none dominates."""
     if not isinstance(error, NoGroundError) or (ground is not None and ground.inliers >= MIN_DOMINANT_SHARE):
         return error, 0.0
     try:
-        seen = _fitted(samples, lambda n: np.ones(len(n), dtype=bool), params)
+        seen = _fitted(samples, lambda n: np.ones(len(n), dtype=bool))
     except DegenerateError:
         seen = None
     if seen is None or seen.inliers < MIN_DOMINANT_SHARE:
@@ -205,23 +178,20 @@ def _explained(
 
 
 def _on_ground(
-    ground: GroundPlane, R_local_left: Floats, samples: Samples, rig: Rig, params: GroundFrameParams, source: str
+    ground: GroundPlane, R_local_left: Floats, samples: Samples, rig: Rig, sigma_disparity: float, source: str
 ) -> GroundFacts:
     """What :func:`level` says of a pair whose ground plane is known."""
     plane = _local_plane(ground, R_local_left)
     view = view_ground(rig, R_local_left, plane)
     cell = view.cell_size()
-    footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, params.sigma_disparity, cell)
+    footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, sigma_disparity, cell)
     points = (samples.rays / np.maximum(samples.rho, 1e-12)[:, None]) @ R_local_left.T
-    relief = _relief(points[samples.rho > 0], plane, footprint, ground.height, params)
+    relief = _relief(points[samples.rho > 0], plane, footprint, ground.height)
     return {
         "T_local_left": RigidTransform(R_local_left, np.zeros(3)).to_list(),
         "source": source,
-        "ground_height": plane[2],
         "plane": plane,
-        "tilt": math.atan(math.hypot(plane[0], plane[1])),
         "relief": relief,
-        "z_range": z_range(plane, relief, footprint),
         "cell_size": cell,
         "footprint": footprint,
         "ground_share": ground.inliers,
@@ -229,7 +199,7 @@ def _on_ground(
     }
 
 
-def scene_plane(samples: Samples, params: GroundFrameParams) -> GroundPlane:
+def scene_plane(samples: Samples) -> GroundPlane:
     """The plane that the scene lies on, if one dominates it and is not seen along itself; else across the view.
 
     Across the view, elevations are a depth map: whatever the scene is, each matched pixel has its own place there.
@@ -239,7 +209,7 @@ def scene_plane(samples: Samples, params: GroundFrameParams) -> GroundPlane:
         raise NoGroundError("RIL-385", "no pixel is matched, so no surface is seen")
     view = rays.mean(axis=0) / np.linalg.norm(rays.mean(axis=0))
     with suppress(NoGroundError):
-        plane = _fitted(samples, lambda n: np.asarray(-n @ view >= math.cos(math.radians(MAX_SLANT_DEG))), params)
+        plane = _fitted(samples, lambda n: np.asarray(-n @ view >= math.cos(math.radians(MAX_SLANT_DEG))))
         if plane.inliers >= MIN_DOMINANT_SHARE:
             return plane
     return GroundPlane(np.array([0.0, 0.0, -1.0]), 1.0 / max(float(np.median(rho)), 1e-9))
@@ -260,28 +230,25 @@ def stated_plane(reference: Sequence[float]) -> GroundPlane:
     return GroundPlane(math.copysign(1.0, height) * normal / length, abs(height))
 
 
-def _on_plane(reference: GroundPlane, samples: Samples, rig: Rig, params: GroundFrameParams) -> GroundFacts:
+def _on_plane(reference: GroundPlane, samples: Samples, rig: Rig, sigma_disparity: float) -> GroundFacts:
     """What :func:`level` says of a pair whose reference plane is no ground."""
     z = reference.up
     # Along the plane, right in the image; for a plane that holds that direction's normal alone, along the optical axis.
     right = np.eye(3)[0 if abs(z[0]) < 0.9 else 2]
     x = (right - (right @ z) * z) / np.linalg.norm(right - (right @ z) * z)
     T_local_left = RigidTransform(np.array([x, np.cross(z, x), z]), np.array([0.0, 0.0, reference.height]))
-    view = view_matches(samples, rig, T_local_left, params.sigma_disparity)
+    view = view_matches(samples, rig, T_local_left, sigma_disparity)
     if not len(view.slant):
         raise NoGroundError("RIL-392", "all matches may as well be infinitely far: no surface can be measured")
     cell = rounded_cell(float(np.median(np.sqrt(view.along * view.across))))
-    max_sigma = float(f"{MAX_SIGMA_RATIO * np.median(params.sigma_disparity / view.slope):.2g}")
-    footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, params.sigma_disparity, max_sigma)
+    max_sigma = float(f"{MAX_SIGMA_RATIO * np.median(sigma_disparity / view.slope):.2g}")
+    footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, sigma_disparity, max_sigma)
     relief = _spread(view.xyz, [0.0, 0.0, 0.0], footprint, RELIEF_MARGIN_SHARE * reference.height)
     return {
         "T_local_left": T_local_left.to_list(),
         "source": REFERENCE_PLANE,
-        "ground_height": None,
         "plane": [0.0, 0.0, 0.0],
-        "tilt": None,
         "relief": relief,
-        "z_range": relief,
         "cell_size": cell,
         "max_sigma": max_sigma,
         "footprint": footprint,
@@ -292,7 +259,8 @@ def _on_plane(reference: GroundPlane, samples: Samples, rig: Rig, params: Ground
 def _cell_without_ground(rho: Floats, rig: Rig) -> float:
     """Cell size, m, by what is seen instead, inverse depths ``rho`` (n,): a pixel at twice the nearest distance."""
     # Where nothing is seen at all, 20 baselines stand for the distance.
-    near = 1.0 / float(np.quantile(rho, 1.0 - NEAREST_SHARE)) if rho.size else 20.0 * rig.baseline
+    # A twentieth may be nearer than what counts as nearest: gross mismatches.
+    near = 1.0 / float(np.quantile(rho, 0.95)) if rho.size else 20.0 * rig.baseline
     return rounded_cell(2.0 * near / coarser_focal(rig))
 
 
@@ -354,14 +322,14 @@ def _given_vertical(hint: VerticalHint) -> tuple[Floats | None, str]:
     return None, ""
 
 
-def _allowed(normals: Floats, vertical: Floats | None, params: GroundFrameParams) -> Bools:
+def _allowed(normals: Floats, vertical: Floats | None) -> Bools:
     """Which normals may be the ground's: near the known vertical, else within the limits of roll and pitch."""
-    tilt = math.radians(params.max_tilt_deg)
+    tilt = math.radians(MAX_TILT_DEG)
     if vertical is not None:
         return np.asarray(normals @ vertical >= math.cos(tilt))
     pitch = np.degrees(np.arctan2(-normals[:, 2], -normals[:, 1]))
     level_enough = np.abs(normals[:, 0]) <= math.sin(tilt)
-    return np.asarray(level_enough & (pitch >= params.min_pitch_deg) & (pitch <= params.max_pitch_deg))
+    return np.asarray(level_enough & (pitch >= MIN_PITCH_DEG) & (pitch <= MAX_PITCH_DEG))
 
 
 def _local_plane(ground: GroundPlane, R_local_left: Floats) -> list[float]:
@@ -369,13 +337,11 @@ def _local_plane(ground: GroundPlane, R_local_left: Floats) -> list[float]:
     return [float(-n[0] / n[2]), float(-n[1] / n[2]), float(-ground.height / n[2])]
 
 
-def _relief(
-    points: Floats, plane: list[float], extent: list[float], height: float, params: GroundFrameParams
-) -> list[float]:
+def _relief(points: Floats, plane: list[float], extent: list[float], height: float) -> list[float]:
     """Robust lowest and highest terrain against the plane within the extent, metres, as far as ground reaches."""
     low, high = _spread(points, plane, extent, RELIEF_MARGIN_SHARE * height)
     # Below, nothing is known that deep but mismatches; above, walls and crowns.
-    return [max(low, -height), min(high, (1.0 + params.ceiling) * height)]
+    return [max(low, -height), min(high, MAX_HEIGHTS * height)]
 
 
 def _spread(points: Floats, plane: list[float], extent: list[float], margin: float) -> list[float]:

@@ -16,14 +16,23 @@ from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
 from rille.stages.terrain import ground_frame as level_stage
 from rille.stages.terrain.ground import _singular_values, view_ground
-from rille.stages.terrain.ground_frame import SCENE, GroundFrameParams, VerticalHint, level
+from rille.stages.terrain.ground_frame import SCENE, GroundFrameParams, VerticalHint, level, z_range
 from rille.stages.terrain.locus.stage import LocusParams, local_lattice
 
 RIG = toed_in_rig()
 PARAMS = GroundFrameParams()
+
 PITCH, ROLL, HEIGHT = 18.0, 2.0, 0.18
 POSE = pitched(PITCH, ROLL)
 FLAT = disparity(RIG, POSE, plane(0.0, 0.0, -HEIGHT))
+
+
+def tilt_of(facts: dict) -> float:
+    return math.atan(math.hypot(*facts["plane"][:2]))
+
+
+def range_of(facts: dict) -> list[float]:
+    return z_range(facts["plane"], facts["relief"], facts["footprint"])
 
 
 def up_of(facts: dict) -> np.ndarray:
@@ -48,8 +57,8 @@ def test_ground_plane_gives_attitude_and_height() -> None:
     assert facts["source"] == "ground plane"
     # Noise of 0.2 px over thousands of pixels, correlated over some 30: a milliradian at most.
     assert math.acos(min(1.0, float(up_of(facts) @ POSE.rotation[2]))) < 2e-3
-    assert facts["ground_height"] == pytest.approx(-HEIGHT, rel=5e-3)
-    assert facts["tilt"] < 1e-9
+    assert facts["plane"][2] == pytest.approx(-HEIGHT, rel=5e-3)
+    assert tilt_of(facts) < 1e-9
     assert facts["ground_share"] > 0.9
 
 
@@ -71,7 +80,7 @@ def test_each_source_and_their_order() -> None:
         assert facts["source"] == source
         np.testing.assert_allclose(up_of(facts), level_up, atol=1e-12)
         np.testing.assert_allclose(facts["plane"], [0.0, math.tan(slope), -HEIGHT], atol=1e-3)
-        assert facts["tilt"] == pytest.approx(slope, abs=1e-3)
+        assert tilt_of(facts) == pytest.approx(slope, abs=1e-3)
     without = level(*maps, RIG, PARAMS)
     assert math.acos(float(up_of(without) @ level_up)) == pytest.approx(slope, abs=1e-3)
 
@@ -95,12 +104,12 @@ def test_street_with_more_walls_than_road() -> None:
     column = column + smooth_noise(column.shape, 0.3, np.random.default_rng(0))
     facts = level(column, row, usable, rig, PARAMS)
     assert facts["ground_share"] < 0.5
-    assert facts["ground_height"] == pytest.approx(-1.65, abs=0.02)
+    assert facts["plane"][2] == pytest.approx(-1.65, abs=0.02)
     assert math.acos(float(up_of(facts) @ pitched(1.0).rotation[2])) < math.radians(0.3)
-    low, high = facts["z_range"]
+    low, high = range_of(facts)
     assert low < -1.65 - 0.05
     assert high > -0.2
-    assert high <= 1.652 + abs(facts["footprint"][3]) * math.tan(facts["tilt"])
+    assert high <= 1.652 + abs(facts["footprint"][3]) * math.tan(tilt_of(facts))
     x_min, x_max, y_min, y_max = facts["footprint"]
     assert x_min < -4.0
     assert x_max > 4.0
@@ -120,15 +129,15 @@ def test_the_far_background_is_not_ground() -> None:
     # Ground beyond 5 sigma of inverse depth, 5 * 0.2 px / (f B), cannot be told from the background.
     on_ground = ground(np.zeros(3), v) < RIG.left.fx * RIG.baseline
     assert facts["ground_share"] == pytest.approx(on_ground.mean(), abs=0.05)
-    assert facts["ground_height"] == pytest.approx(-0.6, rel=0.02)
+    assert facts["plane"][2] == pytest.approx(-0.6, rel=0.02)
 
 
 def test_relief_holds_the_rocks() -> None:
     rocks = nearest(plane(0.0, 0.0, -HEIGHT), ball((0.0, 0.35, -HEIGHT), 0.05), ball((-0.1, 0.5, -HEIGHT), 0.06))
     facts = level(*disparity(RIG, POSE, rocks), RIG, PARAMS, VerticalHint(up=POSE.rotation[2]))
-    assert facts["ground_height"] == pytest.approx(-HEIGHT, rel=0.02)
-    assert facts["z_range"][0] < -HEIGHT
-    assert facts["z_range"][1] > -HEIGHT + 0.055
+    assert facts["plane"][2] == pytest.approx(-HEIGHT, rel=0.02)
+    assert range_of(facts)[0] < -HEIGHT
+    assert range_of(facts)[1] > -HEIGHT + 0.055
     assert facts["relief"][0] < 0.0 < facts["relief"][1]
 
 
@@ -214,7 +223,7 @@ def test_without_ground_elevations_are_distances_from_another_plane(reference: s
     assert T.translation == pytest.approx([0.0, 0.0, 1.5 / math.hypot(0.2, 1.0)], rel=3e-3, abs=1e-9)
     # Right in the image is right on the wall, and the ball, which stands out by 0.1 m, within the range of the search.
     assert T.rotation[0, 0] > 0.9
-    assert facts["z_range"][1] > 0.09
+    assert range_of(facts)[1] > 0.09
     assert facts["footprint"][1] - facts["footprint"][0] > 0.8
 
 
@@ -263,7 +272,7 @@ def test_stage_uses_only_measured_pixels_and_is_repeatable() -> None:
     maps |= {"backmatch_error": error}
     inputs = {"disparity": Bundle(maps, {}), "rig": Bundle({}, {"rig": RIG.to_dict()})}
     facts = level_stage.ground_frame_stage.run(PARAMS, {"pitch": math.radians(PITCH)}, inputs).meta
-    assert facts["ground_height"] == pytest.approx(-HEIGHT, rel=1e-3)
+    assert facts["plane"][2] == pytest.approx(-HEIGHT, rel=1e-3)
     assert facts == level_stage.ground_frame_stage.run(PARAMS, {"pitch": math.radians(PITCH)}, inputs).meta
     json.dumps(facts, allow_nan=False)
 
@@ -281,7 +290,7 @@ def test_kitti_street(data_dir: Path) -> None:
     cam = Camera(P[0, 0, 0], P[0, 1, 1], P[0, 0, 2], P[0, 1, 2], left.shape[1], left.shape[0])
     rig = Rig(cam, cam, RigidTransform(np.eye(3), [P[1, 0, 3] / P[1, 0, 0], 0.0, 0.0]))
     facts = level(-d, np.zeros_like(d), d > 0, rig, PARAMS)
-    assert facts["ground_height"] == pytest.approx(-1.65, abs=0.12)
+    assert facts["plane"][2] == pytest.approx(-1.65, abs=0.12)
     assert math.degrees(math.acos(-float(up_of(facts)[1]))) < 3.0
 
 
