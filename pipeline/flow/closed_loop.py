@@ -455,10 +455,10 @@ class Drive:
 
     def _obstacles(self, stop: Stop, way: Way, segment: Segment, key: Pair) -> Handle:
         """Whether the images on the way show what the last model does not."""
-        p, frames = self.config.obstacle_monitor, way.frames
+        frames = way.frames
         wheels = np.array([way.said.meta["odometry"][way.rows[f]] for f in frames])
-        compared = obstacle_monitor.pairs(wheels, self.config.vehicle.wheel_diameter, p)
-        params = self.config.motion.model_copy(update={"level": p.level})
+        compared = obstacle_monitor.pairs(wheels, self.config.vehicle.wheel_diameter)
+        params = self.config.motion.model_copy(update={"level": obstacle_monitor.LEVEL})
         motions = []
         for a, b in ((frames[i], frames[j]) for i, j in compared):
             images = {"a": self.make.pyramid(a, "left"), "b": self.make.pyramid(b, "left")}

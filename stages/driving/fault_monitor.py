@@ -17,44 +17,23 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import Bundle, Params, stage
+from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.odometry import ResectFacts
 from rille.stages.facts.planning import StopFacts
 from rille.stages.geometry.geometry import RigidTransform, heading_of
 
-
-class FaultMonitorParams(Params):
-    """Thresholds of the safety stops."""
-
-    max_tilt: float = Field(
-        1.0,
-        gt=0,
-        description="tilt of the body over the vehicle's max_slope_deg at which it stops; the body averages over its "
-        "wheels, so it tilts less than the ground",
-    )
-    max_acceleration: float = Field(
-        3.0,
-        gt=0,
-        description="vertical acceleration [m/s2] at which it stops; permitted steps cause less than half of it",
-    )
-    min_landmarks: int = Field(
-        12, ge=6, description="least number of landmarks that agree with a pose; six determine it"
-    )
-    max_slip: float = Field(
-        0.2, gt=0, description="slip [share of the distance by the wheels] at which it stops; usual soil: 0.05 to 0.15"
-    )
-    min_distance: float = Field(
-        0.3,
-        gt=0,
-        description="distance by the wheels [wheelbases] from which slip is judged; below, the errors of the poses are "
-        "as large",
-    )
-    max_turn_deg: float = Field(
-        8.0, gt=0, description="difference [degrees] between the turn by the wheels and by the images at which it stops"
-    )
+MAX_ACCELERATION = 3.0
+"""Vertical acceleration, m/s2, at which it stops; permitted steps cause less than half of it."""
+MIN_LANDMARKS = 12
+"""Landmarks that agree with a pose; six determine it."""
+MAX_SLIP_SHARE = 0.2
+"""Of the distance by the wheels; usual soil: 0.05 to 0.15."""
+MIN_SLIP_WHEELBASES = 0.3
+"""Distance by the wheels from which slip is judged; below, the errors of the poses are as large."""
+MAX_TURN_DEG = 8.0
+"""Difference between the turn by the wheels and by the images."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +63,6 @@ def judge(
     inliers: list[int],
     T_vehicle_left: RigidTransform,
     vehicle: Mapping[str, Any],
-    params: FaultMonitorParams,
 ) -> Verdict:
     """The first image of a leg that is beyond a threshold.
 
@@ -98,7 +76,8 @@ def judge(
     # Motions are those of the vehicle's middle, as the wheels report them, not of the camera, which a turn swings.
     there = [bool(np.isfinite(pose).all()) for pose in poses]
     key = RigidTransform.from_matrix(poses[0]) @ T_vehicle_left.inverse() if there[0] else RigidTransform.identity()
-    steepest = params.max_tilt * float(vehicle["max_slope_deg"])
+    # The body averages over its wheels, so it tilts less than the ground.
+    steepest = float(vehicle["max_slope_deg"])
     sensors = (("attitude", "inclinometer"), ("acceleration", "accelerometer"), ("slip", "wheel odometry"))
     for k in range(1, len(poses)):
         for (kind, sensor), values in zip(sensors, readings, strict=True):
@@ -109,35 +88,35 @@ def judge(
         tilt = math.degrees(math.acos(np.clip((T_vehicle_left.rotation @ readings.up[k])[2], -1.0, 1.0)))
         if tilt > steepest:
             return Verdict(k, "attitude", f"tilt of {tilt:.1f} degrees by the inclinometer, {steepest:.1f} permitted")
-        if readings.acceleration[k] > params.max_acceleration:
-            limit = f"{params.max_acceleration:g} permitted"
+        if readings.acceleration[k] > MAX_ACCELERATION:
+            limit = f"{MAX_ACCELERATION:g} permitted"
             return Verdict(
                 k, "acceleration", f"peak of {readings.acceleration[k]:.1f} m/s2 by the accelerometer, {limit}"
             )
         agree = inliers[k] if there[0] and there[k] else 0
-        if agree < params.min_landmarks:
-            few = f"{agree} landmarks agree with the pose, {params.min_landmarks} are needed"
+        if agree < MIN_LANDMARKS:
+            few = f"{agree} landmarks agree with the pose, {MIN_LANDMARKS} are needed"
             return Verdict(k, "lost", f"tracking is lost: {few}")
         moved = key.inverse() @ (RigidTransform.from_matrix(poses[k]) @ T_vehicle_left.inverse())
-        contradiction = _disagreement(readings.odometry[k], moved, float(vehicle["wheel_base"]), params)
+        contradiction = _disagreement(readings.odometry[k], moved, float(vehicle["wheel_base"]))
         if contradiction:
             return Verdict(k, "slip", contradiction)
     return Verdict(None, "", "")
 
 
-def _disagreement(wheels: Floats, moved: RigidTransform, base: float, params: FaultMonitorParams) -> str:
+def _disagreement(wheels: Floats, moved: RigidTransform, base: float) -> str:
     """In what way wheels and vision contradict each other, in words; empty: they do not."""
     turn = heading_of(moved)
     # The remainder, since headings jump by a full turn.
     apart = math.degrees(abs(math.remainder(turn - float(wheels[2]), 2 * math.pi)))
-    if apart > params.max_turn_deg:
-        return f"wheels and vision differ by {apart:.1f} degrees in heading, {params.max_turn_deg:g} permitted"
+    if apart > MAX_TURN_DEG:
+        return f"wheels and vision differ by {apart:.1f} degrees in heading, {MAX_TURN_DEG:g} permitted"
     way, seen = float(np.hypot(wheels[0], wheels[1])), float(np.linalg.norm(moved.translation))
     # Over a short way the error of vision is as large as the slip that is looked for.
-    if way < params.min_distance * base:
+    if way < MIN_SLIP_WHEELBASES * base:
         return ""
     slip = 1.0 - seen / way
-    if abs(slip) <= params.max_slip:
+    if abs(slip) <= MAX_SLIP_SHARE:
         return ""
     return f"slip of {slip:.0%}: {1000 * way:.0f} mm by the wheels, {1000 * seen:.0f} mm by vision"
 
@@ -152,7 +131,7 @@ def _relative(wheels: Floats) -> Floats:
 
 @stage("fault_monitor")
 def fault_monitor_stage(
-    params: FaultMonitorParams,
+    params: NoParams,
     sense: Bundle,
     resect: Bundle[ResectFacts],
     *,
@@ -169,7 +148,6 @@ def fault_monitor_stage(
         [int(f["inliers"]) for f in resect.meta["per_frame"]],
         T_vehicle_left,
         vehicle,
-        params,
     )
     frame = None if verdict.stop is None else int(resect.meta["per_frame"][verdict.stop]["frame"])
     return Bundle({}, {"stop": verdict.stop, "kind": verdict.kind, "reason": verdict.reason, "frame": frame})

@@ -41,30 +41,23 @@ SIDE_MARGIN_WHEELS = 0.5
 """Distance to either side of the wheels that is watched [wheel diameters]."""
 MODEL_RADIUS_WHEELS = 0.5
 """A point is compared with the greatest height of the model within this radius [wheel diameters]."""
+LEVEL = 1
+"""Pyramid level of the displacements: half the resolution."""
+BASELINE_WHEELS = 1.6
+"""Distance driven between the two compared images [wheel diameters]; larger: less noise."""
+MAX_TURN_DEG = 6.0
+"""Largest turn between two compared images; at 7 and 8 degrees points seemed to rise above ground that the model had
+right."""
+MIN_RISE_WHEELS, MIN_RISE_SIGMAS = 0.25, 2.0
+"""Rise over the model from which a point counts as raised [wheel diameters], and standard deviations of it."""
+MIN_POINTS, MIN_SHARE = 8, 0.35
+"""Raised points within one wheel diameter that are an obstacle, and their share of all points there."""
 
 
 class ObstacleMonitorParams(Params):
-    """Parameters of the stage ``obstacle_monitor``; lengths in wheel diameters suit any scale."""
+    """Parameters of the stage ``obstacle_monitor``."""
 
     enabled: bool = Field(True, description="whether the rover looks for obstacles between stops")
-    level: int = Field(1, ge=0, le=4, description="pyramid level of the displacements; 1: half the resolution")
-    baseline: float = Field(
-        1.6, gt=0, description="distance driven between the two compared images [wheel diameters]; larger: less noise"
-    )
-    max_turn_deg: float = Field(
-        6.0,
-        gt=0,
-        description="largest turn [degrees] between two compared images; at 7 and 8 degrees points seemed to rise "
-        "above ground that the model had right",
-    )
-    min_rise: float = Field(
-        0.25, gt=0, description="rise over the model from which a point counts as raised [wheel diameters]"
-    )
-    sigmas: float = Field(2.0, gt=0, description="standard deviations that a rise must exceed, too")
-    min_points: int = Field(
-        8, ge=1, description="raised points within one wheel diameter from which on they are an obstacle"
-    )
-    min_share: float = Field(0.35, ge=0, le=1, description="least share of raised points among all points there")
 
 
 @dataclass(frozen=True)
@@ -130,7 +123,6 @@ def look(
     camera: Camera,
     T_vehicle_left: RigidTransform,
     vehicle: Vehicle,
-    p: ObstacleMonitorParams,
 ) -> Points:
     """Compute the points that two images show ahead of the vehicle, and which of them rise above the model."""
     wheel = vehicle.wheel_diameter
@@ -165,7 +157,7 @@ def look(
     q = cells + t[:, None] * to_camera
     rise = q[:, 2] - surface.top_at(q[:, :2])
     noise = error / np.maximum(np.hypot(slope[:, 0], slope[:, 1]), 1e-9) * to_camera[:, 2]
-    raised = along & (rise > p.min_rise * wheel) & (rise > p.sigmas * noise) & np.isfinite(rise)
+    raised = along & (rise > MIN_RISE_WHEELS * wheel) & (rise > MIN_RISE_SIGMAS * noise) & np.isfinite(rise)
     place = T_vehicle_local.apply(q)[:, :2]
     return Points(place[along], rise[along], raised[along])
 
@@ -194,16 +186,16 @@ def _seen(view: ViewPair, cells: Floats, camera: Camera) -> tuple[NDArray[np.int
     return np.asarray(at[keep]), np.asarray(ground), np.asarray(centre)
 
 
-def obstacle(points: Points, wheel: float, p: ObstacleMonitorParams) -> Obstacle | None:
+def obstacle(points: Points, wheel: float) -> Obstacle | None:
     """The largest group of raised points within one wheel's diameter that counts; None: there is none."""
     raised = points.place[points.raised]
-    if len(raised) < p.min_points:
+    if len(raised) < MIN_POINTS:
         return None
     together, around = (
         scipy.spatial.KDTree(places).query_ball_point(raised, 0.5 * wheel, p=np.inf, return_length=True)
         for places in (raised, points.place)
     )
-    counts = (together >= p.min_points) & (together >= p.min_share * around)
+    counts = (together >= MIN_POINTS) & (together >= MIN_SHARE * around)
     if not counts.any():
         return None
     best = int(np.argmax(np.where(counts, together, -1)))
@@ -253,8 +245,8 @@ def obstacle_monitor_stage(
         column, row = np.asarray(motion["column_disparity"]), np.asarray(motion["row_disparity"])
         first, second = (RigidTransform.from_matrix(poses[k]) for k in (i, j))
         view = ViewPair(first, second, column, row, ok, int(motion.meta["level"]))
-        points = look(view, surface, camera, T_vehicle_left, vehicle, params)
-        group = obstacle(points, wheel, params)
+        points = look(view, surface, camera, T_vehicle_left, vehicle)
+        group = obstacle(points, wheel)
         if group is None:
             continue
         raised[j], where[j] = group.count, group.place
@@ -272,7 +264,7 @@ def obstacle_monitor_stage(
     return Bundle({"raised": raised, "where": where}, meta)
 
 
-def pairs(odometry: Floats, wheel: float, p: ObstacleMonitorParams) -> list[tuple[int, int]]:
+def pairs(odometry: Floats, wheel: float) -> list[tuple[int, int]]:
     """Which images of a leg are compared: each with the last one before that is a baseline of way behind it.
 
     ``odometry`` (frame, 3): x, y (m), heading (rad) by the wheels.
@@ -281,9 +273,9 @@ def pairs(odometry: Floats, wheel: float, p: ObstacleMonitorParams) -> list[tupl
     for j in range(1, len(odometry)):
         # From the latest backwards: the first image far enough behind is the most alike.
         for i in range(j - 1, -1, -1):
-            if math.degrees(abs(odometry[j, 2] - odometry[i, 2])) > p.max_turn_deg:
+            if math.degrees(abs(odometry[j, 2] - odometry[i, 2])) > MAX_TURN_DEG:
                 break
-            if math.hypot(*(odometry[j, :2] - odometry[i, :2])) >= p.baseline * wheel - 1e-9:
+            if math.hypot(*(odometry[j, :2] - odometry[i, :2])) >= BASELINE_WHEELS * wheel - 1e-9:
                 out.append((i, j))
                 break
     return out

@@ -17,21 +17,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from pydantic import Field
 
-from rille.stages.core.declare import Bundle, Params, stage
+from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.terrain import OverlapFacts, RadiometryFacts
 
 LOG_GAIN_STEP = 0.01
 """Step of log g: half a step is 0.6 of 128 grey values."""
 FADING_WEIGHT = 0.05
 """Weight of the second term: a lasting change fades by 1/e over sqrt(1 / FADING_WEIGHT) = 4.5 models of a chain."""
-
-
-class RadiometryParams(Params):
-    """Parameters of the stage ``radiometry``."""
-
-    level: bool = Field(True, description="level the exposures in the merged ortho image")
 
 
 def level(centres: Mapping[int, Sequence[float]], ratios: Sequence[tuple[int, int, float]]) -> dict[int, int]:
@@ -67,7 +60,7 @@ def level(centres: Mapping[int, Sequence[float]], ratios: Sequence[tuple[int, in
 
 @stage("radiometry")
 def radiometry_stage(
-    params: RadiometryParams, seams: Sequence[Bundle[OverlapFacts]], *, centres: Mapping[str, Sequence[float]]
+    params: NoParams, seams: Sequence[Bundle[OverlapFacts]], *, centres: Mapping[str, Sequence[float]]
 ) -> Bundle[RadiometryFacts]:
     """Factors that level the exposures of overlapping elevation models' grey values."""
     ratios = [
@@ -76,6 +69,6 @@ def radiometry_stage(
         for seam in bundle.meta["seams"]
         if seam["log_ratio"] is not None
     ]
-    steps = level({int(pair): centre for pair, centre in centres.items()}, ratios) if params.level else {}
+    steps = level({int(pair): centre for pair, centre in centres.items()}, ratios)
     steps_by_pair = {str(pair): n for pair, n in sorted(steps.items())}
     return Bundle({}, {"step": LOG_GAIN_STEP, "steps": steps_by_pair, "seams": len(ratios)})

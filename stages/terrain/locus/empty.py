@@ -1,4 +1,4 @@
-"""Why Locus found no cell at all: a surface behind the camera asks for another change than bad matches do."""
+"""Why Locus found no cell at all: a surface that the cameras do not see asks for another change than bad matches do."""
 
 from __future__ import annotations
 
@@ -8,9 +8,6 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.surface import Surface
-
-MIN_CELLS = 400
-"""Cells of a surface, 20 x 20, below which their size is the likely reason."""
 
 
 def explain(
@@ -30,14 +27,6 @@ def explain(
     feet, normals = surface.block(*pick)
     z = np.linspace(*z_range, 9)[:, None, None, None]
     points = T_surface_left.inverse().apply(feet + z * normals)
-    depth = points[..., 2]
-    if not (depth > 0).any():
-        return DegenerateError(
-            "RIL-387",
-            f"the reference surface lies behind the left camera: {depth.min():.3g} to {depth.max():.3g} m along its "
-            "optical axis",
-            remedy="check locus.extent (y is ahead), the vertical (world.up, world.pitch_deg), or T_surface_left",
-        )
     seen = [_inside(camera, p) for camera, p in ((rig.left, points), (rig.right, rig.T_right_left.apply(points)))]
     if not (seen[0] & seen[1]).any():
         left, right = (100.0 * float(s.any(axis=0).mean()) for s in seen)
@@ -45,28 +34,23 @@ def explain(
             "RIL-388",
             f"the cameras look away from the reference surface: the left one sees {left:.0f} %, the right one "
             f"{right:.0f} % of its cells, and no cell is seen by both",
-            remedy="check locus.extent, the vertical, the left/right order and T_right_left",
+            remedy="check locus.extent (y is ahead), the vertical (world.up, world.pitch_deg), the left/right order, "
+            "and T_right_left",
         )
-    count = int(usable.sum())
+    count, cells = int(usable.sum()), surface.rows * surface.cols
     if not count:
         return DegenerateError(
             "RIL-389",
             f"none of {usable.size} disparities is valid, so no elevation can be found",
             remedy="look at the disparity's validity: exposure, focus, left/right order; or raise locus.max_backmatch",
         )
-    cells = surface.rows * surface.cols
-    if cells < MIN_CELLS:
-        return DegenerateError(
-            "RIL-390",
-            f"no cell could be reconstructed, and there are {cells} only ({surface.rows} x {surface.cols}): they are "
-            "too coarse for what the cameras see",
-            remedy="lower locus.cell_size, or leave it out: then it follows from the rig",
-        )
     return DegenerateError(
         "RIL-391",
-        f"no cell could be reconstructed from {count} valid disparities of {usable.size}: they contradict the "
-        f"calibration, or lie outside of {z_range[0]:.4g} to {z_range[1]:.4g} m of elevation",
-        remedy="look at the rig's residuals in the report; or raise locus.max_residual or locus.max_sigma",
+        f"none of {cells} cells could be reconstructed from {count} valid disparities of {usable.size}: they "
+        f"contradict the calibration, or lie outside of {z_range[0]:.4g} to {z_range[1]:.4g} m of elevation, or the "
+        "cells are too coarse for what the cameras see",
+        remedy="look at the rig's residuals in the report; or raise locus.max_residual or locus.max_sigma, or lower "
+        "locus.cell_size",
     )
 
 

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rille.stages.driving.fault_monitor import FaultMonitorParams, Readings, Verdict, judge
+from rille.stages.driving.fault_monitor import Readings, Verdict, judge
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 OPTICAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 T_VEHICLE_LEFT = RigidTransform(rotation_exp([-0.5, 0.0, 0.0]) @ OPTICAL, np.array([0.0, 0.05, 0.18]))
 VEHICLE = {"max_slope_deg": 20.0, "wheel_base": 0.1}
-P = FaultMonitorParams()
 STEP = 0.025
 
 
@@ -39,7 +38,7 @@ def leg(n: int = 5, slip: float = 0.05, turn: float = 0.0) -> dict[str, Any]:
 def judged(**changes: Any) -> Verdict:
     given = leg() | changes
     readings = Readings(given["up"], given["acceleration"], given["odometry"])
-    return judge(readings, given["poses"], given["inliers"], T_VEHICLE_LEFT, VEHICLE, P)
+    return judge(readings, given["poses"], given["inliers"], T_VEHICLE_LEFT, VEHICLE)
 
 
 def test_a_leg_in_order_is_driven_to_its_end() -> None:

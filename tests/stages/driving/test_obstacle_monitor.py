@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import Validity
 from rille.stages.driving.obstacle_monitor import (
+    MIN_POINTS,
+    MIN_RISE_WHEELS,
     MODEL_RADIUS_WHEELS,
     LastModel,
     Obstacle,
@@ -31,7 +33,6 @@ ROVER = Vehicle(
     wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01
 )
 CAMERA = Camera(180.0, 180.0, 159.5, 119.5, 320, 240)
-P = ObstacleMonitorParams()
 HEIGHT, PITCH = 0.18, math.radians(32.0)
 OPTICAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 T_VEHICLE_LEFT = RigidTransform(rotation_exp([-PITCH, 0.0, 0.0]) @ OPTICAL, np.array([0.0, 0.05, HEIGHT]))
@@ -81,7 +82,7 @@ def surface(block: tuple[float, float, float, float] | None = None) -> LastModel
 
 
 def found(v: ViewPair, s: LastModel) -> Obstacle | None:
-    return obstacle(look(v, s, CAMERA, T_VEHICLE_LEFT, ROVER, P), ROVER.wheel_diameter, P)
+    return obstacle(look(v, s, CAMERA, T_VEHICLE_LEFT, ROVER), ROVER.wheel_diameter)
 
 
 @pytest.mark.parametrize("y1", [0.05, 0.075])
@@ -102,7 +103,7 @@ def test_a_block_that_the_model_knows_is_silent() -> None:
 
 
 def test_a_block_lower_than_the_threshold_is_silent() -> None:
-    low = (*BLOCK[:3], 0.5 * P.min_rise * ROVER.wheel_diameter)
+    low = (*BLOCK[:3], 0.5 * MIN_RISE_WHEELS * ROVER.wheel_diameter)
     assert found(view(0.0, 0.05, low), surface()) is None
 
 
@@ -111,7 +112,7 @@ def test_a_block_beside_the_way_is_not_watched() -> None:
 
 
 def test_rises_are_those_of_the_block() -> None:
-    points = look(view(0.0, 0.05, BLOCK, noise=0.0), surface(), CAMERA, T_VEHICLE_LEFT, ROVER, P)
+    points = look(view(0.0, 0.05, BLOCK, noise=0.0), surface(), CAMERA, T_VEHICLE_LEFT, ROVER)
     up = points.rise[points.raised]
     # level-1 pixels straddle the block's edges; on its top the rise is exact
     assert np.percentile(up, 90) == pytest.approx(BLOCK[3], abs=0.001)
@@ -128,15 +129,15 @@ def scattered(raised: int, flat: int, at: float = 0.2) -> Points:
 
 def test_too_few_never_count() -> None:
     wheel = ROVER.wheel_diameter
-    assert obstacle(scattered(P.min_points - 1, 0), wheel, P) is None
-    assert obstacle(scattered(8, 80), wheel, P) is None, "a tenth of what is seen there"
+    assert obstacle(scattered(MIN_POINTS - 1, 0), wheel) is None
+    assert obstacle(scattered(8, 80), wheel) is None, "a tenth of what is seen there"
 
 
 def test_the_largest_group_does_not_hide_a_surer_one() -> None:
     """Twelve of a hundred, and nine of twelve beside them."""
     parts = [scattered(12, 88), scattered(9, 3, 0.3)]
     both = Points(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("place", "rise", "raised")))
-    seen = obstacle(both, ROVER.wheel_diameter, P)
+    seen = obstacle(both, ROVER.wheel_diameter)
     assert seen is not None
     assert seen.count == 9
     assert seen.place[1] == pytest.approx(0.3, abs=0.01)
@@ -145,9 +146,9 @@ def test_the_largest_group_does_not_hide_a_surer_one() -> None:
 def test_images_are_compared_over_a_baseline_and_not_across_a_turn() -> None:
     wheel = ROVER.wheel_diameter
     way = np.array([[0.0, 0.025 * k, 0.0] for k in range(5)])
-    assert pairs(way, wheel, P) == [(0, 2), (1, 3), (2, 4)]
+    assert pairs(way, wheel) == [(0, 2), (1, 3), (2, 4)]
     way[3:, 2] = math.radians(20.0)
-    assert pairs(way, wheel, P) == [(0, 2)]
+    assert pairs(way, wheel) == [(0, 2)]
 
 
 def along_the_way(lost: int | None) -> Bundle:
@@ -169,7 +170,7 @@ def along_the_way(lost: int | None) -> Bundle:
         "motions": motions,
     }
     args = {"pairs": compared, "vehicle": ROVER.model_dump(mode="json"), "T_vehicle_left": T_VEHICLE_LEFT.to_list()}
-    return obstacle_monitor_stage.run(P, args, inputs)
+    return obstacle_monitor_stage.run(ObstacleMonitorParams(), args, inputs)
 
 
 def test_the_stage_says_where_it_stops_and_leaves_out_images_without_a_pose() -> None:

@@ -497,7 +497,7 @@ def test_stage_parameters_of_the_lattice() -> None:
     assert Lattice.from_dict(extent.meta["lattice"]) == Lattice.snap((-0.1, 0.1, 0.6, 0.9), 0.01)
     with raises("RIL-391"):
         stage.locus_stage.run(LocusParams(max_sigma=1e-6, extent=(-0.1, 0.1, 0.6, 0.9)), args, inputs)
-    with raises("RIL-387"):
+    with raises("RIL-388"):
         stage.locus_stage.run(LocusParams(cell_size=0.01, extent=(-0.3, 0.3, -5.0, -4.0)), args, inputs)
     with raises("RIL-356"):
         stage.locus_stage.run(LocusParams(cell_size=1e-5, extent=(-1, 1, 0, 1)), args, inputs)
