@@ -16,7 +16,6 @@ from typing import Annotated
 from rille.datasets.text.count import count
 from rille.pipeline.commands.options import COMPLETE, Work, cache_folder, flag
 from rille.pipeline.engine import memory
-from rille.pipeline.engine.estimate import Earlier, recall
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.memory import words
 from rille.pipeline.engine.plain import brief, some
@@ -77,7 +76,7 @@ def plan(
     budget = memory.budget(options.executor, memory_limit(options))
     jobs = memory.most_workers(options.executor, options.jobs)
     largest = max((needs for _, needs in memory.Estimates().planned(graph)), default=0.0)
-    lines = describe(graph, result, recall(store.hints(graph.sequence)), budget.workers(jobs, largest), verbose=verbose)
+    lines = describe(graph, result, budget.workers(jobs, largest), verbose=verbose)
     # The refusal comes last, so that the table stands above it and shows which task it is.
     for line in chain(lines, needs(graph, budget, jobs)):
         print(line)
@@ -101,7 +100,7 @@ def needs(graph: Graph, budget: memory.Budget, jobs: int) -> Iterable[str]:
             raise refused.at(handle.label)
 
 
-def describe(graph: Graph, result: Result, earlier: Earlier, workers: int, *, verbose: bool = False) -> Iterable[str]:
+def describe(graph: Graph, result: Result, workers: int, *, verbose: bool = False) -> Iterable[str]:
     """Lines of the plan: a table by stage with reasons, totals, and what it rests on."""
     by_stage: dict[str, list[Handle]] = defaultdict(list)
     for handle in graph.nodes:
@@ -113,7 +112,7 @@ def describe(graph: Graph, result: Result, earlier: Earlier, workers: int, *, ve
         yield f"{stage:19s} {len(handles) - len(planned):7d} {len(planned):7d}  {'; '.join(reasons)}".rstrip()
         if verbose:
             yield from (f"    {h.label}: {h.reason}" for h in planned)
-    yield from _totals(graph, result, earlier, workers)
+    yield from _totals(graph, result, workers)
 
 
 def _reasons(planned: list[Handle]) -> list[str]:
@@ -126,14 +125,14 @@ def _reasons(planned: list[Handle]) -> list[str]:
     return listed + ([f"an input is to be computed ({follow})"] if follow else [])
 
 
-def _totals(graph: Graph, result: Result, earlier: Earlier, workers: int) -> Iterable[str]:
+def _totals(graph: Graph, result: Result, workers: int) -> Iterable[str]:
     planned = [h for h in graph.nodes if h.status == "planned"]
     cached = len(graph.nodes) - len(planned)
     line = f"{len(graph.nodes)} tasks known: {cached} cached, {len(planned)} to do"
-    untimed = sorted({h.stage for h in planned if h.stage not in earlier})
-    work = sum(earlier.get(h.stage, (0.0, 0.0))[1] for h in planned)
-    if planned and len(untimed) < len({h.stage for h in planned}):
-        line += f", about {work / workers:.0f} s with {count(workers, 'worker')} by earlier runs"
+    timed = [h.earlier.seconds for h in planned if h.earlier is not None]
+    untimed = sorted({h.stage for h in planned if h.earlier is None})
+    if timed:
+        line += f", about {sum(timed) / workers:.0f} s with {count(workers, 'worker')} by earlier runs"
         line += f" (never timed: {', '.join(untimed)})" if untimed else ""
     yield line
     if result.assumed:

@@ -1,6 +1,7 @@
-"""Progress of a run on stderr: a bar with an estimate on a terminal, plain lines elsewhere, or nothing.
+"""Progress of a run on stderr: a bar on a terminal, plain lines elsewhere, or nothing.
 
-The estimate of the time left is that of :mod:`rille.pipeline.engine.estimate`.
+Both count the tasks that have ended, of those that are laid out by then: most are laid out on the way. The time that is
+left is estimated by rich, from the pace of the last half minute.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ import sys
 import time
 from typing import TYPE_CHECKING, TextIO
 
-from rille.pipeline.engine.estimate import Earlier, TimeEstimate
 from rille.pipeline.engine.plain import plain, raw
 from rille.stages.core.errors import ConfigError
 
@@ -19,10 +19,6 @@ if TYPE_CHECKING:
 
 INTERVAL = 5.0
 """Seconds between plain lines."""
-
-
-SLOW_COMPILE = 1.0
-"""Seconds of compilation from which on it is reported to the user."""
 
 
 def make(mode: str = "auto", stream: TextIO | None = None, *, verbose: bool = False) -> Progress:
@@ -39,21 +35,18 @@ def make(mode: str = "auto", stream: TextIO | None = None, *, verbose: bool = Fa
 
 
 class Progress:
-    """Receives the run's progress: keeps the account that others show, and says nothing."""
+    """Receives the run's progress: counts the tasks that have ended, and says nothing."""
 
     verbose = False
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stderr
         self.graph: Graph | None = None
-        self.estimate = TimeEstimate([], {}, 1)
-        self.seen = 0
         self.done = 0
 
-    def open(self, graph: Graph, earlier: Earlier, jobs: int) -> None:
-        """The run begins: begin the estimate with the tasks that are laid out; the graph may still grow."""
-        self.graph, self.seen = graph, len(graph.nodes)
-        self.estimate = TimeEstimate([h.stage for h in graph.nodes], earlier, max(jobs, 1))
+    def open(self, graph: Graph) -> None:
+        """The run of a graph begins; the graph may still grow."""
+        self.graph = graph
 
     def detail(self, text: str) -> None:
         """A word for who asks for more of them."""
@@ -64,13 +57,8 @@ class Progress:
         """A task was given to a worker."""
 
     def resolved(self, handle: Handle) -> None:
-        """The outcome of a node is known: count it, and what was laid out meanwhile."""
+        """The outcome of a node is known."""
         self.done += 1
-        if self.graph is not None:
-            for added in self.graph.nodes[self.seen :]:
-                self.estimate.added(added.stage)
-            self.seen = len(self.graph.nodes)
-        self.estimate.end(handle)
 
     def failed(self, label: str, error: BaseException) -> None:
         """A task or an expansion failed."""
@@ -88,9 +76,9 @@ class Progress:
 class Lines(Progress):
     """A line every few seconds, and one for each failure: for logs."""
 
-    def open(self, graph: Graph, earlier: Earlier, jobs: int) -> None:
+    def open(self, graph: Graph) -> None:
         """Begin the clock."""
-        super().open(graph, earlier, jobs)
+        super().open(graph)
         self.shown = time.monotonic()
 
     def resolved(self, handle: Handle) -> None:
@@ -99,10 +87,10 @@ class Lines(Progress):
         self._compiled(handle)
         if time.monotonic() - self.shown >= INTERVAL:
             self.shown = time.monotonic()
-            self._say(f"{self.done}/{self.total()} tasks, {handle.label} {handle.status}{to_go(self.estimate)}")
+            self._say(f"{self.done}/{self.total()} tasks, {handle.label} {handle.status}")
 
     def _compiled(self, handle: Handle) -> None:
-        if handle.took.compiling >= SLOW_COMPILE:
+        if handle.took.compiling >= 1.0:
             self._say(f"{handle.stage}: compiling, once: {handle.took.compiling:.0f} s")
 
     def failed(self, label: str, error: BaseException) -> None:
@@ -118,24 +106,19 @@ class Lines(Progress):
 
 
 class Bar(Lines):
-    """A bar that moves with the estimated work done."""
+    """A bar of the tasks that have ended."""
 
-    def open(self, graph: Graph, earlier: Earlier, jobs: int) -> None:
+    def open(self, graph: Graph) -> None:
         """Show the bar."""
         from rich.console import Console
-        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
         from rich.progress import Progress as RichProgress
 
-        super().open(graph, earlier, jobs)
-        columns = (
-            TextColumn("{task.fields[count]}"),
-            BarColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.description}"),
-        )
-        self.rich = RichProgress(*columns, console=Console(file=raw(self.stream)), transient=True)
-        self.task = self.rich.add_task("", total=None, count="")
-        self.begin = time.monotonic()
+        super().open(graph)
+        columns = MofNCompleteColumn(), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+        named = TextColumn("{task.description}", markup=False)
+        self.rich = RichProgress(*columns, named, console=Console(file=raw(self.stream)), transient=True)
+        self.task = self.rich.add_task("", total=None)
         self.rich.start()
 
     def running(self, handle: Handle) -> None:
@@ -149,15 +132,7 @@ class Bar(Lines):
         self._move(handle.label)
 
     def _move(self, label: str) -> None:
-        left = self.estimate.left()
-        gone = time.monotonic() - self.begin
-        self.rich.update(
-            self.task,
-            completed=gone,
-            total=None if left is None else gone + left,
-            count=f"{self.done}/{self.total()}",
-            description=plain(label) + to_go(self.estimate),
-        )
+        self.rich.update(self.task, completed=self.done, total=self.total(), description=plain(label))
 
     def close(self, result: Result) -> None:
         """Take the bar away."""
@@ -177,14 +152,3 @@ def summary(result: Result) -> str:
     parts += [f"{n} {what}" for what, n in (("planned", total.planned), ("failed", total.failed)) if n]
     parts += [f"{total.skipped} left out"] if total.skipped else []
     return f"{', '.join(parts)} in {result.seconds:.1f} s"
-
-
-def to_go(estimate: TimeEstimate) -> str:
-    """``, about 42 s left``; empty where nothing is known."""
-    left = estimate.left()
-    return "" if left is None else f", about {clock(left)} left"
-
-
-def clock(seconds: float) -> str:
-    """``42 s``, ``7 min``."""
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"

@@ -31,7 +31,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from rille.pipeline.engine import estimate, memory, provenance
+from rille.pipeline.engine import memory, provenance
 from rille.pipeline.engine.events import Ledger
 from rille.pipeline.engine.failures import translated
 from rille.pipeline.engine.graph import Expansion, Graph, Handle
@@ -199,8 +199,7 @@ class _Run:
         self.heals: Counter[int] = Counter()
         self.before: dict[int, str] = {}
         """Digests of artifacts that are computed again because they were damaged or gone, by number of the node."""
-        hints = store.hints(graph.sequence)
-        self.hints, self.known = hints, provenance.Known(hints, graph.choice)
+        self.known = provenance.Known(store.hints(graph.sequence), graph.choice)
         self.seen = 0
         """Nodes of a cut graph of which it is known whether they are wanted for themselves."""
         self._ask()
@@ -219,7 +218,6 @@ class _Run:
             self._close(kill=False)
             if not self.dry:
                 self.store.note(h.ref for h in self.graph.nodes if h.ref is not None)
-                estimate.remember(self.hints, self.progress.estimate)
         finally:
             self._count()
             if not self.dry:
@@ -237,7 +235,7 @@ class _Run:
             self.workers.close(kill=kill)
 
     def _loop(self, interrupts: Interrupts) -> None:
-        self.progress.open(self.graph, estimate.recall(self.hints), self.jobs)
+        self.progress.open(self.graph)
         self.store.survey(self.graph.sequence)
         while True:
             while self._take() or self._go_on():

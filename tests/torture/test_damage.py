@@ -39,11 +39,10 @@ KINDS = {
     "other chunk": "mask/c.0.0",
     "directory": "directory",
     "label": "hints/-/keys-.json",
-    "seconds": "hints/-/seconds.json",
     "index": "index.sqlite",
 }
 """Members of an artifact's file, and what is beside the artifacts."""
-HINTS = ("label", "seconds", "index")
+HINTS = ("label", "index")
 READ = ("manifest", "chunk")
 """Kinds that a task which reads ``values`` sees."""
 

@@ -5,7 +5,7 @@ Files in the cache folder::
     artifacts/<stage>/<k>/<key>.zarr.zip    an artifact, one file; <k> are the key's first two digits
     quarantine/<stage>-<key>-<unique>*      a damaged artifact, and the reason, set aside
     index.sqlite                            what artifacts state (rille.pipeline.engine.store.index)
-    hints/<sequence>/                       of its earlier runs, for explanations and estimates; never a matter
+    hints/<sequence>/                       of its earlier runs, for explanations and plans; never a matter
                                             of correctness
     roots/<digest>.json                     folders of runs that use the cache
 
@@ -67,7 +67,7 @@ class Store:
         self._index: Index | None = None
 
     def hints(self, sequence: str) -> Path:
-        """Folder of what earlier runs of a sequence leave for explanations and estimates."""
+        """Folder of what earlier runs of a sequence leave for explanations and plans."""
         # No name leads out of the folder.
         return self.root / "hints" / (quote(sequence, safe="").replace(".", "%2E") or "-")
 

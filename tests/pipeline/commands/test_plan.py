@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from toys.chain import build
 
 from rille.datasets.registry import open_sequence
 from rille.pipeline.commands import plan
-from rille.pipeline.engine import estimate
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow.closed_loop import dataflow
-from rille.pipeline.runs import session
-
-SECONDS = {"numbers": (1.0, 2.0), "scale": (1.0, 3.0), "total": (1.0, 1.0)}
 
 
 def lines(cache, *, verbose=False, sequence="", choice="", **changed):
@@ -23,7 +21,7 @@ def lines(cache, *, verbose=False, sequence="", choice="", **changed):
     build(graph, **changed)
     result = driver.run(graph, Store(cache), driver.RunOptions(dry=True))
     result.check()
-    return list(plan.describe(graph, result, SECONDS, 2, verbose=verbose))
+    return list(plan.describe(graph, result, 2, verbose=verbose))
 
 
 def compute(cache, *, sequence="", choice="", **kw):
@@ -35,15 +33,19 @@ def compute(cache, *, sequence="", choice="", **kw):
 def test_of_an_empty_cache_says_what_it_cannot_know(cache):
     told = lines(cache)
     assert told[1].split() == ["numbers", "0", "4", "never", "computed", "(4)"]
-    assert told[-2] == "4 tasks known: 0 cached, 4 to do, about 4 s with 2 workers by earlier runs"
+    assert told[-2] == "4 tasks known: 0 cached, 4 to do"
     assert told[-1].startswith("more tasks follow, known only after numbers/0, numbers/1, numbers/2")
 
 
-def test_the_time_is_that_of_the_workers_that_there_will_be(cache, monkeypatch, capsys):
-    monkeypatch.setattr(plan, "recall", lambda hints: {"mockup.scene": (1.0, 1.4)})
-    options = session.Work(assignments=("mockup.frames=2",), jobs=2, executor="inline", cache=cache)
-    plan.plan("mockup-short", options=options)
-    assert "s with 1 worker by earlier runs" in capsys.readouterr().out
+def test_the_time_is_that_of_earlier_results_over_the_workers_that_there_will_be(cache):
+    compute(cache)
+    graph = Graph()
+    build(graph, seed=1)
+    result = driver.run(graph, Store(cache), driver.RunOptions(dry=True))
+    for handle in graph.nodes:
+        handle.earlier = None if handle.stage == "total" else replace(handle.earlier, seconds=3.0)
+    told = list(plan.describe(graph, result, 2))
+    assert told[-2].endswith("9 to do, about 12 s with 2 workers by earlier runs (never timed: total)")
 
 
 def test_when_all_is_cached_nothing_is_to_do(cache):
@@ -69,11 +71,8 @@ def test_verbose_gives_each_task_its_reason(cache):
 
 def test_hints_belong_to_their_sequence(cache):
     compute(cache, sequence="long", frames=6)
-    store = Store(cache)
     assert lines(cache, sequence="short", frames=3, seed=1)[1].endswith("never computed (3)")
     assert lines(cache, sequence="long", frames=6, seed=1)[1].endswith("params.seed 0 -> 1 (6)")
-    assert estimate.recall(store.hints("long"))
-    assert estimate.recall(store.hints("short")) == {}
 
 
 def test_what_follows_is_laid_out_by_the_same_choice_of_frames_only(cache):

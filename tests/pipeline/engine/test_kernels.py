@@ -173,7 +173,7 @@ def test_a_run_says_what_it_compiled():
     stream = io.StringIO()
     shown = progress.Lines(stream)
     handle = Graph().node("toys.numbers", "n", NumbersParams(), {"frame": 0})
-    shown.open(Graph(), {}, 1)
+    shown.open(Graph())
     shown.resolved(handle)
     assert stream.getvalue() == ""
     handle.took = Took(compiling=31.2)
