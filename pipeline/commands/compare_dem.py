@@ -1,4 +1,4 @@
-"""``rille compare-dem A B``: figures, a picture and JSON of one elevation model against a reference."""
+"""``rille compare-dem A B``: figures and a raster of the differences of one elevation model from a reference."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
-from rasterio.crs import CRS
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -21,7 +20,7 @@ from rille.pipeline.commands.options import COMPLETE, RUNS, Output, Runs, flag
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.export.read_dem import DemFile, read_elevation, read_ortho
+from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
 from rille.pipeline.export.writers import ENGINEERING_CRS, Meaning, write_bands
 from rille.pipeline.runs import lookup
 from rille.stages.core.errors import InputError
@@ -42,14 +41,15 @@ def compare_dem(
     b: str,
     *,
     align: Literal["none", "shift", "tilt", "rigid", "place"] = "none",
-    changes: Annotated[bool, flag("List what rose or fell from B to A; writes OUTPUT.changes.tif, too.")] = False,
+    changes: Annotated[bool, flag("List what rose or fell from B to A.")] = False,
     output: Annotated[Path, Output] = Path("dem_comparison"),
     runs: Runs = RUNS,
 ) -> int:
     """Compare elevation model A with reference B: errors, completeness, error against range and slope.
 
     The finer one is brought to the coarser one's cells (means of the known cells inside, or bilinear between four known
-    ones); only cells that both know are compared. Prints the figures; writes OUTPUT.png and OUTPUT.json.
+    ones); only cells that both know are compared. Prints the figures; writes OUTPUT.json, and
+    the differences as OUTPUT.tif.
 
     Parameters
     ----------
@@ -80,21 +80,19 @@ def compare_dem(
     for line in figures["warnings"]:
         warn(line)
     _print(figures)
-    rasters: Mapping[str, NDArray[np.float32]] = {}
     coarse = other if one.cell <= other.cell * (1.0 + 1e-9) else one
+    rasters = {"difference": error.astype(np.float32)}
     if changes:
-        rasters, figures["changes"] = changed(one, other, error)
+        rasters["standard_deviation"], figures["changes"] = changed(one, other, error)
         print("\n".join(_change_table(figures["changes"])))
     # Either ending is understood as the name of both files.
-    target = output.with_name(output.name.removesuffix(".png").removesuffix(".json"))
+    target = output.with_name(output.name.removesuffix(".tif").removesuffix(".json"))
     with reported("RIL-614", f"{target} cannot be written", remedy="name others with -o", kind=InputError):
         atomic.write(target.with_name(target.name + ".json"), json.dumps(figures, indent=1, allow_nan=False) + "\n")
-        draw(target.with_name(target.name + ".png"), figures, error)
-        if rasters:
-            profile = {"driver": "COG", "crs": coarse.crs or None, "transform": coarse.transform}
-            meaning = Meaning("m", tags={"error": figures["error"]})
-            write_bands(target.with_name(target.name + ".changes.tif"), rasters, meaning, profile)
-    print(f"{target}.png  {target}.json" + (f"  {target}.changes.tif" if rasters else ""))
+        profile = {"driver": "COG", "crs": coarse.crs or None, "transform": coarse.transform}
+        meaning = Meaning("m", tags={"error": figures["error"]})
+        write_bands(target.with_name(target.name + ".tif"), rasters, meaning, profile)
+    print(f"{target}.tif  {target}.json")
     return COMPLETE
 
 
@@ -113,12 +111,7 @@ def check(a: DemFile, b: DemFile) -> None:
     InputError
         Their CRS differ, or their outlines do not overlap.
     """
-    if a.crs and b.crs and not same_crs(a.crs, b.crs):
-        raise InputError(
-            "RIL-615",
-            f"{a.name} is in {crs_name(a.crs)}, {b.name} in {crs_name(b.crs)}",
-            remedy="bring one to the other's system first, e.g. with gdalwarp -t_srs",
-        )
+    refuse_unlike_systems({a.name: a.crs, b.name: b.crs})
     x0, x1, y0, y1 = a.extent
     u0, u1, v0, v1 = b.extent
     if min(x1, u1) <= max(x0, u0) or min(y1, v1) <= max(y0, v0):
@@ -128,17 +121,6 @@ def check(a: DemFile, b: DemFile) -> None:
             f"y {v0:.6g}..{v1:.6g} m",
             remedy="compare models of the same place",
         )
-
-
-def same_crs(a: str, b: str) -> bool:
-    """Whether two systems (WKT, or as users write them) are one."""
-    own = crs_name(ENGINEERING_CRS)
-    return a == b or {crs_name(a), crs_name(b)} == {own} or CRS.from_user_input(a) == CRS.from_user_input(b)
-
-
-def crs_name(wkt: str) -> str:
-    """Name of a system (WKT)."""
-    return wkt.split('"')[1] if '"' in wkt else wkt
 
 
 def _grid(raster: DemFile) -> Grid:
@@ -196,8 +178,8 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
     return figures, error
 
 
-def changed(a: DemFile, b: DemFile, error: Floats) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:
-    """Rasters and list (JSON-able) of what rose or fell from B to A; ``error``: of :func:`measure`."""
+def changed(a: DemFile, b: DemFile, error: Floats) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    """Standard deviation of the ``error`` of :func:`measure`, and list (JSON-able) of what rose or fell from B to A."""
     grid = evaluation.common(_grid(a), _grid(b))[1]
     sigma = [
         np.zeros(error.shape) if one.sigma is None else evaluation.interpolate(_grid(one), grid.centres(), one.sigma)
@@ -221,8 +203,7 @@ def changed(a: DemFile, b: DemFile, error: Floats) -> tuple[dict[str, NDArray[np
         f"{dem_changes.SURE:g}; standard deviations of both models and of a shift by {dem_changes.SHIFT_CELLS:g} "
         "cells, scaled up where most differences spread more"
     )
-    rasters = {"difference": error.astype(np.float32), "standard_deviation": deviation.astype(np.float32)}
-    return rasters, {"total": total, "patches": rows, "how": how}
+    return deviation.astype(np.float32), {"total": total, "patches": rows, "how": how}
 
 
 def _change_table(changes: Mapping[str, Any]) -> Iterator[str]:
@@ -300,29 +281,3 @@ def _print(figures: dict[str, Any]) -> None:
 
 def _line(f: dict[str, float]) -> str:
     return "  ".join(f"{words} {1e3 * f[k]:.3g} mm" for k, words in WORDS.items() if k in f)
-
-
-def draw(path: Path, figures: dict[str, Any], error: Floats) -> None:
-    """Picture of the errors: map, histogram, and against range and slope."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 8.5), layout="constrained")
-    ((field, histogram), (by_range, by_slope)) = figure.subplots(2, 2)
-    most = 1e3 * max(figures["figures"]["p95"], 1e-9)
-    shown = field.imshow(1e3 * error, cmap="RdBu_r", vmin=-most, vmax=most, interpolation="nearest")
-    figure.colorbar(shown, ax=field, label="A - B, mm")
-    field.set(title="error (columns and rows of the common cells)", facecolor="0.85")
-    known = 1e3 * error[np.isfinite(error)]
-    histogram.hist(np.clip(known, -2 * most, 2 * most), bins=121, color="0.4")
-    histogram.set(xlabel="A - B, mm (the ends hold all beyond)", ylabel="cells")
-    histogram.set_title(_line(figures["figures"]).replace("  ", ", "), fontsize=8)
-    for axis, name, words in ((by_range, "by_range", "range, m"), (by_slope, "by_slope", "slope of B, degrees")):
-        bins = figures[name]["bins"]
-        middle = [0.5 * (k["from"] + k["to"]) for k in bins]
-        for key in ("rmse", "nmad", "p95", "bias"):
-            axis.plot(middle, [1e3 * k[key] for k in bins], "o-", label=WORDS[key])
-        axis.set(xlabel=words, ylabel="mm", title="" if bins else figures[name]["unit"])
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=8)
-    with atomic.replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110, metadata={"Software": None})

@@ -6,7 +6,6 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +17,6 @@ from rasterio.crs import CRS
 
 from rille.datasets.georeference import Georeference
 from rille.pipeline import api
-from rille.pipeline.commands.compare_dem import crs_name, same_crs
 from rille.pipeline.commands.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder
 from rille.pipeline.commands.run_terrain import Terrain
 from rille.pipeline.engine.failures import reported
@@ -27,7 +25,7 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.paths import write_path
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
-from rille.pipeline.export.read_dem import DemFile, read_elevation, read_ortho
+from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
 from rille.pipeline.export.writers import write_trajectory_tum
 from rille.pipeline.runs import lookup
 from rille.stages.core.arrays import Floats
@@ -36,7 +34,6 @@ from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.evaluation.place import Ortho, PlacedImage, place
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
 from rille.stages.terrain.map_localization import MIN_CHI2_GAP, GlobalMap, MapLocalizationParams, SearchArea, fix
-from rille.stages.terrain.shading import hillshade
 
 TURN_DEG = 20.0
 """Degrees to either side of a given heading that are searched."""
@@ -47,8 +44,6 @@ ORTHO_CELLS = 10.0
 FACTS = ("overlap", "rms", "explained", "cells", "independent")
 """Of a fit, for the JSON file."""
 NAMES = ("x_m", "y_m", "z_m", "about_x_deg", "about_y_deg", "yaw_deg")
-PICTURE_CELLS = 1500
-"""Cells of a map along either side of the picture."""
 
 
 @Parameter(name="*")
@@ -95,15 +90,14 @@ class Area:
 class Localization:
     """``pose`` T_map_world with its covariance (6, 6): position, m, and rotation, rad; infinite: not found.
 
-    ``doubt`` in words, empty where there is none; ``other`` x, y of the next best place, if any; ``about``: lines on
-    how it was found; ``facts`` on that for the JSON file.
+    ``doubt`` in words, empty where there is none; ``about``: lines on how it was found; ``facts`` on that for the JSON
+    file.
     """
 
     pose: RigidTransform
     covariance: Floats
     about: tuple[str, ...]
     facts: Mapping[str, Any]
-    other: Floats | None = None
     doubt: str = ""
 
     @property
@@ -134,8 +128,8 @@ def localize(
     """Find where the terrain of a run lies in an elevation model or an ortho image of a larger area.
 
     Prints the place of the run's world frame with standard deviations, and the next best place. If that fits nearly as
-    well, the answer is "ambiguous" and the exit status 3. Writes OUTPUT.json, OUTPUT.png and, unless it is ambiguous,
-    trajectory and path in the map's coordinates: OUTPUT.tum, OUTPUT.gpkg.
+    well, the answer is "ambiguous" and the exit status 3. Writes OUTPUT.json and, unless it is ambiguous, trajectory
+    and path in the map's coordinates: OUTPUT.tum, OUTPUT.gpkg.
 
     Parameters
     ----------
@@ -156,32 +150,23 @@ def localize(
     crs = next((wkt for wkt in systems.values() if wkt), "")
     if terrain.place is not None:
         systems[f"run {terrain.name}"] = CRS.from_user_input(terrain.place.crs).to_wkt(version="WKT2_2019")
-    _check_systems({name: wkt for name, wkt in systems.items() if wkt})
+    refuse_unlike_systems(systems)
     found, why = None, ""
     try:
         found = _found(terrain, model, image, around)
         why = found.doubt
     except DegenerateError as error:
         why = f"{error.code}: {error}"
-    target, written = output.with_name(output.name.removesuffix(".json").removesuffix(".png")), [".json", ".png"]
+    target, written = output.with_name(output.name.removesuffix(".json")), [".json"]
     facts = {"run": terrain.name, "dem": dem and str(dem), "ortho": ortho and str(ortho), "crs": crs}
     with reported("RIL-845", f"{target} cannot be written", remedy="name others with -o", kind=InputError):
         text = json.dumps({**facts, "ambiguous": bool(why), "why": why, **_facts(found)}, indent=1, allow_nan=False)
         atomic.write(target.with_name(target.name + ".json"), text + "\n")
-        _draw(target.with_name(target.name + ".png"), terrain, found, _background(model, image))
         if found is not None and not why:
             written += _export(folder, found, target, crs, Store(cache_folder(cache)))
     print("\n".join([f"ambiguous    {why}", *(found.about if found else ())] if why else _lines(found, crs)))
     print("wrote        " + "  ".join(f"{target}{ending}" for ending in written))
     return HOLES if why else COMPLETE
-
-
-def _check_systems(systems: Mapping[str, str]) -> None:
-    for first, name in pairwise(systems):
-        if not same_crs(systems[first], systems[name]):
-            text = f"{first} is in {crs_name(systems[first])}, {name} in {crs_name(systems[name])}"
-            remedy = "bring the map to the other's system first, e.g. with gdalwarp -t_srs"
-            raise InputError("RIL-848", text, remedy=remedy)
 
 
 def _found(terrain: Terrain, model: DemFile | None, image: Ortho | None, around: SearchArea | None) -> Localization:
@@ -266,7 +251,7 @@ def _by_elevations(terrain: Terrain, model: DemFile, around: SearchArea | None) 
     )
     pose, both = to_map @ placed.pose, np.kron(np.eye(2), to_map.rotation)
     facts = {name: value for name, value in placed.facts().items() if name in FACTS}
-    doubt, other, rival = "", None, "no other place"
+    doubt, rival = "", "no other place"
     if placed.other is not None:
         other, chi2 = to_map.apply([*placed.other[0][:2], 0.0])[:2], placed.other[1]
         facts["other"] = {"x_m": other[0], "y_m": other[1], "chi2": chi2, "wanted": MIN_CHI2_GAP}
@@ -278,7 +263,7 @@ def _by_elevations(terrain: Terrain, model: DemFile, around: SearchArea | None) 
         f"terrain; RMS {placed.rms:.3g} m, {max(placed.explained, 0.0):.0%} of the relief explained",
         f"ambiguity    {rival}",
     )
-    return Localization(pose, both @ placed.covariance @ both.T, about, facts, other, doubt)
+    return Localization(pose, both @ placed.covariance @ both.T, about, facts, doubt)
 
 
 def _facts(found: Localization | None) -> dict[str, Any]:
@@ -327,56 +312,3 @@ def _export(folder: Path, found: Localization, target: Path, crs: str, store: St
         write_path(target.with_name(target.name + ".gpkg"), moved, frame)
         written.append(".gpkg")
     return written
-
-
-def _background(model: DemFile | None, image: Ortho | None) -> Ortho:
-    """Picture of a map, thinned out."""
-    if model is None:
-        assert image is not None
-        picture = image
-    else:
-        t = model.transform @ Affine.translation(0.5, 0.5)
-        shade = hillshade(model.values, model.cell)
-        picture = Ortho(shade, shade > 0, np.array([[t.a, t.b, t.c], [t.d, t.e, t.f]]))
-    step = math.ceil(max(picture.grey.shape) / PICTURE_CELLS)
-    matrix = picture.matrix @ np.diag([step, step, 1.0])
-    return Ortho(picture.grey[::step, ::step], picture.known[::step, ::step], matrix)
-
-
-def _draw(path: Path, terrain: Terrain, found: Localization | None, background: Ortho) -> None:
-    """The whole map with the place, and, enlarged, the map and the run's terrain laid on it."""
-    from matplotlib.figure import Figure
-    from matplotlib.transforms import Affine2D
-
-    def show(axis: Any, picture: Ortho, **how: Any) -> None:
-        shown = axis.imshow(np.where(picture.known, picture.grey, np.nan), interpolation="nearest", **how)
-        shown.set_transform(Affine2D(np.vstack([picture.matrix, [0, 0, 1]])) + axis.transData)
-
-    figure = Figure(figsize=(15, 5.2), layout="constrained")
-    whole, here, laid = axes = figure.subplots(1, 3)
-    rows, cols = background.grey.shape
-    low, high = np.percentile(background.grey[background.known], (1, 99))
-    corners = background.matrix @ [[-0.5, cols, -0.5, cols], [-0.5, -0.5, rows, rows], [1, 1, 1, 1]]
-    for axis, title in zip(axes, ("map", "map, enlarged", "the run's terrain laid on it"), strict=True):
-        show(axis, background, cmap="gray", vmin=low, vmax=high)
-        axis.set(title=title, aspect="equal", xlim=(corners[0].min(), corners[0].max()))
-        axis.set(xlabel="x, m", ylabel="y, m", ylim=(corners[1].min(), corners[1].max()))
-    if found is not None:
-        x0, x1, y0, y1 = terrain.lattice.bounds
-        outline = found.pose.apply([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0], [x0, y0, 0]])[:, :2]
-        whole.plot(*outline.T, color="tab:orange", label="the run's terrain")
-        whole.plot(*found.pose.translation[:2], "o", color="tab:orange", label="its origin")
-        if found.other is not None:
-            whole.plot(*found.other, "x", color="tab:blue", label="its origin, next best place")
-        whole.legend(fontsize=8)
-        shade, to_map = hillshade(terrain.elevation, terrain.lattice.cell), found.pose.rotation[:2, :2]
-        own = to_map @ terrain.image.matrix + np.column_stack([np.zeros((2, 2)), found.pose.translation[:2]])
-        show(laid, Ortho(shade, shade > 0, own), cmap="copper", zorder=3)
-        edge = 0.15 * float(np.ptp(outline, axis=0).max())
-        least, most = outline.min(axis=0) - edge, outline.max(axis=0) + edge
-        for axis in (here, laid):
-            axis.set(xlim=(least[0], most[0]), ylim=(least[1], most[1]))
-    if found is None or found.doubt:
-        figure.suptitle("no place is found" if found is None else "AMBIGUOUS: one of several places", color="tab:red")
-    with atomic.replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110, metadata={"Software": None})

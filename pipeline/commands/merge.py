@@ -13,12 +13,12 @@ import numpy as np
 
 from rille.datasets.georeference import Georeference
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.compare_dem import same_crs
 from rille.pipeline.commands.options import COMPLETE, RUNS, Output, Run, Runs
 from rille.pipeline.commands.run_terrain import Terrain
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.export.read_dem import refuse_unlike_systems
 from rille.pipeline.export.writers import Meaning, write_raster
 from rille.pipeline.runs import lookup
 from rille.stages.core.arrays import Floats
@@ -130,9 +130,7 @@ def _registered(first: Terrain, other: Terrain) -> Session:
         )
     a, b = first.place, other.place
     if a is not None and b is not None:
-        if not same_crs(a.crs, b.crs):
-            text = f"{other.name} is in {b.crs}, {first.name} in {a.crs}"
-            raise InputError("RIL-852", text, remedy="state the georeferences of both sequences in one system")
+        refuse_unlike_systems({other.name: b.crs, first.name: a.crs})
         how, start, rough = "georeferences", _in_system(a).inverse() @ _in_system(b), np.zeros(3)
     else:
         placed = place.place(other.image, first.image)

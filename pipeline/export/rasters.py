@@ -1,9 +1,8 @@
-"""Rasters of the merged terrain and of its hazards, with the styles by which QGIS shows them."""
+"""Rasters of the merged terrain and of its hazards."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.export import colour, ranges
+from rille.pipeline.export import colour
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView, part
 from rille.pipeline.export.writers import ON_PLANE, Meaning, write_raster
@@ -95,17 +94,9 @@ def write_ortho(path: Path, tiles: Tiles, run: RunView, place: Place = None) -> 
     write_raster(path, bands, lattice, Meaning(nodata=0), place)
 
 
-def _write_dem_style(path: Path, tiles: Tiles, place: Place = None) -> None:
-    low, high = ranges.ground_limits(_height(tiles, place)[1])
-    atomic.write(path, dem_style(low, high))
-
-
 CLASSES = {"safe": "#a6d7c3", "caution": "#f0d68a", "hazard": "#c8501e", "unknown (never entered)": "#8d8f98"}
 """Names and colours of the classes 0, 1, 2 and 3, distinct for colour-blind eyes; in grey, what may be driven on is
 light, hazards dark, unknown medium."""
-
-ELEVATIONS = ("#00224e", "#1a386f", "#434e6c", "#61656f", "#7d7c78", "#9b9476", "#bcae6c", "#dec958", "#fee838")
-"""Colours from the lowest elevation to the highest (matplotlib's cividis)."""
 
 SIGNIFICANT_BITS = 12
 """Significant bits of a written measure: 0.02 %, finer than any is known."""
@@ -156,29 +147,6 @@ def rounded(values: NDArray[np.float32], bits: int) -> NDArray[np.float32]:
     return np.asarray(np.ldexp(np.rint(mantissa * scale) / scale, exponent), dtype=np.float32)
 
 
-def dem_style(low: float, high: float) -> str:
-    """QGIS style of elevations, in metres."""
-    # Heights above the sea need more digits than six to tell the steps of a low relief apart.
-    digits = max(6, 4 + math.ceil(math.log10(max(abs(low), abs(high)) / (high - low))))
-    values = [f"{low + (high - low) * k / (len(ELEVATIONS) - 1):.{digits}g}" for k in range(len(ELEVATIONS))]
-    items = "".join(
-        f'<item value="{value}" label="{value}" color="{colour}" alpha="255"/>\n'
-        for value, colour in zip(values, ELEVATIONS, strict=True)
-    )
-    first, last = values[0], values[-1]
-    # clip 0: what lies beyond the range takes its end colours; 1 would leave it out.
-    return (
-        "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
-        '<qgis version="3.22" styleCategories="Symbology" hasScaleBasedVisibilityFlag="0">\n<pipe>\n'
-        f'<rasterrenderer type="singlebandpseudocolor" opacity="1" classificationMin="{first}" '
-        f'classificationMax="{last}" band="1" alphaBand="-1" nodataColor="">\n'
-        "<minMaxOrigin><limits>None</limits></minMaxOrigin>\n<rastershader>\n"
-        f'<colorrampshader colorRampType="INTERPOLATED" clip="0" minimumValue="{first}" maximumValue="{last}">\n'
-        f"{items}</colorrampshader>\n</rastershader>\n</rasterrenderer>\n"
-        '<rasterresampler maxOversampling="2"/>\n</pipe>\n<blendMode>0</blendMode>\n</qgis>\n'
-    )
-
-
 def _terrain(run: RunView) -> dict[str, Any]:
     """Merged terrain and its place: a hole in the run must not look like unknown terrain."""
     return {"tiles": run.products.world_tiles, "place": run.sequence.georeference}
@@ -205,7 +173,6 @@ def _of_risk(name: str, what: str, write: Callable[..., None]) -> Output:
 
 OUTPUTS = (
     _of_terrain("dem.tif", "merged elevation, m, NaN undefined", _raster("elevation", "m", _height)),
-    Output("dem.qml", "colours of dem.tif, which QGIS applies by itself", "QGIS", _write_dem_style, _terrain),
     _of_terrain("dem_sigma.tif", "standard deviation of the elevation, m", _raster("elevation_std", "m", _sigma)),
     _of_terrain("slope.tif", "inclination of the terrain, degrees", _raster("slope", "degree", _slope)),
     _of_terrain("hillshade.tif", "shaded relief of the terrain", _write_hillshade),

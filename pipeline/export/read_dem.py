@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from rille.datasets.text.reading import TABLE, Search, read_lines, read_text
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.memory import free, words
 from rille.pipeline.export.foreign_raster import open_raster
+from rille.pipeline.export.writers import ENGINEERING_CRS
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation.place import Ortho
 
@@ -227,6 +229,34 @@ def _metric_crs(path: Path, crs: Any) -> None:
     unit, factor = crs.linear_units_factor if crs.is_projected else ("metre", 1.0)
     if factor != 1.0:
         raise InputError("RIL-634", f"{path} has coordinates in {unit} of {factor:.6g} m", remedy="give one in metres")
+
+
+def crs_name(wkt: str) -> str:
+    """Name of a system (WKT)."""
+    return wkt.split('"')[1] if '"' in wkt else wkt
+
+
+def refuse_unlike_systems(stated: Mapping[str, str]) -> None:
+    """Refuse models and images that are in unlike systems.
+
+    Parameters
+    ----------
+    stated : system of each by its name, WKT or as users write it; empty where it states none.
+
+    Raises
+    ------
+    InputError
+        Two systems differ.
+    """
+    from rasterio.crs import CRS
+
+    own = crs_name(ENGINEERING_CRS)
+    for (a, first), (b, second) in pairwise((name, crs) for name, crs in stated.items() if crs):
+        names = crs_name(first), crs_name(second)
+        if first != second and set(names) != {own} and CRS.from_user_input(first) != CRS.from_user_input(second):
+            text = f"{a} is in {names[0]}, {b} in {names[1]}"
+            remedy = "bring one to the other's system first, e.g. with gdalwarp -t_srs"
+            raise InputError("RIL-615", text, remedy=remedy)
 
 
 def _of_run(path: Path) -> DemFile:

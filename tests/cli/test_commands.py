@@ -331,9 +331,9 @@ def test_compare_dem(place: Place, tmp_path: Path) -> None:
     for path in tmp_path.glob("named.*"):
         path.unlink()
     assert (first.status, first.err) == (0, "")
-    assert first.last == "dem_comparison.png  dem_comparison.json"
+    assert first.last == "dem_comparison.tif  dem_comparison.json"
     found = contents(tmp_path)
-    assert set(found) == {"dem_comparison.png", "dem_comparison.json"}
+    assert set(found) == {"dem_comparison.tif", "dem_comparison.json"}
     assert "RMSE 0 mm" in first.out
     assert place.rille("compare-dem", first_run, last_run / "dem.tif", folder=tmp_path) == first
     assert contents(tmp_path) == found

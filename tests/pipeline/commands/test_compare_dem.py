@@ -44,16 +44,11 @@ def test_a_lifted_run_against_its_own_raster(tmp_path: Path, capsys: pytest.Capt
     far = np.linalg.norm(LATTICE.xy() - [0.0, 1.0], axis=-1)[np.isfinite(elevation())].max()
     assert found["by_range"]["bins"][-1]["to"] == pytest.approx(far, rel=1e-6)
     assert "before" not in capsys.readouterr().out
-    assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
+    with rasterio.open(tmp_path / "out.tif") as file, rasterio.open(run / "dem.tif") as dem:
+        assert file.transform == dem.transform
+        assert np.nanmedian(file.read(1)) == pytest.approx(0.25, abs=1e-6)
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One picture in this file is enough."""
-    monkeypatch.setattr(compare_dem, "draw", lambda *_: None)
-
-
-@pytest.mark.usefixtures("undrawn")
 def test_a_coarse_raster_of_another_program(tmp_path: Path) -> None:
     x0, x1, _, y1 = LATTICE.bounds
     centres = np.stack(np.meshgrid(x0 + 0.1 + 0.2 * np.arange(17), y1 - 0.1 - 0.2 * np.arange(15)), axis=-1)
@@ -69,7 +64,6 @@ def test_a_coarse_raster_of_another_program(tmp_path: Path) -> None:
     assert "states no CRS" in found["warnings"][0]
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_whole_numbers_with_a_scale_are_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Models of planets come so: 16 bits of millimetres above a datum."""
     z = 100.0 + 0.001 * np.arange(1200.0).reshape(30, 40)
@@ -91,7 +85,6 @@ def grid(path: Path, values: np.ndarray, cell: float, x0: float, y0: float) -> P
     return path
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_an_ascii_grid_is_as_good_as_a_tiff(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     x0, _, y0, y1 = LATTICE.bounds
     z = elevation()
@@ -116,10 +109,9 @@ def coarse_cells(found: dict) -> int:
     return int(found["b"]["rows"] * found["b"]["cols"])
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_alignment_is_told_and_never_silent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     a, b = finished(tmp_path / "a", lift=0.25), finished(tmp_path / "b")
-    compare(a, b, align="tilt", output=tmp_path / "out.png")
+    compare(a, b, align="tilt", output=tmp_path / "out.tif")
     found = json.loads((tmp_path / "out.json").read_text())
     assert found["alignment"]["motion_of_a"]["z_m"] == pytest.approx(-0.25, abs=1e-6)
     assert set(found["alignment"]["motion_of_a"]) == {"z_m", "about_x_deg", "about_y_deg"}
@@ -130,7 +122,6 @@ def test_alignment_is_told_and_never_silent(tmp_path: Path, capsys: pytest.Captu
     assert "before  RMSE 250 mm" in printed
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_georeferenced_runs_compare_in_their_own_system(tmp_path: Path) -> None:
     a, b = finished(tmp_path / "a", PLACE, lift=0.5), finished(tmp_path / "b", PLACE)
     compare(a, b, output=tmp_path / "out")
@@ -173,7 +164,6 @@ def test_one_clear_line_for_what_cannot_be_compared(tmp_path: Path, capsys: pyte
     assert "too flat" not in refused(capsys, run, run, "--align", "nothing")
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_changes_are_listed_with_their_places_and_volumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(5)
     ground = 0.2 * rng.normal(size=(60, 80)).cumsum(0).cumsum(1) / 80 + 0.001 * rng.normal(size=(60, 80))
@@ -186,7 +176,7 @@ def test_changes_are_listed_with_their_places_and_volumes(tmp_path: Path, capsys
     assert (patches[0]["x_m"], patches[0]["y_m"]) == pytest.approx((103.5, 48.5), abs=0.05)
     assert patches[0]["volume_m3"] == pytest.approx(100 * 0.1**2 * 0.05, rel=0.05)
     assert "rose" in capsys.readouterr().out
-    with rasterio.open(tmp_path / "out.changes.tif") as file:
+    with rasterio.open(tmp_path / "out.tif") as file:
         assert file.descriptions == ("difference", "standard_deviation")
         assert file.read(1)[15, 35] == pytest.approx(0.05, abs=0.005)
     compare(before, before, changes=True, output=tmp_path / "same")

@@ -29,12 +29,6 @@ RASTERS = {
 }
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One picture in this file is enough."""
-    monkeypatch.setattr(localize, "_draw", lambda *_: None)
-
-
 def elevations(path: Path, raster: Affine, to_map: Affine = GROUND, noise: float = 0.005, **more: Any) -> Path:
     size = 80 if abs(raster.a) > 0.05 else 230
     x, y = centres(size, size, raster)
@@ -72,11 +66,9 @@ def test_a_run_is_found_in_a_map_that_is_turned_mirrored_or_as_fine(
     assert T.rotation == pytest.approx(true.rotation, abs=5e-3)
     row = np.loadtxt(out.with_suffix(".tum"))
     assert row[1:4] == pytest.approx(T.apply([0.1, 0.2, 0.3]))
-    assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     assert "UTM zone 33N" in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_flat_ground_has_no_place_and_no_trajectory_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -88,7 +80,6 @@ def test_flat_ground_has_no_place_and_no_trajectory_is_written(
     assert capsys.readouterr().out.startswith("ambiguous ")
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_a_start_bounds_the_search(tmp_path: Path) -> None:
     dem, folder, true = elevations(tmp_path / "map.tif", RASTERS["turned"]), made_run(tmp_path / "run", FRAME), truth()
     x, y, _ = true.translation
@@ -107,7 +98,6 @@ def image(path: Path, cell: float, to_map: Affine = GROUND) -> Path:
     return made_map(path, mean.astype(np.uint8), to_map @ raster, crs=UTM)
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_an_ortho_image_tells_x_y_and_yaw_and_bounds_the_elevations(tmp_path: Path) -> None:
     folder, true = made_run(tmp_path / "run", FRAME), truth()
     ortho = image(tmp_path / "ortho.tif", 0.04)
@@ -122,7 +112,6 @@ def test_an_ortho_image_tells_x_y_and_yaw_and_bounds_the_elevations(tmp_path: Pa
     assert facts(tmp_path / "both")["keypoints"] == found["keypoints"]
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_an_ortho_image_of_another_place_is_said_and_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -153,7 +142,7 @@ def test_input_that_is_no_map_is_one_line_each(tmp_path: Path) -> None:
         ("RIL-846", folder, dem, {"area": localize.Area(within=3.0)}),
         ("RIL-847", folder, dem, {"area": localize.Area("here")}),
         ("RIL-847", folder, dem, {"area": localize.Area("1,2,3,4")}),
-        ("RIL-848", elsewhere, dem, {}),
+        ("RIL-615", elsewhere, dem, {}),
         ("RIL-628", folder, unknown, {}),
         ("RIL-338", folder, small, {}),
         ("RIL-630", folder, placeless, {}),

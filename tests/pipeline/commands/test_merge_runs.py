@@ -87,7 +87,7 @@ def test_what_is_no_second_session_is_one_line_each(tmp_path: Path) -> None:
         ("RIL-849", a, a),
         ("RIL-327", a, b),
         ("RIL-851", a, coarse),
-        ("RIL-852", utm, other),
+        ("RIL-615", utm, other),
         ("RIL-323", utm, far),
     ):
         with raises(code):

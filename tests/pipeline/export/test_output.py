@@ -188,7 +188,7 @@ def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
     facts = catalogue.describe(names, whole)
     described = [o.name for o in catalogue.OUTPUTS if o.frame]
     assert list(facts["files"]) == described
-    assert set(described) | {"dem.qml", "risk.tif.aux.xml", "accuracy.json"} == set(names)
+    assert set(described) | {"risk.tif.aux.xml", "accuracy.json"} == set(names)
     assert {about["frame"] for about in facts["files"].values()} <= catalogue.FRAMES.keys()
     assert facts["frames"][4] == {"frame": 4, "name": "left004", "time": 4.0}
     assert facts["units"]["time"] == "frame number"

@@ -6,7 +6,6 @@ import csv
 import hashlib
 from dataclasses import replace
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pyogrio
@@ -20,7 +19,7 @@ from toys.finished import FRAMES, sequence, view
 from rille.datasets.georeference import Georeference
 from rille.pipeline.export.catalogue import describe
 from rille.pipeline.export.paths import write_path
-from rille.pipeline.export.rasters import dem_style, rounded
+from rille.pipeline.export.rasters import rounded
 from rille.pipeline.export.writers import (
     Meaning,
     write_raster,
@@ -177,15 +176,6 @@ def test_equal_paths_make_equal_files(tmp_path: Path) -> None:
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["path.gpkg"]
 
 
-def test_the_style_spans_the_elevations(tmp_path: Path) -> None:
-    (tmp_path / "dem.qml").write_text(dem_style(-1.0, 1.0))
-    style = ElementTree.parse(tmp_path / "dem.qml")
-    assert [float(e.get("value") or "nan") for e in style.findall(".//item")] == [-1.0 + k / 4 for k in range(9)]
-    shader = style.find(".//colorrampshader")
-    assert shader is not None
-    assert (shader.get("minimumValue"), shader.get("maximumValue")) == ("-1", "1")
-
-
 def test_tables_leave_empty_what_is_not_known(tmp_path: Path) -> None:
     write_table(
         tmp_path / "a.csv", {"frame": [1, 2], "name": ["a,b", "c"], "x_m": [0.25, float("nan")], "y": [None, 3]}
@@ -217,9 +207,3 @@ def test_only_what_was_written_is_described() -> None:
     assert placed["files"]["trajectory.tum"]["frame"] == "world"
     assert facts["files"]["dem.tif"]["frame"] == "world"
     assert placed["georeference"]["origin"] == [1.0, 2.0, 3.0]
-
-
-def test_the_style_of_a_low_relief_high_above_the_sea_has_distinct_steps() -> None:
-    style = ElementTree.fromstring(dem_style(1834.50, 1834.52))
-    values = [float(item.attrib["value"]) for item in style.iter("item")]
-    np.testing.assert_allclose(np.diff(values), 0.02 / 8, rtol=0.02)
