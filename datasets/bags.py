@@ -47,9 +47,6 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 INFO, IMU, ODOMETRY = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
 FRAMES = "/tf_static"
 
-LONGEST_GAP = 0.5
-"""s; odometry is interpolated over no longer gap."""
-
 
 @dataclass(frozen=True)
 class TakenImage:
@@ -300,7 +297,8 @@ def _movement(
         topic, messages, T_base_left = found
         stamps = seconds([_stamp(m) for m in messages], f"{path} {topic}", unit="ns")
         timed = TimedPoses(stamps, tuple(_pose(m.pose.pose.position, m.pose.pose.orientation) for m in messages), topic)
-        between = interpolate(timed, times, LONGEST_GAP)
+        # s; odometry is interpolated over no longer gap
+        between = interpolate(timed, times, 0.5)
         odometry = tuple(None if T is None else T @ T_base_left for T in between)
     return inertial, odometry, warnings
 

@@ -32,13 +32,6 @@ from rille.stages.geometry.geometry import RigidTransform
 TRUTH: Mapping[str, bool] = {"state_groundtruth_estimate0": True, "gt": True, "mocap0": True, "vicon0": False}
 """Folders of true poses, the best first, and whether they are those of the body where no ``T_BS`` is stated."""
 
-TRUTH_GAP = 0.15
-"""s; truth is interpolated over no longer gap: at 5 m/s^2 the straight line is then 1.4 cm off at most."""
-
-ROOM = {"locus.cell_size": 0.05}
-"""Drones and hands carry short baselines through rooms and halls: 3 m away, 0.2 px of disparity are 4 cm of depth at
-0.11 m, so that finer cells stay empty. No vehicle, and no rule for the choice of pairs, suits them all."""
-
 FORMS = (("FOLDER", "EuRoC: mav0/cam0, mav0/cam1, each with sensor.yaml and data; imu0, state_groundtruth_estimate0"),)
 """What a user may give."""
 
@@ -62,6 +55,8 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
     truth, imu, warnings = sensors(folder)
     listed = (folder / "cam0" / "data.csv").is_file()
     stamped = all(stamp_of(image.stem) for image in (folder / "cam0" / "data").iterdir())
+    # Drones and hands carry short baselines through rooms and halls: 3 m away, 0.2 px of disparity are 4 cm of depth
+    # at 0.11 m, so that finer cells stay empty. No vehicle, and no rule for the choice of pairs, suits them all.
     manifest = Manifest(
         name=derived_name(folder.parent.name if folder.name == "mav0" else folder.name),
         images=Images(left="cam0/data/*", right="cam1/data/*", pair="nearest" if stamped else "auto"),
@@ -69,7 +64,7 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
         times=Times(file="cam0/data.csv") if listed else Times(names=True),
         truth=truth,
         imu=imu,
-        defaults=ROOM,
+        defaults={"locus.cell_size": 0.05},
     )
     sequence = open_described(manifest, folder, str(folder), digests)
     return replace(sequence, warnings=(*sequence.warnings, *warnings))
@@ -91,10 +86,11 @@ def sensors(folder: Path) -> tuple[Truth | None, Imu | None, list[str]]:
             warnings.append(warning("RIL-685", text))
         else:
             T_marker_left = T_body_left if T_body_marker is None else T_body_marker.inverse() @ T_body_left
+            # s; truth is interpolated over no longer gap: at 5 m/s^2 the straight line is then 1.4 cm off at most
             truth = Truth(
                 file=f"{name}/data.csv",
                 T_body_left=tuple(T_marker_left.to_list()),
-                max_gap=TRUTH_GAP,
+                max_gap=0.15,
                 source=f"{name}, interpolated to the images' times",
             )
     if (folder / "imu0" / "data.csv").is_file():

@@ -37,26 +37,8 @@ STEADY_FORCE = 0.2
 STEADY_RATE = 0.02
 """rad/s, likewise of the rate, where the sensor rests; rotors that idle shake it by 0.007."""
 
-LARGEST_BIAS = 0.15
-"""rad/s; the mean rate of a resting sensor. Cheap gyroscopes have 0.08, faster ones turn indeed."""
-
-FASTEST = 200.0
-"""rad/s; the fastest gyroscopes reach 70 (4000 degrees a second). A larger number is damage."""
-
-HARDEST = 5000.0
-"""m/s^2; accelerometers for shocks reach 500 times gravity."""
-
-SLOW = 0.15
-"""rad/s; while it turns faster, the mean force is not trusted: the sensor stands off the axis."""
-
 BIN = 0.1
 """s; means over it are free of vibration."""
-
-REST = 1.0
-"""s; shortest stretch that counts as rest."""
-
-ENOUGH_REST = 5.0
-"""s; more does not make a better bias, only an older one."""
 
 HALF_WINDOW = 1.0
 """s; the force is averaged over as much before and after a frame, at an end of the record over one side. In a drone's
@@ -131,8 +113,10 @@ def read_imu(path: Path) -> ImuRecord:
     rates, forces = table.numbers(gyro), table.numbers(accelerometer)
     if any("deg" in table.header[k] for k in gyro if table.header):
         rates = np.deg2rad(rates)
-    _possible(rates, FASTEST, "rad/s", table)
-    _possible(forces, HARDEST, "m/s^2", table)
+    # rad/s; the fastest gyroscopes reach 70 (4000 degrees a second). A larger number is damage.
+    _possible(rates, 200.0, "rad/s", table)
+    # m/s^2; accelerometers for shocks reach 500 times gravity
+    _possible(forces, 5000.0, "m/s^2", table)
     _plausible(rates, forces, table.name)
     return ImuRecord(np.array(times), rates, forces, table.name)
 
@@ -214,7 +198,8 @@ class Stretch:
         force = np.einsum("nij,nj->ni", turns, self.forces[chosen])
         mean = force.mean(axis=0)
         steady = bins(force, self.times[chosen]).std(axis=0).max() <= STEADY_FORCE
-        slow = np.linalg.norm(self.rates[chosen].mean(axis=0)) <= SLOW
+        # rad/s; while it turns faster, the mean force is not trusted: the sensor stands off the axis
+        slow = np.linalg.norm(self.rates[chosen].mean(axis=0)) <= 0.15
         return mean if steady and slow and abs(np.linalg.norm(mean) - GRAVITY) <= FORCE_MARGIN else None
 
 
@@ -286,17 +271,19 @@ def resting_bias(imu: ImuRecord, start: float, end: float) -> tuple[Floats | Non
     that of all rest the five seconds nearest to the frames count, which last from ``start`` to ``end``.
     """
     rate, force = bins(imu.rates, imu.times), bins(imu.forces, imu.times)
-    count = round(REST / BIN)
+    # s; shortest stretch that counts as rest
+    count = round(1.0 / BIN)
     if len(rate) < count:
         return None, (NO_BIAS,)
     rates, forces = (np.lib.stride_tricks.sliding_window_view(v, count, axis=0) for v in (rate, force))
     shaken = rates.std(axis=-1).max(axis=-1)
     mean = rates.mean(axis=-1)
+    # rad/s; the mean rate of a resting sensor. Cheap gyroscopes have 0.08, faster ones turn indeed.
     rest = (
         (shaken <= STEADY_RATE)
         & (forces.std(axis=-1).max(axis=-1) <= STEADY_FORCE)
         & (np.abs(np.linalg.norm(forces.mean(axis=-1), axis=-1) - GRAVITY) <= FORCE_MARGIN)
-        & (np.linalg.norm(mean, axis=-1) <= LARGEST_BIAS)
+        & (np.linalg.norm(mean, axis=-1) <= 0.15)
     )
     if not rest.any():
         return None, (NO_BIAS,)
@@ -307,7 +294,8 @@ def resting_bias(imu: ImuRecord, start: float, end: float) -> tuple[Floats | Non
         covered[k : k + count] = True
     times = bins(imu.times[:, None], imu.times)[covered, 0]
     away = np.maximum(start - times, 0) + np.maximum(times - end, 0)
-    nearest = np.argsort(away, kind="stable")[: round(ENOUGH_REST / BIN)]
+    # s; more does not make a better bias, only an older one
+    nearest = np.argsort(away, kind="stable")[: round(5.0 / BIN)]
     bias = np.median(rate[covered][nearest], axis=0)  # seconds at the ends of a rest may have some movement
     words = ", ".join(f"{v:.4f}" for v in bias)
     return bias, (f"gyroscope bias ({words}) rad/s from {len(nearest) * BIN:.1f} s of rest",)

@@ -37,9 +37,6 @@ ORDERED: Mapping[str, tuple[str, ...]] = {
     "euroc": ("time", *POSITION, *QUATERNION),
 }
 
-NORM = 0.01
-"""Of a quaternion, off 1: text keeps three digits at least; more is another column."""
-
 WITHIN = 1e-6
 """s; times that agree to this are the same."""
 
@@ -227,7 +224,8 @@ def _quaternions(table: TextTable, columns: Mapping[str, int]) -> Floats:
 
     q = table.numbers([columns[name] for name in ("qx", "qy", "qz", "qw")])
     norms = np.linalg.norm(q, axis=1)
-    bad = np.flatnonzero(np.abs(norms - 1) > NORM)
+    # Of a quaternion, off 1: text keeps three digits at least; more is another column
+    bad = np.flatnonzero(np.abs(norms - 1) > 0.01)
     if bad.size:
         k = int(bad[0])
         text = f"{table.name}, line {table.lines[k]}: a quaternion of length {norms[k]:.4g}"

@@ -45,10 +45,6 @@ MANIFEST_FORMS = (
 )
 
 
-ENTRY_POINTS = "rille.formats"
-"""Group of the modules by which installed packages add layouts of their own."""
-
-
 @cache
 def layouts() -> tuple[ModuleType, ...]:
     """Modules that open folders or files of a certain layout: those beside this one, then those of installed packages.
@@ -69,7 +65,8 @@ def _installed() -> list[ModuleType]:
     if site.ENABLE_USER_SITE:
         folders.append(site.getusersitepackages())
     distributions = metadata.distributions(path=list(dict.fromkeys(folders)))
-    points = (point for one in distributions for point in one.entry_points.select(group=ENTRY_POINTS))
+    # Group of the modules by which installed packages add layouts of their own
+    points = (point for one in distributions for point in one.entry_points.select(group="rille.formats"))
     return [point.load() for point in sorted(points, key=lambda point: (point.name, point.value))]
 
 

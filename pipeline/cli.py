@@ -48,9 +48,6 @@ COMMANDS = {
 }
 """Module and name of each command."""
 
-COLLECT_AFTER = 50_000
-"""New objects before Python's collector looks for unreachable cycles."""
-
 
 def _versions() -> str:
     """Version of the program, of what its results depend on, and the machine's kind; one a line."""
@@ -109,8 +106,9 @@ def _run(argv: list[str] | None) -> int:
     tokens, debug = [word for word in given if word != "--debug"], "--debug" in given
     try:
         prepare()
+        # New objects before Python's collector looks for unreachable cycles
         # By default the collector looks through all that is imported again and again, a tenth of the time of a start.
-        gc.set_threshold(COLLECT_AFTER)
+        gc.set_threshold(50_000)
         console = Console(file=raw(sys.stdout))  # of the help, which has colours
         chosen = program(listed=True) if tokens in ([], ["-h"], ["--help"]) else app
         code = chosen(tokens, console=console, exit_on_error=False, print_error=False, result_action="return_value")

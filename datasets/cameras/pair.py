@@ -9,13 +9,6 @@ from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, Rig, Sizes
 from rille.stages.geometry.lens import Lens
 
-LEAST_BASELINE = 1e-6
-"""Below this, in any unit of length in use, both cameras stand in one place."""
-
-SIDEWAYS = 0.5
-"""Share of the baseline along the left camera's columns from which it has a side (a vertical rig has none)."""
-
-
 SHORTEST, LONGEST = 0.005, 1000.0
 """Shares of an image's side between which a focal length is one: the angle of view is 179 or 0.06 degrees."""
 
@@ -71,11 +64,13 @@ def rig_of(
         )
     T_right_left = right.T_camera_reference @ left.T_camera_reference.inverse()
     rig = Rig(lenses["left"].ideal_camera(), lenses["right"].ideal_camera(), T_right_left)
-    if rig.baseline < LEAST_BASELINE:
+    # Below this, in any unit of length in use, both cameras stand in one place
+    if rig.baseline < 1e-6:
         text = f"cameras {left.name} and {right.name} stand in one place: the baseline is 0 m"
         raise InputError("RIL-129", text, remedy="give the baseline in metres, or the calibration of both cameras")
     to_the_right = float(T_right_left.inverse().translation[0])
-    if to_the_right < -SIDEWAYS * rig.baseline:
+    # A rig whose baseline is rather vertical has no sides.
+    if to_the_right < -0.5 * rig.baseline:
         raise InputError(
             "RIL-130",
             f"swapped cameras: the right camera {right.name} stands {-to_the_right:.4g} m to the left of the left "

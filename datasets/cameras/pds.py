@@ -18,9 +18,6 @@ from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from rille.datasets.text.reading import SMALL, open_regular
 from rille.stages.geometry.lens import Lens
 
-MOST_IMAGE = 2**31
-"""Bytes of a file whose label is read."""
-
 BEGINS = (b"PDS_VERSION_ID", b"ODL_VERSION_ID", b"CCSD3ZF", b"LBLSIZE=")
 END = re.compile(r"^END[ \t\r]*$", re.MULTILINE)
 GROUP = re.compile(r"^[ \t]*(?:GROUP|OBJECT)[ \t]*=[ \t]*\"?GEOMETRIC_CAMERA_MODEL[A-Z_]*\"?[ \t\r]*$", re.MULTILINE)
@@ -38,13 +35,11 @@ COUNTS = {"CAHV": 4, "CAHVOR": 6, "CAHVORE": 8}
 SKEW = 1e-6
 """Share of the focal length below which columns and rows are perpendicular."""
 
-UNIT_LENGTH = 1e-3
-"""By which A and O, as they are written, may miss it."""
-
 
 def attached(path: Path) -> str:
     """The label at the beginning of a file that is an image; empty where it has none."""
-    with open_regular(path, "calibration", MOST_IMAGE) as file:
+    # bytes; images with a label are large
+    with open_regular(path, "calibration", 2**31) as file:
         start = file.read(16)
         if not start.startswith(BEGINS):
             return ""
@@ -140,7 +135,8 @@ def _entries(text: str, path: Path) -> Fields:
 
 def _unit(f: Fields, key: str, vector: np.ndarray) -> np.ndarray:
     length = float(np.linalg.norm(vector))
-    if not abs(length - 1.0) < UNIT_LENGTH:
+    # By which A and O, as they are written, may miss it
+    if not abs(length - 1.0) < 1e-3:
         raise f.error("RIL-954", key, f"has the length {length:.6g}, it should be a unit vector")
     return np.asarray(vector / length)
 

@@ -24,28 +24,12 @@ Grey = NDArray[np.uint8]
 LEAST_SIDE = 3
 """Inner corners along a side, below which a pattern cannot be distinguished from clutter."""
 
-ABSURD_SQUARE = 1.0
-"""m; no printed board has squares as large: a length in millimetres or centimetres."""
-
 QUICK = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 THOROUGH = (
     cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE,
     cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE,
 )
 """Attempts: by squares, in hundredths of a second, and by the sectors about each corner, in tenths of one."""
-
-WINDOW = 0.25
-"""Half the side of the window about a corner, as a share of the corners' least spacing: clear of the next corner's
-edges, and as many pixels as that leaves. Half of it doubles the noise, twice of it meets the neighbours."""
-
-LEAST_CONTRAST = 0.1
-"""Between squares that touch, as a share of the range of all squares: print under a shadow keeps more."""
-
-MOST_BEND = 0.35
-"""Change from one step between corners to the next, as a share of their mean length. A board tilted by 45 degrees at
-three times its width, or seen through a wide lens, stays below 0.2; corners of clutter exceed 0.5."""
-
-SETTLED = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 
 
 def parse_corners(text: str) -> tuple[int, int]:
@@ -74,7 +58,8 @@ def board_points(corners: tuple[int, int], square: float) -> Floats:
     ConfigError
         ``square`` is not a plausible length in metres.
     """
-    if not 0 < square <= ABSURD_SQUARE:
+    # m; no printed board has squares as large: a length in millimetres or centimetres
+    if not 0 < square <= 1.0:
         guess = next((square / unit for unit in (100.0, 1000.0) if 0.005 <= square / unit <= 0.2), square / 1000.0)
         hint = f"; did you mean {guess:g}?" if square > 0 else ""
         raise ConfigError("RIL-152", f"--square {square:g} m is no side of a square", remedy=f"give it in metres{hint}")
@@ -138,7 +123,10 @@ def steady(points: AnyArray, corners: tuple[int, int]) -> bool:
         steps = np.diff(along, axis=0)
         length = np.linalg.norm(steps, axis=-1)
         bend = np.linalg.norm(np.diff(steps, axis=0), axis=-1)
-        if (bend > MOST_BEND * (length[1:] + length[:-1]) / 2).any():
+        # Change from one step between corners to the next, as a share of their mean length. A board tilted by 45
+        # degrees at three times its width, or seen through a wide lens, stays below 0.2; corners of clutter exceed
+        # 0.5.
+        if (bend > 0.35 * (length[1:] + length[:-1]) / 2).any():
             return False
     return True
 
@@ -153,18 +141,21 @@ def alternates(image: Grey, points: AnyArray, corners: tuple[int, int]) -> bool:
     bright = even if grey[even].mean() > grey[~even].mean() else ~even
     signed = np.where(bright, grey, -grey)  # the sum of two that touch is bright less dark
     steps = np.concatenate([(signed[1:] + signed[:-1]).ravel(), (signed[:, 1:] + signed[:, :-1]).ravel()])
-    return bool(steps.min() > LEAST_CONTRAST * np.ptp(grey))
+    # Between squares that touch, as a share of the range of all squares: print under a shadow keeps more
+    return bool(steps.min() > 0.1 * np.ptp(grey))
 
 
 def refine(image: Grey, points: AnyArray, corners: tuple[int, int]) -> Floats:
     """Corners (n, 2) moved to where all grey value gradients about them point past them."""
     grid = np.asarray(points).reshape(corners[1], corners[0], 2)
     spacing = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min()) for axis in (0, 1))
-    reach = int(np.clip(WINDOW * spacing, 2, 11))
+    # Half the side of the window about a corner, as a share of the corners' least spacing: clear of the next corner's
+    # edges, and as many pixels as that leaves. Half of it doubles the noise, twice of it meets the neighbours.
+    reach = int(np.clip(0.25 * spacing, 2, 11))
     start = np.array(grid, dtype=np.float32).reshape(-1, 1, 2)
-    return np.asarray(cv2.cornerSubPix(image, start, (reach, reach), (-1, -1), SETTLED), dtype=np.float64).reshape(
-        -1, 2
-    )
+    settled = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4
+    refined = cv2.cornerSubPix(image, start, (reach, reach), (-1, -1), settled)
+    return np.asarray(refined, dtype=np.float64).reshape(-1, 2)
 
 
 def same_order(left: Floats, right: Floats, corners: tuple[int, int]) -> Floats:

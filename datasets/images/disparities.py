@@ -26,14 +26,8 @@ from rille.stages.core.errors import InputError
 
 Sign = Literal["left-right", "right-left"]
 
-PNG_UNITS = 256
-"""Values of a 16-bit PNG a pixel."""
-
 NODATA = 42113
 """GDAL's TIFF tag: value of the pixels without data."""
-
-NPY = b"\x93NUMPY"
-"""How files of NumPy begin."""
 
 KINDS = "PFM, TIFF or npy of floating point (pixels), or 16-bit PNG (256 a pixel, 0 unknown)"
 
@@ -53,7 +47,8 @@ def decode(data: bytes, size: tuple[int, int], name: str) -> Floats32:
     """
     try:
         with catch_warnings(action="ignore"):
-            values = _numpy(data, size) if data.startswith(NPY) else _image(data, size)
+            # How files of NumPy begin
+            values = _numpy(data, size) if data.startswith(b"\x93NUMPY") else _image(data, size)
             values = values.astype(np.float32)
     except Exception as error:  # whatever the parser of a damaged file comes upon
         text = f"{name} cannot be read as a map of disparities: {' '.join(str(error).split())[:100]}"
@@ -86,8 +81,9 @@ def _image(data: bytes, size: tuple[int, int]) -> AnyArray:
         raise ValueError("it is of no kind that is read")
     coded = image.format == "PNG" and image.mode == "I;16"
     _check(image.size, size, coded or image.mode == "F")
+    # Values of a 16-bit PNG a pixel
     # PFM's rows, which run from the bottom, and the byte order in its sign are Pillow's business.
-    values = np.asarray(image, np.float32) / (PNG_UNITS if coded else 1)
+    values = np.asarray(image, np.float32) / (256 if coded else 1)
     if image.format == "TIFF" and NODATA in image.tag_v2:
         values[values == np.float32(image.tag_v2[NODATA].strip("\0 "))] = np.nan
     return values

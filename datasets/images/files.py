@@ -43,9 +43,6 @@ EXCHANGE = 'python -c "import sys, cv2; [cv2.imwrite(f, cv2.imread(f, -1).bytesw
 PNG, JPEG, TIFF = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", (b"II", b"MM")
 """How files begin."""
 
-PADDING = 16
-"""Bytes before a JPEG's end marker that are no damage: webcams pad their images."""
-
 _STDERR = threading.Lock()
 
 COLOUR = Array(
@@ -91,7 +88,8 @@ def _unpacked(data: bytes) -> tuple[NDArray[Any] | None, str]:
         aside.seek(0)
         said = aside.read().decode(errors="replace").strip()
     padding = re.fullmatch(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9", said)
-    return image, "" if padding and int(padding[1]) <= PADDING else said
+    # Bytes before a JPEG's end marker that are no damage: webcams pad their images
+    return image, "" if padding and int(padding[1]) <= 16 else said
 
 
 def _decoded(data: bytes) -> NDArray[Any] | None:

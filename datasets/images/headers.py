@@ -36,9 +36,6 @@ FORMATS = ("PNG", "JPEG", "TIFF", "PPM", "BMP")
 WIDTH, HEIGHT, BITS_PER_SAMPLE = 256, 257, 258
 """TIFF tags."""
 
-ORIENTATION = 0x0112
-"""EXIF's tag: 1 as stored, 3 upside down, 6 and 8 turned by a quarter, others mirrored."""
-
 
 def sizes_of(headers: Headers) -> Sizes:
     """Width and height of the left and of the right images, pixels."""
@@ -74,8 +71,9 @@ def orientation(image: Any) -> int:
     """EXIF's orientation of an image of Pillow; 1 where it states none."""
     # Of a damaged tag: whatever the parsers of three formats come upon.
     with catch_warnings(action="ignore"), suppress(Exception):
+        # EXIF's tag of the orientation: 1 as stored, 3 upside down, 6 and 8 turned by a quarter, others mirrored
         # Pillow decodes a whole PNG in search of what it does not have.
-        return int(image.getexif().get(ORIENTATION, 1)) if image.format != "PNG" or "exif" in image.info else 1
+        return int(image.getexif().get(0x0112, 1)) if image.format != "PNG" or "exif" in image.info else 1
     return 1
 
 

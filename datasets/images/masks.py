@@ -18,9 +18,6 @@ from rille.stages.core.arrays import Bools
 from rille.stages.core.declare import AnyArray, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
 
-LEAST_SHARE = 0.05
-"""Of the pixels that must stay: with fewer there is nothing to match."""
-
 
 def usable(mask: AnyArray) -> Bools:
     """Pixels (row, col) that a mask leaves: those brighter than half of its greatest value, whatever its scale."""
@@ -46,7 +43,8 @@ def masked(sequence: Sequence, digests: files.Digests) -> Sequence:
         if keep.shape != (camera.height, camera.width):
             text = f"{place} is {keep.shape[1]} x {keep.shape[0]} pixels, the images {camera.width} x {camera.height}"
             raise InputError("RIL-904", text, remedy="draw the mask on an image as the camera gave it")
-        if keep.mean() < LEAST_SHARE:
+        # Of the pixels that must stay: with fewer there is nothing to match
+        if keep.mean() < 0.05:
             text = f"{place} leaves {100 * keep.mean():.1f} % of the image"
             raise InputError("RIL-905", text, remedy="make bright what is to be used, and dark what is not")
         notes.append(f"a mask leaves out {100 * (1 - keep.mean()):.1f} % of the {side} images ({path.name})")

@@ -22,12 +22,6 @@ from rille.stages.imaging import levels
 FORMATS = ("JPEG", "TIFF", "PNG")
 """Pillow's names of formats that have tags, and may hold several images."""
 
-LOOKED_AT = 3
-"""Frames, spread over the sequence; `rille check` looks at all."""
-
-PART = 254
-"""TIFF's tag of images that are a smaller copy, or a mask, of another one."""
-
 BLOCK = 16
 """Cells of 2 x 2 pixels along a side of a block whose four phases are compared."""
 DEPARTS, SURELY = 0.03, 6.0
@@ -46,7 +40,8 @@ def examined(sequence: Sequence) -> Sequence:
         images a file.
     """
     there = [k for k in range(sequence.frames) if k not in sequence.lost]
-    chosen = there[:: max(1, -(-len(there) // LOOKED_AT))]
+    # Frames, spread over the sequence; `rille check` looks at all
+    chosen = there[:: max(1, -(-len(there) // 3))]
     sources = {camera: [sequence.image(k, camera) for k in chosen] for camera in CAMERAS}
     images = {camera: [image for source in of for image in _images(source)] for camera, of in sources.items()}
     _refuse_several(sources)
@@ -100,7 +95,8 @@ def _count(source: Source) -> int:
         size, count = image.size, getattr(image, "n_frames", 1)
         if count > 1:
             image.seek(1)
-        return count if image.size == size and not getattr(image, "tag_v2", {}).get(PART, 0) else 1
+        # TIFF's tag of images that are a smaller copy, or a mask, of another one
+        return count if image.size == size and not getattr(image, "tag_v2", {}).get(254, 0) else 1
     return 1
 
 

@@ -24,17 +24,11 @@ LONGEST_BASELINE = 20.0
 USUAL_VIEW_DEG = (5.0, 175.0)
 """degrees; horizontal angle of view."""
 
-OFF_CENTRE = 0.1
-"""Of the width: principal points lie nearer to the centre, unless images were scaled or cut after the calibration."""
-
 STREET = {"locus.cell_size": 0.1}
 """0.1 m resolves kerbs where the disparity does."""
 
 CAR = 0.3
 """m, baseline from which a rig is taken for a car's: of a smaller one the cells follow from what its pixels resolve."""
-
-SAME = 0.01
-"""Relative difference of two stated baselines that is no contradiction."""
 
 
 @dataclass(frozen=True)
@@ -194,7 +188,8 @@ def _placed(
     lines = []
     if stated is not None and of_files is not None:
         ours, theirs = (float(np.linalg.norm(T.translation)) for T in (stated, of_files))
-        if theirs > 0 and abs(ours - theirs) > SAME * theirs:
+        # Relative difference of two stated baselines that is no contradiction
+        if theirs > 0 and abs(ours - theirs) > 0.01 * theirs:
             text = f"baseline {ours:g} m of the manifest is used; the calibration file says {theirs:g} m"
             lines.append(warning("RIL-693", text))
     placed = replace(left, T_camera_reference=RigidTransform.identity())
@@ -242,7 +237,8 @@ def unusual(camera: Camera, side: str) -> list[str]:
         text = f"{side} camera: fx = {camera.fx:g} px gives an angle of view of {view:.3g} degrees; is it in pixels?"
         lines.append(warning("RIL-690", text))
     off = max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2)) / camera.width
-    if off > OFF_CENTRE:
+    # Of the width: principal points lie nearer to the centre, unless images were scaled or cut after the calibration
+    if off > 0.1:
         place = f"({camera.cx:g}, {camera.cy:g}) px is far from the centre of {camera.width} x {camera.height} images"
         lines.append(warning("RIL-689", f"{side} camera: principal point {place}: were images scaled or cut?"))
     if not 0.8 < camera.fx / camera.fy < 1.25:

@@ -16,9 +16,6 @@ from rille.datasets.text.names import derived_name
 NEEDED = "NEEDED"
 """Marks a line that must be filled in before the manifest opens."""
 
-TEMPLATE = "template.toml.jinja"
-"""File beside this module: the manifest with places for what was found."""
-
 
 def manifest_text(found: Findings, root: str) -> str:
     """Manifest as TOML; ``root`` is the folder relative to the manifest (or absolute)."""
@@ -28,7 +25,8 @@ def manifest_text(found: Findings, root: str) -> str:
         loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
     environment.filters["toml"] = _value
-    return environment.get_template(TEMPLATE).render(
+    # File beside this module: the manifest with places for what was found
+    return environment.get_template("template.toml.jinja").render(
         **vars(found),
         name=derived_name(found.folder.resolve().name),
         root=root,

@@ -29,9 +29,6 @@ TABLE = 100_000_000
 MOST_LINES = 1_000_000
 """Of a table; each becomes an object of some hundred bytes, and an IMU writes lines of a hundred characters."""
 
-LINE_ENDS = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"
-"""Where ``str.splitlines`` ends a line."""
-
 LONGEST_LINE = 10_000
 """Characters; a pose has 400. Parsers that look back take the square of it."""
 
@@ -51,8 +48,6 @@ LISTED = re.compile(r"\d,\d+,\s")
 SAMPLE = 200
 """Lines that show how a file writes its numbers."""
 
-MILLISECONDS = 10**12
-"""Stamps that are larger have no fraction."""
 POINTERS = (b"version https://git-lfs.github.com/spec/", b"/annex/objects/")
 """How files begin that Git LFS and git-annex left in place of their content."""
 
@@ -138,16 +133,18 @@ def read_text(path: Path, what: str, most: int = SMALL) -> str:
 def read_lines(path: Path, what: str) -> list[str]:
     """Lines of a table (see :func:`read_text`), of which there are no more than ``MOST_LINES``."""
     text = read_text(path, what, TABLE)
+    # Where ``str.splitlines`` ends a line
     # Counted before there is a list of them: empty lines cost nothing in the file.
-    count = sum(map(text.count, LINE_ENDS))
+    count = sum(map(text.count, "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"))
     if count > MOST_LINES:
         raise InputError("RIL-722", f"{what} {path} has {count} lines, at most {MOST_LINES} are read", remedy="cut it")
     lines = text.splitlines()
     _no_long_line(lines, path, what)
     rows = [match for line in lines[:SAMPLE] if (match := COMMA.fullmatch(line.strip()))]
     columns = [[int(row[k]) for row in rows] for k in (1, 2)]
+    # A greater number is a stamp of milliseconds or less, which has no fraction.
     # A comma in each line may part two columns of integers: stamps that never go back, and what goes with them.
-    if not rows or not (all(a < b for c in columns for a, b in pairwise(c)) or columns[0][0] > MILLISECONDS):
+    if not rows or not (all(a < b for c in columns for a, b in pairwise(c)) or columns[0][0] > 10**12):
         refuse_decimal_commas(lines, path)
     return lines
 

@@ -19,19 +19,8 @@ UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 UPPER = {"s": 1e11, "ms": 1e14, "us": 1e17}
 """Above it a value can no longer be in that unit: 1e11 s after 1970 is the year 5138."""
 
-SINCE_1970 = 1e8
-"""s; larger stamps of any unit are known by their magnitude: 1973 and later."""
-
 SLOW = 3600.0
 """s; pairs an hour apart are possible, but a wrong unit is likelier."""
-
-
-LARGEST = 10**20
-"""Above it a value is no time in any unit: nanoseconds reach it in the year 5138."""
-
-
-SMALLEST = Decimal("1e-20")
-"""Below it a value other than 0 is no time either, and quotients of such leave what a Decimal can hold."""
 
 
 def seconds(
@@ -73,7 +62,8 @@ def seconds(
             text = f"{what}, line {line}: time {now} {words}"
             raise InputError("RIL-293", text, remedy="put the rows in order of time, each once, in one unit")
     times = tuple(float(v / UNITS[stated]) for v in exact)
-    if unit == "auto" and times[0] < SINCE_1970:
+    # s; larger stamps of any unit are known by their magnitude: 1973 and later
+    if unit == "auto" and times[0] < 1e8:
         _refuse_slow(times, what)
     return times
 
@@ -84,7 +74,8 @@ def _decimal(value: str | int | float, what: str, line: int) -> Decimal:
         exact = Decimal(text)
     except (InvalidOperation, ValueError):
         exact = Decimal("nan")
-    if not exact.is_finite() or exact.copy_abs() > LARGEST or 0 < exact.copy_abs() < SMALLEST:
+    # Nanoseconds reach the greatest in the year 5138; quotients of smaller ones leave what a Decimal can hold.
+    if not exact.is_finite() or exact.copy_abs() > 10**20 or 0 < exact.copy_abs() < Decimal("1e-20"):
         raise InputError("RIL-291", f"{what}, line {line}: {value!r} is not a time", remedy="give numbers, one a frame")
     return exact
 

@@ -16,9 +16,6 @@ from rille.pipeline.engine import events
 from rille.pipeline.engine.failures import translated
 from rille.pipeline.runs.lookup import LEDGER
 
-SEVERITY = (COMPLETE, HOLES, USAGE, FAILED)
-"""Exit codes, the least severe first."""
-
 STATES = {COMPLETE: "complete", HOLES: "with holes", USAGE: "refused", FAILED: "failed"}
 
 
@@ -54,7 +51,8 @@ def each(sequences: Sequence[str], one: Callable[[str], tuple[int, Path | None]]
 
 def worst(ended: Sequence[Ended]) -> int:
     """The most severe of the exit codes."""
-    return max((one.code for one in ended), key=SEVERITY.index)
+    # Exit codes, the least severe first
+    return max((one.code for one in ended), key=(COMPLETE, HOLES, USAGE, FAILED).index)
 
 
 def table(ended: Sequence[Ended], sequences: Sequence[str]) -> str:

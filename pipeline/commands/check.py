@@ -33,17 +33,6 @@ from rille.stages.imaging.image_quality import ImageFigures, look
 
 Steps = Generator[Wait, Any, None]
 
-MAX_MOTIONS = 12
-"""Successive pairs whose motion is measured, spread over the sequence: a sample tells what a run can expect."""
-
-MAX_PAIRS = 6
-"""Pairs whose rows are compared with those of shifted right images, spread over the sequence."""
-
-NOISE_BEYOND_INFINITY_PX = 1.0
-
-MAX_NAMED = 3
-"""Damaged images that are named one by one; the rest is counted."""
-
 _SETTINGS = Settings()
 
 
@@ -124,7 +113,8 @@ class Inspection:
         yield from self._first_pair(whole[0])
         yield from self._motions()
         if len(whole) > 1:
-            rows = yield self.make.synchrony("synchrony", _spread(whole, MAX_PAIRS), whole)
+            # Pairs whose rows are compared with those of shifted right images, spread over the sequence
+            rows = yield self.make.synchrony("synchrony", _spread(whole, 6), whole)
             self.say(judge.judge_synchrony(rows.meta))
 
     def _images(self) -> Steps:
@@ -148,7 +138,8 @@ class Inspection:
             looks[camera][frame] = look(image, np.asarray(bundle["valid"]))
             if np.ptp(image):  # images of one grey value say the same of any scene
                 digests[camera][frame] = hashlib.sha256(image.tobytes()).hexdigest()
-        for refusal in errors[:MAX_NAMED]:
+        # Damaged images that are named one by one; the rest is counted
+        for refusal in errors[:3]:
             self.refused(refusal, "images")
         whole = f"all {len(images)} open, {' and '.join(sorted(sizes))}"
         text = f"{len(errors)} of {len(images)} images cannot be used" if errors else whole
@@ -184,14 +175,15 @@ class Inspection:
         rho, _ = inverse_depth(rig, left, right - left)
         self.say(judge.judge_matching(disparity.meta["match_rate"], 1.0 / rho[rho > 0], rig.baseline))
         if len(left):
-            beyond = beyond_infinity(rig, left, right) > NOISE_BEYOND_INFINITY_PX
+            beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
             self.say(judge.judge_sides(float(beyond.mean())))
         self.say(judge.judge_epipolar(oriented.meta))
 
     def _motions(self) -> Steps:
         """Overlap of some successive left images."""
+        # Successive pairs whose motion is measured, spread over the sequence: a sample tells what a run can expect
         # Evenly over the sequence, so that a fault of its second half is found as well.
-        chosen = _spread(list(pairwise(self.frames)), MAX_MOTIONS)
+        chosen = _spread(list(pairwise(self.frames)), 12)
         tasks = {(a, b): self.make.motion(a, b) for a, b in chosen if not {(a, "left"), (b, "left")} & self.broken}
         yield Maybe(list(tasks.values()))
         for task in tasks.values():

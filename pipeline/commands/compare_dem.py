@@ -29,8 +29,6 @@ from rille.stages.evaluation import dem_comparison as evaluation
 from rille.stages.evaluation.dem_comparison import Grid
 
 Floats = NDArray[np.float64]
-SLOPES_DEG = np.array([0.0, 2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0])
-RANGE_BINS = 8
 SHOWN_CHANGES = 12
 """Patches that are printed; all are in the JSON file."""
 WORDS = {"rmse": "RMSE", "nmad": "NMAD", "p95": "95 %", "bias": "bias", "median": "median"}
@@ -167,13 +165,14 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
         "within the outline of A",
     }
     slope = np.degrees(np.arctan(np.hypot(*on_b.slopes())))
-    figures["by_slope"] = {"unit": "degrees of B", "bins": evaluation.binned(error, slope, SLOPES_DEG)}
+    edges = np.array([0.0, 2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0])
+    figures["by_slope"] = {"unit": "degrees of B", "bins": evaluation.binned(error, slope, edges)}
     distance, unit = _range(on_b, a, b)
     bins = []
     if distance is not None:
         far = float(np.nanmax(np.where(np.isfinite(error), distance, np.nan)))
         # Bins are open at their upper end: a hair more keeps the farthest cell in the last one.
-        bins = evaluation.binned(error, distance, np.linspace(0.0, far * (1.0 + 1e-9), RANGE_BINS + 1))
+        bins = evaluation.binned(error, distance, np.linspace(0.0, far * (1.0 + 1e-9), 9))
     figures["by_range"] = {"unit": unit, "bins": bins}
     return figures, error
 

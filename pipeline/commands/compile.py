@@ -28,9 +28,6 @@ SMALL = (
 )
 """A reconstruction of five small pairs; it calls every kernel but one of what `mockup-short` calls."""
 
-SHORT = ("drive.max_stops=3",)
-"""A drive that ends, far from its goal, when all kernels of driving were called."""
-
 
 def compile_kernels() -> int:
     """Compile the numerical kernels for this user and machine, so that the first run need not.
@@ -42,7 +39,8 @@ def compile_kernels() -> int:
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
         runs, cache = Path(folder) / "runs", f"{folder}/cache"
         perform(Options("mockup-short", SMALL, runs=runs, cache=cache, progress="quiet"))
-        perform(Options("mockup-loop", SHORT, runs=runs, cache=cache, progress="quiet", verb="drive"))
+        # A drive that ends, far from its goal, when all kernels of driving were called
+        perform(Options("mockup-loop", ("drive.max_stops=3",), runs=runs, cache=cache, progress="quiet", verb="drive"))
     made, seconds = len(_kernels() - before), time.perf_counter() - began
     print(f"{kernels.folder()}  kernels compiled: {made}, in {seconds:.0f} s")
     return COMPLETE

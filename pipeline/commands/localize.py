@@ -39,10 +39,6 @@ TURN_DEG = 20.0
 """Degrees to either side of a given heading that are searched."""
 SENSOR_TILT_DEG, GROUND_TILT_DEG = 0.5, 5.0
 """Standard deviation, degrees, of a vertical that a sensor gives, and of one that is that of the ground."""
-ORTHO_CELLS = 10.0
-"""Cells of the map within which elevations and ortho images must agree on a place."""
-FACTS = ("overlap", "rms", "explained", "cells", "independent")
-"""Of a fit, for the JSON file."""
 NAMES = ("x_m", "y_m", "z_m", "about_x_deg", "about_y_deg", "yaw_deg")
 
 
@@ -195,7 +191,8 @@ def _found(terrain: Terrain, model: DemFile | None, image: Ortho | None, around:
     if by_ortho is None:
         return _by_elevations(terrain, model, around)
     x, y, _ = by_ortho.pose.translation
-    about = SearchArea(float(x), float(y), _yaw(by_ortho.pose), ORTHO_CELLS * model.cell, math.radians(TURN_DEG))
+    # Elevations and ortho images must agree on a place within ten cells of the map.
+    about = SearchArea(float(x), float(y), _yaw(by_ortho.pose), 10.0 * model.cell, math.radians(TURN_DEG))
     found = _by_elevations(terrain, model, about)
     return replace(found, about=(*found.about, *by_ortho.about), facts={**found.facts, **by_ortho.facts})
 
@@ -250,7 +247,8 @@ def _by_elevations(terrain: Terrain, model: DemFile, around: SearchArea | None) 
         MapLocalizationParams.model_validate({"sigma_tilt_deg": tilt}),
     )
     pose, both = to_map @ placed.pose, np.kron(np.eye(2), to_map.rotation)
-    facts = {name: value for name, value in placed.facts().items() if name in FACTS}
+    kept = "overlap", "rms", "explained", "cells", "independent"
+    facts = {name: value for name, value in placed.facts().items() if name in kept}
     doubt, rival = "", "no other place"
     if placed.other is not None:
         other, chi2 = to_map.apply([*placed.other[0][:2], 0.0])[:2], placed.other[1]

@@ -17,9 +17,6 @@ from rille.stages.core.errors import InputError
 from rille.stages.imaging.pyramid import grey
 from rille.stages.imaging.still import MIN_IMAGES, still
 
-MOST_IMAGES = 20
-"""Of a camera: more tell no more."""
-
 
 def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> int:
     """Write masks of what keeps its place in the images, such as the vehicle's own body, for `[masks]` of a manifest.
@@ -38,7 +35,8 @@ def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> int:
     if len(pairs) < MIN_IMAGES:
         text = f"{seq} has {count(len(pairs), 'pair')}, {MIN_IMAGES} are needed to see what keeps its place"
         raise InputError("RIL-906", text, remedy="draw the mask by hand")
-    pairs = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, MOST_IMAGES).round().astype(int))]
+    # Of a camera: more tell no more
+    pairs = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, 20).round().astype(int))]
     written = []
     for camera in CAMERAS:
         images = [pair.taken(camera) for pair in pairs]

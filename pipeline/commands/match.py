@@ -31,9 +31,6 @@ MIN_PIXELS_OF_BAR = 1_000_000
 MIN_MATCHED_SHARE = 0.05
 """Share of matched pixels at which two images have little to do with each other; unrelated ones stay below."""
 
-MAX_BLANK_SHARE = 0.5
-"""Share of pixels without texture of which a user should hear, however well the others match."""
-
 WHY_NOT = (
     (Validity.NO_TEXTURE, "have no texture (black, saturated or blank)"),
     (Validity.OUT_OF_IMAGE, "have their match outside the right image"),
@@ -191,7 +188,7 @@ def warnings(result: Any, left: NDArray[Any], right: NDArray[Any]) -> Iterator[s
         frequent = ", ".join(f"{100 * s:.0f} % {words}" for s, words in shares[:2] if s >= 0.005)
         text = f"only {100 * share:.1f} % of the pixels match ({frequent}): do both images show one scene in one light?"
         yield warning("RIL-700", text)
-    elif blank > MAX_BLANK_SHARE:
+    elif blank > 0.5:  # however well the others match
         text = f"{100 * blank:.0f} % of the pixels have no texture (black, saturated or blank) and cannot match"
         yield warning("RIL-701", text)
     # Of images of unlike size nobody knows how their middles correspond, and so which displacement far things have.

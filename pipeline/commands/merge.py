@@ -34,10 +34,6 @@ from rille.stages.terrain.shading import gradient
 
 MAX_CELL_RATIO = 1.5
 """Of two runs' cells: coarser ones would be interpolated between, finer ones left out."""
-AGREEING_SIGMAS = 3.0
-"""Of a motion, within which georeferences are believed: lattices that fit are then not resampled."""
-ROUNDS = 4
-"""In which the point of a tilted model above a cell is found: its height moves it by less each time."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +153,8 @@ def _registered(first: Terrain, other: Terrain) -> Session:
     sigma = alignment.sigma * math.sqrt(cells / max(independent_cells(error), 1.0)) if cells else alignment.sigma
     sigma = np.where(sigma > 0, sigma, [rough[0], rough[1], 0.0, 0.0, 0.0, rough[2]])
     motion = np.array([*alignment.translation, *rotation_log(alignment.rotation)])
-    if how == "georeferences" and (np.abs(motion) <= AGREEING_SIGMAS * sigma).all():
+    # Georeferences are believed within three standard deviations: lattices that fit are then not resampled.
+    if how == "georeferences" and (np.abs(motion) <= 3.0 * sigma).all():
         alignment = replace(alignment, rotation=np.eye(3), translation=np.zeros(3))
     R, centre = alignment.rotation, alignment.centre
     pose = RigidTransform(R, centre + alignment.translation - R @ centre) @ start
@@ -200,7 +197,8 @@ def _laid(number: int, first: Terrain, session: Session) -> ModelLayer:
     terrain, lattice, pose = session.terrain, session.covered(first.lattice.cell), session.pose
     grid, back, xy = _grid(terrain), session.pose.inverse(), lattice.xy()
     z = np.full(lattice.shape, float(pose.apply([0.0, 0.0, session.level])[2]))
-    for _ in range(ROUNDS):
+    # The point of a tilted model above a cell is found in rounds: its height moves it by less each time.
+    for _ in range(4):
         own = back.apply(np.concatenate([xy, z[..., None]], axis=-1))[..., :2]
         there = dem_comparison.interpolate(grid, own)
         height = pose.apply(np.concatenate([own, there[..., None]], axis=-1))[..., 2]

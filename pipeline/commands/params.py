@@ -18,7 +18,6 @@ from rille.pipeline.flow import config
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import ConfigError
 
-WIDTH = 100
 SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 
@@ -53,7 +52,7 @@ def plain(chosen: Mapping[str, Params]) -> Iterator[str]:
     for name, values in chosen.items():
         for key, default, permitted, words in rows(values):
             yield f"{name}.{key} = {default}" + (f"    [{permitted}]" if permitted else "")
-            yield from textwrap.wrap(words, WIDTH, initial_indent="    ", subsequent_indent="    ")
+            yield from textwrap.wrap(words, 100, initial_indent="    ", subsequent_indent="    ")
         yield ""
 
 

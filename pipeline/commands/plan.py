@@ -33,9 +33,6 @@ MAX_REASONS = 3
 WIDTH = 80
 """Characters of a reason in the table."""
 
-BEHIND = "input "
-"""Begin of the reason of a task that only follows from another one."""
-
 _WORK = Work()
 
 
@@ -117,7 +114,8 @@ def describe(graph: Graph, result: Result, workers: int, *, verbose: bool = Fals
 
 def _reasons(planned: list[Handle]) -> list[str]:
     """The reasons of a stage's tasks, own ones first, the most frequent first, with their number."""
-    own = Counter(h.reason for h in planned if not h.reason.startswith(BEHIND))
+    # The reason of a task that only follows from another one begins so.
+    own = Counter(h.reason for h in planned if not h.reason.startswith("input "))
     listed = [f"{brief(reason, WIDTH)} ({n})" for reason, n in own.most_common(MAX_REASONS)]
     if len(own) > MAX_REASONS:
         listed.append(f"{len(own) - MAX_REASONS} other reasons")

@@ -28,9 +28,6 @@ UPDATED = ("trajectory.tum", "trajectory.kitti", "dem.tif", "dem_sigma.tif", "ri
 LOOK_SECONDS, LOOK_SHARE = 0.25, 0.2
 """Time between two looks at the folder, and share of the time that looking takes at most."""
 
-PATIENCE_SECONDS = 10.0
-"""Time for which a pair between others is waited for; then it counts as lost until it is there."""
-
 _OPTIONS = WatchOptions()
 
 
@@ -132,7 +129,8 @@ class _Watched:
         now = time.monotonic()
         names = {sequence.frame_names[k]: k for k in sequence.lost}
         self.gaps = {name: self.gaps.get(name, now) for name in names}
-        frames = min((names[n] for n, t in self.gaps.items() if now - t < PATIENCE_SECONDS), default=sequence.frames)
+        # Time for which a pair between others is waited for; then it counts as lost until it is there
+        frames = min((names[n] for n, t in self.gaps.items() if now - t < 10.0), default=sequence.frames)
         if frames < sequence.frames:
             self.say(f"waiting: {sequence.lost[frames]}")
         images = [_image(sequence.image(k, c)) for k in range(frames) if k not in sequence.lost for c in CAMERAS]

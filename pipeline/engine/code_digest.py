@@ -31,9 +31,6 @@ from rille.pipeline.engine.runtime.hints import read_hint, write_hint
 
 OWN = ("rille.stages", "rille.datasets")
 
-FORGET = 8
-"""States of the sources that are remembered, before those not in use are forgotten."""
-
 
 class _Source(NamedTuple):
     sha256: str
@@ -73,8 +70,9 @@ class _Memory:
     def save(self) -> None:
         if self.path is None or not self.new:
             return
+        # Eight states of the sources are remembered, before those not in use are forgotten.
         # Each edit adds an entry: without this the file would grow with every save of every module.
-        if len(self.known) > FORGET * len(self.used):
+        if len(self.known) > 8 * len(self.used):
             self.known = {name: self.known[name] for name in self.used}
         write_hint(self.path, {"digest": digest(self.known), "sources": self.known})
         self.new = False

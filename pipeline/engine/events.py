@@ -12,9 +12,6 @@ from typing import Any, TextIO
 from rille.pipeline.engine.graph import Handle
 from rille.pipeline.engine.spec import each
 
-LONGEST = 100_000_000
-"""Bytes of a line; one that reads a million artifacts has less. A file of holes is one line without an end."""
-
 
 class Ledger:
     """Writes to a file, or nowhere."""
@@ -106,7 +103,8 @@ def add_facts(path: Path, **facts: Any) -> None:
 def _lines(path: Path) -> list[dict[str, Any]]:
     rows = []
     with path.open("rb") as file:
-        while line := file.readline(LONGEST):
+        # Bytes of a line; one that reads a million artifacts has less. A file of holes is one line without an end.
+        while line := file.readline(100_000_000):
             try:
                 rows.append(json.loads(line.decode()))
             except (ValueError, RecursionError):

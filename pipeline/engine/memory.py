@@ -21,9 +21,6 @@ from rille.pipeline.engine.runtime.environment import cores
 from rille.pipeline.engine.spec import each
 from rille.stages.core.errors import ConfigError
 
-SHARE = 0.9
-"""Part of what is free that a run takes by itself: page cache for its files, and others that grow, need the rest."""
-
 WORKER_BYTES = 250e6
 """Memory of a worker process between tasks: Python with NumPy, SciPy and numba."""
 
@@ -116,7 +113,8 @@ def budget(executor: Any, limit: float | None) -> Budget:
     own = float(resident())
     if limit is not None:
         return Budget(float(limit), own)
-    return Budget(own + SHARE * free() if executor in ("dask", "inline") else math.inf, own)
+    # Part of what is free that a run takes by itself: page cache for its files, and others that grow, need the rest
+    return Budget(own + 0.9 * free() if executor in ("dask", "inline") else math.inf, own)
 
 
 def most_workers(executor: Any, asked: int | None) -> int:

@@ -27,9 +27,6 @@ KNOWN = {
 }
 """Import name to the distributions that may give it, where they are named otherwise: looking it up takes 0.2 s."""
 
-HARMLESS = frozenset({"pydantic", "rille", "typing_extensions"})
-"""What checks parameters, whose values are part of a key themselves; the engine, whose format is; and types."""
-
 NAMED = (
     *("rille", "numpy", "numba", "scipy", "opencv-python-headless", "dask", "zarr", "rasterio", "pycolmap"),
     *("matplotlib", "jinja2"),
@@ -51,7 +48,8 @@ def versions(module: str) -> dict[str, str]:
     MissingPackageError
         One of them is not installed.
     """
-    names = external_imports(module) - HARMLESS
+    # What checks parameters, whose values are part of a key themselves; the engine, whose format is; and types
+    names = external_imports(module) - frozenset({"pydantic", "rille", "typing_extensions"})
     if "numba" in names:
         names.add("llvmlite")  # generates the code
     return dict(sorted(_version(name) for name in names))

@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from rille.pipeline.engine.store.base import Store
     from rille.pipeline.engine.store.manifest import Ref
 
-KEPT = 4
-"""Earlier keys remembered per label: enough for a user who goes back and forth between a few settings."""
-
 SHOWN = 3
 """Largest number of differences stated for a node."""
 
@@ -86,7 +83,8 @@ class Known:
         used = {_name(h.stage, h.label): h.key for h in nodes if h.ref is not None}
         if all(known.get(name, [""])[0] == key for name, key in used.items()):
             return
-        known |= {name: [key, *(k for k in known.get(name, []) if k != key)][:KEPT] for name, key in used.items()}
+        # Earlier keys remembered per label: enough for a user who goes back and forth between a few settings
+        known |= {name: [key, *(k for k in known.get(name, []) if k != key)][:4] for name, key in used.items()}
         write_hint(self._path, known)
 
 

@@ -46,9 +46,6 @@ from rille.pipeline.engine.task import CodeChangedError, Outcome
 from rille.pipeline.engine.workers import Call, Died, Ended, Failed, Kept, NotBegun, Workers, check, light, make
 from rille.stages.core.errors import DegenerateError, RilleError
 
-MAX_HEALS = 3
-"""Times that a task is begun again because an input was damaged or gone when it read it."""
-
 MISSING = ("failed", "skipped", "planned")
 """Statuses of an input after which a task is not begun."""
 
@@ -426,7 +423,8 @@ class _Run:
 
     def _heal(self, handle: Handle, error: BaseException) -> bool:
         """Have inputs that were damaged or gone when a task read them computed again, and the task after them."""
-        if not isinstance(error, DamagedError | GoneError) or self.heals[handle.index] >= MAX_HEALS:
+        # Times that a task is begun again because an input was damaged or gone when it read it
+        if not isinstance(error, DamagedError | GoneError) or self.heals[handle.index] >= 3:
             return False
         self.heals[handle.index] += 1
         for source in {h.index: h for h in handle.upstream()}.values():

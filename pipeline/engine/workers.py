@@ -53,9 +53,6 @@ WATCH_SECONDS = 0.2
 LOOK_SECONDS = 2.0
 """Time between looks at the scheduler."""
 
-BIRTH_SECONDS = 120.0
-"""Time that workers of our own may take to start, on a machine that others use."""
-
 CONNECT_SECONDS = 10.0
 """Time within which a scheduler must have answered."""
 
@@ -247,7 +244,8 @@ def _here(jobs: int, memory: float) -> Dask:
         _, within = cluster.scheduler.listeners
         # As the default client it would take over whatever else the calling program computes with dask.
         client = Client(within.contact_address, loop=cluster.loop, set_as_default=False)
-        made = Dask(client, foreign.Presence(client, BIRTH_SECONDS), cluster=cluster)
+        # Time that workers of our own may take to start, on a machine that others use
+        made = Dask(client, foreign.Presence(client, 120.0), cluster=cluster)
         cluster.scale(jobs)
     return made
 

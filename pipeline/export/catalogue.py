@@ -47,9 +47,6 @@ def listed(folder: Path) -> Iterator[tuple[str, str, str]]:
 
 # -- frames.json --------------------------------------------------------------------------------------------------
 
-FORMAT = 2
-"""Raised when the meaning of a key of frames.json changes."""
-
 FRAMES: dict[str, dict[str, Any]] = {
     "world": {
         "handedness": "right",
@@ -75,9 +72,6 @@ CONVENTIONS = {
 }
 """How poses and rasters are written, and what the coordinates of a file in either frame are."""
 
-IN_PLACE = (".tif", ".gpkg")
-"""Endings of the files whose coordinates are those of the sequence's CRS where it has one."""
-
 
 def describe(written: Sequence[str], run: RunView, vertical: str = "") -> dict[str, Any]:
     """Return the content of ``frames.json``.
@@ -95,14 +89,16 @@ def describe(written: Sequence[str], run: RunView, vertical: str = "") -> dict[s
     if vertical == REFERENCE_PLANE:
         world |= {"axes": {"x": "right", "y": "up in the image", "z": "away from the reference plane, to the cameras"}}
         world |= {"definition": ON_PLANE, "origin": "point of the reference plane nearest to the first left camera"}
-    placed = IN_PLACE if place is not None else ()
+    # Endings of the files whose coordinates are those of the sequence's CRS where it has one
+    placed = (".tif", ".gpkg") if place is not None else ()
     known = {
         o.name: {"frame": "georeference" if o.name.endswith(placed) else o.frame, "holds": o.what}
         for o in OUTPUTS
         if o.name in written and o.frame
     }
+    # Raised when the meaning of a key of frames.json changes
     return {
-        "format": FORMAT,
+        "format": 2,
         "units": {"length": "m", "angle": "rad, deg where the name says so", "time": "s" if times else "frame number"},
         "frames_of_reference": FRAMES | {"world": world},
         "conventions": CONVENTIONS,

@@ -25,15 +25,6 @@ from rille.stages.core.declare import Bundle
 LINE_Z, POINT_Z = 1002, 1001
 """Geometry types of ISO 19125 well-known binary."""
 
-GPKG_DATE = "2000-01-01T00:00:00.000Z"
-"""Written as time of change into every GeoPackage, so that equal paths make equal files."""
-
-SQLITE_VERSION = slice(96, 100)
-"""Bytes of a SQLite file that name the version of the library that wrote it, which nobody reads."""
-
-OWN_CRS = 100_000
-"""Number within a GeoPackage of a coordinate system that has none of the EPSG."""
-
 SCHEMA = """
 PRAGMA application_id = 0x47504B47;
 PRAGMA user_version = 10300;
@@ -82,7 +73,8 @@ def write_path(path: Path, planned: Bundle, place: Georeference | None = None) -
             )
         package.commit()
         content = bytearray(package.serialize())
-    content[SQLITE_VERSION] = bytes(4)
+    # Bytes of a SQLite file that name the version of the library that wrote it, which nobody reads
+    content[96:100] = bytes(4)
     atomic.write(path, bytes(content))
 
 
@@ -94,7 +86,8 @@ def _enter_crs(package: sqlite3.Connection, place: Georeference | None) -> int:
     package.execute(row, ("WGS 84", WGS84, "EPSG", WGS84, CRS.from_epsg(WGS84).to_wkt()))
     crs = None if place is None else CRS.from_user_input(place.crs)
     number, wkt = (None, ENGINEERING_CRS) if crs is None else (crs.to_epsg(), crs.to_wkt())
-    number, owner = (OWN_CRS, "NONE") if number is None else (number, "EPSG")
+    # Number within a GeoPackage of a coordinate system that has none of the EPSG
+    number, owner = (100_000, "NONE") if number is None else (number, "EPSG")
     package.execute(row, (wkt.split('"')[1], number, owner, number, wkt))
     return number
 
@@ -116,7 +109,8 @@ def _add_layer(
     package.execute(f"CREATE TABLE {name} (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom {kind_name}{columns})")
     # Without an extent, which readers of so few features find by themselves.
     contents = "INSERT INTO gpkg_contents VALUES (?, 'features', ?, '', ?, NULL, NULL, NULL, NULL, ?)"
-    package.execute(contents, (name, name, GPKG_DATE, crs))
+    # Written as time of change into every GeoPackage, so that equal paths make equal files
+    package.execute(contents, (name, name, "2000-01-01T00:00:00.000Z", crs))
     package.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 1, 0)", (name, kind_name, crs))
     for points, values in features:
         row = (None if points is None else _geometry(kind, points, crs), *values.values())

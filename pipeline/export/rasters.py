@@ -22,7 +22,6 @@ from rille.stages.hazard.risk import REASONS, risk_stage
 from rille.stages.terrain import merge
 from rille.stages.terrain.shading import hillshade, slope_deg
 
-LIGHT = {"light": "from the upper left (315 degrees), 45 degrees high"}
 GIS = "QGIS, GDAL"
 
 
@@ -79,7 +78,8 @@ def _write_hillshade(path: Path, tiles: Tiles, place: Place = None) -> None:
     lattice, elevation = whole(tiles, "elevation")
     # The raster is turned by the azimuth where it has a place: there the light has to come from the map's upper left.
     bands = {"hillshade": hillshade(elevation, lattice.cell, 0.0 if place is None else place.azimuth)}
-    write_raster(path, bands, lattice, Meaning(nodata=0, tags=LIGHT), place)
+    light = {"light": "from the upper left (315 degrees), 45 degrees high"}
+    write_raster(path, bands, lattice, Meaning(nodata=0, tags=light), place)
 
 
 def write_ortho(path: Path, tiles: Tiles, run: RunView, place: Place = None) -> None:
@@ -97,9 +97,6 @@ def write_ortho(path: Path, tiles: Tiles, run: RunView, place: Place = None) -> 
 CLASSES = {"safe": "#a6d7c3", "caution": "#f0d68a", "hazard": "#c8501e", "unknown (never entered)": "#8d8f98"}
 """Names and colours of the classes 0, 1, 2 and 3, distinct for colour-blind eyes; in grey, what may be driven on is
 light, hazards dark, unknown medium."""
-
-SIGNIFICANT_BITS = 12
-"""Significant bits of a written measure: 0.02 %, finer than any is known."""
 
 
 def _write_risk(path: Path, risk: Bundle, place: Place = None) -> None:
@@ -131,7 +128,8 @@ def _write_hazard(path: Path, risk: Bundle, place: Place = None) -> None:
         if a.unit in ("m", "rad") and a.name != "elevation":
             bands[a.name] = np.degrees(risk[a.name]) if a.unit == "rad" else risk[a.name]
             units[a.name] = "degree" if a.unit == "rad" else a.unit
-    given = {name: rounded(np.asarray(values, dtype=np.float32), SIGNIFICANT_BITS) for name, values in bands.items()}
+    # Significant bits of a written measure: 0.02 %, finer than any is known
+    given = {name: rounded(np.asarray(values, dtype=np.float32), 12) for name, values in bands.items()}
     write_raster(path, given, Lattice.from_dict(risk.meta["lattice"]), Meaning(units, tags=_vehicle(risk)), place)
 
 

@@ -27,14 +27,8 @@ from rille.stages.evaluation.place import Ortho
 MAX_CELLS = 500_000_000
 """Of an elevation model, which is read whole."""
 
-CELL_BYTES = 100
-"""Memory that a cell takes until it is read, and compared or exported."""
-
 ALLOWED_CELLS, MAX_CELLS_PER_BYTE = 4_000_000, 50
 """Cells that any file may have, and more of them if it has a byte for so many: a sparse file may claim any number."""
-
-MAX_AXIS_CELLS = 10_000_000
-"""Cells; coordinates are read whole even where nothing else is."""
 
 MAX_WALL_M, MAX_STEP_CELLS = 1500.0, 300.0
 """Metres and cells; nothing on Earth rises more upright over less than a cell."""
@@ -214,7 +208,8 @@ def read_ortho(path: Path) -> tuple[Ortho, str]:
 
 def _check_cells(path: Path, shape: tuple[int, ...], stored: int) -> None:
     """Refuse more cells than there is memory for, or than so many ``stored`` bytes can hold."""
-    most = min(MAX_CELLS, free() // CELL_BYTES, max(ALLOWED_CELLS, MAX_CELLS_PER_BYTE * stored))
+    # Memory that a cell takes until it is read, and compared or exported
+    most = min(MAX_CELLS, free() // 100, max(ALLOWED_CELLS, MAX_CELLS_PER_BYTE * stored))
     if math.prod(shape) > most:
         size = f"{' x '.join(map(str, shape))} cells in {words(stored)}"
         text = f"{path} has {size}, at most {most / 1e6:.3g} million are read"
@@ -306,6 +301,7 @@ def check_group(path: Path) -> None:
         if not (entry.is_file() or entry.is_dir()):
             raise InputError("RIL-723", f"{entry.path} is no regular file", remedy=OURS)
     for name, array in zarr.open_group(store=LocalStore(path, read_only=True), mode="r").arrays():
-        if max(array.shape, default=0) > MAX_AXIS_CELLS or math.prod(array.chunks) > MAX_CELLS:
+        # Cells; coordinates are read whole even where nothing else is
+        if max(array.shape, default=0) > 10_000_000 or math.prod(array.chunks) > MAX_CELLS:
             size = " x ".join(map(str, array.shape))
             raise InputError("RIL-982", f"{path}: {name} has {size} values, too many to be read", remedy=OURS)

@@ -33,7 +33,6 @@ from rille.stages.terrain import merge
 from rille.stages.terrain.shading import slope_deg
 
 CONVENTIONS = "CF-1.11"
-CHUNK_CELLS = 512
 UNITS = {"px": "1", "grey": "1"}
 """Units that UDUNITS does not know; the long name has the word."""
 
@@ -68,7 +67,7 @@ def write_terrain(
             group.create_array(
                 name,
                 data=variable.values,
-                chunks=tuple(min(n, CHUNK_CELLS) for n in variable.values.shape) or "auto",
+                chunks=tuple(min(n, 512) for n in variable.values.shape) or "auto",
                 compressors=numcodecs.Zlib(level=1),  # in every build of GDAL
                 fill_value=variable.unknown,
                 attributes={**variable.attributes, "_ARRAY_DIMENSIONS": list(variable.dims)},

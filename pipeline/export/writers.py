@@ -166,10 +166,6 @@ def axes(place: Georeference | None) -> str:
     )
 
 
-FORMULA = ("=", "+", "-", "@", "\t")
-"""A spreadsheet takes a cell that begins so for a formula, and runs it; behind an apostrophe it is text."""
-
-
 def write_table(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:
     """Write columns of equal length as CSV (RFC 4180, but lines end in a line feed); what is not known stays empty."""
     out = io.StringIO()
@@ -187,7 +183,8 @@ def _cell(value: Any) -> str:
         return f"{value:.9g}" if abs(value) < 1e6 else f"{value:.15g}"
     # Names come from who wrote the data: what a terminal would obey is spelt out, what a spreadsheet would run quoted.
     text = plain(str(value))
-    return f"'{text}" if isinstance(value, str) and text.startswith(FORMULA) else text
+    # A spreadsheet takes a cell that begins so for a formula, and runs it; behind an apostrophe it is text
+    return f"'{text}" if isinstance(value, str) and text.startswith(("=", "+", "-", "@", "\t")) else text
 
 
 def write_trajectory_kitti(path: Path, poses: NDArray[np.float64]) -> None:

@@ -54,9 +54,6 @@ T = TypeVar("T")
 NO_PARAMS = NoParams()
 """One object for all tasks without parameters."""
 
-AROUND = 3
-"""Frames before and behind a pair whose right images may be of its time."""
-
 PYRAMID_BYTES = 20 / 3
 """Bytes of a pyramid for each pixel of its image: grey and mask, a third more for the levels above."""
 
@@ -220,7 +217,8 @@ class Builder:
     def synchrony(self, label: str, pairs: Series[int], frames: Series[int]) -> Handle[SynchronyFacts]:
         """Which right images, of those of some frames about each pair, are of the time of the left ones."""
         at = [frames.index(pair) for pair in pairs]
-        near = [f for k, f in enumerate(frames) if any(abs(k - place) <= AROUND for place in at)]
+        # Frames before and behind a pair whose right images may be of its time
+        near = [f for k, f in enumerate(frames) if any(abs(k - place) <= 3 for place in at)]
         images = {"left": [self.pyramid(f, "left") for f in pairs], "right": [self.pyramid(f, "right") for f in near]}
         return self.node(synchrony_stage, label, **images, pairs=list(pairs), frames=near, rig=self.given_rig)
 

@@ -41,9 +41,6 @@ def driven() -> frozenset[str]:
 CHECKED = frozenset(("undistort", "pyramid", "motion", "hfvm", "tiling", "orientation"))
 """Sections that ``rille check`` reads."""
 
-CHOICES = ("terrain.preset", "keyframes.preset")
-"""Parameters that the configuration itself reads: they set others."""
-
 
 def set_by_user(given: Mapping[str, Any], config: Params, without: Params) -> tuple[str, ...]:
     """Dotted keys of ``given`` that a task must read; ``without`` is the configuration as it would be without them."""
@@ -54,7 +51,8 @@ def set_by_user(given: Mapping[str, Any], config: Params, without: Params) -> tu
         off = not getattr(now, "enabled", True) and getattr(then, "enabled", False)
         for name in values if not off else ():
             key = f"{section}.{name}"
-            if getattr(now, name) != getattr(then, name) and key not in CHOICES:
+            # Parameters that the configuration itself reads: they set others
+            if getattr(now, name) != getattr(then, name) and key not in ("terrain.preset", "keyframes.preset"):
                 found.append(key)
     return tuple(found)
 

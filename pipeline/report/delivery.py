@@ -24,13 +24,11 @@ from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
 Rows = list[dict[str, Any]]
 Items = list[dict[str, str]]
 
-ANSWERS = ("no path", "crosscheck")
-"""Kinds of what is missing that are answers, or lie outside of the reconstruction: the run is complete with them."""
-
 
 def is_complete(missing: Items) -> bool:
     """Whether what is missing leaves the reconstruction whole: answers and what lies outside of it."""
-    return all(m["kind"] in ANSWERS for m in missing)
+    # Kinds of what is missing that are answers, or lie outside of the reconstruction: the run is complete with them
+    return all(m["kind"] in ("no path", "crosscheck") for m in missing)
 
 
 def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
@@ -209,7 +207,8 @@ def coverage(view: RunView) -> list[str]:
     maps = {pair: facts_of(view, dem).get("coverage", {}) for pair, dem in view.products.local_dem.items()}
     lacking = {pair: facts["outside"] + facts["unsure"] for pair, facts in maps.items() if facts.get("settings")}
     pair = max(lacking, key=lambda k: lacking[k], default=-1)
-    if lacking.get(pair, 0.0) < MIN_LACKING_SHARE:
+    # Share of the matched pixels from which on it is said that limits keep them off the map
+    if lacking.get(pair, 0.0) < 0.1:
         return []
     facts, size = maps[pair], [metres(v) for v in maps[pair]["size"]]
     settings = " ".join(f"--set {name}={value:g}" for name, value in facts["settings"].items())
@@ -220,14 +219,14 @@ def coverage(view: RunView) -> list[str]:
     ]
 
 
-MIN_LACKING_SHARE = 0.1
 """Share of the matched pixels from which on it is said that limits keep them off the map."""
 
 
 def moved(view: RunView) -> list[str]:
     """What moved by itself, in one line for the run."""
     shares = {pair: float(facts_of(view, one).get("share", 0.0)) for pair, one in view.products.moving.items()}
-    pairs = [pair for pair, share in shares.items() if share >= SAID_MOVED]
+    # Share of an image that moves by itself from which on that is said; errors of displacements come to less
+    pairs = [pair for pair, share in shares.items() if share >= 0.02]
     if not pairs:
         return []
     most = max(pairs, key=lambda pair: shares[pair])
@@ -237,7 +236,6 @@ def moved(view: RunView) -> list[str]:
     ]
 
 
-SAID_MOVED = 0.02
 """Share of an image that moves by itself from which on that is said; errors of displacements come to less."""
 
 

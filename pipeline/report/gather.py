@@ -26,9 +26,6 @@ from rille.stages.geometry.lattice import Lattice, union
 from rille.stages.numeric.robust import mad_sigma
 from rille.stages.odometry.resection.trajectory import world_poses
 
-WORLD = ("elevation", "elevation_std", "spread", "count", "source", "ortho")
-"""Arrays of the merged terrain that figures and tables show."""
-
 
 @dataclass(frozen=True)
 class WorldTerrain:
@@ -125,7 +122,8 @@ class Scene:
         tiles = [b for b in map(self.view.bundle, self.view.products.world_tiles) if b is not None]
         if not tiles:
             return None
-        names = [name for name in WORLD if all(name in tile.arrays for tile in tiles)]
+        shown = "elevation", "elevation_std", "spread", "count", "source", "ortho"
+        names = [name for name in shown if all(name in tile.arrays for tile in tiles)]
         lattice = union(Lattice.from_dict(tile.meta["lattice"]) for tile in tiles)
         return WorldTerrain(lattice, {name: whole(tiles, name)[1] for name in names})
 

@@ -33,12 +33,6 @@ LABELS: Mapping[str, str] = {
 }
 """Words for names of assessing stages, in the order of the page; all others say by themselves what they are."""
 
-ABBREVIATIONS = ("ate", "rpe")
-"""Parts of those names that are written in capitals."""
-
-OF_DRIVE = {"path_length": "Length driven"}
-"""The same for what is judged by the simulator."""
-
 AGREEMENT: Mapping[str, str] = {
     "rmse": "Disagreement of position, RMS",
     "share": "Disagreement of position over the length",
@@ -93,7 +87,8 @@ def _against_truth(view: RunView, frames: Rows, pairs: Rows) -> dict[str, Metric
     by_name: dict[str, Metric] = {}
     if p.drive is not None:
         truth = "the simulator's own placements"
-        by_name |= _assessed(view, p.drive.check, "drive_", "Drive against truth", truth, OF_DRIVE)
+        labels = {"path_length": "Length driven"}
+        by_name |= _assessed(view, p.drive.check, "drive_", "Drive against truth", truth, labels)
     for prefix, handle, group in (
         ("trajectory_", p.accuracy or p.position_accuracy, "Trajectory against truth"),
         ("crosscheck_", p.crosscheck_accuracy, "COLMAP against truth"),
@@ -144,7 +139,7 @@ def _assessed(
 def _label(name: str) -> str:
     """``ate_first_frame_rmse`` to ``ATE first frame RMS``."""
     first, *rest = name.replace("rmse", "RMS").split("_")
-    return " ".join([first.upper() if first in ABBREVIATIONS else first[0].upper() + first[1:], *rest])
+    return " ".join([first.upper() if first in ("ate", "rpe") else first[0].upper() + first[1:], *rest])
 
 
 def _local_elevation(view: RunView, pairs: Rows) -> dict[str, Metric]:

@@ -22,9 +22,6 @@ from rille.pipeline.report.summary import summarise
 from rille.pipeline.report.words import metres, number, quantity, spans
 from rille.stages.hazard.measures import MEASURES
 
-SCRIPTS = ("map_profile.js", "map_space.js", "map.js")
-"""Of the map: the last one calls the others."""
-
 
 def write_report(folder: Path, view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]) -> Items:
     """Write ``report.json`` and ``report.html``, each whole or not at all; give what they list as missing.
@@ -62,6 +59,7 @@ def render(
         bytecode_cache=FileSystemBytecodeCache(str(private_folder())),
     )
     env.filters |= {"quantity": quantity, "number": number, "metres": metres, "spans": spans}
+    scripts = "map_profile.js", "map_space.js", "map.js"  # of the map: the last one calls the others
     return env.get_template("template.html").render(
         facts=facts,
         run=view,
@@ -69,5 +67,5 @@ def render(
         known={name: metric for name, metric in facts["metrics"].items() if metric["value"] is not None},
         files=files,
         measures=MEASURES,
-        script="".join(resources.files("rille.pipeline.report").joinpath(name).read_text("utf-8") for name in SCRIPTS),
+        script="".join(resources.files("rille.pipeline.report").joinpath(name).read_text("utf-8") for name in scripts),
     )

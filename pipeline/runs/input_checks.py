@@ -25,8 +25,6 @@ Floats = NDArray[np.float64]
 Level = Literal["OK", "WARN", "FAIL"]
 
 MIN_SHARPNESS_RATIO = 0.6  # of a camera's median sharpness: a Gaussian blur of one more pixel reduces it to this
-MIN_DEVIATION_GREY = 1.0  # grey levels, standard deviation of an image below which it is blank
-MAX_STEP_RATIO = 2.5  # median steps of time above which a step is a gap
 
 
 @dataclass(frozen=True)
@@ -167,7 +165,8 @@ def judge_times(times: Sequence[float] | None) -> Finding:
         k = int(np.argmax(steps <= 0))
         return judge("times", f"time goes back or rests from frame {k} to {k + 1}", {"steps back": 1})
     usual = float(np.median(steps))
-    gaps, longest = int((steps > MAX_STEP_RATIO * usual).sum()), int(np.argmax(steps))
+    # median steps of time above which a step is a gap
+    gaps, longest = int((steps > 2.5 * usual).sum()), int(np.argmax(steps))
     words = f"{1 / usual:.3g} frames a second over {float(steps.sum()):.4g} s"
     if gaps:
         words += f"; {gaps} gaps, the longest {steps[longest]:.3g} s from frame {longest} to {longest + 1}"
@@ -247,7 +246,8 @@ def judge_looks(looks: Mapping[str, Mapping[int, ImageFigures]], names: Sequence
 def _camera(camera: str, looks: Mapping[int, ImageFigures], names: Sequence[str]) -> Iterator[Finding]:
     """Findings on the images of one camera."""
     at = [names[k] for k in looks]
-    blank = np.flatnonzero(_figure(looks, "deviation") < MIN_DEVIATION_GREY)
+    # grey levels, standard deviation of an image below which it is blank
+    blank = np.flatnonzero(_figure(looks, "deviation") < 1.0)
     if blank.size:
         text = f"{blank.size} {camera} images show nothing, first frame {at[blank[0]]}"
         yield judge("images", text, {"blank": blank.size})

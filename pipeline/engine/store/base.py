@@ -41,9 +41,6 @@ from rille.pipeline.engine.store.zarr_group import encode
 from rille.stages.core.declare import Bundle, Stage
 from rille.stages.core.errors import RilleError
 
-USED_S = 3600.0
-"""Age of a file that a look-up touches, seconds: well below the grace of clearing up, which spares what was touched."""
-
 
 class NonDeterministicError(RilleError):
     """A stage gave two different results for one key."""
@@ -108,7 +105,9 @@ class Store:
                 status = os.stat(path)
                 index = None if fresh else self._index
                 known = index.get(stage, key, folder.mark(status)) if index else None
-                if use and status.st_mtime < time.time() - USED_S:
+                # Age of a file that a look-up touches, seconds: well below the grace of clearing up, which spares
+                # what was touched
+                if use and status.st_mtime < time.time() - 3600.0:
                     folder.touch(path)
                 return known or manifest.reference(self.read_manifest(stage, key), status.st_size)
         except FileNotFoundError:

@@ -19,8 +19,6 @@ from rille.stages.core.errors import RilleError
 if TYPE_CHECKING:
     from rille.pipeline.engine.store.base import Store
 
-BLOSC_OVERHEAD_BYTES = 16
-
 
 class DamagedError(RilleError):
     """The file of an artifact is missing, or is not as it was written."""
@@ -101,7 +99,8 @@ def _read(archive: Archive, name: str, about: Mapping[str, Any], window: tuple[s
     values = np.empty([len(span) for span in spans], dtype)
     touched = [range(s.start // e, -(-s.stop // e) if s else 0) for s, e in zip(spans, edges, strict=True)]
     for at in itertools.product(*touched):
-        data = archive.member(chunk_name(name, at), math.prod(edges) * dtype.itemsize + BLOSC_OVERHEAD_BYTES)
+        # Blosc adds a header of 16 bytes.
+        data = archive.member(chunk_name(name, at), math.prod(edges) * dtype.itemsize + 16)
         # First value of the window, counted from the first one of the chunk.
         shifts = [s.start - i * e for s, i, e in zip(spans, at, edges, strict=True)]
         exact = values.shape == edges and not any(shifts)

@@ -18,11 +18,6 @@ Manifest = dict[str, Any]
 STAGE = r"\w+(?:\.\w+)*"
 """Name of a stage, as it stands in paths (``locus``, ``mockup.scene``)."""
 
-MAX_MANIFEST_BYTES = 256_000_000
-
-MAX_RATIO = 1000
-"""Bytes of a decoded array for one of the file: lz4 makes 255 of one."""
-
 
 class _StoredArray(BaseModel, strict=True):
     """Array of an artifact: NumPy's name of its type, and the edges of the chunks in which it is stored."""
@@ -87,13 +82,14 @@ def read_manifest(archive: Archive, stage: str, key: str) -> Manifest:
     BrokenError
         The archive holds no such manifest.
     """
-    manifest: Manifest = json.loads(archive.member(MANIFEST, MAX_MANIFEST_BYTES))
+    manifest: Manifest = json.loads(archive.member(MANIFEST, 256_000_000))  # bytes at most
     _Manifest.model_validate(manifest)
     if (manifest["stage"], manifest["key"]) != (stage, key):
         raise BrokenError("the manifest is that of another artifact")
     for name, about in manifest["arrays"].items():
         edges = zip(about["chunks"], about["shape"], strict=True)
-        if _nbytes(about) > MAX_RATIO * archive.size or any(edge > max(n, 1) for edge, n in edges):
+        # Bytes of a decoded array for one of the file: lz4 makes 255 of one
+        if _nbytes(about) > 1000 * archive.size or any(edge > max(n, 1) for edge, n in edges):
             raise BrokenError(f"{name} claims more than the file holds")
     return manifest
 

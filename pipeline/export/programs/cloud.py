@@ -26,12 +26,6 @@ from rille.pipeline.export.writers import ENGINEERING_CRS
 from rille.stages.core.errors import InputError
 from rille.stages.terrain.points import colours, cubes, one_a_cube
 
-MADE = date(2000, 1, 1)
-"""Date that every LAZ file states, so that equal clouds make equal files."""
-
-STEPS_PER_SIGMA = 10
-"""Steps of a LAZ coordinate in the median standard deviation across the ray of the first pair."""
-
 ABOUT = {
     "sigma_along": "standard deviation along ray, m",
     "sigma_across": "standard deviation across it, m",
@@ -143,11 +137,13 @@ def _write_laz(path: Path, parts: Iterator[Columns], crs: str) -> None:
 
     first = next(parts)
     header = laspy.LasHeader(point_format=7, version="1.4")
-    header.creation_date, header.generating_software, header.system_identifier = MADE, "Rille", "stereo"
+    # Date that every LAZ file states, so that equal clouds make equal files
+    header.creation_date, header.generating_software, header.system_identifier = date(2000, 1, 1), "Rille", "stereo"
     # LAS has coordinates of 32 bits: without offsets eastings would overflow at steps as fine as these.
     if len(first["x"]):
         header.offsets = [float(np.floor(first[axis].min())) for axis in "xyz"]
-    step = np.median(first["sigma_across"]) / STEPS_PER_SIGMA if len(first["x"]) else 1e-3
+    # Ten steps of a coordinate in the median standard deviation across the ray of the first pair
+    step = np.median(first["sigma_across"]) / 10 if len(first["x"]) else 1e-3
     header.scales = np.full(3, 10.0 ** np.floor(np.log10(step)))
     # With point formats 6 to 10 LAS 1.4 allows only WKT, and wants this bit set.
     header.vlrs.append(WktCoordinateSystemVlr(crs))
