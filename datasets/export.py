@@ -54,9 +54,8 @@ def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs:
         # Beside the folder to be made: a rename in one step needs the same file system.
         part = Path(tempfile.mkdtemp(prefix=f".{directory.name}.", dir=directory.parent))
     except OSError as error:
-        raise InputError(
-            "RIL-166", f"{directory} cannot be made: {error.strerror}", remedy="name another folder"
-        ) from error
+        text = f"{directory} cannot be made: {error.strerror}"
+        raise InputError("RIL-166", text, remedy="name another folder") from error
     try:
         _write(sequence, part, materialise, chosen)
         # mkdtemp makes it readable for its owner alone.

@@ -197,9 +197,8 @@ class Sequence:
     def __post_init__(self) -> None:
         check_name(self.name)
         if self.frames < 1:
-            raise InputError(
-                "RIL-272", f"sequence {self.name} has no frames", remedy="give a folder with at least one pair"
-            )
+            text = f"sequence {self.name} has no frames"
+            raise InputError("RIL-272", text, remedy="give a folder with at least one pair")
         for what in ("frame_names", "times", "truth", "up", "attitude", "odometry"):
             values = getattr(self, what)
             if values is not None and len(values) != self.frames:

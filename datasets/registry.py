@@ -120,9 +120,8 @@ def _loop(sections: dict[str, Mapping[str, Any]], name: str) -> Sequence:
     params, default = (_section("mockup", MockupParams, {**preset, **more}) for more in (given, {}))
     for key in RECORDED_ONLY:
         if getattr(params, key) != getattr(default, key):
-            raise ConfigError(
-                "RIL-734", f"mockup.{key} = {getattr(params, key)}: nothing of a drive reads it", remedy="leave it out"
-            )
+            text = f"mockup.{key} = {getattr(params, key)}: nothing of a drive reads it"
+            raise ConfigError("RIL-734", text, remedy="leave it out")
     return mockup_loop(params, rover, name)
 
 
@@ -180,9 +179,8 @@ def folder_manifest(folder: Path) -> Path | None:
     found = sorted(folder.glob("*.rille.toml")) or [p for p in (folder / "manifest.toml",) if p.is_file()]
     if len(found) > 1:
         names = ", ".join(path.name for path in found)
-        raise InputError(
-            "RIL-279", f"{folder} holds {len(found)} manifests: {names}", remedy=f"choose one, e.g. {found[0]}"
-        )
+        text = f"{folder} holds {len(found)} manifests: {names}"
+        raise InputError("RIL-279", text, remedy=f"choose one, e.g. {found[0]}")
     return found[0] if found else None
 
 

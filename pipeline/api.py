@@ -146,11 +146,9 @@ def assignments(settings: Mapping[str, Settings]) -> list[str]:
             try:
                 lines = tomli_w.dumps({"v": value}).removeprefix("v = ").splitlines()
             except TypeError:
-                raise ConfigError(
-                    "RIL-866",
-                    f"{section}.{name} = {value!r} is no value of TOML",
-                    remedy="give a number, a text, True or False, or a list of these; or leave it out",
-                ) from None
+                text = f"{section}.{name} = {value!r} is no value of TOML"
+                remedy = "give a number, a text, True or False, or a list of these; or leave it out"
+                raise ConfigError("RIL-866", text, remedy=remedy) from None
             # Only a list has several lines: the line feed of a text is escaped.
             words.append(f"{section}.{name}={' '.join(line.strip() for line in lines)}")
     return words
@@ -317,7 +315,6 @@ class Run:
         """
         path = self.folder / name
         if not path.exists():
-            raise InputError(
-                "RIL-862", f"{self.folder} has no {name}", remedy="the report says what is missing, or run again"
-            )
+            text = f"{self.folder} has no {name}"
+            raise InputError("RIL-862", text, remedy="the report says what is missing, or run again")
         return path

@@ -77,9 +77,8 @@ class StereoSequence:
         if not 0 <= number < len(self):
             raise IndexError(f"pair {frame} of {len(self)}")
         if number in self.source.lost:
-            raise InputError(
-                "RIL-863", f"frame {number} of {self.name}: {self.source.lost[number]}", remedy="take another frame"
-            )
+            text = f"frame {number} of {self.name}: {self.source.lost[number]}"
+            raise InputError("RIL-863", text, remedy="take another frame")
         return StereoPair(self, number)
 
     def __iter__(self) -> Iterator[StereoPair]:
@@ -163,20 +162,16 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
 def check_place(path: object) -> None:
     """Refuse what can be no name or path of a sequence."""
     if not isinstance(path, str | Path):
-        raise InputError(
-            "RIL-970",
-            f"a {type(path).__name__} is no sequence",
-            remedy="give a name, a path, or what rille.open returns",
-        )
+        text = f"a {type(path).__name__} is no sequence"
+        raise InputError("RIL-970", text, remedy="give a name, a path, or what rille.open returns")
 
 
 def check_sections(settings: Mapping[str, object]) -> None:
     """Refuse a parameter that is given without its section."""
     for section, values in settings.items():
         if not isinstance(values, Mapping):
-            raise ConfigError(
-                "RIL-861", f"{section}={values!r} is no section", remedy=f'give {section}={{"name": value}}'
-            )
+            text = f"{section}={values!r} is no section"
+            raise ConfigError("RIL-861", text, remedy=f'give {section}={{"name": value}}')
 
 
 def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
@@ -291,11 +286,8 @@ def _disparity(disparity: xarray.Dataset, pair: StereoPair) -> Bundle:
     given = _bundle(disparity, hfvm_stage, "column_disparity", "rille.match")
     size = pair.sequence.rig.left.height, pair.sequence.rig.left.width
     if disparity.column_disparity.shape != size:
-        raise InputError(
-            "RIL-865",
-            f"disparity of {disparity.column_disparity.shape} pixels, the pair's images have {size}",
-            remedy="give the disparity that rille.match finds for this pair",
-        )
+        text = f"disparity of {disparity.column_disparity.shape} pixels, the pair's images have {size}"
+        raise InputError("RIL-865", text, remedy="give the disparity that rille.match finds for this pair")
     return given
 
 
@@ -402,11 +394,8 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
     args = {"vehicle": built.vehicle.model_dump(mode="json", exclude={"name"})}
     given = _bundle(dem, locus_stage.locus_stage, "elevation", "rille.terrain")
     if "reference" in given.meta:
-        raise InputError(
-            "RIL-386",
-            "the elevations are distances from a plane that is no ground, so nothing can drive there",
-            remedy="if it is ground, state its normal as world.up in the manifest",
-        )
+        text = "the elevations are distances from a plane that is no ground, so nothing can drive there"
+        raise InputError("RIL-386", text, remedy="if it is ground, state its normal as world.up in the manifest")
     hazards = risk_stage.risk_stage.run(built.risk, args, {"dem": [given]})
     return _dataset(risk_stage.risk_stage, hazards, settings)
 
@@ -530,11 +519,9 @@ def _bundle(data: xarray.Dataset, stage: Stage, variable: str, maker: str) -> Bu
     for array in stage.outputs:
         given = arrays.get(array.name)
         if given is not None and np.dtype(array.dtype).kind != "f" and given.dtype.kind == "f":
-            raise InputError(
-                "RIL-971",
-                f"{array.name} is {given.dtype}, it was {array.dtype}",
-                remedy=f"mask it by a whole number, e.g. data.assign({array.name}=data.{array.name}.where(mask, 0))",
-            )
+            text = f"{array.name} is {given.dtype}, it was {array.dtype}"
+            remedy = f"mask it by a whole number, e.g. data.assign({array.name}=data.{array.name}.where(mask, 0))"
+            raise InputError("RIL-971", text, remedy=remedy)
     return Bundle(arrays, json.loads(data.attrs["rille"])["meta"])
 
 

@@ -76,9 +76,8 @@ def decompose(projection: NDArray[np.float64], name: str) -> tuple[NDArray[np.fl
     m = projection[:, :3]
     # written so that NaN-free but singular matrices are refused before anything divides by them
     if abs(np.linalg.det(m)) < 1e-9:
-        raise InputError(
-            "RIL-203", f"calibration: {name} is singular", remedy="give P = K [R | t], 12 numbers, row-major"
-        )
+        text = f"calibration: {name} is singular"
+        raise InputError("RIL-203", text, remedy="give P = K [R | t], 12 numbers, row-major")
     if m[1, 0] == m[2, 0] == m[2, 1] == 0.0 and m[2, 2] > 0:
         k, r = m / m[2, 2], np.eye(3)
     else:
@@ -90,8 +89,7 @@ def decompose(projection: NDArray[np.float64], name: str) -> tuple[NDArray[np.fl
         k = k / k[2, 2]
     scale = np.linalg.norm(m[2])
     if abs(k[0, 1]) > 1e-4 * k[0, 0]:
-        raise InputError(
-            "RIL-204", f"calibration: {name} has skewed pixels", remedy="give a camera with perpendicular axes"
-        )
+        text = f"calibration: {name} has skewed pixels"
+        raise InputError("RIL-204", text, remedy="give a camera with perpendicular axes")
     t = np.linalg.solve(k, projection[:, 3]) / scale * np.sign(np.linalg.det(m))
     return k, RigidTransform(orthonormal(r), t)

@@ -23,11 +23,10 @@ def check_focal(camera: Camera, name: str) -> None:
     """
     for f, what, side in ((camera.fx, "fx", camera.width), (camera.fy, "fy", camera.height)):
         if not SHORTEST <= f / side <= LONGEST:
-            raise InputError(
-                "RIL-987",
-                f"camera {name}: {what} = {f:g} px cannot be that of images of {camera.width} x {camera.height} pixels",
-                remedy="give fx and fy in pixels",
+            text = (
+                f"camera {name}: {what} = {f:g} px cannot be that of images of {camera.width} x {camera.height} pixels"
             )
+            raise InputError("RIL-987", text, remedy="give fx and fy in pixels")
 
 
 def rig_of(
@@ -56,12 +55,11 @@ def rig_of(
     lenses = {"left": _sized(left, of_left), "right": _sized(right, of_right)}
     if left.T_camera_reference is None or right.T_camera_reference is None:
         lacking = left if left.T_camera_reference is None else right
-        raise InputError(
-            "RIL-128",
+        text = (
             f"cameras {left.name} and {right.name} have no relative pose: the calibration does not say where "
-            f"{lacking.name} stands",
-            remedy="give the baseline in metres, or a stereo calibration",
+            f"{lacking.name} stands"
         )
+        raise InputError("RIL-128", text, remedy="give the baseline in metres, or a stereo calibration")
     T_right_left = right.T_camera_reference @ left.T_camera_reference.inverse()
     rig = Rig(lenses["left"].ideal_camera(), lenses["right"].ideal_camera(), T_right_left)
     # Below this, in any unit of length in use, both cameras stand in one place

@@ -69,9 +69,8 @@ def opened(path: Path) -> Iterator[Any]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise InputError(
-            "RIL-940", f"{path}: bags are read by the package rosbags", remedy="pip install 'rille[robots]'"
-        ) from error
+        text = f"{path}: bags are read by the package rosbags"
+        raise InputError("RIL-940", text, remedy="pip install 'rille[robots]'") from error
     for file in path.iterdir() if path.is_dir() else (path,):
         open_regular(file, "bag", sys.maxsize).close()
     try:
@@ -82,9 +81,8 @@ def opened(path: Path) -> Iterator[Any]:
         raise
     except Exception as error:  # of a damaged bag: whatever the parsers of five formats come upon
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise InputError(
-            "RIL-941", f"{path} cannot be read as a bag: {reason}", remedy="record or copy it again"
-        ) from error
+        text = f"{path} cannot be read as a bag: {reason}"
+        raise InputError("RIL-941", text, remedy="record or copy it again") from error
 
 
 def depth(message: Any, name: str) -> Header:

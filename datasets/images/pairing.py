@@ -192,9 +192,8 @@ def pair_up(
         if joined is None or not joined.places:
             why = f"the nearest are {joined.apart:.4g} s apart" if joined else "not each has its own"
             remedy = 'state images.tolerance (s), or, of two clocks, images.pair = "order"'
-            raise IncompleteError(
-                "RIL-822", f"{both} make no pairs by the time stamps in their names: {why}", remedy=remedy
-            )
+            text = f"{both} make no pairs by the time stamps in their names: {why}"
+            raise IncompleteError("RIL-822", text, remedy=remedy)
         lines += joined.lines("RIL-821")
         return _named([(left[i], right[j]) for i, j in joined.places])
     if rule == "auto":

@@ -240,9 +240,8 @@ def find_pairs(
         found[side] = paths
     both = sorted(set(found["left"]) & set(found["right"]))
     if both:
-        raise InputError(
-            "RIL-218", f"{name}: images.left and images.right both find {both[0]}", remedy="narrow the patterns"
-        )
+        text = f"{name}: images.left and images.right both find {both[0]}"
+        raise InputError("RIL-218", text, remedy="narrow the patterns")
     try:
         return pair_up(
             found["left"],

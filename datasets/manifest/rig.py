@@ -179,11 +179,9 @@ def _placed(
     if left.T_camera_reference is not None and right.T_camera_reference is not None:
         of_files = right.T_camera_reference @ left.T_camera_reference.inverse()
     if stated is None and of_files is None:
-        raise InputError(
-            "RIL-241",
-            f"{name}: the rig is not known: nothing says where the right camera stands",
-            remedy="give rig.baseline (m; parallel cameras) or rig.T_right_left, or calibration files that have it",
-        )
+        text = f"{name}: the rig is not known: nothing says where the right camera stands"
+        remedy = "give rig.baseline (m; parallel cameras) or rig.T_right_left, or calibration files that have it"
+        raise InputError("RIL-241", text, remedy=remedy)
     chosen = stated if stated is not None else of_files
     lines = []
     if stated is not None and of_files is not None:

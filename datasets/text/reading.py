@@ -79,9 +79,8 @@ def open_regular(path: Path, what: str, most: int) -> BufferedReader:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error  # a path with a zero byte
         reason = f"it is a link to {os.readlink(path)}, which is missing" if is_broken(path) else reason
-        raise InputError(
-            "RIL-138", f"{what} {path} cannot be read: {reason}", remedy="check the path and its rights"
-        ) from error
+        text = f"{what} {path} cannot be read: {reason}"
+        raise InputError("RIL-138", text, remedy="check the path and its rights") from error
     if status.st_size <= most:
         text = f"{what} {path} is a pointer of Git LFS or git-annex; its content is elsewhere"
         raise InputError("RIL-820", text, remedy="fetch it: git lfs pull, or git annex get")
@@ -268,9 +267,8 @@ class Search:
         """
         *above, last = pattern.split("/")
         if not last or pattern.startswith("/"):
-            raise InputError(
-                "RIL-216", f"{pattern!r} is no pattern of files below a folder", remedy="give one such as left/*.png"
-            )
+            text = f"{pattern!r} is no pattern of files below a folder"
+            raise InputError("RIL-216", text, remedy="give one such as left/*.png")
         places = [root]
         for part in above:
             if part == "**":

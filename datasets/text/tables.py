@@ -94,11 +94,8 @@ def read_table(path: Path, what: str) -> TextTable:
             names = text.lstrip("#").strip()
             continue
         if rows and len(row) != len(rows[0]):
-            raise InputError(
-                "RIL-285",
-                f"{path}, line {k}: {len(row)} columns where the first row has {len(rows[0])}",
-                remedy="correct or remove that line",
-            )
+            text = f"{path}, line {k}: {len(row)} columns where the first row has {len(rows[0])}"
+            raise InputError("RIL-285", text, remedy="correct or remove that line")
         rows.append(row)
         at.append(k)
     if not rows:

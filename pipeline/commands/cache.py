@@ -59,11 +59,9 @@ def gc(
     ledgers = [path for folder in roots.folders(store, runs) for path in folder.glob(f"*/*/{lookup.LEDGER}")]
     kept = set[str]().union(*(lookup.used(path.parent) for path in ledgers if path.is_file()))
     if not kept:
-        raise ConfigError(
-            "RIL-744",
-            f"no run is known that uses the cache {store.root}: all of it would go",
-            remedy="give the folder of your runs with --runs, or remove the cache yourself",
-        )
+        text = f"no run is known that uses the cache {store.root}: all of it would go"
+        remedy = "give the folder of your runs with --runs, or remove the cache yourself"
+        raise ConfigError("RIL-744", text, remedy=remedy)
     cleared = maintenance.gc(store, kept, dry_run=dry_run)
     leftovers = cleared.pop("", [])
     if dry_run:

@@ -113,12 +113,11 @@ def check(a: DemFile, b: DemFile) -> None:
     x0, x1, y0, y1 = a.extent
     u0, u1, v0, v1 = b.extent
     if min(x1, u1) <= max(x0, u0) or min(y1, v1) <= max(y0, v0):
-        raise InputError(
-            "RIL-616",
+        text = (
             f"no overlap: A is at x {x0:.6g}..{x1:.6g}, y {y0:.6g}..{y1:.6g} m, B at x {u0:.6g}..{u1:.6g}, "
-            f"y {v0:.6g}..{v1:.6g} m",
-            remedy="compare models of the same place",
+            f"y {v0:.6g}..{v1:.6g} m"
         )
+        raise InputError("RIL-616", text, remedy="compare models of the same place")
 
 
 def _grid(raster: DemFile) -> Grid:

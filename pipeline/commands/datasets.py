@@ -48,9 +48,8 @@ def export_dataset(
     """
     for_dataset, others = config.split_dataset(config.parse_assignments(assignments))
     if others:
-        raise ConfigError(
-            "RIL-063", f"--set {next(iter(others))}: not a section of a sequence", remedy="set mockup.key=value"
-        )
+        text = f"--set {next(iter(others))}: not a section of a sequence"
+        raise ConfigError("RIL-063", text, remedy="set mockup.key=value")
     place = cache_folder(cache)
     store = Store(place)
     # Before minutes of rendering.

@@ -54,9 +54,8 @@ def export(
         laz, ply: one point in each cube of so many metres; 0: all.
     """
     if output is not None and len(to) > 1:
-        raise ConfigError(
-            "RIL-020", f"--output names one place for {len(to)} forms", remedy="give one --to, or leave --output out"
-        )
+        text = f"--output names one place for {len(to)} forms"
+        raise ConfigError("RIL-020", text, remedy="give one --to, or leave --output out")
     folder = lookup.find(run, runs)
     for form in to:
         if output is not None and form in ("laz", "ply", "glb"):

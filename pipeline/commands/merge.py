@@ -119,11 +119,8 @@ def _registered(first: Terrain, other: Terrain) -> Session:
     """
     ratio = other.lattice.cell / first.lattice.cell
     if not 1.0 / MAX_CELL_RATIO < ratio < MAX_CELL_RATIO:
-        raise InputError(
-            "RIL-851",
-            f"cells of {other.name} are {other.lattice.cell:g} m wide, of {first.name} {first.lattice.cell:g} m",
-            remedy=f"run one again with --set locus.cell_size={first.lattice.cell:g}",
-        )
+        text = f"cells of {other.name} are {other.lattice.cell:g} m wide, of {first.name} {first.lattice.cell:g} m"
+        raise InputError("RIL-851", text, remedy=f"run one again with --set locus.cell_size={first.lattice.cell:g}")
     a, b = first.place, other.place
     if a is not None and b is not None:
         refuse_unlike_systems({other.name: b.crs, first.name: a.crs})

@@ -22,9 +22,8 @@ def list_runs(sequence: str = "", *, runs: Runs = RUNS) -> int:
     """
     chosen = [run for run in lookup.all_runs(runs) if sequence in ("", run.parent.name)]
     if not chosen:
-        raise ConfigError(
-            "RIL-880", f"{runs} holds no run{f' of {sequence}' if sequence else ''}", remedy="check --runs"
-        )
+        text = f"{runs} holds no run{f' of {sequence}' if sequence else ''}"
+        raise ConfigError("RIL-880", text, remedy="check --runs")
     print("\n".join(describe(chosen)))
     return COMPLETE
 

@@ -152,11 +152,9 @@ class Presence:
         if threads:
             self._manned = now
         elif now - self._manned > self._patience:
-            raise ClusterError(
-                "RIL-525",
-                f"the dask scheduler at {self._address} had no workers for {self._patience:.0f} s",
-                remedy="start workers, and run the same command: what is committed stays",
-            )
+            text = f"the dask scheduler at {self._address} had no workers for {self._patience:.0f} s"
+            remedy = "start workers, and run the same command: what is committed stays"
+            raise ClusterError("RIL-525", text, remedy=remedy)
         return int(threads)
 
     def silent(self) -> set[str]:

@@ -117,9 +117,8 @@ class Result:
             error = first.error
             if (known := translated(error)) is not None:
                 raise known.at(first.label) from error
-            raise TaskError(
-                "RIL-534", f"{first.label} (stage {first.stage}): {type(error).__name__}: {error}"
-            ) from error
+            text = f"{first.label} (stage {first.stage}): {type(error).__name__}: {error}"
+            raise TaskError("RIL-534", text) from error
 
 
 def is_hole(error: BaseException) -> bool:

@@ -51,11 +51,8 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
     # Computed here as well, from this process's own source files: the client's may be newer.
     own = key_of(spec, refs)
     if key is not None and key != own:
-        raise CodeChangedError(
-            "RIL-581",
-            f"{spec.label}: source code or packages of the worker are not those the run began with",
-            remedy="run again, and edit nothing meanwhile",
-        )
+        text = f"{spec.label}: source code or packages of the worker are not those the run began with"
+        raise CodeChangedError("RIL-581", text, remedy="run again, and edit nothing meanwhile")
     store = Store(root)
     for trial in range(TRIES):
         try:

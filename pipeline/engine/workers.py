@@ -147,11 +147,8 @@ def check(kind: Any, jobs: int | None = None) -> None:
         raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
     # A spawned worker imports the program's main module first: without a guard it would start workers of its own.
     if kind == "dask" and multiprocessing.parent_process() is None and "__mp_main__" in _modules_at_work():
-        raise ConfigError(
-            "RIL-972",
-            "a worker that starts came to this call",
-            remedy='put what the program does under `if __name__ == "__main__":`',
-        )
+        text = "a worker that starts came to this call"
+        raise ConfigError("RIL-972", text, remedy='put what the program does under `if __name__ == "__main__":`')
     if jobs is not None and jobs < 1:
         raise ConfigError("RIL-540", f"{jobs} jobs are not permitted", remedy="give 1 or more")
 

@@ -162,9 +162,6 @@ def unpack(bundle: Bundle) -> dict[str, bytes]:
             files[name] = data[at : at + size]
             at += size
     except (ValueError, TypeError, KeyError) as error:
-        raise InputError(
-            "RIL-983",
-            f"an artifact of the cache holds no files of a run ({error})",
-            remedy="somebody forged it: use another cache",
-        ) from error
+        text = f"an artifact of the cache holds no files of a run ({error})"
+        raise InputError("RIL-983", text, remedy="somebody forged it: use another cache") from error
     return files

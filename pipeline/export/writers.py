@@ -284,11 +284,8 @@ def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.
                 listed = ", ".join(names) or "without names"
                 raise InputError("RIL-622", f"{path} has {file.count} bands ({listed}), no disparity", remedy=remedy)
             if shape and file.shape != shape:
-                raise InputError(
-                    "RIL-044",
-                    f"{path} has {file.width} x {file.height} pixels, the left image {shape[1]} x {shape[0]}",
-                    remedy="give a disparity of this left image",
-                )
+                text = f"{path} has {file.width} x {file.height} pixels, the left image {shape[1]} x {shape[0]}"
+                raise InputError("RIL-044", text, remedy="give a disparity of this left image")
             column, row = file.read(out_dtype="float32", masked=True).filled(np.nan)
     except RasterioError as error:
         raise InputError("RIL-623", f"{path} cannot be read as a TIFF ({error})", remedy=remedy) from error

@@ -372,11 +372,8 @@ def other_plane(config: Any, levels: Series[Any], *, placed: bool) -> Args | Non
         verdict = judge(levels, coarse=config.locus.cell_size is not None)
         return None if verdict.ground or placed or not levels else {"reference": SCENE, "why": verdict.why}
     if placed and wanted != "ground":
-        raise ConfigError(
-            "RIL-052",
-            "distances from a plane that is no ground have no place on Earth",
-            remedy="leave world.origin out, or terrain.reference",
-        )
+        text = "distances from a plane that is no ground have no place on Earth"
+        raise ConfigError("RIL-052", text, remedy="leave world.origin out, or terrain.reference")
     if wanted == "ground":
         return None
     return {"reference": list(wanted) if isinstance(wanted, tuple) else SCENE}

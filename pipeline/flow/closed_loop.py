@@ -159,20 +159,16 @@ class Drive:
 
     def __init__(self, graph: Graph, sequence: Sequence, config: Any) -> None:
         if sequence.simulation is None or config.drive.goal is None:
-            raise ConfigError(
-                "RIL-031", f"{sequence.name} has no goal to drive to", remedy="set drive.goal=[x, y], metres"
-            )
+            text = f"{sequence.name} has no goal to drive to"
+            raise ConfigError("RIL-031", text, remedy="set drive.goal=[x, y], metres")
         if config.locus.cell_size is None:
-            raise ConfigError(
-                "RIL-032", "a drive needs locus.cell_size", remedy="set it to about an eighth of a wheel, metres"
-            )
+            text = "a drive needs locus.cell_size"
+            raise ConfigError("RIL-032", text, remedy="set it to about an eighth of a wheel, metres")
         d, overview = config.drive, sequence.simulation.overview
         if d.frame == "map" and d.pose is None and (d.prior is None or overview is None):
-            raise ConfigError(
-                "RIL-033",
-                "drive.frame=map needs drive.pose, or drive.prior and a global map",
-                remedy="set drive.pose=[x, y, z, degrees], or drive.prior and rover.map_cell",
-            )
+            text = "drive.frame=map needs drive.pose, or drive.prior and a global map"
+            remedy = "set drive.pose=[x, y, z, degrees], or drive.prior and rover.map_cell"
+            raise ConfigError("RIL-033", text, remedy=remedy)
         self.graph, self.sequence, self.config = graph, sequence, config
         self.make = DriveBuilder(graph, sequence, config, self)
         self.products = self.make.products

@@ -101,9 +101,8 @@ def row(rows: Iterable[dict[str, Any]], label: str, run: Path) -> dict[str, Any]
     if label in by_label:
         return by_label[label]
     near = _near(label, by_label)
-    raise ConfigError(
-        "RIL-068", f"run {name(run)} has no task {label!r}", remedy=near or f"it has {some(list(by_label), 4)}"
-    )
+    text = f"run {name(run)} has no task {label!r}"
+    raise ConfigError("RIL-068", text, remedy=near or f"it has {some(list(by_label), 4)}")
 
 
 def _near(text: str, names: Iterable[str]) -> str:

@@ -257,11 +257,8 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> Item
 
     # The folder may go while a run of hours is under way; writing would make one without its first files.
     if not (opened.folder / "config.toml").exists():
-        raise RilleError(
-            "RIL-740",
-            f"{opened.folder} was removed while the run was under way",
-            remedy="run again: what was computed is in the cache",
-        )
+        text = f"{opened.folder} was removed while the run was under way"
+        raise RilleError("RIL-740", text, remedy="run again: what was computed is in the cache")
     tasks = run_files.task_rows(opened.graph)
     whole = opened.late(tasks=tasks, seconds=result.seconds, left_out=result.left_out)
     missing = run_files.write(opened.folder, whole, made, opened.store)
@@ -307,9 +304,8 @@ def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
     """New folder named by time and a short digest of the plan."""
     latest = parent / "latest"
     if latest.exists() and not latest.is_symlink():
-        raise ConfigError(
-            "RIL-765", f"{latest} is no link to a run", remedy="move it away, or choose another --runs folder"
-        )
+        text = f"{latest} is no link to a run"
+        raise ConfigError("RIL-765", text, remedy="move it away, or choose another --runs folder")
     name = f"{started:%Y%m%dT%H%M%SZ}-{hashlib.sha256(plan.encode()).hexdigest()[:8]}"
     # Two runs of one plan within a second: mkdir decides which of them has the name.
     for suffix in chain([""], (f"-{number}" for number in count(2))):

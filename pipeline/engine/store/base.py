@@ -154,9 +154,8 @@ class Store:
         """
         made = self.manifest(ref.stage, ref.key)
         if made is None or made["digest"] != ref.digest:
-            raise GoneError(
-                "RIL-572", f"artifact {ref.stage} {ref.key[:12]} has gone from {self.root}", remedy="run again"
-            )
+            text = f"artifact {ref.stage} {ref.key[:12]} has gone from {self.root}"
+            raise GoneError("RIL-572", text, remedy="run again")
         return Bundle(LazyArrays(self, made), made["meta"])
 
     def commit(

@@ -31,11 +31,8 @@ def locate(cache: Path | str) -> Path:
         It is a URL; the message does not repeat what may be a password.
     """
     if re.match(r"\w+:/", str(cache)):  # a Path has lost the second slash
-        raise ConfigError(
-            "RIL-546",
-            f"a cache at {str(cache).partition(':')[0]}:// is not supported",
-            remedy="give --cache a folder; machines share one by NFS, say",
-        )
+        text = f"a cache at {str(cache).partition(':')[0]}:// is not supported"
+        raise ConfigError("RIL-546", text, remedy="give --cache a folder; machines share one by NFS, say")
     return Path(cache)
 
 
@@ -47,11 +44,9 @@ def clear_errors(root: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno not in (*FULL, *CLOSED, errno.ENOTDIR):
             raise
-        raise StoreError(
-            "RIL-575",
-            f"the cache {root} cannot be used ({os.strerror(error.errno)})",
-            remedy="free space, clear the cache, or choose another folder with --cache",
-        ) from error
+        text = f"the cache {root} cannot be used ({os.strerror(error.errno)})"
+        remedy = "free space, clear the cache, or choose another folder with --cache"
+        raise StoreError("RIL-575", text, remedy=remedy) from error
 
 
 def touch(path: str) -> None:

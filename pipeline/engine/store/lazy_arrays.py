@@ -81,11 +81,9 @@ class LazyArrays(Mapping[str, AnyArray]):
             wrong = str(error)
         aside = self._store.set_aside(stage, key, wrong)
         outcome = "was set aside" if aside else "stays, for the cache cannot be written"
-        raise DamagedError(
-            "RIL-504",
-            f"artifact {self._manifest['label']} ({stage}) is damaged, {wrong}; it {outcome}",
-            remedy="run again: it will be recomputed" if aside else "choose another folder with --cache",
-        )
+        text = f"artifact {self._manifest['label']} ({stage}) is damaged, {wrong}; it {outcome}"
+        remedy = "run again: it will be recomputed" if aside else "choose another folder with --cache"
+        raise DamagedError("RIL-504", text, remedy=remedy)
 
 
 def _read(archive: Archive, name: str, about: Mapping[str, Any], window: tuple[slice, ...]) -> AnyArray:

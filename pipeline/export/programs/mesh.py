@@ -64,9 +64,8 @@ def write_glb(path: Path, terrain: DemFile, ortho: Layer) -> str:
         step += 1
         vertices, faces, uv = _mesh(terrain, step)
     if not len(faces):
-        raise InputError(
-            "RIL-603", f"{terrain.name}: no four neighbouring cells are known", remedy="give a more complete one"
-        )
+        text = f"{terrain.name}: no four neighbouring cells are known"
+        raise InputError("RIL-603", text, remedy="give a more complete one")
     middle = np.round(0.5 * (vertices.min(axis=0) + vertices.max(axis=0)), 3)
     local = vertices - middle
     shown = np.column_stack([local[:, 0], local[:, 2], -local[:, 1]]).astype(np.float32)

@@ -44,9 +44,8 @@ class PlacedPairs:
         self._run, self._every, self.pairs = run, every, [pair for pair in pairs if pair in here]
         self.unplaced = len(pairs) - len(self.pairs)
         if not self.pairs:
-            raise InputError(
-                "RIL-613", "no pair of the run has both a disparity and a pose", remedy="its report says what failed"
-            )
+            text = "no pair of the run has both a disparity and a pose"
+            raise InputError("RIL-613", text, remedy="its report says what failed")
 
     def __iter__(self) -> Iterator[PlacedPair]:
         for pair in self.pairs:

@@ -50,11 +50,9 @@ class RunArtifacts:
         # With the slash, "merge" does not find a stage whose name merely begins so.
         begun = [name for name in self._rows if f"{name}/".startswith(f"{label}/")]
         if not begun:
-            raise InputError(
-                "RIL-609",
-                f"the run has no {label}",
-                remedy="run the same command again if it was stopped; else its report says what failed",
-            )
+            text = f"the run has no {label}"
+            remedy = "run the same command again if it was stopped; else its report says what failed"
+            raise InputError("RIL-609", text, remedy=remedy)
         return self._open(label if label in begun else begun[-1 if last else 0])
 
     def all(self, stage: str) -> dict[str, Bundle]:
