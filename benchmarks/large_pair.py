@@ -170,7 +170,7 @@ def main() -> None:
         )
         if side is not None:
             other = Graph()
-            tiled = tiles.Tiles(other, params, lay_out(other, paths, shape), shape, side, "hfvm").build()
+            tiled = tiles.build(other, params, lay_out(other, paths, shape), shape, side, "hfvm")
             table(other, run(other, store, options.jobs))
             judge(store, tiled.ref, shape)
         if whole is not None:

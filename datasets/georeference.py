@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,6 +39,11 @@ class Georeference:
     def to_dict(self) -> dict[str, Any]:
         """JSON form."""
         return {"crs": self.crs, "origin": list(self.origin), "azimuth": self.azimuth}
+
+    @staticmethod
+    def from_dict(d: Mapping[str, Any]) -> Georeference:
+        """Inverse of :meth:`to_dict`."""
+        return Georeference(d["crs"], tuple(d["origin"]), d["azimuth"])
 
 
 def metric_crs(text: str) -> str:

@@ -104,7 +104,6 @@ class Options(Work):
         Literal["auto", "bar", "plain", "quiet"], Parameter(help="How progress is shown on stderr.")
     ] = "auto"
     quiet: Annotated[bool, flag("No progress; warnings and errors only.", "--quiet", "-q")] = False
-    verbose: Annotated[bool, flag("Say where to watch dask at work.", "--verbose", "-v")] = False
     kept: Annotated[Any, Unparsed] = None
     """:class:`~rille.pipeline.engine.workers.Kept` of several runs, one after another."""
 

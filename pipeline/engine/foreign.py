@@ -1,8 +1,9 @@
 """Schedulers and workers that others have started: what they must be, and whether they are still there.
 
 Every worker must have the source code, the Python and the packages of the client, use one thread a library, and see
-the same cache: a probe is written by each side and read by the other. One that differs is named with the difference,
-and the run does not begin. One that joins later computes the key of each task itself, and fails where it differs.
+the same cache: each reads a probe of the client there, and writes beside it. One that differs is named with the
+difference, and the run does not begin. One that joins later computes the key of each task itself, and fails where it
+differs.
 """
 
 from __future__ import annotations
@@ -28,8 +29,6 @@ PACKAGES = (
 )
 """Distributions whose version must be the client's, and the kind of processor that they work for."""
 
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-
 NO_WORKERS_SECONDS = 30.0
 """Time that a scheduler may be without workers, at the beginning or later, before the run is given up."""
 
@@ -54,8 +53,8 @@ def identity() -> dict[str, str]:
     return found
 
 
-def compare(ours: Identity, cache: Path, token: str) -> str:
-    """Run on a worker: name of the probe that it has left in the cache, if it is like the client.
+def compare(ours: Identity, probe: Path) -> None:
+    """Run on a worker: compare it with the client, which has left a probe in the cache.
 
     Raises
     ------
@@ -67,21 +66,15 @@ def compare(ours: Identity, cache: Path, token: str) -> str:
     if differs:
         remedy = "install the same there, and start it again"
         raise ConfigError("RIL-521", f"differs: {', '.join(differs)}", remedy=remedy)
-    if threads := [name for name in ONE_THREAD if os.environ.get(name) != "1"]:
+    if threads := [name for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS") if os.environ.get(name) != "1"]:
         text = f"may use several threads a library ({threads[0]} is not 1)"
         raise ConfigError("RIL-522", text, remedy="start it with OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1")
-    probe = cache / "probe" / f"{token}-{uuid.uuid4().hex}"
     try:
-        (cache / "probe" / token).read_bytes()
-        atomic.write(probe, "")
-    except (OSError, RilleError) as error:
-        raise _not_shared(cache, " ".join(str(error).split())) from error
-    return probe.name
-
-
-def _not_shared(cache: Path, why: str) -> ConfigError:
-    remedy = "give --cache a folder that all machines share"
-    return ConfigError("RIL-523", f"does not share the cache {cache}: {why}", remedy=remedy)
+        probe.read_bytes()
+        probe.with_name(f"{probe.name}-{uuid.uuid4().hex}").touch()
+    except OSError as error:
+        text = f"does not share the cache {probe.parents[1]}: {' '.join(str(error).split())}"
+        raise ConfigError("RIL-523", text, remedy="give --cache a folder that all machines share") from error
 
 
 def examine(client: Any, cache: Path) -> None:
@@ -92,25 +85,22 @@ def examine(client: Any, cache: Path) -> None:
     ConfigError
         The first such worker, with the difference.
     """
-    probes, token = cache / "probe", uuid.uuid4().hex
+    probe = cache / "probe" / uuid.uuid4().hex
     try:
-        atomic.write(probes / token, "")
-        answers = client.run(compare, identity(), cache, token, on_error="return")
+        atomic.write(probe, "")
+        answers = client.run(compare, identity(), probe, on_error="return")
         for address, answer in sorted(answers.items()):
             name = worker_name(client, address)
             if isinstance(answer, ConfigError):
                 raise answer.at(name)
             if isinstance(answer, BaseException):
                 text = f"{name} cannot run Rille: {type(answer).__name__}: {' '.join(str(answer).split())[:200]}"
-                raise ConfigError(
-                    "RIL-520", text, remedy="install the same version there, and start the workers with it"
-                )
-            if not (probes / answer).is_file():
-                raise _not_shared(cache, "its probe is not seen here").at(name)
+                remedy = "install the same version there, and start the workers with it"
+                raise ConfigError("RIL-520", text, remedy=remedy)
     finally:
-        for probe in probes.glob(f"{token}*"):
+        for left in probe.parent.glob(f"{probe.name}*"):
             with suppress(OSError):
-                probe.unlink()
+                left.unlink()
 
 
 def worker_name(client: Any, address: str) -> str:

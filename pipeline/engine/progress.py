@@ -21,23 +21,19 @@ INTERVAL = 5.0
 """Seconds between plain lines."""
 
 
-def make(mode: str = "auto", stream: TextIO | None = None, *, verbose: bool = False) -> Progress:
-    """``auto`` (bar on a terminal, else plain), ``bar``, ``plain``, ``quiet``; ``verbose``: with details."""
+def make(mode: str = "auto", stream: TextIO | None = None) -> Progress:
+    """``auto`` (bar on a terminal, else plain), ``bar``, ``plain``, ``quiet``."""
     stream = stream or sys.stderr
     if mode == "auto":
         mode = "bar" if stream.isatty() else "plain"
     kinds: dict[str, type[Progress]] = {"bar": Bar, "plain": Lines, "quiet": Progress}
     if mode not in kinds:
         raise ConfigError("RIL-568", f"progress {mode!r} is unknown", remedy=f"one of auto, {', '.join(kinds)}")
-    progress = kinds[mode](stream)
-    progress.verbose = verbose
-    return progress
+    return kinds[mode](stream)
 
 
 class Progress:
     """Receives the run's progress: counts the tasks that have ended, and says nothing."""
-
-    verbose = False
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stderr
@@ -47,11 +43,6 @@ class Progress:
     def open(self, graph: Graph) -> None:
         """The run of a graph begins; the graph may still grow."""
         self.graph = graph
-
-    def detail(self, text: str) -> None:
-        """A word for who asks for more of them."""
-        if self.verbose:
-            print(f"rille: {plain(text)}", file=self.stream, flush=True)
 
     def running(self, handle: Handle) -> None:
         """A task was given to a worker."""

@@ -353,11 +353,8 @@ class _Run:
         name = kind if isinstance(kind, str) else kind.scheduler.address
         self.ledger.run(executor=name, jobs=jobs)
         begin = make if self.options.kept is None else self.options.kept.make
-        workers = begin(kind, jobs, self.store.root, self.budget.limit)
         self.result.workers_started = True
-        if pages := getattr(workers, "pages", ""):
-            self.progress.detail(pages)
-        return workers
+        return begin(kind, jobs, self.store.root, self.budget.limit)
 
     def _resolve(self, handle: Handle, status: str) -> None:
         handle.status = status

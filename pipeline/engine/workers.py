@@ -26,7 +26,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib.util import find_spec
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
@@ -300,16 +299,6 @@ class Dask:
         self.kept, self.closed = False, False
         # The handler runs on the client's event loop: it only hands over what came.
         client.subscribe_topic(self._run, lambda event: self._events.put(event[1]))
-
-    @property
-    def pages(self) -> str:
-        """Sentence with the address of dask's dashboard, which exists if the scheduler's machine has bokeh."""
-        if self._cluster is not None and find_spec("bokeh") is None:
-            return "dask has pages to watch once bokeh is installed: pip install bokeh"
-        try:
-            return f"dask at work: {self._client.dashboard_link}"  # the address is asked of the scheduler
-        except OSError:
-            return ""  # it has gone; the first wait for a task says so
 
     def submit(self, call: Call) -> None:
         """Start a call after those in flight that it waits for."""

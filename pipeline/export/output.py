@@ -109,7 +109,7 @@ FORMS = {
     for form in (
         Form(Rig, Rig.to_dict, Rig.from_dict),
         Form(RigidTransform, RigidTransform.to_list, RigidTransform.from_matrix),
-        Form(Georeference, Georeference.to_dict, lambda d: Georeference(**d | {"origin": tuple(d["origin"])})),
+        Form(Georeference, Georeference.to_dict, Georeference.from_dict),
         Form(Vehicle, methodcaller("model_dump", mode="json"), Vehicle.model_validate),
     )
 }

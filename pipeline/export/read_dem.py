@@ -16,6 +16,7 @@ from affine import Affine
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from rille.datasets.georeference import Georeference
 from rille.datasets.text.reading import TABLE, Search, read_lines, read_text
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.memory import free, words
@@ -267,20 +268,23 @@ def _of_run(path: Path) -> DemFile:
 
 def _cameras(run: Path) -> NDArray[np.float64] | None:
     """Positions (n, 2) of the left camera in the CRS of the run's rasters."""
-    from rille.datasets.georeference import Georeference
-
-    paths = run / "trajectory.kitti", run / "frames.json"
-    if not all(path.exists() for path in paths):
+    if not all((run / name).exists() for name in ("trajectory.kitti", "frames.json")):
         return None
-    lines, text = read_lines(paths[0], "trajectory"), read_text(paths[1], "frames.json", TABLE)
+    lines = read_lines(run / "trajectory.kitti", "trajectory")
     try:
-        poses, facts = np.loadtxt(lines, ndmin=2), json.loads(text).get("georeference")
+        poses, place = np.loadtxt(lines, ndmin=2), georeference_of(run)
         centres = poses[:, [3, 7, 11]][np.isfinite(poses[:, 3])]
-        if facts is not None:
-            centres = Georeference(facts["crs"], tuple(facts["origin"]), facts["azimuth"]).apply(centres)
+        return np.asarray((centres if place is None else place.apply(centres))[:, :2], np.float64)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
-    return np.asarray(centres[:, :2], np.float64)
+
+
+def georeference_of(run: Path) -> Georeference | None:
+    """Place of a run's world frame on Earth, as its ``frames.json`` states it."""
+    if not (run / "frames.json").exists():
+        return None
+    stated = json.loads(read_text(run / "frames.json", "frames.json", TABLE))["georeference"]
+    return None if stated is None else Georeference.from_dict(stated)
 
 
 def check_group(path: Path) -> None:

@@ -248,7 +248,7 @@ class Builder:
             # A smaller right image may be aligned to the left one, and is then as large.
             more = PYRAMID_BYTES * max(math.prod(first) - math.prod(second), 0)
             return self.graph.node(hfvm_stage, label, self.config.hfvm, {}, {}, ports, more)
-        return tiles.Tiles(self.graph, self.config.hfvm, ports, first, side, label).build()
+        return tiles.build(self.graph, self.config.hfvm, ports, first, side, label)
 
     # -- a stereo pair ------------------------------------------------------------------------------------------
 

@@ -88,28 +88,19 @@ def _half(params: HfvmParams) -> int:
     return int(presets.recipe_of(params).half)
 
 
-class Tiles:
-    """The nodes of one pair. ``shape``: rows and columns of the left image."""
+def build(graph: Graph, params: HfvmParams, images: dict[str, Handle], shape: Shape, side: int, label: str) -> Handle:
+    """Add the nodes of one pair; the last one has the disparities. ``shape``: rows and columns of the left image."""
+    rows, cols = ((n + 1) // 2 if _half(params) else n for n in shape)
+    count = len(tiles((rows, cols), side))
 
-    def __init__(
-        self, graph: Graph, params: HfvmParams, images: dict[str, Handle], shape: Shape, side: int, label: str
-    ) -> None:
-        self.graph, self.params, self.images, self.side, self.label = graph, params, images, side, label
-        rows, cols = ((n + 1) // 2 if _half(params) else n for n in shape)
-        self.count = len(tiles((rows, cols), side))
+    def node(step: str, name: str, **given: Any) -> Handle:
+        return graph.call(hfvm_tile_stage, f"{label}/{name}", params, step=step, side=side, **images, **given)
 
-    def build(self) -> Handle:
-        """Add all of them; the last one has the disparities."""
-        coarse = self._node("coarse", "coarse")
-        fine = self._tiles("fine", coarse=coarse)
-        ending = self._node("ending", "ending", coarse=coarse, fine=fine)
-        final = self._tiles("final", coarse=coarse, fine=fine, ending=ending)
-        given = {**self.images, "coarse": coarse, "tiles": final}
-        return self.graph.call(hfvm_join_stage, self.label, self.params, side=self.side, **given)
+    def every_tile(step: str, **inputs: Handle | list[Handle]) -> list[Handle]:
+        return [node(step, f"{step}/{k}", tile=k, **inputs) for k in range(count)]
 
-    def _tiles(self, step: str, **inputs: Handle | list[Handle]) -> list[Handle]:
-        return [self._node(step, f"{step}/{k}", tile=k, **inputs) for k in range(self.count)]
-
-    def _node(self, step: str, label: str, **given: Any) -> Handle:
-        label = f"{self.label}/{label}"
-        return self.graph.call(hfvm_tile_stage, label, self.params, step=step, side=self.side, **self.images, **given)
+    coarse = node("coarse", "coarse")
+    fine = every_tile("fine", coarse=coarse)
+    ending = node("ending", "ending", coarse=coarse, fine=fine)
+    final = every_tile("final", coarse=coarse, fine=fine, ending=ending)
+    return graph.call(hfvm_join_stage, label, params, side=side, **images, coarse=coarse, tiles=final)

@@ -238,7 +238,7 @@ def _compute(opened: _Opened) -> driver.Result:
             keep_going=options.keep_going,
             force=options.force,
             ledger=opened.folder / "ledger.jsonl",
-            progress=progress.make("quiet" if options.quiet else options.progress, verbose=options.verbose),
+            progress=progress.make("quiet" if options.quiet else options.progress),
             memory_limit=memory_limit(options),
             survey=lambda: lay_out(view.sequence, view.config, view.frames, opened.graph.cut),
             kept=options.kept,

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import itertools
-import json
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
@@ -20,8 +18,9 @@ from rille.datasets.text.count import count
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.colour import LUMA
-from rille.pipeline.export.programs.placed_pairs import PlacedPairs
+from rille.pipeline.export.programs.placed_pairs import PlacedPair, PlacedPairs
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
+from rille.pipeline.export.read_dem import georeference_of
 from rille.pipeline.export.writers import ENGINEERING_CRS
 from rille.stages.core.errors import InputError
 from rille.stages.terrain.points import colours, cubes, one_a_cube
@@ -77,7 +76,7 @@ def export(run: RunArtifacts, output: Path, choice: Thinning) -> str:
     """
     from rasterio.crs import CRS
 
-    place, made = _place(run.run), _Made()
+    place, pairs = georeference_of(run.run), PlacedPairs(run, every=choice.every)
     # LAS 1.4 knows the first version of WKT alone.
     crs = CRS.from_user_input(place.crs if place is not None else ENGINEERING_CRS).to_wkt(version="WKT1_GDAL")
     write = _write_laz if output.suffix == ".laz" else _write_ply
@@ -85,53 +84,27 @@ def export(run: RunArtifacts, output: Path, choice: Thinning) -> str:
         reported("RIL-618", f"{output} cannot be written", remedy="name another file with -o", kind=InputError),
         atomic.replacing(output) as temporary,
     ):
-        write(temporary, made.counted(map(choice.of, _pairs(run, choice.every, place, made))), crs)
-    unplaced = f", {made.unplaced} without a pose are left out" if made.unplaced else ""
-    return f"{count(made.points, 'point')} of {count(made.pairs, 'pair')}{unplaced}"
+        points = write(temporary, (choice.of(_columns(run, one, place)) for one in pairs), crs)
+    unplaced = f", {pairs.unplaced} without a pose are left out" if pairs.unplaced else ""
+    return f"{count(points, 'point')} of {count(len(pairs.pairs), 'pair')}{unplaced}"
 
 
-@dataclass
-class _Made:
-    """Counts of what was written."""
-
-    points: int = 0
-    pairs: int = 0
-    unplaced: int = 0
-
-    def counted(self, parts: Iterator[Columns]) -> Iterator[Columns]:
-        for part in parts:
-            self.points, self.pairs = self.points + len(part["x"]), self.pairs + 1
-            yield part
-
-
-def _place(run: Path) -> Georeference | None:
-    """Place of the world frame on Earth, as the run's ``frames.json`` states it."""
-    with suppress(FileNotFoundError):
-        if (about := json.loads((run / "frames.json").read_bytes())["georeference"]) is not None:
-            return Georeference(about["crs"], tuple(about["origin"]), about["azimuth"])
-    return None
+def _columns(run: RunArtifacts, one: PlacedPair, place: Georeference | None) -> Columns:
+    """Columns of a pair's points."""
+    found, T_world_left = one.points, one.T_world_left
+    ray = found.position / np.linalg.norm(found.position, axis=1, keepdims=True) @ T_world_left.rotation.T
+    position = T_world_left.apply(found.position)
+    if place is not None:
+        ray[:, :2], position = ray[:, :2] @ place.rotation.T, place.apply(position)
+    columns = dict(zip("xyz", position.T, strict=True))
+    columns |= zip(("red", "green", "blue"), colours(found, run.left_image(one.pair)).T, strict=True)
+    columns |= {"sigma_along": found.sigma_along, "sigma_across": found.sigma_across}
+    columns |= zip(("ray_x", "ray_y", "ray_z"), ray.T.astype(np.float32), strict=True)
+    return columns | {"pair": np.full(len(position), one.pair, np.uint32)}
 
 
-def _pairs(run: RunArtifacts, every: int, place: Georeference | None, made: _Made) -> Iterator[Columns]:
-    """Columns of each pair's points, in order of the pairs; one pair is in memory at a time."""
-    pairs = PlacedPairs(run, every)
-    made.unplaced = pairs.unplaced
-    for one in pairs:
-        found, T_world_left = one.points, one.T_world_left
-        ray = found.position / np.linalg.norm(found.position, axis=1, keepdims=True) @ T_world_left.rotation.T
-        position = T_world_left.apply(found.position)
-        if place is not None:
-            ray[:, :2], position = ray[:, :2] @ place.rotation.T, place.apply(position)
-        columns = dict(zip("xyz", position.T, strict=True))
-        columns |= zip(("red", "green", "blue"), colours(found, run.left_image(one.pair)).T, strict=True)
-        columns |= {"sigma_along": found.sigma_along, "sigma_across": found.sigma_across}
-        columns |= zip(("ray_x", "ray_y", "ray_z"), ray.T.astype(np.float32), strict=True)
-        columns["pair"] = np.full(len(position), one.pair, np.uint32)
-        yield columns
-
-
-def _write_laz(path: Path, parts: Iterator[Columns], crs: str) -> None:
-    """LAS 1.4, point format 7, the CRS as WKT 1."""
+def _write_laz(path: Path, parts: Iterator[Columns], crs: str) -> int:
+    """Write LAS 1.4, point format 7, the CRS as WKT 1; the number of points."""
     import laspy
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
@@ -160,10 +133,14 @@ def _write_laz(path: Path, parts: Iterator[Columns], crs: str) -> None:
             # LAS counts returns from 1: 0 of 0, which laspy leaves, is not valid.
             record["return_number"][:] = record["number_of_returns"][:] = 1
             file.write_points(record)
+        return int(file.header.point_count)
 
 
-def _write_ply(path: Path, parts: Iterator[Columns], crs: str) -> None:
-    """Binary PLY; coordinates are 64-bit floats: eastings of 32 bits would jump by decimetres."""
+def _write_ply(path: Path, parts: Iterator[Columns], crs: str) -> int:
+    """Write binary PLY; the number of points.
+
+    Coordinates are 64-bit floats: eastings of 32 bits would jump by decimetres.
+    """
     body, count, properties = path.with_suffix(".body"), 0, []
     with body.open("wb") as file:
         for part in parts:
@@ -180,3 +157,4 @@ def _write_ply(path: Path, parts: Iterator[Columns], crs: str) -> None:
         file.write("".join(f"{line}\n" for line in lines).encode())
         shutil.copyfileobj(points, file)
     body.unlink()
+    return count

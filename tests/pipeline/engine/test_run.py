@@ -417,13 +417,6 @@ def test_progress_speaks_on_its_stream_alone(cache, mode, capsys, monkeypatch):
     assert capsys.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("verbose", [True, False])
-def test_details_are_for_who_asks(verbose):
-    stream = io.StringIO()
-    progress.make("quiet", stream, verbose=verbose).detail("dask at work: \x1b[1m")
-    assert stream.getvalue() == ("rille: dask at work: \\x1b[1m\n" if verbose else "")
-
-
 def test_unknown_modes_and_no_workers_are_refused(cache):
     with raises("RIL-568"):
         progress.make("loud")

@@ -155,7 +155,7 @@ def test_unknown_executors(kind):
 def test_threads_of_libraries_are_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "4")
     with raises("RIL-522", "OMP_NUM_THREADS"):
-        foreign.compare(foreign.identity(), tmp_path, "token")
+        foreign.compare(foreign.identity(), tmp_path / "probe" / "token")
 
 
 @pytest.mark.slow

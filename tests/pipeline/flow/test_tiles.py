@@ -52,7 +52,7 @@ def disparity(store, images, params, side):
     if side is None:
         node = graph.node("rille.stages.hfvm.stage", "hfvm", params, inputs=given)
     else:
-        node = tiles.Tiles(graph, params, given, SHAPE, side, "hfvm").build()
+        node = tiles.build(graph, params, given, SHAPE, side, "hfvm")
     driver.run(graph, store, driver.RunOptions(executor="inline")).check()
     return node.ref
 
@@ -75,7 +75,7 @@ def test_wrong_size_of_the_camera_is_one_clear_line(tmp_path, images):
     graph = Graph()
     given = pyramids(graph, images)
     less = (SHAPE[0] // 2, SHAPE[1] // 2)
-    tiles.Tiles(graph, HfvmParams(), given, less, 50, "hfvm").build()
+    tiles.build(graph, HfvmParams(), given, less, 50, "hfvm")
     result = driver.run(graph, Store(tmp_path), driver.RunOptions(executor="inline"))
     assert {failure.error.code for failure in result.failures} == {"RIL-351"}
 
