@@ -21,29 +21,29 @@ from rille.pipeline.commands.options import COMPLETE, FAILED, INTERRUPTED, USAGE
 from rille.pipeline.engine.plain import plain_output, raw
 
 COMMANDS = {
-    "reconstruct": "reconstruct:reconstruct",
-    "watch": "watch:watch",
-    "drive": "reconstruct:drive",
-    "plan": "plan:plan",
-    "graph": "graph:graph",
-    "why": "why:why",
-    "timing": "timing:timing",
-    "view": "view:view",
-    "compare": "compare:compare",
-    "runs": "runs:list_runs",
+    "reconstruct": "computing.reconstruct:reconstruct",
+    "watch": "computing.watch:watch",
+    "drive": "computing.reconstruct:drive",
+    "plan": "computing.plan:plan",
+    "graph": "computing.graph:graph",
+    "why": "results.why:why",
+    "timing": "results.timing:timing",
+    "view": "results.view:view",
+    "compare": "results.compare:compare",
+    "runs": "results.runs:list_runs",
     "params": "params:params",
-    "compile": "compile:compile_kernels",
-    "check": "check:check",
-    "init": "init:init",
-    "calibrate": "calibrate:calibrate",
-    "rig": "rig:rig",
-    "mask": "mask:mask",
-    "match": "match:match",
-    "export": "export:export",
-    "compare-dem": "compare_dem:compare_dem",
-    "localize": "localize:localize",
-    "merge": "merge:merge",
-    "datasets": "datasets:app",
+    "compile": "computing.compile:compile_kernels",
+    "check": "sequences.check:check",
+    "init": "sequences.init:init",
+    "calibrate": "sequences.calibrate:calibrate",
+    "rig": "results.rig:rig",
+    "mask": "sequences.mask:mask",
+    "match": "sequences.match:match",
+    "export": "results.export:export",
+    "compare-dem": "results.compare_dem:compare_dem",
+    "localize": "results.localize:localize",
+    "merge": "results.merge:merge",
+    "datasets": "sequences.datasets:app",
     "cache": "cache:app",
 }
 """Module and name of each command."""
@@ -80,7 +80,8 @@ def program(*, listed: bool = False) -> App:
 def summary(place: str) -> str:
     """First line of the docstring of a command, or of the module of an app of several, read from its source alone."""
     module, _, name = place.partition(":")
-    source = (Path(__file__).parent / "commands" / f"{module}.py").read_text(encoding="utf-8")
+    path = Path(__file__).with_name("commands") / f"{module.replace('.', '/')}.py"
+    source = path.read_text(encoding="utf-8")
     return source[max(source.find(f"def {name}("), 0) :].split('"""', 2)[1].partition("\n")[0]
 
 

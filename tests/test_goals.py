@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from rille.pipeline.commands.init import init
+from rille.pipeline.commands.sequences.init import init
 from rille.pipeline.runs import session
 
 pytestmark = pytest.mark.slow

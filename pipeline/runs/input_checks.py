@@ -1,7 +1,7 @@
 """Judge the figures of a sequence against a table of limits: one finding a subject, with a code and a remedy.
 
-Plain numbers in, findings out; :mod:`rille.pipeline.commands.check` measures them. FAIL: a reconstruction is useless or
-impossible. WARN: it gets worse, or the input is probably a mistake.
+Plain numbers in, findings out; :mod:`rille.pipeline.commands.sequences.check` measures them. FAIL: a reconstruction is
+useless or impossible. WARN: it gets worse, or the input is probably a mistake.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from rille.pipeline.commands.datasets import export_dataset
+from rille.pipeline.commands.sequences.datasets import export_dataset
 from rille.pipeline.runs import session
 
 pytestmark = pytest.mark.slow

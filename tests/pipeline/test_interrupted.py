@@ -37,7 +37,9 @@ runpy.run_module("rille", run_name="__main__")
 """
 
 
-@pytest.mark.parametrize("moment", ["cyclopts", "rich.console", "rille.pipeline.commands.plan", "numpy", "exit"])
+@pytest.mark.parametrize(
+    "moment", ["cyclopts", "rich.console", "rille.pipeline.commands.computing.plan", "numpy", "exit"]
+)
 def test_ctrl_c_while_modules_are_loaded_is_one_line(moment, tmp_path):
     command = [sys.executable, "-c", PROGRAM, "plan", "mockup-short", "--cache", str(tmp_path), moment]
     ended = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120)

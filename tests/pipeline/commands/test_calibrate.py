@@ -12,7 +12,7 @@ import pytest
 from raising import raises
 
 from rille.datasets.cameras import read_cameras, rig_of
-from rille.pipeline.commands.calibrate import Board, Boards, calibrate, cover, doubts
+from rille.pipeline.commands.sequences.calibrate import Board, Boards, calibrate, cover, doubts
 from rille.stages.calibration.target import MODELS, BoardView, RigCalibration, ViewResidual
 from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.lens import Lens

@@ -11,7 +11,7 @@ import pytest
 
 from rille.datasets.protocol import Sequence
 from rille.datasets.registry import open_sequence
-from rille.pipeline.commands.check import inspect
+from rille.pipeline.commands.sequences.check import inspect
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.runs import session
 from rille.pipeline.runs.input_checks import judge_rig

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from rille.pipeline.commands.compare import _figures, _tasks
+from rille.pipeline.commands.results.compare import _figures, _tasks
 
 
 def ledger(run: Path, **digests: str | None) -> Path:

@@ -14,7 +14,7 @@ from rasterio.transform import from_origin
 from terrain_runs import LATTICE, PLACE, elevation, finished, hills
 
 from rille.pipeline import cli
-from rille.pipeline.commands import compare_dem
+from rille.pipeline.commands.results import compare_dem
 
 
 def compare(a: Path, b: Path, **options: Any) -> int:

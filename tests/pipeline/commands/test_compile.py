@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rille.pipeline.commands import compile as compilation
+from rille.pipeline.commands.computing import compile as compilation
 from rille.pipeline.engine.runtime import kernels as compiled
 from rille.stages.core.errors import RilleError
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rille.pipeline.commands import graph
+from rille.pipeline.commands.computing import graph
 from rille.pipeline.commands.options import Settings
 
 

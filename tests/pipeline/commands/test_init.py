@@ -12,7 +12,7 @@ from raising import raises
 from rille.datasets.images.files import Digests
 from rille.datasets.manifest.opening import open_manifest
 from rille.datasets.registry import hindrance
-from rille.pipeline.commands.init import init
+from rille.pipeline.commands.sequences.init import init
 
 SETTINGS = """%YAML:1.0
 Camera.fx: 60.0
@@ -118,7 +118,7 @@ NAMED = Path("nasa_k10")
 
 def test_a_folder_with_the_name_of_a_built_in_sequence_is_that_folder(drive, capsys, monkeypatch):
     monkeypatch.setattr(
-        "rille.pipeline.commands.init.hindrance", lambda path: None if path == NAMED else hindrance(path)
+        "rille.pipeline.commands.sequences.init.hindrance", lambda path: None if path == NAMED else hindrance(path)
     )
     monkeypatch.chdir(drive.parent)
     drive.rename(NAMED)

@@ -15,7 +15,7 @@ from raising import raises
 
 from rille.datasets.georeference import Georeference
 from rille.pipeline import cli
-from rille.pipeline.commands import localize
+from rille.pipeline.commands.results import localize
 from rille.stages.geometry.geometry import RigidTransform
 
 FRAME = Frame(0.4, -0.6, 0.25, yaw=130.0, tilt=0.3)

@@ -9,7 +9,7 @@ import rasterio
 from raising import raises
 
 from rille.pipeline.cli import main
-from rille.pipeline.commands import match as command
+from rille.pipeline.commands.sequences import match as command
 from rille.pipeline.export.writers import read_disparity, write_disparity
 from rille.stages.core.validity import Validity
 

@@ -13,7 +13,7 @@ from map_runs import CELL, SIGMA, Frame, height, made_run
 from raising import raises
 
 from rille.datasets.georeference import Georeference
-from rille.pipeline.commands.merge import merge
+from rille.pipeline.commands.results.merge import merge
 from rille.pipeline.export.read_dem import read_elevation, read_raster
 from rille.stages.geometry.geometry import RigidTransform
 

@@ -8,7 +8,7 @@ import pytest
 from toys.chain import build
 
 from rille.datasets.registry import open_sequence
-from rille.pipeline.commands import plan
+from rille.pipeline.commands.computing import plan
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store

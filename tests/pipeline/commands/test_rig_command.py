@@ -9,7 +9,7 @@ import pytest
 from raising import raises
 from rig_scenes import bed_depth, bed_rig, knocked, matches
 
-from rille.pipeline.commands.rig import _table, _toml, disagreements, joint
+from rille.pipeline.commands.results.rig import _table, _toml, disagreements, joint
 from rille.stages.calibration.rig import RigParams
 from rille.stages.geometry.epipolar import NAMES
 

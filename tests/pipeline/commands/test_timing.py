@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from rille.pipeline.commands import timing
+from rille.pipeline.commands.results import timing
 
 
 def test_seconds_are_summed_by_stage(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from raising import raises
 
 from rille.datasets.images import arrivals
 from rille.pipeline import cli
-from rille.pipeline.commands import watch as command
+from rille.pipeline.commands.computing import watch as command
 from rille.pipeline.commands.options import COMPLETE, HOLES, INTERRUPTED, WatchOptions
 from rille.pipeline.engine import events
 from rille.pipeline.runs import session

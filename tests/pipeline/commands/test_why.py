@@ -9,7 +9,7 @@ import pytest
 from raising import raises
 from toys.chain import run
 
-from rille.pipeline.commands import why
+from rille.pipeline.commands.results import why
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.runs import lookup
 

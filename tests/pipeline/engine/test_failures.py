@@ -37,7 +37,7 @@ def opencv_error() -> cv2.error:
 )
 def test_what_a_machine_or_a_library_refuses_is_told_in_one_line(monkeypatch, capsys, error, code, words):
     assert words in str(translated(error))
-    monkeypatch.setattr("rille.pipeline.commands.init.hindrance", lambda *_: (_ for _ in ()).throw(error))
+    monkeypatch.setattr("rille.pipeline.commands.sequences.init.hindrance", lambda *_: (_ for _ in ()).throw(error))
     with pytest.raises(SystemExit) as end:
         main(["init", "."])
     line = capsys.readouterr().err

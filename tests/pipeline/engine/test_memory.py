@@ -9,7 +9,7 @@ from raising import raises
 from toys.chain import build
 from toys.numbers import NumbersParams
 
-from rille.pipeline.commands import plan
+from rille.pipeline.commands.computing import plan
 from rille.pipeline.engine import events, memory
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph

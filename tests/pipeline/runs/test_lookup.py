@@ -4,7 +4,7 @@ import pytest
 from raising import raises
 from toys import chain
 
-from rille.pipeline.commands import runs
+from rille.pipeline.commands.results import runs
 from rille.pipeline.engine import events
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph

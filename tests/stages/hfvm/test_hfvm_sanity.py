@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from matching_scenes import Texture, convergent_rig, pair, rig_displacement
 
-from rille.pipeline.commands.match import warnings
+from rille.pipeline.commands.sequences.match import warnings
 from rille.stages.core.validity import matched
 from rille.stages.hfvm import sanity
 from rille.stages.hfvm.stage import match

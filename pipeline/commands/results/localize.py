@@ -18,7 +18,7 @@ from rasterio.crs import CRS
 from rille.datasets.georeference import Georeference
 from rille.pipeline import api
 from rille.pipeline.commands.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder
-from rille.pipeline.commands.run_terrain import Terrain
+from rille.pipeline.commands.results.run_terrain import Terrain
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic

@@ -14,7 +14,7 @@ import numpy as np
 from rille.datasets.georeference import Georeference
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE, RUNS, Output, Run, Runs
-from rille.pipeline.commands.run_terrain import Terrain
+from rille.pipeline.commands.results.run_terrain import Terrain
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic

@@ -1,0 +1,1 @@
+"""Commands that look at a sequence, or at pictures, before anything is reconstructed."""
