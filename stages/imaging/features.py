@@ -48,6 +48,12 @@ def grey_bytes(image: NDArray[Any]) -> Bytes:
     return np.clip(np.rint(np.nan_to_num(grey)), 0, 255).astype(np.uint8)
 
 
+def detected_pixel(width: int, height: int) -> float:
+    """Side [pixels] of a pixel of the image in which the features of an image of this size are detected."""
+    reduction = max(max(width, height) / MAX_IMAGE_SIDE, 1.0)
+    return reduction * (2.0 if width * height > MAX_DOUBLED_PIXELS * reduction**2 else 1.0)
+
+
 def extract(image: NDArray[Any], valid: NDArray[Any]) -> Bundle:
     """Points and descriptors of an image (row, col) where ``valid`` (row, col) is not 0."""
     height, width = image.shape

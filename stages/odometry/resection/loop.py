@@ -21,7 +21,7 @@ from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.odometry import LoopFacts
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp, rotation_log
-from rille.stages.imaging.features import PIXEL_CENTRE, match
+from rille.stages.imaging.features import PIXEL_CENTRE, detected_pixel, match
 from rille.stages.odometry.resection.landmarks import Landmarks, landmarks_of
 from rille.stages.odometry.resection.robust_pose import Resection, ResectParams, resect
 from rille.stages.odometry.resection.trajectory import propagation
@@ -36,8 +36,11 @@ MAX_DEPTH_RATIO = 1.1
 """Median ratio of a point's depths by both pairs, either way."""
 MAX_DEPARTURE = 4.0
 """Standard deviations by which the poses of both directions may depart from each other."""
-MATCHED = ResectParams.model_validate({"pixel_sigma": 0.2, "threshold": 2.0})
-"""Errors of matched features as stated for tracks, which the errors found enlarge; some are off by more than tracks."""
+FEATURE_SIGMA = 0.35
+"""Standard deviation of a matched feature's position, in pixels of the image in which features are detected. A track's
+0.2 pixels of the full image gave near landmarks too much weight, and errors twice those stated (flight of EuRoC)."""
+MAX_FEATURE_SIGMAS = 4.0
+"""Back-projection error of a landmark that agrees."""
 HERE = RigidTransform.identity()
 
 
@@ -106,8 +109,10 @@ def _errors(posed: Resection) -> Floats:
 def _posed(a: Features, b: Features, matches: NDArray[np.uint32], seed: int) -> tuple[Resection, NDArray[np.uint32]]:
     """Pose of the second camera by landmarks of the first, and the matches (k, 2) that have one."""
     known = matches[np.isfinite(a.landmarks.position[matches[:, 0], 0])]
+    sigma = FEATURE_SIGMA * detected_pixel(b.camera.width, b.camera.height)
+    params = ResectParams.model_validate({"pixel_sigma": sigma, "threshold": MAX_FEATURE_SIGMAS * sigma})
     try:
-        posed = resect(a.landmarks.take(known[:, 0]), b.points[known[:, 1]], b.camera, [HERE], MATCHED, seed)
+        posed = resect(a.landmarks.take(known[:, 0]), b.points[known[:, 1]], b.camera, [HERE], params, seed)
     except DegenerateError as error:
         raise NoLoopError(error.message.split(": ", 1)[-1]) from error
     count = int(posed.inlier.sum())
@@ -162,7 +167,7 @@ def loop_stage(
     pairs: list[int],
 ) -> Bundle[LoopFacts]:
     """Motions from earlier basic pairs to one that sees their places again."""
-    views: dict[int, Features] = {}
+    views, usual = dict[int, Features](), ResectParams()
 
     def view(k: int) -> Features:
         if k not in views:
@@ -173,8 +178,8 @@ def loop_stage(
                 disparities[k],
                 rig,
                 HERE,
-                disparity_sigma=MATCHED.disparity_sigma,
-                max_depth_ratio=MATCHED.max_depth_ratio,
+                disparity_sigma=usual.disparity_sigma,
+                max_depth_ratio=usual.max_depth_ratio,
             )
             views[k] = Features(points, np.asarray(features[k]["descriptors"], np.float32), known, rig.left)
         return views[k]
