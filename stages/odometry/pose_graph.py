@@ -7,8 +7,8 @@ deviation is 1: what all segments share so adds up over a chain, and a closed lo
 Two things are not known beforehand. Which of the doubtful factors are false: those whose whitened error exceeds a
 ``bound`` once the others hold, by graduated non-convexity (Yang et al. 2020, doi:10.1109/LRA.2020.2965893): first all
 count, then the cost is bent towards a truncated one. And by which factor k the chain's own errors exceed their
-covariances: it is the least under which most factors agree, or a larger one under which these are much more probable
-(restricted likelihood: Patterson and Thompson 1971, doi:10.1093/biomet/58.3.545). Smaller than 1 it is never.
+covariances: it is the least under which most factors agree, and their errors are as large as stated. Smaller than 1 it
+is never.
 """
 
 from __future__ import annotations
@@ -30,11 +30,6 @@ EXCESS = (1.0, 3.0, 10.0, 30.0)
 """Factors k that are tried: on recorded sequences errors were up to 30 times those stated."""
 MAJORITY = 0.7
 """Share of the doubtful factors that have to agree."""
-MAX_SURPRISE = 10.0
-"""Twice the logarithm of likelihood that each component of a factor may cost before it is believed to be false: false
-ones are found anywhere within some hundred standard deviations."""
-MIN_GAIN = 6.63
-"""Twice the logarithm of likelihood that a larger k must gain: chi-squared of one degree of freedom at 1 %."""
 MAX_ROUNDS, GRADUATION = 40, 2.0
 """Of graduated non-convexity, and the factor by which it is undone from round to round."""
 STEPS, FEW_STEPS = 30, 3
@@ -246,25 +241,27 @@ class Adjusted(NamedTuple):
 
 
 def adjust(graph: PoseGraph, start: GraphState, excesses: Sequence[float] = EXCESS) -> Adjusted:
-    """The graph adjusted without the factors that contradict, its chain loosened by what explains the others best."""
-    doubtful = graph.factors.doubtful
-    if not doubtful.any():
-        return _settled(graph, start)
-    strict = first = _decided(replace(graph, excess=excesses[0]), start)
-    for k in excesses[1:]:
-        if first.kept[doubtful].mean() >= MAJORITY:
-            break
-        first = _decided(replace(graph, excess=k), start)
-    if first.kept[doubtful].mean() < MAJORITY:
-        return strict
-    looser = [_settled(replace(first.graph, excess=k), first.state) for k in excesses if k > first.graph.excess]
-    best = min([first, *looser], key=_surprise)
-    best = best if _surprise(best) < _surprise(first) - MIN_GAIN else first
-    more = doubtful & best.kept & ~strict.kept
-    rows = int((graph.factors.root[more] != 0).any(2).sum())
-    if _surprise(best) > _surprise(strict) + MAX_SURPRISE * rows:
-        return strict
-    return best if best is first else _decided(replace(graph, excess=best.graph.excess), start)
+    """The graph adjusted without the factors that contradict, with the least of the excesses that explains the others.
+
+    Where none does, the chain is as exact as it says and all that contradict are left out.
+    """
+    tried = list[Adjusted]()
+    for k in excesses:
+        tried.append(done := _decided(replace(graph, excess=k), start))
+        if _explained(done):
+            return done
+    return tried[0]
+
+
+def _explained(done: Adjusted) -> bool:
+    """Whether most of the doubtful factors count, with errors that one true graph in a hundred exceeds at most."""
+    doubtful = done.graph.factors.doubtful
+    rows = int((done.graph.factors.root[doubtful & done.kept] != 0).any(2).sum())
+    if not rows:
+        return not doubtful.any()
+    # The chain alone has as many unknowns as equations: what is beyond them are the doubtful factors.
+    squares = 2.0 * done.graph.normal(done.state).cost
+    return bool(done.kept[doubtful].mean() >= MAJORITY and squares <= scipy.special.chdtri(rows, 0.01))
 
 
 def _settled(graph: PoseGraph, state: GraphState) -> Adjusted:
@@ -294,11 +291,3 @@ def _decided(graph: PoseGraph, state: GraphState) -> Adjusted:
         mu *= GRADUATION
     graph = replace(graph, weight=np.where(doubtful, np.where(squared <= bound, 1.0, 0.0), 1.0))
     return _settled(graph, state)
-
-
-def _surprise(done: Adjusted) -> float:
-    """Minus twice the logarithm of the restricted likelihood, up to what is the same for all excesses."""
-    graph, normal = done.graph, done.graph.normal(done.state)
-    diagonal = np.abs(_factorised(normal.matrix).U.diagonal())
-    chained = 6 * int((~graph.factors.doubtful).sum()) + graph.common
-    return float(2.0 * normal.cost + np.log(diagonal).sum() + 2.0 * chained * np.log(graph.excess))
