@@ -48,11 +48,6 @@ def test_high_pass_of_a_ramp_by_hand():
     assert found[1] == 0
 
 
-def test_planes_of_a_batch_are_those_of_each_image():
-    batch = np.stack([image(seed=1), image(seed=2)])
-    np.testing.assert_array_equal(features.planes(batch)[:, 1], features.planes(batch[1]))
-
-
 def test_packed_bytes_are_the_rounded_signed_square_roots():
     words, deviation = features.pack(image(), WEIGHTS)
     planes = table_1(image())
@@ -89,12 +84,3 @@ def test_distance_of_words_is_the_sum_of_absolute_byte_differences():
     each(a.view(np.uint64).ravel(), b.view(np.uint64).ravel(), out)
     np.testing.assert_array_equal(out, np.abs(a.astype(int) - b.astype(int)).sum(1))
     assert out[0] == 8 * 255
-
-
-def test_words_of_rows_are_those_of_the_whole():
-    image = (255 * np.random.default_rng(4).random((20, 22))).astype(np.float32)
-    r = features.RADIUS_PX
-    words, deviation = np.empty((8, 10), np.uint64), np.empty((8, 10), np.float32)
-    scale = np.asarray(WEIGHTS, np.float32) * np.float32(features.STEPS_PER_UNIT)
-    features.pack_rows(image, 0, scale, words, deviation)
-    np.testing.assert_array_equal(words, features.pack(image, WEIGHTS)[0][r:-r, r:-r])
