@@ -1,4 +1,4 @@
-"""Standard deviation of disparities against exact ones: the factors of ``rille.stages.hfvm.uncertainty`` and
+"""Standard deviation of disparities against exact ones: the factors of ``rille.stages.hfvm.refinement`` and
 their check.
 
 ``python benchmarks/disparity_std.py`` renders pairs of the built-in mockup (kept in ``--cache``), matches them and
@@ -81,23 +81,23 @@ def judged(
 
     Parts are NaN at pixels without texture, which the factors do not describe alone.
     """
+    from rille.stages.hfvm import refinement
     from rille.stages.hfvm import stage as hfvm
-    from rille.stages.hfvm import uncertainty
     from rille.stages.hfvm.params import HfvmParams
 
     parts: list[Any] = []
-    original = uncertainty.standard_deviation
+    original = refinement.standard_deviation
 
     def recording(noise: Any, column: Any, keep: Any) -> Any:
-        parts.extend(np.where(keep, p, np.nan) for p in (noise, *uncertainty.neighbours(column, keep)))
+        parts.extend(np.where(keep, p, np.nan) for p in (noise, *refinement.neighbours(column, keep)))
         return original(noise, column, keep)
 
-    uncertainty.standard_deviation = recording
+    refinement.standard_deviation = recording
     try:
         params = HfvmParams.model_validate({"preset": preset})
         found = hfvm.match(left, right, params, valid=(left_valid, right_valid))
     finally:
-        uncertainty.standard_deviation = original
+        refinement.standard_deviation = original
     ok = np.isfinite(found.disparity_std) & np.isfinite(truth)
     x = np.stack([np.ones(ok.sum()), *(np.asarray(part[ok], np.float64) for part in parts)])
     error = np.abs(found.column_disparity - truth)[ok].astype(np.float64)

@@ -10,12 +10,12 @@ from rille.pipeline.engine import memory
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.runtime.environment import cores
 from rille.stages.core.declare import Params
-from rille.stages.hfvm import coarse, presets
+from rille.stages.hfvm import coarse, matcher
+from rille.stages.hfvm.image import Shape, tiles
 from rille.stages.hfvm.join_stage import hfvm_join_stage
 from rille.stages.hfvm.matcher import How, Tell, silent
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.tile_stage import hfvm_tile_stage
-from rille.stages.hfvm.windows import Shape, tiles
 from rille.stages.imaging.pyramid import PyramidParams
 
 WHOLE_BYTES, TILE_BYTES = 170, 300
@@ -51,7 +51,7 @@ class Tiling(Params):
 
 def side(tiling: Tiling, params: HfvmParams, pyramid: PyramidParams, shapes: tuple[Shape, Shape]) -> int | None:
     """Side of the tiles of a pair of images, pixels; None: it is matched whole, as one task."""
-    if not presets.local(params) or tiling.tile == 0:
+    if not matcher.local(params) or tiling.tile == 0:
         return None
     # Tiles start from the maps of level 1, which the decisions on brightness and alignment precede.
     if min(_levels(pyramid, shape) - _half(params) for shape in shapes) <= coarse.COARSE_LEVEL:
@@ -85,7 +85,7 @@ def _levels(pyramid: PyramidParams, shape: Shape) -> int:
 
 def _half(params: HfvmParams) -> int:
     """Levels that are left out at the fine end."""
-    return int(presets.recipe_of(params).half)
+    return int(matcher.recipe_of(params).half)
 
 
 def build(graph: Graph, params: HfvmParams, images: dict[str, Handle], shape: Shape, side: int, label: str) -> Handle:

@@ -1,31 +1,122 @@
-"""The finest level, step by step: fractions of a pixel, validity, refinement, isolated patches, planes, filling.
+"""The finest level of a pair and what follows, window by window: of the whole image, or of tiles, each with a halo.
 
-Each step takes what is known of every pixel and returns more of it. All work on a window of the left image, and on
-windows of the right image that hold what the left one's matches reach.
-"""
+::
+
+    coarse levels (whole) -> fine (each window) -> ending (lines and planes of the whole) -> final (each window)
+
+Each step takes what is known of every pixel and returns more of it: fractions of a pixel, validity (4.3.1, 4.3.3),
+refinement, isolated patches; then planes and filling. All work on a window of the left image, and on windows of the
+right image that hold what the left one's matches reach. All but a thousandth of the pixels are within .01 px of the
+result of the pair matched in one window: tiles do not see patches and propagation that reach beyond the halo."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
+import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.validity import Validity, mark
 from rille.stages.geometry import spline
 from rille.stages.geometry.scale import effective
-from rille.stages.hfvm import epipolar, fill, lucas_kanade, plane, relief, textureless, uncertainty
-from rille.stages.hfvm.image import Image, Layer
-from rille.stages.hfvm.level import MAX_FIT_MATCHES, Map
-from rille.stages.hfvm.lucas_kanade import local_mean
+from rille.stages.hfvm import epipolar, plane, refinement, textureless
+from rille.stages.hfvm.coarse import Coarse
+from rille.stages.hfvm.image import Image, Layer, Shape, Window, thinned, whole
+from rille.stages.hfvm.level import MAX_FIT_MATCHES, Band, Map, State, fill_rows, hand_down, match_level
 from rille.stages.hfvm.native.problem import LevelPair
 from rille.stages.hfvm.native.solver import solver
 from rille.stages.hfvm.params import HfvmParams
-from rille.stages.hfvm.validation import FAILED_PX, backmatch, isolated, lands, lonely
-from rille.stages.hfvm.windows import Shape, Window, thinned
+from rille.stages.hfvm.refinement import local_mean
+from rille.stages.numeric.threads import side_by_side
 from rille.stages.numeric.windows import window_count, window_room
+
+FAILED_PX = np.float32(1e9)
+"""Back-matching error where there is nothing to match back from."""
+
+CHANCE_SIZE_FACTOR = 16
+"""Times the size of an isolated patch: none of chance is as large (measured on blurred noise: up to 8 times)."""
+
+CROWD_SIDE_PX = 9
+"""Pixels: side of the neighbourhood in which matches support each other, about that of the features."""
+
+NO_PATCH = -32768
+"""Displacement of pixels that are in no patch."""
+
+
+@njit(cache=True, nogil=True)
+def backmatch(u, v, right, right_valid, error):  # type: ignore[no-untyped-def]
+    """Distance |l - l'| of each left pixel after matching to the right and back (4.3.3), pixels.
+
+    ``error`` comes as FAILED_PX and stays so outside the right image and on its masked pixels. The right map, columns
+    and rows of displacement, is read at the nearest pixel.
+    """
+    ru, rv = right
+    last_x, last_y, half = np.float32(ru.shape[1] - 1), np.float32(ru.shape[0] - 1), np.float32(0.5)
+    for y in range(u.shape[0]):
+        for x in range(u.shape[1]):
+            xr, yr = np.float32(x) + u[y, x], np.float32(y) + v[y, x]
+            if not (xr >= 0 and xr <= last_x and yr >= 0 and yr <= last_y):
+                continue
+            # A half and truncation round to the nearest pixel, since neither is negative here.
+            i, j = np.int64(xr + half), np.int64(yr + half)
+            if right_valid[j, i]:
+                du, dv = u[y, x] + ru[j, i], v[y, x] + rv[j, i]
+                error[y, x] = min(np.sqrt(du * du + dv * dv), FAILED_PX)
+
+
+@njit(cache=True, nogil=True)
+def lands(u, v, keep, right_valid):  # type: ignore[no-untyped-def]
+    """Pixels (bool) of ``keep`` whose displacement ends on a usable pixel of the right image."""
+    landing, half = np.zeros(keep.shape, np.bool_), np.float32(0.5)
+    rows, cols = right_valid.shape
+    for y in range(u.shape[0]):
+        for x in range(u.shape[1]):
+            # Half a pixel beyond the outermost centres is still on the image.
+            xr, yr = np.float32(x) + u[y, x] + half, np.float32(y) + v[y, x] + half
+            if keep[y, x] and 0 < xr < cols and 0 < yr < rows:
+                landing[y, x] = right_valid[np.int64(yr), np.int64(xr)] != 0
+    return landing
+
+
+def lonely(keep: AnyArray, share: float) -> NDArray[np.bool_]:
+    """Pixels of ``keep`` around which (:data:`CROWD_SIDE_PX`, clipped at the border) less than ``share`` is kept."""
+    if share <= 0:
+        return np.zeros(keep.shape, dtype=bool)
+    return np.asarray(keep & (window_count(keep, CROWD_SIDE_PX) < share * window_room(keep.shape, CROWD_SIDE_PX)))
+
+
+def isolated(u: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
+    """Pixels of ``keep`` in patches of fewer than ``size``; where most of the rest lies in small ones, those too.
+
+    Patches hang together along rows and columns where column displacements differ by at most one pixel. Images that
+    have nothing to do with each other match by chance in patches up to some hundred pixels. Of a pair that shows one
+    scene nearly everything lies in patches of thousands: there small ones are believed.
+
+    Parameters
+    ----------
+    u : (row, col) int16 column displacements, pixels.
+    """
+    if size <= 1:
+        return np.zeros(keep.shape, dtype=bool)
+    # In a small image patches of CHANCE_SIZE_FACTOR times the size may not fit: an eighth of it is enough.
+    suspect = _in_small_patches(u, keep, max(size, min(CHANCE_SIZE_FACTOR * size, keep.size // 8)))
+    # The smaller patches are among these, and most matches are not.
+    small = _in_small_patches(u, suspect, size)
+    all_of_them = np.count_nonzero(keep)
+    rest, large = all_of_them - np.count_nonzero(small), all_of_them - np.count_nonzero(suspect)
+    return suspect if large < 0.5 * rest else small
+
+
+def _in_small_patches(u: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
+    """Pixels of ``keep`` that are in a patch of fewer than ``size``."""
+    plane = np.where(keep, u, np.int16(NO_PATCH))
+    cv2.filterSpeckles(plane, NO_PATCH, size - 1, 1)
+    return np.asarray(keep & (plane == NO_PATCH))
+
 
 Results = Mapping[str, AnyArray]
 
@@ -78,9 +169,9 @@ class FinestWork:
         u, v = plane.decompose(self.alignment, u, v, self.shape, a.x0, a.y0)
         return u - np.float32(b.x0 - a.x0), v - np.float32(b.y0 - a.y0)
 
-    def images(self) -> lucas_kanade.SplineImages:
+    def images(self) -> refinement.SplineImages:
         """What refinement compares."""
-        return lucas_kanade.SplineImages(self.a.grey, spline.coefficients(self.right.grey), self.right.valid)
+        return refinement.SplineImages(self.a.grey, spline.coefficients(self.right.grey), self.right.valid)
 
 
 @dataclass(frozen=True)
@@ -143,9 +234,9 @@ def refine(work: FinestWork, fine: Fine) -> Fine:
     keep = fine.keep
     # An image that a plane has aligned is sheared, and takes a step more.
     steps = 1 if work.alignment is None else 2
-    u, v, rest, per_noise = lucas_kanade.refine(work.images(), work.to_right, (fine.u, fine.v), keep, steps)
+    u, v, rest, per_noise = refinement.refine(work.images(), work.to_right, (fine.u, fine.v), keep, steps)
     removed = work.noise[0] ** 2, work.noise[1] ** 2
-    alike, variance = lucas_kanade.surroundings(rest, work.a.deviation, keep, removed)
+    alike, variance = refinement.surroundings(rest, work.a.deviation, keep, removed)
     # Denoising takes means of nine pixels: it divides the residuals' variance by as many; no match is placed better.
     noise = per_noise * (variance * np.float32(9) if any(removed) else variance)
     validity = fine.against(keep & (alike < work.params.correlation), Validity.OVER_THRESHOLD)
@@ -154,7 +245,7 @@ def refine(work: FinestWork, fine: Fine) -> Fine:
 
 def smooth(work: FinestWork, fine: Fine) -> Fine:
     """A piecewise smooth relief fitted to all matches along their epipolar lines."""
-    u, v = work.from_right(*relief.fit(work.images(), *work.to_right(fine.u, fine.v), fine.keep))
+    u, v = work.from_right(*refinement.fit_relief(work.images(), *work.to_right(fine.u, fine.v), fine.keep))
     return replace(fine, u=u, v=v)
 
 
@@ -179,11 +270,11 @@ def blanks(work: FinestWork, fine: Fine) -> Fine:
     room = window_room(keep.shape, SUPPORT_SIDE_PX)
     around = window_count(keep | blank, SUPPORT_SIDE_PX), window_count(keep, SUPPORT_SIDE_PX)
     blank &= (around[0] >= MIN_CONSISTENT_SHARE * room) & (around[1] >= MIN_MATCHED_SHARE * room)
-    noise = np.where(blank, np.float32((uncertainty.BLANK_STD_PX / uncertainty.NOISE_FACTOR) ** 2), fine.noise)
+    noise = np.where(blank, np.float32((refinement.BLANK_STD_PX / refinement.NOISE_FACTOR) ** 2), fine.noise)
     return replace(fine, validity=np.where(blank, np.uint8(0), fine.validity), noise=noise)
 
 
-def lines(results: Results, shapes: tuple[Shape, Shape]) -> epipolar.Matrix | None:
+def fitted_lines(results: Results, shapes: tuple[Shape, Shape]) -> epipolar.Matrix | None:
     """Fundamental matrix of the refined matches (``u, v, validity``) of a whole image; None: they follow no lines."""
     y, x = thinned(results["validity"] == 0, MAX_FIT_MATCHES)
     fitted = epipolar.fit_points(x, y, results["u"][y, x], results["v"][y, x], *shapes)
@@ -193,7 +284,9 @@ def lines(results: Results, shapes: tuple[Shape, Shape]) -> epipolar.Matrix | No
     return epipolar.oriented(fitted[0], shapes[0])
 
 
-def planes(images: tuple[Image, Image], results: Results, f: epipolar.Matrix, near_sign: float) -> textureless.Planes:
+def textureless_planes(
+    images: tuple[Image, Image], results: Results, f: epipolar.Matrix, near_sign: float
+) -> textureless.Planes:
     """Planes of the left image's textureless regions: what no window tells, a whole region does."""
     left, right = (image.layers[textureless.REGION_LEVEL] for image in images)
     rows, cols = left.shape
@@ -244,9 +337,9 @@ def complete(
     alone = lonely(matches, params.min_support)
     mark(validity, alone, Validity.SPECKLE)
     filled = (alone | beside).astype(np.uint8)
-    fill.rows(u, v, matches | beside, params.fill_reach, ending.near_sign or -1.0, filled)
+    fill_rows(u, v, matches | beside, params.fill_reach, ending.near_sign or -1.0, filled)
     matches &= ~alone
-    std = uncertainty.standard_deviation(results["noise"], u, keep & ~alone)
+    std = refinement.standard_deviation(results["noise"], u, keep & ~alone)
     std[on_plane & matches] = plane_std[on_plane & matches]
     # A masked pixel is no part of the image, so it is not filled either.
     filled[(valid == 0) | matches] = 0
@@ -271,3 +364,124 @@ def complete(
         "distance": distance,
         "disparity_std": std,
     }
+
+
+Call = Callable[[], dict[str, AnyArray]]
+
+HALO_PX = 64
+"""Pixels around a tile: 48 that a displacement depends on (rounds, edges, features, sums, refinement), and room for
+patches of 40 pixels."""
+
+TARGET_MARGIN_PX = 40
+"""Pixels around the places in the right image that the predictions of a tile lead to: search, rounds, features."""
+
+FILL_MARGIN_PX = 16
+"""Pixels around a window that its filling and standard deviations depend on, besides the reach along rows."""
+
+
+def fine(pair: Coarse, refinement: tuple[Step, ...], window: Window) -> dict[str, AnyArray]:
+    """Arrays of :class:`~rille.stages.hfvm.finest.Fine` of a window of the left image; displacements to the whole
+    matched image."""
+    views, shape = pair.views, pair.views.left.shapes[0]
+    outer = window.grow(HALO_PX, HALO_PX, shape)
+    state, target = _around(pair, outer)
+    a, b = views.left.cut(outer), views.right.cut(target)
+    if state.level > 0:
+        state = match_level(replace(views, left=a, right=b), 0, state)  # 4.3.4: search, propagate, check, band
+    left, right, noise = a.layers[0], b.layers[0], (views.left.noise, views.right.noise)
+    work = FinestWork(left, right, right, state.left, state.right, views.params, pair.alignment, noise, shape)
+    if pair.alignment is not None:
+        work = replace(work, right=pair.right.layers[0].cut(_landing(work, pair.right.shapes[0])))
+    result = subpixel(work)  # 4.3.2
+    for step in refinement:  # 4.3.3 back-matching, refinement, validation
+        result = step(work, result)
+    arrays = asdict(result)
+    arrays["u"] = arrays["u"] + np.float32(target.x0 - outer.x0)
+    arrays["v"] = arrays["v"] + np.float32(target.y0 - outer.y0)
+    return {name: np.ascontiguousarray(a[window.inside(outer)]) for name, a in arrays.items()}
+
+
+def _around(pair: Coarse, outer: Window) -> tuple[State, Window]:
+    """State of level 1 around a window of level 0, in pixels of it, and the window of the matched image."""
+    state, shape = pair.state, pair.views.right.shapes[0]
+    if outer == whole(pair.views.left.shapes[0]):
+        return state, whole(shape)
+    above = outer.parent()
+    left, right = (hand_down(s, pair.views.params) for s in (state, state.reverse()))
+    own = Map(left.u[above.slices], left.v[above.slices])
+    y0, y1 = (at + 2 * int(f(own.v)) for at, f in ((outer.y0, np.min), (outer.y1, np.max)))
+    x0, x1 = (at + 2 * int(f(own.u)) for at, f in ((outer.x0, np.min), (outer.x1, np.max)))
+    target = _bounded(Window(y0, y1, x0, x1), shape, TARGET_MARGIN_PX)
+    there = target.parent()
+    du, dv = (outer.x0 - target.x0) // 2, (outer.y0 - target.y0) // 2
+    other = Map(right.u[there.slices], right.v[there.slices])
+    maps = Map(*_shifted(own, du, dv)), Map(*_shifted(other, -du, -dv))
+    f = epipolar.moved(state.band.f, (outer.x0, outer.y0), (target.x0, target.y0))
+    left_ok, right_ok = (np.ones(m.u.shape, bool) for m in maps)
+    return State(1, *maps, left_ok, right_ok, Band(f, state.band.mu), state.near_sign), target
+
+
+def _landing(work: FinestWork, shape: Shape) -> Window:
+    """Window of the right image, as it is and of ``shape``, that the matches of a window lead to."""
+    a = work.a.window
+    u, v = work.to_right(work.left.u.astype(np.float32), work.left.v.astype(np.float32))
+    y, x = np.arange(a.y0, a.y1)[:, None] + v, np.arange(a.x0, a.x1) + u
+    # Relative to the window that stands there until this one is known.
+    x, y = x - a.x0 + work.right.window.x0, y - a.y0 + work.right.window.y0
+    ends = Window(*(int(n) for n in (np.nanmin(y), np.nanmax(y) + 1, np.nanmin(x), np.nanmax(x) + 1)))
+    return _bounded(ends, shape, TARGET_MARGIN_PX)
+
+
+def ending(pair: Coarse, arrays: Mapping[str, AnyArray], with_planes: bool) -> Ending:
+    """What the matches of the whole image tell its windows: their epipolar lines, and planes without texture."""
+    views, sign = pair.views, pair.state.near_sign
+    # Without a band rows are free: they are not to be set by lines.
+    free = views.params.band == 0 or views.levels <= textureless.REGION_LEVEL
+    f = None if free else fitted_lines(arrays, (views.left.shapes[0], views.right.shapes[0]))
+    planes = textureless_planes((views.left, views.right), arrays, f, sign) if f is not None and with_planes else None
+    return Ending(sign, pair.alignment, f, planes, views.left.shapes[0])
+
+
+def around(pair: Coarse, window: Window) -> Window:
+    """Window that :func:`final` needs the arrays of."""
+    return window.grow(FILL_MARGIN_PX, FILL_MARGIN_PX + pair.views.params.fill_reach, pair.views.left.shapes[0])
+
+
+def final(pair: Coarse, window: Window, fine_arrays: Mapping[str, AnyArray], ending: Ending) -> dict[str, AnyArray]:
+    """Arrays of the disparities of a window, from those of :func:`fine` of the window around it, or of the image."""
+    outer, params = around(pair, window), pair.views.params
+    if fine_arrays["u"].shape != outer.shape:
+        fine_arrays = {name: array[outer.slices] for name, array in fine_arrays.items()}
+    arrays = complete(fine_arrays, pair.views.left.layers[0].cut(outer).valid, outer, params, ending)
+    return {name: np.ascontiguousarray(a[window.inside(outer)]) for name, a in arrays.items()}
+
+
+def put_together(calls: Mapping[Window, Call], shape: Shape, threads: int) -> dict[str, AnyArray]:
+    """Arrays of an image of ``shape``, from those that calls make of its windows, ``threads`` at a time."""
+    parts = side_by_side(list(calls.values()), threads)
+    if len(parts) == 1:
+        return parts[0]
+    total: dict[str, AnyArray] = {}
+    for window, arrays in zip(calls, parts, strict=True):
+        for name, values in arrays.items():
+            total.setdefault(name, np.empty(shape, values.dtype))[window.slices] = values
+    return total
+
+
+def _shifted(m: Map, du: int, dv: int) -> tuple[AnyArray, AnyArray]:
+    return m.u + np.int16(du), m.v + np.int16(dv)
+
+
+def _bounded(window: Window, shape: Shape, margin: int) -> Window:
+    """The window, wider by ``margin`` on every side, within an image; two pixels at least, with even borders."""
+    (y0, y1), (x0, x1) = (
+        _bounds(low - margin, high + margin, size)
+        for low, high, size in ((window.y0, window.y1, shape[0]), (window.x0, window.x1, shape[1]))
+    )
+    return Window(y0, y1, x0, x1)
+
+
+def _bounds(low: int, high: int, size: int) -> tuple[int, int]:
+    first = max(0, min(low, size - 2)) // 2 * 2
+    last = (max(high, first + 2) + 1) // 2 * 2
+    return first, min(last, size)

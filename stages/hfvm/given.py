@@ -1,55 +1,78 @@
-"""Disparities that another program made, checked against the images: which to believe, and how far.
+"""Whether to believe disparities: pixel by pixel those that another program made, and matches as a whole.
 
-Columns are the other program's. A pixel counts as matched if it passes the matcher's own checks: feature distance, the
-way back, correlation of the windows, size of its patch (:mod:`~rille.stages.hfvm.finest`). The way back is matched in
-the right image itself, at the finest level, from the map as the right camera sees it: where a depth edge lies too far
-out, or a hidden pixel has its neighbour's disparity, the right image leads elsewhere. In SGBM's maps without its own
-checks .105 of the pixels with truth of Middlebury's chosen half are off by 2 px, .111 of the judged half; .021 and .017
-are off and count as matched. With the map itself for the way back .040 and .035 did.
+**Another program's** are checked against the images. Columns are the other program's. A pixel counts as matched if it
+passes the matcher's own checks: feature distance, the way back, correlation of the windows, size of its patch
+(:mod:`~rille.stages.hfvm.finest`). The way back is matched in the right image itself, at the finest level, from the map
+as the right camera sees it: where a depth edge lies too far out, or a hidden pixel has its neighbour's disparity, the
+right image leads elsewhere. In SGBM's maps without its own checks .105 of the pixels with truth of Middlebury's chosen
+half are off by 2 px, .111 of the judged half; .021 and .017 are off and count as matched. With the map itself for the
+way back .040 and .035 did.
 
 A map of disparities says nothing of rows; the images do. How far refinement would move a column is part of the standard
 deviation: 65 and 89 % of the matched pixels of the chosen half err by at most one and two of it, 61 and 86 % of the
 judged half; without this part 60 and 86, 56 and 82. 2026-11-26.
-"""
+
+**Matches as a whole** deserve doubt by two signs, which images show without calibration, each a share of a sample of
+the matches: those far from every epipolar line, as no rigid scene has them; and those that look as well elsewhere along
+their line, as on a repeating pattern, where each match may be off by a period.
+
+With the right camera on the right, nothing has a column displacement greater than infinitely far things have (right
+minus left). Without calibration that of far things is not known: cameras that converge by an angle t move them by
+D = f t. But they also make a keystone, a row displacement (t / f) x y about the image's middle, which matches show.
+The focal length f is between half and three times the image width, so D is k f^2 with k = t / f within bounds. Images
+are swapped for certain where nearly all displacements lie beyond the upper one."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray, Bundle, Memory, stage
 from rille.stages.core.validity import Validity, matched
 from rille.stages.facts.matching import DisparityFacts
-from rille.stages.hfvm import brightness, finest, presets, start, uncertainty
-from rille.stages.hfvm.finest import Ending, FinestWork
-from rille.stages.hfvm.image import view
+from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX
+from rille.stages.hfvm import finest, matcher, refinement
+from rille.stages.hfvm.coarse import (
+    MIN_LOG_RATIO,
+    PriorDisparities,
+    greatest,
+    impose,
+    known_beforehand,
+    levelled,
+    ratio_of_matches,
+)
+from rille.stages.hfvm.finest import Ending, FinestWork, lands
+from rille.stages.hfvm.image import Shape, view, whole
 from rille.stages.hfvm.level import FREE_BAND, Map, State, Views, one_way
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS, facts
-from rille.stages.hfvm.validation import lands
-from rille.stages.hfvm.windows import Shape, whole
 from rille.stages.imaging.pyramid import Pyramid
+from rille.stages.numeric.least_squares import irls
+from rille.stages.numeric.robust import cauchy
 
 NEAR_SIGN = -1.0
 """Between parallel cameras nearer things have lesser column displacements (see ``level.State``)."""
 
 
-def check(left: Pyramid, right: Pyramid, given: start.PriorDisparities, params: HfvmParams) -> dict[str, AnyArray]:
+def check(left: Pyramid, right: Pyramid, given: PriorDisparities, params: HfvmParams) -> dict[str, AnyArray]:
     """Arrays of :class:`~rille.stages.hfvm.stage.StereoMatches` of given displacements, of which columns are kept.
 
     ``params``: thresholds of the checks; those of preset ``paper`` have other units, and the default's are taken.
     """
-    params = HfvmParams() if params.preset in presets.WHOLE else params
+    params = HfvmParams() if params.preset in matcher.WHOLE else params
     known = np.isfinite(given.u)
     u, zeros = np.where(known, given.u, np.float32(0.0)), np.zeros_like(given.u)
     there = Map(np.rint(u).astype(np.int16), np.zeros(u.shape, np.int16))
     a, b = view(left, params), view(right, params)
     inside = lands(np.rint(u), zeros, known, right.valid[0])
-    ratio = brightness.matched(a, b, State(0, there, there, inside, inside, FREE_BAND, NEAR_SIGN))
-    if ratio is not None and brightness.greatest(ratio) > brightness.MIN_LOG_RATIO:
-        b = brightness.levelled(b, ratio)
-    back = _way_back(Views(a, b, params, presets.recipe_of(params).steps), given)
+    ratio = ratio_of_matches(a, b, State(0, there, there, inside, inside, FREE_BAND, NEAR_SIGN))
+    if ratio is not None and greatest(ratio) > MIN_LOG_RATIO:
+        b = levelled(b, ratio)
+    back = _way_back(Views(a, b, params, matcher.recipe_of(params).steps), given)
     left_layer, right_layer = a.layers[0], b.layers[0]
     work = FinestWork(
         left_layer, right_layer, right_layer, there, back, params, None, (a.noise, b.noise), left_layer.shape
@@ -58,24 +81,24 @@ def check(left: Pyramid, right: Pyramid, given: start.PriorDisparities, params: 
     fine = replace(fine, validity=fine.against(~known, Validity.OVER_THRESHOLD))
     fine = finest.refine(work, fine)
     # Scaled as the noise will be.
-    moved = ((fine.u - u) / np.float32(uncertainty.NOISE_FACTOR)) ** 2
+    moved = ((fine.u - u) / np.float32(refinement.NOISE_FACTOR)) ** 2
     fine = replace(fine, u=u, noise=fine.noise + moved)
     for step in (finest.landing, finest.speckles, finest.blanks):
         fine = step(work, fine)
     results = asdict(fine)
     ending = Ending(
-        NEAR_SIGN, None, finest.lines(results, (left_layer.shape, right_layer.shape)), None, left_layer.shape
+        NEAR_SIGN, None, finest.fitted_lines(results, (left_layer.shape, right_layer.shape)), None, left_layer.shape
     )
     return finest.complete(results, left_layer.valid, whole(left_layer.shape), params, ending)
 
 
-def _way_back(views: Views, given: start.PriorDisparities) -> Map:
+def _way_back(views: Views, given: PriorDisparities) -> Map:
     """Displacements of the right image, matched at the finest level near the given ones."""
     above = None
     if views.levels > 1:
         left, right = (_nothing(image.shapes[1]) for image in (views.left, views.right))
         unknown = np.zeros(left.u.shape, bool), np.zeros(right.u.shape, bool)
-        above = start.impose(views, State(1, left, right, *unknown, FREE_BAND, NEAR_SIGN), given).reverse()
+        above = impose(views, State(1, left, right, *unknown, FREE_BAND, NEAR_SIGN), given).reverse()
     return one_way(views.reverse(), 0, above, -NEAR_SIGN, views.steps.rounds[1])
 
 
@@ -89,7 +112,7 @@ def hfvm_given_stage(params: HfvmParams, left: Bundle, right: Bundle, given: Bun
     """Disparities that another program made, checked against the images of a stereo pair."""
     a, b = Pyramid.from_bundle(left), Pyramid.from_bundle(right)
     column = np.asarray(given["column_disparity"])
-    prior = start.check((column, np.zeros_like(column)), a.shape)
+    prior = known_beforehand((column, np.zeros_like(column)), a.shape)
     assert prior is not None
     arrays = check(a, b, prior, params)
     if "disparity_std" in given.arrays:
@@ -97,3 +120,167 @@ def hfvm_given_stage(params: HfvmParams, left: Bundle, right: Bundle, given: Bun
         stated = matched(arrays["validity"]) & (given["disparity_std"] > 0)
         arrays["disparity_std"] = np.where(stated, given["disparity_std"], arrays["disparity_std"])
     return Bundle(arrays, facts(arrays, params, False, int(np.count_nonzero(a.valid[0]))))
+
+
+MIN_MATCHES = 100
+"""Matches that a judgement needs at least."""
+
+MAX_FIT_MATCHES = 2000
+"""Matches that the lines are fitted to."""
+
+MAX_PATCHES = 150
+"""Matches whose likeness is sought."""
+
+
+PATCH_RADIUS_PX = 8
+"""Pixels: half side of a patch."""
+
+SEARCH_REACH_PX = 64
+"""Pixels: how far from its match a likeness is sought."""
+
+MIN_APART_PX = 8
+"""Pixels: how far from its match a likeness counts."""
+
+MIN_CORRELATION = 0.7
+"""Least correlation of a match whose patch says anything."""
+
+MAX_CORRELATION_LOSS = 0.05
+"""By how much less than the match a likeness may correlate."""
+
+MIN_RIGID_SHARE = 0.75
+"""Share of matches on their lines below which a pair is doubtful. Right pairs reach .98; one through unrectified lenses
+.82; photographs of a chess board, matched in part, .71 to .97."""
+
+MAX_REPEATED_SHARE = 0.5
+"""Share of matches that look as well elsewhere above which a pair is doubtful. Right pairs reach .34, a board .86."""
+
+Places = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def judge(left: AnyArray, right: AnyArray, disparity: Any, matched: NDArray[np.bool_]) -> tuple[float, float] | None:
+    """Shares of the matches that lie on their lines, and that look as well elsewhere; None: too few to tell.
+
+    Parameters
+    ----------
+    left, right : (row, col) grey images.
+    disparity : their :class:`~rille.stages.hfvm.stage.StereoMatches`; ``matched`` (row, col): which of it to judge.
+    """
+    places = sample(disparity.column_disparity, disparity.row_disparity, matched)
+    if places is None:
+        return None
+    f = lines(places)
+    return on_their_lines(places, f), repeated(left, right, places, f)
+
+
+def sample(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> Places | None:
+    """Evenly strided matches: left and right pixels (n, 2), column and row; None where there are too few."""
+    indices = np.flatnonzero(matched)
+    if len(indices) < MIN_MATCHES:
+        return None
+    y, x = np.unravel_index(_strided(indices, MAX_FIT_MATCHES), matched.shape)
+    left = np.stack([x, y], 1).astype(np.float64)
+    return left, left + np.stack([column[y, x], row[y, x]], 1)
+
+
+def lines(places: Places) -> NDArray[np.float64] | None:
+    """Fundamental matrix that most matches agree on; None where there is none."""
+    f, _ = cv2.findFundamentalMat(*places, cv2.USAC_MAGSAC, 0.5 * MAX_LINE_DISTANCE_PX, 0.999, 5000)
+    return None if f is None or f.shape != (3, 3) else np.asarray(f, np.float64)
+
+
+def on_their_lines(places: Places, f: NDArray[np.float64] | None) -> float:
+    """Share of the matches that lie near their epipolar line; 0 where there are no lines."""
+    if f is None:
+        return 0.0
+    ones = np.ones((len(places[0]), 1))
+    line = np.hstack([places[0], ones]) @ f.T
+    distance = np.abs(np.sum(line * np.hstack([places[1], ones]), axis=1)) / np.hypot(line[:, 0], line[:, 1])
+    return float(np.mean(distance <= MAX_LINE_DISTANCE_PX))
+
+
+def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.float64] | None) -> float:
+    """Share of the matches that look as well elsewhere on their epipolar line; 0 where too few patches say anything.
+
+    Parameters
+    ----------
+    left, right : (row, col) grey images.
+    """
+    a, b = (np.ascontiguousarray(image, np.float32) for image in (left, right))
+    keep = _inside(places[0], a.shape, PATCH_RADIUS_PX) & _inside(places[1], b.shape, PATCH_RADIUS_PX)
+    chosen = _strided(np.flatnonzero(keep), MAX_PATCHES)
+    looks_alike = []
+    for (x, y), (p, q) in zip(*(np.rint(side[chosen]).astype(int) for side in places), strict=True):
+        patch = a[y - PATCH_RADIUS_PX : y + PATCH_RADIUS_PX + 1, x - PATCH_RADIUS_PX : x + PATCH_RADIUS_PX + 1]
+        y0, x0 = max(q - SEARCH_REACH_PX - PATCH_RADIUS_PX, 0), max(p - SEARCH_REACH_PX - PATCH_RADIUS_PX, 0)
+        around = b[y0 : q + SEARCH_REACH_PX + PATCH_RADIUS_PX + 1, x0 : p + SEARCH_REACH_PX + PATCH_RADIUS_PX + 1]
+        score = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
+        j, i = np.indices(score.shape)
+        j, i = j + y0 + PATCH_RADIUS_PX, i + x0 + PATCH_RADIUS_PX
+        # The match has been rounded, so that its peak may lie beside it.
+        own = float(score[np.hypot(j - q, i - p) <= 2].max())
+        if not np.isfinite(own) or own < MIN_CORRELATION:
+            continue
+        # Without lines the row through the match stands in.
+        line = (0.0, 1.0, -float(q)) if f is None else f @ (x, y, 1.0)
+        here = np.abs(line[0] * i + line[1] * j + line[2]) <= MAX_LINE_DISTANCE_PX * np.hypot(line[0], line[1])
+        elsewhere = score[here & (np.hypot(j - q, i - p) >= MIN_APART_PX)]
+        looks_alike.append(elsewhere.size > 0 and float(elsewhere.max()) >= own - MAX_CORRELATION_LOSS)
+    return float(np.mean(looks_alike)) if len(looks_alike) >= MIN_MATCHES // 4 else 0.0
+
+
+def _strided(indices: AnyArray, most: int) -> AnyArray:
+    """At most so many of the given ones, evenly strided from the first to the last."""
+    return indices[np.linspace(0, len(indices) - 1, min(most, len(indices))).astype(np.intp)]
+
+
+def _inside(places: AnyArray, shape: tuple[int, ...], margin: int) -> NDArray[np.bool_]:
+    last = np.array([shape[1] - 1 - margin, shape[0] - 1 - margin])
+    return np.asarray(((np.rint(places) >= margin) & (np.rint(places) <= last)).all(axis=1))
+
+
+def swapped(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> bool:
+    """Whether left and right image of a stereo rig must have been swapped; False also where nobody can know.
+
+    Parameters
+    ----------
+    column, row : (row, col) disparities, pixels, right minus left.
+    matched : (row, col) bool, which to trust.
+    """
+    indices = np.flatnonzero(matched)
+    if len(indices) < MIN_MATCHES:
+        return False
+    indices = indices[:: 1 + len(indices) // MAX_FIT_MATCHES]
+    y, x = np.unravel_index(indices, matched.shape)
+    u, v = (np.asarray(a).reshape(-1)[indices].astype(np.float64) for a in (column, row))
+    width = matched.shape[1]
+    k, sigma = _keystone((x - 0.5 * (width - 1)) / width, (y - 0.5 * (matched.shape[0] - 1)) / width, u, v)
+    # In units of the image width k is D in pixels for a focal length of one width.
+    most = k + 3.0 * sigma
+    # Fields of view of 90 and 19 degrees: .5 and 3 image widths. A keystone may be negative: then the short focal
+    # length gives the upper bound.
+    bound = max(most * 0.5**2, most * 3.0**2)
+    # Nearly all have to lie beyond the bound, and a pixel beyond it proves nothing.
+    return bool(np.percentile(u, 10.0) > bound + 1.0)
+
+
+def _keystone(x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray) -> tuple[float, float]:
+    """Factor of x y in the row displacements, pixels, and its standard deviation, robustly (Cauchy weights).
+
+    Other terms: row offset, roll, scale, relative pitch, baseline across the rows, one camera before the other.
+    """
+    depth = (u - u.mean()) / max(float(u.std()), 1e-6)
+    terms = np.stack([x * y, np.ones_like(x), x, y, y * y, depth, depth * y], -1)
+    spread = 1e-3
+
+    def weigh(residual: AnyArray) -> AnyArray:
+        # Rows that agree exactly leave residuals of zero to divide by.
+        nonlocal spread
+        spread = max(1.5 * float(np.median(np.abs(residual))), 1e-3)
+        return cauchy(residual, spread)
+
+    # A flat scene has no depth, whose terms are zero: without a hold the matrix would be singular.
+    hold = 1e-9 * len(x) * np.eye(terms.shape[1])
+    solution = irls(terms, v, weigh, hold, np.zeros(terms.shape[1]), rounds=8)
+    weight = weigh(terms @ solution - v)
+    normal = (terms * weight[:, None]).T @ terms + hold
+    return float(solution[0]), spread * float(np.sqrt(np.linalg.inv(normal)[0, 0]))

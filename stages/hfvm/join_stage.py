@@ -12,10 +12,10 @@ import numpy as np
 
 from rille.stages.core.declare import AnyArray, Bundle, stage
 from rille.stages.facts.matching import DisparityFacts, TileFacts
+from rille.stages.hfvm.image import Window, whole
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS, facts
 from rille.stages.hfvm.tile_stage import Task, TileInputs, mosaic
-from rille.stages.hfvm.windows import Window, whole
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.validity import Validity, mark
-from rille.stages.hfvm import features, fill
-from rille.stages.hfvm.finest import Ending, complete
-from rille.stages.hfvm.level import Map
+from rille.stages.hfvm.finest import FAILED_PX, Ending, backmatch, complete
+from rille.stages.hfvm.image import planes as table_1
+from rille.stages.hfvm.image import whole
+from rille.stages.hfvm.level import Map, agree, fill_rows
 from rille.stages.hfvm.native.reference import linear
 from rille.stages.hfvm.params import HfvmParams
-from rille.stages.hfvm.validation import FAILED_PX, agree, backmatch
-from rille.stages.hfvm.windows import whole
 from rille.stages.imaging.pyramid import Pyramid
 
 OFFSET_BINS = 16
@@ -82,7 +81,7 @@ def match(left: Pyramid, right: Pyramid, params: HfvmParams, tell: Callable[[flo
         images = left.filled[n], right.filled[n]
         valid = left.valid[n], right.valid[n]
         # 4.3.1: feature vectors, whose distance is Eq. 1
-        planes = [features.planes(image) for image in images]
+        planes = [table_1(image) for image in images]
         vectors = [weighted(plane, params.weights) for plane in planes]
         # 4.3.4: both directions, median-filtered
         ways = [
@@ -98,7 +97,7 @@ def match(left: Pyramid, right: Pyramid, params: HfvmParams, tell: Callable[[flo
             ok = agree(maps[k], maps[1 - k], valid[k], valid[1 - k], params.backmatch)
             ok &= (ways[k].distance >= 0) & (ways[k].distance <= params.threshold)
             u, v = maps[k].u.astype(np.float32), maps[k].v.astype(np.float32)
-            fill.rows(u, v, ok, params.fill_reach, -1.0 if k == 0 else 1.0, np.zeros(u.shape, np.uint8))
+            fill_rows(u, v, ok, params.fill_reach, -1.0 if k == 0 else 1.0, np.zeros(u.shape, np.uint8))
             above.append(Map(*(np.rint(a).astype(np.int16) for a in (u, v))))
     return _finish(vectors, maps, valid, planes[0][6], params)
 

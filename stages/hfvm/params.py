@@ -8,9 +8,11 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from rille.stages.core.declare import Params
-from rille.stages.hfvm.features import PAPER_WEIGHTS
 
 Weights = tuple[float, float, float, float, float, float, float, float]
+
+PAPER_WEIGHTS: Weights = (2.0, 2.0, 3.0, 3.0, 3.0, 3.0, 10.0, 4.0)
+"""Weights w of Table 1."""
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "default": {},
@@ -20,7 +22,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     # Grey levels: distances are Eq. 1's there, no sums of bytes.
     "paper": {"weights": PAPER_WEIGHTS, "threshold": 15.0, "texture": 0.0, "fill_reach": 100000},
 }
-"""Parameters that a preset sets differently; a value given by the user wins. Its steps: ``presets.RECIPES``."""
+"""Parameters that a preset sets differently; a value given by the user wins. Its steps: ``matcher.RECIPES``."""
 
 
 class HfvmParams(Params):

@@ -1,16 +1,16 @@
 """Hierarchical feature vector matching: dense two-dimensional disparities of any two images (paper, 4.3).
 
 Nothing is rectified and no calibration is used. ``match`` works on plain arrays; :mod:`~rille.stages.hfvm.matcher` has
-the method on one page, in the order of the paper; ``presets``: each preset as a list of steps (their parameters:
+the method on one page, in the order of the paper, and each preset as a list of steps (their parameters:
 :class:`~rille.stages.hfvm.params.HfvmParams`).
 
-- ``image``, ``features``: grey values, masks and features of a level; ``brightness``, ``plane``, ``viewpoint``: what
-  makes the images alike, which ``coarse`` puts together; ``start``: disparities known beforehand.
+- ``image``: grey values, masks and features of windows of an image; ``coarse``: known disparities, brightness, and the
+  levels down to 1; ``plane``: alignment by a homography.
 - ``level``: one level: search, propagation, paths, depth edges, check, band (``epipolar``). ``native``: its loops.
-- ``tiles``, ``finest``: the finest level, window by window: ``lucas_kanade``, ``relief``, ``validation``,
-  ``textureless``, ``fill``, ``uncertainty``.
-- ``paper``: section 4.3 to the letter. ``sanity``: whether to believe a result. ``given``:
-  whether to believe another program's.
+- ``finest``: the finest level, window by window; ``refinement`` of displacements, and their standard deviations;
+  ``textureless``: planes.
+- ``tile_stage``, ``join_stage``: large pairs as tasks. ``paper``: section 4.3 to the letter. ``given``: whether to believe
+  another program's disparities, or matches as a whole.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 from rille.stages.core.declare import AnyArray, Array, Bundle, Memory, stage
 from rille.stages.core.validity import Mask, counts
 from rille.stages.facts.matching import DisparityFacts
-from rille.stages.hfvm import matcher, paper, start
-from rille.stages.hfvm.matcher import How, MatchResult
+from rille.stages.hfvm import matcher, paper
+from rille.stages.hfvm.coarse import PriorDisparities, known_beforehand
+from rille.stages.hfvm.matcher import WHOLE, How, MatchResult
 from rille.stages.hfvm.params import HfvmParams
-from rille.stages.hfvm.presets import WHOLE
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
@@ -49,7 +49,7 @@ class StereoMatches:
     regions (:mod:`~rille.stages.hfvm.textureless`). ``distance``: float32 mean feature distance at the
     whole-pixel match (byte steps; preset ``paper``: Eq. 1, grey levels), NaN on such planes and where the match
     leaves the right image. ``disparity_std``: float32 pixels, standard deviation of the column disparity (see
-    :mod:`~rille.stages.hfvm.uncertainty`), NaN where not ``MATCHED``. ``aligned``: whether the right image was
+    :mod:`~rille.stages.hfvm.refinement`), NaN where not ``MATCHED``. ``aligned``: whether the right image was
     pre-aligned by a plane.
     """
 
@@ -79,7 +79,7 @@ def match(
     params : matcher's parameters; None: preset ``default``.
     valid : of the left and the right image (row, col), not zero where usable; None: everywhere.
     prior : column and row disparities of the left image, pixels, NaN undefined, to start from (see
-        :mod:`rille.stages.hfvm.start`); None: nothing is known.
+        :mod:`rille.stages.hfvm.coarse`); None: nothing is known.
     how : progress, tiles, threads. Tiles need less memory; all but a thousandth of the pixels are within .01 px.
         Presets ``accurate`` and ``paper`` are matched whole.
 
@@ -95,11 +95,11 @@ def match(
     """
     levels = PyramidParams()
     a, b = (pyramid.build(image, levels, usable) for image, usable in zip((left, right), valid, strict=True))
-    return match_pyramids(a, b, params or HfvmParams(), start.check(prior, left.shape), how)
+    return match_pyramids(a, b, params or HfvmParams(), known_beforehand(prior, left.shape), how)
 
 
 def match_pyramids(
-    left: Pyramid, right: Pyramid, params: HfvmParams, prior: start.PriorDisparities | None = None, how: How = HOW
+    left: Pyramid, right: Pyramid, params: HfvmParams, prior: PriorDisparities | None = None, how: How = HOW
 ) -> StereoMatches:
     """Match two image pyramids as :func:`match` does."""
     if params.preset in WHOLE:

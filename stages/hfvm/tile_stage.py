@@ -1,4 +1,4 @@
-"""One step of matching a large pair, for one tile: what :mod:`rille.stages.hfvm.tiles` composes, as tasks.
+"""One step of matching a large pair, for one tile: what :mod:`rille.stages.hfvm.finest` composes, as tasks.
 
 Steps ``coarse`` and ``ending`` are of the whole pair, ``fine`` and ``final`` of one tile.
 """
@@ -15,15 +15,14 @@ import numpy as np
 from rille.stages.core.declare import AnyArray, Array, Bundle, stage
 from rille.stages.core.errors import InputError
 from rille.stages.facts.matching import TileFacts
-from rille.stages.hfvm import coarse, enlarge, presets, textureless, tiles
+from rille.stages.hfvm import coarse, finest, matcher, textureless
 from rille.stages.hfvm.coarse import Coarse
 from rille.stages.hfvm.finest import Ending
-from rille.stages.hfvm.image import view
+from rille.stages.hfvm.image import Window, view, whole
+from rille.stages.hfvm.image import tiles as cut
 from rille.stages.hfvm.level import Band, Map, State, Views
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS
-from rille.stages.hfvm.windows import Window, whole
-from rille.stages.hfvm.windows import tiles as cut
 from rille.stages.imaging.pyramid import Pyramid
 
 FINE = ("u", "v", "validity", "error", "distance", "noise")
@@ -86,20 +85,20 @@ class Task:
     @cached_property
     def half(self) -> bool:
         """Whether the pair is matched at half its resolution."""
-        recipe = presets.recipe_of(self.params)
-        return presets.halves(recipe, *(int(pyramid.meta["levels"]) for pyramid in self.given[:2]))
+        recipe = matcher.recipe_of(self.params)
+        return matcher.halves(recipe, *(int(pyramid.meta["levels"]) for pyramid in self.given[:2]))
 
     @cached_property
-    def recipe(self) -> presets.Recipe:
+    def recipe(self) -> matcher.Recipe:
         """Steps of matching at the resolution at which the pair is matched."""
-        return presets.recipe_of(self.views.params)
+        return matcher.recipe_of(self.views.params)
 
     @cached_property
     def views(self) -> Views:
         """Both images at that resolution."""
-        params, first = (presets.halved(self.params), 1) if self.half else (self.params, 0)
+        params, first = (matcher.halved(self.params), 1) if self.half else (self.params, 0)
         left, right = (view(opened(bundle).above(first), params) for bundle in self.given[:2])
-        return Views(left, right, params, presets.recipe_of(params).steps)
+        return Views(left, right, params, matcher.recipe_of(params).steps)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -153,12 +152,12 @@ def _coarse(task: Task) -> Bundle[TileFacts]:
 
 
 def _fine(task: Task) -> Bundle[TileFacts]:
-    return Bundle(tiles.fine(task.pair, task.recipe.refinement, task.window), {})
+    return Bundle(finest.fine(task.pair, task.recipe.refinement, task.window), {})
 
 
 def _ending(task: Task) -> Bundle[TileFacts]:
     arrays = task.fine(whole(task.shape), ("u", "v", "validity"))
-    ending = tiles.ending(task.pair, arrays, task.recipe.planes)
+    ending = finest.ending(task.pair, arrays, task.recipe.planes)
     meta: TileFacts = {"f": None if ending.f is None else ending.f.tolist(), "terms": None}
     if ending.planes is None:
         return Bundle({}, meta)
@@ -175,12 +174,12 @@ def _final(task: Task) -> Bundle[TileFacts]:
     ending = Ending(task.pair.state.near_sign, task.pair.alignment, f, planes, shape)
     # At half the resolution with the neighbours that slopes are taken from.
     window = task.window.grow(1, 1, shape) if task.half else task.window
-    arrays = tiles.final(task.pair, window, task.fine(tiles.around(task.pair, window)), ending)
+    arrays = finest.final(task.pair, window, task.fine(finest.around(task.pair, window)), ending)
     if task.half:
         left, right = (tuple(one.raster("level_0").shape) for one in task.given[:2])
         outer, inner = window.child(left), task.window.child(left)
         valid = np.ascontiguousarray(task.given.left.raster("valid_0")[outer.slices])
-        arrays = enlarge.doubled(arrays, valid, right, (outer.x0, outer.y0))
+        arrays = matcher.doubled(arrays, valid, right, (outer.x0, outer.y0))
         arrays = {name: np.ascontiguousarray(a[inner.inside(outer)]) for name, a in arrays.items()}
     return Bundle(arrays, {})
 

@@ -12,8 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from rille.stages.hfvm.brightness import MAX_FIT_PIXELS, MAX_GREY, MIN_FIT_PIXELS, MIN_GREY, MIN_LOG_RATIO
-from rille.stages.hfvm.windows import thinned
+from rille.stages.hfvm.coarse import MAX_FIT_PIXELS, MAX_GREY, MIN_FIT_PIXELS, MIN_GREY, MIN_LOG_RATIO
+from rille.stages.hfvm.image import thinned
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.odometry.displacements import LevelDisplacements
 

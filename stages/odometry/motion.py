@@ -24,13 +24,13 @@ from rille.stages.core.validity import Mask, Validity, defined, mark, matched, m
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts
 from rille.stages.geometry.geometry import Camera
-from rille.stages.hfvm import epipolar, fill
+from rille.stages.hfvm import epipolar
 from rille.stages.hfvm.image import view
-from rille.stages.hfvm.level import LevelSteps, Views, descend, median, propagate, search
+from rille.stages.hfvm.level import LevelSteps, Views, descend, fill_rows, median, propagate, search
+from rille.stages.hfvm.matcher import DEFAULT
 from rille.stages.hfvm.native.problem import LevelPair
 from rille.stages.hfvm.native.solver import solver
 from rille.stages.hfvm.params import HfvmParams
-from rille.stages.hfvm.presets import DEFAULT
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.odometry.derotation import Derotation
 from rille.stages.odometry.displacements import common_similarity
@@ -130,7 +130,7 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     good = validity == 0
     interpolated = np.zeros(good.shape, np.uint8)
     # Small gaps are filled, so that tracks across them have a prediction; they are marked as no measurements.
-    fill.rows(u, v, good, hp.fill_reach, state.near_sign or -1.0, interpolated)
+    fill_rows(u, v, good, hp.fill_reach, state.near_sign or -1.0, interpolated)
     mark(validity, good, Validity.MATCHED)
     mark(validity, interpolated != 0, Validity.INTERPOLATED)
     u[~defined(validity)] = v[~defined(validity)] = np.nan

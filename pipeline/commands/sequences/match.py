@@ -178,7 +178,7 @@ def _check_outputs(left: Path, right: Path, output: Path, confidence: Path | Non
 
 def warnings(result: Any, left: NDArray[Any], right: NDArray[Any]) -> Iterator[str]:
     """Signs that two matched images do not fit, one line each with its figure; ``result``: their ``StereoMatches``."""
-    from rille.stages.hfvm import sanity
+    from rille.stages.hfvm import given
 
     share, blank = float(matched(result.validity).mean()), float(has(result.validity, Validity.NO_TEXTURE).mean())
     ok = matched_back(result.validity, result.backmatch_error)
@@ -192,22 +192,22 @@ def warnings(result: Any, left: NDArray[Any], right: NDArray[Any]) -> Iterator[s
         text = f"{100 * blank:.0f} % of the pixels have no texture (black, saturated or blank) and cannot match"
         yield warning("RIL-701", text)
     # Of images of unlike size nobody knows how their middles correspond, and so which displacement far things have.
-    elif left.shape == right.shape and sanity.swapped(result.column_disparity, result.row_disparity, ok):
+    elif left.shape == right.shape and given.swapped(result.column_disparity, result.row_disparity, ok):
         median = float(np.median(result.column_disparity[ok]))
         text = (
             f"disparities have the sign of swapped images (median {median:+.1f} px, right minus left): if this is "
             "a pair of a left and a right camera, give them in the other order"
         )
         yield warning("RIL-702", text)
-    elif (judged := sanity.judge(left, right, result, ok)) is not None:
+    elif (judged := given.judge(left, right, result, ok)) is not None:
         on_lines, repeated = judged
-        if on_lines < sanity.MIN_RIGID_SHARE:
+        if on_lines < given.MIN_RIGID_SHARE:
             text = (
                 f"only {100 * on_lines:.0f} % of the matches lie within {MAX_LINE_DISTANCE_PX:.0f} px of one epipolar "
                 "geometry: wrong matches, things that move, or a lens that distorts: look at them first"
             )
             yield warning("RIL-703", text)
-        if repeated > sanity.MAX_REPEATED_SHARE:
+        if repeated > given.MAX_REPEATED_SHARE:
             text = (
                 f"{100 * repeated:.0f} % of the matches look as well elsewhere on their epipolar line: on a repeating "
                 "pattern they may be off by a period: look at them first"

@@ -10,7 +10,7 @@ from numba import njit
 
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm import epipolar
-from rille.stages.hfvm.features import distance
+from rille.stages.hfvm.image import distance
 from rille.stages.hfvm.native.problem import (
     CANDIDATES,
     FAR,
@@ -511,7 +511,7 @@ def _sweep(listed, grey, costs, backward, total):  # type: ignore[no-untyped-def
                         for m in range(CANDIDATES):
                             step = costs.small * _gap(listed.shift[y, x, k], listed.shift[y - s, i, m])
                             best = min(best, before[d, i, m] + min(step, far))
-                        cost = min(cost + best - least, NONE)
+                        cost = min(cost + best - least, np.int64(NONE))
                     after[d, x, k] = cost
                     total[y, x, k] += cost
         before, after = after, before

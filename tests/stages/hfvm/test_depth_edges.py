@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rille.stages.hfvm.features import compact
+from rille.stages.hfvm.image import compact
 from rille.stages.hfvm.level import EDGE_RULE
 from rille.stages.hfvm.native.problem import LevelPair, pack_map, unpacked
 from rille.stages.hfvm.native.reference import EDGE_RADIUS as RADIUS

@@ -2,8 +2,8 @@ import numpy as np
 from numba import njit
 from scipy import ndimage
 
-from rille.stages.hfvm import features
-from rille.stages.hfvm.features import BAND_PASS, GAUSSIAN, HIGH_PASS, WIDE_BAND_PASS
+from rille.stages.hfvm import image as images
+from rille.stages.hfvm.image import BAND_PASS, GAUSSIAN, HIGH_PASS, WIDE_BAND_PASS
 
 WEIGHTS = (4.0, 4.0, 2.0, 2.0, 0.5, 0.5, 2.0, 1.0)
 
@@ -37,19 +37,19 @@ def test_kernels_are_those_of_the_table():
 
 def test_planes_against_scipy():
     # float32 sums of at most 25 values below 255: 1e-3 is ten times their rounding.
-    np.testing.assert_allclose(features.planes(image()), table_1(image()), atol=1e-3)
+    np.testing.assert_allclose(images.planes(image()), table_1(image()), atol=1e-3)
 
 
 def test_high_pass_of_a_ramp_by_hand():
     ramp = np.tile(np.arange(20, dtype=np.float32), (20, 1))
-    found = features.planes(ramp)[:, 10, 10]
+    found = images.planes(ramp)[:, 10, 10]
     # convolution turns (2 1 0 -1 -2) over: 2*2 + 1 + 1 + 2*2 = 10 grey levels for slope one, over 4
     assert found[0] == 2.5
     assert found[1] == 0
 
 
 def test_packed_bytes_are_the_rounded_signed_square_roots():
-    words, deviation = features.pack(image(), WEIGHTS)
+    words, deviation = images.pack(image(), WEIGHTS)
     planes = table_1(image())
     scale = 2 * np.array(WEIGHTS)[:, None, None]
     exact = np.clip(128 + np.sign(planes) * np.sqrt(np.abs(planes)) * scale, 0, 255)
@@ -59,23 +59,23 @@ def test_packed_bytes_are_the_rounded_signed_square_roots():
 
 
 def test_flat_image_has_the_middle_byte_and_no_deviation():
-    words, deviation = features.pack(np.full((9, 9), 200, np.float32), WEIGHTS)
+    words, deviation = images.pack(np.full((9, 9), 200, np.float32), WEIGHTS)
     assert (unpack(words)[:6] == 128).all()
     assert (deviation == 0).all()
 
 
 def test_mirrored_image_mirrors_the_row_features():
     a = image()
-    mirrored = features.planes(a[:, ::-1])[:, :, ::-1]
-    np.testing.assert_allclose(mirrored[[0, 2, 4]], -features.planes(a)[[0, 2, 4]], atol=1e-4)
-    np.testing.assert_allclose(mirrored[[1, 3, 5, 6, 7]], features.planes(a)[[1, 3, 5, 6, 7]], atol=1e-3)
+    mirrored = images.planes(a[:, ::-1])[:, :, ::-1]
+    np.testing.assert_allclose(mirrored[[0, 2, 4]], -images.planes(a)[[0, 2, 4]], atol=1e-4)
+    np.testing.assert_allclose(mirrored[[1, 3, 5, 6, 7]], images.planes(a)[[1, 3, 5, 6, 7]], atol=1e-3)
 
 
 def test_distance_of_words_is_the_sum_of_absolute_byte_differences():
     @njit
     def each(a, b, out):
         for i in range(len(a)):
-            out[i] = features.distance(a[i], b[i])
+            out[i] = images.distance(a[i], b[i])
 
     rng = np.random.default_rng(0)
     a, b = rng.integers(0, 256, (2, 500, 8)).astype(np.uint8)

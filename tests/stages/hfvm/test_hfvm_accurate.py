@@ -9,11 +9,10 @@ from matching_scenes import Texture, pair, seen
 from rille.stages.core.errors import RilleError
 from rille.stages.core.validity import Validity, has, matched
 from rille.stages.geometry.spline import coefficients
-from rille.stages.hfvm import epipolar, relief
-from rille.stages.hfvm.features import compact
-from rille.stages.hfvm.image import Layer
+from rille.stages.hfvm import epipolar, refinement
+from rille.stages.hfvm.finest import lonely
+from rille.stages.hfvm.image import Layer, compact
 from rille.stages.hfvm.level import FREE_BAND, Look, Map, paths
-from rille.stages.hfvm.lucas_kanade import SplineImages
 from rille.stages.hfvm.native import reference
 from rille.stages.hfvm.native.problem import (
     CANDIDATES,
@@ -26,8 +25,8 @@ from rille.stages.hfvm.native.problem import (
     unpacked,
 )
 from rille.stages.hfvm.params import PRESETS, HfvmParams
+from rille.stages.hfvm.refinement import SplineImages
 from rille.stages.hfvm.stage import match
-from rille.stages.hfvm.validation import lonely
 from rille.stages.imaging.pyramid import PyramidParams, build
 
 ACC = HfvmParams(preset="accurate")
@@ -234,7 +233,7 @@ def slanted(noise):
 
 
 def fitted(left, right, start, keep):
-    return relief.fit(SplineImages(left, coefficients(right), np.ones(right.shape, np.uint8)), *start, keep)
+    return refinement.fit_relief(SplineImages(left, coefficients(right), np.ones(right.shape, np.uint8)), *start, keep)
 
 
 def test_relief_restores_a_slanted_plane():
@@ -284,7 +283,7 @@ def test_sweeps_converge_to_the_minimum():
     grey = rng.normal(0, 4, (4, *shape)).astype(float32)
     grey[0] = np.where(keep, rng.uniform(0.2, 1, shape), 0)
     stiff = np.zeros((2, *shape), float32)
-    relief._stiffness(u, v, keep, float32(2.0), float32(30.0), stiff)
+    refinement._stiffness(u, v, keep, float32(2.0), float32(30.0), stiff)
     across, down = stiff
     direction = rng.uniform(0, np.pi, shape)
     lines = np.stack([np.cos(direction), np.sin(direction), rng.normal(0, 1, shape)], -1).astype(float32)
@@ -312,10 +311,10 @@ def test_sweeps_converge_to_the_minimum():
     want = np.zeros(2 * n)
     want[there] = np.linalg.solve(matrix[np.ix_(there, there)], right[there])
     normal = np.zeros((5, *shape), float32)
-    relief._normal(grey, u, v, lines * np.sqrt(hold), keep, stiff, normal)
+    refinement._normal(grey, u, v, lines * np.sqrt(hold), keep, stiff, normal)
     assert np.count_nonzero(normal[0]) == keep.sum()
     for _ in range(60):
-        u, v = relief._solve(normal, stiff, u, v)
+        u, v = refinement._relax(normal, stiff, u, v)
     np.testing.assert_allclose(np.concatenate([u.ravel(), v.ravel()]), want, atol=2e-3)
 
 

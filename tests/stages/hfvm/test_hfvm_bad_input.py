@@ -8,12 +8,12 @@ from raising import raises
 
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Validity, defined, has, matched
-from rille.stages.hfvm import start
+from rille.stages.hfvm import coarse
+from rille.stages.hfvm.finest import isolated
+from rille.stages.hfvm.given import swapped
 from rille.stages.hfvm.matcher import How
 from rille.stages.hfvm.params import HfvmParams
-from rille.stages.hfvm.sanity import swapped
 from rille.stages.hfvm.stage import match
-from rille.stages.hfvm.validation import isolated
 
 BORDER = 8
 MOST_CHANCE = 0.05
@@ -219,10 +219,10 @@ def test_prior_that_a_plane_leads_beyond_all_bounds_is_unknown():
     # A plane whose horizon lies 16000 px to the right, and given displacements that end just before it.
     horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0 / 16000.0, 0.0, 1.0]])
     ends = np.full((64, 64), 15900.0, np.float32)
-    led = start.aligned(start.check((ends, 0 * ends), ends.shape), horizon)
+    led = coarse.aligned(coarse.known_beforehand((ends, 0 * ends), ends.shape), horizon)
     assert led is not None
-    np.testing.assert_array_less(np.abs(led.u[np.isfinite(led.u)]), start.MAX_DISPLACEMENT_PX)
-    near = start.aligned(start.check((0 * ends, 0 * ends), ends.shape), horizon)
+    np.testing.assert_array_less(np.abs(led.u[np.isfinite(led.u)]), coarse.MAX_DISPLACEMENT_PX)
+    near = coarse.aligned(coarse.known_beforehand((0 * ends, 0 * ends), ends.shape), horizon)
     assert near is not None
     assert np.isfinite(near.u).all()
 

@@ -5,12 +5,12 @@ import pytest
 from matching_scenes import pair, seen
 
 from rille.stages.core.validity import matched
-from rille.stages.hfvm import brightness
+from rille.stages.hfvm import coarse
+from rille.stages.hfvm.image import Window
 from rille.stages.hfvm.image import view as image_of
 from rille.stages.hfvm.level import FREE_BAND, Map, State
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
-from rille.stages.hfvm.windows import Window
 from rille.stages.imaging.pyramid import PyramidParams, build
 
 SHAPE = (160, 220)
@@ -29,7 +29,7 @@ def state(level, u, ok):
 
 def logarithm(shape, level=0):
     y, x = np.indices(shape)
-    return np.tensordot(RATIO, brightness.terms(x, y, level, SHAPE), 1)
+    return np.tensordot(RATIO, coarse.terms(x, y, level, SHAPE), 1)
 
 
 def corners(x, y):
@@ -40,19 +40,19 @@ def corners(x, y):
 
 def test_terms_mean_the_same_place_on_each_level():
     x = np.array([0.0, 20.0, 54.0])
-    fine = brightness.terms(4 * x + 1.5, 4 * x + 1.5, 0, SHAPE)
-    np.testing.assert_allclose(brightness.terms(x, x, 2, SHAPE), fine, atol=1e-12)
+    fine = coarse.terms(4 * x + 1.5, 4 * x + 1.5, 0, SHAPE)
+    np.testing.assert_allclose(coarse.terms(x, x, 2, SHAPE), fine, atol=1e-12)
 
 
 @pytest.mark.parametrize("level", [0, 2])
 def test_levelled_view_is_multiplied_by_the_exponential(level):
     plain = view(np.random.default_rng(0).uniform(10, 200, SHAPE).astype(np.float32))
-    found = brightness.levelled(plain, RATIO)
+    found = coarse.levelled(plain, RATIO)
     window = Window(3, 30, 5, 41)
     expected = plain.layers[level].grey * np.exp(logarithm(plain.shapes[level], level))
     np.testing.assert_allclose(found.layers[level].grey, expected, rtol=1e-5)
     np.testing.assert_allclose(found.layers[level].cut(window).grey, expected[window.slices], rtol=1e-5)
-    assert brightness.levelled(plain, None) is plain
+    assert coarse.levelled(plain, None) is plain
 
 
 def test_matches_tell_the_ratio_though_a_third_is_wrong():
@@ -61,19 +61,19 @@ def test_matches_tell_the_ratio_though_a_third_is_wrong():
     right = left / np.exp(logarithm(SHAPE)).astype(np.float32)
     u = np.where(rng.random(SHAPE) < 1 / 3, 7, 0).astype(np.int16)
     ok = np.arange(SHAPE[1]) < SHAPE[1] - 7
-    found = brightness.matched(view(left), view(right), state(0, u, np.broadcast_to(ok, SHAPE).copy()))
+    found = coarse.ratio_of_matches(view(left), view(right), state(0, u, np.broadcast_to(ok, SHAPE).copy()))
     y, x = np.indices(SHAPE)
     # a wrong match errs by .28 in the mean of squares; held down by the robust fit and by 2600 others
-    off = np.tensordot(found - RATIO, brightness.terms(x, y, 0, SHAPE), 1)
+    off = np.tensordot(found - RATIO, coarse.terms(x, y, 0, SHAPE), 1)
     assert np.abs(off).mean() < 0.02
-    assert brightness.matched(view(left), view(right), state(0, u, np.zeros(SHAPE, bool))) is None
+    assert coarse.ratio_of_matches(view(left), view(right), state(0, u, np.zeros(SHAPE, bool))) is None
 
 
 def test_guess_of_one_scene_in_two_lights():
     left = np.random.default_rng(2).uniform(60, 120, SHAPE).astype(np.float32)
     right = left / np.exp(logarithm(SHAPE)).astype(np.float32)
-    found = brightness.guess(view(left), view(right), 2)
-    assert brightness.greatest(found - RATIO) < 0.1 < brightness.greatest(RATIO)
+    found = coarse.guess(view(left), view(right), 2)
+    assert coarse.greatest(found - RATIO) < 0.1 < coarse.greatest(RATIO)
 
 
 @pytest.mark.parametrize("preset", ["default", "fast"])
@@ -100,5 +100,5 @@ def test_equal_light_is_left_alone():
     u = np.full(shape, -3, np.int16)
     ok = np.zeros(shape, bool)
     ok[:, 6:] = True
-    found = brightness.matched(*views, state(level, u, ok))
-    assert brightness.greatest(found) < brightness.MIN_LOG_RATIO
+    found = coarse.ratio_of_matches(*views, state(level, u, ok))
+    assert coarse.greatest(found) < coarse.MIN_LOG_RATIO

@@ -12,14 +12,14 @@ from scipy import ndimage
 from rille.stages.core.validity import Validity, has
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.spline import coefficients
-from rille.stages.hfvm import epipolar, features, fill, lucas_kanade, paper, plane, uncertainty
-from rille.stages.hfvm.image import view
-from rille.stages.hfvm.level import Map
+from rille.stages.hfvm import epipolar, level, paper, plane, refinement
+from rille.stages.hfvm.finest import FAILED_PX, backmatch, isolated
+from rille.stages.hfvm.image import Window, view
+from rille.stages.hfvm.image import planes as table_1
+from rille.stages.hfvm.level import Map, agree
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.plane import Sample
 from rille.stages.hfvm.stage import match
-from rille.stages.hfvm.validation import FAILED_PX, agree, backmatch, isolated
-from rille.stages.hfvm.windows import Window
 from rille.stages.imaging.pyramid import PyramidParams, build
 
 
@@ -75,7 +75,7 @@ class TestConsistency:
     @pytest.mark.parametrize(("near_sign", "expected"), [(-1.0, -2), (1.0, -20)])
     def test_an_occlusion_gets_its_background(self, near_sign, expected):
         u, v, filled = np.array([[-2, 9, 9, -20]], np.float32), zeros(1, 4), np.zeros((1, 4), np.uint8)
-        fill.rows(u, v, np.array([[True, False, False, True]]), 10, near_sign, filled)
+        level.fill_rows(u, v, np.array([[True, False, False, True]]), 10, near_sign, filled)
         np.testing.assert_array_equal(u[0, 1:3], expected)
         np.testing.assert_array_equal(filled, [[0, 1, 1, 0]])
 
@@ -84,7 +84,7 @@ class TestConsistency:
         keep = np.zeros((1, 12), bool)
         keep[0, [2, 5]] = True
         u[0, 2], u[0, 5] = 1.0, 2.5
-        fill.rows(u, v, keep, 3, -1.0, filled)
+        level.fill_rows(u, v, keep, 3, -1.0, filled)
         np.testing.assert_allclose(u[0, :9], [1, 1, 1, 1.5, 2, 2.5, 2.5, 2.5, 2.5])
         np.testing.assert_array_equal(filled[0], [1, 1, 0, 1, 1, 0, 1, 1, 1, 0, 0, 0])
 
@@ -215,8 +215,8 @@ class TestPlane:
 
 def refined(left, right, start, keep, steps=1):
     """Result of Lucas-Kanade steps towards all of a right image, usable everywhere."""
-    images = lucas_kanade.SplineImages(left, coefficients(right), np.ones(right.shape, np.uint8))
-    return lucas_kanade.refine(images, lambda u, v: (u, v), start, keep, steps)
+    images = refinement.SplineImages(left, coefficients(right), np.ones(right.shape, np.uint8))
+    return refinement.refine(images, lambda u, v: (u, v), start, keep, steps)
 
 
 class TestRefine:
@@ -248,7 +248,7 @@ class TestRefine:
         mean = lambda z: ndimage.uniform_filter(z, 5)  # noqa: E731
         variance = lambda z: (mean(z * z) - mean(z) ** 2).astype(np.float32)  # noqa: E731
         found = [
-            lucas_kanade.surroundings(variance(d), np.sqrt(variance(s)), keep, (0.0, 0.0))
+            refinement.surroundings(variance(d), np.sqrt(variance(s)), keep, (0.0, 0.0))
             for d, s in ((0.1 * a - 0.1 * b, signal + 0.1 * a), (a - b, a))
         ]
         (same, _), (none, around) = found
@@ -271,10 +271,10 @@ class TestRefine:
             (signal - other, 0.0, -0.3, 0.3),
             (signal - other + 1.5 * noise, 1.5**2, -0.5, 0.5),
         ):
-            found, _ = lucas_kanade.surroundings(variance(difference), np.sqrt(variance(signal)), keep, (0.0, told))
+            found, _ = refinement.surroundings(variance(difference), np.sqrt(variance(signal)), keep, (0.0, told))
             assert low < found[inner].mean() < high
         # Noise of the left image is in its deviation, too: what is left of it is the texture's.
-        found, _ = lucas_kanade.surroundings(
+        found, _ = refinement.surroundings(
             variance(signal - other), np.sqrt(variance(signal + noise)), keep, (1.0, 0.0)
         )
         assert abs(found[inner].mean() - 0.5) < 0.2
@@ -286,7 +286,7 @@ def test_local_mean_takes_only_like_neighbours():
     u[2, 2] = 0.9
     keep = np.ones((5, 5), bool)
     keep[0, 0] = False
-    out_u, _ = lucas_kanade.local_mean(u, v, keep, 1, 1)
+    out_u, _ = refinement.local_mean(u, v, keep, 1, 1)
     assert out_u[2, 2] == pytest.approx(0.9 / 6)
     assert out_u[2, 3] == 10
     assert out_u[0, 0] == 0
@@ -324,7 +324,7 @@ class TestLookup:
         grey = (grey - grey.mean()) / grey.std() * 40 + 128
         moved = ndimage.map_coordinates(grey, [y, x - 2.5 - (x - 256) * 0.012 - (y - 128) * 0.004], mode="nearest")
         images = [(a + rng.normal(0, 1, a.shape)).clip(0, 255)[16:-16, 32:-32] for a in (grey, moved)]
-        planes = [features.planes(image.astype(np.float32)) for image in images]
+        planes = [table_1(image.astype(np.float32)) for image in images]
         vectors = [paper.weighted(plane, p.weights) for plane in planes]
         ways = (paper._one_way(*way, None, p) for way in (vectors, vectors[::-1]))
         maps = [Map(cv2.medianBlur(way.u, 3), cv2.medianBlur(way.v, 3)) for way in ways]
@@ -347,7 +347,7 @@ def test_a_patch_without_texture_on_a_textured_wall_is_matched_with_a_larger_dev
     np.testing.assert_allclose(found.column_disparity[inside], -12, atol=0.5)
     around = found.disparity_std[20:60, 40:180]
     more = np.nanmin(found.disparity_std[inside]) ** 2 - np.nanmedian(around) ** 2
-    assert more > 0.99 * uncertainty.BLANK_STD_PX**2
+    assert more > 0.99 * refinement.BLANK_STD_PX**2
 
 
 def test_a_spline_is_scipys_between_pixels():
@@ -355,7 +355,7 @@ def test_a_spline_is_scipys_between_pixels():
     def call(found, x, y):
         i, j = int(x), int(y)
         t, s = x - np.float32(i), y - np.float32(j)
-        return lucas_kanade.spline_value(found.ravel(), j * found.shape[1] + i, found.shape[1], t, s)
+        return refinement.spline_value(found.ravel(), j * found.shape[1] + i, found.shape[1], t, s)
 
     image = np.random.default_rng(8).uniform(0, 255, (9, 10)).astype(np.float32)
     for x, y in np.random.default_rng(9).uniform(2, 6, (50, 2)).astype(np.float32):

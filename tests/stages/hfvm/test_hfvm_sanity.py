@@ -6,7 +6,7 @@ from matching_scenes import Texture, convergent_rig, pair, rig_displacement
 
 from rille.pipeline.commands.sequences.match import warnings
 from rille.stages.core.validity import matched
-from rille.stages.hfvm import sanity
+from rille.stages.hfvm import given
 from rille.stages.hfvm.stage import match
 
 
@@ -36,11 +36,11 @@ def test_too_few_matches_are_not_judged():
     y, x = np.indices((140, 180), dtype=np.float64)
     left, right = Texture(0)(x, y), Texture(1)(x, y)
     found = match(left, right)
-    assert sanity.judge(left, right, found, matched(found.validity)) is None
+    assert given.judge(left, right, found, matched(found.validity)) is None
 
 
 def test_lines_of_an_exact_geometry_hold_all_matches():
     _, _, u, v = pair(rig_displacement(convergent_rig(), lambda x, y: 1.5 + 0.3 * np.sin(x / 25)))
-    places = sanity.sample(u, v, np.ones(u.shape, bool))
-    assert sanity.on_their_lines(places, sanity.lines(places)) > 0.99
-    assert sanity.on_their_lines(places, None) == 0.0
+    places = given.sample(u, v, np.ones(u.shape, bool))
+    assert given.on_their_lines(places, given.lines(places)) > 0.99
+    assert given.on_their_lines(places, None) == 0.0

@@ -5,13 +5,11 @@ import pytest
 from matching_scenes import pair
 
 from rille.stages.core.validity import matched
-from rille.stages.hfvm.image import view
-from rille.stages.hfvm.matcher import How
+from rille.stages.hfvm.finest import _bounded
+from rille.stages.hfvm.image import Window, thinned, tiles, view, whole
+from rille.stages.hfvm.matcher import How, local
 from rille.stages.hfvm.params import HfvmParams
-from rille.stages.hfvm.presets import local
 from rille.stages.hfvm.stage import match
-from rille.stages.hfvm.tiles import _bounded
-from rille.stages.hfvm.windows import Window, thinned, tiles, whole
 from rille.stages.imaging.pyramid import PyramidParams, build
 
 SHAPE = (300, 420)

@@ -6,17 +6,17 @@ from matching_scenes import Texture, pair
 
 from rille.stages.core.validity import matched
 from rille.stages.geometry.spline import coefficients
-from rille.stages.hfvm import lucas_kanade
+from rille.stages.hfvm import refinement
 from rille.stages.hfvm.params import HfvmParams
+from rille.stages.hfvm.refinement import FLOOR_PX, neighbours, standard_deviation
 from rille.stages.hfvm.stage import match
-from rille.stages.hfvm.uncertainty import FLOOR_PX, neighbours, standard_deviation
 
 
 def per_noise(left, right):
     """Variance of undisplaced columns for a unit of variance of the grey levels."""
     nothing, keep = np.zeros(left.shape, np.float32), np.ones(left.shape, bool)
-    images = lucas_kanade.SplineImages(left, coefficients(right), np.ones(right.shape, np.uint8))
-    return lucas_kanade.refine(images, lambda u, v: (u, v), (nothing, nothing), keep, 1).per_noise
+    images = refinement.SplineImages(left, coefficients(right), np.ones(right.shape, np.uint8))
+    return refinement.refine(images, lambda u, v: (u, v), (nothing, nothing), keep, 1).per_noise
 
 
 def test_noise_part_is_the_inverse_structure_tensor_of_the_window():
@@ -25,7 +25,7 @@ def test_noise_part_is_the_inverse_structure_tensor_of_the_window():
     window = np.s_[y - 2 : y + 3, x - 2 : x + 3]
     gy, gx = np.gradient(image.astype(np.float64))
     g = np.stack([gx[window].ravel(), gy[window].ravel()])
-    tensor = 25 * np.cov(g, bias=True) + 25 * lucas_kanade.ASSUMED_NOISE_VARIANCE * np.eye(2)
+    tensor = 25 * np.cov(g, bias=True) + 25 * refinement.ASSUMED_NOISE_VARIANCE * np.eye(2)
     assert per_noise(image, image)[y, x] == pytest.approx(np.linalg.inv(tensor)[0, 0], rel=1e-4)
 
 

@@ -5,13 +5,12 @@ import numpy as np
 import pytest
 
 from rille.stages.core.validity import matched
-from rille.stages.hfvm import epipolar, features, textureless
+from rille.stages.hfvm import epipolar, textureless
+from rille.stages.hfvm.image import Window, pack, whole
 from rille.stages.hfvm.matcher import How
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
-from rille.stages.hfvm.textureless import Planes
-from rille.stages.hfvm.wide_search import MAX_DISTANCE, MIN_DISTINCT_STEPS, WINDOW_SIDE_PX, WordPair, search
-from rille.stages.hfvm.windows import Window, whole
+from rille.stages.hfvm.textureless import MAX_DISTANCE, MIN_DISTINCT_STEPS, WINDOW_SIDE_PX, Planes, WordPair, search
 
 ROWS, COLS = 220, 300
 WALL = -8.0
@@ -148,7 +147,7 @@ def test_a_window_of_planes_is_part_of_the_whole(window):
 def test_search_and_its_definition_agree():
     rng = np.random.default_rng(5)
     images = [rng.normal(100, 0.4, (40, 60)).astype(np.float32) for _ in range(2)]
-    words, others = (features.pack(image, HfvmParams().weights)[0] for image in images)
+    words, others = (pack(image, HfvmParams().weights)[0] for image in images)
     valid = np.ones((40, 60), np.uint8)
     valid[20:, 36:] = 0
     window, steps = Window(5, 31, 12, 50), np.arange(-9, 4, dtype=np.float32)
