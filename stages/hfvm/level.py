@@ -68,7 +68,7 @@ def fill_rows(u, v, keep, reach, near_sign, filled):  # type: ignore[no-untyped-
 MAX_FIT_MATCHES = 500
 """Matches that a band or plane is fitted to; more change nothing that matters and cost time."""
 
-PATH_COSTS = PathCosts(compact=8, small=36, large=240, grey=10.0)
+PATH_COSTS = PathCosts(compact=8, small=36, large=240, grey=10)
 """Costs of propagation along paths: larger ``compact``: depth edges less fattened; ``small``: smoother; ``large``:
 fewer depth steps; ``grey``: depth steps follow image edges less."""
 
@@ -207,16 +207,12 @@ def propagate(look: Look, field: Field) -> Field:
 def paths(look: Look, field: Field) -> Field:
     """Displacements chosen by costs gathered along paths from the borders of the image.
 
-    A pixel's candidates are its own displacement and those a pixel beside it, those of near and farther pixels, and
-    those handed down. Along six directions (eight but for those within a row) each gathers the least cost of getting
-    there, smoothness included; so evidence travels over weak texture as far as it must, and stops at depth edges.
+    A pixel's candidates are its own displacement and those a pixel beside it, and those of near and farther pixels.
+    Along six directions (eight but for those within a row) each gathers the least cost of getting there, smoothness
+    included; so evidence travels over weak texture as far as it must, and stops at depth edges.
     """
-    up = None if look.up is None else (look.up.u, look.up.v)
-    listed = solver.candidates(look.pair, (look.a.compact, look.b.compact), field.shift, up, PATH_COSTS)
-    total = np.zeros(listed.cost.shape, np.int32)
-    for backward in (False, True):
-        solver.sweep(listed, look.a.grey, PATH_COSTS, backward, total)
-    solver.choose(listed, total, field.shift)
+    compact = LevelPair(look.a.compact, look.b.compact, epipolar.NO_BAND, 0.0)
+    solver.paths(look.pair, compact, look.a.grey, PATH_COSTS, field.shift)
     return field
 
 

@@ -9,8 +9,8 @@ the method on one page, in the order of the paper, and each preset as a list of 
 - ``level``: one level: search, propagation, paths, depth edges, check, band (``epipolar``). ``native``: its loops.
 - ``finest``: the finest level, window by window; ``refinement`` of displacements, and their standard deviations;
   ``textureless``: planes.
-- ``tile_stage``, ``join_stage``: large pairs as tasks. ``paper``: section 4.3 to the letter. ``given``: whether to believe
-  another program's disparities, or matches as a whole.
+- ``tile_stage``, ``join_stage``: large pairs as tasks. ``paper``: section 4.3 to the letter. ``given``: whether to
+  believe another program's disparities, or matches as a whole.
 """
 
 from __future__ import annotations

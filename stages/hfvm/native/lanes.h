@@ -21,7 +21,6 @@ typedef int16_t Sixteen __attribute__((vector_size(32)));
 typedef float EightFloat __attribute__((vector_size(32)));
 typedef int32_t Four __attribute__((vector_size(16)));
 typedef uint64_t Square __attribute__((vector_size(32)));
-typedef int16_t Numbers __attribute__((vector_size(16)));
 typedef struct { Square low, high; } Words; /* eight feature vectors */
 #define LESS(a, b) ((a) < (b))
 #define SAME(a, b) ((a) == (b))
@@ -147,8 +146,6 @@ RULE uint32_t bits_of(Eight mask) { /* a bit for each lane, the first one lowest
 #endif
 }
 RULE int32_t any(Eight mask) { return bits_of(mask) != 0; }
-RULE Four first_half(Eight a) { return __builtin_shufflevector(a, a, 0, 1, 2, 3); }
-RULE Four second_half(Eight a) { return __builtin_shufflevector(a, a, 4, 5, 6, 7); }
 RULE Eight columns(Eight shift) { return shift << 16 >> 16; }
 RULE Eight moved(Eight shift, int u, int v) { /* in halves: no carry runs from the columns into the rows */
   Eight step = (Eight){} + (int32_t)((uint32_t)v << 16 | (u & 0xFFFF));

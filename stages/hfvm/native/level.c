@@ -21,27 +21,29 @@ int supported(void) {
 
 /* ---- search ---- */
 
-/* `centres`: room, (rows + 2) x (cols + 2) of the parents; a border repeats the edge. */
-void EXPORT(search)(const Pair *pair, const Parents *up, Shift reach, Field out, int32_t *centres) {
-  int32_t stride = up->cols + 2, rows = pair->left.rows, cols = pair->left.cols;
-  for (int32_t j = 0; j < up->rows; j++) {
+/* Displacements and costs of an image from those of the coarser level, half as large. `centres`: room, two rows and two
+   columns more than that has; a border repeats the edge. */
+void EXPORT(search)(const Pair *pair, const int16_t *up_u, const int16_t *up_v, const Shift *reach, int32_t *shift,
+                    int32_t *cost, int32_t *centres) {
+  int32_t rows = pair->left.rows, cols = pair->left.cols, up_rows = (rows + 1) / 2;
+  Parents up = {up_u, up_v, (cols + 1) / 2};
+  int32_t stride = up.cols + 2;
+  for (int32_t j = 0; j < up_rows; j++) {
     RowLines row = row_lines(&pair->band, pair->y0 + 2 * j + 0.5);
     int32_t *to = centres + (int64_t)(j + 1) * stride;
-    for (int32_t i = 0; i < up->cols; i++) to[i + 1] = centre_of(pair, up, row, i, j);
-    to[0] = to[1], to[up->cols + 1] = to[up->cols];
+    for (int32_t i = 0; i < up.cols; i++) to[i + 1] = centre_of(pair, &up, row, i, j);
+    to[0] = to[1], to[up.cols + 1] = to[up.cols];
   }
   memcpy(centres, centres + stride, stride * sizeof *centres);
-  memcpy(centres + (int64_t)(up->rows + 1) * stride, centres + (int64_t)up->rows * stride, stride * sizeof *centres);
-  for (int32_t j = 0; j < up->rows; j++) {
+  memcpy(centres + (int64_t)(up_rows + 1) * stride, centres + (int64_t)up_rows * stride, stride * sizeof *centres);
+  for (int32_t j = 0; j < up_rows; j++) {
     RowLines row = row_lines(&pair->band, pair->y0 + 2 * j + 0.5);
-    for (int32_t i = 0; i < up->cols; i++) {
+    for (int32_t i = 0; i < up.cols; i++) {
       const int32_t *centre = centres + (int64_t)(j + 1) * stride + i + 1;
-      Children best = search_parent(pair, row, centre, stride, (Shift){i, j}, reach);
+      Children best = search_parent(pair, row, centre, stride, (Shift){i, j}, *reach);
       for (int n = 0; n < 4; n++) {
         int32_t x = 2 * i + (n & 1), y = 2 * j + (n >> 1);
-        if (x >= cols || y >= rows) continue;
-        out.shift[(int64_t)y * cols + x] = best.shift[n];
-        out.cost[(int64_t)y * cols + x] = best.cost[n];
+        if (x < cols && y < rows) shift[(int64_t)y * cols + x] = best.shift[n], cost[(int64_t)y * cols + x] = best.cost[n];
       }
     }
   }
@@ -49,11 +51,11 @@ void EXPORT(search)(const Pair *pair, const Parents *up, Shift reach, Field out,
 
 /* ---- propagation ---- */
 
+typedef struct { int32_t *shift, *cost; } Field;          /* displacements, and what they cost */
 typedef struct { int32_t *columns, *shift, *cost; } Todo; /* columns of a row to look at, and what was settled there */
 
-/* One colour of row y. `dirty`: pixels to look at; `again`: whether a later turn looks again at what changes. */
-static void turn_row(const Pair *pair, Field field, uint8_t *dirty, Todo todo, int32_t y, int32_t turn, Smoothing how,
-                     int again) {
+/* One colour of row y. `dirty`: pixels to look at. */
+static void turn_row(const Pair *pair, Field field, uint8_t *dirty, Todo todo, int32_t y, int32_t turn, Smoothing how) {
   int32_t rows = pair->left.rows, cols = pair->left.cols, n = 0;
   int32_t above = y > 0 ? y - 1 : rows > 1, below_ = y + 1 < rows ? y + 1 : rows > 1 ? rows - 2 : 0;
   int64_t start = (int64_t)y * cols;
@@ -95,7 +97,7 @@ static void turn_row(const Pair *pair, Field field, uint8_t *dirty, Todo todo, i
   }
   for (int32_t k = 0; k < n; k++) {
     int32_t x = todo.columns[k];
-    int32_t changed = again && todo.shift[k] != own[x];
+    int32_t changed = how.rounds > 1 && todo.shift[k] != own[x];
     field.shift[start + x] = todo.shift[k], field.cost[start + x] = todo.cost[k];
     /* The pixel itself as well: what lies beside its new displacement has not been tried. */
     if (changed) before[x] = after[x] = flags[x] = flags[x > 0 ? x - 1 : 0] = flags[x + 1 < cols ? x + 1 : x] = 1;
@@ -103,22 +105,22 @@ static void turn_row(const Pair *pair, Field field, uint8_t *dirty, Todo todo, i
 }
 
 /* Rounds over the two colours of a checkerboard, in place. Each turn follows the one before at a row's distance, so that
-   all of them pass over the image while it is at hand. `dirty`: room, a byte a pixel, `room`: 3 (cols + LANES). */
-void EXPORT(propagate)(const Pair *pair, Field field, Smoothing how, int32_t rounds, uint8_t *dirty, int32_t *room) {
-  int32_t rows = pair->left.rows, wide = pair->left.cols + LANES, turns = 2 * rounds;
+   all of them pass over the image while it is at hand. `dirty`: zeros, a byte a pixel; `room`: 3 (cols + LANES). */
+void EXPORT(propagate)(const Pair *pair, int32_t *shift, int32_t *cost, const Smoothing *smoothing, uint8_t *dirty,
+                       int32_t *room) {
+  int32_t rows = pair->left.rows, wide = pair->left.cols + LANES, turns = 2 * smoothing->rounds;
   Todo todo = {room, room + wide, room + 2 * wide};
+  Smoothing how = *smoothing;
   if (pair->band.cost < SHARP) how.beside = 2;
-  memset(dirty, 0, (size_t)rows * pair->left.cols);
   for (int32_t step = 0; turns && step < rows + turns - 1; step++) {
     for (int32_t turn = step - rows + 1 > 0 ? step - rows + 1 : 0; turn < turns && turn <= step; turn++)
-      turn_row(pair, field, dirty, todo, step - turn, turn, how, turns > 2);
+      turn_row(pair, (Field){shift, cost}, dirty, todo, step - turn, turn, how);
   }
 }
 
 /* ---- fractions of a pixel ---- */
 
 enum { SUM_RADIUS = 2, WINDOW = 2 * SUM_RADIUS + 1, SIDE_BY_SIDE = LANES - WINDOW + 1 };
-typedef struct { float *u, *v, *distance; } Fine;
 typedef struct { int32_t at, west, east, north, south; } Sums; /* distances at a displacement, and a pixel beside it */
 
 /* Where two lines of equal and opposite slope through three distances meet, within half a pixel. */
@@ -164,7 +166,8 @@ static inline void sum_windows(const uint64_t *here, const uint64_t *there, int3
 }
 /* Displacements with fractions from distances summed over 5 x 5 pixels, and the mean distance; where the window, moved
    by a pixel, leaves an image, the displacement as it is and the pixel's own distance; -1 outside, or not wanted. */
-void EXPORT(sums)(const Pair *pair, const int16_t *us, const int16_t *vs, const uint8_t *wanted, Fine out) {
+void EXPORT(sums)(const Pair *pair, const int16_t *us, const int16_t *vs, const uint8_t *wanted, float *out_u, float *out_v,
+                  float *out_distance) {
   int32_t rows = pair->left.rows, cols = pair->left.cols, far = SUM_RADIUS + 1;
   int32_t right_rows = pair->right.rows, right_cols = pair->right.cols;
   Sums found[SIDE_BY_SIDE];
@@ -173,13 +176,13 @@ void EXPORT(sums)(const Pair *pair, const int16_t *us, const int16_t *vs, const 
       int64_t i = (int64_t)y * cols + x;
       int32_t u = us[i], v = vs[i], xr = x + pair->ahead_x + u, yr = y + pair->ahead_y + v;
       n = 1;
-      out.u[i] = (float)u, out.v[i] = (float)v, out.distance[i] = -1.0f;
+      out_u[i] = (float)u, out_v[i] = (float)v, out_distance[i] = -1.0f;
       if (!wanted[i] || xr < 0 || xr >= right_cols || yr < 0 || yr >= right_rows) continue;
       const uint64_t *here = pair->left.words + i, *there = pair->right.words + (int64_t)yr * right_cols + xr;
       int32_t most = cols - SUM_RADIUS - x < right_cols - far - xr ? cols - SUM_RADIUS - x : right_cols - far - xr;
       if (x < SUM_RADIUS || y < SUM_RADIUS || y + SUM_RADIUS >= rows || xr < far || yr < far || yr + far >= right_rows ||
           most <= 0) {
-        out.distance[i] = (float)distance(*here, *there);
+        out_distance[i] = (float)distance(*here, *there);
         continue;
       }
       if (most >= SIDE_BY_SIDE) {
@@ -194,9 +197,9 @@ void EXPORT(sums)(const Pair *pair, const int16_t *us, const int16_t *vs, const 
       }
       for (int k = 0; k < n; k++) {
         Sums s = found[k];
-        out.u[i + k] = (float)u + fraction(s.west, s.at, s.east);
-        out.v[i + k] = (float)v + fraction(s.north, s.at, s.south);
-        out.distance[i + k] = (float)s.at / (float)(WINDOW * WINDOW);
+        out_u[i + k] = (float)u + fraction(s.west, s.at, s.east);
+        out_v[i + k] = (float)v + fraction(s.north, s.at, s.south);
+        out_distance[i + k] = (float)s.at / (float)(WINDOW * WINDOW);
       }
     }
   }
@@ -298,133 +301,104 @@ void EXPORT(edges)(const Pair *pair, const int16_t *grey, const int32_t *shift, 
 /* ---- paths ---- */
 
 enum { MOST = 8, NONE = 32767, UNIT = 4, OUTSIDE = 8000 }; /* candidates; costs: none, of a byte step, outside */
-typedef struct { int32_t *shift; int16_t *cost; } Candidates; /* MOST of each pixel */
-typedef struct { int32_t compact, small, large; float grey; } PathCosts;
+typedef struct { int32_t compact, small, large, grey; } PathCosts;
 typedef struct { Eight shift; int32_t count; } List; /* beyond `count` the first displacement is repeated */
+typedef struct { Eight shift, cost, total; } Candidates; /* of a pixel; total: with what the paths to it cost */
 
 /* Append a displacement that leads into the right image and is not there yet. */
-static inline void append(const Image *right, int32_t x, int32_t y, int32_t shift, List *list) {
+static inline void append(const Pair *pair, int32_t x, int32_t y, int32_t shift, List *list) {
   const Eight order = {0, 1, 2, 3, 4, 5, 6, 7};
-  int32_t xr = x + (int16_t)shift, yr = y + (shift >> 16);
-  if (xr < 0 || yr < 0 || xr >= right->cols || yr >= right->rows) return;
   Eight tried = (Eight){} + shift;
-  if (any(SAME(list->shift, tried))) return;
+  if (list->count == MOST || !inside(&pair->right, x + (int16_t)shift, y + (shift >> 16)) || any(SAME(list->shift, tried)))
+    return;
   list->shift = PICK(SAME(order, (Eight){} + list->count), tried, list->shift);
   list->count++;
 }
-/* Candidates of a pixel: the own displacement, those a pixel beside it, those around, those of the coarser level. */
-static List candidates_of(const Pair *pair, const int32_t *maps, const Parents *up, int32_t x, int32_t y) {
+/* Candidates of a pixel: the own displacement, those a pixel beside it, those of near and farther pixels. */
+static List candidates_of(const Pair *pair, const int32_t *maps, int32_t x, int32_t y) {
   static const int8_t around[12][2] = {{0, -1}, {0, 1}, {-1, 0}, {1, 0}, {-3, -3}, {-3, 3}, {3, -3}, {3, 3},
                                        {0, -8}, {0, 8}, {-8, 0}, {8, 0}};
-  static const int8_t beside[4][2] = {{0, -1}, {0, 1}, {-1, 0}, {1, 0}};
   int32_t rows = pair->left.rows, cols = pair->left.cols, shift = maps[(int64_t)y * cols + x];
   Shift own = unpack(shift);
   List list = {(Eight){} + shift, 1};
-  for (int n = 0; n < 4; n++) append(&pair->right, x, y, pack(own.u + beside[n][1], own.v + beside[n][0]), &list);
-  for (int n = 0; n < 12 && list.count < MOST; n++) {
-    int64_t j = within(y + around[n][0], rows), i = within(x + around[n][1], cols);
-    append(&pair->right, x, y, maps[j * cols + i], &list);
-  }
-  for (int n = 0; up->rows && n < 9 && list.count < MOST; n++) {
-    int64_t k = (int64_t)within(y / 2 + n / 3 - 1, up->rows) * up->cols + within(x / 2 + n % 3 - 1, up->cols);
-    append(&pair->right, x, y, pack(2 * up->u[k], 2 * up->v[k]), &list);
-  }
+  for (int n = 0; n < 4; n++) append(pair, x, y, pack(own.u + around[n][1], own.v + around[n][0]), &list);
+  for (int n = 0; n < 12; n++)
+    append(pair, x, y, maps[(int64_t)within(y + around[n][0], rows) * cols + within(x + around[n][1], cols)], &list);
   return list;
 }
-/* What four displacements cost for their distance from the line of a pixel. */
-static inline Four off_lines(Line line, double share, Four u, Four v) {
-  typedef double Doubles __attribute__((vector_size(32)));
-  Doubles off = __builtin_convertvector(u, Doubles) * line.a + __builtin_convertvector(v, Doubles) * line.b + line.c;
-  off = share * (Doubles)((Square)off & INT64_MAX);
-  Doubles most = (Doubles){} + 2 * OUTSIDE;
-  return __builtin_convertvector((Doubles)PICK((Square)(off < most), (Square)off, (Square)most), Four);
-}
-/* Candidates of every pixel, each once, and their costs; all but the first lead into the right image. `compact`: words of
-   both images' compact features. */
-void EXPORT(candidates)(const Pair *pair, const uint64_t *const compact[2], const int32_t *maps, const Parents *up,
-                        PathCosts costs, Candidates out) {
+/* Candidates of a pixel, each once, and their costs; all but the first lead into the right image. `compact`: the images'
+   compact features. */
+static Candidates listed(const Pair *pair, const Pair *compact, const int32_t *maps, const PathCosts *costs, int32_t x,
+                         int32_t y) {
   const Eight order = {0, 1, 2, 3, 4, 5, 6, 7};
-  int32_t cols = pair->left.cols, right_cols = pair->right.cols;
-  double share = (UNIT + costs.compact) * pair->band.cost;
-  for (int32_t y = 0; y < pair->left.rows; y++) {
-    for (int32_t x = 0; x < cols; x++) {
-      int64_t i = (int64_t)y * cols + x;
-      Line line = unit_line(&pair->band, x + pair->x0, y + pair->y0);
-      List list = candidates_of(pair, maps, up, x, y);
-      Eight u = columns(list.shift), v = list.shift >> 16, xr = u + x, yr = v + y;
-      Eight inside = below(xr, right_cols) & below(yr, pair->right.rows), at = (yr * right_cols + xr) & inside;
-      Square own = (Square){} + pair->left.words[i], own_compact = (Square){} + compact[0][i];
-      Eight cost = UNIT * distances((Words){own, own}, words_at(pair->right.words, at));
-      cost += costs.compact * distances((Words){own_compact, own_compact}, words_at(compact[1], at));
-      Four low = off_lines(line, share, first_half(u), first_half(v));
-      Four high = off_lines(line, share, second_half(u), second_half(v));
-      cost = PICK(inside, cost, (Eight){} + OUTSIDE) + __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7);
-      /* Leaves room below NONE for the greatest step, 10000. */
-      cost = PICK(order < list.count, least_of(cost, (Eight){} + 2 * OUTSIDE), (Eight){} + NONE);
-      Numbers narrow = __builtin_convertvector(cost, Numbers);
-      memcpy(out.shift + i * MOST, &list.shift, sizeof list.shift);
-      memcpy(out.cost + i * MOST, &narrow, sizeof narrow);
-    }
-  }
-}
-static inline Eight costs_at(const int16_t *cost) {
-  Numbers narrow;
-  memcpy(&narrow, cost, sizeof narrow);
-  return __builtin_convertvector(narrow, Eight);
-}
-static inline Eight ints_from(const int32_t *numbers) {
-  Eight ints;
-  memcpy(&ints, numbers, sizeof ints);
-  return ints;
+  int32_t right_cols = pair->right.cols;
+  int64_t i = place(&pair->left, x, y);
+  RowLines row = row_lines(&pair->band, y + pair->y0);
+  Line line = line_at(row, (float)(x + pair->x0), (float)(UNIT + costs->compact) * row.cost);
+  List list = candidates_of(pair, maps, x, y);
+  Eight u = columns(list.shift), v = list.shift >> 16, xr = u + x, yr = v + y;
+  Eight within_right = below(xr, right_cols) & below(yr, pair->right.rows), at = (yr * right_cols + xr) & within_right;
+  Square own = (Square){} + pair->left.words[i], own_compact = (Square){} + compact->left.words[i];
+  Eight cost = UNIT * distances((Words){own, own}, words_at(pair->right.words, at));
+  cost += costs->compact * distances((Words){own_compact, own_compact}, words_at(compact->right.words, at));
+  cost = PICK(within_right, cost, (Eight){} + OUTSIDE);
+  cost += magnitude(line.a * floats(u) + line.b * floats(v) + line.c, 2 * OUTSIDE);
+  /* Leaves room below NONE for the greatest step, 10000. */
+  cost = PICK(order < list.count, least_of(cost, (Eight){} + 2 * OUTSIDE), (Eight){} + NONE);
+  return (Candidates){list.shift, cost, {0}};
 }
 /* Costs of a pixel's candidates from those of the pixel before on a path:
    cost + min over m (before[m] + min(small |difference to m|, far)) - min over m before[m]. */
-static inline Eight path_step(Eight shift, Eight cost, const int32_t *from, const int32_t *before, int32_t small, int32_t far) {
+static inline Eight path_step(const Candidates *here, const Candidates *from, Eight before, int32_t small, int32_t far) {
   Eight top = (Eight){} + far;
   int32_t least = before[0];
   for (int m = 1; m < MOST; m++) least = before[m] < least ? before[m] : least;
   Eight best = top + least;
   for (int m = 0; m < MOST; m++)
-    best = least_of(best, before[m] + least_of(small * apart(shift, (Eight){} + from[m]), top));
-  return least_of(cost + best - least, (Eight){} + NONE);
+    best = least_of(best, before[m] + least_of(small * apart(here->shift, (Eight){} + from->shift[m]), top));
+  return least_of(here->cost + best - least, (Eight){} + NONE);
 }
-/* Add to `total` the costs along three directions: from the upper left, above, the upper right; `backward`: their
-   opposites. `room`: 6 rows of MOST numbers a pixel. */
-void EXPORT(sweep)(int32_t rows, int32_t cols, Candidates all, const float *grey, PathCosts costs, int32_t backward,
-                   int32_t *total, int32_t *room) {
-  int32_t s = backward ? -1 : 1;
-  int64_t size = (int64_t)3 * cols * MOST;
-  int32_t *before = room, *after = room + size;
+/* Add to all totals the costs along three directions: from the upper left, above, the upper right; `s` = -1: their
+   opposites. `room`: six rows. */
+static void sweep(const Pair *pair, Candidates *all, const float *grey, const PathCosts *costs, int32_t s, Eight *room) {
+  int32_t rows = pair->left.rows, cols = pair->left.cols;
+  Eight *before = room, *after = room + 3 * cols;
   for (int32_t row = 0; row < rows; row++) {
-    int32_t y = backward ? rows - 1 - row : row, j = y - s;
+    int32_t y = s < 0 ? rows - 1 - row : row;
     for (int32_t x = 0; x < cols; x++) {
-      int64_t at = ((int64_t)y * cols + x) * MOST;
-      Eight shift = ints_from(all.shift + at), sum = ints_from(total + at);
+      int64_t at = place(&pair->left, x, y);
       for (int d = 0; d < 3; d++) {
         int32_t i = x + s * (d - 1);
-        Eight cost = costs_at(all.cost + at);
-        if (j >= 0 && j < rows && i >= 0 && i < cols) {
-          float change = fabsf(grey[(int64_t)y * cols + x] - grey[(int64_t)j * cols + i]);
-          float jump = (float)costs.large / (1.0f + change / costs.grey), small = (float)(2 * costs.small);
-          int64_t from = ((int64_t)j * cols + i) * MOST;
+        Eight cost = all[at].cost;
+        if (inside(&pair->left, i, y - s)) {
+          int64_t from = place(&pair->left, i, y - s);
+          float jump = (float)costs->large / (1.0f + fabsf(grey[at] - grey[from]) / (float)costs->grey);
+          float small = (float)(2 * costs->small);
           /* Small differences cost less than jumps even where the grey step is greatest. */
-          int32_t far = (int32_t)(jump > small ? jump : small);
-          cost = path_step(shift, cost, all.shift + from, before + ((int64_t)d * cols + i) * MOST, costs.small, far);
+          cost = path_step(&all[at], &all[from], before[d * cols + i], costs->small, (int32_t)(jump > small ? jump : small));
         }
-        memcpy(after + ((int64_t)d * cols + x) * MOST, &cost, sizeof cost);
-        sum += cost;
+        after[d * cols + x] = cost;
+        all[at].total += cost;
       }
-      memcpy(total + at, &sum, sizeof sum);
     }
-    int32_t *other = before;
+    Eight *other = before;
     before = after, after = other;
   }
 }
-/* Displacement of least total; the first of equal ones. */
-void EXPORT(choose)(Candidates all, const int32_t *total, int64_t pixels, int32_t *maps) {
+/* Displacements of least cost along paths; of equal ones the first candidate's. `room`: a Candidates a pixel, and six rows
+   of Eight, at a multiple of 32 bytes. */
+void EXPORT(paths)(const Pair *pair, const Pair *compact, const float *grey, const PathCosts *costs, int32_t *maps,
+                   void *room) {
+  int32_t rows = pair->left.rows, cols = pair->left.cols;
+  int64_t pixels = (int64_t)rows * cols;
+  Candidates *all = room;
+  for (int32_t y = 0; y < rows; y++)
+    for (int32_t x = 0; x < cols; x++) all[place(&pair->left, x, y)] = listed(pair, compact, maps, costs, x, y);
+  sweep(pair, all, grey, costs, 1, (Eight *)(all + pixels));
+  sweep(pair, all, grey, costs, -1, (Eight *)(all + pixels));
   for (int64_t i = 0; i < pixels; i++) {
-    int64_t at = i * MOST, best = at;
-    for (int64_t k = at + 1; k < at + MOST; k++) best = all.cost[k] != NONE && total[k] < total[best] ? k : best;
-    maps[i] = all.shift[best];
+    int best = 0;
+    for (int k = 1; k < MOST; k++) best = all[i].cost[k] != NONE && all[i].total[k] < all[i].total[best] ? k : best;
+    maps[i] = all[i].shift[best];
   }
 }

@@ -24,8 +24,7 @@ typedef struct {
   int32_t x0, y0;           /* where the left window begins in its image */
   int32_t ahead_x, ahead_y; /* and in the right window */
 } Pair;
-typedef struct { int32_t *shift, *cost; } Field; /* of each left pixel: displacement, v << 16 | u, and what it costs */
-typedef struct { const int16_t *u, *v; int32_t rows, cols; } Parents; /* displacements of the coarser level */
+typedef struct { const int16_t *u, *v; int32_t cols; } Parents;      /* displacements of the coarser level */
 
 RULE int32_t pack(int32_t u, int32_t v) { return (int32_t)((uint32_t)v << 16 | (u & 0xFFFF)); }
 RULE Shift unpack(int32_t shift) { return (Shift){(int16_t)shift, shift >> 16}; }
@@ -43,13 +42,6 @@ RULE Line line_at(RowLines row, float x, float cost) {
   float a = row.t[0] + row.t[1] * x, b = row.t[2] + row.t[3] * x, c = row.t[4] + x * (row.t[5] + x * row.t[6]);
   float norm = sqrtf(a * a + b * b), scale = cost / (norm > LEAST_NORMAL ? norm : LEAST_NORMAL);
   return (Line){a * scale, b * scale, c * scale};
-}
-/* The line of one pixel, its normal of length one. */
-RULE Line unit_line(const Band *band, double x, double y) {
-  const double *f = band->f;
-  double a = f[0] * x + f[1] * y + f[2], b = f[3] * x + f[4] * y + f[5], c = f[6] * x + f[7] * y + f[8];
-  double norm = sqrt(a * a + b * b), scale = 1.0 / (norm > LEAST_NORMAL ? norm : LEAST_NORMAL);
-  return (Line){(float)(a * scale), (float)(b * scale), (float)((c + a * x + b * y) * scale)};
 }
 RULE int32_t off_line(Line line, Shift s) {
   float off = fabsf(line.a * (float)s.u + line.b * (float)s.v + line.c);
@@ -130,8 +122,10 @@ RULE Children search_parent(const Pair *pair, RowLines row, const int32_t *centr
 
 /* ---- propagation: from the neighbours ---- */
 
-typedef struct { int32_t smoothness, beside; } Smoothing; /* cost of roughness; tried beside a displacement: nothing,
-                                                             columns (1), rows as well (2) */
+typedef struct {
+  int32_t smoothness, rounds; /* cost of roughness; number of rounds */
+  int32_t beside;             /* tried beside a displacement: nothing (0), columns (1), rows as well (2) */
+} Smoothing;
 typedef struct { Eight shift, cost, total; } Settled;     /* total: with the cost of roughness */
 typedef struct { EightFloat a, b, c; } Lines;
 

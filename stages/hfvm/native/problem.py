@@ -71,17 +71,7 @@ class PathCosts(NamedTuple):
     compact: int
     small: int
     large: int
-    grey: float
-
-
-class Candidates(NamedTuple):
-    """Candidates of each pixel, (row, col, :data:`CANDIDATES`): packed displacements, int32, and costs, int16.
-
-    Where there are fewer the first is repeated, at cost :data:`NONE`.
-    """
-
-    shift: AnyArray
-    cost: AnyArray
+    grey: int
 
 
 CANDIDATES = 8

@@ -15,7 +15,6 @@ from rille.stages.hfvm.native.problem import (
     CANDIDATES,
     FAR,
     NONE,
-    Candidates,
     EdgeRule,
     Field,
     LevelPair,
@@ -24,7 +23,7 @@ from rille.stages.hfvm.native.problem import (
     unpacked,
 )
 
-FARTHEST_OFF = np.float32(2047)
+FARTHEST_OFF = 2047
 """Most that the band costs: as much as the greatest distance."""
 
 SHARP = 3.0
@@ -190,9 +189,15 @@ def _cost(pair, line, at, shift):  # type: ignore[no-untyped-def]
     y, x = at[0] + pair.ahead_y + rows_of(shift), at[1] + pair.ahead_x + columns(shift)
     if y < 0 or y >= pair.right.shape[0] or x < 0 or x >= pair.right.shape[1]:
         return np.int64(FAR)
-    off = abs((line[0] * np.float32(columns(shift)) + line[1] * np.float32(rows_of(shift))) + line[2])
     own, other = pair.left[at[0], at[1]], pair.right[np.uint64(y), np.uint64(x)]
-    return distance(own, other) + np.int64(off if off < FARTHEST_OFF else FARTHEST_OFF)
+    return distance(own, other) + _off(line, shift, FARTHEST_OFF)
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def _off(line, shift, most):  # type: ignore[no-untyped-def]
+    """Cost of a displacement off an epipolar line, whole byte steps, at most ``most``."""
+    off = abs((line[0] * np.float32(columns(shift)) + line[1] * np.float32(rows_of(shift))) + line[2])
+    return np.int64(off if off < np.float32(most) else most)
 
 
 # -- propagation -------------------------------------------------------------------------------------------------------
@@ -409,91 +414,66 @@ def _window_cost(pair, grey, y, x, u, v, rule):  # type: ignore[no-untyped-def]
 # -- paths -------------------------------------------------------------------------------------------------------------
 
 
-def candidates(
-    pair: LevelPair,
-    compact: tuple[AnyArray, AnyArray],
-    shift: AnyArray,
-    up: tuple[AnyArray, AnyArray] | None,
-    costs: PathCosts,
-) -> Candidates:
-    """Candidates of every pixel, each once, and what each costs by itself; the first :data:`CANDIDATES` of them.
+def paths(pair: LevelPair, compact: LevelPair, grey: AnyArray, costs: PathCosts, shift: AnyArray) -> None:
+    """Write to ``shift`` the candidates of each pixel of least cost along paths; of equal ones the first.
 
-    In this order: the pixel's own displacement, :data:`BESIDE` steps from it, those of the pixels :data:`AROUND` it,
-    those of the coarser level, doubled. All but the first lead into the right image. At the border the nearest pixel
-    inside stands for one outside.
+    Candidates are at most :data:`CANDIDATES`, in this order and each once: the pixel's own displacement, those
+    :data:`BESIDE` it, those of the pixels :data:`AROUND` it. All but the first lead into the right image. At the border
+    the nearest pixel inside stands for one outside.
 
     Parameters
     ----------
-    compact : words of both images' compact features, uint64.
+    compact : words of both images' compact features.
+    grey : (row, col) float32, of the left image.
     shift : (row, col) int32 packed displacements.
-    up : columns and rows of displacement of the coarser level, int16, or None.
     """
-    listed = Candidates(np.empty((*shift.shape, CANDIDATES), np.int32), np.empty((*shift.shape, CANDIDATES), np.int16))
-    none = np.zeros((0, 0), np.int16)
-    _candidates(pair, compact, shift, up or (none, none), costs.compact, listed)
-    return listed
-
-
-@njit(cache=True, nogil=True, forceinline=True)
-def _inside(index, size):  # type: ignore[no-untyped-def]
-    return min(max(index, 0), size - 1)
+    listed = np.empty((*shift.shape, CANDIDATES), np.int32), np.empty((*shift.shape, CANDIDATES), np.int32)
+    _candidates(pair, compact, shift, costs.compact, listed)
+    total = np.zeros(listed[1].shape, np.int32)
+    for backward in (False, True):
+        _sweep(listed, grey, costs, backward, total)
+    total[listed[1] == NONE] = UNSEEN
+    np.copyto(shift, np.take_along_axis(listed[0], total.argmin(-1)[..., None], -1)[..., 0])
 
 
 @njit(cache=True, nogil=True)
-def _candidates(pair, compact, shift, up, share, listed):  # type: ignore[no-untyped-def]
-    rows, cols = shift.shape
-    us, vs = np.empty(26, np.int64), np.empty(26, np.int64)
+def _candidates(pair, compact, shift, share, listed):  # type: ignore[no-untyped-def]
+    (rows, cols), (high, wide) = shift.shape, pair.right.shape
     for y in range(rows):
+        terms = epipolar.row_terms(pair.f, np.float64(y + pair.y0))
         for x in range(cols):
-            us[0], vs[0], tried = columns(shift[y, x]), rows_of(shift[y, x]), 1
-            for j, i in BESIDE:
-                us[tried], vs[tried] = us[0] + i, vs[0] + j
-                tried += 1
-            for j, i in AROUND:
-                near = shift[_inside(y + j, rows), _inside(x + i, cols)]
-                us[tried], vs[tried] = columns(near), rows_of(near)
-                tried += 1
-            if up[0].size:
-                for n in range(9):
-                    j = _inside(y // 2 + n // 3 - 1, up[0].shape[0])
-                    i = _inside(x // 2 + n % 3 - 1, up[0].shape[1])
-                    us[tried], vs[tried] = 2 * np.int64(up[0][j, i]), 2 * np.int64(up[1][j, i])
-                    tried += 1
-            count = 0
-            line = epipolar.unit_line(pair.f, np.float64(x + pair.x0), np.float64(y + pair.y0))
-            for n in range(tried):
-                u, v = us[n], vs[n]
-                inside = 0 <= x + u < pair.right.shape[1] and 0 <= y + v < pair.right.shape[0]
+            line = epipolar.line(terms, np.float32(x + pair.x0), np.float32(UNIT + share) * np.float32(pair.mu))
+            known, cost, count = listed[0][y, x], listed[1][y, x], 0
+            known[:], cost[:] = shift[y, x], NONE
+            for n in range(1 + len(BESIDE) + len(AROUND)):
+                tried = shift[y, x]
+                if 0 < n <= len(BESIDE):
+                    tried = pack(columns(tried) + BESIDE[n - 1][1], rows_of(tried) + BESIDE[n - 1][0])
+                elif n > 0:
+                    j, i = AROUND[n - 1 - len(BESIDE)]
+                    tried = shift[min(max(y + j, 0), rows - 1), min(max(x + i, 0), cols - 1)]
+                q, p = y + rows_of(tried), x + columns(tried)
+                inside = 0 <= p < wide and 0 <= q < high
                 # Each once: there is room for few, and equal ones would take it from others.
-                known = n > 0 and not inside
-                for k in range(count):
-                    known |= listed.shift[y, x, k] == pack(u, v)
-                if known or count == CANDIDATES:
+                if count == CANDIDATES or (n > 0 and (not inside or (known == tried).any())):
                     continue
-                cost = np.int64(OUTSIDE)
+                apart = np.int64(OUTSIDE)
                 if inside:
-                    cost = UNIT * distance(pair.left[y, x], pair.right[y + v, x + u])
-                    cost += share * distance(compact[0][y, x], compact[1][y + v, x + u])
-                off = abs(np.float64(line[0]) * u + np.float64(line[1]) * v + np.float64(line[2]))
-                cost += np.int64(min((UNIT + share) * pair.mu * off, 2.0 * OUTSIDE))
+                    apart = UNIT * distance(pair.left[y, x], pair.right[q, p])
+                    apart += share * distance(compact.left[y, x], compact.right[q, p])
                 # Leaves room below NONE for the greatest step, 10000.
-                listed.shift[y, x, count], listed.cost[y, x, count] = pack(u, v), min(cost, 2 * OUTSIDE)
+                known[count], cost[count] = tried, min(apart + _off(line, tried, 2 * OUTSIDE), 2 * OUTSIDE)
                 count += 1
-            for k in range(count, CANDIDATES):
-                listed.shift[y, x, k], listed.cost[y, x, k] = shift[y, x], NONE
-
-
-def sweep(listed: Candidates, grey: AnyArray, costs: PathCosts, backward: bool, total: AnyArray) -> None:
-    """Add to ``total`` (row, col, :data:`CANDIDATES`) int32 the costs along three directions: from the upper left,
-    above, the upper right; ``backward``: their opposites. ``grey``: (row, col) float32."""
-    _sweep(listed, grey, costs, backward, total)
 
 
 @njit(cache=True, nogil=True)
 def _sweep(listed, grey, costs, backward, total):  # type: ignore[no-untyped-def]
-    """Costs of a pixel's candidates from those of the pixel before on a path:
-    cost + min over m (before[m] + min(small |difference to m|, far)) - min over m before[m]."""
-    rows, cols = grey.shape
+    """Add the costs along three directions: from the upper left, above, the upper right; ``backward``: their opposites.
+
+    Those of a pixel's candidates, from those of the pixel before on a path:
+    cost + min over m (before[m] + min(small |difference to m|, far)) - min over m before[m].
+    """
+    (shift, cost), (rows, cols) = listed, grey.shape
     before, after = np.zeros((2, 3, cols, CANDIDATES), np.int64)
     s = -1 if backward else 1
     for row in range(rows):
@@ -501,19 +481,17 @@ def _sweep(listed, grey, costs, backward, total):  # type: ignore[no-untyped-def
         for x in range(cols):
             for d in range(3):
                 i = x + s * (d - 1)
-                begins = row == 0 or i < 0 or i >= cols
-                far = 0 if begins else _jump(abs(grey[y, x] - grey[y - s, i]), costs)
-                least = 0 if begins else before[d, i].min()
-                for k in range(CANDIDATES):
-                    cost = np.int64(listed.cost[y, x, k])
-                    if not begins:
+                after[d, x] = cost[y, x]
+                if row > 0 and 0 <= i < cols:
+                    far, least = _jump(abs(grey[y, x] - grey[y - s, i]), costs), before[d, i].min()
+                    for k in range(CANDIDATES):
                         best = least + far
                         for m in range(CANDIDATES):
-                            step = costs.small * _gap(listed.shift[y, x, k], listed.shift[y - s, i, m])
+                            step = costs.small * _gap(shift[y, x, k], shift[y - s, i, m])
                             best = min(best, before[d, i, m] + min(step, far))
-                        cost = min(cost + best - least, np.int64(NONE))
-                    after[d, x, k] = cost
-                    total[y, x, k] += cost
+                        after[d, x, k] = min(after[d, x, k] + best - least, NONE)
+                for k in range(CANDIDATES):
+                    total[y, x, k] += after[d, x, k]
         before, after = after, before
 
 
@@ -523,20 +501,3 @@ def _jump(change, costs):  # type: ignore[no-untyped-def]
     jump = np.float32(costs.large) / (np.float32(1.0) + change / np.float32(costs.grey))
     # Small differences cost less than jumps even where the grey step is greatest.
     return np.int64(max(jump, np.float32(2 * costs.small)))
-
-
-def choose(listed: Candidates, total: AnyArray, shift: AnyArray) -> None:
-    """Write the packed displacements of least total to ``shift``; the first of equal ones."""
-    _choose(listed, total, shift)
-
-
-@njit(cache=True, nogil=True)
-def _choose(listed, total, shift):  # type: ignore[no-untyped-def]
-    for y in range(shift.shape[0]):
-        for x in range(shift.shape[1]):
-            best = 0
-            for k in range(1, CANDIDATES):
-                # Strictly less: the pixel's own displacement comes first and wins ties.
-                if listed.cost[y, x, k] != NONE and total[y, x, k] < total[y, x, best]:
-                    best = k
-            shift[y, x] = listed.shift[y, x, best]
