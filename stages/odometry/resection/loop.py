@@ -167,7 +167,7 @@ def loop_stage(
     pairs: list[int],
 ) -> Bundle[LoopFacts]:
     """Motions from earlier basic pairs to one that sees their places again."""
-    views, usual = dict[int, Features](), ResectParams()
+    views, usual = dict[int, Features](), ResectParams.model_validate({})
 
     def view(k: int) -> Features:
         if k not in views:
