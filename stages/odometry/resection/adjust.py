@@ -93,45 +93,33 @@ class JoinedPieces(NamedTuple):
     piece: NDArray[np.int16]
 
 
-def join(poses: Floats, piece: NDArray[np.int16], factors: Factors) -> JoinedPieces:
+def join(poses: Floats, piece: NDArray[np.int16], factors: Factors, sure: Bools) -> JoinedPieces:
     """Pieces laid together by the factors between them, each by the one that most others agree with.
+
+    Within a piece the chain contradicts a place that is taken for another; between two pieces nothing but a second
+    factor, so that one alone joins them only if it is ``sure``.
 
     Parameters
     ----------
     poses, piece : (n, 3, 4) and (n,), each piece in a frame of its own.
+    sure : which factors (m,) need no other that agrees about with them.
     """
-    poses, piece = poses.copy(), piece.copy()
     while True:
-        between = factors.take(np.flatnonzero(piece[factors.ends[:, 0]] != piece[factors.ends[:, 1]]))
-        if not len(between.ends):
+        pieces = np.sort(piece[factors.ends], axis=1)
+        for first, other in np.unique(pieces[pieces[:, 0] != pieces[:, 1]], axis=0):
+            rows = np.flatnonzero((pieces == [first, other]).all(1))
+            here = factors.take(rows)
+            graph = PoseGraph(here, len(poses), 0, np.ones(len(rows)))
+            laid = [_moved(poses, piece == other, ends, pose) for ends, pose in zip(here.ends, here.poses, strict=True)]
+            states = (GraphState.of(moved, here.shared.shape[2]) for moved in laid)
+            squares = np.array([(graph.errors(state) ** 2).sum(1) for state in states])
+            joins = sure[rows] | ((squares <= EXCESS[-1] ** 2 * here.bound).sum(1) > 1)
+            if joins.any():
+                costs = np.where(joins, np.minimum(squares, here.bound).sum(1), np.inf)
+                poses, piece = laid[int(np.argmin(costs))], np.where(piece == other, first, piece)
+                break
+        else:
             return JoinedPieces(poses, piece)
-        first = piece[between.ends].min()
-        other = next(int(pair.max()) for pair in piece[between.ends] if pair.min() == first)
-        here = between.take(np.flatnonzero((np.sort(piece[between.ends], axis=1) == [first, other]).all(1)))
-        moved = [_moved(poses, piece == other, ends, pose) for ends, pose in zip(here.ends, here.poses, strict=True)]
-        graph = PoseGraph(here, len(poses), 0, np.ones(len(here.ends)))
-        costs = [
-            float(np.minimum((graph.errors(GraphState.of(p, here.shared.shape[2])) ** 2).sum(1), here.bound).sum())
-            for p in moved
-        ]
-        poses, piece = moved[int(np.argmin(costs))], np.where(piece == other, first, piece)
-
-
-def supported(poses: Floats, piece: NDArray[np.int16], factors: Factors) -> Bools:
-    """Which factors (m,) are within a piece, or agree about with another one between the same two pieces.
-
-    Within a piece the chain contradicts a place that is taken for another; between two pieces nothing but a second one.
-    """
-    pieces = np.sort(piece[factors.ends], axis=1)
-    out = np.asarray(pieces[:, 0] == pieces[:, 1])
-    for k in np.flatnonzero(~out):
-        here = factors.take(np.flatnonzero((pieces == pieces[k]).all(1)))
-        laid = _moved(poses, piece == pieces[k, 1], factors.ends[k], factors.poses[k])
-        errors = PoseGraph(here, len(poses), 0, np.ones(len(here.ends))).errors(
-            GraphState.of(laid, here.shared.shape[2])
-        )
-        out[k] = ((errors**2).sum(1) <= EXCESS[-1] ** 2 * here.bound).sum() > 1
-    return out
 
 
 def _moved(poses: Floats, rows: Bools, ends: NDArray[np.intp], pose: Floats) -> Floats:
@@ -174,16 +162,17 @@ def adjust_stage(
     chain = chain_factors(refined or segments, numbers, row)
     given = [one for bundle in loops for one in bundle.meta["factors"] if one["from"] in row and one["to"] in row]
     stated = stated_factors(given, row)
-    sure = supported(chained.poses[posed], chained.piece[posed], stated)
-    alone = [one for one, used in zip(given, sure, strict=True) if not used]
-    given, stated = [one for one, used in zip(given, sure, strict=True) if used], stated.take(np.flatnonzero(sure))
     sensors = Sensors.of(priors or {}, posed)
     sensors.believe(chained.poses[posed], chained.piece[posed])
-    relative = [sensor.factors(0.0) for sensor in sensors.relative]
-    joined = join(chained.poses[posed], chained.piece[posed], Factors.joined([stated, *relative]))
-    poses, piece = sensors.laid(*joined)
+    between = Factors.joined([stated, *(sensor.factors(0.0) for sensor in sensors.relative)])
+    sure = np.arange(len(between.ends)) >= len(given)
+    poses, piece = sensors.laid(*join(chained.poses[posed], chained.piece[posed], between, sure))
+    alone = piece[stated.ends[:, 0]] != piece[stated.ends[:, 1]]
     out, excess = chained, 1.0
-    lines = [f"frames {one['from']} and {one['to']} alone link their pieces, which are not joined" for one in alone]
+    lines = [
+        f"frames {given[k]['from']} and {given[k]['to']} alone link their pieces, which are not joined"
+        for k in np.flatnonzero(alone)
+    ]
     for number in np.unique(piece):
         nodes = np.flatnonzero(piece == number)
         own, mine = _within(chain, nodes), _within(stated, nodes)
