@@ -14,7 +14,6 @@ import math
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
@@ -34,34 +33,18 @@ def interest_operator(image: Floats32) -> Floats32:
     The three outermost pixels, where a window leaves the image, are 0.
     """
     out = np.zeros(image.shape, np.float32)
-    if min(image.shape) > 2 * (HALF + 1):
-        _least_sums(np.ascontiguousarray(image, dtype=np.float32), out)
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _least_sums(image, out):  # type: ignore[no-untyped-def]
-    """Fill ``out``. Works on slices of rows, whose indices start at 0: only such loops become vector code."""
-    rows, cols = image.shape
-    square, tall = np.zeros((rows, cols), np.float32), np.empty(cols, np.float32)
-    out[HALF + 1 : -HALF - 1, HALF + 1 : -HALF - 1] = np.inf
-    wide, inner = cols - 2, cols - 2 * HALF - 2
+    (rows, cols), edge = image.shape, HALF + 1
+    if min(rows, cols) <= 2 * edge:
+        return out
+    sums = list[Floats32]()
+    here = image[1:-1, 1:-1]
     for dr, dc in DIRECTIONS:
-        for y in range(1, rows - 1):
-            here, both = image[y, 1 : 1 + wide], square[y, 1 : 1 + wide]
-            there, back = image[y + dr, 1 + dc : 1 + dc + wide], image[y - dr, 1 - dc : 1 - dc + wide]
-            for x in range(wide):
-                # Both senses of a direction, or the operator would prefer the side of a corner it is shifted to.
-                ahead, behind = there[x] - here[x], back[x] - here[x]
-                both[x] = np.float32(0.5) * (ahead * ahead + behind * behind)
-        for y in range(HALF + 1, rows - HALF - 1):
-            a, b, c, d, e = square[y - 2], square[y - 1], square[y], square[y + 1], square[y + 2]
-            for x in range(cols):
-                tall[x] = a[x] + b[x] + c[x] + d[x] + e[x]
-            least, first = out[y, HALF + 1 : cols - HALF - 1], tall[1:]
-            for x in range(inner):
-                total = first[x] + first[x + 1] + first[x + 2] + first[x + 3] + first[x + 4]
-                least[x] = min(least[x], total)
+        # Both senses of a direction, or the operator would prefer the side of a corner it is shifted to.
+        ahead, behind = (image[1 + r : rows - 1 + r, 1 + c : cols - 1 + c] for r, c in ((dr, dc), (-dr, -dc)))
+        square = 0.5 * ((ahead - here) ** 2 + (behind - here) ** 2)
+        sums.append(cv2.boxFilter(square, -1, (SIDE, SIDE), normalize=False))
+    out[edge:-edge, edge:-edge] = np.minimum.reduce(sums)[HALF:-HALF, HALF:-HALF]
+    return out
 
 
 def interest_points(
