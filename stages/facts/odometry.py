@@ -9,8 +9,6 @@ class MotionFacts(Facts):
     """Coarse displacements, px of level 0 (None: nothing matches), and shares of the pixels with texture."""
 
     level: int
-    median_column: float | None
-    median_row: float | None
     median_length: float | None
     match_rate: float | None
     overlap: float | None
@@ -57,22 +55,19 @@ class KeyframesFacts(Facts):
 
 
 class TrackFacts(Facts):
-    """Numbers of the ``frames`` of a segment, and how many points were ``tracked`` to each."""
+    """Numbers of the ``frames`` of a segment."""
 
     frames: list[int]
-    tracked: list[int]
 
 
 class ResectFacts(Facts):
     """Poses of a segment's frames.
 
-    ``per_frame``: frame, inliers, rms_px, and what else is known of each. ``without_coordinates`` counts landmarks.
+    ``per_frame``: frame, landmarks, inliers, rms_px of each, and why it is ``lost``.
     ``jump`` (column, row, px) and ``knocked``: the rig moved before the pair at the segment's end.
     """
 
     per_frame: list[dict[str, Any]]
-    without_coordinates: dict[str, int]
-    """By cause."""
     contradiction: NotRequired[str]
     jump: NotRequired[list[float]]
     knocked: NotRequired[str]

@@ -38,14 +38,6 @@ class Templates(NamedTuple):
     affinity: Floats
 
 
-class Aligned(NamedTuple):
-    """``position`` (n, 2) column, row in b, NaN where it leaves the image, does not converge or is refused; ``error``
-    (n,) rms grey difference over the template before the last step, NaN likewise."""
-
-    position: Floats
-    error: Floats
-
-
 def align(
     a: Floats32,
     b: Floats32,
@@ -55,8 +47,10 @@ def align(
     spread: float,
     reach: float,
     settled: float = SETTLED_PX,
-) -> Aligned:
-    """Positions in ``b`` of the templates around points of ``a``.
+) -> Floats:
+    """Positions (n, 2) column, row in ``b`` of the templates around points of ``a``.
+
+    NaN where one leaves the image, does not converge or is refused.
 
     Parameters
     ----------
@@ -66,7 +60,7 @@ def align(
     reach : pixels; a result farther than this from ``start`` is refused.
     settled : step [pixels] below which a template has converged.
     """
-    out = Aligned(np.full(templates.points.shape, np.nan), np.full(len(templates.points), np.nan))
+    out = np.full(templates.points.shape, np.nan)
     _align_all(
         np.ascontiguousarray(a, dtype=np.float32),
         np.ascontiguousarray(b, dtype=np.float32),
@@ -116,8 +110,7 @@ def _align_all(a, b, templates, ridge, reach, settled, out):  # type: ignore[no-
             if not (abs(at[0] - start[0]) <= reach and abs(at[1] - start[1]) <= reach):
                 break
             if max(abs(dx), abs(dy)) < settled:
-                out.position[n] = at
-                out.error[n] = np.sqrt(np.mean(grey**2))
+                out[n] = at
                 break
 
 

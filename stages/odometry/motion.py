@@ -226,8 +226,6 @@ def motion_stage(
     usable = int(np.count_nonzero(found.validity & np.uint8(Validity.OUT_OF_IMAGE) == 0))
     meta: MotionFacts = {
         "level": found.level,
-        "median_column": float(np.median(u)) if u.size else None,
-        "median_row": float(np.median(v)) if u.size else None,
         "median_length": float(np.median(np.hypot(u, v))) if u.size else None,
         "match_rate": int(np.count_nonzero(ok)) / usable if usable else None,
         "overlap": int(np.count_nonzero(seen)) / usable if usable else None,

@@ -28,7 +28,7 @@ from rille.stages.core.errors import InputError
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts, TrackFacts
 from rille.stages.imaging.pyramid import Pyramid
-from rille.stages.odometry.affine_lk import HALF, Aligned, Templates, align
+from rille.stages.odometry.affine_lk import HALF, Templates, align
 from rille.stages.odometry.displacements import NEIGHBOURS, LevelDisplacements, fit_affinity, known
 from rille.stages.odometry.exposure import levelled
 from rille.stages.odometry.moravec import clear_of_mask, interest_points
@@ -71,11 +71,10 @@ class TrackParams(Params):
 
 @dataclass(frozen=True)
 class Tracks:
-    """``points`` (n, frames, 2) column, row, NaN lost; ``birth`` (n,) frame index; ``distance`` (n, frames), NaN."""
+    """``points`` (n, frames, 2) column, row, NaN lost; ``birth`` (n,) index of the frame that the template is from."""
 
     points: Floats32
     birth: NDArray[np.int16]
-    distance: Floats32
 
 
 def track(frames: Sequence[Pyramid], motions: Sequence[LevelDisplacements], params: TrackParams) -> Tracks:
@@ -101,7 +100,7 @@ def track(frames: Sequence[Pyramid], motions: Sequence[LevelDisplacements], para
         _advance(state, frames, motions[j - 1], j, params)
         if j < len(frames) - 1:
             state = _reseed(state, frames, j, params)
-    return Tracks(state.points.astype(np.float32), state.birth, state.distance.astype(np.float32))
+    return Tracks(state.points.astype(np.float32), state.birth)
 
 
 @dataclass
@@ -110,25 +109,16 @@ class _State:
 
     points: Floats
     birth: NDArray[np.int16]
-    distance: Floats
     expected: Floats
 
     @staticmethod
     def born(points: Floats, frame: int, frames: int) -> _State:
-        n = len(points)
-        state = _State(
-            np.full((n, frames, 2), np.nan), np.full(n, frame, np.int16), np.full((n, frames), np.nan), points.copy()
-        )
-        state.points[:, frame], state.distance[:, frame] = points, 0.0
+        state = _State(np.full((len(points), frames, 2), np.nan), np.full(len(points), frame, np.int16), points.copy())
+        state.points[:, frame] = points
         return state
 
     def and_also(self, other: _State, keep: Bools) -> _State:
-        return _State(
-            *(
-                np.concatenate([getattr(self, name), getattr(other, name)[keep]])
-                for name in ("points", "birth", "distance", "expected")
-            )
-        )
+        return _State(*(np.concatenate([mine, vars(other)[name][keep]]) for name, mine in vars(self).items()))
 
 
 def _advance(state: _State, frames: Sequence[Pyramid], motion: LevelDisplacements, j: int, params: TrackParams) -> None:
@@ -142,8 +132,7 @@ def _advance(state: _State, frames: Sequence[Pyramid], motion: LevelDisplacement
         # From the coarse displacements, which outliers do not pull.
         affinity, _ = fit_affinity(then, state.expected, inside & known(then), then[who])
         templates = Templates(then[who], state.expected[who], affinity)
-        place, error = _aligned(frames[int(birth)], frames[j], templates, params)
-        state.points[who, j], state.distance[who, j] = place, error
+        state.points[who, j] = place = _aligned(frames[int(birth)], frames[j], templates, params)
         state.expected[who] = np.where(np.isfinite(place), place, state.expected[who])
 
 
@@ -158,33 +147,28 @@ def _reseed(state: _State, frames: Sequence[Pyramid], j: int, params: TrackParam
     if len(seeds) == 0 or len(here) < NEIGHBOURS:
         return state
     affinity, shift = fit_affinity(here, there, np.ones(len(here), bool), seeds)
-    place, error = _aligned(frames[j], frames[0], Templates(seeds, seeds + shift, affinity), params)
     new = _State.born(seeds, j, len(frames))
-    new.points[:, 0], new.distance[:, 0] = place, error
-    return state.and_also(new, known(place))
+    new.points[:, 0] = _aligned(frames[j], frames[0], Templates(seeds, seeds + shift, affinity), params)
+    return state.and_also(new, known(new.points[:, 0]))
 
 
-def _aligned(a: Pyramid, b: Pyramid, templates: Templates, params: TrackParams) -> Aligned:
-    """Positions in ``b`` of points of ``a`` whose alignment back ends where they are; NaN of the others."""
+def _aligned(a: Pyramid, b: Pyramid, templates: Templates, params: TrackParams) -> Floats:
+    """Positions (n, 2) in ``b`` of points of ``a`` whose alignment back ends where they are; NaN of the others."""
     # A difference of two images has the noise of both.
     how = {"noise": params.noise * 2.0**0.5, "spread": AFFINITY_SIGMA, "reach": REACH_PX}
-    place, error = align(a.images[0], b.images[0], templates, **how)
+    place = align(a.images[0], b.images[0], templates, **how)
     good = np.flatnonzero(clear_of_mask(b.valid[0], place, HALF))
     good = good[np.abs(np.linalg.det(templates.affinity[good])) > MIN_AREA]
     back = Templates(place[good], templates.points[good], np.linalg.inv(templates.affinity[good]))
-    miss = align(b.images[0], a.images[0], back, **how, settled=SETTLED_BACK_PX).position - templates.points[good]
+    miss = align(b.images[0], a.images[0], back, **how, settled=SETTLED_BACK_PX) - templates.points[good]
     kept = np.isin(np.arange(len(place)), good[np.hypot(*miss.T) <= MAX_RETURN_PX])
-    return Aligned(np.where(kept[:, None], place, np.nan), np.where(kept, error, np.nan))
+    return np.where(kept[:, None], place, np.nan)
 
 
 @stage(
     "track",
-    version=2,
-    outputs=[
-        Array("points", ("point", "frame", "uv"), "float32", "px", "column and row of the point", nodata="nan"),
-        Array("birth", ("point",), "int16", "1", "index of the frame that the template is from"),
-        Array("distance", ("point", "frame"), "float32", "grey", "rms difference to the template", nodata="nan"),
-    ],
+    version=3,
+    outputs=[Array("points", ("point", "frame", "uv"), "float32", "px", "column and row of the point", nodata="nan")],
 )
 def track_stage(
     params: TrackParams,
@@ -199,7 +183,4 @@ def track_stage(
         for b in motions
     ]
     found = track([Pyramid.from_bundle(b) for b in pyramids], moves, params)
-    return Bundle(
-        {"points": found.points, "birth": found.birth, "distance": found.distance},
-        {"frames": list(frames), "tracked": [int(v) for v in np.isfinite(found.distance).sum(0)]},
-    )
+    return Bundle({"points": found.points}, {"frames": list(frames)})

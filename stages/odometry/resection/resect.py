@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Bytes, Floats, Floats32
+from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import Array, Bundle, stage
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.facts.calibration import CalibrationFacts
@@ -48,7 +48,6 @@ class SegmentPoses:
     covariance: Floats
     shared: Floats
     inlier: Bytes
-    residual: Floats32
     facts: list[dict[str, Any]]
 
     @staticmethod
@@ -59,7 +58,6 @@ class SegmentPoses:
             np.full((frames, 6, 6), np.nan),
             np.full((frames, 6, SHARED_SOURCES), np.nan),
             np.zeros((points, frames), np.uint8),
-            np.full((points, frames), np.nan, np.float32),
             [],
         )
 
@@ -81,15 +79,16 @@ def resect_segment(
     known = points.known()
     key = points.T_local_key
     out.poses[0], out.covariance[0], out.shared[0] = key.matrix34, 0.0, 0.0
-    out.inlier[known[:, 0], 0], out.residual[known[:, 0], 0] = 1, 0.0
-    out.facts.append(_facts(frames[0], int(known[:, 0].sum())) | {"inliers": int(known[:, 0].sum()), "rms_px": 0.0})
+    out.inlier[known[:, 0], 0] = 1
+    count = int(known[:, 0].sum())
+    out.facts.append({"frame": frames[0], "landmarks": count, "inliers": count, "rms_px": 0.0})
     last, together = key, list[float]()
     doubt: AmbiguousError | None = None
     trusted = np.ones(len(known), bool)
     for j in range(1, len(frames)):
         # What once moved by itself is no landmark: seen longer than others, or standing for a while, it might prevail.
         use = np.flatnonzero(known[:, j] & trusted)
-        facts = _facts(frames[j], use.size)
+        facts: dict[str, Any] = {"frame": frames[j], "landmarks": int(use.size), "inliers": 0, "rms_px": None}
         out.facts.append(facts)
         predicted = None if reckoned is None else reckoned[j]
         try:
@@ -111,19 +110,14 @@ def resect_segment(
             continue
         last = posed.T_local_left
         out.poses[j], out.covariance[j], out.shared[j] = last.matrix34, posed.covariance, posed.shared
-        out.inlier[use, j], out.residual[use, j] = posed.inlier, posed.residual
-        facts |= posed.facts() | ({} if trusted.all() else {"moving": int((known[:, j] & ~trusted).sum())})
+        out.inlier[use, j] = posed.inlier
+        facts |= {"inliers": int(posed.inlier.sum()), "rms_px": posed.rms_px}
+        facts |= {} if trusted.all() else {"moving": int((known[:, j] & ~trusted).sum())}
         together.append(posed.together)
     # One frame's figure scatters by a fifth, a segment's frames share their landmarks.
     out.covariance[:] *= max(1.0, float(np.mean(together))) if together else 1.0
     out.covariance[:] += out.shared @ np.swapaxes(out.shared, 1, 2)
     return out
-
-
-def _facts(frame: int, landmarks: int) -> dict[str, Any]:
-    """Facts of a frame without a pose."""
-    none = {"rms_px": None, "disparity_bias_px": None, "errors_together": None}
-    return {"frame": frame, "landmarks": landmarks, "inliers": 0, **none}
 
 
 def _resect_frame(
@@ -193,7 +187,6 @@ class ResectInputs(NamedTuple):
         Array("landmarks", ("point", "xyz"), "float64", "m", "coordinates of the landmarks", "nan", "local"),
         Array("per_pixel", ("point", "xyz"), "float64", "m/px", "their motion with the disparity", "nan", "local"),
         Array("disparity_sigma", ("point",), "float64", "px", "standard deviation of their disparity", "nan"),
-        Array("residual", ("point", "frame"), "float32", "px", "back-projection error", nodata="nan"),
     ],
 )
 def resect_stage(
@@ -229,7 +222,7 @@ def resect_stage(
     segment = resect_segment(points, frames, params, reckoned)
     for fact in segment.facts[1:] if refused is not None else ():
         fact["lost"] = refused
-    meta: ResectFacts = {"per_frame": segment.facts, "without_coordinates": landmarks.lost}
+    meta: ResectFacts = {"per_frame": segment.facts}
     if inputs.after is not None and inputs.rig_after is not None:
         jumped = knocked(points, segment, inputs.after, Rig.from_dict(inputs.rig_after.meta["rig"]))
         if jumped is not None:
@@ -237,6 +230,6 @@ def resect_stage(
             meta["warnings"] = [f"{jumped[0]}: calibrate anew from there on"]
     for line in [fact["contradiction"] for fact in segment.facts if "contradiction" in fact]:
         meta["contradiction"], meta["warnings"] = line, [line]
-    arrays = {name: getattr(segment, name) for name in ("poses", "covariance", "shared", "inlier", "residual")}
+    arrays = {name: getattr(segment, name) for name in ("poses", "covariance", "shared", "inlier")}
     arrays |= {"landmarks": landmarks.position, "per_pixel": landmarks.per_pixel, "disparity_sigma": landmarks.sigma}
     return Bundle(arrays, meta)

@@ -26,8 +26,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 import pycolmap
 import scipy
@@ -135,14 +133,10 @@ class Resection:
         """Covariance (6, 6) of the pose, all errors together."""
         return np.asarray(self.covariance + self.shared @ self.shared.T)
 
-    def facts(self) -> dict[str, Any]:
-        """Facts of the frame."""
-        return {
-            "inliers": int(self.inlier.sum()),
-            "rms_px": float(np.sqrt(np.mean(self.residual[self.inlier] ** 2))),
-            "disparity_bias_px": self.bias,
-            "errors_together": self.together,
-        }
+    @property
+    def rms_px(self) -> float:
+        """RMS back-projection error of the landmarks that agree, pixels."""
+        return float(np.sqrt(np.mean(self.residual[self.inlier] ** 2)))
 
 
 def resect(

@@ -43,13 +43,11 @@ def test_known_motion_is_found(affinity, gain, offset):
     a, b = views(affinity, shift, gain, offset)
     truth = POINTS @ affinity.T + shift
     start = truth + np.random.default_rng(1).uniform(-0.7, 0.7, truth.shape)
-    found, error = run(a, b, start, affinity + 0.03)  # the expected affinity is a little wrong
+    found = run(a, b, start, affinity + 0.03)  # the expected affinity is a little wrong
     assert np.isfinite(found).all(1).mean() > 0.95
     good = np.isfinite(found).all(1)
     # Interpolation error of 1 % of the contrast over its gradient, averaged over the template: well below 0.02 px.
     assert np.abs(found - truth)[good].max() < 0.02
-    if gain == 1.0:
-        assert np.nanmax(error) < 1.0
 
 
 def test_noise_gives_the_error_that_theory_says():
@@ -58,25 +56,23 @@ def test_noise_gives_the_error_that_theory_says():
     sigma = 4.0
     noisy = (b + sigma * np.random.default_rng(2).standard_normal(b.shape)).astype(np.float32)
     truth = POINTS + shift
-    found, error = run(a, noisy, truth, np.eye(2), noise=sigma, spread=1e-3)
+    found = run(a, noisy, truth, np.eye(2), noise=sigma, spread=1e-3)
     gy, gx = np.gradient(a)
     bound = sigma / np.sqrt(121 * np.array([np.mean(gx**2), np.mean(gy**2)]))  # Cramer-Rao of a shift alone
     rms = np.sqrt(np.nanmean((found - truth) ** 2, axis=0))
     assert (rms > 0.6 * bound).all()
     assert (rms < 1.6 * bound).all()  # correlation of the two gradients, gain and offset cost some
-    assert np.nanmedian(error) == pytest.approx(sigma, rel=0.1)
 
 
 def test_refused_are_points_too_far_off_outside_lost_or_without_texture():
     a, b = views(np.eye(2), np.zeros(2))
     start = POINTS.copy()
     start[0] += 0.8
-    found, _ = run(a, b, start, np.eye(2), reach=0.5)
+    found = run(a, b, start, np.eye(2), reach=0.5)
     assert np.isnan(found[0]).all()
     start[1], start[2] = np.nan, [2.0, 2.0]
-    found, error = run(a, b, start, np.eye(2))
+    found = run(a, b, start, np.eye(2))
     assert np.isnan(found[1:3]).all()
-    assert np.isnan(error[1:3]).all()
     assert np.isfinite(found[3:]).all()
     flat = np.full_like(a, 90.0)
-    assert np.isnan(run(flat, flat, POINTS, np.eye(2))[0]).all()
+    assert np.isnan(run(flat, flat, POINTS, np.eye(2))).all()

@@ -65,14 +65,14 @@ def test_overlap_of_a_frame_that_moved_by_a_quarter():
     a, b, *_ = pair(lambda x, y: (50.0, 0.0), (160, 200))
     out = run(a, b)
     assert out.meta["level"] == 2
-    assert out.meta["median_column"] == pytest.approx(50, abs=1)
+    assert np.nanmedian(out["column_disparity"]) == pytest.approx(50, abs=1)
     assert out.meta["overlap"] == pytest.approx(0.75, abs=0.05)
     assert out.meta["overlap"] <= out.meta["match_rate"]
 
 
 def test_meta_of_nothing_is_none():
     out = run(np.zeros((40, 40), np.uint8), np.zeros((40, 40), np.uint8))
-    assert out.meta["median_column"] is None
+    assert out.meta["median_length"] is None
     assert out.meta["match_rate"] == 0
 
 

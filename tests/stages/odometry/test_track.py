@@ -99,7 +99,7 @@ def test_empty_buckets_get_points_that_are_known_in_the_key_frame(monkeypatch):
     assert np.isfinite(with_new.points[born, 0]).all()
     assert (with_new.points[born, 1] == np.rint(with_new.points[born, 1])).all()  # seeds lie on pixels
     assert np.nanmedian(errors(with_new, places)[born]) < 0.06
-    assert np.isfinite(with_new.distance[:, 2]).sum() > np.isfinite(without.distance[:, 2]).sum()
+    assert np.isfinite(with_new.points[:, 2, 0]).sum() > np.isfinite(without.points[:, 2, 0]).sum()
 
 
 def test_masked_regions_hold_no_point_in_any_frame():
