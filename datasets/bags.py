@@ -41,7 +41,6 @@ FORMS = (
     ("BAG", "ROS 1 or 2 bag or mcap (FILE.bag, FILE.mcap, folder with metadata.yaml): two image topics, camera_info"),
     ("BAG:LEFT,RIGHT", "the same; LEFT and RIGHT name the image topics"),
 )
-"""What a user may give."""
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 INFO, IMU, ODOMETRY = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"

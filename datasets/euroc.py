@@ -33,7 +33,6 @@ TRUTH: Mapping[str, bool] = {"state_groundtruth_estimate0": True, "gt": True, "m
 """Folders of true poses, the best first, and whether they are those of the body where no ``T_BS`` is stated."""
 
 FORMS = (("FOLDER", "EuRoC: mav0/cam0, mav0/cam1, each with sensor.yaml and data; imu0, state_groundtruth_estimate0"),)
-"""What a user may give."""
 
 
 def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | None:

@@ -41,7 +41,6 @@ FORMS = (
     ("FOLDER", "two image folders (image_0/1, image_2/3, image_l/r or left/right), calib.txt; poses.txt, times.txt"),
     ("ROOT:NN", "KITTI odometry: ROOT/sequences/NN and ROOT/poses/NN.txt"),
 )
-"""What a user may give."""
 
 
 def image_folders(folder: Path) -> tuple[str, str] | None:

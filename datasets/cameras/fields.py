@@ -44,8 +44,6 @@ LENS = re.compile(
 COEFFICIENT = re.compile(r"(^|[._ ])(k\d|p[12]|s[1-4]|xi|tau_?[xy])$|distor|radial|tangential|coef", re.I)
 """Keys of one number that is a coefficient: K1 and P1 may be matrices, and a single ``dist`` is a distance."""
 
-NOT_ZERO = re.compile(r"[-+]?[0.]*[1-9]")
-
 OTHER = re.compile(r"std|deviat|sigma|err|covar|uncert|mask|file|path|name|topic|frame|unit|comment", re.I)
 """In keys that only look like those of a lens: they hold its errors, or the name of something."""
 
@@ -266,7 +264,8 @@ def _untaken(values: Mapping[Any, Any], at: str, used: set[str]) -> Iterator[tup
             yield from _untaken(value, f"{path}.", used)
         elif path not in used and not OTHER.search(path):
             of_lens = (LENS if flat is not None and len(flat) > 1 else COEFFICIENT).search(key)
-            if _named(key, value) or (of_lens and any(NOT_ZERO.match(str(v)) for v in flat or [value])):
+            not_zero = any(re.match(r"[-+]?[0.]*[1-9]", str(v)) for v in flat or [value])
+            if _named(key, value) or (of_lens and not_zero):
                 yield path, value
 
 

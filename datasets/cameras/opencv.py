@@ -26,12 +26,7 @@ DISTORTION_OF_SIDE = re.compile(r"d|dist(ortion)?(coeff?s?|coefficients)?")
 
 SINGLE = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K")
 DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D")
-MESSAGE = {
-    "K": "camera_matrix",
-    "D": "distortion_coefficients",
-    "R": "rectification_matrix",
-    "P": "projection_matrix",
-}
+MESSAGE = {"K": "camera_matrix", "D": "distortion_coefficients", "R": "rectification_matrix", "P": "projection_matrix"}
 """Fields of ROS' message camera_info, in ROS 2 in small letters, and the keys of its files."""
 WIDTHS = ("image_width", "image_Width", "width", "LEFT.width", "Camera.width")
 HEIGHTS = ("image_height", "image_Height", "height", "LEFT.height", "Camera.height")

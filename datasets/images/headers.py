@@ -33,9 +33,6 @@ Headers = tuple[Header, Header]
 FORMATS = ("PNG", "JPEG", "TIFF", "PPM", "BMP")
 """Pillow's names of the formats."""
 
-WIDTH, HEIGHT, BITS_PER_SAMPLE = 256, 257, 258
-"""TIFF tags."""
-
 
 def sizes_of(headers: Headers) -> Sizes:
     """Width and height of the left and of the right images, pixels."""
@@ -50,7 +47,7 @@ def read_header(file: BinaryIO) -> Header | None:
         if image is not None:
             bits = _bits(image)
             # Pillow exchanges width and height where a tag says that the image is turned.
-            width, height = (image.tag_v2[k] for k in (WIDTH, HEIGHT)) if image.format == "TIFF" else image.size
+            width, height = (image.tag_v2[k] for k in (256, 257)) if image.format == "TIFF" else image.size
             return Header(width, height, 8 if bits <= 8 else 16 if bits <= 16 else bits)
     return None
 
@@ -80,7 +77,7 @@ def orientation(image: Any) -> int:
 def _bits(image: Any) -> int:
     """Bits a sample."""
     if image.format == "TIFF":
-        return int(image.tag_v2.get(BITS_PER_SAMPLE, (1,))[0])
+        return int(image.tag_v2.get(258, (1,))[0])  # BitsPerSample
     if image.format in ("JPEG", "BMP"):
         return 8
     # Layouts of two bytes a sample have "16" in their names; beside others stands a netpbm file's greatest value.

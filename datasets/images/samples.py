@@ -24,10 +24,6 @@ FORMATS = ("JPEG", "TIFF", "PNG")
 
 BLOCK = 16
 """Cells of 2 x 2 pixels along a side of a block whose four phases are compared."""
-DEPARTS, SURELY = 0.03, 6.0
-"""Share of the grey value, and standard deviations, by which phases differ in a block that shows a mosaic."""
-MOSAIC, FEWEST = 0.4, 12
-"""Share of such blocks of at least so many; ordinary images have at most 0.12, mosaics at least 0.74."""
 
 
 def examined(sequence: Sequence) -> Sequence:
@@ -106,15 +102,17 @@ def mosaic(image: AnyArray) -> bool:
     In each block of cells of 2 x 2 pixels the means of the four phases differ, where in an ordinary image they agree.
     """
     rows, cols = (n // (2 * BLOCK) for n in image.shape)
-    if rows * cols < FEWEST:
+    if rows * cols < 12:
         return False
     cut = image[: rows * 2 * BLOCK, : cols * 2 * BLOCK].astype(np.float32)
     cells = cut.reshape(rows, BLOCK, 2, cols, BLOCK, 2).transpose(2, 5, 0, 3, 1, 4).reshape(4, rows, cols, -1)
     a, b, c, d = cells
     phases = np.stack([(a + d - b - c) / 2, a - d, b - c])
     departs = np.abs(phases.mean(-1))
-    found = (departs > DEPARTS * cells.mean((0, 3))) & (departs > SURELY * phases.std(-1) / BLOCK)
-    return bool(found.any(0).mean() > MOSAIC)
+    # By a share of the grey value, and by standard deviations.
+    differ = (departs > 0.03 * cells.mean((0, 3))) & (departs > 6.0 * phases.std(-1) / BLOCK)
+    # In ordinary images at most 0.12 of the blocks show a mosaic, in mosaics at least 0.74.
+    return bool(differ.any(0).mean() > 0.4)
 
 
 def _orientations(sources: Mapping[str, list[Source]]) -> list[str]:

@@ -20,15 +20,7 @@ from rille.datasets.cameras.model import RECTIFIED
 from rille.datasets.images import disparities, files
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import ImagePair, common_headers, pair_up
-from rille.datasets.manifest.model import (
-    Cameras,
-    Disparity,
-    DisparityMaps,
-    Images,
-    Manifest,
-    RigSection,
-    read_manifest,
-)
+from rille.datasets.manifest.model import Cameras, Disparity, DisparityMaps, Images, Manifest, RigSection, read_manifest
 from rille.datasets.manifest.motion import MotionReader, StatedMotion
 from rille.datasets.manifest.rig import read_optics
 from rille.datasets.protocol import Sequence, Source

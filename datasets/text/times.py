@@ -19,16 +19,9 @@ UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 UPPER = {"s": 1e11, "ms": 1e14, "us": 1e17}
 """Above it a value can no longer be in that unit: 1e11 s after 1970 is the year 5138."""
 
-SLOW = 3600.0
-"""s; pairs an hour apart are possible, but a wrong unit is likelier."""
-
 
 def seconds(
-    values: Sequence[str | int | float],
-    what: str,
-    *,
-    unit: str = "auto",
-    lines: Sequence[int] | None = None,
+    values: Sequence[str | int | float], what: str, *, unit: str = "auto", lines: Sequence[int] | None = None
 ) -> tuple[float, ...]:
     """Time stamps in seconds.
 
@@ -98,7 +91,8 @@ def _unit(exact: Sequence[Decimal], what: str, lines: Sequence[int]) -> str:
 def _refuse_slow(times: Sequence[float], what: str) -> None:
     """Refuse stamps that no unit by magnitude fits: small ones that are far apart for seconds."""
     usual = float(np.median(np.diff(np.asarray(times)))) if len(times) > 1 else 0.0
-    if usual > SLOW:
+    # s; pairs an hour apart are possible, but a wrong unit is likelier
+    if usual > 3600.0:
         text = f"times of {what} are {usual:.4g} s apart, if they are seconds"
         remedy = 'state their unit: times.unit = "ns" in the manifest, or time_ns as the name of the column'
         raise InputError("RIL-687", text, remedy=remedy)

@@ -32,8 +32,7 @@ Assignments = Annotated[
     tuple[str, ...], several("A parameter, section.key=value, for example locus.cell_size=0.002", "--set", "-s")
 ]
 CacheFolder = Annotated[
-    str | None,
-    Parameter(name="--cache", help="Folder of cached artifacts; RILLE_CACHE or .rille/cache by default."),
+    str | None, Parameter(name="--cache", help="Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.")
 ]
 Output = Parameter(name=["--output", "-o"])
 Run = Annotated[

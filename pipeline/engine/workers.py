@@ -277,14 +277,7 @@ class Dask:
 
     room = 2000  # workers need not wait for this process, and the scheduler stays small
 
-    def __init__(
-        self,
-        client: Any,
-        presence: foreign.Presence,
-        *,
-        cluster: Any = None,
-        ours: bool = True,
-    ) -> None:
+    def __init__(self, client: Any, presence: foreign.Presence, *, cluster: Any = None, ours: bool = True) -> None:
         self._client, self._presence, self._cluster, self._ours = client, presence, cluster, ours
         self._run, self._submitted = f"rille-{uuid.uuid4().hex}", 0
         self._looked = time.monotonic()

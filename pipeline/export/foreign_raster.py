@@ -18,9 +18,6 @@ from rille.datasets.text.reading import open_regular
 TIFF = (b"II", b"MM")
 """How a TIFF begins; what begins otherwise is read as an ESRI ASCII grid."""
 
-ALONE = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
-"""GDAL's settings by which masks, overviews and notes beside a file are not looked for."""
-
 
 @contextmanager
 def _quiet() -> Iterator[None]:
@@ -52,7 +49,9 @@ def open_raster(path: Path) -> Iterator[Any]:
         # Whoever needs a place refuses the file in a line of their own.
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
-            with _quiet(), rasterio.Env(**ALONE), rasterio.open(path, driver=driver) as file:
+            # By these settings GDAL looks for no masks, overviews and notes beside a file.
+            alone = rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR", GDAL_PAM_ENABLED="NO")
+            with _quiet(), alone, rasterio.open(path, driver=driver) as file:
                 yield file
         except UnicodeDecodeError as error:
             raise RasterioIOError("a text in it is not UTF-8") from error

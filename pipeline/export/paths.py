@@ -43,8 +43,7 @@ INSERT INTO gpkg_spatial_ref_sys VALUES ('undefined cartesian', -1, 'NONE', -1, 
 INSERT INTO gpkg_spatial_ref_sys VALUES ('undefined geographic', 0, 'NONE', 0, 'undefined', NULL);
 """
 
-WGS84 = 4326
-"""EPSG number of a system that each GeoPackage must define."""
+WGS84 = 4326  # in EPSG's numbers; each GeoPackage must define it
 
 COLUMN_TYPES = {str: "TEXT", bool: "BOOLEAN", int: "INTEGER", float: "DOUBLE"}
 """SQL type of the first of these types that a property is of."""

@@ -28,15 +28,6 @@ from rille.stages.evaluation.place import Ortho
 MAX_CELLS = 500_000_000
 """Of an elevation model, which is read whole."""
 
-ALLOWED_CELLS, MAX_CELLS_PER_BYTE = 4_000_000, 50
-"""Cells that any file may have, and more of them if it has a byte for so many: a sparse file may claim any number."""
-
-MAX_WALL_M, MAX_STEP_CELLS = 1500.0, 300.0
-"""Metres and cells; nothing on Earth rises more upright over less than a cell."""
-
-USUAL_MARKS, MAX_BANK_CELLS = (0.0, -1.0, -99.0, -999.0, 255.0, 999.0), 30.0
-"""Values that often mark what is unknown, and cells by which ground may rise from one of them everywhere at once."""
-
 OURS = "give a run as Rille writes it"
 
 NO_PLACE = "give a raster that says itself where its cells are"
@@ -117,13 +108,14 @@ def _without_marks(dem: DemFile) -> DemFile:
     gap, mark = max((low - least, least), (most - high, most))
     marked = values == mark
     several, apart = marked.sum() > 1, gap > high - low
-    usual = apart and gap > MAX_BANK_CELLS * dem.cell and mark in USUAL_MARKS
+    usual = apart and gap > 30.0 * dem.cell and mark in (0.0, -1.0, -99.0, -999.0, 255.0, 999.0)
     inner = ndimage.binary_erosion(marked, np.ones((3, 3)), border_value=1)
-    steep = gap > MAX_STEP_CELLS * dem.cell and several and apart
+    # Nothing on Earth rises by 300 cells, or by 1500 m, over less than a cell.
+    steep = gap > 300.0 * dem.cell and several and apart
     text = (
         f"{dem.name}: {mark:.9g} in {marked.sum()} cells {{}}, the others are {low:.6g} to {high:.6g} m: taken as {{}}"
     )
-    if not (steep or (gap > MAX_WALL_M and (several or apart)) or (usual and 2 * inner.sum() < marked.sum())):
+    if not (steep or (gap > 1500.0 and (several or apart)) or (usual and 2 * inner.sum() < marked.sum())):
         doubt = text.format("may be no elevation", "one; if it marks what is unknown, state it in the file, as NODATA")
         return replace(dem, warnings=(*dem.warnings, warning("RIL-726", doubt))) if usual else dem
     line = warning("RIL-725", text.format("is no elevation", "unknown; state it in the file, as NODATA"))
@@ -210,7 +202,7 @@ def read_ortho(path: Path) -> tuple[Ortho, str]:
 def _check_cells(path: Path, shape: tuple[int, ...], stored: int) -> None:
     """Refuse more cells than there is memory for, or than so many ``stored`` bytes can hold."""
     # Memory that a cell takes until it is read, and compared or exported
-    most = min(MAX_CELLS, free() // 100, max(ALLOWED_CELLS, MAX_CELLS_PER_BYTE * stored))
+    most = min(MAX_CELLS, free() // 100, max(4_000_000, 50 * stored))
     if math.prod(shape) > most:
         size = f"{' x '.join(map(str, shape))} cells in {words(stored)}"
         text = f"{path} has {size}, at most {most / 1e6:.3g} million are read"

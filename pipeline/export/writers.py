@@ -76,11 +76,7 @@ class Meaning:
 
 
 def write_raster(
-    path: Path,
-    bands: Mapping[str, NDArray[Any]],
-    lattice: Lattice,
-    meaning: Meaning,
-    place: Georeference | None = None,
+    path: Path, bands: Mapping[str, NDArray[Any]], lattice: Lattice, meaning: Meaning, place: Georeference | None = None
 ) -> None:
     """Write a cloud-optimised GeoTIFF in the engineering CRS, or in that of ``place``.
 

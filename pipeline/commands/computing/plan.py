@@ -30,9 +30,6 @@ from rille.stages.core.errors import ConfigError
 MAX_REASONS = 3
 """Different reasons of a stage that are printed; ``verbose`` prints each task's."""
 
-WIDTH = 80
-"""Characters of a reason in the table."""
-
 _WORK = Work()
 
 
@@ -116,7 +113,7 @@ def _reasons(planned: list[Handle]) -> list[str]:
     """The reasons of a stage's tasks, own ones first, the most frequent first, with their number."""
     # The reason of a task that only follows from another one begins so.
     own = Counter(h.reason for h in planned if not h.reason.startswith("input "))
-    listed = [f"{brief(reason, WIDTH)} ({n})" for reason, n in own.most_common(MAX_REASONS)]
+    listed = [f"{brief(reason, 80)} ({n})" for reason, n in own.most_common(MAX_REASONS)]
     if len(own) > MAX_REASONS:
         listed.append(f"{len(own) - MAX_REASONS} other reasons")
     follow = len(planned) - own.total()

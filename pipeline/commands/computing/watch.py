@@ -25,9 +25,6 @@ from rille.stages.core.errors import ConfigError, IncompleteError, InputError, R
 UPDATED = ("trajectory.tum", "trajectory.kitti", "dem.tif", "dem_sigma.tif", "risk.tif", "path.gpkg")
 """Files that each update makes; all others, COLMAP's trajectory and the figures follow at the end."""
 
-LOOK_SECONDS, LOOK_SHARE = 0.25, 0.2
-"""Time between two looks at the folder, and share of the time that looking takes at most."""
-
 _OPTIONS = WatchOptions()
 
 
@@ -107,7 +104,7 @@ class _Watched:
             elif self.is_over(seen):
                 return self.finish()
             else:
-                time.sleep(max(LOOK_SECONDS, took / LOOK_SHARE))
+                time.sleep(max(0.25, 5 * took))  # looking takes a fifth of the time at most
 
     def look(self) -> _Seen | None:
         """Open the sequence as far as it has arrived; None where that is not enough to open it.

@@ -8,16 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from rille.pipeline.commands.options import (
-    COMPLETE,
-    RUNS,
-    CacheFolder,
-    Output,
-    Run,
-    Runs,
-    cache_folder,
-    check_output,
-)
+from rille.pipeline.commands.options import COMPLETE, RUNS, CacheFolder, Output, Run, Runs, cache_folder, check_output
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.runs import lookup
 from rille.stages.core.errors import ConfigError

@@ -37,8 +37,6 @@ from rille.stages.terrain.map_localization import MIN_CHI2_GAP, GlobalMap, MapLo
 
 TURN_DEG = 20.0
 """Degrees to either side of a given heading that are searched."""
-SENSOR_TILT_DEG, GROUND_TILT_DEG = 0.5, 5.0
-"""Standard deviation, degrees, of a vertical that a sensor gives, and of one that is that of the ground."""
 NAMES = ("x_m", "y_m", "z_m", "about_x_deg", "about_y_deg", "yaw_deg")
 
 
@@ -238,7 +236,8 @@ def _by_elevations(terrain: Terrain, model: DemFile, around: SearchArea | None) 
         x, y, _ = to_map.inverse().apply([around.x, around.y, 0.0])
         heading, turn = around.heading - _yaw(to_map), around.turn
         distance = min(around.distance, everywhere + math.hypot(middle[0] - x, middle[1] - y))
-    tilt = SENSOR_TILT_DEG if terrain.vertical == "attitude" else GROUND_TILT_DEG
+    # Standard deviation, degrees, of a vertical that a sensor gives, and of one that is that of the ground.
+    tilt = 0.5 if terrain.vertical == "attitude" else 5.0
     placed = fix(
         terrain.elevation,
         terrain.lattice,

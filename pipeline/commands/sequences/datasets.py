@@ -30,13 +30,7 @@ def list_datasets() -> int:
 
 
 @app.command(name="export")
-def export_dataset(
-    seq: str,
-    directory: Path,
-    *,
-    assignments: Assignments = (),
-    cache: CacheFolder = None,
-) -> int:
+def export_dataset(seq: str, directory: Path, *, assignments: Assignments = (), cache: CacheFolder = None) -> int:
     """Write a built-in sequence as plain files (PNG, rig, poses, disparity, DEM, times), for use by other tools.
 
     Parameters

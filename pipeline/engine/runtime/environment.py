@@ -15,13 +15,6 @@ from rille.pipeline.engine.runtime.apart import absolute_search_paths
 from rille.pipeline.engine.runtime.kernels import use_own_folder
 from rille.pipeline.engine.runtime.private import private_folder
 
-MMAP_THRESHOLD, TRIM_THRESHOLD = 32 << 20, 128 << 20
-"""Bytes: blocks from which on glibc takes each from the system, and free memory from which on it gives it back. By
-default it gives back every array, and a tenth of the time of matching goes into taking memory anew."""
-
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-"""Numbers of the two in glibc's ``malloc.h``."""
-
 SINGLE = ("OMP", "OPENBLAS", "MKL", "NUMBA", "BLIS", "VECLIB_MAXIMUM", "NUMEXPR")
 
 
@@ -50,8 +43,9 @@ def _keep_memory() -> None:
     # Only glibc has it.
     with suppress(AttributeError, OSError, TypeError):
         mallopt = ctypes.CDLL(None).mallopt
-        mallopt(M_MMAP_THRESHOLD, MMAP_THRESHOLD)
-        mallopt(M_TRIM_THRESHOLD, TRIM_THRESHOLD)
+        # By default it gives back every array, and a tenth of the time of matching goes into taking memory anew.
+        mallopt(-3, 32 << 20)  # M_MMAP_THRESHOLD: bytes of a block that it takes from the system by itself
+        mallopt(-1, 128 << 20)  # M_TRIM_THRESHOLD: bytes of free memory from which on it gives it back
 
 
 @cache

@@ -68,10 +68,7 @@ def _node(values: AnyArray, dims: list[str], attributes: Mapping[str, str]) -> d
         # No folders within the archive: its members are flat.
         "chunk_key_encoding": {"name": "default", "configuration": {"separator": "."}},
         "fill_value": "NaN" if values.dtype.kind == "f" else values.dtype.type(0).item(),
-        "codecs": [
-            {"name": "bytes", "configuration": {"endian": "little"}},
-            {"name": "blosc", "configuration": blosc},
-        ],
+        "codecs": [{"name": "bytes", "configuration": {"endian": "little"}}, {"name": "blosc", "configuration": blosc}],
         "attributes": attributes,
         "dimension_names": dims,
         "zarr_format": 3,

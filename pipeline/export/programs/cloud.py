@@ -36,7 +36,6 @@ ABOUT = {
 """What the columns are that LAS does not know, in 32 letters at most."""
 
 PLY_TYPES = {"float64": "double", "float32": "float", "uint8": "uchar", "uint32": "uint"}
-"""PLY's names of types."""
 
 Columns = Mapping[str, NDArray[Any]]
 

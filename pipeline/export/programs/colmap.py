@@ -155,11 +155,7 @@ def _ends(track: Bundle) -> list[int]:
 
 
 def _points(
-    segment: MatchedSegment,
-    rig: Rig,
-    poses: Mapping[int, RigidTransform],
-    seen: Seen,
-    images: Mapping[int, Bundle],
+    segment: MatchedSegment, rig: Rig, poses: Mapping[int, RigidTransform], seen: Seen, images: Mapping[int, Bundle]
 ) -> Iterator[tuple[Floats, list[tuple[tuple[int, str], int]], int]]:
     """Points of a segment in the world, by which pixel of which images each is seen, and its grey value (or black).
 

@@ -17,16 +17,13 @@ from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.classification import HAZARDOUS, UNKNOWN
 
-OCCUPIED, NOT_KNOWN = 100, 255
-"""Values of a pixel of mode raw."""
-
 
 def write_run(folder: Path, run: RunArtifacts) -> str:
     """Write the map of a run into a new folder; what was written, in words."""
     risk = run.risk()
     lattice, classes = Lattice.from_dict(risk.meta["lattice"]), np.asarray(risk["risk"])
     percent = np.rint(100.0 * np.nan_to_num(np.clip(risk["p_hazard"], 0.0, 1.0)))
-    cells = np.select([classes == HAZARDOUS, classes == UNKNOWN], [OCCUPIED, NOT_KNOWN], percent)
+    cells = np.select([classes == HAZARDOUS, classes == UNKNOWN], [100, 255], percent)
     left, _, bottom, _ = (round(v, 9) for v in lattice.bounds)
     about = {"image": "map.pgm", "mode": "raw", "resolution": lattice.cell, "origin": [left, bottom, 0.0], "negate": 0}
     # map_server demands both thresholds in every mode, also in raw, which has no use for them.

@@ -13,9 +13,6 @@ from rille.pipeline.engine.store.base import Store
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
 
-STOP = re.compile(r"risk/(\d{1,9})")
-"""Label of the hazards that a drive knew at a stop."""
-
 
 def export_run(kind: str, run: Path, target: Path, store: Store) -> str:
     """Write a run folder in a form, such as ``colmap`` or ``nav2``, as a folder; the line to print.
@@ -76,7 +73,7 @@ class RunArtifacts:
 
     def risk(self) -> Bundle:
         """Risk map of the world; of a drive, what it knew at its last stop."""
-        stops = [int(stop[1]) for name in self._rows if (stop := STOP.fullmatch(name))]
+        stops = [int(stop) for stop in self.labels(r"risk/(\d{1,9})")]
         return self.one(f"risk/{max(stops)}" if stops and "risk/world" not in self._rows else "risk/world")
 
     def digests(self) -> Iterator[tuple[str, str]]:
