@@ -16,7 +16,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numcodecs
 import numpy as np
@@ -32,7 +32,6 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain import merge
 from rille.stages.terrain.shading import slope_deg
 
-CONVENTIONS = "CF-1.11"
 UNITS = {"px": "1", "grey": "1"}
 """Units that UDUNITS does not know; the long name has the word."""
 
@@ -53,54 +52,32 @@ def write_terrain(
     place : of the world frame, where it is known.
     facts : attributes of the whole group, e.g. ``title``, ``source``.
     """
-    import zarr
+    import xarray
 
     where = {} if place is None else {f"georeference_{name}": value for name, value in place.to_dict().items()}
-    about = {"Conventions": CONVENTIONS, "frame": FRAME, **facts, "cell_size_m": lattice.cell, **where}
-    variables = {name: _variable(spec, values) for name, (spec, values) in arrays.items()}
+    about = {"Conventions": "CF-1.11", "frame": FRAME, **facts, "cell_size_m": lattice.cell, **where}
+    variables = {name: (("y", "x"), values, _attributes(spec)) for name, (spec, values) in arrays.items()}
     others = [name for name in arrays if name not in ("elevation", "ortho", SLOPE.name)]
-    variables["elevation"].attributes.update(positive="up", ancillary_variables=" ".join(others))
+    variables["elevation"][2].update(positive="up", ancillary_variables=" ".join(others))
+    # In every build of GDAL.
+    encoding: dict[str, Any] = {name: {"compressors": numcodecs.Zlib(level=1)} for name in arrays}
+    for name, (spec, values) in arrays.items():
+        encoding[name]["chunks"] = tuple(min(n, 512) for n in values.shape)
+        encoding[name]["_FillValue"] = np.nan if values.dtype.kind == "f" else int(spec.nodata) if spec.nodata else None
     # zarr says that readers of other languages may not know consolidated metadata.
     with atomic.replacing(path) as folder, warnings.catch_warnings(action="ignore"):
-        group = zarr.create_group(folder, zarr_format=2, attributes=about)
-        for name, variable in (variables | _coordinates(lattice)).items():
-            group.create_array(
-                name,
-                data=variable.values,
-                chunks=tuple(min(n, 512) for n in variable.values.shape) or "auto",
-                compressors=numcodecs.Zlib(level=1),  # in every build of GDAL
-                fill_value=variable.unknown,
-                attributes={**variable.attributes, "_ARRAY_DIMENSIONS": list(variable.dims)},
-                config={"write_empty_chunks": True},
-            )
-        zarr.consolidate_metadata(group.store)
+        terrain = xarray.Dataset(variables, _coordinates(lattice), about)
+        terrain.to_zarr(folder, zarr_format=2, consolidated=True, encoding=encoding, write_empty_chunks=True)
 
 
-class _Variable(NamedTuple):
-    """Values with the names of their axes, attributes, and the value of a cell where nothing is known, if any."""
-
-    dims: tuple[str, ...]
-    values: NDArray[Any]
-    attributes: dict[str, Any]
-    unknown: float | None = None
+def _attributes(spec: Array) -> dict[str, Any]:
+    about: dict[str, Any] = {"units": UNITS.get(spec.unit, spec.unit), "long_name": spec.long_name}
+    about |= {"quantity": spec.unit} if spec.unit in UNITS else {}
+    # _CRS is GDAL's own attribute for the system of a zarr array.
+    return about | {"frame": spec.frame or "world", "_CRS": {"wkt": ENGINEERING_CRS}}
 
 
-def _variable(spec: Array, values: NDArray[Any]) -> _Variable:
-    about: dict[str, Any] = {
-        "units": UNITS.get(spec.unit, spec.unit),
-        "long_name": spec.long_name,
-        "frame": spec.frame or "world",
-        # GDAL's own attribute for the system of a zarr array.
-        "_CRS": {"wkt": ENGINEERING_CRS},
-        "coordinates": "spatial_ref",
-    }
-    if spec.unit in UNITS:
-        about["quantity"] = spec.unit
-    unknown = np.nan if values.dtype.kind == "f" else int(spec.nodata) if spec.nodata else None
-    return _Variable(("y", "x"), values, about, unknown)
-
-
-def _coordinates(lattice: Lattice) -> dict[str, _Variable]:
+def _coordinates(lattice: Lattice) -> dict[str, Any]:
     half = 0.5 * lattice.cell
     # In GDAL's order, which is not that of affine.
     corner = lattice.x0 - half, lattice.cell, 0.0, lattice.y0 + half, 0.0, -lattice.cell
@@ -111,10 +88,10 @@ def _coordinates(lattice: Lattice) -> dict[str, _Variable]:
         "long_name": "Rille world frame (local metres)",
         "GeoTransform": " ".join(f"{v:.17g}" for v in corner),
     }
-    coordinates = {"spatial_ref": _Variable((), np.array(0, np.int32), reference)}
+    coordinates: dict[str, Any] = {"spatial_ref": ((), np.int32(0), reference)}
     for axis, values, words in (("x", lattice.xs(), "right"), ("y", lattice.ys(), "ahead")):
         about = {"units": "m", "axis": axis.upper(), "long_name": f"{axis} of the cell centre, world frame, {words}"}
-        coordinates[axis] = _Variable((axis,), values, about)
+        coordinates[axis] = (axis, values, about)
     return coordinates
 
 
