@@ -48,46 +48,54 @@ TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
 
 class Table(Params):
-    """A table of the manifest; below each key stands its description."""
+    """A table of the manifest, whose keys are its attributes."""
 
 
 class Images(Table):
-    """``[images]``: which files are the pairs."""
+    """``[images]``: which files are the pairs.
+
+    Attributes
+    ----------
+    left : pattern of the left images below the root, e.g. left/*.png; ** is any folder; or BAG, or BAG:TOPIC.
+    right : pattern of the right images, or the same bag.
+    pair : how images are paired: by name (left/right aside), by the last number in the name, by the nearest time stamp
+        in it, or by order; auto: by name, by time stamps where these differ, else by number.
+    tolerance : s; time between the images of a pair at most, by the stamps in their names; by default a quarter of the
+        usual interval, at most 0.01.
+    rectified : whether the images are rectified; by default they are where a word of their folders' or files' names
+        begins with rect.
+    """
 
     left: str
-    """pattern of the left images below the root, e.g. left/*.png; ** is any folder; or BAG, or BAG:TOPIC"""
     right: str
-    """pattern of the right images, or the same bag"""
     pair: Literal["auto", "name", "number", "nearest", "order"] = "auto"
-    """how images are paired: by name (left/right aside), by the last number in the name, by the nearest time stamp in
-    it, or by order; auto: by name, by time stamps where these differ, else by number"""
     tolerance: float | None = Field(default=None, gt=0)
-    """s; time between the images of a pair at most, by the stamps in their names; by default a quarter of the usual
-    interval, at most 0.01"""
     rectified: bool | None = None
-    """whether the images are rectified; by default they are where a word of their folders' or files' names begins with
-    rect"""
 
 
 class PinholeLens(Table):
-    """One camera stated in the manifest."""
+    """One camera stated in the manifest.
+
+    Attributes
+    ----------
+    fx : px, focal length in columns.
+    fy : px, focal length in rows; that in columns where it is not given.
+    cx : px, column of the principal point; centre of the first pixel is 0.
+    cy : px, row of the principal point.
+    width : px, of the images that were calibrated; those given by default.
+    height : px, of the images that were calibrated.
+    model : distortion model; radtan where there are coefficients.
+    distortion : coefficients in OpenCV's order, e.g. k1 k2 p1 p2 [k3].
+    """
 
     fx: float | None = Field(default=None, gt=0)
-    """px, focal length in columns"""
     fy: float | None = Field(default=None, gt=0)
-    """px, focal length in rows; that in columns where it is not given"""
     cx: float | None = None
-    """px, column of the principal point; centre of the first pixel is 0"""
     cy: float | None = None
-    """px, row of the principal point"""
     width: int | None = Field(default=None, ge=1)
-    """px, of the images that were calibrated; those given by default"""
     height: int | None = Field(default=None, ge=1)
-    """px, of the images that were calibrated"""
     model: Literal["none", "radtan", "rational", "fisheye"] | None = None
-    """distortion model; radtan where there are coefficients"""
     distortion: tuple[float, ...] = ()
-    """coefficients in OpenCV's order, e.g. k1 k2 p1 p2 [k3]"""
 
     @model_validator(mode="after")
     def _whole(self) -> PinholeLens:
@@ -112,16 +120,20 @@ OneCamera = Annotated[Annotated[str, Tag(FILE)] | Annotated[PinholeLens, Tag(FIG
 
 
 class Cameras(PinholeLens):
-    """``[cameras]``: one file, a file or a table each, or figures that hold for both cameras."""
+    """``[cameras]``: one file, a file or a table each, or figures that hold for both cameras.
+
+    Attributes
+    ----------
+    file : calibration file of both cameras.
+    left : calibration file of the left camera, or its figures.
+    right : calibration file of the right camera, or its figures.
+    names : names of the left and the right camera within the file, where it has more or other ones.
+    """
 
     file: str | None = None
-    """calibration file of both cameras"""
     left: OneCamera | None = None
-    """calibration file of the left camera, or its figures"""
     right: OneCamera | None = None
-    """calibration file of the right camera, or its figures"""
     names: tuple[str, str] | None = None
-    """names of the left and the right camera within the file, where it has more or other ones"""
 
     @model_validator(mode="after")
     def _one_form(self) -> Cameras:
@@ -137,16 +149,20 @@ class Cameras(PinholeLens):
 
 
 class RigSection(Table):
-    """``[rig]``: where the right camera stands, unless the calibration files say it."""
+    """``[rig]``: where the right camera stands, unless the calibration files say it.
+
+    Attributes
+    ----------
+    baseline : m; the right camera stands that far along the left one's x axis.
+    T_right_left : rows of [R | t], m: x_right = R x_left + t.
+    file : rig that `rille rig` has estimated; its relative orientation is used as it is, with rig.mode fixed.
+    unit : m; length of one unit of the calibration files, 0.001 where they say mm.
+    """
 
     baseline: float | None = None
-    """m; the right camera stands that far along the left one's x axis"""
     T_right_left: Pose | None = None
-    """rows of [R | t], m: x_right = R x_left + t"""
     file: str | None = None
-    """rig that `rille rig` has estimated; its relative orientation is used as it is, with rig.mode fixed"""
     unit: float = Field(default=1.0, gt=0)
-    """m; length of one unit of the calibration files, 0.001 where they say mm"""
 
     @model_validator(mode="after")
     def _one_baseline(self) -> RigSection:
@@ -160,43 +176,59 @@ class RigSection(Table):
 
 
 class DisparityMaps(Table):
-    """``[truth_disparity]``: true disparities of the left images, only to judge the matcher's."""
+    """``[truth_disparity]``: true disparities of the left images, only to judge the matcher's.
+
+    Attributes
+    ----------
+    left : pattern of the maps, one a pair, named or numbered as the left images are: .pfm, .tif or .npy of floating
+        point (px; 0, infinite or NaN: unknown), or 16-bit .png (256 a pixel, 0 unknown).
+    sign : left-right: values are the column in the left image minus that in the right one, the usual; right-left: the
+        reverse.
+    """
 
     left: str
-    """pattern of the maps, one a pair, named or numbered as the left images are: .pfm, .tif or .npy of floating point
-    (px; 0, infinite or NaN: unknown), or 16-bit .png (256 a pixel, 0 unknown)"""
     sign: Literal["left-right", "right-left"] = "left-right"
-    """left-right: values are the column in the left image minus that in the right one, the usual; right-left: the
-    reverse"""
 
 
 class Disparity(DisparityMaps):
-    """``[disparity]``: maps that another program made of the left images, in the place of the matcher's."""
+    """``[disparity]``: maps that another program made of the left images, in the place of the matcher's.
+
+    Attributes
+    ----------
+    sigma : px; standard deviation of all values, or pattern of maps of it; estimated by default.
+    """
 
     sigma: Annotated[float, Field(gt=0)] | str | None = None
-    """px; standard deviation of all values, or pattern of maps of it; estimated by default"""
 
 
 class Masks(Table):
-    """``[masks]``: parts of the images that never show the scene, such as the vehicle's own body."""
+    """``[masks]``: parts of the images that never show the scene, such as the vehicle's own body.
+
+    Attributes
+    ----------
+    left : grey image of the left camera's size, as it takes them: bright where a pixel is used, dark where it is not.
+    right : the same of the right camera.
+    """
 
     left: str | None = None
-    """grey image of the left camera's size, as it takes them: bright where a pixel is used, dark where it is not"""
     right: str | None = None
-    """the same of the right camera"""
 
 
 class Times(Table):
-    """``[times]``: when the pairs were taken."""
+    """``[times]``: when the pairs were taken.
+
+    Attributes
+    ----------
+    file : one time a line for each pair, or a table of time and file name.
+    names : the left images' names are time stamps.
+    rate_hz : 1/s; pairs at a constant rate.
+    unit : unit of file or names; auto: by magnitude.
+    """
 
     file: str | None = None
-    """one time a line for each pair, or a table of time and file name"""
     names: bool = False
-    """the left images' names are time stamps"""
     rate_hz: float | None = Field(default=None, gt=0)
-    """1/s; pairs at a constant rate"""
     unit: TimeUnit = "auto"
-    """unit of file or names; auto: by magnitude"""
 
     @model_validator(mode="after")
     def _one_source(self) -> Times:
@@ -207,32 +239,40 @@ class Times(Table):
 
 
 class PoseFile(Table):
-    """Base of ``[odometry]`` and ``[truth]``: poses of the left camera or of a body that carries it."""
+    """Base of ``[odometry]`` and ``[truth]``: poses of the left camera or of a body that carries it.
+
+    Attributes
+    ----------
+    file : poses, one a pair, or with times.
+    format : kitti 3 x 4, tum, euroc or csv.
+    T_body_left : rows of [R | t], m: from the left camera's frame to the body's whose poses the file has.
+    unit : m; length of one unit of the file, 0.001 where it says mm.
+    max_gap : s; poses are interpolated over no longer gap.
+    time_offset : s; added to the file's times so that they are those of the images.
+    source : words: where the poses come from.
+    """
 
     file: str
-    """poses, one a pair, or with times"""
     format: PoseFormat = "auto"
-    """kitti 3 x 4, tum, euroc or csv"""
     T_body_left: Pose | None = None
-    """rows of [R | t], m: from the left camera's frame to the body's whose poses the file has"""
     unit: float = Field(default=1.0, gt=0)
-    """m; length of one unit of the file, 0.001 where it says mm"""
     max_gap: float = Field(default=0.5, gt=0)
-    """s; poses are interpolated over no longer gap"""
     time_offset: float = 0.0
-    """s; added to the file's times so that they are those of the images"""
     source: str = ""
-    """words: where the poses come from"""
 
 
 class Odometry(PoseFile):
-    """``[odometry]``: dead reckoning; it predicts, and where it says how good it is it is a measurement, too."""
+    """``[odometry]``: dead reckoning; it predicts, and where it says how good it is it is a measurement, too.
+
+    Attributes
+    ----------
+    drift : standard deviation of a way as a share of it, e.g. 0.02; with turn_deg: the trajectory is adjusted to the
+        odometry, which joins its pieces.
+    turn_deg : degrees for each metre of way; standard deviation of the rotation.
+    """
 
     drift: float | None = Field(default=None, gt=0, lt=1)
-    """standard deviation of a way as a share of it, e.g. 0.02; with turn_deg: the trajectory is adjusted to the
-    odometry, which joins its pieces"""
     turn_deg: float | None = Field(default=None, gt=0)
-    """degrees for each metre of way; standard deviation of the rotation"""
 
     @model_validator(mode="after")
     def _both_or_none(self) -> Odometry:
@@ -242,80 +282,101 @@ class Odometry(PoseFile):
 
 
 class PositionFile(Table):
-    """``[positions]``: where an antenna (GNSS) or a prism was; the trajectory is adjusted to them."""
+    """``[positions]``: where an antenna (GNSS) or a prism was; the trajectory is adjusted to them.
+
+    Attributes
+    ----------
+    file : table of time and position, x and y in the plane in metres (easting, northing), and perhaps z up.
+    sigma : m; standard deviation of each coordinate, or of x, y and z.
+    lever_arm : m; where the antenna or prism is in the left camera's frame: x right, y down, z ahead.
+    columns : names or numbers (from 1) of the columns, as for truth; names that are clear need none.
+    unit : m; length of one unit of the file.
+    time_offset : s; added to the file's times so that they are those of the images; what is left of it is estimated.
+    """
 
     file: str
-    """table of time and position, x and y in the plane in metres (easting, northing), and perhaps z up"""
     sigma: PositiveFloat | tuple[PositiveFloat, PositiveFloat, PositiveFloat]
-    """m; standard deviation of each coordinate, or of x, y and z"""
     lever_arm: Vector = (0.0, 0.0, 0.0)
-    """m; where the antenna or prism is in the left camera's frame: x right, y down, z ahead"""
     columns: Columns = Field(default={})
-    """names or numbers (from 1) of the columns, as for truth; names that are clear need none"""
     unit: float = Field(default=1.0, gt=0)
-    """m; length of one unit of the file"""
     time_offset: float = 0.0
-    """s; added to the file's times so that they are those of the images; what is left of it is estimated"""
 
 
 class Truth(PoseFile):
-    """``[truth]``: poses, or positions alone, which are compared after a rigid fit in the plane."""
+    """``[truth]``: poses, or positions alone, which are compared after a rigid fit in the plane.
+
+    Attributes
+    ----------
+    columns : names or numbers (from 1) of the columns of positions alone, e.g. { time = "gps s", x = "E", y = "N" }; x
+        and y span the ground, y left of x seen from above, z is up; names that are clear need none.
+    lever_arm : m; where the antenna or prism of positions alone is in the left camera's frame: x right, y down, z
+        ahead; none: fitted where turns show it, and the report says so.
+    """
 
     columns: Columns = Field(default={})
-    """names or numbers (from 1) of the columns of positions alone, e.g. { time = "gps s", x = "E", y = "N" }; x and y
-    span the ground, y left of x seen from above, z is up; names that are clear need none"""
     lever_arm: Vector | None = None
-    """m; where the antenna or prism of positions alone is in the left camera's frame: x right, y down, z ahead; none:
-    fitted where turns show it, and the report says so"""
 
 
 class Attitude(Table):
-    """``[attitude]``: rotation from a sensor."""
+    """``[attitude]``: rotation from a sensor.
+
+    Attributes
+    ----------
+    file : table of time and roll, pitch, yaw or a quaternion; or poses, of which R is taken.
+    format : as for poses.
+    T_body_left : rows of [R | t]: from the left camera's frame to the sensor's.
+    up : direction of up in the sensor's reference; none: not used as such.
+    sigma_deg : degrees; standard deviation of the rotation from frame to frame and of up; with it the trajectory is
+        adjusted to them.
+    max_gap : s; attitudes are interpolated over no longer gap.
+    time_offset : s; added to the file's times so that they are those of the images.
+    """
 
     file: str
-    """table of time and roll, pitch, yaw or a quaternion; or poses, of which R is taken"""
     format: PoseFormat = "auto"
-    """as for poses"""
     T_body_left: Pose | None = None
-    """rows of [R | t]: from the left camera's frame to the sensor's"""
     up: Direction | None = None
-    """direction of up in the sensor's reference; none: not used as such"""
     sigma_deg: float | None = Field(default=None, gt=0)
-    """degrees; standard deviation of the rotation from frame to frame and of up; with it the trajectory is adjusted to
-    them"""
     max_gap: float = Field(default=0.5, gt=0)
-    """s; attitudes are interpolated over no longer gap"""
     time_offset: float = 0.0
-    """s; added to the file's times so that they are those of the images"""
 
 
 class Imu(Table):
-    """``[imu]``: angular rates and accelerations."""
+    """``[imu]``: angular rates and accelerations.
+
+    Attributes
+    ----------
+    file : table of time, rates (rad/s) about x y z and accelerations (m/s2) along them.
+    T_imu_left : rows of [R | t]: from the left camera's frame to the IMU's.
+    sigma_deg : degrees; as for attitude.
+    time_offset : s; added to the file's times so that they are those of the images.
+    """
 
     file: str
-    """table of time, rates (rad/s) about x y z and accelerations (m/s2) along them"""
     T_imu_left: Pose
-    """rows of [R | t]: from the left camera's frame to the IMU's"""
     sigma_deg: float | None = Field(default=None, gt=0)
-    """degrees; as for attitude"""
     time_offset: float = 0.0
-    """s; added to the file's times so that they are those of the images"""
 
 
 class World(Table):
-    """``[world]``: what is known of the vertical, and of the place."""
+    """``[world]``: what is known of the vertical, and of the place.
+
+    Attributes
+    ----------
+    pitch_deg : degrees; downward pitch of the left camera's axis over the ground, roll 0.
+    up : direction of up in the reference frame of the calibration files (the left camera's where they state none), the
+        same for all pairs.
+    crs : projected CRS in metres of the results, e.g. "EPSG:32633"; with origin and azimuth_deg.
+    origin : m; easting, northing and height of the first left camera's centre in that CRS.
+    azimuth_deg : degrees clockwise from grid north; heading of the first left camera's optical axis, the world's y
+        axis.
+    """
 
     pitch_deg: float | None = Field(default=None, gt=-90, lt=90)
-    """degrees; downward pitch of the left camera's axis over the ground, roll 0"""
     up: Direction | None = None
-    """direction of up in the reference frame of the calibration files (the left camera's where they state none), the
-    same for all pairs"""
     crs: Annotated[str, AfterValidator(metric_crs)] | None = None
-    """projected CRS in metres of the results, e.g. "EPSG:32633"; with origin and azimuth_deg"""
     origin: Vector | None = None
-    """m; easting, northing and height of the first left camera's centre in that CRS"""
     azimuth_deg: float | None = Field(default=None, ge=-360, le=360)
-    """degrees clockwise from grid north; heading of the first left camera's optical axis, the world's y axis"""
 
     @model_validator(mode="after")
     def _one_vertical_and_a_whole_place(self) -> World:
@@ -335,12 +396,18 @@ class World(Table):
 
 
 class Manifest(Table):
-    """A stereo sequence in a folder of any form."""
+    """A stereo sequence in a folder of any form.
+
+    Attributes
+    ----------
+    name : short name, used for folders; the manifest's folder by default.
+    root : folder of all files, relative to the manifest; ${VARIABLE} is allowed.
+    defaults : parameters that suit the sequence, e.g. locus.cell_size = 0.05.
+    notes : facts that the report repeats.
+    """
 
     name: str = ""
-    """short name, used for folders; the manifest's folder by default"""
     root: str = "."
-    """folder of all files, relative to the manifest; ${VARIABLE} is allowed"""
     images: Images
     cameras: Cameras = Cameras()
     rig: RigSection = RigSection()
@@ -356,9 +423,7 @@ class Manifest(Table):
     world: World = World()
     vehicle: Vehicle | None = None
     defaults: dict[str, Any] = Field(default={})
-    """parameters that suit the sequence, e.g. locus.cell_size = 0.05"""
     notes: tuple[str, ...] = ()
-    """facts that the report repeats"""
 
     @model_validator(mode="after")
     def _one_rotation(self) -> Manifest:
