@@ -49,11 +49,15 @@ Known = dict["Handle", Bundle]
 
 @dataclass(frozen=True)
 class StereoSequence:
-    """A calibrated stereo sequence; ``sequence[k]`` is its pair number k, ``len(sequence)`` how many there are."""
+    """A calibrated stereo sequence; ``sequence[k]`` is its pair number k, ``len(sequence)`` how many there are.
+
+    Attributes
+    ----------
+    drawn : images that were read or rendered already, by label.
+    """
 
     source: Sequence
     drawn: dict[str, Bundle] = field(default_factory=dict, repr=False, compare=False)
-    """Images that were read or rendered already, by label."""
 
     def __repr__(self) -> str:
         return f"<StereoSequence {self.name}: {len(self)} pairs>"

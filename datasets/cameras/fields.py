@@ -49,12 +49,16 @@ OTHER = re.compile(r"std|deviat|sigma|err|covar|uncert|mask|file|path|name|topic
 
 
 class Fields:
-    """Entries of a calibration file by key; ``file`` is its name for errors, ``at`` the way to a nested part."""
+    """Entries of a calibration file by key; ``file`` is its name for errors, ``at`` the way to a nested part.
+
+    Attributes
+    ----------
+    used : full keys that a reader has taken, nested ones included.
+    """
 
     def __init__(self, values: Mapping[Any, Any], file: str, at: str = "", used: set[str] | None = None) -> None:
         self.values, self.file, self.at = {str(k): v for k, v in values.items()}, file, at
         self.used = set[str]() if used is None else used
-        """Full keys that a reader has taken, nested ones included."""
 
     def __contains__(self, key: str) -> bool:
         return self.values.get(key) is not None

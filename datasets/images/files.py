@@ -239,10 +239,14 @@ class Digests:
 
     Where a file for it is given, each new digest is appended there as a line ``digest size mtime_ns path``: it is only
     a memo, so that a line that does not parse is passed over.
+
+    Attributes
+    ----------
+    growing : whether images are still arriving: those without a partner are left out, and so are rows of tables for
+        more.
     """
 
     growing = False
-    """Whether images are still arriving: those without a partner are left out, and so are rows of tables for more."""
 
     def __init__(self, memory: Path | None = None) -> None:
         self._memory = memory

@@ -45,7 +45,12 @@ Unparsed = Parameter(parse=False)
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Settings:
-    """Options that choose what is computed, and the cache; ``sequence`` is the word or path that names the sequence."""
+    """Options that choose what is computed, and the cache; ``sequence`` is the word or path that names the sequence.
+
+    Attributes
+    ----------
+    opened : the :class:`~rille.datasets.protocol.Sequence` itself, where it is open already.
+    """
 
     sequence: Annotated[str, Unparsed] = ""
     assignments: Assignments = ()
@@ -56,7 +61,6 @@ class Settings:
     cache: CacheFolder = None
     verb: Annotated[str, Unparsed] = "reconstruct"
     opened: Annotated[Any, Unparsed] = None
-    """The :class:`~rille.datasets.protocol.Sequence` itself, where it is open already."""
 
     def command(self) -> str:
         """The command line that repeats this run, as a shell takes it, in one line."""
@@ -91,7 +95,12 @@ class Work(Settings):
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Options(Work):
-    """Those, and options of the folder of results and of the messages during a run."""
+    """Those, and options of the folder of results and of the messages during a run.
+
+    Attributes
+    ----------
+    kept : :class:`~rille.pipeline.engine.workers.Kept` of several runs, one after another.
+    """
 
     keep_going: Annotated[
         bool, flag("After a failure, finish all tasks that do not depend on it; the exit status is then 3.")
@@ -104,7 +113,6 @@ class Options(Work):
     ] = "auto"
     quiet: Annotated[bool, flag("No progress; warnings and errors only.", "--quiet", "-q")] = False
     kept: Annotated[Any, Unparsed] = None
-    """:class:`~rille.pipeline.engine.workers.Kept` of several runs, one after another."""
 
     def part(self) -> str:
         """The options that choose a part of the run, as they are typed; empty: all of it."""

@@ -33,9 +33,10 @@ OWN = ("rille.stages", "rille.datasets")
 
 
 class _Source(NamedTuple):
+    """Digest of a module, and absolute dotted names that it may import (attributes among them)."""
+
     sha256: str
     imports: tuple[str, ...]
-    """Absolute dotted names that the module may import (attributes among them)."""
 
 
 @dataclass

@@ -110,13 +110,17 @@ def worker_name(client: Any, address: str) -> str:
 
 
 class Presence:
-    """Whether the scheduler answers, and has workers."""
+    """Whether the scheduler answers, and has workers.
+
+    Attributes
+    ----------
+    _heard : when the scheduler heard of each worker last, by its clock, and since when we know that, by ours.
+    """
 
     def __init__(self, client: Any, patience: float) -> None:
         self._client, self._address, self._patience = client, client.scheduler.address, patience
         self._answered = self._manned = time.monotonic()
         self._heard: dict[tuple[str, float], float] = {}
-        """When the scheduler heard of each worker last, by its clock, and since when we know that, by ours."""
 
     def threads(self) -> int:
         """Threads of all workers now.

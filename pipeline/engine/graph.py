@@ -140,21 +140,26 @@ def done(handle: Handle[F]) -> Generator[Wait, Any, Ref[F]]:
 
 @dataclass
 class Graph:
-    """Nodes in order of creation, and expansions that wait for some of them."""
+    """Nodes in order of creation, and expansions that wait for some of them.
+
+    Attributes
+    ----------
+    sequence, choice : name of the sequence it works on, and of the choice of its frames: hints of earlier runs are kept
+        by them.
+    last : called once nothing else will be laid out: adds what reads all of it.
+    cut : what of it is wanted; None: all.
+    asked : numbers of the nodes that a cut graph computes, as far as it is known.
+    unfinished : flows that wait for something: where a plan ends with some, it does not know all tasks.
+    """
 
     sequence: str = ""
-    """Name of the sequence it works on, and of the choice of its frames: hints of earlier runs are kept by them."""
     choice: str = ""
     nodes: list[Handle] = field(default_factory=list)
     expansions: list[tuple[list[Handle], Expansion, bool]] = field(default_factory=list)
     last: Callable[[], None] | None = None
-    """Called once nothing else will be laid out: adds what reads all of it."""
     cut: Cut | None = None
-    """What of it is wanted; None: all."""
     asked: set[int] = field(default_factory=set)
-    """Numbers of the nodes that a cut graph computes, as far as it is known."""
     unfinished: int = 0
-    """Flows that wait for something: where a plan ends with some, it does not know all tasks."""
     _labels: set[str] = field(default_factory=set)
     _complete: set[str] = field(default_factory=set)
 

@@ -123,11 +123,15 @@ def most_workers(executor: Any, asked: int | None) -> int:
 
 
 class Estimates:
-    """Estimates of the tasks of one graph, in the order of their creation."""
+    """Estimates of the tasks of one graph, in the order of their creation.
+
+    Attributes
+    ----------
+    _results : decoded bytes of results still to come, by number of the node.
+    """
 
     def __init__(self) -> None:
         self._results: dict[int, float] = {}
-        """Decoded bytes of results still to come, by number of the node."""
 
     def task(self, handle: Handle) -> float:
         """Memory of a task beyond that of an idle worker, bytes."""

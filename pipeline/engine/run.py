@@ -174,6 +174,18 @@ def run(graph: Graph, store: Store, options: RunOptions = _DEFAULTS) -> Result:
 
 
 class _Run:
+    """One run of a graph.
+
+    Attributes
+    ----------
+    taken : nodes of the graph that were taken up, in order.
+    again : numbers of nodes to be taken up again, the least first.
+    in_flight : with the workers.
+    suspects : numbers of nodes whose workers died; each is tried when nothing else runs, and is then in ``alone``.
+    before : digests of artifacts that are computed again because they were damaged or gone, by number of the node.
+    seen : nodes of a cut graph of which it is known whether they are wanted for themselves.
+    """
+
     def __init__(self, graph: Graph, store: Store, options: RunOptions) -> None:
         self.graph, self.store, self.options = graph, store, options
         self.dry, self.force, self.progress = options.dry, frozenset(options.force), options.progress
@@ -184,20 +196,14 @@ class _Run:
         self.jobs = memory.most_workers(options.executor, options.jobs)
         self.stopped = ""
         self.taken = 0
-        """Nodes of the graph that were taken up, in order."""
         self.again: list[int] = []
-        """Numbers of nodes to be taken up again, the least first."""
         self.in_flight: dict[int, Handle] = {}
-        """With the workers."""
         self.suspects: list[int] = []
-        """Numbers of nodes whose workers died; each is tried when nothing else runs, and is then in ``alone``."""
         self.alone: set[int] = set()
         self.heals: Counter[int] = Counter()
         self.before: dict[int, str] = {}
-        """Digests of artifacts that are computed again because they were damaged or gone, by number of the node."""
         self.known = provenance.Known(store.hints(graph.sequence), graph.choice)
         self.seen = 0
-        """Nodes of a cut graph of which it is known whether they are wanted for themselves."""
         self._ask()
 
     def go(self) -> Result:

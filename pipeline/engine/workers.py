@@ -116,11 +116,15 @@ class NotBegun:
 
 @dataclass(frozen=True)
 class Died:
-    """In the place of an outcome: this many worker processes died while they had the task."""
+    """In the place of an outcome: this many worker processes died while they had the task.
+
+    Attributes
+    ----------
+    memory : memory [bytes, in words] at which dask ended the last of them; empty if something else ended it.
+    """
 
     workers: int
     memory: str = ""
-    """Memory [bytes, in words] at which dask ended the last of them; empty if something else ended it."""
 
 
 Ended = Outcome | Failed | NotBegun | Died
@@ -273,6 +277,11 @@ class Dask:
     """Workers of dask; ``cluster`` is one of our own, ``ours`` whether the client is.
 
     ``kept`` ones stay at the end of a run, unless they are killed.
+
+    Attributes
+    ----------
+    _labels : labels of tasks in flight, by the names that dask knows.
+    _named : silent workers that the user was warned of.
     """
 
     room = 2000  # workers need not wait for this process, and the scheduler stays small
@@ -284,10 +293,8 @@ class Dask:
         self._futures: dict[int, Any] = {}
         self._leaving: list[Any] = []
         self._labels: dict[str, str] = {}
-        """Labels of tasks in flight, by the names that dask knows."""
         self._events: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._named: set[str] = set()
-        """Silent workers that the user was warned of."""
         self._gone: set[Any] = set()
         self.kept, self.closed = False, False
         # The handler runs on the client's event loop: it only hands over what came.

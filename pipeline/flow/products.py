@@ -31,7 +31,12 @@ from rille.stages.facts.terrain import AuditFacts, DemFacts, GroundFacts, MapFix
 
 @dataclass
 class Stop:
-    """One stop and the leg that follows it: handles, the frame it stands at, and in words what became of the leg."""
+    """One stop and the leg that follows it: handles, the frame it stands at, and in words what became of the leg.
+
+    Attributes
+    ----------
+    row : of the leg's artifact, where the leg ended: the last one, unless something ended it before.
+    """
 
     index: int
     frame: int
@@ -47,7 +52,6 @@ class Stop:
     obstacle: Handle | None = None
     frames: list[int] = field(default_factory=list)
     row: int = -1
-    """Of the leg's artifact, where the leg ended: the last one, unless something ended it before."""
     event: str = ""
     thoughts: int = 0
 
@@ -66,7 +70,12 @@ class Driven:
 
 @dataclass
 class Products:
-    """Handles of what a run delivers; the report and the exporters read them once the graph has run."""
+    """Handles of what a run delivers; the report and the exporters read them once the graph has run.
+
+    Attributes
+    ----------
+    chained : the trajectory before it was adjusted to loops; None: it was not.
+    """
 
     images: dict[int, Handle] = field(default_factory=dict)
     undistorted: dict[int, Handle] = field(default_factory=dict)
@@ -95,7 +104,6 @@ class Products:
     world_tiles: list[Handle[MergeFacts]] = field(default_factory=list)
     loops: list[Handle[LoopFacts]] = field(default_factory=list)
     chained: Handle[TrajectoryFacts] | None = None
-    """The trajectory before it was adjusted to loops; None: it was not."""
     trajectory: Handle[TrajectoryFacts] | None = None
     world_risk: Handle | None = None
     world_path: Handle | None = None

@@ -84,7 +84,12 @@ class _Seen(NamedTuple):
 
 @dataclass
 class _Watched:
-    """What has been seen of a sequence, and taken; ``folder`` of the last results, ``once`` for what updates say."""
+    """What has been seen of a sequence, and taken; ``folder`` of the last results, ``once`` for what updates say.
+
+    Attributes
+    ----------
+    gaps : when it was first seen, by the monotonic clock, that a frame between others is missing, by its name.
+    """
 
     options: WatchOptions
     arrivals: Arrivals
@@ -92,7 +97,6 @@ class _Watched:
     folder: Path | None = None
     taken: _Seen | None = None
     gaps: dict[str, float] = field(default_factory=dict)
-    """When it was first seen, by the monotonic clock, that a frame between others is missing, by its name."""
 
     def to_the_end(self) -> int:
         """Update until nothing is to be waited for, and reconstruct everything; the exit code."""

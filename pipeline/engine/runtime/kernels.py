@@ -145,14 +145,17 @@ class Compiling:
     """Follows numba while it looks for kernels, compiles and saves them: one process of this user at a time.
 
     ``seconds`` are those for which this process compiled, or waited for another one; loading alone does not count.
+
+    Attributes
+    ----------
+    unchecked : functions whose files were not compared with their checksums yet.
+    saved : functions of which a kernel is saved just now.
     """
 
     def __init__(self) -> None:
         self.seconds = 0.0
         self.unchecked: list[Locator] = []
-        """Functions whose files were not compared with their checksums yet."""
         self.saved: list[Locator] = []
-        """Functions of which a kernel is saved just now."""
         self._depth, self._since, self._waited, self._change = 0, 0.0, False, threading.Lock()
 
     def begin(self) -> None:
