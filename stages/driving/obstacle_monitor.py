@@ -259,7 +259,6 @@ def obstacle_monitor_stage(
         "frame": None if stop is None else frames[stop],
         "reason": reason,
         "frames": frames,
-        "watched": [int(j) for i, j in pairs if known[i] and known[j]],
     }
     return Bundle({"raised": raised, "where": where}, meta)
 

@@ -40,8 +40,6 @@ class RigFacts(Facts):
     changed: bool
     parameters: NotRequired[list[dict[str, Any]]]
     """Name, value, asked, sigma, unit, observed, freed, why; in mode ``fixed`` what would be changed."""
-    held: NotRequired[list[str]]
-    """Names and reasons."""
     per_pair: NotRequired[list[dict[str, Any]]]
     """Pair, values and sigma by name, degrees, of what is observed."""
     residual_before_px: NotRequired[float]

@@ -12,14 +12,6 @@ class PyramidFacts(Facts):
     noise: float | None
 
 
-class UndistortedFacts(Facts):
-    """``frame`` and ``camera`` of an image, and the ``usable`` share of its pixels."""
-
-    frame: int
-    camera: str
-    usable: float
-
-
 class QualityFacts(Facts):
     """Of each image of a frame: mean, deviation, sharpness, detail and digest."""
 

@@ -28,7 +28,6 @@ class PathFacts(Facts):
     frame: str
     length_m: float | None
     climb_m: float | None
-    caution_share: float | None
     max_inclination: float | None
     """rad"""
     max_tilt: float | None
@@ -66,4 +65,3 @@ class StopFacts(Facts):
     reason: str
     kind: NotRequired[str]
     frames: NotRequired[list[int]]
-    watched: NotRequired[list[int]]

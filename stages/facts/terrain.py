@@ -55,8 +55,6 @@ class DemFacts(Facts):
     """Angle of a pixel, rad."""
     defined: NotRequired[float]
     """Share of the cells."""
-    median_residual: NotRequired[float | None]
-    """px"""
     median_elevation_std: NotRequired[float | None]
     """m"""
     coverage: NotRequired[Json]
@@ -77,11 +75,10 @@ class MergeFacts(Facts):
 
 
 class BoundsFacts(Facts):
-    """``shares`` of the cells that are unknown, and that are bounded although not seen."""
+    """Bounds of the height of the ground."""
 
     lattice: Json
     frame: str
-    shares: dict[str, float]
 
 
 class OverlapFacts(Facts):
@@ -100,9 +97,8 @@ class AuditFacts(Facts):
 
 
 class RadiometryFacts(Facts):
-    """Whole ``steps`` of log-exposure ``step`` that each model's grey values are raised by, from ``seams`` ratios."""
+    """Whole ``steps`` of log-exposure that each model's grey values are raised by, from ``seams`` ratios."""
 
-    step: float
     steps: dict[str, int]
     seams: int
 

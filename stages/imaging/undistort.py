@@ -16,7 +16,6 @@ from numba import njit
 from rille.stages.core.arrays import Bytes, Floats, Floats32
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
-from rille.stages.facts.imaging import UndistortedFacts
 from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import Lens
 from rille.stages.imaging.pyramid import grey
@@ -128,19 +127,14 @@ def _resample(image, usable, maps, table, out, out_valid):  # type: ignore[no-un
 )
 def undistort_stage(
     params: NoParams, image: Bundle, *, lens: Lens, camera: Camera, frame: int, camera_name: str
-) -> Bundle[UndistortedFacts]:
+) -> Bundle:
     """One image with its lens distortion removed."""
     try:
         ideal, valid = undistort(image["image"], lens, camera, image["valid"])
     except InputError as error:
         raise error.at(f"frame {frame}, {camera_name} camera") from error
-    meta: UndistortedFacts = {
-        "frame": frame,
-        "camera": camera_name,
-        "usable": float(np.count_nonzero(valid) / valid.size),
-    }
     arrays: dict[str, AnyArray] = {"image": ideal, "valid": valid}
     if "colour" in image.arrays:
         bands = [undistort(band, lens, camera)[0] for band in np.moveaxis(image["colour"], 2, 0)]
         arrays["colour"] = np.rint(np.stack(bands, axis=2)).astype(np.uint8)
-    return Bundle(arrays, meta)
+    return Bundle(arrays, {})

@@ -36,12 +36,6 @@ def huber_weight(size, bound):  # type: ignore[no-untyped-def]
     return bound / np.maximum(size, bound)
 
 
-@register_jitable
-def huber_cost(size, bound):  # type: ignore[no-untyped-def]
-    """Huber's cost of one residual of absolute value ``size``: a parabola, beyond ``bound`` its tangent."""
-    return 0.5 * size * size if size <= bound else bound * size - 0.5 * bound * bound
-
-
 def cauchy(residual: NDArray, spread: float) -> NDArray:
     """Cauchy's weights of residuals: a half at ``spread``."""
     return 1.0 / (1.0 + (residual / spread) ** 2)

@@ -19,7 +19,6 @@ from rille.stages.planning.wheels import wheel_positions
 
 STRAIGHT, RIGHT, ACROSS, LEFT = 1, 2, 4, 8
 """Bits of the directions: along columns; to row 0 and greater columns; along rows; to row 0 and smaller columns."""
-ALL_DIRECTIONS = STRAIGHT | RIGHT | ACROSS | LEFT
 DIRECTED_STEPS = ((STRAIGHT, -1, 0), (RIGHT, -1, 1), (ACROSS, 0, 1), (LEFT, -1, -1))
 """Bit, row and column of one step in each direction."""
 ROUNDING_CELLS = 1e-9

@@ -11,7 +11,7 @@ import numpy as np
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.measures import MEASURES
-from rille.stages.hazard.risk import CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
+from rille.stages.hazard.risk import DOUBT_BIT, HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.path_ground import Maps
 from rille.stages.planning.row_graph import Ints
@@ -80,7 +80,7 @@ def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> di
         "ended_by": route.ended_by,
     }
     if len(xyz) == 0:
-        others = ("length_m", "climb_m", "caution_share", "start", "target", "left_out_m")
+        others = ("length_m", "climb_m", "start", "target", "left_out_m")
         return meta | dict.fromkeys((*WORST, *others))
     at = tuple(route.cells.T)
     steps, ends = np.diff(xyz, axis=0), route.cells[[0, -1], 0]
@@ -91,7 +91,6 @@ def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> di
         | {
             "length_m": float(np.sqrt((steps**2).sum(axis=1)).sum()),
             "climb_m": float(np.maximum(steps[:, 2], 0.0).sum()),
-            "caution_share": float((maps["risk"][at] == CAUTION).mean()),
             # Rows with known ground before the start and beyond the target.
             "left_out_m": [float(rows) * lattice.cell for rows in (route.span[1] - ends[0], ends[1] - route.span[0])],
             "start": [float(v) for v in xyz[0]],

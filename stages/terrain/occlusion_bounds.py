@@ -122,7 +122,5 @@ def occlusion_bounds_stage(
         highest = ceiling(seen + k * std, own, centre)[own.window(part)]
         here = lattice.window(part)
         least[here] = np.fmin(least[here], highest)
-    bounds, unknown = Bounds.of(z, k * s, least), np.isnan(z)
-    shares = {"unknown": float(unknown.mean()), "bounded": float((unknown & np.isfinite(least)).mean())}
-    meta: BoundsFacts = {"lattice": lattice.to_dict(), "frame": "world", "shares": shares}
-    return Bundle({"upper": bounds.upper, "lower": bounds.lower}, meta)
+    bounds = Bounds.of(z, k * s, least)
+    return Bundle({"upper": bounds.upper, "lower": bounds.lower}, {"lattice": lattice.to_dict(), "frame": "world"})

@@ -71,4 +71,4 @@ def radiometry_stage(
     ]
     steps = level({int(pair): centre for pair, centre in centres.items()}, ratios)
     steps_by_pair = {str(pair): n for pair, n in sorted(steps.items())}
-    return Bundle({}, {"step": LOG_GAIN_STEP, "steps": steps_by_pair, "seams": len(ratios)})
+    return Bundle({}, {"steps": steps_by_pair, "seams": len(ratios)})

@@ -363,7 +363,6 @@ def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: i
         "T_frame_left": T.to_list(),
         "pixel_rad": 1.0 / coarser_focal(rig),
         "defined": float(np.mean(np.isfinite(dem.elevation))),
-        "median_residual": _median(dem.residual),
         "median_elevation_std": _median(dem.elevation_std),
     }
     if level["source"] == REFERENCE_PLANE:

@@ -66,7 +66,7 @@ def test_a_sound_rig_stays_to_the_bit_and_nothing_is_warned_of():
     assert found["rig"] == found["given"] == rig.to_dict()
     assert (found["changed"], found["source"], found["warnings"]) == (False, "given calibration", [])
     assert found["residual_before_px"] == found["residual_after_px"] == pytest.approx(0.2, rel=0.1)
-    assert len(found["held"]) == 5
+    assert not any(p["freed"] for p in found["parameters"])
 
 
 def test_a_knock_is_repaired_and_told():
@@ -81,7 +81,7 @@ def test_a_knock_is_repaired_and_told():
     assert "contradicts the images" in first
     assert "0.30 degrees clockwise" in first
     assert "held: yaw" in second
-    assert found["held"][0].startswith("yaw: not observed")
+    assert found["parameters"][1]["why"].startswith("not observed")
 
 
 def test_mode_fixed_only_tells():

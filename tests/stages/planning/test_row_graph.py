@@ -11,8 +11,10 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from rille.stages.planning.configuration_space import ALL_DIRECTIONS, LEFT, RIGHT, STRAIGHT
+from rille.stages.planning.configuration_space import ACROSS, LEFT, RIGHT, STRAIGHT
 from rille.stages.planning.row_graph import NEIGHBOURS, STEPS_AHEAD, UNREACHED, GridCosts, sweep, trace
+
+ALL_DIRECTIONS = STRAIGHT | RIGHT | ACROSS | LEFT
 
 
 def terrain(height: np.ndarray, ways: np.ndarray, sideways: int = 0, toll: np.ndarray | int = 0) -> GridCosts:

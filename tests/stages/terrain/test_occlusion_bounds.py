@@ -131,5 +131,5 @@ def test_no_line_is_drawn_to_what_was_seen_too_coarsely() -> None:
     _, seen = wall()
     coarse = run(OcclusionBoundsParams(max_footprint=0.003), model(seen))
     assert np.isnan(np.asarray(coarse["upper"])[np.isnan(seen)]).all()
-    assert coarse.meta["shares"]["bounded"] == 0.0
-    assert run(OcclusionBoundsParams(max_footprint=0.1), model(seen)).meta["shares"]["bounded"] > 0.01
+    fine = run(OcclusionBoundsParams(max_footprint=0.1), model(seen))
+    assert np.isfinite(np.asarray(fine["upper"])[np.isnan(seen)]).mean() > 0.01
