@@ -20,8 +20,6 @@ from unittest.mock import patch
 from driving.beds import NOMINAL, choose_goal, config_of, prepared
 
 ALL = "all ideas"
-PARAMETERS = {"cost of doubtful ground": "local_planner.uncertainty_cost=1"}
-"""Ideas that a parameter switches off."""
 
 
 def replacements() -> dict[str, tuple[Any, str, Any]]:
@@ -44,7 +42,8 @@ def replacements() -> dict[str, tuple[Any, str, Any]]:
         "cost beside hazards": (ground, "PROXIMITY_COST", 0.0),
         "cost of unseen spots narrower than a wheel": (clearance, "_opened", lambda mask, *_: mask),
         "cost of caution and doubted ground": (ground, "CAUTION_COST", 1e-9),
-        "lower cost of ground seen from afar": (ground, "FAR_COST", float("inf")),
+        "lower cost of ground seen from afar": (ground, "FAR_COST", ground.UNKNOWN_COST),
+        "cost of doubtful ground": (ground, "LIKELY_COST", ground.UNKNOWN_COST),
     }
 
 
@@ -63,7 +62,7 @@ def drive(seed: int, cover: float, idea: str) -> dict[str, Any]:
     from driving.exact_bed import ExactBed
 
     settings = [f"mockup.seed={seed}", f"rover.seed={seed}", f"mockup.rock_cover={cover}"]
-    sequence, layers = prepared([*settings, *([PARAMETERS[idea]] if idea in PARAMETERS else [])])
+    sequence, layers = prepared(settings)
     config = config_of(layers)
     goal = choose_goal(ExactBed.of(sequence, config, NOMINAL), config)
     if goal is None:
@@ -94,7 +93,7 @@ def main() -> None:
 
     given = arguments()
     prepare_environment()
-    ideas = [ALL, *(given.idea or [*replacements(), *PARAMETERS])]
+    ideas = [ALL, *(given.idea or replacements())]
     rows = [json.loads(line) for line in given.out.read_text().splitlines()] if given.out.exists() else []
     done = {(r["seed"], r["cover"], r["idea"]) for r in rows}
     first, end = (int(v) for v in given.seeds.split(":"))

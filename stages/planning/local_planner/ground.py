@@ -22,8 +22,15 @@ from rille.stages.planning.local_planner.state_lattice import LatticeGraph, Pose
 
 Point = tuple[float, float]
 
+SPACING_WHEELS = 0.25
+"""Of the lattice of poses, wheel diameters."""
+# Costs are factors of a metre's cost; a metre over known, free ground costs 1.
+UNKNOWN_COST = 2.0
 FAR_COST = 1.3
 """Cost of a metre over ground seen from afar alone; it seldom changes when seen from near."""
+LIKELY_COST = 4.0
+"""Cost of a metre over ground with a likely hazard, or with unseen spots narrower than a wheel, which are shadows of
+stones; both mostly remain when seen from near."""
 CAUTION_COST = 0.2
 """Added to the cost of a metre where all wheels are on caution ground."""
 DOUBT_WEIGHT = 60
@@ -43,6 +50,8 @@ class Ground:
 
     turn_cost = 0.3
     """Cost of a turn on the spot, wheelbases of free ground per radian."""
+    reverse_cost = 3.0
+    """Cost of a metre driven backwards, where no camera looks."""
 
     def __init__(
         self, footing: Footing, start: Point, heading: float, p: LocalPlannerParams, closed: Sequence[Point] = ()
@@ -54,7 +63,7 @@ class Ground:
         closed : middles [m] of circles in which unknown ground counts as closed.
         """
         self.footing, self.start, self.heading, self.p, self.closed = footing, start, heading, p, tuple(closed)
-        self.vehicle, self.cell, self.reverse_cost = footing.vehicle, footing.lattice.cell, p.reverse_cost
+        self.vehicle, self.cell = footing.vehicle, footing.lattice.cell
         here = footing.gaps(*(np.array([v]) for v in (*start, heading)))
         # A vehicle that slipped into a margin may leave it: near its place, ground that is no worse by more than a cell
         # is accepted.
@@ -64,7 +73,7 @@ class Ground:
         ]
         # Rounded to cells, places less than half a cell apart may be a diagonal apart.
         self.unknown_here = min(0.0, float(here.unknown[0]) - 1.5 * self.cell)
-        spacing = max(p.spacing * self.vehicle.wheel_diameter, self.cell)
+        spacing = max(SPACING_WHEELS * self.vehicle.wheel_diameter, self.cell)
         self.grid = PoseGrid.over(footing.lattice, start, heading, spacing)
         self.graph = LatticeGraph.of(footing, self.grid, self._price)
 
@@ -92,17 +101,17 @@ class Ground:
     def _price(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Bools, Floats]:
         """Poses that may be driven, and the price of a metre, infinite where none may be planned."""
         known, opened = self._split(gaps, x, y, slack)
-        unknown = np.full(x.shape, self.p.unknown_cost)
+        unknown = np.full(x.shape, UNKNOWN_COST)
         if self.footing.glanced is not None:
-            unknown[self._on(self.footing.glanced, x, y)] = min(FAR_COST, self.p.unknown_cost)
+            unknown[self._on(self.footing.glanced, x, y)] = FAR_COST
         # Likely hazards, and gaps narrower than a wheel, which are the shadows of stones, remain when seen from nearer.
         stays = (gaps.gap <= self.vehicle.margin) | ((gaps.unknown <= 0) & (gaps.frontier > 0))
-        unknown = np.where(stays, np.maximum(self.p.uncertainty_cost, unknown), unknown)
+        unknown = np.where(stays, LIKELY_COST, unknown)
         # Of the five parts that stand on ground: the wheels and the middle.
         caution = CAUTION_COST * ((gaps.caution + DOUBT_WEIGHT * gaps.doubted) / 5)
         # Far doubts cost no more than unknown ground.
         fades = (self._away(x, y) > NEAR_WHEELBASES) & ~stays
-        caution = np.where(fades, np.minimum(caution, self.p.unknown_cost - 1.0), caution)
+        caution = np.where(fades, np.minimum(caution, UNKNOWN_COST - 1.0), caution)
         price = np.where(known, 1.0, unknown) + caution
         if self.vehicle.margin > 0:
             # From the edge of hazards by sigma alone, as they have no margin.
@@ -201,10 +210,7 @@ class Ground:
 class KnownFreeGround(Ground):
     """Known ground alone, at no price but its length, whatever the direction."""
 
-    turn_cost = 0.0
-
-    def __init__(self, footing: Footing, start: Point, heading: float, p: LocalPlannerParams) -> None:
-        super().__init__(footing, start, heading, p.model_copy(update={"reverse_cost": 1.0}))
+    turn_cost, reverse_cost = 0.0, 1.0
 
     def _price(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Bools, Floats]:
         known, _ = self._split(gaps, x, y, slack)

@@ -1,7 +1,4 @@
-"""Parameters of the stage ``local_planner``: length of a leg, limits of probability, and costs of ground.
-
-Costs are factors of a metre's cost; a metre over known, free ground costs 1.
-"""
+"""Parameters of the stage ``local_planner``: length of a leg, and limits of probability."""
 
 from __future__ import annotations
 
@@ -9,6 +6,8 @@ from pydantic import Field
 
 from rille.stages.core.declare import Params
 
+TOLERANCE_WHEELBASES = 0.3
+"""Distance from the goal at which it is reached."""
 MIN_LEG_WHEELBASES = 0.3
 """Length of the shortest leg; where none is longer, the rover looks elsewhere first."""
 
@@ -40,20 +39,4 @@ class LocalPlannerParams(Params):
         description="probability of a hazard up to which ground may be driven on that only its standard deviation "
         "makes hazardous; 0: never, then few paths among rocks are found. The vehicle's limits are about half of those "
         "at which it tips over",
-    )
-    unknown_cost: float = Field(2.0, ge=1, description="cost of a metre over unknown ground")
-    uncertainty_cost: float = Field(
-        4.0,
-        ge=1,
-        description="cost of a metre over ground with a likely hazard, or with unseen spots narrower than a wheel, "
-        "which are shadows of stones; both mostly remain when seen from near",
-    )
-    reverse_cost: float = Field(3.0, ge=1, description="cost of a metre driven backwards, where no camera looks")
-    replan_hysteresis: float = Field(
-        0.15, ge=0, description="share of its cost by which a new path must be cheaper to replace the present one"
-    )
-    spacing: float = Field(0.25, gt=0, le=1, description="spacing of the lattice of poses [wheel diameters]")
-    tolerance: float = Field(0.3, gt=0, description="distance from the goal [wheelbases] at which it is reached")
-    max_looks: int = Field(
-        3, ge=1, description="views taken from one place without a leg, after which the unknown ground ahead is closed"
     )

@@ -35,7 +35,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.planning.local_planner.clearance import Footing
 from rille.stages.planning.local_planner.ground import Ground, KnownFreeGround
 from rille.stages.planning.local_planner.look import AHEAD, FieldOfView, PlannerMemory, Stand, Target
-from rille.stages.planning.local_planner.params import MIN_LEG_WHEELBASES, LocalPlannerParams
+from rille.stages.planning.local_planner.params import MIN_LEG_WHEELBASES, TOLERANCE_WHEELBASES, LocalPlannerParams
 from rille.stages.planning.local_planner.route import (
     Piece,
     first_metres,
@@ -52,6 +52,10 @@ Point = tuple[float, float]
 Before = tuple[Floats, NDArray[np.int8]]
 """Rest of a way: vertices (vertex, 2), m, and how it is driven (piece,), 1 ahead, -1 back."""
 
+MAX_LOOKS = 3
+"""Views taken from one place without a leg, after which the unknown ground ahead is closed."""
+MIN_GAIN_SHARE = 0.15
+"""Of its cost, by which a new path must be cheaper to replace the present one."""
 MAX_LOOK_TURN = math.radians(120.0)
 """Largest turn that is tried to see the way from one place; one beyond the bound of a leg is made in several legs."""
 LOOK_TURN = math.radians(25.0)
@@ -98,7 +102,7 @@ def plan_leg(
     goal : m.
     memory : earlier looks of the vehicle; None: none.
     before : rest of the path planned at the last stop: (vertex, 2) m, (piece,) gear. It is kept unless another one is
-        cheaper by ``replan_hysteresis``; None: there is none.
+        cheaper by :data:`MIN_GAIN_SHARE`; None: there is none.
     view : the ground that the cameras of the vehicle see.
 
     Raises
@@ -111,26 +115,26 @@ def plan_leg(
         _check(footing.lattice, name, point)
     base = footing.vehicle.wheel_base
     left = math.hypot(goal[0] - start[0], goal[1] - start[1])
-    if left <= params.tolerance * base:
+    if left <= TOLERANCE_WHEELBASES * base:
         return _stay("goal", f"{1000 * left:.0f} mm from the goal", start, [])
     ground = Ground(footing, start, heading, params, memory.closed)
     # Half of the tolerance, so that a vehicle that ends a little beside its place has reached the goal nevertheless.
-    goals, cost, move = ground.search(goal, 0.5 * params.tolerance * base)
+    goals, cost, move = ground.search(goal, 0.5 * TOLERANCE_WHEELBASES * base)
     kept, least, price = list[Piece](), ground.from_start(cost), math.inf
     if before is not None:
         kept, price = ground.again(_onward(before, start, heading, ground.grid.spacing))
     if not np.isfinite(min(least, price)):
         why = _why_closed(ground, goals, cost)
-        turn = 0.0 if memory.looks >= params.max_looks else _free_turn(ground, memory.looks)
+        turn = 0.0 if memory.looks >= MAX_LOOKS else _free_turn(ground, memory.looks)
         if turn:
             return _stay("look", f"{why}: looks around", start, [], turn=turn)
         return _stay("no path", why, start, [])
     # Without this the cheaper of two ways round a stone may change at each stop, and the vehicle goes to and fro.
-    way = kept if kept and price <= (1.0 + params.replan_hysteresis) * least else ground.way(move)
+    way = kept if kept and price <= (1.0 + MIN_GAIN_SHARE) * least else ground.way(move)
     plan = _straight(ground, way)
     known = _known_pieces(plan)
     target = Target.of(ground, plan, known, view) if known < len(plan) else None
-    return _Plan(ground, way, plan, target, can_look=memory.looks < params.max_looks).leg()
+    return _Plan(ground, way, plan, target, can_look=memory.looks < MAX_LOOKS).leg()
 
 
 @dataclass(frozen=True)
@@ -242,7 +246,7 @@ def shortest(footing: Footing, stand: Stand, goal: Point, params: LocalPlannerPa
     """Length, m, of the shortest way over known ground, at no price but its length; None: none."""
     start, heading = (stand[0], stand[1]), stand[2]
     ground = KnownFreeGround(footing, start, heading, params)
-    _, cost, move = ground.search(goal, 0.5 * params.tolerance * footing.vehicle.wheel_base)
+    _, cost, move = ground.search(goal, 0.5 * TOLERANCE_WHEELBASES * footing.vehicle.wheel_base)
     if not np.isfinite(ground.from_start(cost)):
         return None
     return length_of(straightened(ground.way(move), heading, ground.clear, ground.cell))

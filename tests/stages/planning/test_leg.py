@@ -14,17 +14,19 @@ from raising import raises
 
 from rille.stages.core.declare import Bundle
 from rille.stages.hazard.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
+from rille.stages.planning.local_planner import ground as ground_rules
+from rille.stages.planning.local_planner import policy
 from rille.stages.planning.local_planner.clearance import Footing, Hazards
 from rille.stages.planning.local_planner.ground import CLOSED_WHEELBASES, FAR_COST, Ground
 from rille.stages.planning.local_planner.look import AHEAD as ANYWHERE
 from rille.stages.planning.local_planner.look import FieldOfView, PlannerMemory, Stand
-from rille.stages.planning.local_planner.params import MIN_LEG_WHEELBASES, LocalPlannerParams
-from rille.stages.planning.local_planner.policy import Leg, plan_leg, shortest
+from rille.stages.planning.local_planner.params import MIN_LEG_WHEELBASES
+from rille.stages.planning.local_planner.policy import MAX_LOOKS, Leg, plan_leg, shortest
 from rille.stages.planning.local_planner.route import length_of, through
 from rille.stages.planning.local_planner.stage import SeenGround, next_leg, seen_so_far, shortest_way
 from rille.stages.terrain.occlusion_bounds import Bounds
 
-TIRED = PlannerMemory(looks=P.max_looks)
+TIRED = PlannerMemory(looks=MAX_LOOKS)
 """Of a vehicle that has looked as often as it may."""
 
 
@@ -140,7 +142,7 @@ def test_it_closes_what_stays_unknown_in_view_and_goes_another_way() -> None:
     risk = ground(((np.abs(Y - 0.15) < 0.07) & (X < 0.1), UNKNOWN))
     start, goal = (-0.3, 0.0, 0.0), (-0.3, 0.8)
     places: list[tuple[float, float]] = []
-    while (leg := plan_leg(risk, start, goal, P, PlannerMemory(P.max_looks, places))).where is not None:
+    while (leg := plan_leg(risk, start, goal, P, PlannerMemory(MAX_LOOKS, places))).where is not None:
         places.append(leg.where)
         assert len(places) < 12
     assert leg.verdict in ("turn", "drive")
@@ -230,11 +232,12 @@ def test_of_a_kept_way_it_drives_what_is_known() -> None:
     assert 0.0 <= closed.where[1] - leg.path[-1, 1] < LATTICE.cell + 1e-9
 
 
-def test_a_kept_way_is_not_given_up_for_rounding() -> None:
+def test_a_kept_way_is_not_given_up_for_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(policy, "MIN_GAIN_SHARE", 5.0)
     beside = ground((X > 0.045, HAZARDOUS))  # the right wheels of a way straight ahead lack a part of the margin
-    straight, even = np.array([START, GOAL]), P.model_copy(update={"replan_hysteresis": 5.0})
+    straight = np.array([START, GOAL])
     for closed in ([], [(0.0, 0.25)]):
-        leg = plan_leg(beside, AT, GOAL, even, PlannerMemory(closed=closed), before=(straight, AHEAD[:1]))
+        leg = plan_leg(beside, AT, GOAL, P, PlannerMemory(closed=closed), before=(straight, AHEAD[:1]))
         assert leg.verdict == "drive"
         assert leg.path == pytest.approx(np.array([START, (0.0, P.max_length * ROVER.wheel_base)]))
     # but never onto what is hazardous by sigma alone
@@ -329,22 +332,24 @@ def test_at_the_rim_of_what_is_near_only_what_is_clearly_free_from_afar_counts(c
     assert not known.unknown.any()
 
 
-def test_ground_seen_from_afar_alone_is_planned_over_rather_than_unseen_one_and_never_driven() -> None:
+def test_ground_seen_from_afar_alone_is_planned_over_rather_than_unseen_one_and_never_driven(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     unknown = Y > 0.15
     glanced = unknown & (np.abs(X - 0.25) < 0.1)
     free = np.full(LATTICE.shape, SAFE, np.uint8)
 
-    def planned(risk: np.ndarray, p: LocalPlannerParams = P) -> Leg:
+    def planned(risk: np.ndarray) -> Leg:
         footing = Footing.of(Hazards(risk, unknown=unknown, glanced=glanced), LATTICE, ROVER)
-        return plan_leg(footing, AT, GOAL, p)
+        return plan_leg(footing, AT, GOAL, P)
 
     leg = planned(free)
     assert leg.path[-1, 1] + 0.5 * ROVER.wheel_base <= 0.155 - ROVER.margin
     assert leg.way[:, 0].max() > 0.15
-    dear = P.model_copy(update={"unknown_cost": FAR_COST})
-    assert planned(free, dear).way[:, 0].max() < 0.05
     wall = np.where(glanced & (np.abs(Y - 0.5) < 0.02), np.uint8(HAZARDOUS), free)
     assert planned(wall).way[:, 0].max() < 0.15
+    monkeypatch.setattr(ground_rules, "UNKNOWN_COST", FAR_COST)
+    assert planned(free).way[:, 0].max() < 0.05
 
 
 def test_standing_beside_unknown_ground_it_may_leave_but_not_go_nearer() -> None:
