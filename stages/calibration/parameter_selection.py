@@ -65,6 +65,14 @@ SYSTEMATIC_PX = 0.1
 model and rectification."""
 
 
+MAX_DEPTH_ERROR = 0.03
+"""Largest relative depth error that the uncertainty of an observed parameter may cause; a wrong toe-in of a parallel
+rig causes 0.1 and more, of a convergent rig 0.01 to 0.02."""
+
+MIN_DEPTH_CHANGE = 0.005
+"""Relative change of depth from which on a correction is applied, as by ``least_rows``."""
+
+
 class RelativeParams(Params):
     """When a parameter of the rig may depart from the calibration."""
 
@@ -74,20 +82,11 @@ class RelativeParams(Params):
         description="standard deviations, systematic errors included, by which the images must contradict a "
         "calibrated value to change it",
     )
-    max_depth_error: float = Field(
-        0.03,
-        gt=0,
-        description="largest relative depth error that the uncertainty of an observed parameter may cause; a wrong "
-        "toe-in of a parallel rig causes 0.1 and more, of a convergent rig 0.01 to 0.02",
-    )
     least_rows: float = Field(
         0.4,
         ge=0,
         description="change of row offsets [pixels RMS] from which on a correction is applied; KITTI's calibration is"
         " good to 0.4",
-    )
-    least_depth: float = Field(
-        0.005, ge=0, description="relative change of depth from which on a correction is applied, too"
     )
     prior_principal: float = Field(
         0.005,
@@ -212,7 +211,7 @@ class _Chooser:
         rows = float(np.max(np.abs(correction) * self.rows))
         depth = math.sqrt(float(correction @ self.depth @ correction))
         # Points beyond infinity prove that depth is wrong, so a correction of any size counts.
-        return self.impossible or rows >= self.params.least_rows or depth >= self.params.least_depth
+        return self.impossible or rows >= self.params.least_rows or depth >= MIN_DEPTH_CHANGE
 
     def _add(self, chosen: list[int], group: Sequence[int]) -> None:
         """Take up what the images change most, one after the other."""
@@ -263,7 +262,7 @@ class _Chooser:
         rows, depth = abs(value) * self.rows[i], abs(value) * math.sqrt(float(self.depth[i, i]))
         found = f"{math.degrees(value):+.3f} +- {math.degrees(sigma):.3f} degrees"
         error = self._depth_error(i, chosen)
-        if error > p.max_depth_error and not self._infinity(i, chosen):
+        if error > MAX_DEPTH_ERROR and not self._infinity(i, chosen):
             off = self.priors.principal[dict(PARTNERS).get(i, 0)]
             return (
                 f"not observed: a principal point that is {off:.1f} px off looks like it, so that "
@@ -277,7 +276,7 @@ class _Chooser:
                 f"likelier a principal point that is off, with the right depth, for no other angle departs: the images "
                 f"say {found}, which is {100 * depth:.1f} % of depth"
             )
-        if rows < p.least_rows and depth < p.least_depth:
+        if rows < p.least_rows and depth < MIN_DEPTH_CHANGE:
             return f"not worth it: the images say {found}, which moves rows by {rows:.2f} px, depth by {depth:.2%}"
         return None
 
@@ -289,7 +288,7 @@ class _Chooser:
 
     def _parameter(self, i: int, chosen: list[int], fit: OrientationFit) -> Parameter:
         others = [k for k in chosen if k != i]
-        observed = self._depth_error(i, others) <= self.params.max_depth_error or i in chosen
+        observed = self._depth_error(i, others) <= MAX_DEPTH_ERROR or i in chosen
         if i not in chosen:
             value, sigma = self._estimate(i, chosen)
             why = self._refusal(i, chosen) or "not worth it: with the others it moves rows and depth by too little"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -125,7 +125,7 @@ def calibrate_rig(
     _enough(views)
     task = Adjustment(board, tuple(views), sizes, model)
     # A bounded loss sees no way from far off, and a fisheye's start is some pixels off.
-    x = task.solve(task.solve(task.start()) if model == "fisheye" else task.start(), robust=True)
+    x = replace(task, robust=True).solve(task.solve(task.start()) if model == "fisheye" else task.start())
     first = task.residuals(x)
     # Half a pixel at least: where all views fit to a tenth, four tenths are still a good view.
     limit = max(BAD_PX, BAD_RATIO * float(np.median([r.worst for r in first])))
@@ -179,6 +179,8 @@ class Adjustment:
     views: tuple[BoardView, ...]
     sizes: Sizes
     model: str
+    robust: bool = False
+    """Cauchy's loss, which bounds what a view can do; else least squares."""
 
     @property
     def lens(self) -> int:
@@ -268,15 +270,30 @@ class Adjustment:
             by_lens, by_pose = j[:, 6 : 10 + d.size], j[:, :6]
         return points.reshape(-1) - found.reshape(-1), by_lens, by_pose
 
-    def solve(self, x: Floats, *, robust: bool = False) -> Floats:
-        """Least squares from ``x``; robust: Cauchy's loss, which bounds what a view can do.
+    def normal(self, x: Floats) -> _Normal:
+        """Normal equations."""
+        residual, jacobian = self.evaluate(x)
+        # Of each corner, over the distance beyond which it loses weight.
+        squares = (residual.reshape(-1, 2) ** 2).sum(1) / CORNER_SCALE**2
+        weight = np.repeat(1.0 / (1.0 + squares), 2) if self.robust else np.ones(residual.size)
+        weighted = (jacobian * weight[:, None]).T
+        cost = CORNER_SCALE**2 * float((np.log1p(squares) if self.robust else squares).sum())
+        return _Normal(weighted @ jacobian, weighted @ residual, cost if math.isfinite(cost) else math.inf)
+
+    def ahead(self, x: Floats, normal: _Normal, damping: float) -> Floats:
+        """The unknowns one damped step on."""
+        damped = normal.matrix + damping * np.diag(np.diag(normal.matrix))
+        return x + np.linalg.lstsq(damped, -normal.gradient, rcond=None)[0]
+
+    def solve(self, x: Floats) -> Floats:
+        """The unknowns of least cost, from ``x`` on.
 
         Raises
         ------
         DegenerateError
             The adjustment diverges.
         """
-        x = levenberg_marquardt(_Corners(self, robust), x, MAX_STEPS, SETTLED).state
+        x = levenberg_marquardt(self, x, MAX_STEPS, SETTLED).state
         if not (np.isfinite(x).all() and min(x[0], x[1], x[self.lens], x[self.lens + 1]) > 0):
             raise DegenerateError("RIL-312", "the adjustment of the cameras diverges", remedy=MORE_VIEWS)
         return x
@@ -347,33 +364,6 @@ class _Normal(NamedTuple):
     matrix: Floats
     gradient: Floats
     cost: float
-
-
-@dataclass(frozen=True)
-class _Corners:
-    """The corners of an adjustment as a problem of least squares."""
-
-    of: Adjustment
-    robust: bool
-
-    def normal(self, x: Floats) -> _Normal:
-        """Normal equations, by Cauchy's weights or plain."""
-        residual, jacobian = self.of.evaluate(x)
-        squares = _squares(residual)
-        weight = np.repeat(1.0 / (1.0 + squares), 2) if self.robust else np.ones(residual.size)
-        weighted = (jacobian * weight[:, None]).T
-        cost = CORNER_SCALE**2 * float((np.log1p(squares) if self.robust else squares).sum())
-        return _Normal(weighted @ jacobian, weighted @ residual, cost if math.isfinite(cost) else math.inf)
-
-    def ahead(self, x: Floats, normal: _Normal, damping: float) -> Floats:
-        """The unknowns one damped step on."""
-        damped = normal.matrix + damping * np.diag(np.diag(normal.matrix))
-        return x + np.linalg.lstsq(damped, -normal.gradient, rcond=None)[0]
-
-
-def _squares(residual: Floats) -> Floats:
-    """Squared distance of each corner, over that beyond which it loses weight."""
-    return np.asarray((residual.reshape(-1, 2) ** 2).sum(1) / CORNER_SCALE**2)
 
 
 def _flat_pose(board: Floats, angles: Floats) -> tuple[float, RigidTransform]:

@@ -59,15 +59,8 @@ class HeightGrid:
 
     def at(self, what: Floats, points: Floats) -> Floats:
         """Bilinear values (n,) of one of the arrays at points (n, 2); NaN outside or beside unknown nodes."""
-        row, col = (self.y0 - points[:, 1]) / self.cell, (points[:, 0] - self.x0) / self.cell
-        rows, cols = what.shape
-        inside = (row >= 0) & (col >= 0) & (row <= rows - 1) & (col <= cols - 1)
-        r = np.clip(np.floor(np.where(inside, row, 0.0)).astype(np.intp), 0, rows - 2)
-        c = np.clip(np.floor(np.where(inside, col, 0.0)).astype(np.intp), 0, cols - 2)
-        u, v = row - r, col - c
-        top = (1 - v) * what[r, c] + v * what[r, c + 1]
-        foot = (1 - v) * what[r + 1, c] + v * what[r + 1, c + 1]
-        return np.where(inside, (1 - u) * top + u * foot, np.nan)
+        index = (self.y0 - points[:, 1]) / self.cell, (points[:, 0] - self.x0) / self.cell
+        return np.asarray(scipy.ndimage.map_coordinates(what, index, order=1, cval=np.nan))
 
 
 def highest(z: Floats, reach: float) -> Floats:

@@ -56,11 +56,11 @@ def test_toe_in_of_a_street_is_held_even_where_it_is_wrong():
     assert math.degrees(decision.parameters[1].asked) == pytest.approx(0.5, abs=0.1)
 
 
-def test_an_angle_that_departs_alone_is_likelier_a_principal_point_and_with_others_a_knock():
+def test_an_angle_that_departs_alone_is_likelier_a_principal_point_and_with_others_a_knock(monkeypatch):
     rig = street_rig()
-    anyhow = PARAMS.model_copy(update={"max_depth_error": 1.0})
+    monkeypatch.setattr(parameter_selection, "MAX_DEPTH_ERROR", 1.0)
     alone, both = (
-        decide(rig, [matches(knocked(rig, yaw_deg=0.3, roll_deg=roll), street_depth, pair=k) for k in range(3)], anyhow)
+        decide(rig, [matches(knocked(rig, yaw_deg=0.3, roll_deg=roll), street_depth, pair=k) for k in range(3)], PARAMS)
         for roll in (0.0, 0.3)
     )
     assert not alone.changed
@@ -180,7 +180,7 @@ def test_what_is_small_is_left():
     decision = decide(rig, [matches(knocked(rig, pitch_deg=0.015), street_depth, pair=k) for k in range(2)], PARAMS)
     assert not decision.changed
     assert "not worth it" in decision.parameters[0].why
-    eager = RelativeParams(least_rows=0.0, least_depth=0.0)
+    eager = RelativeParams(least_rows=0.0)
     assert "pitch" in freed(
         decide(rig, [matches(knocked(rig, pitch_deg=0.015), street_depth, pair=k) for k in range(3)], eager)
     )
