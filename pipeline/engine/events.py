@@ -6,8 +6,9 @@ Each line is written as soon as the outcome is known, so a killed run leaves the
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from rille.pipeline.engine.graph import Handle
 from rille.pipeline.engine.spec import each
@@ -17,11 +18,11 @@ class Ledger:
     """Writes to a file, or nowhere."""
 
     def __init__(self, path: Path | None) -> None:
-        self._file: TextIO | None = None
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            # Line by line: what a killed run had done by then is in the file.
-            self._file = path.open("w", encoding="utf-8", buffering=1)
+        # Line by line: what a killed run had done by then is in the file.
+        place = path or Path(os.devnull)
+        self._file = place.open("w", encoding="utf-8", buffering=1)
 
     def write(self, handle: Handle) -> None:
         """Write the outcome of a node: sources of its inputs, reason of the cache miss, time and memory."""
@@ -49,13 +50,11 @@ class Ledger:
         self._line({"run": facts})
 
     def _line(self, row: dict[str, Any]) -> None:
-        if self._file is not None:
-            self._file.write(json.dumps(row) + "\n")
+        self._file.write(json.dumps(row) + "\n")
 
     def close(self) -> None:
         """Close the file."""
-        if self._file is not None:
-            self._file.close()
+        self._file.close()
 
 
 def _took(handle: Handle) -> dict[str, Any]:

@@ -39,7 +39,7 @@ KINDS = {
     "other chunk": "mask/c.0.0",
     "directory": "directory",
     "label": "hints/-/keys-.json",
-    "index": "hints/-/index.txt",
+    "index": "index.sqlite",
 }
 """Members of an artifact's file, and what is beside the artifacts."""
 HINTS = ("label", "index")

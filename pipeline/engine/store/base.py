@@ -4,8 +4,9 @@ Files in the cache folder::
 
     artifacts/<stage>/<k>/<key>.zarr.zip    an artifact, one file; <k> are the key's first two digits
     quarantine/<stage>-<key>-<unique>*      a damaged artifact, and the reason, set aside
-    hints/<sequence>/                       of its earlier runs, for explanations, plans and look-ups
-                                            (rille.pipeline.engine.store.index); never a matter of correctness
+    index.sqlite                            what artifacts state (rille.pipeline.engine.store.index)
+    hints/<sequence>/                       of its earlier runs, for explanations and plans; never a matter
+                                            of correctness
     roots/<digest>.json                     folders of runs that use the cache
 
 The file of an artifact (:mod:`rille.pipeline.engine.store.archive`) is its own commit: it is on the disk as a whole
@@ -22,7 +23,6 @@ import json
 import os
 import tempfile
 import time
-import uuid
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -73,7 +73,7 @@ class Store:
 
         ``sequence`` is the name of the sequence that the runs are of.
         """
-        self._index = Index(self.root, self.hints(sequence))
+        self._index = Index(self.root, sequence)
 
     def note(self, refs: Iterable[Ref]) -> None:
         """Enter into the index, at the end of a run, the artifacts that it used. Best effort."""
@@ -201,9 +201,8 @@ class Store:
     def set_aside(self, stage: str, key: str, reason: str) -> bool:
         """Move a damaged artifact out of the way; False: it stays, for the cache may be read-only."""
         try:
-            aside = self.root / "quarantine" / f"{stage}-{key[:16]}-{uuid.uuid4().hex[:8]}"
-            aside.parent.mkdir(parents=True, exist_ok=True)
-            os.rename(self.root / artifact_path(stage, key), aside)
+            path = self.root / artifact_path(stage, key)
+            aside = folder.quarantine(path, self.root, f"{stage}-{key[:16]}")
         except OSError as error:
             return isinstance(error, FileNotFoundError)  # another run has set it aside
         with suppress(OSError):

@@ -6,6 +6,7 @@ import errno
 import os
 import re
 import time
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -66,6 +67,14 @@ def files(root: Path, area: str) -> list[tuple[str, os.stat_result]]:
             with suppress(OSError):  # gone meanwhile
                 listed.append((path.relative_to(root).as_posix(), path.lstat()))
     return sorted(listed)
+
+
+def quarantine(path: Path, root: Path, name: str) -> Path:
+    """Move a file aside; its new path, whose name begins with ``name``."""
+    aside = root / "quarantine" / f"{name}-{uuid.uuid4().hex[:8]}"
+    aside.parent.mkdir(parents=True, exist_ok=True)
+    os.rename(path, aside)
+    return aside
 
 
 def mark(status: os.stat_result) -> str:

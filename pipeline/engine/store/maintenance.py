@@ -91,9 +91,8 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
             if error.errno in CLOSED:  # else somebody else cleared it away
                 refused.append(error)
     if cleared and not dry_run:
-        for grown in store.root.glob(f"hints/*/{index.NAME}"):  # the next run writes it anew
-            with suppress(OSError):
-                grown.unlink()
+        with suppress(OSError):
+            (store.root / index.NAME).unlink()  # it only grows, and the next run writes it anew
     if refused:
         with clear_errors(store.root):
             raise refused[0]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from toys import chain
@@ -35,23 +37,19 @@ def refs(nodes):
     return {label: ref for label, (_, ref) in nodes.items()}
 
 
-def at(cache):
-    """File of the index of a sequence without a name."""
-    return Store(cache).hints("") / index.NAME
-
-
-def lines(cache):
-    return at(cache).read_text().split("\n")
+def rows(cache, query="SELECT * FROM artifacts", *values):
+    with sqlite3.connect(cache / index.NAME) as database:
+        return database.execute(query, values).fetchall()
 
 
 def test_a_second_run_reads_no_manifest_and_finds_the_same(cache):
     run(cache)
-    before = lines(cache)
+    before = rows(cache)
     assert len(before) == NODES
     with_index, read, result = run(cache)
     assert (read, result.total().cached) == ([], NODES)
-    assert lines(cache) == before
-    at(cache).unlink()
+    assert rows(cache) == before
+    (cache / index.NAME).unlink()
     without, read, _ = run(cache)
     assert len(read) == NODES
     assert with_index == without
@@ -93,7 +91,7 @@ def test_what_was_changed_a_moment_ago_is_neither_entered_nor_believed(cache, mo
     with monkeypatch.context() as patched:
         patched.setattr(folder, "RACY_S", 3600.0)
         run(cache)
-        assert not at(cache).exists()
+        assert not (cache / index.NAME).exists()
     run(cache)
     monkeypatch.setattr(folder, "RACY_S", 3600.0)
     assert len(run(cache)[1]) == NODES
@@ -108,49 +106,99 @@ def of_gigabytes(path):
     os.truncate(path, 3_000_000_000)
 
 
+def of_another_program(path):
+    path.unlink()
+    with sqlite3.connect(path) as database:
+        database.execute("CREATE TABLE places (url)")
+
+
+def a_program(path):
+    """A view that never ends."""
+    path.unlink()
+    with sqlite3.connect(path) as database:
+        database.execute(
+            "CREATE VIEW artifacts AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) "
+            "SELECT i AS sequence, i AS key, i AS stated, i AS checksum FROM n"
+        )
+
+
+def with_a_trigger(path):
+    with sqlite3.connect(path) as database:
+        database.execute("CREATE TRIGGER t AFTER INSERT ON artifacts BEGIN DELETE FROM artifacts; END")
+
+
 @pytest.mark.parametrize(
     "way",
     [
-        *(pipe, of_gigabytes),
+        *(pipe, of_gigabytes, of_another_program, a_program, with_a_trigger),
         lambda path: path.write_bytes(b"\xff" * 99),
-        lambda path: path.write_text("\n".join(path.read_text().replace('"meta":{', '"meta":{"more":1,').split("\n"))),
+        lambda path: path.write_bytes(path.read_bytes()[:3000]),
+        lambda path: (path.unlink(), path.mkdir()),
     ],
 )
-def test_an_index_that_is_none_of_ours_is_not_believed(cache, way):
+def test_an_index_that_is_none_of_ours_is_set_aside(cache, way):
     nodes, _, _ = run(cache)
-    way(at(cache))
+    way(cache / index.NAME)
     again, read, _ = run(cache)
     assert len(read) == NODES
+    assert len(list((cache / "quarantine").iterdir())) == 1
     assert refs(again) == refs(nodes)
     assert run(cache)[1] == [], "it was written anew"
 
 
 def test_an_index_may_be_a_link_to_nothing_or_to_a_file_of_somebody_else(cache, tmp_path):
+    theirs = tmp_path / "theirs.sqlite"
     run(cache)
-    (tmp_path / "theirs.txt").write_text("theirs")
-    for target in (tmp_path / "theirs.txt", tmp_path / "nothing"):
-        at(cache).unlink()
-        at(cache).symlink_to(target)
+    (cache / index.NAME).rename(theirs)
+    before = theirs.read_bytes()
+    for target in (theirs, tmp_path / "nothing"):
+        (cache / index.NAME).unlink(missing_ok=True)
+        (cache / index.NAME).symlink_to(target)
         assert len(run(cache)[1]) == NODES
-    assert (tmp_path / "theirs.txt").read_text() == "theirs"
+    assert theirs.read_bytes() == before
     assert not (tmp_path / "nothing").exists()
 
 
 @pytest.mark.parametrize(
-    "stated", ["{}", '{"key": 1, "stage": [], "digest": "", "meta": []}', "[" * 100_000, "", "\x85"]
+    ("stated", "right"),
+    [
+        ('["m", {}]', True),
+        ('["m", {"key": 1, "stage": [], "digest": "", "meta": []}]', True),
+        ("[" * 100_000, True),
+        (7, True),
+        (b"\xff", True),
+        (None, True),
+        ("flipped", False),
+    ],
 )
-def test_a_line_that_is_none_of_ours_is_not_believed(cache, stated):
+def test_a_row_that_is_none_of_ours_is_not_believed(cache, stated, right):
     nodes, _, _ = run(cache)
-    rests = [" ".join([*line.split(" ", 3)[1:3], stated]) for line in lines(cache)]
-    at(cache).write_text("\n".join(f"{zlib.crc32(rest.encode()):08x} {rest}" for rest in rests))
+    if stated == "flipped":
+        stated = rows(cache)[0][2].replace('"meta":{', '"meta":{"more":1,', 1)
+    checksum = zlib.crc32(str(stated).encode()) if right else 5
+    rows(cache, "UPDATE artifacts SET stated = ?, checksum = ?", stated, checksum)
     again, read, _ = run(cache)
     assert len(read) == NODES
     assert refs(again) == refs(nodes)
 
 
-def test_half_an_index_spares_half_of_the_manifests(cache):
-    run(cache)
-    data = at(cache).read_bytes()
-    at(cache).write_bytes(data[: len(data) // 2])
-    assert 0 < len(run(cache)[1]) < NODES
-    assert run(cache)[1] == []
+def test_a_locked_index_costs_a_bounded_wait(cache, monkeypatch):
+    nodes, _, _ = run(cache)
+    monkeypatch.setattr(index, "TIMEOUT_S", 0.05)
+    with sqlite3.connect(cache / index.NAME) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        again, read, _ = run(cache)
+    assert len(read) == NODES
+    assert refs(again) == refs(nodes)
+    assert run(cache)[1] == [], "it is as it was"
+
+
+def test_several_runs_enter_what_they_used_at_once(cache):
+    nodes, _, _ = run(cache)
+    (cache / index.NAME).unlink()
+    stores = [Store(cache) for _ in nodes]
+    for k, store in enumerate(stores):
+        store.survey(f"s{k % 2}")
+    with ThreadPoolExecutor(NODES) as pool:
+        list(pool.map(lambda store, ref: store.note([ref]), stores, refs(nodes).values()))
+    assert sorted(row[1] for row in rows(cache)) == sorted(ref.key for ref in refs(nodes).values())

@@ -209,7 +209,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule(way=st.sampled_from(sorted(DAMAGES)), seed=st.integers(0, 10**6))
     def the_index_is_damaged(self, way: str, seed: int) -> None:
-        path = self.stores[0].hints("s") / index.NAME
+        path = self.root / index.NAME
         if path.exists():
             path.write_bytes(DAMAGES[way](path.read_bytes() or b"0", random.Random(seed)))
 
