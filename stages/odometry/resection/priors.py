@@ -344,11 +344,10 @@ def vertical_contradiction(up: Floats, sigma: float, poses: Floats, piece: NDArr
     for k in np.unique(piece[np.isfinite(up).all(1)]):
         rows = np.flatnonzero((piece == k) & np.isfinite(up).all(1))
         above = np.einsum("nij,nj->ni", poses[rows, :, :3], up[rows])
-        mean = above.mean(0) / np.linalg.norm(above.mean(0))
-        off = math.sqrt(float((np.cross(above, mean) ** 2).sum(1).mean()))
-        if off > MIN_TURN + MIN_SIGMAS * sigma:
-            allowed = math.degrees(MIN_TURN + MIN_SIGMAS * sigma)
-            return f"in the world it wanders by {math.degrees(off):.1f} degrees, where {allowed:.1f} are possible"
+        mean = np.broadcast_to(above.mean(0) / np.linalg.norm(above.mean(0)), above.shape)
+        _, why = departure(mean, above, MIN_TURN + MIN_SIGMAS * sigma, "directions")
+        if why:
+            return why
     return ""
 
 
