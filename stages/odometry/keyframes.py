@@ -178,7 +178,7 @@ def _why(steps: Sequence[Step], k: int, key: int, ahead: Covisibility, params: K
     """Why position ``k`` should be basic, given what ``ahead`` would still be seen one frame on; empty: it need not."""
     if any(doubtful(step, params) for step in steps[max(k - 1, key) : k + 1]):
         return "few matches"
-    if ahead.less_than(params.overlap):
+    if ahead.overlap < params.overlap:
         return "overlap"
     return "max_gap" if k + 1 - key > params.max_gap else ""
 

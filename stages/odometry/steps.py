@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import chain, pairwise
 
 import numpy as np
@@ -130,15 +129,11 @@ class Covisibility:
         """Share of the first frame that is still seen."""
         return float(self.part.sum()) / len(self.later.blocks)
 
-    @cached_property
+    @property
     def covered(self) -> float:
-        """Share of the later frame that the first one saw; half of the time of a step, so only where it is asked."""
+        """Share of the later frame that the first one saw."""
         _, back = fit_affinity(self.points, self.origin, np.ones(len(self.points), bool), self.later.blocks)
         return float(np.mean(_part_inside(self.later.blocks + back, self.later)))
-
-    def less_than(self, overlap: float) -> bool:
-        """Whether they have less in common: one share below it decides."""
-        return self.kept < overlap or self.covered < overlap
 
     @property
     def overlap(self) -> float:
