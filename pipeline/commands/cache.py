@@ -9,7 +9,7 @@ from typing import Annotated
 
 from cyclopts import App
 
-from rille.pipeline.commands.options import COMPLETE, FAILED, RUNS, CacheFolder, Runs, cache_folder, flag
+from rille.pipeline.commands.options import COMPLETE, FAILED, FLAG, RUNS, CacheFolder, Runs, cache_folder
 
 app = App(name="cache", help=__doc__)
 
@@ -42,11 +42,16 @@ def gc(
     *,
     cache: CacheFolder = None,
     runs: Runs = RUNS,
-    dry_run: Annotated[bool, flag("List by stage what would be removed, and remove nothing.")] = False,
+    dry_run: Annotated[bool, FLAG] = False,
 ) -> int:
     """Remove artifacts that no kept run refers to, leftovers of interrupted runs, and kernels that nothing uses.
 
     What was made or used within a day stays: a run may be under way.
+
+    Parameters
+    ----------
+    dry_run
+        List by stage what would be removed, and remove nothing.
     """
     from rille.pipeline.engine.memory import words
     from rille.pipeline.engine.runtime import kernels

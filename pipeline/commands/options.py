@@ -17,20 +17,14 @@ COMPLETE, FAILED, USAGE, HOLES, INTERRUPTED = 0, 1, 2, 3, 130
 RUNS = Path("runs")
 
 
-def flag(words: str, *names: str) -> Parameter:
-    """An option that is given or not, without a ``--no-`` form."""
-    return Parameter(name=list(names) or None, negative="", help=words)
+FLAG = Parameter(negative="")
+"""An option that is given or not, without a ``--no-`` form."""
 
+SEVERAL = Parameter(negative="", consume_multiple=False, show_default=False)
+"""An option that may be repeated, one value each time."""
 
-def several(words: str, *names: str) -> Parameter:
-    """An option that may be repeated, one value each time."""
-    help_text = f"{words}; may be repeated."
-    return Parameter(name=list(names) or None, negative="", consume_multiple=False, show_default=False, help=help_text)
-
-
-Assignments = Annotated[
-    tuple[str, ...], several("A parameter, section.key=value, for example locus.cell_size=0.002", "--set", "-s")
-]
+SET_HELP = "A parameter, section.key=value, for example locus.cell_size=0.002; may be repeated."
+Assignments = Annotated[tuple[str, ...], SEVERAL, Parameter(name=["--set", "-s"], help=SET_HELP)]
 CacheFolder = Annotated[
     str | None, Parameter(name="--cache", help="Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.")
 ]
@@ -47,17 +41,20 @@ Unparsed = Parameter(parse=False)
 class Settings:
     """Options that choose what is computed, and the cache; ``sequence`` is the word or path that names the sequence.
 
-    Attributes
+    Parameters
     ----------
-    opened : the :class:`~rille.datasets.protocol.Sequence` itself, where it is open already.
+    config
+        TOML file of parameters; every run writes one with all defaults filled.
+    frames
+        Frame range START:STOP[:STEP], as in Python; all by default.
+    opened
+        The :class:`~rille.datasets.protocol.Sequence` itself, where it is open already.
     """
 
     sequence: Annotated[str, Unparsed] = ""
     assignments: Assignments = ()
-    config: Annotated[
-        Path | None, Parameter(help="TOML file of parameters; every run writes one with all defaults filled.")
-    ] = None
-    frames: Annotated[str | None, Parameter(help="Frame range START:STOP[:STEP], as in Python; all by default.")] = None
+    config: Path | None = None
+    frames: str | None = None
     cache: CacheFolder = None
     verb: Annotated[str, Unparsed] = "reconstruct"
     opened: Annotated[Any, Unparsed] = None
@@ -75,21 +72,24 @@ class Settings:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Work(Settings):
-    """Those, and options that choose where tasks run; ``executor`` may also be a ``Client`` of dask."""
+    """Those, and options that choose where tasks run; ``executor`` may also be a ``Client`` of dask.
 
-    jobs: Annotated[int | None, Parameter(help="Worker processes; the number of cores by default.")] = None
-    force: Annotated[frozenset[str], several("A stage to compute again although it is cached")] = frozenset()
-    executor: Annotated[
-        Any,
-        Parameter(
-            help="Where tasks run: dask (a cluster of this machine), inline, or a dask scheduler's address, "
-            "tcp://host:port."
-        ),
-    ] = "dask"
-    memory_limit: Annotated[
-        str | None,
-        Parameter(help="Memory that a run may use in total, for example 6GB or 75%; by default 90 % of what is free."),
-    ] = None
+    Parameters
+    ----------
+    jobs
+        Worker processes; the number of cores by default.
+    force
+        A stage to compute again although it is cached; may be repeated.
+    executor
+        Where tasks run: dask (a cluster of this machine), inline, or a dask scheduler's address, tcp://host:port.
+    memory_limit
+        Memory that a run may use in total, for example 6GB or 75%; by default 90 % of what is free.
+    """
+
+    jobs: int | None = None
+    force: Annotated[frozenset[str], SEVERAL] = frozenset()
+    executor: Any = "dask"
+    memory_limit: str | None = None
 
 
 @Parameter(name="*")
@@ -97,21 +97,28 @@ class Work(Settings):
 class Options(Work):
     """Those, and options of the folder of results and of the messages during a run.
 
-    Attributes
+    Parameters
     ----------
-    kept : :class:`~rille.pipeline.engine.workers.Kept` of several runs, one after another.
+    keep_going
+        After a failure, finish all tasks that do not depend on it; the exit status is then 3.
+    until
+        Compute a stage's tasks and what they need, nothing else; may be repeated.
+    only
+        Make a file, for example dem.tif, and what it needs, nothing else; may be repeated.
+    progress
+        How progress is shown on stderr.
+    quiet
+        No progress; warnings and errors only.
+    kept
+        :class:`~rille.pipeline.engine.workers.Kept` of several runs, one after another.
     """
 
-    keep_going: Annotated[
-        bool, flag("After a failure, finish all tasks that do not depend on it; the exit status is then 3.")
-    ] = False
-    until: Annotated[tuple[str, ...], several("Compute a stage's tasks and what they need, nothing else")] = ()
-    only: Annotated[tuple[str, ...], several("Make a file, for example dem.tif, and what it needs, nothing else")] = ()
+    keep_going: Annotated[bool, FLAG] = False
+    until: Annotated[tuple[str, ...], SEVERAL] = ()
+    only: Annotated[tuple[str, ...], SEVERAL] = ()
     runs: Runs = RUNS
-    progress: Annotated[
-        Literal["auto", "bar", "plain", "quiet"], Parameter(help="How progress is shown on stderr.")
-    ] = "auto"
-    quiet: Annotated[bool, flag("No progress; warnings and errors only.", "--quiet", "-q")] = False
+    progress: Literal["auto", "bar", "plain", "quiet"] = "auto"
+    quiet: Annotated[bool, FLAG, Parameter(name=["--quiet", "-q"])] = False
     kept: Annotated[Any, Unparsed] = None
 
     def part(self) -> str:
@@ -136,13 +143,19 @@ class DriveOptions(Options):
 @Parameter(name="*")
 @dataclass(frozen=True)
 class WatchOptions(Options):
-    """Those of a run, and when the watch ends."""
+    """Those of a run, and when the watch ends.
+
+    Parameters
+    ----------
+    until_idle
+        End when nothing has arrived for so many seconds; by default at Ctrl-C.
+    count
+        End when so many pairs have arrived.
+    """
 
     frames: Annotated[str | None, Unparsed] = None
-    until_idle: Annotated[
-        float | None, Parameter(help="End when nothing has arrived for so many seconds; by default at Ctrl-C.")
-    ] = None
-    count: Annotated[int | None, Parameter(help="End when so many pairs have arrived.")] = None
+    until_idle: float | None = None
+    count: int | None = None
 
 
 def cache_folder(given: str | Path | None) -> Path:

@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 from rille.datasets.images.misalign import MisalignParams
 from rille.datasets.mockup.params import MockupParams
 from rille.datasets.mockup.rover import RoverParams
-from rille.pipeline.commands.options import COMPLETE, flag
+from rille.pipeline.commands.options import COMPLETE, FLAG
 from rille.pipeline.flow import config
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import ConfigError
@@ -21,13 +21,15 @@ from rille.stages.core.errors import ConfigError
 SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 
-def params(section: str = "", *, markdown: Annotated[bool, flag("As tables of Markdown.")] = False) -> int:
+def params(section: str = "", *, markdown: Annotated[bool, FLAG] = False) -> int:
     """Print all parameters, or those of one section: default, what is permitted, and meaning.
 
     Parameters
     ----------
     section
         Such as locus; all by default.
+    markdown
+        As tables of Markdown.
     """
     known = sections()
     if section and section not in known:

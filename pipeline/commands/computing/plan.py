@@ -13,8 +13,10 @@ from dataclasses import replace
 from itertools import chain
 from typing import Annotated
 
+from cyclopts import Parameter
+
 from rille.datasets.text.count import count
-from rille.pipeline.commands.options import COMPLETE, Work, cache_folder, flag
+from rille.pipeline.commands.options import COMPLETE, FLAG, Work, cache_folder
 from rille.pipeline.engine import memory
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.memory import words
@@ -37,7 +39,7 @@ def plan(
     seq: str = "mockup",
     *,
     options: Work = _WORK,
-    verbose: Annotated[bool, flag("Each task with its reason.", "--verbose", "-v")] = False,
+    verbose: Annotated[bool, FLAG, Parameter(name=["--verbose", "-v"])] = False,
 ) -> int:
     """Show what `reconstruct` would compute and why, and what is cached; nothing is computed.
 
@@ -45,6 +47,8 @@ def plan(
     ----------
     seq
         As for reconstruct.
+    verbose
+        Each task with its reason.
     """
     settled = settings_of_run(replace(options, sequence=seq))
     sequence, frames, config = settled.sequence, settled.frames, settled.config

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE, RUNS, Output, Runs, flag
+from rille.pipeline.commands.options import COMPLETE, FLAG, RUNS, Output, Runs
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
@@ -39,7 +39,7 @@ def compare_dem(
     b: str,
     *,
     align: Literal["none", "shift", "tilt", "rigid", "place"] = "none",
-    changes: Annotated[bool, flag("List what rose or fell from B to A.")] = False,
+    changes: Annotated[bool, FLAG] = False,
     output: Annotated[Path, Output] = Path("dem_comparison"),
     runs: Runs = RUNS,
 ) -> int:
@@ -58,6 +58,8 @@ def compare_dem(
     align
         Move A onto B first: shift (x, y, z), tilt (z and two inclinations) or rigid (all six); the motion is printed.
         place: two runs of one place in frames of their own; found by their ortho images, then rigid.
+    changes
+        List what rose or fell from B to A.
     output
         Files to write, without ending.
     """

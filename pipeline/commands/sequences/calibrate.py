@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rille.datasets.images import chessboard, pairing
 from rille.datasets.images.files import SUFFIXES, read_grey
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE, Output, check_output, flag
+from rille.pipeline.commands.options import COMPLETE, FLAG, Output, check_output
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig
@@ -64,7 +64,7 @@ def calibrate(
     board: Board,
     model: Literal["radtan", "radtan4", "rational", "fisheye"] = "radtan",
     output: Annotated[Path, Output] = Path("rig.yaml"),
-    keep_bad: Annotated[bool, flag("Keep views whose residuals are far above the others'.")] = False,
+    keep_bad: Annotated[bool, FLAG] = False,
 ) -> int:
     """Calibrate a stereo rig from pictures of a chessboard; prints the residual of each view.
 
@@ -78,6 +78,8 @@ def calibrate(
         Distortion model.
     output
         YAML file to write.
+    keep_bad
+        Keep views whose residuals are far above the others'.
     """
     check_output(output, *((".yaml", ".yml") if output.suffix else ()))
     given = None if board.corners is None else chessboard.parse_corners(board.corners)

@@ -12,7 +12,7 @@ from rille.datasets.inspection import Findings, inspect
 from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_words
 from rille.datasets.registry import hindrance
 from rille.datasets.text.names import derived_name
-from rille.pipeline.commands.options import COMPLETE, Output, flag
+from rille.pipeline.commands.options import COMPLETE, FLAG, Output
 from rille.pipeline.engine.failures import reported
 from rille.stages.core.errors import ConfigError, InputError
 
@@ -21,7 +21,7 @@ def init(
     directory: Path,
     *,
     output: Annotated[Path | None, Output] = None,
-    force: Annotated[bool, flag("Replace a manifest that is there.")] = False,
+    force: Annotated[bool, FLAG] = False,
 ) -> int:
     """Write a commented manifest of a folder of stereo images: what was found, and what is still needed.
 
@@ -31,6 +31,8 @@ def init(
         Folder with the images, and with whatever is known of the cameras.
     output
         Manifest to write; by default DIRECTORY's name with .rille.toml, in the present folder.
+    force
+        Replace a manifest that is there.
     """
     hindered = hindrance(directory.absolute())  # never a built-in sequence of the same name
     if output is None and not force and (directory.is_dir() or is_bag(directory)) and hindered is None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rille.datasets.images.files import read_grey, refuse_swapped
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE, HOLES, Assignments, Output, check_output, flag
+from rille.pipeline.commands.options import COMPLETE, FLAG, HOLES, Assignments, Output, check_output
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import raw, warn
 from rille.pipeline.export.writers import read_disparity, write_confidence, write_disparity
@@ -105,7 +105,7 @@ def match(
     *,
     output: Annotated[Path, Output] = Path("disparity.tif"),
     matcher: Matcher = _MATCHER,
-    dense: Annotated[bool, flag("Fill undefined disparities by interpolation.")] = False,
+    dense: Annotated[bool, FLAG] = False,
     confidence: Path | None = None,
 ) -> int:
     """Match any two images, without calibration or rectification, to a two-band disparity TIFF.
@@ -121,6 +121,8 @@ def match(
         Search image.
     output
         TIFF to write.
+    dense
+        Fill undefined disparities by interpolation.
     confidence
         TIFF to write with the bands disparity_std (pixels, standard deviation of the column), validity (bits) and
         backmatch_error (pixels).
