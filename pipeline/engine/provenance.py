@@ -7,6 +7,7 @@ the end of a run, and where it is wrong or missing only the words suffer.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import cached_property
@@ -53,7 +54,9 @@ class Known:
     def _others(self) -> list[Keys]:
         """Of other choices of frames, the newest first."""
         found = [p for p in self._path.parent.glob("keys-*.json") if p != self._path]
-        return [_read(p) for p in sorted(found, key=_written, reverse=True)]
+        with suppress(OSError):  # one was removed just now
+            return [_read(p) for p in sorted(found, key=os.path.getmtime, reverse=True)]
+        return []
 
     def reason(self, store: Store, stage: str, label: str, key: str, recipe: Mapping[str, Any]) -> str:
         """Why ``key`` is missed, in words: ``params.cell_size 0.02 -> 0.01``, ``never computed`` ..."""
@@ -93,7 +96,11 @@ def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     found = _values("params", then.get("params"), now["params"]) + _values("args", then.get("args"), now["args"])
     found += _inputs(then.get("inputs", {}), now["inputs"])
     old, new = then.get("code", {}), now["code"]
-    found += [f"code: {_file(m)} {_change(m, old, new)}" for m in sorted({*old, *new}) if old.get(m) != new.get(m)]
+    found += [
+        f"code: {m.replace('.', '/')}.py {_change(m, old, new)}"
+        for m in sorted({*old, *new})
+        if old.get(m) != new.get(m)
+    ]
     old, new = then.get("env", {}), now["env"]
     found += [
         f"{d} {old.get(d, 'none')} -> {new.get(d, 'none')}" for d in sorted({*old, *new}) if old.get(d) != new.get(d)
@@ -128,10 +135,6 @@ def _inputs(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     return found
 
 
-def _file(module: str) -> str:
-    return module.replace(".", "/") + ".py"
-
-
 def _change(name: str, old: Mapping[str, str], new: Mapping[str, str]) -> str:
     return "is new" if name not in old else "is gone" if name not in new else "changed"
 
@@ -142,9 +145,3 @@ def _name(stage: str, label: str) -> str:
 
 def _read(path: Path) -> Keys:
     return read_hint(path, _KEYS) or {}
-
-
-def _written(path: Path) -> float:
-    with suppress(OSError):
-        return path.stat().st_mtime
-    return 0.0

@@ -85,7 +85,11 @@ def made_run(folder: Path, frame: Frame, place: Georeference | None = None, **mo
     write_terrain(folder / "terrain.zarr", arrays, lattice, place, {"title": "made"})
     world = {"definition": "made", "vertical": more.get("vertical", "attitude")}
     frames = [{"frame": 0, "name": "0", "time": 0.0}]
-    facts = {"frames_of_reference": {"world": world}, "frames": frames, "georeference": None}
+    facts = {
+        "frames_of_reference": {"world": world},
+        "frames": frames,
+        "georeference": None if place is None else place.to_dict(),
+    }
     (folder / "frames.json").write_text(json.dumps(facts))
     (folder / "ledger.jsonl").write_text("")
     write_trajectory_kitti(folder / "trajectory.kitti", np.array([np.hstack([np.eye(3), [[0.1], [0.2], [0.3]]])]))

@@ -9,7 +9,7 @@ import time
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple, TextIO
+from typing import NamedTuple
 
 from rille.datasets.images.arrivals import Arrivals
 from rille.datasets.protocol import CAMERAS, Sequence, Source
@@ -40,7 +40,7 @@ def watch(seq: str, *, options: WatchOptions = _OPTIONS) -> int:
     """
     configuration.build(session.configured(options)[1])  # a wrong parameter should not wait for the first pair
     kept, arrivals = Kept(), Arrivals(cache_folder(options.cache) / "files.json")
-    watched = _Watched(replace(options, sequence=seq, kept=kept), arrivals, _Once(sys.stderr))
+    watched = _Watched(replace(options, sequence=seq, kept=kept), arrivals)
     try:
         return watched.to_the_end()
     except KeyboardInterrupt:
@@ -49,29 +49,6 @@ def watch(seq: str, *, options: WatchOptions = _OPTIONS) -> int:
         return INTERRUPTED
     finally:
         kept.close()
-
-
-class _Once:
-    """Stream that writes each line once: every update has the same warnings."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream, self._line, self._said = stream, "", set[str]()
-
-    def write(self, text: str) -> int:
-        """Write the lines that are whole by now and new."""
-        *lines, self._line = (self._line + text).split("\n")
-        for line in lines:
-            if line not in self._said:
-                self._said.add(line)
-                self._stream.write(f"{line}\n")
-        return len(text)
-
-    def flush(self) -> None:
-        """Write what the stream behind holds back."""
-        self._stream.flush()
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._stream, name)
 
 
 class _Seen(NamedTuple):
@@ -84,18 +61,19 @@ class _Seen(NamedTuple):
 
 @dataclass
 class _Watched:
-    """What has been seen of a sequence, and taken; ``folder`` of the last results, ``once`` for what updates say.
+    """What has been seen of a sequence, and taken; ``folder`` of the last results.
 
     Attributes
     ----------
+    said : lines that were printed on stderr: every update has the same warnings.
     gaps : when it was first seen, by the monotonic clock, that a frame between others is missing, by its name.
     """
 
     options: WatchOptions
     arrivals: Arrivals
-    once: _Once
     folder: Path | None = None
     taken: _Seen | None = None
+    said: set[str] = field(default_factory=set)
     gaps: dict[str, float] = field(default_factory=dict)
 
     def to_the_end(self) -> int:
@@ -125,7 +103,7 @@ class _Watched:
         except InputError as error:
             if self.taken is None and not isinstance(error, IncompleteError):
                 raise
-            self.say(f"waiting: {error.message}")
+            self.say(f"rille: waiting: {error.message}")
             return None
         now = time.monotonic()
         names = {sequence.frame_names[k]: k for k in sequence.lost}
@@ -133,7 +111,7 @@ class _Watched:
         # Time for which a pair between others is waited for; then it counts as lost until it is there
         frames = min((names[n] for n, t in self.gaps.items() if now - t < 10.0), default=sequence.frames)
         if frames < sequence.frames:
-            self.say(f"waiting: {sequence.lost[frames]}")
+            self.say(f"rille: waiting: {sequence.lost[frames]}")
         images = [_image(sequence.image(k, c)) for k in range(frames) if k not in sequence.lost for c in CAMERAS]
         return _Seen(sequence, frames, {Path(image.hints["path"]): image.args["sha256"] for image in images})
 
@@ -153,17 +131,20 @@ class _Watched:
         before, self.taken = {} if self.taken is None else self.taken.files, seen
         replaced = [path.name for path, digest in seen.files.items() if before.get(path, digest) != digest]
         if replaced:
-            self.say(f"written anew, so that what depends on it is computed anew: {some(replaced, 6)}")
+            self.say(f"rille: written anew, so that what depends on it is computed anew: {some(replaced, 6)}")
         part = not (self.options.until or self.options.only)
         options = replace(self.options, quiet=True, only=UPDATED if part else self.options.only)
+        warnings = io.StringIO()
         try:
-            with redirect_stderr(self.once):
+            with redirect_stderr(warnings):
                 _, line = self.run(options, seen)
         except ConfigError:
             raise
         except RilleError as error:
             complain(error)
             return
+        finally:
+            self.say(warnings.getvalue())
         since = time.monotonic() - max(self.arrivals.first_seen(path) for path in seen.files)
         print(f"{len(seen.files) // 2} pairs, {since:.1f} s after the last file: {line}", flush=True)
 
@@ -184,7 +165,7 @@ class _Watched:
         print(line)
         left_out += self.arrivals.troubles()
         if left_out:
-            self.say(f"not all has arrived: {'; '.join(left_out)}")
+            self.say(f"rille: not all has arrived: {'; '.join(left_out)}")
         return max(code, HOLES) if left_out else code
 
     def run(self, options: WatchOptions, seen: _Seen) -> tuple[int, str]:
@@ -198,8 +179,11 @@ class _Watched:
         return code, said.getvalue().partition("\n")[0]
 
     def say(self, text: str) -> None:
-        """Print a line on stderr, if it was not printed before."""
-        print(f"rille: {text}", file=self.once, flush=True)
+        """Print lines on stderr that were not printed before."""
+        for line in text.splitlines():
+            if line not in self.said:
+                self.said.add(line)
+                print(line, file=sys.stderr, flush=True)
 
 
 def _image(source: Source) -> Source:

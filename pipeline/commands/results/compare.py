@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from rille.datasets.manifest.opening import dotted
 from rille.datasets.text.reading import read_lines, read_toml
 from rille.pipeline import api
 from rille.pipeline.commands.options import COMPLETE, RUNS, Run, Runs
@@ -27,18 +28,10 @@ def compare(a: Run, b: Run, *, runs: Runs = RUNS) -> int:
     # All before anything is printed: where something cannot be read there is no half of a comparison.
     with lookup.reading(*both):
         reports = [api.Run(run).report for run in both]
-        settings = [_flat(read_toml(run / "config.toml", "configuration")) for run in both]
+        settings = [dict(dotted(read_toml(run / "config.toml", "configuration"))) for run in both]
         lines = [*_parameters(*settings), *_tasks(*both), *_figures(*reports), _positions(*both)]
     print("\n".join([f"A {lookup.name(one)}", f"B {lookup.name(other)}", *lines]))
     return COMPLETE
-
-
-def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Values of nested tables by dotted names."""
-    flat: dict[str, Any] = {}
-    for name, value in table.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
-    return flat
 
 
 def _parameters(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:

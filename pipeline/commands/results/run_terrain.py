@@ -12,6 +12,7 @@ import numpy as np
 from rille.datasets.georeference import Georeference
 from rille.datasets.text.reading import TABLE, read_text
 from rille.pipeline.api import Run
+from rille.pipeline.export.read_dem import georeference_of
 from rille.pipeline.runs import lookup
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
@@ -54,10 +55,7 @@ class Terrain:
             lattice = Lattice(float(terrain.x[0]), float(terrain.y[0]), float(about["cell_size_m"]), rows, cols)
             names = "elevation", "elevation_std", "ortho"
             elevation, sigma, ortho = (np.asarray(terrain[key], np.float64) for key in names)
-            place = None
-            if "georeference_crs" in about:
-                east, north, height = about["georeference_origin"]
-                place = Georeference(about["georeference_crs"], (east, north, height), about["georeference_azimuth"])
+            place = georeference_of(folder)
         if vertical == REFERENCE_PLANE:
             text = f"elevations of run {name} are distances from a plane that is no ground"
             raise InputError("RIL-842", text, remedy="run it with --set terrain.reference=ground")
