@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,8 +20,9 @@ from numba import njit
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import DegenerateError
+from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Rig, RigidTransform
-from rille.stages.geometry.scale import coarser_focal, of_rig
+from rille.stages.geometry.scale import coarser_focal
 from rille.stages.numeric.least_squares import irls
 
 
@@ -91,7 +92,7 @@ def fit_plane(
         # theta = -n / h: its length is one over the height.
         share, length = float(np.mean(on)), float(np.linalg.norm(theta))
         if share >= MIN_GROUND_SHARE and bool(allowed(-theta[None] / length)[0]):
-            reach = length * float(np.quantile(_length(rays[on]) / expected[on], 0.9))
+            reach = length * float(np.quantile(np.linalg.norm(rays[on], axis=1) / expected[on], 0.9))
             return GroundPlane(-theta / length, 1.0 / length, share, reach)
     raise NoGroundError("RIL-343", "the disparity shows no ground plane below the camera")
 
@@ -201,19 +202,30 @@ def rounded_cell(size: float) -> float:
 _125 = (1.0, 2.0, 5.0)
 
 
-def view_matches(samples: Samples, rig: Rig, T_local_left: RigidTransform, sigma_d: float) -> PlaneView:
-    """View of the plane z = 0 of the local frame by matched pixels, each on a surface parallel to it.
+def view_points(
+    samples: Samples, rig: Rig, T_local_left: RigidTransform, sigma_d: float, slopes: Sequence[float] = (0.0, 0.0)
+) -> PlaneView:
+    """View of a plane by points, each on a surface parallel to it: z = a x + b y of the local frame (``slopes`` a, b).
 
-    A depth 1/rho with the error sigma / rho^2 moves a point along its ray r by as much of r, and the elevation by that
-    part of it which is along the plane's normal. ``sigma_d``: pixels of disparity that ``sigma`` stands for.
+    On the ray r of a pixel (z = 1), which gains r . (-a, -b, 1) of height over the plane with each metre of depth,
+    depth 1/rho with the error sigma / rho^2 has that part of it as error of elevation; and a pixel, 1 / (rho f) wide
+    there, covers as much of the plane over that gain. ``sigma_d``: pixels of disparity that ``sigma`` stands for.
     """
-    rays, rho, sigma = (values[samples.rho > MIN_DEPTH_SIGMAS * samples.sigma] for values in samples)
-    points = rays / rho[:, None]
-    slant, toward = _length(points), np.abs(rays @ T_local_left.rotation[2])
-    across = slant / coarser_focal(rig)
-    along = across * _length(rays) / np.maximum(toward, 1e-3)
-    slope = sigma_d * rho**2 / (sigma * np.maximum(toward, 1e-3))
-    return PlaneView(T_local_left.apply(points), slant, along, across, slope, stray=0.005)
+    rays, rho, sigma = samples
+    gain = np.maximum(np.abs(rays @ (np.array([-slopes[0], -slopes[1], 1.0]) @ T_local_left.rotation)), 1e-3)
+    # The range grows along the ray: beside the middle of the image longer than depth, and the width is across the ray.
+    aside = np.hypot(1.0, rays @ T_local_left.rotation[0])
+    points, across = rays / rho[:, None], 1.0 / (rho * coarser_focal(rig) * aside)
+    slant = np.asarray(np.linalg.norm(points, axis=1))
+    return PlaneView(
+        T_local_left.apply(points), slant, across * aside**2 / gain, across, sigma_d * rho**2 / (sigma * gain)
+    )
+
+
+def view_matches(samples: Samples, rig: Rig, T_local_left: RigidTransform, sigma_d: float) -> PlaneView:
+    """View of the plane z = 0 of the local frame by matched pixels; ``sigma_d`` as in :func:`view_points`."""
+    near = samples.rho > MIN_DEPTH_SIGMAS * samples.sigma
+    return replace(view_points(Samples(*(values[near] for values in samples)), rig, T_local_left, sigma_d), stray=0.005)
 
 
 MIN_DEPTH_SIGMAS = 3.0
@@ -228,56 +240,22 @@ def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> Plane
     DegenerateError
         No pixel of the left camera sees the plane where the right one does, too.
     """
+    a, b, c = plane
     cam = rig.left
     # Many rows, few columns: ground grows far from row to row, and changes little along one.
     cols, rows = np.linspace(1, cam.width - 2, 48), np.linspace(1, cam.height - 2, 256)
     pixels = np.stack(np.meshgrid(cols, rows), axis=-1).reshape(-1, 2)
-    here = _meet(rig, R_local_left, plane, pixels)
-    right = rig.right.project(rig.T_right_left.apply(here @ R_local_left))
-    with np.errstate(invalid="ignore"):
-        in_both = ((right >= 0) & (right <= [rig.right.width - 1, rig.right.height - 1])).all(-1)
-    pixels, here = pixels[in_both], here[in_both]
-    steps = [_meet(rig, R_local_left, plane, pixels + step) - here for step in ([0.5, 0.0], [0.0, 0.5])]
-    jacobian = 2.0 * np.stack(steps, axis=-1)[:, :2]
-    slope = _elevation_slope(rig, R_local_left, plane, here)
-    # Beside the horizon half a pixel may lead to a ray that misses the plane.
-    good = np.isfinite(jacobian).all((1, 2)) & (slope > 0)
-    if not good.any():
+    rays = cam.rays(pixels)
+    rho = rays @ (np.array([-a, -b, 1.0]) @ R_local_left) / c
+    with np.errstate(divide="ignore", invalid="ignore"):
+        right = rig.right.project(rig.T_right_left.apply(rays / rho[:, None]))
+        in_both = (rho > 0) & ((right >= 0) & (right <= [rig.right.width - 1, rig.right.height - 1])).all(-1)
+    if not in_both.any():
         raise DegenerateError(
             "RIL-345",
             "the two cameras see no common ground",
             remedy="check the pitch, the left/right order and T_right_left",
         )
-    # By columns and rows of the left image, a pixel of which is a part of a coarser one of the right.
-    size = _singular_values(jacobian[good] / np.minimum(of_rig(rig), 1.0))
-    return PlaneView(here[good], _length(here[good]), size[:, 0], size[:, 1], slope[good])
-
-
-def _singular_values(m: Floats) -> Floats:
-    """Singular values (n, 2), the greater first, of matrices (n, 2, 2)."""
-    a, b, c, d = m[:, 0, 0], m[:, 0, 1], m[:, 1, 0], m[:, 1, 1]
-    plus, minus = np.hypot(a + d, c - b), np.hypot(a - d, c + b)
-    return np.asarray(0.5 * np.stack([plus + minus, np.abs(plus - minus)], -1), dtype=np.float64)
-
-
-def _meet(rig: Rig, R_local_left: Floats, plane: Sequence[float], pixels: Floats) -> Floats:
-    """Points (n, 3) of the local frame where the rays of left pixels meet the plane; NaN where they do not."""
-    a, b, c = plane
-    v = rig.left.rays(pixels) @ R_local_left.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance = c / (v[:, 2] - a * v[:, 0] - b * v[:, 1])
-    return np.where(distance > 0, distance, np.nan)[:, None] * v
-
-
-def _elevation_slope(rig: Rig, R_local_left: Floats, plane: Sequence[float], points: Floats) -> Floats:
-    """ds/dZ (n,) on the plane, pixels per metre: mismatch of a point lifted by a ten-thousandth of the distance."""
-    lift = 1e-4 * _length(points)
-    lifted = points + lift[:, None] * np.array([0.0, 0.0, 1.0])
-    behind = _meet(rig, R_local_left, plane, rig.left.project(lifted @ R_local_left))
-    seen = rig.right.project(rig.T_right_left.apply(behind @ R_local_left))
-    own = rig.right.project(rig.T_right_left.apply(lifted @ R_local_left))
-    return _length(seen - own) / lift
-
-
-def _length(vectors: Floats) -> Floats:
-    return np.asarray(np.linalg.norm(vectors, axis=-1), dtype=np.float64)
+    _, per_pixel = inverse_depth(rig, pixels[in_both], (right - pixels)[in_both])
+    level = RigidTransform(R_local_left, np.zeros(3))
+    return view_points(Samples(rays[in_both], rho[in_both], per_pixel), rig, level, 1.0, (a, b))

@@ -15,7 +15,7 @@ from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
 from rille.stages.terrain import ground_frame as level_stage
-from rille.stages.terrain.ground import _singular_values, view_ground
+from rille.stages.terrain.ground import view_ground
 from rille.stages.terrain.ground_frame import SCENE, GroundFrameParams, VerticalHint, level, z_range
 from rille.stages.terrain.locus.stage import LocusParams, local_lattice
 
@@ -294,9 +294,29 @@ def test_kitti_street(data_dir: Path) -> None:
     assert math.degrees(math.acos(-float(up_of(facts)[1]))) < 3.0
 
 
-def test_singular_values_of_small_matrices():
-    m = np.random.default_rng(4).normal(size=(50, 2, 2))
-    np.testing.assert_allclose(_singular_values(m), np.linalg.svd(m, compute_uv=False), rtol=1e-9, atol=1e-12)
+@pytest.mark.parametrize("plane_given", [[0.0, 0.0, -HEIGHT], [0.1, -0.15, -HEIGHT]])
+def test_the_view_of_a_plane_is_that_of_lifted_points_and_neighbouring_pixels(plane_given: list[float]) -> None:
+    """Pixels of disparity for a point lifted by a tenth of a millimetre; ground between the rays of four pixels."""
+    a, b, c = plane_given
+    view = view_ground(RIG, POSE.rotation, plane_given)
+    point = view.xyz[len(view.xyz) // 2]
+    assert point[2] == pytest.approx(c + a * point[0] + b * point[1])
+
+    def meet(pixel: np.ndarray) -> np.ndarray:
+        ray = RIG.left.rays(pixel) @ POSE.rotation.T
+        return (c / (ray @ [-a, -b, 1.0]))[..., None] * ray
+
+    def seen(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return RIG.left.project(p @ POSE.rotation), RIG.right.project(RIG.T_right_left.apply(p @ POSE.rotation))
+
+    left, right = seen(point + 1e-4 * np.eye(3)[2])
+    behind = seen(meet(left))[1]
+    k = len(view.xyz) // 2
+    assert view.slope[k] == pytest.approx(np.linalg.norm(right - behind) / 1e-4, rel=1e-3)
+    pixel = seen(point)[0]
+    across, down = (meet(pixel + step) - meet(pixel - step) for step in ([0.5, 0.0], [0.0, 0.5]))
+    area = abs(across[0] * down[1] - across[1] * down[0])
+    assert view.along[k] * view.across[k] == pytest.approx(area, rel=0.02)
 
 
 @pytest.mark.parametrize(("scale", "coarser"), [(4.0, 1.0), (0.9, 1.0), (0.25, 4.0)])
