@@ -19,7 +19,6 @@ from rille.stages.calibration.parameter_selection import Decision, RelativeParam
 from rille.stages.calibration.relative_orientation import MIN_MATCHES, RIG, PointPairs, rms
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, stage
-from rille.stages.core.errors import InputError
 from rille.stages.core.validity import matched_back
 from rille.stages.facts.calibration import OrientationFacts
 from rille.stages.geometry.epipolar import corrected, distances, standing
@@ -137,18 +136,9 @@ _MATCH = ("match",)
 )
 def orientation_stage(params: OrientationParams, disparity: Bundle, *, rig: Rig, pair: int) -> Bundle[OrientationFacts]:
     """Relative orientation of the right camera from one pair's disparity."""
-    if not rig.baseline > 0:
-        raise InputError(
-            "RIL-402", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
-        )
     # On planes of textureless regions row displacements were set, not measured.
     usable = matched_back(np.asarray(disparity["validity"]), np.asarray(disparity["backmatch_error"]))
-    if usable.shape != (rig.left.height, rig.left.width):
-        raise InputError(
-            "RIL-403",
-            f"the disparity is {usable.shape}, the left camera's image {(rig.left.height, rig.left.width)}",
-            remedy="give the camera's width and height as the images have them",
-        )
+    rig.check(usable.shape)
     left, right = thin(
         disparity["column_disparity"], disparity["row_disparity"], usable, disparity["backmatch_error"], params.samples
     )

@@ -78,10 +78,7 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams) -> Ri
     InputError
         The cameras share one projection centre, or their images are swapped.
     """
-    if not given.baseline > 0:
-        raise InputError(
-            "RIL-427", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
-        )
+    given.check()
     facts: RigFacts = {
         "rig": given.to_dict(),
         "given": given.to_dict(),

@@ -154,6 +154,16 @@ class Rig:
         """Distance of the two projection centres, metres."""
         return float(np.linalg.norm(self.T_right_left.translation))
 
+    def check(self, shape: tuple[int, ...] | None = None) -> None:
+        """Refuse a rig without a baseline, and a disparity (rows, cols) of another size than the left image's."""
+        if not self.baseline > 0:
+            remedy = "give T_right_left with a translation in metres"
+            raise InputError("RIL-377", "the rig's baseline is 0 m", remedy=remedy)
+        expected = self.left.height, self.left.width
+        if shape not in (None, expected):
+            remedy = "give the camera's width and height as the images have them"
+            raise InputError("RIL-376", f"the disparity is {shape}, the left camera's image {expected}", remedy=remedy)
+
     def to_dict(self) -> dict[str, Any]:
         """JSON form."""
         return {

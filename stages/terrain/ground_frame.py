@@ -273,13 +273,7 @@ def z_range(plane: list[float], relief: list[float], extent: list[float]) -> lis
 def sampled(maps: tuple[NDArray[Any], NDArray[Any]], usable: Bools, rig: Rig, sigma_disparity: float) -> Samples:
     """Rays, inverse depths and their errors at a regular sparse grid of usable pixels; ``maps``: both disparities."""
     column, row = maps
-    expected = (rig.left.height, rig.left.width)
-    if column.shape != expected:
-        raise InputError("RIL-376", f"the disparity is {column.shape}, the left camera's image {expected}")
-    if not rig.baseline > 0:
-        raise DegenerateError(
-            "RIL-377", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
-        )
+    rig.check(column.shape)
     step = max(1, int(math.sqrt(column.size / (2 * MAX_FIT_PIXELS))))
     r, c = np.nonzero(usable[::step, ::step])
     r, c = r * step, c * step

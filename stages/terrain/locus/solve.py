@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
-from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.scale import of_rig
 from rille.stages.geometry.surface import Surface
@@ -55,18 +54,9 @@ class PairArrays:
     def __init__(
         self, matches: Matches, image: ArrayLike, rig: Rig, T_surface_left: RigidTransform, limits: SearchLimits
     ) -> None:
-        lowest, highest = limits.z_range
-        if not rig.baseline > 0:
-            raise DegenerateError(
-                "RIL-394", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
-            )
-        if not lowest < highest:
-            raise InputError("RIL-395", f"the range of elevations {lowest}..{highest} m is empty")
-        shape = (rig.left.height, rig.left.width)
         maps = [np.asarray(a) for a in (matches.column, matches.row, image)]
-        for name, array in zip(("column disparity", "row disparity", "image"), maps, strict=True):
-            if array.shape != shape:
-                raise InputError("RIL-396", f"the {name} is {array.shape}, the left camera's image {shape}")
+        shape = maps[0].shape
+        rig.check(shape)
         disparity = np.stack(maps[:2], axis=-1, dtype=np.float32, casting="unsafe")
         # NaN in the arrays, not a mask: the kernel's sums become NaN by themselves where a pixel must not be used.
         disparity[~matches.usable] = np.nan
@@ -78,7 +68,7 @@ class PairArrays:
         epipole = rig.right.matrix @ rig.T_right_left.translation
         sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)
         self.cameras = PairCameras(*projections(rig, T_surface_left), epipole, sizes)
-        self.z_range = float(lowest), float(highest)
+        self.z_range = limits.z_range
 
     def cells(self, feet: Floats, normals: Floats, low: ArrayLike, high: ArrayLike, out: Dem) -> None:
         """Fill ``out`` (r, c) with cells (r, c, 3), searched from low..high (NaN: left out)."""

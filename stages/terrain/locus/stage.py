@@ -24,7 +24,7 @@ from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Bundle, Memory, Params, raster, stage
-from rille.stages.core.errors import ConfigError, DegenerateError, InputError
+from rille.stages.core.errors import ConfigError, DegenerateError
 from rille.stages.core.validity import matched
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.imaging import PyramidFacts
@@ -130,9 +130,7 @@ def reconstruct(
     Raises
     ------
     InputError
-        An array's shape differs from its camera's, ``z_range`` is empty, or ``right`` is missing.
-    DegenerateError
-        The baseline is zero.
+        The disparity's shape differs from its camera's, or the baseline is zero.
     """
     image, right, back = pair.left, pair.right, pair.back
     limits = SearchLimits(z_range, params.max_residual, params.max_jump, params.sigma_disparity)
@@ -140,8 +138,7 @@ def reconstruct(
     seen = None if right is None else _views(image, right, rig, T_surface_left)
     apart = None
     if back is not None:
-        if right is None:
-            raise InputError("RIL-381", "disparities of the right image are given without the image")
+        assert right is not None
         # The same solver with the cameras exchanged: the right image's disparity is that of a rig whose left camera it
         # is.
         turned = Rig(rig.right, rig.left, rig.T_right_left.inverse())
@@ -167,10 +164,6 @@ def leave_out_unsure(dem: Dem, greatest: float | None) -> None:
 def _views(image: ArrayLike, right: ArrayLike, rig: Rig, T_surface_left: RigidTransform) -> SurfaceViews:
     """Both images as they see the surface."""
     images = [np.ascontiguousarray(a, np.float32) for a in (image, right)]
-    if images[1].shape != (rig.right.height, rig.right.width):
-        raise InputError(
-            "RIL-382", f"the right image is {images[1].shape}, its camera's {(rig.right.height, rig.right.width)}"
-        )
     return views(*projections(rig, T_surface_left), images[0], images[1], T_surface_left.translation)
 
 

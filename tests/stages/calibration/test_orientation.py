@@ -131,7 +131,7 @@ def test_nothing_matched_is_no_failure():
 
 def test_wrong_inputs_are_named():
     rig = toed_in_rig()
-    with raises("RIL-402"):
+    with raises("RIL-377"):
         run(Rig(rig.left, rig.right, RigidTransform.identity()), scene(rig))
-    with raises("RIL-403"):
+    with raises("RIL-376"):
         run(street_rig(), scene(rig))

@@ -45,7 +45,7 @@ def test_without_pairs_the_given_rig_passes_through(inputs):
 
 def test_no_baseline_is_refused():
     rig = toed_in_rig()
-    with raises("RIL-427"):
+    with raises("RIL-377"):
         facts(Rig(rig.left, rig.right, RigidTransform.identity()), [])
 
 

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from raising import raises
 from terrain_scenes import disparity, pitched, plane, smooth_noise, toed_in_rig
 
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
@@ -232,11 +231,6 @@ def test_without_steps_or_a_right_image_the_disparity_decides() -> None:
         np.testing.assert_array_equal(values, getattr(none, name))
 
 
-def test_a_right_image_of_another_size_is_refused() -> None:
-    with raises("RIL-382"):
-        model(MAPS[0], right=RIGHT[:-1])
-
-
 def flat(elevation: list[float], std: list[float]) -> Dem:
     arrays = [np.array([values], np.float32) for values in (elevation, std, [0.1] * len(std), [9.0] * len(std))]
     arrays[2][~np.isfinite(arrays[0])] = np.nan
@@ -281,5 +275,3 @@ def test_cells_that_one_direction_lost_come_from_the_other() -> None:
     assert np.abs(both.ortho - texture(LATTICE.xy().reshape(-1, 2)).reshape(x.shape))[lost].max() < 3.0
     np.testing.assert_allclose(np.abs((both.elevation - TRUTH) * scale)[wrong].mean(), 0.5, atol=0.1)
     assert np.median(both.elevation_std[wrong]) > 2.0 * np.median(both.elevation_std[plain])
-    with raises("RIL-381"):
-        reconstruct(MatchedPair(LEFT, forth, back=back), *args)
