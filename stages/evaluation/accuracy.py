@@ -19,7 +19,6 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
-from rille.stages.core.errors import InputError
 from rille.stages.evaluation import rigid
 from rille.stages.evaluation.conventions import better_reading
 from rille.stages.evaluation.metric import metric
@@ -49,14 +48,7 @@ def trajectory_accuracy(
     -------
     Arrays ``position``, ``position_truth`` (frame, xyz) in the world frame (truth brought there by the first frame that
     has both), and metrics by name; with fewer than two frames that have both no error applies.
-
-    Raises
-    ------
-    InputError
-        The numbers of frames differ.
     """
-    if estimate.shape != truth.shape:
-        raise InputError("RIL-300", f"{len(estimate)} estimated and {len(truth)} true poses do not match")
     has_pose, has_truth = posed(estimate), posed(truth)
     judged = np.flatnonzero(has_pose & has_truth)
     figures = {

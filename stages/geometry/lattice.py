@@ -11,6 +11,7 @@ import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -51,10 +52,8 @@ class Lattice:
             raise InputError(
                 "RIL-354", f"cell size {self.cell} m is not positive", remedy="give the cell size in metres"
             )
-        if self.rows < 1 or self.cols < 1:
-            raise InputError(
-                "RIL-355", f"a lattice of {self.rows} x {self.cols} cells is empty", remedy="widen its extent"
-            )
+        assert self.rows > 0
+        assert self.cols > 0
         if self.rows * self.cols > MAX_CELLS:
             enough = 1.06 * self.cell * math.sqrt(self.rows * self.cols / MAX_CELLS)  # rounding takes up to 5 %
             raise ConfigError(
@@ -78,12 +77,8 @@ class Lattice:
     def snap(bounds: Sequence[float], cell: float) -> Lattice:
         """Smallest lattice whose cells (not only their centres) cover ``bounds`` = x_min, x_max, y_min, y_max."""
         x_min, x_max, y_min, y_max = (float(v) for v in bounds)
-        if not (math.isfinite(x_max - x_min) and math.isfinite(y_max - y_min) and x_min <= x_max and y_min <= y_max):
-            raise InputError(
-                "RIL-358", f"extent x {x_min}..{x_max}, y {y_min}..{y_max} m is empty", remedy="give min before max"
-            )
-        if not (math.isfinite(cell) and cell > 0):
-            raise InputError("RIL-359", f"cell size {cell} m is not positive", remedy="give the cell size in metres")
+        assert x_min <= x_max
+        assert y_min <= y_max
         slack = 1e-6  # a bound on a cell's border does not ask for the next cell
         low = [math.floor(v / cell + 0.5 + slack) for v in (x_min, y_min)]
         high = [math.ceil(v / cell - 0.5 - slack) for v in (x_max, y_max)]
@@ -151,8 +146,8 @@ class Lattice:
         """Slices (rows, cols) of an array on this lattice that hold ``part``, which must lie inside."""
         self._same_cell(part)
         row, col = self.j0 - part.j0, part.i0 - self.i0
-        if row < 0 or col < 0 or row + part.rows > self.rows or col + part.cols > self.cols:
-            raise InputError("RIL-360", "the window is not inside the lattice")
+        assert 0 <= row <= self.rows - part.rows
+        assert 0 <= col <= self.cols - part.cols
         return slice(row, row + part.rows), slice(col, col + part.cols)
 
     def tiles(self, size: int) -> Iterator[Lattice]:
@@ -192,12 +187,7 @@ def _cuts(first: int, count: int, size: int) -> list[tuple[int, int]]:
 
 def union(lattices: Iterable[Lattice]) -> Lattice:
     """Smallest lattice that holds all given ones (at least one)."""
-    result: Lattice | None = None
-    for lattice in lattices:
-        result = lattice if result is None else result.union(lattice)
-    if result is None:
-        raise InputError("RIL-362", "no lattice to unite", remedy="give at least one elevation model")
-    return result
+    return reduce(Lattice.union, lattices)
 
 
 def mosaic(parts: Sequence[tuple[Lattice, NDArray[Any]]], nodata: float, target: Lattice | None = None) -> NDArray[Any]:
@@ -212,8 +202,7 @@ def mosaic(parts: Sequence[tuple[Lattice, NDArray[Any]]], nodata: float, target:
     whole = target or union(lattice for lattice, _ in parts)
     out = np.full(whole.shape, nodata, dtype=parts[0][1].dtype if parts else np.float32)
     for lattice, array in parts:
-        if array.shape != lattice.shape:
-            raise InputError("RIL-363", f"an array of {array.shape} does not fit its lattice {lattice.shape}")
+        assert array.shape == lattice.shape
         common = whole.intersection(lattice)
         if common is not None:
             out[whole.window(common)] = array[lattice.window(common)]

@@ -233,10 +233,7 @@ class Lens:
 
 
 def _points(points: ArrayLike) -> Floats:
-    p = np.asarray(points, dtype=np.float64)
-    if p.ndim != 2 or p.shape[1] != 2:
-        raise InputError("RIL-372", f"points of shape {p.shape} are not (n, 2)", remedy="give column and row of each")
-    return p
+    return np.asarray(points, dtype=np.float64).reshape(-1, 2)
 
 
 def _first_root(in_square: Polynomial) -> float:

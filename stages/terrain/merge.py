@@ -34,7 +34,6 @@ from pydantic import Field
 
 from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.core.declare import Bundle, Memory, Params, raster, stage
-from rille.stages.core.errors import InputError
 from rille.stages.facts.terrain import DemFacts, MergeFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice, Window
@@ -120,19 +119,17 @@ class ModelLayer:
 
 
 def merge(layers: Sequence[ModelLayer], tile: Lattice, params: MergeParams) -> Merged:
-    """Merge elevation models on a tile of their common lattice.
+    """Merge elevation models, each of another pair, on a tile of their common lattice.
 
     The result does not depend, in any bit, on the order of the layers, nor on where tiles begin.
 
     Raises
     ------
     InputError
-        Two layers are of the same pair, or a layer's cell differs from the tile's.
+        A layer's cell differs from the tile's.
     """
     ordered = sorted(layers, key=lambda layer: layer.pair)
-    pairs = [layer.pair for layer in ordered]
-    if len(set(pairs)) != len(pairs):
-        raise InputError("RIL-399", f"two elevation models of one pair among {pairs}", remedy="merge each pair once")
+    assert len({layer.pair for layer in ordered}) == len(ordered)
     ordered = [layer for layer in ordered if tile.intersection(layer.lattice) is not None]
     others = {"count": (0, np.uint16), "source": (-1, np.int32)}
     out = Merged._make(np.full(tile.shape, *others.get(name, (np.nan, np.float32))) for name in Merged._fields)

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rille.stages.core.arrays import Bytes, Floats, Floats32
-from rille.stages.core.errors import InputError
 
 WEIGHT = (1.0, 2.0, 1.0)
 
@@ -25,14 +24,7 @@ def gradient(elevation: ArrayLike, cell: float) -> Floats:
     ----------
     elevation : (rows, cols) metres, NaN unknown; row 0 at the greatest y.
     cell : side of a cell, metres.
-
-    Raises
-    ------
-    InputError
-        The cell is not positive.
     """
-    if not cell > 0:
-        raise InputError("RIL-441", f"the cell size {cell} m is not positive")
     z = np.asarray(elevation, dtype=np.float64)
     known = np.isfinite(z)
     middle = np.where(known, z, 0.0)

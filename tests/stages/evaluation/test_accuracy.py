@@ -9,7 +9,6 @@ import pytest
 from evo.core import metrics as evo_metrics
 from evo.core.metrics import PoseRelation, StatisticsType
 from evo.core.trajectory import PosePath3D
-from raising import raises
 from scipy.spatial.transform import Rotation
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
@@ -121,8 +120,6 @@ def test_missing_frames_are_counted_and_bridged() -> None:
     )
     assert ours["drift"]["value"] == pytest.approx(0.0, abs=1e-9)
     assert "15 pairs" in ours["rpe_translation_rmse"]["how"]
-    with raises("RIL-300"):
-        trajectory_accuracy(true[1:], true)
 
 
 def test_a_camera_at_rest_has_no_drift_figure() -> None:

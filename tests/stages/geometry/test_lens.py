@@ -175,11 +175,9 @@ def test_json_round_trip(lens):
     assert Lens.from_dict(lens.to_dict()) == lens
 
 
-def test_no_points_and_wrong_points():
+def test_no_points():
     assert LENSES["radtan"].undistort(np.empty((0, 2))).shape == (0, 2)
     assert LENSES["radtan"].distort(np.empty((0, 2))).shape == (0, 2)
-    with raises("RIL-372"):
-        LENSES["radtan"].distort([1.0, 2.0, 3.0])
 
 
 @pytest.mark.parametrize(

@@ -241,7 +241,7 @@ def test_unusable_values_have_no_weight() -> None:
 
 
 def test_what_is_refused() -> None:
-    with raises("RIL-399"):
+    with pytest.raises(AssertionError):
         merge([layer(1, 0.0), layer(1, 1.0)], TILE, PARAMS)
     with raises("RIL-361"):
         merge([layer(1, 0.0, lattice=Lattice.at(0, 0, 0.2, 4, 5))], TILE, PARAMS)
