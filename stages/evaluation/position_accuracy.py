@@ -106,7 +106,8 @@ class Fit(NamedTuple):
 
 
 class Offset(NamedTuple):
-    """Seconds to add to the times of the truth; ``low`` and ``high``: until there the squared error at most doubles.
+    """Seconds to add to the times of the truth; ``low`` and ``high``: until there the squared error at most doubles, to
+    half the time between frames.
 
     ``determined``: both ends lie within what was searched, and close enough together.
     """
@@ -164,23 +165,15 @@ def find_offset(moments: Floats, estimate: Floats, truth: TruePositions, upright
     if not np.isfinite(errors).any():
         return None
     value, step = float(tried[np.argmin(errors)]), float(tried[1] - tried[0])
-    for _ in range(4):  # each time ten times finer
-        near = value + np.linspace(-step, step, 21)
-        value, step = float(near[np.argmin([error(offset) for offset in near])]), step / 10
-    limit = EQUAL_ERROR * error(value)
-    worse = np.flatnonzero(errors > limit)
+    span, options = (value - step, value + step), {"xatol": 1e-5}
+    near = scipy.optimize.minimize_scalar(error, bounds=span, method="bounded", options=options)
+    value = value if errors.min() <= near.fun else float(near.x)
+    worse = np.flatnonzero(errors > EQUAL_ERROR * error(value))
     above = int(np.searchsorted(tried[worse], value))
-    # The nearest worse offset to either side; without one, and where too few frames are compared, no end was found.
+    # The nearest worse offset to either side; without one, and where too few frames are compared, no end was reached.
     ends = [worse[above - 1] if above > 0 else 0, worse[above] if above < len(worse) else -1]
-    ended = [bool(limit < errors[k] < np.inf) for k in ends]
-    low, high = (
-        float(
-            scipy.optimize.brentq(lambda offset: error(offset) - limit, value, tried[k], xtol=SAME_TIME_S)
-            if end
-            else tried[k]
-        )
-        for k, end in zip(ends, ended, strict=True)
-    )
+    ended = [bool(EQUAL_ERROR * error(value) < errors[k] < np.inf) for k in ends]
+    low, high = (float(tried[k]) for k in ends)
     determined = all(ended) and high - low < MAX_RANGE_SHARE * np.ptp(tried[np.isfinite(errors)])
     return Offset(0.0 if not determined and low <= 0.0 <= high else value, low, high, bool(determined))
 
