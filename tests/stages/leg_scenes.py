@@ -11,8 +11,8 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import SAFE
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.local_planner.clearance import Footing, Hazards
+from rille.stages.planning.local_planner.ground import LocalPlannerParams
 from rille.stages.planning.local_planner.look import FieldOfView
-from rille.stages.planning.local_planner.params import LocalPlannerParams
 
 ROVER = Vehicle(
     wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01

@@ -33,9 +33,14 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.planning.local_planner.clearance import Footing
-from rille.stages.planning.local_planner.ground import Ground, KnownFreeGround
+from rille.stages.planning.local_planner.ground import (
+    MIN_LEG_WHEELBASES,
+    TOLERANCE_WHEELBASES,
+    Ground,
+    KnownFreeGround,
+    LocalPlannerParams,
+)
 from rille.stages.planning.local_planner.look import AHEAD, FieldOfView, PlannerMemory, Stand, Target
-from rille.stages.planning.local_planner.params import MIN_LEG_WHEELBASES, TOLERANCE_WHEELBASES, LocalPlannerParams
 from rille.stages.planning.local_planner.route import (
     Piece,
     first_metres,

@@ -23,8 +23,8 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.classification import HAZARDOUS, UNKNOWN, UNSEEN_BIT
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.local_planner.clearance import Footing, Hazards
+from rille.stages.planning.local_planner.ground import LocalPlannerParams
 from rille.stages.planning.local_planner.look import FieldOfView, PlannerMemory, Stand
-from rille.stages.planning.local_planner.params import LocalPlannerParams
 from rille.stages.planning.local_planner.policy import Before, Leg, plan_leg, shortest
 from rille.stages.terrain.occlusion_bounds import Bounds
 

@@ -38,8 +38,7 @@ from rille.stages.geometry.surface import Surface, plane
 from rille.stages.terrain.ground import PlaneView, view_ground, view_matches
 from rille.stages.terrain.ground_frame import sampled
 from rille.stages.terrain.ground_frame import z_range as plane_z_range
-from rille.stages.terrain.locus.coverage import Limits, coverage
-from rille.stages.terrain.locus.empty import explain
+from rille.stages.terrain.locus.coverage import Limits, coverage, explain
 from rille.stages.terrain.locus.kernel import Dem
 from rille.stages.terrain.locus.refinement import refine
 from rille.stages.terrain.locus.solve import Matches, PairArrays, SearchLimits, join, projections, solve

@@ -17,10 +17,9 @@ from rille.stages.hazard.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
 from rille.stages.planning.local_planner import ground as ground_rules
 from rille.stages.planning.local_planner import policy
 from rille.stages.planning.local_planner.clearance import Footing, Hazards
-from rille.stages.planning.local_planner.ground import CLOSED_WHEELBASES, FAR_COST, Ground
+from rille.stages.planning.local_planner.ground import CLOSED_WHEELBASES, FAR_COST, MIN_LEG_WHEELBASES, Ground
 from rille.stages.planning.local_planner.look import AHEAD as ANYWHERE
 from rille.stages.planning.local_planner.look import FieldOfView, PlannerMemory, Stand
-from rille.stages.planning.local_planner.params import MIN_LEG_WHEELBASES
 from rille.stages.planning.local_planner.policy import MAX_LOOKS, Leg, plan_leg, shortest
 from rille.stages.planning.local_planner.route import length_of, through
 from rille.stages.planning.local_planner.stage import SeenGround, next_leg, seen_so_far, shortest_way

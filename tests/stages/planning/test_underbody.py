@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import SAFE, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning.local_planner.clearance import Footing, Hazards
-from rille.stages.planning.local_planner.underbody import Straddle, clears
+from rille.stages.planning.local_planner.clearance import Footing, Hazards, Straddle, clears
 from rille.stages.terrain.occlusion_bounds import Bounds
 
 ROVER = Vehicle(

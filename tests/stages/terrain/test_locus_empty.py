@@ -8,7 +8,7 @@ from terrain_scenes import pitched, toed_in_rig
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.surface import plane
-from rille.stages.terrain.locus.empty import explain
+from rille.stages.terrain.locus.coverage import explain
 
 RIG, T_LOCAL_LEFT = toed_in_rig(), pitched(35.0)
 AHEAD = Lattice.snap((-0.2, 0.2, 0.6, 1.0), 0.01)

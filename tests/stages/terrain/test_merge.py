@@ -13,8 +13,16 @@ from terrain_scenes import ArrayLayer
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.geometry.lattice import Lattice, mosaic
 from rille.stages.terrain import merge as merge_stage
-from rille.stages.terrain.merge import EXACT, MergeParams, Placed, footprint, merge
-from rille.stages.terrain.merge_kernel import ORTHO_WEIGHT_EXPONENT, RESIDUAL_SCALE_PX, Merged
+from rille.stages.terrain.merge import (
+    EXACT,
+    ORTHO_WEIGHT_EXPONENT,
+    RESIDUAL_SCALE_PX,
+    Merged,
+    MergeParams,
+    Placed,
+    footprint,
+    merge,
+)
 
 TILE = Lattice.at(0, 0, 0.1, 4, 5)
 PARAMS = MergeParams()
