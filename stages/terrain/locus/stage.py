@@ -264,11 +264,6 @@ def _size(params: LocusParams, args: Mapping[str, Any], metas: Mapping[str, Any]
     return 24.0 * lattice.rows * lattice.cols
 
 
-def _median(array: Floats32) -> float | None:
-    values = array[np.isfinite(array)]
-    return float(np.median(values)) if values.size else None
-
-
 _FRAME = "local or world (meta: frame)"
 
 
@@ -355,7 +350,7 @@ def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: i
         "T_frame_left": T.to_list(),
         "pixel_rad": 1.0 / coarser_focal(rig),
         "defined": float(np.mean(np.isfinite(dem.elevation))),
-        "median_elevation_std": _median(dem.elevation_std),
+        "median_elevation_std": float(np.nanmedian(dem.elevation_std)),
     }
     if level["source"] == REFERENCE_PLANE:
         meta["reference"] = REFERENCE_PLANE
