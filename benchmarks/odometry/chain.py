@@ -6,6 +6,7 @@ pose depends on (elevation models, risk, path, cross-check), and the cache of ar
 
 from __future__ import annotations
 
+import copy
 import importlib
 import itertools
 import time
@@ -18,6 +19,8 @@ import numpy as np
 
 from rille.datasets.protocol import Sequence, Source
 from rille.pipeline.flow import config as configuration
+from rille.pipeline.flow.builders import recalibrated
+from rille.pipeline.flow.reconstruction import CALIBRATIONS
 from rille.stages.core.declare import Bundle, NoParams, declared
 from rille.stages.odometry.resection.trajectory import world_poses
 
@@ -94,10 +97,11 @@ def settings(sequence: Sequence, assignments: list[str]) -> Any:
 
 
 class Chain:
-    """One run of the stages."""
+    """One run of the stages; ``cameras`` are the left camera as given, and as it was corrected so far."""
 
-    def __init__(self, images: Images, config: Any) -> None:
+    def __init__(self, images: Images, config: Any, cameras: tuple[Any, ...] = ()) -> None:
         self.images, self.sequence, self.config = images, images.sequence, config
+        self.cameras = (*cameras, self.sequence.rig.left.to_dict())
         self.frames = list(images.frames)
         self.clock = Clock()
         self._pyramids: dict[tuple[int, str], Bundle] = {}
@@ -119,8 +123,16 @@ class Chain:
         given = {"segments": [r for r, _, _ in segments], "levels": [level for _, level, _ in segments]}
         if self.config.refine.enabled:
             given["refined"] = self._refined(segments)
+            first = {"given": self.cameras[0]} if len(self.cameras) > 1 else {}
+            found = self._stage("intrinsics", first, segments=given["refined"], rig=self.calibration)
+            given["intrinsics"] = found
+            if any(found.meta["correction"]) and len(self.cameras) <= CALIBRATIONS:
+                other = copy.copy(self.images)
+                other.sequence = recalibrated(self.sequence, found.meta["correction"])
+                return Chain(other, self.config, self.cameras).run()
         trajectory = self._stage("trajectory", {"frames": self.frames, "lost": lost}, **given)
         facts = {"basic": basic, "select": select.meta, "resect": [r.meta for r, _, _ in segments]}
+        facts |= {"intrinsics": given["intrinsics"].meta if "intrinsics" in given else {}}
         facts |= {"rig": self.rig_facts, "trajectory": trajectory.meta}
         return Navigated(world_poses(trajectory), trajectory["covariance"], facts, self.clock)
 

@@ -52,7 +52,11 @@ LOOP: Mapping[str, Any] = {
 """``mockup-loop``: small images of wide-angle cameras, which see the ground from 0.08 m before them to the horizon;
 one ray a pixel, since a drive takes a hundred of them."""
 
+EXACT_CALIBRATION = 1e-5
+"""Standard deviation of the simulated cameras' focal length and principal point, over the focal length."""
+
 LOOP_DEFAULTS: Mapping[str, Any] = {
+    "intrinsics.prior": EXACT_CALIBRATION,
     "terrain.preset": "accurate",
     "track.points": 400,
     "locus.cell_size": 0.004,
@@ -219,7 +223,12 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         truth_dem=dem,
         truth_disparity=lambda frame: sources.disparity(frame, lefts[frame]),
         evaluation_window=EVALUATION_WINDOW_M,
-        defaults={"keyframes.rule": "stride", "keyframes.stride": 4, "locus.cell_size": 0.001},
+        defaults={
+            "keyframes.rule": "stride",
+            "keyframes.stride": 4,
+            "locus.cell_size": 0.001,
+            "intrinsics.prior": EXACT_CALIBRATION,
+        },
         notes=(
             f"simulated at 1:10 with seed {p.seed}; lengths are those of the model",
             "truth frame: z up, y along the bed, x right, origin in the middle of the near edge at mean height",

@@ -17,9 +17,9 @@ Order of creation is priority: what is created first runs first.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any, Generic
+from typing import Any, Generic, cast
 
 from rille.pipeline.engine.spec import Refs, Spec, each, flat
 from rille.pipeline.engine.store.manifest import Ref
@@ -160,7 +160,8 @@ class Graph:
     cut: Cut | None = None
     asked: set[int] = field(default_factory=set)
     unfinished: int = 0
-    _labels: set[str] = field(default_factory=set)
+    anew: bool = False
+    _labels: dict[str, Handle] = field(default_factory=dict)
     _complete: set[str] = field(default_factory=set)
 
     def node(
@@ -186,14 +187,18 @@ class Graph:
         TypeError
             The inputs do not fit the ports of the stage, or the parameters are of another model.
         """
-        if label in self._labels:
-            raise ValueError(f"the label {label!r} is taken: labels of nodes are unique")
         module = stage if isinstance(stage, str) else stage.module
         spec = Spec(module, label, params, dict(args) if args else _NONE, dict(hints) if hints else _NONE)
         given = {p: h if isinstance(h, Handle) else list(h) for p, h in (inputs or {}).items()}
+        while (taken := self._labels.get(spec.label)) is not None:
+            if not self.anew:
+                raise ValueError(f"the label {label!r} is taken: labels of nodes are unique")
+            if taken.spec == spec and taken.inputs == given:
+                return cast(Handle[F], taken)
+            spec = replace(spec, label=f"{spec.label}/anew")
         _check_ports(spec, given)
         handle: Handle[F] = Handle(len(self.nodes), spec, given, expect=expect)
-        self._labels.add(label)
+        self._labels[spec.label] = handle
         self.nodes.append(handle)
         return handle
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, Concatenate, ParamSpec, TypeVar
@@ -37,6 +37,7 @@ from rille.stages.imaging.features import features_stage
 from rille.stages.imaging.pyramid import pyramid_stage
 from rille.stages.imaging.undistort import undistort_stage
 from rille.stages.odometry.motion import motion_stage
+from rille.stages.odometry.resection.intrinsics import corrected
 from rille.stages.odometry.resection.pose import pose_stage
 from rille.stages.odometry.resection.resect import resect_stage
 from rille.stages.odometry.track import track_stage
@@ -59,13 +60,19 @@ PYRAMID_BYTES = 20 / 3
 
 
 @dataclass(frozen=True)
-class Pair:
-    """A basic pair: disparity, rig that it is reconstructed with, vertical, and elevation model in its own frame."""
+class MatchedPair:
+    """A basic pair: disparity, rig that it is reconstructed with, and vertical."""
 
     frame: int
     disparity: Handle
     rig: Handle[CalibrationFacts]
     level: Handle[GroundFacts]
+
+
+@dataclass(frozen=True)
+class Pair(MatchedPair):
+    """A basic pair with the elevation model in its own frame."""
+
     dem: Handle[DemFacts]
 
 
@@ -97,6 +104,16 @@ def name(graph: Graph, sequence: Sequence, frames: Series[int]) -> None:
     graph.sequence, graph.choice = sequence.name, digest(tuple(frames))[:16]
 
 
+def recalibrated(sequence: Sequence, errors: Series[float]) -> Sequence:
+    """The sequence with both cameras changed by errors of focal length and principal point (over the former)."""
+    rig, lenses = sequence.rig, (sequence.lenses or {}).items()
+    return replace(
+        sequence,
+        rig=replace(rig, left=corrected(rig.left, errors), right=corrected(rig.right, errors)),
+        lenses={side: replace(lens, camera=corrected(lens.camera, errors)) for side, lens in lenses} or None,
+    )
+
+
 class Builder:
     """Adds tasks of a sequence to a graph, with the parameters of a configuration.
 
@@ -108,6 +125,7 @@ class Builder:
         self.graph, self.sequence, self.config = graph, sequence, config
         self.products = Products()
         self.made: dict[Any, Any] = {}
+        self.given_camera = sequence.rig.left.to_dict()
 
     # Arguments of many tasks, one object for all: each would hold some kilobytes of its own until the run's end.
 
@@ -130,6 +148,14 @@ class Builder:
         # A section is named as its stage; a stage without parameters has none.
         chosen: Params = params or getattr(self.config, stage.name, NO_PARAMS)
         return self.graph.call(stage, label, chosen, **given)
+
+    def recalibrate(self, errors: Series[float]) -> None:
+        """Go on with both cameras changed; what does not rest on them is the same task as before."""
+        self.sequence = recalibrated(self.sequence, errors)
+        self.graph.anew = True
+        self.made.clear()
+        self.products.contradictions.clear()
+        del self.given_rig
 
     # -- images -------------------------------------------------------------------------------------------------
 
@@ -273,7 +299,9 @@ class Builder:
         label = "ground_frame" if plane is None else "reference_plane"
         return self.node(ground_frame_stage, f"{label}/{frame}", **given, **(plane or {}))
 
-    def pair(self, frame: int, level: Handle[GroundFacts], known: Handle[CalibrationFacts], first: Pair | None) -> Pair:
+    def pair(
+        self, frame: int, level: Handle[GroundFacts], known: Handle[CalibrationFacts], first: MatchedPair | None
+    ) -> Pair:
         """Local elevation model of a pair above its reference plane; ``known`` is its rig.
 
         Cells and extent of the ``first`` pair (None: this one) serve all, so that they merge.
@@ -326,7 +354,12 @@ class Builder:
     # -- between pairs ------------------------------------------------------------------------------------------
 
     def segment(
-        self, frames: Series[int], key: Pair, more: Args | None = None, which: str = "", after: Pair | None = None
+        self,
+        frames: Series[int],
+        key: MatchedPair,
+        more: Args | None = None,
+        which: str = "",
+        after: MatchedPair | None = None,
     ) -> Segment:
         """Track and resect the left images that follow basic pair ``key``, which is the first of them.
 

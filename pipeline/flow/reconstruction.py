@@ -29,7 +29,8 @@ basic, and ``keyframes`` chooses anew. ``resect`` compares each basic pair with 
 knocked nothing is posed.
 
 A segment needs landmarks only relative to its own basic pair, so all segments are resected and refined in parallel, and
-``trajectory`` chains them; ``intrinsics`` asks all of them for an error of the cameras. Where other sensors are
+``trajectory`` chains them; ``intrinsics`` asks all of them for errors of the calibration, whose covariance it needs.
+Where the cameras are wrong, all that rests on them is laid out anew with corrected ones. Where other sensors are
 measurements (dead reckoning, GNSS, attitude) all poses are adjusted to them together: ``adjust``. Locus then runs a
 second time, directly on the shared world lattice, so nothing is resampled. With ``locus.both`` it reads the disparities
 of both images (``hfvm/back``). What depends on data (which pairs are basic, how far the world reaches) follows as
@@ -55,13 +56,14 @@ import numpy as np
 from rille.pipeline.engine.graph import Complete, Handle, Maybe, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow import assessment
-from rille.pipeline.flow.builders import Builder, Pair, Segment, centre, merge_tiles, other_plane
+from rille.pipeline.flow.builders import Builder, MatchedPair, Pair, Segment, centre, merge_tiles, other_plane
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.evaluation.crosscheck import crosscheck_stage, windows
 from rille.stages.evaluation.crosscheck_join import crosscheck_join_stage
 from rille.stages.facts.calibration import CalibrationFacts, RigFacts
 from rille.stages.facts.evaluation import JoinFacts
 from rille.stages.facts.odometry import (
+    IntrinsicsFacts,
     KeyframesFacts,
     LoopFacts,
     MovingFacts,
@@ -108,6 +110,9 @@ TABLE_FRAMES = 100
 PLACES_FRAMES = 500
 """Frames whose basic pairs are looked for in earlier ones together: blocks that are read by all later blocks."""
 
+CALIBRATIONS = 4
+"""Corrections of the cameras, at most: of a focal length that is 10 % off one to three are usual."""
+
 Steps = Generator[Wait, Any, None]
 Facts = Mapping[str, Any]
 
@@ -148,36 +153,48 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     lost = sorted([*missing, *found.meta["lost"]], key=lambda item: item["frame"])
     row = {frame: k for k, frame in enumerate(frames)}
     behind = [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1]
-    chosen, rigs = yield from simultaneous(make, chain, behind, found.meta["unfit"])
-    if chosen is None:
-        return
-    basic = [chain[i] for i in chosen.meta["basic"]]
-    yield Complete(("keyframes", "synchrony", "rig", "calibration"))
+    turn = 0
+    while True:
+        if turn and p.crosscheck is not None:
+            p.crosscheck = another_program(make, whole)
+        chosen, rigs = yield from simultaneous(make, chain, behind, found.meta["unfit"])
+        if chosen is None:
+            return
+        basic = [chain[i] for i in chosen.meta["basic"]]
+        yield Complete(("keyframes", "synchrony", "rig", "calibration"))
+        matched = yield from matched_pairs(make, rigs)
 
-    # At each basic pair, the rover's stop: local elevation model, hazards and path.
-    pairs = yield from basic_pairs(make, rigs)
+        # Behind each basic pair: tracks, and poses in its frame. They show errors of the calibration.
+        ways = [[chain[i] for i in part] for part in chosen.meta["segments"]]
+        segments = [
+            make.segment(way, matched[way[0]], dead_reckoning(make, way), after=matched.get(way[-1])) for way in ways
+        ]
+        segments, moved = yield from unmoved(make, matched, segments)
+        p.tracks, p.resections = [s.track for s in segments], [s.resection for s in segments]
+        p.refined = refined(make, matched, segments)
+        correction = (yield from asked_for(make, matched[basic[0]])) if p.refined else []
+        if not any(correction) or turn == CALIBRATIONS:
+            break
+        make.recalibrate(correction)
+        turn += 1
+    if p.intrinsics is not None:
+        p.contradictions.append(p.intrinsics)
 
-    # In between: tracks, poses in the frame of the segment's basic pair, and their product.
-    segments = []
-    for part in chosen.meta["segments"]:
-        way = [chain[i] for i in part]
-        segments.append(make.segment(way, pairs[way[0]], dead_reckoning(make, way), after=pairs.get(way[-1])))
-    segments, moved = yield from unmoved(make, pairs, segments)
-    p.tracks, p.resections = [s.track for s in segments], [s.resection for s in segments]
-    p.refined = refined(make, pairs, segments)
-    if p.refined:
-        flow(checked_intrinsics(make, pairs[basic[0]]), lays=())
+    # At each basic pair, the rover's stop: local elevation model, hazards and path. In between: the segments' product.
+    pairs = local_models(make, [pair for k, pair in matched.items() if k not in moved], matched[basic[0]])
+    yield Complete(("hfvm", "disparity_accuracy"))
     p.trajectory = make.node(
         trajectory_stage,
         "trajectory",
         segments=p.resections,
-        levels=[pairs[s.frames[0]].level for s in segments] or [pairs[basic[0]].level],
+        levels=[matched[s.frames[0]].level for s in segments] or [matched[basic[0]].level],
         refined=p.refined or None,
+        intrinsics=p.intrinsics,
         frames=list(frames),
         steps=steps_of(make, chosen),
         lost=lost or None,
     )
-    yield from adjusted(make, frames, [pair for k, pair in pairs.items() if k not in moved])
+    yield from adjusted(make, frames, list(pairs.values()))
     flow(assessment.of_trajectory(make, frames), lays=("accuracy",))
     yield Complete(("track", "resect", "refine", "intrinsics", "trajectory", "features", "loops", "loop", "adjust"))
     yield Complete(("agreement", "position_accuracy", "accuracy", "truth"))
@@ -186,9 +203,9 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     # The world is that of the largest piece: its models, straight on the world lattice.
     start, end = posed.meta["pieces"][posed.meta["main"]]
     world = set(posed.meta.get("world", range(start, end + 1)))
-    p.moving = moving_parts(make, segments, pairs) if make.config.moving.enabled else {}
+    p.moving = moving_parts(make, segments, matched) if make.config.moving.enabled else {}
     # Pairs of other pieces have poses in frames of their own: nothing says where they lie in this world.
-    there = [k for k in basic if k in world and posed.meta["positions"][row[k]] and k not in moved]
+    there = [k for k in pairs if k in world and posed.meta["positions"][row[k]]]
     for k in there:
         _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory, p.moving.get(k))
     prints = [
@@ -326,13 +343,14 @@ def simultaneous(
         mode = "per_pair"
 
 
-def basic_pairs(make: Builder, rigs: dict[int, Handle[CalibrationFacts]]) -> Generator[Wait, Any, dict[int, Pair]]:
-    """Stereo pairs to local elevation models, each with its rig; on ground also to risk maps and paths."""
-    p, pairs = make.products, dict[int, Pair]()
+def matched_pairs(
+    make: Builder, rigs: dict[int, Handle[CalibrationFacts]]
+) -> Generator[Wait, Any, dict[int, MatchedPair]]:
+    """Disparities of stereo pairs, each with its rig, and their vertical and reference plane."""
+    p = make.products
     verticals = {k: vertical(make, k) for k in rigs}
     p.level = {k: make.level(k, verticals[k], known) for k, known in rigs.items()}
-    for k in rigs:
-        p.disparity[k], p.orientations[k] = make.disparity(k), make.orientation(k)
+    p.disparity, p.orientations = {k: make.disparity(k) for k in rigs}, {k: make.orientation(k) for k in rigs}
     yield Complete(("undistort", "pyramid", "orientation", *(() if make.config.locus.both else ("hfvm",))))
     judged = yield Maybe(list(p.level.values()))
     placed = make.sequence.georeference is not None
@@ -340,14 +358,19 @@ def basic_pairs(make: Builder, rigs: dict[int, Handle[CalibrationFacts]]) -> Gen
     if plane is not None:
         p.level = {k: make.level(k, verticals[k], known, plane) for k, known in rigs.items()}
     yield Complete(("ground_frame",))
-    for k, known in rigs.items():
-        pair = pairs[k] = make.pair(k, p.level[k], known, pairs.get(next(iter(rigs))))
-        p.local_dem[k] = pair.dem
-        if plane is None:
+    return {k: MatchedPair(k, p.disparity[k], known, p.level[k]) for k, known in rigs.items()}
+
+
+def local_models(make: Builder, matched: list[MatchedPair], first: MatchedPair) -> dict[int, Pair]:
+    """Local elevation models of stereo pairs in the cells of the ``first``; on ground also risk maps and paths."""
+    p, pairs = make.products, dict[int, Pair]()
+    for one in matched:
+        k, pair = one.frame, make.pair(one.frame, one.level, one.rig, first)
+        pairs[k], p.local_dem[k] = pair, pair.dem
+        if "reference" not in one.level.spec.args:
             p.local_risk[k] = make.hazards(f"risk/local/{k}", [pair.dem])
             p.local_path[k] = make.node(path_stage, f"path/local/{k}", risk=p.local_risk[k], use="local")
         make.graph.flow(assessment.of_pair(make, pair), lays=("dem_accuracy",))
-    yield Complete(("hfvm", "disparity_accuracy"))
     return pairs
 
 
@@ -363,7 +386,7 @@ def vertical(make: Builder, pair: int) -> dict[str, Any]:
 
 
 def unmoved(
-    make: Builder, pairs: Mapping[int, Pair], segments: list[Segment]
+    make: Builder, pairs: Mapping[int, MatchedPair], segments: list[Segment]
 ) -> Generator[Wait, Any, tuple[list[Segment], set[int]]]:
     """Segments, those refused whose basic pair measures otherwise than the first: its rig was knocked; and such pairs.
 
@@ -380,8 +403,6 @@ def unmoved(
             p.contradictions.append(s.resection)
         if end in pairs and np.linalg.norm(by) > MIN_JUMP_PX:
             moved.add(end)
-            for models in (p.local_dem, p.local_risk, p.local_path):
-                models.pop(end, None)
     return out, moved
 
 
@@ -434,11 +455,12 @@ def adjusted(make: Builder, frames: Series[int], pairs: list[Pair]) -> Steps:
         segments=p.resections,
         refined=p.refined or None,
         loops=p.loops or None,
+        intrinsics=p.intrinsics,
         priors=known or None,
     )
 
 
-def refined(make: Builder, pairs: Mapping[int, Pair], segments: list[Segment]) -> list[Handle[RefineFacts]]:
+def refined(make: Builder, pairs: Mapping[int, MatchedPair], segments: list[Segment]) -> list[Handle[RefineFacts]]:
     """Segments adjusted with their landmarks, where that is wanted."""
     if not make.config.refine.enabled:
         return []
@@ -460,7 +482,9 @@ def refined(make: Builder, pairs: Mapping[int, Pair], segments: list[Segment]) -
     return out
 
 
-def moving_parts(make: Builder, segments: list[Segment], pairs: Mapping[int, Pair]) -> dict[int, Handle[MovingFacts]]:
+def moving_parts(
+    make: Builder, segments: list[Segment], pairs: Mapping[int, MatchedPair]
+) -> dict[int, Handle[MovingFacts]]:
     """What moves by itself in each basic pair, by the next frame; in the last one by the frame before."""
     out = dict[int, Handle[MovingFacts]]()
     for segment in segments:
@@ -479,13 +503,13 @@ def moving_parts(make: Builder, segments: list[Segment], pairs: Mapping[int, Pai
     return out
 
 
-def checked_intrinsics(make: Builder, key: Pair) -> Generator[Wait, Any, None]:
-    """Ask all segments for an error of the cameras' intrinsics; of the rig of pair ``key``."""
+def asked_for(make: Builder, key: MatchedPair) -> Generator[Wait, Any, list[float]]:
+    """Correction of the cameras that all segments ask for, zeros where they do not; of the rig of pair ``key``."""
     p = make.products
-    p.intrinsics = make.node(intrinsics_stage, "intrinsics", segments=p.refined, rig=key.rig)
-    judged = yield from done(p.intrinsics)
-    if "contradiction" in judged.meta:
-        p.contradictions.append(p.intrinsics)
+    given = make.given_camera if make.graph.anew else None
+    p.intrinsics = make.node(intrinsics_stage, "intrinsics", segments=p.refined, rig=key.rig, given=given)
+    judged: list[Ref[IntrinsicsFacts] | None] = yield Maybe([p.intrinsics])
+    return [] if judged[0] is None else judged[0].meta["correction"]
 
 
 def seen_again(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[Handle[LoopFacts]]]:

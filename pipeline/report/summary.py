@@ -19,6 +19,7 @@ from rille.pipeline.report.gather import Scene, facts_of, frames_of
 from rille.pipeline.report.metrics import metric, metrics
 from rille.pipeline.report.words import metres, number, quantity
 from rille.stages.evaluation import imu_check
+from rille.stages.odometry.resection.intrinsics import CORRECTED
 from rille.stages.odometry.resection.trajectory import world_poses
 
 REPORT_FORMAT = 2
@@ -43,7 +44,13 @@ def gather(view: RunView) -> dict[str, Any]:
         "frames": frames,
         "pairs": pairs,
         "vehicle": view.config.vehicle.model_dump(mode="json"),
-        "notes": [*view.sequence.notes, *delivery.coverage(view), *delivery.moved(view), *given_numbers(view)],
+        "notes": [
+            *view.sequence.notes,
+            *delivery.coverage(view),
+            *delivery.moved(view),
+            *given_numbers(view),
+            *resting(view),
+        ],
         "rig": _rig(scene),
         "crosscheck": _crosscheck(scene),
         "path": _path(scene),
@@ -195,6 +202,15 @@ def _small_sigma(figures: Mapping[str, Any]) -> list[str]:
         "too small, or the truth has a turn or errors of its own; until that is known do not weigh by them; what the "
         "merged map says of σ and of the probability of a hazard holds for the shape of the ground, not for its place"
     ]
+
+
+def resting(view: RunView) -> list[str]:
+    """Numbers of the cameras that the tracks show little of, with the standard deviations that poses reckon with."""
+    facts = facts_of(view, view.products.intrinsics)
+    numbers = list(facts.get("errors", {}).items())[:CORRECTED]
+    held = [f"{name} +- {100.0 * sigma:.2g} %" for name, (_, sigma) in numbers if name in facts["held"]]
+    text = "These numbers of the cameras rest on the calibration as given, for the tracks show little of them"
+    return [f"{text}: {', '.join(held)} of the focal length; the covariances of poses hold that."] if held else []
 
 
 AGAINST_TRUTH = {

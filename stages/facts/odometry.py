@@ -74,18 +74,23 @@ class ResectFacts(Facts):
 
 
 class RefineFacts(Facts):
-    """A segment adjusted with its landmarks: bias and costs of the ``adjustment``, and contributions to the errors of
-    the ``intrinsics``; both empty where no frame has a pose."""
+    """A segment adjusted with its landmarks: bias and costs of the ``adjustment``, and what it says of errors of the
+    calibration (``intrinsics``: ``information``, ``pull``, ``turn_deg``); both empty where no frame has a pose."""
 
     adjustment: dict[str, Any]
-    intrinsics: list[tuple[float, float]]
+    intrinsics: dict[str, Any]
     per_frame: list[dict[str, Any]]
 
 
 class IntrinsicsFacts(Facts):
-    """Errors of the intrinsics with their sigmas, over the focal length; none of a few segments."""
+    """``errors`` of the calibration, each with its sigma, and their ``covariance``; those that are ``held`` by the
+    calibration as given, since the sequence shows them little; ``correction`` that the tracks ask for (else 0) of focal
+    length and principal point, over the focal length."""
 
-    intrinsics: NotRequired[dict[str, Any]]
+    errors: dict[str, list[float]]
+    covariance: list[list[float]]
+    held: list[str]
+    correction: list[float]
     contradiction: NotRequired[str]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from rille.stages.core.declare import Array
 
 NO_VERTICAL = "none"
@@ -29,4 +31,17 @@ SHARED = Array(
     "m, rad",
     "errors of position and rotation vector per standard deviation of what all segments share",
     "nan",
+)
+
+BY_INTRINSICS = Array(
+    "by_intrinsics",
+    ("frame", "parameter", "number"),
+    "float64",
+    "m, rad",
+    "change of position and rotation vector with each error of the calibration that is estimated",
+    "nan",
+)
+
+OWN_COVARIANCE = replace(
+    COVARIANCE, name="own_covariance", long_name="covariance if the calibration had no errors", optional=True
 )

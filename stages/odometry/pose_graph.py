@@ -66,6 +66,10 @@ class Factors:
             column += more
         return Factors(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names}, shared=np.vstack(shared))
 
+    def beside(self, others: Factors) -> Factors:
+        """These and others with the same sources."""
+        return Factors(**{name: np.concatenate([value, getattr(others, name)]) for name, value in vars(self).items()})
+
     def take(self, chosen: NDArray[np.intp]) -> Factors:
         """Those with these numbers."""
         return Factors(**{name: value[chosen] for name, value in vars(self).items()})

@@ -21,7 +21,7 @@ SEEN = {"ground_share": 0.6, "ground_reach": 4.0}
 FACTS: dict[str, dict[str, Any]] = {
     "frame_screening": {"asks": {"bridges": [], "sides": []}, "chain": [0, 1, 2], "lost": [], "unfit": []},
     "keyframes": {"basic": [0, 2], "segments": [[0, 1, 2]], "displacement": [1.0, 1.0], "match_rate": [1.0, 1.0]},
-    "intrinsics": {},
+    "intrinsics": {"correction": []},
     "moving": {"share": 0.0},
     "trajectory": {"pieces": [[0, 2]], "main": 0, "frames": [0, 1, 2], "positions": [[0, k, 0] for k in range(3)]},
     "radiometry": {"steps": {}},
@@ -36,7 +36,7 @@ FACTS: dict[str, dict[str, Any]] = {
 }
 """What each stage would have found: enough that the graph grows to its end."""
 
-APART = {"trajectory": {"refined"}, "resect": {"after", "rig_after"}, "locus": {"moving"}}
+APART = {"trajectory": {"refined", "intrinsics"}, "resect": {"after", "rig_after"}, "locus": {"moving"}}
 """Ports that one flow alone has, by stage: a drive goes on before there is anything to be adjusted jointly, a pair
 after a segment to compare its rig with, or a frame that shows what moved."""
 

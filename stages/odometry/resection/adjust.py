@@ -5,6 +5,9 @@ measured from the key frame of its segment, with errors of its own and with thos
 between other frames close loops in it, or join pieces between which the chain is broken; then all poses are adjusted
 together (:mod:`rille.stages.odometry.pose_graph`). A factor that contradicts the others is left out and named.
 
+Errors of the calibration are sources of the graph, too. They show in stated motions as in those of the chain (the more,
+the longer the way), which are measured with the same cameras: only other sensors can tell them.
+
 Pieces that factors join become one piece, in the frame of the first of them. Pieces without factors stay bit by bit.
 """
 
@@ -12,24 +15,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
-from rille.stages.core.declare import AnyArray, Bundle, NoParams, stage
+from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
-from rille.stages.facts.odometry import FactorsFacts, RefineFacts, ResectFacts, TrajectoryFacts
+from rille.stages.facts.odometry import FactorsFacts, IntrinsicsFacts, RefineFacts, ResectFacts, TrajectoryFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, bound_of, root_of
 from rille.stages.odometry.resection.priors import Sensors
-from rille.stages.odometry.resection.trajectory import Chained, account, trajectory_stage, without_vertical
+from rille.stages.odometry.resection.trajectory import Chained, ChainLink, account, trajectory_stage, without_vertical
+
+MIN_WAY_SHARE = 0.03
+"""Of the chain's ways along a direction, over those along the main one, for it to tell errors along that direction."""
 
 
-def chain_factors(segments: Sequence[Bundle], numbers: Sequence[Sequence[int]], row: Mapping[int, int]) -> Factors:
-    """Factors from the key frame of each segment to its other frames.
+def chain_factors(segments: Sequence[ChainLink], numbers: Sequence[Sequence[int]], row: Mapping[int, int]) -> Factors:
+    """Factors from the key frame of each segment to its other frames; the sources of the calibration are the last.
 
     Parameters
     ----------
@@ -38,17 +44,17 @@ def chain_factors(segments: Sequence[Bundle], numbers: Sequence[Sequence[int]], 
     row : node of each frame that has a pose.
     """
     ends, poses, covariances, shared = list[list[int]](), list[Floats](), list[Floats](), list[Floats]()
-    for bundle, frames in zip(segments, numbers, strict=True):
-        key = RigidTransform.from_matrix(bundle["poses"][0])
+    for link, frames in zip(segments, numbers, strict=True):
+        key = RigidTransform.from_matrix(link.poses[0])
         turn = np.kron(np.eye(2), key.rotation.T)
         for k, frame in enumerate(frames[1:], start=1):
-            if frame not in row or frames[0] not in row or not np.isfinite(bundle["poses"][k]).all():
+            if frame not in row or frames[0] not in row or not np.isfinite(link.poses[k]).all():
                 continue
-            common = bundle["shared"][k]
+            common = link.shared[k]
             ends.append([row[frames[0]], row[frame]])
-            poses.append((key.inverse() @ RigidTransform.from_matrix(bundle["poses"][k])).matrix34)
-            covariances.append(turn @ (bundle["covariance"][k] - common @ common.T) @ turn.T)
-            shared.append(turn @ common)
+            poses.append((key.inverse() @ RigidTransform.from_matrix(link.poses[k])).matrix34)
+            covariances.append(turn @ (link.covariance[k] - common @ common.T) @ turn.T)
+            shared.append(turn @ np.hstack([common, link.calibration[k]]))
     count = len(ends)
     return Factors(
         np.array(ends, np.intp).reshape(-1, 2),
@@ -84,6 +90,21 @@ def stated_factors(given: Sequence[Mapping[str, Any]], row: Mapping[int, int]) -
         np.zeros((len(given), 3)),
         np.full(len(given), bound_of(6)),
     )
+
+
+def measured_alike(stated: Factors, chain: Factors, calibration: int) -> Factors:
+    """Stated factors with the sources of the chain, of which the last ones, of the ``calibration``, show in them, too.
+
+    By the way from one end to the other as they show in the chain on average: a least-squares fit.
+    """
+    count, sources = len(stated.ends), chain.shared.shape[2]
+    seen = np.zeros((count, 6, sources))
+    if len(chain.ends) and calibration:
+        per_way = np.linalg.lstsq(
+            chain.poses[:, :, 3], chain.shared[:, :, -calibration:].reshape(len(chain.ends), -1), rcond=MIN_WAY_SHARE
+        )[0]
+        seen[:, :, -calibration:] = (stated.poses[:, :, 3] @ per_way).reshape(count, 6, calibration)
+    return replace(stated, shared=seen)
 
 
 class JoinedPieces(NamedTuple):
@@ -150,18 +171,21 @@ def adjust_stage(
     segments: Sequence[Bundle[ResectFacts]],
     refined: Sequence[Bundle[RefineFacts]] = (),
     loops: Sequence[Bundle[FactorsFacts]] = (),
+    intrinsics: Bundle[IntrinsicsFacts] | None = None,
     *,
     priors: Mapping[str, Any] | None = None,
 ) -> Bundle[TrajectoryFacts]:
     """Poses of all left frames, adjusted to places seen again and to what other sensors say."""
     frames = trajectory.meta["frames"]
-    chained = Chained(*(np.array(trajectory[name]) for name in ("poses", "covariance", "segment", "piece")))
+    chained = Chained(**{field.name: np.array(trajectory[field.name]) for field in fields(Chained)})
     posed = np.flatnonzero(chained.piece >= 0)
     row = {frames[k]: node for node, k in enumerate(posed)}
     numbers = [[int(f["frame"]) for f in bundle.meta["per_frame"]] for bundle in segments]
-    chain = chain_factors(refined or segments, numbers, row)
+    links = [ChainLink.of(bundle, intrinsics) for bundle in refined or segments]
+    calibration = links[0].calibration.shape[2] if links else 0
+    chain = chain_factors(links, numbers, row)
     given = [one for bundle in loops for one in bundle.meta["factors"] if one["from"] in row and one["to"] in row]
-    stated = stated_factors(given, row)
+    stated = measured_alike(stated_factors(given, row), chain, calibration)
     sensors = Sensors.of(priors or {}, posed)
     sensors.believe(chained.poses[posed], chained.piece[posed])
     between = Factors.joined([stated, *(sensor.factors(0.0) for sensor in sensors.relative)])
@@ -176,11 +200,11 @@ def adjust_stage(
     for number in np.unique(piece):
         nodes = np.flatnonzero(piece == number)
         own, mine = _within(chain, nodes), _within(stated, nodes)
-        done = sensors.adjusted(poses[nodes], nodes, [own, mine])
+        done = sensors.adjusted(poses[nodes], nodes, own.beside(mine))
         if done is None:
             continue
         excess = max(excess, done.graph.excess)
-        out = _written(out, posed[nodes], done)
+        out = _written(out, posed[nodes], done, slice(own.shared.shape[2] - calibration, own.shared.shape[2]))
         kept = done.kept[len(own.ends) : len(own.ends) + len(mine.ends)]
         for k in np.flatnonzero(np.isin(stated.ends, nodes).all(1))[~kept]:
             ends = np.searchsorted(nodes, stated.ends[k])
@@ -196,13 +220,20 @@ def _within(factors: Factors, nodes: NDArray[np.intp]) -> Factors:
     return replace(inside, ends=np.searchsorted(nodes, inside.ends))
 
 
-def _written(out: Chained, rows: NDArray[np.intp], done: Adjusted) -> Chained:
-    """The trajectory with the adjusted poses in these rows, which are one piece now."""
-    poses, covariance, piece = out.poses.copy(), out.covariance.copy(), out.piece.copy()
+def _written(out: Chained, rows: NDArray[np.intp], done: Adjusted, calibration: slice) -> Chained:
+    """The trajectory with the adjusted poses in these rows, which are one piece now.
+
+    ``calibration`` are the sources that are errors of it.
+    """
+    changed = {name: value.copy() for name, value in vars(out).items()}
+    exact = replace(done.graph.factors, shared=done.graph.factors.shared.copy())
+    exact.shared[:, :, calibration] = 0.0
     # The place of positions and of the vertical is a node behind the frames.
-    poses[rows], covariance[rows] = done.state.poses[:-1], done.graph.covariance(done.state)[:-1]
-    piece[rows] = piece[rows].min()
-    return replace(out, poses=poses, covariance=covariance, piece=piece)
+    changed["poses"][rows] = done.state.poses[:-1]
+    changed["covariance"][rows] = done.graph.covariance(done.state)[:-1]
+    changed["own_covariance"][rows] = replace(done.graph, factors=exact).covariance(done.state)[:-1]
+    changed["piece"][rows] = changed["piece"][rows].min()
+    return Chained(**changed)
 
 
 def _bundle(
@@ -224,10 +255,4 @@ def _bundle(
         **more,
         "warnings": [*facts["warnings"], *without_vertical(facts["pieces"], verticals), *lines],
     }
-    arrays: dict[str, AnyArray] = {
-        "poses": out.poses,
-        "covariance": out.covariance,
-        "segment": out.segment,
-        "piece": piece,
-    }
-    return Bundle(arrays, meta)
+    return Bundle(vars(replace(out, piece=piece)), meta)

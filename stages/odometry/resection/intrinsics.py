@@ -1,9 +1,16 @@
-"""Error of the intrinsics that both cameras share, from the contributions of all adjusted segments.
+"""Errors of the calibration in the adjustment: unknowns that all segments share, each with a prior.
 
 A wrong focal length stretches what a stereo pair sees along the optical axis, a wrong principal point shears it. A
 straight drive shows neither. Where the camera turns, it sees the same points stretched along another axis, which no
-motion explains. Each segment gives the change of its adjustment's cost with each number, its landmarks triangulated and
-its tracks undistorted anew; all segments together give the error.
+motion explains. Each segment gives the part of its normal equations that is left for these numbers when its own
+unknowns (poses, depths, bias) are eliminated, and the change of its poses with each number. The parts of all segments
+and the priors of a usual calibration give the errors and their covariance; the trajectory adds it up like other errors
+that all segments share.
+
+A number of the cameras that the tracks contradict is corrected, and all that rests on it is computed anew: images are
+undistorted, rig and segments found with the corrected cameras, so that poses and maps are of one calibration. An error
+that does not contradict its prior is part of the covariance alone. Held are the rig's yaw, which the common error of
+the disparities stands for, and the baseline's length, which no image shows.
 """
 
 from __future__ import annotations
@@ -15,37 +22,79 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
+from pydantic import Field
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import Bundle, NoParams, stage
+from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.odometry import IntrinsicsFacts, RefineFacts
+from rille.stages.geometry import epipolar
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lens import Lens
-from rille.stages.numeric.robust import huber_weight, mad_sigma
-from rille.stages.odometry.resection.bundle_adjustment import RefineParams, SegmentState, SegmentTracks, adjust
+from rille.stages.numeric.robust import huber_weight
+from rille.stages.odometry.resection.bundle_adjustment import (
+    RefineParams,
+    SegmentAdjustment,
+    SegmentNormal,
+    SegmentState,
+    SegmentTracks,
+)
 from rille.stages.odometry.resection.landmarks import triangulated
 
-NAMES = ("focal length", "principal point's column", "principal point's row")
+PRIORS: Mapping[str, float] = {
+    "focal length": 1.0,
+    "principal point's column": 1.0,
+    "principal point's row": 1.0,
+    "radial distortion": 1.0,
+    "pitch": 0.1,
+    "roll": 0.1,
+    "baseline across": 0.1,
+    "baseline forward": 0.1,
+}
+"""Numbers whose errors are estimated: of both cameras over the focal length, and their coefficient k1; of the rig's
+correction (:mod:`rille.stages.geometry.epipolar`), rad. With each its standard deviation over that of the focal length:
+the rows of all pairs show the rig's angles far better (:mod:`rille.stages.calibration.rig`)."""
 
-STEP = 0.01
-"""Change of each number by which the cost is differentiated, over the focal length, as all errors here."""
+CORRECTED = 3
+"""How many of these are corrected: those of the camera without distortion."""
 
-MAX_MOVE, MAX_ERROR, MAX_MOVES = 0.03, 0.2, 8
-"""Largest move towards a segment's own minimum, largest error over the focal length, and number of moves: far from its
-minimum the cost is no parabola."""
+STEP = 1e-4
+"""Change of each number by which the tracks are differentiated."""
 
 MIN_TURN_DEG = 4.0
 """Turn of a segment from which on it counts: errors that all tracks share hide what smaller ones show."""
 
 MIN_SEGMENTS = 3
-"""Segments that turn, below which nothing is said."""
+"""Segments that turn, below which the prior decides."""
 
 MIN_ERROR = 0.0175
 """Error over the focal length up to which calibrations pass for good: what remains of lens distortion looks like it."""
 
+MIN_CHANGE = 0.004
+"""The same of a camera that was corrected: which prior it had is no longer believed."""
+
 MIN_SIGMAS = 5.0
-"""Standard deviations from which on an error is stated."""
+"""Standard deviations of the estimate from which on a prior is not believed."""
+
+HELD_SHARE = 0.7
+"""Share of the prior's standard deviation above which a number rests on the calibration as given."""
+
+
+class IntrinsicsParams(Params):
+    """Parameters of the stage ``intrinsics``."""
+
+    prior: float = Field(
+        0.005,
+        gt=0,
+        description="standard deviation, as calibrated, of the focal length and of the principal point over the focal "
+        "length, and of the radial distortion (k1); a tenth of it is that of the rig's angles [rad]; 0.005 is usual "
+        "for a calibration with a target",
+    )
+
+    @property
+    def sigma(self) -> Floats:
+        """Standard deviations (k,) of :data:`PRIORS`."""
+        return self.prior * np.array(list(PRIORS.values()))
 
 
 class SegmentCameras(NamedTuple):
@@ -56,125 +105,187 @@ class SegmentCameras(NamedTuple):
     T_local_key: RigidTransform
 
 
-def changed(camera: Camera, name: str, by: float) -> Camera:
-    """Camera with another focal length or principal point, by a share of the focal length."""
-    if name == NAMES[0]:
-        return replace(camera, fx=camera.fx * (1.0 + by), fy=camera.fy * (1.0 + by))
-    if name == NAMES[1]:
-        return replace(camera, cx=camera.cx + by * camera.fx)
-    return replace(camera, cy=camera.cy + by * camera.fy)
+class IntrinsicsPart(NamedTuple):
+    """What a segment says of k errors: ``information`` (k, k), ``pull`` (k,); ``by_error`` (frame, 6, k) changes of its
+    poses (position m, rotation vector rad of T_local_left) with each."""
+
+    information: Floats
+    pull: Floats
+    by_error: Floats
 
 
-def with_change(views: SegmentTracks, cameras: SegmentCameras, name: str, by: float) -> SegmentTracks:
-    """Measurements as they would be if both cameras had another number."""
+def corrected(camera: Camera, errors: Sequence[float] | Floats) -> Camera:
+    """Camera whose focal length and principal point are changed by the first of ``errors``."""
+    larger, column, row = 1.0 + errors[0], camera.cx + errors[1] * camera.fx, camera.cy + errors[2] * camera.fy
+    return replace(camera, fx=camera.fx * larger, fy=camera.fy * larger, cx=column, cy=row)
+
+
+def corrected_rig(rig: Rig, errors: Floats) -> Rig:
+    """Rig whose cameras and angles are changed by ``errors`` (k,)."""
+    pitch, *others = errors[CORRECTED + 1 :]
+    turned = epipolar.corrected(rig, np.array([pitch, 0.0, *others]))
+    return replace(turned, left=corrected(rig.left, errors), right=corrected(rig.right, errors))
+
+
+def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) -> SegmentTracks:
+    """Measurements as they would be if the calibration were changed by ``errors`` (k,)."""
     rig, T_local_key = cameras.rig, cameras.T_local_key
-    other = replace(rig, left=changed(rig.left, name, by), right=changed(rig.right, name, by))
+    other = corrected_rig(rig, errors)
 
     def undistorted_anew(pixels: Floats, side: str, given: Camera, ideal: Camera) -> Floats:
-        if (lens := cameras.lenses.get(side)) is None:
-            return pixels
-        raw = lens.distort(np.nan_to_num(pixels).reshape(-1, 2), given)
-        again = replace(lens, camera=changed(lens.camera, name, by))
-        return again.undistort(raw, ideal).reshape(pixels.shape)
+        if (lens := cameras.lenses.get(side)) is not None:
+            raw = lens.distort(np.nan_to_num(pixels).reshape(-1, 2), given)
+            again = replace(lens, camera=corrected(lens.camera, errors))
+            pixels = again.undistort(raw, ideal).reshape(pixels.shape)
+        focal, centre = np.array([ideal.fx, ideal.fy]), np.array([ideal.cx, ideal.cy])
+        ray = (pixels - centre) / focal
+        return np.asarray(pixels - errors[CORRECTED] * focal * ray * (ray**2).sum(-1, keepdims=True))
 
-    key = T_local_key.inverse().apply(views.position)
+    key = T_local_key.inverse().apply(tracks.position)
     left = undistorted_anew(rig.left.project(key), "left", rig.left, other.left)
     right = undistorted_anew(rig.right.project(rig.T_right_left.apply(key)), "right", rig.right, other.right)
-    at = triangulated(left, right, other, T_local_key, views.sigma)
-    pixels = undistorted_anew(views.pixels, "left", rig.left, other.left)
-    return replace(views, position=at.position, along=at.per_pixel, pixels=pixels, camera=other.left)
+    at = triangulated(left, right, other, T_local_key, tracks.sigma)
+    pixels = undistorted_anew(tracks.pixels, "left", rig.left, other.left)
+    return replace(tracks, position=at.position, along=at.per_pixel, pixels=pixels, camera=other.left)
+
+
+def turn_deg(state: SegmentState, T_local_key: RigidTransform) -> float:
+    """Largest turn of a frame of the segment from its key, degrees."""
+    turns = scipy.spatial.transform.Rotation.from_matrix(state.R @ T_local_key.rotation).magnitude()
+    return math.degrees(turns.max())
 
 
 def contribution(
-    views: SegmentTracks, state: SegmentState, cameras: SegmentCameras, params: RefineParams
-) -> list[tuple[float, float]]:
-    """Information and pull of the error of each of :data:`NAMES` by an adjusted segment, all its unknowns free.
+    tracks: SegmentTracks, state: SegmentState, cameras: SegmentCameras, params: RefineParams
+) -> IntrinsicsPart:
+    """What an adjusted segment says of the errors of :data:`PRIORS`, all its unknowns free, by the stated errors."""
+    problem = SegmentAdjustment(tracks, params)
+    normal, k = problem.normal(state), len(PRIORS)
+    steps = [SegmentAdjustment(with_errors(tracks, cameras, STEP * one), params) for one in np.eye(k)]
+    p, n = normal.between.shape
+    by_pose, by_depth, squares, gradient = np.zeros((p, k)), np.zeros((k, n)), np.zeros((k, k)), np.zeros(k)
+    for f in range(len(state.R)):
+        errors, others = problem.errors(state, f), [one.errors(state, f) for one in steps]
+        usable = np.isfinite([one.norm for one in (errors, *others)]).all(0)
+        slope = np.stack([one.error - errors.error for one in others], axis=-1) / STEP
+        weighted = slope * np.where(usable, problem.weights(errors, f), 0.0)[:, None, None]
+        by_pose[6 * f : 6 * f + 6] = np.einsum("nai,nak->ik", errors.jacobian[..., :6], weighted, optimize=True)
+        by_depth += np.einsum("nak,na->kn", weighted, errors.jacobian[..., 6])
+        squares += np.einsum("nai,nak->ik", slope, weighted, optimize=True)
+        gradient += np.einsum("nak,na->k", weighted, errors.error)
+    # A shift of one depth and that of all depths move a pixel alike.
+    by_pose[-1] = by_depth.sum(1)
+    matrix, right = SegmentNormal(
+        np.block([[normal.poses, by_pose], [by_pose.T, squares]]),
+        np.vstack([normal.between, by_depth]),
+        normal.depths,
+        np.concatenate([normal.pose_gradient, gradient]),
+        normal.depth_gradient,
+        normal.cost,
+    ).without_depths()
+    step = -np.linalg.solve(matrix[:p, :p], matrix[:p, p:])
+    # Of C = -R^T t and of R^T, by the left perturbation of T_cam_local.
+    turned = np.swapaxes(state.R, 1, 2)[:, None] @ -step[:-1].reshape(-1, 2, 3, k)
+    information = matrix[p:, p:] + matrix[p:, :p] @ step
+    return IntrinsicsPart(information, right[p:] + step.T @ right[:p], turned.reshape(-1, 6, k))
 
-    Both are those of the parabola at the segment's own minimum; 0 where the segment turns too little.
-    """
-    turns = scipy.spatial.transform.Rotation.from_matrix(state.R @ cameras.T_local_key.rotation).magnitude()
-    if turns.max() < math.radians(MIN_TURN_DEG):
-        return [(0.0, 0.0)] * len(NAMES)
 
-    def parabola(name: str, by: float) -> tuple[float, float]:
-        """Second derivative of the cost by an error, and minus the first, at an error."""
-        three = [with_change(views, cameras, name, by + step) for step in (-STEP, 0.0, STEP)]
-        finite = [np.isfinite(v.position).all(1) & np.isfinite(v.pixels).all(2) for v in three]
-        seen = views.seen & np.all(finite, axis=0)
-        below, at, above = (adjust(replace(v, seen=seen), state, params).after for v in three)
-        return (below - 2.0 * at + above) / STEP**2, (below - above) / (2.0 * STEP)
+class CommonErrors(NamedTuple):
+    """Errors (k,) that all segments share, their covariance (k, k), and which of them contradict their priors (k,)."""
 
-    parts = []
-    for name in NAMES:
-        by = 0.0
-        for _ in range(MAX_MOVES):
-            information, pull = parabola(name, by)
-            move = pull / information if information > 0 else math.copysign(MAX_MOVE, pull)
-            if abs(move) <= MAX_MOVE or abs(by) > MAX_ERROR:
-                break
-            by += math.copysign(MAX_MOVE, move)
-        parts.append((information, information * by + pull))
-    return parts
+    errors: Floats
+    covariance: Floats
+    wrong: Floats
 
 
-def common_error(parts: Floats) -> tuple[float, float]:
-    """Error that all segments share and its standard deviation, infinite of too few segments.
+def common_errors(information: Floats, pull: Floats, sigma: Floats, least: float = MIN_ERROR) -> CommonErrors:
+    """Errors that all segments share, by their parts and the priors; a prior that they contradict is left out.
 
     The segments' own values scatter by more than their errors, for their landmarks are few and near each other; the
-    scatter decides.
+    scatter decides. Of priors that are contradicted the one that is most goes first: where the camera turns about one
+    axis, one wrong number looks like another one.
 
     Parameters
     ----------
-    parts : (segment, 2) information and pull of each.
+    information, pull : (segment, k, k) and (segment, k) of each.
+    sigma : (k,) of the priors.
+    least : error up to which a prior is believed.
     """
-    # Rounding leaves a segment that tells nothing with no or negative information.
-    parts = parts[parts[:, 0] > 0]
-    if len(parts) < MIN_SEGMENTS:
-        return 0.0, float("inf")
-    claimed, value = parts[:, 0], parts[:, 1] / parts[:, 0]
-    information = claimed
-    for _ in range(5):  # of a segment that is far off, no more than of one at two deviations
-        error = float((information * value).sum() / information.sum())
-        off = np.abs(value - error) * np.sqrt(claimed)
-        # At least what the segments claim: few of them may agree by chance.
-        spread = max(1.0, mad_sigma(off, 0.0))
-        information = claimed * huber_weight(off, 2.0 * spread)
-    return error, spread * float(information.sum()) ** -0.5
+    held, wrong = np.diag(sigma**-2.0), np.zeros(len(sigma), bool)
+    while True:
+        prior, weight, spread = held * ~wrong, np.ones(len(pull)), 1.0
+        for _ in range(5):  # of a segment that is far off, no more than of one at two deviations
+            matrix = np.einsum("s,sij->ij", weight, information) / spread**2
+            right = (weight @ pull) / spread**2
+            errors = np.linalg.solve(matrix + prior, right)
+            rest = pull - information @ errors
+            square = np.einsum("si,si->s", rest, np.linalg.solve(information + held, rest[..., None])[..., 0])
+            off = np.sqrt(square / len(sigma))
+            # At least what the segments claim: few of them may agree by chance.
+            spread = max(1.0, float(np.median(off))) if len(off) else 1.0
+            weight = huber_weight(off, 2.0 * spread)
+        departure = np.zeros(CORRECTED)
+        for i in np.flatnonzero(~wrong[:CORRECTED]):
+            free = matrix + prior * (np.arange(len(sigma)) != i)
+            if matrix[i, i] > 0:
+                value, variance = np.linalg.solve(free, right)[i], np.linalg.inv(free)[i, i]
+                departure[i] = abs(value) / math.sqrt(variance) if abs(value) > least else 0.0
+        if departure.max() <= MIN_SIGMAS:
+            return CommonErrors(errors, np.linalg.inv(matrix + prior), wrong)
+        wrong[departure.argmax()] = True
 
 
-def contradiction(errors: Sequence[tuple[float, float]], focal: float) -> str:
-    """One line on the numbers of :data:`NAMES` that the tracks contradict; empty where they contradict none.
-
-    Where the camera turns about one axis, one wrong number looks like another one: all that it may be are named.
+def contradiction(used: Camera, given: Camera, sigma: Floats) -> str:
+    """One line on the numbers of the camera in use that are not those given; empty where all are.
 
     Parameters
     ----------
-    errors : of each, with its standard deviation, over the focal length.
-    focal : focal length, pixels.
+    sigma : (k,) standard deviations of the errors.
     """
+    focal = given.fx
+    changes = (used.fx / focal - 1.0, (used.cx - given.cx) / focal, (used.cy - given.cy) / focal)
     wrong = []
-    for name, (error, sigma) in zip(NAMES, errors, strict=True):
-        if abs(error) > max(MIN_ERROR, MIN_SIGMAS * sigma):
-            scale, unit = (100.0, "%") if name == NAMES[0] else (focal, "px")
-            wrong.append(f"the {name} by some {scale * error:+.2g} +- {scale * sigma:.1g} {unit}")
+    for name, change, one, (scale, unit) in zip(
+        PRIORS, changes, sigma, ((100.0, "%"), (focal, "px"), (focal, "px")), strict=False
+    ):
+        if abs(change) > MIN_ERROR:
+            wrong.append(f"the {name} by some {scale * change:+.2g} +- {scale * one:.1g} {unit}")
     if not wrong:
         return ""
     return (
         "the tracks contradict the calibration of both cameras: where the camera turns they ask for another one, "
-        f"{' or '.join(wrong)}; scale and heading are wrong: calibrate anew"
+        f"{' and '.join(wrong)}; all is computed with that: calibrate anew"
     )
 
 
-@stage("intrinsics")
+@stage("intrinsics", version=2)
 def intrinsics_stage(
-    params: NoParams, segments: Sequence[Bundle[RefineFacts]], rig: Bundle[CalibrationFacts]
+    params: IntrinsicsParams,
+    segments: Sequence[Bundle[RefineFacts]],
+    rig: Bundle[CalibrationFacts],
+    *,
+    given: Camera | None = None,
 ) -> Bundle[IntrinsicsFacts]:
-    """Errors of the intrinsics that the tracks of all segments show."""
-    parts = np.array([segment.meta["intrinsics"] for segment in segments if segment.meta["intrinsics"]])
-    if len(parts) < MIN_SEGMENTS:
-        return Bundle({}, {})
-    errors = [common_error(parts[:, k]) for k in range(len(NAMES))]
-    facts: IntrinsicsFacts = {"intrinsics": dict(zip(NAMES, errors, strict=True))}
-    if line := contradiction(errors, Rig.from_dict(rig.meta["rig"]).left.fx):
-        facts |= {"contradiction": line, "warnings": [line]}
+    """Errors of the calibration that the tracks of all segments show; ``given``: the left camera, if corrected."""
+    parts = [s.meta["intrinsics"] for s in segments if s.meta["intrinsics"]]
+    turning = [part for part in parts if part["turn_deg"] >= MIN_TURN_DEG]
+    if len(turning) < MIN_SEGMENTS:
+        turning = []
+    k = len(PRIORS)
+    information = np.array([part["information"] for part in turning]).reshape(-1, k, k)
+    pull = np.array([part["pull"] for part in turning]).reshape(-1, k)
+    common = common_errors(information, pull, params.sigma, MIN_ERROR if given is None else MIN_CHANGE)
+    sigma, used = np.sqrt(np.diag(common.covariance)), Rig.from_dict(rig.meta["rig"]).left
+    correction = np.where(common.wrong, common.errors, 0.0)[:CORRECTED]
+    facts: IntrinsicsFacts = {
+        "errors": dict(zip(PRIORS, np.column_stack([common.errors, sigma]).tolist(), strict=True)),
+        # What is not corrected stays in the poses: their covariance has its square.
+        "covariance": (common.covariance + np.outer(common.errors, common.errors)).tolist(),
+        "held": [name for name, share in zip(PRIORS, sigma / params.sigma, strict=True) if share > HELD_SHARE],
+        "correction": correction.tolist(),
+    }
+    if line := contradiction(corrected(used, correction), given or used, sigma):
+        facts["contradiction"] = line
+        # Said once, by the last of the corrections.
+        facts["warnings"] = [] if correction.any() else [line]
     return Bundle({}, facts)

@@ -1,5 +1,8 @@
 """One frame's pose out of the trajectory: what stands on it is recomputed only where this pose has changed.
 
+Its covariance is without errors of the calibration where a plane gives the vertical. A wrong focal length lifts the
+camera on its way and tilts the ground that it sees alike; the world's vertical follows the ground: no height is off.
+
 A trajectory that is adjusted to a place seen again moves all poses, most of them by less than shows in a map. Where an
 elevation model would move by at most a quarter of a cell, anywhere in it, its pose stays that of the chain, covariance
 and all: so the model, and world tiles of such models alone, are those of the run without that place.
@@ -18,7 +21,7 @@ from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.facts.terrain import DemFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.geometry.pose_arrays import COVARIANCE, POSES
+from rille.stages.geometry.pose_arrays import COVARIANCE, GROUND_PLANE, POSES, REFERENCE_PLANE
 
 MAX_MOVE_CELLS = 0.25
 """Cells that a model may lie off its adjusted place."""
@@ -34,7 +37,7 @@ def greatest_move(before: RigidTransform, after: RigidTransform, local: DemFacts
 
 @stage(
     "pose",
-    version=2,
+    version=3,
     outputs=[
         replace(POSES, frame="world", nodata=""),
         replace(COVARIANCE, frame="world", nodata="", optional=True),
@@ -55,5 +58,10 @@ def pose_stage(
     if chained is not None and local is not None:
         before, after = (RigidTransform.from_matrix(one["poses"][row]) for one in (chained, trajectory))
         used = chained if greatest_move(before, after, local.meta) <= MAX_MOVE_CELLS else trajectory
-    kept = [name for name in ("poses", "covariance") if name in used.arrays]
-    return Bundle({name: np.asarray(used[name])[row : row + 1].copy() for name in kept}, {})
+    arrays = {name: used[name][row : row + 1].copy() for name in ("poses", "covariance") if name in used.arrays}
+    # Of another trajectory than that of the segments nothing says what the calibration has to do with it.
+    if "own_covariance" in used.arrays:
+        vertical = used.meta["verticals"][int(used["piece"][row])]
+        if vertical in (GROUND_PLANE, REFERENCE_PLANE):
+            arrays["covariance"] = used["own_covariance"][row : row + 1].copy()
+    return Bundle(arrays, {})

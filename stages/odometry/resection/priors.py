@@ -442,32 +442,31 @@ class Sensors:
         self.fit, poses, piece = found
         return poses, piece
 
-    def adjusted(self, poses: Floats, nodes: NDArray[np.intp], parts: list[Factors]) -> Adjusted | None:
-        """A piece adjusted to its chain and stated factors (the ``parts``) and to the sensors; None: nothing to adjust.
+    def adjusted(self, poses: Floats, nodes: NDArray[np.intp], known: Factors) -> Adjusted | None:
+        """A piece adjusted to its chain and stated factors (``known``) and to the sensors; None: nothing to adjust.
 
         Parameters
         ----------
         poses : (n, 3, 4) in a common frame; the place is a node behind them.
         nodes : (n,) numbers of these nodes in the trajectory.
         """
-        clocks, count = dict[str, Clock](), sum(len(part.ends) for part in parts)
-        common, columns = parts[0].shared.shape[2], sum(part.shared.shape[2] for part in parts)
+        clocks, count, common = dict[str, Clock](), len(known.ends), known.shared.shape[2]
         done = None
         # Clocks first, by which what is left of the errors then tells more of the chain's.
         for excesses in ((1.0,), (1.0,), EXCESS, EXCESS, EXCESS):
             groups = self._groups(poses, nodes, clocks)
-            if not groups and not len(parts[1].ends):
+            if not groups and not known.doubtful.any():
                 return None
-            factors = Factors.joined([*parts, *groups.values(), anchor(poses[0])])
+            factors = Factors.joined([known, *groups.values(), anchor(poses[0])])
             ends = np.where(factors.ends < 0, len(nodes), factors.ends)
             graph = PoseGraph(replace(factors, ends=ends), len(nodes) + 1, 0, np.ones(len(ends)), common=common)
             start = GraphState.of(np.concatenate([poses, np.eye(3, 4)[None]]), factors.shared.shape[2])
             done = adjust(graph, start, excesses)
-            if excesses == EXCESS and not self._refused(groups, done, count, columns):
+            if excesses == EXCESS and not self._refused(groups, done, count, common):
                 break
-            clocks = self._clocks(groups, clocks, done, columns)
+            clocks = self._clocks(groups, clocks, done, common)
         assert done is not None
-        clocks = self._clocks(groups, clocks, done, columns)
+        clocks = self._clocks(groups, clocks, done, common)
         self._account(clocks, done.state.poses[-1])
         return done
 

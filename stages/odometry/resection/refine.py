@@ -9,8 +9,8 @@ The poses' covariances are those of this adjustment, by the same rules as the re
 (:mod:`rille.stages.odometry.resection.robust_pose`): the errors that are found set the scale, what the stated ones
 leave beyond them is shared by all segments.
 
-An error of the intrinsics shows over the whole sequence only: each task gives the contribution of its segment
-(:mod:`rille.stages.odometry.resection.intrinsics`).
+An error of the calibration shows over the whole sequence only: each task gives what its segment says of it, and how its
+poses change with it (:mod:`rille.stages.odometry.resection.intrinsics`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from rille.stages.facts.odometry import RefineFacts, ResectFacts, TrackFacts
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lens import Lens
-from rille.stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
+from rille.stages.geometry.pose_arrays import BY_INTRINSICS, COVARIANCE, POSES, SHARED
 from rille.stages.geometry.projection import NEAREST_M
 from rille.stages.odometry.resection.bundle_adjustment import (
     RefineParams,
@@ -38,7 +38,7 @@ from rille.stages.odometry.resection.bundle_adjustment import (
     SegmentTracks,
     adjust,
 )
-from rille.stages.odometry.resection.intrinsics import SegmentCameras, contribution
+from rille.stages.odometry.resection.intrinsics import PRIORS, IntrinsicsPart, SegmentCameras, contribution, turn_deg
 from rille.stages.odometry.resection.pnp import Pose, back_projection, bias_information, pose_covariance
 from rille.stages.odometry.resection.robust_pose import (
     MIN_LANDMARKS,
@@ -96,8 +96,17 @@ def _in_front(start: SegmentStart, state: SegmentState) -> SegmentStart | None:
     return moved._replace(tracks=replace(start.tracks, seen=start.tracks.seen & (z >= NEAREST_M))).determined()
 
 
-def pose_errors(tracks: SegmentTracks, state: SegmentState, params: RefineParams) -> tuple[Floats, Floats]:
-    """Covariances (frame, 6, 6) of adjusted poses, and roots (frame, 6, 7) of the part that all segments share.
+class PoseErrors(NamedTuple):
+    """Covariances (frame, 6, 6) of adjusted poses, roots (frame, 6, 7) of the part that all segments share, and the
+    variance of the errors of tracks over the one stated, correlation between neighbours included; at least 1."""
+
+    covariance: Floats
+    shared: Floats
+    excess: float
+
+
+def pose_errors(tracks: SegmentTracks, state: SegmentState, params: RefineParams) -> PoseErrors:
+    """Errors of the poses of an adjusted segment.
 
     Of position (m) and rotation vector (rad) of T_local_left, as in
     :mod:`rille.stages.odometry.resection.robust_pose`.
@@ -115,8 +124,9 @@ def pose_errors(tracks: SegmentTracks, state: SegmentState, params: RefineParams
         errors = back_projection(problem.observations(f), Pose(state.R[f], state.t[f], state.bias))
         weight = problem.weights(errors, f)[seen]
         together.append(scatter_of_blocks(tracks.pixels[f][seen], errors.error[seen], weight, tracks.camera))
-    covariance *= max(1.0, float(np.mean(together)))
-    return covariance + shared @ np.swapaxes(shared, 1, 2), shared
+    correlation = max(1.0, float(np.mean(together)))
+    covariance = covariance * correlation + shared @ np.swapaxes(shared, 1, 2)
+    return PoseErrors(covariance, shared, max(factor, 1.0) * correlation)
 
 
 class RefineInputs(NamedTuple):
@@ -130,11 +140,12 @@ class RefineInputs(NamedTuple):
 
 @stage(
     "refine",
-    version=6,
+    version=7,
     outputs=[
         replace(POSES, frame="local"),
         replace(COVARIANCE, frame="local"),
         replace(SHARED, frame="local"),
+        replace(BY_INTRINSICS, frame="local"),
         Array("landmarks", ("point", "xyz"), "float64", "m", "landmarks after the adjustment", "nan", "local"),
         Array("inlier", ("point", "frame"), "uint8", "1", "landmark agrees with the pose", nodata="0"),
     ],
@@ -150,7 +161,8 @@ def refine_stage(
     # A frame that keeps too few landmarks keeps the pose of its resection.
     names = ("poses", "covariance", "shared", "landmarks", "inlier")
     out = {name: np.array(inputs.resection[name]) for name in names}
-    meta: RefineFacts = {"adjustment": {}, "intrinsics": [], "per_frame": []}
+    out["by_intrinsics"] = np.zeros((len(out["poses"]), 6, len(PRIORS)))
+    meta: RefineFacts = {"adjustment": {}, "intrinsics": {}, "per_frame": []}
     start = segment_start(inputs.track, inputs.resection, rig)
     if start is not None:
         minimum = adjust(start.tracks, start.state, params)
@@ -158,18 +170,25 @@ def refine_stage(
         meta["adjustment"] = {"bias_px": minimum.state.bias, **costs}
         opened = {side: Lens.from_dict(lens) for side, lens in (lenses or {}).items()}
         cameras = SegmentCameras(rig, opened, T_local_key)
-        meta["intrinsics"] = contribution(start.tracks, minimum.state, cameras, params)
         if (end := _in_front(start, minimum.state)) is not None:
-            _replace(out, end, params)
+            errors = pose_errors(end.tracks, end.state, params)
+            part = contribution(end.tracks, end.state, cameras, params)
+            _replace(out, end, errors, part)
+            meta["intrinsics"] = {
+                "information": (part.information / errors.excess).tolist(),
+                "pull": (part.pull / errors.excess).tolist(),
+                "turn_deg": turn_deg(end.state, T_local_key),
+            }
             meta["per_frame"] = _per_frame(out, end, inputs.track.meta["frames"])
     return Bundle(out, meta)
 
 
-def _replace(out: Mapping[str, Any], end: SegmentStart, params: RefineParams) -> None:
+def _replace(out: Mapping[str, Any], end: SegmentStart, errors: PoseErrors, part: IntrinsicsPart) -> None:
     """Write an adjusted segment over its resection."""
     for row, R, t in zip(end.frames, end.state.R, end.state.t, strict=True):
         out["poses"][row] = RigidTransform(R, t).inverse().matrix34
-    out["covariance"][end.frames], out["shared"][end.frames] = pose_errors(end.tracks, end.state, params)
+    out["covariance"][end.frames], out["shared"][end.frames] = errors.covariance, errors.shared
+    out["by_intrinsics"][end.frames] = part.by_error
     out["landmarks"][end.points] = end.landmarks()
     out["inlier"][:] = 0
     out["inlier"][end.points, 0] = end.tracks.seen.any(0)

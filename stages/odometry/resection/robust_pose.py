@@ -10,8 +10,9 @@ errors are weighted by how exactly the landmark itself is known (see :mod:`rille
 
 Covariances here are 6 x 6 of ``(dt, dtheta)`` in the destination frame: position error in metres, then the rotation
 vector ``R_true = exp(dtheta) R`` in radians. They contain the errors of the measurements and a shared error of the
-disparities, but not errors of the calibration (focal length, direction of the camera in the vehicle). They have two
-parts:
+disparities. Errors of the intrinsics come with the adjustment
+(:mod:`rille.stages.odometry.resection.intrinsics`); the direction of the camera in the vehicle is in none. They have
+two parts:
 
 * what the residuals show: the errors found, times what they go together by (:func:`scatter_of_blocks`). It begins anew
   with the landmarks of every segment;

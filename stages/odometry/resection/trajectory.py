@@ -15,7 +15,9 @@ along the piece. If no pair has one, the frame of the piece is that of its first
 says so.
 
 Of the covariances, what each segment has for itself adds up; of what all segments share, the errors add up, which grows
-with the length of the way and not with its root (:mod:`rille.stages.odometry.resection.resect`).
+with the length of the way and not with its root (:mod:`rille.stages.odometry.resection.resect`). So do those of the
+calibration (:mod:`rille.stages.odometry.resection.intrinsics`). Without these the covariance is given, too: a plane of
+ground that they tilt defines the world's vertical, so that they tilt no elevation above it.
 """
 
 from __future__ import annotations
@@ -32,21 +34,32 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
-from rille.stages.facts.odometry import RefineFacts, ResectFacts, TrajectoryFacts
+from rille.stages.facts.odometry import IntrinsicsFacts, RefineFacts, ResectFacts, TrajectoryFacts
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform, cross_matrix, level_rotation, orthonormal
-from rille.stages.geometry.pose_arrays import COVARIANCE, NO_VERTICAL, POSES
+from rille.stages.geometry.pose_arrays import COVARIANCE, NO_VERTICAL, OWN_COVARIANCE, POSES
 
 
 class ChainLink(NamedTuple):
     """Poses (frames, 3, 4) T_local_left of a segment, key frame first, NaN of a lost frame.
 
-    ``covariance`` (frames, 6, 6), and the root ``shared`` (frames, 6, k) of the part of it that all segments share.
+    ``covariance`` (frames, 6, 6), and the root ``shared`` (frames, 6, k) of the part of it that all segments share. The
+    root ``calibration`` (frames, 6, c) of that by errors of the calibration is no part of it.
     """
 
     poses: Floats
     covariance: Floats
     shared: Floats
+    calibration: Floats
+
+    @staticmethod
+    def of(segment: Bundle, intrinsics: Bundle[IntrinsicsFacts] | None) -> ChainLink:
+        """Link of a segment; without ``intrinsics`` it knows nothing of errors of the calibration."""
+        poses, covariance, shared = (np.asarray(segment[name]) for name in ("poses", "covariance", "shared"))
+        if intrinsics is None:
+            return ChainLink(poses, covariance, shared, np.zeros((len(poses), 6, 0)))
+        root = np.linalg.cholesky(np.array(intrinsics.meta["covariance"]))
+        return ChainLink(poses, covariance, shared, np.asarray(segment["by_intrinsics"]) @ root)
 
 
 @dataclass(frozen=True)
@@ -54,12 +67,14 @@ class Chained:
     """Poses of the frames in order, key frames once.
 
     ``poses`` (frames, 3, 4) T_world_left, m, NaN of a lost frame; ``covariance`` (frames, 6, 6) of (position m,
-    rotation rad) in the world frame; ``segment`` (frames,) that posed the frame (a key frame belongs to the one
-    before it); ``piece`` (frames,) number of the unbroken piece, -1 of a lost frame.
+    rotation rad) in the world frame, ``own_covariance`` the same without errors of the calibration; ``segment``
+    (frames,) that posed the frame (a key frame belongs to the one before it); ``piece`` (frames,) number of the
+    unbroken piece, -1 of a lost frame.
     """
 
     poses: Floats
     covariance: Floats
+    own_covariance: Floats
     segment: NDArray[np.int16]
     piece: NDArray[np.int16]
 
@@ -81,22 +96,23 @@ def chain(segments: Sequence[ChainLink], levels: Sequence[RigidTransform]) -> Ch
     """
     if len(levels) != max(len(segments), 1):
         raise InputError("RIL-450", f"{len(segments)} segments and {len(levels)} levels do not make a trajectory")
-    kinds = segments[0].shared.shape[2] if segments else 0
-    nothing = np.zeros((6, 6)), np.zeros((6, kinds))
-    world, (own, common), broken, piece = levels[0], nothing, False, 0
-    poses, covariances, owner, pieces = [world.matrix34], [own], [0], [0]
+    widths = [segments[0].shared.shape[2], segments[0].calibration.shape[2]] if segments else [0, 0]
+    nothing = np.zeros((6, 6)), *(np.zeros((6, width)) for width in widths)
+    world, (own, common, by_camera), broken, piece = levels[0], nothing, False, 0
+    poses, covariances, owns, owner, pieces = [world.matrix34], [own], [own], [0], [0]
     for number, (segment, level) in enumerate(zip(segments, levels, strict=False)):
         local = segment.poses
         # Both come from the same level stage: a difference beyond rounding means that the wrong ones were paired.
         if np.abs(local[0] - level.matrix34).max() > 1e-9 * max(1.0, float(np.abs(local[0]).max())):
             raise InputError("RIL-451", f"segment {number} was not resected in the local frame of its own basic pair")
         if broken:
-            world, (own, common), piece = level, nothing, piece + 1
-            poses[-1], covariances[-1], owner[-1], pieces[-1] = world.matrix34, own, number, piece
+            world, (own, common, by_camera), piece = level, nothing, piece + 1
+            poses[-1], covariances[-1], owns[-1] = world.matrix34, own, own
+            owner[-1], pieces[-1] = number, piece
         # Once a segment: over thousands of products rounding would bend the rotation.
         T_world_local = _clean(world @ level.inverse())
-        key, key_own, key_common = world, own, common
-        for pose, pose_cov, pose_shared in zip(*(each[1:] for each in segment), strict=True):
+        key, key_own, key_common, key_by_camera = world, own, common, by_camera
+        for pose, pose_cov, pose_shared, pose_by_camera in zip(*(each[1:] for each in segment), strict=True):
             broken = not np.isfinite(pose).all()
             if not broken:
                 world = T_world_local @ RigidTransform.from_matrix(pose)
@@ -106,12 +122,21 @@ def chain(segments: Sequence[ChainLink], levels: Sequence[RigidTransform]) -> Ch
                 # Rounding makes the two halves of the product differ, and more so from frame to frame.
                 own = _symmetric(lever @ key_own @ lever.T + turn @ alone @ turn.T)
                 common = lever @ key_common + turn @ pose_shared
+                by_camera = lever @ key_by_camera + turn @ pose_by_camera
             poses.append(np.full((3, 4), np.nan) if broken else world.matrix34)
-            covariances.append(np.full((6, 6), np.nan) if broken else own + common @ common.T)
+            without = np.full((6, 6), np.nan) if broken else own + common @ common.T
+            covariances.append(without + by_camera @ by_camera.T)
+            owns.append(without)
             owner.append(-1 if broken else number)
             pieces.append(-1 if broken else piece)
     return _without_single_frames(
-        Chained(np.array(poses), np.array(covariances), np.array(owner, np.int16), np.array(pieces, np.int16))
+        Chained(
+            np.array(poses),
+            np.array(covariances),
+            np.array(owns),
+            np.array(owner, np.int16),
+            np.array(pieces, np.int16),
+        )
     )
 
 
@@ -122,9 +147,10 @@ def _without_single_frames(found: Chained) -> Chained:
     alone = ~np.isin(found.piece, kept)
     number = np.full(len(count) + 1, -1, np.int16)  # the last is that of lost frames, -1
     number[kept] = np.arange(len(kept))
-    poses, covariance, segment = found.poses.copy(), found.covariance.copy(), found.segment.copy()
-    poses[alone], covariance[alone], segment[alone] = np.nan, np.nan, -1
-    return Chained(poses, covariance, segment, number[found.piece])
+    rows = {name: value.copy() for name, value in vars(found).items()}
+    rows["poses"][alone], rows["covariance"][alone], rows["own_covariance"][alone] = np.nan, np.nan, np.nan
+    rows["segment"][alone] = -1
+    return Chained(**rows | {"piece": number[found.piece]})
 
 
 def propagation(key: RigidTransform, T_world_local: RigidTransform, world: RigidTransform) -> tuple[Floats, Floats]:
@@ -170,10 +196,10 @@ def levelled(found: Chained, first: int, up: Floats) -> Chained:
     turn = level_rotation(R.T @ up) @ R.T
     # Position and rotation vector turn alike.
     both = np.kron(np.eye(2), turn)
-    poses, covariance = found.poses.copy(), found.covariance.copy()
+    poses, covariance, own = found.poses.copy(), found.covariance.copy(), found.own_covariance.copy()
     poses[rows] = turn @ poses[rows]
-    covariance[rows] = both @ covariance[rows] @ both.T
-    return replace(found, poses=poses, covariance=covariance)
+    covariance[rows], own[rows] = (both @ each[rows] @ both.T for each in (covariance, own))
+    return replace(found, poses=poses, covariance=covariance, own_covariance=own)
 
 
 def _with_verticals(found: Chained, keys: Sequence[int], levels: Sequence[Bundle]) -> tuple[Chained, list[str]]:
@@ -199,11 +225,11 @@ def _with_verticals(found: Chained, keys: Sequence[int], levels: Sequence[Bundle
 
 def _spread(found: Chained, at: NDArray[np.intp], count: int) -> Chained:
     """The same with a row for each of ``count`` frames; ``at`` (n,) are the rows of those that were tracked."""
-    poses, covariance = np.full((count, 3, 4), np.nan), np.full((count, 6, 6), np.nan)
-    segment, piece = np.full(count, -1, np.int16), np.full(count, -1, np.int16)
-    poses[at], covariance[at] = found.poses, found.covariance
-    segment[at], piece[at] = found.segment, found.piece
-    return Chained(poses, covariance, segment, piece)
+    rows = dict[str, AnyArray]()
+    for name, value in vars(found).items():
+        rows[name] = np.full((count, *value.shape[1:]), -1 if value.dtype == np.int16 else np.nan, value.dtype)
+        rows[name][at] = value
+    return Chained(**rows)
 
 
 def account(frames: list[int], piece: NDArray[np.int16], causes: Mapping[int, str]) -> dict[str, Any]:
@@ -265,31 +291,38 @@ def _facts(segments: Sequence[Bundle]) -> list[dict[str, Any]]:
     return facts
 
 
+class TrajectoryInputs(NamedTuple):
+    """Segments as resected, levels of their key frames; segments as adjusted, and what they say of the cameras."""
+
+    segments: Sequence[Bundle[ResectFacts]]
+    levels: Sequence[Bundle[GroundFacts]]
+    refined: Sequence[Bundle[RefineFacts]] = ()
+    intrinsics: Bundle[IntrinsicsFacts] | None = None
+
+
 @stage(
     "trajectory",
-    version=3,
+    version=4,
     outputs=[
         replace(POSES, frame="world"),
         replace(COVARIANCE, frame="world"),
+        replace(OWN_COVARIANCE, frame="world"),
         Array("segment", ("frame",), "int16", "1", "segment that posed the frame, -1: lost", "-1"),
         Array("piece", ("frame",), "int16", "1", "unbroken piece, each in its own frame; -1: lost", "-1"),
     ],
 )
 def trajectory_stage(
     params: NoParams,
-    segments: Sequence[Bundle[ResectFacts]],
-    levels: Sequence[Bundle[GroundFacts]],
-    refined: Sequence[Bundle[RefineFacts]] = (),
+    inputs: TrajectoryInputs,
     *,
     frames: list[int],
     lost: Sequence[Mapping[str, Any]] = (),
     steps: Sequence[tuple[float | None, float]] | None = None,
 ) -> Bundle[TrajectoryFacts]:
     """Poses of all left frames in the world frame."""
-    level = [RigidTransform.from_matrix(b.meta["T_local_left"]) for b in levels]
-    posed: Sequence[Bundle] = refined or segments
-    chained = [ChainLink(*(np.asarray(b[name]) for name in ChainLink._fields)) for b in posed]
-    facts = _facts(segments) or [{"frame": frames[0], "inliers": 0}]
+    level = [RigidTransform.from_matrix(b.meta["T_local_left"]) for b in inputs.levels]
+    chained = [ChainLink.of(b, inputs.intrinsics) for b in inputs.refined or inputs.segments]
+    facts = _facts(inputs.segments) or [{"frame": frames[0], "inliers": 0}]
     causes = {int(f["frame"]): str(f["cause"]) for f in lost}
     causes |= {int(f["frame"]): str(f["lost"]) for f in facts if "lost" in f}
     if steps is not None:
@@ -299,8 +332,8 @@ def trajectory_stage(
     row = {frame: k for k, frame in enumerate(frames)}
     at = np.array([row[int(f["frame"])] for f in facts], dtype=np.intp)
     found = _spread(chain(chained, level), at, len(frames))
-    keys = [row[int(b.meta["per_frame"][0]["frame"])] for b in segments] or [int(at[0])]
-    found, verticals = _with_verticals(found, keys, levels)
+    keys = [row[int(b.meta["per_frame"][0]["frame"])] for b in inputs.segments] or [int(at[0])]
+    found, verticals = _with_verticals(found, keys, inputs.levels)
     counted = account(frames, found.piece, causes)
     counted["warnings"] += without_vertical(counted["pieces"], verticals)
     inliers = {int(f["frame"]): int(f["inliers"]) for f in facts}
@@ -312,10 +345,4 @@ def trajectory_stage(
         "verticals": verticals,
         **counted,  # type: ignore[typeddict-item]
     }
-    arrays: dict[str, AnyArray] = {
-        "poses": found.poses,
-        "covariance": found.covariance,
-        "segment": found.segment,
-        "piece": found.piece,
-    }
-    return Bundle(arrays, meta)
+    return Bundle(vars(found), meta)

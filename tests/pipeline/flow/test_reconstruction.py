@@ -39,6 +39,7 @@ def lay_out(
     doubts: list[tuple[str, dict[str, Any]]] | None = None,
     jumps: dict[str, dict[str, Any]] | None = None,
     ground: dict[str, Any] | None = None,
+    cameras: list[list[float]] | None = None,
     **given: Any,
 ) -> tuple[Graph, Products]:
     """The graph as it grows with these facts of the stages; ``doubts`` are those behind the first choice, in order."""
@@ -55,16 +56,16 @@ def lay_out(
         handles, go_on, _ = [w for w in graph.expansions if w[0][0].stage == stage][-1]
         facts = found | meta if stage == "keyframes" else meta
         go_on(*(SimpleNamespace(meta=facts) for _ in handles))
-    for handles, go_on, _ in list(graph.expansions):
-        if handles[0].label.startswith("ground_frame"):
-            go_on(*(SimpleNamespace(meta=ground or GROUND) for _ in handles))
-    for handles, go_on, _ in list(graph.expansions):
-        if handles[0].stage == "resect":
-            go_on(*(SimpleNamespace(meta=(jumps or {}).get(h.label, {})) for h in handles))
-    for stage, meta in (("intrinsics", {}), ("trajectory", trajectory)):
+    for turn, correction in enumerate([*(cameras or []), [0.0, 0.0, 0.0]]):
+        facts = {"keyframes": found, "ground_frame": ground or GROUND, "intrinsics": {"correction": correction}}
+        for stage in [*(("keyframes", "rig") if turn else ()), "ground_frame", "resect", "intrinsics"]:
+            of = (jumps or {}) if stage == "resect" else {}
+            for handles, go_on, _ in [w for w in graph.expansions if w[0][0].stage == stage][-1:]:
+                go_on(*(SimpleNamespace(meta=of.get(h.label, facts.get(stage, {}))) for h in handles))
+    for name in ("ground_frame", "trajectory"):
         for handles, go_on, _ in list(graph.expansions):
-            if handles[0].label == stage:
-                go_on(SimpleNamespace(meta=meta))
+            if handles[0].label.startswith(name) and len(handles) == 1:
+                go_on(SimpleNamespace(meta=trajectory if name == "trajectory" else ground or GROUND))
     return graph, products
 
 
@@ -90,6 +91,26 @@ def test_a_lost_frame_is_bridged_and_no_pyramid_is_made_twice() -> None:
     assert products.trajectory.spec.args["lost"] == [{"frame": 3, "cause": "black"}]
     assert list(products.world_dem) == [0, 4, 6]
     assert labels(graph, "accuracy") == ["accuracy"]
+
+
+def test_wrong_cameras_are_corrected_in_all_that_rests_on_them_and_nothing_else_is_made_twice() -> None:
+    graph, products = lay_out(
+        [],
+        {"chain": list(range(8)), "lost": [], "unfit": []},
+        {"basic": [0, 4], "segments": [[0, 1, 2, 3, 4], [4, 5, 6, 7]]},
+        {"frames": list(range(8)), "pieces": [[0, 7]], "main": 0, "positions": [[0, 0, k] for k in range(8)]},
+        cameras=[[-0.1, 0.0, 0.0]],
+    )
+    assert labels(graph, "intrinsics") == ["intrinsics", "intrinsics/anew"]
+    asked = [h for h in graph.nodes if h.label in ("orientation/0", "orientation/0/anew")]
+    given, again = (h.spec.args["rig"]["left"]["fx"] for h in asked)
+    assert again == pytest.approx(0.9 * given)
+    (anew,) = [h for h in graph.nodes if h.label == "calibration/anew"]
+    using = [*products.refined, *products.local_dem.values(), *products.world_dem.values()]
+    assert [h.inputs["rig"] for h in using] == [anew] * 6
+    assert len(labels(graph, "hfvm")) == 2
+    assert labels(graph, "locus")[:2] == ["locus/local/0", "locus/local/4"]
+    assert products.intrinsics in products.contradictions
 
 
 @pytest.mark.parametrize("sees_ground", [True, False])

@@ -46,8 +46,8 @@ def test_of_each_stage_a_part_has_all_tasks_and_all_that_they_read(chain: Chain)
         ("motion", {"hfvm", "features", "keyframes", "locus", "trajectory"}),
         ("features", {"crosscheck", "motion", "hfvm", "trajectory"}),
         ("hfvm", {"features", "ground_frame", "locus", "track", "trajectory"}),
-        ("trajectory", {"crosscheck", "intrinsics", "locus", "accuracy", "agreement", "merge"}),
-        ("merge", {"crosscheck", "intrinsics", "accuracy", "dem_accuracy", "path", "risk"}),
+        ("trajectory", {"crosscheck", "locus", "accuracy", "agreement", "merge"}),
+        ("merge", {"crosscheck", "accuracy", "dem_accuracy", "path", "risk"}),
     ],
 )
 def test_what_a_stage_does_not_need_is_left_out(chain: Chain, until: str, without: set[str]) -> None:

@@ -1,6 +1,7 @@
 """The pose graph against a dense solver, closed forms and sampling; loops that are true, false, or join pieces."""
 
 import numpy as np
+import pytest
 import scipy
 from raising import raises
 
@@ -63,9 +64,9 @@ def seen(truth, a, b, rng):
     return motion(a, b, noisy(truth[a].inverse() @ truth[b], LOOP, rng))
 
 
-def adjusted(segments, trajectory, *factors):
+def adjusted(segments, trajectory, *factors, **more):
     loops = [Bundle({}, {"factors": list(factors)})]
-    out = adjust_stage.run(NoParams(), {}, {"trajectory": trajectory, "segments": segments, "loops": loops})
+    out = adjust_stage.run(NoParams(), {}, {"trajectory": trajectory, "segments": segments, "loops": loops, **more})
     check_outputs(adjust_stage, out)
     return out
 
@@ -241,3 +242,26 @@ def test_an_impossible_covariance_is_refused():
     segments, before = run_of(ring(), np.random.default_rng(8))
     with raises("RIL-452", "frame 0", "frame 11"):
         adjusted(segments, before, motion(0, 11, RigidTransform.identity(), -LOOP))
+
+
+@pytest.mark.parametrize("frames", [12, 36])
+def test_an_error_of_the_calibration_stays_in_the_covariance_however_many_frames_and_loops_there_are(frames):
+    """Of the scale, 1 %: all motions that are measured share it, those between places that are seen again, too."""
+    truth, rng = ring(frames), np.random.default_rng(9)
+    segments, _ = run_of(truth, rng)
+    scaled = []
+    for one in segments:
+        way = one["poses"][:, :, 3] - one["poses"][0, :, 3]
+        by = np.concatenate([way, np.zeros_like(way)], axis=1)[:, :, None]
+        scaled.append(Bundle(dict(one.arrays) | {"by_intrinsics": by}, one.meta))
+    scale = {"intrinsics": Bundle({}, {"covariance": [[1e-4]]})}
+    levels = [Bundle({}, {"T_local_left": one["poses"][0].ravel().tolist(), "source": "attitude"}) for one in scaled]
+    inputs = {"segments": segments, "levels": levels, "refined": scaled, **scale}
+    before = trajectory_stage.run(NoParams(), {"frames": list(range(frames))}, inputs)
+    loops = [seen(truth, k, frames - 1 - k, rng) for k in range(frames // 6)]
+    out = adjusted(segments, before, *loops, refined=scaled, **scale)
+    shares = [
+        np.trace((one["covariance"] - one["own_covariance"])[frames // 2, :3, :3]) ** 0.5 for one in (before, out)
+    ]
+    # Half a round of 5 m lies 10 m away.
+    assert shares == pytest.approx([0.1, 0.1], rel=0.15)

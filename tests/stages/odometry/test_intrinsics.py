@@ -1,4 +1,4 @@
-"""Intrinsics that the tracks contradict: found where the camera turns, with and without a lens, and never on a line."""
+"""Errors of the intrinsics: found where the camera turns, with and without a lens; else part of the covariances."""
 
 from __future__ import annotations
 
@@ -7,90 +7,146 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 from rille.stages.odometry.resection.bundle_adjustment import RefineParams, SegmentState, SegmentTracks, adjust
 from rille.stages.odometry.resection.intrinsics import (
-    NAMES,
+    CORRECTED,
+    PRIORS,
+    IntrinsicsParams,
     SegmentCameras,
-    changed,
-    common_error,
-    contradiction,
+    common_errors,
     contribution,
+    corrected,
+    intrinsics_stage,
+    with_errors,
 )
 from rille.stages.odometry.resection.landmarks import triangulated
+from rille.stages.odometry.resection.refine import pose_errors
 
 CAMERA = Camera(450.0, 450.0, 375.5, 239.5, 752, 480)
 BENT = Lens(CAMERA, "radtan", (-0.28, 0.07, 0.0, 0.0))
 PARAMS = RefineParams()
+SIGMA = IntrinsicsParams().sigma
+NAMES = tuple(PRIORS)
 LEVEL = RigidTransform(rotation_exp(np.array([1.2, 0.1, -0.1])), np.array([0.3, 0.2, 1.0]))
+T_RIGHT_LEFT = RigidTransform(np.eye(3), np.array([-0.12, 0.0, 0.0]))
+POINTS = 80
 
 
-def contributions(given: Camera, lens: Lens, turn: float) -> list[list[tuple[float, float]]]:
-    """Of eight segments: a camera of 450 px turns by some ``turn`` radians, and is taken for the given one."""
-    T_right_left = RigidTransform(np.eye(3), np.array([-0.12, 0.0, 0.0]))
-    rig, wrong = Rig(given, given, T_right_left), replace(lens, camera=given)
-    out = []
+def segment(seed: int, given: Camera, lens: Lens, turn: float) -> tuple[SegmentTracks, SegmentState, SegmentCameras]:
+    """A camera of 450 px that turns by some ``turn`` radians, and is taken for the given one; true poses."""
+    rng = np.random.default_rng(seed)
+    rig, wrong = Rig(given, given, T_RIGHT_LEFT), replace(lens, camera=given)
+
+    def measured(points):
+        pixels = wrong.undistort(lens.distort(CAMERA.project(points), CAMERA), given)
+        return pixels + 0.1 * rng.standard_normal(pixels.shape)
+
+    X = CAMERA.rays(rng.uniform([60, 40], [690, 440], (POINTS, 2))) * rng.uniform(2.0, 8.0, (POINTS, 1))
+    moves = [
+        RigidTransform(rotation_exp(turn * rng.standard_normal(3) * k), 0.1 * rng.standard_normal(3)) for k in (1, 2)
+    ]
+    at = triangulated(measured(X), measured(T_RIGHT_LEFT.apply(X)), rig, LEVEL, np.full(POINTS, 0.2))
+    pixels = np.array([measured(move.apply(X)) for move in moves])
+    tracks = SegmentTracks(at.position, at.per_pixel, at.sigma, pixels, np.ones((2, POINTS), bool), given)
+    true = [move @ LEVEL.inverse() for move in moves]
+    state = SegmentState(
+        np.array([T.rotation for T in true]), np.array([T.translation for T in true]), np.zeros(POINTS)
+    )
+    lenses = {} if lens.ideal else {"left": wrong, "right": wrong}
+    return tracks, state, SegmentCameras(rig, lenses, LEVEL)
+
+
+def facts_of(given: Camera, lens: Lens, turn: float = 0.05, first: Camera | None = None):
+    """Facts that eight segments lead to, of a camera that is given, or was corrected from the ``first``."""
+    parts, rig = [], Bundle({}, {"rig": Rig(given, given, T_RIGHT_LEFT).to_dict()})
     for seed in range(8):
-        rng = np.random.default_rng(seed)
-
-        def measured(points, rng=rng):
-            pixels = wrong.undistort(lens.distort(CAMERA.project(points), CAMERA), given)
-            return pixels + 0.1 * rng.standard_normal(pixels.shape)
-
-        X = CAMERA.rays(rng.uniform([60, 40], [690, 440], (80, 2))) * rng.uniform(2.0, 8.0, (80, 1))
-        moves = [
-            RigidTransform(rotation_exp(turn * rng.standard_normal(3) * k), 0.1 * rng.standard_normal(3))
-            for k in (1, 2)
-        ]
-        at = triangulated(measured(X), measured(T_right_left.apply(X)), rig, LEVEL, np.full(80, 0.2))
-        pixels = np.array([measured(move.apply(X)) for move in moves])
-        views = SegmentTracks(at.position, at.per_pixel, at.sigma, pixels, np.ones((2, 80), bool), given)
-        start = [move @ LEVEL.inverse() for move in moves]
-        state = SegmentState(
-            np.array([T.rotation for T in start]), np.array([T.translation for T in start]), np.zeros(80)
-        )
-        state = adjust(views, state, PARAMS).state
-        lenses = {} if lens.ideal else {"left": wrong, "right": wrong}
-        out.append(contribution(views, state, SegmentCameras(rig, lenses, LEVEL), PARAMS))
-    return out
+        tracks, state, cameras = segment(seed, given, lens, turn)
+        part = contribution(tracks, adjust(tracks, state, PARAMS).state, cameras, PARAMS)
+        facts = {"information": part.information, "pull": part.pull, "turn_deg": 57.3 * turn}
+        parts.append(Bundle({}, {"intrinsics": facts}))
+    known = {"given": first.to_dict()} if first else {}
+    return intrinsics_stage.run(IntrinsicsParams(), known, {"segments": parts, "rig": rig}).meta
 
 
-def errors(given: Camera, lens: Lens, turn: float = 0.03) -> list[tuple[float, float]]:
-    parts = np.array(contributions(given, lens, turn))
-    return [common_error(parts[:, k]) for k in range(len(NAMES))]
+def corrections(given: Camera, lens: Lens, turn: float = 0.1):
+    """The camera that the run computes with, corrected and asked again as the flow does, and the last facts."""
+    used = given
+    for _ in range(4):
+        facts = facts_of(used, lens, turn, given)
+        if not any(facts["correction"]):
+            break
+        used = corrected(used, facts["correction"])
+    return used, facts
 
 
 @pytest.mark.parametrize(("by", "lens"), [(0.1, Lens(CAMERA)), (0.03, BENT)], ids=["pinhole", "lens"])
-@pytest.mark.parametrize("name", NAMES)
-def test_a_wrong_number_is_named_where_the_camera_turns(name, by, lens):
-    found = errors(changed(CAMERA, name, by), lens)
-    assert name in contradiction(found, CAMERA.fx)
-    assert 0.7 < -found[NAMES.index(name)][0] / by < 1.4
+@pytest.mark.parametrize("number", range(CORRECTED))
+def test_a_wrong_number_is_corrected_where_the_camera_turns(number, by, lens):
+    used, facts = corrections(corrected(CAMERA, by * np.eye(CORRECTED)[number]), lens)
+    assert NAMES[number] in facts["contradiction"]
+    assert facts["warnings"]
+    off = np.array([used.fx - CAMERA.fx, used.cx - CAMERA.cx, used.cy - CAMERA.cy]) / CAMERA.fx
+    assert np.abs(off).max() < 0.006
 
 
 @pytest.mark.parametrize("lens", [Lens(CAMERA), BENT], ids=["pinhole", "lens"])
 def test_right_numbers_are_believed(lens):
-    assert contradiction(errors(CAMERA, lens), CAMERA.fx) == ""
+    facts = facts_of(CAMERA, lens, 0.1)
+    assert "contradiction" not in facts
+    assert facts["correction"] == [0.0] * CORRECTED
+    errors, sigma = np.array(list(facts["errors"].values())).T
+    assert (np.abs(errors) < 4.0 * sigma).all()
+    assert NAMES[0] not in facts["held"]
 
 
-def test_a_straight_drive_does_not_tell_a_focal_length():
-    assert contradiction(errors(changed(CAMERA, NAMES[0], 0.1), Lens(CAMERA), 0.001), CAMERA.fx) == ""
+def test_a_straight_drive_rests_on_the_given_numbers_and_their_prior():
+    facts = facts_of(corrected(CAMERA, [0.1, 0.0, 0.0]), Lens(CAMERA), turn=0.0)
+    assert "contradiction" not in facts
+    assert facts["held"] == list(NAMES)
+    assert np.array(facts["covariance"]) == pytest.approx(np.diag(SIGMA**2))
 
 
-def test_the_common_error_is_the_mean_and_a_segment_far_off_counts_as_one_at_two_deviations():
-    same = np.array([[1e4, 10.0]] * 12)
-    error, sigma = common_error(same)
-    assert error == pytest.approx(0.001)
-    assert sigma == pytest.approx((12e4) ** -0.5)
-    # Huber's mean: eleven at 0 and one far off balance where 11 t = 2 deviations.
-    same[:, 1] = [0.0] * 11 + [20.0 * 1e4**0.5]
-    assert common_error(same)[0] == pytest.approx(2.0 * 1e4**-0.5 / 11, rel=1e-3)
-    assert common_error(same[:2]) == (0.0, float("inf"))
+def test_covariances_contain_the_errors_of_the_calibration():
+    """Monte Carlo: numbers drawn from a prior; NEES of straight segments and of some that turn."""
+    sigma, rng = 0.015, np.random.default_rng(3)
+    for turn in (0.0, 0.05):
+        with_prior, without = [], []
+        for seed in range(24):
+            given = corrected(CAMERA, sigma * rng.standard_normal(CORRECTED))
+            tracks, true, cameras = segment(100 + seed, given, Lens(CAMERA), turn)
+            state = adjust(tracks, true, PARAMS).state
+            part, own = contribution(tracks, state, cameras, PARAMS), pose_errors(tracks, state, PARAMS)
+            for f in range(2):
+                T, Q = (RigidTransform(s.R[f], s.t[f]).inverse() for s in (state, true))
+                turned = Q.rotation @ T.rotation.T
+                error = np.append(Q.translation - T.translation, [turned[2, 1], turned[0, 2], turned[1, 0]])
+                by_camera = sigma * part.by_error[f][:, :CORRECTED]
+                shared = own.covariance[f] + by_camera @ by_camera.T
+                with_prior.append(error @ np.linalg.solve(shared, error) / 6.0)
+                without.append(error @ np.linalg.solve(own.covariance[f], error) / 6.0)
+        assert 0.5 < np.mean(with_prior) < 1.5
+        assert np.mean(without) > 2.0
+
+
+def test_a_turned_right_camera_moves_poses_as_the_change_with_its_angles_says():
+    tracks, true, cameras = segment(5, CAMERA, Lens(CAMERA), 0.05)
+    part, number = contribution(tracks, adjust(tracks, true, PARAMS).state, cameras, PARAMS), NAMES.index("roll")
+    by = 2e-4
+    other = with_errors(tracks, cameras, by * np.eye(len(NAMES))[number])
+    before, after = adjust(tracks, true, PARAMS).state, adjust(other, true, PARAMS).state
+    for f in range(2):
+        T, moved = (RigidTransform(s.R[f], s.t[f]).inverse() for s in (before, after))
+        expected = by * part.by_error[f][:3, number]
+        assert np.abs(moved.translation - T.translation - expected).max() < 0.2 * np.abs(expected).max()
 
 
 def test_segments_that_scatter_by_more_than_they_claim_widen_the_error():
-    value = 0.003 * np.random.default_rng(1).standard_normal(400)
-    error, sigma = common_error(np.column_stack([np.full(400, 1e6), 1e6 * value]))  # claimed: 0.001
-    assert sigma == pytest.approx(0.003 / 20.0, rel=0.15)
-    assert abs(error) < 4.0 * sigma
+    k = len(NAMES)
+    value = 0.003 * np.random.default_rng(1).standard_normal((400, k))
+    information = np.tile(1e6 * np.eye(k), (400, 1, 1))  # claimed: 0.001
+    common = common_errors(information, 1e6 * value, np.ones(k))
+    assert np.sqrt(np.diag(common.covariance)) == pytest.approx(np.full(k, 0.003 / 20.0), rel=0.15)
+    assert (np.abs(common.errors) < 4.0 * 0.003 / 20.0).all()

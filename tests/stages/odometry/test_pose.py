@@ -23,6 +23,16 @@ def test_one_pose_with_its_covariance() -> None:
     assert set(found.arrays) == {"poses"}
 
 
+@pytest.mark.parametrize(("vertical", "name"), [("ground plane", "own_covariance"), ("attitude", "covariance")])
+def test_errors_of_the_calibration_are_in_heights_unless_a_plane_takes_them_out(vertical, name) -> None:
+    rng = np.random.default_rng(1)
+    arrays = {one: rng.normal(size=(3, 6, 6)) for one in ("covariance", "own_covariance")}
+    arrays |= {"poses": rng.normal(size=(3, 3, 4)), "piece": np.array([0, 1, 1], np.int16)}
+    trajectory = Bundle(arrays, {"verticals": ["none", vertical]})
+    found = pose.pose_stage.run(NoParams(), {"row": 1}, {"trajectory": trajectory})
+    np.testing.assert_array_equal(found["covariance"], arrays[name][1:2])
+
+
 def test_the_merge_reads_height_and_rotations_of_it() -> None:
     covariance = np.arange(36.0)
     meta = {"pose_covariance": covariance.tolist(), "T_frame_left": [1, 0, 0, 4, 0, 1, 0, 5, 0, 0, 1, 6]}

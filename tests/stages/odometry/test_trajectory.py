@@ -8,7 +8,12 @@ from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.odometry.resection.trajectory import ChainLink, chain, trajectory_stage
 
 NONE = np.zeros((9, 6, 2))
+
 """Nothing is shared."""
+
+
+def link(poses, covariance, shared, calibration=None):
+    return ChainLink(poses, covariance, shared, NONE[: len(poses), :, :0] if calibration is None else calibration)
 
 
 def pose(rng, scale=1.0):
@@ -29,7 +34,7 @@ def test_scan_equals_composition_by_hand_whatever_the_tilt_of_the_local_frames()
     for (a, b), T_local_key in zip(cuts, levels, strict=True):
         local = [T_local_key @ truth[a].inverse() @ truth[i] for i in range(a, b + 1)]
         poses = np.array([T.matrix34 for T in local])
-        segments.append(ChainLink(poses, np.zeros((b - a + 1, 6, 6)), NONE[: b - a + 1]))
+        segments.append(link(poses, np.zeros((b - a + 1, 6, 6)), NONE[: b - a + 1]))
     found = chain(segments, levels)
     poses, covariance, segment = found.poses, found.covariance, found.segment
     assert not found.piece.any()
@@ -45,7 +50,7 @@ def test_a_segment_of_another_local_frame_is_refused():
     T = level(rng)
     with raises("RIL-451", "segment 0"):
         poses = np.array([level(rng).matrix34, pose(rng).matrix34])
-        chain([ChainLink(poses, np.zeros((2, 6, 6)), NONE[:2])], [T])
+        chain([link(poses, np.zeros((2, 6, 6)), NONE[:2])], [T])
     with raises("RIL-450"):
         chain([], [])
 
@@ -64,7 +69,7 @@ def test_covariance_is_that_of_sampled_trajectories():
     local = [np.array([T.matrix34, (T @ pose(rng, 0.5)).matrix34]) for T in levels]
     spread = np.diag([2e-3, 1e-3, 3e-3, 1e-3, 2e-3, 5e-4]) ** 2
     covs = [np.array([np.zeros((6, 6)), spread])] * 3
-    found = chain([ChainLink(p, c, NONE[:2]) for p, c in zip(local, covs, strict=True)], levels)
+    found = chain([link(p, c, NONE[:2]) for p, c in zip(local, covs, strict=True)], levels)
     mean, covariance = found.poses, found.covariance
     samples = []
     for _ in range(1500):
@@ -72,7 +77,7 @@ def test_covariance_is_that_of_sampled_trajectories():
         for poses in local:
             d = np.sqrt(np.diag(spread)) * rng.standard_normal(6)
             T = RigidTransform(rotation_exp(d[3:]) @ poses[1][:, :3], poses[1][:, 3] + d[:3])
-            noisy.append(ChainLink(np.array([poses[0], T.matrix34]), covs[0], NONE[:2]))
+            noisy.append(link(np.array([poses[0], T.matrix34]), covs[0], NONE[:2]))
         end = chain(noisy, levels).poses[-1]
         turn = end[:, :3] @ mean[-1][:, :3].T
         w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
@@ -149,9 +154,14 @@ def test_what_segments_share_adds_up_and_what_they_do_not_adds_squared():
     shared[1, 2, 0] = 2e-3
     own = np.zeros((2, 6, 6))
     own[1, 2, 2] = 3e-3**2
-    one = ChainLink(np.array([start, step]), own + shared @ np.swapaxes(shared, 1, 2), shared)
+    one = link(np.array([start, step]), own + shared @ np.swapaxes(shared, 1, 2), shared)
     found = chain([one] * 4, [RigidTransform.identity()] * 4)
     np.testing.assert_allclose(found.covariance[:, 2, 2], [k * 3e-3**2 + (k * 2e-3) ** 2 for k in range(5)], atol=1e-15)
+    # Of the calibration 5 mm more, which a run that knows it exactly does not have.
+    calibrated = chain([one._replace(calibration=2.5 * shared)] * 4, [RigidTransform.identity()] * 4)
+    np.testing.assert_array_equal(calibrated.own_covariance, found.covariance)
+    more = calibrated.covariance - calibrated.own_covariance
+    np.testing.assert_allclose(more[:, 2, 2], [(k * 5e-3) ** 2 for k in range(5)], atol=1e-15)
 
 
 def test_refined_poses_and_their_covariances_take_the_place_of_resected_ones():
