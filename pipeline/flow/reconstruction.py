@@ -153,6 +153,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     lost = sorted([*missing, *found.meta["lost"]], key=lambda item: item["frame"])
     row = {frame: k for k, frame in enumerate(frames)}
     behind = [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1]
+    # Where the tracks contradict the cameras, all that rests on these is laid out anew with corrected ones.
     turn = 0
     while True:
         if turn and p.crosscheck is not None:
@@ -270,6 +271,7 @@ def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref[Screen
     along = steps(make, whole)
     bridges: dict[tuple[int, int], Handle] = {}
     sides: dict[int, Handle] = {}
+    # Where the tracks contradict the cameras, all that rests on these is laid out anew with corrected ones.
     turn = 0
     while True:
         asked = make.node(
@@ -509,7 +511,8 @@ def asked_for(make: Builder, key: MatchedPair) -> Generator[Wait, Any, list[floa
     given = make.given_camera if make.graph.anew else None
     p.intrinsics = make.node(intrinsics_stage, "intrinsics", segments=p.refined, rig=key.rig, given=given)
     judged: list[Ref[IntrinsicsFacts] | None] = yield Maybe([p.intrinsics])
-    return [] if judged[0] is None else judged[0].meta["correction"]
+    # A plan takes the facts of earlier runs, which may be those of an earlier release.
+    return [] if judged[0] is None else judged[0].meta.get("correction", [])
 
 
 def seen_again(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[Handle[LoopFacts]]]:
