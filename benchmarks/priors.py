@@ -54,7 +54,7 @@ class Simulated:
     def _late(self, late: float) -> list[Any]:
         """True poses of moments that are earlier."""
         from rille.stages.geometry.geometry import RigidTransform
-        from rille.stages.odometry.resection.priors import resampled
+        from rille.stages.odometry.resection.sensors import resampled
 
         poses = resampled(np.array([T.matrix34 for T in self.truth]), self.times, -late)
         return [RigidTransform.from_matrix(T) if np.isfinite(T).all() else None for T in poses]

@@ -15,9 +15,12 @@ from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.calibration import SynchronyFacts
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Rig
-from rille.stages.imaging.features import PIXEL_CENTRE, extract, match
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.numeric.robust import mad_sigma
+from rille.stages.odometry.features import features, matches
+
+MAX_FEATURES = 1500
+"""Most features of an image."""
 
 MAX_DISTANCE_SHARE = 0.1
 """Share of the right image's height that a match may depart from its line: what departs more is mismatched."""
@@ -37,7 +40,7 @@ def row_offsets(rig: Rig, left: tuple[Floats32, Floats32], right: tuple[Floats32
 
     The median is that of a camera that is turned a little, which no shift in time explains.
     """
-    rows = match(left[1], right[1])
+    rows = matches(left[1], right[1])
     points = (side[0][rows[:, k]].astype(np.float64) for k, side in enumerate((left, right)))
     apart, _ = distances(rig, np.zeros(5), *points)
     # Before the spread is taken: far mismatches would hide what a shift does to the others.
@@ -72,12 +75,6 @@ def best_partners(offsets: Mapping[int, Mapping[int, Floats | None]]) -> Synchro
     return facts
 
 
-def _features(image: Pyramid) -> tuple[Floats32, Floats32]:
-    """Features of an image: points (n, 2) column, row, and descriptors (n, 128)."""
-    found = extract(image.images[0], image.valid[0])
-    return found["points"] - np.float32(PIXEL_CENTRE), found["descriptors"].astype(np.float32)
-
-
 @stage("synchrony")
 def synchrony_stage(
     params: NoParams,
@@ -89,7 +86,7 @@ def synchrony_stage(
     pairs: Sequence[int],
 ) -> Bundle[SynchronyFacts]:
     """Which right image is of the time of a left one, where the rows contradict their names."""
-    ours, theirs = ([_features(Pyramid.from_bundle(one)) for one in side] for side in (left, right))
+    ours, theirs = ([features(Pyramid.from_bundle(one), 0, MAX_FEATURES) for one in side] for side in (left, right))
     offsets = {
         pair: {f: row_offsets(rig, left, right) for f, right in zip(frames, theirs, strict=True)}
         for pair, left in zip(pairs, ours, strict=True)

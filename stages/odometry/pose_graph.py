@@ -26,7 +26,7 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import cross_matrix, rotation_exp, rotation_log
 from rille.stages.numeric.least_squares import levenberg_marquardt
 
-EXCESS = (1.0, 3.0, 10.0, 30.0)
+EXCESS = (1.0, 2.0, 5.0, 10.0, 30.0)
 """Factors k that are tried: on recorded sequences errors were up to 30 times those stated."""
 MAJORITY = 0.7
 """Share of the doubtful factors that have to agree."""

@@ -50,7 +50,7 @@ def test_what_departs_too_far_is_told_by_the_right_images_own_height():
     left, right = (Camera(100.0 * s, 100.0 * s, 50.0 * s, 50.0 * s, 100 * s, 100 * s) for s in (1, 4))
     rig = Rig(left, right, RigidTransform(np.eye(3), np.array([-0.1, 0.0, 0.0])))
     rng = np.random.default_rng(0)
-    points, features = rng.uniform(10, 90, (200, 2)), 512 * np.eye(200, dtype=np.float32)
+    points, features = rng.uniform(10, 90, (200, 2)), np.eye(200, dtype=np.float32)
     # A twentieth of the right image's height is a fifth of the left one's.
     theirs = 4 * points + np.column_stack([np.full(200, -8.0), 20 + rng.normal(0, 1, 200)])
     apart = synchrony.row_offsets(rig, (points, features), (theirs, features))
