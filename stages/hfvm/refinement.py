@@ -7,8 +7,8 @@ Feature vectors compare upright windows; where the two views foreshorten a surfa
 is biased. Warping the right image by the smoothed disparities first makes the windows alike, and what is left is a
 small displacement, solved per window. A pixel keeps the step only if it makes its window fit better.
 
-Steps use the left image's gradient, so they are taken in the frame of the aligned right image, where neighbours move
-alike even between turned views; grey values are read from the right image itself, which is interpolated only once.
+Steps are taken in the frame of the aligned right image, where neighbours move alike even between turned views; grey
+values and gradients are those of the spline through the right image itself, which is interpolated only once.
 
 **Relief.** Displacements of all matches at once, piecewise smooth and along epipolar lines.
 
@@ -69,8 +69,6 @@ WINDOW_RADIUS_PX = 2
 ASSUMED_NOISE_VARIANCE = 8.0
 """Assumed noise, squared grey levels per pixel: it shortens steps where texture is weak."""
 
-SUM_PLANES = 10
-
 CORRELATION_SIDE_PX = 9
 """Pixels: fewer do not tell correlated noise from texture."""
 
@@ -111,18 +109,16 @@ def refine(
     start : (row, col) float32, smoothed displacements, pixels.
     keep : (row, col) bool, pixels that have one.
     """
-    (now_u, now_v), first = start, None
+    now, rests = start, list[AnyArray]()
     for _ in range(steps):
-        there = to_right(now_u, now_v)
-        step_u, step_v, last, per_noise = (np.empty(keep.shape, np.float32) for _ in range(4))
-        _step(images, there, keep, (step_u, step_v, last, per_noise))
-        first = last if first is None else first
-        # The same arrays mean no alignment, and nothing to convert.
-        if there[0] is not now_u:
-            step_u, step_v = now_u + (step_u - there[0]), now_v + (step_v - there[1])
-        now_u, now_v = local_mean(step_u, step_v, keep, 1, 1)
-    _take_back(start, first, (now_u, now_v), last)
-    return Refined(now_u, now_v, last, per_noise)
+        step_u, step_v, rest, per_noise = _step(images, to_right, now, keep)
+        rests.append(rest)
+        now = local_mean(now[0] + step_u, now[1] + step_v, keep, 1, 1)
+    first, last = rests[0], rests[-1]
+    # Back where steps led far or away from a fit. Residuals are those before a step: of a single one distance decides.
+    better = (last <= first) & (np.hypot(now[0] - start[0], now[1] - start[1]) <= MAX_CORRECTION_PX)
+    u, v = np.where(better, now[0], start[0]), np.where(better, now[1], start[1])
+    return Refined(u, v, np.where(better, last, first), per_noise)
 
 
 def local_mean(u: AnyArray, v: AnyArray, keep: AnyArray, radius: int, stride: int) -> tuple[AnyArray, AnyArray]:
@@ -171,149 +167,83 @@ def _local_mean(u, v, keep, window, out):  # type: ignore[no-untyped-def]
             out_v[y, x] = v[y, x] + (sv[x] / n if keep[y, x] else nil)
 
 
-@njit(cache=True, nogil=True)
-def spline_value(coefficients, at, width, t, s):  # type: ignore[no-untyped-def]
-    """Value of a cubic spline: sum_k sum_m w_k(s) w_m(t) coefficients[k, m]; these are flat, in rows of ``width``.
+def _step(images: SplineImages, to_right: Frame, now: tuple[AnyArray, AnyArray], keep: AnyArray) -> AnyArray:
+    """One mean-free step for every kept pixel: planes (4, row, col) float32.
 
-    ``at``: index of the pixel above and left of the point's own; ``t, s``: the point's distance right of and below it,
-    within a pixel. 4 x 4 coefficients from ``at - width - 1`` on are read.
+    Columns and rows, zero where there is none; residual variance before the step, infinite where there is none; and the
+    variance of the column for a unit of variance of the grey levels.
     """
-    across, down = weights(t), weights(s)
-    nil = np.float32(0.0)
-    c0, c1, c2, c3 = nil, nil, nil, nil
-    for k in range(4):
-        # Unsigned indices need no check for counting from the end.
-        i = np.uint64(at + (k - 1) * width - 1)
-        c0 += down[k] * coefficients[i]
-        c1 += down[k] * coefficients[i + np.uint64(1)]
-        c2 += down[k] * coefficients[i + np.uint64(2)]
-        c3 += down[k] * coefficients[i + np.uint64(3)]
-    # Rows first, then pairs of columns: this order fixes the rounding of published artifacts.
-    return (across[0] * c0 + across[2] * c2) + (across[1] * c1 + across[3] * c3)
+    u, v = to_right(*now)
+    count, gx, gy, rest = _warped(images, u, v, keep)
+    if u is not now[0]:
+        # Along the axes of the frame of steps, which the right image's may be turned and scaled against.
+        (u1, v1), (u2, v2) = to_right(now[0] + 1, now[1]), to_right(now[0], now[1] + 1)
+        along = gx * (u1 - u) + gy * (v1 - v), gx * (u2 - u) + gy * (v2 - v)
+        gx, gy = (np.where(count > 0, g, np.float32(0)) for g in along)
+    products = count, gx, gy, rest, gx * gx, gx * gy, gy * gy, gx * rest, gy * rest, rest * rest
+    out = np.empty((4, *keep.shape), np.float32)
+    _solve_windows(tuple(window_sum32(plane, 2 * WINDOW_RADIUS_PX + 1) for plane in products), keep, out)
+    return out
 
 
 @njit(cache=True, nogil=True)
-def _products(images, now, keep, y, out):  # type: ignore[no-untyped-def]
-    """Row ``y`` of the planes whose window sums a step needs, zero where a pixel takes no part.
-
-    ``out`` (SUM_PLANES, radius + col + radius): count, gx, gy, r, gx gx, gx gy, gy gy, gx r, gy r, r r, with the
-    gradient of the left image. Reach: a pixel.
-    """
-    left, spline, valid = images.left, images.spline, images.valid
-    (rows, cols), (rrows, rcols) = left.shape, spline.shape
-    (u, v), radius = now, WINDOW_RADIUS_PX
-    if y < 0 or y >= rows:
-        out[:] = np.float32(0.0)
-        return
-    one, half, nil = np.float32(1.0), np.float32(0.5), np.float32(0.0)
-    # A spline reads one coefficient before and two after.
-    last_x, last_y = np.float32(rcols - 2), np.float32(rrows - 2)
-    end = radius + cols
-    n, gx, gy, rest = out[0, radius:end], out[1, radius:end], out[2, radius:end], out[3, radius:end]
-    lu, lv, grey = u[y], v[y], left[y]
-    flat, taking = spline.reshape(-1), keep[y]
-    for x in range(cols):
-        xr, yr = np.float32(x) + lu[x], np.float32(y) + lv[x]
-        n[x] = rest[x] = nil
-        if not (taking[x] and xr >= one and xr < last_x and yr >= one and yr < last_y):
-            continue
-        if not valid[np.uint64(yr + half), np.uint64(xr + half)]:
-            continue
-        i, j = np.int64(xr), np.int64(yr)
-        value = spline_value(flat, j * rcols + i, rcols, xr - np.float32(i), yr - np.float32(j))
-        n[x], rest[x] = one, grey[x] - value
-    above, below = left[max(y - 1, 0)], left[min(y + 1, rows - 1)]
-    # As if the edge were repeated: a difference over one pixel, halved like those over two.
-    gx[0], gx[cols - 1] = half * (grey[min(1, cols - 1)] - grey[0]), half * (grey[cols - 1] - grey[max(cols - 2, 0)])
-    inner, west, east = gx[1 : cols - 1], grey[: cols - 2], grey[2:]
-    for x in range(cols - 2):
-        inner[x] = half * (east[x] - west[x])
-    for x in range(cols):
-        gx[x] *= n[x]
-        gy[x] = half * n[x] * (below[x] - above[x])
-    for k, (p, q) in enumerate(((gx, gx), (gx, gy), (gy, gy), (gx, rest), (gy, rest), (rest, rest))):
-        product = out[4 + k, radius:end]
-        for x in range(cols):
-            product[x] = p[x] * q[x]
-
-
-@njit(cache=True, nogil=True)
-def _step(images, now, keep, new):  # type: ignore[no-untyped-def]
-    """One mean-free step for every kept pixel, from ``now`` (columns and rows of displacement) to ``new``.
-
-    ``new``: displacements, residual variance before the step (inf: none), variance for a unit of variance of the grey
-    levels. The gradient is the left image's (inverse compositional form). float32 throughout: every window is summed
-    afresh, so nothing adds up. Reach: the window's radius, and of the left image a pixel more.
-    """
-    rows, cols = keep.shape
-    size = 2 * WINDOW_RADIUS_PX + 1
-    fresh = np.zeros((SUM_PLANES, cols + 2 * WINDOW_RADIUS_PX), np.float32)
-    ring = np.zeros((size, SUM_PLANES, cols), np.float32)
-    total = np.empty((SUM_PLANES, cols), np.float32)
-    # From above the image on: the ring must hold all rows of the first window before that is solved.
-    for y in range(-WINDOW_RADIUS_PX, rows):
-        _products(images, now, keep, y + WINDOW_RADIUS_PX, fresh)
-        for k in range(SUM_PLANES):
-            part, out = fresh[k], ring[(y + WINDOW_RADIUS_PX) % size, k]
-            one, two, three, four = part[1 : 1 + cols], part[2 : 2 + cols], part[3 : 3 + cols], part[4:]
-            for x in range(cols):
-                out[x] = (part[x] + (one[x] + two[x])) + (three[x] + four[x])
-        if y < 0:
-            continue
-        first = y + WINDOW_RADIUS_PX + 1
-        for k in range(SUM_PLANES):
-            one, two, three = ring[first % size, k], ring[(first + 1) % size, k], ring[(first + 2) % size, k]
-            four, five, out = ring[(first + 3) % size, k], ring[(first + 4) % size, k], total[k]
-            for x in range(cols):
-                out[x] = (one[x] + (two[x] + three[x])) + (four[x] + five[x])
-        _solve_windows(total, keep[y], y, now, new)
-
-
-@njit(cache=True, nogil=True)
-def _solve_windows(s, keep, y, now, new):  # type: ignore[no-untyped-def]
-    """Steps of row ``y`` from the window sums."""
-    u, v = now[0][y], now[1][y]
-    new_u, new_v, energy, per_noise = new[0][y], new[1][y], new[2][y], new[3][y]
+def _solve_windows(sums, keep, out):  # type: ignore[no-untyped-def]
+    """Steps from the sums over each pixel's window."""
     noise, least = np.float32(ASSUMED_NOISE_VARIANCE), np.float32(0.5 * (2 * WINDOW_RADIUS_PX + 1) ** 2)
-    one, nil, far = np.float32(1.0), np.float32(0.0), np.float32(np.inf)
-    count, sum_gx, sum_gy, sum_r = s[0], s[1], s[2], s[3]
-    sum_gx_gx, sum_gx_gy, sum_gy_gy, sum_gx_r, sum_gy_r, sum_r_r = s[4], s[5], s[6], s[7], s[8], s[9]
-    for x in range(u.size):
-        use = keep[x] & (count[x] >= least)
-        n = count[x] if use else one
-        inverse = one / n
-        m1, m2, m3 = sum_gx[x] * inverse, sum_gy[x] * inverse, sum_r[x] * inverse
-        # Noise on the diagonal shortens steps where texture is weak.
-        a = sum_gx_gx[x] - sum_gx[x] * m1 + noise * n
-        b = sum_gx_gy[x] - sum_gx[x] * m2
-        c = sum_gy_gy[x] - sum_gy[x] * m2 + noise * n
-        p = sum_gx_r[x] - sum_gx[x] * m3
-        q = sum_gy_r[x] - sum_gy[x] * m3
-        # A window of noise alone has a determinant of at least (noise n)^2.
-        det = a * c - b * b
-        good = use & (det > nil)
-        inverse_det = one / (det if det > nil else one)
-        du, dv = (c * p - b * q) * inverse_det, (a * q - b * p) * inverse_det
-        # Rounding may leave the residual of a perfect fit below zero.
-        energy[x] = max(sum_r_r[x] - sum_r[x] * m3, nil) * inverse if use else far
-        per_noise[x] = c * inverse_det if good else nil
-        # A pixel at most: beyond it the step is a guess.
-        new_u[x] = u[x] + (min(max(du, -one), one) if good else nil)
-        new_v[x] = v[x] + (min(max(dv, -one), one) if good else nil)
+    one, nil = np.float32(1.0), np.float32(0.0)
+    for y in range(keep.shape[0]):
+        for x in range(keep.shape[1]):
+            n = sums[0][y, x]
+            if not keep[y, x] or n < least:
+                out[0, y, x], out[1, y, x], out[2, y, x], out[3, y, x] = nil, nil, np.float32(np.inf), nil
+                continue
+            sum_gx, sum_gy, sum_r = sums[1][y, x], sums[2][y, x], sums[3][y, x]
+            # Noise on the diagonal shortens steps where texture is weak, and keeps the determinant positive.
+            a = sums[4][y, x] - sum_gx * sum_gx / n + noise * n
+            b = sums[5][y, x] - sum_gx * sum_gy / n
+            c = sums[6][y, x] - sum_gy * sum_gy / n + noise * n
+            p, q = sums[7][y, x] - sum_gx * sum_r / n, sums[8][y, x] - sum_gy * sum_r / n
+            det = a * c - b * b
+            # A pixel at most: beyond it the step is a guess.
+            out[0, y, x] = min(max((c * p - b * q) / det, -one), one)
+            out[1, y, x] = min(max((a * q - b * p) / det, -one), one)
+            # Rounding may leave the residual of a perfect fit below zero.
+            out[2, y, x], out[3, y, x] = max(sums[9][y, x] - sum_r * sum_r / n, nil) / n, c / det
+
+
+def _warped(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> AnyArray:
+    """Planes (4, row, col), zero where a pixel takes no part: 1, gradient (x, y) of the right image, left minus it."""
+    planes = np.zeros((4, *u.shape), np.float32)
+    _warp(images, u, v, keep, planes)
+    return planes
 
 
 @njit(cache=True, nogil=True)
-def _take_back(start, first, new, last):  # type: ignore[no-untyped-def]
-    """Start displacements and residuals where steps led far or away from a fit."""
-    (u, v), (new_u, new_v), farthest = start, new, np.float32(MAX_CORRECTION_PX)
-    for y in range(u.shape[0]):
-        for x in range(u.shape[1]):
-            du, dv = new_u[y, x] - u[y, x], new_v[y, x] - v[y, x]
-            # After a single step both are one array (residuals are those before it): the distance alone counts.
-            better = (last[y, x] <= first[y, x]) & (du * du + dv * dv <= farthest * farthest)
-            new_u[y, x] = new_u[y, x] if better else u[y, x]
-            new_v[y, x] = new_v[y, x] if better else v[y, x]
-            last[y, x] = last[y, x] if better else first[y, x]
+def _warp(images, u, v, keep, out):  # type: ignore[no-untyped-def]
+    left, spline, right_valid = images.left, images.spline, images.valid
+    rows, cols = left.shape
+    last_x, last_y, half = spline.shape[1] - 2, spline.shape[0] - 2, np.float32(0.5)
+    for y in range(rows):
+        for x in range(cols):
+            xr, yr = np.float32(x) + u[y, x], np.float32(y) + v[y, x]
+            if not (keep[y, x] and xr >= 1 and xr < last_x and yr >= 1 and yr < last_y):
+                continue
+            if not right_valid[np.int64(yr + half), np.int64(xr + half)]:
+                continue
+            i, j = np.int64(xr), np.int64(yr)
+            t, s = xr - np.float32(i), yr - np.float32(j)
+            wx, wy, dx, dy = weights(t), weights(s), slopes(t), slopes(s)
+            value = gx = gy = np.float32(0.0)
+            for k in range(4):
+                across = along = np.float32(0.0)
+                for m in range(4):
+                    c = spline[j - 1 + k, i - 1 + m]
+                    across += wx[m] * c
+                    along += dx[m] * c
+                value += wy[k] * across
+                gx += wy[k] * along
+                gy += dy[k] * across
+            out[0, y, x], out[1, y, x], out[2, y, x], out[3, y, x] = 1, gx, gy, left[y, x] - value
 
 
 def surroundings(
@@ -412,8 +342,7 @@ def fit_relief(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -
 def _grey(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> AnyArray:
     """Planes (4, row, col): weight of each pixel, gradient (x, y) of the warped right image, difference of the images
     free of its local mean; weight 0 where a pixel does not take part."""
-    planes = np.zeros((4, *u.shape), np.float32)
-    _warped(images, u, v, keep, planes)
+    planes = _warped(images, u, v, keep)
     known, _, _, rest = planes
     mean, weight = np.zeros_like(rest), known
     # The first mean is of equal weights; what lies across an edge then counts for little, but one weighting does not
@@ -425,38 +354,6 @@ def _grey(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> Any
     planes[0] = weight
     planes[3] -= mean
     return planes
-
-
-@njit(cache=True, nogil=True)
-def _warped(images, u, v, keep, out):  # type: ignore[no-untyped-def]
-    """Planes: 1 where a pixel takes part, gradient (x, y) of the warped right image, left minus right; else zero.
-
-    ``spline``: coefficients of the right image's cubic spline.
-    """
-    left, spline, right_valid = images.left, images.spline, images.valid
-    rows, cols = left.shape
-    last_x, last_y, half = spline.shape[1] - 2, spline.shape[0] - 2, np.float32(0.5)
-    for y in range(rows):
-        for x in range(cols):
-            xr, yr = np.float32(x) + u[y, x], np.float32(y) + v[y, x]
-            if not (keep[y, x] and xr >= 1 and xr < last_x and yr >= 1 and yr < last_y):
-                continue
-            if not right_valid[np.int64(yr + half), np.int64(xr + half)]:
-                continue
-            i, j = np.int64(xr), np.int64(yr)
-            t, s = xr - np.float32(i), yr - np.float32(j)
-            wx, wy, dx, dy = weights(t), weights(s), slopes(t), slopes(s)
-            value = gx = gy = np.float32(0.0)
-            for k in range(4):
-                across = along = np.float32(0.0)
-                for m in range(4):
-                    c = spline[j - 1 + k, i - 1 + m]
-                    across += wx[m] * c
-                    along += dx[m] * c
-                value += wy[k] * across
-                gx += wy[k] * along
-                gy += dy[k] * across
-            out[0, y, x], out[1, y, x], out[2, y, x], out[3, y, x] = 1, gx, gy, left[y, x] - value
 
 
 def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int]) -> tuple[AnyArray, float]:

@@ -60,8 +60,8 @@ class Library:
     def search(self, pair: LevelPair, up: tuple[AnyArray, AnyArray], reach: tuple[int, int], out: Field) -> None:
         """Write the best displacements around those of the coarser level, see ``reference.search``."""
         room = np.empty((up[0].shape[0] + 2, up[0].shape[1] + 2), np.int32)
-        centres, results = [_at(a, np.int16) for a in up], [_at(a, np.int32) for a in out]
-        self._call("search", pair, *centres, reach, *results, room.ctypes.data)
+        above, here = [_at(a, np.int16) for a in up], [_at(a, np.int32) for a in out]
+        self._call("search", pair, *above, reach, *here, room.ctypes.data)
 
     def propagate(self, pair: LevelPair, field: Field, smoothing: Smoothing) -> None:
         """Improve displacements in place by those of the neighbours, see ``reference.propagate``."""

@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matching_scenes import convergent_rig, pair, rig_displacement
-from numba import njit
 from scipy import ndimage
 
 from rille.stages.core.validity import Validity, has
@@ -350,14 +349,18 @@ def test_a_patch_without_texture_on_a_textured_wall_is_matched_with_a_larger_dev
     assert more > 0.99 * refinement.BLANK_STD_PX**2
 
 
-def test_a_spline_is_scipys_between_pixels():
-    @njit
-    def call(found, x, y):
-        i, j = int(x), int(y)
-        t, s = x - np.float32(i), y - np.float32(j)
-        return refinement.spline_value(found.ravel(), j * found.shape[1] + i, found.shape[1], t, s)
-
+def test_values_and_gradients_are_those_of_scipys_spline():
     image = np.random.default_rng(8).uniform(0, 255, (9, 10)).astype(np.float32)
-    for x, y in np.random.default_rng(9).uniform(2, 6, (50, 2)).astype(np.float32):
-        expected = ndimage.map_coordinates(image, [[y], [x]], np.float64, order=3, mode="mirror")
-        np.testing.assert_allclose(call(coefficients(image), x, y), expected[0], atol=5e-3)
+    x, y = np.random.default_rng(9).uniform(2, 6, (2, 1, 50)).astype(np.float32)
+    nothing = np.zeros((1, 50), np.float32)
+    images = refinement.SplineImages(nothing, coefficients(image), np.ones(image.shape, np.uint8))
+    count, gx, gy, rest = refinement._warped(images, x - np.arange(50, dtype=np.float32), y, nothing == 0)
+
+    def value(dx, dy):
+        at = [np.float64(y) + dy, np.float64(x) + dx]
+        return ndimage.map_coordinates(image, at, np.float64, order=3, mode="mirror")
+
+    assert count.all()
+    np.testing.assert_allclose(-rest, value(0, 0), atol=5e-3)
+    np.testing.assert_allclose(gx, (value(1e-4, 0) - value(-1e-4, 0)) / 2e-4, atol=2e-2)
+    np.testing.assert_allclose(gy, (value(0, 1e-4) - value(0, -1e-4)) / 2e-4, atol=2e-2)
