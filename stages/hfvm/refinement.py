@@ -66,6 +66,9 @@ Frame = Callable[[AnyArray, AnyArray], tuple[AnyArray, AnyArray]]
 WINDOW_RADIUS_PX = 2
 """Pixels: the windows are 5 x 5; larger ones have less noise, and smooth small relief away."""
 
+BAND_ROWS = 64
+"""Rows whose windows are summed together: fourteen planes of a whole image would be its greatest need of memory."""
+
 ASSUMED_NOISE_VARIANCE = 8.0
 """Assumed noise, squared grey levels per pixel: it shortens steps where texture is weak."""
 
@@ -173,16 +176,20 @@ def _step(images: SplineImages, to_right: Frame, now: tuple[AnyArray, AnyArray],
     Columns and rows, zero where there is none; residual variance before the step, infinite where there is none; and the
     variance of the column for a unit of variance of the grey levels.
     """
-    u, v = to_right(*now)
-    count, gx, gy, rest = _warped(images, u, v, keep)
-    if u is not now[0]:
-        # Along the axes of the frame of steps, which the right image's may be turned and scaled against.
-        (u1, v1), (u2, v2) = to_right(now[0] + 1, now[1]), to_right(now[0], now[1] + 1)
-        along = gx * (u1 - u) + gy * (v1 - v), gx * (u2 - u) + gy * (v2 - v)
-        gx, gy = (np.where(count > 0, g, np.float32(0)) for g in along)
-    products = count, gx, gy, rest, gx * gx, gx * gy, gy * gy, gx * rest, gy * rest, rest * rest
-    out = np.empty((4, *keep.shape), np.float32)
-    _solve_windows(tuple(window_sum32(plane, 2 * WINDOW_RADIUS_PX + 1) for plane in products), keep, out)
+    there, out = to_right(*now), np.empty((4, *keep.shape), np.float32)
+    # Along the axes of the frame of steps, which the right image's may be turned and scaled against.
+    axes = [] if there[0] is now[0] else [to_right(now[0] + 1, now[1]), to_right(now[0], now[1] + 1)]
+    for top in range(0, len(keep), BAND_ROWS):
+        first = max(top - WINDOW_RADIUS_PX, 0)
+        band, inner = slice(first, top + BAND_ROWS + WINDOW_RADIUS_PX), slice(top - first, top - first + BAND_ROWS)
+        u, v = (a[band] for a in there)
+        count, gx, gy, rest = _warped(images._replace(left=images.left[band]), u, v + np.float32(first), keep[band])
+        if axes:
+            along = (gx * (i[band] - u) + gy * (j[band] - v) for i, j in axes)
+            gx, gy = (np.where(count > 0, g, np.float32(0)) for g in along)
+        products = count, gx, gy, rest, gx * gx, gx * gy, gy * gy, gx * rest, gy * rest, rest * rest
+        sums = tuple(window_sum32(plane, 2 * WINDOW_RADIUS_PX + 1)[inner] for plane in products)
+        _solve_windows(sums, keep[top : top + BAND_ROWS], out[:, top : top + BAND_ROWS])
     return out
 
 
