@@ -119,7 +119,8 @@ def refine(
         now = local_mean(now[0] + step_u, now[1] + step_v, keep, 1, 1)
     first, last = rests[0], rests[-1]
     # Back where steps led far or away from a fit. Residuals are those before a step: of a single one distance decides.
-    better = (last <= first) & (np.hypot(now[0] - start[0], now[1] - start[1]) <= MAX_CORRECTION_PX)
+    du, dv = now[0] - start[0], now[1] - start[1]
+    better = (last <= first) & (du * du + dv * dv <= MAX_CORRECTION_PX**2)
     u, v = np.where(better, now[0], start[0]), np.where(better, now[1], start[1])
     return Refined(u, v, np.where(better, last, first), per_noise)
 
@@ -197,13 +198,11 @@ def _step(images: SplineImages, to_right: Frame, now: tuple[AnyArray, AnyArray],
 def _solve_windows(sums, keep, out):  # type: ignore[no-untyped-def]
     """Steps from the sums over each pixel's window."""
     noise, least = np.float32(ASSUMED_NOISE_VARIANCE), np.float32(0.5 * (2 * WINDOW_RADIUS_PX + 1) ** 2)
-    one, nil = np.float32(1.0), np.float32(0.0)
+    one, nil, far = np.float32(1.0), np.float32(0.0), np.float32(np.inf)
     for y in range(keep.shape[0]):
         for x in range(keep.shape[1]):
-            n = sums[0][y, x]
-            if not keep[y, x] or n < least:
-                out[0, y, x], out[1, y, x], out[2, y, x], out[3, y, x] = nil, nil, np.float32(np.inf), nil
-                continue
+            n = max(sums[0][y, x], one)
+            use = keep[y, x] & (n >= least)
             sum_gx, sum_gy, sum_r = sums[1][y, x], sums[2][y, x], sums[3][y, x]
             # Noise on the diagonal shortens steps where texture is weak, and keeps the determinant positive.
             a = sums[4][y, x] - sum_gx * sum_gx / n + noise * n
@@ -212,10 +211,11 @@ def _solve_windows(sums, keep, out):  # type: ignore[no-untyped-def]
             p, q = sums[7][y, x] - sum_gx * sum_r / n, sums[8][y, x] - sum_gy * sum_r / n
             det = a * c - b * b
             # A pixel at most: beyond it the step is a guess.
-            out[0, y, x] = min(max((c * p - b * q) / det, -one), one)
-            out[1, y, x] = min(max((a * q - b * p) / det, -one), one)
+            out[0, y, x] = min(max((c * p - b * q) / det, -one), one) if use else nil
+            out[1, y, x] = min(max((a * q - b * p) / det, -one), one) if use else nil
             # Rounding may leave the residual of a perfect fit below zero.
-            out[2, y, x], out[3, y, x] = max(sums[9][y, x] - sum_r * sum_r / n, nil) / n, c / det
+            out[2, y, x] = max(sums[9][y, x] - sum_r * sum_r / n, nil) / n if use else far
+            out[3, y, x] = c / det if use else nil
 
 
 def _warped(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> AnyArray:
@@ -243,8 +243,9 @@ def _warp(images, u, v, keep, out):  # type: ignore[no-untyped-def]
             value = gx = gy = np.float32(0.0)
             for k in range(4):
                 across = along = np.float32(0.0)
+                row = spline[np.uint64(j - 1 + k)]
                 for m in range(4):
-                    c = spline[j - 1 + k, i - 1 + m]
+                    c = row[np.uint64(i - 1 + m)]
                     across += wx[m] * c
                     along += dx[m] * c
                 value += wy[k] * across
