@@ -135,9 +135,8 @@ def lines(f: Matrix, shape: tuple[int, ...]) -> NDArray[np.float32]:
 
     Zeros where ``f`` is zero.
     """
-    out = np.empty((*shape, 3), np.float32)
-    _lines(f, out)
-    return out
+    y, x = np.indices(shape).reshape(2, -1)
+    return np.ascontiguousarray(lines_at(f, x, y).T.reshape(*shape, 3))
 
 
 def moved(f: Matrix, left: tuple[int, int], right: tuple[int, int]) -> Matrix:
@@ -158,13 +157,6 @@ def unit_line(f, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _lines(f, out):  # type: ignore[no-untyped-def]
-    for j in range(out.shape[0]):
-        for i in range(out.shape[1]):
-            out[j, i, 0], out[j, i, 1], out[j, i, 2] = unit_line(f, np.float64(i), np.float64(j))
-
-
-@njit(cache=True, nogil=True)
 def row_terms(f, y):  # type: ignore[no-untyped-def]
     """Lines of a row as polynomials of the column: seven float32, see :func:`line`.
 
@@ -172,16 +164,7 @@ def row_terms(f, y):  # type: ignore[no-untyped-def]
     """
     a, b = f[0, 1] * y + f[0, 2], f[1, 1] * y + f[1, 2]
     c = f[2, 2] + f[2, 1] * y + b * y
-    terms = a, f[0, 0], b, f[1, 0], c, f[2, 0] + a + f[1, 0] * y, f[0, 0]
-    return (
-        np.float32(terms[0]),
-        np.float32(terms[1]),
-        np.float32(terms[2]),
-        np.float32(terms[3]),
-        np.float32(terms[4]),
-        np.float32(terms[5]),
-        np.float32(terms[6]),
-    )
+    return np.array([a, f[0, 0], b, f[1, 0], c, f[2, 0] + a + f[1, 0] * y, f[0, 0]]).astype(np.float32)
 
 
 @njit(cache=True, nogil=True)

@@ -26,29 +26,13 @@ from rille.stages.hfvm.native.reference import linear
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging.pyramid import Pyramid
 
-OFFSET_BINS = 16
-
 _HALF = (0.0, 0.0587, 0.1219, 0.1889, 0.2573, 0.3222, 0.3799, 0.4265, 0.5)
 DEFAULT_TABLE: tuple[float, ...] = (*(-v for v in _HALF[:0:-1]), *_HALF)
 """Even offset at each sixteenth of the found one; learnt on noise of spectrum 1 / f^1.3, displaced by all fractions."""
 
 
-def learn(offsets: ArrayLike) -> tuple[float, ...]:
-    """Table of ``OFFSET_BINS + 1`` even offsets at found offsets -0.5 ... 0.5, out of a sample of found offsets.
-
-    The histogram is made symmetric: the sign of an offset is a matter of which image is the left one.
-    """
-    clipped = np.clip(np.asarray(offsets, dtype=np.float64).ravel(), -0.5, 0.5)
-    counts, _ = np.histogram(clipped, bins=OFFSET_BINS, range=(-0.5, 0.5))
-    counts = counts + counts[::-1]
-    if counts.sum() == 0:
-        return tuple(i / OFFSET_BINS - 0.5 for i in range(OFFSET_BINS + 1))
-    share = np.cumsum(counts) / counts.sum()
-    return (-0.5, *(round(float(s) - 0.5, 4) for s in share))
-
-
 def even(offsets: ArrayLike, table: tuple[float, ...] = DEFAULT_TABLE) -> NDArray[np.float32]:
-    """Offsets mapped by a table of :func:`learn`, linear between its knots."""
+    """Offsets mapped by a table, linear between its knots."""
     knots = np.linspace(-0.5, 0.5, len(table))
     return np.asarray(np.interp(np.asarray(offsets), knots, np.asarray(table)), dtype=np.float32)
 

@@ -54,13 +54,21 @@ MIN_DISTINCT_STEPS = 2
 """Steps from the best one to those that it must be distinct from."""
 
 
-class WordPair(NamedTuple):
-    """Features of both images and mask of the right one, (row, col); ``window``: where the region lies in the left."""
+class Region(NamedTuple):
+    """A region, by the window that holds it, and what its pixels are compared with.
+
+    ``left``: features (row, col) of the window, whose first column and row are ``x0, y0``; ``inside``: bool, which
+    pixels belong to the region; ``lines``: see :func:`rille.stages.hfvm.epipolar.lines`; ``right, valid``: features and
+    mask of the right image.
+    """
 
     left: AnyArray
+    inside: AnyArray
+    lines: AnyArray
     right: AnyArray
     valid: AnyArray
-    window: Window
+    x0: int
+    y0: int
 
 
 class Searched(NamedTuple):
@@ -90,38 +98,25 @@ class Best(NamedTuple):
     ahead: AnyArray
 
 
-def search(images: WordPair, region: NDArray[np.bool_], lines: AnyArray, steps: AnyArray) -> Searched:
-    """Search for the best step along the line of each pixel of a region.
-
-    Parameters
-    ----------
-    region : (row, col) bool, pixels of the window.
-    lines : of these pixels, see :func:`rille.stages.hfvm.epipolar.lines`.
-    steps : (n,) float32 pixels, ascending by 1.
-    """
-    rows, cols = images.valid.shape
-    best, tried = np.zeros(region.shape, np.float32), np.zeros(region.shape, np.int32)
-    searched = Best(best, *np.full((5, *region.shape), np.inf, np.float32))
-    previous, passed = np.full((2, *region.shape), np.inf, np.float32)
-    size = np.maximum(window_count(region, WINDOW_SIDE_PX), 1)
-    claims = np.full((2, rows, cols), np.inf, np.float32)
-    last: deque[AnyArray] = deque()
+def search(region: Region, steps: AnyArray) -> Searched:
+    """The best step along the line of each pixel of a region, of ``steps``: (n,) float32 pixels, ascending by 1."""
+    shape = region.inside.shape
+    tried, size = np.zeros(shape, np.int32), np.maximum(window_count(region.inside, WINDOW_SIDE_PX), 1)
+    best = Best(np.zeros(shape, np.float32), *np.full((5, *shape), np.inf, np.float32))
+    claims = np.full((2, *region.right.shape), np.inf, np.float32)
+    # Sums of the steps before, and the least of all that are more than MIN_DISTINCT_STEPS behind.
+    last, passed = deque[AnyArray](), np.full(shape, np.inf, np.float32)
     for step in steps:
-        at = np.full(region.shape, step)
-        total = _sums(images, region, lines, at)
+        total = _sums(region, np.full(shape, step))
         tried += np.isfinite(total)
-        _claim(total / size, lines, step, (images.window.x0, images.window.y0), claims)
         if len(last) > MIN_DISTINCT_STEPS:
             np.minimum(passed, last.popleft(), out=passed)
+        _keep(region, step, (total, last[-1] if last else passed, passed), (best, size, claims))
         last.append(total)
-        _keep(total, step, previous, passed, searched)
-        previous = total
-    rival = np.minimum(searched.behind, searched.ahead)
-    distinct = np.subtract(rival, searched.least, out=np.zeros_like(rival), where=np.isfinite(rival))
-    mutual = np.zeros_like(region)
-    _claimed(searched.least, lines, best, (images.window.x0, images.window.y0), claims[1], mutual)
-    fraction = _fraction(searched.before, searched.least, searched.after)
-    return Searched(tried, best + fraction, searched.least, distinct, mutual)
+    rival, mutual = np.minimum(best.behind, best.ahead), np.zeros(shape, bool)
+    distinct = np.subtract(rival, best.least, out=np.zeros_like(rival), where=np.isfinite(rival))
+    _claimed(region, best, claims[1], mutual)
+    return Searched(tried, best.step + _fraction(best.before, best.least, best.after), best.least, distinct, mutual)
 
 
 def _fraction(before: AnyArray, least: AnyArray, after: AnyArray) -> AnyArray:
@@ -135,102 +130,74 @@ def _fraction(before: AnyArray, least: AnyArray, after: AnyArray) -> AnyArray:
     return np.divide(0.5 * fall, rise, out=np.zeros_like(least), where=rise > 0)
 
 
-def excess(images: WordPair, region: NDArray[np.bool_], lines: AnyArray, at: AnyArray, least: AnyArray) -> AnyArray:
+def excess(region: Region, at: AnyArray, least: AnyArray) -> AnyArray:
     """By how much a pixel's distance, mean of the window, exceeds that of the window's ``least`` sum at other steps.
 
-    ``at``: steps (row, col) float32. Infinite where a step leads out of the
-    right image.
+    ``at``: steps (row, col) float32. Infinite where a step leads out of the right image.
     """
-    sums = _sums(images, region, lines, at)
+    sums = _sums(region, at)
     more = np.subtract(sums, least, out=np.full_like(sums, np.inf), where=np.isfinite(sums) & np.isfinite(least))
-    return np.asarray(more / np.maximum(window_count(region, WINDOW_SIDE_PX), 1))
+    return np.asarray(more / np.maximum(window_count(region.inside, WINDOW_SIDE_PX), 1))
 
 
-class Words(NamedTuple):
-    """Features of a window of the left image and of the right image, and the right one's mask."""
-
-    left: AnyArray
-    right: AnyArray
-    valid: AnyArray
-
-
-class Distances(NamedTuple):
-    """Distances of pixels, and where there is nothing to compare them with."""
-
-    cost: AnyArray
-    outside: AnyArray
-
-
-def _sums(images: WordPair, region: NDArray[np.bool_], lines: AnyArray, at: AnyArray) -> AnyArray:
+def _sums(region: Region, at: AnyArray) -> AnyArray:
     """Sum (row, col) of the distances of a region's pixels in each window, float32; infinite outside of the region and
     where one of them leads out of the right image."""
-    cost, outside = np.zeros(region.shape, np.float32), np.zeros(region.shape, np.uint8)
-    left = np.ascontiguousarray(images.left[images.window.slices])
-    place = images.window.x0, images.window.y0
-    _distances(Words(left, images.right, images.valid), region, lines, at, place, Distances(cost, outside))
+    cost, outside = np.zeros(at.shape, np.float32), np.zeros(at.shape, np.uint8)
+    _distances(region, at, cost, outside)
     total = window_sum32(cost, WINDOW_SIDE_PX)
-    total[(cv2.dilate(outside, np.ones((WINDOW_SIDE_PX, WINDOW_SIDE_PX), np.uint8)) != 0) | ~region] = np.inf
+    total[(cv2.dilate(outside, np.ones(2 * (WINDOW_SIDE_PX,), np.uint8)) != 0) | ~region.inside] = np.inf
     return total
 
 
 @njit(cache=True, nogil=True)
-def _end(line, step, x, y):  # type: ignore[no-untyped-def]
-    """Row and column of the right image that its step along its line leads a pixel to."""
+def _end(region, y, x, step):  # type: ignore[no-untyped-def]
+    """Row and column of the right image that its step along its line leads a pixel of the window to."""
+    line = region.lines[y, x]
     u, v = epipolar.on_line((line[0], line[1], line[2]), step)
-    return np.int64(np.rint(y + v)), np.int64(np.rint(x + u))
+    return np.int64(np.rint(y + region.y0 + v)), np.int64(np.rint(x + region.x0 + u))
 
 
 @njit(cache=True, nogil=True)
-def _distances(words, region, lines, at, place, out):  # type: ignore[no-untyped-def]
+def _distances(region, at, cost, outside):  # type: ignore[no-untyped-def]
     """Distances of a region's pixels to those their step away along their lines."""
-    rows, cols = words.right.shape
-    for y in range(region.shape[0]):
-        for x in range(region.shape[1]):
-            if region[y, x]:
-                j, i = _end(lines[y, x], at[y, x], x + place[0], y + place[1])
-                out.outside[y, x] = i < 0 or i >= cols or j < 0 or j >= rows or not words.valid[j, i]
-                if not out.outside[y, x]:
-                    out.cost[y, x] = min(distance(words.left[y, x], words.right[j, i]), MAX_DISTANCE)
+    rows, cols = region.right.shape
+    for y, x in np.ndindex(at.shape):
+        if region.inside[y, x]:
+            j, i = _end(region, y, x, at[y, x])
+            outside[y, x] = i < 0 or i >= cols or j < 0 or j >= rows or not region.valid[j, i]
+            if not outside[y, x]:
+                cost[y, x] = min(distance(region.left[y, x], region.right[j, i]), MAX_DISTANCE)
 
 
 @njit(cache=True, nogil=True)
-def _claim(mean, lines, step, place, claims):  # type: ignore[no-untyped-def]
-    """Of each right pixel the least ``mean`` distance of the windows led to it, and the step that did."""
-    for y in range(mean.shape[0]):
-        for x in range(mean.shape[1]):
-            if mean[y, x] < np.inf:
-                j, i = _end(lines[y, x], step, x + place[0], y + place[1])
-                if mean[y, x] < claims[0, j, i]:
-                    claims[0, j, i], claims[1, j, i] = mean[y, x], step
+def _keep(region, step, sums, kept):  # type: ignore[no-untyped-def]
+    """Update ``best`` (:class:`Best`) with the sums of one more step, and ``claims``: of each right pixel the least
+    mean distance of the windows led to it, and the step that did."""
+    (total, previous, passed), (best, size, claims) = sums, kept
+    for y, x in np.ndindex(total.shape):
+        if total[y, x] < np.inf:
+            j, i = _end(region, y, x, step)
+            mean = np.float32(total[y, x] / size[y, x])
+            if mean < claims[0, j, i]:
+                claims[0, j, i], claims[1, j, i] = mean, step
+        if total[y, x] < best.least[y, x]:
+            best.step[y, x], best.least[y, x] = step, total[y, x]
+            best.before[y, x], best.after[y, x] = previous[y, x], np.inf
+            best.behind[y, x], best.ahead[y, x] = passed[y, x], np.inf
+        elif step - best.step[y, x] == 1:
+            best.after[y, x] = total[y, x]
+        elif step - best.step[y, x] > MIN_DISTINCT_STEPS:
+            best.ahead[y, x] = min(best.ahead[y, x], total[y, x])
 
 
 @njit(cache=True, nogil=True)
-def _claimed(least, lines, best, place, steps, mutual):  # type: ignore[no-untyped-def]
+def _claimed(region, best, steps, mutual):  # type: ignore[no-untyped-def]
     """Whether the step that claims the right pixel is like the pixel's own."""
-    for y in range(least.shape[0]):
-        for x in range(least.shape[1]):
-            if least[y, x] < np.inf:
-                j, i = _end(lines[y, x], best[y, x], x + place[0], y + place[1])
-                mutual[y, x] = abs(steps[j, i] - best[y, x]) <= MIN_DISTINCT_STEPS
-
-
-@njit(cache=True, nogil=True)
-def _keep(total, step, previous, passed, best):  # type: ignore[no-untyped-def]
-    """Update ``best`` (:class:`Best`) with the sums of one more step.
-
-    ``previous``: the sums of the step before; ``passed``: the least of all steps more than :data:`MIN_DISTINCT_STEPS`
-    behind this one.
-    """
-    for y in range(total.shape[0]):
-        for x in range(total.shape[1]):
-            if total[y, x] < best.least[y, x]:
-                best.step[y, x], best.least[y, x] = step, total[y, x]
-                best.before[y, x], best.after[y, x] = previous[y, x], np.inf
-                best.behind[y, x], best.ahead[y, x] = passed[y, x], np.inf
-            elif step - best.step[y, x] == 1:
-                best.after[y, x] = total[y, x]
-            elif step - best.step[y, x] > MIN_DISTINCT_STEPS:
-                best.ahead[y, x] = min(best.ahead[y, x], total[y, x])
+    for y, x in np.ndindex(mutual.shape):
+        if best.least[y, x] < np.inf:
+            j, i = _end(region, y, x, best.step[y, x])
+            mutual[y, x] = abs(steps[j, i] - best.step[y, x]) <= MIN_DISTINCT_STEPS
 
 
 REGION_LEVEL = 1
@@ -309,27 +276,29 @@ def find(
     up = plane.finer(REGION_LEVEL)
     coarse = up.T @ f @ up
     steps = _steps(along, far_sign if epipolar.along_rows(coarse, left.shape) else 0.0)
-    for window, region in _regions(unmatched & (left.deviation < MAX_DEVIATION_GREY) & (left.valid != 0)):
-        images = WordPair(left.words, right.words, right.valid, window)
-        lines = epipolar.lines(epipolar.moved(coarse, *2 * ((window.x0, window.y0),)), region.shape)
-        best = search(images, region, lines, steps)
+    for window, inside in _regions(unmatched & (left.deviation < MAX_DEVIATION_GREY) & (left.valid != 0)):
+        x0, y0 = window.x0, window.y0
+        lines = epipolar.lines(epipolar.moved(coarse, (x0, y0), (x0, y0)), inside.shape)
+        words = np.ascontiguousarray(left.words[window.slices])
+        region = Region(words, inside, lines, right.words, right.valid, x0, y0)
+        best = search(region, steps)
         # Half of the displacements leave a window with a vote inside the right image.
         usable = (best.tried >= 0.5 * len(steps)) & (best.distinct > 0)
         y, x = np.nonzero(usable & best.mutual)
-        if len(y) < max(MIN_REGION_PX, MIN_VOTING_SHARE * np.count_nonzero(region)):
+        if len(y) < max(MIN_REGION_PX, MIN_VOTING_SHARE * np.count_nonzero(inside)):
             continue
         votes, step = best.distinct[y, x].astype(np.float64), best.best[y, x].astype(np.float64)
-        g, error = _fit(x + window.x0, y + window.y0, step, votes)
-        rows, cols = np.indices(region.shape)
-        on_plane = (g[0] + g[1] * (cols + window.x0) + g[2] * (rows + window.y0)).astype(np.float32)
-        more = excess(images, region, lines, on_plane, best.least)
+        g, error = _fit(x + x0, y + y0, step, votes)
+        rows, cols = np.indices(inside.shape)
+        on_plane = (g[0] + g[1] * (cols + x0) + g[2] * (rows + y0)).astype(np.float32)
+        more = excess(region, on_plane, best.least)
         inner = (steps[1] + 0.5 < step) & (step < steps[-2] - 0.5)
         agree = (error <= MAX_AGREE_DISTANCE_PX) & inner & np.isfinite(more[y, x])
         if _sure(agree, votes, best.tried[y, x]):
             terms.append(_at_level_0(g, error[agree]))
             alike = more <= np.quantile(more[y[agree], x[agree]], ALIKE_QUANTILE)
             # What has another match of its own is not of this plane.
-            label[window.slices][region & ~(usable & best.mutual)] = -len(terms)
+            label[window.slices][inside & ~(usable & best.mutual)] = -len(terms)
             label[window.slices][usable & alike] = len(terms)
     return Planes(label, terms, f)
 

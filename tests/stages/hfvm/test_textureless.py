@@ -10,7 +10,7 @@ from rille.stages.hfvm.image import Window, pack, whole
 from rille.stages.hfvm.matcher import How
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
-from rille.stages.hfvm.textureless import MAX_DISTANCE, MIN_DISTINCT_STEPS, WINDOW_SIDE_PX, Planes, WordPair, search
+from rille.stages.hfvm.textureless import MAX_DISTANCE, MIN_DISTINCT_STEPS, WINDOW_SIDE_PX, Planes, Region, search
 
 ROWS, COLS = 220, 300
 WALL = -8.0
@@ -155,7 +155,8 @@ def test_search_and_its_definition_agree():
     region[2:24, 3:36] = True
     region[10:14, 12:20] = False
     lines = epipolar.lines(np.array([[0, 0, 0], [0, 0, 1.0], [0, -1.0, -1.0]]), window.shape)
-    found = search(WordPair(words, others, valid, window), region, lines, steps)
+    left = np.ascontiguousarray(words[window.slices])
+    found = search(Region(left, region, lines, others, valid, window.x0, window.y0), steps)
     a, b = (w.view(np.uint8).reshape(*w.shape, 8).astype(int) for w in (words, others))
     inside_region = np.argwhere(region)
     sums, sizes = np.full((*region.shape, len(steps)), np.inf), np.zeros(region.shape)
