@@ -105,25 +105,36 @@ HIGH_PASS = (2, 1, 0, -1, -2)
 BAND_PASS = (1, 0, -1, 0, 1, 0, -1)
 WIDE_BAND_PASS = (2, 1, 0, -1, -2, -1, 0, 1, 2, 1, 0, -1, -2)
 GAUSSIAN = ((0, 1, 2, 1, 0), (1, 3, 5, 3, 1), (2, 5, 8, 5, 2), (1, 3, 5, 3, 1), (0, 1, 2, 1, 0))
-KERNELS = tuple(
+RADIUS_PX = 6
+"""Pixels: reach of the widest kernel; images are completed by repeating their edge."""
+
+
+def _taps(kernel: Sequence[Sequence[int]], feature: int, norm: int) -> list[tuple[int, int, int, float]]:
+    """Number of the feature, rows and columns into the frame, and factor, of the pixels that a kernel adds up."""
+    rows, cols = (RADIUS_PX + len(side) // 2 for side in (kernel, kernel[0]))
     # Turned around, since the table's are convolutions; the signs of the derivatives hang on it.
-    np.ascontiguousarray(np.array(kernel, np.float32)[::-1, ::-1] / np.float32(norm))
-    for kernel, norm in (
-        ((HIGH_PASS,), 4),
-        (np.transpose((HIGH_PASS,)), 4),
-        ((BAND_PASS,), 2),
-        (np.transpose((BAND_PASS,)), 2),
-        ((WIDE_BAND_PASS,), 8),
-        (np.transpose((WIDE_BAND_PASS,)), 8),
-        (GAUSSIAN, 56),
-    )
+    return [
+        (feature, rows - j, cols - i, factor / norm)
+        for j, line in enumerate(kernel)
+        for i, factor in enumerate(line)
+        if factor
+    ]
+
+
+TAPS = np.array(
+    [
+        tap
+        for k, (kernel, norm) in enumerate(((HIGH_PASS, 4), (BAND_PASS, 2), (WIDE_BAND_PASS, 8)))
+        for tap in (*_taps([kernel], 2 * k, norm), *_taps([[factor] for factor in kernel], 2 * k + 1, norm))
+    ]
+    + _taps(GAUSSIAN, 7, 56)
 )
-"""Kernels of Table 1 over their divisors n: features 0 to 5, and 7. Feature 6 is the local variance."""
+"""Table 1, over its divisors n: features 0 to 5, and 7. Feature 6 is the local variance, whose mean needs none."""
 
 DEVIATION = 6
 """Number of the feature that is the local standard deviation."""
 
-VARIANCE_SIDE_PX = 5
+VARIANCE_RADIUS_PX = 2
 """Pixels; the paper gives no window for the variance, 5 x 5 is our choice."""
 
 STEPS_PER_UNIT = 2.0
@@ -141,16 +152,45 @@ def planes(image: AnyArray) -> Planes:
     -------
     (8, row, col) float32, grey levels; plane 6 is the standard deviation.
     """
-    a, edge = np.ascontiguousarray(image, np.float32), cv2.BORDER_REPLICATE
-    out = np.empty((8, *a.shape), np.float32)
-    for kernel, k in zip(KERNELS, (0, 1, 2, 3, 4, 5, 7), strict=True):
-        cv2.filter2D(a, -1, kernel, dst=out[k], borderType=edge)
-    # From the middle of the range: the difference of squares then loses fewer digits.
-    centred, side = a - np.float32(128.0), 2 * (VARIANCE_SIDE_PX,)
-    mean, square = (cv2.boxFilter(part, -1, side, borderType=edge) for part in (centred, centred * centred))
-    # Rounding may leave the variance of a flat window below zero.
-    np.sqrt(np.maximum(square - mean * mean, 0), out=out[DEVIATION])
+    framed, out = _framed(image, RADIUS_PX), np.empty((8, *image.shape), np.float32)
+    for y in range(len(image)):
+        row_of_features(framed[y : y + 2 * RADIUS_PX + 1], TAPS, out[:, y])
     return out
+
+
+def _framed(image: AnyArray, wide: int) -> AnyArray:
+    """The image as float32 in a frame that repeats its edge."""
+    a = np.asarray(image, np.float32)
+    return np.asarray(cv2.copyMakeBorder(a, wide, wide, wide, wide, cv2.BORDER_REPLICATE))
+
+
+@njit(cache=True, nogil=True)
+def row_of_features(rows, taps, out):  # type: ignore[no-untyped-def]
+    """Features (8, col) of a row, from the 13 ``rows`` around it, whose frame they include."""
+    cols, middle = out.shape[1], np.float32(128.0)
+    out[:] = np.float32(0.0)
+    for t in range(len(taps)):
+        target, factor = out[np.int64(taps[t, 0])], np.float32(taps[t, 3])
+        source = rows[np.int64(taps[t, 1])][np.int64(taps[t, 2]) :]
+        for x in range(cols):
+            target[x] += factor * source[x]
+    width, size = 2 * VARIANCE_RADIUS_PX + 1, np.float32((2 * VARIANCE_RADIUS_PX + 1) ** 2)
+    first = RADIUS_PX - VARIANCE_RADIUS_PX
+    sums, squares = np.zeros(cols + width - 1, np.float32), np.zeros(cols + width - 1, np.float32)
+    for k in range(first, first + width):
+        source = rows[k][first:]
+        for x in range(sums.size):
+            # From the middle of the range: the difference of squares below then loses fewer digits.
+            grey = source[x] - middle
+            sums[x] += grey
+            squares[x] += grey * grey
+    for x in range(cols):
+        total, square = np.float32(0.0), np.float32(0.0)
+        for k in range(width):
+            total += sums[x + k]
+            square += squares[x + k]
+        # Rounding may leave the variance of a flat window below zero.
+        out[DEVIATION, x] = np.sqrt(max(square / size - (total / size) * (total / size), np.float32(0.0)))
 
 
 def pack(image: AnyArray, weights: tuple[float, ...]) -> tuple[Words, AnyArray]:
@@ -166,20 +206,24 @@ def pack(image: AnyArray, weights: tuple[float, ...]) -> tuple[Words, AnyArray]:
     words : (row, col) uint64, byte l is feature l: 128 + round(2 w_l sign(f_l) sqrt|f_l|), clipped.
     deviation : (row, col) float32, local standard deviation, grey levels (feature 6).
     """
-    table, words = planes(image), np.zeros(image.shape, np.uint64)
-    _add_bytes(table, np.asarray(weights, np.float32) * np.float32(STEPS_PER_UNIT), words)
-    return words, table[DEVIATION].copy()
+    words, deviation = np.zeros(image.shape, np.uint64), np.empty(image.shape, np.float32)
+    scale = np.asarray(weights, np.float32) * np.float32(STEPS_PER_UNIT)
+    _pack(_framed(image, RADIUS_PX), TAPS, scale, words, deviation)
+    return words, deviation
 
 
 @njit(cache=True, nogil=True)
-def _add_bytes(table, scale, words):  # type: ignore[no-untyped-def]
-    """Write each plane's signed square roots, times its scale, to a byte of the words, which are zero."""
-    for y in range(words.shape[0]):
+def _pack(framed, taps, scale, words, deviation):  # type: ignore[no-untyped-def]
+    features = np.empty((8, words.shape[1]), np.float32)
+    for y in range(len(words)):
+        row_of_features(framed[y : y + 2 * RADIUS_PX + 1], taps, features)
         line = words[y]
-        for k in range(len(table)):
-            plane, factor, shift = table[k, y], scale[k], np.uint64(8 * k)
+        for k in range(8):
+            plane, factor, shift = features[k], scale[k], np.uint64(8 * k)
             for x in range(line.size):
                 line[x] |= _byte(plane[x], factor) << shift
+        for x in range(line.size):
+            deviation[y, x] = features[DEVIATION, x]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -227,7 +271,7 @@ def compact(image: AnyArray) -> Words:
     (row, col) uint64, byte k is ``128 + round(8 sign(s) sqrt|s|)`` of the step s to neighbour k, clipped.
     """
     words = np.empty(image.shape, np.uint64)
-    _compact(cv2.copyMakeBorder(np.asarray(image, np.float32), 1, 1, 1, 1, cv2.BORDER_REPLICATE), words)
+    _compact(_framed(image, 1), words)
     return words
 
 
