@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -123,16 +123,8 @@ class Parameter:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON form, in degrees."""
-        return {
-            "name": self.name,
-            "value": math.degrees(self.value),
-            "asked": math.degrees(self.asked),
-            "sigma": math.degrees(self.sigma),
-            "unit": "deg",
-            "observed": self.observed,
-            "freed": self.freed,
-            "why": self.why,
-        }
+        degrees = {name: math.degrees(getattr(self, name)) for name in ("value", "asked", "sigma")}
+        return asdict(self) | degrees | {"unit": "deg"}
 
 
 @dataclass(frozen=True)

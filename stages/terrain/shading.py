@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rille.stages.core.arrays import Bytes, Floats, Floats32
-
-WEIGHT = (1.0, 2.0, 1.0)
+from rille.stages.numeric.windows import window_count
 
 
 def gradient(elevation: ArrayLike, cell: float) -> Floats:
@@ -27,33 +27,26 @@ def gradient(elevation: ArrayLike, cell: float) -> Floats:
     """
     z = np.asarray(elevation, dtype=np.float64)
     known = np.isfinite(z)
-    middle = np.where(known, z, 0.0)
-    inner = np.pad(np.where(known, z, np.nan), 1, constant_values=np.nan)
-    rows, cols = z.shape
-    # weighted sums of 1, x, y, xx, xy, yy and of z, xz, yz about the middle cell
-    sums = np.zeros((9, rows, cols))
-    count = np.zeros((rows, cols), np.int8)
-    for i, y in enumerate((1.0, 0.0, -1.0)):
-        for j, x in enumerate((-1.0, 0.0, 1.0)):
-            part = inner[i : i + rows, j : j + cols] - middle
-            there = np.isfinite(part)
-            w = np.where(there, WEIGHT[i] * WEIGHT[j], 0.0)
-            rise = np.where(there, part, 0.0)
-            count += there
-            for k, factor in enumerate((1.0, x, y, x * x, x * y, y * y)):
-                sums[k] += w * factor
-            for k, factor in enumerate((1.0, x, y), start=6):
-                sums[k] += w * factor * rise
-    n, sx, sy, xx, xy, yy, sz, xz, yz = sums
+    # Weighted sums of 1, x, y, xx, xy, yy and of z, xz, yz about each cell; y is against the rows.
+    one, line, square = np.array([1.0, 2.0, 1.0]), np.array([-1.0, 0.0, 1.0]), np.array([1.0, 0.0, 1.0])
+    there, height = known.astype(np.float64), np.where(known, z, 0.0)
+    kernels = ((one, one), (line, one), (one, -line), (square, one), (line, -line), (one, square))
+    n, sx, sy, xx, xy, yy = (_filtered(there, *kernel) for kernel in kernels)
+    sz, xz, yz = (_filtered(height, *kernel) for kernel in kernels[:3])
     safe = np.maximum(n, 1.0)
     xx, xy, yy = xx - sx * sx / safe, xy - sx * sy / safe, yy - sy * sy / safe
     xz, yz = xz - sx * sz / safe, yz - sy * sz / safe
     det = xx * yy - xy * xy
     # Of nine cells six do not lie on two lines only, and the plane has three unknowns.
-    good = known & (count >= 6) & (det > 1e-9)
+    good = known & (window_count(known, 3) >= 6) & (det > 1e-9)
     det = np.where(good, det, 1.0)
     slopes = np.stack([(yy * xz - xy * yz) / det, (xx * yz - xy * xz) / det]) / cell
     return np.where(good, slopes, np.nan)
+
+
+def _filtered(values: Floats, across: Floats, down: Floats) -> Floats:
+    """Sums over 3 x 3 cells, weighted along rows and columns; outside is nothing."""
+    return np.asarray(cv2.sepFilter2D(values, cv2.CV_64F, across, down, borderType=cv2.BORDER_CONSTANT))
 
 
 def slope_deg(elevation: ArrayLike, cell: float) -> Floats32:
