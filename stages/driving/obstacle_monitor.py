@@ -3,13 +3,10 @@
 The paper leaves it open (section 8). Between two stops there is one camera and its motion: coarse displacements between
 two images some centimetres of way apart (stage ``motion``) are a stereo pair along the drive, whose relative pose the
 resection has just found. For each cell of the last elevation model ahead of the vehicle the model predicts where its
-point goes; what the image shows instead is put down to another depth along the same ray,
-
-    e = (displacement found) - (displacement predicted),   t = e . g / |g|^2,   g = d(displacement) / dt,
-
-with t the share of the distance to the camera, and so to a point in space. It counts as raised where it lies higher
-than all of the model within reach of its errors, by more than half a wheel's radius and by more than its noise. Enough
-raised points together, which are much of the points seen there, are an obstacle: the vehicle stops and looks.
+point is seen; its displacement is a disparity of that pair (:func:`~rille.stages.geometry.epipolar.inverse_depth`), and
+so a point in space. It counts as raised where it lies higher than all of the model within reach of its errors, by more
+than half a wheel's radius and by more than its noise. Enough raised points together, which are much of the points seen
+there, are an obstacle: the vehicle stops and looks.
 """
 
 from __future__ import annotations
@@ -31,6 +28,7 @@ from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.odometry import MotionFacts, ResectFacts
 from rille.stages.facts.planning import StopFacts
 from rille.stages.facts.terrain import DemFacts
+from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.vehicle import Vehicle
@@ -133,31 +131,22 @@ def look(
     near = (
         (np.abs(ahead[:, 0]) <= wide) & (ahead[:, 1] > 0.5 * vehicle.wheel_base) & (ahead[:, 1] <= REACH_WHEELS * wheel)
     )
-    cells = surface.points[near]
-    pixel, cells, first = _seen(view, cells, camera)
-    displacement = np.stack([view.column[pixel[:, 1], pixel[:, 0]], view.row[pixel[:, 1], pixel[:, 0]]], axis=1)
-    target = first + displacement.astype(np.float64)
-    # t = 0 is the model's ground, t = 1 the camera: obstacles lie between.
-    to_camera = view.before.translation - cells
-    t = np.zeros(len(cells))
-    slope = np.ones((len(cells), 2))
-    # Three Newton steps: displacements are nearly linear in t over what is looked for.
-    for _ in range(3):
-        here = camera.project(T_now.apply(cells + t[:, None] * to_camera))
-        slope = (camera.project(T_now.apply(cells + (t + 1e-4)[:, None] * to_camera)) - here) / 1e-4
-        t = t + ((target - here) * slope).sum(1) / np.maximum((slope**2).sum(1), 1e-12)
-        # Kept between half as far beneath the ground and four fifths of the way to the camera, where the projection's
-        # derivative grows beyond use.
-        t = np.clip(np.nan_to_num(t), -0.5, 0.8)
-    left_over = target - camera.project(T_now.apply(cells + t[:, None] * to_camera))
+    pixel, ground, first = _seen(view, surface.points[near], camera)
+    maps = view.column, view.row
+    displacement = np.stack([a[pixel[:, 1], pixel[:, 0]].astype(np.float64) for a in maps], axis=1)
+    rho, per_pixel = inverse_depth(Rig(camera, camera, T_now @ view.before), first, displacement)
+    with np.errstate(divide="ignore"):
+        q = view.before.apply(camera.rays(first) / np.where(rho > 0, rho, np.nan)[:, None])
     # Half a pixel of the pyramid's level.
     error = 0.5 * 2.0**view.level
-    # A displacement across the epipolar line is a wrong match, not another depth.
-    along = np.hypot(left_over[:, 0], left_over[:, 1]) <= 3.0 * error
-    q = cells + t[:, None] * to_camera
+    # A displacement across the epipolar line is a wrong match, not another depth; obstacles are much nearer than the
+    # ground behind them, but not at the camera.
+    missed = first + displacement - camera.project(T_now.apply(q))
+    away, behind = (np.linalg.norm(p - view.before.translation, axis=1) for p in (q, ground))
+    along = (np.hypot(*missed.T) <= 3.0 * error) & (away > 0.2 * behind) & (away < 1.5 * behind)
     rise = q[:, 2] - surface.top_at(q[:, :2])
-    noise = error / np.maximum(np.hypot(slope[:, 0], slope[:, 1]), 1e-9) * to_camera[:, 2]
-    raised = along & (rise > MIN_RISE_WHEELS * wheel) & (rise > MIN_RISE_SIGMAS * noise) & np.isfinite(rise)
+    noise = error * per_pixel / np.maximum(rho, 1e-9) * np.abs(q[:, 2] - view.before.translation[2])
+    raised = along & (rise > MIN_RISE_WHEELS * wheel) & (rise > MIN_RISE_SIGMAS * noise)
     place = T_vehicle_local.apply(q)[:, :2]
     return Points(place[along], rise[along], raised[along])
 
