@@ -62,9 +62,9 @@ def scenes(pairs: int | None, preset: str) -> Iterator[tuple[str, Any]]:
 def compare(kind: str, scene: Any, methods: list[Any]) -> list[dict[str, Any]]:
     """Default figures and swept curves of all methods on one scene."""
     from gridding.measures import FIGURES, judge, least, on_the_same_cells, sweep
-    from gridding.methods import DEFAULT
+    from gridding.methods import MAX_BACKMATCH_PX
 
-    limit = DEFAULT.max_backmatch
+    limit = MAX_BACKMATCH_PX
     found: list[dict[str, Any]] = []
     first = None
     for method in methods:
@@ -138,12 +138,12 @@ def summary(found: list[dict[str, Any]]) -> None:
 def times(scene: Any, methods: list[Any], rounds: int, preset: str) -> list[dict[str, Any]]:
     """Least seconds of each step in alternating rounds, and ratios to the pair's matching by the same preset."""
     from gridding import accurate
-    from gridding.methods import DEFAULT
+    from gridding.methods import MAX_BACKMATCH_PX
     from gridding.scenes import match
 
     ours = scene.matched(preset)
     jobs: dict[str, Callable[[], Any]] = {"matching": lambda: match(scene, preset)}
-    jobs |= {m.name: lambda m=m: m.run(ours, DEFAULT.max_backmatch, True) for m in methods}
+    jobs |= {m.name: lambda m=m: m.run(ours, MAX_BACKMATCH_PX, True) for m in methods}
     jobs |= accurate.jobs(scene)
     taken: dict[str, list[float]] = {name: [] for name in jobs}
     for job in jobs.values():

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from rille.pipeline.flow import config
+from rille.stages.core.validity import matched_back
 from rille.stages.geometry.surface import plane
 from rille.stages.hfvm.stage import match
 from rille.stages.terrain.locus.solve import Matches
-from rille.stages.terrain.locus.stage import MatchedPair, reconstruct, usable
+from rille.stages.terrain.locus.stage import MatchedPair, reconstruct
 
 from .scenes import Scene
 
@@ -28,7 +29,7 @@ def jobs(scene: Scene) -> dict[str, Callable[[], Any]]:
         found.clear()
         for (image, valid), (other, also) in (sides, sides[::-1]):
             d = match(image, other, chosen.hfvm, valid=(valid, also))
-            good = usable(d.validity, d.backmatch_error, chosen.locus)
+            good = matched_back(d.validity, d.backmatch_error)
             found.append(Matches(d.column_disparity, d.row_disparity, good, d.disparity_std))
 
     def locus() -> Any:

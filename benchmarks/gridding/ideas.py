@@ -32,7 +32,6 @@ IDEAS: tuple[tuple[str, dict[str, Any], Changes], ...] = (
     ("a window for the local mean", {}, {(refinement, "MEAN_SIDE_CELLS"): 151}),
     ("limit of a jump", {"max_jump": 1e9}, {}),
     ("limit of the residual", {"max_residual": 1e9}, {}),
-    ("limit of back-matching", {"max_backmatch": 1e9}, {}),
     ("limit of the standard deviation", {"max_std": 1e9}, {}),
     ("doubt beside hidden ground", {}, {(uncertainty, "HOLE_VARIANCE_PX2"): 0.0}),
     ("doubt where cells moved", {}, {(uncertainty, "MOVE_FACTOR"): 0.0}),
@@ -73,9 +72,7 @@ def _figures(given: tuple[Any, dict[str, Any]], params: dict[str, Any], changes:
     """RMS error of all and of the surest cells, completeness, share of errors within one standard deviation."""
     (scene, found), before = given, {place: getattr(*place) for place in changes}
     chosen = LocusParams(max_sigma=scene.max_sigma, **params)
-    forth, back = (
-        Matches(d.column, d.row, d.usable(chosen.max_backmatch), d.std) for d in (found["forth"], found["back"])
-    )
+    forth, back = (Matches(d.column, d.row, d.usable(np.inf), d.std) for d in (found["forth"], found["back"]))
     pair = MatchedPair(scene.left, forth, scene.right, back if chosen.both else None)
     try:
         for (module, name), value in changes.items():

@@ -8,10 +8,10 @@ import numpy as np
 
 from rille.stages.numeric.robust import mad_sigma
 
-from .methods import DEFAULT, Method, Model
+from .methods import MAX_BACKMATCH_PX, Method, Model
 from .scenes import Scene
 
-FILTERS = ((0.35, True), (DEFAULT.max_backmatch, True), (DEFAULT.max_backmatch, False), (np.inf, False))
+FILTERS = ((0.35, True), (MAX_BACKMATCH_PX, True), (MAX_BACKMATCH_PX, False), (np.inf, False))
 """Limits of back-matching that the sweep goes through, pixels, and whether the geometry's error is bounded."""
 TRUE_FILTERS = ((np.inf, True), (np.inf, False))
 """The same for true disparities."""

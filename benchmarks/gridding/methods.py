@@ -23,6 +23,7 @@ from .scenes import Scene, pixels_of
 
 Floats = NDArray[np.float64]
 DEFAULT = LocusParams()
+MAX_BACKMATCH_PX = 1.0
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.hfvm.stage import match
 from rille.stages.terrain.ground_frame import GroundFrameParams, VerticalHint, level, z_range
 from rille.stages.terrain.locus.solve import Matches
-from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, local_lattice, reconstruct, usable
+from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, local_lattice, reconstruct
 
 Floats32 = NDArray[np.float32]
 
@@ -107,7 +107,7 @@ class Pair:
     back: Any
 
     def matches(self, found: Any) -> Matches:
-        good = usable(found.validity, found.backmatch_error, self.params)
+        good = matched_back(found.validity, found.backmatch_error)
         return Matches(found.column_disparity, found.row_disparity, good, found.disparity_std)
 
 

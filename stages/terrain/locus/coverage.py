@@ -53,7 +53,7 @@ def explain(
         return DegenerateError(
             "RIL-389",
             f"none of {usable.size} disparities is valid, so no elevation can be found",
-            remedy="look at the disparity's validity: exposure, focus, left/right order; or raise locus.max_backmatch",
+            remedy="look at the disparity's validity: exposure, focus, left/right order; or raise hfvm.backmatch",
         )
     return DegenerateError(
         "RIL-391",

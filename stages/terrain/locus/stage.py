@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from rille.stages.core.arrays import Bools, Floats32
+from rille.stages.core.arrays import Floats32
 from rille.stages.core.declare import Bundle, Memory, Params, raster, stage
 from rille.stages.core.errors import ConfigError, DegenerateError
-from rille.stages.core.validity import matched
+from rille.stages.core.validity import matched_back
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MovingFacts, TrajectoryFacts
@@ -70,7 +70,6 @@ class LocusParams(Params):
     )
     sigma_disparity: float = Field(0.2, gt=0, description="standard deviation of a typical disparity [pixels]")
     max_residual: float = Field(0.5, gt=0, description="largest residual |p_l + d - p_r| of a solution [pixels]")
-    max_backmatch: float = Field(1.0, gt=0, description="largest back-matching error [pixels] (4.3.3)")
     refine_steps: int = Field(
         2, ge=0, le=20, description="number of Gauss-Newton steps that refine the elevations by both images; 0: none"
     )
@@ -234,14 +233,8 @@ def world_lattice(elevation: Floats32, lattice: Lattice, T_world_local: RigidTra
     return Lattice.snap(bounds, lattice.cell), [float(low[2] - margin), float(high[2] + margin)]
 
 
-def usable(validity: ArrayLike, backmatch_error: ArrayLike, params: LocusParams) -> Bools:
-    """Pixels that were measured, not filled, and match back to within ``max_backmatch`` pixels."""
-    with np.errstate(invalid="ignore"):
-        return matched(np.asarray(validity)) & (np.asarray(backmatch_error) <= params.max_backmatch)
-
-
-def _matches(disparity: Bundle, params: LocusParams) -> Matches:
-    good = usable(disparity["validity"], disparity["backmatch_error"], params)
+def _matches(disparity: Bundle) -> Matches:
+    good = matched_back(np.asarray(disparity["validity"]), np.asarray(disparity["backmatch_error"]))
     maps = np.asarray(disparity["column_disparity"]), np.asarray(disparity["row_disparity"])
     return Matches(*maps, good, disparity.arrays.get("disparity_std"))
 
@@ -299,7 +292,7 @@ def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: i
     """Elevation model and ortho image of a basic pair."""
     rig, level, trajectory = Rig.from_dict(inputs.rig.meta["rig"]), inputs.level.meta, inputs.trajectory
     T_local_left = RigidTransform.from_matrix(level["T_local_left"])
-    matches = _matches(inputs.disparity, params)
+    matches = _matches(inputs.disparity)
     if inputs.moving is not None:
         matches.usable[np.asarray(inputs.moving["moving"]) != 0] = False
     seen: PlaneView | None = None
@@ -329,7 +322,7 @@ def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: i
         inputs.left["level_0"],
         matches,
         inputs.right["level_0"] if inputs.right is not None else None,
-        _matches(inputs.back, params) if inputs.back is not None else None,
+        _matches(inputs.back) if inputs.back is not None else None,
     )
     low, high = z_range
     dem = reconstruct(matched, rig, T, plane(lattice), (low, high), params.model_copy(update=NO_LIMIT))
