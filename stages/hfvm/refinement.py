@@ -66,9 +66,6 @@ Frame = Callable[[AnyArray, AnyArray], tuple[AnyArray, AnyArray]]
 WINDOW_RADIUS_PX = 2
 """Pixels: the windows are 5 x 5; larger ones have less noise, and smooth small relief away."""
 
-BAND_ROWS = 64
-"""Rows whose windows are summed together: fourteen planes of a whole image would be its greatest need of memory."""
-
 ASSUMED_NOISE_VARIANCE = 8.0
 """Assumed noise, squared grey levels per pixel: it shortens steps where texture is weak."""
 
@@ -117,12 +114,24 @@ def refine(
         step_u, step_v, rest, per_noise = _step(images, to_right, now, keep)
         rests.append(rest)
         now = local_mean(now[0] + step_u, now[1] + step_v, keep, 1, 1)
-    first, last = rests[0], rests[-1]
-    # Back where steps led far or away from a fit. Residuals are those before a step: of a single one distance decides.
-    du, dv = now[0] - start[0], now[1] - start[1]
-    better = (last <= first) & (du * du + dv * dv <= MAX_CORRECTION_PX**2)
-    u, v = np.where(better, now[0], start[0]), np.where(better, now[1], start[1])
-    return Refined(u, v, np.where(better, last, first), per_noise)
+    _take_back(start, rests[0], now, rests[-1])
+    return Refined(*now, rests[-1], per_noise)
+
+
+@njit(cache=True, nogil=True)
+def _take_back(start, first, new, last):  # type: ignore[no-untyped-def]
+    """Start displacements and residuals where steps led far or away from a fit.
+
+    Residuals are those before a step: after a single one ``last`` is ``first``, and the distance alone counts.
+    """
+    (u, v), (new_u, new_v), farthest = start, new, np.float32(MAX_CORRECTION_PX**2)
+    for y in range(u.shape[0]):
+        for x in range(u.shape[1]):
+            du, dv = new_u[y, x] - u[y, x], new_v[y, x] - v[y, x]
+            better = (last[y, x] <= first[y, x]) & (du * du + dv * dv <= farthest)
+            new_u[y, x] = new_u[y, x] if better else u[y, x]
+            new_v[y, x] = new_v[y, x] if better else v[y, x]
+            last[y, x] = last[y, x] if better else first[y, x]
 
 
 def local_mean(u: AnyArray, v: AnyArray, keep: AnyArray, radius: int, stride: int) -> tuple[AnyArray, AnyArray]:
@@ -178,80 +187,114 @@ def _step(images: SplineImages, to_right: Frame, now: tuple[AnyArray, AnyArray],
     variance of the column for a unit of variance of the grey levels.
     """
     there, out = to_right(*now), np.empty((4, *keep.shape), np.float32)
-    # Along the axes of the frame of steps, which the right image's may be turned and scaled against.
-    axes = [] if there[0] is now[0] else [to_right(now[0] + 1, now[1]), to_right(now[0], now[1] + 1)]
-    for top in range(0, len(keep), BAND_ROWS):
-        first = max(top - WINDOW_RADIUS_PX, 0)
-        band, inner = slice(first, top + BAND_ROWS + WINDOW_RADIUS_PX), slice(top - first, top - first + BAND_ROWS)
-        u, v = (a[band] for a in there)
-        count, gx, gy, rest = _warped(images._replace(left=images.left[band]), u, v + np.float32(first), keep[band])
-        if axes:
-            along = (gx * (i[band] - u) + gy * (j[band] - v) for i, j in axes)
-            gx, gy = (np.where(count > 0, g, np.float32(0)) for g in along)
-        products = count, gx, gy, rest, gx * gx, gx * gy, gy * gy, gx * rest, gy * rest, rest * rest
-        sums = tuple(window_sum32(plane, 2 * WINDOW_RADIUS_PX + 1)[inner] for plane in products)
-        _solve_windows(sums, keep[top : top + BAND_ROWS], out[:, top : top + BAND_ROWS])
+    axes = np.empty((4, 0, 0), np.float32)
+    if there[0] is not now[0]:
+        # Of the frame of steps, which the right image's may be turned and scaled against.
+        ends = *to_right(now[0] + 1, now[1]), *to_right(now[0], now[1] + 1)
+        axes = np.stack([end - begin for end, begin in zip(ends, 2 * there, strict=True)])
+    _window_steps(images, there, axes, keep, out)
     return out
 
 
 @njit(cache=True, nogil=True)
+def _window_steps(images, now, axes, keep, out):  # type: ignore[no-untyped-def]
+    """Steps of all windows; each is summed afresh, so that nothing adds up. Reach: the window's radius."""
+    (rows, cols), radius, size = keep.shape, WINDOW_RADIUS_PX, 2 * WINDOW_RADIUS_PX + 1
+    fresh, total = np.zeros((10, cols + 2 * radius), np.float32), np.empty((10, cols), np.float32)
+    ring = np.zeros((size, 10, cols), np.float32)
+    # From above the image on: the ring must hold all rows of the first window before that is solved.
+    for y in range(-radius, rows):
+        row = ring[(y + radius) % size]
+        _products(images, now, axes, keep, y + radius, fresh[:, radius : radius + cols])
+        for k in range(10):
+            part, line = fresh[k], row[k]
+            for x in range(cols):
+                line[x] = (part[x] + (part[x + 1] + part[x + 2])) + (part[x + 3] + part[x + 4])
+        if y >= 0:
+            for k in range(10):
+                a, b, c, d, e, line = ring[0, k], ring[1, k], ring[2, k], ring[3, k], ring[4, k], total[k]
+                for x in range(cols):
+                    line[x] = (a[x] + (b[x] + c[x])) + (d[x] + e[x])
+            _solve_windows(total, keep[y], out[:, y])
+
+
+@njit(cache=True, nogil=True)
+def _products(images, now, axes, keep, y, out):  # type: ignore[no-untyped-def]
+    """Row ``y`` of the planes (10, col) that are summed: count, gx, gy, r, gx gx, gx gy, gy gy, gx r, gy r, r r; zero
+    where a pixel takes no part."""
+    out[:] = np.float32(0.0)
+    if y < len(keep):
+        warp_row(images, now[0], now[1], keep, y, out)
+        count, gx, gy, rest = out[0], out[1], out[2], out[3]
+        if axes.size:
+            for x in range(gx.size):
+                if count[x] > 0:
+                    along = gx[x] * axes[0, y, x] + gy[x] * axes[1, y, x]
+                    gx[x], gy[x] = along, gx[x] * axes[2, y, x] + gy[x] * axes[3, y, x]
+        for k, (p, q) in enumerate(((gx, gx), (gx, gy), (gy, gy), (gx, rest), (gy, rest), (rest, rest))):
+            product = out[4 + k]
+            for x in range(gx.size):
+                product[x] = p[x] * q[x]
+
+
+@njit(cache=True, nogil=True)
 def _solve_windows(sums, keep, out):  # type: ignore[no-untyped-def]
-    """Steps from the sums over each pixel's window."""
+    """Steps of a row from the sums (10, col) over each pixel's window."""
     noise, least = np.float32(ASSUMED_NOISE_VARIANCE), np.float32(0.5 * (2 * WINDOW_RADIUS_PX + 1) ** 2)
     one, nil, far = np.float32(1.0), np.float32(0.0), np.float32(np.inf)
-    for y in range(keep.shape[0]):
-        for x in range(keep.shape[1]):
-            n = max(sums[0][y, x], one)
-            use = keep[y, x] & (n >= least)
-            sum_gx, sum_gy, sum_r = sums[1][y, x], sums[2][y, x], sums[3][y, x]
-            # Noise on the diagonal shortens steps where texture is weak, and keeps the determinant positive.
-            a = sums[4][y, x] - sum_gx * sum_gx / n + noise * n
-            b = sums[5][y, x] - sum_gx * sum_gy / n
-            c = sums[6][y, x] - sum_gy * sum_gy / n + noise * n
-            p, q = sums[7][y, x] - sum_gx * sum_r / n, sums[8][y, x] - sum_gy * sum_r / n
-            det = a * c - b * b
-            # A pixel at most: beyond it the step is a guess.
-            out[0, y, x] = min(max((c * p - b * q) / det, -one), one) if use else nil
-            out[1, y, x] = min(max((a * q - b * p) / det, -one), one) if use else nil
-            # Rounding may leave the residual of a perfect fit below zero.
-            out[2, y, x] = max(sums[9][y, x] - sum_r * sum_r / n, nil) / n if use else far
-            out[3, y, x] = c / det if use else nil
+    for x in range(keep.size):
+        n = max(sums[0, x], one)
+        use = keep[x] & (n >= least)
+        sum_gx, sum_gy, sum_r = sums[1, x], sums[2, x], sums[3, x]
+        # Noise on the diagonal shortens steps where texture is weak, and keeps the determinant positive.
+        a = sums[4, x] - sum_gx * sum_gx / n + noise * n
+        b = sums[5, x] - sum_gx * sum_gy / n
+        c = sums[6, x] - sum_gy * sum_gy / n + noise * n
+        p, q = sums[7, x] - sum_gx * sum_r / n, sums[8, x] - sum_gy * sum_r / n
+        det = a * c - b * b
+        # A pixel at most: beyond it the step is a guess.
+        out[0, x] = min(max((c * p - b * q) / det, -one), one) if use else nil
+        out[1, x] = min(max((a * q - b * p) / det, -one), one) if use else nil
+        # Rounding may leave the residual of a perfect fit below zero.
+        out[2, x] = max(sums[9, x] - sum_r * sum_r / n, nil) / n if use else far
+        out[3, x] = c / det if use else nil
 
 
 def _warped(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> AnyArray:
     """Planes (4, row, col), zero where a pixel takes no part: 1, gradient (x, y) of the right image, left minus it."""
     planes = np.zeros((4, *u.shape), np.float32)
-    _warp(images, u, v, keep, planes)
+    for y in range(len(u)):
+        warp_row(images, u, v, keep, y, planes[:, y])
     return planes
 
 
 @njit(cache=True, nogil=True)
-def _warp(images, u, v, keep, out):  # type: ignore[no-untyped-def]
-    left, spline, right_valid = images.left, images.spline, images.valid
-    rows, cols = left.shape
-    last_x, last_y, half = spline.shape[1] - 2, spline.shape[0] - 2, np.float32(0.5)
-    for y in range(rows):
-        for x in range(cols):
-            xr, yr = np.float32(x) + u[y, x], np.float32(y) + v[y, x]
-            if not (keep[y, x] and xr >= 1 and xr < last_x and yr >= 1 and yr < last_y):
-                continue
-            if not right_valid[np.int64(yr + half), np.int64(xr + half)]:
-                continue
-            i, j = np.int64(xr), np.int64(yr)
-            t, s = xr - np.float32(i), yr - np.float32(j)
-            wx, wy, dx, dy = weights(t), weights(s), slopes(t), slopes(s)
-            value = gx = gy = np.float32(0.0)
-            for k in range(4):
-                across = along = np.float32(0.0)
-                row = spline[np.uint64(j - 1 + k)]
-                for m in range(4):
-                    c = row[np.uint64(i - 1 + m)]
-                    across += wx[m] * c
-                    along += dx[m] * c
-                value += wy[k] * across
-                gx += wy[k] * along
-                gy += dy[k] * across
-            out[0, y, x], out[1, y, x], out[2, y, x], out[3, y, x] = 1, gx, gy, left[y, x] - value
+def warp_row(images, u, v, keep, y, out):  # type: ignore[no-untyped-def]
+    """Row ``y`` of :func:`_warped`; ``out`` (4, col) comes as zeros."""
+    spline, half = images.spline, np.float32(0.5)
+    last_x, last_y = spline.shape[1] - 2, spline.shape[0] - 2
+    for x in range(u.shape[1]):
+        xr, yr = np.float32(x) + u[y, x], np.float32(y) + v[y, x]
+        if not (keep[y, x] and xr >= 1 and xr < last_x and yr >= 1 and yr < last_y):
+            continue
+        # Unsigned indices need no check for counting from the end.
+        if not images.valid[np.uint64(yr + half), np.uint64(xr + half)]:
+            continue
+        i, j = np.int64(xr), np.int64(yr)
+        t, s = xr - np.float32(i), yr - np.float32(j)
+        wx, wy, dx, dy = weights(t), weights(s), slopes(t), slopes(s)
+        value = gx = gy = np.float32(0.0)
+        for k in range(4):
+            across = along = np.float32(0.0)
+            line = spline[np.uint64(j - 1 + k)]
+            for m in range(4):
+                c = line[np.uint64(i - 1 + m)]
+                across += wx[m] * c
+                along += dx[m] * c
+            value += wy[k] * across
+            gx += wy[k] * along
+            gy += dy[k] * across
+        out[0, x], out[1, x], out[2, x], out[3, x] = 1, gx, gy, images.left[y, x] - value
 
 
 def surroundings(
