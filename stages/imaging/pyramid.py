@@ -15,7 +15,6 @@ from typing import Any, overload
 
 import cv2
 import numpy as np
-from numba import njit
 from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats32
@@ -46,11 +45,11 @@ MIN_FRAME_SHARE = 0.1
 MAX_FRAME_DEPTH_SHARE = 0.1
 """Share of the shorter side that a black frame reaches in."""
 
-MIN_VALID = np.float32(3.0)
+MIN_VALID = 3
 """Valid pixels of four that make a coarse pixel valid. A frame one pixel wide doubles its width so, in pixels of the
 image, from level to level."""
 
-MIN_VALID_AT_FRAME = np.float32(2.0)
+MIN_VALID_AT_FRAME = 2
 """The same where the image has a black frame: pixels that are half outside of a warped image draw matches astray."""
 
 
@@ -210,42 +209,25 @@ def frame(image: Floats32, valid: Bools) -> Bools | None:
     return framed
 
 
-def halved(image: Floats32, mask: Mask, levels: int, least: np.float32 = MIN_VALID) -> Pyramid:
+def halved(image: Floats32, mask: Mask, levels: int, least: int = MIN_VALID) -> Pyramid:
     """Pyramid of so many levels of a float32 image (0 where masked) and its mask; ``least`` of four make one valid.
 
     Of a window that starts and ends where a pixel of the top level does, it is a part of the image's pyramid.
     """
     images, masks = [image], [mask]
     for _ in range(levels - 1):
-        rows, cols = images[-1].shape
-        shape = (rows + 1) // 2, (cols + 1) // 2
-        images.append(np.empty(shape, np.float32))
-        masks.append(np.empty(shape, np.uint8))
-        _means(images[-2], masks[-2], least, images[-1], masks[-1])
+        odd = [(0, n % 2) for n in image.shape]
+        total, count = (_four(np.pad(a, odd, mode="edge")) for a in (images[-1], masks[-1]))
+        valid = count >= least
+        image = np.where(valid, total / np.maximum(count, 1).astype(np.float32), np.float32(0.0))
+        images.append(image)
+        masks.append(valid.view(np.uint8))
     return Pyramid(tuple(images), tuple(masks))
 
 
-@njit(cache=True, nogil=True)
-def _means(image, mask, least, coarse, valid):  # type: ignore[no-untyped-def]
-    """Indices without sign, so that the compiler need not mind negative ones and makes vector code of the loop."""
-    rows, cols = image.shape
-    nil, one = np.float32(0.0), np.float32(1.0)
-    for y in range(coarse.shape[0]):
-        a, b = image[2 * y], image[min(2 * y + 1, rows - 1)]
-        p, q = mask[2 * y], mask[min(2 * y + 1, rows - 1)]
-        means, usable = coarse[y], valid[y]
-        for x in range(cols // 2):
-            i, k = np.uint64(2 * x), np.uint64(2 * x + 1)
-            # Counted in float32, the type of the sums: a mix of types would keep the loop from becoming vector code.
-            count = (np.float32(p[i]) + np.float32(p[k])) + (np.float32(q[i]) + np.float32(q[k]))
-            means[x] = (a[i] + a[k] + b[i] + b[k]) / max(count, one) if count >= least else nil
-            usable[x] = count >= least
-        if cols % 2:
-            x, i = cols // 2, cols - 1
-            # The last column stands for a repeated one.
-            count = np.float32(2 * (p[i] + q[i]))
-            means[x] = (a[i] + a[i] + b[i] + b[i]) / max(count, one) if count >= least else nil
-            usable[x] = count >= least
+def _four(a: AnyArray) -> AnyArray:
+    """Sums of 2 x 2 pixels, in this order, which fixes the last digits."""
+    return np.asarray(a[::2, ::2] + a[::2, 1::2] + a[1::2, ::2] + a[1::2, 1::2])
 
 
 def filled_from(above: Floats32, image: Floats32, mask: Bools, y: int = 0, x: int = 0) -> Floats32:

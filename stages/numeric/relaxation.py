@@ -23,8 +23,7 @@ BORDER = 2
 """Cells of nothing around: a second difference reaches two cells far."""
 
 
-@njit(cache=True, nogil=True)
-def bend_weights(field, scale, bend, strength):  # type: ignore[no-untyped-def]
+def bend_weights(field: Floats32, scale: Floats32, bend: float, strength: float) -> tuple[Floats32, Floats32]:
     """Weights ``across``, ``down`` (rows, cols) of the second differences at each cell, float32.
 
     They are ``strength scale^2 / (1 + (scale second difference / bend)^2)``: strong on smooth parts, weak at edges, 0
@@ -35,21 +34,12 @@ def bend_weights(field, scale, bend, strength):  # type: ignore[no-untyped-def]
     field : (rows, cols), NaN unknown.
     scale : (rows, cols) units of ``bend`` in one of the field; NaN unknown.
     """
-    rows, cols = field.shape
-    across, down = np.zeros((rows, cols), np.float32), np.zeros((rows, cols), np.float32)
-    for r in range(rows):
-        for c in range(cols):
-            s = scale[r, c]
-            if not s > 0.0:
-                continue
-            if 0 < c < cols - 1:
-                second = field[r, c - 1] - field[r, c] + field[r, c + 1] - field[r, c]
-                if np.isfinite(second):
-                    across[r, c] = strength * s * s / (1.0 + (second * s / bend) ** 2)
-            if 0 < r < rows - 1:
-                second = field[r - 1, c] - field[r, c] + field[r + 1, c] - field[r, c]
-                if np.isfinite(second):
-                    down[r, c] = strength * s * s / (1.0 + (second * s / bend) ** 2)
+    across, down = np.zeros_like(field), np.zeros_like(field)
+    for axis, out in ((1, across), (0, down)):
+        inner = (slice(None),) * axis + (slice(1, -1),)
+        units = scale[inner]
+        weight = strength * units**2 / (1.0 + (np.diff(field, 2, axis=axis) * units / bend) ** 2)
+        out[inner] = np.nan_to_num(weight)
     return across, down
 
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import DegenerateError
@@ -124,24 +123,13 @@ def _consensus(
     if not len(theta):
         return None
     # Planes are compared on some 1200 points; the best one is then fitted to all.
-    totals, scored = np.empty(len(theta)), slice(None, None, max(1, len(rays) // 1200))
-    _totals(theta, rays[scored], rho[scored], MIN_HORIZON_SIGMAS * sigma[scored], tolerance[scored] ** -2.0, totals)
-    return np.asarray(theta[int(np.argmax(totals))], dtype=np.float64)
-
-
-@njit(cache=True, nogil=True)
-def _totals(theta, rays, rho, horizon, information, out):  # type: ignore[no-untyped-def]
-    """Truncated quadratic agreement (m,) of planes (m, 3) with the points, summed."""
-    for m in range(len(theta)):
-        a, b, c = theta[m]
-        total = 0.0
-        for n in range(len(rays)):
-            expected = a * rays[n, 0] + b * rays[n, 1] + c * rays[n, 2]
-            off = rho[n] - expected
-            agreement = 1.0 - off * off * information[n]
-            if expected > horizon[n] and agreement > 0.0:
-                total += agreement
-        out[m] = total
+    scored = slice(None, None, max(1, len(rays) // 1200))
+    expected = theta @ rays[scored].T
+    agreement = 1.0 - ((rho[scored] - expected) / tolerance[scored]) ** 2
+    seen = (expected > MIN_HORIZON_SIGMAS * sigma[scored]) & (agreement > 0.0)
+    # Truncated quadratic agreement with the points.
+    best = np.argmax(np.sum(agreement, axis=1, where=seen))
+    return np.asarray(theta[int(best)], dtype=np.float64)
 
 
 class Samples(NamedTuple):
