@@ -162,12 +162,13 @@ def _end(region, y, x, step):  # type: ignore[no-untyped-def]
 def _distances(region, at, cost, outside):  # type: ignore[no-untyped-def]
     """Distances of a region's pixels to those their step away along their lines."""
     rows, cols = region.right.shape
-    for y, x in np.ndindex(at.shape):
-        if region.inside[y, x]:
-            j, i = _end(region, y, x, at[y, x])
-            outside[y, x] = i < 0 or i >= cols or j < 0 or j >= rows or not region.valid[j, i]
-            if not outside[y, x]:
-                cost[y, x] = min(distance(region.left[y, x], region.right[j, i]), MAX_DISTANCE)
+    for y in range(at.shape[0]):
+        for x in range(at.shape[1]):
+            if region.inside[y, x]:
+                j, i = _end(region, y, x, at[y, x])
+                outside[y, x] = i < 0 or i >= cols or j < 0 or j >= rows or not region.valid[j, i]
+                if not outside[y, x]:
+                    cost[y, x] = min(distance(region.left[y, x], region.right[j, i]), MAX_DISTANCE)
 
 
 @njit(cache=True, nogil=True)
@@ -175,29 +176,31 @@ def _keep(region, step, sums, kept):  # type: ignore[no-untyped-def]
     """Update ``best`` (:class:`Best`) with the sums of one more step, and ``claims``: of each right pixel the least
     mean distance of the windows led to it, and the step that did."""
     (total, previous, passed), (best, size, claims) = sums, kept
-    for y, x in np.ndindex(total.shape):
-        if total[y, x] < np.inf:
-            j, i = _end(region, y, x, step)
-            mean = np.float32(total[y, x] / size[y, x])
-            if mean < claims[0, j, i]:
-                claims[0, j, i], claims[1, j, i] = mean, step
-        if total[y, x] < best.least[y, x]:
-            best.step[y, x], best.least[y, x] = step, total[y, x]
-            best.before[y, x], best.after[y, x] = previous[y, x], np.inf
-            best.behind[y, x], best.ahead[y, x] = passed[y, x], np.inf
-        elif step - best.step[y, x] == 1:
-            best.after[y, x] = total[y, x]
-        elif step - best.step[y, x] > MIN_DISTINCT_STEPS:
-            best.ahead[y, x] = min(best.ahead[y, x], total[y, x])
+    for y in range(total.shape[0]):
+        for x in range(total.shape[1]):
+            if total[y, x] < np.inf:
+                j, i = _end(region, y, x, step)
+                mean = np.float32(total[y, x] / size[y, x])
+                if mean < claims[0, j, i]:
+                    claims[0, j, i], claims[1, j, i] = mean, step
+            if total[y, x] < best.least[y, x]:
+                best.step[y, x], best.least[y, x] = step, total[y, x]
+                best.before[y, x], best.after[y, x] = previous[y, x], np.inf
+                best.behind[y, x], best.ahead[y, x] = passed[y, x], np.inf
+            elif step - best.step[y, x] == 1:
+                best.after[y, x] = total[y, x]
+            elif step - best.step[y, x] > MIN_DISTINCT_STEPS:
+                best.ahead[y, x] = min(best.ahead[y, x], total[y, x])
 
 
 @njit(cache=True, nogil=True)
 def _claimed(region, best, steps, mutual):  # type: ignore[no-untyped-def]
     """Whether the step that claims the right pixel is like the pixel's own."""
-    for y, x in np.ndindex(mutual.shape):
-        if best.least[y, x] < np.inf:
-            j, i = _end(region, y, x, best.step[y, x])
-            mutual[y, x] = abs(steps[j, i] - best.step[y, x]) <= MIN_DISTINCT_STEPS
+    for y in range(mutual.shape[0]):
+        for x in range(mutual.shape[1]):
+            if best.least[y, x] < np.inf:
+                j, i = _end(region, y, x, best.step[y, x])
+                mutual[y, x] = abs(steps[j, i] - best.step[y, x]) <= MIN_DISTINCT_STEPS
 
 
 REGION_LEVEL = 1
