@@ -207,12 +207,13 @@ def propagate(look: Look, field: Field) -> Field:
 def paths(look: Look, field: Field) -> Field:
     """Displacements chosen by costs gathered along paths from the borders of the image.
 
-    A pixel's candidates are its own displacement and those a pixel beside it, and those of near and farther pixels.
-    Along six directions (eight but for those within a row) each gathers the least cost of getting there, smoothness
-    included; so evidence travels over weak texture as far as it must, and stops at depth edges.
+    A pixel's candidates are its own displacement and those a pixel beside it, those of near and farther pixels, and
+    those handed down. Along six directions (eight but for those within a row) each gathers the least cost of getting
+    there, smoothness included; so evidence travels over weak texture as far as it must, and stops at depth edges.
     """
     compact = LevelPair(look.a.compact, look.b.compact, epipolar.NO_BAND, 0.0)
-    solver.paths(look.pair, compact, look.a.grey, PATH_COSTS, field.shift)
+    up = None if look.up is None else (look.up.u, look.up.v)
+    solver.paths(look.pair, compact, up, look.a.grey, PATH_COSTS, field.shift)
     return field
 
 

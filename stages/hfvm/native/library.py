@@ -25,6 +25,10 @@ class _Pair(Structure):
     )
 
 
+class _Parents(Structure):
+    _fields_ = (("u", c_void_p), ("v", c_void_p), ("cols", c_int32))
+
+
 def _at(array: AnyArray, kind: DTypeLike) -> int:
     """Address of an array's first number; refuses what C would read wrongly."""
     if array.dtype != kind or not array.flags.c_contiguous:
@@ -49,10 +53,14 @@ class Library:
             usable = usable[: usable.index(variant) + 1]
         self.variant = [suffix for suffix in usable if hasattr(self._library, f"search{suffix}")][-1]
 
-    def _call(self, name: str, pair: LevelPair, *arguments: int | _Pair | tuple[int, ...]) -> None:
-        """Call a function; arrays are given by address, pairs and tuples of whole numbers by reference."""
+    def _call(self, name: str, pair: LevelPair, *arguments: int | Structure | tuple[int, ...]) -> None:
+        """Call a function; arrays are given by address, structures and tuples of whole numbers by reference."""
         given = [
-            byref((len(a) * c_int32)(*a)) if isinstance(a, tuple) else byref(a) if isinstance(a, _Pair) else c_void_p(a)
+            byref((len(a) * c_int32)(*a))
+            if isinstance(a, tuple)
+            else byref(a)
+            if isinstance(a, Structure)
+            else c_void_p(a)
             for a in arguments
         ]
         getattr(self._library, f"{name}{self.variant}")(byref(_pair(pair)), *given)
@@ -84,9 +92,19 @@ class Library:
         self._call("edges", pair, *given, tuple(rule), out.ctypes.data)
         return out
 
-    def paths(self, pair: LevelPair, compact: LevelPair, grey: AnyArray, costs: PathCosts, shift: AnyArray) -> None:
+    def paths(
+        self,
+        pair: LevelPair,
+        compact: LevelPair,
+        up: tuple[AnyArray, AnyArray] | None,
+        grey: AnyArray,
+        costs: PathCosts,
+        shift: AnyArray,
+    ) -> None:
         """Write the displacements of least cost along paths, see ``reference.paths``."""
         # Three numbers of 32 bits a candidate, and six rows of one; vectors begin at multiples of 32 bytes.
         room = np.empty(4 * CANDIDATES * (3 * shift.size + 6 * shift.shape[1]) + 32, np.uint8)
         at = room.ctypes.data + -room.ctypes.data % 32
-        self._call("paths", pair, _pair(compact), _at(grey, np.float32), tuple(costs), _at(shift, np.int32), at)
+        parents = _Parents() if up is None else _Parents(_at(up[0], np.int16), _at(up[1], np.int16), up[0].shape[1])
+        given = _pair(compact), parents, _at(grey, np.float32), tuple(costs), _at(shift, np.int32), at
+        self._call("paths", pair, *given)

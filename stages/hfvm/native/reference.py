@@ -414,21 +414,30 @@ def _window_cost(pair, grey, y, x, u, v, rule):  # type: ignore[no-untyped-def]
 # -- paths -------------------------------------------------------------------------------------------------------------
 
 
-def paths(pair: LevelPair, compact: LevelPair, grey: AnyArray, costs: PathCosts, shift: AnyArray) -> None:
+def paths(
+    pair: LevelPair,
+    compact: LevelPair,
+    up: tuple[AnyArray, AnyArray] | None,
+    grey: AnyArray,
+    costs: PathCosts,
+    shift: AnyArray,
+) -> None:
     """Write to ``shift`` the candidates of each pixel of least cost along paths; of equal ones the first.
 
     Candidates are at most :data:`CANDIDATES`, in this order and each once: the pixel's own displacement, those
-    :data:`BESIDE` it, those of the pixels :data:`AROUND` it. All but the first lead into the right image. At the border
-    the nearest pixel inside stands for one outside.
+    :data:`BESIDE` it, those of the pixels :data:`AROUND` it, those of the coarser level, doubled. All but the first
+    lead into the right image. At the border the nearest pixel inside stands for one outside.
 
     Parameters
     ----------
     compact : words of both images' compact features.
+    up : columns and rows of displacement of the coarser level, int16, or None.
     grey : (row, col) float32, of the left image.
     shift : (row, col) int32 packed displacements.
     """
     listed = np.empty((*shift.shape, CANDIDATES), np.int32), np.empty((*shift.shape, CANDIDATES), np.int32)
-    _candidates(pair, compact, shift, costs.compact, listed)
+    none = np.zeros((0, 0), np.int16)
+    _candidates(pair, (compact, costs.compact), up or (none, none), shift, listed)
     total = np.zeros(listed[1].shape, np.int32)
     for backward in (False, True):
         _sweep(listed, grey, costs, backward, total)
@@ -437,17 +446,22 @@ def paths(pair: LevelPair, compact: LevelPair, grey: AnyArray, costs: PathCosts,
 
 
 @njit(cache=True, nogil=True)
-def _candidates(pair, compact, shift, share, listed):  # type: ignore[no-untyped-def]
-    (rows, cols), (high, wide) = shift.shape, pair.right.shape
+def _candidates(pair, second, up, shift, listed):  # type: ignore[no-untyped-def]
+    (compact, share), (rows, cols), (high, wide) = second, shift.shape, pair.right.shape
     for y in range(rows):
         terms = epipolar.row_terms(pair.f, np.float64(y + pair.y0))
         for x in range(cols):
             line = epipolar.line(terms, np.float32(x + pair.x0), np.float32(UNIT + share) * np.float32(pair.mu))
             known, cost, count = listed[0][y, x], listed[1][y, x], 0
             known[:], cost[:] = shift[y, x], NONE
-            for n in range(1 + len(BESIDE) + len(AROUND)):
+            near = 1 + len(BESIDE) + len(AROUND)
+            for n in range(near + (9 if up[0].size else 0)):
                 tried = shift[y, x]
-                if 0 < n <= len(BESIDE):
+                if n >= near:
+                    j = min(max(y // 2 + (n - near) // 3 - 1, 0), up[0].shape[0] - 1)
+                    i = min(max(x // 2 + (n - near) % 3 - 1, 0), up[0].shape[1] - 1)
+                    tried = pack(2 * np.int64(up[0][j, i]), 2 * np.int64(up[1][j, i]))
+                elif 0 < n <= len(BESIDE):
                     tried = pack(columns(tried) + BESIDE[n - 1][1], rows_of(tried) + BESIDE[n - 1][0])
                 elif n > 0:
                     j, i = AROUND[n - 1 - len(BESIDE)]

@@ -134,7 +134,7 @@ def test_path_costs_are_those_of_the_definition(seed):
     np.testing.assert_array_equal(total[there], brute_force(cu, cv, cost, grey, 36, 240, 10.0)[there])
 
 
-def listed(maps, y, x, right_shape):
+def listed(maps, up, y, x, right_shape):
     """Candidates (u, v) of a pixel by their definition."""
     u, v = maps
     rows, cols = u.shape
@@ -143,6 +143,12 @@ def listed(maps, y, x, right_shape):
     for j, i in reference.AROUND:
         near = min(max(y + j, 0), rows - 1), min(max(x + i, 0), cols - 1)
         more.append((u[near], v[near]))
+    for k in range(9 if up is not None else 0):
+        above = (
+            min(max(y // 2 + k // 3 - 1, 0), up[0].shape[0] - 1),
+            min(max(x // 2 + k % 3 - 1, 0), up[0].shape[1] - 1),
+        )
+        more.append((2 * up[0][above], 2 * up[1][above]))
     for a, b in more:
         inside = 0 <= x + a < right_shape[1] and 0 <= y + b < right_shape[0]
         if inside and (int(a), int(b)) not in found and len(found) < CANDIDATES:
@@ -151,16 +157,19 @@ def listed(maps, y, x, right_shape):
 
 
 @pytest.mark.parametrize("mu", [0.0, 3.0])
-def test_candidates_and_their_costs_are_those_of_the_definition(mu):
+@pytest.mark.parametrize("with_up", [False, True])
+def test_candidates_and_their_costs_are_those_of_the_definition(mu, with_up):
     rng = np.random.default_rng(3)
     left, right = (rng.uniform(0, 255, shape).astype(np.float32) for shape in ((11, 14), (12, 17)))
     a, b = view(left), view(right)
     maps = rng.integers(-6, 6, (2, *left.shape)).astype(np.int16)
+    up = rng.integers(-3, 3, (2, 6, 7)).astype(np.int16) if with_up else None
     f = rng.normal(0, 1, (3, 3))
     lines = epipolar.lines(f, left.shape)
     compact_pair = LevelPair(a.compact, b.compact, np.zeros((3, 3)), 0.0)
     shift, cost = np.empty((2, *left.shape, CANDIDATES), np.int32)
-    given = compact_pair, pack_map(*maps), 8, (shift, cost)
+    above = (np.zeros((0, 0), np.int16),) * 2 if up is None else tuple(up)
+    given = (compact_pair, 8), above, pack_map(*maps), (shift, cost)
     reference._candidates(LevelPair(a.words, b.words, f, mu), *given)
     cu, cv = unpacked(shift)
 
@@ -168,7 +177,7 @@ def test_candidates_and_their_costs_are_those_of_the_definition(mu):
         return int(np.abs(bytes_of(word).astype(int) - bytes_of(other)).sum())
 
     for y, x in np.ndindex(left.shape):
-        want = listed(maps, y, x, right.shape)
+        want = listed(maps, up, y, x, right.shape)
         there = cost[y, x] != NONE
         assert list(zip(cu[y, x, there].tolist(), cv[y, x, there].tolist(), strict=True)) == want
         for k, (i, j) in enumerate(want):

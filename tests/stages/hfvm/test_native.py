@@ -108,15 +108,17 @@ def test_edges(native, sizes):
 
 
 @pytest.mark.parametrize("sizes", SIZES)
-def test_paths(native, sizes):
+@pytest.mark.parametrize("with_up", [False, True])
+def test_paths(native, sizes, with_up):
     rng = np.random.default_rng(5)
     pair = some_pair(sizes, rng, 8.0)._replace(ahead_x=0, ahead_y=0)
     grey, costs = rng.uniform(0, 255, sizes[0]).astype(np.float32), PathCosts(8, 36, 240, 10)
     compact = LevelPair(words(sizes[0], rng), words(sizes[1], rng), np.zeros((3, 3)), 0.0)
+    up = some_maps(tuple((n + 1) // 2 for n in sizes[0]), rng) if with_up else None
     before = pack_map(*some_maps(sizes[0], rng))
     found = before.copy(), before.copy()
     for solver, shift in zip((native, reference), found, strict=True):
-        solver.paths(pair, compact, grey, costs, shift)
+        solver.paths(pair, compact, up, grey, costs, shift)
     np.testing.assert_array_equal(*found)
     assert sizes[0][0] < 9 or (found[0] != before).any()
 
