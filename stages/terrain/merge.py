@@ -28,10 +28,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -84,127 +84,72 @@ class Merged(NamedTuple):
     relief_std: Floats32
 
 
-class _Cell(NamedTuple):
-    """What the models that know a cell say of it (n,): elevation, standard deviations of its own and of the pose, m,
-    weight, grey value, and the model's index in the stack."""
-
-    z: Floats
-    sigma: Floats
-    pose: Floats
-    weight: Floats
-    grey: Floats
-    model: NDArray[np.int64]
-
-
-@njit(cache=True, nogil=True)
-def merge_cells(stack, x, y, alike, worst, out):  # type: ignore[no-untyped-def]
-    """Merge a stack of models; weights and equations are those of :mod:`rille.stages.terrain.merge`.
+def merge_cells(stack: Stack, x: Floats, y: Floats, alike: float, worst: float, out: Merged) -> None:
+    """Merge a stack of models; weights and equations are those of the module.
 
     ``x`` (cols,), ``y`` (rows,) of the cells, m; ``alike``: correlation of two models' errors; ``worst``: greatest
     standard deviation but for the poses, m; ``out``: the :class:`Merged` to fill, NaN, 0 and -1 before.
     """
-    count, rows, cols = stack.z.shape
-    floats = np.empty((5, count))
-    cell = _Cell(floats[0], floats[1], floats[2], floats[3], floats[4], np.empty(count, np.int64))
-    apart, order = np.empty(count), np.empty(count, np.int64)
-    for r in range(rows):
-        for c in range(cols):
-            known = _gather(stack, r, c, (x[c], y[r]), cell)
-            # Of two models that contradict each other none is the outlier.
-            if known >= 3:
-                _reweigh(cell, apart, order, known)
-            if known:
-                _average(cell, known, alike, worst, (r, c), stack.pair, out)
-
-
-@njit(cache=True, nogil=True)
-def _gather(stack, r, c, place, cell):  # type: ignore[no-untyped-def]
-    """Number of models that know a cell at ``place`` (x, y), m, which are put into ``cell``."""
-    n = 0
-    for k in range(stack.z.shape[0]):
-        z, sigma = stack.z[k, r, c], float(stack.sigma[k, r, c])
-        residual = float(stack.residual[k, r, c]) / RESIDUAL_SCALE_PX
-        if not (math.isfinite(z) and sigma > 0.0 and residual >= 0.0):
-            continue
+    z, sigma, residual = (a.astype(np.float64) for a in (stack.z, stack.sigma, stack.residual / RESIDUAL_SCALE_PX))
+    with np.errstate(divide="ignore", over="ignore"):
         weight = 1.0 / (sigma * sigma * (1.0 + residual * residual))
-        if weight > 0.0 and weight < math.inf:
-            cell.z[n], cell.sigma[n], cell.weight[n], cell.model[n] = z, sigma, weight, k
-            cell.grey[n] = min(stack.gain[k] * stack.ortho[k, r, c], 255.0)
-            cell.pose[n] = _swing(stack.pose[k], place[0] - stack.centre[k, 0], place[1] - stack.centre[k, 1])
-            n += 1
-    return n
-
-
-@njit(cache=True, nogil=True)
-def _swing(cov, dx, dy):  # type: ignore[no-untyped-def]
-    """Standard deviation of the elevation at dx, dy from the camera by ``cov`` of (height, rotation about x, y)."""
-    tilt = dy * dy * cov[1, 1] + dx * dx * cov[2, 2] - 2.0 * dx * dy * cov[1, 2]
-    return math.sqrt(max(0.0, cov[0, 0] + tilt + 2.0 * (dy * cov[0, 1] - dx * cov[0, 2])))
-
-
-@njit(cache=True, nogil=True)
-def _reweigh(cell, apart, order, n):  # type: ignore[no-untyped-def]
-    """Multiply the weights by Tukey's biweight about the weighted median; ``apart``, ``order``: room for n numbers."""
-    centre = _median(cell.z, cell.weight, order, n)
-    for i in range(n):
-        apart[i] = abs(cell.z[i] - centre)
-    typical = MAD_TO_SIGMA * _median(apart, np.ones(n), order, n)
-    for i in range(n):
+    known = np.isfinite(z) & (sigma > 0.0) & (residual >= 0.0) & (weight > 0.0) & np.isfinite(weight)
+    z, sigma, weight = (np.where(known, a, 0.0) for a in (z, sigma, weight))
+    # Of two models that contradict each other none is the outlier.
+    several = np.count_nonzero(known, axis=0) >= 3
+    if several.any():
+        centre = _median(z, weight)
+        typical = MAD_TO_SIGMA * _median(np.abs(z - centre), known.astype(np.float64))
         # At least its own standard deviation: models that agree by chance must not shut out a third.
-        cell.weight[i] *= bisquare((cell.z[i] - centre) / (TUKEY_BISQUARE * max(typical, cell.sigma[i])))
-
-
-@njit(cache=True, nogil=True)
-def _median(values, weight, order, n):  # type: ignore[no-untyped-def]
-    """Lower weighted median of ``n`` values: the least that half of the weight does not exceed."""
-    total = 0.0
-    for i in range(n):
-        total += weight[i]
-        j = i
-        while j > 0 and values[order[j - 1]] > values[i]:
-            order[j] = order[j - 1]
-            j -= 1
-        order[j] = i
-    running = 0.0
-    for i in range(n):
-        running += weight[order[i]]
-        if running >= 0.5 * total:
-            return values[order[i]]
-    return values[order[n - 1]]
-
-
-@njit(cache=True, nogil=True)
-def _average(cell, n, alike, worst, at, pair, out):  # type: ignore[no-untyped-def]
-    """Weighted means of the ``n`` models that know a cell; nothing where they are too uncertain."""
-    total = top = mean = apart = together = placed = grey = greys = spread = 0.0
-    used, best = 0, -1
-    for i in range(n):
-        total += cell.weight[i]
-        if cell.weight[i] > 0.0:
-            used += 1
-        if cell.weight[i] > top:
-            top, best = cell.weight[i], cell.model[i]
-    for i in range(n):
-        share = cell.weight[i] / total
-        mean += share * cell.z[i]
-        apart += (share * cell.sigma[i]) ** 2
-        together += share * cell.sigma[i]
-        # Poses drift together, so that their errors do not average out.
-        placed += share * cell.pose[i]
-        if cell.weight[i] > 0.0 and math.isfinite(cell.grey[i]):
-            sharp = (cell.weight[i] / top) ** ORTHO_WEIGHT_EXPONENT
-            grey += sharp * cell.grey[i]
-            greys += sharp
-    for i in range(n):
-        spread += cell.weight[i] / total * (cell.z[i] - mean) ** 2
+        bound = TUKEY_BISQUARE * np.where(known, np.maximum(typical, sigma), 1.0)
+        weight = np.where(several, weight * bisquare((z - centre) / bound), weight)
+    top = weight.max(axis=0)
+    share = weight / np.where(top > 0.0, _total(weight), 1.0)
+    mean, together = _total(share * z), _total(share * sigma)
+    apart = _total((share * sigma) ** 2)
     # Unrelated errors (alike = 0) average out; errors of one cause (alike = 1) add up as if there were one model.
     variance = apart + alike * (together * together - apart)
+    # Poses drift together, so that their errors do not average out.
+    placed = _total(share * _swing(stack, x, y))
+    grey = np.minimum(stack.gain[:, None, None] * stack.ortho, 255.0)
+    sharp = np.where(np.isfinite(grey), (weight / np.where(top > 0.0, top, 1.0)) ** ORTHO_WEIGHT_EXPONENT, 0.0)
+    greys = _total(sharp)
+    ortho = np.divide(_total(sharp * np.nan_to_num(grey)), greys, out=np.full(top.shape, np.nan), where=greys > 0)
     # The limit is on the models' own errors, without the poses' part.
-    if math.sqrt(variance) <= worst:
-        out.elevation[at], out.elevation_std[at] = mean, math.sqrt(variance + placed * placed)
-        out.spread[at], out.relief_std[at] = math.sqrt(spread), math.sqrt(apart)
-        out.ortho[at] = grey / greys if greys > 0.0 else math.nan
-        out.count[at], out.source[at] = used, pair[best]
+    good = (top > 0.0) & (np.sqrt(variance) <= worst)
+    maps = {
+        "elevation": mean,
+        "elevation_std": np.sqrt(variance + placed * placed),
+        "spread": np.sqrt(_total(share * (z - mean) ** 2)),
+        "count": np.count_nonzero(weight, axis=0),
+        "source": stack.pair[weight.argmax(axis=0)],
+        "ortho": ortho,
+        "relief_std": np.sqrt(apart),
+    }
+    for name, values in maps.items():
+        np.copyto(getattr(out, name), values, where=good, casting="unsafe")
+
+
+def _total(values: Floats) -> Floats:
+    """Sum over the models, one after the other: NumPy's own order depends on the shape of a strip."""
+    return np.asarray(reduce(np.add, values))
+
+
+def _swing(stack: Stack, x: Floats, y: Floats) -> Floats:
+    """Standard deviations (n, rows, cols) of the elevations by the covariances of (height, rotation about x, y)."""
+    dx, dy = (x - stack.centre[:, :1])[:, None, :], (y - stack.centre[:, 1:])[:, :, None]
+    covariance = stack.pose[..., None, None]
+    tilt = dy * dy * covariance[:, 1, 1] + dx * dx * covariance[:, 2, 2] - 2.0 * dx * dy * covariance[:, 1, 2]
+    both = covariance[:, 0, 0] + tilt + 2.0 * (dy * covariance[:, 0, 1] - dx * covariance[:, 0, 2])
+    return np.asarray(np.sqrt(np.maximum(0.0, both)))
+
+
+def _median(values: Floats, weight: Floats) -> Floats:
+    """Lower weighted medians over the first axis: the least value that half of the weight does not exceed."""
+    order = np.argsort(values, axis=0, kind="stable")
+    running = np.cumsum(np.take_along_axis(weight, order, axis=0), axis=0)
+    middle = np.argmax(running >= 0.5 * running[-1], axis=0)
+    return np.asarray(np.take_along_axis(values, np.take_along_axis(order, middle[None], axis=0), axis=0)[0])
 
 
 STRIP_BYTES = 1 << 26
@@ -300,8 +245,8 @@ def merge(layers: Sequence[ModelLayer], tile: Lattice, params: MergeParams) -> M
     others = {"count": (0, np.uint16), "source": (-1, np.int32)}
     out = Merged._make(np.full(tile.shape, *others.get(name, (np.nan, np.float32))) for name in Merged._fields)
     worst = math.inf if params.max_std_cells is None else params.max_std_cells * tile.cell
-    # Four maps of four bytes a cell and model.
-    lines = max(1, STRIP_BYTES // (16 * max(len(ordered), 1) * tile.cols))
+    # Some sixteen numbers of eight bytes a cell and model.
+    lines = max(1, STRIP_BYTES // (128 * max(len(ordered), 1) * tile.cols))
     for start in range(0, tile.rows, lines):
         strip = Lattice.at(tile.i0, tile.j0 - start, tile.cell, min(lines, tile.rows - start), tile.cols)
         rows = slice(start, start + strip.rows)
