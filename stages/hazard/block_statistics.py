@@ -6,6 +6,8 @@ keeps its highest and its lowest height and whole sums.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,8 +39,7 @@ def reduce_to_blocks(surface: Floats32, closed: Floats32, std: Floats32, n: int,
     closed : the surface with holes closed; cells are counted, with their standard deviation ``std``, on it.
     n, lag : side of a block, and distance of the cells that are compared, cells.
     """
-    heights = _blocks(surface, n, np.nan)
-    high, low = (extreme.reduce(extreme.reduce(heights, axis=1), axis=2) for extreme in (np.fmax, np.fmin))
+    high, low = (reduce(extreme, _of_blocks(surface, n, np.nan)) for extreme in (np.fmax, np.fmin))
     known = ~np.isnan(closed)
     variance = np.where(known, std * std, np.float32(0.0))
     pairs, deviation = np.zeros(surface.shape, np.uint8), np.zeros(surface.shape, np.float32)
@@ -49,11 +50,11 @@ def reduce_to_blocks(surface: Floats32, closed: Floats32, std: Floats32, n: int,
         for end in (ahead, behind):
             pairs[end] += both
             deviation[end] += square
-    sums = (_blocks(a, n, 0).sum(axis=(1, 3), dtype=np.float64) for a in (known, variance, pairs, deviation))
+    sums = (reduce(np.add, _of_blocks(a, n, 0), np.zeros(high.shape)) for a in (known, variance, pairs, deviation))
     return Blocks(high, low, *sums)
 
 
-def _blocks(a: NDArray[Any], n: int, fill: float) -> NDArray[Any]:
-    """Blocks (row, n, col, n); the last ones, which may be partial, are completed with ``fill``."""
+def _of_blocks(a: NDArray[Any], n: int, fill: float) -> Iterator[NDArray[Any]]:
+    """The first, second ... cells (row, col) of all blocks; the last blocks, which may be partial, get ``fill``."""
     whole = np.pad(a, [(0, -size % n) for size in a.shape], constant_values=fill)
-    return whole.reshape(whole.shape[0] // n, n, whole.shape[1] // n, n)
+    return (whole[i::n, j::n] for i, j in np.ndindex(n, n))

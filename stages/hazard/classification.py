@@ -15,16 +15,16 @@ on cells is compared with its limit.
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes, Floats32
+from rille.stages.core.declare import AnyArray
 from rille.stages.hazard.measures import MEASURES, HazardInput, Measure
 
 Bits = NDArray[np.uint16]
@@ -73,63 +73,18 @@ class Rules(NamedTuple):
     min_known: float
 
 
-class Limit(NamedTuple):
-    """One measure's limit, bias and spread as above; ``added`` standard deviations of its load; its bit; and the index
-    of its noise and doubt in those of :class:`ClassifiedBlocks`: 0 wheel's window, 1 below the vehicle."""
-
-    limit: np.float32
-    bias: np.float32
-    spread: np.float32
-    added: np.float32
-    bit: np.uint16
-    window: int
-
-    @staticmethod
-    def of(measure: Measure, terrain: HazardInput, sigmas: float) -> Limit:
-        """Limit of a measure for the vehicle of ``terrain``, with ``sigmas`` standard deviations."""
-        length, f = measure.length(terrain), np.float32
-        bias, spread = measure.bias / length, measure.spread / length
-        # A measure already carries the bias of its extrema, so only the rest of the standard deviations is added.
-        added = max(0.0, sigmas * spread - bias)
-        limit = f(measure.greatest(terrain.vehicle))
-        return Limit(limit, f(bias), f(spread), f(added), np.uint16(measure.bit), int(measure.below))
-
-
-class ClassifiedBlocks(NamedTuple):
-    """Arrays (row, col) of blocks, float32 and uint16.
-
-    ``load`` and ``excess``: greatest ones of the measures on blocks; ``over``: bits of those above their limits;
-    ``flags``: bits whatever the class. ``noise`` and ``doubt`` (window, row, col): standard deviation, and the same
-    widened by what may be hidden, metres, in the wheel's window and below the vehicle; ``share``: known share of the
-    wheel's window; ``bands``: rasters of the measures.
-    """
+class Verdicts(NamedTuple):
+    """Arrays (row, col): greatest ``load`` and ``excess`` of the measures, float32, and bits of those ``over`` their
+    limits."""
 
     load: Floats32
     excess: Floats32
     over: Bits
-    flags: Bits
-    noise: Floats32
-    doubt: Floats32
-    share: Floats32
-    bands: tuple[Floats32, ...]
-
-
-class Cells(NamedTuple):
-    """Arrays (row, col) of cells: elevation with holes ``closed`` and 1 where it was ``filled``; then the results:
-    classes, reasons, probability, rasters of the measures on blocks, and those on cells (NaN where unknown)."""
-
-    closed: Floats32
-    filled: Bytes
-    risk: Bytes
-    reason: Bits
-    p: Floats32
-    bands: tuple[Floats32, ...]
-    fields: tuple[Floats32, ...]
 
 
 def classify(
     terrain: HazardInput, filled: Bytes, rules: Rules, measures: tuple[Measure, ...] = MEASURES
-) -> dict[str, NDArray]:
+) -> dict[str, AnyArray]:
     """Classes, reasons and rasters (row, col) of :func:`rille.stages.hazard.risk.risk_map`.
 
     Parameters
@@ -137,46 +92,71 @@ def classify(
     filled : (row, col) 1 where a hole of the elevation was closed.
     measures : rows of the table, at least one on cells and one on blocks.
     """
-    closed, vehicle, n = terrain.closed, terrain.vehicle, terrain.stride
+    share, patchy, n = terrain.known_share(), terrain.places.unstood, terrain.stride
     values = {m.name: m.kernel(terrain) for m in measures}
-    on_cells, on_blocks = ([m for m in measures if m.on_blocks == kind] for kind in (False, True))
-    blocks = _judge_blocks(terrain, rules.sigmas, on_blocks, values)
-    limits = tuple(Limit.of(m, terrain, rules.sigmas) for m in on_cells)
-    fields = tuple(values[m.name] for m in on_cells)
-    del terrain, values  # blocks of a large map take as much memory as all rasters together
-    shape = closed.shape
-    bands = tuple(np.empty(shape, np.float32) for _ in on_blocks)
-    risk, reason, p = (np.empty(shape, t) for t in (np.uint8, np.uint16, np.float32))
-    cells = Cells(closed, filled, risk, reason, p, bands, fields)
-    _classify(limits, blocks, cells, n, rules, _table())
-    rasters = {m.name: a for m, a in zip(on_blocks, bands, strict=True)}
-    rasters |= {m.name: _band(m, a, vehicle.clearance) for m, a in zip(on_cells, fields, strict=True)}
-    return {"risk": risk, "reason": reason} | {m.band: rasters[m.name] for m in measures} | {"p_hazard": p}
-
-
-def _judge_blocks(
-    terrain: HazardInput, sigmas: float, on_blocks: list[Measure], values: dict[str, Floats32]
-) -> ClassifiedBlocks:
-    """The measures on blocks against their limits, and the noise of all measures."""
-    vehicle, share, patchy = terrain.vehicle, terrain.known_share(), terrain.places.unstood
     noise = np.stack([terrain.window_noise(), terrain.footprint_noise()])
     # In proportion to the unknown share, and of a step, since anything higher shows at the rim of the known ground.
-    hidden = np.float32(HIDDEN_STEPS * vehicle.max_step) * np.stack([1.0 - np.minimum(share, 1.0), patchy])
-    doubt = np.hypot(noise, hidden)
-    load, excess = np.zeros_like(share), np.full_like(share, -MAX_EXCESS)
-    over = np.zeros(share.shape, np.uint16)
-    for m in on_blocks:
-        value, limit = values[m.name], Limit.of(m, terrain, sigmas)
-        own = (value + limit.added * noise[limit.window]) / limit.limit
-        above = value - limit.bias * noise[limit.window] - limit.limit
-        # Hidden ground can only raise a measure, so it makes no hazard less certain.
-        std = np.where(above > 0, noise[limit.window], doubt[limit.window])
-        load = np.maximum(load, own)
-        excess = np.maximum(excess, above / (limit.spread * std + np.float32(MIN_RELATIVE_STD) * limit.limit))
-        over |= np.where(own > 1, limit.bit, NO_BITS)
+    hidden = np.float32(HIDDEN_STEPS * terrain.vehicle.max_step)
+    doubt = np.hypot(noise, hidden * np.stack([1.0 - np.minimum(share, 1.0), patchy]))
     flags = np.where((share < MIN_WHOLE_SHARE) | (patchy > 0), np.uint16(UNSEEN_BIT), NO_BITS)
-    bands = tuple(_band(m, values[m.name], vehicle.clearance) for m in on_blocks)
-    return ClassifiedBlocks(load, excess, over, flags, noise, doubt, share, bands)
+
+    def spread(a: AnyArray) -> AnyArray:
+        """Cells (row, col) of blocks."""
+        rows, cols = terrain.closed.shape
+        return np.asarray(a.repeat(n, axis=0)[:rows].repeat(n, axis=1)[:, :cols])
+
+    nothing = Verdicts(np.zeros_like(share), np.full_like(share, -MAX_EXCESS), np.zeros(share.shape, np.uint16))
+    on_cells, on_blocks = ([m for m in measures if m.on_blocks == kind] for kind in (False, True))
+    judged = _judged(nothing, terrain, rules.sigmas, [(m, values[m.name]) for m in on_blocks], (noise, doubt))
+    wide = [np.stack([spread(a) for a in maps]) for maps in (noise, doubt)]
+    cells = Verdicts(*(spread(a) for a in judged))
+    load, excess, over = _judged(
+        cells, terrain, rules.sigmas, [(m, values[m.name]) for m in on_cells], (wide[0], wide[1])
+    )
+    steps = np.floor(np.clip(excess, -MAX_EXCESS, MAX_EXCESS) * STEPS_PER_EXCESS) + MAX_EXCESS * STEPS_PER_EXCESS
+    p = _table()[steps.astype(np.intp)]
+    # A hazard that is proven by a part of the window stays one, however little is known.
+    known = ~np.isnan(terrain.closed)
+    hazardous = known & (load > 1)
+    unknown = ~(hazardous | (known & (spread(share) >= rules.min_known)))
+    careful = (load > rules.caution) | (p > rules.max_p)
+    risk = np.select([unknown, hazardous, careful], [UNKNOWN, HAZARDOUS, CAUTION], SAFE).astype(np.uint8)
+    reason = spread(flags) | np.where(filled != 0, np.uint16(FILLED_BIT), NO_BITS)
+    reason |= np.where(hazardous, over | np.where(excess <= 0, np.uint16(DOUBT_BIT), NO_BITS), NO_BITS)
+    reason |= np.where(unknown, np.uint16(UNKNOWN_BIT), NO_BITS)
+    out: dict[str, AnyArray] = {"risk": risk, "reason": reason}
+    for m in measures:
+        band = _band(m, values.pop(m.name), terrain.vehicle.clearance)
+        out[m.band] = np.where(unknown, np.float32(np.nan), spread(band) if m.on_blocks else band)
+    return out | {"p_hazard": np.where(unknown, np.float32(np.nan), p)}
+
+
+def _judged(
+    before: Verdicts,
+    terrain: HazardInput,
+    sigmas: float,
+    values: Sequence[tuple[Measure, Floats32]],
+    spreads: tuple[AnyArray, AnyArray],
+) -> Verdicts:
+    """Measures against the vehicle's limits, added to what was judged before.
+
+    ``spreads`` (window, row, col): standard deviation, and the same widened by what may be hidden, metres, in the
+    wheel's window and below the vehicle.
+    """
+    (load, excess, over), f = before, np.float32
+    for m, value in values:
+        length, limit = m.length(terrain), f(m.greatest(terrain.vehicle))
+        bias, spread = m.bias / length, m.spread / length
+        noise, doubt = (maps[int(m.below)] for maps in spreads)
+        # A measure already carries the bias of its extrema, so only the rest of the standard deviations is added.
+        own = (value + f(max(0.0, sigmas * spread - bias)) * noise) / limit
+        above = value - f(bias) * noise - limit
+        # Hidden ground can only raise a measure, so it makes no hazard less certain.
+        std = np.where(above > 0, noise, doubt)
+        load = np.maximum(load, own)
+        excess = np.maximum(excess, above / (f(spread) * std + f(MIN_RELATIVE_STD) * limit))
+        over = over | np.where(own > 1, np.uint16(m.bit), NO_BITS)
+    return Verdicts(load, excess, over)
 
 
 def _band(m: Measure, values: Floats32, most: float) -> Floats32:
@@ -196,53 +176,3 @@ def _table() -> Floats32:
     # Beyond the ends of the table the probability counts as certain, whatever the tails of Student's t.
     chance[0], chance[-1] = 0.0, 1.0
     return np.asarray(chance, dtype=np.float32)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _classify(limits, blocks, cells, n, rules, table):  # type: ignore[no-untyped-def]
-    """Fill the results of ``cells``, block by block of ``n`` x ``n``; ``limits`` are those of ``cells.fields``."""
-    rows, cols = cells.risk.shape
-    count = len(limits)
-    per_noise, per_doubt = np.empty(count, np.float32), np.empty(count, np.float32)
-    for i in range(blocks.load.shape[0]):
-        for j in range(blocks.load.shape[1]):
-            for k in range(count):
-                least, w = np.float32(MIN_RELATIVE_STD) * limits[k].limit, limits[k].window
-                per_noise[k] = np.float32(1.0) / (limits[k].spread * blocks.noise[w, i, j] + least)
-                per_doubt[k] = np.float32(1.0) / (limits[k].spread * blocks.doubt[w, i, j] + least)
-            for r in range(i * n, min(i * n + n, rows)):
-                for c in range(j * n, min(j * n + n, cols)):
-                    load, excess, over = blocks.load[i, j], blocks.excess[i, j], blocks.over[i, j]
-                    for k in range(count):
-                        limit, value = limits[k], cells.fields[k][r, c]
-                        noise = blocks.noise[limit.window, i, j]
-                        own = (value + limit.added * noise) / limit.limit
-                        above = value - limit.bias * noise - limit.limit
-                        load = max(load, own)
-                        excess = max(excess, above * (per_noise[k] if above > 0 else per_doubt[k]))
-                        over |= limit.bit if own > 1 else NO_BITS
-                    p = table[
-                        int(
-                            math.floor(min(max(excess, -MAX_EXCESS), MAX_EXCESS) * STEPS_PER_EXCESS)
-                            + MAX_EXCESS * STEPS_PER_EXCESS
-                        )
-                    ]
-                    known = not math.isnan(cells.closed[r, c])
-                    reason = blocks.flags[i, j]
-                    if cells.filled[r, c]:
-                        reason |= np.uint16(FILLED_BIT)
-                    # A hazard that is proven by a part of the window stays one, however little is known.
-                    if known and load > 1:
-                        cells.risk[r, c] = HAZARDOUS
-                        reason |= over | (np.uint16(DOUBT_BIT) if excess <= 0 else NO_BITS)
-                    elif known and blocks.share[i, j] >= rules.min_known:
-                        cells.risk[r, c] = CAUTION if load > rules.caution or p > rules.max_p else SAFE
-                    else:
-                        cells.risk[r, c], p = UNKNOWN, np.float32(np.nan)
-                        reason |= np.uint16(UNKNOWN_BIT)
-                    cells.reason[r, c], cells.p[r, c] = reason, p
-                    unknown = cells.risk[r, c] == UNKNOWN
-                    for k in range(len(blocks.bands)):
-                        cells.bands[k][r, c] = np.float32(np.nan) if unknown else blocks.bands[k][i, j]
-                    for k in range(count if unknown else 0):
-                        cells.fields[k][r, c] = np.float32(np.nan)
