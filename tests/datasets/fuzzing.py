@@ -10,9 +10,10 @@ import json
 import random
 import shutil
 import signal
+import sqlite3
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from rille.datasets.manifest.opening import open_manifest
 from rille.datasets.registry import open_sequence
 from rille.pipeline.engine.store.archive import pack
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.index import NAME, Index
+from rille.pipeline.engine.store.index import TABLE, Index
 from rille.pipeline.engine.store.manifest import artifact_path
 from rille.pipeline.engine.store.zarr_group import codec
 from rille.pipeline.export.writers import read_disparity
@@ -125,15 +126,18 @@ def _lookup(cache: Path, data: bytes) -> None:
     dict(store.open(ref).arrays)
 
 
+def database(path: Path) -> None:
+    (path.parent / "index.sqlite").write_bytes(path.read_bytes())
+    known = Index(path.parent, "s")
+    for key in list(known._rows):
+        known.get("numbers", key, "1.2.3")
+
+
 def index(path: Path) -> None:
-    Index(path.parent, path.parent).get("numbers", KEY, MARK)
-
-
-def line(path: Path) -> None:
-    """A line that is wrong behind a checksum that is right."""
-    stated = f"{KEY} {MARK} {path.read_bytes().decode(errors='replace')}"
-    path.with_name(NAME).write_text(f"{zlib.crc32(stated.encode()):08x} {stated}", encoding="utf-8")
-    index(path)
+    """A row that is wrong behind a checksum that is right."""
+    known, stated = Index(path.parent, "s"), path.read_bytes().decode(errors="replace")
+    known._rows = {KEY: (stated, zlib.crc32(stated.encode()))}
+    known.get("numbers", KEY, "1.2.3")
 
 
 READERS: dict[str, Callable[[Path], None]] = {
@@ -150,8 +154,8 @@ READERS: dict[str, Callable[[Path], None]] = {
     "euroc": euroc,
     "packed": packed,
     "artifact": artifact,
+    "database": database,
     "index": index,
-    "line": line,
 }
 
 
@@ -169,16 +173,27 @@ MANIFEST = {
     "meta": {"frame": 0},
     "provenance": {"reason": "new"},
 }
-MARK = "1.2.3"
-STATED = json.dumps({"key": KEY, "stage": "numbers", "digest": "b" * 64, "meta": {}, "nbytes": 48, "stored": 9})
-LINE = f"{KEY} {MARK} {STATED}"
+STATED = [
+    "1.2.3",
+    {"key": KEY, "stage": "numbers", "digest": "b" * 64, "meta": {"frame": 0}, "nbytes": 48, "stored": 9},
+]
+
+
+def _database() -> bytes:
+    with closing(sqlite3.connect(":memory:")) as made:
+        made.execute(f"CREATE TABLE {TABLE}")
+        stated = json.dumps(STATED)
+        rows = [("s", f"{k:064d}", stated, zlib.crc32(stated.encode())) for k in range(3)]
+        made.executemany("INSERT INTO artifacts VALUES (?, ?, ?, ?)", rows)
+        made.commit()
+        return made.serialize()
 
 
 MADE: dict[str, bytes] = {
     "artifact/made": json.dumps(MANIFEST).encode(),
     "packed/made": bytes(pack({"values/c.0.0": CHUNK, "manifest.json": json.dumps(MANIFEST).encode()})),
-    f"index/{NAME}": f"{zlib.crc32(LINE.encode()):08x} {LINE}".encode(),
-    "line/made": STATED.encode(),
+    "index/made": json.dumps(STATED).encode(),
+    "database/made": _database(),
 }
 """Seeds of what Rille itself writes."""
 
