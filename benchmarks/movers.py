@@ -191,8 +191,9 @@ def main() -> None:
         def row(name: str, run: Any, *cells: str) -> None:
             posed = int(np.isfinite(np.asarray(run.trajectory.position)).all(1).sum())
             # Of a trajectory of one frame there is no error.
-            figures = (run.metrics.get(f"trajectory_{key}") for key in ("rpe_translation_rmse", "drift"))
-            error, drift = (np.nan if figure is None else figure["value"] for figure in figures)
+            none = {"value": None}
+            figures = (run.metrics.get(f"trajectory_{key}", none) for key in ("rpe_translation_rmse", "drift"))
+            error, drift = (np.nan if figure["value"] is None else figure["value"] for figure in figures)
             print(f"| {name} | {posed} | {1e3 * error:.1f} | {drift:.2f} | {' | '.join(cells)} |", flush=True)
 
         clean = rille.reconstruct(street, frames=f"0:{FRAMES}", **same)
