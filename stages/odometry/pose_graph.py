@@ -268,11 +268,6 @@ def _explained(done: Adjusted) -> bool:
     return bool(done.kept[doubtful].mean() >= MAJORITY and squares <= scipy.special.chdtri(rows, 0.01))
 
 
-def _settled(graph: PoseGraph, state: GraphState) -> Adjusted:
-    """The graph adjusted with its weights as they are."""
-    return Adjusted(graph, levenberg_marquardt(graph, state, STEPS).state)
-
-
 def _decided(graph: PoseGraph, state: GraphState) -> Adjusted:
     """Which of the doubtful factors count, by graduated non-convexity, and the state that follows."""
     doubtful, bound = graph.factors.doubtful, graph.factors.bound
@@ -294,4 +289,4 @@ def _decided(graph: PoseGraph, state: GraphState) -> Adjusted:
             break
         mu *= GRADUATION
     graph = replace(graph, weight=np.where(doubtful, np.where(squared <= bound, 1.0, 0.0), 1.0))
-    return _settled(graph, state)
+    return Adjusted(graph, levenberg_marquardt(graph, state, STEPS).state)
