@@ -262,9 +262,10 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
     """Positions (n, 2) of the left camera in the CRS of the run's rasters."""
     if not all((run / name).exists() for name in ("trajectory.kitti", "frames.json")):
         return None
-    lines = read_lines(run / "trajectory.kitti", "trajectory")
+    # Before what follows: a file that cannot be read is refused, one that says something else has no cameras.
+    lines, text = read_lines(run / "trajectory.kitti", "trajectory"), _frames_text(run)
     try:
-        poses, place = np.loadtxt(lines, ndmin=2), georeference_of(run)
+        poses, place = np.loadtxt(lines, ndmin=2), _place(text)
         centres = poses[:, [3, 7, 11]][np.isfinite(poses[:, 3])]
         return np.asarray((centres if place is None else place.apply(centres))[:, :2], np.float64)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
@@ -275,7 +276,15 @@ def georeference_of(run: Path) -> Georeference | None:
     """Place of a run's world frame on Earth, as its ``frames.json`` states it."""
     if not (run / "frames.json").exists():
         return None
-    stated = json.loads(read_text(run / "frames.json", "frames.json", TABLE))["georeference"]
+    return _place(_frames_text(run))
+
+
+def _frames_text(run: Path) -> str:
+    return read_text(run / "frames.json", "frames.json", TABLE)
+
+
+def _place(frames: str) -> Georeference | None:
+    stated = json.loads(frames).get("georeference")
     return None if stated is None else Georeference.from_dict(stated)
 
 
