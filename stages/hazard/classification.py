@@ -108,11 +108,9 @@ def classify(
     nothing = Verdicts(np.zeros_like(share), np.full_like(share, -MAX_EXCESS), np.zeros(share.shape, np.uint16))
     on_cells, on_blocks = ([m for m in measures if m.on_blocks == kind] for kind in (False, True))
     judged = _judged(nothing, terrain, rules.sigmas, [(m, values[m.name]) for m in on_blocks], (noise, doubt))
-    wide = [np.stack([spread(a) for a in maps]) for maps in (noise, doubt)]
-    cells = Verdicts(*(spread(a) for a in judged))
-    load, excess, over = _judged(
-        cells, terrain, rules.sigmas, [(m, values[m.name]) for m in on_cells], (wide[0], wide[1])
-    )
+    wide = np.stack([spread(a) for a in noise]), np.stack([spread(a) for a in doubt])
+    fine, cells = [(m, values[m.name]) for m in on_cells], Verdicts(*(spread(a) for a in judged))
+    load, excess, over = _judged(cells, terrain, rules.sigmas, fine, wide)
     steps = np.floor(np.clip(excess, -MAX_EXCESS, MAX_EXCESS) * STEPS_PER_EXCESS) + MAX_EXCESS * STEPS_PER_EXCESS
     p = _table()[steps.astype(np.intp)]
     # A hazard that is proven by a part of the window stays one, however little is known.
