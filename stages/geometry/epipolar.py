@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import njit
 
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import Rig, RigidTransform, cross_matrix, left_jacobian, rotation_exp
@@ -67,14 +68,32 @@ def distances(rig: Rig, correction: Floats, left: Floats, right: Floats) -> tupl
     upright = rotation @ cross_matrix(centre)
     to_slopes = [to_line @ cross_matrix(turns[:, i]) @ upright @ to_ray for i in range(3)]
     to_slopes += [to_line @ rotation @ cross_matrix(swings[:, i]) @ to_ray for i in range(2)]
-    points = np.column_stack([left, np.ones(len(left))])
-    line, turned = points @ (to_line @ upright @ to_ray).T, points @ np.swapaxes(to_slopes, 1, 2)
-    length = _signed_length(line)
-    distance = ((right * line[:, :2]).sum(axis=1) + line[:, 2]) / length
-    # Quotient rule: the line's normal changes its length as well.
-    moved = (turned[..., :2] * right).sum(axis=2) + turned[..., 2]
-    longer = (turned[..., :2] * line[:, :2]).sum(axis=2)
-    return distance, (moved / length - longer * distance / length**2).T
+    distance, slopes = np.empty(len(left)), np.empty((len(left), 5))
+    _distances(to_line @ upright @ to_ray, np.array(to_slopes), left, right, distance, slopes)
+    return distance, slopes
+
+
+@njit(cache=True, nogil=True)
+def _distances(to_line, to_slopes, left, right, distance, slopes):  # type: ignore[no-untyped-def]
+    """Distances (n,) from the lines ``to_line @ p`` of left pixels p, and their derivatives (n, 5)."""
+    line = np.empty(3)
+    for n in range(len(left)):
+        x, y, u, v = left[n, 0], left[n, 1], right[n, 0], right[n, 1]
+        for i in range(3):
+            line[i] = to_line[i, 0] * x + to_line[i, 1] * y + to_line[i, 2]
+        length = np.sqrt(line[0] ** 2 + line[1] ** 2)
+        # A line has no sense of its own: its normal points down the image, or to the right where it is steep.
+        if (line[0] if abs(line[0]) > abs(line[1]) else line[1]) < 0:
+            length = -length
+        d = (u * line[0] + v * line[1] + line[2]) / length
+        distance[n] = d
+        for p in range(5):
+            m = to_slopes[p]
+            a = m[0, 0] * x + m[0, 1] * y + m[0, 2]
+            b = m[1, 0] * x + m[1, 1] * y + m[1, 2]
+            c = m[2, 0] * x + m[2, 1] * y + m[2, 2]
+            # Quotient rule: the line's normal changes its length as well.
+            slopes[n, p] = (u * a + v * b + c) / length - (line[0] * a + line[1] * b) * d / length**2
 
 
 def normals(rig: Rig, correction: Floats, left: Floats) -> Floats:
