@@ -70,6 +70,11 @@ class Region(NamedTuple):
     x0: int
     y0: int
 
+    @property
+    def size(self) -> AnyArray:
+        """Number of the region's pixels in the window around each, at least one."""
+        return np.maximum(window_count(self.inside, WINDOW_SIDE_PX), 1)
+
 
 class Searched(NamedTuple):
     """What a search tells of each pixel of a region, (row, col).
@@ -101,7 +106,7 @@ class Best(NamedTuple):
 def search(region: Region, steps: AnyArray) -> Searched:
     """The best step along the line of each pixel of a region, of ``steps``: (n,) float32 pixels, ascending by 1."""
     shape = region.inside.shape
-    tried, size = np.zeros(shape, np.int32), np.maximum(window_count(region.inside, WINDOW_SIDE_PX), 1)
+    tried, size = np.zeros(shape, np.int32), region.size
     best = Best(np.zeros(shape, np.float32), *np.full((5, *shape), np.inf, np.float32))
     claims = np.full((2, *region.right.shape), np.inf, np.float32)
     # Sums of the steps before, and the least of all that are more than MIN_DISTINCT_STEPS behind.
@@ -111,7 +116,8 @@ def search(region: Region, steps: AnyArray) -> Searched:
         tried += np.isfinite(total)
         if len(last) > MIN_DISTINCT_STEPS:
             np.minimum(passed, last.popleft(), out=passed)
-        _keep(region, step, (total, last[-1] if last else passed, passed), (best, size, claims))
+        _keep(step, (total, last[-1] if last else passed, passed), best)
+        _claim(region, step, total / size, claims)
         last.append(total)
     rival, mutual = np.minimum(best.behind, best.ahead), np.zeros(shape, bool)
     distinct = np.subtract(rival, best.least, out=np.zeros_like(rival), where=np.isfinite(rival))
@@ -137,7 +143,7 @@ def excess(region: Region, at: AnyArray, least: AnyArray) -> AnyArray:
     """
     sums = _sums(region, at)
     more = np.subtract(sums, least, out=np.full_like(sums, np.inf), where=np.isfinite(sums) & np.isfinite(least))
-    return np.asarray(more / np.maximum(window_count(region.inside, WINDOW_SIDE_PX), 1))
+    return np.asarray(more / region.size)
 
 
 def _sums(region: Region, at: AnyArray) -> AnyArray:
@@ -172,17 +178,23 @@ def _distances(region, at, cost, outside):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _keep(region, step, sums, kept):  # type: ignore[no-untyped-def]
-    """Update ``best`` (:class:`Best`) with the sums of one more step, and ``claims``: of each right pixel the least
-    mean distance of the windows led to it, and the step that did."""
-    (total, previous, passed), (best, size, claims) = sums, kept
+def _claim(region, step, mean, claims):  # type: ignore[no-untyped-def]
+    """Of each right pixel the least ``mean`` distance of the windows led to it, and the step that did."""
+    for y in range(mean.shape[0]):
+        for x in range(mean.shape[1]):
+            if mean[y, x] < np.inf:
+                j, i = _end(region, y, x, step)
+                if mean[y, x] < claims[0, j, i]:
+                    claims[0, j, i], claims[1, j, i] = mean[y, x], step
+
+
+@njit(cache=True, nogil=True)
+def _keep(step, sums, best):  # type: ignore[no-untyped-def]
+    """Update ``best`` (:class:`Best`) with the sums of one more step, of the step before, and the least of those far
+    behind."""
+    total, previous, passed = sums
     for y in range(total.shape[0]):
         for x in range(total.shape[1]):
-            if total[y, x] < np.inf:
-                j, i = _end(region, y, x, step)
-                mean = np.float32(total[y, x] / size[y, x])
-                if mean < claims[0, j, i]:
-                    claims[0, j, i], claims[1, j, i] = mean, step
             if total[y, x] < best.least[y, x]:
                 best.step[y, x], best.least[y, x] = step, total[y, x]
                 best.before[y, x], best.after[y, x] = previous[y, x], np.inf
