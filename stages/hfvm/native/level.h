@@ -107,16 +107,13 @@ RULE Children search_parent(const Pair *pair, RowLines row, const int32_t *centr
   int32_t soft = pair->band.cost < SHARP;
   for (int k = 0; k < CENTRES; k++) {
     Shift s = unpack(centres[k]);
-    int32_t rows = soft || k == 0 ? reach.v : 0, again = 0;
-    for (int j = 0; j < k; j++) again |= centres[j] == centres[k];
-    if (again) continue;
-    /* What the parent's own row has tried need not be tried again. */
-    int32_t beside = k > 0 && s.v == own.v ? s.u - own.u : 2 * reach.u + 1;
-    if (beside < -reach.u || beside > reach.u) try_row(pair, line, s, 1, &best);
+    try_row(pair, line, s, 1, &best);
+    int32_t rows = soft || k == 0 ? reach.v : 0;
     for (int32_t dv = -rows; dv <= rows; dv++) {
       int32_t columns = soft || dv == 0 ? reach.u : 0, first = s.u - columns, last = s.u + columns;
-      if (dv == 0 && beside >= 0 && beside <= 2 * reach.u) first = own.u + reach.u + 1;
-      if (dv == 0 && beside <= 0 && beside >= -2 * reach.u) last = own.u - reach.u - 1;
+      /* What the parent's own row has tried need not be tried again. */
+      if (k > 0 && s.v + dv == own.v && first >= own.u - reach.u && first <= own.u + reach.u) first = own.u + reach.u + 1;
+      if (k > 0 && s.v + dv == own.v && last >= own.u - reach.u && last <= own.u + reach.u) last = own.u - reach.u - 1;
       if (first <= last) try_row(pair, line, (Shift){first, s.v + dv}, last - first + 1, &best);
     }
   }
