@@ -50,6 +50,7 @@ RULE int32_t off_line(Line line, Shift s) {
 
 /* ---- search: around predictions, for the four pixels of a parent ---- */
 
+typedef struct { int32_t u, count, centre, v, cross; } Strip; /* count columns from u on of row v; see try_strip */
 typedef struct { int32_t x, y, shift[4], cost[4]; } Children; /* the first pixel, and the best so far of two by two */
 
 RULE int32_t inside(const Image *image, int32_t x, int32_t y) {
@@ -57,34 +58,98 @@ RULE int32_t inside(const Image *image, int32_t x, int32_t y) {
 }
 RULE int64_t place(const Image *image, int32_t x, int32_t y) { return (int64_t)y * image->cols + x; }
 
-/* Try `count` displacements, from s on along the row: each of the four pixels takes what costs it less. */
-RULE void try_row(const Pair *pair, Line line, Shift s, int32_t count, Children *best) {
-  const Image *left = &pair->left, *right = &pair->right;
-  int32_t x = best->x + pair->ahead_x + s.u, y = best->y + pair->ahead_y + s.v;
-#ifndef __CUDACC__
-  if (inside(right, x, y) && inside(right, x + count, y + 1) && inside(left, best->x + 1, best->y + 1)) {
-    Square own = square(left->words, place(left, best->x, best->y), left->cols);
-    int64_t at = place(right, x, y);
-    Four least, chosen;
-    __builtin_memcpy(&least, best->cost, sizeof least);
-    __builtin_memcpy(&chosen, best->shift, sizeof chosen);
-    for (int32_t k = 0; k < count; k++, s.u++) {
-      Four cost = square_distances(own, square(right->words, at + k, right->cols)) + off_line(line, s);
-      Four better = cost < least, shift = (Four){} + pack(s.u, s.v);
-      least = PICK(better, cost, least), chosen = PICK(better, shift, chosen);
-    }
-    __builtin_memcpy(best->cost, &least, sizeof least);
-    __builtin_memcpy(best->shift, &chosen, sizeof chosen);
+RULE void try_pixel(const Pair *pair, Line line, Children *best, int n, Shift s) {
+  int32_t x = best->x + (n & 1), y = best->y + (n >> 1), xr = x + pair->ahead_x + s.u, yr = y + pair->ahead_y + s.v;
+  if (!inside(&pair->right, xr, yr)) return;
+  int32_t cost = distance(pair->left.words[place(&pair->left, x, y)],
+                          pair->right.words[place(&pair->right, xr, yr)]) + off_line(line, s);
+  if (cost < best->cost[n]) best->cost[n] = cost, best->shift[n] = pack(s.u, s.v);
+}
+/* Candidates of a strip, in this order: the centre's column, the others; where it is crossed, the rows above and below
+   the centre. Near the border of an image pixel by pixel. */
+RULE void try_strip_singly(const Pair *pair, Line line, Strip strip, Children *best) {
+  for (int n = 0; n < 4; n++) {
+    if (best->x + (n & 1) >= pair->left.cols || best->y + (n >> 1) >= pair->left.rows) continue;
+    if (strip.centre >= strip.u && strip.centre < strip.u + strip.count)
+      try_pixel(pair, line, best, n, (Shift){strip.centre, strip.v});
+    for (int k = 0; k < strip.count; k++) try_pixel(pair, line, best, n, (Shift){strip.u + k, strip.v});
+    if (!strip.cross) continue;
+    try_pixel(pair, line, best, n, (Shift){strip.centre, strip.v - 1});
+    try_pixel(pair, line, best, n, (Shift){strip.centre, strip.v + 1});
+  }
+}
+#ifdef __CUDACC__
+#define try_strip try_strip_singly
+#else
+RULE void try_square(const Pair *pair, Square own, int64_t at, int32_t off, int32_t shift, Children *best) {
+  Four cost = square_distances(own, square(pair->right.words, at, pair->right.cols)) + off, least, chosen;
+  __builtin_memcpy(&least, best->cost, sizeof least);
+  __builtin_memcpy(&chosen, best->shift, sizeof chosen);
+  Four better = cost < least, tried = (Four){} + shift;
+  least = PICK(better, cost, least), chosen = PICK(better, tried, chosen);
+  __builtin_memcpy(best->cost, &least, sizeof least);
+  __builtin_memcpy(best->shift, &chosen, sizeof chosen);
+}
+RULE void try_strip(const Pair *pair, Line line, Strip strip, Children *best) {
+  int32_t x = best->x, y = best->y, cols = pair->left.cols, right_cols = pair->right.cols;
+  int32_t xr = x + pair->ahead_x, yr = y + pair->ahead_y + strip.v;
+  if (x + 1 >= cols || y + 1 >= pair->left.rows || xr + strip.u < 0 || xr + strip.u + strip.count >= right_cols ||
+      yr < strip.cross || yr + 1 + strip.cross >= pair->right.rows) {
+    try_strip_singly(pair, line, strip, best);
     return;
   }
+  Square own = square(pair->left.words, (int64_t)y * cols + x, cols);
+  Eight u = (Eight){0, 1, 2, 3, 4, 5, 6, 7} + strip.u, v = (Eight){} + strip.v;
+  Eight off = magnitude(line.a * floats(u) + line.b * floats(v) + line.c, FARTHEST_OFF);
+  int64_t row = (int64_t)yr * right_cols + xr;
+  int32_t offs[LANES], centre = strip.centre - strip.u;
+  __builtin_memcpy(offs, &off, sizeof offs);
+  if (centre >= 0 && centre < strip.count)
+    try_square(pair, own, row + strip.centre, offs[centre], pack(strip.centre, strip.v), best);
+  for (int k = 0; k < strip.count; k++)
+    try_square(pair, own, row + strip.u + k, offs[k], pack(strip.u + k, strip.v), best);
+  for (int side = -strip.cross; side <= strip.cross; side += 2) {
+    if (!strip.cross) break;
+    Shift s = {strip.centre, strip.v + side};
+    try_square(pair, own, row + side * right_cols + s.u, off_line(line, s), pack(s.u, s.v), best);
+  }
+}
 #endif
-  for (int32_t k = 0; k < 4 * count; k++) {
-    int32_t n = k & 3, dx = n & 1, dy = n >> 1;
-    Shift one = {s.u + (k >> 2), s.v};
-    if (!inside(left, best->x + dx, best->y + dy) || !inside(right, x + (k >> 2) + dx, y + dy)) continue;
-    int32_t cost = distance(left->words[place(left, best->x + dx, best->y + dy)],
-                            right->words[place(right, x + (k >> 2) + dx, y + dy)]) + off_line(line, one);
-    if (cost < best->cost[n]) best->cost[n] = cost, best->shift[n] = pack(one.u, one.v);
+
+/* Along the rows through the centres, and along the column through the parent's. Centres of the parent's row whose
+   strips touch are searched together, where eight columns hold them. */
+RULE void search_rows(const Pair *pair, Line line, const int32_t centres[CENTRES], Shift reach, Children *best) {
+  Shift own = unpack(centres[0]);
+  int32_t wide = 2 * reach.u + 1, most = wide < 8 - wide ? wide : 8 - wide, low = own.u, high = own.u, apart_from = 0;
+  for (int k = 1; k < CENTRES; k++) {
+    Shift other = unpack(centres[k]);
+    if (other.v == own.v && high - other.u <= most && other.u - low <= most) {
+      low = other.u < low ? other.u : low;
+      high = other.u > high ? other.u : high;
+    } else {
+      apart_from |= 1 << k;
+    }
+  }
+  try_strip(pair, line, (Strip){low - reach.u, high - low + wide, own.u, own.v, reach.v}, best);
+  for (int k = 1; k < CENTRES; k++) {
+    Shift other = unpack(centres[k]);
+    if (apart_from >> k & 1) try_strip(pair, line, (Strip){other.u - reach.u, wide, other.u, other.v, 0}, best);
+  }
+}
+/* The same for any reach; where the band is soft, the whole rectangle about each centre. */
+RULE void search_rectangles(const Pair *pair, Line line, const int32_t centres[CENTRES], Shift reach, Children *best) {
+  int32_t soft = pair->band.cost < SHARP;
+  for (int k = 0; k < CENTRES; k++) {
+    Shift centre = unpack(centres[k]);
+    if (k > 0 && centres[k] == centres[0]) continue;
+    for (int dv = -reach.v; dv <= reach.v; dv++) {
+      if (!soft && k > 0 && dv != 0) continue;
+      int32_t side = soft || dv == 0 ? reach.u : 0;
+      for (int first = -side; first <= side; first += 8) {
+        int32_t count = side + 1 - first < 8 ? side + 1 - first : 8;
+        try_strip(pair, line, (Strip){centre.u + first, count, centre.u, centre.v + dv, 0}, best);
+      }
+    }
   }
 }
 /* Doubled displacement of a parent, moved towards its line, by a pixel at most: a coarse fit may be wrong by more. */
@@ -96,27 +161,15 @@ RULE int32_t centre_of(const Pair *pair, const Parents *up, RowLines row, int32_
   off = off < -1.0f ? -1.0f : off > 1.0f ? 1.0f : off;
   return pack((int32_t)((float)s.u - rintf(off * line.a)), (int32_t)((float)s.v - rintf(off * line.b)));
 }
-/* The best displacements of the four pixels of parent (i, j): along the row through each centre, about its own centre also
-   along the column; where the band is soft, in the whole rectangle about each. Of equal ones its own centre wins; with
-   nothing inside the right image it stays. `centre`: the parent's among all, which have a frame of one. */
+/* The best displacements of the four pixels of parent (i, j). With nothing inside the right image the prediction stays.
+   `centre`: the parent's among all centres, which have a frame of one and are `stride` apart. */
 RULE Children search_parent(const Pair *pair, RowLines row, const int32_t *centre, int32_t stride, Shift at, Shift reach) {
   const int32_t centres[CENTRES] = {centre[0], centre[-1], centre[1], centre[-stride], centre[stride]};
   Line line = line_at(row, (float)pair->x0 + ((float)(2 * at.u) + 0.5f), row.cost);
   Children best = {2 * at.u, 2 * at.v, {centre[0], centre[0], centre[0], centre[0]}, {FAR, FAR, FAR, FAR}};
-  Shift own = unpack(centre[0]);
-  int32_t soft = pair->band.cost < SHARP;
-  for (int k = 0; k < CENTRES; k++) {
-    Shift s = unpack(centres[k]);
-    try_row(pair, line, s, 1, &best);
-    int32_t rows = soft || k == 0 ? reach.v : 0;
-    for (int32_t dv = -rows; dv <= rows; dv++) {
-      int32_t columns = soft || dv == 0 ? reach.u : 0, first = s.u - columns, last = s.u + columns;
-      /* What the parent's own row has tried need not be tried again. */
-      if (k > 0 && s.v + dv == own.v && first >= own.u - reach.u && first <= own.u + reach.u) first = own.u + reach.u + 1;
-      if (k > 0 && s.v + dv == own.v && last >= own.u - reach.u && last <= own.u + reach.u) last = own.u - reach.u - 1;
-      if (first <= last) try_row(pair, line, (Shift){first, s.v + dv}, last - first + 1, &best);
-    }
-  }
+  /* A row about a centre fits into eight columns up to a reach of 3, and a cross has one row to either side. */
+  if (pair->band.cost >= SHARP && reach.u <= 3 && reach.v <= 1) search_rows(pair, line, centres, reach, &best);
+  else search_rectangles(pair, line, centres, reach, &best);
   return best;
 }
 

@@ -32,6 +32,11 @@ SHARP = 3.0
 TRUNCATION = 2
 """Pixels: beyond this a step to a neighbour costs no more, so that depth edges stay."""
 
+COLUMNS = 8
+"""Columns that are searched together."""
+
+MAX_STRIPS = 512
+"""Room for the strips of a pixel: 5 centres, 17 rows, 3 pieces each."""
 
 SUM_RADIUS = 2
 """Pixels: reach of the windows over which distances are summed."""
@@ -39,6 +44,8 @@ SUM_RADIUS = 2
 EDGE_RADIUS = 3
 """Pixels: reach of the windows that place depth edges."""
 
+TOP_RADIUS = 1
+"""Pixels: reach of the windows of the top level."""
 
 UNSEEN = np.iinfo(np.int32).max
 """More than any cost of the top level."""
@@ -49,8 +56,8 @@ UNIT = 4
 OUTSIDE = 8000
 """Cost of a candidate that leads out of the other image: that of unlike pixels."""
 
-BESIDE = ((0, -1), (0, 1), (-1, 0), (1, 0))
-"""Rows and columns added to a pixel's own displacement."""
+BESIDE = ((0, 0), (0, -1), (0, 1), (-1, 0), (1, 0))
+"""Rows and columns added to a pixel's own displacement on a path."""
 
 AROUND = ((0, -1), (0, 1), (-1, 0), (1, 0), (-3, -3), (-3, 3), (3, -3), (3, 3), (0, -8), (0, 8), (-8, 0), (8, 0))
 """Rows and columns from a pixel to those whose displacements it tries on a path: beside it, beyond an edge, a gap."""
@@ -75,6 +82,13 @@ def rows_of(shift):  # type: ignore[no-untyped-def]
     return np.int64(shift) >> 16
 
 
+@njit(cache=True, nogil=True, forceinline=True)
+def _off_line(line, u, v):  # type: ignore[no-untyped-def]
+    """Cost of displacement (u, v) off an epipolar line, whole byte steps."""
+    off = abs((line[0] * np.float32(u) + line[1] * np.float32(v)) + line[2])
+    return np.int64(off if off < FARTHEST_OFF else FARTHEST_OFF)
+
+
 # -- the top level -----------------------------------------------------------------------------------------------------
 
 
@@ -84,34 +98,63 @@ def exhaustive(pair: LevelPair, reach: tuple[int, int], out: Field) -> None:
     Null prediction and large search area (4.3.4), for the top level. Mean over the window's pixels that both images
     show; of equal ones the shorter displacement wins. The cost is the distance of each pixel alone.
     """
-    _exhaustive(pair.left, pair.right, reach, out)
+    _exhaustive(pair.left, pair.right, reach[0], reach[1], out)
 
 
 @njit(cache=True, nogil=True)
-def _exhaustive(left, right, reach, out):  # type: ignore[no-untyped-def]
-    (rows, cols), (right_rows, right_cols) = left.shape, right.shape
+def _keep_least(total, tall, first, last, tried, best, out):  # type: ignore[no-untyped-def]
+    """Take ``tried`` in ``out`` where the mean of ``total``, in sixteenths, then its length, is less than ``best``.
+
+    ``first, last``: the columns that both images show; ``tall``: how many rows of the window they show. Displacements
+    are packed.
+    """
+    length = np.int32(abs(columns(tried)) + abs(rows_of(tried)))
+    for x in range(first, last):
+        inner = first + TOP_RADIUS <= x < last - TOP_RADIUS
+        wide = 2 * TOP_RADIUS + 1 if inner else min(last, x + TOP_RADIUS + 1) - max(first, x - TOP_RADIUS)
+        # Mean and length in one number, so that one comparison decides both: 2040 x 16 x 4096 is below 2^31.
+        cost = np.int32(np.float64(total[x]) * 16.0 / np.float64(tall * wide)) * np.int32(4096) + length
+        # Strictly less: of equal ones the first displacement in row, column order stays.
+        if cost < best[x]:
+            best[x], out[x] = cost, tried
+
+
+@njit(cache=True, nogil=True)
+def _exhaustive(left, right, reach_x, reach_y, out):  # type: ignore[no-untyped-def]
+    rows, cols = left.shape
+    rrows, rcols = right.shape
+    radius, side = TOP_RADIUS, 2 * TOP_RADIUS + 1
     best = np.full((rows, cols), UNSEEN, np.int32)
-    single = np.empty((rows + 2, cols + 2), np.int32)
-    out.shift[:], out.cost[:] = 0, FAR
-    for v in range(-reach[1], reach[1] + 1):
-        for u in range(-reach[0], reach[0] + 1):
-            top, bottom = max(0, -v), min(rows, right_rows - v)
-            first, last = max(0, -u), min(cols, right_cols - u)
-            # Zeros stand for pixels that not both images show.
-            single[:] = 0
+    out.shift[:] = 0
+    single = np.zeros((rows + 2 * radius, cols + 2 * radius), np.int32)
+    total = np.zeros(cols, np.int32)
+    for v in range(-reach_y, reach_y + 1):
+        top, bottom = max(0, -v), min(rows, rrows - v)
+        for u in range(-reach_x, reach_x + 1):
+            first, last = max(0, -u), min(cols, rcols - u)
+            if top >= bottom or first >= last:
+                continue
+            # A frame of nothing stands for pixels that not both images show.
+            single[top : top + radius] = 0
             for y in range(top, bottom):
+                row, words, others = single[y + radius], left[y], right[y + v]
+                row[:] = 0
                 for x in range(first, last):
-                    single[y + 1, x + 1] = distance(left[y, x], right[y + v, x + u])
+                    row[x + radius] = distance(words[x], others[x + u])
+            single[bottom + radius : bottom + 2 * radius] = 0
             for y in range(top, bottom):
-                for x in range(first, last):
-                    total = np.int32(0)
-                    for j in range(y, y + 3):
-                        total += single[j, x] + single[j, x + 1] + single[j, x + 2]
-                    shown = (min(bottom, y + 2) - max(top, y - 1)) * (min(last, x + 2) - max(first, x - 1))
-                    # Mean, in sixteenths, and length in one number: 2040 x 16 x 4096 is below 2^31.
-                    cost = np.int32(16 * total // shown * 4096 + abs(u) + abs(v))
-                    if cost < best[y, x]:
-                        best[y, x], out.shift[y, x], out.cost[y, x] = cost, pack(u, v), single[y + 1, x + 1]
+                total[:] = 0
+                for j in range(y, y + side):
+                    for i in range(side):
+                        part = single[j, i : i + cols]
+                        for x in range(cols):
+                            total[x] += part[x]
+                tall = min(bottom, y + radius + 1) - max(top, y - radius)
+                _keep_least(total, tall, first, last, pack(u, v), best[y], out.shift[y])
+    for y in range(rows):
+        for x in range(cols):
+            j, i = y + rows_of(out.shift[y, x]), x + columns(out.shift[y, x])
+            out.cost[y, x] = distance(left[y, x], right[j, i]) if best[y, x] < UNSEEN else FAR
 
 
 # -- search ------------------------------------------------------------------------------------------------------------
@@ -120,10 +163,10 @@ def _exhaustive(left, right, reach, out):  # type: ignore[no-untyped-def]
 def search(pair: LevelPair, up: tuple[AnyArray, AnyArray], reach: tuple[int, int], out: Field) -> None:
     """Write the best displacements around the doubled ones of the coarse parent and of the pixels beside it.
 
-    The four pixels of a parent try the same, and share the line of their middle: each centre and the row through it,
-    and about the parent's also the column; where the band is not sharp, the whole rectangle about each. Where it is,
-    each centre is first moved towards its line, by a pixel at most: a coarse fit may be wrong by more. With nothing
-    inside the right image the prediction stays: it leads out of it.
+    The four pixels of a parent try the same, and share the line of their middle: along the row through each centre, and
+    about the parent's also along its column; where the band is not sharp, over the whole rectangle about each. Of equal
+    ones the parent's own wins. Where the band is sharp each centre is first moved towards its line, by a pixel at most:
+    a coarse fit may be wrong by more. With nothing inside the right image the prediction stays: it leads out of it.
 
     Parameters
     ----------
@@ -156,41 +199,79 @@ def _centres(pair, up_u, up_v, centres):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _search(pair, centres, reach, out):  # type: ignore[no-untyped-def]
-    (rows, cols), soft = pair.left.shape, pair.mu < SHARP
-    for y in range(rows):
-        terms = epipolar.row_terms(pair.f, pair.y0 + 2 * (y // 2) + 0.5)
-        for x in range(cols):
-            j, i = y // 2 + 1, x // 2 + 1
-            middle = np.float32(pair.x0) + (np.float32(2 * (x // 2)) + np.float32(0.5))
-            line = epipolar.line(terms, middle, np.float32(pair.mu))
-            near = centres[j, i], centres[j, i - 1], centres[j, i + 1], centres[j - 1, i], centres[j + 1, i]
-            best, least = near[0], np.int64(FAR)
-            for k in range(5):
-                u, v = columns(near[k]), rows_of(near[k])
-                best, least = _tried(pair, line, (y, x), pack(u, v), (best, least))
-                tall = reach[1] if soft or k == 0 else 0
-                for dv in range(-tall, tall + 1):
-                    wide = reach[0] if soft or dv == 0 else 0
-                    for du in range(-wide, wide + 1):
-                        best, least = _tried(pair, line, (y, x), pack(u + du, v + dv), (best, least))
-            out.shift[y, x], out.cost[y, x] = best, least
+    left, right, shift, costs = pair.left, pair.right, out.shift, out.cost
+    near, best, least = np.empty(5, np.int32), np.empty(4, np.int32), np.empty(4, np.int64)
+    (rows, cols), (right_rows, right_cols) = left.shape, right.shape
+    strips, words = np.empty((MAX_STRIPS, 5), np.int64), np.empty(4, np.uint64)
+    for j in range(1, centres.shape[0] - 1):
+        terms = epipolar.row_terms(pair.f, pair.y0 + 2 * (j - 1) + 0.5)
+        for i in range(1, centres.shape[1] - 1):
+            near[0], near[1], near[2] = centres[j, i], centres[j, i - 1], centres[j, i + 1]
+            near[3], near[4] = centres[j - 1, i], centres[j + 1, i]
+            x, y = 2 * (i - 1), 2 * (j - 1)
+            line = epipolar.line(terms, np.float32(pair.x0) + (np.float32(x) + np.float32(0.5)), np.float32(pair.mu))
+            for n in range(4):
+                best[n], least[n] = near[0], FAR
+                words[n] = left[min(y + (n >> 1), rows - 1), min(x + (n & 1), cols - 1)]
+            planned = _plan(near, reach, pair.mu, strips)
+            for m in range(planned):
+                u, count, centre, v, cross = strips[m, 0], strips[m, 1], strips[m, 2], strips[m, 3], strips[m, 4]
+                for k in range(0 if u <= centre < u + count else 1, count + 1 + 2 * cross):
+                    du = centre if k == 0 or k > count else u + k - 1
+                    dv = v if k <= count else v + 2 * (k - count) - 3
+                    xr, yr = x + pair.ahead_x + du, y + pair.ahead_y + dv
+                    off, tried = _off_line(line, du, dv), pack(du, dv)
+                    for n in range(4):
+                        p, q = xr + (n & 1), yr + (n >> 1)
+                        if 0 <= p < right_cols and 0 <= q < right_rows:
+                            cost = distance(words[n], right[np.uint64(q), np.uint64(p)]) + off
+                            best[n] = tried if cost < least[n] else best[n]
+                            least[n] = min(cost, least[n])
+            for n in range(4):
+                p, q = x + (n & 1), y + (n >> 1)
+                if p < cols and q < rows:
+                    shift[q, p], costs[q, p] = best[n], least[n]
 
 
-@njit(cache=True, nogil=True, forceinline=True)
-def _tried(pair, line, at, shift, so_far):  # type: ignore[no-untyped-def]
-    """The best displacement so far and its cost, after one more is tried for the pixel ``at`` (row, column)."""
-    cost = _cost(pair, line, at, shift)
-    return (shift, cost) if cost < so_far[1] else so_far
+@njit(cache=True, nogil=True)
+def _plan(near, reach, mu, strips):  # type: ignore[no-untyped-def]
+    """Strips to search, and how many: first column, number of columns, the centre's column, row, and whether crossed.
+
+    Candidates of a strip, in this order: the centre's column, the others; where it is crossed, the rows above and below
+    the centre. Along the rows through the centres those of the parent's row whose strips touch are searched together,
+    where eight columns hold them; with any reach, or a soft band, piece by piece.
+    """
+    u, v = columns(near[0]), rows_of(near[0])
+    if mu < SHARP or reach[0] > 3 or reach[1] > 1:
+        return _rectangles(near, reach, mu < SHARP, strips)
+    wide = 2 * reach[0] + 1
+    most, low, high, n = min(wide, COLUMNS - wide), u, u, 1
+    for k in range(1, 5):
+        cu, cv = columns(near[k]), rows_of(near[k])
+        if cv == v and high - cu <= most and cu - low <= most:
+            low, high = min(low, cu), max(high, cu)
+        else:
+            strips[n] = cu - reach[0], wide, cu, cv, 0
+            n += 1
+    # Put last, since only now its ends are known, but tried first: of equal costs the parent's strip wins.
+    strips[0] = low - reach[0], high - low + wide, u, v, reach[1]
+    return n
 
 
-@njit(cache=True, nogil=True, forceinline=True)
-def _cost(pair, line, at, shift):  # type: ignore[no-untyped-def]
-    """Distance of a pixel to that its displacement leads to, and the cost off the line; FAR outside."""
-    y, x = at[0] + pair.ahead_y + rows_of(shift), at[1] + pair.ahead_x + columns(shift)
-    if y < 0 or y >= pair.right.shape[0] or x < 0 or x >= pair.right.shape[1]:
-        return np.int64(FAR)
-    own, other = pair.left[at[0], at[1]], pair.right[np.uint64(y), np.uint64(x)]
-    return distance(own, other) + _off(line, shift, FARTHEST_OFF)
+@njit(cache=True, nogil=True)
+def _rectangles(near, reach, soft, strips):  # type: ignore[no-untyped-def]
+    """Rows and column about each centre; where the band is ``soft``, the whole rectangle."""
+    n = 0
+    for k in range(5):
+        u, v = columns(near[k]), rows_of(near[k])
+        for dv in range(-reach[1], reach[1] + 1):
+            if (k > 0 and near[k] == near[0]) or not (soft or k == 0 or dv == 0):
+                continue
+            side = reach[0] if soft or dv == 0 else 0
+            for first in range(-side, side + 1, COLUMNS):
+                strips[n] = u + first, min(COLUMNS, side + 1 - first), u, v + dv, 0
+                n += 1
+    return n
 
 
 @njit(cache=True, nogil=True, forceinline=True)
@@ -218,36 +299,68 @@ def propagate(pair: LevelPair, field: Field, smoothing: Smoothing) -> None:
 
 @njit(cache=True, nogil=True)
 def _propagate(pair, field, smoothing, dirty):  # type: ignore[no-untyped-def]
-    shift, costs, (rows, cols), (smoothness, rounds, beside) = field.shift, field.cost, pair.left.shape, smoothing
+    left, right, shift, costs = pair.left, pair.right, field.shift, field.cost
+    (rows, cols), (right_rows, right_cols), (smoothness, rounds, beside) = left.shape, right.shape, smoothing
+    ahead_x, ahead_y, mu = pair.ahead_x, pair.ahead_y, np.float32(pair.mu)
+    lines, tried = np.empty((cols, 3), np.float32), np.empty(8, np.int32)
     for turn in range(2 * rounds):
         for y in range(rows):
             terms = epipolar.row_terms(pair.f, np.float64(y + pair.y0))
-            up, down = _mirrored(y - 1, rows), _mirrored(y + 1, rows)
+            for x in range(cols):
+                lines[x, 0], lines[x, 1], lines[x, 2] = epipolar.line(terms, np.float32(x + pair.x0), mu)
+            up, down = np.uint64(_mirrored(y - 1, rows)), np.uint64(_mirrored(y + 1, rows))
             for x in range((y + turn) & 1, cols, 2):
                 # The first turn of each colour looks at every pixel; later ones at what was marked.
                 if turn >= 2 and not dirty[y, x]:
                     continue
                 dirty[y, x] = 0
-                near = shift[up, x], shift[y, _mirrored(x - 1, cols)], shift[y, _mirrored(x + 1, cols)], shift[down, x]
-                own, best, cost = shift[y, x], shift[y, x], np.int64(costs[y, x])
+                west, east = np.uint64(_mirrored(x - 1, cols)), np.uint64(_mirrored(x + 1, cols))
+                own, near = shift[y, x], (shift[up, x], shift[y, west], shift[y, east], shift[down, x])
+                best, cost, word = own, np.int64(costs[y, x]), left[y, x]
                 least = cost + smoothness * _roughness(own, near)
-                line = epipolar.line(terms, np.float32(x + pair.x0), np.float32(pair.mu))
-                for k in range(2 * beside + 4):
-                    if k < 2 * beside:
-                        tried = pack(columns(own) + BESIDE[k][1], rows_of(own) + BESIDE[k][0])
-                    else:
-                        tried = near[k - 2 * beside]
-                        if rows_of(tried) == rows_of(own) and abs(columns(tried) - columns(own)) <= 1:
-                            continue
-                    its_cost = _cost(pair, line, (y, x), tried)
-                    total = its_cost + smoothness * _roughness(tried, near)
-                    if its_cost < FAR and total < least:
-                        best, cost, least = tried, its_cost, total
+                line = lines[x, 0], lines[x, 1], lines[x, 2]
+                for k in range(_listed(own, near, beside, tried)):
+                    one = tried[k]
+                    xr, yr = x + ahead_x + columns(one), y + ahead_y + rows_of(one)
+                    if xr < 0 or xr >= right_cols or yr < 0 or yr >= right_rows:
+                        continue
+                    its_cost = distance(word, right[np.uint64(yr), np.uint64(xr)])
+                    its_cost += _off_line(line, columns(one), rows_of(one))
+                    total = its_cost + smoothness * _roughness(one, near)
+                    if total < least:
+                        best, cost, least = one, its_cost, total
                 shift[y, x], costs[y, x] = best, cost
                 if best != own and rounds > 1:
                     # The pixel itself as well: what lies beside its new displacement has not been tried.
                     dirty[y, x] = dirty[y, max(x - 1, 0)] = dirty[y, min(x + 1, cols - 1)] = 1
                     dirty[up, x] = dirty[down, x] = 1
+
+
+@njit(cache=True, nogil=True)
+def _listed(own, near, beside, tried):  # type: ignore[no-untyped-def]
+    """Number of displacements to try: those beside the own one, then those of the neighbours, each once."""
+    u, v = columns(own), rows_of(own)
+    n = 0
+    if beside > 0:
+        tried[0], tried[1], n = pack(u - 1, v), pack(u + 1, v), 2
+    if beside > 1:
+        tried[2], tried[3], n = pack(u, v - 1), pack(u, v + 1), 4
+    above, west, east, below = near
+    # What cannot be predicted is written always, and kept by counting.
+    tried[n] = above
+    n += _apart(above, u, v)
+    tried[n] = west
+    n += _apart(west, u, v) & (west != above)
+    tried[n] = east
+    n += _apart(east, u, v) & (east != above) & (east != west)
+    tried[n] = below
+    return n + (_apart(below, u, v) & (below != above) & (below != west) & (below != east))
+
+
+@njit(cache=True, nogil=True)
+def _apart(shift, u, v):  # type: ignore[no-untyped-def]
+    """Whether a displacement is more than a column beside (u, v)."""
+    return (rows_of(shift) != v) | (abs(columns(shift) - u) > 1)
 
 
 @njit(cache=True, nogil=True, forceinline=True)
@@ -259,16 +372,11 @@ def _mirrored(index, size):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, forceinline=True)
 def _roughness(shift, near):  # type: ignore[no-untyped-def]
     """Sum over the neighbours of min(|du| + |dv|, TRUNCATION)."""
-    total = np.int64(0)
-    for k in range(4):
-        total += min(_gap(shift, near[k]), TRUNCATION)
-    return total
-
-
-@njit(cache=True, nogil=True, forceinline=True)
-def _gap(a, b):  # type: ignore[no-untyped-def]
-    """|du| + |dv| of the difference of two displacements."""
-    return abs(columns(a) - columns(b)) + abs(rows_of(a) - rows_of(b))
+    u, v = columns(shift), rows_of(shift)
+    a, b, c, d, most = near[0], near[1], near[2], near[3], np.int64(TRUNCATION)
+    total = min(abs(u - columns(a)) + abs(v - rows_of(a)), most) + min(abs(u - columns(b)) + abs(v - rows_of(b)), most)
+    total += min(abs(u - columns(c)) + abs(v - rows_of(c)), most)
+    return total + min(abs(u - columns(d)) + abs(v - rows_of(d)), most)
 
 
 # -- fractions of a pixel ----------------------------------------------------------------------------------------------
@@ -303,36 +411,54 @@ def linear(before, at, after):  # type: ignore[no-untyped-def]
     return min(max(d, np.float32(-0.5)), np.float32(0.5))
 
 
-@njit(cache=True, nogil=True)
-def _window_sum(pair, y, x, q, p):  # type: ignore[no-untyped-def]
-    """Distances, summed, between the window of the left pixel at row y, column x, and that of the right at q, p."""
-    total = np.int64(0)
+@njit(cache=True, nogil=True, forceinline=True)
+def _column(left, right, at, to):  # type: ignore[no-untyped-def]
+    """Distances summed over a column of the window: undisplaced, west, east, north (16 bits each), and south."""
+    (y, x), (q, p) = at, to
+    packed, south = np.uint64(0), np.uint64(0)
     for j in range(-SUM_RADIUS, SUM_RADIUS + 1):
-        for i in range(-SUM_RADIUS, SUM_RADIUS + 1):
-            total += distance(pair.left[y + j, x + i], pair.right[q + j, p + i])
-    return total
+        word, row = left[np.uint64(y + j), np.uint64(x)], right[np.uint64(q + j)]
+        packed += np.uint64(distance(word, row[np.uint64(p)]))
+        packed += np.uint64(distance(word, row[np.uint64(p - 1)])) << np.uint64(16)
+        packed += np.uint64(distance(word, row[np.uint64(p + 1)])) << np.uint64(32)
+        packed += np.uint64(distance(word, right[np.uint64(q + j - 1), np.uint64(p)])) << np.uint64(48)
+        south += np.uint64(distance(word, right[np.uint64(q + j + 1), np.uint64(p)]))
+    return packed, south
 
 
 @njit(cache=True, nogil=True)
 def _sums(pair, maps, wanted, out):  # type: ignore[no-untyped-def]
+    """Neighbours of equal displacement share the columns of their windows."""
     (us, vs), (out_u, out_v, out_distance) = maps, out
-    (rows, cols), (high, wide), far = pair.left.shape, pair.right.shape, SUM_RADIUS + 1
+    left, right = pair.left, pair.right
+    rows, cols = left.shape
+    far, size = SUM_RADIUS + 1, 2 * SUM_RADIUS + 1
+    packed, south = np.zeros(size, np.uint64), np.zeros(size, np.uint64)
+    low = np.uint64(0xFFFF)
     for y in range(rows):
+        held = -1  # last column whose sums are there, at displacement (u, v)
+        u = v = np.int64(0)
         for x in range(cols):
-            u, v = np.int64(us[y, x]), np.int64(vs[y, x])
+            if us[y, x] != u or vs[y, x] != v:
+                u, v, held = np.int64(us[y, x]), np.int64(vs[y, x]), -1
             q, p = y + pair.ahead_y + v, x + pair.ahead_x + u
             out_u[y, x], out_v[y, x], out_distance[y, x] = u, v, -1.0
-            if not wanted[y, x] or p < 0 or p >= wide or q < 0 or q >= high:
+            if not wanted[y, x] or p < 0 or p >= right.shape[1] or q < 0 or q >= right.shape[0]:
                 continue
-            if min(x, y, cols - 1 - x, rows - 1 - y) < SUM_RADIUS or min(p, q, wide - 1 - p, high - 1 - q) < far:
-                out_distance[y, x] = distance(pair.left[y, x], pair.right[q, p])
+            inside = min(x, y, cols - 1 - x, rows - 1 - y) >= SUM_RADIUS
+            if not inside or min(p, q, right.shape[1] - 1 - p, right.shape[0] - 1 - q) < far:
+                out_distance[y, x] = distance(left[y, x], right[q, p])
                 continue
-            at = _window_sum(pair, y, x, q, p)
-            west, east = _window_sum(pair, y, x, q, p - 1), _window_sum(pair, y, x, q, p + 1)
-            above, below = _window_sum(pair, y, x, q - 1, p), _window_sum(pair, y, x, q + 1, p)
+            for i in range(max(held + 1, x - SUM_RADIUS), x + SUM_RADIUS + 1):
+                packed[i % size], south[i % size] = _column(left, right, (y, i), (q, i - x + p))
+            held = x + SUM_RADIUS
+            total = packed[0] + packed[1] + packed[2] + packed[3] + packed[4]
+            below = np.int64(south[0] + south[1] + south[2] + south[3] + south[4])
+            at, west = np.int64(total & low), np.int64((total >> np.uint64(16)) & low)
+            east, above = np.int64((total >> np.uint64(32)) & low), np.int64(total >> np.uint64(48))
             out_u[y, x] = np.float32(u) + linear(west, at, east)
             out_v[y, x] = np.float32(v) + linear(above, at, below)
-            out_distance[y, x] = np.float32(at) / np.float32((2 * SUM_RADIUS + 1) ** 2)
+            out_distance[y, x] = np.float32(at) / np.float32(size * size)
 
 
 # -- depth edges -------------------------------------------------------------------------------------------------------
@@ -478,6 +604,12 @@ def _candidates(pair, second, up, shift, listed):  # type: ignore[no-untyped-def
                 # Leaves room below NONE for the greatest step, 10000.
                 known[count], cost[count] = tried, min(apart + _off(line, tried, 2 * OUTSIDE), 2 * OUTSIDE)
                 count += 1
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def _gap(a, b):  # type: ignore[no-untyped-def]
+    """|du| + |dv| of the difference of two displacements."""
+    return abs(columns(a) - columns(b)) + abs(rows_of(a) - rows_of(b))
 
 
 @njit(cache=True, nogil=True)

@@ -77,12 +77,28 @@ def centre(up_u, up_v, f, j, i, mu):
 
 def candidates(centres, reach_x, reach_y, mu):
     """Displacements that a pixel tries, in the order in which equal ones win."""
-    sharp = mu >= reference.SHARP
-    for k, (cu, cv) in enumerate(centres):
+    (u, v), sharp = centres[0], mu >= reference.SHARP
+    if not sharp or reach_x > 3:
+        for m, (cu, cv) in enumerate(dict.fromkeys(centres)):
+            for dv in range(-reach_y, reach_y + 1) if not sharp or m == 0 else [0]:
+                wide = reach_x if not sharp or dv == 0 else 0
+                for first in range(-wide, wide + 1, 8):
+                    piece = list(range(first, min(first + 8, wide + 1)))
+                    yield from ((cu + du, cv + dv) for du in sorted(piece, key=lambda du: (du != 0, du)))
+        return
+    low = high = u
+    apart = []
+    for cu, cv in centres[1:]:
+        if cv == v and max(high - cu, cu - low) <= min(2 * reach_x + 1, 7 - 2 * reach_x):
+            low, high = min(low, cu), max(high, cu)
+        else:
+            apart.append((cu, cv))
+    yield u, v
+    yield from ((du, v) for du in range(low - reach_x, high + reach_x + 1))
+    yield from ((u, v + dv) for dv in range(-reach_y, reach_y + 1))
+    for cu, cv in apart:
         yield cu, cv
-        for dv in range(-reach_y, reach_y + 1) if not sharp or k == 0 else [0]:
-            wide = reach_x if not sharp or dv == 0 else 0
-            yield from ((cu + du, cv + dv) for du in range(-wide, wide + 1))
+        yield from ((cu + du, cv) for du in range(-reach_x, reach_x + 1))
 
 
 @pytest.mark.parametrize("mu", [0.0, 2.0, 3.0])
