@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 
 from rille.stages.core.declare import AnyArray
 
@@ -46,23 +47,35 @@ def standard_deviation(images: Sequence[AnyArray], masks: Sequence[AnyArray]) ->
 
 def _blocks(images: Sequence[AnyArray], masks: Sequence[AnyArray], y: int) -> AnyArray:
     """Variances of the noise in the blocks of 16 rows from ``y`` on, those with a masked pixel left out."""
-    count = images[0].shape[1] // BLOCK_SIDE_PX - 2
-    fine, coarse = (
-        _mean_squares(images[level], masks[level], y >> level, BLOCK_SIDE_PX >> level, count) for level in (0, 1)
-    )
-    variances = (fine - coarse) / 0.75
+    squares = np.empty((2, images[0].shape[1] // BLOCK_SIDE_PX - 2))
+    for level, side in ((0, BLOCK_SIDE_PX), (1, BLOCK_SIDE_PX // 2)):
+        _mean_squares(images[level], masks[level], y >> level, side, squares[level])
+    variances = (squares[0] - squares[1]) / 0.75
     return np.asarray(variances[~np.isnan(variances)])
 
 
-def _mean_squares(image: AnyArray, mask: AnyArray, first: int, side: int, count: int) -> AnyArray:
-    """Mean squared second differences (count,) of the blocks in the ``side`` rows from ``first`` on, the outermost two
-    left out; NaN where a pixel is masked. ``side``: a multiple of eight."""
-    rows, cols = slice(first, first + side), slice(side, side * (count + 1))
-    around = image[first - 1 : first + side + 1, side - 1 : side * (count + 1) + 1].astype(np.float64)
-    # White noise of variance 1 has a second difference of variance 6 along an axis, 36 along both.
-    bend = np.diff(np.diff(around, 2, axis=0), 2, axis=1) / 6.0
-    sums = np.where(mask[rows, cols], bend * bend, np.nan).reshape(side, count, side // 8, 8).sum(axis=2)
-    for _ in range(3):
-        # Pairs: this order fixes the last digits.
-        sums = sums[..., ::2] + sums[..., 1::2]
-    return np.asarray(sums[..., 0].sum(axis=0) / (side * side))
+@njit(cache=True, nogil=True)
+def _mean_squares(image, mask, first, side, squares):  # type: ignore[no-untyped-def]
+    """Mean squared second differences of the blocks in the ``side`` rows from ``first`` on, the outermost two left out;
+    NaN where a pixel is masked. ``side``: a multiple of eight."""
+    width = squares.size * side
+    down, square, part = np.empty(width + 2), np.empty(width), np.empty(8)
+    squares[:] = 0.0
+    for y in range(first, first + side):
+        # The blocks' columns, and one more to either side.
+        a, b, c = image[y - 1][side - 1 :], image[y][side - 1 :], image[y + 1][side - 1 :]
+        usable = mask[y][side:]
+        for x in range(width + 2):
+            down[x] = (np.float64(c[x]) - b[x]) - (np.float64(b[x]) - a[x])
+        for x in range(width):
+            # White noise of variance 1 has a second difference of variance 6 along an axis, 36 along both.
+            bend = ((down[x + 2] - down[x + 1]) - (down[x + 1] - down[x])) / 6.0
+            square[x] = bend * bend if usable[x] else np.nan
+        for k in range(squares.size):
+            # Eight sums side by side: this order fixes the last digits.
+            part[:] = 0.0
+            for x in range(k * side, (k + 1) * side, 8):
+                for i in range(8):
+                    part[i] += square[x + i]
+            squares[k] += ((part[0] + part[1]) + (part[2] + part[3])) + ((part[4] + part[5]) + (part[6] + part[7]))
+    squares /= side * side
