@@ -28,7 +28,7 @@ FIGURES = {
         "rig_residual": 0.410,
         "matched": 0.876,
         "mapped_area": 77.2,
-        "elevation_sigma": 0.00600,
+        "elevation_sigma": 0.00448,
         "overlap_median": 0.000803,
         "safe": 0.518,
         "path_length": 9.31,  # metres

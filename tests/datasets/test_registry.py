@@ -21,6 +21,7 @@ def test_every_listed_name_opens():
         "keyframes.rule": "stride",
         "keyframes.stride": 4,
         "locus.cell_size": 0.001,
+        "intrinsics.prior": 1e-5,
     }
     configuration.build(configuration.expand(full.defaults))
     assert full.evaluation_window == (-0.3, 0.4, 0.3, 0.7)

@@ -125,7 +125,9 @@ def editable(tmp_path, program_environment):
     """A copy of the toys that a test may edit: ``run(old, new)`` gives the nodes of a run after the edit."""
     shutil.copytree(HERE / "toys", tmp_path / "lib" / "toys", ignore=shutil.ignore_patterns("__pycache__"))
     environment = program_environment | {
-        "PYTHONPATH": os.pathsep.join([str(tmp_path / "lib"), str(HERE.parent.parent)])
+        "PYTHONPATH": os.pathsep.join([str(tmp_path / "lib"), str(HERE.parent.parent)]),
+        # Python takes compiled code for that of an edit in the same second that keeps the file's size.
+        "PYTHONDONTWRITEBYTECODE": "1",
     }
 
     def run(file="helper.py", old="", new=""):
