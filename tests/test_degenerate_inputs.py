@@ -46,9 +46,10 @@ ELSEWHERE = {
         "hfvm.given",
         "imaging.undistort",
         "terrain.map_localization",
+        *("odometry.places", "odometry.resection.loop", "odometry.resection.adjust"),
     ),
 }
-"""Stages that need a lens, positions, a map, disparities or a doubt: tested beside their own modules."""
+"""Stages that need a lens, positions, a map, disparities, a doubt or a place seen again: tested with their modules."""
 
 AMOUNTS = {"nothing": 0, "one": 1, "few": 3}
 POINTS = ("point", "block", "match", "vertex")

@@ -75,7 +75,7 @@ def test_a_run_finds_its_kernels_compiled(tmp_path: Path) -> None:
         return done.stdout
 
     compiled = [int(n) for n in re.findall(r"compiled: (\d+)", rille("compile") + rille("compile"))]
-    assert compiled[0] > 100
+    assert compiled[0] > 50
     assert compiled[1] == 0
     assert [p.name for p in tmp_path.iterdir()] == ["own"]
     folder = tmp_path / "own" / "rille" / "kernels"
