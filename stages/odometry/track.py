@@ -10,7 +10,8 @@ measured against the first.
 A point that is lost keeps its predicted position and may be found again. Buckets of the image that have run empty get
 new points at intermediate frames; such a point is looked up backwards in the key frame, where its coordinates are
 known, and dropped if it is not found there. Where the exposure changes, it is undone first
-(:mod:`rille.stages.odometry.exposure`).
+(:mod:`rille.stages.odometry.exposure`); where a frame is blurred, lost points are searched in images blurred alike
+(:mod:`rille.stages.odometry.sharpness`).
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from pydantic import Field
 from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Params, stage
 from rille.stages.core.errors import InputError
+from rille.stages.core.validity import Mask
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts, TrackFacts
 from rille.stages.imaging.pyramid import Pyramid
@@ -32,6 +34,7 @@ from rille.stages.odometry.affine_lk import HALF, Templates, align
 from rille.stages.odometry.displacements import NEIGHBOURS, LevelDisplacements, fit_affinity, known
 from rille.stages.odometry.exposure import levelled
 from rille.stages.odometry.moravec import clear_of_mask, interest_points
+from rille.stages.odometry.sharpness import equally_sharp
 
 BORDER = 8
 """Pixels between an interest point and the image's edge: template, cubic interpolation and a step of the alignment."""
@@ -153,14 +156,25 @@ def _reseed(state: _State, frames: Sequence[Pyramid], j: int, params: TrackParam
 
 
 def _aligned(a: Pyramid, b: Pyramid, templates: Templates, params: TrackParams) -> Floats:
+    """Positions (n, 2) in ``b`` of points of ``a``; NaN of those that are not found."""
+    images = a.images[0], b.images[0]
+    place = _there_and_back(*images, b.valid[0], templates, params)
+    alike = equally_sharp(*images, templates.points, templates.start)
+    if alike is not None:
+        lost = np.isnan(place[:, 0])
+        place[lost] = _there_and_back(*alike, b.valid[0], Templates(*(v[lost] for v in templates)), params)
+    return place
+
+
+def _there_and_back(a: Floats32, b: Floats32, valid: Mask, templates: Templates, params: TrackParams) -> Floats:
     """Positions (n, 2) in ``b`` of points of ``a`` whose alignment back ends where they are; NaN of the others."""
     # A difference of two images has the noise of both.
     how = {"noise": params.noise * 2.0**0.5, "spread": AFFINITY_SIGMA, "reach": REACH_PX}
-    place = align(a.images[0], b.images[0], templates, **how)
-    good = np.flatnonzero(clear_of_mask(b.valid[0], place, HALF))
+    place = align(a, b, templates, **how)
+    good = np.flatnonzero(clear_of_mask(valid, place, HALF))
     good = good[np.abs(np.linalg.det(templates.affinity[good])) > MIN_AREA]
     back = Templates(place[good], templates.points[good], np.linalg.inv(templates.affinity[good]))
-    miss = align(b.images[0], a.images[0], back, **how, settled=SETTLED_BACK_PX) - templates.points[good]
+    miss = align(b, a, back, **how, settled=SETTLED_BACK_PX) - templates.points[good]
     kept = np.isin(np.arange(len(place)), good[np.hypot(*miss.T) <= MAX_RETURN_PX])
     return np.where(kept[:, None], place, np.nan)
 
