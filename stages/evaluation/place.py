@@ -71,7 +71,7 @@ def place(a: Ortho, b: Ortho) -> PlacedImage:
     scale = 1.0 if motion is None else math.hypot(motion[0, 0], motion[1, 0])
     if motion is None or agreeing < FEWEST or abs(scale - 1.0) > MOST_SCALE:
         text = f"the ortho images do not show one place: {agreeing} keypoints agree, at a scale of {scale:.3f}"
-        raise DegenerateError("RIL-327", text, remedy="compare models in one frame, or of one place in one light")
+        raise DegenerateError("RIL-327", text, remedy="compare models in one frame, or of one place")
     # A turn alone, about the middle of the matches that agree.
     turn = motion[:, :2] / scale
     start = p[used].mean(axis=0)

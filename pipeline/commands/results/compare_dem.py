@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE, FLAG, RUNS, Output, Runs
+from rille.pipeline.commands.results.registration import register
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
@@ -24,7 +25,7 @@ from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, re
 from rille.pipeline.export.writers import ENGINEERING_CRS, Meaning, write_bands
 from rille.pipeline.runs import lookup
 from rille.stages.core.errors import InputError
-from rille.stages.evaluation import dem_changes, place
+from rille.stages.evaluation import dem_changes
 from rille.stages.evaluation import dem_comparison as evaluation
 from rille.stages.evaluation.dem_comparison import Grid
 
@@ -57,7 +58,7 @@ def compare_dem(
         Reference, likewise.
     align
         Move A onto B first: shift (x, y, z), tilt (z and two inclinations) or rigid (all six); the motion is printed.
-        place: two runs of one place in frames of their own; found by their ortho images, then rigid.
+        place: two runs of one place in frames of their own; found by their ortho images or their relief, then rigid.
     changes
         List what rose or fell from B to A.
     output
@@ -71,8 +72,9 @@ def compare_dem(
         if files:
             text = f"{files[0]} is no run: it has no ortho image"
             raise InputError("RIL-908", text, remedy="leave --align place out")
-        placed = place.place(*(read_ortho(path / "ortho.tif")[0] for path in paths))
-        found = {"motion_of_a": placed.motion.tolist(), "keypoints": placed.agreeing}
+        images = (read_ortho(path / "ortho.tif")[0] for path in paths)
+        placed = register(*images, (one.values, other.values))
+        found = {"motion_of_a": placed.motion.tolist(), "by": placed.by}
         one, align = moved(one, placed.motion), "rigid"
     check(one, other)
     figures, error = measure(one, other, align)
@@ -263,8 +265,8 @@ def _print(figures: dict[str, Any]) -> None:
     print(f"cells: {figures['resampling']}; errors are A minus B")
     if figures["place"]:
         (cos, _, x), (sin, _, y) = figures["place"]["motion_of_a"]
-        turn, agreeing = math.degrees(math.atan2(sin, cos)), figures["place"]["keypoints"]
-        print(f"place: A turned by {turn:.3f} degrees, moved by {x:.4f}, {y:.4f} m ({agreeing} keypoints)")
+        turn = math.degrees(math.atan2(sin, cos))
+        print(f"place: A turned by {turn:.3f} degrees, moved by {x:.4f}, {y:.4f} m ({figures['place']['by']})")
     if "alignment" in figures:
         aligned = figures["alignment"]
         moved = ", ".join(f"{k} {v:.6g} (sigma {aligned['sigma'][k]:.2g})" for k, v in aligned["motion_of_a"].items())

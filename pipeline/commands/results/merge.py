@@ -14,6 +14,7 @@ import numpy as np
 from rille.datasets.georeference import Georeference
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE, RUNS, Output, Run, Runs
+from rille.pipeline.commands.results.registration import register
 from rille.pipeline.commands.results.run_terrain import Terrain
 from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
@@ -23,7 +24,7 @@ from rille.pipeline.export.writers import Meaning, write_raster
 from rille.pipeline.runs import lookup
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
-from rille.stages.evaluation import dem_comparison, place
+from rille.stages.evaluation import dem_comparison
 from rille.stages.evaluation.dem_comparison import Alignment, Grid
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
 from rille.stages.geometry.lattice import Lattice, union
@@ -62,8 +63,8 @@ class Session:
 def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RUNS) -> int:
     """Merge the terrains of several runs of one place: dem.tif, dem_sigma.tif and ortho.tif in the first run's frame.
 
-    Runs with georeferences in one system are laid by these, others by their ortho images; then elevations decide, with
-    stated standard deviations, which those of the merged terrain contain. Prints how far the runs differ.
+    Runs with georeferences in one system are laid by these, others by ortho images or relief; then elevations decide,
+    with stated standard deviations, which those of the merged terrain contain. Prints how far the runs differ.
 
     Parameters
     ----------
@@ -113,7 +114,7 @@ def _registered(first: Terrain, other: Terrain) -> Session:
     Raises
     ------
     DegenerateError
-        Their ortho images show no place that both share, or several.
+        Neither their ortho images nor their relief show a place that both share, or they show several.
     InputError
         Their cells are too unlike, or they have no ground in common.
     """
@@ -126,10 +127,9 @@ def _registered(first: Terrain, other: Terrain) -> Session:
         refuse_unlike_systems({other.name: b.crs, first.name: a.crs})
         how, start, rough = "georeferences", _in_system(a).inverse() @ _in_system(b), np.zeros(3)
     else:
-        placed = place.place(other.image, first.image)
-        heading = math.atan2(placed.motion[1, 0], placed.motion[0, 0])
-        start = RigidTransform(rotation_exp([0.0, 0.0, heading]), np.array([*placed.motion[:, 2], 0.0]))
-        how, rough = f"ortho images, {placed.agreeing} keypoints", placed.sigma
+        placed = register(other.image, first.image, (other.elevation, first.elevation))
+        start = RigidTransform(rotation_exp([0.0, 0.0, placed.heading]), np.array([*placed.motion[:, 2], 0.0]))
+        how, rough = placed.by, placed.sigma
     turn = start.rotation[:2, :2]
     own = other.image.matrix
     moved = np.column_stack([turn @ own[:, :2], turn @ own[:, 2] + start.translation[:2]])

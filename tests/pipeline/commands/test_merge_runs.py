@@ -53,6 +53,16 @@ def test_sessions_in_frames_of_their_own_become_one_terrain(tmp_path: Path, caps
     assert "cells in common" in capsys.readouterr().out
 
 
+def test_sessions_in_unlike_light_are_laid_by_their_relief(tmp_path: Path) -> None:
+    a, b = made_run(tmp_path / "a", FIRST), made_run(tmp_path / "b", SECOND, noise=2, light=7)
+    assert merge(str(a), str(b), output=tmp_path / "out") == 0
+    one = facts(tmp_path / "out")
+    assert one["by"].startswith("relief, ")
+    expected, found = FIRST.pose.inverse() @ SECOND.pose, RigidTransform.from_matrix(one["T_first_world"])
+    assert found.translation == pytest.approx(expected.translation, abs=0.1 * CELL)
+    assert found.rotation == pytest.approx(expected.rotation, abs=5e-4)
+
+
 def read_elevation_of(run: Path) -> np.ndarray:
     import xarray
 
