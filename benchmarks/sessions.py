@@ -166,7 +166,7 @@ def judge(seed: int, place: Path) -> str:
     return (
         f"seed {seed}: registered ({found['place']['by']}) within {shift:.2f} cells of {1e3 * cell:.0f} mm, "
         f"{known.sum()} compared; {len(ratios)} of {sides} sides of moved stones found, their volumes "
-        f"{np.median(ratios):.2f} of the exact ones (median); {len(patches)} patches listed, {false} where nothing changed"
+        f"{np.median(ratios):.2f} of the exact ones (median); {len(patches)} listed, {false} where nothing changed"
     )
 
 

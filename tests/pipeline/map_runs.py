@@ -76,7 +76,9 @@ def made_run(folder: Path, frame: Frame, place: Georeference | None = None, **mo
     values = {
         "elevation": elevation * more.get("known", 1.0),
         "elevation_std": np.full(lattice.shape, SIGMA),
-        "ortho": np.where(np.isfinite(elevation), grey(there[..., 0], there[..., 1], more.get("light", frame.seed)), np.nan),
+        "ortho": np.where(
+            np.isfinite(elevation), grey(there[..., 0], there[..., 1], more.get("light", frame.seed)), np.nan
+        ),
     }
     arrays = {
         name: (raster(name, "m", name, "float32", "nan", "world"), v.astype(np.float32)) for name, v in values.items()
