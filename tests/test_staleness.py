@@ -88,7 +88,7 @@ DATASETS = {"mockup": MockupParams, "misalign": MisalignParams}
 SOURCES = [f"{section}.{name}" for section, kind in DATASETS.items() for name in kind.model_fields]
 READ_BY = {
     "mockup.up_noise_deg": {"ground_frame"},
-    "mockup.attitude_noise_deg": {"motion", "ground_frame"},
+    "mockup.attitude_noise_deg": {"ground_frame"},
     **{parameter: {"image/right"} for parameter in SOURCES if parameter.startswith("misalign.")},
 }
 """Parameters of a sequence that few tasks get, directly or as an argument."""

@@ -225,15 +225,7 @@ class Builder:
     def motion(self, a: int, b: int) -> Handle[MotionFacts]:
         """Displacements from one left image to another."""
         images = {"a": self.pyramid(a, "left"), "b": self.pyramid(b, "left")}
-        return self.node(motion_stage, f"motion/{a}-{b}", **images, **self._turn(a, b))
-
-    def _turn(self, a: int, b: int) -> dict[str, Any]:
-        """What is known of the rotation of the left camera from frame to frame."""
-        before, after = (None if self.sequence.attitude is None else self.sequence.attitude[f] for f in (a, b))
-        if before is None or after is None:
-            return {}
-        rotation = np.array(after).T @ np.array(before)
-        return {"rotation": rotation.tolist(), "camera": self.sequence.rig.left.to_dict()}
+        return self.node(motion_stage, f"motion/{a}-{b}", **images)
 
     def sides(self, frame: int) -> Handle[SwapFacts]:
         """Whether the images of a pair are exchanged."""

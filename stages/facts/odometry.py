@@ -6,13 +6,13 @@ from rille.stages.core.declare import Facts
 
 
 class MotionFacts(Facts):
-    """Coarse displacements, px of level 0 (None: nothing matches), and shares of the pixels with texture."""
+    """Coarse displacements, px of level 0 (None: nothing matches), and shares of the pixels with texture;
+    ``turn_found_deg`` of the image, where one was undone."""
 
     level: int
     median_length: float | None
     match_rate: float | None
     overlap: float | None
-    derotated: bool
     turn_found_deg: float
 
 

@@ -1,23 +1,20 @@
-"""Undoing a known rotation between two frames of one camera, so that matching sees only what its translation does.
+"""Undoing the rotation between two frames of one camera, so that matching sees only what its translation does.
 
 A camera that only turns moves its image by the homography ``K R K^-1``, whatever the scene. Feature vectors compare
-upright windows: beyond ten degrees of roll they match less and less, at 25 degrees a third of the tracks is wrong. With
-an attitude the later frame is resampled first to how the earlier one was held; an error of the attitude of some degrees
-does no harm, since matching still searches in two dimensions.
+upright windows: beyond ten degrees of roll they match less and less, at 25 degrees a third of the tracks is wrong. So
+the later frame is resampled to how the earlier one was held; an error of some degrees does no harm, since matching
+still searches in two dimensions.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats, Floats32
-from rille.stages.core.errors import InputError
-from rille.stages.geometry.geometry import Camera
 from rille.stages.hfvm.plane import translation, warp
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid, PyramidParams
@@ -33,44 +30,6 @@ class Derotation:
 
     homography: Floats
     shape: tuple[int, int]
-
-    @staticmethod
-    def of(rotation: ArrayLike, camera: Camera) -> Derotation:
-        """Build from the rotation R_b_a (3, 3) between two frames of a camera.
-
-        Raises
-        ------
-        InputError
-            The matrix is not a rotation.
-        """
-        R = np.asarray(rotation, dtype=np.float64)
-        if R.shape != (3, 3) or not np.isfinite(R).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-4:
-            raise InputError(
-                "RIL-305", "an attitude is not a 3 x 3 rotation", remedy="check the attitudes of the sequence"
-            )
-        K = camera.matrix
-        # R_b_a takes rays of a to rays of b: a pixel of the upright frame is looked up in b.
-        return Derotation(K @ R @ np.linalg.inv(K), (camera.height, camera.width))
-
-    @property
-    def reach(self) -> float:
-        """Greatest displacement of an image corner, pixels; infinite where one turns out of the half space ahead."""
-        rows, cols = self.shape
-        corners = np.array([[x, y, 1.0] for y in (0.0, rows - 1.0) for x in (0.0, cols - 1.0)])
-        moved = corners @ self.homography.T
-        # A corner behind the camera has an image, on the wrong side.
-        if (moved[:, 2] <= 0).any():
-            return float("inf")
-        return float(np.linalg.norm(moved[:, :2] / moved[:, 2:] - corners[:, :2], axis=1).max())
-
-    @property
-    def roll_deg(self) -> float:
-        """Rotation, degrees, column towards row, that the homography makes of the image about its centre."""
-        centre = np.array([(self.shape[1] - 1) / 2.0, (self.shape[0] - 1) / 2.0, 1.0])
-        x, y, w = self.homography @ centre
-        # Quotient rule of (H p)_xy / (H p)_z: what a homography does to lengths and angles there.
-        slopes = self.homography[:2, :2] - np.outer([x / w, y / w], self.homography[2, :2])
-        return math.degrees(math.atan2((slopes[1, 0] - slopes[0, 1]) / w, (slopes[0, 0] + slopes[1, 1]) / w))
 
     def apply(self, b: Pyramid) -> Pyramid:
         """Pyramid of frame b held like a, with a margin; masked where b does not reach."""

@@ -3,16 +3,14 @@
 The hierarchical matcher of stage ``hfvm``, stopped at a coarse level. There is no epipolar band: a camera that moves
 forward has radial flow, whose epipolar lines meet inside the image, where a band says nothing about the way along it.
 
-Where the rotation between the frames is known from a sensor, it is undone before matching
-(:mod:`rille.stages.odometry.derotation`); where the matches are too few, or show a rotation of the image, the
-homography that features show is undone (:mod:`rille.stages.odometry.features`). The displacements are those of the
-frames as they were taken all the same.
+Where the matches are too few, or show a rotation of the image, the homography that features show
+(:mod:`rille.stages.odometry.features`) is undone before matching again (:mod:`rille.stages.odometry.derotation`). The
+displacements are those of the frames as they were taken all the same.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +21,6 @@ from rille.stages.core.declare import AnyArray, Bundle, Params, raster, stage
 from rille.stages.core.validity import Mask, Validity, defined, mark, matched, matched_share
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts
-from rille.stages.geometry.geometry import Camera
 from rille.stages.hfvm import epipolar
 from rille.stages.hfvm.image import view
 from rille.stages.hfvm.level import LevelSteps, Views, descend, fill_rows, median, propagate, search
@@ -65,8 +62,7 @@ class MotionParams(Params):
         ge=0,
         le=1,
         description="if fewer than this share of the textured pixels match, undo a homography fitted to features and "
-        "match again; an upright window matches 3/4 of a street scene and 1/3 when turned by 30 degrees; 0: undo only"
-        " a rotation that an attitude sensor gives",
+        "match again; an upright window matches 3/4 of a street scene and 1/3 when turned by 30 degrees; 0: never",
     )
 
 
@@ -85,8 +81,6 @@ class Motion:
     validity: Mask
 
 
-STILL_PX = 2.0
-"""Pixels of the result's level: a rotation that moves no corner farther is left to the matcher."""
 MIN_ROLL_DEG = 10.0
 """Rotation of the image below which nothing is undone: up to there, one to three per cent of the tracks are wrong."""
 MIN_TEXTURED = 100
@@ -100,7 +94,7 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
 
     Parameters
     ----------
-    turn : the known rotation between the frames, undone before matching.
+    turn : a rotation between the frames, undone before matching.
     """
     if turn is not None:
         b = turn.apply(b)
@@ -142,25 +136,22 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     return Motion(level, u, v, validity)
 
 
-def _turned(
-    a: Pyramid, b: Pyramid, plain: Motion, params: MotionParams, turn: Derotation | None
-) -> tuple[Motion, Derotation] | None:
-    """Displacements after undoing the homography of features, and that homography; None: not needed, or no better."""
+def _turned(a: Pyramid, b: Pyramid, plain: Motion, params: MotionParams) -> Motion | None:
+    """Displacements after undoing the homography of features; None: that is not needed, or no better."""
     textured = int(np.count_nonzero((plain.validity & np.uint8(Validity.NO_TEXTURE)) == 0))
     if params.turn_below == 0 or textured < MIN_TEXTURED:
         return None
     share, needed = matched_share(plain.validity), MIN_GAIN
     if share >= params.turn_below:
         # Small rotations are the matcher's, which stands them: resampling the image costs more than they do.
-        if abs(_roll_deg(plain) - (0.0 if turn is None else turn.roll_deg)) < MIN_ROLL_DEG:
+        if abs(_roll_deg(plain)) < MIN_ROLL_DEG:
             return None
         needed = 1.0
     homography = feature_homography(a, b)
     if homography is None:
         return None
-    upright = Derotation(homography, a.shape)
-    motion = coarse_motion(a, b, params, upright)
-    return (motion, upright) if matched_share(motion.validity) > needed * share else None
+    motion = coarse_motion(a, b, params, Derotation(homography, a.shape))
+    return motion if matched_share(motion.validity) > needed * share else None
 
 
 def _roll_deg(motion: Motion) -> float:
@@ -172,19 +163,6 @@ def _roll_deg(motion: Motion) -> float:
     shift = np.stack([motion.column_disparity[row, col], motion.row_disparity[row, col]], -1).astype(np.float64)
     similarity = common_similarity(origin, origin + shift)
     return math.degrees(math.atan2(similarity[1, 0], similarity[0, 0]))
-
-
-def known_turn(rotation: Sequence[Sequence[float]] | None, camera: Camera | None, level: int) -> Derotation | None:
-    """The known rotation of a step, where there is one and it moves the image noticeably.
-
-    Parameters
-    ----------
-    rotation, camera : 3 x 3 rows of R_b_a, and the camera that turned: both or neither.
-    """
-    if rotation is None or camera is None:
-        return None
-    turn = Derotation.of(rotation, camera)
-    return turn if turn.reach > STILL_PX * 2.0**level else None
 
 
 _GRID = "coarse level of a"
@@ -199,23 +177,13 @@ _GRID = "coarse level of a"
     ],
 )
 def motion_stage(
-    params: MotionParams,
-    a: Bundle[PyramidFacts],
-    b: Bundle[PyramidFacts],
-    *,
-    rotation: Sequence[Sequence[float]] | None = None,
-    camera: Camera | None = None,
+    params: MotionParams, a: Bundle[PyramidFacts], b: Bundle[PyramidFacts]
 ) -> Bundle[MotionFacts]:
     """Coarse displacements of all points from one left frame to the next."""
-    turn = known_turn(rotation, camera, params.level)
     before, after = Pyramid.from_bundle(a), Pyramid.from_bundle(b)
-    found = coarse_motion(before, after, params, turn)
-    turned, roll_deg = _turned(before, after, found, params, turn), 0.0
-    if turned is not None:
-        roll_deg = -turn.roll_deg if turn is not None else 0.0
-        found, turn = turned
-        # Into -180 .. 180: a difference of 350 degrees is a turn by 10 the other way.
-        roll_deg = (roll_deg + turn.roll_deg + 180.0) % 360.0 - 180.0
+    plain = coarse_motion(before, after, params)
+    turned = _turned(before, after, plain, params)
+    found = plain if turned is None else turned
     ok = matched(found.validity)
     rows, cols = ok.shape
     scale = np.float32(2.0**found.level)
@@ -229,8 +197,7 @@ def motion_stage(
         "median_length": float(np.median(np.hypot(u, v))) if u.size else None,
         "match_rate": int(np.count_nonzero(ok)) / usable if usable else None,
         "overlap": int(np.count_nonzero(seen)) / usable if usable else None,
-        "derotated": turn is not None,
-        "turn_found_deg": roll_deg,
+        "turn_found_deg": 0.0 if turned is None else _roll_deg(turned),
     }
     arrays: dict[str, AnyArray] = {
         "column_disparity": found.column_disparity,
