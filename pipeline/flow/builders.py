@@ -13,8 +13,6 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-import numpy as np
-
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.keys import digest

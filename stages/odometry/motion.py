@@ -176,9 +176,7 @@ _GRID = "coarse level of a"
         raster("validity", "1", "bit mask, see stages.core.validity", "uint8", "", _GRID),
     ],
 )
-def motion_stage(
-    params: MotionParams, a: Bundle[PyramidFacts], b: Bundle[PyramidFacts]
-) -> Bundle[MotionFacts]:
+def motion_stage(params: MotionParams, a: Bundle[PyramidFacts], b: Bundle[PyramidFacts]) -> Bundle[MotionFacts]:
     """Coarse displacements of all points from one left frame to the next."""
     before, after = Pyramid.from_bundle(a), Pyramid.from_bundle(b)
     plain = coarse_motion(before, after, params)
