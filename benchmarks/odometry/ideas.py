@@ -70,9 +70,7 @@ IDEAS = (
     ),
     Idea("rig as it is given", ("rig.mode=fixed",)),
     Idea("no smooth error beside the rig", name="calibration.parameter_selection.SYSTEMATIC_PX", function=0.001),
-    Idea(
-        "no principal point beside the angles", ("rig.prior_principal=0.00001", "orientation.prior_principal=0.00001")
-    ),
+    Idea("no principal point beside the angles", ("rig.prior_principal=0.00001",)),
 )
 
 

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from typing import Any, Literal, cast
 
 import numpy as np
+import scipy
 from pydantic import Field
 
-from rille.stages.calibration.orientation import misalignment
 from rille.stages.calibration.parameter_selection import (
     BEYOND_SHARE,
     Decision,
@@ -39,7 +39,7 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, stage
 from rille.stages.core.errors import InputError
 from rille.stages.facts.calibration import OrientationFacts, RigFacts
-from rille.stages.geometry.epipolar import NAMES, corrected, distances
+from rille.stages.geometry.epipolar import NAMES, corrected, distances, standing
 from rille.stages.geometry.geometry import Rig
 from rille.stages.numeric.robust import mad_sigma
 
@@ -114,14 +114,16 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams) -> dict[str,
             "points the other way",
             remedy="exchange the left and the right images, or the sign of the baseline",
         )
-    residuals = _residuals(given, rig, pairs, decision)
+    weights, of_given, off = np.concatenate(decision.fit.weights), _distances(given, pairs), _distances(rig, pairs)
+    # The same points before and after: residuals of two sets of inliers say nothing about a repair.
+    before, after = (rms(np.concatenate(one), weights) for one in (of_given, off))
     kept = "not repaired, for no mount moves that far" if far else "kept because rig.mode = fixed"
-    warnings = _contradiction(given, pairs, decision, "repaired" if applied else kept)
+    median = float(np.median(np.concatenate(of_given)[weights > 0]))
+    warnings = _contradiction(given, median, decision, "repaired" if applied else kept)
     marks: dict[str, Any] = {"contradiction": warnings[0]} if far else {}
-    rows = [distances(rig, np.zeros(RIG), m.left, m.right)[0] for m in pairs]
-    suspects = [m.pair for m, d in zip(pairs, rows, strict=True) if far or mad_sigma(d) > BAD_ROWS_PX]
+    suspects = [m.pair for m, d in zip(pairs, off, strict=True) if far or mad_sigma(d) > BAD_ROWS_PX]
     marks |= {"suspects": suspects} if suspects else {}
-    warnings += _doubts(share, residuals["residual_after_px"])
+    warnings += _doubts(share, after)
     moves, knocked = _drift(decision.start, per_pair, params)
     warnings += moves
     marks |= {"knocked": knocked} if knocked else {}
@@ -133,8 +135,9 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams) -> dict[str,
         "per_pair": per_pair,
         "pairs": len(pairs),
         "matches": sum(len(m.left) for m in pairs),
+        "residual_before_px": before,
+        "residual_after_px": after,
         "warnings": warnings,
-        **residuals,
         **marks,
     }
 
@@ -160,13 +163,9 @@ def _alone(given: Rig, matches: PointPairs, start: Linear, decision: Decision, p
     }
 
 
-def _residuals(given: Rig, rig: Rig, pairs: Sequence[PointPairs], decision: Decision) -> dict[str, float]:
-    weights = np.concatenate(decision.fit.weights)
-    found = {}
-    for name, used in (("before", given), ("after", rig)):
-        d = np.concatenate([distances(used, np.zeros(RIG), m.left, m.right)[0] for m in pairs])
-        found[f"residual_{name}_px"] = rms(d, weights)
-    return found
+def _distances(rig: Rig, pairs: Sequence[PointPairs]) -> list[Floats]:
+    """Distances (n,) of each pair's matches from their epipolar lines, pixels."""
+    return [distances(rig, np.zeros(RIG), m.left, m.right)[0] for m in pairs]
 
 
 def _word(p: Parameter) -> str:
@@ -180,14 +179,35 @@ def _source(decision: Decision, applied: bool, pairs: int) -> str:
     return f"given calibration, {names} repaired from {pairs} pair{'s' if pairs > 1 else ''}"
 
 
-def _contradiction(given: Rig, pairs: Sequence[PointPairs], decision: Decision, done: str) -> list[str]:
-    """What a user should know of a calibration that the images contradict; ``done``: what became of it."""
+def _misalignment(rig: Rig, offset: float, decision: Decision) -> str:
+    """How the right image departs from the given rig, in words: offset across lines (pixels) and freed parameters."""
+    # The offset tells already of the angle that makes it.
+    if standing(rig):
+        lines, where, told = "columns", "far right" if offset > 0 else "far left", "yaw"
+    else:
+        lines, where, told = "rows", "low" if offset > 0 else "high", "pitch"
+    parts = [f"{lines} of the right image lie {abs(offset):.2f} px too {where}"]
+    for p in decision.parameters:
+        degrees = math.degrees(p.value)
+        # Positive roll turns x (right) to y (down), which is clockwise as one sees the image.
+        if p.freed and p.name == "roll":
+            parts.append(f"it is turned by {abs(degrees):.2f} degrees {'' if degrees > 0 else 'anti'}clockwise")
+        elif p.freed and p.name != told:
+            parts.append(f"{_word(p)} is off by {degrees:+.2f} degrees")
+    return ", ".join(parts)
+
+
+def _contradiction(given: Rig, offset: float, decision: Decision, done: str) -> list[str]:
+    """What a user should know of a calibration that the images contradict.
+
+    Parameters
+    ----------
+    offset : median distance of the matches from their epipolar lines, pixels.
+    done : what became of it.
+    """
     if not decision.changed:
         return []
-    signed = [distances(given, np.zeros(RIG), m.left, m.right)[0] for m in pairs]
-    # The same points before and after: residuals of two sets of inliers say nothing about a repair.
-    inlier = np.concatenate(decision.fit.weights) > 0
-    words = misalignment(given, float(np.median(np.concatenate(signed)[inlier])), decision)
+    words = _misalignment(given, offset, decision)
     lines = [f"the calibration contradicts the images: {words}; {done}"]
     hidden = [p for p in decision.parameters if not p.observed]
     if hidden:
@@ -257,16 +277,16 @@ def _shown(start: Sequence[Linear], columns: list[int], usual: Floats, departure
     columns : of the design, those of the parameters.
     usual, departure : (parameters,) of all pairs and (pairs, parameters) of each against them, radians.
     """
-    error, claimed, left = (np.full((len(start), BLOCKS**2), np.nan) for _ in range(3))
-    for k, (one, by) in enumerate(zip(start, departure, strict=True)):
+    blocks, medians = np.arange(BLOCKS**2), list[list[Floats]]()
+    for one, by in zip(start, departure, strict=True):
         design = one.design[:, columns]
         off, shift = one.constant + design @ usual, -(design @ by)
-        for block in np.flatnonzero(np.bincount(one.block) >= MIN_MATCHES_OF_BLOCK):
-            inside = one.block == block
-            error[k, block], claimed[k, block] = np.median(off[inside]), np.median(shift[inside])
-            left[k, block] = np.median((off - shift)[inside])
+        enough = np.bincount(one.block, minlength=BLOCKS**2) >= MIN_MATCHES_OF_BLOCK
+        each = (scipy.ndimage.median(values, one.block, blocks) for values in (off, shift, off - shift))
+        medians.append([np.where(enough, values, np.nan) for values in each])
+    left = np.array([rest for _, _, rest in medians])
     moved = np.zeros(len(start))
-    for k, (found, wanted) in enumerate(zip(error, claimed, strict=True)):
+    for k, (found, wanted, _) in enumerate(medians):
         seen = np.isfinite(found)
         if seen.any():
             # What the block moved by in the direction that the parameters claim, at most as far as they claim.

@@ -13,19 +13,18 @@ class CalibrationFacts(Facts):
 
 
 class OrientationFacts(Facts):
-    """Relative orientation from one pair; too few ``matches`` give ``words`` on that alone."""
+    """Matches of one pair against the given rig; too few ``matches`` give ``words`` on that alone."""
 
     pair: int
     matches: int
-    parameters: list[dict[str, Any]]
-    """Name, value, asked, sigma, unit, observed, freed, why, of each parameter."""
-    words: str
+    words: NotRequired[str]
     row_offset: NotRequired[float]
     """Median distance from the epipolar line, px, along rows."""
     roll_deg: NotRequired[float]
+    """Turn of the right camera that the matches ask for."""
     residual_before_px: NotRequired[float]
     residual_after_px: NotRequired[float]
-    """RMS of inliers."""
+    """RMS of inliers, and with the right camera turned as they ask for."""
 
 
 class RigFacts(Facts):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from terrain_scenes import box, disparity, nearest, pitched, plane, smooth_noise
 
 from rille.stages.calibration import orientation
 from rille.stages.calibration.orientation import OrientationParams, orient, thin
-from rille.stages.calibration.parameter_selection import RelativeParams
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Rig, RigidTransform
@@ -40,30 +38,18 @@ def test_thin_of_nothing():
 
 def test_too_few_matches_say_so():
     m = matches(street_rig(), street_depth, samples=30)
-    arrays, facts = orient(street_rig(), m, RelativeParams())
-    assert facts["parameters"] == []
+    weight, facts = orient(street_rig(), m)
     assert "fewer" in facts["words"]
-    assert len(arrays["weight"]) == len(m.left)
+    assert len(weight) == len(m.left)
 
 
-def test_words_and_figures_of_a_knock():
+def test_figures_of_a_knock():
     m = matches(knocked(street_rig(), pitch_deg=-0.24, roll_deg=0.3), street_depth, outliers=0.1)
-    _, facts = orient(street_rig(), m, RelativeParams())
-    assert facts["words"].startswith("rows of the right image lie 3.")
-    assert [fact for fact in ("too low", "0.30 degrees clockwise") if fact not in facts["words"]] == []
+    _, facts = orient(street_rig(), m)
     assert facts["roll_deg"] == pytest.approx(0.3, abs=0.01)
     # what lies above the image's middle is sampled less: the offset is that of the matches
     assert facts["row_offset"] == pytest.approx(3.0, abs=0.4)
     assert facts["residual_after_px"] < 0.3 < 1.0 < facts["residual_before_px"]
-
-
-def test_words_of_a_knock_where_one_camera_stands_above_the_other():
-    rig = street_rig()
-    standing = replace(rig, T_right_left=RigidTransform(np.eye(3), np.array([0.0, -rig.baseline, 0.0])))
-    m = matches(knocked(standing, yaw_deg=0.24, roll_deg=0.3), street_depth)
-    _, facts = orient(standing, m, RelativeParams())
-    assert facts["words"].startswith("columns of the right image lie 3.")
-    assert facts["words"].endswith(" px too far right, it is turned by 0.30 degrees clockwise")
 
 
 def scene(true: Rig):
@@ -94,14 +80,8 @@ def test_stage_on_a_dense_disparity():
     out = run(rig, scene(knocked(rig, pitch_deg=0.4, roll_deg=-0.5)))
     check_outputs(orientation.orientation_stage, out)
     json.dumps(out.meta, allow_nan=False)
-    values = {p["name"]: p["value"] for p in out.meta["parameters"]}
-    # 0.02 degrees are a tenth of a pixel of rows
-    assert values["pitch"] == pytest.approx(0.4, abs=0.02)
-    assert values["roll"] == pytest.approx(-0.5, abs=0.03)
-    inlier = out["weight"] > 0
-    assert np.sqrt(np.mean(out["residual_after"][inlier] ** 2)) == pytest.approx(
-        out.meta["residual_after_px"], rel=1e-5
-    )
+    assert out.meta["roll_deg"] == pytest.approx(-0.5, abs=0.03)
+    assert (out["weight"] > 0).mean() > 0.9
     assert out.meta["residual_after_px"] < 0.2 < out.meta["residual_before_px"]
     assert out.meta["pair"] == 7
     again = run(rig, scene(knocked(rig, pitch_deg=0.4, roll_deg=-0.5)))
@@ -116,7 +96,7 @@ def test_matches_that_nothing_matched_back_have_no_say():
     other["backmatch_error"][part] = np.nan
     other["row_disparity"][part] += 40
     whole, half = run(rig, given), run(rig, other)
-    assert half.meta["parameters"][0]["value"] == pytest.approx(whole.meta["parameters"][0]["value"], abs=0.05)
+    assert half.meta["residual_after_px"] == pytest.approx(whole.meta["residual_after_px"], rel=0.2)
     assert half["left"][:, 1].min() >= part.stop
 
 

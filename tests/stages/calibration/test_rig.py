@@ -84,6 +84,15 @@ def test_a_knock_is_repaired_and_told():
     assert found["parameters"][1]["why"].startswith("not observed")
 
 
+def test_words_of_a_knock_where_one_camera_stands_above_the_other():
+    rig = street_rig()
+    standing = replace(rig, T_right_left=RigidTransform(np.eye(3), np.array([0.0, -rig.baseline, 0.0])))
+    pairs = [matches(knocked(standing, yaw_deg=0.24, roll_deg=0.3), street_depth, pair=k) for k in range(2)]
+    line = facts(standing, pairs)["warnings"][0]
+    assert "columns of the right image lie 3." in line
+    assert " px too far right, it is turned by 0.30 degrees clockwise" in line
+
+
 def test_mode_fixed_only_tells():
     rig = street_rig()
     found = facts(rig, street(pitch_deg=-0.24), mode="fixed")
