@@ -77,7 +77,7 @@ class KeyframesParams(Params):
     @model_validator(mode="before")
     @classmethod
     def _stride_alone(cls, values: Any) -> Any:
-        """Who sets a stride and no rule wants the stride."""
+        """A stride that is set without a rule selects rule stride."""
         if isinstance(values, Mapping) and "stride" in values and "rule" not in values:
             return {"rule": "stride", **values}
         return values
@@ -89,22 +89,6 @@ class KeyframesParams(Params):
         if isinstance(values, Mapping) and values.get("preset") == "navigation":
             return {**NAVIGATION, **values}
         return values
-
-
-@dataclass(frozen=True)
-class Choice:
-    """The basic pairs.
-
-    Attributes
-    ----------
-    basic : their positions in the sequence.
-    why : reason for each: first frame, stride, overlap, max_gap, few matches, behind a gap.
-    overlap : share of each that overlaps the basic pair before; None for the first, and with too few coarse matches.
-    """
-
-    basic: list[int]
-    why: list[str]
-    overlap: list[float | None]
 
 
 @dataclass(frozen=True)
@@ -128,8 +112,8 @@ class Marked:
 UNMARKED = Marked()
 
 
-def by_stride(steps: Sequence[Step], params: KeyframesParams, marked: Marked = UNMARKED) -> Choice:
-    """Positions 0, stride, 2 stride ... of one more frame than there are steps; for an unfit one the next that is.
+def by_stride(steps: Sequence[Step], params: KeyframesParams, marked: Marked = UNMARKED) -> dict[int, str]:
+    """Positions 0, stride, 2 stride ... of one more frame than there are steps, and why; for an unfit one the next.
 
     A frame after a step with too few matches is basic, too: the frames that follow then get poses, in a piece of their
     own.
@@ -143,35 +127,29 @@ def by_stride(steps: Sequence[Step], params: KeyframesParams, marked: Marked = U
         fit = next((n for n in range(k, count) if n not in marked.unfit), None)
         if fit is not None:
             chosen.setdefault(fit, wanted[k])
-    basic, (_, *why) = list(chosen), chosen.values()
-    overlap = [_overlap(steps[a:b], params) for a, b in itertools.pairwise(basic)]
-    return Choice(basic, ["first frame", *why], [None, *overlap])
+    return chosen
 
 
-def by_overlap(steps: Sequence[Step], params: KeyframesParams, marked: Marked = UNMARKED) -> Choice:
-    """Basic pairs as far apart as the wanted overlap permits; at least one frame apart.
+def by_overlap(steps: Sequence[Step], params: KeyframesParams, marked: Marked = UNMARKED) -> dict[int, str]:
+    """Positions as far apart as the wanted overlap permits, and why; at least one frame apart.
 
     Parameters
     ----------
     steps : coarse displacements from each frame to the next.
     marked : in place of an unfit position the last one before that may be basic, else the next one.
     """
-    choice = Choice([0], ["first frame"], [None])
-    seen, k = (Covisibility.all_of(steps[0]) if steps else None), 0
-    while k < len(steps):
-        assert seen is not None
-        step, key = steps[k], choice.basic[-1]
-        ahead = seen.after(step)
+    chosen, key, k = {0: ""}, 0, 0
+    seen = Covisibility.all_of(steps[0]) if steps else None
+    while seen is not None and k < len(steps):
+        ahead = seen.after(steps[k])
         reason = "behind a gap" if k in marked.behind else _why(steps, k, key, ahead, params)
         fit = next((n for n in range(k, key, -1) if n not in marked.unfit), None) if reason else None
         if fit is not None:
-            choice.basic.append(fit)
-            choice.why.append(reason)
-            choice.overlap.append(_overlap(steps[key:fit], params, seen if fit == k else None))
-            k, step = fit, steps[fit]
-            ahead = Covisibility.all_of(step).after(step)
+            chosen[fit] = reason
+            k = key = fit
+            ahead = Covisibility.all_of(steps[k]).after(steps[k])
         seen, k = ahead, k + 1
-    return choice
+    return chosen
 
 
 def _why(steps: Sequence[Step], k: int, key: int, ahead: Covisibility, params: KeyframesParams) -> str:
@@ -188,11 +166,11 @@ def doubtful(step: Step, params: KeyframesParams) -> bool:
     return step.match_rate < params.min_matches or int(step.known.sum()) < LEAST_BLOCKS
 
 
-def _overlap(steps: Sequence[Step], params: KeyframesParams, seen: Covisibility | None = None) -> float | None:
-    """Overlap of the frames before and behind some steps, by what is ``seen`` there; None: one of them is doubtful."""
+def _overlap(steps: Sequence[Step], params: KeyframesParams) -> float | None:
+    """Overlap of the frames before and behind some steps; None: one of them is doubtful."""
     if any(doubtful(step, params) for step in steps):
         return None
-    return (seen or reduce(Covisibility.after, steps, Covisibility.all_of(steps[0]))).overlap
+    return reduce(Covisibility.after, steps, Covisibility.all_of(steps[0])).overlap
 
 
 def segments(basic: list[int], frames: int) -> list[list[int]]:
@@ -238,15 +216,17 @@ def keyframes_stage(
         raise InputError("RIL-438", f"{frames} frames need {frames - 1} steps, not {len(moves)}")
     stride = params.rule == "stride"
     marked = Marked.of(frames, unfit, behind)
-    choice = (by_stride if stride else by_overlap)(moves, params, marked)
+    chosen = (by_stride if stride else by_overlap)(moves, params, marked)
+    basic, (_, *why) = list(chosen), chosen.values()
+    overlap = [None, *(_overlap(moves[a:b], params) for a, b in itertools.pairwise(basic))]
     meta: KeyframesFacts = {
-        "basic": choice.basic,
-        "segments": segments(choice.basic, frames),
+        "basic": basic,
+        "segments": segments(basic, frames),
         "rule": f"every {params.stride}" if stride else f"overlap {params.overlap:g}",
-        "overlap": choice.overlap,
-        "why": choice.why,
+        "overlap": overlap,
+        "why": ["first frame", *why],
         "displacement": [step.displacement for step in moves],
         "match_rate": [step.match_rate for step in moves],
-        "warnings": _warnings(moves, choice.overlap, params),
+        "warnings": _warnings(moves, overlap, params),
     }
     return Bundle({}, meta)

@@ -34,8 +34,6 @@ MAX_ROUNDS, GRADUATION = 40, 2.0
 """Of graduated non-convexity, and the factor by which it is undone from round to round."""
 STEPS, FEW_STEPS = 30, 3
 """Steps of a whole adjustment, and of one round."""
-BLOCK_COLUMNS = 600
-"""Columns of the inverse that are computed together."""
 
 
 @dataclass(frozen=True)
@@ -205,17 +203,11 @@ class PoseGraph:
 
     def covariance(self, state: GraphState) -> Floats:
         """Covariances (n, 6, 6) of (position m, rotation rad) against the held node."""
-        solver, size = _factorised(self.normal(state).matrix), self.unknowns
-        out = np.zeros((self.nodes, 6, 6))
-        free = np.flatnonzero(np.arange(self.nodes) != self.held)
-        for part in np.split(free, range(BLOCK_COLUMNS // 6, len(free), BLOCK_COLUMNS // 6)):
-            at = self._columns[part]
-            unit = np.zeros((size, 6 * len(part)))
-            unit[(at[:, None] + np.arange(6)).reshape(-1), np.arange(6 * len(part))] = 1.0
-            inverse = solver.solve(unit)
-            for k, (node, first) in enumerate(zip(part, at, strict=True)):
-                block = inverse[first : first + 6, 6 * k : 6 * k + 6]
-                out[node] = 0.5 * (block + block.T)
+        solver, out = _factorised(self.normal(state).matrix), np.zeros((self.nodes, 6, 6))
+        for node in np.flatnonzero(np.arange(self.nodes) != self.held):
+            first = int(self._columns[node])
+            block = solver.solve(np.eye(self.unknowns, 6, -first))[first : first + 6]
+            out[node] = 0.5 * (block + block.T)
         return out
 
     def source_sigmas(self, state: GraphState) -> Floats:

@@ -28,7 +28,8 @@ from rille.stages.facts.odometry import FactorsFacts, IntrinsicsFacts, RefineFac
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, bound_of, root_of
 from rille.stages.odometry.resection.priors import Sensors
-from rille.stages.odometry.resection.trajectory import Chained, ChainLink, account, trajectory_stage, without_vertical
+from rille.stages.odometry.resection.sensors import moved
+from rille.stages.odometry.resection.trajectory import Chained, ChainLink, account, trajectory_stage
 
 MIN_WAY_SHARE = 0.03
 """Of the chain's ways along a direction, over those along the main one, for it to tell errors along that direction."""
@@ -145,12 +146,8 @@ def join(poses: Floats, piece: NDArray[np.int16], factors: Factors, sure: Bools)
 
 def _moved(poses: Floats, rows: Bools, ends: NDArray[np.intp], pose: Floats) -> Floats:
     """Poses (n, 3, 4), those of some rows moved as one so that a factor with one end in them holds."""
-    a, b = (RigidTransform.from_matrix(poses[k]) for k in ends)
-    measured = RigidTransform.from_matrix(pose)
-    move = a @ measured @ b.inverse() if rows[ends[1]] else b @ measured.inverse() @ a.inverse()
-    out = poses.copy()
-    out[rows] = [(move @ RigidTransform.from_matrix(T)).matrix34 for T in poses[rows]]
-    return out
+    a, b, measured = (RigidTransform.from_matrix(T) for T in (*poses[ends], pose))
+    return moved(poses, rows, a @ measured @ b.inverse() if rows[ends[1]] else b @ measured.inverse() @ a.inverse())
 
 
 def _left_out(one: Mapping[str, Any], adjusted: Floats) -> str:
@@ -243,16 +240,14 @@ def _bundle(
     kept, number = np.unique(out.piece[out.piece >= 0], return_inverse=True)
     piece = out.piece.copy()
     piece[piece >= 0] = number
-    frames = before.meta["frames"]
-    facts = account(frames, piece, {int(one["frame"]): one["cause"] for one in before.meta["lost"]})
+    out, frames = replace(out, piece=piece), before.meta["frames"]
     verticals = [before.meta["verticals"][k] for k in kept]
+    facts = account(frames, out, {int(one["frame"]): one["cause"] for one in before.meta["lost"]}, verticals)
     meta: TrajectoryFacts = {
         **before.meta,
         **facts,  # type: ignore[typeddict-item]
-        "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in out.poses],
-        "verticals": verticals,
         "world": [frame for frame, k in zip(frames, piece, strict=True) if k == facts["main"]],
         **more,
-        "warnings": [*facts["warnings"], *without_vertical(facts["pieces"], verticals), *lines],
+        "warnings": [*facts["warnings"], *lines],
     }
-    return Bundle(vars(replace(out, piece=piece)), meta)
+    return Bundle(vars(out), meta)

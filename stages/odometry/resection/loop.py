@@ -90,20 +90,14 @@ def loop_between(a: Features, b: Features, matches: NDArray[np.uint32], seed: in
     around = T_a_b @ T_b_a
     lever, turn = propagation(T_a_b, T_a_b, around)
     off = np.concatenate([around.translation, rotation_log(around.rotation)])
-    of_a, of_b = _errors(there), _errors(back)
-    both = lever @ of_a @ lever.T + turn @ of_b @ turn.T
+    both = lever @ there.total @ lever.T + turn @ back.total @ turn.T
     excess = float(off @ np.linalg.solve(both, off)) / 6.0
     if excess > MAX_DEPARTURE**2:
         raise NoLoopError(f"the poses of both directions depart by {np.linalg.norm(off[:3]):.2g} m")
-    share = of_a @ lever.T @ np.linalg.solve(both, off)
+    share = there.total @ lever.T @ np.linalg.solve(both, off)
     T = RigidTransform(rotation_exp(-share[3:]) @ T_a_b.rotation, T_a_b.translation - share[:3])
     # Both directions share their matches: their mean is not said to be better than the first, nor than they agree.
-    return Loop(T, max(excess, 1.0) * of_a, int(there.inlier.sum()))
-
-
-def _errors(posed: Resection) -> Floats:
-    """Covariance (6, 6) of a pose, all errors together, neighbours' being alike."""
-    return np.asarray(max(1.0, posed.together) * posed.covariance + posed.shared @ posed.shared.T)
+    return Loop(T, max(excess, 1.0) * there.total, int(there.inlier.sum()))
 
 
 def _posed(a: Features, b: Features, matches: NDArray[np.uint32], seed: int) -> tuple[Resection, NDArray[np.uint32]]:

@@ -78,23 +78,16 @@ def departures(
 def _coarse(disparity: Bundle, shape: tuple[int, int]) -> Floats:
     """Disparities (n, 2) at the pixels of a coarse grid, row by row: that of the pixel in the middle; NaN unmatched."""
     good = matched(np.asarray(disparity["validity"]))
-    rows, cols = (
-        np.minimum((np.arange(n) + 0.5) * m / n, m - 1).astype(np.intp) for n, m in zip(shape, good.shape, strict=True)
-    )
-    maps = [
-        np.where(good, np.asarray(disparity[name]), np.nan)[np.ix_(rows, cols)]
-        for name in ("column_disparity", "row_disparity")
-    ]
-    return np.stack(maps, -1).reshape(-1, 2)
+    maps = [np.where(good, np.asarray(disparity[n]), np.nan) for n in ("column_disparity", "row_disparity")]
+    coarse = cv2.resize(np.stack(maps, -1), shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+    return coarse.reshape(-1, 2).astype(np.float64)
 
 
 def _at(shift: Floats, places: Floats) -> Floats:
-    """Displacements (n, 2) of the nearest pixels to places (n, 2) column, row of the grid; NaN outside."""
-    rows, cols = shift.shape[:2]
-    known = np.asarray(np.isfinite(places).all(1))
-    x, y = np.rint(np.where(known[:, None], places, -1.0)).astype(np.intp).T
-    inside = (x >= 0) & (y >= 0) & (x < cols) & (y < rows)
-    return np.where(inside[:, None], shift[np.where(inside, y, 0), np.where(inside, x, 0)], np.nan)
+    """Displacements (n, 2) of the nearest pixels to the places (n, 2) of all pixels, column, row; NaN outside."""
+    x, y = np.nan_to_num(places, nan=-9.0).astype(np.float32).T.reshape(2, *shift.shape[:2])
+    outside = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (np.nan, np.nan)}
+    return np.asarray(cv2.remap(shift, x, y, cv2.INTER_NEAREST, **outside), np.float64).reshape(-1, 2)
 
 
 def moving(off: Floats, params: MovingParams) -> Bools:

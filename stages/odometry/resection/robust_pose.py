@@ -132,8 +132,8 @@ class Resection:
 
     @property
     def total(self) -> Floats:
-        """Covariance (6, 6) of the pose, all errors together."""
-        return np.asarray(self.covariance + self.shared @ self.shared.T)
+        """Covariance (6, 6) of the pose, all errors together, neighbours' being alike."""
+        return np.asarray(max(1.0, self.together) * self.covariance + self.shared @ self.shared.T)
 
     @property
     def rms_px(self) -> float:

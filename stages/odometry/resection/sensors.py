@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Floats
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
 from rille.stages.odometry.pose_graph import Factors, bound_of
 
@@ -39,6 +39,12 @@ def between(poses: Floats, a: NDArray[np.intp], b: NDArray[np.intp]) -> Floats:
     back = np.swapaxes(poses[a, :, :3], 1, 2)
     way = np.einsum("mij,mj->mi", back, poses[b, :, 3] - poses[a, :, 3])
     return np.concatenate([back @ poses[b, :, :3], way[:, :, None]], axis=2)
+
+
+def moved(poses: Floats, rows: Bools, move: RigidTransform) -> Floats:
+    """Poses (n, 3, 4), those of some rows (n,) moved as one."""
+    R, C = move.rotation @ poses[:, :, :3], move.apply(poses[:, :, 3])
+    return np.where(rows[:, None, None], np.concatenate([R, C[:, :, None]], axis=2), poses)
 
 
 def resampled(poses: Floats, times: Floats, shift: float) -> Floats:
@@ -184,13 +190,11 @@ def placed(
     first, *others = enough(fixes, piece) or (-1,)
     if first < 0:
         return None
-    poses, piece, mine = poses.copy(), piece.copy(), piece[fixes.nodes]
+    mine = piece[fixes.nodes]
     laid = fit_plane(fixes.positions[mine == first], fixes.antenna[mine == first])
     for k in others:
         move = fit_plane(fixes.antenna[mine == k], laid.apply(fixes.positions[mine == k]))
-        rows = piece == k
-        poses[rows] = [(move @ RigidTransform.from_matrix(T)).matrix34 for T in poses[rows]]
-        piece[rows] = first
+        poses, piece = moved(poses, piece == k, move), np.where(piece == k, piece.dtype.type(first), piece)
     return laid, poses, piece
 
 

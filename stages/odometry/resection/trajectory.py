@@ -96,61 +96,48 @@ def chain(segments: Sequence[ChainLink], levels: Sequence[RigidTransform]) -> Ch
     """
     if len(levels) != max(len(segments), 1):
         raise InputError("RIL-450", f"{len(segments)} segments and {len(levels)} levels do not make a trajectory")
-    widths = [segments[0].shared.shape[2], segments[0].calibration.shape[2]] if segments else [0, 0]
-    nothing = np.zeros((6, 6)), *(np.zeros((6, width)) for width in widths)
-    world, (own, common, by_camera), broken, piece = levels[0], nothing, False, 0
-    poses, covariances, owns, owner, pieces = [world.matrix34], [own], [own], [0], [0]
+    shared = segments[0].shared.shape[2] if segments else 0
+    count = shared + segments[0].calibration.shape[2] if segments else 0
+    world, own, common, broken, piece = levels[0], np.zeros((6, 6)), np.zeros((6, count)), False, 0
+    rows: list[tuple[Floats, Floats, Floats, int, int]] = [(world.matrix34, own, own, 0, 0)]
+    lost = np.full((3, 4), np.nan), np.full((6, 6), np.nan), np.full((6, 6), np.nan), -1, -1
     for number, (segment, level) in enumerate(zip(segments, levels, strict=False)):
         local = segment.poses
         # Both come from the same level stage: a difference beyond rounding means that the wrong ones were paired.
         if np.abs(local[0] - level.matrix34).max() > 1e-9 * max(1.0, float(np.abs(local[0]).max())):
             raise InputError("RIL-451", f"segment {number} was not resected in the local frame of its own basic pair")
         if broken:
-            world, (own, common, by_camera), piece = level, nothing, piece + 1
-            poses[-1], covariances[-1], owns[-1] = world.matrix34, own, own
-            owner[-1], pieces[-1] = number, piece
+            world, own, common, piece = level, np.zeros((6, 6)), np.zeros((6, count)), piece + 1
+            rows[-1] = world.matrix34, own, own, number, piece
         # Once a segment: over thousands of products rounding would bend the rotation.
         T_world_local = _clean(world @ level.inverse())
-        key, key_own, key_common, key_by_camera = world, own, common, by_camera
-        for pose, pose_cov, pose_shared, pose_by_camera in zip(*(each[1:] for each in segment), strict=True):
+        key, key_own, key_common = world, own, common
+        for pose, covariance, *roots in zip(*(each[1:] for each in segment), strict=True):
             broken = not np.isfinite(pose).all()
-            if not broken:
-                world = T_world_local @ RigidTransform.from_matrix(pose)
-                lever, turn = propagation(key, T_world_local, world)
-                alone = pose_cov - pose_shared @ pose_shared.T
-                # Own errors add as variances; those of one cause go together in all segments, so their roots add first.
-                # Rounding makes the two halves of the product differ, and more so from frame to frame.
-                own = _symmetric(lever @ key_own @ lever.T + turn @ alone @ turn.T)
-                common = lever @ key_common + turn @ pose_shared
-                by_camera = lever @ key_by_camera + turn @ pose_by_camera
-            poses.append(np.full((3, 4), np.nan) if broken else world.matrix34)
-            without = np.full((6, 6), np.nan) if broken else own + common @ common.T
-            covariances.append(without + by_camera @ by_camera.T)
-            owns.append(without)
-            owner.append(-1 if broken else number)
-            pieces.append(-1 if broken else piece)
-    return _without_single_frames(
-        Chained(
-            np.array(poses),
-            np.array(covariances),
-            np.array(owns),
-            np.array(owner, np.int16),
-            np.array(pieces, np.int16),
-        )
-    )
+            if broken:
+                rows.append(lost)
+                continue
+            world = T_world_local @ RigidTransform.from_matrix(pose)
+            lever, turn = propagation(key, T_world_local, world)
+            alone = covariance - roots[0] @ roots[0].T
+            # Own errors add as variances; those of one cause go together in all segments, so their roots add first.
+            # Rounding makes the two halves of the product differ, and more so from frame to frame.
+            own = _symmetric(lever @ key_own @ lever.T + turn @ alone @ turn.T)
+            common = lever @ key_common + turn @ np.hstack(roots)
+            without = own + common[:, :shared] @ common[:, :shared].T
+            rows.append((world.matrix34, own + common @ common.T, without, number, piece))
+    poses, covariances, owns, owner, pieces = zip(*rows, strict=True)
+    arrays = np.array(poses), np.array(covariances), np.array(owns)
+    return _without_single_frames(Chained(*arrays, np.array(owner, np.int16), np.array(pieces, np.int16)))
 
 
 def _without_single_frames(found: Chained) -> Chained:
     """A frame that is a piece by itself is lost like others, unless there is nothing else; pieces count on from 0."""
     count = np.bincount(found.piece[found.piece >= 0])
     kept = np.flatnonzero(count > 1) if (count > 1).any() else np.arange(1)
-    alone = ~np.isin(found.piece, kept)
-    number = np.full(len(count) + 1, -1, np.int16)  # the last is that of lost frames, -1
-    number[kept] = np.arange(len(kept))
-    rows = {name: value.copy() for name, value in vars(found).items()}
-    rows["poses"][alone], rows["covariance"][alone], rows["own_covariance"][alone] = np.nan, np.nan, np.nan
-    rows["segment"][alone] = -1
-    return Chained(**rows | {"piece": number[found.piece]})
+    there = np.flatnonzero(np.isin(found.piece, kept))
+    rows = Chained(**{name: value[there] for name, value in vars(found).items()})
+    return _spread(replace(rows, piece=np.searchsorted(kept, rows.piece).astype(np.int16)), there, len(found.piece))
 
 
 def propagation(key: RigidTransform, T_world_local: RigidTransform, world: RigidTransform) -> tuple[Floats, Floats]:
@@ -232,8 +219,13 @@ def _spread(found: Chained, at: NDArray[np.intp], count: int) -> Chained:
     return Chained(**rows)
 
 
-def account(frames: list[int], piece: NDArray[np.int16], causes: Mapping[int, str]) -> dict[str, Any]:
-    """Pieces, how many frames have a pose and how many in the world, lost frames with their causes; in words."""
+def account(frames: list[int], found: Chained, causes: Mapping[int, str], verticals: Sequence[str]) -> dict[str, Any]:
+    """Facts of a trajectory, and lines on what is missing.
+
+    Positions, pieces with their ``verticals``, how many frames have a pose and how many in the world, and lost frames
+    with their ``causes``.
+    """
+    piece = found.piece
     posed = np.flatnonzero(piece >= 0)
     pieces = [
         [frames[rows[0]], frames[rows[-1]]]
@@ -260,9 +252,23 @@ def account(frames: list[int], piece: NDArray[np.int16], causes: Mapping[int, st
         where = ", ".join(f"before frame {a} ({causes.get(a, 'no motion found')})" for a, _ in pieces[1:])
         world = f"each in its own frame, the world is that of piece {largest(piece) + 1}, the largest"
         lines.append(f"the trajectory is broken {where}: {words}; {world}")
+    lines += [
+        f"nothing tells of the vertical at frames {a}-{b}: their world is that of camera {a}, whose own up is z"
+        for (a, b), source in zip(pieces, verticals, strict=True)
+        if source == NO_VERTICAL
+    ]
     main = largest(piece)
-    counts = {"posed": len(posed), "in_world": int((piece == main).sum())}
-    return {"pieces": pieces, "main": main, **counts, "lost": lost, "warnings": lines}
+    return {
+        # Facts are JSON, which has no NaN.
+        "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in found.poses],
+        "verticals": list(verticals),
+        "pieces": pieces,
+        "main": main,
+        "posed": len(posed),
+        "in_world": int((piece == main).sum()),
+        "lost": lost,
+        "warnings": lines,
+    }
 
 
 def _moved(frames: list[int], steps: Sequence[tuple[float | None, float]]) -> dict[int, list[str]]:
@@ -272,15 +278,6 @@ def _moved(frames: list[int], steps: Sequence[tuple[float | None, float]]) -> di
         for (a, b), (turn, share) in zip(pairwise(frames), steps, strict=True)
         if turn is not None
     }
-
-
-def without_vertical(pieces: Sequence[Sequence[int]], verticals: Sequence[str]) -> list[str]:
-    """Lines on the pieces whose vertical is not known."""
-    return [
-        f"nothing tells of the vertical at frames {a}-{b}: their world is that of camera {a}, whose own up is z"
-        for (a, b), source in zip(pieces, verticals, strict=True)
-        if source == NO_VERTICAL
-    ]
 
 
 def _facts(segments: Sequence[Bundle]) -> list[dict[str, Any]]:
@@ -334,15 +331,10 @@ def trajectory_stage(
     found = _spread(chain(chained, level), at, len(frames))
     keys = [row[int(b.meta["per_frame"][0]["frame"])] for b in inputs.segments] or [int(at[0])]
     found, verticals = _with_verticals(found, keys, inputs.levels)
-    counted = account(frames, found.piece, causes)
-    counted["warnings"] += without_vertical(counted["pieces"], verticals)
     inliers = {int(f["frame"]): int(f["inliers"]) for f in facts}
     meta: TrajectoryFacts = {
         "frames": frames,
         "inliers": [inliers.get(f, 0) for f in frames],
-        # Facts are JSON, which has no NaN.
-        "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in found.poses],
-        "verticals": verticals,
-        **counted,  # type: ignore[typeddict-item]
+        **account(frames, found, causes, verticals),  # type: ignore[typeddict-item]
     }
     return Bundle(vars(found), meta)

@@ -24,7 +24,7 @@ from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.hazard.risk import RiskParams
-from rille.stages.odometry.resection.trajectory import account
+from rille.stages.odometry.resection.trajectory import Chained, account
 from rille.stages.planning.path import PathParams
 
 
@@ -193,8 +193,10 @@ def test_frames_posed_are_counted_alike_all_over_the_report(tmp_path: Path) -> N
     made = bundles()
     arrays, piece = dict(made["trajectory"].arrays), np.array([0, 0, 0, -1, 1, 1], dtype=np.int16)
     arrays["poses"] = np.where((piece < 0)[:, None, None], np.nan, arrays["poses"])
-    facts = account([0, 1, 2, 3, 4, 5], piece, {3: "black"})
-    made["trajectory"] = Bundle(arrays | {"piece": piece}, {"frames": [0, 1, 2, 3, 4, 5]} | facts)
+    arrays |= {"piece": piece}
+    found = Chained(own_covariance=arrays["covariance"], **arrays)
+    facts = account([0, 1, 2, 3, 4, 5], found, {3: "black"}, ["attitude", "attitude"])
+    made["trajectory"] = Bundle(arrays, {"frames": [0, 1, 2, 3, 4, 5]} | facts)
     facts, _, _, _ = written(tmp_path, view(made))
     assert facts["metrics"]["frames_posed"]["value"] == 5
     assert facts["metrics"]["frames_in_world"]["value"] == 3
