@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from rille.stages.calibration.parameter_selection import ANGLES, RelativeParams
-from rille.stages.calibration.relative_orientation import MIN_MATCHES, RIG, PointPairs, adjust, rms
+from rille.stages.calibration.relative_orientation import MIN_MATCHES, RIG, PointPairs, rms, settle
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, Params, stage
 from rille.stages.core.validity import matched_back
@@ -70,7 +70,7 @@ def orient(rig: Rig, matches: PointPairs) -> tuple[Floats, OrientationFacts]:
     if count < MIN_MATCHES:
         facts["words"] = f"not checked: {count} matches are fewer than {MIN_MATCHES}"
         return np.zeros(count), facts
-    fit = adjust(rig, [matches], np.arange(RIG) < ANGLES, RelativeParams().priors(rig), rival=False)
+    fit = settle(rig, [matches], np.arange(RIG) < ANGLES, RelativeParams().priors(rig))
     before, after = (
         distances(one, np.zeros(RIG), matches.left, matches.right)[0] for one in (rig, corrected(rig, fit.x[:RIG]))
     )
