@@ -28,13 +28,11 @@ from pydantic import Field
 from rille.stages.calibration.relative_orientation import (
     PARTNERS,
     RIG,
-    Linear,
     OrientationFit,
     PointPairs,
     Priors,
     adjust,
     consider_covariance,
-    linearised,
     settle,
     solution,
 )
@@ -136,13 +134,11 @@ class Decision:
     correction : (5,) radians; 0 for held parameters.
     parameters : the parameters, in order of :data:`rille.stages.geometry.epipolar.NAMES`.
     fit : the fit behind the correction.
-    start : linearised residuals of each pair, from which other fits may start.
     """
 
     correction: Floats
     parameters: tuple[Parameter, ...]
     fit: OrientationFit
-    start: tuple[Linear, ...] = ()
 
     @property
     def changed(self) -> bool:
@@ -164,8 +160,7 @@ class _Chooser:
 
     def __init__(self, rig: Rig, pairs: Sequence[PointPairs], params: RelativeParams) -> None:
         self.rig, self.pairs, self.params, self.priors = rig, pairs, params, params.priors(rig)
-        self.start = linearised(rig, pairs)
-        self.all = adjust(rig, pairs, [True] * RIG, self.priors, rival=True, start=self.start)
+        self.all = adjust(rig, pairs, [True] * RIG, self.priors, rival=True)
         self.solved: dict[tuple[frozenset[int], bool], tuple[Floats, Floats, float]] = {}
         # Sensitivities at the rig that the images ask for: a wrong toe-in would state them for wrong depths.
         near = corrected(rig, self.all.x[:RIG])
@@ -190,12 +185,12 @@ class _Chooser:
             chosen = []
             fit, correction = self._settled(chosen)
         parameters = tuple(self._parameter(i, chosen, fit) for i in range(RIG))
-        return Decision(correction, parameters, fit, tuple(self.start))
+        return Decision(correction, parameters, fit)
 
     def _settled(self, chosen: Sequence[int]) -> tuple[OrientationFit, Floats]:
         """The fit with the chosen parameters free, and their correction (5,)."""
         free = [i in chosen for i in range(RIG)]
-        fit = settle(self.rig, self.pairs, free, self.priors, self.start)
+        fit = settle(self.rig, self.pairs, free, self.priors)
         return fit, np.where(free, fit.x[:RIG], 0.0)
 
     def _worth(self, correction: Floats) -> bool:

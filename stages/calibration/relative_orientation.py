@@ -126,9 +126,9 @@ class Linear:
     block: NDArray[np.int64]
 
 
-def linearised(rig: Rig, pairs: Sequence[PointPairs]) -> list[Linear]:
-    """Linearise the epipolar distances of each pair at the given rig; every fit starts from these."""
-    return [_linear(rig, m) for m in pairs]
+def linearised(rig: Rig, pairs: Sequence[PointPairs], x: Floats | None = None) -> list[Linear]:
+    """Epipolar distances of each pair with systematic errors, linearised about unknowns x (SIZE,), None: zeros."""
+    return [_linear(rig, m, np.zeros(SIZE) if x is None else x) for m in pairs]
 
 
 def adjust(
@@ -138,7 +138,6 @@ def adjust(
     priors: Priors,
     *,
     rival: bool,
-    start: Sequence[Linear] | None = None,
 ) -> OrientationFit:
     """Adjust a rig to point pairs, together with the errors of the images that no rig explains.
 
@@ -147,21 +146,18 @@ def adjust(
     free : which of the five parameters of the rig have no prior. The others have the prior of an intact calibration
         (``priors``), so that they take up their part of the residuals and the free ones do not.
     rival : see :func:`precision`.
-    start : the result of :func:`linearised` for these pairs, if it is known already.
     """
-    return _adjust(rig, pairs, precision(free, priors, rival=rival), start)
+    return _adjust(rig, pairs, precision(free, priors, rival=rival))
 
 
-def settle(
-    rig: Rig, pairs: Sequence[PointPairs], free: Sequence[bool], priors: Priors, start: Sequence[Linear] | None = None
-) -> OrientationFit:
+def settle(rig: Rig, pairs: Sequence[PointPairs], free: Sequence[bool], priors: Priors) -> OrientationFit:
     """Fit the free parameters so that the residuals of the resulting rig are smallest.
 
     The other parameters are fixed at their given values, and the smooth error is not estimated. Neither may take up a
     part of the residuals here, because in the resulting rig the others are as given and the smooth error remains.
     """
     none = replace(priors, rotation=EXACT_RAD, baseline=EXACT_RAD, systematic=NO_SMOOTH_PX)
-    return _adjust(rig, pairs, precision(free, none, rival=False), start)
+    return _adjust(rig, pairs, precision(free, none, rival=False))
 
 
 def consider_covariance(fit: OrientationFit, free: Sequence[bool], priors: Priors, held: Floats) -> Floats:
@@ -184,13 +180,13 @@ def consider_covariance(fit: OrientationFit, free: Sequence[bool], priors: Prior
     return np.asarray(covariance[:RIG, :RIG], dtype=np.float64)
 
 
-def _adjust(rig: Rig, pairs: Sequence[PointPairs], prior: Floats, start: Sequence[Linear] | None) -> OrientationFit:
+def _adjust(rig: Rig, pairs: Sequence[PointPairs], prior: Floats) -> OrientationFit:
     """Gauss-Newton with weights from the scatter; ``prior`` matrix (SIZE, SIZE)."""
-    x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), start or linearised(rig, pairs)
+    x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), linearised(rig, pairs)
     for _ in range(MAX_ITERATIONS):
         # All pairs are linearised about the same x, so the first tells.
         if np.abs(x - linear[0].about)[:RIG].max() > MAX_LINEAR_STEP_RAD:
-            linear = [_linear(rig, m, x, one) for m, one in zip(pairs, linear, strict=True)]
+            linear = linearised(rig, pairs, x)
         parts = [_pair(one, scale, x) for one, scale in zip(linear, scales, strict=True)]
         scales = [p.noise for p in parts]
         normal = np.sum([p.normal for p in parts], axis=0)
@@ -233,24 +229,15 @@ class _Part:
     weights: Floats
 
 
-def _linear(rig: Rig, matches: PointPairs, x: Floats | None = None, before: Linear | None = None) -> Linear:
-    """Distances of a corrected rig with systematic errors about ``x``; what stays is taken from ``before``."""
-    x = np.zeros(SIZE) if x is None else x
+def _linear(rig: Rig, matches: PointPairs, x: Floats) -> Linear:
+    """Distances of a corrected rig with systematic errors about ``x``."""
     distance, by_rig = distances(rig, x[:RIG], matches.left, matches.right)
     # A principal point further right (down) by a pixel, its rotation made up for by yaw (pitch).
     made_up = by_rig[:, [1, 0]] * [-1.0 / rig.right.fx, 1.0 / rig.right.fy]
     shifts = made_up - normals(rig, x[:RIG], matches.left)
-    basis = _smooth_terms(rig, matches) if before is None else before.design[:, SMOOTH]
-    design = np.column_stack([by_rig, shifts, basis])
-    block = _blocks(rig, matches) if before is None else before.block
-    return Linear(distance - by_rig @ x[:RIG], design, x, block)
-
-
-def _blocks(rig: Rig, matches: PointPairs) -> NDArray[np.int64]:
-    """Block (n,) of the image that each left point lies in."""
-    column = np.minimum(matches.left[:, 0] * BLOCKS / rig.left.width, BLOCKS - 1).astype(np.int64)
-    row = np.minimum(matches.left[:, 1] * BLOCKS / rig.left.height, BLOCKS - 1).astype(np.int64)
-    return np.asarray(row * BLOCKS + column, dtype=np.int64)
+    design = np.column_stack([by_rig, shifts, _smooth_terms(rig, matches)])
+    column, row = np.minimum(matches.left.T * BLOCKS / [[rig.left.width], [rig.left.height]], BLOCKS - 1).astype(int)
+    return Linear(distance - by_rig @ x[:RIG], design, x, row * BLOCKS + column)
 
 
 def _pair(linear: Linear, last: float, x: Floats) -> _Part:

@@ -32,6 +32,7 @@ from rille.stages.calibration.relative_orientation import (
     Linear,
     PointPairs,
     adjust,
+    linearised,
     rms,
     solution,
 )
@@ -105,7 +106,7 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams) -> dict[str,
     far = any(abs(math.degrees(p.value)) > MAX_TURN_DEG for p in decision.parameters)
     applied = params.mode != "fixed" and decision.changed and not far
     rig = corrected(given, decision.correction) if applied else given
-    per_pair = [_alone(given, m, one, decision, params) for m, one in zip(pairs, decision.start, strict=True)]
+    per_pair = [_alone(given, m, decision, params) for m in pairs]
     share = impossible_share(rig, pairs, decision.fit)
     if share > SWAPPED_SHARE:
         raise InputError(
@@ -124,7 +125,7 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams) -> dict[str,
     suspects = [m.pair for m, d in zip(pairs, off, strict=True) if far or mad_sigma(d) > BAD_ROWS_PX]
     marks |= {"suspects": suspects} if suspects else {}
     warnings += _doubts(share, after)
-    moves, knocked = _drift(decision.start, per_pair, params)
+    moves, knocked = _drift(linearised(given, pairs), per_pair, params)
     warnings += moves
     marks |= {"knocked": knocked} if knocked else {}
     return {
@@ -149,12 +150,12 @@ def _share(pairs: list[PointPairs]) -> list[PointPairs]:
     return [PointPairs(m.pair, m.left[::s], m.right[::s]) for m, s in zip(pairs, steps, strict=True)]
 
 
-def _alone(given: Rig, matches: PointPairs, start: Linear, decision: Decision, params: RigParams) -> dict[str, Any]:
+def _alone(given: Rig, matches: PointPairs, decision: Decision, params: RigParams) -> dict[str, Any]:
     """One pair's own values and sigmas, degrees, of all that the sequence observes."""
     names = [p.name for p in decision.parameters if p.observed]
     free = [p.observed for p in decision.parameters]
     priors = params.priors(given)
-    fit = adjust(given, [matches], free, priors, rival=False, start=[start])
+    fit = adjust(given, [matches], free, priors, rival=False)
     sigma = np.sqrt(np.diag(solution(fit, free, priors, rival=False)[1]))
     return {
         "pair": matches.pair,
