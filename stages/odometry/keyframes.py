@@ -27,6 +27,10 @@ from rille.stages.odometry.steps import Covisibility, Step, steps_of
 LEAST_BLOCKS = 12
 """Least number of blocks with a displacement from which the overlap of two images is estimated."""
 
+MIN_MATCHES = 0.2
+"""Share of the textured pixels that must find a displacement; below, both frames become basic pairs (rule stride: the
+later one)."""
+
 LITTLE = 0.4
 """Overlap below which a stride, which asks for none, is warned of: most landmarks of a segment leave the image."""
 
@@ -65,13 +69,6 @@ class KeyframesParams(Params):
         16,
         ge=1,
         description="largest number of frames between basic pairs under rule overlap; light and shadows change",
-    )
-    min_matches: float = Field(
-        0.2,
-        ge=0,
-        le=1,
-        description="share of the textured pixels that must find a displacement; below, both frames become basic "
-        "pairs (rule stride: the later one)",
     )
 
     @model_validator(mode="before")
@@ -119,7 +116,7 @@ def by_stride(steps: Sequence[Step], params: KeyframesParams, marked: Marked = U
     own.
     """
     count = len(steps) + 1
-    broken = [k + 1 for k, step in enumerate(steps) if doubtful(step, params)]
+    broken = [k + 1 for k, step in enumerate(steps) if doubtful(step)]
     wanted = dict.fromkeys(marked.behind, "behind a gap") | dict.fromkeys(broken, "few matches")
     wanted |= dict.fromkeys(range(0, count, params.stride), "stride")
     chosen: dict[int, str] = {}
@@ -154,21 +151,21 @@ def by_overlap(steps: Sequence[Step], params: KeyframesParams, marked: Marked = 
 
 def _why(steps: Sequence[Step], k: int, key: int, ahead: Covisibility, params: KeyframesParams) -> str:
     """Why position ``k`` should be basic, given what ``ahead`` would still be seen one frame on; empty: it need not."""
-    if any(doubtful(step, params) for step in steps[max(k - 1, key) : k + 1]):
+    if any(doubtful(step) for step in steps[max(k - 1, key) : k + 1]):
         return "few matches"
     if ahead.overlap < params.overlap:
         return "overlap"
     return "max_gap" if k + 1 - key > params.max_gap else ""
 
 
-def doubtful(step: Step, params: KeyframesParams) -> bool:
+def doubtful(step: Step) -> bool:
     """Whether a step has too few matches to be used."""
-    return step.match_rate < params.min_matches or int(step.known.sum()) < LEAST_BLOCKS
+    return step.match_rate < MIN_MATCHES or int(step.known.sum()) < LEAST_BLOCKS
 
 
-def _overlap(steps: Sequence[Step], params: KeyframesParams) -> float | None:
+def _overlap(steps: Sequence[Step]) -> float | None:
     """Overlap of the frames before and behind some steps; None: one of them is doubtful."""
-    if any(doubtful(step, params) for step in steps):
+    if any(doubtful(step) for step in steps):
         return None
     return reduce(Covisibility.after, steps, Covisibility.all_of(steps[0])).overlap
 
@@ -182,7 +179,7 @@ def segments(basic: list[int], frames: int) -> list[list[int]]:
 def _warnings(steps: Sequence[Step], overlap: Sequence[float | None], params: KeyframesParams) -> list[str]:
     """What the choice could not give."""
     lines = []
-    blind = [k for k, step in enumerate(steps) if doubtful(step, params)]
+    blind = [k for k, step in enumerate(steps) if doubtful(step)]
     if blind:
         lines.append(
             f"{len(blind)} of {len(steps)} steps between frames have too few coarse matches (at least"
@@ -218,7 +215,7 @@ def keyframes_stage(
     marked = Marked.of(frames, unfit, behind)
     chosen = (by_stride if stride else by_overlap)(moves, params, marked)
     basic, (_, *why) = list(chosen), chosen.values()
-    overlap = [None, *(_overlap(moves[a:b], params) for a, b in itertools.pairwise(basic))]
+    overlap = [None, *(_overlap(moves[a:b]) for a, b in itertools.pairwise(basic))]
     meta: KeyframesFacts = {
         "basic": basic,
         "segments": segments(basic, frames),

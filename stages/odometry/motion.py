@@ -49,14 +49,6 @@ class MotionParams(Params):
     top_rows: float = Field(
         default=0.25, gt=0, le=1, description="share of the image height searched up and down at the top pyramid level"
     )
-    smoothness: int = Field(
-        default=5,
-        ge=0,
-        description="cost [feature byte steps] of a displacement difference of one pixel to each neighbour",
-    )
-    rounds: int = Field(
-        default=6, ge=0, le=32, description="propagation rounds at each pyramid level; more than 6 change little"
-    )
     turn_below: float = Field(
         default=0.5,
         ge=0,
@@ -81,6 +73,9 @@ class Motion:
     validity: Mask
 
 
+SMOOTHNESS, ROUNDS = 5, 6
+"""Cost [feature byte steps] of a displacement difference of one pixel to each neighbour; and propagation rounds at each
+pyramid level, of which more change little."""
 MIN_ROLL_DEG = 10.0
 """Rotation of the image below which nothing is undone: up to there, one to three per cent of the tracks are wrong."""
 MIN_TEXTURED = 100
@@ -106,11 +101,11 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
         top_rows=params.top_rows,
         # Both directions alike: displacements between frames have no epipolar line to prefer.
         search_columns=1,
-        smoothness=params.smoothness,
-        rounds=params.rounds,
+        smoothness=SMOOTHNESS,
+        rounds=ROUNDS,
     )
     # At a coarse level no level is finest: all have the same rounds. At level 0 the matcher's own figures hold.
-    rounds = (params.rounds, params.rounds) if level else DEFAULT.steps.rounds
+    rounds = (ROUNDS, ROUNDS) if level else DEFAULT.steps.rounds
     views = Views(view(a, hp), view(b, hp), hp, LevelSteps((search, propagate, median), (), rounds))
     state, layers = descend(views, 0), (views.left.layers[0], views.right.layers[0])
     validity = np.zeros(state.left.u.shape, np.uint8)

@@ -25,6 +25,9 @@ from rille.stages.odometry.displacements import known
 
 MAX_DISPARITY_STEP_PX = 1.0
 """Pixels: neighbours whose disparities differ by more lie on two surfaces; also the bound of back-matching (4.3.3)."""
+MAX_RELATIVE_SIGMA = 0.2
+"""Largest standard deviation of a landmark's distance over the distance; beyond, depth is no longer normal though
+disparity is, and first-order covariances are wrong."""
 TEMPLATE_HALF_PX = 5
 """Half the side of a template, pixels (see stages.odometry.affine_lk): what its relief is taken over."""
 
@@ -74,19 +77,13 @@ class SegmentPoints(NamedTuple):
 
 
 def landmarks_of(
-    points: Floats,
-    disparity: Bundle,
-    rig: Rig,
-    T_local_left: RigidTransform,
-    *,
-    disparity_sigma: float,
-    max_depth_ratio: float,
+    points: Floats, disparity: Bundle, rig: Rig, T_local_left: RigidTransform, disparity_sigma: float
 ) -> Landmarks:
     """Landmarks of points (n, 2) column, row of the left key image; ``disparity`` is that of its pair.
 
     A point needs four matched (not filled) neighbours on one surface, rays that meet within a pixel in front of the
     camera, no relief of two surfaces under its template, and a distance whose standard deviation is below
-    ``max_depth_ratio`` of it. ``disparity_sigma``: pixels, of a disparity without relief.
+    :data:`MAX_RELATIVE_SIGMA` of it. ``disparity_sigma``: pixels, of a disparity without relief.
     """
     offset, matched = matches_at(points, disparity)
     right = points + offset
@@ -97,8 +94,7 @@ def landmarks_of(
     meets = matched & (depth > 0) & (np.abs(off) <= MAX_DISPARITY_STEP_PX)
     smooth = meets & np.isfinite(sigma)
     spread = np.linalg.norm(landmarks.per_pixel, axis=1) * sigma
-    # Beyond, depth is no longer normal though disparity is, and first-order covariances are wrong.
-    near = smooth & (spread <= max_depth_ratio * np.where(smooth, depth, 0.0))
+    near = smooth & (spread <= MAX_RELATIVE_SIGMA * np.where(smooth, depth, 0.0))
     lost = {
         "without a consistent stereo match": int((~matched).sum()),
         "whose rays do not meet": int((matched & ~meets).sum()),

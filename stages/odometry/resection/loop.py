@@ -167,14 +167,7 @@ def loop_stage(
         if k not in views:
             rig, points = Rig.from_dict(rigs[k].meta["rig"]), np.asarray(features[k]["points"], np.float64)
             points = points - PIXEL_CENTRE
-            known = landmarks_of(
-                points,
-                disparities[k],
-                rig,
-                HERE,
-                disparity_sigma=usual.disparity_sigma,
-                max_depth_ratio=usual.max_depth_ratio,
-            )
+            known = landmarks_of(points, disparities[k], rig, HERE, usual.disparity_sigma)
             views[k] = Features(points, np.asarray(features[k]["descriptors"], np.float32), known, rig.left)
         return views[k]
 

@@ -23,6 +23,10 @@ DISPARITY_SIGMA_PX = 0.3
 """Standard deviation of a disparity, with what a coarse pixel holds of relief."""
 SIGMAS = 3.0
 """Times that by which a place may be off."""
+MIN_DEPARTURE_PX = 1.5
+"""Departure of a displacement from that of the still scene, in pixels of its level, from which on something moved."""
+MIN_SHARE = 0.002
+"""Share of the image that a moving part has at least; smaller ones are errors."""
 GROWN = 2
 """Coarse pixels by which a moving part is widened: its border is blurred by the windows of the matcher."""
 
@@ -31,15 +35,6 @@ class MovingParams(Params):
     """Parameters of the stage ``moving``."""
 
     enabled: bool = Field(True, description="leave what moves by itself out of the world's terrain")
-    limit: float = Field(
-        1.5,
-        gt=0,
-        description="departure of a displacement from that of the still scene, in pixels of the displacements' level, "
-        "from which on something moved",
-    )
-    smallest: float = Field(
-        0.002, gt=0, le=1, description="share of the image that a moving part has at least; smaller ones are errors"
-    )
 
 
 def departures(
@@ -90,14 +85,14 @@ def _at(shift: Floats, places: Floats) -> Floats:
     return np.asarray(cv2.remap(shift, x, y, cv2.INTER_NEAREST, **outside), np.float64).reshape(-1, 2)
 
 
-def moving(off: Floats, params: MovingParams) -> Bools:
+def moving(off: Floats) -> Bools:
     """Pixels (row, col) of connected parts that depart, each a little widened."""
     with np.errstate(invalid="ignore"):
-        departs = (off > params.limit).astype(np.uint8)
+        departs = (off > MIN_DEPARTURE_PX).astype(np.uint8)
     # Single rows and corners are errors of the displacements; what is left after opening is a surface.
     opened = cv2.morphologyEx(departs, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
-    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= params.smallest * off.size]
+    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= MIN_SHARE * off.size]
     side = 2 * GROWN + 1
     return np.asarray(cv2.dilate(np.isin(labels, large).astype(np.uint8), np.ones((side, side), np.uint8)) != 0)
 
@@ -122,7 +117,7 @@ def moving_stage(
     if len(poses) == 2 and np.isfinite(poses).all():
         a, b = (RigidTransform.from_matrix(pose) for pose in poses)
         off = departures(disparity, motion, Rig.from_dict(rig.meta["rig"]), b.inverse() @ a, back=back)
-        parts = moving(off, params).astype(np.uint8)
+        parts = moving(off).astype(np.uint8)
         out = cv2.resize(parts, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST)
     share = float(out.mean())
     return Bundle({"moving": out}, {"share": share})

@@ -207,8 +207,7 @@ def resect_stage(
         inputs.disparity,
         rig,
         T_local_key,
-        disparity_sigma=params.disparity_sigma,
-        max_depth_ratio=params.max_depth_ratio,
+        params.disparity_sigma,
     )
     reckoned = None
     if prediction is not None:

@@ -39,7 +39,7 @@ from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.projection import Pinhole
 from rille.stages.numeric.least_squares import levenberg_marquardt
-from rille.stages.odometry.resection.landmarks import Landmarks
+from rille.stages.odometry.resection.landmarks import MAX_RELATIVE_SIGMA, Landmarks
 from rille.stages.odometry.resection.pnp import (
     Errors,
     Observations,
@@ -96,12 +96,6 @@ class ResectParams(Params):
         gt=0,
         description="largest back-projection error [pixels] of an inlier; the worst landmarks are removed until all "
         "are below; 1.0: 5 pixel_sigma",
-    )
-    max_depth_ratio: float = Field(
-        0.2,
-        gt=0,
-        description="largest standard deviation of a landmark's distance over the distance; beyond, first-order error"
-        " propagation fails",
     )
     max_position_ratio: float = Field(
         0.02,
@@ -239,7 +233,7 @@ def _without_inconsistent(
             "raise resect.threshold or choose basic pairs closer",
         )
         pose = levenberg_marquardt(PoseAdjustment(obs, active, params.bias_sigma), pose, MAX_STEPS, 1e-3).state
-        usable = _first_order(obs, pose, params)
+        usable = _first_order(obs, pose)
         if (active & ~usable).any():
             active = active & usable
             continue
@@ -254,14 +248,14 @@ def _without_inconsistent(
         active[np.argsort(-norm, kind="stable")[: math.ceil(beyond / REMOVED_SHARE)]] = False
 
 
-def _first_order(obs: Observations, pose: Pose, params: ResectParams) -> Bools:
+def _first_order(obs: Observations, pose: Pose) -> Bools:
     """Which landmarks (n,) are so far before the camera that first-order errors hold.
 
     A camera that has come close to a landmark, or passed it, sees its error along the old ray at any size: such a
     landmark agrees with everything, thousands of pixels off.
     """
     depth = obs.landmarks @ pose.R[2] + pose.t[2]
-    return np.asarray(obs.sigma * np.sqrt((obs.per_pixel**2).sum(1)) <= params.max_depth_ratio * depth)
+    return np.asarray(obs.sigma * np.sqrt((obs.per_pixel**2).sum(1)) <= MAX_RELATIVE_SIGMA * depth)
 
 
 def _certainty(

@@ -32,7 +32,7 @@ def pair(column, row, valid):
 
 
 def from_disparity(points, maps, rig=RIG, T=T_LOCAL_LEFT, sigma=0.1):
-    return landmarks_of(points, pair(*maps[:3]), rig, T, disparity_sigma=sigma, max_depth_ratio=0.2)
+    return landmarks_of(points, pair(*maps[:3]), rig, T, sigma)
 
 
 def test_landmarks_lie_on_the_plane_that_was_seen():

@@ -97,9 +97,9 @@ def test_a_board_that_is_pushed_aside_is_found_and_little_beside_it(back: bool) 
 def test_where_nothing_is_known_nothing_moves() -> None:
     disparity, motion, segment = given(0.5)
     unknown = Bundle({**motion.arrays, "validity": np.zeros_like(motion["validity"])}, motion.meta)
-    assert not moving(departures(disparity, unknown, RIG, T_B_A, back=False), MovingParams()).any()
+    assert not moving(departures(disparity, unknown, RIG, T_B_A, back=False)).any()
     dark = Bundle({**disparity.arrays, "validity": np.zeros_like(disparity["validity"])}, {})
-    assert not moving(departures(dark, motion, RIG, T_B_A, back=False), MovingParams()).any()
+    assert not moving(departures(dark, motion, RIG, T_B_A, back=False)).any()
     lost = Bundle({"poses": np.full((2, 3, 4), np.nan)}, {})
     inputs = {"disparity": disparity, "rig": Bundle({}, {"rig": RIG.to_dict()}), "motion": motion, "segment": lost}
     assert not np.asarray(moving_stage.run(MovingParams(), {}, inputs)["moving"]).any()
@@ -109,8 +109,8 @@ def test_where_nothing_is_known_nothing_moves() -> None:
 def test_a_small_part_is_an_error_of_the_displacements() -> None:
     off = np.zeros((60, 100))
     off[10:13, 10:13] = 9.0
-    assert not moving(off, MovingParams()).any()
+    assert not moving(off).any()
     off[30:40, 50:70] = 9.0
-    mask = moving(off, MovingParams())
+    mask = moving(off)
     assert mask[28:42, 48:72].all()
     assert mask.sum() == 14 * 24
