@@ -142,8 +142,7 @@ class Sequence:
     attitude : R_reference_left of each frame from a sensor (gyroscope, compass); the reference is any inertial frame,
         the same for all frames, and only differences between frames are used. None where it is not known.
     imu_axes : R_imu_left, where ``up`` and ``attitude`` are those of an IMU.
-    odometry : T_odometry_left of each frame by dead reckoning, metres; predicts, and is part of the result only as a
-        prior.
+    odometry : T_odometry_left of each frame by dead reckoning, metres; part of the result only as a prior.
     priors : sensors that the trajectory is adjusted to, and how good they are: ``odometry`` (drift, turn),
         ``attitude`` and ``up`` (sigma, rad), ``positions`` (positions, times, sigma, lever).
     pitch : downward pitch of the left camera's optical axis, radians, stated with the rig; roll 0.

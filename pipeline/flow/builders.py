@@ -347,13 +347,13 @@ class Builder:
         self,
         frames: Series[int],
         key: MatchedPair,
-        more: Args | None = None,
         which: str = "",
         after: MatchedPair | None = None,
+        refused: str | None = None,
     ) -> Segment:
         """Track and resect the left images that follow basic pair ``key``, which is the first of them.
 
-        ``more``: arguments of the resection; ``after``: the basic pair that the last image is of.
+        ``after``: the basic pair that the last image is of; ``refused``: why no frame shall have a pose.
         """
         which = which or f"{key.frame}"
         images = [self.pyramid(frame, "left") for frame in frames]
@@ -368,7 +368,7 @@ class Builder:
             disparity=key.disparity,
             after=after and after.disparity,
             rig_after=after and after.rig,
-            **(more or {}),
+            refused=refused,
         )
         return Segment(tuple(frames), tracked, posed)
 

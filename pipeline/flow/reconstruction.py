@@ -167,9 +167,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
 
         # Behind each basic pair: tracks, and poses in its frame. They show errors of the calibration.
         ways = [[chain[i] for i in part] for part in chosen.meta["segments"]]
-        segments = [
-            make.segment(way, matched[way[0]], dead_reckoning(make, way), after=matched.get(way[-1])) for way in ways
-        ]
+        segments = [make.segment(way, matched[way[0]], after=matched.get(way[-1])) for way in ways]
         segments, moved = yield from unmoved(make, matched, segments)
         p.tracks, p.resections = [s.track for s in segments], [s.resection for s in segments]
         p.refined = refined(make, matched, segments)
@@ -399,7 +397,7 @@ def unmoved(
     judged = yield Maybe([s.resection for s in segments])
     for s, one in zip(segments, judged, strict=True):
         k, end = s.frames[0], s.frames[-1]
-        out.append(make.segment(s.frames, pairs[k], {"refused": cause}, f"{k}/refused") if k in moved else s)
+        out.append(make.segment(s.frames, pairs[k], f"{k}/refused", refused=cause) if k in moved else s)
         if one is not None and "jump" in one.meta:
             by, cause = by + one.meta["jump"], one.meta["knocked"]
             p.contradictions.append(s.resection)
@@ -414,16 +412,6 @@ def steps_of(make: Builder, chosen: Ref[KeyframesFacts]) -> list[list[float | No
     lengths, focal = chosen.meta["displacement"], make.sequence.rig.left.fx
     turns = [None if length is None else round(math.atan(length / focal), 4) for length in lengths]
     return [[turn, share] for turn, share in zip(turns, chosen.meta["match_rate"], strict=True)]
-
-
-def dead_reckoning(make: Builder, segment: list[int]) -> dict[str, Any]:
-    """Predicted poses of a segment's frames in its key frame."""
-    known = make.sequence.odometry
-    key = None if known is None else known[segment[0]]
-    if known is None or key is None:
-        return {}
-    poses = [known[f] for f in segment]
-    return {"prediction": [None if T is None else (key.inverse() @ T).to_list() for T in poses]}
 
 
 def sensors(make: Builder, frames: Series[int]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import Any
 
 import numpy as np
@@ -203,14 +203,11 @@ def _neighbours(frames: Sequence[int], of: set[int]) -> set[int]:
 
 def _doubtful_runs(good: Sequence[bool]) -> list[tuple[int, int]]:
     """Places (i, j) of the frames before and behind each run of at least two doubtful steps between good ones."""
-    runs, first = [], None
-    for k, fine in enumerate([*good, True]):
-        if not fine and first is None:
-            first = k
-        if fine and first is not None:
-            if k - first >= 2:
-                runs.append((first, k))
-            first = None
+    runs = []
+    for fine, group in groupby(range(len(good)), good.__getitem__):
+        steps = list(group)
+        if not fine and len(steps) >= 2:
+            runs.append((steps[0], steps[-1] + 1))
     return runs
 
 

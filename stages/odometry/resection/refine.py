@@ -154,10 +154,8 @@ def refine_stage(
     params: RefineParams, inputs: RefineInputs, *, lenses: Mapping[str, Any] | None = None
 ) -> Bundle[RefineFacts]:
     """Poses of a segment adjusted jointly with its landmarks."""
-    rig, T_local_key = (
-        Rig.from_dict(inputs.rig.meta["rig"]),
-        RigidTransform.from_matrix(inputs.level.meta["T_local_left"]),
-    )
+    rig = Rig.from_dict(inputs.rig.meta["rig"])
+    T_local_key = RigidTransform.from_matrix(inputs.level.meta["T_local_left"])
     # A frame that keeps too few landmarks keeps the pose of its resection.
     names = ("poses", "covariance", "shared", "landmarks", "inlier")
     out = {name: np.array(inputs.resection[name]) for name in names}
@@ -179,7 +177,7 @@ def refine_stage(
                 "pull": (part.pull / errors.excess).tolist(),
                 "turn_deg": turn_deg(end.state, T_local_key),
             }
-            meta["per_frame"] = _per_frame(out, end, inputs.track.meta["frames"])
+            meta["per_frame"] = _per_frame(end, params, inputs.track.meta["frames"])
     return Bundle(out, meta)
 
 
@@ -195,13 +193,11 @@ def _replace(out: Mapping[str, Any], end: SegmentStart, errors: PoseErrors, part
     out["inlier"][np.ix_(end.points, end.frames)] = end.tracks.seen.T
 
 
-def _per_frame(out: Mapping[str, Any], end: SegmentStart, numbers: list[int]) -> list[dict[str, Any]]:
+def _per_frame(end: SegmentStart, params: RefineParams, numbers: list[int]) -> list[dict[str, Any]]:
     """Number, inliers and RMS back-projection error [pixels] of each adjusted frame."""
-    rows, landmarks = [], out["landmarks"][end.points]
+    problem, rows = SegmentAdjustment(end.tracks, params), []
     for f, row in enumerate(end.frames):
-        seen = end.tracks.seen[f]
-        at = RigidTransform.from_matrix(out["poses"][row]).inverse().apply(landmarks[seen])
-        off = end.tracks.camera.project(at) - end.tracks.pixels[f][seen]
-        rms = float(np.sqrt((off**2).sum(1).mean()))
-        rows.append({"frame": int(numbers[row]), "inliers": int(seen.sum()), "rms_px": rms})
+        off = problem.errors(end.state, f).pixels[end.tracks.seen[f]]
+        rms = float(np.sqrt((off**2).mean()))
+        rows.append({"frame": int(numbers[row]), "inliers": len(off), "rms_px": rms})
     return rows

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import Array, Bundle, stage
-from rille.stages.core.errors import DegenerateError, InputError
+from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.odometry import ResectFacts, TrackFacts
 from rille.stages.facts.terrain import GroundFacts
@@ -62,18 +62,10 @@ class SegmentPoses:
         )
 
 
-def resect_segment(
-    points: SegmentPoints,
-    frames: Sequence[int],
-    params: ResectParams,
-    reckoned: Sequence[RigidTransform | None] | None = None,
-) -> SegmentPoses:
+def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectParams) -> SegmentPoses:
     """Poses of the frames of a segment, the key frame's given. A frame that cannot be posed is lost, the others go on.
 
-    Parameters
-    ----------
-    frames : frame numbers, for messages and seeds.
-    reckoned : T_key_left of each frame by dead reckoning, where there is one; competes as a start.
+    ``frames`` are the frame numbers, for messages and seeds.
     """
     out = SegmentPoses.unposed(*points.tracks.shape[:2])
     known = points.known()
@@ -90,18 +82,16 @@ def resect_segment(
         use = np.flatnonzero(known[:, j] & trusted)
         facts: dict[str, Any] = {"frame": frames[j], "landmarks": int(use.size), "inliers": 0, "rms_px": None}
         out.facts.append(facts)
-        predicted = None if reckoned is None else reckoned[j]
         try:
             # What is in doubt stays so: later frames see fewer of the landmarks that told the motions apart.
             if doubt:
                 raise doubt
-            starts = [last] if predicted is None else [last, key @ predicted]
-            posed = _resect_frame(points, j, use, starts, params, frames[j])
+            posed = _resect_frame(points, j, use, last, params, frames[j])
             others = moving_by_themselves(points, j, trusted, posed, params, frames[j])
             if others.size:
                 trusted[others] = False
                 use = np.flatnonzero(known[:, j] & trusted)
-                posed = _resect_frame(points, j, use, starts, params, frames[j])
+                posed = _resect_frame(points, j, use, last, params, frames[j])
         except DegenerateError as error:
             facts["lost"] = error.message.removeprefix(f"frame {frames[j]}: ")
             if isinstance(error, AmbiguousError) and not doubt:
@@ -124,11 +114,11 @@ def _resect_frame(
     points: SegmentPoints,
     j: int,
     use: NDArray[np.intp],
-    starts: Sequence[RigidTransform],
+    last: RigidTransform,
     params: ResectParams,
     frame: int,
 ) -> Resection:
-    """Pose of the frame in place ``j`` of a segment, by the points that are used."""
+    """Pose of the frame in place ``j`` of a segment behind pose ``last``, by the points that are used."""
     enough(
         use.size,
         f"frame {frame}: too few landmarks: {use.size} of {len(points.tracks)} tracked points have coordinates and were"
@@ -136,7 +126,7 @@ def _resect_frame(
         MORE_POINTS,
     )
     pixels = points.tracks[use, j].astype(np.float64)
-    return resect(points.landmarks.take(use), pixels, points.camera, starts, params, frame)
+    return resect(points.landmarks.take(use), pixels, points.camera, [last], params, frame)
 
 
 def knocked(points: SegmentPoints, segment: SegmentPoses, after: Bundle, rig: Rig) -> tuple[str, list[float]] | None:
@@ -189,36 +179,18 @@ class ResectInputs(NamedTuple):
         Array("disparity_sigma", ("point",), "float64", "px", "standard deviation of their disparity", "nan"),
     ],
 )
-def resect_stage(
-    params: ResectParams,
-    inputs: ResectInputs,
-    *,
-    prediction: Sequence[Sequence[float] | None] | None = None,
-    refused: str | None = None,
-) -> Bundle[ResectFacts]:
+def resect_stage(params: ResectParams, inputs: ResectInputs, *, refused: str | None = None) -> Bundle[ResectFacts]:
     """Poses of a segment's frames in the local frame of its basic pair."""
-    rig, T_local_key = (
-        Rig.from_dict(inputs.rig.meta["rig"]),
-        RigidTransform.from_matrix(inputs.level.meta["T_local_left"]),
-    )
+    rig = Rig.from_dict(inputs.rig.meta["rig"])
+    T_local_key = RigidTransform.from_matrix(inputs.level.meta["T_local_left"])
     frames, tracks = inputs.track.meta["frames"], np.asarray(inputs.track["points"])
-    landmarks = landmarks_of(
-        np.asarray(inputs.track["points"])[:, 0].astype(np.float64),
-        inputs.disparity,
-        rig,
-        T_local_key,
-        params.disparity_sigma,
-    )
-    reckoned = None
-    if prediction is not None:
-        reckoned = [None if T is None else RigidTransform.from_matrix(T) for T in prediction]
-        if len(reckoned) != len(frames):
-            raise InputError("RIL-423", f"{len(frames)} frames need {len(frames)} predicted poses, not {len(reckoned)}")
+    key_points = tracks[:, 0].astype(np.float64)
+    landmarks = landmarks_of(key_points, inputs.disparity, rig, T_local_key, params.disparity_sigma)
     if refused is not None:
         # Of a rig that was knocked: what it measures is worth no pose.
         tracks = np.where(np.arange(len(frames))[:, None] == 0, tracks, np.float32(np.nan))
     points = SegmentPoints(tracks, landmarks, rig.left, T_local_key)
-    segment = resect_segment(points, frames, params, reckoned)
+    segment = resect_segment(points, frames, params)
     for fact in segment.facts[1:] if refused is not None else ():
         fact["lost"] = refused
     meta: ResectFacts = {"per_frame": segment.facts}

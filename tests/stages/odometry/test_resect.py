@@ -18,7 +18,6 @@ from rille.stages.geometry.geometry import (
 )
 from rille.stages.geometry.projection import Pinhole, perturbed
 from rille.stages.numeric.least_squares import levenberg_marquardt
-from rille.stages.odometry.resection import robust_pose
 from rille.stages.odometry.resection.landmarks import Landmarks
 from rille.stages.odometry.resection.pnp import Observations, Pose, PoseAdjustment, back_projection
 from rille.stages.odometry.resection.resect import SegmentPoints, knocked, resect_segment
@@ -54,11 +53,11 @@ def observed(landmarks, per_pixel, sigma, pixels, pixel_sigma=0.2):
     return Observations(landmarks, per_pixel, sigma, pixels, Pinhole.of(CAMERA), pixel_sigma)
 
 
-def segment_poses(points, landmarks, key, frames, reckoned=None):
+def segment_poses(points, landmarks, key, frames):
     """Points of a segment, whose landmarks are exact, and its poses."""
     known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(len(landmarks)), {"too far": 3})
     given = SegmentPoints(points, known, CAMERA, key)
-    return given, resect_segment(given, frames, PARAMS, reckoned)
+    return given, resect_segment(given, frames, PARAMS)
 
 
 def test_projection_is_eq_4_with_t_the_translation_and_the_position_minus_rt_t():
@@ -366,7 +365,7 @@ def test_a_camera_that_has_turned_about_is_posed():
     assert not found.inlier[:16].any()
 
 
-def test_wrong_dead_reckoning_does_no_harm():
+def test_a_wrong_prediction_does_no_harm():
     rng = np.random.default_rng(15)
     truth = true_pose(rng)
     landmarks = scene(rng)
@@ -378,24 +377,6 @@ def test_wrong_dead_reckoning_does_no_harm():
     )
     np.testing.assert_allclose(misled.T_local_left.matrix34, plain.T_local_left.matrix34, atol=1e-9)
     np.testing.assert_array_equal(misled.inlier, plain.inlier)
-
-
-def test_a_segment_takes_predictions_relative_to_its_key_frame(monkeypatch):
-    """With nothing else to start from, frames are posed by their predictions alone."""
-    monkeypatch.setattr(robust_pose, "_sampled", lambda *given: [])
-    rng = np.random.default_rng(16)
-    key = RigidTransform(rotation_exp([0.2, 2.5, 0.1]), np.array([1.0, 2.0, 3.0]))
-    about = RigidTransform(rotation_exp([0.0, 2.9, 0.0]), np.array([0.1, 0.0, 0.2]))
-    near = RigidTransform(rotation_exp([0.0, 0.02, 0.0]), np.array([0.0, 0.0, 0.1]))
-    steps = [RigidTransform.identity(), near, about]
-    groups = [(key @ step).apply(scene(rng, 40)) for step in (near, about)]  # what each way of looking shows
-    landmarks = np.concatenate(groups)
-    points = np.full((80, 3, 2), np.nan, np.float32)
-    points[:, 0] = 100.0
-    points[:40, 1], points[40:, 2] = seen(key @ near, groups[0]), seen(key @ about, groups[1])
-    assert segment_poses(points, landmarks, key, [0, 1, 2])[1].facts[2]["lost"]
-    _, found = segment_poses(points, landmarks, key, [0, 1, 2], [None, near, about])
-    np.testing.assert_allclose(found.poses, [(key @ step).matrix34 for step in steps], atol=1e-5)
 
 
 def test_errors_smaller_than_stated_leave_what_residuals_do_not_show_to_the_shared_part():
