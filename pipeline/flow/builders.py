@@ -235,7 +235,7 @@ class Builder:
         at = [frames.index(pair) for pair in pairs]
         # Frames before and behind a pair whose right images may be of its time
         near = [f for k, f in enumerate(frames) if any(abs(k - place) <= 3 for place in at)]
-        images = {"left": [self.pyramid(f, "left") for f in pairs], "right": [self.pyramid(f, "right") for f in near]}
+        images = {"left": [self.features(f, "left") for f in pairs], "right": [self.features(f, "right") for f in near]}
         return self.node(synchrony_stage, label, **images, pairs=list(pairs), frames=near, rig=self.given_rig)
 
     @once

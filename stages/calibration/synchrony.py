@@ -10,17 +10,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.calibration import SynchronyFacts
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Rig
-from rille.stages.imaging.pyramid import Pyramid
+from rille.stages.imaging.features import PIXEL_CENTRE, match
 from rille.stages.numeric.robust import mad_sigma
-from rille.stages.odometry.features import features, matches
-
-MAX_FEATURES = 1500
-"""Most features of an image."""
 
 MAX_DISTANCE_SHARE = 0.1
 """Share of the right image's height that a match may depart from its line: what departs more is mismatched."""
@@ -35,13 +31,13 @@ MIN_SPREAD_PX = 1.0
 """Pixels of spread as named, below which no other image is looked for; matches within are on their lines."""
 
 
-def row_offsets(rig: Rig, left: tuple[Floats32, Floats32], right: tuple[Floats32, Floats32]) -> Floats | None:
+def row_offsets(rig: Rig, left: Bundle, right: Bundle) -> Floats | None:
     """Distances [px] of the matches from their epipolar lines, about their median; None of too few matches.
 
     The median is that of a camera that is turned a little, which no shift in time explains.
     """
-    rows = matches(left[1], right[1])
-    points = (side[0][rows[:, k]].astype(np.float64) for k, side in enumerate((left, right)))
+    rows = match(*(np.asarray(side["descriptors"], np.float32) for side in (left, right)))
+    points = (np.asarray(s["points"], np.float64)[rows[:, k]] - PIXEL_CENTRE for k, s in enumerate((left, right)))
     apart, _ = distances(rig, np.zeros(5), *points)
     # Before the spread is taken: far mismatches would hide what a shift does to the others.
     apart = apart[np.abs(apart) < MAX_DISTANCE_SHARE * rig.right.height]
@@ -85,10 +81,9 @@ def synchrony_stage(
     frames: Sequence[int],
     pairs: Sequence[int],
 ) -> Bundle[SynchronyFacts]:
-    """Which right image is of the time of a left one, where the rows contradict their names."""
-    ours, theirs = ([features(Pyramid.from_bundle(one), 0, MAX_FEATURES) for one in side] for side in (left, right))
+    """Which right image is of the time of a left one by their features, where the rows contradict their names."""
     offsets = {
-        pair: {f: row_offsets(rig, left, right) for f, right in zip(frames, theirs, strict=True)}
-        for pair, left in zip(pairs, ours, strict=True)
+        pair: {f: row_offsets(rig, ours, theirs) for f, theirs in zip(frames, right, strict=True)}
+        for pair, ours in zip(pairs, left, strict=True)
     }
     return Bundle({}, best_partners(offsets))

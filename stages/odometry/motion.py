@@ -3,9 +3,9 @@
 The hierarchical matcher of stage ``hfvm``, stopped at a coarse level. There is no epipolar band: a camera that moves
 forward has radial flow, whose epipolar lines meet inside the image, where a band says nothing about the way along it.
 
-Where the matches are too few, or show a rotation of the image, the homography that features show
-(:mod:`rille.stages.odometry.features`) is undone before matching again (:mod:`rille.stages.odometry.derotation`). The
-displacements are those of the frames as they were taken all the same.
+Where the matches are too few, or show a rotation of the image, the homography that keypoints show is undone before
+matching again (:mod:`rille.stages.hfvm.plane`): beyond ten degrees of roll upright windows match less and less, at 25
+degrees a third of the tracks is wrong. The displacements are those of the frames as they were taken all the same.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rille.stages.core.declare import AnyArray, Bundle, Params, raster, stage
 from rille.stages.core.validity import Mask, Validity, defined, mark, matched, matched_share
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts
-from rille.stages.hfvm import epipolar
+from rille.stages.hfvm import epipolar, plane
 from rille.stages.hfvm.image import view
 from rille.stages.hfvm.level import LevelSteps, Views, descend, fill_rows, median, propagate, search
 from rille.stages.hfvm.matcher import DEFAULT
@@ -29,9 +29,7 @@ from rille.stages.hfvm.native.problem import LevelPair
 from rille.stages.hfvm.native.solver import solver
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging.pyramid import Pyramid
-from rille.stages.odometry.derotation import Derotation
 from rille.stages.odometry.displacements import common_similarity
-from rille.stages.odometry.features import feature_homography
 
 
 class MotionParams(Params):
@@ -84,15 +82,13 @@ MIN_GAIN = 1.2
 """A homography is believed if it raises the share of matches by a fifth; chance matches do not."""
 
 
-def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation | None = None) -> Motion:
+def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: plane.Matrix | None = None) -> Motion:
     """Displacements from frame ``a`` to frame ``b``; of a shallower pyramid its top level.
 
     Parameters
     ----------
-    turn : a rotation between the frames, undone before matching.
+    turn : homography (3, 3) from level-0 pixels of a to those of b, undone before matching; None: not needed.
     """
-    if turn is not None:
-        b = turn.apply(b)
     level = min(params.level, a.levels - 1, b.levels - 1)
     a, b = a.above(level), b.above(level)
     hp = HfvmParams(
@@ -106,7 +102,11 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     )
     # At a coarse level no level is finest: all have the same rounds. At level 0 the matcher's own figures hold.
     rounds = (ROUNDS, ROUNDS) if level else DEFAULT.steps.rounds
-    views = Views(view(a, hp), view(b, hp), hp, LevelSteps((search, propagate, median), (), rounds))
+    left, right = view(a, hp), view(b, hp)
+    if turn is not None:
+        turn = np.linalg.inv(plane.finer(level)) @ turn @ plane.finer(level)
+        right = plane.aligned(right, turn, left)
+    views = Views(left, right, hp, LevelSteps((search, propagate, median), (), rounds))
     state, layers = descend(views, 0), (views.left.layers[0], views.right.layers[0])
     validity = np.zeros(state.left.u.shape, np.uint8)
     pair = LevelPair(layers[0].words, layers[1].words, epipolar.NO_BAND, 0.0)
@@ -123,16 +123,15 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     mark(validity, good, Validity.MATCHED)
     mark(validity, interpolated != 0, Validity.INTERPOLATED)
     u[~defined(validity)] = v[~defined(validity)] = np.nan
-    u, v = u * scale, v * scale
     if turn is not None:
-        u, v = turn.compose(u, v, level)
+        u, v = plane.compose(turn, u, v, a.shape)
         # Seen in the upright frame, but its place in b lies behind the camera.
         validity[np.isnan(u)] &= ~np.uint8(Validity.MATCHED | Validity.INTERPOLATED)
-    return Motion(level, u, v, validity)
+    return Motion(level, u * scale, v * scale, validity)
 
 
 def _turned(a: Pyramid, b: Pyramid, plain: Motion, params: MotionParams) -> Motion | None:
-    """Displacements after undoing the homography of features; None: that is not needed, or no better."""
+    """Displacements after undoing the homography of keypoints; None: that is not needed, or no better."""
     textured = int(np.count_nonzero((plain.validity & np.uint8(Validity.NO_TEXTURE)) == 0))
     if params.turn_below == 0 or textured < MIN_TEXTURED:
         return None
@@ -142,10 +141,10 @@ def _turned(a: Pyramid, b: Pyramid, plain: Motion, params: MotionParams) -> Moti
         if abs(_roll_deg(plain)) < MIN_ROLL_DEG:
             return None
         needed = 1.0
-    homography = feature_homography(a, b)
-    if homography is None:
+    turn = plane.find_turn(view(a, HfvmParams()), view(b, HfvmParams()))
+    if turn is None:
         return None
-    motion = coarse_motion(a, b, params, Derotation(homography, a.shape))
+    motion = coarse_motion(a, b, params, turn)
     return motion if matched_share(motion.validity) > needed * share else None
 
 

@@ -146,7 +146,7 @@ def relief(points: Floats, disparity: Bundle) -> Floats:
     side = 2 * TEMPLATE_HALF_PX + 1
     first = np.floor(np.where(known(points)[:, None], points, -1e6) + 0.5).astype(np.intp) - TEMPLATE_HALF_PX
     rows, cols = np.shape(disparity["validity"])
-    if min(rows, cols) < side:
+    if min(rows, cols) < side or not len(points):
         return np.full(len(points), np.nan)
     # No template leaves the image.
     inside = np.asarray((first >= 0).all(1) & (first <= [cols - side, rows - side]).all(1))

@@ -240,7 +240,7 @@ def test_a_pair_of_two_moments_is_no_basic_pair() -> None:
     assert list(products.disparity) == [0, 2, 5, 6]
     right = next(h for h in graph.nodes if h.stage == "synchrony").inputs["right"]
     assert isinstance(right, list)
-    assert [h.label for h in right] == [f"pyramid/right/{k}" for k in range(7)]
+    assert [h.label for h in right] == [f"features/right/{k}" for k in range(7)]
     assert list(products.world_dem) == [0, 2, 5, 6]
 
 

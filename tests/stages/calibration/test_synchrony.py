@@ -12,7 +12,7 @@ from rille.stages.calibration import synchrony
 from rille.stages.calibration.synchrony import best_partners
 from rille.stages.core.declare import Bundle, NoParams
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
-from rille.stages.imaging import pyramid
+from rille.stages.imaging.features import extract
 
 
 @pytest.mark.data
@@ -27,11 +27,11 @@ from rille.stages.imaging import pyramid
 def test_the_right_image_of_each_pair_is_found(data_dir, rights, partners, words):
     street = data_dir / "kitti06_51"
 
-    def pyramids(folder, frames):
+    def features(folder, frames):
         files = sorted((street / folder).iterdir())
         read = [cv2.imread(str(files[k]), cv2.IMREAD_REDUCED_GRAYSCALE_2) for k in frames]
         taken = [Bundle({"image": image, "valid": np.ones(image.shape, np.uint8)}, {}) for image in read]
-        return [pyramid.pyramid_stage.run(pyramid.PyramidParams(), {}, {"image": image}) for image in taken]
+        return [extract(one["image"], one["valid"]) for one in taken]
 
     rig = open_sequence(str(street)).rig
     half = [
@@ -39,7 +39,7 @@ def test_the_right_image_of_each_pair_is_found(data_dir, rights, partners, words
         for c in (rig.left, rig.right)
     ]
     args = {"pairs": [10, 11, 12], "frames": [9, 10, 11, 12, 13], "rig": Rig(*half, rig.T_right_left).to_dict()}
-    ports = {"left": pyramids("image_l", [10, 11, 12]), "right": pyramids("image_r", rights)}
+    ports = {"left": features("image_l", [10, 11, 12]), "right": features("image_r", rights)}
     facts = synchrony.synchrony_stage.run(NoParams(), args, ports).meta
     assert facts["partners"] == partners
     assert words in facts.get("contradiction", "")
@@ -50,10 +50,11 @@ def test_what_departs_too_far_is_told_by_the_right_images_own_height():
     left, right = (Camera(100.0 * s, 100.0 * s, 50.0 * s, 50.0 * s, 100 * s, 100 * s) for s in (1, 4))
     rig = Rig(left, right, RigidTransform(np.eye(3), np.array([-0.1, 0.0, 0.0])))
     rng = np.random.default_rng(0)
-    points, features = rng.uniform(10, 90, (200, 2)), np.eye(200, dtype=np.float32)
+    points, descriptors = rng.uniform(10, 90, (200, 2)), np.kron(np.eye(200), np.full(4, 255)).astype(np.uint8)
     # A twentieth of the right image's height is a fifth of the left one's.
     theirs = 4 * points + np.column_stack([np.full(200, -8.0), 20 + rng.normal(0, 1, 200)])
-    apart = synchrony.row_offsets(rig, (points, features), (theirs, features))
+    sides = (Bundle({"points": one + 0.5, "descriptors": descriptors}, {}) for one in (points, theirs))
+    apart = synchrony.row_offsets(rig, *sides)
     assert len(apart) == 200
     assert np.std(apart) == pytest.approx(1.0, abs=0.2)
 
