@@ -227,7 +227,7 @@ class Builder:
 
     def sides(self, frame: int) -> Handle[SwapFacts]:
         """Whether the images of a pair are exchanged."""
-        images = {camera: self.pyramid(frame, camera) for camera in ("left", "right")}
+        images = {camera: self.features(frame, camera) for camera in CAMERAS}
         return self.node(swap_check_stage, f"swap_check/{frame}", **images, frame=frame, rig=self.given_rig)
 
     def synchrony(self, label: str, pairs: Series[int], frames: Series[int]) -> Handle[SynchronyFacts]:

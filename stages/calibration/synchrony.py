@@ -15,7 +15,7 @@ from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.calibration import SynchronyFacts
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Rig
-from rille.stages.imaging.features import PIXEL_CENTRE, match
+from rille.stages.imaging.features import matched_points
 from rille.stages.numeric.robust import mad_sigma
 
 MAX_DISTANCE_SHARE = 0.1
@@ -36,9 +36,7 @@ def row_offsets(rig: Rig, left: Bundle, right: Bundle) -> Floats | None:
 
     The median is that of a camera that is turned a little, which no shift in time explains.
     """
-    rows = match(*(np.asarray(side["descriptors"], np.float32) for side in (left, right)))
-    points = (np.asarray(s["points"], np.float64)[rows[:, k]] - PIXEL_CENTRE for k, s in enumerate((left, right)))
-    apart, _ = distances(rig, np.zeros(5), *points)
+    apart, _ = distances(rig, np.zeros(5), *matched_points(left, right))
     # Before the spread is taken: far mismatches would hide what a shift does to the others.
     apart = apart[np.abs(apart) < MAX_DISTANCE_SHARE * rig.right.height]
     return np.asarray(apart - np.median(apart)) if len(apart) >= MIN_MATCHES else None

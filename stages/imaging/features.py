@@ -108,6 +108,14 @@ def match(a: Floats32, b: Floats32) -> NDArray[np.uint32]:
     return np.stack([rows, forward[rows]], axis=1).astype(np.uint32)
 
 
+def matched_points(a: Bundle, b: Bundle) -> tuple[Floats, Floats]:
+    """Points (m, 2), (m, 2) column, row of features that match, of results of stage ``features``; the centre of the
+    first pixel is at (0, 0)."""
+    pairs = match(*(np.asarray(one["descriptors"], np.float32) for one in (a, b)))
+    first, second = (np.asarray(s["points"], np.float64)[pairs[:, k]] - PIXEL_CENTRE for k, s in enumerate((a, b)))
+    return first, second
+
+
 def _nearest(products: Floats32) -> NDArray[np.intp]:
     """Column of the nearest descriptor of each row, -1 where there is no clear one; spoils ``products``."""
     rows = np.arange(len(products))

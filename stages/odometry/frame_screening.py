@@ -42,7 +42,7 @@ QUIET = 0.25
 
 SIMULTANEOUS_SHARE = 0.6
 """Share of its matches that fit the rig, of the best share of any frame that was tested, below which left and right of
-a frame are not of one time: on a street .24 to .40 of the matches fit then, of simultaneous images .96 to .99."""
+a frame are not of one time: on a street .30 to .51 of the matches fit then, of simultaneous images .97 to .99."""
 
 
 class FrameScreeningParams(Params):

@@ -5,10 +5,10 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from rille.stages.calibration import swap_check
-from rille.stages.core.declare import Bundle, NoParams
+from rille.stages.core.declare import NoParams
 from rille.stages.geometry.epipolar import fits
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
-from rille.stages.imaging import pyramid
+from rille.stages.imaging.features import extract
 
 CAMERA = Camera(400.0, 400.0, 319.5, 239.5, 640, 480)
 
@@ -52,11 +52,7 @@ def test_exchanged_images_are_told_at_any_scale_of_the_right_camera(scale, swap)
     images = [seen(left, RigidTransform.identity(), texture), seen(right, T, texture)]
     # Sharper than its pixels would alias.
     images = [gaussian_filter(image, max(0.0, k)) for image, k in zip(images, (0.7, 0.7 * scale), strict=True)]
-    inputs = {}
-    for side, image in zip(("left", "right"), images[::-1] if swap else images, strict=True):
-        built = pyramid.build(np.clip(image, 0, 255), pyramid.PyramidParams())
-        arrays = {f"level_{n}": level for n, level in enumerate(built.images)}
-        arrays |= {f"valid_{n}": mask for n, mask in enumerate(built.valid)}
-        inputs[side] = Bundle(arrays, {"levels": built.levels, "noise": built.noise})
+    sides = images[::-1] if swap else images
+    inputs = {side: extract(image, np.ones(image.shape)) for side, image in zip(("left", "right"), sides, strict=True)}
     found = swap_check.swap_check_stage.run(NoParams(), {"frame": 0, "rig": Rig(left, right, T).to_dict()}, inputs).meta
     assert found["swapped"] == swap, found
