@@ -70,7 +70,8 @@ def orient(rig: Rig, matches: PointPairs) -> tuple[Floats, OrientationFacts]:
     if count < MIN_MATCHES:
         facts["words"] = f"not checked: {count} matches are fewer than {MIN_MATCHES}"
         return np.zeros(count), facts
-    fit = settle(rig, [matches], np.arange(RIG) < ANGLES, RelativeParams().priors(rig))
+    turns = [k < ANGLES for k in range(RIG)]
+    fit = settle(rig, [matches], turns, RelativeParams.model_validate({}).priors(rig))
     before, after = (
         distances(one, np.zeros(RIG), matches.left, matches.right)[0] for one in (rig, corrected(rig, fit.x[:RIG]))
     )

@@ -1,4 +1,5 @@
-"""Coarse displacements between two frames: what they are at given points, and the affinities that they show."""
+"""Coarse displacements between two frames, what they are at given points, and the affinities that they show; windows of
+images about points."""
 
 from __future__ import annotations
 
@@ -7,9 +8,11 @@ from typing import Any
 
 import numpy as np
 import scipy
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
+from rille.stages.core.declare import AnyArray
 from rille.stages.numeric.least_squares import irls
 
 NEIGHBOURS = 12
@@ -21,6 +24,20 @@ PULL = 5.0
 def known(points: Floats) -> Bools:
     """Which points (n, k) are not NaN."""
     return np.asarray(np.isfinite(points).all(axis=1))
+
+
+def windows_at(points: Floats, half: int, *images: AnyArray) -> tuple[Bools, list[AnyArray]]:
+    """Which points (n, 2) column, row have a window inside the images (rows, cols), and each image's windows.
+
+    These are (n, side, side) of ``2 half + 1`` pixels about the nearest pixel, and anything for points without.
+    """
+    side, shape = 2 * half + 1, images[0].shape
+    if min(shape) < side:
+        return np.zeros(len(points), bool), [np.zeros((len(points), side, side), image.dtype) for image in images]
+    first = np.floor(np.where(np.isfinite(points), points, -1e6) + 0.5).astype(np.intp) - half
+    inside = np.asarray((first >= 0).all(1) & (first <= [shape[1] - side, shape[0] - side]).all(1))
+    x, y = np.where(inside[:, None], first, 0).T
+    return inside, [sliding_window_view(image, (side, side))[y, x] for image in images]
 
 
 def known_median(values: NDArray[Any], known: NDArray[Any]) -> NDArray[Any]:

@@ -14,10 +14,10 @@ import math
 
 import cv2
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
+from rille.stages.odometry.displacements import windows_at
 
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 HALF = 2
@@ -106,10 +106,5 @@ def _peaks(response: Floats32, least: float) -> tuple[NDArray[np.intp], NDArray[
 
 def clear_of_mask(valid: Bytes, points: Floats, border: int) -> Bools:
     """Whether points (n, 2) are at least ``border`` pixels away from the image's edge and from anything unusable."""
-    side, (rows, cols) = 2 * border + 1, valid.shape
-    if min(rows, cols) < side:
-        return np.zeros(len(points), bool)
-    first = np.floor(np.where(np.isfinite(points), points, -1.0) + 0.5).astype(np.intp) - border
-    inside = np.asarray((first >= 0).all(1) & (first <= [cols - side, rows - side]).all(1))
-    x, y = np.where(inside[:, None], first, 0).T
-    return np.asarray(inside & (sliding_window_view(valid, (side, side))[y, x] != 0).all((1, 2)))
+    inside, (around,) = windows_at(points, border, valid)
+    return np.asarray(inside & (around != 0).all((1, 2)))

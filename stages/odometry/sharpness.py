@@ -11,6 +11,7 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.odometry.affine_lk import SIDE
+from rille.stages.odometry.displacements import windows_at
 
 NOTABLE = 0.6
 """Share of squared gradients from which on images count as equally sharp: a blur of half a pixel leaves .7."""
@@ -49,10 +50,6 @@ def _blurred(image: Floats32, points: Floats, wanted: float) -> Floats32:
 
 def _gradients(image: Floats32, points: Floats) -> float:
     """Mean squared gradient of the templates around the points: median over those inside; 0 where none is."""
-    x, y = np.rint(points).astype(np.intp).T
-    rows, cols = image.shape
-    inside = (x >= 0) & (x < cols) & (y >= 0) & (y < rows)
-    if not inside.any():
-        return 0.0
     squares = sum(cv2.Scharr(image, cv2.CV_32F, dx, 1 - dx) ** 2 for dx in (0, 1))
-    return float(np.median(cv2.blur(squares, (SIDE, SIDE))[y[inside], x[inside]]))
+    inside, (mean,) = windows_at(points, 0, cv2.blur(squares, (SIDE, SIDE)))
+    return float(np.median(mean[inside])) if inside.any() else 0.0

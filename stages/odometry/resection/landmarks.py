@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
@@ -21,7 +20,7 @@ from rille.stages.core.validity import matched as is_matched
 from rille.stages.geometry.epipolar import NAMES, distances, inverse_depth
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.numeric.least_squares import irls
-from rille.stages.odometry.displacements import known
+from rille.stages.odometry.displacements import windows_at
 
 MAX_DISPARITY_STEP_PX = 1.0
 """Pixels: neighbours whose disparities differ by more lie on two surfaces; also the bound of back-matching (4.3.3)."""
@@ -143,18 +142,11 @@ def relief(points: Floats, disparity: Bundle) -> Floats:
     :data:`MAX_DISPARITY_STEP_PX`, since then there are two surfaces, or where less than half of the template is
     matched.
     """
-    side = 2 * TEMPLATE_HALF_PX + 1
-    first = np.floor(np.where(known(points)[:, None], points, -1e6) + 0.5).astype(np.intp) - TEMPLATE_HALF_PX
-    rows, cols = np.shape(disparity["validity"])
-    if min(rows, cols) < side or not len(points):
-        return np.full(len(points), np.nan)
-    # No template leaves the image.
-    inside = np.asarray((first >= 0).all(1) & (first <= [cols - side, rows - side]).all(1))
-    x, y = np.where(inside[:, None], first, 0).T
-    column, row, valid = (
-        sliding_window_view(np.asarray(disparity[name]), (side, side))[y, x].reshape(-1, side**2)
-        for name in ("column_disparity", "row_disparity", "validity")
-    )
+    if not len(points):
+        return np.zeros(0)
+    names = "column_disparity", "row_disparity", "validity"
+    inside, windows = windows_at(points, TEMPLATE_HALF_PX, *(np.asarray(disparity[name]) for name in names))
+    column, row, valid = (window.reshape(len(points), -1) for window in windows)
     values = np.stack([column, row], -1).astype(np.float64)
     use = inside[:, None] & is_matched(valid) & np.isfinite(values).all(-1)
     values[~use] = 0.0
@@ -164,7 +156,7 @@ def relief(points: Floats, disparity: Bundle) -> Floats:
     # In units of the template, so that all sums are of the same size.
     design = np.stack([np.ones(dx.size), dx / TEMPLATE_HALF_PX, dy / TEMPLATE_HALF_PX], -1)
     # Matched pixels on a line leave the slope across open: it is 0 then.
-    plane = irls(design[None], values, lambda _: use, 1e-9 * np.eye(3), rounds=1)
+    plane = irls(design[None], values, lambda _: use.astype(np.float64), 1e-9 * np.eye(3), rounds=1)
     rest = np.where(use[..., None], values - design @ plane, 0.0)
     rms = np.sqrt((rest**2).sum((1, 2)) / np.maximum(use.sum(1), 1))
     return np.where((2 * use.sum(1) > dx.size) & (rms <= MAX_DISPARITY_STEP_PX), rms, np.nan)

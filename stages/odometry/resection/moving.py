@@ -75,14 +75,14 @@ def _coarse(disparity: Bundle, shape: tuple[int, int]) -> Floats:
     good = matched(np.asarray(disparity["validity"]))
     maps = [np.where(good, np.asarray(disparity[n]), np.nan) for n in ("column_disparity", "row_disparity")]
     coarse = cv2.resize(np.stack(maps, -1), shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-    return coarse.reshape(-1, 2).astype(np.float64)
+    return np.asarray(coarse, np.float64).reshape(-1, 2)
 
 
 def _at(shift: Floats, places: Floats) -> Floats:
     """Displacements (n, 2) of the nearest pixels to the places (n, 2) of all pixels, column, row; NaN outside."""
     x, y = np.nan_to_num(places, nan=-9.0).astype(np.float32).T.reshape(2, *shift.shape[:2])
-    outside = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (np.nan, np.nan)}
-    return np.asarray(cv2.remap(shift, x, y, cv2.INTER_NEAREST, **outside), np.float64).reshape(-1, 2)
+    found = cv2.remap(shift, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan, np.nan))
+    return np.asarray(found, np.float64).reshape(-1, 2)
 
 
 def moving(off: Floats) -> Bools:
