@@ -161,7 +161,6 @@ class _Chooser:
     def __init__(self, rig: Rig, pairs: Sequence[PointPairs], params: RelativeParams) -> None:
         self.rig, self.pairs, self.params, self.priors = rig, pairs, params, params.priors(rig)
         self.all = adjust(rig, pairs, [True] * RIG, self.priors, rival=True)
-        self.solved: dict[tuple[frozenset[int], bool], tuple[Floats, Floats, float]] = {}
         # Sensitivities at the rig that the images ask for: a wrong toe-in would state them for wrong depths.
         near = corrected(rig, self.all.x[:RIG])
         self.depth = np.mean([depth_sensitivity(near, m.left, m.right) for m in pairs], axis=0)
@@ -209,10 +208,7 @@ class _Chooser:
             chosen.append(max(able, key=lambda i: self._gain(i, chosen)))
 
     def _solve(self, chosen: Sequence[int], *, rival: bool) -> tuple[Floats, Floats, float]:
-        key = frozenset(chosen), rival
-        if key not in self.solved:
-            self.solved[key] = solution(self.all, [i in chosen for i in range(RIG)], self.priors, rival=rival)
-        return self.solved[key]
+        return solution(self.all, [i in chosen for i in range(RIG)], self.priors, rival=rival)
 
     def _gain(self, i: int, chosen: list[int]) -> float:
         return self._solve([*chosen, i], rival=False)[2]

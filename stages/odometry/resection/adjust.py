@@ -25,7 +25,7 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
 from rille.stages.facts.odometry import FactorsFacts, IntrinsicsFacts, RefineFacts, ResectFacts, TrajectoryFacts
-from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.geometry import RigidTransform, rotation_log
 from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, bound_of, root_of
 from rille.stages.odometry.resection.priors import Sensors
 from rille.stages.odometry.resection.sensors import moved
@@ -133,7 +133,7 @@ def join(poses: Floats, piece: NDArray[np.int16], factors: Factors, sure: Bools)
             here = factors.take(rows)
             graph = PoseGraph(here, len(poses), 0, np.ones(len(rows)))
             laid = [_moved(poses, piece == other, ends, pose) for ends, pose in zip(here.ends, here.poses, strict=True)]
-            states = (GraphState.of(moved, here.shared.shape[2]) for moved in laid)
+            states = (GraphState.of(one, here.shared.shape[2]) for one in laid)
             squares = np.array([(graph.errors(state) ** 2).sum(1) for state in states])
             joins = sure[rows] | ((squares <= EXCESS[-1] ** 2 * here.bound).sum(1) > 1)
             if joins.any():
@@ -154,7 +154,7 @@ def _left_out(one: Mapping[str, Any], adjusted: Floats) -> str:
     """Line on a factor that contradicts: by how much it departs from the adjusted poses (2, 3, 4) of its ends."""
     a, b = (RigidTransform.from_matrix(T) for T in adjusted)
     off = RigidTransform.from_matrix(one["pose"]).inverse() @ a.inverse() @ b
-    turn = math.degrees(math.acos(min(1.0, max(-1.0, 0.5 * (np.trace(off.rotation) - 1.0)))))
+    turn = math.degrees(np.linalg.norm(rotation_log(off.rotation)))
     return (
         f"the motion from frame {one['from']} to frame {one['to']} ({one.get('source', 'stated')}) contradicts the "
         f"others by {np.linalg.norm(off.translation):.2g} m and {turn:.2g} degrees: it is left out"
