@@ -179,11 +179,7 @@ class Chain:
         ]
 
     def _motion(self, a: int, b: int) -> Bundle:
-        s, args = self.sequence, dict[str, Any]()
-        before, after = (None if s.attitude is None else s.attitude[f] for f in (a, b))
-        if before is not None and after is not None:
-            args |= {"rotation": (np.array(after).T @ np.array(before)).tolist(), "camera": s.rig.left.to_dict()}
-        return self._stage("motion", args, a=self._pyramid(a, "left"), b=self._pyramid(b, "left"))
+        return self._stage("motion", {}, a=self._pyramid(a, "left"), b=self._pyramid(b, "left"))
 
     def _match(self, pair: int) -> Bundle:
         left, right = (self._pyramid(pair, c) for c in ("left", "right"))
