@@ -156,7 +156,7 @@ class Chain:
                 self.motion[a, b] = self._motion(a, b)
                 bridges.append((a, b))
             for f in asks["sides"]:
-                pair = {c: self._pyramid(f, c) for c in ("left", "right")}
+                pair = {c: self._stage("features", {}, image=self._image(f, c)) for c in ("left", "right")}
                 sides[f] = self._stage("swap_check", {"frame": f, "rig": self.sequence.rig.to_dict()}, **pair)
 
     def _steps(self, frames: list[int]) -> list[Bundle]:
