@@ -73,18 +73,12 @@ class KeyframesParams(Params):
 
     @model_validator(mode="before")
     @classmethod
-    def _stride_alone(cls, values: Any) -> Any:
-        """A stride that is set without a rule selects rule stride."""
-        if isinstance(values, Mapping) and "stride" in values and "rule" not in values:
-            return {"rule": "stride", **values}
-        return values
-
-    @model_validator(mode="before")
-    @classmethod
-    def _navigation(cls, values: Any) -> Any:
-        """What preset navigation sets. The validator written last runs first, so a mere stride changes nothing."""
+    def _rule(cls, values: Any) -> Any:
+        """Preset navigation sets its rule, to which a mere stride changes nothing; else a mere stride sets its own."""
         if isinstance(values, Mapping) and values.get("preset") == "navigation":
             return {**NAVIGATION, **values}
+        if isinstance(values, Mapping) and "stride" in values:
+            return {"rule": "stride", **values}
         return values
 
 

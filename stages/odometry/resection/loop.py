@@ -10,6 +10,7 @@ matches in agreement, or at another scale.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -161,15 +162,13 @@ def loop_stage(
     pairs: list[int],
 ) -> Bundle[LoopFacts]:
     """Motions from earlier basic pairs to one that sees their places again."""
-    views, usual = dict[int, Features](), ResectParams.model_validate({})
+    usual = ResectParams.model_validate({})
 
+    @cache
     def view(k: int) -> Features:
-        if k not in views:
-            rig, points = Rig.from_dict(rigs[k].meta["rig"]), np.asarray(features[k]["points"], np.float64)
-            points = points - PIXEL_CENTRE
-            known = landmarks_of(points, disparities[k], rig, HERE, usual.disparity_sigma)
-            views[k] = Features(points, np.asarray(features[k]["descriptors"], np.float32), known, rig.left)
-        return views[k]
+        rig, points = Rig.from_dict(rigs[k].meta["rig"]), np.asarray(features[k]["points"], np.float64) - PIXEL_CENTRE
+        known = landmarks_of(points, disparities[k], rig, HERE, usual.disparity_sigma)
+        return Features(points, np.asarray(features[k]["descriptors"], np.float32), known, rig.left)
 
     factors, refused = list[dict[str, Any]](), list[dict[str, Any]]()
     for k, pair in enumerate(pairs[1:], start=1):
