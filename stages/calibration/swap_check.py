@@ -15,8 +15,9 @@ from rille.stages.imaging.features import matched_points
 
 LEAST = 50
 """Matches, below which nothing is said."""
-TOLERANCE_PX = 3.0
-"""Distance from its line up to which a match fits: a rig that was knocked a little is no exchanged one."""
+TOLERANCE_PX = 2.0
+"""Distance from its line up to which a match fits. Of two images of a street that are one frame apart .22 to .32 of the
+matches fit so, of simultaneous ones .95 to .98; on a desert up to .08, and .99."""
 
 
 @stage("swap_check")

@@ -42,7 +42,7 @@ QUIET = 0.25
 
 SIMULTANEOUS_SHARE = 0.6
 """Share of its matches that fit the rig, of the best share of any frame that was tested, below which left and right of
-a frame are not of one time: on a street .30 to .51 of the matches fit then, of simultaneous images .97 to .99."""
+a frame are not of one time. A best share below it is that of a wrong rig, and tells nothing of the times."""
 
 
 class FrameScreeningParams(Params):
@@ -110,7 +110,7 @@ def judge(
     for f in frames:
         if f in sides and sides[f]["swapped"]:
             out.lost.setdefault(f, _swapped(sides[f]))
-        elif f in sides and sides[f].get("as_given", best) < SIMULTANEOUS_SHARE * best:
+        elif best > SIMULTANEOUS_SHARE and f in sides and sides[f].get("as_given", best) < SIMULTANEOUS_SHARE * best:
             out.lost.setdefault(f, _of_two_times(sides[f]["as_given"], best))
     doubted = set(jumps) | _neighbours(frames, {f for f in out.lost if f in sides})
     out.asks["sides"] = [f for f in frames if f in doubted and f not in sides and f not in out.lost]
