@@ -41,7 +41,7 @@ def translated(error: BaseException) -> RilleError | None:
 
 def _remedy(number: int) -> str:
     if number in FULL:
-        return "free space, clear the cache, or choose other folders with --runs and --cache"
+        return "free space, clear the cache, or choose another place with --output, --runs or --cache"
     if number in CLOSED:
-        return "choose folders that may be written with --runs and --cache"
+        return "choose a place that may be written with --output, --runs or --cache"
     return "check the path; the same command resumes from here"

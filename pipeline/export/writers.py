@@ -249,13 +249,9 @@ def write_confidence(
 
 def _write_image(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning) -> None:
     """Write arrays (row, col) on image pixels as bands of a float32 TIFF, NaN undefined."""
-    from rasterio.errors import NotGeoreferencedWarning
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)  # an image has no place on the ground
-        # 3 is TIFF's predictor of floats; GTiff does not choose by itself, as COG does.
-        profile = {"driver": "GTiff", "predictor": 3}
-        write_bands(path, {n: np.asarray(v, np.float32) for n, v in bands.items()}, meaning, profile)
+    # 3 is TIFF's predictor of floats; GTiff does not choose by itself, as COG does.
+    profile = {"driver": "GTiff", "predictor": 3}
+    write_bands(path, {n: np.asarray(v, np.float32) for n, v in bands.items()}, meaning, profile)
 
 
 def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -154,8 +154,8 @@ def test_a_fault_of_the_program_is_not_told_as_one_of_the_run(run: Path, capsys:
     def broken(*_: Any) -> Any:
         raise ValueError("own")
 
-    monkeypatch.setattr("rille.pipeline.export.programs.mesh.export", broken)
-    assert told(capsys, "export", "seq/2", "--to", "glb") == (1, ["RIL-999"])
+    monkeypatch.setattr("rille.pipeline.api.Run.file", broken)
+    assert told(capsys, "view", "seq/2") == (1, ["RIL-999"])
 
 
 @pytest.mark.parametrize("kind", ["colmap", "nav2"])

@@ -12,7 +12,7 @@ from raising import raises
 
 import rille
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.export.programs.cloud import Thinning, export
+from rille.pipeline.export.programs.cloud import write_run
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.stages.core.validity import matched
 
@@ -68,7 +68,7 @@ def test_points_and_terrain_of_another_programs_map(tmp_path: Path, data_dir: Pa
     sigma = np.asarray(found["disparity_std"])[ok & known]
     assert (error[ok & known] < sigma).mean() == pytest.approx(0.68, abs=0.1)
     assert found.meta["match_rate"] == pytest.approx(ok.mean())
-    assert int(export(artifacts, tmp_path / "points.ply", Thinning()).split()[0]) > 0.99 * ok.sum()
+    assert int(write_run(tmp_path / "points.ply", artifacts).split()[0]) > 0.99 * ok.sum()
     assert np.isfinite(run.terrain.elevation).sum() > 1000
 
 

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE, FLAG, RUNS, Output, Runs
 from rille.pipeline.commands.results.registration import register
-from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
@@ -89,11 +88,10 @@ def compare_dem(
         print("\n".join(_change_table(figures["changes"])))
     # Either ending is understood as the name of both files.
     target = output.with_name(output.name.removesuffix(".tif").removesuffix(".json"))
-    with reported("RIL-614", f"{target} cannot be written", remedy="name others with -o", kind=InputError):
-        atomic.write(target.with_name(target.name + ".json"), json.dumps(figures, indent=1, allow_nan=False) + "\n")
-        profile = {"driver": "COG", "crs": coarse.crs or None, "transform": coarse.transform}
-        meaning = Meaning("m", tags={"error": figures["error"]})
-        write_bands(target.with_name(target.name + ".tif"), rasters, meaning, profile)
+    atomic.write(target.with_name(target.name + ".json"), json.dumps(figures, indent=1, allow_nan=False) + "\n")
+    profile = {"driver": "COG", "crs": coarse.crs or None, "transform": coarse.transform}
+    meaning = Meaning("m", tags={"error": figures["error"]})
+    write_bands(target.with_name(target.name + ".tif"), rasters, meaning, profile)
     print(f"{target}.tif  {target}.json")
     return COMPLETE
 

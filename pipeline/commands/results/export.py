@@ -10,8 +10,12 @@ from cyclopts.validators import Number
 
 from rille.pipeline.commands.options import COMPLETE, RUNS, CacheFolder, Output, Run, Runs, cache_folder, check_output
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.export.programs.run_artifacts import export_run
 from rille.pipeline.runs import lookup
 from rille.stages.core.errors import ConfigError
+
+FILES = {"laz": "cloud.laz", "ply": "cloud.ply", "glb": "terrain.glb"}
+"""Name of the file of a form, in the run's folder; any other form is a folder of the form's name."""
 
 Form = Literal["laz", "ply", "glb", "frames", "colmap", "nav2", "rocrate"]
 
@@ -47,26 +51,12 @@ def export(
     if output is not None and len(to) > 1:
         text = f"--output names one place for {len(to)} forms"
         raise ConfigError("RIL-020", text, remedy="give one --to, or leave --output out")
-    folder = lookup.find(run, runs)
+    folder, store = lookup.find(run, runs), Store(cache_folder(cache))
     for form in to:
-        if output is not None and form in ("laz", "ply", "glb"):
+        if output is not None and form in FILES:
             check_output(output, f".{form}")
-        if form == "glb":
-            from rille.pipeline.export.programs import mesh
-
-            path, words = mesh.export(folder, output)
-            print(f"{path}  {words}")
-        elif form in ("laz", "ply"):
-            from rille.pipeline.export.programs import cloud
-            from rille.pipeline.export.programs.run_artifacts import RunArtifacts
-
-            path = output or folder / f"cloud.{form}"
-            with lookup.reading(folder):
-                artifacts = RunArtifacts(folder, Store(cache_folder(cache)))
-                print(f"{path}  {cloud.export(artifacts, path, cloud.Thinning(every, voxel))}")
-        else:
-            from rille.pipeline.export.programs.run_artifacts import export_run
-
-            with lookup.reading(folder):
-                print(export_run(form, folder, output or folder / form, Store(cache_folder(cache))))
+        path = output or folder / FILES.get(form, form)
+        thinning = {"every": every, "voxel": voxel} if form in ("laz", "ply") else {}
+        with lookup.reading(folder):
+            print(f"{path}  {export_run(form, folder, path, store, **thinning)}")
     return COMPLETE

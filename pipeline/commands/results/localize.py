@@ -19,7 +19,6 @@ from rille.datasets.georeference import Georeference
 from rille.pipeline import api
 from rille.pipeline.commands.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder
 from rille.pipeline.commands.results.run_terrain import Terrain
-from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
@@ -153,11 +152,10 @@ def localize(
         why = f"{error.code}: {error}"
     target, written = output.with_name(output.name.removesuffix(".json")), [".json"]
     facts = {"run": terrain.name, "dem": dem and str(dem), "ortho": ortho and str(ortho), "crs": crs}
-    with reported("RIL-845", f"{target} cannot be written", remedy="name others with -o", kind=InputError):
-        text = json.dumps({**facts, "ambiguous": bool(why), "why": why, **_facts(found)}, indent=1, allow_nan=False)
-        atomic.write(target.with_name(target.name + ".json"), text + "\n")
-        if found is not None and not why:
-            written += _export(folder, found, target, crs, Store(cache_folder(cache)))
+    text = json.dumps({**facts, "ambiguous": bool(why), "why": why, **_facts(found)}, indent=1, allow_nan=False)
+    atomic.write(target.with_name(target.name + ".json"), text + "\n")
+    if found is not None and not why:
+        written += _export(folder, found, target, crs, Store(cache_folder(cache)))
     print("\n".join([f"ambiguous    {why}", *(found.about if found else ())] if why else _lines(found, crs)))
     print("wrote        " + "  ".join(f"{target}{ending}" for ending in written))
     return HOLES if why else COMPLETE

@@ -16,7 +16,6 @@ from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE, RUNS, Output, Run, Runs
 from rille.pipeline.commands.results.registration import register
 from rille.pipeline.commands.results.run_terrain import Terrain
-from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import refuse_unlike_systems
@@ -84,16 +83,14 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
     layers += [_laid(number, first, one) for number, one in enumerate(sessions, start=1)]
     merged = merge_layers(layers, lattice, MergeParams.model_validate({}))
     height = merged.elevation if first.place is None else merged.elevation + first.place.origin[2]
-    with reported("RIL-850", f"{output} cannot be written", remedy="name another folder with -o", kind=InputError):
-        output.mkdir(parents=True, exist_ok=True)
-        for name, band, values, unit in (
-            ("dem.tif", "elevation", height, "m"),
-            ("dem_sigma.tif", "elevation_std", merged.elevation_std, "m"),
-            ("ortho.tif", "ortho", merged.ortho, ""),
-        ):
-            write_raster(output / name, {band: np.asarray(values, np.float32)}, lattice, Meaning(unit), first.place)
-        facts = {"frame_of": first.name, "runs": [dict(one.facts) for one in sessions]}
-        atomic.write(output / "merge.json", json.dumps(facts, indent=1) + "\n")
+    for name, band, values, unit in (
+        ("dem.tif", "elevation", height, "m"),
+        ("dem_sigma.tif", "elevation_std", merged.elevation_std, "m"),
+        ("ortho.tif", "ortho", merged.ortho, ""),
+    ):
+        write_raster(output / name, {band: np.asarray(values, np.float32)}, lattice, Meaning(unit), first.place)
+    facts = {"frame_of": first.name, "runs": [dict(one.facts) for one in sessions]}
+    atomic.write(output / "merge.json", json.dumps(facts, indent=1) + "\n")
     for one in sessions:
         print(_line(one))
     known = np.isfinite(merged.elevation)

@@ -19,7 +19,6 @@ import tomli_w
 from rille.datasets.text.reading import read_toml
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE, RUNS, CacheFolder, Output, Runs, cache_folder, check_output
-from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
@@ -87,8 +86,7 @@ def rig(
         raise InputError("RIL-028", text, remedy="give runs of sequences with one calibration, and images of one size")
     params = RigParams.model_validate(read_toml(folders[0] / "config.toml", "configuration").get("rig", {}))
     found = joint(Rig.from_dict(next(iter(given.values()))), matches, params)
-    with reported("RIL-029", f"cannot write {output}", remedy="choose another --output"):
-        output.write_text(_toml(found), encoding="utf-8")
+    output.write_text(_toml(found), encoding="utf-8")
     print("\n".join(_table(found)))
     for line in disagreements(found, params.significance):
         warn(line)

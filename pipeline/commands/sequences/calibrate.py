@@ -21,7 +21,6 @@ from rille.datasets.images import chessboard, pairing
 from rille.datasets.images.files import SUFFIXES, read_grey
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE, FLAG, Output, check_output
-from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import warn
 from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig
 from rille.stages.core.errors import InputError, told
@@ -88,8 +87,7 @@ def calibrate(
     points = chessboard.board_points(boards.corners, board.square)
     rig = calibrate_rig(points, boards.views, boards.sizes, model, keep_bad=keep_bad)
     _refuse_clutter(rig, boards)
-    with reported("RIL-012", f"cannot write {output}", remedy="choose another --output"):
-        output.write_text(_yaml(rig, boards, board.square), encoding="utf-8")
+    output.write_text(_yaml(rig, boards, board.square), encoding="utf-8")
     origin, size = "given" if given else "found", " x ".join(map(str, boards.corners))
     print(f"board        {size} inner corners ({origin}), squares of {board.square:g} m")
     print("\n".join([*_views(rig, boards), "", *_parameters(rig, model), ""]))

@@ -13,8 +13,7 @@ from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_
 from rille.datasets.registry import hindrance
 from rille.datasets.text.names import derived_name
 from rille.pipeline.commands.options import COMPLETE, FLAG, Output
-from rille.pipeline.engine.failures import reported
-from rille.stages.core.errors import ConfigError, InputError
+from rille.stages.core.errors import ConfigError
 
 
 def init(
@@ -52,9 +51,7 @@ def init(
         raise ConfigError("RIL-038", f"{path} exists", remedy="give another --output, or overwrite it by --force")
     # Written whether complete or not: what is missing stands in it as comments, at its place.
     text = manifest_text(findings, _root(directory, path))
-    remedy = f"name another file, e.g. --output {name}"
-    with reported("RIL-039", f"{path} cannot be written", remedy=remedy, kind=InputError):
-        path.write_text(text, encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
     needed = needs(text)
     left = hindrance(path) if not needed else None
     if left is not None:

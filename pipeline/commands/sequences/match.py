@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from rille.datasets.images.files import read_grey, refuse_swapped
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE, FLAG, HOLES, Assignments, Output, check_output
-from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.plain import raw, warn
 from rille.pipeline.export.writers import read_disparity, write_confidence, write_disparity
 from rille.pipeline.flow import config as configuration
@@ -148,11 +147,9 @@ def match(
     kept = np.isfinite(result.column_disparity) if dense else matched(result.validity)
     column, row = (np.where(kept, array, np.nan) for array in (result.column_disparity, result.row_disparity))
     tags = {"LEFT": left.name, "RIGHT": right.name}
-    with _written(output):
-        write_disparity(output, column, row, tags | {"FILLED": str(dense).lower()})
+    write_disparity(output, column, row, tags | {"FILLED": str(dense).lower()})
     if confidence is not None:
-        with _written(confidence):
-            write_confidence(confidence, result.disparity_std, result.validity, result.backmatch_error, tags)
+        write_confidence(confidence, result.disparity_std, result.validity, result.backmatch_error, tags)
     for line in (*levelled, *warnings(result, *images)):
         warn(line)
     share = float(matched(result.validity).mean())
@@ -160,10 +157,6 @@ def match(
     figures = f"matched {100 * share:.1f} %, defined {100 * float(kept.mean()):.1f} % of {kept.size} pixels"
     print(f"{output}  {figures}{typical}")
     return COMPLETE if share >= MIN_MATCHED_SHARE else HOLES
-
-
-def _written(path: Path) -> AbstractContextManager[None]:
-    return reported("RIL-991", f"{path} cannot be written", remedy="name another file", kind=InputError)
 
 
 def _check_outputs(left: Path, right: Path, output: Path, confidence: Path | None) -> None:

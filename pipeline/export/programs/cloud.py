@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -15,14 +14,11 @@ from numpy.typing import NDArray
 
 from rille.datasets.georeference import Georeference
 from rille.datasets.text.count import count
-from rille.pipeline.engine.failures import reported
-from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.colour import LUMA
 from rille.pipeline.export.programs.placed_pairs import PlacedPair, PlacedPairs
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.read_dem import georeference_of
 from rille.pipeline.export.writers import ENGINEERING_CRS
-from rille.stages.core.errors import InputError
 from rille.stages.terrain.points import colours, cubes, one_a_cube
 
 ABOUT = {
@@ -40,52 +36,43 @@ PLY_TYPES = {"float64": "double", "float32": "float", "uint8": "uchar", "uint32"
 Columns = Mapping[str, NDArray[Any]]
 
 
-@dataclass
-class Thinning:
-    """Points that are written: of each ``every``-th row and column, and one in each cube of side ``voxel``, m (0: all).
-
-    In a cube that points of several pairs fall into the first pair's stays, and of one pair's the most certain point.
-    """
-
-    every: int = 1
-    voxel: float = 0.0
-    _taken: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-
-    def of(self, columns: Columns) -> Columns:
-        """The points of a pair that stay."""
-        if not self.voxel:
-            return columns
-        cube = cubes(np.column_stack([columns[axis] for axis in "xyz"]), self.voxel)
-        first = one_a_cube(cube, columns["sigma_along"])
-        first = first[~np.isin(cube[first], self._taken)]
-        self._taken = np.union1d(self._taken, cube[first])
-        return {name: values[first] for name, values in columns.items()}
-
-
-def export(run: RunArtifacts, output: Path, choice: Thinning) -> str:
+def write_run(path: Path, run: RunArtifacts, every: int = 1, voxel: float = 0.0) -> str:
     """Write the points of a run as LAZ or PLY, by the ending of the file; what is in it.
 
     Columns: x, y, z (m; of the place on Earth where the sequence has one), red, green, blue of the left image, the
     standard deviations along and across the ray of the left camera (m), the ray's direction, and the pair's frame.
 
+    Parameters
+    ----------
+    every : each so many-th row and column alone.
+    voxel : one point in each cube of this side, m (0: all): that of the first pair, and of one pair's the most certain.
+
     Raises
     ------
     InputError
-        The run has no pair with a disparity and a pose, or the file cannot be written.
+        The run has no pair with a disparity and a pose.
     """
     from rasterio.crs import CRS
 
-    place, pairs = georeference_of(run.run), PlacedPairs(run, every=choice.every)
+    place, pairs = georeference_of(run.run), PlacedPairs(run, every)
     # LAS 1.4 knows the first version of WKT alone.
     crs = CRS.from_user_input(place.crs if place is not None else ENGINEERING_CRS).to_wkt(version="WKT1_GDAL")
-    write = _write_laz if output.suffix == ".laz" else _write_ply
-    with (
-        reported("RIL-618", f"{output} cannot be written", remedy="name another file with -o", kind=InputError),
-        atomic.replacing(output) as temporary,
-    ):
-        points = write(temporary, (choice.of(_columns(run, one, place)) for one in pairs), crs)
+    write = _write_laz if path.suffix == ".laz" else _write_ply
+    parts = (_columns(run, one, place) for one in pairs)
+    points = write(path, _thinned(parts, voxel) if voxel else parts, crs)
     unplaced = f", {pairs.unplaced} without a pose are left out" if pairs.unplaced else ""
     return f"{count(points, 'point')} of {count(len(pairs.pairs), 'pair')}{unplaced}"
+
+
+def _thinned(parts: Iterator[Columns], voxel: float) -> Iterator[Columns]:
+    """The points of each pair that stay."""
+    taken = np.zeros(0, np.int64)
+    for columns in parts:
+        cube = cubes(np.column_stack([columns[axis] for axis in "xyz"]), voxel)
+        first = one_a_cube(cube, columns["sigma_along"])
+        first = first[~np.isin(cube[first], taken)]
+        taken = np.union1d(taken, cube[first])
+        yield {name: values[first] for name, values in columns.items()}
 
 
 def _columns(run: RunArtifacts, one: PlacedPair, place: Georeference | None) -> Columns:

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.pipeline.engine.failures import reported
-from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.read_dem import DemFile, opened_raster, read_elevation
 from rille.stages.core.errors import InputError
 
@@ -24,23 +23,21 @@ Layer = NDArray[np.float64] | None
 """Values of the cells of a terrain, (rows, cols) or of colours (rows, cols, 3), where the run has them."""
 
 
-def export(run: Path, output: Path | None) -> tuple[Path, str]:
-    """Write the terrain of the run in a folder as a mesh, by default ``terrain.glb`` there; what is in the file.
+def write_run(path: Path, run: RunArtifacts) -> str:
+    """Write the terrain of a run as a mesh; what is in the file.
 
     Raises
     ------
     InputError
-        The run has no terrain, or the file cannot be written.
+        The run has no terrain.
     """
-    target = output or run / "terrain.glb"
-    terrain = read_elevation(run)
-    with reported("RIL-601", f"{target} cannot be written", remedy="name another file with -o", kind=InputError):
-        return target, write_glb(target, terrain, _beside(run, "ortho", terrain))
+    terrain = read_elevation(run.run)
+    return write_glb(path, terrain, _ortho(run.run, terrain))
 
 
-def _beside(run: Path, name: str, terrain: DemFile) -> Layer:
-    """Another raster of the run on the same cells, (rows, cols) or of colours (rows, cols, 3); None: there is none."""
-    path = run / f"{name}.tif"
+def _ortho(run: Path, terrain: DemFile) -> Layer:
+    """The ortho image of the run, (rows, cols) or of colours (rows, cols, 3); None: there is none."""
+    path = run / "ortho.tif"
     if not path.is_file():
         return None
     with opened_raster(path) as raster:
@@ -77,8 +74,7 @@ def write_glb(path: Path, terrain: DemFile, ortho: Layer) -> str:
     scene.metadata["origin_m"] = middle.tolist()
     scene.metadata["axes"] = "x = x, y = z, z = -y of the terrain's frame, metres from origin_m"
     scene.metadata["crs_wkt"] = terrain.crs
-    with atomic.replacing(path) as temporary:
-        temporary.write_bytes(scene.export(file_type="glb", include_normals=True))
+    path.write_bytes(scene.export(file_type="glb", include_normals=True))
     every = "" if step == 1 else f", every {step}. cell (of more than {MAX_FACES} triangles)"
     return f"{len(vertices)} vertices, {len(faces)} triangles{every}"
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from rille.pipeline.engine import events
 from rille.pipeline.engine.runtime import atomic
@@ -13,21 +15,29 @@ from rille.pipeline.engine.store.base import Store
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
 
+WRITERS = {"laz": "cloud", "ply": "cloud", "glb": "mesh"}
+"""Modules that write files; any other form is a folder, which the module of its name writes."""
 
-def export_run(kind: str, run: Path, target: Path, store: Store) -> str:
-    """Write a run folder in a form, such as ``colmap`` or ``nav2``, as a folder; the line to print.
+
+def export_run(form: str, run: Path, target: Path, store: Store, **thinning: float) -> str:
+    """Write a run folder in a form, such as ``laz`` or ``colmap``, whole or not at all; what was written, in words.
+
+    Parameters
+    ----------
+    thinning : of points, as :func:`rille.pipeline.export.programs.cloud.write_run` takes it.
 
     Raises
     ------
     InputError
-        The run has nothing that the form shows, its artifacts are gone from the cache, or ``target`` is not empty.
+        The run has nothing that the form shows, its artifacts are gone from the cache, or ``target`` is a folder that
+        is not empty.
     """
-    if target.exists() and any(target.iterdir()):
+    if target.is_dir() and any(target.iterdir()):
         raise InputError("RIL-607", f"{target} is not empty", remedy="give a new folder with --output")
-    write_run = import_module(f"rille.pipeline.export.programs.{kind}").write_run
-    with atomic.replacing(target) as folder:
-        words = write_run(folder, RunArtifacts(run, store))
-    return f"{target}: {words}"
+    write_run = import_module(f"rille.pipeline.export.programs.{WRITERS.get(form, form)}").write_run
+    with atomic.replacing(target) as temporary:
+        words: str = write_run(temporary, RunArtifacts(run, store), **thinning)
+    return words
 
 
 class RunArtifacts:
@@ -35,8 +45,11 @@ class RunArtifacts:
 
     def __init__(self, run: Path, store: Store) -> None:
         self.run, self._store = run, store
-        rows = events.read(run / "ledger.jsonl")
-        self._rows = {row["label"]: row for row in rows if row["status"] in ("computed", "cached") and "key" in row}
+
+    @cached_property
+    def _rows(self) -> dict[str, dict[str, Any]]:
+        rows = events.read(self.run / "ledger.jsonl")
+        return {row["label"]: row for row in rows if row["status"] in ("computed", "cached") and "key" in row}
 
     def find(self, label: str) -> Bundle | None:
         """The artifact of exactly this label, if the run has it."""

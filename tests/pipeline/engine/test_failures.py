@@ -31,7 +31,7 @@ def opencv_error() -> cv2.error:
     [
         (MemoryError("std::bad_alloc"), "RIL-736", "--memory-limit"),
         (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/there/file"), "RIL-737", "/there/file"),
-        (PermissionError(errno.EACCES, os.strerror(errno.EACCES), "/there"), "RIL-737", "--runs"),
+        (PermissionError(errno.EACCES, os.strerror(errno.EACCES), "/there"), "RIL-737", "--output"),
         (opencv_error(), "RIL-738", "OpenCV"),
     ],
 )
@@ -47,7 +47,7 @@ def test_what_a_machine_or_a_library_refuses_is_told_in_one_line(monkeypatch, ca
 
 
 def test_an_error_of_the_system_without_a_number_keeps_its_words():
-    with raises("RIL-012", "cannot write a: it is not there"), reported("RIL-012", "cannot write a", remedy="change"):
+    with raises("RIL-061", "cannot make a: it is not there"), reported("RIL-061", "cannot make a", remedy="change"):
         raise OSError("it is not there")
 
 

@@ -15,7 +15,7 @@ import trimesh
 from raising import raises
 
 from rille.datasets.georeference import Georeference
-from rille.pipeline.export.programs.cloud import Thinning, export
+from rille.pipeline.export.programs.cloud import write_run
 from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
@@ -77,8 +77,8 @@ def expected(every: int = 1) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(parts), np.repeat([3, 5], len(rays))
 
 
-def written(run: Any, path: Path, choice: Thinning | None = None) -> str:
-    return export(run, path, choice or Thinning())
+def written(run: Any, path: Path, **thinning: Any) -> str:
+    return write_run(path, run, **thinning)
 
 
 @pytest.mark.parametrize("place", [None, PLACE])
@@ -114,7 +114,7 @@ def test_sigma_and_ray_are_those_of_the_left_camera(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("place", [None, PLACE])
 def test_trimesh_reads_the_same_points(tmp_path: Path, place: Georeference | None) -> None:
-    written(Recorded(tmp_path / "run", place), tmp_path / "a.ply", Thinning(every=3))
+    written(Recorded(tmp_path / "run", place), tmp_path / "a.ply", every=3)
     position, pair = expected(every=3)
     cloud = trimesh.load(tmp_path / "a.ply")
     np.testing.assert_allclose(cloud.vertices, position if place is None else place.apply(position), atol=2e-6)
@@ -127,7 +127,7 @@ def test_trimesh_reads_the_same_points(tmp_path: Path, place: Georeference | Non
 def test_of_a_voxel_one_point_stays_the_first_pair_s(tmp_path: Path) -> None:
     run = Recorded(tmp_path / "run")
     written(run, tmp_path / "all.ply")
-    written(run, tmp_path / "thin.ply", Thinning(voxel=0.5))
+    written(run, tmp_path / "thin.ply", voxel=0.5)
     whole, thin = (trimesh.load(tmp_path / f"{n}.ply") for n in ("all", "thin"))
     cubes = [np.floor(cloud.vertices / 0.5) for cloud in (whole, thin)]
     assert len(np.unique(cubes[1], axis=0)) == len(cubes[1]) == len(np.unique(cubes[0], axis=0))

@@ -12,20 +12,28 @@ import trimesh
 from raising import raises
 from terrain_runs import LATTICE, elevation, finished
 
+from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs import mesh
+from rille.pipeline.export.programs.run_artifacts import export_run
 from rille.pipeline.export.read_dem import read_elevation
 from rille.pipeline.export.writers import Meaning, write_raster
 
 KNOWN = np.isfinite(elevation())
 
 
+def exported(run: Path) -> tuple[Path, str]:
+    """Path of the mesh of a run, and what is said of it."""
+    path = run / "terrain.glb"
+    return path, export_run("glb", run, path, Store(run / "cache"))
+
+
 def test_equal_runs_make_equal_files(tmp_path: Path) -> None:
-    made = [mesh.export(finished(tmp_path / n), None)[0].read_bytes() for n in "ab"]
+    made = [exported(finished(tmp_path / n))[0].read_bytes() for n in "ab"]
     assert made[0] == made[1]
 
 
 def test_the_mesh_is_the_terrain_the_right_way_up(tmp_path: Path) -> None:
-    path, words = mesh.export(finished(tmp_path), None)
+    path, words = exported(finished(tmp_path))
     terrain = trimesh.load(path).to_geometry()
     quads = KNOWN[:-1, :-1] & KNOWN[1:, :-1] & KNOWN[:-1, 1:] & KNOWN[1:, 1:]
     assert len(terrain.faces) == 2 * quads.sum()
@@ -59,7 +67,7 @@ def _floats(path: Path, document: dict, accessor: int, width: int) -> np.ndarray
 
 
 def test_accessors_are_within_their_views_and_state_their_bounds(tmp_path: Path) -> None:
-    path, _ = mesh.export(finished(tmp_path), None)
+    path, _ = exported(finished(tmp_path))
     document = _json(path)
     (buffer,) = document["buffers"]
     sizes = {5125: 4, 5126: 4, 5123: 2}
@@ -79,17 +87,14 @@ def test_accessors_are_within_their_views_and_state_their_bounds(tmp_path: Path)
 
 def test_large_terrain_is_thinned_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mesh, "MAX_FACES", 2000)
-    path, words = mesh.export(finished(tmp_path), None)
+    path, words = exported(finished(tmp_path))
     assert "every 2. cell" in words
     assert len(trimesh.load(path).to_geometry().faces) <= 2000
 
 
 def test_what_is_no_run_is_said(tmp_path: Path) -> None:
     with raises("RIL-635"):
-        mesh.export(tmp_path, None)
-    (finished(tmp_path / "run") / "file").write_text("")
-    with raises("RIL-601"):
-        mesh.export(tmp_path / "run", tmp_path / "run" / "file" / "a.glb")
+        exported(tmp_path)
 
 
 def texture(path: Path) -> np.ndarray:
@@ -111,5 +116,5 @@ def test_cells_without_an_image_are_grey_in_a_coloured_run_too(tmp_path: Path) -
     bands = np.full((3, *KNOWN.shape), 90, np.uint8)
     bands[:, 20:25] = 0  # 0 means unknown in the file
     write_raster(run / "ortho.tif", dict(zip(("red", "green", "blue"), bands, strict=True)), LATTICE, Meaning(nodata=0))
-    path, _ = mesh.export(run, None)
+    path, _ = exported(run)
     assert texture(path).tolist() == [90, mesh.UNSEEN_GREY]
