@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import RunView, part
+from rille.pipeline.export.view import RunView
 
 
 def _write(path: Path, run: RunView) -> None:
@@ -29,15 +29,8 @@ def _write(path: Path, run: RunView) -> None:
 
 def _reads(run: RunView) -> tuple[object, ...]:
     p = run.products
-    trajectory = p.accuracy, p.position_accuracy
-    return (
-        *trajectory,
-        p.disparity_accuracy,
-        p.local_dem_accuracy,
-        p.dem_accuracy,
-        p.path_check,
-        run.sequence.truth_source,
-    )
+    by_pair = p.disparity_accuracy, p.local_dem_accuracy
+    return *by_pair, p.accuracy, p.position_accuracy, p.dem_accuracy, p.path_check, run.sequence.truth_source
 
 
 OUTPUTS = (
@@ -46,7 +39,7 @@ OUTPUTS = (
         "errors against truth: of each pair's disparities and elevations, the trajectory, the merged map, the path",
         "any text editor, jq",
         _write,
-        lambda run: {"run": part(run, _reads)},
+        reads=_reads,
     ),
 )
 STAGE = stage("output.accuracy", "Errors against truth as a file", OUTPUTS)

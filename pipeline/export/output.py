@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from rille.datasets.georeference import Georeference
-from rille.pipeline.export.view import Part, RunView
+from rille.pipeline.export.view import Part, Reads, RunView
 from rille.stages.core.declare import AnyArray, Array, Bundle, Memory, NoParams, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Rig, RigidTransform
@@ -33,6 +33,9 @@ BLOCK_BYTES = 1024
 CONTENT = Array("content", ("block", "byte"), "uint8", "1", "bytes of the files, one behind another")
 
 
+Writer = Callable[[Path, RunView], None]
+
+
 @dataclass(frozen=True)
 class Output:
     """One file (or folder) of a run.
@@ -42,20 +45,24 @@ class Output:
     name : of the file.
     what : what it is, in words.
     opens : free programs that open it.
-    write : ``write(path, **inputs)`` writes it; None for what each run renders. It may write nothing, or for a name
-        with a ``*`` several files beside ``path``.
-    inputs : what ``write`` takes of a run, by name: products, which it gets as artifacts, and plain facts. Where one
-        that has no default in ``write`` is not there as a whole, the file is not made; of others (a list, a
-        dictionary, a :class:`rille.pipeline.export.view.Part`) what is missing is None.
+    write : ``write(path, run)`` writes it, of the part of a run that is named here, with artifacts for handles; None
+        for what each run renders. It may write nothing, or for a name with a ``*`` several files beside ``path``.
     frame : frame of reference of its values, a key of :data:`rille.pipeline.export.catalogue.FRAMES`; empty: none.
+    needs : products that it is made of: where one is not there as a whole, the file is not made.
+    reads : what else it takes of a run: products, of which those that are missing are None, and plain facts.
     """
 
     name: str
     what: str
     opens: str
-    write: Callable[..., None] | None = None
-    inputs: Callable[[RunView], Mapping[str, Any]] = lambda _: {}
+    write: Writer | None = None
     frame: str = ""
+    needs: Reads = lambda _: ()
+    reads: Reads = lambda _: ()
+
+    def names(self, run: RunView) -> tuple[object, ...]:
+        """All that it takes of a run."""
+        return *self.needs(run), *self.reads(run)
 
 
 def stage(name: str, summary: str, outputs: Sequence[Output]) -> Stage:
@@ -66,8 +73,7 @@ def stage(name: str, summary: str, outputs: Sequence[Output]) -> Stage:
         write, bundles = writers[args["file"]], [Bundle(_Unkept(b), b.meta) for b in inputs["read"]]
         assert write is not None
         with TemporaryDirectory() as folder:
-            taken = {name: _restored(form, bundles) for name, form in args["inputs"].items()}
-            write(Path(folder) / args["file"], **taken)
+            write(Path(folder) / args["file"], _restored(args["run"], bundles))
             return pack(Path(folder))
 
     return Stage(name, 1, summary, NoParams, ("read*",), (CONTENT,), run, Memory(fixed=300e6, factor=1.0, result=0.1))
@@ -92,7 +98,7 @@ class _Unkept(Mapping[str, AnyArray]):
         return len(self._bundle.arrays)
 
 
-# -- inputs of a writer out of the arguments of its task --------------------------------------------------------
+# -- what a writer gets, out of the arguments of its task --------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -117,7 +123,7 @@ FORMS = {
 
 
 def _restored(form: Any, bundles: Sequence[Bundle]) -> Any:
-    """The input of a plain form, with artifacts for handles."""
+    """What a plain form stands for, with artifacts for handles."""
     if isinstance(form, list):
         return tuple(_restored(item, bundles) for item in form)
     if not isinstance(form, dict):

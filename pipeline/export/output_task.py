@@ -7,43 +7,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import is_dataclass
-from inspect import Parameter, signature
 from types import ModuleType
 from typing import Any
 
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.export.output import FORMS, Output
-from rille.pipeline.export.view import Part, RunView
+from rille.pipeline.export.view import Part, RunView, part
 from rille.stages.core.declare import NoParams
 
 
 def handles(output: Output, run: RunView) -> list[Handle]:
     """Handles of all artifacts that an output takes, each once."""
-    return _handles(dict(output.inputs(run)))
+    return _handles(part(run, output.names))
 
 
 def add(graph: Graph, module: ModuleType, output: Output, run: RunView) -> Handle | None:
     """Add the task that makes an output of ``module``; None where something that it needs is not there."""
-    assert output.write is not None
-    taken = output.inputs(run)
-    parameters = signature(output.write).parameters
-    if not all(_whole(value) for name, value in taken.items() if parameters[name].default is Parameter.empty):
+    if not all(needed and all(map(_due, _handles(needed))) for needed in output.needs(run)):
         return None
     there: dict[Handle, int] = {}
-    forms = {name: _form(value, there, _due) for name, value in taken.items()}
-    args = {"file": output.name, "inputs": forms}
+    args = {"file": output.name, "run": _form(part(run, output.names), there, _due)}
     return graph.node(module.__name__, f"output/{output.name}", NoParams(), args, {}, {"read": list(there)})
 
 
 def _due(handle: Handle) -> bool:
     """Whether there is an artifact; a plan counts on those that are to be computed."""
     return handle.ref is not None or handle.status == "planned"
-
-
-def _whole(value: Any) -> bool:
-    """Whether an input is there, with all its artifacts; a part of a run may have holes."""
-    empty = value is None or (isinstance(value, list | dict) and not value)
-    return isinstance(value, Part) or (not empty and all(map(_due, _handles(value))))
 
 
 def _handles(value: Any) -> list[Handle]:

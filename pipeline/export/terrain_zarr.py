@@ -14,7 +14,7 @@ standard name for heights above the first camera. Where the sequence has a place
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.rasters import above, whole
+from rille.pipeline.export.rasters import above, tiles_of, whole
+from rille.pipeline.export.view import RunView
 from rille.pipeline.export.writers import ENGINEERING_CRS, FRAME
-from rille.stages.core.declare import Array, Bundle
+from rille.stages.core.declare import Array
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain import merge
 from rille.stages.terrain.shading import slope_deg
@@ -98,20 +99,20 @@ def _coordinates(lattice: Lattice) -> dict[str, Any]:
 SLOPE = Array("slope", ("row", "col"), "float32", "degree", "inclination of the terrain", "nan", "world")
 
 
-def _write_output(path: Path, tiles: Sequence[Bundle], sequence: str, place: Georeference | None = None) -> None:
+def _write_output(path: Path, run: RunView) -> None:
     """All merged arrays, put together of the world tiles, and the slope."""
-    arrays = {}
+    arrays, tiles = {}, tiles_of(run)
     for spec in merge.merge_stage.outputs:
         if spec.dims == ("row", "col") and all(spec.name in tile.arrays for tile in tiles):
             lattice, values = whole(tiles, spec.name)
             arrays[spec.name] = (spec, values)
     arrays["slope"] = (SLOPE, slope_deg(arrays["elevation"][1], lattice.cell))
     about = {
-        "title": f"Merged terrain of the sequence {sequence}",
+        "title": f"Merged terrain of the sequence {run.sequence.name}",
         "source": "stereo images: disparity by HFVM, elevation models by Locus, merged; Rille",
         **above(tiles),
     }
-    write_terrain(path, arrays, lattice, place, about)
+    write_terrain(path, arrays, lattice, run.sequence.georeference, about)
 
 
 OUTPUTS = (
@@ -120,12 +121,9 @@ OUTPUTS = (
         "all merged arrays with units and coordinates",
         "xarray.open_zarr, GDAL",
         _write_output,
-        lambda run: {
-            "tiles": run.products.world_tiles,
-            "sequence": run.sequence.name,
-            "place": run.sequence.georeference,
-        },
         "world",
+        lambda run: (run.products.world_tiles,),
+        lambda run: (run.sequence.name, run.sequence.georeference),
     ),
 )
 STAGE = stage("output.terrain", "The merged terrain as one zarr group", OUTPUTS)

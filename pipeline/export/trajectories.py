@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Series
 from pathlib import Path
 from typing import Any
 
 from rille.pipeline.export import writers
-from rille.pipeline.export.comparison import compare
+from rille.pipeline.export.comparison import CrosscheckComparison, compare
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import RunView, part
+from rille.pipeline.export.view import RunView, there
 from rille.pipeline.export.writers import write_table, write_trajectory_kitti, write_trajectory_tum
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.pose_arrays import NO_VERTICAL, REFERENCE_PLANE
@@ -28,31 +27,38 @@ def _world(trajectory: Bundle, piece: int) -> str:
     return special.get(trajectory.meta["verticals"][piece], writers.FRAME)
 
 
-def _write_kitti(path: Path, trajectory: Bundle) -> None:
-    write_trajectory_kitti(path, world_poses(trajectory))
+def _trajectory(run: RunView) -> Bundle:
+    return there(run, run.products.trajectory)
 
 
-def _write_tum(path: Path, trajectory: Bundle, times: Series[float]) -> None:
-    write_trajectory_tum(path, world_poses(trajectory), times, _world(trajectory, trajectory.meta["main"]))
+def _write_kitti(path: Path, run: RunView) -> None:
+    write_trajectory_kitti(path, world_poses(_trajectory(run)))
 
 
-def _write_pieces(path: Path, trajectory: Bundle, times: Series[float]) -> None:
+def _write_tum(path: Path, run: RunView) -> None:
+    trajectory = _trajectory(run)
+    write_trajectory_tum(path, world_poses(trajectory), stamps(run), _world(trajectory, trajectory.meta["main"]))
+
+
+def _write_pieces(path: Path, run: RunView) -> None:
+    trajectory = _trajectory(run)
     for number in range(len(trajectory.meta["verticals"])):
         if number != trajectory.meta["main"]:
             piece = path.with_name(path.name.replace("*", str(number + 1)))
-            write_trajectory_tum(piece, world_poses(trajectory, number), times, _world(trajectory, number))
+            write_trajectory_tum(piece, world_poses(trajectory, number), stamps(run), _world(trajectory, number))
 
 
-def _write_crosscheck(path: Path, agreement: Bundle, run: RunView) -> None:
-    trajectory = run.bundle(run.products.trajectory)
-    assert trajectory is not None  # the agreement is with it
-    world = _world(trajectory, trajectory.meta["main"])
-    write_trajectory_tum(path, compare(run, agreement).poses, stamps(run), world)
+def _compared(run: RunView) -> CrosscheckComparison:
+    return compare(run, there(run, run.products.agreement))
 
 
-def _write_agreement(path: Path, agreement: Bundle, run: RunView) -> None:
-    compared, trajectory = compare(run, agreement), run.bundle(run.products.trajectory)
-    assert trajectory is not None
+def _write_crosscheck(path: Path, run: RunView) -> None:
+    trajectory = _trajectory(run)
+    write_trajectory_tum(path, _compared(run).poses, stamps(run), _world(trajectory, trajectory.meta["main"]))
+
+
+def _write_agreement(path: Path, run: RunView) -> None:
+    compared, trajectory = _compared(run), _trajectory(run)
     names = [run.sequence.frame_names[f] for f in run.frames]
     columns: dict[str, list[Any]] = {"frame": list(run.frames), "name": names}
     if run.sequence.times is not None:
@@ -62,16 +68,20 @@ def _write_agreement(path: Path, agreement: Bundle, run: RunView) -> None:
     write_table(path, columns | compared.columns())
 
 
-def _posed(run: RunView) -> dict[str, Any]:
-    return {"trajectory": run.products.trajectory, "times": stamps(run)}
+def _posed(run: RunView) -> tuple[object, ...]:
+    return (run.products.trajectory,)
 
 
-def _compared(run: RunView) -> dict[str, Any]:
-    def reads(run: RunView) -> tuple[object, ...]:
-        p, s = run.products, run.sequence
-        return p.trajectory, p.accuracy, p.crosscheck_accuracy, s.times, s.frame_names
+def _times(run: RunView) -> tuple[object, ...]:
+    return (run.sequence.times,)
 
-    return {"agreement": run.products.agreement, "run": part(run, reads)}
+
+def _agreed(run: RunView) -> tuple[object, ...]:
+    return run.products.agreement, run.products.trajectory
+
+
+def _beside(run: RunView) -> tuple[object, ...]:
+    return run.products.accuracy, run.products.crosscheck_accuracy, run.sequence.times, run.sequence.frame_names
 
 
 OUTPUTS = (
@@ -80,39 +90,43 @@ OUTPUTS = (
         "pose of each left camera, a 3 x 4 matrix a line, world from camera, m",
         "evo (evo_traj kitti), any text editor",
         _write_kitti,
-        lambda run: {"trajectory": run.products.trajectory},
         "world",
+        _posed,
     ),
     Output(
         "trajectory.tum",
         "the same as time, position and quaternion x y z w",
         "evo (evo_traj tum), CloudCompare",
         _write_tum,
-        _posed,
         "world",
+        _posed,
+        _times,
     ),
     Output(
         "trajectory.piece*.tum",
         "another unbroken piece of the trajectory, in a frame of its own",
         "evo (evo_traj tum), CloudCompare",
         _write_pieces,
-        _posed,
+        needs=_posed,
+        reads=_times,
     ),
     Output(
         "crosscheck.tum",
         "the trajectory by COLMAP in the same form, laid on ours without a change of scale",
         "evo (evo_ape tum trajectory.tum crosscheck.tum)",
         _write_crosscheck,
-        _compared,
         "world",
+        _agreed,
+        _beside,
     ),
     Output(
         "agreement.csv",
         "each frame: our position, COLMAP's, their disagreement, whether it is flagged, errors where there is truth",
         "LibreOffice Calc, any text editor",
         _write_agreement,
-        _compared,
         "world",
+        _agreed,
+        _beside,
     ),
 )
 STAGE = stage("output.trajectories", "Trajectories as files", OUTPUTS)

@@ -92,13 +92,26 @@ class Part(SimpleNamespace):
         return artifact
 
 
-def part(run: RunView, reads: Callable[[RunView], tuple[object, ...]]) -> RunView:
-    """The part of a run that ``reads`` names, such as ``(run.products.trajectory, run.sequence.rig)``, and its frames.
+Reads = Callable[[RunView], tuple[object, ...]]
+"""Names a part of a run, such as ``lambda run: (run.products.trajectory, run.sequence.rig)``."""
 
-    Nothing else is within reach of who gets it.
-    """
+
+def names(reads: Reads) -> list[str]:
+    """Dotted names of what ``reads`` names, such as ``products.trajectory``."""
+    return [str(name) for name in reads(cast(RunView, _Name()))]
+
+
+def there(run: RunView, handle: Any) -> Bundle:
+    """The artifact of a handle that has one."""
+    bundle = run.bundle(handle)
+    assert bundle is not None
+    return bundle
+
+
+def part(run: RunView, reads: Reads) -> RunView:
+    """The part of a run that ``reads`` names, and its frames; nothing else is within reach of who gets it."""
     named = Part(frames=run.frames)
-    for name in map(str, reads(cast(RunView, _Name()))):
+    for name in names(reads):
         *path, last = name.split(".")
         source: Any = run
         target: Any = named

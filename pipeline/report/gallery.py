@@ -10,7 +10,7 @@ import numpy as np
 
 from rille.pipeline.export import colour, ranges
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import RunView, part
+from rille.pipeline.export.view import RunView
 from rille.pipeline.report import canvas, figures, gather, strips, tables, terrain_map
 from rille.pipeline.report.canvas import FIGURE, Block, Figure
 from rille.pipeline.report.figures import Curve, Plot
@@ -139,7 +139,7 @@ class Drawing:
         def write(path: Path, run: RunView) -> None:
             path.write_bytes(FIGURE.dump_json(self.figure(run)))
 
-        return Output(self.title, "", "", write, lambda run: {"run": part(run, self.reads)})
+        return Output(self.title, "", "", write, reads=self.reads)
 
 
 def _of_map(run: RunView) -> tuple[object, ...]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from rille.datasets.text.count import count
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import RunView, part
+from rille.pipeline.export.view import RunView
 from rille.pipeline.report import delivery, tables
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene, facts_of, frames_of
@@ -359,5 +359,5 @@ def _reads(run: RunView) -> tuple[object, ...]:
     )
 
 
-OUTPUTS = (Output("facts", "", "", _write, lambda run: {"run": part(run, _reads)}),)
+OUTPUTS = (Output("facts", "", "", _write, reads=_reads),)
 STAGE = stage("output.facts", "Figures and tables of the report in numbers", OUTPUTS)

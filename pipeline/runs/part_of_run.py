@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import replace
-from typing import Any
 
 from rille.pipeline.engine.graph import Cut
 from rille.pipeline.export import catalogue
-from rille.pipeline.export.view import RunView
+from rille.pipeline.export.view import names
 from rille.pipeline.flow import config
-from rille.pipeline.flow.products import Products
 from rille.stages.core.errors import ConfigError
 
 FLOWS = ("builders", "reconstruction", "assessment")
@@ -33,27 +30,13 @@ MADE_BY = {
 """Stage of each product that files are made of; others are there before the trajectory is."""
 
 
-class _Reading(Products):
-    """Products, all empty, that note which of them are read."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.__dict__["read"] = set[str]()
-
-    def __getattribute__(self, name: str) -> Any:
-        if name in MADE_BY:
-            self.__dict__["read"].add(name)
-        return super().__getattribute__(name)
-
-
-def cut(until: Collection[str], only: Collection[str], view: RunView) -> Cut | None:
+def cut(until: Collection[str], only: Collection[str]) -> Cut | None:
     """Return what of a run's graph is wanted; None where that is all of it.
 
     Parameters
     ----------
     until : names of stages.
     only : names of files of a run, as :data:`rille.pipeline.export.catalogue.OUTPUTS` has them.
-    view : the run before it is laid out.
 
     Raises
     ------
@@ -73,8 +56,6 @@ def cut(until: Collection[str], only: Collection[str], view: RunView) -> Cut | N
         return Cut(frozenset(until), lambda h: h.stage in wanted or h.label.partition("/")[0] in wanted)
     if not only:
         return None
-    empty = _Reading()
-    for name in only:
-        files[name].inputs(replace(view, products=empty))
-    behind = {MADE_BY[name] for name in empty.read} or {"trajectory"}
+    read = {name.removeprefix("products.") for file in only for name in names(files[file].names)}
+    behind = {MADE_BY[name] for name in read & MADE_BY.keys()} or {"trajectory"}
     return Cut(frozenset(behind), lambda h: h.label.partition("/")[0] in wanted)

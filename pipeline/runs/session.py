@@ -33,7 +33,6 @@ from rille.pipeline.export.view import UNSTATED, RunView
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import Drive, dataflow
-from rille.pipeline.flow.products import Products
 from rille.pipeline.runs import part_of_run, roots
 from rille.pipeline.runs.input_checks import judge_rig
 from rille.stages.core.errors import ConfigError, RilleError
@@ -199,8 +198,7 @@ def _open(options: Options) -> _Opened:
         raise ConfigError("RIL-059", f"{sequence.name} is recorded, it cannot be driven", remedy="drive mockup-loop")
     header = f"# {options.command()}\n# rille reconstruct SEQ --config THIS_FILE uses the same parameters.\n\n"
     text = header + configuration.to_toml(config, sequence.parameters)
-    bare = RunView("", sequence, frames, Products(), (), config)
-    graph, store = Graph(cut=part_of_run.cut(options.until, options.only, bare)), Store(cache_folder(options.cache))
+    graph, store = Graph(cut=part_of_run.cut(options.until, options.only)), Store(cache_folder(options.cache))
     products, drive = dataflow(graph, sequence, config, frames)
     # After the layout, which refuses what does not fit: then no folder is left behind.
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))

@@ -63,9 +63,9 @@ def test_each_cell_takes_the_colour_of_its_pair_and_keeps_the_merged_grey():
 
 
 def test_grey_sequences_write_grey_ortho_images(tmp_path):
-    view, made = run()
+    view, _ = run()
     assert not colour.coloured(view, np.zeros((1, 1), int))
-    write_ortho(tmp_path / "ortho.tif", [made["tile"]], view)
+    write_ortho(tmp_path / "ortho.tif", view)
     with rasterio.open(tmp_path / "ortho.tif") as found:
         assert (found.count, found.dtypes[0]) == (1, "float32")
 

@@ -19,7 +19,6 @@ from toys.finished import FRAMES, sequence, view
 from rille.datasets.georeference import Georeference
 from rille.pipeline.export.catalogue import describe
 from rille.pipeline.export.paths import write_path
-from rille.pipeline.export.rasters import rounded
 from rille.pipeline.export.writers import (
     Meaning,
     write_raster,
@@ -110,15 +109,6 @@ def test_classes_have_colours(tmp_path: Path) -> None:
     with rasterio.open(tmp_path / "a.tif") as file:
         assert file.colorinterp == (rasterio.enums.ColorInterp.palette,)
         assert [file.colormap(1)[k] for k in (0, 1)] == [(0xA6, 0xD7, 0xC3, 255), (0, 1, 255, 255)]
-
-
-def test_measures_are_rounded_to_significant_bits() -> None:
-    values = np.array([0.1, -123.456, 3e-5, 0.0, np.nan, np.inf], np.float32)
-    found = rounded(values, 12)
-    np.testing.assert_allclose(found, values, rtol=2.0**-12)
-    assert (found.view(np.uint32)[:4] & 0xFFF == 0).all()
-    assert np.isnan(found[4])
-    assert found[5] == np.inf
 
 
 def test_a_raster_that_does_not_fit_is_refused(tmp_path: Path) -> None:

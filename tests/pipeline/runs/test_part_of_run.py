@@ -12,7 +12,6 @@ from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow.closed_loop import dataflow
-from rille.pipeline.flow.products import Products
 from rille.pipeline.runs import part_of_run, run_files
 
 
@@ -24,8 +23,7 @@ def chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
 
 def part(chain: Chain, until: tuple[str, ...] = (), only: tuple[str, ...] = ()) -> tuple[Graph, driver.Result]:
     """The graph of a part, over a store that has every artifact of a reconstruction but those of files."""
-    bare = RunView("", chain.sequence, FRAMES, Products(), (), chain.config)
-    graph = Graph(cut=part_of_run.cut(until, only, bare))
+    graph = Graph(cut=part_of_run.cut(until, only))
     products, _ = dataflow(graph, chain.sequence, chain.config, FRAMES)
     view = RunView("", chain.sequence, FRAMES, products, (), chain.config, until=until, only=only)
     graph.last = lambda: run_files.lay_out(graph, view, {})
