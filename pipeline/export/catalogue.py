@@ -14,7 +14,7 @@ from rille.pipeline.export import accuracy, paths, rasters, terrain_zarr, trajec
 from rille.pipeline.export.output import Output
 from rille.pipeline.export.trajectories import stamps
 from rille.pipeline.export.view import RunView
-from rille.pipeline.export.writers import FRAME, ON_PLANE, UNLEVELLED
+from rille.pipeline.export.writers import FRAME, WORLDS
 from rille.stages.geometry.pose_arrays import NO_VERTICAL, REFERENCE_PLANE
 
 MADE = (trajectories, rasters, terrain_zarr, paths, accuracy)
@@ -61,6 +61,15 @@ FRAMES: dict[str, dict[str, Any]] = {
     },
 }
 
+OTHER_WORLDS: dict[str, dict[str, Any]] = {
+    NO_VERTICAL: {"axes": {"x": "right", "y": "optical axis of the first camera", "z": "that camera's up"}},
+    REFERENCE_PLANE: {
+        "axes": {"x": "right", "y": "up in the image", "z": "away from the reference plane, to the cameras"},
+        "origin": "point of the reference plane nearest to the first left camera",
+    },
+}
+"""How the world frame differs by the source of its vertical."""
+
 CONVENTIONS = {
     "pose": "of the left camera, T_world_left: x_world = R x_left + t",
     "trajectory.kitti": "[R | t] row by row, a line a frame in the order of `frames` here; nan where there is no pose",
@@ -82,13 +91,8 @@ def describe(written: Sequence[str], run: RunView, vertical: str = "") -> dict[s
     vertical : source of the world's vertical, "none" if there is none; empty without a trajectory.
     """
     times, place, names = run.sequence.times, run.sequence.georeference, run.sequence.frame_names
-    world = FRAMES["world"] | ({"vertical": vertical} if vertical else {})
-    if vertical == NO_VERTICAL:
-        world |= {"axes": {"x": "right", "y": "optical axis of the first camera", "z": "that camera's up"}}
-        world |= {"definition": UNLEVELLED}
-    if vertical == REFERENCE_PLANE:
-        world |= {"axes": {"x": "right", "y": "up in the image", "z": "away from the reference plane, to the cameras"}}
-        world |= {"definition": ON_PLANE, "origin": "point of the reference plane nearest to the first left camera"}
+    world = FRAMES["world"] | OTHER_WORLDS.get(vertical, {}) | {"definition": WORLDS.get(vertical, FRAME)}
+    world |= {"vertical": vertical} if vertical else {}
     # Endings of the files whose coordinates are those of the sequence's CRS where it has one
     placed = (".tif", ".gpkg") if place is not None else ()
     known = {

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from operator import methodcaller
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -101,23 +101,18 @@ class _Unkept(Mapping[str, AnyArray]):
 # -- what a writer gets, out of the arguments of its task --------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Form:
+class Form(NamedTuple):
     """How values of a class are written as plain JSON, and read back."""
 
-    kind: type
     write: Callable[[Any], Any]
     read: Callable[[Any], Any]
 
 
 FORMS = {
-    form.kind.__name__: form
-    for form in (
-        Form(Rig, Rig.to_dict, Rig.from_dict),
-        Form(RigidTransform, RigidTransform.to_list, RigidTransform.from_matrix),
-        Form(Georeference, Georeference.to_dict, Georeference.from_dict),
-        Form(Vehicle, methodcaller("model_dump", mode="json"), Vehicle.model_validate),
-    )
+    "Rig": Form(Rig.to_dict, Rig.from_dict),
+    "RigidTransform": Form(RigidTransform.to_list, RigidTransform.from_matrix),
+    "Georeference": Form(Georeference.to_dict, Georeference.from_dict),
+    "Vehicle": Form(methodcaller("model_dump", mode="json"), Vehicle.model_validate),
 }
 """Facts that are not plain, by the names of their classes."""
 

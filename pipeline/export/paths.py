@@ -47,7 +47,7 @@ INSERT INTO gpkg_spatial_ref_sys VALUES ('undefined geographic', 0, 'NONE', 0, '
 WGS84 = 4326  # in EPSG's numbers; each GeoPackage must define it
 
 COLUMN_TYPES = {str: "TEXT", bool: "BOOLEAN", int: "INTEGER", float: "DOUBLE"}
-"""SQL type of the first of these types that a property is of."""
+"""SQL types of properties."""
 
 
 def write_path(path: Path, planned: Bundle, place: Georeference | None = None) -> None:
@@ -61,7 +61,7 @@ def write_path(path: Path, planned: Bundle, place: Georeference | None = None) -
     place : of the world frame; the coordinates are then those of its CRS, else of the engineering CRS.
     """
     facts = {"name": "path", "frame": FRAME, "axes": axes(place), "unit": "m", **planned.meta}
-    facts = {name: value for name, value in facts.items() if isinstance(value, str | int | float)}
+    facts = {name: value for name, value in facts.items() if type(value) in COLUMN_TYPES}
     vertices = np.asarray(planned["path"]) if place is None else place.apply(np.asarray(planned["path"]))
     with closing(sqlite3.connect(":memory:")) as package:
         package.executescript(SCHEMA)
@@ -102,10 +102,7 @@ def _add_layer(
     """Add a table of features, each with its points (n, 3) or (3,), or none, and its properties."""
     kind_name = "LINESTRING" if kind == LINE_Z else "POINT"
     properties = features[0][1]
-    types = {
-        key: next(sql for kind, sql in COLUMN_TYPES.items() if isinstance(v, kind)) for key, v in properties.items()
-    }
-    columns = "".join(f', "{key}" {sql}' for key, sql in types.items())
+    columns = "".join(f', "{key}" {COLUMN_TYPES[type(value)]}' for key, value in properties.items())
     package.execute(f"CREATE TABLE {name} (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom {kind_name}{columns})")
     # Without an extent, which readers of so few features find by themselves.
     contents = "INSERT INTO gpkg_contents VALUES (?, 'features', ?, '', ?, NULL, NULL, NULL, NULL, ?)"

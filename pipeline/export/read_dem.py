@@ -23,6 +23,7 @@ from rille.pipeline.engine.memory import free, words
 from rille.pipeline.export.foreign_raster import open_raster
 from rille.pipeline.export.writers import ENGINEERING_CRS
 from rille.stages.core.errors import InputError
+from rille.stages.evaluation.dem_comparison import Grid
 from rille.stages.evaluation.place import Ortho
 
 MAX_CELLS = 500_000_000
@@ -59,11 +60,21 @@ class DemFile:
         return float(np.sqrt(abs(self.transform.determinant)))
 
     @property
+    def grid(self) -> Grid:
+        """The elevations, placed by the centres of their cells."""
+        return Grid(self.values, centres(self.transform))
+
+    @property
     def extent(self) -> tuple[float, float, float, float]:
         """Outline x_min, x_max, y_min, y_max in the CRS."""
         rows, cols = self.values.shape
         corners = np.array([self.transform @ c for c in ((0, 0), (cols, 0), (0, rows), (cols, rows))])
         return tuple(float(f(corners[:, k])) for k in (0, 1) for f in (np.min, np.max))  # type: ignore[return-value]
+
+
+def centres(transform: Affine) -> NDArray[np.float64]:
+    """Map (2, 3) from (column, row, 1) of the cells' centres, of a raster's transform, which is that of corners."""
+    return np.asarray(transform @ Affine.translation(0.5, 0.5), np.float64).reshape(3, 3)[:2]
 
 
 def read_elevation(path: Path) -> DemFile:
@@ -143,11 +154,6 @@ def opened_raster(path: Path) -> Iterator[Any]:
         raise InputError("RIL-629", f"{path} cannot be read as a raster ({error})", remedy=remedy) from error
 
 
-def _check_place(path: Path, transform: Affine) -> None:
-    if transform == Affine.identity():
-        raise InputError("RIL-630", f"{path} has no geotransform", remedy=NO_PLACE)
-
-
 def read_raster(path: Path) -> DemFile:
     """First band of a GeoTIFF, or an ESRI ASCII grid.
 
@@ -160,19 +166,16 @@ def read_raster(path: Path) -> DemFile:
         # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
         values = file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
         crs, transform, unit = file.crs, file.transform, file.units[0]
-    _check_place(path, transform)
+    wkt = _checked_system(path, transform, crs)
     # Lengths of the cell's sides, not a and e: a raster may be turned.
     across, down = np.hypot(transform.a, transform.d), np.hypot(transform.b, transform.e)
     if not (0.0 < abs(transform.determinant) < math.inf and np.isclose(across, down, rtol=1e-6, atol=0.0)):
         remedy = "resample it to square cells, e.g. with gdalwarp -tr"
         raise InputError("RIL-631", f"{path} has cells of {across:g} x {down:g}", remedy=remedy)
-    if crs is not None:
-        _metric_crs(path, crs)
     if unit and unit.lower() not in METRE:
         remedy = "convert it, e.g. with gdal_calc"
         raise InputError("RIL-632", f"{path} has elevations in {unit!r}, not in metres", remedy=remedy)
     doubt = warning("RIL-962", f"{path} states no unit of its elevations: taken as metres")
-    wkt = "" if crs is None else crs.to_wkt(version="WKT2_2019")
     return DemFile(str(path), values, transform, wkt, warnings=() if unit else (doubt,))
 
 
@@ -187,16 +190,11 @@ def read_ortho(path: Path) -> tuple[Ortho, str]:
     with opened_raster(path) as file:
         grey, known = file.read(out_dtype="float32").mean(axis=0), file.dataset_mask() != 0
         t, crs = file.transform, file.crs
-    _check_place(path, t)
-    if crs is not None:
-        _metric_crs(path, crs)
+    wkt = _checked_system(path, t, crs)
     known &= np.isfinite(grey)
     if not known.any():
         raise InputError("RIL-856", f"{path} has no known cell", remedy="give another image")
-    t = t @ Affine.translation(0.5, 0.5)
-    return Ortho(grey, known, np.array([[t.a, t.b, t.c], [t.d, t.e, t.f]])), "" if crs is None else crs.to_wkt(
-        version="WKT2_2019"
-    )
+    return Ortho(grey, known, centres(t)), wkt
 
 
 def _check_cells(path: Path, shape: tuple[int, ...], stored: int) -> None:
@@ -209,7 +207,12 @@ def _check_cells(path: Path, shape: tuple[int, ...], stored: int) -> None:
         raise InputError("RIL-981", text, remedy="cut it, or resample it to larger cells")
 
 
-def _metric_crs(path: Path, crs: Any) -> None:
+def _checked_system(path: Path, transform: Affine, crs: Any) -> str:
+    """WKT of the system of a raster, empty where it states none."""
+    if transform == Affine.identity():
+        raise InputError("RIL-630", f"{path} has no geotransform", remedy=NO_PLACE)
+    if crs is None:
+        return ""
     if crs.is_geographic:
         remedy = "project it, e.g. with gdalwarp -t_srs"
         raise InputError("RIL-633", f"{path} is in degrees ({crs.to_string()})", remedy=remedy)
@@ -217,6 +220,8 @@ def _metric_crs(path: Path, crs: Any) -> None:
     unit, factor = crs.linear_units_factor if crs.is_projected else ("metre", 1.0)
     if factor != 1.0:
         raise InputError("RIL-634", f"{path} has coordinates in {unit} of {factor:.6g} m", remedy="give one in metres")
+    wkt: str = crs.to_wkt(version="WKT2_2019")
+    return wkt
 
 
 def crs_name(wkt: str) -> str:
@@ -262,10 +267,9 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
     """Positions (n, 2) of the left camera in the CRS of the run's rasters."""
     if not all((run / name).exists() for name in ("trajectory.kitti", "frames.json")):
         return None
-    # Before what follows: a file that cannot be read is refused, one that says something else has no cameras.
-    lines, text = read_lines(run / "trajectory.kitti", "trajectory"), _frames_text(run)
+    # A file that cannot be read is refused, one that says something else has no cameras.
     try:
-        poses, place = np.loadtxt(lines, ndmin=2), _place(text)
+        poses, place = np.loadtxt(read_lines(run / "trajectory.kitti", "trajectory"), ndmin=2), georeference_of(run)
         centres = poses[:, [3, 7, 11]][np.isfinite(poses[:, 3])]
         return np.asarray((centres if place is None else place.apply(centres))[:, :2], np.float64)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
@@ -274,17 +278,8 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
 
 def georeference_of(run: Path) -> Georeference | None:
     """Place of a run's world frame on Earth, as its ``frames.json`` states it."""
-    if not (run / "frames.json").exists():
-        return None
-    return _place(_frames_text(run))
-
-
-def _frames_text(run: Path) -> str:
-    return read_text(run / "frames.json", "frames.json", TABLE)
-
-
-def _place(frames: str) -> Georeference | None:
-    stated = json.loads(frames).get("georeference")
+    path = run / "frames.json"
+    stated = json.loads(read_text(path, "frames.json", TABLE)).get("georeference") if path.exists() else None
     return None if stated is None else Georeference.from_dict(stated)
 
 

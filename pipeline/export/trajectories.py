@@ -5,13 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from rille.pipeline.export import writers
 from rille.pipeline.export.comparison import CrosscheckComparison, compare
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView, there
-from rille.pipeline.export.writers import write_table, write_trajectory_kitti, write_trajectory_tum
+from rille.pipeline.export.writers import FRAME, WORLDS, write_table, write_trajectory_kitti, write_trajectory_tum
 from rille.stages.core.declare import Bundle
-from rille.stages.geometry.pose_arrays import NO_VERTICAL, REFERENCE_PLANE
 from rille.stages.odometry.resection.trajectory import world_poses
 
 
@@ -23,8 +21,7 @@ def stamps(run: RunView) -> list[float]:
 
 def _world(trajectory: Bundle, piece: int) -> str:
     """Frame of a piece in words."""
-    special = {NO_VERTICAL: writers.UNLEVELLED, REFERENCE_PLANE: writers.ON_PLANE}
-    return special.get(trajectory.meta["verticals"][piece], writers.FRAME)
+    return WORLDS.get(trajectory.meta["verticals"][piece], FRAME)
 
 
 def _trajectory(run: RunView) -> Bundle:

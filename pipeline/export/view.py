@@ -58,7 +58,6 @@ class RunView:
     command : the command line that repeats this run.
     vehicle_source : who stated the vehicle's limits, in words.
     started : when, in words (ISO 8601, UTC).
-    notes : further facts to repeat.
     part : the options that chose a part of the run; empty: all of it.
     until, only : of a part: the stages whose tasks, or the files, that it is to make.
     left_out : of a part: the known tasks that were not wanted, by stage.
@@ -77,7 +76,6 @@ class RunView:
     command: str = ""
     vehicle_source: str = ""
     started: str = ""
-    notes: tuple[str, ...] = ()
     part: str = ""
     until: tuple[str, ...] = ()
     only: tuple[str, ...] = ()

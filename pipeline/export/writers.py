@@ -24,6 +24,7 @@ from rille.pipeline.export.foreign_raster import open_raster
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.pose_arrays import NO_VERTICAL, REFERENCE_PLANE
 
 FRAME = (
     "right-handed, metres: origin at the first left camera's centre, z up, y the horizontal projection of its "
@@ -42,6 +43,9 @@ ON_PLANE = (
     "the point of the plane that is nearest to the first left camera, x right in its image, y up"
 )
 """The same where elevations are distances from another plane than the ground."""
+
+WORLDS = {NO_VERTICAL: UNLEVELLED, REFERENCE_PLANE: ON_PLANE}
+"""The world frame in words by the source of its vertical, where it is not :data:`FRAME`."""
 
 ENGINEERING_CRS = (
     'LOCAL_CS["Rille world frame (local metres)",UNIT["metre",1,AUTHORITY["EPSG","9001"]],'

@@ -153,7 +153,6 @@ class _Opened:
         """Return the view with facts that are known late: among them the frames that a drive has taken."""
         if self.drive is not None:
             known["sequence"], known["frames"] = self.drive.taken()
-            known["notes"] = known["sequence"].notes
         return replace(self.view, **known)
 
 
@@ -215,7 +214,6 @@ def _open(options: Options) -> _Opened:
         command=options.command(),
         vehicle_source=settled.vehicle_source,
         started=started.strftime("%Y-%m-%dT%H:%M:%SZ"),
-        notes=sequence.notes,
         part=options.part(),
         until=options.until,
         only=options.only,

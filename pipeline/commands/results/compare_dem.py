@@ -122,12 +122,6 @@ def check(a: DemFile, b: DemFile) -> None:
         raise InputError("RIL-616", text, remedy="compare models of the same place")
 
 
-def _grid(raster: DemFile) -> Grid:
-    # A raster's transform gives the corners of its cells, the comparison wants their centres.
-    t = raster.transform @ Affine.translation(0.5, 0.5)
-    return Grid(raster.values, np.array([[t.a, t.b, t.c], [t.d, t.e, t.f]]))
-
-
 def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any], Floats]:
     """All figures of A against the reference B (JSON-able), and the error, m, of the common cells (rows, cols).
 
@@ -138,7 +132,7 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
     DegenerateError
         The alignment that was asked for is not determined.
     """
-    on_a, on_b, how = evaluation.common(_grid(a), _grid(b))
+    on_a, on_b, how = evaluation.common(a.grid, b.grid)
     missing_crs = [warning("RIL-694", f"{r.name} states no CRS: taken as the other's") for r in (a, b) if not r.crs]
     figures: dict[str, Any] = {
         "a": _about(a),
@@ -180,9 +174,9 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
 
 def changed(a: DemFile, b: DemFile, error: Floats) -> tuple[NDArray[np.float32], dict[str, Any]]:
     """Standard deviation of the ``error`` of :func:`measure`, and list (JSON-able) of what rose or fell from B to A."""
-    grid = evaluation.common(_grid(a), _grid(b))[1]
+    grid = evaluation.common(a.grid, b.grid)[1]
     sigma = [
-        np.zeros(error.shape) if one.sigma is None else evaluation.interpolate(_grid(one), grid.centres(), one.sigma)
+        np.zeros(error.shape) if one.sigma is None else evaluation.interpolate(one.grid, grid.centres(), one.sigma)
         for one in (a, b)
     ]
     deviation = dem_changes.standard_deviation(error, np.hypot(*sigma), np.hypot(*grid.slopes()), grid.cell)
@@ -242,7 +236,7 @@ def _alignment(alignment: evaluation.Alignment, kind: str) -> dict[str, Any]:
 
 def _within(target: Grid, a: DemFile) -> NDArray[np.bool_]:
     """Target cells (rows, cols) whose centres lie in the outline of A."""
-    index = _grid(a).index(target.centres())
+    index = a.grid.index(target.centres())
     return np.asarray(((index >= -0.5) & (index <= np.array(a.values.shape) - 0.5)).all(axis=-1))
 
 

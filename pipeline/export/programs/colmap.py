@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,20 +71,14 @@ def _segments(bundles: RunArtifacts) -> list[MatchedSegment]:
     # A leg of a drive that was stopped is tracked once more, up to there: the later one counts.
     tracks, resections = bundles.all("track"), bundles.all("resect")
     of_key = {_ends(track)[0]: (track, resections[part]) for part, track in tracks.items() if part in resections}
-    keys = sorted(of_key)
-    tracked = [of_key[key] for key in keys]
-    points = [(np.asarray(resection["landmarks"]), np.asarray(resection["inlier"])) for _, resection in tracked]
-    refined = [bundles.find(f"refine/{key}") for key in keys]
-    points = [
-        (np.asarray(b["landmarks"]), np.asarray(b["inlier"])) if b is not None else one
-        for b, one in zip(refined, points, strict=True)
-    ]
-    return [
-        MatchedSegment(
-            track, resection, {f: b for f in _ends(track) if (b := bundles.find(f"hfvm/{f}")) is not None}, *of
-        )
-        for (track, resection), of in zip(tracked, points, strict=True)
-    ]
+    segments = []
+    for key, (track, resection) in sorted(of_key.items(), key=itemgetter(0)):
+        matches = {f: pair for f in _ends(track) if (pair := bundles.find(f"hfvm/{f}")) is not None}
+        refined = bundles.find(f"refine/{key}")
+        points = resection if refined is None else refined
+        landmarks, inlier = np.asarray(points["landmarks"]), np.asarray(points["inlier"])
+        segments.append(MatchedSegment(track, resection, matches, landmarks, inlier))
+    return segments
 
 
 def build(
