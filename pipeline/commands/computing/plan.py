@@ -1,4 +1,4 @@
-"""``rille plan``: what a run would compute, what it would take from the cache, and why; no work is done.
+"""``rille plan``: what a run would compute, what it would take from the cache, and why; ``rille graph``: its stages.
 
 What follows from results that are still to come (which pairs are basic, how far the world reaches) is laid out by the
 same results of the last run. A task behind one that is to be computed counts as to be computed; where its input turns
@@ -16,7 +16,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from rille.datasets.text.count import count
-from rille.pipeline.commands.options import COMPLETE, FLAG, Work, cache_folder
+from rille.pipeline.commands.options import COMPLETE, FLAG, Settings, Work, cache_folder
 from rille.pipeline.engine import memory
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.memory import words
@@ -26,13 +26,13 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
-from rille.pipeline.runs.session import memory_limit, settings_of_run
+from rille.pipeline.runs.session import lay_out, memory_limit, settings, settings_of_run
 from rille.stages.core.errors import ConfigError
 
 MAX_REASONS = 3
 """Different reasons of a stage that are printed; ``verbose`` prints each task's."""
 
-_WORK = Work()
+_SETTINGS, _WORK = Settings(), Work()
 
 
 def plan(
@@ -139,3 +139,29 @@ def _totals(graph: Graph, result: Result, workers: int) -> Iterable[str]:
         yield f"laid out by the last run's {names}, which will be computed anew: the layout may change"
     if result.unknown:
         yield f"more tasks follow, known only after {some(list(dict.fromkeys(result.unknown)), 3)}"
+
+
+def graph(seq: str = "mockup", *, options: Settings = _SETTINGS) -> int:
+    """Draw the stages of a run, the number of their tasks, and what each reads.
+
+    What depends on results that are still to come is drawn as the last run had it, where there was one.
+    Prints text for Graphviz: rille graph SEQ | dot -Tsvg > graph.svg.
+
+    Parameters
+    ----------
+    seq
+        As for reconstruct.
+    """
+    settled = settings(replace(options, sequence=seq))
+    laid_out = lay_out(settled.sequence, settled.config, settled.frames)
+    run(laid_out, Store(cache_folder(options.cache)), RunOptions(dry=True)).check()
+    print(dot(laid_out))
+    return COMPLETE
+
+
+def dot(graph: Graph) -> str:
+    """Return a box for each stage with the number of its tasks, and an arrow for each stage that one reads."""
+    tasks = Counter(handle.stage for handle in graph.nodes)
+    arrows = dict.fromkeys((source.stage, handle.stage) for handle in graph.nodes for source in handle.upstream())
+    boxes = (f'  "{stage}" [label="{stage} x {count}"];' for stage, count in tasks.items())
+    return "\n".join(["digraph {", *boxes, *(f'  "{a}" -> "{b}";' for a, b in arrows if a != b), "}"])

@@ -1,12 +1,15 @@
-"""``rille runs``: the list of all runs."""
+"""``rille runs``, ``timing`` and ``view``: the list of all runs, where the time of one went, and its report."""
 
 from __future__ import annotations
 
-from collections import Counter
+import os
+import sys
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from rille.pipeline.commands.options import COMPLETE, RUNS, Runs
+from rille.datasets.text.count import count
+from rille.pipeline.commands.options import COMPLETE, RUNS, Run, Runs
 from rille.pipeline.engine import events
 from rille.pipeline.runs import lookup
 from rille.stages.core.errors import ConfigError
@@ -35,11 +38,52 @@ def describe(chosen: Iterable[Path]) -> Iterator[str]:
         with lookup.reading(run):
             statuses = Counter(row["status"] for row in events.read(run / lookup.LEDGER))
             facts = events.facts(run / lookup.LEDGER)
-            seconds = facts.get("total", facts.get("seconds"))
             missing = statuses["failed"] + statuses["skipped"]
             # "ok": all tasks have ended; "total": the files and the report are written, too.
             whole = "complete" if "total" in facts else "interrupted"
             state = "interrupted" if "ok" not in facts else f"{missing} missing" if missing else whole
-            took = "" if seconds is None else f"{seconds:.1f}"
             counts = f"{statuses['computed']:8d} {statuses['cached']:8d}"
+            seconds = facts.get("total", facts.get("seconds"))
+            took = "" if seconds is None else f"{seconds:.1f}"
             yield f"{lookup.name(run):44s} {state:12s} {counts} {took:>8s}"
+
+
+def timing(run: Run = "latest", *, runs: Runs = RUNS) -> int:
+    """Show where the time of a run went, by stage.
+
+    Seconds of all tasks of a stage together; compiling: the part that compiled kernels, or waited for another worker
+    that did. The other part of the workers' time reads and commits artifacts, starts workers and waits.
+    """
+    folder = lookup.find(run, runs)
+    with lookup.reading(folder):
+        print("\n".join(by_stage(folder)))
+    return COMPLETE
+
+
+def by_stage(run: Path) -> Iterator[str]:
+    """Lines of the table of a run's time, the stage with the most seconds first."""
+    rows, facts = events.read(run / lookup.LEDGER), events.facts(run / lookup.LEDGER)
+    stages = defaultdict[str, Counter[str]](Counter)
+    for row in rows:
+        sums = Counter({"seconds": row.get("kernel", 0.0), "compiling": row.get("compiling", 0.0), row["status"]: 1})
+        stages[row["stage"]] += sums
+    wall = facts.get("total", facts.get("seconds"))
+    took = "it did not come to its end" if wall is None else f"{wall:.1f} s"
+    yield f"run {lookup.name(run)}: {took} with {count(int(facts.get('jobs', 1)), 'worker')}"
+    yield f"{'stage':19s} {'seconds':>9s} {'compiling':>9s} {'computed':>8s} {'cached':>8s}"
+    largest_first = sorted(stages.items(), key=lambda stage: -stage[1]["seconds"])
+    for name, sums in [*largest_first, ("all", sum(stages.values(), Counter[str]()))]:
+        yield f"{name:19s} {sums['seconds']:9.1f} {sums['compiling']:9.1f} {sums['computed']:8d} {sums['cached']:8d}"
+
+
+def view(run: Run = "latest", *, runs: Runs = RUNS) -> int:
+    """Open the report of a run in the browser; print its path."""
+    from rille.pipeline import api  # it imports NumPy, for which a list need not wait
+
+    opened = api.open_run(run, runs)
+    page = opened.file("report.html")
+    # Over SSH there may be a text browser, which would take the terminal.
+    if sys.platform == "darwin" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
+        opened.show()
+    print(page)
+    return COMPLETE

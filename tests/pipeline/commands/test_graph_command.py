@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from rille.pipeline.commands.computing import graph
+from rille.pipeline.commands.computing.plan import graph
 from rille.pipeline.commands.options import Settings
 
 
 def test_every_stage_is_in_the_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = Settings(assignments=("mockup.frames=3",), cache=str(tmp_path / "cache"))
-    assert graph.graph("mockup-short", options=options) == 0
+    assert graph("mockup-short", options=options) == 0
     text = capsys.readouterr().out
     assert '  "mockup.render" [label="mockup.render x 6"];' in text
     assert '"mockup.render" -> "pyramid"' in text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from rille.pipeline.commands.results import timing
+from rille.pipeline.commands.results import runs
 
 
 def test_seconds_are_summed_by_stage(tmp_path: Path) -> None:
@@ -19,7 +19,7 @@ def test_seconds_are_summed_by_stage(tmp_path: Path) -> None:
     ]
     lines += [{"run": {"jobs": 2}}, {"run": {"seconds": 6.0}}, {"run": {"total": 7.5}}]
     (run / "ledger.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    head, _, *stages = timing.table(run)
+    head, _, *stages = runs.by_stage(run)
     assert head == "run toy/1: 7.5 s with 2 workers"
     assert [line.split() for line in stages] == [
         ["track", "4.5", "2.2", "2", "0"],
