@@ -1,5 +1,7 @@
 """``rille plan``: what a run would compute, what it would take from the cache, and why; ``rille graph``: its stages.
 
+No work is done.
+
 What follows from results that are still to come (which pairs are basic, how far the world reaches) is laid out by the
 same results of the last run. A task behind one that is to be computed counts as to be computed; where its input turns
 out as before, to the bit, the run will find it in the cache all the same. The plan is thus an upper bound.

@@ -18,7 +18,7 @@ from rasterio.crs import CRS
 from rille.datasets.georeference import Georeference
 from rille.pipeline import api
 from rille.pipeline.commands.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder
-from rille.pipeline.commands.results.run_terrain import Terrain
+from rille.pipeline.commands.results.run_terrain import Terrain, level_pose, yaw
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
@@ -28,8 +28,9 @@ from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, re
 from rille.pipeline.export.writers import write_trajectory_tum
 from rille.pipeline.runs import lookup
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import AnyArray, Bundle
+from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
+from rille.stages.evaluation.dem_comparison import Grid
 from rille.stages.evaluation.place import Ortho, PlacedImage, place
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
 from rille.stages.terrain.map_localization import MIN_CHI2_GAP, GlobalMap, MapLocalizationParams, SearchArea, fix
@@ -83,13 +84,11 @@ class Area:
 class Localization:
     """``pose`` T_map_world with its covariance (6, 6): position, m, and rotation, rad; infinite: not found.
 
-    ``doubt`` in words, empty where there is none; ``about``: lines on how it was found; ``facts`` on that for the JSON
-    file.
+    ``facts``: how it was found, for the JSON file; ``doubt`` in words, empty where there is none.
     """
 
     pose: RigidTransform
     covariance: Floats
-    about: tuple[str, ...]
     facts: Mapping[str, Any]
     doubt: str = ""
 
@@ -97,12 +96,25 @@ class Localization:
     def numbers(self) -> dict[str, tuple[float, float]]:
         """What was found, by name, with its standard deviation: position, tilts about the map's axes, yaw."""
         R, sigma = self.pose.rotation, np.sqrt(np.diag(self.covariance))
-        tilts = np.degrees(rotation_log(R @ rotation_exp([0.0, 0.0, -_yaw(self.pose)])))[:2]
-        values = *self.pose.translation, *tilts, math.degrees(_yaw(self.pose))
+        tilts = np.degrees(rotation_log(R @ rotation_exp([0.0, 0.0, -yaw(self.pose)])))[:2]
+        values = *self.pose.translation, *tilts, math.degrees(yaw(self.pose))
         sigmas = *sigma[:3], *np.degrees(sigma[3:])
         return {
             name: (float(value), float(s)) for name, value, s in zip(NAMES, values, sigmas, strict=True) if s < math.inf
         }
+
+    def about(self) -> Iterator[str]:
+        """Lines on how it was found."""
+        facts = self.facts
+        if "cells" in facts:
+            yield (
+                f"fit          {facts['cells']} cells ({facts['independent']:.0f} independent), {facts['overlap']:.0%} "
+                f"of the terrain; RMS {facts['rms']:.3g} m, {max(facts['explained'], 0.0):.0%} of the relief explained"
+            )
+            rival = "next best place ({x_m:.2f}, {y_m:.2f}) m: chi2 larger by {chi2:.0f}, {wanted:g} wanted"
+            yield f"ambiguity    {rival.format(**facts['other']) if 'other' in facts else 'no other place'}"
+        if "keypoints" in facts:
+            yield f"ortho        {facts['keypoints']} keypoints agree"
 
 
 _EVERYWHERE = Area()
@@ -156,7 +168,7 @@ def localize(
     atomic.write(target.with_name(target.name + ".json"), text + "\n")
     if found is not None and not why:
         written += _export(folder, found, target, crs, Store(cache_folder(cache)))
-    print("\n".join([f"ambiguous    {why}", *(found.about if found else ())] if why else _lines(found, crs)))
+    print("\n".join([f"ambiguous    {why}", *(found.about() if found else ())] if why else _lines(found, crs)))
     print("wrote        " + "  ".join(f"{target}{ending}" for ending in written))
     return HOLES if why else COMPLETE
 
@@ -172,7 +184,8 @@ def _found(terrain: Terrain, model: DemFile | None, image: Ortho | None, around:
     by_ortho = None
     if image is not None:
         if around is not None and around.distance < math.inf:
-            image = image._replace(known=image.known & _in_reach(image, terrain, around))
+            away = np.linalg.norm(Grid(image.grey, image.matrix).centres() - [around.x, around.y], axis=-1)
+            image = image._replace(known=image.known & (away <= around.distance + terrain.radius))
         try:
             by_ortho = _by_ortho(place(terrain.image, image))
         except DegenerateError as error:
@@ -188,35 +201,19 @@ def _found(terrain: Terrain, model: DemFile | None, image: Ortho | None, around:
         return _by_elevations(terrain, model, around)
     x, y, _ = by_ortho.pose.translation
     # Elevations and ortho images must agree on a place within ten cells of the map.
-    about = SearchArea(float(x), float(y), _yaw(by_ortho.pose), 10.0 * model.cell, math.radians(TURN_DEG))
+    about = SearchArea(float(x), float(y), yaw(by_ortho.pose), 10.0 * model.cell, math.radians(TURN_DEG))
     found = _by_elevations(terrain, model, about)
-    return replace(found, about=(*found.about, *by_ortho.about), facts={**found.facts, **by_ortho.facts})
-
-
-def _yaw(pose: RigidTransform) -> float:
-    return math.atan2(pose.rotation[1, 0], pose.rotation[0, 0])
-
-
-def _in_reach(image: Ortho, terrain: Terrain, around: SearchArea) -> AnyArray:
-    """Cells (row, col) of an image that the terrain may cover."""
-    row, col = np.indices(image.known.shape)
-    x, y = np.tensordot(image.matrix, np.stack([col, row, np.ones_like(row)]), axes=1)
-    return np.asarray(np.hypot(x - around.x, y - around.y) <= around.distance + terrain.radius)
+    return replace(found, facts={**found.facts, **by_ortho.facts})
 
 
 def _by_ortho(placed: PlacedImage) -> Localization:
     """The place that keypoints agree on; neither height nor tilt."""
-    turn, shift = placed.motion[:, :2], placed.motion[:, 2]
-    heading = math.atan2(turn[1, 0], turn[0, 0])
-    pose = RigidTransform(rotation_exp([0.0, 0.0, heading]), np.array([*shift, 0.0]))
     # The middle of the matches is known; the origin may be far from it.
-    arm, kept = shift - placed.middle, np.ix_([0, 1, 5], [0, 1, 5])
+    arm, kept = placed.motion[:, 2] - placed.middle, np.ix_([0, 1, 5], [0, 1, 5])
     lever = np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]], [0.0, 0.0, 1.0]])
     covariance = np.diag(np.full(6, math.inf))
     covariance[kept] = lever @ np.diag(placed.sigma**2) @ lever.T
-    return Localization(
-        pose, covariance, (f"ortho        {placed.agreeing} keypoints agree",), {"keypoints": placed.agreeing}
-    )
+    return Localization(level_pose(placed.motion), covariance, {"keypoints": placed.agreeing})
 
 
 def _by_elevations(terrain: Terrain, model: DemFile, around: SearchArea | None) -> Localization:
@@ -232,7 +229,7 @@ def _by_elevations(terrain: Terrain, model: DemFile, around: SearchArea | None) 
     x, y, heading, distance, turn = *middle, 0.0, everywhere, math.pi
     if around is not None:
         x, y, _ = to_map.inverse().apply([around.x, around.y, 0.0])
-        heading, turn = around.heading - _yaw(to_map), around.turn
+        heading, turn = around.heading - yaw(to_map), around.turn
         distance = min(around.distance, everywhere + math.hypot(middle[0] - x, middle[1] - y))
     # Standard deviation, degrees, of a vertical that a sensor gives, and of one that is that of the ground.
     tilt = 0.5 if terrain.vertical == "attitude" else 5.0
@@ -246,19 +243,13 @@ def _by_elevations(terrain: Terrain, model: DemFile, around: SearchArea | None) 
     pose, both = to_map @ placed.pose, np.kron(np.eye(2), to_map.rotation)
     kept = "overlap", "rms", "explained", "cells", "independent"
     facts = {name: value for name, value in placed.facts().items() if name in kept}
-    doubt, rival = "", "no other place"
+    doubt = ""
     if placed.other is not None:
         other, chi2 = to_map.apply([*placed.other[0][:2], 0.0])[:2], placed.other[1]
         facts["other"] = {"x_m": other[0], "y_m": other[1], "chi2": chi2, "wanted": MIN_CHI2_GAP}
         there, here = (f"({point[0]:.2f}, {point[1]:.2f}) m" for point in (other, pose.translation))
-        rival = f"next best place {there}: chi2 larger by {chi2:.0f}, {MIN_CHI2_GAP:g} wanted"
         doubt = f"{there} fits {'better than' if chi2 < 0 else 'nearly as well as'} {here}" if placed.doubt else ""
-    about = (
-        f"fit          {placed.cells} cells ({placed.independent:.0f} independent), {placed.overlap:.0%} of the "
-        f"terrain; RMS {placed.rms:.3g} m, {max(placed.explained, 0.0):.0%} of the relief explained",
-        f"ambiguity    {rival}",
-    )
-    return Localization(pose, both @ placed.covariance @ both.T, about, facts, doubt)
+    return Localization(pose, both @ placed.covariance @ both.T, facts, doubt)
 
 
 def _facts(found: Localization | None) -> dict[str, Any]:
@@ -283,7 +274,7 @@ def _lines(found: Localization | None, crs: str) -> Iterator[str]:
         word, _, unit = name.rpartition("_")
         digits = min(6, max(0, 1 - math.floor(math.log10(max(sigma, 1e-6)))))
         yield f"  {word:10s} {value:.{digits}f} +- {sigma:.{digits}f} {unit}"
-    yield from found.about
+    yield from found.about()
 
 
 def _export(folder: Path, found: Localization, target: Path, crs: str, store: Store) -> list[str]:

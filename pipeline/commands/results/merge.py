@@ -15,7 +15,7 @@ from rille.datasets.georeference import Georeference
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE, RUNS, Output, Run, Runs
 from rille.pipeline.commands.results.registration import register
-from rille.pipeline.commands.results.run_terrain import Terrain
+from rille.pipeline.commands.results.run_terrain import Terrain, level_pose, yaw
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import refuse_unlike_systems
@@ -101,10 +101,6 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
     return COMPLETE
 
 
-def _grid(terrain: Terrain) -> Grid:
-    return Grid(terrain.elevation, terrain.image.matrix)
-
-
 def _registered(first: Terrain, other: Terrain) -> Session:
     """Lay a run on the first one.
 
@@ -125,13 +121,11 @@ def _registered(first: Terrain, other: Terrain) -> Session:
         how, start, rough = "georeferences", _in_system(a).inverse() @ _in_system(b), np.zeros(3)
     else:
         placed = register(other.image, first.image, (other.elevation, first.elevation))
-        start = RigidTransform(rotation_exp([0.0, 0.0, placed.heading]), np.array([*placed.motion[:, 2], 0.0]))
-        how, rough = placed.by, placed.sigma
-    turn = start.rotation[:2, :2]
-    own = other.image.matrix
-    moved = np.column_stack([turn @ own[:, :2], turn @ own[:, 2] + start.translation[:2]])
+        how, start, rough = placed.by, level_pose(placed.motion), placed.sigma
     # The place is level: so far it turns about the vertical alone.
-    one, two, _ = dem_comparison.common(Grid(other.elevation + start.translation[2], moved), _grid(first))
+    moved = start.rotation[:2, :2] @ other.grid.matrix
+    moved[:, 2] += start.translation[:2]
+    one, two, _ = dem_comparison.common(Grid(other.elevation + start.translation[2], moved), first.grid)
     alignment = _aligned(one, two)
     if alignment is None:
         if a is None or b is None:
@@ -189,7 +183,7 @@ def _layer(
 def _laid(number: int, first: Terrain, session: Session) -> ModelLayer:
     """The terrain of a run on the first one's lattice, interpolated once, with the sigma of where it lies."""
     terrain, lattice, pose = session.terrain, session.covered(first.lattice.cell), session.pose
-    grid, back, xy = _grid(terrain), session.pose.inverse(), lattice.xy()
+    grid, back, xy = terrain.grid, session.pose.inverse(), lattice.xy()
     z = np.full(lattice.shape, float(pose.apply([0.0, 0.0, session.level])[2]))
     # The point of a tilted model above a cell is found in rounds: its height moves it by less each time.
     for _ in range(4):
@@ -216,11 +210,11 @@ def _laid(number: int, first: Terrain, session: Session) -> ModelLayer:
 def _line(one: Session) -> str:
     """How a run was laid, and how far it differs."""
     x, y, z = one.pose.translation
-    yaw = math.degrees(math.atan2(one.pose.rotation[1, 0], one.pose.rotation[0, 0]))
     overlap, sigma = one.facts["overlap"], one.sigma
+    turned, turn = math.degrees(yaw(one.pose)), math.degrees(sigma[5])
     place_ = (
-        f"{one.terrain.name}: at {x:.4g}, {y:.4g}, {z:.4g} m, turned by {yaw:.3f} degrees (sigma "
-        f"{1e3 * sigma[0]:.2g}, {1e3 * sigma[1]:.2g}, {1e3 * sigma[2]:.2g} mm, {math.degrees(sigma[5]):.2g} degrees; "
+        f"{one.terrain.name}: at {x:.4g}, {y:.4g}, {z:.4g} m, turned by {turned:.3f} degrees (sigma "
+        f"{1e3 * sigma[0]:.2g}, {1e3 * sigma[1]:.2g}, {1e3 * sigma[2]:.2g} mm, {turn:.2g} degrees; "
         f"by {one.facts['by']})"
     )
     if not overlap["cells"]:

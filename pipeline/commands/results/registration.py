@@ -29,11 +29,6 @@ class Registration:
     by: str
     sigma: Floats
 
-    @property
-    def heading(self) -> float:
-        """To the left, rad."""
-        return math.atan2(self.motion[1, 0], self.motion[0, 0])
-
 
 def register(a: Ortho, b: Ortho, heights: tuple[Floats, Floats]) -> Registration:
     """Find where A lies in B, without a start.

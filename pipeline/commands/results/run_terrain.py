@@ -16,9 +16,22 @@ from rille.pipeline.export.read_dem import georeference_of
 from rille.pipeline.runs import lookup
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
+from rille.stages.evaluation.dem_comparison import Grid
 from rille.stages.evaluation.place import Ortho
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
+
+
+def level_pose(motion: Floats) -> RigidTransform:
+    """Motion (2, 3) in the plane, a turn and a shift, as one of space."""
+    turn = rotation_exp([0.0, 0.0, math.atan2(motion[1, 0], motion[0, 0])])
+    return RigidTransform(turn, np.array([*motion[:, 2], 0.0]))
+
+
+def yaw(pose: RigidTransform) -> float:
+    """Angle, rad, to the left, of the x axis of a frame."""
+    return math.atan2(pose.rotation[1, 0], pose.rotation[0, 0])
 
 
 @dataclass(frozen=True)
@@ -65,11 +78,15 @@ class Terrain:
         return Terrain(name, elevation, sigma, ortho, lattice, place, vertical)
 
     @property
+    def grid(self) -> Grid:
+        """The elevations in the world frame."""
+        at = self.lattice
+        return Grid(self.elevation, np.array([[at.cell, 0.0, at.x0], [0.0, -at.cell, at.y0]]))
+
+    @property
     def image(self) -> Ortho:
         """The ortho image in the world frame."""
-        at = self.lattice
-        matrix = np.array([[at.cell, 0.0, at.x0], [0.0, -at.cell, at.y0]])
-        return Ortho(self.ortho.astype(np.float32), np.isfinite(self.ortho), matrix)
+        return Ortho(self.ortho.astype(np.float32), np.isfinite(self.ortho), self.grid.matrix)
 
     @property
     def radius(self) -> float:
