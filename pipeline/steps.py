@@ -277,7 +277,7 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
             "position": (("point", "xyz"), found.position, {"units": "m", "frame": "left camera"}),
             "sigma_along": ("point", found.sigma_along, {"units": "m"}),
             "sigma_across": ("point", found.sigma_across, {"units": "m"}),
-            "colour": (("point", "rgb"), colours(found, left)),
+            "colour": (("point", "rgb"), colours(found.pixel, left)),
             "pixel": (("point", "uv"), found.pixel, {"units": "px"}),
         }
     )

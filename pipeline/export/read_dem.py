@@ -1,9 +1,16 @@
-"""Elevation models read back: from a GeoTIFF or ESRI ASCII grid, or a run's folder."""
+"""Rasters read back: elevation models, from a GeoTIFF or ESRI ASCII grid or a run's folder, ortho images, disparities.
+
+Others may have written them: they are opened so that no file, nor one beside it, can name another that is then read.
+GDAL opens what a file says by any of its drivers: tiles of other files, addresses in the net. So the driver is given,
+one whose files hold all that they show; and what may lie beside a file (``.msk``, ``.ovr``, ``.aux.xml``) is not read.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+import sys
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -17,10 +24,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from rille.datasets.georeference import Georeference
-from rille.datasets.text.reading import TABLE, Search, read_lines, read_text
+from rille.datasets.text.reading import TABLE, Search, open_regular, read_lines, read_text
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.memory import free, words
-from rille.pipeline.export.foreign_raster import open_raster
 from rille.pipeline.export.writers import ENGINEERING_CRS
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation.dem_comparison import Grid
@@ -32,6 +38,9 @@ MAX_CELLS = 500_000_000
 OURS = "give a run as Rille writes it"
 
 NO_PLACE = "give a raster that says itself where its cells are"
+
+TIFF = (b"II", b"MM")
+"""How a TIFF begins; what begins otherwise is read as an ESRI ASCII grid."""
 
 METRE = ("m", "metre", "metres", "meter", "meters")
 
@@ -135,23 +144,40 @@ def _without_marks(dem: DemFile) -> DemFile:
 
 
 @contextmanager
+def _quiet() -> Iterator[None]:
+    """Without what rasterio prints of GDAL's complaints that quote bytes which are no UTF-8."""
+    before, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+
+
+@contextmanager
 def opened_raster(path: Path) -> Iterator[Any]:
-    """A GeoTIFF or ESRI ASCII grid, open for reading, with no more cells than can be read.
+    """A GeoTIFF or ESRI ASCII grid, open for reading.
 
     Raises
     ------
     InputError
-        It cannot be read, or has too many cells.
+        It cannot be read, or is a pipe or a device, on which GDAL would wait for ever.
     """
-    from rasterio.errors import RasterioError
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
-    try:
-        with open_raster(path) as file:
-            _check_cells(path, file.shape, path.stat().st_size)
-            yield file
-    except RasterioError as error:
-        remedy = "give a GeoTIFF, or an ESRI ASCII grid as text without a byte order mark"
-        raise InputError("RIL-629", f"{path} cannot be read as a raster ({error})", remedy=remedy) from error
+    with open_regular(path, "raster", sys.maxsize) as head:
+        driver = "GTiff" if head.peek(2).startswith(TIFF) else "AAIGrid"
+    # By these settings GDAL looks for no masks, overviews and notes beside a file.
+    alone = rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR", GDAL_PAM_ENABLED="NO")
+    with warnings.catch_warnings(), _quiet(), alone:
+        # Whoever needs a place refuses the file in a line of their own.
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        try:
+            with rasterio.open(path, driver=driver) as file:
+                yield file
+        except (RasterioError, UnicodeDecodeError) as error:
+            remedy = "give a GeoTIFF, or an ESRI ASCII grid as text without a byte order mark"
+            raise InputError("RIL-629", f"{path} cannot be read as a raster ({error})", remedy=remedy) from error
 
 
 def read_raster(path: Path) -> DemFile:
@@ -163,6 +189,7 @@ def read_raster(path: Path) -> DemFile:
         It cannot be read, has no geotransform, or has another unit.
     """
     with opened_raster(path) as file:
+        _check_cells(path, file.shape, path.stat().st_size)
         # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
         values = file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
         crs, transform, unit = file.crs, file.transform, file.units[0]
@@ -188,6 +215,7 @@ def read_ortho(path: Path) -> tuple[Ortho, str]:
         It cannot be read, has no geotransform, no known cell, or is not in metres.
     """
     with opened_raster(path) as file:
+        _check_cells(path, file.shape, path.stat().st_size)
         grey, known = file.read(out_dtype="float32").mean(axis=0), file.dataset_mask() != 0
         t, crs = file.transform, file.crs
     wkt = _checked_system(path, t, crs)
@@ -195,6 +223,31 @@ def read_ortho(path: Path) -> tuple[Ortho, str]:
     if not known.any():
         raise InputError("RIL-856", f"{path} has no known cell", remedy="give another image")
     return Ortho(grey, known, centres(t)), wkt
+
+
+def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Column and row disparity (row, col), float32 pixels, NaN undefined, of a TIFF as ``rille match`` writes it.
+
+    Parameters
+    ----------
+    shape : (rows, columns) that it must have; compared before anything is unpacked.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, its two bands are not those, or it has another size.
+    """
+    remedy = "give a TIFF with the bands column_disparity and row_disparity, as rille match writes"
+    with opened_raster(path) as file:
+        names = tuple(name for name in file.descriptions if name)
+        if file.count != 2 or names not in ((), ("column_disparity", "row_disparity")):
+            listed = ", ".join(names) or "without names"
+            raise InputError("RIL-622", f"{path} has {file.count} bands ({listed}), no disparity", remedy=remedy)
+        if shape and file.shape != shape:
+            text = f"{path} has {file.width} x {file.height} pixels, the left image {shape[1]} x {shape[0]}"
+            raise InputError("RIL-044", text, remedy="give a disparity of this left image")
+        column, row = file.read(out_dtype="float32", masked=True).filled(np.nan)
+    return np.ascontiguousarray(column), np.ascontiguousarray(row)
 
 
 def _check_cells(path: Path, shape: tuple[int, ...], stored: int) -> None:
@@ -267,9 +320,10 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
     """Positions (n, 2) of the left camera in the CRS of the run's rasters."""
     if not all((run / name).exists() for name in ("trajectory.kitti", "frames.json")):
         return None
-    # A file that cannot be read is refused, one that says something else has no cameras.
+    # Before what follows: a file that cannot be read is refused, one that says something else has no cameras.
+    lines, frames = read_lines(run / "trajectory.kitti", "trajectory"), _frames(run)
     try:
-        poses, place = np.loadtxt(read_lines(run / "trajectory.kitti", "trajectory"), ndmin=2), georeference_of(run)
+        poses, place = np.loadtxt(lines, ndmin=2), _place(frames)
         centres = poses[:, [3, 7, 11]][np.isfinite(poses[:, 3])]
         return np.asarray((centres if place is None else place.apply(centres))[:, :2], np.float64)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
@@ -278,8 +332,15 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
 
 def georeference_of(run: Path) -> Georeference | None:
     """Place of a run's world frame on Earth, as its ``frames.json`` states it."""
-    path = run / "frames.json"
-    stated = json.loads(read_text(path, "frames.json", TABLE)).get("georeference") if path.exists() else None
+    return _place(_frames(run)) if (run / "frames.json").exists() else None
+
+
+def _frames(run: Path) -> str:
+    return read_text(run / "frames.json", "frames.json", TABLE)
+
+
+def _place(frames: str) -> Georeference | None:
+    stated = json.loads(frames).get("georeference")
     return None if stated is None else Georeference.from_dict(stated)
 
 

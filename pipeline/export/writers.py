@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.plain import plain
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.export.foreign_raster import open_raster
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.lattice import Lattice
@@ -256,33 +255,3 @@ def _write_image(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning
     # 3 is TIFF's predictor of floats; GTiff does not choose by itself, as COG does.
     profile = {"driver": "GTiff", "predictor": 3}
     write_bands(path, {n: np.asarray(v, np.float32) for n, v in bands.items()}, meaning, profile)
-
-
-def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Column and row disparity (row, col), float32 pixels, NaN undefined, of a TIFF as :func:`write_disparity` makes.
-
-    Parameters
-    ----------
-    shape : (rows, columns) that it must have; compared before anything is unpacked.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, its two bands are not those, or it has another size.
-    """
-    from rasterio.errors import RasterioError
-
-    remedy = "give a TIFF with the bands column_disparity and row_disparity, as rille match writes"
-    try:
-        with open_raster(path) as file:
-            names = tuple(name for name in file.descriptions if name)
-            if file.count != 2 or names not in ((), ("column_disparity", "row_disparity")):
-                listed = ", ".join(names) or "without names"
-                raise InputError("RIL-622", f"{path} has {file.count} bands ({listed}), no disparity", remedy=remedy)
-            if shape and file.shape != shape:
-                text = f"{path} has {file.width} x {file.height} pixels, the left image {shape[1]} x {shape[0]}"
-                raise InputError("RIL-044", text, remedy="give a disparity of this left image")
-            column, row = file.read(out_dtype="float32", masked=True).filled(np.nan)
-    except RasterioError as error:
-        raise InputError("RIL-623", f"{path} cannot be read as a TIFF ({error})", remedy=remedy) from error
-    return np.ascontiguousarray(column), np.ascontiguousarray(row)

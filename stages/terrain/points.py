@@ -90,9 +90,9 @@ def points(disparity: Bundle, rig: Rig, every: int = 1) -> PairPoints:
     )
 
 
-def colours(points: PairPoints, image: Bundle) -> Bytes:
-    """Red, green and blue (n, 3) of points in the left image of their pair; three times its grey where it is grey."""
-    column, row = points.pixel.T
+def colours(pixel: NDArray[np.integer], image: Bundle) -> Bytes:
+    """Red, green and blue (n, 3) of pixels (n, 2), column and row, of an image; thrice its grey where it is grey."""
+    column, row = pixel.T
     if "colour" in image.arrays:
         return np.asarray(np.asarray(image["colour"])[row, column])
     grey = np.asarray(image["image"])

@@ -30,7 +30,7 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.index import TABLE, Index
 from rille.pipeline.engine.store.manifest import artifact_path
 from rille.pipeline.engine.store.zarr_group import codec
-from rille.pipeline.export.writers import read_disparity
+from rille.pipeline.export.read_dem import read_disparity
 from rille.pipeline.flow import config
 from rille.stages.core.errors import RilleError
 

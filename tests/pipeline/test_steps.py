@@ -16,7 +16,7 @@ from rille.pipeline import steps
 from rille.pipeline.cli import main
 from rille.pipeline.engine import events
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.export.writers import read_disparity
+from rille.pipeline.export.read_dem import read_disparity
 
 MOCKUP = {"frames": 3, "image_width": 285, "image_height": 260, "focal_length": 300.0}
 VEHICLE = {"wheel_diameter": 0.05, "track": 0.08, "wheel_base": 0.1, "clearance": 0.03, "max_step": 0.012}

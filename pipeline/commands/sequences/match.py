@@ -17,7 +17,7 @@ from rille.datasets.images.files import read_grey, refuse_swapped
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands.options import COMPLETE, FLAG, HOLES, Assignments, Output, check_output
 from rille.pipeline.engine.plain import raw, warn
-from rille.pipeline.export.writers import read_disparity, write_confidence, write_disparity
+from rille.pipeline.export.writers import write_confidence, write_disparity
 from rille.pipeline.flow import config as configuration
 from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.core.validity import Validity, has, matched, matched_back
@@ -88,6 +88,8 @@ class Matcher:
         """
         if self.prior_disparity is None:
             return None
+        from rille.pipeline.export.read_dem import read_disparity
+
         column, row = read_disparity(self.prior_disparity, shape)
         if not (np.isfinite(column) & np.isfinite(row)).any():
             text = f"prior disparity {self.prior_disparity} is undefined everywhere"

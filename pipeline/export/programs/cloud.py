@@ -83,7 +83,7 @@ def _columns(run: RunArtifacts, one: PlacedPair, place: Georeference | None) -> 
     if place is not None:
         ray[:, :2], position = ray[:, :2] @ place.rotation.T, place.apply(position)
     columns = dict(zip("xyz", position.T, strict=True))
-    columns |= zip(("red", "green", "blue"), colours(found, run.left_image(one.pair)).T, strict=True)
+    columns |= zip(("red", "green", "blue"), colours(found.pixel, run.left_image(one.pair)).T, strict=True)
     columns |= {"sigma_along": found.sigma_along, "sigma_across": found.sigma_across}
     columns |= zip(("ray_x", "ray_y", "ray_z"), ray.T.astype(np.float32), strict=True)
     return columns | {"pair": np.full(len(position), one.pair, np.uint32)}

@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 
 from rille.datasets.text.reading import TABLE, read_text
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
+from rille.stages.core.arrays import Bytes
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.imaging.features import PIXEL_CENTRE
 from rille.stages.odometry.resection.landmarks import matches_at
 from rille.stages.odometry.resection.trajectory import world_poses
+from rille.stages.terrain.points import colours
 
 Floats = NDArray[np.float64]
 
@@ -134,9 +136,9 @@ def build(
             )
             image.frame_id = k
             model.add_image(image)
-    for position, elements, grey in points:
+    for position, elements, colour in points:
         track = pycolmap.Track([pycolmap.TrackElement(number[image], at) for image, at in elements])
-        model.add_point3D(position, track, np.full(3, grey, dtype=np.uint8))
+        model.add_point3D(position, track, colour)
     for k in range(1, len(poses) + 1):
         model.register_frame(k)
     model.update_point_3d_errors()
@@ -151,8 +153,8 @@ def _ends(track: Bundle) -> list[int]:
 
 def _points(
     segment: MatchedSegment, rig: Rig, poses: Mapping[int, RigidTransform], seen: Seen, images: Mapping[int, Bundle]
-) -> Iterator[tuple[Floats, list[tuple[tuple[int, str], int]], int]]:
-    """Points of a segment in the world, by which pixel of which images each is seen, and its grey value (or black).
+) -> Iterator[tuple[Floats, list[tuple[tuple[int, str], int]], Bytes]]:
+    """Points of a segment in the world, by which pixel of which images each is seen, and its colour (or black).
 
     The pixels are added to ``seen``.
     """
@@ -175,13 +177,9 @@ def _points(
             vectors, matched = matches_at(left, pair)
             pixels[:, j, 1] += vectors
             shown[:, j, 1] = agrees & matched & _near(rig.right, rig.T_right_left.apply(in_left), pixels[:, j, 1])
-    grey = np.asarray(images[key]["image"]) if key in images else np.zeros((1, 1), np.uint8)
-    columns, rows = (
-        np.clip(np.nan_to_num(pixels[:, 0, 0, k]).astype(int), 0, n - 1) for k, n in enumerate(grey.shape[::-1])
-    )
-    values = grey[rows, columns]
-    # COLMAP's colours have 8 bits: of 16 the high byte. Undistorted images are floats of 0..255.
-    values = np.rint(values) if values.dtype.kind == "f" else values >> (8 * (values.itemsize - 1))
+    last = rig.left.width - 1, rig.left.height - 1
+    first = np.clip(np.nan_to_num(pixels[:, 0, 0]).astype(int), 0, last)
+    rgb = colours(first, images[key]) if key in images else np.zeros((len(first), 3), np.uint8)
     # A point seen once would slide along its ray in any adjustment of the model.
     for k in np.flatnonzero(np.isfinite(world).all(1) & (shown.sum(axis=(1, 2)) > 1)):
         elements = []
@@ -189,7 +187,7 @@ def _points(
             image = frames[j], SIDES[side]
             elements.append((image, len(seen[image])))
             seen[image].append(pixels[k, j, side] + PIXEL_CENTRE)
-        yield world[k], elements, int(values[k])
+        yield world[k], elements, rgb[k]
 
 
 def _near(camera: Camera, points: Floats, pixels: Floats) -> NDArray[np.bool_]:

@@ -11,7 +11,8 @@ from raising import raises
 from rille.pipeline.cli import main
 from rille.pipeline.commands.sequences import match as command
 from rille.pipeline.engine.failures import translated
-from rille.pipeline.export.writers import read_disparity, write_disparity
+from rille.pipeline.export.read_dem import read_disparity
+from rille.pipeline.export.writers import write_disparity
 from rille.stages.core.validity import Validity
 
 SHIFT = -9.0
@@ -156,10 +157,10 @@ def test_priors_that_are_none(folder):
     write_disparity(folder / "nothing.tif", nothing, nothing, {})
     with raises("RIL-045"):
         run(folder, prior=folder / "nothing.tif")
-    with raises("RIL-623"):
+    with raises("RIL-629"):
         run(folder, prior=folder / "left.png")
     (folder / "text.tif").write_text("no image")
-    for name, code in (("text.tif", "RIL-623"), ("absent.tif", "RIL-138")):
+    for name, code in (("text.tif", "RIL-629"), ("absent.tif", "RIL-138")):
         with raises(code, name):
             run(folder, prior=folder / name)
 

@@ -91,9 +91,9 @@ def test_colour_is_that_of_the_left_image(dtype, scale):
     grey = np.arange(LEFT.height * LEFT.width).reshape(LEFT.height, LEFT.width) % 251
     column, row = found.pixel.T
     image = Bundle({"image": (grey * scale).astype(dtype)}, {})
-    np.testing.assert_array_equal(colours(found, image), np.repeat(grey[row, column, None], 3, axis=1))
+    np.testing.assert_array_equal(colours(found.pixel, image), np.repeat(grey[row, column, None], 3, axis=1))
     rgb = np.stack([grey, grey[::-1], grey * 0], axis=2).astype(np.uint8)
-    np.testing.assert_array_equal(colours(found, Bundle({**image.arrays, "colour": rgb}, {})), rgb[row, column])
+    np.testing.assert_array_equal(colours(found.pixel, Bundle({**image.arrays, "colour": rgb}, {})), rgb[row, column])
 
 
 def test_of_a_voxel_the_most_certain_point_stays():
