@@ -110,7 +110,7 @@ def _write_output(path: Path, run: RunView) -> None:
     about = {
         "title": f"Merged terrain of the sequence {run.sequence.name}",
         "source": "stereo images: disparity by HFVM, elevation models by Locus, merged; Rille",
-        **above(tiles),
+        **above(run),
     }
     write_terrain(path, arrays, lattice, run.sequence.georeference, about)
 

@@ -8,7 +8,7 @@ from test_output import run
 
 from rille.datasets.images.files import decode_colour
 from rille.pipeline.export import colour
-from rille.pipeline.export.rasters import write_ortho
+from rille.pipeline.export.rasters import OUTPUTS
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
@@ -65,7 +65,8 @@ def test_each_cell_takes_the_colour_of_its_pair_and_keeps_the_merged_grey():
 def test_grey_sequences_write_grey_ortho_images(tmp_path):
     view, _ = run()
     assert not colour.coloured(view, np.zeros((1, 1), int))
-    write_ortho(tmp_path / "ortho.tif", view)
+    (row,) = (output for output in OUTPUTS if output.name == "ortho.tif")
+    row.write(tmp_path / "ortho.tif", view)
     with rasterio.open(tmp_path / "ortho.tif") as found:
         assert (found.count, found.dtypes[0]) == (1, "float32")
 
