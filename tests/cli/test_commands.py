@@ -310,7 +310,7 @@ def test_export_of_a_model_replaces_none(place: Place, tmp_path: Path) -> None:
     words = ["export", place.runs("other")[-1], "--to", "colmap", "--output", tmp_path / "colmap"]
     first, files = place.rille(*words), contents(tmp_path)
     assert (first.status, first.err) == (0, "")
-    assert first.last.startswith(f"{tmp_path / 'colmap'}: 2 frames of 2 images, ")
+    assert first.last.startswith(f"{tmp_path / 'colmap'}  2 frames of 2 images, ")
     assert len(files) > 3
     again = place.rille(*words)
     assert (again.status, again.out) == (2, "")
