@@ -77,8 +77,8 @@ class DemFile:
     def extent(self) -> tuple[float, float, float, float]:
         """Outline x_min, x_max, y_min, y_max in the CRS."""
         rows, cols = self.values.shape
-        corners = np.array([self.transform @ c for c in ((0, 0), (cols, 0), (0, rows), (cols, rows))])
-        return tuple(float(f(corners[:, k])) for k in (0, 1) for f in (np.min, np.max))  # type: ignore[return-value]
+        x, y = self.transform @ (np.array([0, cols, 0, cols]), np.array([0, 0, rows, rows]))
+        return float(x.min()), float(x.max()), float(y.min()), float(y.max())
 
 
 def centres(transform: Affine) -> NDArray[np.float64]:

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.plain import plain
 from rille.pipeline.engine.runtime import atomic
-from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.pose_arrays import NO_VERTICAL, REFERENCE_PLANE
@@ -89,15 +88,7 @@ def write_raster(
     bands : arrays (row, col) of one dtype on ``lattice``, by the band's name.
     place : of the world frame. The raster is not resampled: its geotransform is turned by the azimuth. Elevations have
         to be heights in its system already.
-
-    Raises
-    ------
-    InputError
-        An array does not fit the lattice.
     """
-    for name, values in bands.items():
-        if values.shape != lattice.shape:
-            raise InputError("RIL-621", f"band {name} of {values.shape} cells does not fit its lattice {lattice.shape}")
     profile = {
         "driver": "COG",
         "crs": ENGINEERING_CRS if place is None else place.crs,

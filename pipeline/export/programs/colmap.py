@@ -206,6 +206,5 @@ def _rigid(pycolmap: Any, T: RigidTransform) -> Any:
 
 def _names(run: Path) -> dict[int, str]:
     """Image names by frame number, as the run wrote them down."""
-    facts = json.loads(read_text(run / "frames.json", "frames.json", TABLE))
-    rows = facts.get("frames", [])
-    return {int(r["frame"]): str(r["name"]) for r in rows if isinstance(r, dict) and "name" in r}
+    rows = json.loads(read_text(run / "frames.json", "frames.json", TABLE)).get("frames", [])
+    return {int(row["frame"]): str(row["name"]) for row in rows}

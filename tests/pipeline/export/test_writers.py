@@ -13,7 +13,6 @@ import pyproj
 import pytest
 import rasterio
 from evo.tools import file_interface
-from raising import raises
 from toys.finished import FRAMES, sequence, view
 
 from rille.datasets.georeference import Georeference
@@ -109,11 +108,6 @@ def test_classes_have_colours(tmp_path: Path) -> None:
     with rasterio.open(tmp_path / "a.tif") as file:
         assert file.colorinterp == (rasterio.enums.ColorInterp.palette,)
         assert [file.colormap(1)[k] for k in (0, 1)] == [(0xA6, 0xD7, 0xC3, 255), (0, 1, 255, 255)]
-
-
-def test_a_raster_that_does_not_fit_is_refused(tmp_path: Path) -> None:
-    with raises("RIL-621"):
-        write_raster(tmp_path / "a.tif", {"a": np.zeros((2, 2), np.uint8)}, LATTICE, Meaning("1", nodata=None))
 
 
 def test_evo_reads_the_trajectories(tmp_path: Path) -> None:
