@@ -80,7 +80,6 @@ def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]
         "seconds": round(view.seconds, 3),
         "versions": dict(view.versions),
         "vehicle": {**facts["vehicle"], "source": view.vehicle_source},
-        "notes": list(dict.fromkeys(facts["notes"])),
     }
 
 

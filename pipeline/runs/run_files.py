@@ -73,9 +73,8 @@ def task_rows(graph: Graph) -> tuple[TaskRow, ...]:
     """One row a task, with the seconds that it took whenever it was computed."""
     rows = []
     for h in graph.nodes:
-        seconds: float | None = h.took.seconds if h.status == "computed" else None
-        if h.status == "cached" and h.ref is not None:
-            seconds = h.ref.seconds
+        before = None if h.ref is None else h.ref.seconds
+        seconds = h.took.seconds if h.status == "computed" else before
         reason = " ".join(str(h.error).split()) if h.error is not None else h.reason
         rows.append(TaskRow(h.label, h.stage, h.status, seconds, reason))  # type: ignore[arg-type]
     return tuple(rows)
