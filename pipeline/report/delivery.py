@@ -219,9 +219,6 @@ def coverage(view: RunView) -> list[str]:
     ]
 
 
-"""Share of the matched pixels from which on it is said that limits keep them off the map."""
-
-
 def moved(view: RunView) -> list[str]:
     """What moved by itself, in one line for the run."""
     shares = {pair: float(facts_of(view, one).get("share", 0.0)) for pair, one in view.products.moving.items()}
@@ -234,9 +231,6 @@ def moved(view: RunView) -> list[str]:
         f"{len(pairs)} of {len(shares)} pairs show something that moves by itself, pair {most} the most: "
         f"{shares[most]:.0%} of its image. The world's terrain is made without it; models of single pairs hold it."
     ]
-
-
-"""Share of an image that moves by itself from which on that is said; errors of displacements come to less."""
 
 
 def _path(view: RunView) -> Items:

@@ -143,17 +143,9 @@ class Drawing:
 
 
 def _of_map(run: RunView) -> tuple[object, ...]:
-    p, s = run.products, run.sequence
-    return (
-        p.world_tiles,
-        p.world_risk,
-        p.world_path,
-        p.drive,
-        p.disparity,
-        *colour.reads(run),
-        s.truth,
-        run.config.vehicle,
-    )
+    p = run.products
+    drawn = p.world_tiles, p.world_risk, p.world_path, p.drive, p.disparity, p.accuracy, run.config.vehicle
+    return *drawn, *colour.reads(run)
 
 
 def _of_stops(run: RunView) -> tuple[object, ...]:
@@ -163,7 +155,7 @@ def _of_stops(run: RunView) -> tuple[object, ...]:
 
 def _of_trajectory(run: RunView) -> tuple[object, ...]:
     p = run.products
-    return p.trajectory, p.agreement, p.accuracy, p.crosscheck_accuracy, run.sequence.truth
+    return p.trajectory, p.agreement, p.accuracy, p.crosscheck_accuracy
 
 
 DRAWINGS = (
@@ -171,7 +163,7 @@ DRAWINGS = (
     Drawing(
         "Drive",
         strips.drive,
-        lambda run: (run.products.drive, run.products.images, run.products.trajectory, run.sequence.truth),
+        lambda run: (run.products.drive, run.products.images, run.products.trajectory, run.products.accuracy),
     ),
     Drawing("Disparity", _disparity, lambda run: (run.products.disparity, run.sequence.rig)),
     Drawing("Stops", strips.pairs, _of_stops),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.pipeline.export import ranges
 from rille.pipeline.export.artifacts import Floats, used_rig
 from rille.pipeline.export.artifacts import by_frame as rows
 from rille.pipeline.export.comparison import CrosscheckComparison, compare
@@ -21,9 +19,7 @@ from rille.pipeline.flow.products import Stop
 from rille.stages.core.declare import Bundle
 from rille.stages.evaluation.rigid import by_frame
 from rille.stages.geometry.epipolar import distances
-from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice, union
-from rille.stages.numeric.robust import mad_sigma
 from rille.stages.odometry.resection.trajectory import world_poses
 
 
@@ -68,18 +64,6 @@ class Track:
     def in_world(self) -> NDArray[np.bool_]:
         """Frames that have a pose in the world."""
         return np.asarray(np.isfinite(self.left).all(axis=1))
-
-
-@dataclass(frozen=True)
-class Difference:
-    """Elevation of the model of ``pair`` minus that of the one before, in the world, over their common cells, m.
-
-    ``median``; ``deviation`` robust (1.4826 times the median absolute deviation).
-    """
-
-    pair: int
-    median: float
-    deviation: float
 
 
 @dataclass(frozen=True)
@@ -149,14 +133,6 @@ class Scene:
         return None if agreement is None else compare(self.view, agreement)
 
     @cached_property
-    def differences(self) -> list[Difference]:
-        """Differences of successive elevation models that overlap, in the order of the pairs."""
-        view = self.view
-        present = [pair for pair, handle in view.products.world_dem.items() if view.bundle(handle) is not None]
-        differences = (_difference(view, before, pair) for before, pair in itertools.pairwise(present))
-        return [difference for difference in differences if difference is not None]
-
-    @cached_property
     def calibration(self) -> Calibration | None:
         """The rig, as it was given and as it was used; None if no task examined it."""
         p = self.view.products
@@ -196,29 +172,21 @@ def trajectory(view: RunView) -> Track:
     segment, piece = (np.nan_to_num(rows(view, bundle, name), nan=-1).astype(int) for name in ("segment", "piece"))
     return Track(
         np.where(there[:, None], poses[:, :, 3], np.nan),
-        _truth_in_world(view, poses),
+        _truth_in_world(view),
         np.where(there, np.sqrt(np.maximum(variances, 0)), np.nan),
         np.where(there, segment, -1),
         piece,
     )
 
 
-def _truth_in_world(view: RunView, poses: Floats) -> Floats | None:
-    """True positions (frame, 3) of the left camera, brought to the world by the first frame that has both alone.
+def _truth_in_world(view: RunView) -> Floats | None:
+    """True positions (frame, 3) of the left camera in the world, NaN in gaps, as ``accuracy`` brought them there.
 
-    NaN in gaps; None where no frame has both.
+    None where no frame has a pose and truth.
     """
-    true = [None if view.sequence.truth is None else view.sequence.truth[frame] for frame in view.frames]
-    placed = (
-        (RigidTransform.from_matrix(p), t)
-        for p, t in zip(poses, true, strict=True)
-        if t is not None and np.isfinite(p).all()
-    )
-    estimate, first = next(placed, (None, None))
-    if estimate is None or first is None:
-        return None
-    T_world_truth = estimate @ first.inverse()
-    return np.array([[np.nan] * 3 if pose is None else (T_world_truth @ pose).translation for pose in true])
+    assessed = view.bundle(view.products.accuracy)
+    truth = np.full((1, 3), np.nan) if assessed is None else rows(view, assessed, "position_truth")
+    return truth if np.isfinite(truth).any() else None
 
 
 def stops(view: RunView) -> list[Stop]:
@@ -268,20 +236,3 @@ def _residuals(view: RunView, pair: int) -> tuple[Floats, Floats, Floats] | None
     before = distances(given, np.zeros(5), left, right)[0]
     after = before if used.to_dict() == given.to_dict() else distances(used, np.zeros(5), left, right)[0]
     return left, before, after
-
-
-def _difference(view: RunView, before: int, pair: int) -> Difference | None:
-    models = [terrain(view.bundle(view.products.world_dem[k]), "elevation") for k in (before, pair)]
-    if models[0] is None or models[1] is None:
-        return None
-    common = models[0].lattice.intersection(models[1].lattice)
-    if common is None:
-        return None
-    first, second = (
-        np.asarray(m.arrays["elevation"][m.lattice.window(common)], dtype=np.float64) for m in models if m is not None
-    )
-    known = np.isfinite(second - first)
-    if int(known.sum()) < ranges.FEW:
-        return None
-    sampled = ranges.sample(second - first)
-    return Difference(pair, float(np.median(sampled)), mad_sigma(sampled))

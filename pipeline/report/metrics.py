@@ -222,7 +222,9 @@ def _matching(pairs: Rows) -> dict[str, Metric]:
         by_name["matched"] = metric("Matched pixels", statistics.fmean(matched), "1", how, every)
     offsets = _values(pairs, "difference_m")
     if offsets:
-        how = "elevation of a model minus that of the one before in their common cells: median, its size over pairs"
+        how = (
+            "elevation of a model minus that of the one before, bias of their common cells: its size, median over pairs"
+        )
         every, value = f"{len(offsets)} of {len(pairs) - 1} successive models", statistics.median(map(abs, offsets))
         by_name["overlap_median"] = metric("Offset of overlapping models", value, "m", how, every)
     return by_name

@@ -70,7 +70,7 @@ def of_pairs(p: Products) -> tuple[object, ...]:
     """Products that :func:`pairs` reads."""
     return (
         *(p.keyframes, p.screening, p.orientations, p.disparity, p.level, p.local_dem, p.local_risk, p.local_path),
-        *(p.local_dem_accuracy, p.world_dem),
+        *(p.local_dem_accuracy, p.seams),
     )
 
 
@@ -81,10 +81,11 @@ def pairs(scene: gather.Scene) -> list[Row]:
     tracked = chain(view)
     numbers = [tracked[i] for i in choice.get("basic", ())]
     overlap, why = (dict(zip(numbers, choice.get(key) or (), strict=False)) for key in ("overlap", "why"))
-    differences = {d.pair: d for d in scene.differences}
-    rows = []
+    rows = list[Row]()
     for pair, handle in p.disparity.items():
-        disparity, difference = view.bundle(handle), differences.get(pair)
+        disparity, before = view.bundle(handle), rows[-1]["frame"] if rows else None
+        seams = facts_of(view, p.seams.get(pair)).get("seams", ())
+        difference = next((seam for seam in seams if seam["other"] == before), {})
         dem, path = facts_of(view, p.local_dem.get(pair)), facts_of(view, p.local_path.get(pair))
         shares = facts_of(view, p.local_risk.get(pair)).get("shares", {})
         judged = facts_of(view, p.local_dem_accuracy.get(pair)).get("metrics", {})
@@ -109,8 +110,8 @@ def pairs(scene: gather.Scene) -> list[Row]:
                 "why_basic": why.get(pair),
                 "overlap": overlap.get(pair),
                 "epipolar_px": facts_of(view, p.orientations.get(pair)).get("residual_before_px"),
-                "difference_m": None if difference is None else difference.median,
-                "difference_deviation_m": None if difference is None else difference.deviation,
+                "difference_m": difference.get("bias"),
+                "difference_deviation_m": difference.get("noise"),
             }
         )
     return rows

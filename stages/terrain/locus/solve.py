@@ -9,8 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
+from rille.stages.core.declare import Params
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.scale import of_rig
 from rille.stages.geometry.surface import Surface
@@ -34,41 +36,65 @@ class Matches:
     std: ArrayLike | None = None
 
 
-@dataclass(frozen=True)
-class SearchLimits:
-    """What the search of elevations is bounded by.
+class LocusParams(Params):
+    """Parameters of the stage ``locus``."""
 
-    ``z_range`` lowest and highest elevation, metres; ``max_residual`` of a solution and ``max_jump`` in its bilinear
-    cell, pixels; ``sigma`` standard deviation of disparities that have none of their own, pixels.
-    """
-
-    z_range: tuple[float, float]
-    max_residual: float
-    max_jump: float
-    sigma: float
+    cell_size: float | None = Field(None, gt=0, description="side of a cell [m]; not set: it follows from the rig")
+    extent: tuple[float, float, float, float] | None = Field(
+        None, description="x_min, x_max, y_min, y_max [m] in the local frame; not set: what both cameras see well"
+    )
+    max_range_cells: float = Field(
+        6.0, gt=0, description="number of cells that a pixel may cover along the range within the automatic extent"
+    )
+    max_sigma: float | None = Field(
+        None,
+        gt=0,
+        description="largest standard deviation [m], by sigma_disparity; not set: one cell size, and above a plane "
+        "that is no ground ten times that of the median match",
+    )
+    max_std: float | None = Field(
+        None, gt=0, description="largest standard deviation [m] of a cell, by the matcher's; not set: 1.4 max_sigma"
+    )
+    sigma_disparity: float = Field(0.2, gt=0, description="standard deviation of a typical disparity [pixels]")
+    max_residual: float = Field(0.5, gt=0, description="largest residual |p_l + d - p_r| of a solution [pixels]")
+    refine_steps: int = Field(
+        2, ge=0, le=20, description="number of Gauss-Newton steps that refine the elevations by both images; 0: none"
+    )
+    refined_share: float = Field(
+        1.0, gt=0, le=1, description="weight of the refined elevation; 0.5 for matches of preset accurate, 1 for others"
+    )
+    both: bool = Field(
+        False, description="also match from right to left and use both elevations; doubles the time of matching"
+    )
+    max_jump: float = Field(
+        3.0, gt=0, description="largest range of the four disparities around a cell [pixels] that are one surface"
+    )
 
 
 class PairArrays:
-    """The arrays of one pair as the kernel wants them."""
+    """The arrays of one pair as the kernel wants them; elevations are searched in ``z_range``, m."""
 
     def __init__(
-        self, matches: Matches, image: ArrayLike, rig: Rig, T_surface_left: RigidTransform, limits: SearchLimits
+        self,
+        matches: Matches,
+        image: ArrayLike,
+        rig: Rig,
+        T_surface_left: RigidTransform,
+        z_range: tuple[float, float],
+        params: LocusParams,
     ) -> None:
-        maps = [np.asarray(a) for a in (matches.column, matches.row, image)]
-        shape = maps[0].shape
+        shape = np.shape(matches.column)
         rig.check(shape)
-        disparity = np.stack(maps[:2], axis=-1, dtype=np.float32, casting="unsafe")
+        disparity = np.stack([matches.column, matches.row], axis=-1, dtype=np.float32, casting="unsafe")
         # NaN in the arrays, not a mask: the kernel's sums become NaN by themselves where a pixel must not be used.
         disparity[~matches.usable] = np.nan
-        std = np.full(shape, limits.sigma) if matches.std is None else matches.std
-        grey, std = (np.ascontiguousarray(a, np.float32) for a in (maps[2], std))
+        std = np.full(shape, params.sigma_disparity) if matches.std is None else matches.std
+        grey, std = (np.ascontiguousarray(a, np.float32) for a in (image, std))
         wide, high = of_rig(rig)
-        scale = float(wide), float(high)
-        self.seen = Observed(disparity, std, grey, float(limits.max_residual), float(limits.max_jump), scale)
+        self.seen = Observed(disparity, std, grey, params.max_residual, params.max_jump, (float(wide), float(high)))
         epipole = rig.right.matrix @ rig.T_right_left.translation
         sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)
-        self.cameras = PairCameras(*projections(rig, T_surface_left), epipole, sizes)
-        self.z_range = limits.z_range
+        self.cameras, self.z_range = PairCameras(*projections(rig, T_surface_left), epipole, sizes), z_range
 
     def cells(self, feet: Floats, normals: Floats, low: ArrayLike, high: ArrayLike, out: Dem) -> None:
         """Fill ``out`` (r, c) with cells (r, c, 3), searched from low..high (NaN: left out)."""

@@ -20,10 +20,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field
 
 from rille.stages.core.arrays import Floats32
-from rille.stages.core.declare import Bundle, Memory, Params, raster, stage
+from rille.stages.core.declare import Bundle, Memory, raster, stage
 from rille.stages.core.errors import ConfigError, DegenerateError
 from rille.stages.core.validity import matched_back
 from rille.stages.facts.calibration import CalibrationFacts
@@ -41,47 +40,12 @@ from rille.stages.terrain.ground_frame import z_range as plane_z_range
 from rille.stages.terrain.locus.coverage import Limits, coverage, explain
 from rille.stages.terrain.locus.kernel import Dem
 from rille.stages.terrain.locus.refinement import refine
-from rille.stages.terrain.locus.solve import Matches, PairArrays, SearchLimits, join, projections, solve
+from rille.stages.terrain.locus.solve import LocusParams, Matches, PairArrays, join, projections, solve
 from rille.stages.terrain.locus.uncertainty import standard_deviation
 from rille.stages.terrain.locus.views import SurfaceViews, views
 
 OWN_STD_FACTOR = 1.4  # times max_sigma: a cell's own standard deviation scatters about the typical one
 NO_LIMIT = {"max_sigma": None, "max_std": None}
-
-
-class LocusParams(Params):
-    """Parameters of the stage ``locus``."""
-
-    cell_size: float | None = Field(None, gt=0, description="side of a cell [m]; not set: it follows from the rig")
-    extent: tuple[float, float, float, float] | None = Field(
-        None, description="x_min, x_max, y_min, y_max [m] in the local frame; not set: what both cameras see well"
-    )
-    max_range_cells: float = Field(
-        6.0, gt=0, description="number of cells that a pixel may cover along the range within the automatic extent"
-    )
-    max_sigma: float | None = Field(
-        None,
-        gt=0,
-        description="largest standard deviation [m], by sigma_disparity; not set: one cell size, and above a plane "
-        "that is no ground ten times that of the median match",
-    )
-    max_std: float | None = Field(
-        None, gt=0, description="largest standard deviation [m] of a cell, by the matcher's; not set: 1.4 max_sigma"
-    )
-    sigma_disparity: float = Field(0.2, gt=0, description="standard deviation of a typical disparity [pixels]")
-    max_residual: float = Field(0.5, gt=0, description="largest residual |p_l + d - p_r| of a solution [pixels]")
-    refine_steps: int = Field(
-        2, ge=0, le=20, description="number of Gauss-Newton steps that refine the elevations by both images; 0: none"
-    )
-    refined_share: float = Field(
-        1.0, gt=0, le=1, description="weight of the refined elevation; 0.5 for matches of preset accurate, 1 for others"
-    )
-    both: bool = Field(
-        False, description="also match from right to left and use both elevations; doubles the time of matching"
-    )
-    max_jump: float = Field(
-        3.0, gt=0, description="largest range of the four disparities around a cell [pixels] that are one surface"
-    )
 
 
 @dataclass(frozen=True)
@@ -131,9 +95,7 @@ def reconstruct(
         The disparity's shape differs from its camera's, or the baseline is zero.
     """
     image, right, back = pair.left, pair.right, pair.back
-    limits = SearchLimits(z_range, params.max_residual, params.max_jump, params.sigma_disparity)
-    out = solve(PairArrays(pair.matches, image, rig, T_surface_left, limits), surface)
-    seen = None if right is None else _views(image, right, rig, T_surface_left)
+    out = solve(PairArrays(pair.matches, image, rig, T_surface_left, z_range, params), surface)
     apart = None
     if back is not None:
         assert right is not None
@@ -141,10 +103,12 @@ def reconstruct(
         # is.
         turned = Rig(rig.right, rig.left, rig.T_right_left.inverse())
         T_surface_right = T_surface_left @ rig.T_right_left.inverse()
-        other = solve(PairArrays(back, right, turned, T_surface_right, limits), surface)
+        other = solve(PairArrays(back, right, turned, T_surface_right, z_range, params), surface)
         apart = out.elevation - other.elevation
         out = join(out, other)
-    if seen is not None and (params.refine_steps or back is not None):
+    if right is not None and (params.refine_steps or back is not None):
+        images = (np.ascontiguousarray(a, np.float32) for a in (image, right))
+        seen = views(*projections(rig, T_surface_left), *images, T_surface_left.translation)
         _refine(out, seen, surface, params, apart)
     leave_out_unsure(out, greatest_std(params, pair.matches.std is not None))
     return out
@@ -157,12 +121,6 @@ def leave_out_unsure(dem: Dem, greatest: float | None) -> None:
         unsure = ~(dem.elevation_std <= greatest)
         for array in dem:
             np.copyto(array, np.nan, where=unsure)
-
-
-def _views(image: ArrayLike, right: ArrayLike, rig: Rig, T_surface_left: RigidTransform) -> SurfaceViews:
-    """Both images as they see the surface."""
-    images = [np.ascontiguousarray(a, np.float32) for a in (image, right)]
-    return views(*projections(rig, T_surface_left), images[0], images[1], T_surface_left.translation)
 
 
 def _refine(dem: Dem, views: SurfaceViews, surface: Surface, params: LocusParams, apart: Floats32 | None) -> None:

@@ -131,7 +131,9 @@ def test_no_comparison_is_told_only_where_it_was_switched_off(tmp_path: Path) ->
 
 
 def test_gaps_of_the_truth_are_told_and_bridged(tmp_path: Path) -> None:
-    base = view()
+    made = bundles()
+    made["accuracy"]["position_truth"][[0, 3]] = np.nan
+    base = view(made)
     truth = list(base.sequence.truth or ())
     truth[0] = truth[3] = None
     facts, _, _, _ = written(tmp_path, replace(base, sequence=replace(base.sequence, truth=tuple(truth))))
@@ -158,7 +160,7 @@ def test_a_single_pair_has_no_trajectory_and_lacks_none(tmp_path: Path) -> None:
     trajectory = made["trajectory"]
     made["trajectory"] = Bundle({k: v[:1] for k, v in trajectory.arrays.items()}, {"frames": [0]})
     one: Any = products()
-    for name in ("disparity", "level", "local_dem", "local_risk", "local_path", "world_dem", "local_dem_accuracy"):
+    for name in ("disparity", "level", "local_dem", "local_risk", "local_path", "local_dem_accuracy"):
         setattr(one, name, {0: getattr(one, name)[0]})
     one.tracks, one.resections = [], []
     made["tile"] = Bundle({k: v for k, v in made["tile"].arrays.items() if k != "spread"}, made["tile"].meta)

@@ -200,7 +200,7 @@ def test_an_imu_that_contradicts_the_images_is_warned_of():
 def test_standard_deviations_are_not_judged_by_truth_that_was_misread(warnings, told):
     made = bundles()
     metrics = made["accuracy"].meta["metrics"] | {"nees": {"value": 850.0, "unit": "", "how": ""}}
-    made["accuracy"] = Bundle({}, {"metrics": metrics, "warnings": warnings})
+    made["accuracy"] = Bundle(made["accuracy"].arrays, {"metrics": metrics, "warnings": warnings})
     lines = summary.gather(view(made))["warnings"]
     assert sum("times their standard deviations" in line for line in lines) == told
 

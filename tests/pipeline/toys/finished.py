@@ -114,8 +114,8 @@ def bundles() -> dict[str, Bundle]:
     error = np.where(np.isfinite(z), 4e-4, np.nan).astype(np.float32)
     judged = dem_accuracy(z, z - error, np.ones(z.shape, dtype=bool))
     made["dem_accuracy"] = Bundle({"error": error}, {**lattice, "metrics": judged})
-    _, assessed = trajectory_accuracy(poses, poses)
-    made["accuracy"] = Bundle({}, {"metrics": assessed})
+    positions, assessed = trajectory_accuracy(poses, poses)
+    made["accuracy"] = Bundle(positions, {"metrics": assessed, "frames": list(FRAMES)})
     _, checked = path_check(path, risk, Lattice.from_dict(LATTICE))
     made["path_check"] = Bundle({}, {"metrics": checked})
     for frame in FRAMES:
@@ -133,13 +133,13 @@ def bundles() -> dict[str, Bundle]:
     column = np.full((48, 64), -8.0, dtype=np.float32)
     column[:4] = np.nan
     validity = np.where(np.isfinite(column), 1, 16).astype(np.uint8)
+    # The second model lies 3 mm above the first.
+    made["seams4"] = Bundle({}, {"pair": 4, "seams": [{"pair": 4, "other": 0, "bias": 0.003, "noise": 0.0}]})
     for pair in BASIC:
         made[f"disparity{pair}"] = Bundle(
             {"column_disparity": column, "row_disparity": 0.1 * column, "validity": validity}, {}
         )
         made[f"level{pair}"] = Bundle({}, {"source": "pitch"})
-        # The second model lies 3 mm above the first.
-        made[f"world_dem{pair}"] = Bundle({"elevation": z + np.float32(7.5e-4 * pair), "elevation_std": sigma}, lattice)
         made[f"orientation{pair}"] = orientation()
         made[f"local_dem{pair}"] = Bundle(dem, {**lattice, "defined": 0.9, "median_elevation_std": 5e-4})
         metrics = {"rmse": figure(1e-3 * (1 + pair), "m", "x"), "completeness": figure(0.9 - 0.05 * pair, "1", "x")}
@@ -239,7 +239,7 @@ def products() -> Products:
         local_dem=each("local_dem", BASIC),
         local_risk=each("local_risk", BASIC),
         local_path=each("local_path", BASIC),
-        world_dem=each("world_dem", BASIC),
+        seams={4: "seams4"},
         local_dem_accuracy=each("local_dem_accuracy", BASIC),
     )
     found.tracks, found.resections, found.world_tiles = ["track0", "track1"], ["resect0", "resect1"], ["tile"]
@@ -269,6 +269,8 @@ TASKS = (
 
 def view(made: dict[str, Bundle] | None = None, *, truth: bool = True, **changes: Any) -> RunView:
     store = bundles() if made is None else made
+    if not truth:
+        store.pop("accuracy", None)
     base = RunView(
         run_id="20260101T000000Z-abcdef12",
         sequence=sequence(truth=truth),

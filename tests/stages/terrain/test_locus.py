@@ -273,9 +273,7 @@ def test_a_search_that_begins_below_the_surface_finds_it_or_nothing() -> None:
     """On the way up pixels are missing, so that many a cell has to go down again from where it began."""
     column, row, usable = maps = disparity(RIG, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
     there = usable & (np.random.default_rng(4).random(usable.shape) < 0.85)
-    task = locus_solve.PairArrays(
-        Matches(column, row, there), IMAGE, RIG, T_LOCAL_LEFT, locus_solve.SearchLimits((-1.0, -0.3), 0.5, 3.0, 0.2)
-    )
+    task = locus_solve.PairArrays(Matches(column, row, there), IMAGE, RIG, T_LOCAL_LEFT, (-1.0, -0.3), LocusParams())
     dem = Dem(*np.full((4, *LATTICE.shape), np.nan, np.float32))
     every = np.arange(LATTICE.rows), np.arange(LATTICE.cols)
     task.cells(*reference_plane(LATTICE).block(*every), -HEIGHT - 0.05, -HEIGHT - 0.01, dem)
