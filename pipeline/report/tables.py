@@ -85,7 +85,7 @@ def pairs(scene: gather.Scene) -> list[Row]:
     for pair, handle in p.disparity.items():
         disparity, before = view.bundle(handle), rows[-1]["frame"] if rows else None
         seams = facts_of(view, p.seams.get(pair)).get("seams", ())
-        difference = next((seam for seam in seams if seam["other"] == before), {})
+        difference: Row = next((seam for seam in seams if seam["other"] == before), {})
         dem, path = facts_of(view, p.local_dem.get(pair)), facts_of(view, p.local_path.get(pair))
         shares = facts_of(view, p.local_risk.get(pair)).get("shares", {})
         judged = facts_of(view, p.local_dem_accuracy.get(pair)).get("metrics", {})

@@ -50,23 +50,6 @@ ORTHO_WEIGHT_EXPONENT = 8
 """Of the ortho image's weights: the best image, but without a visible seam."""
 
 
-class Stack(NamedTuple):
-    """Models (n, rows, cols) float32, NaN undefined: elevations, their standard deviations, residuals, grey values.
-
-    ``pair`` (n,) numbers of the models; ``gain`` (n,) of the grey values; ``centre`` (n, 2) and ``pose`` (n, 3, 3):
-    where each camera stands, m, and the covariance of its height and its rotations about x and y.
-    """
-
-    z: Floats32
-    sigma: Floats32
-    residual: Floats32
-    ortho: Floats32
-    pair: NDArray[np.int64]
-    gain: Floats
-    centre: Floats
-    pose: Floats
-
-
 class Merged(NamedTuple):
     """Maps (rows, cols) of merged cells.
 
@@ -84,13 +67,28 @@ class Merged(NamedTuple):
     relief_std: Floats32
 
 
-def merge_cells(stack: Stack, x: Floats, y: Floats, alike: float, worst: float, out: Merged) -> None:
-    """Merge a stack of models; weights and equations are those of the module.
+NOTHING: Mapping[str, Any] = dict.fromkeys(Merged._fields, np.float32(np.nan)) | {
+    "count": np.uint16(0),
+    "source": np.int32(-1),
+}
+"""Values of a cell that no model gives."""
 
-    ``x`` (cols,), ``y`` (rows,) of the cells, m; ``alike``: correlation of two models' errors; ``worst``: greatest
-    standard deviation but for the poses, m; ``out``: the :class:`Merged` to fill, NaN, 0 and -1 before.
+
+def merge_cells(
+    maps: Floats32, layers: Sequence[ModelLayer], strip: Lattice, alike: float, worst: float
+) -> dict[str, Any]:
+    """Maps (rows, cols) of :class:`Merged` by name; weights and equations are those of the module.
+
+    Parameters
+    ----------
+    maps : (4, n, rows, cols) elevations, their standard deviations, residuals and grey values of n models, NaN
+        undefined, on the cells of ``strip``.
+    layers : (n,) those models.
+    alike : correlation of two models' errors.
+    worst : greatest standard deviation but for the poses, m.
     """
-    z, sigma, residual = (a.astype(np.float64) for a in (stack.z, stack.sigma, stack.residual / RESIDUAL_SCALE_PX))
+    z, sigma, residual, ortho = maps.astype(np.float64)
+    residual /= RESIDUAL_SCALE_PX
     with np.errstate(divide="ignore", over="ignore"):
         weight = 1.0 / (sigma * sigma * (1.0 + residual * residual))
     known = np.isfinite(z) & (sigma > 0.0) & (residual >= 0.0) & (weight > 0.0) & np.isfinite(weight)
@@ -110,24 +108,22 @@ def merge_cells(stack: Stack, x: Floats, y: Floats, alike: float, worst: float, 
     # Unrelated errors (alike = 0) average out; errors of one cause (alike = 1) add up as if there were one model.
     variance = apart + alike * (together * together - apart)
     # Poses drift together, so that their errors do not average out.
-    placed = _total(share * _swing(stack, x, y))
-    grey = np.minimum(stack.gain[:, None, None] * stack.ortho, 255.0)
+    placed = _total(share * _swing(layers, strip))
+    grey = np.minimum(np.array([layer.gain for layer in layers])[:, None, None] * ortho, 255.0)
     sharp = np.where(np.isfinite(grey), (weight / np.where(top > 0.0, top, 1.0)) ** ORTHO_WEIGHT_EXPONENT, 0.0)
     greys = _total(sharp)
-    ortho = np.divide(_total(sharp * np.nan_to_num(grey)), greys, out=np.full(top.shape, np.nan), where=greys > 0)
-    # The limit is on the models' own errors, without the poses' part.
-    good = (top > 0.0) & (np.sqrt(variance) <= worst)
-    maps = {
+    merged = {
         "elevation": mean,
         "elevation_std": np.sqrt(variance + placed * placed),
         "spread": np.sqrt(_total(share * (z - mean) ** 2)),
         "count": np.count_nonzero(weight, axis=0),
-        "source": stack.pair[weight.argmax(axis=0)],
-        "ortho": ortho,
+        "source": np.array([layer.pair for layer in layers])[weight.argmax(axis=0)],
+        "ortho": np.divide(_total(sharp * np.nan_to_num(grey)), greys, out=np.full(top.shape, np.nan), where=greys > 0),
         "relief_std": np.sqrt(apart),
     }
-    for name, values in maps.items():
-        np.copyto(getattr(out, name), values, where=good, casting="unsafe")
+    # The limit is on the models' own errors, without the poses' part.
+    good = (top > 0.0) & (np.sqrt(variance) <= worst)
+    return {name: np.where(good, a.astype(NOTHING[name].dtype), NOTHING[name]) for name, a in merged.items()}
 
 
 def _total(values: Floats) -> Floats:
@@ -135,10 +131,11 @@ def _total(values: Floats) -> Floats:
     return np.asarray(reduce(np.add, values))
 
 
-def _swing(stack: Stack, x: Floats, y: Floats) -> Floats:
+def _swing(layers: Sequence[ModelLayer], strip: Lattice) -> Floats:
     """Standard deviations (n, rows, cols) of the elevations by the covariances of (height, rotation about x, y)."""
-    dx, dy = (x - stack.centre[:, :1])[:, None, :], (y - stack.centre[:, 1:])[:, :, None]
-    covariance = stack.pose[..., None, None]
+    centre = np.array([layer.pose.centre for layer in layers])
+    dx, dy = (strip.xs() - centre[:, :1])[:, None, :], (strip.ys() - centre[:, 1:])[:, :, None]
+    covariance = np.array([layer.pose.covariance for layer in layers])[..., None, None]
     tilt = dy * dy * covariance[:, 1, 1] + dx * dx * covariance[:, 2, 2] - 2.0 * dx * dy * covariance[:, 1, 2]
     both = covariance[:, 0, 0] + tilt + 2.0 * (dy * covariance[:, 0, 1] - dx * covariance[:, 0, 2])
     return np.asarray(np.sqrt(np.maximum(0.0, both)))
@@ -242,23 +239,22 @@ def merge(layers: Sequence[ModelLayer], tile: Lattice, params: MergeParams) -> M
     ordered = sorted(layers, key=lambda layer: layer.pair)
     assert len({layer.pair for layer in ordered}) == len(ordered)
     ordered = [layer for layer in ordered if tile.intersection(layer.lattice) is not None]
-    others = {"count": (0, np.uint16), "source": (-1, np.int32)}
-    out = Merged._make(np.full(tile.shape, *others.get(name, (np.nan, np.float32))) for name in Merged._fields)
+    out = {name: np.full(tile.shape, none) for name, none in NOTHING.items()}
     worst = math.inf if params.max_std_cells is None else params.max_std_cells * tile.cell
     # Some sixteen numbers of eight bytes a cell and model.
     lines = max(1, STRIP_BYTES // (128 * max(len(ordered), 1) * tile.cols))
     for start in range(0, tile.rows, lines):
         strip = Lattice.at(tile.i0, tile.j0 - start, tile.cell, min(lines, tile.rows - start), tile.cols)
-        rows = slice(start, start + strip.rows)
         present = [layer for layer in ordered if strip.intersection(layer.lattice) is not None]
         if present:
-            part = Merged._make(values[rows] for values in out)
-            merge_cells(_stacked(present, strip), strip.xs(), strip.ys(), params.alike, worst, part)
-    return out
+            part = merge_cells(_read(present, strip), present, strip, params.alike, worst)
+            for name, values in part.items():
+                out[name][start : start + strip.rows] = values
+    return Merged(**out)
 
 
-def _stacked(layers: Sequence[ModelLayer], strip: Lattice) -> Stack:
-    """Read a strip of the models."""
+def _read(layers: Sequence[ModelLayer], strip: Lattice) -> Floats32:
+    """Read a strip of the models: arrays (4, n, rows, cols), see :func:`merge_cells`."""
     maps = np.full((4, len(layers), *strip.shape), np.nan, dtype=np.float32)
     for k, layer in enumerate(layers):
         common = strip.intersection(layer.lattice)
@@ -266,32 +262,29 @@ def _stacked(layers: Sequence[ModelLayer], strip: Lattice) -> Stack:
         here, there = strip.window(common), layer.lattice.window(common)
         for target, name in zip(maps, ("elevation", "elevation_std", "residual", "ortho"), strict=True):
             target[k][here] = layer.part(name, there)
-    z, sigma, residual, ortho = maps
-    return Stack(
-        z,
-        sigma,
-        residual,
-        ortho,
-        np.array([layer.pair for layer in layers]),
-        np.array([layer.gain for layer in layers]),
-        np.array([layer.pose.centre for layer in layers]),
-        np.array([layer.pose.covariance for layer in layers]),
-    )
+    return maps
 
 
-def _fine(dem: Bundle, lattice: Lattice, most: float) -> Callable[[str, Window], Any]:
-    """Parts of a model without the elevations of cells whose footprint is greater than ``most`` metres."""
-    if "pixel_rad" not in dem.meta:  # no image: vouched for
-        return dem.part
-    centre = RigidTransform.from_matrix(dem.meta["T_frame_left"]).translation
-    angle = float(dem.meta["pixel_rad"])
+def seen_finely(elevation: Floats32, x: Floats, y: Floats, facts: Mapping[str, Any], most: float | None) -> Floats32:
+    """Elevations (row, col), m, but NaN where a pixel covers more than ``most`` metres, see :func:`footprint`.
+
+    ``facts`` are those of the model; one that no image shows (``pixel_rad``) is vouched for.
+    """
+    if most is None or "pixel_rad" not in facts:
+        return elevation
+    centre = RigidTransform.from_matrix(facts["T_frame_left"]).translation
+    covered = footprint(elevation, x, y, centre, facts["pixel_rad"])
+    return np.where(covered <= most, elevation, np.float32(np.nan))
+
+
+def _fine(dem: Bundle, lattice: Lattice, most: float | None) -> Callable[[str, Window], Any]:
+    """Parts of a model, elevations by :func:`seen_finely`."""
 
     def part(name: str, window: Window) -> Any:
         values = np.asarray(dem.part(name, window))
         if name != "elevation":
             return values
-        covered = footprint(values, lattice.xs()[window[1]], lattice.ys()[window[0]], centre, angle)
-        return np.where(covered <= most, values, np.float32(np.nan))
+        return seen_finely(values, lattice.xs()[window[1]], lattice.ys()[window[0]], dem.meta, most)
 
     return part
 
@@ -323,8 +316,7 @@ def merge_stage(
     for dem in dems:
         pair, own = dem.meta["pair"], Lattice.from_dict(dem.meta["lattice"])
         gain = math.exp(LOG_GAIN_STEP * steps.get(str(pair), 0))
-        part = dem.part if params.max_footprint is None else _fine(dem, own, params.max_footprint)
-        layers.append(ModelLayer(pair, own, part, gain, Placed.of(dem.meta)))
+        layers.append(ModelLayer(pair, own, _fine(dem, own, params.max_footprint), gain, Placed.of(dem.meta)))
     merged = merge(layers, lattice, params)
     meta: MergeFacts = {
         "lattice": lattice.to_dict(),

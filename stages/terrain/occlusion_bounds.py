@@ -25,7 +25,7 @@ from rille.stages.core.declare import Bundle, Params, raster, stage
 from rille.stages.facts.terrain import BoundsFacts, DemFacts, MergeFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.terrain.merge import footprint
+from rille.stages.terrain.merge import seen_finely
 
 SIGHT_STEP_CELLS = 0.5
 """Cells from point to point of a line of sight."""
@@ -113,9 +113,7 @@ def occlusion_bounds_stage(
         own = Lattice.from_dict(dem.meta["lattice"])
         centre = RigidTransform.from_matrix(dem.meta["T_frame_left"]).translation
         seen, std = (np.asarray(dem[name], dtype=np.float32) for name in ("elevation", "elevation_std"))
-        if params.max_footprint is not None:
-            covered = footprint(seen, own.xs(), own.ys(), centre, float(dem.meta["pixel_rad"]))
-            seen = np.where(covered <= params.max_footprint, seen, np.float32(np.nan))
+        seen = seen_finely(seen, own.xs(), own.ys(), dem.meta, params.max_footprint)
         part = own.intersection(lattice)
         if part is None:
             continue

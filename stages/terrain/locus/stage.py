@@ -107,8 +107,8 @@ def reconstruct(
         apart = out.elevation - other.elevation
         out = join(out, other)
     if right is not None and (params.refine_steps or back is not None):
-        images = (np.ascontiguousarray(a, np.float32) for a in (image, right))
-        seen = views(*projections(rig, T_surface_left), *images, T_surface_left.translation)
+        both = [np.ascontiguousarray(a, np.float32) for a in (image, right)]
+        seen = views(*projections(rig, T_surface_left), both[0], both[1], T_surface_left.translation)
         _refine(out, seen, surface, params, apart)
     leave_out_unsure(out, greatest_std(params, pair.matches.std is not None))
     return out
