@@ -174,10 +174,8 @@ def agreement_stage(
         rigid.by_frame(np.asarray(crosscheck[name]), given, frames)
         for name in ("piece_poses", "piece", "line_distance")
     )
-    piece, own = np.nan_to_num(numbers, nan=-1).astype(np.int64), np.zeros(len(frames), np.int64)
-    if "piece" in trajectory.arrays:
-        own = np.asarray(trajectory["piece"], dtype=np.int64)
-        piece = unbroken(piece, own)
+    own = np.asarray(trajectory.arrays.get("piece", np.zeros(len(frames))), np.int64)
+    piece = unbroken(np.nan_to_num(numbers, nan=-1).astype(np.int64), own)
     arrays, scale, scaled = compare(ours, theirs, piece)
     arrays["line_distance"] = lines
     flags, limits = flag(arrays)

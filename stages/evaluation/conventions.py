@@ -54,9 +54,8 @@ MIRRORS = {
 
 
 class ReadingFit(NamedTuple):
-    """Misfit of a reading over the extent, at least and as it is stated; its number of changes; what to do."""
+    """Misfit of a reading over the extent; its number of changes; what to do."""
 
-    least: float
     misfit: float
     changes: int
     words: str
@@ -95,14 +94,14 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
             words = [word for word in (order, direction, mirror) if word]
             # M R M and M t of a mirror M = diag(signs).
             fits += _fits(P, compose(poses * np.outer(signs, [*signs, 1.0]), mount), mount, words)
-    best, least = min(fit.misfit for fit in fits), min(fit.least for fit in fits)
+    best = min(fit.misfit for fit in fits)
     if best > MAX_SHARE * as_read:
         return []
+    # The simplest of those that fit: others may fit better by the estimate's own errors.
     most = min(MAX_SHARE * as_read, SIMPLE_FACTOR * best + ALIKE_SHARE)
-    alike = [fit for fit in fits if fit.least <= ALIKE_FACTOR * least + ALIKE_SHARE and fit.misfit <= most]
-    simple = [fit for fit in alike if fit.changes == min(fit.changes for fit in alike)]
-    best = min(fit.misfit for fit in simple)
-    simple = [fit for fit in sorted(simple) if fit.misfit <= ALIKE_FACTOR * best + ALIKE_SHARE]
+    changes = min(fit.changes for fit in fits if fit.misfit <= most)
+    simple = sorted(fit for fit in fits if fit.changes == changes)
+    simple = [fit for fit in simple if fit.misfit <= ALIKE_FACTOR * simple[0].misfit + ALIKE_SHARE]
     told = list(dict.fromkeys(fit.words for fit in simple))
     return [
         f"the truth fits the trajectory far better by another convention ({100 * best:.2g} % of its extent are left, "
@@ -137,7 +136,7 @@ def _fits(P: Floats, Q: Floats, mount: Floats, words: list[str]) -> list[Reading
             said = [*words, f"its poses are those of a body with other axes: state truth.T_body_left = {body.tolist()}"]
         # Simple ones first: conventions of the file and axes that are exchanged, then axes that are turned.
         changes = len(said) + (axes is turn)
-        fits.append(ReadingFit(_misfit(P, Q @ _turn(turn)), _misfit(P, Q @ _turn(axes)), changes, " and ".join(said)))
+        fits.append(ReadingFit(_misfit(P, Q @ _turn(axes)), changes, " and ".join(said)))
     return fits
 
 

@@ -95,6 +95,5 @@ def crosscheck_join_stage(
         "longest": longest,
         "pieces": pieces,
         "reasons": [b.meta["reason"] for b in windows if b.meta["reason"]],
-        "positions": [None if not np.isfinite(p).all() else [float(v) for v in p[:, 3]] for p in poses],
     }
     return Bundle({"poses": poses, "piece_poses": chained, "piece": piece, "line_distance": line}, meta)

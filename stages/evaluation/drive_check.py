@@ -18,8 +18,8 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
+from rille.stages.evaluation.accuracy import trajectory_accuracy
 from rille.stages.evaluation.metric import metric
-from rille.stages.evaluation.rigid import compose, inverse
 from rille.stages.facts.evaluation import DriveCheckFacts, Metric, TruthFacts
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry.geometry import way_length
@@ -53,8 +53,8 @@ def placements(parts: Sequence[Mapping[str, Floats]], vehicle: Mapping[str, Any]
 
 def localisation(estimate: Floats, truth: Floats, length: float) -> tuple[Floats, dict[str, Metric]]:
     """Error (frame,) m of the poses (frame, 3, 4), NaN of a frame without one; and that of the last that has one."""
-    aligned = compose(estimate[0], compose(inverse(truth[0]), truth))
-    error = np.linalg.norm(estimate[:, :, 3] - aligned[:, :, 3], axis=1)
+    positions, _ = trajectory_accuracy(estimate, truth)
+    error = np.linalg.norm(positions["position"] - positions["position_truth"], axis=1)
     # A drive that ends because tracking is lost has no pose at its last image.
     known = error[np.isfinite(error)]
     last = float(known[-1]) if len(known) else math.nan

@@ -13,7 +13,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.grid8 import search
-from rille.stages.planning.path_ground import COST_UNIT_M, Maps, PathMaps, PathParams
+from rille.stages.planning.path_ground import COST_UNIT_M, Maps, PathMaps, PathParams, cell_of
 from rille.stages.planning.row_graph import UNREACHED
 
 
@@ -87,7 +87,7 @@ def shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> di
 
 def _shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> float | None:
     ground = PathMaps(maps, lattice, vehicle, PathParams(p_certain_hazard=1.0))
-    first, last = ((int(r), int(c)) for r, c in np.rint(lattice.index(path[[0, -1], :2])))
+    first, last = (cell_of(lattice, point[:2]) for point in (path[0], path[-1]))
     ways, level = ground.ways("middle"), np.zeros(lattice.shape, np.int64)
     if not all(0 <= r < ways.shape[0] and 0 <= c < ways.shape[1] and ways[r, c] for r, c in (first, last)):
         return None

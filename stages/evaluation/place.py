@@ -15,9 +15,10 @@ import numpy as np
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import DegenerateError
+from rille.stages.imaging.features import UNIT_BYTES, match
 
-KEYPOINTS, RATIO = 8000, 0.8
-"""Of an image; and how much more alike than the second best a match must be."""
+KEYPOINTS = 8000
+"""Of an image."""
 
 NEAR_CELLS = 2.0
 """Cells of the coarser image within which matches agree."""
@@ -65,7 +66,8 @@ def place(a: Ortho, b: Ortho) -> PlacedImage:
     """
     near = NEAR_CELLS * max(_cell(a), _cell(b))
     (here, one), (there, other) = _described(a, _cell(b)), _described(b, _cell(a))
-    p, q = _alike(here, one, there, other)
+    alike = match(one, other)
+    p, q = here[alike[:, 0]], there[alike[:, 1]]
     motion, used = _agreed(p, q, near)
     agreeing = int(used.sum())
     scale = 1.0 if motion is None else math.hypot(motion[0, 0], motion[1, 0])
@@ -85,14 +87,6 @@ def place(a: Ortho, b: Ortho) -> PlacedImage:
     spread = float(np.sqrt(np.mean((q[used] - middle - arm @ turn.T) ** 2)))
     sigma = spread / np.sqrt([agreeing, agreeing, float((arm**2).sum())])
     return PlacedImage(np.column_stack([turn, middle - turn @ start]), agreeing, middle, sigma)
-
-
-def _alike(here: Floats, one: AnyArray, there: Floats, other: AnyArray) -> tuple[Floats, Floats]:
-    """Places (n, 2) in both images of keypoints that are alike."""
-    matches = cv2.BFMatcher().knnMatch(one, other, k=2) if len(here) and len(there) else []
-    pairs = [first for first, *second in matches if second and first.distance < RATIO * second[0].distance]
-    index = np.array([(m.queryIdx, m.trainIdx) for m in pairs], dtype=np.intp).reshape(-1, 2)
-    return here[index[:, 0]], there[index[:, 1]]
 
 
 def _agreed(p: Floats, q: Floats, near: float) -> tuple[Floats | None, Bools]:
@@ -135,4 +129,4 @@ def _described(image: Ortho, other: float) -> tuple[Floats, AnyArray]:
         return np.empty((0, 2)), np.empty((0, 128), np.float32)
     at = np.array([point.pt for point in points])
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
-    return at @ matrix[:, :2].T + matrix[:, 2], root
+    return at @ matrix[:, :2].T + matrix[:, 2], (UNIT_BYTES * root).astype(np.float32)

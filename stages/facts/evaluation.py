@@ -54,14 +54,13 @@ class WindowFacts(Facts):
 class JoinFacts(Facts):
     """The windows of the crosscheck, joined: ``pieces`` are lists of frames, ``longest`` the number of one (-1: none).
 
-    ``positions`` (x, y, z), m, or None, are of the longest; ``reasons`` say why windows have no model.
+    ``reasons`` say why windows have no model.
     """
 
     frames: list[int]
     longest: int
     pieces: list[list[int]]
     reasons: list[str]
-    positions: list[list[float] | None]
 
 
 class AgreementFacts(Facts):
