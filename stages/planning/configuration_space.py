@@ -14,7 +14,6 @@ import numpy as np
 
 from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.numeric.extrema import running_max
 from rille.stages.planning.wheels import wheel_positions
 
 STRAIGHT, RIGHT, ACROSS, LEFT = 1, 2, 4, 8
@@ -57,7 +56,7 @@ class FreePlaces:
         closed : cells on which its middle may not be, without a margin.
         """
         self._vehicle, self._cell, self._unknown = vehicle, cell, unknown
-        near, middle = (grown(mask, vehicle.margin / cell) for mask in (wheel_hazard, body_hazard))
+        near, middle = (distance(mask, cell) <= np.float32(vehicle.margin) for mask in (wheel_hazard, body_hazard))
         if closed is not None:
             middle |= closed
         wheels = wheel_positions(vehicle)
@@ -89,13 +88,6 @@ class FreePlaces:
         for r, c in cells:
             out |= padded[border + r : border + r + rows, border + c : border + c + cols]
         return out
-
-
-def grown(mask: Bools, reach: float) -> Bools:
-    """Cells within ``reach`` cells of the mask: an octagon that holds the circle."""
-    # Rounded up: a margin that is a fraction of a cell too wide closes a way, one too narrow touches a hazard.
-    cells = math.ceil(reach - ROUNDING_CELLS)
-    return running_max(mask.astype(np.float32), cells) > 0 if cells > 0 else mask.copy()
 
 
 def widened(mask: Bools, half_length: float, half_width: float, step: tuple[int, int]) -> Bools:

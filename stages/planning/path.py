@@ -46,7 +46,7 @@ from rille.stages.hazard.measures import MEASURES
 from rille.stages.hazard.risk import DOUBT_BIT, HAZARDOUS, UNKNOWN, check_size
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.grid8 import search
-from rille.stages.planning.path_ground import COST_UNIT_M, GROUNDS, Maps, PathMaps, PathParams, Point
+from rille.stages.planning.path_ground import COST_UNIT_M, GROUNDS, Maps, PathMaps, PathParams, Point, cell_of
 from rille.stages.planning.row_graph import UNREACHED, Cell, Ints, sweep, trace
 
 
@@ -168,6 +168,7 @@ def hazard_words(maps: Maps, at: tuple[int, int], vehicle: Vehicle) -> str:
 __all__ = ["PathParams", "Route", "describe", "find_path", "path_stage"]
 
 Ends = tuple[Point | None, Point | None]
+Cells = tuple[Cell | None, Cell | None]
 
 START_COST = 1e3
 """Cost of a metre [m of climb] by which a path by rows begins beside its place, more than that of any ground."""
@@ -207,15 +208,17 @@ def find_path(
     for name, point in zip(("start", "target"), ends, strict=True):
         if point is not None:
             _check_end(maps, lattice, vehicle, name, point)
-    search = _Search(maps, lattice, vehicle, ends, stretch)
-    route, limit = search.route(params), params.p_certain_hazard
+    start, target = (None if point is None else cell_of(lattice, point) for point in ends)
+    cells, limit = (start, target), params.p_certain_hazard
+    route = _route(PathMaps(maps, lattice, vehicle, params), vehicle, cells, stretch, params)
     if len(route.cells):
         return replace(route, ended_by=GOAL if ends[1] is not None else ending(route, maps, lattice, vehicle, limit))
     # A limit that closed nothing cannot be the reason.
     if limit >= 1 or "p_hazard" not in maps:
         return route
     # Searched once more without the limit, only to name the figure that would open a way.
-    other = search.route(params.model_copy(update={"p_certain_hazard": 1.0}))
+    unlimited = params.model_copy(update={"p_certain_hazard": 1.0})
+    other = _route(PathMaps(maps, lattice, vehicle, unlimited), vehicle, cells, stretch, unlimited)
     if not len(other.cells):
         return route
     # Rounded up to three digits, so that a path with the printed figure as its limit exists.
@@ -227,77 +230,62 @@ def find_path(
     return replace(route, reason=reason)
 
 
-@dataclass(frozen=True)
-class _Search:
-    """Arguments of :func:`find_path`."""
+def _route(ground: PathMaps, vehicle: Vehicle, ends: Cells, stretch: bool, params: PathParams) -> Route:
+    """Path of the planner that is asked for; ``auto``: by rows, else in any direction. Others as in :func:`find_path`,
+    ``ends`` as cells."""
+    far, near = span = row_span(~ground.closed)
+    cell, target = ground.lattice.cell, ends[1]
+    length = math.ceil(2.0 * vehicle.half_length / cell)
+    # On a short map a vehicle's length could make start and target swap their rows.
+    slack, blocking = min(length, (near - far) // 4), near
+    for planner in ("rows", "grid8") if params.planner == "auto" else (params.planner,):
+        by_rows = planner == "rows"
+        behind = 0 if stretch and not by_rows else near - slack
+        for below, starts in _grounds(ground, ends, behind, by_rows=by_rows):
+            if by_rows:
+                # The length that every path has, a row a step, is free.
+                terrain = ground.terrain(below, params.detour_cost, 1.0)
+                cost, steps = sweep(terrain, first_costs(starts, near, cell))
+            else:
+                # A step costs its length as climb: else a path of no climb could be of any length.
+                cost, steps = search(ground.terrain(below, 1.0, 0.0), nearest_middle(starts, near), target)
+            reached = cost < UNREACHED
+            top, bottom = row_span(reached)
+            if by_rows:
+                blocking, row, limit, leads = top - 1, far, far + slack, top <= far + slack
+            else:
+                # As far as it leads for a stop; a mission's path need not end in the very last corner.
+                row, limit, leads = top, top + (slack if stretch else 0), bottom - top >= length
+            end = nearest_middle(reached[: limit + 1], row) if leads else None
+            if target is not None:
+                end = target if reached[target] else None
+            if end is not None:
+                cells = trace(steps, end)
+                return Route(cells, ground.xyz(cells), planner, below, span)
+    reason = BY_ROWS if params.planner == "rows" else AHEAD if None in ends else JOINED
+    return Route(np.empty((0, 2), np.int64), np.empty((0, 3)), planner, "middle", span, reason, blocking)
 
-    maps: Maps
-    lattice: Lattice
-    vehicle: Vehicle
-    ends: Ends
-    stretch: bool
 
-    def route(self, params: PathParams) -> Route:
-        """Path of the planner that is asked for; ``auto``: by rows, else in any direction."""
-        ground = PathMaps(self.maps, self.lattice, self.vehicle, params)
-        far, near = span = row_span(~ground.closed)
-        length = math.ceil(2.0 * self.vehicle.half_length / self.lattice.cell)
-        # On a short map a vehicle's length could make start and target swap their rows.
-        slack, blocking, target = min(length, (near - far) // 4), near, self._cell(1)
-        for planner in ("rows", "grid8") if params.planner == "auto" else (params.planner,):
-            by_rows = planner == "rows"
-            behind = 0 if self.stretch and not by_rows else near - slack
-            for below, starts in self._grounds(ground, behind, by_rows=by_rows):
-                if by_rows:
-                    # The length that every path has, a row a step, is free.
-                    terrain = ground.terrain(below, params.detour_cost, 1.0)
-                    cost, steps = sweep(terrain, first_costs(starts, near, self.lattice.cell))
-                else:
-                    # A step costs its length as climb: else a path of no climb could be of any length.
-                    cost, steps = search(ground.terrain(below, 1.0, 0.0), nearest_middle(starts, near), target)
-                reached = cost < UNREACHED
-                top, bottom = row_span(reached)
-                if by_rows:
-                    blocking, row, limit, leads = top - 1, far, far + slack, top <= far + slack
-                else:
-                    # As far as it leads for a stop; a mission's path need not end in the very last corner.
-                    row, limit, leads = top, top + (slack if self.stretch else 0), bottom - top >= length
-                end = nearest_middle(reached[: limit + 1], row) if leads else None
-                if target is not None:
-                    end = target if reached[target] else None
-                if end is not None:
-                    cells = trace(steps, end)
-                    return Route(cells, ground.xyz(cells), planner, below, span)
-        nothing = np.empty((0, 2), np.int64)
-        reason = BY_ROWS if params.planner == "rows" else AHEAD if None in self.ends else JOINED
-        return Route(nothing, np.empty((0, 3)), planner, "middle", span, reason, blocking)
-
-    def _cell(self, which: int) -> Cell | None:
-        """Row and column of the start (0) or the target (1); None: not given."""
-        point = self.ends[which]
-        row, col = (0, 0) if point is None else np.rint(self.lattice.index(point)).astype(np.int64).tolist()
-        return None if point is None else (row, col)
-
-    def _grounds(self, ground: PathMaps, behind: int, *, by_rows: bool) -> Iterator[tuple[str, Bools]]:
-        """Parts of the vehicle that stay on known ground, with the cells (row, col) where a path may start on each: the
-        one that is given, or from row ``behind`` on all cells by rows, else the connected ground over most rows."""
-        given, order = self._cell(0), list(GROUNDS)
-        at = given or self._cell(1)
-        if not by_rows and None in self.ends:
-            # With a free end a stricter ground would always find some path, on however small a part.
-            order.sort(key=lambda below: -ground.connected(below, behind, at)[1])
-        for below in order:
-            cells = ground.ways(below) > 0 if by_rows or given else ground.connected(below, behind, at)[0]
-            starts = np.zeros_like(cells)
-            where = np.s_[behind:] if given is None else given
-            starts[where] = cells[where]
-            if starts.any():
-                yield below, starts
+def _grounds(ground: PathMaps, ends: Cells, behind: int, *, by_rows: bool) -> Iterator[tuple[str, Bools]]:
+    """Parts of the vehicle that stay on known ground, with the cells (row, col) where a path may start on each: the
+    one that is given, or from row ``behind`` on all cells by rows, else the connected ground over most rows."""
+    (given, target), order = ends, list(GROUNDS)
+    at = given or target
+    if not by_rows and None in ends:
+        # With a free end a stricter ground would always find some path, on however small a part.
+        order.sort(key=lambda below: -ground.connected(below, behind, at)[1])
+    for below in order:
+        cells = ground.ways(below) > 0 if by_rows or given else ground.connected(below, behind, at)[0]
+        starts = np.zeros_like(cells)
+        where = np.s_[behind:] if given is None else given
+        starts[where] = cells[where]
+        if starts.any():
+            yield below, starts
 
 
 def _check_end(maps: Maps, lattice: Lattice, vehicle: Vehicle, name: str, point: Point) -> None:
     """Refuse a start or target outside the map, in a hazard or on unknown ground, with the figure that decides."""
-    row, col = (int(v) for v in np.rint(lattice.index(point)))
+    row, col = cell_of(lattice, point)
     where = f"path.{name} ({point[0]:g}, {point[1]:g}) m"
     if not (0 <= row < lattice.rows and 0 <= col < lattice.cols):
         x0, x1, y0, y1 = lattice.bounds

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -75,6 +75,12 @@ class PathParams(Params):
         description="probability of a hazard from which ground is closed, though no measure exceeds its limit by "
         "enough standard deviations; where this alone closes all paths, the reason says so",
     )
+
+
+def cell_of(lattice: Lattice, point: Sequence[float] | Floats) -> Cell:
+    """Row and column of the cell that holds a point x, y, m; they may lie outside of the lattice."""
+    row, col = np.rint(lattice.index(point)).astype(np.int64).tolist()
+    return row, col
 
 
 class PathMaps:
