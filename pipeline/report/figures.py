@@ -103,11 +103,10 @@ def raster(values: Floats, label: str, alt: str, *, extent: Extent | None = None
 
 def medians(points: Floats, values: Floats, size: tuple[int, int]) -> Floats:
     """Medians (row, col) of values (n,) at points (n, 2) column, row, in cells of an image of ``size`` (cols, rows)."""
+    from scipy.stats import binned_statistic_2d
+
     # Residuals are averaged in 24 cells along the longer side.
     cell = max(size) / 24
-    cols, rows = (max(1, round(n / cell)) for n in size)
-    at = np.clip((points * [cols / size[0], rows / size[1]]).astype(int), 0, [cols - 1, rows - 1])
-    index, grid = at[:, 1] * cols + at[:, 0], np.full(rows * cols, np.nan)
-    for k in np.unique(index):
-        grid[k] = np.median(values[index == k])
-    return grid.reshape(rows, cols)
+    bins, span = [max(1, round(n / cell)) for n in size[::-1]], [(0, n) for n in size[::-1]]
+    col, row = np.clip(points, 0, size).T
+    return np.asarray(binned_statistic_2d(row, col, values, "median", bins, span).statistic)

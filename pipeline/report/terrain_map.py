@@ -170,8 +170,7 @@ def _frusta(scene: Scene) -> list[Any]:
     far = 2.0 * view.sequence.rig.baseline
     # Pixel centres are whole numbers: the image begins half a pixel before the first.
     right, foot = camera.width - 0.5, camera.height - 0.5
-    corners = [(-0.5, -0.5), (right, -0.5), (right, foot), (-0.5, foot)]
-    rays = np.array([((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0) for u, v in corners])
+    rays = camera.rays([(-0.5, -0.5), (right, -0.5), (right, foot), (-0.5, foot)])
     points = np.vstack([np.zeros(3), far * rays])
     for frame, pose in zip(bundle.meta["frames"], world_poses(bundle), strict=True):
         if frame in view.products.disparity and np.isfinite(pose).all():

@@ -91,10 +91,8 @@ def compare(
         # of motions are in the frame before, and so free of the alignment.
         second = rows[1:][np.diff(rows) == 1]
         E = rigid.relative_error(theirs, ours, second - 1, second)
-        arrays["step_distance"][second], arrays["step_angle"][second] = (
-            np.linalg.norm(E[:, :, 3], axis=1),
-            rigid.angle(E),
-        )
+        arrays["step_distance"][second] = np.linalg.norm(E[:, :, 3], axis=1)
+        arrays["step_angle"][second] = rigid.angle(E)
         rests = at_rest(ours[rows], arrays["step_distance"][second])
         # A camera at rest: its positions are noise, and would turn the alignment to any side.
         share = math.inf if rests else ORIENTATION_SHARE

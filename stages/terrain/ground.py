@@ -23,6 +23,7 @@ from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.scale import coarser_focal
 from rille.stages.numeric.least_squares import irls
+from rille.stages.terrain.points import MIN_DEPTH_SIGMAS
 
 
 class NoGroundError(DegenerateError):
@@ -214,10 +215,6 @@ def view_matches(samples: Samples, rig: Rig, T_local_left: RigidTransform, sigma
     """View of the plane z = 0 of the local frame by matched pixels; ``sigma_d`` as in :func:`view_points`."""
     near = samples.rho > MIN_DEPTH_SIGMAS * samples.sigma
     return replace(view_points(Samples(*(values[near] for values in samples)), rig, T_local_left, sigma_d), stray=0.005)
-
-
-MIN_DEPTH_SIGMAS = 3.0
-"""Standard deviations of an inverse depth above 0 from which on a match is not infinitely far."""
 
 
 def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> PlaneView:

@@ -120,11 +120,6 @@ class Target:
     view: FieldOfView
     points: Floats
 
-    @staticmethod
-    def of(ground: Ground, way: Sequence[Piece], first: int, view: FieldOfView) -> Target:
-        """Build for the first piece of a path that is not known to be free."""
-        return Target(ground, view, ground.lacking(way, first))
-
     def turn(self, at: Point, heading: float, right: float, left: float) -> float | None:
         """Least turn (rad) on the spot, within bounds and where the wheels have room, after which it is in view."""
         turns = [0.0]

@@ -43,9 +43,8 @@ from rille.stages.planning.local_planner.ground import (
 from rille.stages.planning.local_planner.look import AHEAD, FieldOfView, PlannerMemory, Stand, Target
 from rille.stages.planning.local_planner.route import (
     Piece,
-    first_metres,
-    last_metres,
     length_of,
+    split,
     straightened,
     through,
     turnable,
@@ -138,7 +137,7 @@ def plan_leg(
     way = kept if kept and price <= (1.0 + MIN_GAIN_SHARE) * least else ground.way(move)
     plan = _straight(ground, way)
     known = _known_pieces(plan)
-    target = Target.of(ground, plan, known, view) if known < len(plan) else None
+    target = Target(ground, view, ground.lacking(plan, known)) if known < len(plan) else None
     return _Plan(ground, way, plan, target, can_look=memory.looks < MAX_LOOKS).leg()
 
 
@@ -159,7 +158,7 @@ class _Plan:
         ground, target = self.ground, self.target
         base, start, heading = ground.vehicle.wheel_base, ground.start, ground.heading
         bound = math.radians(ground.p.max_turn_deg)
-        leg = first_metres(self.pieces[: _known_pieces(self.pieces)], ground.p.max_length * base)
+        leg, _ = split(self.pieces[: _known_pieces(self.pieces)], ground.p.max_length * base)
         least = MIN_LEG_WHEELBASES * base
         # A last piece to the goal may be shorter.
         if length_of(leg) < min(least, length_of(self.pieces) - 1e-9):
@@ -167,7 +166,7 @@ class _Plan:
         facing = 0.0
         view = None if target is None else target.last_view(leg, bound)
         if view is not None and view[0] >= least:
-            leg, facing = first_metres(leg, view[0]), view[1]
+            leg, facing = split(leg, view[0])[0], view[1]
         elif (look := self._look(bound)) is not None:
             return look
         leg, turn = within_turn(leg, heading, bound)
@@ -177,7 +176,7 @@ class _Plan:
         end, turn = leg[-1], turn or facing
         if not turnable(end.b, end.heading, end.heading + turn, ground.clear):
             turn = 0.0
-        rest = last_metres(self.pieces, length_of(leg))
+        _, rest = split(self.pieces, length_of(leg))
         return Leg("drive", "", *_line(leg, start), turn, vertices(self.way, start), *_line(rest, end.b))
 
     def _look(self, widest: float) -> Leg | None:
@@ -203,9 +202,9 @@ class _Plan:
 def _straight(ground: Ground, way: Sequence[Piece]) -> list[Piece]:
     """A way whose first metres are made straighter, as far as they are known."""
     # Beyond some legs the map will have changed before the vehicle is there: straightening it is for nothing.
-    first = first_metres(way[: _known_pieces(way)], 4.0 * ground.p.max_length * ground.vehicle.wheel_base)
-    straight = straightened(first, ground.heading, ground.plain, ground.cell)
-    return [*straight, *last_metres(way, length_of(first))]
+    known = _known_pieces(way)
+    first, rest = split(way[:known], 4.0 * ground.p.max_length * ground.vehicle.wheel_base)
+    return [*straightened(first, ground.heading, ground.plain, ground.cell), *rest, *way[known:]]
 
 
 def _line(way: Sequence[Piece], start: Point) -> tuple[Floats, NDArray[np.int8]]:

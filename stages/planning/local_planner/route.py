@@ -73,7 +73,7 @@ def straightened(way: Sequence[Piece], heading: float, clear: Clear, spacing: fl
             last += 1
         j, best = i, way[i]
         for end in range(last, i, -1):
-            line = _line(way[i], way[end])
+            line = straight(way[i].a, way[end].b, way[i].heading, way[i].gear)
             after = way[end + 1].heading if end + 1 < len(way) else line.heading
             # A quarter turn or more off means that the way bends back: the straight line would be driven the other way
             # round.
@@ -85,10 +85,10 @@ def straightened(way: Sequence[Piece], heading: float, clear: Clear, spacing: fl
     return out
 
 
-def _line(first: Piece, last: Piece) -> Piece:
-    dx, dy = first.gear * (last.b[0] - first.a[0]), first.gear * (last.b[1] - first.a[1])
-    turn = math.remainder(math.atan2(-dx, dy) - first.heading, 2 * math.pi)
-    return Piece(first.a, last.b, first.heading + turn, first.gear)
+def straight(a: tuple[float, float], b: tuple[float, float], heading: float, gear: int) -> Piece:
+    """The piece between two points, m; its heading is counted on from the one given, by the shorter turn."""
+    dx, dy = gear * (b[0] - a[0]), gear * (b[1] - a[1])
+    return Piece(a, b, heading + math.remainder(math.atan2(-dx, dy) - heading, 2 * math.pi), gear)
 
 
 def _drivable(line: Piece, before: float, after: float, clear: Clear, spacing: float) -> bool:
@@ -108,27 +108,19 @@ def turnable(at: tuple[float, float], before: float, after: float, clear: Clear)
     return clear(np.full(n, at[0]), np.full(n, at[1]), np.linspace(before, after, n))
 
 
-def first_metres(way: Sequence[Piece], length: float) -> list[Piece]:
-    """The first ``length`` metres of a way."""
-    out: list[Piece] = []
-    for piece in way:
-        if length <= MIN_LENGTH_M:
-            break
-        out.append(piece.cut(length) if piece.length > length else piece)
-        length -= piece.length
-    return out
-
-
-def last_metres(way: Sequence[Piece], length: float) -> list[Piece]:
-    """Return the rest of a path after its first ``length`` metres."""
-    out: list[Piece] = []
+def split(way: Sequence[Piece], length: float) -> tuple[list[Piece], list[Piece]]:
+    """The first ``length`` metres of a way, and the rest."""
+    first, rest = list[Piece](), list[Piece]()
     for piece in way:
         if length >= piece.length - MIN_LENGTH_M:
-            length -= piece.length
-            continue
-        out.append(replace(piece, a=piece.cut(length).b) if length > 0 else piece)
-        length = 0.0
-    return out
+            first.append(piece)
+        elif length <= MIN_LENGTH_M:
+            rest.append(piece)
+        else:
+            first.append(piece.cut(length))
+            rest.append(replace(piece, a=first[-1].b))
+        length -= piece.length
+    return first, rest
 
 
 def within_turn(way: Sequence[Piece], heading: float, bound: float) -> tuple[list[Piece], float]:
@@ -160,9 +152,7 @@ def through(points: Floats, gear: NDArray[np.int8], heading: float) -> list[Piec
     the one given, by the shorter turn."""
     out: list[Piece] = []
     for a, b, g in zip(points[:-1].tolist(), points[1:].tolist(), gear.tolist(), strict=True):
-        dx, dy = g * (b[0] - a[0]), g * (b[1] - a[1])
-        heading += math.remainder(math.atan2(-dx, dy) - heading, 2 * math.pi)
-        out.append(Piece((a[0], a[1]), (b[0], b[1]), heading, g))
+        out.append(straight((a[0], a[1]), (b[0], b[1]), out[-1].heading if out else heading, g))
     return out
 
 

@@ -271,10 +271,8 @@ def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: i
         maps = np.asarray(matches.column), np.asarray(matches.row)
         samples = sampled(maps, matches.usable, rig, params.sigma_disparity)
         seen = view_matches(samples, rig, T_local_left, params.sigma_disparity)
-        T, lattice = (
-            T_local_left,
-            local_lattice(seen if level["source"] == REFERENCE_PLANE else _of_ground(rig, level), cell, params),
-        )
+        view = seen if level["source"] == REFERENCE_PLANE else _of_ground(rig, level)
+        T, lattice = T_local_left, local_lattice(view, cell, params)
         z_range = plane_z_range(level["plane"], level["relief"], list(lattice.bounds))
     matched = MatchedPair(
         inputs.left["level_0"],

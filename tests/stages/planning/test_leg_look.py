@@ -11,7 +11,7 @@ from leg_scenes import CAMERAS, GOAL, LATTICE, START, P, X, Y, ground
 from rille.stages.hazard.risk import UNKNOWN
 from rille.stages.planning.local_planner.ground import Ground
 from rille.stages.planning.local_planner.look import TURN_STEP, Target
-from rille.stages.planning.local_planner.route import Piece, first_metres
+from rille.stages.planning.local_planner.route import Piece, split
 
 FREE = Ground(ground(), START, 0.0, P)
 BOUND = math.radians(P.max_turn_deg)
@@ -38,7 +38,7 @@ def test_a_leg_is_driven_as_far_as_the_target_stays_in_view() -> None:
     for points in ([(0.0, 0.35)], [(0.1, 0.3), (0.12, 0.3)]):
         seen = target(points).last_view(leg, BOUND)
         assert seen is not None
-        y = first_metres(leg, seen[0])[-1].b[1]
+        y = split(leg, seen[0])[0][-1].b[1]
         assert CAMERAS.sees(np.array(points), (0.0, y, seen[1])).all()
         beyond = [
             CAMERAS.sees(np.array(points), (0.0, y + 2.1 * LATTICE.cell, k * TURN_STEP)).all() for k in range(-8, 9)
@@ -51,5 +51,5 @@ def test_the_target_is_what_is_not_known_beneath_the_first_pose_that_is_not() ->
     spot = np.hypot(X - 0.04, Y - 0.4) < 0.015
     on = Ground(ground((spot, UNKNOWN)), START, 0.0, P)
     way = [Piece(START, (0.0, 0.33), 0.0, 1), Piece((0.0, 0.33), GOAL, 0.0, 1, known=False)]
-    aim = Target.of(on, way, 1, CAMERAS)
+    aim = Target(on, CAMERAS, on.lacking(way, 1))
     assert np.hypot(*(aim.points - (0.04, 0.4)).T).max() < 0.015

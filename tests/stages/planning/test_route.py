@@ -11,10 +11,9 @@ import pytest
 
 from rille.stages.planning.local_planner.route import (
     Piece,
-    first_metres,
-    last_metres,
     length_of,
     pieces,
+    split,
     straightened,
     through,
     turnable,
@@ -79,7 +78,7 @@ def test_ahead_and_back_are_not_joined() -> None:
 
 
 def test_the_first_metres_and_the_first_turns() -> None:
-    part = first_metres(STAIRS, 0.15)
+    part = split(STAIRS, 0.15)[0]
     assert length_of(part) == pytest.approx(0.15)
     assert part[-1].b == pytest.approx((0.05, 0.1))
     assert within_turn(STAIRS, 0.0, 1.0) == (STAIRS[:1], pytest.approx(-1.0))
@@ -101,7 +100,7 @@ def test_the_first_metres_and_the_first_turns() -> None:
 
 def test_the_first_and_the_last_metres_are_the_whole_way() -> None:
     for length in (0.0, 0.04, 0.1, 0.15, 0.25):
-        parts = [*first_metres(STAIRS, length), *last_metres(STAIRS, length)]
+        parts = [piece for part in split(STAIRS, length) for piece in part]
         assert length_of(parts) == pytest.approx(length_of(STAIRS))
         assert [piece.b for piece in parts if piece.b in [p.b for p in STAIRS]] == [piece.b for piece in STAIRS]
         assert all(a.b == pytest.approx(b.a) for a, b in itertools.pairwise(parts))
@@ -125,8 +124,8 @@ def test_a_turn_is_looked_at_all_the_way() -> None:
 
 def test_what_rounding_leaves_over_is_no_piece() -> None:
     way = [Piece((0.0, 0.0), (0.0, 0.1), 0.0, 1), Piece((0.0, 0.1), (0.0, 0.2), 0.0, 1)]
-    assert [piece.b for piece in first_metres(way, 0.1 + 1e-15)] == [(0.0, 0.1)]
-    assert [piece.a for piece in last_metres(way, 0.1 - 1e-15)] == [(0.0, 0.1)]
+    assert [piece.b for piece in split(way, 0.1 + 1e-15)[0]] == [(0.0, 0.1)]
+    assert [piece.a for piece in split(way, 0.1 - 1e-15)[1]] == [(0.0, 0.1)]
 
 
 def graph_but(what: str, k: int) -> LatticeGraph:
