@@ -332,16 +332,14 @@ def _sequence(view: RunView) -> dict[str, Any]:
 
 def _stages(view: RunView) -> dict[str, dict[str, Any]]:
     """By stage: tasks computed and cached in this run; seconds of the former, and of all when they were computed."""
-    by_stage: dict[str, dict[str, Any]] = {}
+    by_stage, counted = dict[str, dict[str, Any]](), ("computed", "cached", "failed", "skipped")
+    timed = "seconds", "seconds_when_computed"
     for t in view.tasks:
-        zero = {"computed": 0, "cached": 0, "failed": 0, "skipped": 0, "seconds": 0.0, "seconds_when_computed": 0.0}
-        row = by_stage.setdefault(t.stage, zero)
+        row = by_stage.setdefault(t.stage, dict.fromkeys(counted, 0) | dict.fromkeys(timed, 0.0))
         row[t.status] += 1
         row["seconds"] += (t.seconds or 0.0) if t.status == "computed" else 0.0
         row["seconds_when_computed"] += t.seconds or 0.0
-    for row in by_stage.values():
-        row["seconds"], row["seconds_when_computed"] = round(row["seconds"], 3), round(row["seconds_when_computed"], 3)
-    return by_stage
+    return {name: {key: round(value, 3) for key, value in row.items()} for name, row in by_stage.items()}
 
 
 def _reads(run: RunView) -> tuple[object, ...]:

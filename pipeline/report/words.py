@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -61,10 +62,7 @@ def spread(values: Any) -> str:
 
 def spans(numbers: list[int]) -> str:
     """``[1, 2, 3, 7]`` to ``1-3, 7``."""
-    ranges: list[list[int]] = []
-    for n in numbers:
-        if ranges and n == ranges[-1][1] + 1:
-            ranges[-1][1] = n
-        else:
-            ranges.append([n, n])
-    return ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in ranges)
+    # Of successive numbers the place in the list less the number is the same.
+    groups = itertools.groupby(enumerate(numbers), key=lambda at: at[1] - at[0])
+    runs = [[n for _, n in group] for _, group in groups]
+    return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)

@@ -9,16 +9,19 @@ matches do (:func:`explain`).
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import math
+from typing import Any
 
 import numpy as np
 
-from rille.stages.core.arrays import Bools, Floats, Floats32
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import MAX_CELLS, Lattice
 from rille.stages.geometry.surface import Surface
 from rille.stages.terrain.ground import PlaneView
+from rille.stages.terrain.locus.kernel import Dem
+from rille.stages.terrain.locus.solve import LocusParams
 
 
 def explain(
@@ -72,19 +75,8 @@ def _inside(camera: Camera, points: Floats) -> Bools:
         return np.asarray(((pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1])).all(axis=-1))
 
 
-class Limits(NamedTuple):
-    """``z_range`` of the search, m; largest standard deviation, m, of a cell (``std``) and by a typical disparity of a
-    pixel within the extent (``sigma``), infinite for none; ``range_cells`` that a pixel may cover there, infinite for a
-    stated extent."""
-
-    z_range: tuple[float, float]
-    std: float
-    sigma: float
-    range_cells: float
-
-
 def coverage(
-    view: PlaneView, surface: tuple[Floats32, Floats32], lattice: Lattice, sigma_d: float, limits: Limits
+    view: PlaneView, dem: Dem, lattice: Lattice, z_range: tuple[float, float], greatest: float, params: LocusParams
 ) -> dict[str, Any]:
     """Shares of the matched pixels that are ``outside``, ``unsure`` and ``off`` the surface; ``settings`` by which the
     map would hold nearly all that lie within the range of elevations (None: no limit keeps them out), and ``size`` m
@@ -93,37 +85,41 @@ def coverage(
     Parameters
     ----------
     view : of the matched pixels.
-    surface : elevation and standard deviation (rows, cols), m, of all cells, the unsure ones too.
-    sigma_d : standard deviation of a typical disparity, pixels.
+    dem : all cells, the unsure ones too.
+    z_range : of the search, m.
+    greatest : largest standard deviation of a cell, m.
+    params : limits of the extent; ``max_sigma`` is set.
     """
+    assert params.max_sigma is not None
+    sigma_d, farthest = params.sigma_disparity, math.inf if params.extent else params.max_range_cells
     x, y, z = view.xyz.T
     x_min, x_max, y_min, y_max = lattice.bounds
-    searched = (z >= limits.z_range[0]) & (z <= limits.z_range[1])
+    searched = (z >= z_range[0]) & (z <= z_range[1])
     inside = searched & (x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max)
     row, col = np.rint(lattice.index(view.xyz[inside, :2])).astype(np.intp).clip(0, np.array(lattice.shape) - 1).T
-    elevation, std = (values[row, col].astype(np.float64) for values in surface)
+    elevation, std = (values[row, col].astype(np.float64) for values in (dem.elevation, dem.elevation_std))
     # Within three standard deviations and a cell.
     on = np.abs(elevation - z[inside]) <= 3.0 * std + lattice.cell
     shares = {
         "outside": 1.0 - np.count_nonzero(inside) / len(z),
-        "unsure": np.count_nonzero(on & (std > limits.std)) / len(z),
+        "unsure": np.count_nonzero(on & (std > greatest)) / len(z),
         "off": np.count_nonzero(~on) / len(z),
     }
     facts: dict[str, Any] = {**shares, "settings": None, "size": None}
     if not on.any():
         return facts
     # Cells that are too unsure ask for a higher limit in proportion.
-    sigma = max(_upper_quantile(std[on]) * limits.sigma / limits.std, _upper_quantile(sigma_d / view.slope[searched]))
+    sigma = max(_upper_quantile(std[on]) * params.max_sigma / greatest, _upper_quantile(sigma_d / view.slope[searched]))
     cells = _upper_quantile(view.along[searched] / lattice.cell)
-    needs = {"locus.max_sigma": (sigma, limits.sigma), "locus.max_range_cells": (cells, limits.range_cells)}
+    needs = {"locus.max_sigma": (sigma, params.max_sigma), "locus.max_range_cells": (cells, farthest)}
     wider = {name: need for name, (need, limit) in needs.items() if need > limit}
     if wider:
-        good = searched & (sigma_d / view.slope <= max(sigma, limits.sigma))
-        good &= view.along <= max(cells, limits.range_cells) * lattice.cell
+        good = searched & (sigma_d / view.slope <= max(sigma, params.max_sigma))
+        good &= view.along <= max(cells, farthest) * lattice.cell
         low, high = np.quantile(view.xyz[good, :2], [view.stray, 1.0 - view.stray], axis=0)
         facts["size"] = (high - low).tolist()
         if np.prod(high - low) > 0.5 * MAX_CELLS * lattice.cell**2:
-            wider = {"locus.cell_size": max(sigma, cells * lattice.cell / limits.range_cells)}
+            wider = {"locus.cell_size": max(sigma, cells * lattice.cell / farthest)}
         facts["settings"] = {name: float(f"{need:.2g}") for name, need in wider.items()}
     return facts
 

@@ -37,7 +37,7 @@ from rille.stages.geometry.surface import Surface, plane
 from rille.stages.terrain.ground import PlaneView, view_ground, view_matches
 from rille.stages.terrain.ground_frame import sampled
 from rille.stages.terrain.ground_frame import z_range as plane_z_range
-from rille.stages.terrain.locus.coverage import Limits, coverage, explain
+from rille.stages.terrain.locus.coverage import coverage, explain
 from rille.stages.terrain.locus.kernel import Dem
 from rille.stages.terrain.locus.refinement import refine
 from rille.stages.terrain.locus.solve import LocusParams, Matches, PairArrays, join, projections, solve
@@ -285,9 +285,7 @@ def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: i
     greatest = greatest_std(params, matches.std is not None)
     covered: dict[str, Any] | None = None
     if seen is not None:
-        farthest = params.max_range_cells if params.extent is None else math.inf
-        limits = Limits((low, high), greatest or math.inf, params.max_sigma or math.inf, farthest)
-        covered = coverage(seen, (dem.elevation, dem.elevation_std), lattice, params.sigma_disparity, limits)
+        covered = coverage(seen, dem, lattice, (low, high), greatest or math.inf, params)
     leave_out_unsure(dem, greatest)
     if not np.isfinite(dem.elevation).any():
         raise explain(rig, T, plane(lattice), (low, high), matches.usable)
