@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.evaluation.metric import metric
+from rille.stages.evaluation.rigid import lengths_along
 from rille.stages.facts.evaluation import Metric, MetricsFacts
+from rille.stages.geometry.geometry import way_length
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
@@ -22,12 +26,10 @@ def crossed_cells(path: Floats, lattice: Lattice) -> NDArray[np.int64]:
 
     The line is sampled at a quarter of a cell, so that it cannot pass more than a cell's corner unseen.
     """
-    points = [path[:1, :2]]
-    for a, b in zip(path[:-1, :2], path[1:, :2], strict=True):
-        n = max(1, int(np.ceil(4.0 * np.hypot(*(b - a)) / lattice.cell)))
-        points.append(a + (b - a) * (np.arange(1, n + 1) / n)[:, None])
-    cells = np.rint(lattice.index(np.concatenate(points))).astype(np.int64)
-    return np.unique(cells, axis=0)
+    along = lengths_along(path[:, :2])
+    at = np.linspace(0.0, along[-1], 1 + math.ceil(4.0 * along[-1] / lattice.cell))
+    points = np.stack([np.interp(at, along, axis) for axis in path[:, :2].T], axis=1)
+    return np.unique(np.rint(lattice.index(points)).astype(np.int64), axis=0)
 
 
 def path_check(path: Floats, risk: Bytes, lattice: Lattice) -> tuple[NDArray[np.int64], dict[str, Metric]]:
@@ -77,7 +79,7 @@ def shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> di
     if best is None:
         why = "none leads from one end of the path to the other" if len(path) else "no path was found"
         return {"length_ratio": metric(why, "1", how)}
-    length = float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum())
+    length = way_length(path[:, :2])
     ratio = length / best if best > 0 else None
     return {
         "shortest_length": metric(best, "m", how),
