@@ -68,9 +68,9 @@ def of_trajectory(make: Builder, frames: Sequence[int]) -> Steps:
 def _of_crosscheck(make: Builder, joined: Handle[JoinFacts], known: Handle[TruthFacts]) -> Steps:
     """The other program's trajectory against truth, where it has one there."""
     found = yield from done(joined)
-    posed = [f for f, position in zip(found.meta["frames"], found.meta["positions"], strict=True) if position]
-    if any(_truth(make, frame) is not None for frame in posed):
-        piece = found.meta["longest"] if len(found.meta["pieces"]) > 1 else None
+    pieces, longest = found.meta["pieces"], found.meta["longest"]
+    if pieces and any(_truth(make, frame) is not None for frame in pieces[longest]):
+        piece = longest if len(pieces) > 1 else None
         make.products.crosscheck_accuracy = make.node(
             accuracy_stage, "accuracy/crosscheck", trajectory=joined, truth=known, piece=piece
         )
