@@ -152,7 +152,7 @@ def test_nothing_is_made_without_what_it_needs_and_holes_are_passed_on() -> None
     assert drawn is not None
     assert drawn.spec.args["run"]["part"]["products"]["part"]["world_path"] is None
     assert {handle.name for handle in read(drawn)} == {
-        *("disparity0", "disparity4", "rig", "trajectory", "risk", "tile"),
+        *("accuracy", "disparity0", "disparity4", "rig", "trajectory", "risk", "tile"),
         *(f"image{frame}" for frame in FRAMES),
     }
 
