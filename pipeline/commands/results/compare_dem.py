@@ -71,8 +71,8 @@ def compare_dem(
         if files:
             text = f"{files[0]} is no run: it has no ortho image"
             raise InputError("RIL-908", text, remedy="leave --align place out")
-        images = (read_ortho(path / "ortho.tif")[0] for path in paths)
-        placed = register(*images, (one.values, other.values))
+        image, reference = (read_ortho(path / "ortho.tif")[0] for path in paths)
+        placed = register(image, reference, (one.values, other.values))
         found = {"motion_of_a": placed.motion.tolist(), "by": placed.by}
         one, align = moved(one, placed.motion), "rigid"
     check(one, other)

@@ -63,7 +63,7 @@ def _by_relief(a: Ortho, b: Ortho, heights: tuple[Floats, Floats]) -> Registrati
         reach = max(math.hypot(x, y) for x in model.bounds[:2] for y in model.bounds[2:])
         area = SearchArea(0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0, 0.5 * math.hypot(x1 - x0, y1 - y0) + reach, math.pi)
         elevations = GlobalMap(heights[1], ground.x0, ground.y0, ground.cell)
-        found = fix(heights[0], model, elevations, area, MapLocalizationParams())
+        found = fix(heights[0], model, elevations, area, MapLocalizationParams.model_validate({}))
     except (DegenerateError, InputError):
         return None
     if found.doubt:
