@@ -7,22 +7,21 @@ and the label, of the code and packages behind the stage, and of the *output dig
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from rille.pipeline.engine.code_digest import module_digests
-from rille.pipeline.engine.keys import text
+from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.packages import versions
 from rille.pipeline.engine.runtime.kernels import use_own_folder
 from rille.pipeline.engine.store.manifest import Ref
 from rille.stages.core.declare import Params, Stage, declared
 
-FORMAT = 3
+FORMAT = 4
 """Enters every key: raise it when the meaning of keys or artifacts changes."""
 
 Refs = Mapping[str, Ref | list[Ref]]
@@ -58,15 +57,6 @@ class Spec:
         return resolve(self.module)
 
 
-class _Common(NamedTuple):
-    """What all tasks of a stage have in common, and its canonical text in the order of the names: what stands before
-    ``inputs``, and what after ``params``."""
-
-    parts: dict[str, Any]
-    before: str
-    after: str
-
-
 @cache
 def resolve(module: str) -> Stage:
     """The stage of a module; its source is digested just before the import, so that both see the same files."""
@@ -82,25 +72,25 @@ def resolve(module: str) -> Stage:
 
 
 def recipe(spec: Spec, refs: Refs) -> dict[str, Any]:
-    """All that determines a result; its digest is the key."""
-    return {**_shared(spec.module).parts, "params": spec.params, "args": dict(spec.args), "inputs": each(_digest, refs)}
+    """All that determines a result, by name."""
+    return {**_shared(spec.module)[0], **_own(spec, refs)}
 
 
 def key_of(spec: Spec, refs: Refs) -> str:
-    """Key of a task, ``digest(recipe(spec, refs))``; what all tasks of a stage share is made text once."""
-    common = _shared(spec.module)
-    args, params = text(dict(spec.args), f"{spec.label}.args"), text(spec.params, f"{spec.label}.params")
-    parts = f'{{"args":{args},{common.before},"inputs":{text(each(_digest, refs))},"params":{params},{common.after}}}'
-    return hashlib.sha256(parts.encode()).hexdigest()
+    """Key of a task: the digest of its recipe, in which one digest stands for what all tasks of a stage share."""
+    return digest({"stage": _shared(spec.module)[1], **_own(spec, refs)}, spec.label)
+
+
+def _own(spec: Spec, refs: Refs) -> dict[str, Any]:
+    return {"params": spec.params, "args": dict(spec.args), "inputs": each(_digest, refs)}
 
 
 @cache
-def _shared(module: str) -> _Common:
-    stage = resolve(module)
-    found = (module_digests(module), versions(module), FORMAT, stage.name, stage.version)
-    fixed = dict(zip(("code", "env", "format", "stage", "version"), found, strict=True))
-    texts = [f'"{name}":{text(value)}' for name, value in fixed.items()]
-    return _Common(fixed, ",".join(texts[:3]), ",".join(texts[3:]))
+def _shared(module: str) -> tuple[dict[str, Any], str]:
+    """What all tasks of a stage have in common, and the digest of it."""
+    stage, code, env = resolve(module), module_digests(module), versions(module)
+    parts = {"code": code, "env": env, "format": FORMAT, "stage": stage.name, "version": stage.version}
+    return parts, digest(parts, module)
 
 
 def _digest(ref: Ref) -> str:

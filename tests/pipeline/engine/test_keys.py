@@ -123,13 +123,15 @@ def test_models_count_with_their_defaults_filled():
     assert digest(Outer()) != digest(Twin())
 
 
-def test_a_task_s_key_is_the_digest_of_its_recipe():
+def test_a_task_s_key_is_the_digest_of_its_recipe_with_one_for_what_its_stage_s_tasks_share():
     spec = Spec(
         "toys.scale", 'scale/"0"', ScaleParams(offset=0.5), {"pair": 3, "at": [0.1, None], "a": {"z": 1, "b": 2}}
     )
     one, other = (Ref(k * 64, "numbers", k * 64, {}, 0, 0, 0.0) for k in "ab")
     for refs in ({"values": one}, {"values": other}, {"values": [one, other]}, {}):
-        assert key_of(spec, refs) == digest(recipe(spec, refs))
+        made = recipe(spec, refs)
+        shared = {name: made.pop(name) for name in ("code", "env", "format", "stage", "version")}
+        assert key_of(spec, refs) == digest({"stage": digest(shared), **made})
     assert key_of(spec, {"values": one}) != key_of(spec, {"values": other})
     assert key_of(spec, {}) != key_of(replace(spec, params=ScaleParams(offset=0.25)), {})
     with pytest.raises(TypeError, match=r"args\.b is a object"):
