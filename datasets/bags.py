@@ -23,7 +23,7 @@ from rille.datasets.cameras.model import RECTIFIED
 from rille.datasets.images import bag
 from rille.datasets.images.files import Digests, check_size
 from rille.datasets.images.headers import Header, sizes_of
-from rille.datasets.images.pairing import join, side_of
+from rille.datasets.images.pairing import join, two_sides
 from rille.datasets.imu import ImuRecord, Inertial, at_frames
 from rille.datasets.inspection import CALIBRATIONS, Findings, FoundImages, find_calibration
 from rille.datasets.manifest.model import Cameras, Images, Manifest
@@ -144,18 +144,13 @@ def _topics(reader: Any, path: Path, wanted: str | None) -> tuple[str, str]:
             remedy = f"name two with a comma between them, left first; there are {there}"
             raise InputError("RIL-945", text, remedy=remedy)
         return names[0], names[1]
-    pairs: dict[tuple[bool, bool, int, str], dict[int, str]] = {}
-    for topic in images:
-        found = side_of(topic)
-        if found is not None:
-            rank = (kinds[topic] == bag.COMPRESSED, not RECTIFIED.search(topic))
-            pairs.setdefault((*rank, found[0], found[2]), {})[found[1]] = topic
-    whole = {key: sides for key, sides in pairs.items() if len(sides) == 2}
-    best = [sides for key, sides in whole.items() if key[:2] == min(whole)[:2]]
+    ranks = {topic: (kinds[topic] == bag.COMPRESSED, not RECTIFIED.search(topic)) for topic in images}
+    found = (two_sides(topic for topic in images if ranks[topic] == rank) for rank in sorted(set(ranks.values())))
+    best = next((pairs for pairs in found if pairs), [])
     if len(best) != 1:
         text = f"{path} has {len(best) or 'no'} image topics that are left and right by name (images: {there})"
         raise InputError("RIL-946", text, remedy=f"name them: {path}:LEFT,RIGHT")
-    return best[0][0], best[0][1]
+    return best[0]
 
 
 def _messages(reader: Any, topic: str) -> Iterator[tuple[int, bytes, Any]]:

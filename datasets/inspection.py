@@ -9,21 +9,23 @@ from __future__ import annotations
 import glob
 import re
 from collections import defaultdict
-from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
 
 from rille.datasets.cameras import KNOWN, CalibratedCamera, read_cameras
 from rille.datasets.cameras.model import of_size
+from rille.datasets.images import pairing
 from rille.datasets.images.files import SUFFIXES, common_header
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import unread
-from rille.datasets.images.pairing import SIDES, ImagePair, common_headers, natural, pair_up, side_of, stamp_of
+from rille.datasets.images.pairing import ImagePair, natural, side_of, stamp_of
 from rille.datasets.poses import names_positions, read_positions
 from rille.datasets.text.reading import Search, is_file, read_lines
+from rille.datasets.text.tables import read_table
 from rille.stages.core.errors import InputError, RilleError
 from rille.stages.geometry.geometry import Sizes
 
@@ -39,8 +41,6 @@ UNWRITABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """In a name: control characters and line separators, which would end a comment, and bytes that are not UTF-8."""
 
 SPLIT = "if each shows both views: ffmpeg -i FILE -vf crop=iw/2:ih:0:0 left/FILE -vf crop=iw/2:ih:iw/2:0 right/FILE"
-
-NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -197,11 +197,11 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     left, right = both[key]
     sizes, trouble, matched, lines = None, "", tuple[ImagePair, ...](), list[str]()
     try:
-        matched = pair_up(left, right, gaps=True, warnings=lines)  # as the manifest opens
-        sizes = sizes_of(common_headers(matched))
+        matched = pairing.pair_up(left, right, gaps=True, warnings=lines)  # as the manifest opens
+        sizes = sizes_of(pairing.common_headers(matched))
     except InputError as error:
         trouble = str(error)
-    tokens = SIDES[key[0]]
+    tokens = pairing.SIDES[key[0]]
     return FoundImages(
         pattern(left, folder),
         pattern(right, folder),
@@ -234,9 +234,8 @@ def pattern(paths: list[Path], folder: Path) -> str:
 
 
 def _common_start(words: list[str]) -> str:
-    """Letters that all words begin with; all lie between the first and the last in alphabetical order."""
-    first, last = min(words), max(words)
-    return first[: next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))]
+    """Letters that all words begin with."""
+    return "".join(of[0] for of in takewhile(lambda letters: len(set(letters)) == 1, zip(*words, strict=False)))
 
 
 # -- calibration -------------------------------------------------------------------------------------------------------
@@ -265,9 +264,7 @@ def find_calibration(found: Findings, texts: list[Path]) -> None:
             names = (chosen[0].name, chosen[1].name)
             candidates.append(replace(_calibration((name,), chosen), names=names))
     single = {name: cameras[0] for name, cameras in read.items() if len(cameras) == 1}
-    candidates += [
-        _calibration((left, right), [single[left], single[right]]) for left, right in _two_sides(list(single))
-    ]
+    candidates += [_calibration(pair, [single[name] for name in pair]) for pair in pairing.two_sides(single)]
     candidates += [_calibration((name,), [camera]) for name, camera in single.items()]
     if candidates:
         found.calibration = max(
@@ -282,16 +279,6 @@ def _of_sides(cameras: list[CalibratedCamera], sides: tuple[str, str]) -> list[C
     by_number = {int(n[0]): c for c in cameras if (n := re.search(r"\d+(?=\D*$)", c.name))}
     chosen = [by_number[int(n[0])] for n in numbers if n and int(n[0]) in by_number]
     return chosen if len(chosen) == 2 else cameras[:2]
-
-
-def _two_sides(names: list[str]) -> Iterable[tuple[str, str]]:
-    """Names that differ in the side's token alone."""
-    sides: dict[tuple[int, str], dict[int, str]] = defaultdict(dict)
-    for name in names:
-        at = side_of(name.rpartition(".")[0])
-        if at is not None:
-            sides[at[0], at[2]][at[1]] = name
-    return [(pair[0], pair[1]) for pair in sides.values() if len(pair) == 2]
 
 
 def _calibration(names: tuple[str, ...], cameras: list[CalibratedCamera]) -> FoundCalibration:
@@ -313,29 +300,22 @@ def table_kind(path: Path, pairs: int) -> str:
     InputError
         It is no text, has decimal commas, or is one of true positions by its columns' names, and cannot be read.
     """
-    lines = [line.strip() for line in read_lines(path, "table") if line.strip()]
-    comments = [line for line in lines if not NUMBER.match(line)]
-    rows = [line for line in lines if NUMBER.match(line)]
-    if not rows:
+    read_lines(path, "table")  # refuses what is no text; of other files most are no tables, which is no error
+    try:
+        table = read_table(path, "table")
+        row = np.array([float(cell) for cell in table.rows[0]])
+    except (InputError, ValueError):
         return ""
-    header = comments[0].lower() if comments else ""
-    words = [word for word in re.split(r"[,;\s]+", rows[0]) if word]
-    numbers = [float(word) for word in words if NUMBER.fullmatch(word)]
-    if len(numbers) < len(words):
-        return ""
-    if any(word in header for word in ("gyro", "w_rs", "ang_vel", "angular", "accel")) and len(numbers) >= 7:
+    header = " ".join(table.header)
+    if any(word in header for word in ("gyro", "w_rs", "ang_vel", "angular", "accel")) and row.size >= 7:
         return "imu"
     if "yaw" in header and "roll" in header:
         return "attitude"
-    if _are_positions(path, pairs):
+    positions = read_positions(path, "csv", {}) if names_positions(table) else None
+    # Without times they must be one a pair.
+    if positions is not None and (positions.times is not None or len(positions.positions) == pairs):
         return "positions"
-    return _kind_of_row(np.array(numbers), len(rows), pairs, "times" if "time" in path.stem.lower() else "")
-
-
-def _are_positions(path: Path, pairs: int) -> bool:
-    """Whether named columns are positions without rotation, and with times, or one a pair."""
-    found = read_positions(path, "csv", {}) if names_positions(path) else None
-    return found is not None and (found.times is not None or len(found.positions) == pairs)
+    return _kind_of_row(row, len(table.rows), pairs, "times" if "time" in path.stem.lower() else "")
 
 
 def _kind_of_row(row: np.ndarray, rows: int, pairs: int, named: str) -> str:

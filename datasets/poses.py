@@ -144,12 +144,9 @@ def times_of(table: TextTable, column: int) -> tuple[float, ...]:
     return seconds(table.text(column), table.name, unit=said[1] if said else "auto", lines=table.lines)
 
 
-def names_positions(path: Path) -> bool:
-    """Whether a file is a table whose columns are named as x and y, or east and north."""
-    try:
-        return {"x", "y"} <= _meanings(read_table(path, "pose file")).keys()
-    except InputError:
-        return False
+def names_positions(table: TextTable) -> bool:
+    """Whether columns are named as x and y, or east and north."""
+    return {"x", "y"} <= _meanings(table).keys()
 
 
 def _column(table: TextTable, stated: str | int) -> int:

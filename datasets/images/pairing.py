@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -135,6 +136,16 @@ def side_of(name: str) -> tuple[int, int, str] | None:
             if count:
                 return row, side, neutral
     return None
+
+
+def two_sides(names: Iterable[str]) -> list[tuple[str, str]]:
+    """Left and right of the names that differ in the side's token alone."""
+    sides: dict[tuple[int, str], dict[int, str]] = defaultdict(dict)
+    for name in names:
+        at = side_of(name)
+        if at is not None:
+            sides[at[0], at[2]][at[1]] = name
+    return [(of[0], of[1]) for of in sides.values() if len(of) == 2]
 
 
 def without_side(stem: str, side: int) -> str:
