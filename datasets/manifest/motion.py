@@ -15,7 +15,7 @@ from rille.datasets.images.pairing import ImagePair, ends, stamp_of
 from rille.datasets.imu import at_frames, read_imu
 from rille.datasets.manifest.model import Attitude, Imu, Manifest, PoseFile, PositionFile, Times, Truth
 from rille.datasets.manifest.rig import direction
-from rille.datasets.poses import coverage, interpolate, read_poses, read_positions, refuse_apart
+from rille.datasets.poses import TimedPositions, coverage, interpolate, read_poses, read_positions, refuse_apart
 from rille.datasets.protocol import Positions, Rows, rows_of
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.times import seconds
@@ -190,7 +190,7 @@ class MotionReader:
         kind = "positions" if alone else "poses"
         self.motion.truth_source = section.source or f"{kind} of {section.file}, as recorded"
         if alone is not None:
-            self.motion.truth_positions = self.positions(section, alone.times, alone.positions)
+            self.motion.truth_positions = self.true_positions(section, alone)
             return
         if section.lever_arm is not None:
             text = f"{self.name}: truth.lever_arm: {section.file} holds poses, not positions alone"
@@ -199,27 +199,39 @@ class MotionReader:
         if section.T_body_left is not None:
             self.motion.truth_mount = RigidTransform.from_matrix(section.T_body_left)
 
-    def positions(self, section: Truth, at: tuple[float, ...] | None, rows: tuple[tuple[float, ...], ...]) -> Positions:
-        """Positions of the truth in metres, at times (s) of the images' clock or one a pair."""
-        where = f"{self.name}: truth.{{}}: {section.file} "
+    def true_positions(self, section: Truth, found: TimedPositions) -> Positions:
+        """Positions of the truth, which have no rotations."""
         if section.T_body_left is not None:
-            text = where.format("T_body_left") + "holds positions, which have no rotations by which to move them"
+            text = f"{self.name}: truth.T_body_left: {section.file} holds positions, which have no rotations to move by"
             raise InputError("RIL-802", text, remedy="remove T_body_left, or give poses")
-        spacing = float(np.median(np.diff(at))) if at is not None and len(at) > 1 else 0.0
-        if self.motion.times is None or at is None:
-            rows = tuple(self.arrived(rows))
-            if len(rows) != len(self.pairs):
-                text = f"has {len(rows)} positions for {len(self.pairs)} pairs, and not both have times"
-                remedy = "give one a pair, or times of both ([times] of the pairs)"
-                raise IncompleteError("RIL-803", where.format("file") + text, remedy=remedy)
-            at = None
-        elif spacing > section.max_gap:
-            text = f"has positions {spacing:.4g} s apart, more than {section.max_gap:g} s: nothing would be compared"
+        rows, times = self.positions(section, found, "truth")
+        spacing = float(np.median(np.diff(times))) if times is not None and len(times) > 1 else 0.0
+        if spacing > section.max_gap:
+            text = f"{self.name}: truth.max_gap: {section.file} has positions {spacing:.4g} s apart, more than "
+            text += f"{section.max_gap:g} s: nothing would be compared"
             remedy = "raise truth.max_gap, if straight lines between them are exact enough"
-            raise InputError("RIL-804", where.format("max_gap") + text, remedy=remedy)
-        times = None if at is None else tuple(t + section.time_offset for t in at)
-        scaled = tuple(tuple(section.unit * v for v in row) for row in rows)
-        return Positions(scaled, times, section.max_gap, section.lever_arm)
+            raise InputError("RIL-804", text, remedy=remedy)
+        return Positions(rows, times, section.max_gap, section.lever_arm)
+
+    def positions(
+        self, section: Truth | PositionFile, found: TimedPositions, table: str
+    ) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...] | None]:
+        """Positions in metres, and their times (s) of the images' clock; None: they are one a pair.
+
+        Raises
+        ------
+        IncompleteError
+            They or the pairs have no times, and they are not one a pair.
+        """
+        rows = tuple(tuple(section.unit * v for v in row) for row in found.positions)
+        if found.times is not None and self.motion.times is not None:
+            return rows, tuple(t + section.time_offset for t in found.times)
+        rows = tuple(self.arrived(rows))
+        if len(rows) != len(self.pairs):
+            text = f"{self.name}: {table}.file: {section.file} has {len(rows)} positions for {len(self.pairs)} pairs"
+            remedy = "give one a pair, or times of both ([times] of the pairs)"
+            raise IncompleteError("RIL-803", f"{text}, and not both have times", remedy=remedy)
+        return rows, None
 
     def measured(self, section: PositionFile) -> dict[str, Any]:
         """Positions that are measurements, in metres, at times (s) of the images' clock; numbers of pairs without it.
@@ -230,21 +242,16 @@ class MotionReader:
             The file holds no positions, or has no times and not one row a pair, or no time in common with the pairs.
         """
         columns = {str(meaning): column for meaning, column in section.columns.items()}
-        table = read_positions(self.root / section.file, "auto", columns)
-        if table is None:
+        found = read_positions(self.root / section.file, "auto", columns)
+        if found is None:
             text = f"{self.name}: positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")
-        rows = [[section.unit * v for v in row] for row in table.positions]
-        if table.times is not None and self.motion.times is not None:
-            times = [t + section.time_offset for t in table.times]
-            refuse_apart(times, self.motion.times, table.name)
-        elif len(rows) == len(self.pairs):
-            times = list(self.motion.times or range(len(rows)))
-        else:
-            text = f"{self.name}: positions.file: {section.file} has {len(rows)} positions for {len(self.pairs)} pairs"
-            raise InputError("RIL-456", f"{text}, and not both have times", remedy=NEEDS_TIMES)
+        rows, times = self.positions(section, found, "positions")
+        if times is not None and self.motion.times is not None:
+            refuse_apart(times, self.motion.times, found.name)
+        at = list(times or self.motion.times or range(len(rows)))
         sigma = [section.sigma] * 3 if isinstance(section.sigma, float) else list(section.sigma)
-        return {"positions": rows, "times": times, "sigma": sigma, "lever": list(section.lever_arm)}
+        return {"positions": [list(row) for row in rows], "times": at, "sigma": sigma, "lever": list(section.lever_arm)}
 
     def attitude(self, section: Attitude) -> None:
         """Rotations of a sensor, and the vertical where the file's reference is known to have one."""

@@ -602,7 +602,7 @@ def test_without_standard_deviations_sensors_are_no_measurements(tmp_path):
     ("more", "lines", "expected"),
     [
         ("sigma = 0.5", [tum(k, k) for k in range(3)], ("RIL-453", "p.txt", "columns = ")),
-        ("sigma = 0.5", ["x,y", "1,2", "2,3"], ("RIL-456", "2 positions for 3 pairs")),
+        ("sigma = 0.5", ["x,y", "1,2", "2,3"], ("RIL-803", "2 positions for 3 pairs")),
         ("sigma = 0.5", ["time,x,y", "100,1,2", "101,2,3"], ("RIL-269", "100.000")),
         ("sigma = 0.5", ["lat,lon,when", "50.1,8.2,0", "50.1,8.3,1"], ("RIL-805", "lat")),
         ('sigma = 0.5\ncolumns = { x = "E" }', ["time,x,y", "0,1,2"], ("RIL-806", "'E'")),
