@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
@@ -40,8 +39,14 @@ def examined(sequence: Sequence) -> Sequence:
     chosen = there[:: max(1, -(-len(there) // 3))]
     sources = {camera: [sequence.image(k, camera) for k in chosen] for camera in CAMERAS}
     images = {camera: [image for source in of for image in _images(source)] for camera, of in sources.items()}
-    _refuse_several(sources)
-    lines = _orientations(sources)
+    orientations: dict[str, set[int]] = {camera: set() for camera in CAMERAS}
+    for camera, source in ((camera, source) for camera, of in sources.items() for source in of):
+        turned, several = _tags(source)
+        if several > 1:  # as stacks, and both views of a stereo camera
+            text = f"{source.hints['path']} holds {several} images, and one is read of each file"
+            raise InputError("RIL-831", text, remedy="take them apart, a folder a camera: magick FILE left/%06d.png")
+        orientations[camera].add(turned)
+    lines = _orientations(*orientations.values())
     for camera, of in images.items():
         files.refuse_swapped(of, f"the {camera} images")
     for camera in [camera for camera, of in images.items() if of and mosaic(of[0])]:
@@ -72,28 +77,22 @@ def _images(source: Source) -> list[AnyArray]:
     return []
 
 
-def _refuse_several(sources: Mapping[str, list[Source]]) -> None:
-    """Refuse files that hold several images of one size, as stacks and both views of a stereo camera."""
-    for source in (source for of in sources.values() for source in of):
-        count = _count(source)
-        if count > 1:
-            text = f"{source.hints['path']} holds {count} images, and one is read of each file"
-            raise InputError("RIL-831", text, remedy="take them apart, a folder a camera: magick FILE left/%06d.png")
-
-
-def _count(source: Source) -> int:
-    """How many images of the size of the first one a file holds, apart from masks; 1 where it cannot be read."""
+def _tags(source: Source) -> tuple[int, int]:
+    """EXIF's orientation of an image file, and how many images of the size of the first one it holds, apart from masks;
+    1 where it cannot be read."""
+    turned = several = 1
     with (
         catch_warnings(action="ignore"),
         suppress(Exception),  # of a damaged directory: whatever the parsers come upon
         Image.open(source.hints["path"], formats=FORMATS) as image,
     ):
-        size, count = image.size, getattr(image, "n_frames", 1)
+        turned, size, count = orientation(image), image.size, getattr(image, "n_frames", 1)
         if count > 1:
             image.seek(1)
         # TIFF's tag of images that are a smaller copy, or a mask, of another one
-        return count if image.size == size and not getattr(image, "tag_v2", {}).get(254, 0) else 1
-    return 1
+        if image.size == size and not getattr(image, "tag_v2", {}).get(254, 0):
+            several = count
+    return turned, several
 
 
 def mosaic(image: AnyArray) -> bool:
@@ -115,12 +114,11 @@ def mosaic(image: AnyArray) -> bool:
     return bool(differ.any(0).mean() > 0.4)
 
 
-def _orientations(sources: Mapping[str, list[Source]]) -> list[str]:
+def _orientations(left: set[int], right: set[int]) -> list[str]:
     """A line where all images are turned alike: they are taken as they are stored."""
-    left, right = (sorted({_orientation(source) for source in of}) for of in sources.values())
-    if {*left, *right} <= {1}:
+    if left | right <= {1}:
         return []
-    words = f"EXIF orientations are {left} of left images and {right} of right ones"
+    words = f"EXIF orientations are {sorted(left)} of left images and {sorted(right)} of right ones"
     if left != right or len(left) > 1:
         remedy = (
             "turn the pixels (magick mogrify -auto-orient FILES), or remove the tags (exiftool -Orientation= FILES)"
@@ -129,10 +127,3 @@ def _orientations(sources: Mapping[str, list[Source]]) -> list[str]:
     return [
         warning("RIL-829", f"{words}: they are ignored, the calibration is taken for the pixels as they are stored")
     ]
-
-
-def _orientation(source: Source) -> int:
-    """EXIF's orientation of an image file; 1 where it states none."""
-    with suppress(Exception), Image.open(source.hints["path"], formats=FORMATS) as image:
-        return orientation(image)
-    return 1
