@@ -20,7 +20,7 @@ from rille.datasets.images.masks import masked
 from rille.datasets.images.misalign import MisalignParams, misalign
 from rille.datasets.images.samples import examined
 from rille.datasets.manifest.opening import open_manifest
-from rille.datasets.mockup.params import RECORDED_ONLY, SHORT, MockupParams
+from rille.datasets.mockup.params import SHORT, MockupParams, RigParams
 from rille.datasets.mockup.rover import RoverParams
 from rille.datasets.mockup.sequence import LOOP, mockup, mockup_loop
 from rille.datasets.protocol import Sequence
@@ -117,12 +117,7 @@ def _loop(sections: dict[str, Mapping[str, Any]], name: str) -> Sequence:
     preset, given = BUILT_IN[name][1], sections.pop("mockup", {})
     rover = _section("rover", RoverParams, sections.pop("rover", {}))
     _none_left(sections, name)
-    params, default = (_section("mockup", MockupParams, {**preset, **more}) for more in (given, {}))
-    for key in RECORDED_ONLY:
-        if getattr(params, key) != getattr(default, key):
-            text = f"mockup.{key} = {getattr(params, key)}: nothing of a drive reads it"
-            raise ConfigError("RIL-734", text, remedy="leave it out")
-    return mockup_loop(params, rover, name)
+    return mockup_loop(_section("mockup", RigParams, {**preset, **given}), rover, name)
 
 
 def _opened(name_or_path: str, digests: Digests) -> Sequence:

@@ -57,10 +57,9 @@ class RenderParams(Params):
     )
 
 
-class MockupParams(SceneParams, RenderParams):
-    """Every choice of the simulated experiment."""
+class RigParams(SceneParams, RenderParams):
+    """The bed, and the two cameras over it."""
 
-    frames: int = Field(40, ge=1, le=2000, description="number of stereo pairs")
     image_width: int = Field(570, ge=16, le=4096, description="width of the images [px]")
     image_height: int = Field(520, ge=16, le=4096, description="height of the images [px]")
     focal_length: float = Field(600.0, gt=10.0, le=10000.0, description="focal length [px]; 600: 51 degrees at 570 px")
@@ -72,6 +71,19 @@ class MockupParams(SceneParams, RenderParams):
     camera_height: float = Field(
         0.18, gt=0.05, le=1.0, description="height of the cameras above the mean of the bed [m]"
     )
+    rig_error_deg: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="rotation errors of the given rig about the right camera's x, y, z [degrees]"
+    )
+
+    def part(self, kind: type[Part]) -> Part:
+        """The parameters of one half, bed or camera."""
+        return kind(**{name: getattr(self, name) for name in kind.model_fields})
+
+
+class MockupParams(RigParams):
+    """Every choice of the simulated experiment: a recorded motion, and the vertical and attitude given with it."""
+
+    frames: int = Field(40, ge=1, le=2000, description="number of stereo pairs")
     forward: float = Field(0.03, ge=-0.5, le=0.5, description="motion ahead per frame [m] (section 7.4)")
     sideways: float = Field(0.015, ge=-0.5, le=0.5, description="motion to the right per frame [m] (section 7.4)")
     turn_deg: float = Field(
@@ -96,18 +108,7 @@ class MockupParams(SceneParams, RenderParams):
         description="standard deviation of an attitude sensor's error about each axis [degrees]; it replaces the "
         "inclinometer and gives rotations from frame to frame as well; not set: no such sensor",
     )
-    rig_error_deg: tuple[float, float, float] = Field(
-        (0.0, 0.0, 0.0), description="rotation errors of the given rig about the right camera's x, y, z [degrees]"
-    )
-
-    def part(self, kind: type[Part]) -> Part:
-        """The parameters of one half, bed or camera."""
-        return kind(**{name: getattr(self, name) for name in kind.model_fields})
 
 
 SHORT = {"frames": 9, "bed_width": 1.2, "bed_length": 1.2}
 """``mockup-short``: two segments and the pair that ends the second, on a smaller bed."""
-
-MOTION = ("frames", "forward", "sideways", "roll_deg", "roll_swing_deg", "jitter_deg")
-RECORDED_ONLY = (*MOTION, "up_noise_deg", "attitude_noise_deg")
-"""Parameters of a recorded motion and of the vertical and attitude given with it; a rover has ``RoverParams``."""

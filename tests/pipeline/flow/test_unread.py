@@ -69,7 +69,7 @@ def test_what_no_such_run_can_read_is_refused_before_anything_is_computed(tmp_pa
 @pytest.mark.parametrize("assignment", ["mockup.forward=0.1", "mockup.frames=3", "mockup.up_noise_deg=1.0"])
 def test_a_drive_refuses_how_a_recorded_rig_moves(assignment):
     given = configuration.parse_assignments([assignment])
-    with raises("RIL-734", assignment.partition("=")[0]):
+    with raises("RIL-280", assignment.partition("=")[0]):
         open_sequence("mockup-loop", given)
     with raises("RIL-281", "misalign"):
         open_sequence("mockup-loop", {"misalign": {"rows": 3.0}})
