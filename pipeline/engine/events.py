@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -60,19 +61,10 @@ class Ledger:
 def _took(handle: Handle) -> dict[str, Any]:
     """Times (seconds; of day since 1970) and bytes of a computed task; see
     :class:`~rille.pipeline.engine.graph.Took`."""
-    took = handle.took
-    assert handle.ref is not None
-    return {
-        "started": round(took.started, 4),
-        "ended": round(took.started + took.seconds, 4),
-        "seconds": round(took.seconds, 4),
-        "kernel": round(took.kernel, 4),
-        "peak_rss": took.peak_rss,
-        "compiling": round(took.compiling, 4),
-        "worker": took.worker,
-        "bytes": handle.ref.nbytes,
-        "stored": handle.ref.stored,
-    }
+    took, ref = handle.took, handle.ref
+    assert ref is not None
+    row = asdict(took) | {"ended": took.started + took.seconds, "bytes": ref.nbytes, "stored": ref.stored}
+    return {name: round(value, 4) if isinstance(value, float) else value for name, value in row.items()}
 
 
 def read(path: Path) -> list[dict[str, Any]]:

@@ -9,7 +9,6 @@ that does not fit even alone is refused, with the parameter that makes it smalle
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -135,30 +134,21 @@ class Estimates:
 
     def task(self, handle: Handle) -> float:
         """Memory of a task beyond that of an idle worker, bytes."""
-        memory, size = handle.spec.stage.memory, input_bytes(handle, self._results)
+        stage = handle.spec.stage
         inputs = [float(h.ref.nbytes) if h.ref else self._results.get(h.index, 0.0) for h in handle.upstream()]
+        more = handle.expect  # what it reads from outside, and what its stage adds
+        with suppress(Exception):  # an estimate only, and facts may be still to come
+            if stage.memory.size is not None:
+                more += stage.memory.size(handle.spec.params, handle.spec.args, each(_meta, handle.inputs))
+        size = sum(inputs) + more
         # Guesses upon guesses would grow without end along a chain: no result is larger than the largest it came from.
-        most = max(*inputs, size - sum(inputs)) if inputs else math.inf
-        self._results[handle.index] = min(memory.result * size, most)
-        return memory.fixed + memory.factor * size
+        most = max(*inputs, more) if inputs else math.inf
+        self._results[handle.index] = min(stage.memory.result * size, most)
+        return stage.memory.fixed + stage.memory.factor * size
 
     def planned(self, graph: Graph) -> list[tuple[Handle, float]]:
         """Tasks of a dry run that are to be computed, each with its memory [bytes]."""
         return [(handle, self.task(handle)) for handle in graph.nodes if handle.status == "planned"]
-
-
-def input_bytes(handle: Handle, expected: Mapping[int, float] | None = None) -> float:
-    """Bytes that a task works on: its inputs decoded, what it reads from outside, and what its stage adds.
-
-    ``expected`` are bytes of results still to come, by index of the node.
-    """
-    parts = (float(ref.nbytes) if (ref := h.ref) else (expected or {}).get(h.index, 0.0) for h in handle.upstream())
-    size = handle.expect + sum(parts)
-    more = handle.spec.stage.memory.size
-    if more is not None:
-        with suppress(Exception):  # an estimate only, and facts may be still to come
-            size += more(handle.spec.params, handle.spec.args, each(_meta, handle.inputs))
-    return size
 
 
 def _meta(handle: Handle) -> Any:
