@@ -9,7 +9,7 @@ package of the module itself. Imports under ``if TYPE_CHECKING:`` never run and 
 computed name are not seen, and neither are data files beside the code: keep tables in modules.
 
 A file is read once a process: what is digested is what was imported, even while somebody edits. Parsing all of them
-takes most of a second, so what was found in a file is remembered by the bytes of the file (:func:`remember_in`).
+takes most of a second, so what was found in a file is remembered by the bytes of the file (:func:`remember`).
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from pydantic import TypeAdapter
 
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.runtime.hints import read_hint, write_hint
+from rille.pipeline.engine.runtime.private import private_folder
 
 OWN = ("rille.stages", "rille.datasets")
 
@@ -51,17 +52,12 @@ _KEPT = TypeAdapter(_Kept)
 
 
 class _Memory:
-    """What was found in source files, by the bytes of each and of this module; a damaged file counts as none."""
+    """What was found in source files, by the bytes of each and of this module, as a file keeps it from process to
+    process; a damaged file counts as none."""
 
-    def __init__(self) -> None:
-        self.path: Path | None = None
-        self.known: dict[str, _Source] = {}
-        self.used: set[str] = set()
-        self.new = False
+    def __init__(self, path: Path) -> None:
+        self._path, self.used, self.new = path, set[str](), False
         self._reader = hashlib.sha256(f"{sys.version}\0".encode() + Path(__file__).read_bytes()).digest()
-
-    def load(self, path: Path) -> None:
-        self.path, self.new = path, False
         found = read_hint(path, _KEPT)
         self.known = found.sources if found is not None and found.digest == digest(found.sources) else {}
 
@@ -69,27 +65,24 @@ class _Memory:
         return hashlib.sha256(self._reader + f"{module}\0{path.name}\0".encode() + data).hexdigest()
 
     def save(self) -> None:
-        if self.path is None or not self.new:
+        if not self.new:
             return
         # Eight states of the sources are remembered, before those not in use are forgotten.
         # Each edit adds an entry: without this the file would grow with every save of every module.
         if len(self.known) > 8 * len(self.used):
             self.known = {name: self.known[name] for name in self.used}
-        write_hint(self.path, {"digest": digest(self.known), "sources": self.known})
+        write_hint(self._path, {"digest": digest(self.known), "sources": self.known})
         self.new = False
 
 
-_memory = _Memory()
-
-
-def remember_in(path: Path) -> None:
-    """File that keeps from process to process what was found in source files; a hint, never a matter of correctness."""
-    _memory.load(path)
+@cache
+def _memory() -> _Memory:
+    return _Memory(private_folder() / "sources.json")
 
 
 def remember() -> None:
-    """Write that file, if there is anything new."""
-    _memory.save()
+    """Write what was found in source files for later processes; a hint, never a matter of correctness."""
+    _memory().save()
 
 
 @cache
@@ -200,16 +193,17 @@ def _file(module: str) -> Path | None:
 @cache
 def _read(name: str, path: Path) -> _Source:
     data = path.read_bytes()
-    known = _memory.name(name, path, data)
-    _memory.used.add(known)
-    if known not in _memory.known:
+    memory = _memory()
+    known = memory.name(name, path, data)
+    memory.used.add(known)
+    if known not in memory.known:
         tree = _Strip().visit(ast.parse(data))
         # Relative imports count from the package: of an __init__ that is the module itself.
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
         text = hashlib.sha256(ast.dump(tree).encode()).hexdigest()
-        _memory.known[known] = _Source(text, tuple(sorted(set(_imports(tree, package)))))
-        _memory.new = True
-    return _memory.known[known]
+        memory.known[known] = _Source(text, tuple(sorted(set(_imports(tree, package)))))
+        memory.new = True
+    return memory.known[known]
 
 
 def _imports(tree: ast.AST, package: str) -> Iterator[str]:

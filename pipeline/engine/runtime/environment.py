@@ -10,10 +10,8 @@ import os
 from contextlib import suppress
 from functools import cache
 
-from rille.pipeline.engine.code_digest import remember_in
 from rille.pipeline.engine.runtime.apart import absolute_search_paths
 from rille.pipeline.engine.runtime.kernels import use_own_folder
-from rille.pipeline.engine.runtime.private import private_folder
 
 SINGLE = ("OMP", "OPENBLAS", "MKL", "NUMBA", "BLIS", "VECLIB_MAXIMUM", "NUMEXPR")
 
@@ -31,7 +29,6 @@ def worker_environment() -> dict[str, str]:
 
 def prepare_environment() -> None:
     """Set this process up to run stages itself, and to start workers."""
-    _remember_sources()
     os.environ.update(worker_environment())
     use_own_folder()
     _keep_memory()
@@ -46,12 +43,6 @@ def _keep_memory() -> None:
         # By default it gives back every array, and a tenth of the time of matching goes into taking memory anew.
         mallopt(-3, 32 << 20)  # M_MMAP_THRESHOLD: bytes of a block that it takes from the system by itself
         mallopt(-1, 128 << 20)  # M_TRIM_THRESHOLD: bytes of free memory from which on it gives it back
-
-
-@cache
-def _remember_sources() -> None:
-    """Read once a process what is known of source files: each call from Python would take a tenth of a second."""
-    remember_in(private_folder() / "sources.json")
 
 
 def cores() -> int:

@@ -161,30 +161,36 @@ def test_an_unknown_module_is_named():
         code_digest.code_digest("rille.stages.nowhere")
 
 
-def test_what_was_found_in_sources_is_remembered_by_their_bytes(package, tmp_path, monkeypatch):
-    monkeypatch.setattr(code_digest, "_memory", code_digest._Memory())
-    file = tmp_path / "cache" / "sources.json"
-    code_digest.remember_in(file)
+@pytest.fixture
+def memory(tmp_path, monkeypatch):
+    """``memory()``: what a new process finds in the file of the memory, from then on in use."""
+
+    def reread():
+        found = code_digest._Memory(tmp_path / "cache" / "sources.json")
+        monkeypatch.setattr(code_digest, "_memory", lambda: found)
+        return found
+
+    reread()
+    return reread
+
+
+def test_what_was_found_in_sources_is_remembered_by_their_bytes(package, memory, monkeypatch):
     first, edited = package(), package("sibling.py", "5", "6")
     code_digest.remember()
     monkeypatch.setattr(code_digest.ast, "parse", lambda _: pytest.fail("a file was parsed again"))
-    code_digest.remember_in(file)
+    memory()
     assert package() == edited
     assert package("sibling.py", "6", "5") == first
 
 
-def test_a_damaged_memory_of_sources_is_none(package, tmp_path, monkeypatch):
-    monkeypatch.setattr(code_digest, "_memory", code_digest._Memory())
+def test_a_damaged_memory_of_sources_is_none(package, memory, tmp_path):
     file = tmp_path / "cache" / "sources.json"
-    code_digest.remember_in(file)
     first = package()
     code_digest.remember()
     whole = file.read_bytes()
     for damaged in (b"", whole[:-20], b"[]", b"{}", whole.replace(b"own_toy.near.half", b"own_toy.near.hall")):
         file.write_bytes(damaged)
-        code_digest.remember_in(file)
-        assert code_digest._memory.known == {}
+        assert memory().known == {}
         assert package() == first
     file.write_bytes(whole)
-    code_digest.remember_in(file)
-    assert code_digest._memory.known
+    assert memory().known
