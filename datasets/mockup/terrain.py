@@ -7,10 +7,11 @@ its own stream of the seed, so that changing one leaves the others as they were.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import BSpline
 
 from rille.datasets.mockup.params import SceneParams
 from rille.stages.core.arrays import Floats, Floats32
@@ -37,34 +38,16 @@ def stream(seed: int, part: int) -> np.random.Generator:
 def add_octave(out: Floats32, spacing: float, amplitude: float, rng: np.random.Generator) -> None:
     """Add smooth noise of RMS ``amplitude`` to ``out``: a cubic B-spline, one random value each ``spacing`` nodes."""
     grid = rng.standard_normal([int(n / spacing) + 5 for n in out.shape], dtype=np.float32)
-    first_row, first_col = (np.floor(np.arange(n) / spacing).astype(int) for n in out.shape)
-    row_weights, col_weights = (_spline_weights(np.arange(n) / spacing) for n in out.shape)
+    # Sparse, four weights a node: no BLAS sums their products, so that they are the same bits everywhere.
+    rows, cols = (
+        BSpline.design_matrix(np.arange(n) / spacing, np.arange(-3.0, coefficients + 1), 3)
+        for n, coefficients in zip(out.shape, grid.shape, strict=True)
+    )
     # RMS of unit white noise after smoothing with the two-dimensional cubic B-spline.
     scale = amplitude / 0.479
-    # Row by row: a bed's albedo is large. Sums are written out, not as matrix products: the same bits from any BLAS.
-    for row, i in enumerate(first_row):
-        line = _weighted(row_weights[:, row], grid[i : i + 4])
-        out[row] += scale * _weighted(col_weights, [line[first_col + k] for k in range(4)])
-
-
-def _spline_weights(x: Floats) -> Floats:
-    """Weights (4, n) of the uniform cubic B-spline's coefficients from floor(x) on, at places x (n,)."""
-    f = x - np.floor(x)
-    g = 1.0 - f
-    return np.stack(
-        [
-            g * g * g / 6.0,
-            (3.0 * f * f * f - 6.0 * f * f + 4.0) / 6.0,
-            (3.0 * g * g * g - 6.0 * g * g + 4.0) / 6.0,
-            f * f * f / 6.0,
-        ]
-    )
-
-
-def _weighted(weights: Floats, values: Any) -> Floats:
-    """Sum (n,) of four values (4, n), each times its weight (4,) or (4, n)."""
-    w, v = weights, values
-    return np.asarray(w[0] * v[0] + w[1] * v[1] + w[2] * v[2] + w[3] * v[3])
+    for at in range(0, len(out), 256):  # some rows at a time: a bed's albedo is large
+        part = slice(at, at + 256)
+        out[part] += scale * (cols @ (rows[part] @ grid).T).T
 
 
 def relief(p: SceneParams, shape: tuple[int, int]) -> Floats32:
