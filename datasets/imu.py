@@ -289,9 +289,7 @@ def resting_bias(imu: ImuRecord, start: float, end: float) -> tuple[Floats | Non
         return None, (NO_BIAS,)
     quietest = int(np.flatnonzero(rest)[np.argmin(shaken[rest])])
     rest &= np.linalg.norm(mean - mean[quietest], axis=-1) <= STEADY_RATE
-    covered = np.zeros(len(rate), bool)
-    for k in np.flatnonzero(rest):
-        covered[k : k + count] = True
+    covered = np.convolve(rest, np.ones(count)) > 0  # bins of a second of rest
     times = bins(imu.times[:, None], imu.times)[covered, 0]
     away = np.maximum(start - times, 0) + np.maximum(times - end, 0)
     # s; more does not make a better bias, only an older one

@@ -121,10 +121,7 @@ def warp(image: AnyArray, valid: AnyArray, lens: Lens, params: MisalignParams) -
         (valid != 0).astype(np.uint8), kernel, anchor=(1, 1), borderType=cv2.BORDER_CONSTANT, borderValue=0
     )
     # The kernel begins one pixel before the position, and reads less of it where that is a whole pixel.
-    near = np.floor(at).astype(np.int64)
-    inside = (near >= 0).all(0) & (near[0] < image.shape[0]) & (near[1] < image.shape[1])
-    mask = np.zeros(image.shape, np.uint8)
-    mask[inside] = whole[near[0][inside], near[1][inside]]
+    mask = scipy.ndimage.map_coordinates(whole, np.floor(at), order=0)
     return np.where(mask != 0, values, 0).astype(image.dtype), mask
 
 
