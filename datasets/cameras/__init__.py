@@ -44,7 +44,7 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
     (colmap.is_colmap, colmap.colmap),
     (kitti.is_kitti, kitti.kitti),
     (lambda text: "[LEFT_CAM_" in text, makers.zed),
-    (makers.is_matrix, makers.matrix),
+    (lambda text: bool(makers.numbers_of_matrix(text)), makers.matrix),
 )
 """Text formats: how each is recognised, and its reader."""
 

@@ -34,14 +34,6 @@ ZED_SIZES = {
 }
 """Pixels of the resolutions that a ``.conf`` has a section for."""
 
-NUMBER, ZERO, ONE = r"(-?\d{1,6}\.?\d*(?:e[-+]?\d+)?)", r"-?0(?:\.0*)?(?:e[-+]?\d+)?", r"1(?:\.0*)?(?:e[-+]?0+)?"
-NEXT = r"[\s,;\[\]]+"
-MATRIX = re.compile(
-    rf"[\s\[]*{NEXT.join((NUMBER, ZERO, NUMBER, ZERO, NUMBER, NUMBER, ZERO, ZERO, ONE))}(?:{NEXT}([^\s\]]+))?[\s\]]*",
-    re.I,
-)
-"""Text of nine numbers fx 0 cx, 0 fy cy, 0 0 1, and perhaps a tenth."""
-
 
 def zed(text: str, path: Path) -> list[CalibratedCamera]:
     """Both cameras at each resolution. Lengths in the file are millimetres, here metres.
@@ -120,17 +112,21 @@ def _to_root(sockets: Fields, socket: str) -> tuple[str, RigidTransform]:
     return socket, T
 
 
-def is_matrix(text: str) -> bool:
-    """Whether the text is nine numbers K, or ten: K and the baseline."""
-    found = MATRIX.fullmatch(text[:1000])
-    return found is not None and float(found[1]) > LEAST_FOCAL
+def numbers_of_matrix(text: str) -> list[str]:
+    """Nine numbers fx 0 cx, 0 fy cy, 0 0 1 that a text holds, and perhaps a tenth; nothing of any other text."""
+    words = re.sub(r"[\[\],;]", " ", text[:1000]).split()
+    try:
+        k = [float(word) for word in words[:9]]
+    except ValueError:
+        return []
+    fits = len(words) in (9, 10) and k[0] > LEAST_FOCAL and k[1] == k[3] == k[6] == k[7] == 0 and k[8] == 1
+    return words if fits else []
 
 
 def matrix(text: str, path: Path) -> list[CalibratedCamera]:
     """Two parallel cameras alike, of ``K.txt`` with K row by row and a baseline in metres; without one, a camera."""
-    found = MATRIX.fullmatch(text[:1000])
-    assert found is not None
-    f = Fields(dict(zip(("fx", "cx", "fy", "cy", "baseline"), found.groups(), strict=True)), str(path))
+    fx, _, cx, _, fy, cy, _, _, _, *baseline = numbers_of_matrix(text)
+    f = Fields({"fx": fx, "fy": fy, "cx": cx, "cy": cy, "baseline": next(iter(baseline), None)}, str(path))
     lens = f.optics("fx fy cx cy", "none", "", UNKNOWN_SIZE)
     if "baseline" not in f:
         return [CalibratedCamera(path.stem, lens)]
