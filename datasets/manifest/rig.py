@@ -136,8 +136,6 @@ def _one(value: str | PinholeLens, side: str, root: Path, name: str, size: tuple
 def _of_file(section: Cameras, path: Path, name: str, sizes: Sizes) -> tuple[CalibratedCamera, ...]:
     """Left and right camera of one file; a single camera is taken for both."""
     found = read_cameras(path)
-    if section.names is None:
-        found = of_size(found, sizes)
     if section.names is not None:
         by_name = {camera.name: camera for camera in found}
         missing = [wanted for wanted in section.names if wanted not in by_name]
@@ -145,6 +143,7 @@ def _of_file(section: Cameras, path: Path, name: str, sizes: Sizes) -> tuple[Cal
             text = f"{name}: cameras.names: {path} has no camera {missing[0]!r}"
             raise InputError("RIL-237", text, remedy=f"it has {', '.join(by_name)}")
         return tuple(by_name[wanted] for wanted in section.names)
+    found = of_size(found, sizes)
     if len(found) > 2:
         text = f"{name}: {path} has {len(found)} cameras: {', '.join(camera.name for camera in found)}"
         raise InputError("RIL-238", text, remedy="say which two by cameras.names = [left, right]")
