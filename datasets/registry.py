@@ -79,7 +79,6 @@ def catalogue() -> list[tuple[str, str]]:
 def open_sequence(
     name_or_path: str,
     overrides: Mapping[str, Mapping[str, Any]] | None = None,
-    memory: Path | None = None,
     digests: Digests | None = None,
 ) -> Sequence:
     """A sequence by built-in name or by path.
@@ -89,8 +88,8 @@ def open_sequence(
     name_or_path : built-in name, manifest, folder, or ``ROOT:NN``.
     overrides : parameters by section: ``{"mockup": {"seed": 3}}`` for the mockups, ``{"misalign": {"rows": 3}}`` for
         any sequence.
-    memory : file that keeps the digests of image files from run to run.
-    digests : in its place, what knows the files of a sequence whose images are still arriving.
+    digests : remembers those of image files, perhaps from run to run; or knows the files of a sequence whose images are
+        still arriving.
 
     Raises
     ------
@@ -100,24 +99,21 @@ def open_sequence(
         An override is unknown, not permitted, or of another kind of sequence.
     """
     sections = dict(overrides or {})
+    preset = BUILT_IN.get(name_or_path, ("", {}))[1]
+
+    def section(name: str, kind: type[Model], **preset: Any) -> Model:
+        return validated("RIL-280", kind, {**preset, **sections.pop(name, {})}, section=name)
+
     if name_or_path == "mockup-loop":
-        return _loop(sections, name_or_path)
-    warp = _section("misalign", MisalignParams, sections.pop("misalign", {}))
-    if name_or_path in BUILT_IN:
-        preset, given = BUILT_IN[name_or_path][1], sections.pop("mockup", {})
+        bed, rover = section("mockup", RigParams, **preset), section("rover", RoverParams)
         _none_left(sections, name_or_path)
-        sequence = mockup(_section("mockup", MockupParams, {**preset, **given}), name_or_path)
-    else:
-        _none_left(sections, name_or_path)
-        sequence = _opened(name_or_path, digests or Digests(memory))
-    return misalign(sequence, warp)
-
-
-def _loop(sections: dict[str, Mapping[str, Any]], name: str) -> Sequence:
-    preset, given = BUILT_IN[name][1], sections.pop("mockup", {})
-    rover = _section("rover", RoverParams, sections.pop("rover", {}))
-    _none_left(sections, name)
-    return mockup_loop(_section("mockup", RigParams, {**preset, **given}), rover, name)
+        return mockup_loop(bed, rover, name_or_path)
+    knocked = section("misalign", MisalignParams)
+    simulated = section("mockup", MockupParams, **preset) if name_or_path in BUILT_IN else None
+    _none_left(sections, name_or_path)
+    if simulated is not None:
+        return misalign(mockup(simulated, name_or_path), knocked)
+    return misalign(_opened(name_or_path, digests or Digests()), knocked)
 
 
 def _opened(name_or_path: str, digests: Digests) -> Sequence:
@@ -157,7 +153,7 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
 def hindrance(place: Path) -> RilleError | None:
     """Why a folder or a manifest does not open as it is; None where it does."""
     try:
-        _opened(str(place), Digests(None))
+        _opened(str(place), Digests())
     except RilleError as error:
         return error
     return None
@@ -177,10 +173,6 @@ def folder_manifest(folder: Path) -> Path | None:
         text = f"{folder} holds {len(found)} manifests: {names}"
         raise InputError("RIL-279", text, remedy=f"choose one, e.g. {found[0]}")
     return found[0] if found else None
-
-
-def _section(name: str, kind: type[Model], values: Mapping[str, Any]) -> Model:
-    return validated("RIL-280", kind, values, section=name)
 
 
 def _none_left(sections: Mapping[str, Any], name: str) -> None:

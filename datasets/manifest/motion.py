@@ -5,46 +5,27 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+from rille.datasets import protocol
 from rille.datasets.images.pairing import ImagePair, ends, stamp_of
 from rille.datasets.imu import at_frames, read_imu
-from rille.datasets.manifest.model import Attitude, Imu, Manifest, PoseFile, PositionFile, Times, Truth
+from rille.datasets.manifest.model import Attitude, Imu, Manifest, Odometry, PoseFile, PositionFile, Times, Truth
 from rille.datasets.manifest.rig import direction
 from rille.datasets.poses import TimedPositions, coverage, interpolate, read_poses, read_positions, refuse_apart
-from rille.datasets.protocol import Positions, Rows, rows_of
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.times import seconds
 from rille.stages.core.errors import IncompleteError, InputError
 from rille.stages.geometry.geometry import RigidTransform
 
 Poses = tuple[RigidTransform | None, ...]
-Ups = tuple[tuple[float, float, float] | None, ...]
 Row = TypeVar("Row")
 
 NEEDS_TIMES = "give [times] with file, names = true or rate_hz"
-
-
-@dataclass
-class StatedMotion:
-    """One entry a pair, as in :class:`rille.datasets.protocol.Sequence`; ``warnings`` collects what is suspicious."""
-
-    times: tuple[float, ...] | None
-    truth: Poses | None = None
-    truth_positions: Positions | None = None
-    truth_source: str = ""
-    truth_mount: RigidTransform | None = None
-    odometry: Poses | None = None
-    attitude: tuple[Rows | None, ...] | None = None
-    imu_axes: Rows | None = None
-    up: Ups | None = None
-    priors: dict[str, Any] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
 
 
 @dataclass
@@ -56,18 +37,19 @@ class MotionReader:
     root : folder that files are relative to.
     name : the manifest's, for errors.
     pairs : of images; of some a file may be absent.
-    motion : what has been read so far; times come first, by which the others are interpolated.
+    sequence : with what has been read so far; times come first, by which the others are interpolated.
     growing : images are still arriving, so that a table may have rows for more of them.
     """
 
     root: Path
     name: str
     pairs: Sequence[ImagePair]
-    motion: StatedMotion
+    sequence: protocol.Sequence
     growing: bool = False
 
-    def read(self, manifest: Manifest) -> StatedMotion:
-        """Everything that the tables ``times``, ``truth``, ``odometry``, ``positions``, ``attitude``, ``imu`` state.
+    def read(self, manifest: Manifest) -> protocol.Sequence:
+        """The sequence with what the tables ``times``, ``truth``, ``odometry``, ``positions``, ``attitude``, ``imu``
+        state.
 
         Raises
         ------
@@ -75,24 +57,26 @@ class MotionReader:
             A file cannot be used, does not belong to these pairs, or needs times where the pairs have none.
         """
         if manifest.times is not None:
-            self.motion.times = self.times(manifest.times)
+            self.state(times=self.times(manifest.times))
         if manifest.truth is not None:
             self.truth(manifest.truth)
         if manifest.odometry is not None:
-            odometry, priors = manifest.odometry, self.motion.priors
-            self.motion.odometry = self.poses(odometry, "odometry")
-            if odometry.drift is not None and odometry.turn_deg is not None:
-                priors["odometry"] = {"drift": odometry.drift, "turn": math.radians(odometry.turn_deg)}
+            self.odometry(manifest.odometry)
         if manifest.positions is not None:
-            self.motion.priors["positions"] = self.measured(manifest.positions)
+            self.measured(manifest.positions)
         if manifest.attitude is not None:
             self.attitude(manifest.attitude)
         if manifest.imu is not None:
             self.imu(manifest.imu)
         sensor = manifest.attitude or manifest.imu
         if sensor is not None and sensor.sigma_deg is not None:
-            self.motion.priors |= {key: {"sigma": math.radians(sensor.sigma_deg)} for key in ("attitude", "up")}
-        return self.motion
+            sigma = {"sigma": math.radians(sensor.sigma_deg)}
+            self.state(priors={**self.sequence.priors, "attitude": sigma, "up": sigma})
+        return self.sequence
+
+    def state(self, **found: Any) -> None:
+        """Enter something into the sequence."""
+        self.sequence = replace(self.sequence, **found)
 
     def times(self, section: Times) -> tuple[float, ...]:
         """Time of each pair, s; of one without a row of its own between its neighbours.
@@ -167,12 +151,13 @@ class MotionReader:
         unit = section.unit if isinstance(section, PoseFile) else 1.0
         poses: Poses = tuple(p and RigidTransform(p.rotation, unit * p.translation) for p in timed.poses)
         if timed.times is not None:
-            if self.motion.times is None:
+            if self.sequence.times is None:
                 text = f"{self.name}: the poses of {path} have times, but the pairs have none"
                 raise InputError("RIL-231", text, remedy=NEEDS_TIMES)
             moved = replace(timed, poses=poses, times=tuple(t + section.time_offset for t in timed.times))
-            poses = interpolate(moved, self.motion.times, section.max_gap)
-            self.motion.warnings += coverage(poses, self.motion.times, f"{table} ({path.name})")
+            poses = interpolate(moved, self.sequence.times, section.max_gap)
+            gaps = coverage(poses, self.sequence.times, f"{table} ({path.name})")
+            self.state(warnings=(*self.sequence.warnings, *gaps))
         elif len(self.arrived(poses)) in self.counts():
             poses = tuple(self.one_a_pair(self.arrived(poses)))
         else:
@@ -188,18 +173,24 @@ class MotionReader:
         columns = {str(meaning): column for meaning, column in section.columns.items()}
         alone = read_positions(self.root / section.file, section.format, columns)
         kind = "positions" if alone else "poses"
-        self.motion.truth_source = section.source or f"{kind} of {section.file}, as recorded"
+        self.state(truth_source=section.source or f"{kind} of {section.file}, as recorded")
         if alone is not None:
-            self.motion.truth_positions = self.true_positions(section, alone)
+            self.state(truth_positions=self.true_positions(section, alone))
             return
         if section.lever_arm is not None:
             text = f"{self.name}: truth.lever_arm: {section.file} holds poses, not positions alone"
             raise InputError("RIL-782", text, remedy="state where the camera is in their body as T_body_left")
-        self.motion.truth = self.poses(section, "truth")
-        if section.T_body_left is not None:
-            self.motion.truth_mount = RigidTransform.from_matrix(section.T_body_left)
+        mount = None if section.T_body_left is None else RigidTransform.from_matrix(section.T_body_left)
+        self.state(truth=self.poses(section, "truth"), truth_mount=mount)
 
-    def true_positions(self, section: Truth, found: TimedPositions) -> Positions:
+    def odometry(self, section: Odometry) -> None:
+        """Dead reckoning, which is a measurement where it says how good it is."""
+        self.state(odometry=self.poses(section, "odometry"))
+        if section.drift is not None and section.turn_deg is not None:
+            sigmas = {"drift": section.drift, "turn": math.radians(section.turn_deg)}
+            self.state(priors={**self.sequence.priors, "odometry": sigmas})
+
+    def true_positions(self, section: Truth, found: TimedPositions) -> protocol.Positions:
         """Positions of the truth, which have no rotations."""
         if section.T_body_left is not None:
             text = f"{self.name}: truth.T_body_left: {section.file} holds positions, which have no rotations to move by"
@@ -211,7 +202,7 @@ class MotionReader:
             text += f"{section.max_gap:g} s: nothing would be compared"
             remedy = "raise truth.max_gap, if straight lines between them are exact enough"
             raise InputError("RIL-804", text, remedy=remedy)
-        return Positions(rows, times, section.max_gap, section.lever_arm)
+        return protocol.Positions(rows, times, section.max_gap, section.lever_arm)
 
     def positions(
         self, section: Truth | PositionFile, found: TimedPositions, table: str
@@ -224,7 +215,7 @@ class MotionReader:
             They or the pairs have no times, and they are not one a pair.
         """
         rows = tuple(tuple(section.unit * v for v in row) for row in found.positions)
-        if found.times is not None and self.motion.times is not None:
+        if found.times is not None and self.sequence.times is not None:
             return rows, tuple(t + section.time_offset for t in found.times)
         rows = tuple(self.arrived(rows))
         if len(rows) != len(self.pairs):
@@ -233,7 +224,7 @@ class MotionReader:
             raise IncompleteError("RIL-803", f"{text}, and not both have times", remedy=remedy)
         return rows, None
 
-    def measured(self, section: PositionFile) -> dict[str, Any]:
+    def measured(self, section: PositionFile) -> None:
         """Positions that are measurements, in metres, at times (s) of the images' clock; numbers of pairs without it.
 
         Raises
@@ -247,29 +238,37 @@ class MotionReader:
             text = f"{self.name}: positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")
         rows, times = self.positions(section, found, "positions")
-        if times is not None and self.motion.times is not None:
-            refuse_apart(times, self.motion.times, found.name)
-        at = list(times or self.motion.times or range(len(rows)))
+        if times is not None and self.sequence.times is not None:
+            refuse_apart(times, self.sequence.times, found.name)
         sigma = [section.sigma] * 3 if isinstance(section.sigma, float) else list(section.sigma)
-        return {"positions": [list(row) for row in rows], "times": at, "sigma": sigma, "lever": list(section.lever_arm)}
+        measured = {
+            "positions": [list(row) for row in rows],
+            "times": list(times or self.sequence.times or range(len(rows))),
+            "sigma": sigma,
+            "lever": list(section.lever_arm),
+        }
+        self.state(priors={**self.sequence.priors, "positions": measured})
 
     def attitude(self, section: Attitude) -> None:
         """Rotations of a sensor, and the vertical where the file's reference is known to have one."""
         poses = self.poses(section, "attitude")
-        self.motion.attitude = tuple(None if pose is None else rows_of(pose.rotation) for pose in poses)
+        self.state(attitude=tuple(None if pose is None else protocol.rows_of(pose.rotation) for pose in poses))
         if section.up is not None:
-            self.motion.up = tuple(None if p is None else direction(section.up, p.inverse()) for p in poses)
+            self.state(up=tuple(None if p is None else direction(section.up, p.inverse()) for p in poses))
 
     def imu(self, section: Imu) -> None:
         """Rotations and vertical by an IMU."""
-        if self.motion.times is None:
+        sequence = self.sequence
+        if sequence.times is None:
             text = f"{self.name}: [imu] needs times, but the pairs have none"
             raise InputError("RIL-232", text, remedy=NEEDS_TIMES)
         imu = read_imu(self.root / section.file)
         shifted = replace(imu, times=imu.times + section.time_offset)
-        inertial = at_frames(shifted, self.motion.times, RigidTransform.from_matrix(section.T_imu_left))
-        self.motion.attitude = inertial.attitude if any(inertial.attitude) else None
-        self.motion.up = inertial.up if any(inertial.up) else None
-        self.motion.imu_axes = inertial.axes
-        self.motion.notes += inertial.notes
-        self.motion.warnings += inertial.warnings
+        inertial = at_frames(shifted, sequence.times, RigidTransform.from_matrix(section.T_imu_left))
+        self.state(
+            attitude=inertial.attitude if any(inertial.attitude) else sequence.attitude,
+            up=inertial.up if any(inertial.up) else sequence.up,
+            imu_axes=inertial.axes,
+            notes=(*sequence.notes, *inertial.notes),
+            warnings=(*sequence.warnings, *inertial.warnings),
+        )

@@ -21,7 +21,7 @@ from rille.datasets.images import disparities, files
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import ImagePair, common_headers, pair_up
 from rille.datasets.manifest.model import Cameras, Disparity, DisparityMaps, Images, Manifest, RigSection, read_manifest
-from rille.datasets.manifest.motion import MotionReader, StatedMotion
+from rille.datasets.manifest.motion import MotionReader
 from rille.datasets.manifest.rig import read_optics
 from rille.datasets.protocol import Sequence, Source
 from rille.datasets.text.names import derived_name
@@ -62,30 +62,18 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
         exact = _disparity("truth_disparity", manifest.truth_disparity, root, name, (base, pairs), digests)
         note = f"true disparities are those of {manifest.truth_disparity.left}; they only judge"
         base = replace(base, truth_disparity=exact, notes=(*base.notes, note))
-    motion = MotionReader(root, name, pairs, StatedMotion(base.times), growing=digests.growing).read(manifest)
+    sequence = MotionReader(root, name, pairs, base, growing=digests.growing).read(manifest)
     world, pinned = manifest.world, {} if manifest.rig.file is None else {"rig.mode": "fixed"}
-    pitch = None if world.pitch_deg is None else math.radians(world.pitch_deg)
     return replace(
-        base,
+        sequence,
         name=manifest.name,
-        times=motion.times,
-        truth=motion.truth,
-        truth_positions=motion.truth_positions,
-        truth_source=motion.truth_source,
-        truth_mount=motion.truth_mount,
-        up=motion.up or base.up,
-        attitude=motion.attitude or base.attitude,
-        imu_axes=motion.imu_axes,
-        odometry=motion.odometry or base.odometry,
-        priors=motion.priors,
-        pitch=pitch,
+        pitch=None if world.pitch_deg is None else math.radians(world.pitch_deg),
         georeference=world.place,
         masks={side: root / path for side, path in manifest.masks if path is not None},
         vehicle=manifest.vehicle,
         # A pinned rig is that of all pieces of a log: none of them may repair it for itself.
-        defaults={**base.defaults, **pinned, **dict(dotted(manifest.defaults))},
-        notes=(*base.notes, *motion.notes, *manifest.notes),
-        warnings=(*base.warnings, *motion.warnings),
+        defaults={**sequence.defaults, **pinned, **dict(dotted(manifest.defaults))},
+        notes=(*sequence.notes, *manifest.notes),
     )
 
 

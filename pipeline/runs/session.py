@@ -17,6 +17,7 @@ from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rille.datasets.images.files import Digests
 from rille.datasets.protocol import Sequence
 from rille.datasets.registry import open_sequence
 from rille.pipeline.commands.options import COMPLETE, HOLES, Options, Settings, Work, cache_folder
@@ -88,7 +89,7 @@ def settings(options: Settings) -> Settled:
     """Open a sequence and determine its configuration: defaults, presets, file and options of the user."""
     for_dataset, for_stages = configured(options)
     if options.opened is None:
-        sequence = open_sequence(options.sequence, for_dataset, cache_folder(options.cache) / "files.json")
+        sequence = open_sequence(options.sequence, for_dataset, Digests(cache_folder(options.cache) / "files.json"))
     elif for_dataset:
         text = f"{next(iter(for_dataset))}: the sequence is open already"
         raise ConfigError("RIL-860", text, remedy="give its parameters to rille.open")
