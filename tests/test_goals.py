@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,19 @@ def test_resting_drone(data_dir: Path, tmp_path: Path) -> None:
     metrics(str(data_dir / "euroc_still"), tmp_path)
     poses = np.loadtxt(next(tmp_path.glob("runs/*/latest/trajectory.kitti"))).reshape(-1, 3, 4)
     assert np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=1).sum() < 0.02
+
+
+@pytest.mark.data
+def test_an_imu_with_exchanged_axes_is_named(data_dir: Path, tmp_path: Path) -> None:
+    """Where the wrong vertical leaves no ground, elevations are measured from another plane; the word must stay."""
+    folder = tmp_path / "drone"
+    shutil.copytree(data_dir / "euroc_still", folder)
+    head, *rows = (folder / "mav0" / "imu0" / "data.csv").read_text().splitlines()
+    exchanged = [",".join(row.split(",")[k] for k in (0, 3, 2, 1, 6, 5, 4)) for row in rows]
+    (folder / "mav0" / "imu0" / "data.csv").write_text("\n".join([head, *exchanged]) + "\n")
+    metrics(str(folder), tmp_path, "crosscheck.enabled=false", "hfvm.preset=fast")
+    report = json.loads(next(tmp_path.glob("runs/*/latest/report.json")).read_text())
+    assert any("would have to be its z, -y, x; or z, y, x" in line for line in report["warnings"])
 
 
 @pytest.mark.data

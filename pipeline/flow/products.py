@@ -89,6 +89,7 @@ class Products:
     agreement: Handle[AgreementFacts] | None = None
     crosscheck_accuracy: Handle[AccuracyFacts] | None = None
     disparity: dict[int, Handle] = field(default_factory=dict)
+    ground: dict[int, Handle[GroundFacts]] = field(default_factory=dict)
     level: dict[int, Handle[GroundFacts]] = field(default_factory=dict)
     local_dem: dict[int, Handle[DemFacts]] = field(default_factory=dict)
     local_risk: dict[int, Handle] = field(default_factory=dict)

@@ -349,7 +349,7 @@ def matched_pairs(
     """Disparities of stereo pairs, each with its rig, and their vertical and reference plane."""
     p = make.products
     verticals = {k: vertical(make, k) for k in rigs}
-    p.level = {k: make.level(k, verticals[k], known) for k, known in rigs.items()}
+    p.ground = p.level = {k: make.level(k, verticals[k], known) for k, known in rigs.items()}
     p.disparity, p.orientations = {k: make.disparity(k) for k in rigs}, {k: make.orientation(k) for k in rigs}
     yield Complete(("undistort", "pyramid", "orientation", *(() if make.config.locus.both else ("hfvm",))))
     judged = yield Maybe(list(p.level.values()))

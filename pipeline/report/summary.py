@@ -171,7 +171,8 @@ def _displaced(view: RunView) -> list[str]:
 
 def _imu(view: RunView) -> list[str]:
     """The IMU contradicts the images, by its rotations or by its gravity."""
-    s, trajectory, levels = view.sequence, view.bundle(view.products.trajectory), view.products.level
+    # Of the ground that was looked for: elevations may be measured from another plane.
+    s, trajectory, levels = view.sequence, view.bundle(view.products.trajectory), view.products.ground
     if s.imu_axes is None or s.attitude is None:
         return []
     axes, lines = np.array(s.imu_axes), []
@@ -347,7 +348,7 @@ def _reads(run: RunView) -> tuple[object, ...]:
     return (
         *(p.contradictions, p.intrinsics, p.crosschecks, p.crosscheck, p.agreement, p.crosscheck_accuracy),
         *(p.loops, p.chained, p.trajectory, p.accuracy, p.position_accuracy, p.overlap_audit),
-        *(p.rigs, p.resections, p.refined),
+        *(p.rigs, p.ground, p.resections, p.refined),
         *(p.moving, p.world_tiles, p.world_risk, p.world_path, p.dem_accuracy, p.path_check, p.drive),
         *(p.disparity_accuracy, *tables.of_pairs(p)),
         *(config.vehicle, config.rig.significance, config.crosscheck.enabled),

@@ -148,8 +148,9 @@ def given(positions, rotation, footprint):
     poses = np.concatenate([np.broadcast_to(rotation, (len(positions), 3, 3)), positions[:, :, None]], axis=2)
     level = SimpleNamespace(meta={"footprint": footprint})
     camera = SimpleNamespace(fx=350.0, fy=350.0, width=600, height=200)
+    levels = {0: level, 4: None}
     return SimpleNamespace(
-        products=SimpleNamespace(trajectory=Bundle({"poses": poses}, {}), level={0: level, 4: None}),
+        products=SimpleNamespace(trajectory=Bundle({"poses": poses}, {}), level=levels, ground=levels),
         sequence=SimpleNamespace(rig=SimpleNamespace(left=camera, baseline=0.5)),
         bundle=lambda handle: handle,
     )
@@ -188,7 +189,7 @@ def test_an_imu_that_contradicts_the_images_is_warned_of():
     run.sequence.__dict__.update(known)
     (rates,) = summary._imu(run)
     assert "degrees a second" in rates
-    run.products.level[0].meta["seen_up"] = [0.0, 0.0, -1.0]
+    run.products.ground[0].meta["seen_up"] = [0.0, 0.0, -1.0]
     run.sequence.attitude = [np.eye(3)] * 9
     (gravity,) = summary._imu(run)
     assert "up is 90 degrees off" in gravity
