@@ -17,14 +17,13 @@ from rille.pipeline.engine.runtime.private import private_folder
 from rille.pipeline.export.catalogue import listed
 from rille.pipeline.export.view import RunView
 from rille.pipeline.report.canvas import Figure
-from rille.pipeline.report.delivery import Items
 from rille.pipeline.report.summary import summarise
 from rille.pipeline.report.words import metres, number, quantity, spans
 from rille.stages.hazard.measures import MEASURES
 
 
-def write_report(folder: Path, view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]) -> Items:
-    """Write ``report.json`` and ``report.html``, each whole or not at all; give what they list as missing.
+def write_report(folder: Path, view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]) -> dict[str, Any]:
+    """Write ``report.json`` and ``report.html``, each whole or not at all; give what the former holds.
 
     Parameters
     ----------
@@ -37,8 +36,7 @@ def write_report(folder: Path, view: RunView, facts: Mapping[str, Any], figures:
     # RFC 8259 has no NaN: better an error here than a file that only Python reads.
     atomic.write(folder / "report.json", json.dumps(whole, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
     atomic.write(folder / "report.html", render(view, whole, figures, list(listed(folder))))
-    missing: Items = whole["missing"]
-    return missing
+    return whole
 
 
 def render(

@@ -20,7 +20,6 @@ from rille.pipeline.export.output_task import add, handles
 from rille.pipeline.export.view import RunView, TaskRow
 from rille.pipeline.report import gallery, summary
 from rille.pipeline.report.canvas import FIGURE
-from rille.pipeline.report.delivery import Items
 from rille.pipeline.report.page import write_report
 
 MODULES = (*catalogue.MADE, gallery, summary)
@@ -80,8 +79,8 @@ def task_rows(graph: Graph) -> tuple[TaskRow, ...]:
     return tuple(rows)
 
 
-def write(folder: Path, view: RunView, made: Made, store: Store) -> Items:
-    """Write all files of a run; what has no artifact is left out; give what the report lists as missing."""
+def write(folder: Path, view: RunView, made: Made, store: Store) -> dict[str, Any]:
+    """Write all files of a run; what has no artifact is left out; give what ``report.json`` holds."""
     # Copies, not links: a user may edit or delete any file of a run, and the cache stays whole.
     for output in (output for module in catalogue.MADE for output in module.OUTPUTS):
         for name, content in _files(made.get(output.name), store).items():

@@ -168,11 +168,14 @@ def perform(options: Options) -> tuple[int, Path]:
     opened.graph.last = lambda: run_files.lay_out(opened.graph, opened.late(), made)
     result = _compute(opened)
     remember()
-    missing = _write(opened, result, made)
+    report = _write(opened, result, made)
+    missing: Items = report["missing"]
     _point_latest(opened.folder)
     suspicious = (line for h in opened.graph.nodes if h.ref is not None for line in h.ref.meta.get("warnings", ()))
-    for line in dict.fromkeys(suspicious):
-        warn(line)
+    # Some follow from several tasks alone; those of the input were said before the run.
+    for line in dict.fromkeys((*suspicious, *report["warnings"])):
+        if line not in opened.view.sequence.warnings:
+            warn(line)
     arrived = _outcome(opened)
     total = result.total()
     for item in missing:
@@ -248,8 +251,8 @@ def _compute(opened: _Opened) -> driver.Result:
     return result
 
 
-def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> Items:
-    """Write everything that the run leaves; give what is missing."""
+def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict[str, Any]:
+    """Write everything that the run leaves; give what ``report.json`` holds."""
     from rille.pipeline.runs import run_files
 
     # The folder may go while a run of hours is under way; writing would make one without its first files.
@@ -258,10 +261,10 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> Item
         raise RilleError("RIL-740", text, remedy="run again: what was computed is in the cache")
     tasks = run_files.task_rows(opened.graph)
     whole = opened.late(tasks=tasks, seconds=result.seconds, left_out=result.left_out)
-    missing = run_files.write(opened.folder, whole, made, opened.store)
+    report = run_files.write(opened.folder, whole, made, opened.store)
     total = (datetime.now(UTC) - opened.started).total_seconds()
     events.add_facts(opened.folder / "ledger.jsonl", total=total)
-    return missing
+    return report
 
 
 def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...], cut: Cut | None = None) -> Graph:
