@@ -57,7 +57,7 @@ def _by_relief(a: Ortho, b: Ortho, heights: tuple[Floats, Floats]) -> Registrati
     """The only place whose relief fits; None where there is none, or another fits nearly as well."""
     try:
         model, ground = _lattice(a), _lattice(b)
-        if model is None or ground is None:
+        if model is None or ground is None or (a.grey.shape, b.grey.shape) != (heights[0].shape, heights[1].shape):
             return None
         x0, x1, y0, y1 = ground.bounds
         reach = max(math.hypot(x, y) for x in model.bounds[:2] for y in model.bounds[2:])
