@@ -20,7 +20,7 @@ from rille.datasets.images.masks import masked
 from rille.datasets.images.misalign import MisalignParams, misalign
 from rille.datasets.images.samples import examined
 from rille.datasets.manifest.opening import open_manifest
-from rille.datasets.mockup.params import SHORT, MockupParams, RigParams
+from rille.datasets.mockup.params import SHORT, MockupParams, SetupParams
 from rille.datasets.mockup.rover import RoverParams
 from rille.datasets.mockup.sequence import LOOP, mockup, mockup_loop
 from rille.datasets.protocol import Sequence
@@ -105,7 +105,7 @@ def open_sequence(
         return validated("RIL-280", kind, {**preset, **sections.pop(name, {})}, section=name)
 
     if name_or_path == "mockup-loop":
-        bed, rover = section("mockup", RigParams, **preset), section("rover", RoverParams)
+        bed, rover = section("mockup", SetupParams, **preset), section("rover", RoverParams)
         _none_left(sections, name_or_path)
         return mockup_loop(bed, rover, name_or_path)
     knocked = section("misalign", MisalignParams)

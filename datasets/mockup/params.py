@@ -57,7 +57,7 @@ class RenderParams(Params):
     )
 
 
-class RigParams(SceneParams, RenderParams):
+class SetupParams(SceneParams, RenderParams):
     """The bed, and the two cameras over it."""
 
     image_width: int = Field(570, ge=16, le=4096, description="width of the images [px]")
@@ -80,7 +80,7 @@ class RigParams(SceneParams, RenderParams):
         return kind(**{name: getattr(self, name) for name in kind.model_fields})
 
 
-class MockupParams(RigParams):
+class MockupParams(SetupParams):
     """Every choice of the simulated experiment: a recorded motion, and the vertical and attitude given with it."""
 
     frames: int = Field(40, ge=1, le=2000, description="number of stereo pairs")

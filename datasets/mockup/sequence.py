@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from rille.datasets.mockup.params import MockupParams, RenderParams, RigParams, SceneParams
+from rille.datasets.mockup.params import MockupParams, RenderParams, SceneParams, SetupParams
 from rille.datasets.mockup.rover import START, RoverParams
 from rille.datasets.protocol import CAMERAS, Rows, Sequence, Simulation, Source, rows_of
 from rille.stages.core.declare import NoParams
@@ -67,7 +67,7 @@ beds, three stops each) half as many have a probability below 0.3, none below 0.
 false hazards. It takes a quarter more time a stop. Poses need no more points than by default."""
 
 
-def mount(p: RigParams, camera: str) -> RigidTransform:
+def mount(p: SetupParams, camera: str) -> RigidTransform:
     """T_body_camera of the true rig."""
     side = -1.0 if camera == "left" else 1.0
     toe, pitch = math.radians(p.toe_in_deg), math.radians(p.pitch_deg)
@@ -110,14 +110,14 @@ def body_poses(p: MockupParams) -> list[RigidTransform]:
     return poses
 
 
-def true_rig(p: RigParams) -> Rig:
+def true_rig(p: SetupParams) -> Rig:
     """The rig that takes the images."""
     f, width, height = p.focal_length, p.image_width, p.image_height
     camera = Camera(f, f, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
     return Rig(camera, camera, mount(p, "right").inverse() @ mount(p, "left"))
 
 
-def given_rig(p: RigParams) -> Rig:
+def given_rig(p: SetupParams) -> Rig:
     """The rig as it is handed to the reconstruction: the true one with the stated error."""
     rig = true_rig(p)
     error = RigidTransform(rotation_exp(np.deg2rad(p.rig_error_deg)), np.zeros(3))
@@ -251,7 +251,7 @@ def vehicle_at_scale() -> Vehicle:
     )
 
 
-def mockup_loop(p: RigParams, rover: RoverParams, name: str = "mockup-loop") -> Sequence:
+def mockup_loop(p: SetupParams, rover: RoverParams, name: str = "mockup-loop") -> Sequence:
     """The sequence of a rover that is driven: one pair at the start, the others come about on the way."""
     sources = Sources(true_rig(p), {})
     # The cameras stand 5 cm ahead of the centre of the wheels.

@@ -58,7 +58,7 @@ PYRAMID_BYTES = 20 / 3
 
 
 @dataclass(frozen=True)
-class MatchedPair:
+class BasicPair:
     """A basic pair: disparity, rig that it is reconstructed with, and vertical."""
 
     frame: int
@@ -68,7 +68,7 @@ class MatchedPair:
 
 
 @dataclass(frozen=True)
-class Pair(MatchedPair):
+class Pair(BasicPair):
     """A basic pair with the elevation model in its own frame."""
 
     dem: Handle[DemFacts]
@@ -290,7 +290,7 @@ class Builder:
         return self.node(ground_frame_stage, f"{label}/{frame}", **given, **(plane or {}))
 
     def pair(
-        self, frame: int, level: Handle[GroundFacts], known: Handle[CalibrationFacts], first: MatchedPair | None
+        self, frame: int, level: Handle[GroundFacts], known: Handle[CalibrationFacts], first: BasicPair | None
     ) -> Pair:
         """Local elevation model of a pair above its reference plane; ``known`` is its rig.
 
@@ -346,9 +346,9 @@ class Builder:
     def segment(
         self,
         frames: Series[int],
-        key: MatchedPair,
+        key: BasicPair,
         which: str = "",
-        after: MatchedPair | None = None,
+        after: BasicPair | None = None,
         refused: str | None = None,
     ) -> Segment:
         """Track and resect the left images that follow basic pair ``key``, which is the first of them.

@@ -56,7 +56,7 @@ import numpy as np
 from rille.pipeline.engine.graph import Complete, Handle, Maybe, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow import assessment
-from rille.pipeline.flow.builders import Builder, MatchedPair, Pair, Segment, centre, merge_tiles, other_plane
+from rille.pipeline.flow.builders import BasicPair, Builder, Pair, Segment, centre, merge_tiles, other_plane
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.evaluation.crosscheck import crosscheck_stage, windows
 from rille.stages.evaluation.crosscheck_join import crosscheck_join_stage
@@ -345,7 +345,7 @@ def simultaneous(
 
 def matched_pairs(
     make: Builder, rigs: dict[int, Handle[CalibrationFacts]]
-) -> Generator[Wait, Any, dict[int, MatchedPair]]:
+) -> Generator[Wait, Any, dict[int, BasicPair]]:
     """Disparities of stereo pairs, each with its rig, and their vertical and reference plane."""
     p = make.products
     verticals = {k: vertical(make, k) for k in rigs}
@@ -358,10 +358,10 @@ def matched_pairs(
     if plane is not None:
         p.level = {k: make.level(k, verticals[k], known, plane) for k, known in rigs.items()}
     yield Complete(("ground_frame",))
-    return {k: MatchedPair(k, p.disparity[k], known, p.level[k]) for k, known in rigs.items()}
+    return {k: BasicPair(k, p.disparity[k], known, p.level[k]) for k, known in rigs.items()}
 
 
-def local_models(make: Builder, matched: list[MatchedPair], first: MatchedPair) -> dict[int, Pair]:
+def local_models(make: Builder, matched: list[BasicPair], first: BasicPair) -> dict[int, Pair]:
     """Local elevation models of stereo pairs in the cells of the ``first``; on ground also risk maps and paths."""
     p, pairs = make.products, dict[int, Pair]()
     for one in matched:
@@ -386,7 +386,7 @@ def vertical(make: Builder, pair: int) -> dict[str, Any]:
 
 
 def unmoved(
-    make: Builder, pairs: Mapping[int, MatchedPair], segments: list[Segment]
+    make: Builder, pairs: Mapping[int, BasicPair], segments: list[Segment]
 ) -> Generator[Wait, Any, tuple[list[Segment], set[int]]]:
     """Segments, those refused whose basic pair measures otherwise than the first: its rig was knocked; and such pairs.
 
@@ -450,7 +450,7 @@ def adjusted(make: Builder, frames: Series[int], pairs: list[Pair]) -> Steps:
     )
 
 
-def refined(make: Builder, pairs: Mapping[int, MatchedPair], segments: list[Segment]) -> list[Handle[RefineFacts]]:
+def refined(make: Builder, pairs: Mapping[int, BasicPair], segments: list[Segment]) -> list[Handle[RefineFacts]]:
     """Segments adjusted with their landmarks, where that is wanted."""
     if not make.config.refine.enabled:
         return []
@@ -473,7 +473,7 @@ def refined(make: Builder, pairs: Mapping[int, MatchedPair], segments: list[Segm
 
 
 def moving_parts(
-    make: Builder, segments: list[Segment], pairs: Mapping[int, MatchedPair]
+    make: Builder, segments: list[Segment], pairs: Mapping[int, BasicPair]
 ) -> dict[int, Handle[MovingFacts]]:
     """What moves by itself in each basic pair, by the next frame; in the last one by the frame before."""
     out = dict[int, Handle[MovingFacts]]()
@@ -493,7 +493,7 @@ def moving_parts(
     return out
 
 
-def asked_for(make: Builder, key: MatchedPair) -> Generator[Wait, Any, list[float]]:
+def asked_for(make: Builder, key: BasicPair) -> Generator[Wait, Any, list[float]]:
     """Correction of the cameras that all segments ask for, zeros where they do not; of the rig of pair ``key``."""
     p = make.products
     given = make.given_camera if make.graph.anew else None
