@@ -9,7 +9,6 @@ import numpy as np
 
 from rille.pipeline.flow import config
 from rille.stages.core.validity import matched_back
-from rille.stages.geometry.surface import plane
 from rille.stages.hfvm.stage import match
 from rille.stages.terrain.locus.solve import Matches
 from rille.stages.terrain.locus.stage import MatchedPair, reconstruct
@@ -35,6 +34,6 @@ def jobs(scene: Scene) -> dict[str, Callable[[], Any]]:
     def locus() -> Any:
         forth, back = found
         pair = MatchedPair(np.asarray(scene.left, np.float32), forth, scene.right, back)
-        return reconstruct(pair, scene.rig, scene.T_surface_left, plane(scene.lattice), scene.z_range, chosen.locus)
+        return reconstruct(pair, scene.rig, scene.T_local_left, scene.lattice, scene.z_range, chosen.locus)
 
     return {MATCHING: matching, LOCUS: locus}

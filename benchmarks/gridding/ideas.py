@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from rille.stages.geometry.surface import plane
 from rille.stages.terrain.locus import refinement, solve, uncertainty
 from rille.stages.terrain.locus.solve import Matches
 from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
@@ -77,7 +76,7 @@ def _figures(given: tuple[Any, dict[str, Any]], params: dict[str, Any], changes:
     try:
         for (module, name), value in changes.items():
             setattr(module, name, value)
-        dem = reconstruct(pair, scene.rig, scene.T_surface_left, plane(scene.lattice), scene.z_range, chosen)
+        dem = reconstruct(pair, scene.rig, scene.T_local_left, scene.lattice, scene.z_range, chosen)
     finally:
         for (module, name), value in before.items():
             setattr(module, name, value)

@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.geometry.surface import plane
 from rille.stages.terrain.locus.solve import Matches
 from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
 
@@ -53,7 +52,7 @@ def locus(scene: Scene, max_backmatch: float, bounded: bool, *, images: bool = T
     d = scene.disparities
     right = scene.right if images and d.std is not None else None
     pair = MatchedPair(scene.left, Matches(d.column, d.row, d.usable(max_backmatch), d.std), right)
-    dem = reconstruct(pair, scene.rig, scene.T_surface_left, plane(scene.lattice), scene.z_range, params)
+    dem = reconstruct(pair, scene.rig, scene.T_local_left, scene.lattice, scene.z_range, params)
     return Model(dem.elevation, dem.elevation_std)
 
 
@@ -78,9 +77,9 @@ def triangulate(scene: Scene, max_backmatch: float, bounded: bool) -> Cloud:
     usable = d.usable(max_backmatch)
     left = pixels_of(d.column.shape)[usable]
     right = left + np.stack([d.column, d.row], axis=-1)[usable]
-    T_left_surface = scene.T_surface_left.inverse()
-    P_left = rig.left.matrix @ T_left_surface.matrix34
-    P_right = rig.right.matrix @ (rig.T_right_left @ T_left_surface).matrix34
+    T_left_local = scene.T_local_left.inverse()
+    P_left = rig.left.matrix @ T_left_local.matrix34
+    P_right = rig.right.matrix @ (rig.T_right_left @ T_left_local).matrix34
     h = cv2.triangulatePoints(P_left, P_right, left.T, right.T)
     found = (h[:3] / h[3]).T
     good, sigma = _judge(scene, found, left, right, P_right)
@@ -104,7 +103,7 @@ def _judge(
     rays = rig.left.rays(left)
     R, t = rig.T_right_left.rotation, rig.T_right_left.translation
     epipole = rig.right.matrix @ t
-    depth = scene.T_surface_left.inverse().apply(points)[:, 2]
+    depth = scene.T_local_left.inverse().apply(points)[:, 2]
     e = right * epipole[2] - epipole[:2]
     e /= np.linalg.norm(e, axis=1, keepdims=True)
     at = [(rays * (depth * k)[:, None]) @ (rig.right.matrix @ R).T + epipole for k in (1.0, 1.001)]
@@ -112,7 +111,7 @@ def _judge(
     off = right - near
     across = np.abs(off[:, 0] * e[:, 1] - off[:, 1] * e[:, 0])
     moved = np.abs(np.sum((far - near) * e, axis=1))
-    rise = np.abs((rays @ scene.T_surface_left.rotation.T)[:, 2]) * 0.001 * np.abs(depth)
+    rise = np.abs((rays @ scene.T_local_left.rotation.T)[:, 2]) * 0.001 * np.abs(depth)
     return (depth > 0) & (across <= DEFAULT.max_residual), rise / np.maximum(moved, 1e-12)
 
 

@@ -58,7 +58,7 @@ class Scene:
     left: NDArray[np.uint8]
     right: NDArray[np.uint8]
     rig: Rig
-    T_surface_left: RigidTransform
+    T_local_left: RigidTransform
     lattice: Lattice
     z_range: tuple[float, float]
     max_sigma: float
@@ -145,8 +145,8 @@ def motorcycle() -> Scene | None:
     known = np.isfinite(truth.u)
     depth = f * baseline / (offset - truth.u)
     far = float(np.nanpercentile(depth, 99.5))
-    T_surface_left = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, far]))
-    points = T_surface_left.apply(cameras[0].rays(pixels_of(left.shape)) * depth[..., None])
+    T_local_left = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, far]))
+    points = T_local_left.apply(cameras[0].rays(pixels_of(left.shape)) * depth[..., None])
     cell = round(float(np.nanmin(depth)) / f * NEAREST_CELLS_PX, 4)
     bounds = [float(v) for k in (0, 1) for v in np.nanpercentile(points[..., k], [1, 99])]
     lattice = Lattice.snap(bounds, cell)
@@ -159,7 +159,7 @@ def motorcycle() -> Scene | None:
     judged = np.isfinite(surface) & (np.abs(seen - surface) < 1e-9)
     true = Disparities(truth.u.astype(np.float32), truth.v.astype(np.float32), both)
     everywhere = np.ones(left.shape, bool)
-    place = T_surface_left, lattice, z_range, max_sigma
+    place = T_local_left, lattice, z_range, max_sigma
     valid = everywhere, everywhere
     return Scene("motorcycle", left, right, rig, *place, surface.astype(np.float32), judged, true, valid)
 

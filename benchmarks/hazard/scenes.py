@@ -24,7 +24,6 @@ from rille.pipeline.flow import config
 from rille.stages.core.validity import matched_back
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.geometry.surface import plane
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.hfvm.stage import match
 from rille.stages.terrain.ground_frame import GroundFrameParams, VerticalHint, level, z_range
@@ -45,7 +44,6 @@ ATTITUDE_DEG = 0.2
 MADE_BY = (
     "benchmarks/hazard/scenes.py", "pipeline/flow/config.py", "datasets/mockup/*.py", "stages/hfvm/**/*.py",
     "stages/terrain/ground_frame.py", "stages/terrain/ground.py", "stages/terrain/locus/*.py",
-    "stages/geometry/surface.py",
     "stages/geometry/lattice.py", "stages/core/validity.py",
 )  # fmt: skip
 """Modules by which a scene is made: one that was kept is used as long as none of them changes."""
@@ -151,7 +149,7 @@ def _reconstructed(
     low, high = z_range(facts["plane"], facts["relief"], list(lattice.bounds))
     left, right = (np.asarray(image, np.float32) for image in pair.images)
     both = MatchedPair(left, given, right, None if pair.back is None else pair.matches(pair.back))
-    dem = reconstruct(both, pair.rig, T_local_left, plane(lattice), (low, high), pair.params)
+    dem = reconstruct(both, pair.rig, T_local_left, lattice, (low, high), pair.params)
     return lattice, (T_local_left, (low, high)), (dem.elevation, dem.elevation_std)
 
 

@@ -18,32 +18,26 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import MAX_CELLS, Lattice
-from rille.stages.geometry.surface import Surface
 from rille.stages.terrain.ground import PlaneView
 from rille.stages.terrain.locus.kernel import Dem
 from rille.stages.terrain.locus.solve import LocusParams
 
 
 def explain(
-    rig: Rig, T_surface_left: RigidTransform, surface: Surface, z_range: tuple[float, float], usable: Bools
+    rig: Rig, T_local_left: RigidTransform, lattice: Lattice, z_range: tuple[float, float], usable: Bools
 ) -> DegenerateError:
     """The error to raise for an elevation model without any cell.
 
     Parameters
     ----------
-    rig, T_surface_left, surface, z_range, usable : as Locus got them.
+    rig, T_local_left, lattice, z_range, usable : as Locus got them.
     """
-    pick = [
-        # At most 64 cells along either side are looked at.
-        np.unique(np.linspace(0, n - 1, 64).astype(np.intp))
-        for n in (surface.rows, surface.cols)
-    ]
-    feet, normals = surface.block(*pick)
-    z = np.linspace(*z_range, 9)[:, None, None, None]
-    points = T_surface_left.inverse().apply(feet + z * normals)
+    # At most 64 cells along either side are looked at.
+    y, x = (np.unique(axis[np.linspace(0, len(axis) - 1, 64).astype(np.intp)]) for axis in (lattice.ys(), lattice.xs()))
+    points = T_local_left.inverse().apply(np.stack(np.meshgrid(x, y, np.linspace(*z_range, 9)), axis=-1))
     seen = [_inside(camera, p) for camera, p in ((rig.left, points), (rig.right, rig.T_right_left.apply(points)))]
     if not (seen[0] & seen[1]).any():
-        left, right = (100.0 * float(s.any(axis=0).mean()) for s in seen)
+        left, right = (100.0 * float(s.any(axis=-1).mean()) for s in seen)
         return DegenerateError(
             "RIL-388",
             f"the cameras look away from the reference surface: the left one sees {left:.0f} %, the right one "
@@ -51,7 +45,7 @@ def explain(
             remedy="check locus.extent (y is ahead), the vertical (world.up, world.pitch_deg), the left/right order, "
             "and T_right_left",
         )
-    count, cells = int(usable.sum()), surface.rows * surface.cols
+    count, cells = int(usable.sum()), lattice.rows * lattice.cols
     if not count:
         return DegenerateError(
             "RIL-389",

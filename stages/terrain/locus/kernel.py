@@ -1,12 +1,13 @@
 """Kernel of Locus reconstruction (paper, section 4.4): cells straight from the disparity.
 
-For a cell with foot F and normal N let P(Z) = F + Z N, p_l and p_r its projections and d the disparity vector. The
-paper minimises |g(Z)|, g = p_l(Z) + d(p_l(Z)) - p_r(Z). Here the *sign change* of s(Z) = g(Z) . e is solved, e being
-the direction at p_r in which a point moves when it recedes along the left camera's ray (the local epipolar line): the
-same solution with a tenth of the evaluations, and more exact, because a minimum is flat and a sign change is not.
+For a cell at (x, y) of the plane z = 0, the reference surface, let P(Z) = (x, y, Z), p_l and p_r its projections and d
+the disparity vector. The paper minimises |g(Z)|, g = p_l(Z) + d(p_l(Z)) - p_r(Z). Here the *sign change* of
+s(Z) = g(Z) . e is solved, e being the direction at p_r in which a point moves when it recedes along the left camera's
+ray (the local epipolar line): the same solution with a tenth of the evaluations, and more exact, because a minimum is
+flat and a sign change is not.
 
 s > 0: the surface that the left camera sees behind P is farther than P, so P is in free space; s < 0: P is behind the
-surface. A terrain surface is a change from free (above) to behind (below) along the normal. Where the change happens
+surface. A terrain surface is a change from free (above) to behind (below) along z. Where the change happens
 across a depth jump between two pixels nothing was seen: the cell is occluded there.
 
 **Which change, where there are several.** The search begins at the top of the cell's interval. If the point there is
@@ -35,7 +36,7 @@ SOLVED_PX = 1e-3  # |s| of a solution: a two-hundredth of the disparity's usual 
 
 
 class PairCameras(NamedTuple):
-    """``left``, ``right`` (3, 4) projections from the frame of the surface to pixels; ``epipole`` (3,) homogeneous
+    """``left``, ``right`` (3, 4) projections from the frame of the lattice to pixels; ``epipole`` (3,) homogeneous
     projection of the left camera's centre into the right image; ``sizes`` (4,) width and height of the left, then of
     the right image."""
 
@@ -63,9 +64,9 @@ class Observed(NamedTuple):
 
 
 class Dem(NamedTuple):
-    """Elevation model on a reference surface, arrays (rows, cols) float32, NaN undefined.
+    """Elevation model on a lattice, arrays (rows, cols) float32, NaN undefined.
 
-    ``elevation`` and its standard deviation ``elevation_std`` in metres along the surface's normal, ``residual`` the
+    ``elevation`` and its standard deviation ``elevation_std`` in metres, ``residual`` the
     mismatch at the solution in pixels, ``ortho`` the grey value of the left image.
     """
 
@@ -75,22 +76,21 @@ class Dem(NamedTuple):
     ortho: Floats32
 
 
-class BlockCells(NamedTuple):
-    """Cells of a block.
+class Cells(NamedTuple):
+    """Cells at ``x`` (cols,) and ``y`` (rows,), metres.
 
-    ``feet``, ``normals`` (r, c, 3) metres, frame of the surface; ``low``, ``high`` (r, c) interval of Z in which the
-    search starts, metres, NaN: the cell is left out. The search may leave it: upwards while the point is behind the
-    surface, downwards while it is free.
+    ``low``, ``high`` (rows, cols) interval of Z in which the search starts, metres, NaN: the cell is left out. The
+    search may leave it: upwards while the point is behind the surface, downwards while it is free.
     """
 
-    feet: Floats
-    normals: Floats
+    x: Floats
+    y: Floats
     low: Floats32
     high: Floats32
 
 
 class Line(NamedTuple):
-    """Line of a cell in one image: its points F + Z N have the homogeneous projections a + Z b."""
+    """Line of a cell in one image: its points (x, y, Z) have the homogeneous projections a + Z b."""
 
     a0: float
     a1: float
@@ -154,85 +154,59 @@ class Solution(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def search(cells, z_range, cameras, seen, out):  # type: ignore[no-untyped-def]
-    """Solve every cell of a block (:class:`BlockCells`) from what is :class:`Observed`.
+    """Solve every cell of :class:`Cells` from what is :class:`Observed`.
 
-    ``z_range``: limits of Z, metres; ``out``: the :class:`Dem` of the block, to be filled with NaN before.
+    ``z_range``: limits of Z, metres; ``out``: the :class:`Dem` of the cells, to be filled with NaN before.
     """
     # Arrays are taken out of their tuples before the loops: each time costs an atomic count of references.
-    feet, normals, low, high = cells.feet, cells.normals, cells.low, cells.high
+    xs, ys, low, high = cells.x, cells.y, cells.low, cells.high
     elevation, std, residual, ortho = out.elevation, out.elevation_std, out.residual, out.ortho
-    left, right, sizes = projection_rows(cameras.left), projection_rows(cameras.right), cameras.sizes
-    direction = cameras.epipole[0], cameras.epipole[1], cameras.epipole[2]
-    size = sizes[0], sizes[1], sizes[2], sizes[3]
-    rows, cols = low.shape
-    for r in range(rows):
-        for c in range(cols):
+    left, right, sizes, direction = cameras.left, cameras.right, cameras.sizes, cameras.epipole
+    for r in range(len(ys)):
+        for c in range(len(xs)):
             if math.isnan(low[r, c]):
                 continue
-            foot, normal = vector(feet, r, c), vector(normals, r, c)
-            lines = PairLines(line_of(left, foot, normal), line_of(right, foot, normal))
+            lines = PairLines(line_of(left, xs[c], ys[r]), line_of(right, xs[c], ys[r]))
             start = low[r, c], high[r, c]
-            cell = solve_cell(lines, visible(lines, size, z_range), start, direction, seen)
+            cell = solve_cell(lines, visible(lines, sizes, z_range), start, direction, seen)
             elevation[r, c], std[r, c], residual[r, c], ortho[r, c] = cell
 
 
-@njit(cache=True, nogil=True)
-def vector(a, r, c):  # type: ignore[no-untyped-def]
-    """Numbers of a vector of an array (rows, cols, 3)."""
-    return a[r, c, 0], a[r, c, 1], a[r, c, 2]
-
-
-@njit(cache=True, nogil=True)
-def projection_rows(P):  # type: ignore[no-untyped-def]
-    """Rows of a projection (3, 4), as numbers."""
-    return (
-        (P[0, 0], P[0, 1], P[0, 2], P[0, 3]),
-        (P[1, 0], P[1, 1], P[1, 2], P[1, 3]),
-        (P[2, 0], P[2, 1], P[2, 2], P[2, 3]),
-    )
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
-def line_of(projection, foot, normal):  # type: ignore[no-untyped-def]
-    """Line of a cell in an image."""
-    p, q, w = projection
+def line_of(P, x, y):  # type: ignore[no-untyped-def]
+    """Line of a cell at x, y in an image by its projection (3, 4)."""
     return Line(
-        dot(p, foot) + p[3], dot(q, foot) + q[3], dot(w, foot) + w[3], dot(p, normal), dot(q, normal), dot(w, normal)
+        P[0, 0] * x + P[0, 1] * y + P[0, 3],
+        P[1, 0] * x + P[1, 1] * y + P[1, 3],
+        P[2, 0] * x + P[2, 1] * y + P[2, 3],
+        P[0, 2],
+        P[1, 2],
+        P[2, 2],
     )
-
-
-@njit(cache=True, nogil=True)
-def dot(row, v):  # type: ignore[no-untyped-def]
-    """Product of the first three numbers of both."""
-    return row[0] * v[0] + row[1] * v[1] + row[2] * v[2]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def visible(lines, sizes, z_range):  # type: ignore[no-untyped-def]
     """Part (low, high) of ``z_range`` that projects into both images; empty (low > high) where there is none."""
-    low, high = _inside(lines.left, sizes[0] - 1.0, sizes[1] - 1.0, z_range)
-    return _inside(lines.right, sizes[2] - 1.0, sizes[3] - 1.0, (low, high))
-
-
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _inside(line, w, h, span):  # type: ignore[no-untyped-def]
-    """Part of a span where 0 <= x <= w, 0 <= y <= h in front of the camera: x = X / W with W > 0 is X >= 0."""
-    span = _bound(line.a0, line.b0, span)
-    span = _bound(w * line.a2 - line.a0, w * line.b2 - line.b0, span)
-    span = _bound(line.a1, line.b1, span)
-    span = _bound(h * line.a2 - line.a1, h * line.b2 - line.b1, span)
-    return _bound(line.a2 - MIN_DEPTH_M, line.b2, span)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _bound(p, q, span):  # type: ignore[no-untyped-def]
-    """Part of a span where p + z q >= 0."""
-    low, high = span
-    if q > 0.0:
-        return max(low, -p / q), high
-    if q < 0.0:
-        return low, min(high, -p / q)
-    return low, (high if p >= 0.0 else -np.inf)
+    low, high = z_range
+    for k in range(2):
+        line = lines.left if k == 0 else lines.right
+        w, h = sizes[2 * k] - 1.0, sizes[2 * k + 1] - 1.0
+        # In front of the camera x = X / W has W > 0, and 0 <= x <= w is X >= 0 and w W - X >= 0.
+        for p, q in (
+            (line.a0, line.b0),
+            (w * line.a2 - line.a0, w * line.b2 - line.b0),
+            (line.a1, line.b1),
+            (h * line.a2 - line.a1, h * line.b2 - line.b1),
+            (line.a2 - MIN_DEPTH_M, line.b2),
+        ):
+            if q > 0.0:
+                low = max(low, -p / q)
+            elif q < 0.0:
+                high = min(high, -p / q)
+            elif p < 0.0:
+                high = -np.inf
+    return low, high
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -19,7 +19,7 @@ import math
 import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats32
-from rille.stages.geometry.surface import Surface
+from rille.stages.geometry.lattice import Lattice
 from rille.stages.numeric.relaxation import bend_weights, relax
 from rille.stages.numeric.windows import window_sum32
 from rille.stages.terrain.locus.views import OrthoPair, SurfaceViews, look
@@ -38,7 +38,7 @@ HALVING_RESIDUAL_GREY = 10.0
 """Difference [grey levels] that halves a cell's weight, well above camera noise."""
 
 
-def refine(views: SurfaceViews, surface: Surface, elevation: Floats32, steps: int) -> tuple[Floats32, OrthoPair]:
+def refine(views: SurfaceViews, lattice: Lattice, elevation: Floats32, steps: int) -> tuple[Floats32, OrthoPair]:
     """Elevations that fit both images best, and what the images show there.
 
     Parameters
@@ -51,7 +51,7 @@ def refine(views: SurfaceViews, surface: Surface, elevation: Floats32, steps: in
     elevation (rows, cols), and what :func:`rille.stages.terrain.locus.views.look` gives for it, the right image with
     the left one's contrast.
     """
-    z, seen = elevation, look(views, surface, elevation)
+    z, seen = elevation, look(views, lattice, elevation)
     # From the first look, for all steps: an exposure does not change with the elevations.
     gain = _gain(seen)
     _level(seen, gain)
@@ -64,13 +64,13 @@ def refine(views: SurfaceViews, surface: Surface, elevation: Floats32, steps: in
         # About the start, not the last step: many small steps could otherwise wander to another likeness.
         reach = MAX_CHANGE_PX / seen.scale
         z = np.where(keep, np.clip(moved, elevation - reach, elevation + reach), elevation)
-        seen = look(views, surface, z)
+        seen = look(views, lattice, z)
         _level(seen, gain)
     return z, seen
 
 
 def _gain(seen: OrthoPair) -> float:
-    """Factor that gives the right image the left one's contrast, from the gradients along the surface's axes."""
+    """Factor that gives the right image the left one's contrast, from the gradients along the lattice's axes."""
     left, right = (
         sum(float(np.nansum(np.square(np.diff(image, axis=axis)), dtype=np.float64)) for axis in (0, 1))
         for image in (seen.left, seen.right)

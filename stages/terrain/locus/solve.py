@@ -1,4 +1,4 @@
-"""Locus over a whole surface: cells from one disparity map, coarse to fine, and models of both directions joined.
+"""Locus over a whole lattice: cells from one disparity map, coarse to fine, and models of both directions joined.
 
 The kernel and its equations are in :mod:`rille.stages.terrain.locus.kernel`.
 """
@@ -8,16 +8,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from rille.stages.core.arrays import Bools, Floats, Floats32
+from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Params
 from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.scale import of_rig
-from rille.stages.geometry.surface import Surface
-from rille.stages.terrain.locus.kernel import BlockCells, Dem, Observed, PairCameras, search
-from rille.stages.terrain.locus.views import BLOCK_ROWS
+from rille.stages.terrain.locus.kernel import Cells, Dem, Observed, PairCameras, search
 
 COARSE_CELLS = 8  # cells that a coarse cell is wide: a 64th of the cells search the whole range
 ONE_SIDED_STD_FACTOR = 2.0  # matched one way alone: errors of such cells are two to three times as large
@@ -71,55 +70,46 @@ class LocusParams(Params):
     )
 
 
-class PairArrays:
-    """The arrays of one pair as the kernel wants them; elevations are searched in ``z_range``, m."""
-
-    def __init__(
-        self,
-        matches: Matches,
-        image: ArrayLike,
-        rig: Rig,
-        T_surface_left: RigidTransform,
-        z_range: tuple[float, float],
-        params: LocusParams,
-    ) -> None:
-        shape = np.shape(matches.column)
-        rig.check(shape)
-        disparity = np.stack([matches.column, matches.row], axis=-1, dtype=np.float32, casting="unsafe")
-        # NaN in the arrays, not a mask: the kernel's sums become NaN by themselves where a pixel must not be used.
-        disparity[~matches.usable] = np.nan
-        std = np.full(shape, params.sigma_disparity) if matches.std is None else matches.std
-        grey, std = (np.ascontiguousarray(a, np.float32) for a in (image, std))
-        wide, high = of_rig(rig)
-        self.seen = Observed(disparity, std, grey, params.max_residual, params.max_jump, (float(wide), float(high)))
-        epipole = rig.right.matrix @ rig.T_right_left.translation
-        sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)
-        self.cameras, self.z_range = PairCameras(*projections(rig, T_surface_left), epipole, sizes), z_range
-
-    def cells(self, feet: Floats, normals: Floats, low: ArrayLike, high: ArrayLike, out: Dem) -> None:
-        """Fill ``out`` (r, c) with cells (r, c, 3), searched from low..high (NaN: left out)."""
-        start = [np.ascontiguousarray(np.broadcast_to(v, feet.shape[:2]), np.float32) for v in (low, high)]
-        search(BlockCells(feet, normals, *start), self.z_range, self.cameras, self.seen, out)
+def observed(matches: Matches, image: ArrayLike, rig: Rig, params: LocusParams) -> Observed:
+    """What the kernel reads of matches, and of the image whose pixels are matched: the left one of ``rig``."""
+    shape = np.shape(matches.column)
+    rig.check(shape)
+    disparity = np.stack([matches.column, matches.row], axis=-1, dtype=np.float32, casting="unsafe")
+    # NaN in the arrays, not a mask: the kernel's sums become NaN by themselves where a pixel must not be used.
+    disparity[~matches.usable] = np.nan
+    std = np.full(shape, params.sigma_disparity) if matches.std is None else matches.std
+    grey, std = (np.ascontiguousarray(a, np.float32) for a in (image, std))
+    wide, high = of_rig(rig)
+    return Observed(disparity, std, grey, params.max_residual, params.max_jump, (float(wide), float(high)))
 
 
-def solve(task: PairArrays, surface: Surface) -> Dem:
-    """Every cell of a surface from one disparity map, coarse to fine: a few coarse cells search the whole range."""
+def cameras_of(rig: Rig, T_local_left: RigidTransform) -> PairCameras:
+    """Cameras of a rig in the frame of the lattice."""
+    T_left_local = T_local_left.inverse()
+    left = rig.left.matrix @ T_left_local.matrix34
+    right = rig.right.matrix @ (rig.T_right_left @ T_left_local).matrix34
+    sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)
+    epipole = rig.right.matrix @ rig.T_right_left.translation
+    return PairCameras(np.ascontiguousarray(left), np.ascontiguousarray(right), epipole, sizes)
+
+
+def solve(seen: Observed, cameras: PairCameras, lattice: Lattice, z_range: tuple[float, float]) -> Dem:
+    """Every cell of a lattice, coarse to fine: a few coarse cells search the whole ``z_range``, m."""
+
+    def searched(rows: NDArray[np.intp], cols: NDArray[np.intp], low: Floats32, high: Floats32) -> Dem:
+        out = Dem(*np.full((4, len(rows), len(cols)), np.nan, np.float32))
+        search(Cells(lattice.xs()[cols], lattice.ys()[rows], low, high), z_range, cameras, seen, out)
+        return out
+
+    every = [np.arange(n) for n in lattice.shape]
     # The last row and column as well, so that every cell lies between coarse ones.
-    rows, cols = (np.unique(np.append(np.arange(0, n, COARSE_CELLS), n - 1)) for n in (surface.rows, surface.cols))
-    coarse, out = _undefined(rows.size, cols.size), _undefined(surface.rows, surface.cols)
-    task.cells(*surface.block(rows, cols), *task.z_range, coarse)
-    cols = np.arange(surface.cols)
-    lowest, highest = (v[:, cols // COARSE_CELLS + 1] for v in _around(coarse.elevation))
-    for start in range(0, surface.rows, BLOCK_ROWS):
-        rows = np.arange(start, min(start + BLOCK_ROWS, surface.rows))
-        near = rows // COARSE_CELLS + 1
-        block = Dem(*(array[start : start + rows.size] for array in out))
-        task.cells(*surface.block(rows, cols), lowest[near], highest[near], block)
-    return out
-
-
-def _undefined(rows: int, cols: int) -> Dem:
-    return Dem(*np.full((4, rows, cols), np.nan, np.float32))
+    coarse = [np.unique(np.append(n[::COARSE_CELLS], n[-1])) for n in every]
+    whole = [np.full([len(n) for n in coarse], z, np.float32) for z in z_range]
+    padded = np.pad(searched(*coarse, *whole).elevation, 2, constant_values=np.nan)
+    around = np.lib.stride_tricks.sliding_window_view(padded, (4, 4))
+    near = np.ix_(*(n // COARSE_CELLS + 1 for n in every))
+    # Lowest and highest of the 4 x 4 coarse cells around. NaN gives way: one known neighbour is enough.
+    return searched(*every, *(extreme.reduce(around, axis=(2, 3))[near] for extreme in (np.fmin, np.fmax)))
 
 
 def join(a: Dem, b: Dem) -> Dem:
@@ -137,25 +127,3 @@ def join(a: Dem, b: Dem) -> Dem:
     std = np.where(both, np.sqrt(sa * sb + (za - zb) ** 2), ONE_SIDED_STD_FACTOR * np.where(only_a, sa, sb))
     residual = np.where(only_a, a.residual, b.residual)
     return Dem(z.astype(np.float32), std.astype(np.float32), residual, a.ortho)
-
-
-def projections(rig: Rig, T_surface_left: RigidTransform) -> tuple[Floats, Floats]:
-    """Projections (3, 4) from the frame of the surface to pixels of the left and the right image."""
-    T_left_surface = T_surface_left.inverse()
-    left = rig.left.matrix @ T_left_surface.matrix34
-    right = rig.right.matrix @ (rig.T_right_left @ T_left_surface).matrix34
-    return np.ascontiguousarray(left), np.ascontiguousarray(right)
-
-
-def _around(coarse: Floats32) -> tuple[Floats32, Floats32]:
-    """Lowest and highest elevation of the 4 x 4 coarse cells around each gap between them; NaN where none has one."""
-    padded = np.pad(coarse, 2, constant_values=np.nan)
-    shape = padded.shape[0] - 3, padded.shape[1] - 3
-    low = np.full(shape, np.nan, np.float32)
-    high = low.copy()
-    for i in range(4):
-        for j in range(4):
-            near = padded[i : i + shape[0], j : j + shape[1]]
-            # NaN gives way: one known neighbour is enough to say where a gap is searched.
-            low, high = np.fmin(low, near), np.fmax(high, near)
-    return low, high

@@ -1,8 +1,8 @@
 """Locus reconstruction: elevation model and ortho image straight from the disparity (paper, section 4.4).
 
-The cells come first, not the image points: for each cell of a reference surface the straight line perpendicular to it
-is projected into both images (the left and right *locus*); the left locus, mapped through the disparity, meets the
-right one at the elevation. Nothing is rectified and no point cloud is made: rows and columns are those of the original
+The cells come first, not the image points: for each cell of a lattice the straight line perpendicular to it is
+projected into both images (the left and right *locus*); the left locus, mapped through the disparity, meets the right
+one at the elevation. Nothing is rectified and no point cloud is made: rows and columns are those of the original
 images, for any orientation of the cameras. The kernel and its equations are in
 :mod:`rille.stages.terrain.locus.kernel`; elevations are then refined by what both images show of the surface
 (:mod:`rille.stages.terrain.locus.refinement`).
@@ -33,16 +33,16 @@ from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
 from rille.stages.geometry.scale import coarser_focal
-from rille.stages.geometry.surface import Surface, plane
+from rille.stages.geometry.spline import coefficients
 from rille.stages.terrain.ground import PlaneView, view_ground, view_matches
 from rille.stages.terrain.ground_frame import sampled
 from rille.stages.terrain.ground_frame import z_range as plane_z_range
 from rille.stages.terrain.locus.coverage import coverage, explain
 from rille.stages.terrain.locus.kernel import Dem
 from rille.stages.terrain.locus.refinement import refine
-from rille.stages.terrain.locus.solve import LocusParams, Matches, PairArrays, join, projections, solve
+from rille.stages.terrain.locus.solve import LocusParams, Matches, cameras_of, join, observed, solve
 from rille.stages.terrain.locus.uncertainty import standard_deviation
-from rille.stages.terrain.locus.views import SurfaceViews, views
+from rille.stages.terrain.locus.views import SurfaceViews, View
 
 OWN_STD_FACTOR = 1.4  # times max_sigma: a cell's own standard deviation scatters about the typical one
 NO_LIMIT = {"max_sigma": None, "max_std": None}
@@ -67,17 +67,16 @@ class MatchedPair:
 def reconstruct(
     pair: MatchedPair,
     rig: Rig,
-    T_surface_left: RigidTransform,
-    surface: Surface,
+    T_local_left: RigidTransform,
+    lattice: Lattice,
     z_range: tuple[float, float],
     params: LocusParams,
 ) -> Dem:
-    """Elevation and ortho image of every cell of a reference surface.
+    """Elevation and ortho image of every cell of a lattice.
 
     Parameters
     ----------
-    T_surface_left : pose of the left camera in the frame of the surface.
-    surface : feet and normals of the cells, metres.
+    T_local_left : pose of the left camera in the frame of the lattice.
     z_range : lowest and highest elevation searched, metres.
     params : thresholds, and ``sigma_disparity`` for matches without standard deviations; ``cell_size`` and
         ``extent`` are not used here.
@@ -95,21 +94,22 @@ def reconstruct(
         The disparity's shape differs from its camera's, or the baseline is zero.
     """
     image, right, back = pair.left, pair.right, pair.back
-    out = solve(PairArrays(pair.matches, image, rig, T_surface_left, z_range, params), surface)
+    cameras = cameras_of(rig, T_local_left)
+    out = solve(observed(pair.matches, image, rig, params), cameras, lattice, z_range)
     apart = None
     if back is not None:
         assert right is not None
         # The same solver with the cameras exchanged: the right image's disparity is that of a rig whose left camera it
         # is.
         turned = Rig(rig.right, rig.left, rig.T_right_left.inverse())
-        T_surface_right = T_surface_left @ rig.T_right_left.inverse()
-        other = solve(PairArrays(back, right, turned, T_surface_right, z_range, params), surface)
+        behind = cameras_of(turned, T_local_left @ turned.T_right_left)
+        other = solve(observed(back, right, turned, params), behind, lattice, z_range)
         apart = out.elevation - other.elevation
         out = join(out, other)
     if right is not None and (params.refine_steps or back is not None):
-        both = [np.ascontiguousarray(a, np.float32) for a in (image, right)]
-        seen = views(*projections(rig, T_surface_left), both[0], both[1], T_surface_left.translation)
-        _refine(out, seen, surface, params, apart)
+        both = (View(P, coefficients(a)) for P, a in ((cameras.left, image), (cameras.right, right)))
+        seen = SurfaceViews(*both, T_local_left.translation)
+        _refine(out, seen, lattice, params, apart)
     leave_out_unsure(out, greatest_std(params, pair.matches.std is not None))
     return out
 
@@ -123,12 +123,12 @@ def leave_out_unsure(dem: Dem, greatest: float | None) -> None:
             np.copyto(array, np.nan, where=unsure)
 
 
-def _refine(dem: Dem, views: SurfaceViews, surface: Surface, params: LocusParams, apart: Floats32 | None) -> None:
+def _refine(dem: Dem, views: SurfaceViews, lattice: Lattice, params: LocusParams, apart: Floats32 | None) -> None:
     """Refine a model in place: elevations, their standard deviations, grey values of the left image.
 
     ``apart``: (rows, cols) difference of both directions of matching, metres; None: there was one.
     """
-    elevation, seen = refine(views, surface, dem.elevation, params.refine_steps)
+    elevation, seen = refine(views, lattice, dem.elevation, params.refine_steps)
     moved = elevation - dem.elevation
     dem.elevation_std[...] = standard_deviation(elevation, seen, moved, apart, dem.elevation_std)
     share = np.float32(params.refined_share)
@@ -198,7 +198,7 @@ def _matches(disparity: Bundle) -> Matches:
 
 
 def _size(params: LocusParams, args: Mapping[str, Any], metas: Mapping[str, Any]) -> float:
-    """Bytes of the surface's arrays, four of float32, and a half more for refining them."""
+    """Bytes of the model's arrays, four of float32, and a half more for refining them."""
     if args["frame"] == "world":
         lattice = Lattice.from_dict(metas["local"]["lattice"])
     elif "no_ground" in metas["level"]:
@@ -281,14 +281,14 @@ def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: i
         _matches(inputs.back) if inputs.back is not None else None,
     )
     low, high = z_range
-    dem = reconstruct(matched, rig, T, plane(lattice), (low, high), params.model_copy(update=NO_LIMIT))
+    dem = reconstruct(matched, rig, T, lattice, (low, high), params.model_copy(update=NO_LIMIT))
     greatest = greatest_std(params, matches.std is not None)
     covered: dict[str, Any] | None = None
     if seen is not None:
         covered = coverage(seen, dem, lattice, (low, high), greatest or math.inf, params)
     leave_out_unsure(dem, greatest)
     if not np.isfinite(dem.elevation).any():
-        raise explain(rig, T, plane(lattice), (low, high), matches.usable)
+        raise explain(rig, T, lattice, (low, high), matches.usable)
     meta: DemFacts = {
         "lattice": lattice.to_dict(),
         "frame": frame,

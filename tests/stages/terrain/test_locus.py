@@ -23,8 +23,6 @@ from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.geometry.surface import Surface
-from rille.stages.geometry.surface import plane as reference_plane
 from rille.stages.terrain import ground_frame as level_stage
 from rille.stages.terrain.ground import view_ground
 from rille.stages.terrain.locus import kernel, stage
@@ -48,7 +46,7 @@ def pair(*maps: np.ndarray) -> MatchedPair:
 
 def solve(maps: tuple[np.ndarray, np.ndarray, np.ndarray], z: tuple[float, float], rig: Rig = RIG) -> Dem:
     column, row, usable = maps
-    return reconstruct(pair(column, row, usable), rig, T_LOCAL_LEFT, reference_plane(LATTICE), z, PARAMS)
+    return reconstruct(pair(column, row, usable), rig, T_LOCAL_LEFT, LATTICE, z, PARAMS)
 
 
 def tolerance(maps: tuple[np.ndarray, np.ndarray, np.ndarray], points: np.ndarray) -> np.ndarray:
@@ -123,7 +121,7 @@ def test_a_right_camera_of_another_scale_sees_no_jumps_of_its_own(scale: float) 
         pair(column + odd, row, usable),
         rig,
         T_LOCAL_LEFT,
-        reference_plane(LATTICE),
+        LATTICE,
         (-1.0, -0.3),
         LocusParams(max_jump=1.0),
     )
@@ -240,9 +238,8 @@ def test_cells_of_a_great_standard_deviation_of_their_own_are_left_out() -> None
 
     def dem(**limits: float) -> Dem:
         params = LocusParams(**limits)
-        surface = reference_plane(LATTICE)
         given = MatchedPair(IMAGE, Matches(column, row, usable, std))
-        return reconstruct(given, RIG, T_LOCAL_LEFT, surface, (-1.0, -0.3), params)
+        return reconstruct(given, RIG, T_LOCAL_LEFT, LATTICE, (-1.0, -0.3), params)
 
     whole = dem()
     seen = np.isfinite(whole.elevation)
@@ -273,10 +270,11 @@ def test_a_search_that_begins_below_the_surface_finds_it_or_nothing() -> None:
     """On the way up pixels are missing, so that many a cell has to go down again from where it began."""
     column, row, usable = maps = disparity(RIG, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
     there = usable & (np.random.default_rng(4).random(usable.shape) < 0.85)
-    task = locus_solve.PairArrays(Matches(column, row, there), IMAGE, RIG, T_LOCAL_LEFT, (-1.0, -0.3), LocusParams())
+    seen = locus_solve.observed(Matches(column, row, there), IMAGE, RIG, LocusParams())
     dem = Dem(*np.full((4, *LATTICE.shape), np.nan, np.float32))
-    every = np.arange(LATTICE.rows), np.arange(LATTICE.cols)
-    task.cells(*reference_plane(LATTICE).block(*every), -HEIGHT - 0.05, -HEIGHT - 0.01, dem)
+    start = (np.full(LATTICE.shape, -HEIGHT - below, np.float32) for below in (0.05, 0.01))
+    cells = kernel.Cells(LATTICE.xs(), LATTICE.ys(), *start)
+    kernel.search(cells, (-1.0, -0.3), locus_solve.cameras_of(RIG, T_LOCAL_LEFT), seen, dem)
     found = np.isfinite(dem.elevation)
     assert 0.05 < found.mean() < 0.9
     truth = np.full(LATTICE.shape, -HEIGHT)
@@ -299,13 +297,13 @@ def test_the_scene_scales_with_the_baseline() -> None:
     T = RIG.T_right_left
     rig = Rig(RIG.left, RIG.right, RigidTransform(T.rotation, 2.0 * T.translation))
     lattice = Lattice.at(LATTICE.i0, LATTICE.j0, 2 * LATTICE.cell, LATTICE.rows, LATTICE.cols)
-    large = reconstruct(pair(*maps), rig, T_LOCAL_LEFT, reference_plane(lattice), (-1.6, -0.6), PARAMS)
+    large = reconstruct(pair(*maps), rig, T_LOCAL_LEFT, lattice, (-1.6, -0.6), PARAMS)
     np.testing.assert_allclose(large.elevation, 2.0 * small.elevation, rtol=1e-5)
     np.testing.assert_allclose(large.elevation_std, 2.0 * small.elevation_std, rtol=1e-3)
     np.testing.assert_allclose(large.ortho, small.ortho, rtol=1e-4)
 
 
-def test_a_reference_surface_of_ones_own() -> None:
+def test_a_reference_plane_of_ones_own() -> None:
     """A slope seen from its own parallel plane 4 cm below it."""
     a, b, below = 0.2, -0.15, 0.04
     maps = disparity(RIG, T_LOCAL_LEFT, plane(a, b, -HEIGHT))
@@ -316,26 +314,18 @@ def test_a_reference_surface_of_ones_own() -> None:
     foot = np.array([0.0, 0.9, -HEIGHT + 0.9 * b]) - below * normal
     T = RigidTransform(np.column_stack([across, along, normal]), foot)
     lattice = Lattice.snap((-0.2, 0.2, -0.2, 0.3), 0.01)
-
-    def own(rows: np.ndarray, cols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x, y = lattice.xs()[cols][:, None], lattice.ys()[rows][:, None, None]
-        feet = foot + x * across + y * along
-        return feet, np.broadcast_to(normal, feet.shape).copy()
-
-    surface = Surface(lattice.rows, lattice.cols, own)
-    found = reconstruct(pair(*maps), RIG, T_LOCAL_LEFT, surface, (-0.1, 0.2), PARAMS)
+    found = reconstruct(pair(*maps), RIG, T.inverse() @ T_LOCAL_LEFT, lattice, (-0.1, 0.2), PARAMS)
     seen = np.isfinite(found.elevation)
     assert seen.mean() > 0.9
     points = T.apply(np.dstack([lattice.xy(), np.full(lattice.shape, below)]).reshape(-1, 3)).reshape(*lattice.shape, 3)
     assert (np.abs(found.elevation - below) <= tolerance(maps, points))[seen].all()
 
 
-def test_a_block_border_shows_nowhere() -> None:
-    assert LATTICE.rows > locus_solve.BLOCK_ROWS
+def test_where_coarse_cells_begin_shows_nowhere() -> None:
     maps = disparity(RIG, T_LOCAL_LEFT, plane(0.1, 0.1, -HEIGHT))
     whole = solve(maps, (-1.0, -0.3))
     coarse_start = Lattice.at(LATTICE.i0, LATTICE.j0 - 16, LATTICE.cell, LATTICE.rows - 16, LATTICE.cols)
-    part = reconstruct(pair(*maps), RIG, T_LOCAL_LEFT, reference_plane(coarse_start), (-1.0, -0.3), PARAMS)
+    part = reconstruct(pair(*maps), RIG, T_LOCAL_LEFT, coarse_start, (-1.0, -0.3), PARAMS)
     for name in ("elevation", "residual", "ortho"):
         assert np.allclose(getattr(whole, name)[16:], getattr(part, name), equal_nan=True, atol=2e-3), name
 
@@ -350,7 +340,7 @@ def test_degraded_input() -> None:
         pair(column, row, usable),
         RIG,
         T_LOCAL_LEFT,
-        reference_plane(behind),
+        behind,
         (-1.0, 1.0),
         PARAMS,
     )

@@ -7,7 +7,6 @@ from terrain_scenes import pitched, toed_in_rig
 
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.geometry.surface import plane
 from rille.stages.terrain.locus.coverage import explain
 
 RIG, T_LOCAL_LEFT = toed_in_rig(), pitched(35.0)
@@ -16,7 +15,7 @@ GOOD = np.ones((240, 320), bool)
 
 
 def reason(rig: Rig = RIG, where: Lattice = AHEAD, usable: np.ndarray = GOOD) -> str:
-    return str(explain(rig, T_LOCAL_LEFT, plane(where), (-0.6, -0.4), usable))
+    return str(explain(rig, T_LOCAL_LEFT, where, (-0.6, -0.4), usable))
 
 
 def test_cameras_that_look_away_are_told_with_what_each_sees() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -9,19 +10,18 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from rille.stages.geometry.geometry import rotation_exp
 from rille.stages.terrain.locus.kernel import (
     MARGIN_STEPS,
     SOLVED_PX,
-    BlockCells,
     Bracket,
+    Cells,
     Dem,
     Line,
     Observed,
     PairCameras,
     PairLines,
-    line_of,
     mismatch,
-    projection_rows,
     root,
     search,
     steps_of,
@@ -50,7 +50,7 @@ def cells(n: int = 20, spread: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lines(foot: np.ndarray, normal: np.ndarray) -> PairLines:
-    return PairLines(*(line_of(projection_rows(p), tuple(foot), tuple(normal)) for p in (LEFT, RIGHT)))
+    return PairLines(*(Line(*(p[:, :3] @ foot + p[:, 3]), *(p[:, :3] @ normal)) for p in (LEFT, RIGHT)))
 
 
 def pixel(projection: np.ndarray, point: np.ndarray) -> np.ndarray:
@@ -163,24 +163,25 @@ def stands(at: Callable[[float], tuple[float, float]], below: float, dz: float, 
 def test_of_several_changes_the_one_is_taken_that_the_module_names() -> None:
     """Wavy disparities with gaps; the row disparity refuses some of the roots."""
     n, rng = 32, np.random.default_rng(7)
-    feet, normals = cells(n, 0.15)
-    normals = -normals  # towards the camera
+    turn = rotation_exp([math.pi - 0.15, 0.2, 0.0])  # z towards the camera
+    x, y = (rng.uniform(-0.15, 0.15, k) for k in (8, 4))
+    feet, normal = np.stack([*np.meshgrid(x, y), np.zeros((4, 8))], axis=-1).reshape(-1, 3) @ turn.T, turn[:, 2]
     low, high = (rng.uniform(*ends, n).astype(np.float32) for ends in ((-3.0, -0.8), (-0.8, 0.3)))
     low[::3] = high[::3] - np.float32(0.02)
-    y, x = np.mgrid[:HEIGHT, :WIDTH]
-    waves = -4.5 + 2.5 * np.sin(1.5 * x + y), 0.5 + 0.7 * np.sin(0.7 * x - 0.4 * y)
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    waves = -4.5 + 2.5 * np.sin(1.5 * u + v), 0.5 + 0.7 * np.sin(0.7 * u - 0.4 * v)
     disparity = np.stack(waves, axis=-1).astype(np.float32)
     disparity[rng.random((HEIGHT, WIDTH)) < 0.01] = np.nan
     limit = 0.45
-    out = Dem(*(np.full((1, n), np.nan, np.float32) for _ in range(4)))
-    block = BlockCells(feet[None], normals[None], low[None], high[None])
-    cameras = PairCameras(LEFT, RIGHT, EPIPOLE, SIZES)
-    search(block, (-4.0, 0.4), cameras, observed(disparity, limit, np.inf), out)
+    out = Dem(*(np.full((4, 8), np.nan, np.float32) for _ in range(4)))
+    turned = (np.column_stack([p[:, :3] @ turn, p[:, 3]]) for p in (LEFT, RIGHT))
+    there = Cells(x, y, low.reshape(4, 8), high.reshape(4, 8))
+    search(there, (-4.0, 0.4), PairCameras(*turned, EPIPOLE, SIZES), observed(disparity, limit, np.inf), out)
     met = []
-    for k, found in enumerate(out.elevation[0].astype(float)):
-        pair = lines(feet[k], normals[k])
+    for k, found in enumerate(out.elevation.ravel().astype(float)):
+        pair = lines(feet[k], normal)
         bottom, dz, count, start, last = steps_of(pair, visible(pair, SIZES, (-4.0, 0.4)), (low[k], high[k]))
-        at = partial(lambda k, z: expected(feet[k] + z * normals[k], disparity), k)
+        at = partial(lambda k, z: expected(feet[k] + z * normal, disparity), k)
         steps = changes(np.array([at(bottom + j * dz)[0] for j in range(count + 1)]), start, int(last))
         verdicts = [stands(at, bottom + step * dz, dz, limit) for step in steps]
         tried, (where, verdict) = next(((i, v) for i, v in enumerate(verdicts) if v[1] != "no"), (0, (np.nan, "no")))
