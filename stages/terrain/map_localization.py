@@ -3,11 +3,10 @@
 The model is level, or nearly so: x, y, z, heading and a small tilt place it. It is averaged over blocks as wide as the
 map's cells, for single cells would differ from the map by their relief and not by a wrong place.
 
-1. Every place and heading is tried that a coarse version of map and model tells apart. The score is the mean square of
-   the height differences about their own plane, which takes out height and tilt. With weights w of the model's blocks
-   and k of the map's known cells, all sums over a place are correlations of w, w z, k, k h and moments of w with each
-   other (masked registration: Padfield 2012, doi:10.1109/TIP.2011.2181402), which the fast Fourier transform gives for
-   all places of a heading at once.
+1. Every place and heading is tried that a coarse version of map and model tells apart. The score is the variance of
+   the height differences. With weights w of the model's blocks and k of the map's known cells, all sums over a place
+   are correlations of w, w z, w z^2 with k, k h, k h^2 (masked registration: Padfield 2012,
+   doi:10.1109/TIP.2011.2181402), which the fast Fourier transform gives for all places of a heading at once.
 2. The best places that are no neighbours are each refined on the map itself by Gauss-Newton with Huber's weights. The
    slopes are those of the model, whose noise is less than the map's: noise in slopes would count as relief and make the
    covariance too small. The tilt has a prior, ``sigma_tilt_deg``.
@@ -88,6 +87,11 @@ class SearchArea:
     heading: float
     distance: float
     turn: float
+
+    @property
+    def place(self) -> tuple[float, float, float]:
+        """x, y and heading of its middle."""
+        return self.x, self.y, self.heading
 
 
 @dataclass(frozen=True)
@@ -241,14 +245,20 @@ def fix(
     if (tries := _tries(coarse, far, wide)) > MAX_TRIES_AT_ALL:
         text = f"the map is too large to be searched: {tries:.1g} places and headings, at most {MAX_TRIES_AT_ALL:.0g}"
         raise InputError("RIL-840", text, remedy="name a start, or one that is nearer")
-    fine = thin(elevation, lattice, max(0.5 * coarse.cell, lattice.cell))
     rough = thin(elevation, lattice, coarse.cell)
     near, fits = NEIGHBOURS * coarse.cell, list[_Fit]()
-    for start in _search(fine.points - middle, coarse, wide, middle, params.min_overlap):
+    for start in _search(rough.points - middle, coarse, wide, middle, params.min_overlap):
         fit = _refined(rough, coarse, middle, start, near, params)
         fit = fit and _refined(blocks, ground, middle, fit.state, near, params)
         fits += [fit] if fit else []
-    inside = [fit for fit in fits if _beyond(fit.state, around, middle, far) <= near]
+
+    def apart(fit: _Fit, place: Floats) -> tuple[float, float]:
+        """Distances, m, from a place (x, y, heading) of the origin, and of the farthest points by the turn alone."""
+        x, y, turn = fit.place(middle) - place
+        return math.hypot(x, y), abs(math.remainder(turn, 2.0 * math.pi)) * far
+
+    allowed = around.distance + near, around.turn * far + near
+    inside = [fit for fit in fits if np.all(np.less_equal(apart(fit, np.array(around.place)), allowed))]
     best = min(inside, key=lambda fit: fit.square, default=None)
     if best is None or _condition(best.normal) < MIN_EIGENVALUE:
         raise DegenerateError(
@@ -257,29 +267,12 @@ def fix(
             remedy="give a finer map, another start, or a model of more ground",
         )
     placed = _placed(best, blocks, middle, math.radians(params.sigma_tilt_deg))
-    rivals = [fit for fit in fits if _apart(fit.state, best.state, far) > near]
+    rivals = [fit for fit in fits if max(apart(fit, best.place(middle))) > near]
     if not rivals:  # all of the best starts led to one place: what is worse than they are is no rival
         return placed
     other = min(rivals, key=lambda fit: fit.square)
     chi2 = placed.independent * math.log(max(other.square, 1e-24) / max(best.square, 1e-24))
-    return replace(placed, other=(np.array([*_origin(other.state, middle), other.state[5]]), chi2))
-
-
-def _origin(state: Floats, middle: Floats) -> Floats:
-    """x, y of the model's origin."""
-    return np.asarray(state[:2] - np.array(_turned(middle[None], state[5]))[:, 0])
-
-
-def _apart(a: Floats, b: Floats, far: float) -> float:
-    """Distance, m, of two places, or of the farthest points of a model that is turned from one to the other."""
-    return max(math.hypot(*(a - b)[:2]), abs(math.remainder(a[5] - b[5], 2.0 * math.pi)) * far)
-
-
-def _beyond(state: Floats, around: SearchArea, middle: Floats, far: float) -> float:
-    """Distance, m, of a place from what is searched, likewise."""
-    x, y = _origin(state, middle)
-    turned = abs(math.remainder(state[5] - around.heading, 2.0 * math.pi))
-    return max(math.hypot(x - around.x, y - around.y) - around.distance, (turned - around.turn) * far)
+    return replace(placed, other=(other.place(middle), chi2))
 
 
 def _tries(ground: GlobalMap, far: float, around: SearchArea) -> float:
@@ -329,8 +322,8 @@ def _turned(points: Floats, heading: float) -> tuple[Floats, Floats]:
 
 
 def _scores(points: Floats, ground: GlobalMap, headings: Floats) -> Iterator[tuple[Floats, Floats]]:
-    """Of each heading: mean square (row, col), m2, of the differences about their plane, with the middle of the model
-    at each cell, and the share of the model that the map knows there."""
+    """Of each heading: variance (row, col), m2, of the differences, with the middle of the model at each cell, and the
+    share of the model that the map knows there."""
     far = math.ceil(float(np.hypot(*points[:, :2].T).max()) / ground.cell) + 1
     side, (rows, cols) = 2 * far + 1, ground.heights.shape
     known = np.isfinite(ground.heights)
@@ -341,27 +334,18 @@ def _scores(points: Floats, ground: GlobalMap, headings: Floats) -> Iterator[tup
     maps = np.zeros((3, *shape))
     maps[:, far : far + rows, far : far + cols] = known, heights, heights**2
     k, h, hh = scipy.fft.rfft2(maps)
-    v, u = np.mgrid[-1.0 : 1.0 : side * 1j, -1.0 : 1.0 : side * 1j]
-    moments = np.stack([np.ones((side, side)), u, v, u * u, u * v, v * v])
     for heading in headings:
         x, y = _turned(points, heading)
         at = (far - np.rint(y / ground.cell).astype(int)) * side + far + np.rint(x / ground.cell).astype(int)
         count = np.bincount(at, minlength=side * side)
-        z = (np.bincount(at, points[:, 2], side * side) / np.maximum(count, 1)).reshape(side, side)
-        w = (count > 0).reshape(side, side)
+        z = np.bincount(at, points[:, 2], side * side) / np.maximum(count, 1)
+        model = np.stack([count > 0, z, z * z]).reshape(3, side, side)
         # Conjugates: correlations, not convolutions.
-        model = np.conj(scipy.fft.rfft2(np.stack([*(w * moments), *(z * moments[:3]), z * z]), shape))
-        products = [
-            *(k * model[:6]),
-            *(h * model[:3] - k * model[6:9]),
-            hh * model[0] - 2 * h * model[6] + k * model[9],
-        ]
-        n, su, sv, uu, uv, vv, d, du, dv, dd = scipy.fft.irfft2(np.stack(products), shape)[:, :rows, :cols]
-        overlap, n = n / w.sum(), np.maximum(n, 1.0)
-        uu, uv, vv = uu - su * su / n, uv - su * sv / n, vv - sv * sv / n
-        du, dv = du - su * d / n, dv - sv * d / n
-        plane = (du * du * vv - 2 * du * dv * uv + dv * dv * uu) / np.maximum(uu * vv - uv * uv, 1e-9)
-        yield np.maximum((dd - d * d / n - plane) / n, 0.0), overlap
+        w, wz, wzz = np.conj(scipy.fft.rfft2(model, shape))
+        products = np.stack([k * w, h * w - k * wz, hh * w - 2 * h * wz + k * wzz])
+        n, d, dd = scipy.fft.irfft2(products, shape)[:, :rows, :cols]
+        overlap, n = n / model[0].sum(), np.maximum(n, 1.0)
+        yield np.maximum((dd - d * d / n) / n, 0.0), overlap
 
 
 class _Fit(NamedTuple):
@@ -372,6 +356,10 @@ class _Fit(NamedTuple):
     square: float
     differences: Floats
     normal: Floats
+
+    def place(self, middle: Floats) -> Floats:
+        """x, y and heading of the model's origin."""
+        return np.array([*(self.state[:2] - np.ravel(_turned(middle[None], self.state[5]))), self.state[5]])
 
 
 def _rotation(state: Floats) -> Floats:
