@@ -47,29 +47,27 @@ class GroundPlane:
     reach: float = 0.0
 
 
-def fit_plane(
-    rays: Floats,
-    rho: Floats,
-    sigma: Floats,
-    allowed: Callable[[Floats], Bools],
-    relief: float,
-    rng: np.random.Generator,
-) -> GroundPlane:
+class Samples(NamedTuple):
+    """Rays (n, 3) with z = 1 of the left camera, inverse depths ``rho`` (n,) and their standard deviations, 1/m."""
+
+    rays: Floats
+    rho: Floats
+    sigma: Floats
+
+
+def fit_plane(samples: Samples, allowed: Callable[[Floats], Bools]) -> GroundPlane:
     """Robust ground plane: RANSAC among the allowed normals, then iteratively re-weighted least squares.
 
     Parameters
     ----------
-    rays : (n, 3) with z = 1, left camera frame.
-    rho, sigma : (n,) inverse depth and its error, 1/m.
     allowed : which of the normals (m, 3) pointing up may be the ground's.
-    relief : deviation from the plane that still counts as ground, as a share of the camera's height.
-    rng : generator of the samples.
 
     Raises
     ------
     DegenerateError
         No allowed plane holds a twentieth of the points.
     """
+    rays, rho, sigma = samples
     if rays.shape[0] < MIN_POINTS:
         raise DegenerateError(
             "RIL-342",
@@ -77,8 +75,8 @@ def fit_plane(
             remedy="check exposure and focus, and that left and right show one scene",
         )
     # dh of height changes 1/Z by the share dh/h.
-    tolerance = np.sqrt((2.0 * sigma) ** 2 + (relief * rho) ** 2)
-    theta = _consensus(rays, rho, sigma, tolerance, allowed, rng)
+    tolerance = np.sqrt((2.0 * sigma) ** 2 + (MAX_RELIEF_SHARE * rho) ** 2)
+    theta = _consensus(samples, tolerance, allowed)
     if theta is not None:
         information = tolerance**-2.0
 
@@ -99,20 +97,15 @@ def fit_plane(
 
 MIN_POINTS = 100
 MIN_GROUND_SHARE = 0.05
+MAX_RELIEF_SHARE = 0.02  # largest distance of ground from the plane, of the camera's height
 MIN_HORIZON_SIGMAS = 5.0  # an inverse depth of fewer of its sigmas agrees with any plane, and is not counted
 
 
-def _consensus(
-    rays: Floats,
-    rho: Floats,
-    sigma: Floats,
-    tolerance: Floats,
-    allowed: Callable[[Floats], Bools],
-    rng: np.random.Generator,
-) -> Floats | None:
+def _consensus(samples: Samples, tolerance: Floats, allowed: Callable[[Floats], Bools]) -> Floats | None:
     """The allowed plane of most agreement among planes through three points; None: none is allowed."""
+    rays, rho, sigma = samples
     # An all-ground sample of three is among a thousand (p > .999) where a fifth of the pixels are ground.
-    triples = rng.integers(0, rays.shape[0], size=(1000, 3))
+    triples = np.random.default_rng(1999).integers(0, rays.shape[0], size=(1000, 3))
     volume = np.abs(np.linalg.det(rays[triples]))
     # Three rays that lie nearly in one plane with the camera do not fix the ground.
     triples = triples[volume > 1e-3 * np.ptp(rays[:, 0]) * np.ptp(rays[:, 1])]
@@ -131,14 +124,6 @@ def _consensus(
     # Truncated quadratic agreement with the points.
     best = np.argmax(np.sum(agreement, axis=1, where=seen))
     return np.asarray(theta[int(best)], dtype=np.float64)
-
-
-class Samples(NamedTuple):
-    """Rays (n, 3) with z = 1 of the left camera, inverse depths ``rho`` (n,) and their standard deviations, 1/m."""
-
-    rays: Floats
-    rho: Floats
-    sigma: Floats
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ normal towards the camera, x the right of the image. All that reads elevations w
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -51,7 +51,6 @@ SCENE = "scene"
 
 MAX_TILT_DEG = 30.0  # largest slope of the ground, and largest roll of an unknown attitude
 MIN_PITCH_DEG, MAX_PITCH_DEG = -20.0, 75.0  # downward pitch of a rig whose attitude is unknown
-MAX_RELIEF_SHARE = 0.02  # largest distance of ground from the plane, of the camera's height
 RELIEF_MARGIN_SHARE = 0.05  # of the camera's height, that the range of elevations is widened by: a low rock, a kerb
 MAX_HEIGHTS = 2.0  # greatest elevation above the ground that is searched, camera heights
 DEFAULT_RANGE_CELLS = 6.0  # of the footprint in meta; the stage locus has its own parameter
@@ -115,7 +114,7 @@ def level(
     rays, rho, sigma = samples
     ground = None
     try:
-        ground = _fitted(samples, lambda n: _allowed(n, known_up))
+        ground = fit_plane(samples, lambda n: _allowed(n, known_up))
         R_local_left = level_rotation(ground.up if known_up is None else known_up)
         return _on_ground(ground, R_local_left, samples, rig, params.sigma_disparity, source or GROUND_PLANE)
     except DegenerateError as error:
@@ -144,7 +143,7 @@ def level(
     if known_up is not None:
         with suppress(DegenerateError):
             # The images may show ground where the given vertical has none: then one of the two is wrong.
-            facts["seen_up"] = _fitted(samples, lambda n: _allowed(n, None)).up.tolist()
+            facts["seen_up"] = fit_plane(samples, lambda n: _allowed(n, None)).up.tolist()
     if ground is not None and isinstance(why, CoarseGroundError) and ground.inliers >= MIN_DOMINANT_SHARE:
         # Larger cells than those that suit the rig may still make a map.
         plane, everywhere = _local_plane(ground, R_local_left), [-math.inf, math.inf] * 2
@@ -154,18 +153,13 @@ def level(
     return facts
 
 
-def _fitted(samples: Samples, allowed: Callable[[Floats], Bools]) -> GroundPlane:
-    """The ground plane that the samples show, with a normal that is allowed."""
-    return fit_plane(*samples, allowed, MAX_RELIEF_SHARE, np.random.default_rng(1999))
-
-
 def _explained(error: DegenerateError, samples: Samples, ground: GroundPlane | None) -> tuple[DegenerateError, float]:
     """Why there is no ground, or none that is seen well enough, with the remedy of that cause; and the share of the
     samples on another plane, 0 where none dominates."""
     if not isinstance(error, NoGroundError) or (ground is not None and ground.inliers >= MIN_DOMINANT_SHARE):
         return error, 0.0
     try:
-        seen = _fitted(samples, lambda n: np.ones(len(n), dtype=bool))
+        seen = fit_plane(samples, lambda n: np.ones(len(n), dtype=bool))
     except DegenerateError:
         seen = None
     if seen is None or seen.inliers < MIN_DOMINANT_SHARE:
@@ -209,7 +203,7 @@ def scene_plane(samples: Samples) -> GroundPlane:
         raise NoGroundError("RIL-385", "no pixel is matched, so no surface is seen")
     view = rays.mean(axis=0) / np.linalg.norm(rays.mean(axis=0))
     with suppress(NoGroundError):
-        plane = _fitted(samples, lambda n: np.asarray(-n @ view >= math.cos(math.radians(MAX_SLANT_DEG))))
+        plane = fit_plane(samples, lambda n: np.asarray(-n @ view >= math.cos(math.radians(MAX_SLANT_DEG))))
         if plane.inliers >= MIN_DOMINANT_SHARE:
             return plane
     return GroundPlane(np.array([0.0, 0.0, -1.0]), 1.0 / max(float(np.median(rho)), 1e-9))

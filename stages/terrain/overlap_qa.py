@@ -39,7 +39,7 @@ class SeamFit(NamedTuple):
     over the cells, m."""
 
     bias: float
-    tilt: Floats
+    tilt: list[float]
     noise: float
     systematic: float
 
@@ -56,7 +56,9 @@ def fit_seam(difference: Floats, x: Floats, y: Floats) -> SeamFit | None:
     # Standard deviations at half weight: 95 % efficiency where errors are normal.
     plane = irls(design, z, lambda r: cauchy(r, 2.385 * mad_sigma(r, 0.0) + floor), rounds=8)
     surface = design @ plane
-    return SeamFit(float(plane[0]), plane[1:], mad_sigma(z - surface, 0.0), math.sqrt(float(np.mean(surface**2))))
+    return SeamFit(
+        float(plane[0]), plane[1:].tolist(), mad_sigma(z - surface, 0.0), math.sqrt(float(np.mean(surface**2)))
+    )
 
 
 def seam(dem: Bundle, own: Mapping[str, Floats32], other: Bundle) -> dict[str, Any] | None:
@@ -82,10 +84,7 @@ def seam(dem: Bundle, own: Mapping[str, Floats32], other: Bundle) -> dict[str, A
         "pair": int(dem.meta["pair"]),
         "other": int(other.meta["pair"]),
         "cells": int(np.count_nonzero(known)),
-        "bias": fit.bias,
-        "tilt": fit.tilt.tolist(),
-        "noise": fit.noise,
-        "systematic": fit.systematic,
+        **fit._asdict(),
         "expected": float(np.median(np.hypot(std[0][seen], std[1][seen]))),
         "log_ratio": _log_ratio(grey[0][seen], grey[1][seen]),
     }

@@ -43,7 +43,7 @@ class Straddle(NamedTuple):
     be below a point of the belly; ``stand`` (2, row, col) at which a wheel stands at least and at most, NaN unknown.
 
     ``weights`` (point, wheel) of the belly's points; ``limits``: track, wheel base, clearance (m) and the greatest
-    squared gradient. Without bounds all arrays of heights are empty.
+    squared gradient.
     """
 
     void: Floats32
@@ -53,16 +53,13 @@ class Straddle(NamedTuple):
     limits: Floats
 
     @staticmethod
-    def of(void: Floats32, bounds: Bounds | None, vehicle: Vehicle, belly: Floats, cell: float) -> Straddle:
+    def of(void: Floats32, bounds: Bounds, vehicle: Vehicle, belly: Floats, cell: float) -> Straddle:
         """``belly`` (point, 2) right and ahead of the middle, m; ``cell`` side of a cell, m."""
         gradient = math.tan(math.radians(vehicle.max_slope_deg))
         limits = np.array([vehicle.track, vehicle.wheel_base, vehicle.clearance, gradient * gradient])
         share = belly / limits[:2]
         # Bilinear weights of the four wheels: products of a share along the track and one along the wheel base.
         weights = np.prod(0.5 + share[:, None] * np.sign(wheel_positions(vehicle)), axis=-1)
-        if bounds is None:
-            nothing = np.empty((0, 0), np.float32)
-            return Straddle(void, nothing, np.stack([nothing, nothing]), weights, limits)
         seen = np.isfinite(bounds.lower)
         # A point stands for the square of belly about it, half a diagonal wide, and the margin beyond.
         apart = max(float(np.diff(np.unique(side)).max()) for side in belly.T)
@@ -85,13 +82,11 @@ def stands(straddle, at, heights):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    straddle : :class:`Straddle`; without bounds the answer is False.
+    straddle : :class:`Straddle`.
     at : (4, 2) row and column of the cells under the wheels: front left, front right, rear left, rear right.
     heights : (4,), m; filled with the least height at which each wheel stands.
     """
     stand = straddle.stand
-    if stand.shape[1] == 0:
-        return False
     for k in range(4):
         heights[k] = stand[0, at[k, 0], at[k, 1]]
         if math.isnan(heights[k]):
@@ -248,7 +243,9 @@ class Footing:
         )
         wide = _opened(unknown, 0.5 * vehicle.wheel_diameter, cell)
         # Where lines of sight bound the hidden ground, the belly may pass; elsewhere unknown ground is a void to it.
-        void = distance(unknown if bounds is None else unknown & np.isnan(bounds.upper), cell)
+        nothing = np.full(risk.shape, np.nan, np.float32)
+        bounds = bounds or Bounds(nothing, nothing)
+        void = distance(unknown & np.isnan(bounds.upper), cell)
         straddle = Straddle.of(void, bounds, vehicle, _belly(vehicle), cell)
         unseen, frontier = distance(unknown, cell), distance(wide, cell)
         maps = FootingMaps(wheels, body, unseen, frontier, cost_class, straddle)

@@ -212,7 +212,8 @@ class Ground:
             metres = piece.length * (self.reverse_cost if piece.gear < 0 else 1.0)
             cost += turn * float(price[:n].max()) + metres * float(price[n:].mean())
             # The known part is driven now: cut there, or a whole long piece would count as unknown.
-            first = piece.length * float(share[np.argmin(known) - 1])  # metres before the first pose not known
+            unknown = int(np.argmin(known))
+            first = piece.length * float(share[unknown - 1]) if unknown else 0.0  # metres before that pose
             if not known.all() and first > 0:
                 out.append(replace(piece.cut(first), known=True))
                 piece = replace(piece, a=out[-1].b)
