@@ -43,6 +43,8 @@ def replacements() -> dict[str, tuple[Any, str, Any]]:
         "cost of unseen spots narrower than a wheel": (clearance, "_opened", lambda mask, *_: mask),
         "cost of caution and doubted ground": (ground, "CAUTION_COST", 1e-9),
         "lower cost of ground seen from afar": (ground, "FAR_COST", ground.UNKNOWN_COST),
+        "lower cost of far doubts": (ground, "NEAR_WHEELBASES", float("inf")),
+        "ground no worse than that under the vehicle": (ground, "HERE_WHEELBASES", -1.0),
         "cost of doubtful ground": (ground, "LIKELY_COST", ground.UNKNOWN_COST),
     }
 

@@ -247,6 +247,12 @@ def test_a_kept_way_is_not_given_up_for_rounding(monkeypatch: pytest.MonkeyPatch
     assert leg.path[-1, 1] < 0.15 - 0.5 * ROVER.wheel_base + LATTICE.cell
 
 
+def test_a_kept_piece_that_begins_on_unknown_ground_is_not_known_to_its_end() -> None:
+    there = Ground(ground(((np.abs(Y - 0.4) < 0.05), UNKNOWN)), START, 0.0, P)
+    onward = through(np.array([(0.0, 0.4), GOAL]), AHEAD[:1], 0.0)
+    assert [(piece.known, piece.length) for piece in there.again(onward)[0]] == [(False, pytest.approx(0.4))]
+
+
 def judged(hazardous: np.ndarray, chance: float) -> Bundle:
     risk = np.where(hazardous, np.uint8(HAZARDOUS), np.uint8(SAFE))
     maps = {"risk": risk, "reason": np.where(hazardous, np.uint16(REASONS["step"]), np.uint16(0))}
