@@ -164,9 +164,9 @@ def _seen(view: ViewPair, cells: Floats, camera: Camera) -> tuple[NDArray[np.int
     ok[ok] &= view.matched[at[ok, 1], at[ok, 0]]
     at, cells, depth = at[ok], cells[ok], in_camera[ok, 2]
     # By pixel, then by depth: the first of each pixel is the one that hides the others.
-    order = np.lexsort((depth, at[:, 0], at[:, 1]))
-    flat = (at[:, 1] * cols + at[:, 0])[order]
-    keep = order[np.concatenate([[True], np.diff(flat) != 0])] if len(order) else order
+    flat = at[:, 1] * cols + at[:, 0]
+    order = np.lexsort((depth, flat))
+    keep = order[np.unique(flat[order], return_index=True)[1]]
     centre = (at[keep] + 0.5) * scale - 0.5
     rays = camera.rays(centre) @ view.before.rotation.T
     origin = view.before.translation

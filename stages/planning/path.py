@@ -35,7 +35,6 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, Memory, stage
@@ -296,10 +295,10 @@ def _check_end(maps: Maps, lattice: Lattice, vehicle: Vehicle, name: str, point:
         )
     kind = maps["risk"][row, col]
     if kind == UNKNOWN:
-        free = np.argwhere(maps["risk"] < HAZARDOUS)
-        away = (
-            f", the nearest ground to drive on is {_away(free, row, col, lattice.cell):.3g} m away" if len(free) else ""
-        )
+        free, away = np.argwhere(maps["risk"] < HAZARDOUS), ""
+        if len(free):
+            metres = float(np.hypot(*(free - (row, col)).T).min()) * lattice.cell
+            away = f", the nearest ground to drive on is {metres:.3g} m away"
         raise InputError("RIL-407", f"{where} lies on unknown ground{away}", remedy=f"choose another {name}")
     if kind == HAZARDOUS:
         raise InputError(
@@ -307,10 +306,6 @@ def _check_end(maps: Maps, lattice: Lattice, vehicle: Vehicle, name: str, point:
             f"{where} lies in a hazard: {hazard_words(maps, (row, col), vehicle)}",
             remedy=f"choose another {name}",
         )
-
-
-def _away(cells: NDArray[np.intp], row: int, col: int, cell: float) -> float:
-    return float(np.hypot(cells[:, 0] - row, cells[:, 1] - col).min()) * cell
 
 
 def first_costs(starts: Bools, row: int, cell: float) -> Ints:

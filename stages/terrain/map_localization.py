@@ -199,14 +199,12 @@ class GlobalMap:
 
     def within(self, x: float, y: float, distance: float) -> GlobalMap:
         """The part within a distance of a place along either axis; it may be empty."""
-        rows, cols = self.heights.shape
-        row, col = (self.y0 - y) / self.cell, (x - self.x0) / self.cell
-        first, last = (
-            [min(max(round(at + side * distance / self.cell), 0), n) for at, n in ((row, rows), (col, cols))]
-            for side in (-1, 1)
+        at = np.array([self.y0 - y, x - self.x0])
+        (row, col), (last, right) = (
+            np.clip(np.rint((at + side * distance) / self.cell), 0, self.heights.shape).astype(int) for side in (-1, 1)
         )
-        part = self.heights[first[0] : last[0], first[1] : last[1]]
-        return replace(self, heights=part, x0=self.x0 + first[1] * self.cell, y0=self.y0 - first[0] * self.cell)
+        x0, y0 = self.x0 + float(col) * self.cell, self.y0 - float(row) * self.cell
+        return replace(self, heights=self.heights[row:last, col:right], x0=x0, y0=y0)
 
 
 def fix(

@@ -122,6 +122,4 @@ def cubes(position: Floats, side: float) -> NDArray[np.int64]:
 def one_a_cube(cube: NDArray[np.int64], sigma: Floats32) -> NDArray[np.intp]:
     """Indices, ascending, of the most certain point of each cube."""
     order = np.lexsort((sigma, cube))
-    change = np.ones(len(order), bool)
-    change[1:] = np.diff(cube[order]) != 0
-    return np.sort(order[change])
+    return np.sort(order[np.unique(cube[order], return_index=True)[1]])

@@ -8,10 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
-from rille.stages.core.arrays import Bools, Floats32
+from rille.stages.core.arrays import Bools
 from rille.stages.core.declare import Params
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
@@ -96,20 +96,21 @@ def cameras_of(rig: Rig, T_local_left: RigidTransform) -> PairCameras:
 def solve(seen: Observed, cameras: PairCameras, lattice: Lattice, z_range: tuple[float, float]) -> Dem:
     """Every cell of a lattice, coarse to fine: a few coarse cells search the whole ``z_range``, m."""
 
-    def searched(rows: NDArray[np.intp], cols: NDArray[np.intp], low: Floats32, high: Floats32) -> Dem:
-        out = Dem(*np.full((4, len(rows), len(cols)), np.nan, np.float32))
-        search(Cells(lattice.xs()[cols], lattice.ys()[rows], low, high), z_range, cameras, seen, out)
+    def searched(cells: Cells) -> Dem:
+        out = Dem(*np.full((4, *cells.low.shape), np.nan, np.float32))
+        search(cells, z_range, cameras, seen, out)
         return out
 
-    every = [np.arange(n) for n in lattice.shape]
+    rows, cols, xs, ys = np.arange(lattice.rows), np.arange(lattice.cols), lattice.xs(), lattice.ys()
     # The last row and column as well, so that every cell lies between coarse ones.
-    coarse = [np.unique(np.append(n[::COARSE_CELLS], n[-1])) for n in every]
-    whole = [np.full([len(n) for n in coarse], z, np.float32) for z in z_range]
-    padded = np.pad(searched(*coarse, *whole).elevation, 2, constant_values=np.nan)
+    few, sparse = (np.unique(np.append(n[::COARSE_CELLS], n[-1])) for n in (rows, cols))
+    low, high = (np.full((len(few), len(sparse)), z, np.float32) for z in z_range)
+    padded = np.pad(searched(Cells(xs[sparse], ys[few], low, high)).elevation, 2, constant_values=np.nan)
+    # Of the 4 x 4 coarse cells around; NaN gives way, since one known neighbour is enough to say where to search.
     around = np.lib.stride_tricks.sliding_window_view(padded, (4, 4))
-    near = np.ix_(*(n // COARSE_CELLS + 1 for n in every))
-    # Lowest and highest of the 4 x 4 coarse cells around. NaN gives way: one known neighbour is enough.
-    return searched(*every, *(extreme.reduce(around, axis=(2, 3))[near] for extreme in (np.fmin, np.fmax)))
+    near = np.ix_(rows // COARSE_CELLS + 1, cols // COARSE_CELLS + 1)
+    low, high = (extreme.reduce(around, axis=(2, 3))[near] for extreme in (np.fmin, np.fmax))
+    return searched(Cells(xs, ys, low, high))
 
 
 def join(a: Dem, b: Dem) -> Dem:

@@ -107,8 +107,8 @@ def reconstruct(
         apart = out.elevation - other.elevation
         out = join(out, other)
     if right is not None and (params.refine_steps or back is not None):
-        both = (View(P, coefficients(a)) for P, a in ((cameras.left, image), (cameras.right, right)))
-        seen = SurfaceViews(*both, T_local_left.translation)
+        one, two = (View(P, coefficients(a)) for P, a in ((cameras.left, image), (cameras.right, right)))
+        seen = SurfaceViews(one, two, T_local_left.translation)
         _refine(out, seen, lattice, params, apart)
     leave_out_unsure(out, greatest_std(params, pair.matches.std is not None))
     return out
