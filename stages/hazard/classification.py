@@ -22,9 +22,10 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+from pydantic import Field
 
 from rille.stages.core.arrays import Bytes, Floats32
-from rille.stages.core.declare import AnyArray
+from rille.stages.core.declare import AnyArray, Params
 from rille.stages.hazard.measures import MEASURES, HazardInput, Measure
 
 Bits = NDArray[np.uint16]
@@ -64,13 +65,42 @@ MIN_RELATIVE_STD = 1e-12
 NO_BITS = np.uint16(0)
 
 
-class Rules(NamedTuple):
-    """Thresholds of the classes: parameters of ``risk``."""
+class RiskParams(Params):
+    """Parameters of ``risk``; the limits themselves are the vehicle's."""
 
-    sigmas: float
-    caution: float
-    max_p: float
-    min_known: float
+    window: float = Field(
+        default=1.0,
+        gt=0,
+        le=20,
+        description="side of the window [wheel diameters] in which terrain is judged; a wheel bridges what is finer",
+    )
+    sigmas: float = Field(
+        default=1.25,
+        ge=0,
+        le=10,
+        description="number of standard deviations added to a measure before it is compared with its limit",
+    )
+    caution: float = Field(
+        default=0.75,
+        gt=0,
+        le=1,
+        description="share of a limit from which a cell is caution ground; 0.75 is the usual reserve",
+    )
+    max_p: float = Field(
+        default=0.02, gt=0, lt=0.5, description="probability of a hazard from which a cell is caution ground"
+    )
+    min_known: float = Field(
+        default=0.5,
+        gt=0,
+        le=1,
+        description="smallest known share of the window; below it a cell is unknown; 0.5 is a straight border",
+    )
+    max_hole: float = Field(
+        default=0.5,
+        ge=0,
+        le=1,
+        description="widest hole [wheel diameters] that is closed; over 0.5 a wheel sinks by 0.07 diameters",
+    )
 
 
 class Verdicts(NamedTuple):
@@ -83,7 +113,7 @@ class Verdicts(NamedTuple):
 
 
 def classify(
-    terrain: HazardInput, filled: Bytes, rules: Rules, measures: tuple[Measure, ...] = MEASURES
+    terrain: HazardInput, filled: Bytes, params: RiskParams, measures: tuple[Measure, ...] = MEASURES
 ) -> dict[str, AnyArray]:
     """Classes, reasons and rasters (row, col) of :func:`rille.stages.hazard.risk.risk_map`.
 
@@ -107,17 +137,17 @@ def classify(
 
     nothing = Verdicts(np.zeros_like(share), np.full_like(share, -MAX_EXCESS), np.zeros(share.shape, np.uint16))
     on_cells, on_blocks = ([m for m in measures if m.on_blocks == kind] for kind in (False, True))
-    judged = _judged(nothing, terrain, rules.sigmas, [(m, values[m.name]) for m in on_blocks], (noise, doubt))
+    judged = _judged(nothing, terrain, params.sigmas, [(m, values[m.name]) for m in on_blocks], (noise, doubt))
     wide = np.stack([spread(a) for a in noise]), np.stack([spread(a) for a in doubt])
     fine, cells = [(m, values[m.name]) for m in on_cells], Verdicts(*(spread(a) for a in judged))
-    load, excess, over = _judged(cells, terrain, rules.sigmas, fine, wide)
+    load, excess, over = _judged(cells, terrain, params.sigmas, fine, wide)
     steps = np.floor(np.clip(excess, -MAX_EXCESS, MAX_EXCESS) * STEPS_PER_EXCESS) + MAX_EXCESS * STEPS_PER_EXCESS
     p = _table()[steps.astype(np.intp)]
     # A hazard that is proven by a part of the window stays one, however little is known.
     known = ~np.isnan(terrain.closed)
     hazardous = known & (load > 1)
-    unknown = ~(hazardous | (known & (spread(share) >= rules.min_known)))
-    careful = (load > rules.caution) | (p > rules.max_p)
+    unknown = ~(hazardous | (known & (spread(share) >= params.min_known)))
+    careful = (load > params.caution) | (p > params.max_p)
     risk = np.select([unknown, hazardous, careful], [UNKNOWN, HAZARDOUS, CAUTION], SAFE).astype(np.uint8)
     reason = spread(flags) | np.where(filled != 0, np.uint16(FILLED_BIT), NO_BITS)
     reason |= np.where(hazardous, over | np.where(excess <= 0, np.uint16(DOUBT_BIT), NO_BITS), NO_BITS)

@@ -26,10 +26,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from rille.stages.core.arrays import Floats32
-from rille.stages.core.declare import Bundle, Memory, Params, raster, stage
+from rille.stages.core.declare import Bundle, Memory, raster, stage
 from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.planning import RiskFacts
 from rille.stages.geometry.lattice import Lattice, mosaic, union
@@ -42,14 +41,14 @@ from rille.stages.hazard.classification import (
     UNKNOWN,
     UNKNOWN_BIT,
     UNSEEN_BIT,
-    Rules,
+    RiskParams,
     classify,
 )
 from rille.stages.hazard.measures import BITS, MEASURES, HazardInput, window_reach
 from rille.stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
 from rille.stages.numeric.holes import close_holes
 
-__all__ = ["BITS", "CAUTION", "DOUBT_BIT", "HAZARDOUS", "REASONS", "SAFE", "UNKNOWN", "UNKNOWN_BIT", "risk_map"]
+__all__ = ["CAUTION", "DOUBT_BIT", "HAZARDOUS", "REASONS", "SAFE", "UNKNOWN", "UNKNOWN_BIT", "RiskParams", "risk_map"]
 
 
 CLASSES = {"safe": SAFE, "caution": CAUTION, "hazardous": HAZARDOUS, "unknown": UNKNOWN}
@@ -57,44 +56,6 @@ CLASSES = {"safe": SAFE, "caution": CAUTION, "hazardous": HAZARDOUS, "unknown": 
 REASONS = BITS | {"unknown": UNKNOWN_BIT, "filled": FILLED_BIT, "uncertain": DOUBT_BIT, "unseen": UNSEEN_BIT}
 """Bits of ``reason``: a measure over its limit; too little known to judge; elevation interpolated; over a limit only
 because of sigma; some of the ground that is looked at is unknown."""
-
-
-class RiskParams(Params):
-    """Parameters of ``risk``; the limits themselves are the vehicle's."""
-
-    window: float = Field(
-        default=1.0,
-        gt=0,
-        le=20,
-        description="side of the window [wheel diameters] in which terrain is judged; a wheel bridges what is finer",
-    )
-    sigmas: float = Field(
-        default=1.25,
-        ge=0,
-        le=10,
-        description="number of standard deviations added to a measure before it is compared with its limit",
-    )
-    caution: float = Field(
-        default=0.75,
-        gt=0,
-        le=1,
-        description="share of a limit from which a cell is caution ground; 0.75 is the usual reserve",
-    )
-    max_p: float = Field(
-        default=0.02, gt=0, lt=0.5, description="probability of a hazard from which a cell is caution ground"
-    )
-    min_known: float = Field(
-        default=0.5,
-        gt=0,
-        le=1,
-        description="smallest known share of the window; below it a cell is unknown; 0.5 is a straight border",
-    )
-    max_hole: float = Field(
-        default=0.5,
-        ge=0,
-        le=1,
-        description="widest hole [wheel diameters] that is closed; over 0.5 a wheel sinks by 0.07 diameters",
-    )
 
 
 def risk_map(
@@ -133,8 +94,7 @@ def risk_map(
     std = np.where(np.isfinite(elevation_std), elevation_std, 0.0).astype(np.float32)
     gap, side = p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell)
     z, s, filled = close_holes(elevation, std, gap, side, p.min_known)
-    rules = Rules(p.sigmas, p.caution, p.max_p, p.min_known)
-    classes = classify(HazardInput(elevation, z, s, cell, vehicle, window), filled, rules)
+    classes = classify(HazardInput(elevation, z, s, cell, vehicle, window), filled, p)
     return classes | {"filled": filled, "elevation": z}
 
 

@@ -13,14 +13,14 @@ from rille.stages.hazard.classification import (
     MAX_EXCESS,
     STEPS_PER_EXCESS,
     UNKNOWN,
-    Rules,
+    RiskParams,
     _table,
     classify,
 )
 from rille.stages.hazard.measures import MEASURES, HazardInput, Measure
 from rille.stages.numeric.extrema import running_max
 
-RULES = Rules(sigmas=1.25, caution=0.75, max_p=0.02, min_known=0.5)
+RULES = RiskParams(sigmas=1.25, caution=0.75, max_p=0.02, min_known=0.5)
 
 
 def random_terrain(seed: int, stride: int) -> HazardInput:

@@ -13,7 +13,8 @@ from vehicles import SHORT
 
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.hazard.risk import BITS, CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
+from rille.stages.hazard.measures import BITS
+from rille.stages.hazard.risk import CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.path import PathParams, Route, describe, find_path, nearest_middle, path_stage
 
