@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,9 @@ OVERLAP = 3
 
 MIN_START_ANGLE_DEG = 0.1
 """Triangulation angle of the images that a model begins with: a pixel of disparity at a focal length of 600."""
+
+NEAR_ANGLE_DEG = 1.5
+"""Triangulation angle below which COLMAP drops a point: it registers the next images by the nearer ones alone."""
 
 SEED = 0
 """Of COLMAP's random sampling."""
@@ -144,28 +147,44 @@ def _write_frames(database: Any, cameras: list[Any], features: Sequence[Bundle])
     return verified
 
 
-def _line_distances(rig: Rig, features: Sequence[Bundle], verified: Verified) -> Floats:
+def _stereo_points(features: Sequence[Bundle], verified: Verified) -> dict[int, tuple[Floats, Floats]]:
+    """Points (m, 2), (m, 2), px, at which left and right match, by the number of the left image."""
+    # Pairs of one camera lie an even number of images apart.
+    return {
+        left: tuple(
+            np.asarray(features[k - 1]["points"], np.float64)[rows] - PIXEL_CENTRE
+            for k, rows in zip((left, right), matches.T, strict=True)
+        )
+        for (left, right), matches in verified.items()
+        if right == left + 1
+    }
+
+
+def _line_distances(rig: Rig, frames: int, stereo: Mapping[int, tuple[Floats, Floats]]) -> Floats:
     """Median distance (frame,), px, of the matches of left and right from their epipolar lines under the given rig.
 
     NaN where the two do not match. Verified are matches by any motion between two cameras: an image that has slipped in
     its row is no outlier there, and registration does without it.
     """
-    out = np.full(len(features) // 2, np.nan)
-    for frame, image in enumerate(range(1, len(features), 2)):
-        if (image, image + 1) in verified:
-            both = zip(features[image - 1 : image + 1], verified[image, image + 1].T, strict=True)
-            left, right = (np.asarray(one["points"], np.float64)[rows] - PIXEL_CENTRE for one, rows in both)
-            out[frame] = np.median(np.abs(distances(rig, np.zeros(5), left, right)[0]))
+    out = np.full(frames, np.nan)
+    for left, points in stereo.items():
+        out[left // 2] = np.median(np.abs(distances(rig, np.zeros(5), *points)[0]))
     return out
 
 
-def _models(database: Any, verified: Verified) -> list[Any]:
-    """Models, each begun with the best stereo pair that no model holds yet, as long as it might become the greatest."""
-    # Pairs of one camera lie an even number of images apart.
-    stereo = {left: len(matches) for (left, other), matches in verified.items() if other == left + 1}
-    models, left, most = [], set(stereo), 0
+def _near(rig: Rig, left: Floats, right: Floats) -> int:
+    """Number of the matches whose rays meet under an angle at which COLMAP keeps the point."""
+    rays = rig.left.rays(left), rig.right.rays(right) @ rig.T_right_left.rotation
+    cosine = (rays[0] * rays[1]).sum(axis=1) / np.prod([np.linalg.norm(r, axis=1) for r in rays], axis=0)
+    return int((cosine <= math.cos(math.radians(NEAR_ANGLE_DEG))).sum())
+
+
+def _models(database: Any, starts: Mapping[int, int]) -> list[Any]:
+    """Models, each begun with the stereo pair of the most near points (``starts``, by the number of the left image)
+    that no model holds yet, as long as it might become the greatest."""
+    models, left, most = [], set(starts), 0
     while len(left) > most:
-        start = max(left, key=lambda number: (stereo[number], -number))
+        start = max(left, key=lambda number: (starts[number], -number))
         left.discard(start)
         for model in _map(database, (start, start + 1)):
             models.append(model)
@@ -228,7 +247,8 @@ def crosscheck_stage(
     features = list(itertools.chain.from_iterable(zip(left, right, strict=True)))
     with pycolmap.Database.open(":memory:") as database:
         verified = _write_frames(database, _write_rig(database, rig), features)
-        models = _models(database, verified)
+        stereo = _stereo_points(features, verified)
+        models = _models(database, {left: _near(rig, *points) for left, points in stereo.items()})
     poses, reprojection, reason = np.full((len(frames), 3, 4), np.nan), None, ""
     if models:
         # Models of one window do not share a frame of reference; what the others hold is left to the neighbouring
@@ -241,4 +261,4 @@ def crosscheck_stage(
         count = np.median([len(f["points"]) for f in features])
         reason = f"no two images match (median {count:.0f} features an image)"
     meta: WindowFacts = {"frames": list(frames), "reprojection_px": reprojection, "reason": reason}
-    return Bundle({"poses": poses, "line_distance": _line_distances(rig, features, verified)}, meta)
+    return Bundle({"poses": poses, "line_distance": _line_distances(rig, len(frames), stereo)}, meta)
