@@ -1,4 +1,4 @@
-"""Schedulers and workers that others have started: what they must be, and whether they are still there.
+"""Workers that others have started: what they must be.
 
 Every worker must have the source code, the Python and the packages of the client, use one thread a library, and see
 the same cache: each reads a probe of the client there, and writes beside it. One that differs is named with the
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import platform
-import time
 import uuid
 from collections.abc import Mapping
 from contextlib import suppress
@@ -21,7 +20,7 @@ from typing import Any
 from rille.pipeline.engine.code_digest import OWN, tree_digest
 from rille.pipeline.engine.packages import version
 from rille.pipeline.engine.runtime import atomic
-from rille.stages.core.errors import ConfigError, RilleError
+from rille.stages.core.errors import ConfigError
 
 PACKAGES = (
     *("dask", "distributed", "google-crc32c", "llvmlite", "numba", "numcodecs", "numpy", "pydantic", "zarr"),
@@ -29,17 +28,7 @@ PACKAGES = (
 )
 """Distributions whose version must be the client's, and the kind of processor that they work for."""
 
-NO_WORKERS_SECONDS = 30.0
-"""Time that a scheduler may be without workers, at the beginning or later, before the run is given up."""
-
-SILENCE_SECONDS = 20.0
-"""Time without an answer of the scheduler before it counts as gone, and of a worker before the user is warned."""
-
 Identity = Mapping[str, str]
-
-
-class ClusterError(RilleError):
-    """The scheduler or all of its workers are gone."""
 
 
 def identity() -> dict[str, str]:
@@ -89,8 +78,10 @@ def examine(client: Any, cache: Path) -> None:
     try:
         atomic.write(probe, "")
         answers = client.run(compare, identity(), probe, on_error="return")
+        workers = client.scheduler_info(n_workers=-1)["workers"]
         for address, answer in sorted(answers.items()):
-            name = worker_name(client, address)
+            known = workers.get(address, {}).get("name", "")
+            name = f"worker {known} ({address})" if known not in ("", address) else f"worker {address}"
             if isinstance(answer, ConfigError):
                 raise answer.at(name)
             if isinstance(answer, BaseException):
@@ -101,64 +92,3 @@ def examine(client: Any, cache: Path) -> None:
         for left in probe.parent.glob(f"{probe.name}*"):
             with suppress(OSError):
                 left.unlink()
-
-
-def worker_name(client: Any, address: str) -> str:
-    """Name of a worker for messages."""
-    known = client.scheduler_info(n_workers=-1)["workers"].get(address, {}).get("name", "")
-    return f"worker {known} ({address})" if known not in ("", address) else f"worker {address}"
-
-
-class Presence:
-    """Whether the scheduler answers, and has workers.
-
-    Attributes
-    ----------
-    _heard : when the scheduler heard of each worker last, by its clock, and since when we know that, by ours.
-    """
-
-    def __init__(self, client: Any, patience: float) -> None:
-        self._client, self._address, self._patience = client, client.scheduler.address, patience
-        self._answered = self._manned = time.monotonic()
-        self._heard: dict[tuple[str, float], float] = {}
-
-    def threads(self) -> int:
-        """Threads of all workers now.
-
-        Raises
-        ------
-        ClusterError
-            The scheduler is gone, or had no workers for too long.
-        """
-        now = time.monotonic()
-        try:
-            identity = self._client.scheduler.identity
-            workers = self._client.sync(identity, n_workers=-1, callback_timeout=SILENCE_SECONDS / 2)["workers"]
-        except Exception as error:
-            # One question without an answer is a busy scheduler; only a long silence is a lost one.
-            if self._client.status in ("closing", "closed") or time.monotonic() - self._answered > SILENCE_SECONDS:
-                raise self.gone() from error
-            return 0
-        self._answered = now
-        heard = [(address, worker["last_seen"]) for address, worker in workers.items()]
-        self._heard = {word: self._heard.get(word, now) for word in heard}
-        threads = sum(worker["nthreads"] for worker in workers.values())
-        if threads:
-            self._manned = now
-        elif now - self._manned > self._patience:
-            text = f"the dask scheduler at {self._address} had no workers for {self._patience:.0f} s"
-            remedy = "start workers, and run the same command: what is committed stays"
-            raise ClusterError("RIL-525", text, remedy=remedy)
-        return int(threads)
-
-    def silent(self) -> set[str]:
-        """Addresses of the workers from which nothing was heard for long, by the last look."""
-        return {address for (address, _), since in self._heard.items() if self._answered - since > SILENCE_SECONDS}
-
-    def gone(self) -> ClusterError:
-        """The scheduler is."""
-        return ClusterError(
-            "RIL-526",
-            f"the dask scheduler at {self._address} is gone",
-            remedy="start it again with its workers, and run the same command: what is committed stays",
-        )

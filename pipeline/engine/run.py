@@ -26,7 +26,7 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -141,7 +141,6 @@ class RunOptions:
     ledger : file of JSON lines, one a node, written as they resolve.
     progress : receives every step of the run.
     memory_limit : bytes that this process and its workers may take together; None is what is free here.
-    survey : lays the same graph out anew, to look ahead: what cannot fit into memory is refused before anything runs.
     kept : workers of runs before and after this one; None: those of this run end with it.
     """
 
@@ -153,7 +152,6 @@ class RunOptions:
     ledger: Path | None = None
     progress: Progress = field(default_factory=Progress)
     memory_limit: float | None = None
-    survey: Callable[[], Graph] | None = None
     kept: Kept | None = None
 
 
@@ -181,6 +179,7 @@ class _Run:
     taken : nodes of the graph that were taken up, in order.
     again : numbers of nodes to be taken up again, the least first.
     in_flight : with the workers.
+    first : nodes to be computed that are known before any result is, until the workers are started for them.
     suspects : numbers of nodes whose workers died; each is tried when nothing else runs, and is then in ``alone``.
     before : digests of artifacts that are computed again because they were damaged or gone, by number of the node.
     seen : nodes of a cut graph of which it is known whether they are wanted for themselves.
@@ -198,6 +197,7 @@ class _Run:
         self.taken = 0
         self.again: list[int] = []
         self.in_flight: dict[int, Handle] = {}
+        self.first: list[Handle] = []
         self.suspects: list[int] = []
         self.alone: set[int] = set()
         self.heals: Counter[int] = Counter()
@@ -243,6 +243,9 @@ class _Run:
             while self._take() or self._go_on():
                 # An interrupt in a finaliser or a callback of a weak reference was remembered, not raised.
                 interrupts.check()
+            if self.first and not self.stopped:
+                self._begin()
+                continue
             if not self.in_flight:
                 return
             assert self.workers is not None
@@ -323,15 +326,16 @@ class _Run:
             handle.reason = self.known.reason(self.store, handle.stage, handle.label, handle.key, made)
 
     def _submit(self, handle: Handle, upstream: list[Handle]) -> None:
-        if self.workers is None:
-            self.workers = self._begin()
         needs = self.estimates.task(handle)
+        if self.workers is None:
+            self.first.append(handle)
+            return
         if (refused := self.budget.refusal(handle, needs)) is not None and all(h.done for h in upstream):
             self._fail(handle, Failed(refused))
             return
         if needs > self.largest:
             self.largest = needs
-            self.workers.shrink(self.budget.workers(self.jobs, needs))
+            self.workers.scale(self.budget.workers(self.jobs, needs))
         force = handle.stage in self.force
         call = Call(handle.index, self.store.root, handle.spec, each(_given, handle.inputs), handle.key, force)
         handle.status = "running"
@@ -339,17 +343,14 @@ class _Run:
         self.workers.submit(call)
         self.progress.running(handle)
 
-    def _begin(self) -> Workers:
-        """Look ahead, refuse what cannot fit, and start the workers that memory leaves room for."""
+    def _begin(self) -> None:
+        """Refuse what cannot fit, and start the workers that memory leaves room for; then the first nodes are taken up
+        again."""
         kind = self.options.executor
         check(kind, self.options.jobs)
         self.budget = memory.budget(kind, self.options.memory_limit)
-        ahead = self.options.survey() if self.options.survey is not None else Graph()
-        # A run that looks up only, by the same code: what it foresees is what will be done.
-        dry = _Run(ahead, self.store, RunOptions(force=self.force, dry=True))
-        while dry._take() or dry._go_on():
-            pass
-        for handle, needs in memory.Estimates().planned(ahead):
+        for handle in self.first:
+            needs = self.estimates.task(handle)
             if (refused := self.budget.refusal(handle, needs)) is not None:
                 raise refused.at(handle.label)
             self.largest = max(self.largest, needs)
@@ -360,7 +361,8 @@ class _Run:
         self.ledger.run(executor=name, jobs=jobs)
         begin = make if self.options.kept is None else self.options.kept.make
         self.result.workers_started = True
-        return begin(kind, jobs, self.store.root, self.budget.limit)
+        self.workers = begin(kind, jobs, self.store.root, self.budget.limit)
+        self.again, self.first = [handle.index for handle in self.first], []
 
     def _resolve(self, handle: Handle, status: str) -> None:
         handle.status = status
@@ -468,7 +470,7 @@ class _Run:
                 self._ask()
                 return True
         last = self.graph.last
-        if last is None or (self.graph.expansions and self.in_flight):
+        if last is None or (self.graph.expansions and (self.first or self.in_flight)):
             return False
         self.graph.last = None
         last()

@@ -32,17 +32,15 @@ from typing import Any
 
 import psutil
 
-from rille.datasets.text.warning import warning
 from rille.pipeline.engine import foreign
-from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime.apart import ignore_settings, leave_out, take_back
 from rille.pipeline.engine.runtime.environment import prepare_environment, worker_environment
 from rille.pipeline.engine.runtime.interrupts import held
 from rille.pipeline.engine.runtime.private import private_folder
-from rille.pipeline.engine.spec import Spec, flat
+from rille.pipeline.engine.spec import Spec, each, flat
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import Outcome, ensure
-from rille.stages.core.errors import ConfigError
+from rille.stages.core.errors import ConfigError, RilleError
 
 KINDS = ("dask", "inline")
 
@@ -52,14 +50,22 @@ WATCH_SECONDS = 0.2
 LOOK_SECONDS = 2.0
 """Time between looks at the scheduler."""
 
-CONNECT_SECONDS = 10.0
-"""Time within which a scheduler must have answered."""
+CONNECT_SECONDS, ANSWER_SECONDS = 10.0, 20.0
+"""Time within which a scheduler must have answered, at first and later."""
+
+NO_WORKERS_SECONDS, START_SECONDS = 30.0, 120.0
+"""Time that a scheduler may be without workers, at the beginning or later, before the run is given up; the second: that
+workers of our own may take to start, on a machine that others use."""
 
 LEAVE_SECONDS, HURRY_SECONDS = 2.0, 0.5
 """Time to take leave of a scheduler at the end of a run, and of an interrupted one."""
 
 DEATHS = 1
 """Deaths of its worker after which dask, on this machine, begins a task once more; at the next it gives it back."""
+
+
+class ClusterError(RilleError):
+    """The scheduler or all of its workers are gone."""
 
 
 @dataclass(frozen=True)
@@ -81,10 +87,11 @@ class Call:
     def run(self, made: Mapping[int, Ref]) -> Outcome | Failed:
         """Run it here, with the artifacts of the calls that it waited for."""
 
-        def ref(given: Ref | int) -> Ref:
-            return made[given] if isinstance(given, int) else given
+        def ref(given: Any) -> Ref:
+            found: Ref = made[given] if isinstance(given, int) else given
+            return found
 
-        refs = {p: [ref(g) for g in given] if isinstance(given, list) else ref(given) for p, given in self.refs.items()}
+        refs = each(ref, self.refs)
         try:
             return ensure(self.root, self.spec, refs, key=self.key or None, force=self.force)
         except Exception as error:
@@ -149,20 +156,12 @@ def check(kind: Any, jobs: int | None = None) -> None:
     if isinstance(kind, str) and kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
         raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
     # A spawned worker imports the program's main module first: without a guard it would start workers of its own.
-    if kind == "dask" and multiprocessing.parent_process() is None and "__mp_main__" in _modules_at_work():
+    at_work = {frame.f_globals.get("__name__") for frame, _ in traceback.walk_stack(inspect.currentframe())}
+    if kind == "dask" and multiprocessing.parent_process() is None and "__mp_main__" in at_work:
         text = "a worker that starts came to this call"
         raise ConfigError("RIL-972", text, remedy='put what the program does under `if __name__ == "__main__":`')
     if jobs is not None and jobs < 1:
         raise ConfigError("RIL-540", f"{jobs} jobs are not permitted", remedy="give 1 or more")
-
-
-def _modules_at_work() -> set[str]:
-    """Names of the modules whose code is being executed by this thread."""
-    names, frame = set(), inspect.currentframe()
-    while frame is not None:
-        names.add(frame.f_globals.get("__name__", ""))
-        frame = frame.f_back
-    return names
 
 
 def make(kind: Any, jobs: int, cache: Path, memory: float) -> Workers:
@@ -203,7 +202,7 @@ class Inline:
         call, self._call = self._call, None
         return [(call.number, call.run({}))]
 
-    def shrink(self, jobs: int) -> None:
+    def scale(self, jobs: int) -> None:
         """There is one worker."""
 
     def cancel(self) -> None:
@@ -244,9 +243,8 @@ def _here(jobs: int, memory: float) -> Dask:
         _, within = cluster.scheduler.listeners
         # As the default client it would take over whatever else the calling program computes with dask.
         client = Client(within.contact_address, loop=cluster.loop, set_as_default=False)
-        # Time that workers of our own may take to start, on a machine that others use
-        made = Dask(client, foreign.Presence(client, 120.0), cluster=cluster)
-        cluster.scale(jobs)
+        made = Dask(client, cluster=cluster)
+        made.scale(jobs)
     return made
 
 
@@ -261,41 +259,34 @@ def _elsewhere(where: Any, cache: Path) -> Dask:
             client = Client(where, set_as_default=False, timeout=CONNECT_SECONDS)
         except (OSError, TimeoutError, ValueError) as error:
             raise ConfigError("RIL-541", f"no dask scheduler answers at {where}", remedy="check the address") from error
-    presence = foreign.Presence(client, foreign.NO_WORKERS_SECONDS)
+    made = Dask(client, ours=client is not where)
     try:
-        while not presence.threads():
+        while not made.threads():
             time.sleep(WATCH_SECONDS)
         foreign.examine(client, cache)
-        return Dask(client, presence, ours=client is not where)
     except BaseException:
-        if client is not where:
-            _leave(client, HURRY_SECONDS)
+        made.close(kill=True)
         raise
+    return made
 
 
 class Dask:
     """Workers of dask; ``cluster`` is one of our own, ``ours`` whether the client is.
 
     ``kept`` ones stay at the end of a run, unless they are killed.
-
-    Attributes
-    ----------
-    _labels : labels of tasks in flight, by the names that dask knows.
-    _named : silent workers that the user was warned of.
     """
 
     room = 2000  # workers need not wait for this process, and the scheduler stays small
 
-    def __init__(self, client: Any, presence: foreign.Presence, *, cluster: Any = None, ours: bool = True) -> None:
-        self._client, self._presence, self._cluster, self._ours = client, presence, cluster, ours
+    def __init__(self, client: Any, *, cluster: Any = None, ours: bool = True) -> None:
+        self._client, self._cluster, self._ours = client, cluster, ours
+        self._address = client.scheduler.address
         self._run, self._submitted = f"rille-{uuid.uuid4().hex}", 0
-        self._looked = time.monotonic()
+        self._looked = self._manned = time.monotonic()
         self._futures: dict[int, Any] = {}
         self._leaving: list[Any] = []
-        self._labels: dict[str, str] = {}
         self._events: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        self._named: set[str] = set()
-        self._gone: set[Any] = set()
+        self._dead: set[Any] = set()
         self.kept, self.closed = False, False
         # The handler runs on the client's event loop: it only hands over what came.
         client.subscribe_topic(self._run, lambda event: self._events.put(event[1]))
@@ -318,13 +309,12 @@ class Dask:
             pure=False,
             retries=0,
         )
-        self._labels[name] = call.spec.label
 
     def wait(self) -> list[tuple[int, Ended]]:
         """Block until at least one call has ended; all that have ended meanwhile are given."""
         ended: list[tuple[int, Ended]] = []
         while not ended:
-            # Not for ever: a call whose worker died, a scheduler that is lost, and silent workers send no event.
+            # Not for ever: a call whose worker died and a scheduler that is lost send no event.
             ended = self._events_of(WATCH_SECONDS)
             due = time.monotonic() - self._looked > LOOK_SECONDS
             if due:
@@ -338,7 +328,7 @@ class Dask:
         lost = [n for n, future in self._futures.items() if future.status not in ("pending", "finished")]
         # A call must not come back before the inputs that it had.
         ended = self._events_of(0) if lost else []
-        return ended + [(n, self._why(self._release(n))) for n in lost if n in self._futures]
+        return ended + [(n, self._why(self._futures.pop(n))) for n in lost if n in self._futures]
 
     def _events_of(self, timeout: float) -> list[tuple[int, Ended]]:
         """What has ended by its own word; the first of it is waited for."""
@@ -349,23 +339,17 @@ class Dask:
                 # Of another name: it ran again because its worker died after it had said so.
                 if number in self._futures and self._futures[number].key == name:
                     # Dask has not heard of the end yet: a future that is dropped now would count as cancelled.
-                    self._leaving.append(self._release(number))
+                    self._leaving.append(self._futures.pop(number))
                     ended.append((number, outcome))
         self._leaving = [future for future in self._leaving if future.status == "pending"]
         return ended
-
-    def _release(self, number: int) -> Any:
-        """The future of a call, which is no longer in flight."""
-        future = self._futures.pop(number)
-        del self._labels[future.key]
-        return future
 
     def _why(self, future: Any) -> Ended:
         """Why a call ended without a word."""
         from distributed import KilledWorker
 
         if future.status != "error":  # distributed cancels all futures when the connection to the scheduler is lost
-            raise self._presence.gone()
+            raise self._gone()
         error = future.exception()
         if not isinstance(error, KilledWorker):  # it could not even be unpickled there
             return Failed.of(error)
@@ -379,47 +363,54 @@ class Dask:
                 memory = f"{event['rss'] / 1e6:.0f} MB"
         return Died(error.allowed_failures + 1, memory)
 
+    def threads(self) -> int:
+        """Threads of all workers now.
+
+        Raises
+        ------
+        ClusterError
+            The scheduler is gone, or had no workers for too long.
+        """
+        try:
+            identity = self._client.scheduler.identity
+            workers = self._client.sync(identity, n_workers=-1, callback_timeout=ANSWER_SECONDS)["workers"].values()
+        except Exception as error:
+            raise self._gone() from error
+        now, patience = time.monotonic(), NO_WORKERS_SECONDS if self._cluster is None else START_SECONDS
+        if workers:
+            self._manned = now
+        elif now - self._manned > patience:
+            text = f"the dask scheduler at {self._address} had no workers for {patience:.0f} s"
+            remedy = "start workers, and run the same command: what is committed stays"
+            raise ClusterError("RIL-525", text, remedy=remedy)
+        return sum(worker["nthreads"] for worker in workers)
+
+    def _gone(self) -> ClusterError:
+        """The error of a scheduler that is gone."""
+        text = f"the dask scheduler at {self._address} is gone"
+        remedy = "start it again with its workers, and run the same command: what is committed stays"
+        return ClusterError("RIL-526", text, remedy=remedy)
+
     def _look(self) -> None:
-        """Look whether the scheduler is there and has workers, which of them are silent, and which are gone."""
-        self._presence.threads()
-        self._warn_of_silent(self._presence.silent())
+        """Look whether the scheduler is there and has workers, and which workers of our own are gone."""
+        self.threads()
         if self._cluster is not None:
             # A nanny does not start a worker again that died just as it began: after two looks we do.
-            gone = {nanny for nanny in self._cluster.workers.values() if not nanny.is_alive()}
-            for nanny in gone & self._gone:
+            dead = {nanny for nanny in self._cluster.workers.values() if not nanny.is_alive()}
+            for nanny in dead & self._dead:
                 # Nannies belong to the event loop of the client: their methods must run there.
                 self._client.loop.add_callback(nanny.instantiate)
-            self._gone = gone - self._gone
+            self._dead = dead - self._dead
         self._looked = time.monotonic()
 
-    def _warn_of_silent(self, silent: set[str]) -> None:
-        """Warn once of each worker that is silent (stopped, or its machine is gone) in the midst of a task of ours."""
-        self._named &= silent
-        nannies = getattr(self._cluster, "workers", {}).values()
-        processes = {nanny.worker_address: f", process {nanny.pid}," for nanny in nannies}
-        for address in silent - self._named:
-            with suppress(Exception):  # it has left meanwhile
-                given = [key for key in self._client.processing([address])[address] if key in self._labels]
-                if given:
-                    who = foreign.worker_name(self._client, address) + processes.get(address, "")
-                    text = f"{who} has been silent for {foreign.SILENCE_SECONDS:.0f} s at {self._labels[given[0]]}"
-                    warn(warning("RIL-710", f"{text}: let it go on if it was stopped (kill -CONT), or end it"))
-                    self._named.add(address)
-
-    def shrink(self, jobs: int) -> None:
-        """Keep no more than so many workers of our own; tasks of those that go are begun on others."""
-        if self._cluster is not None and jobs < len(self._cluster.worker_spec):
-            self._cluster.scale(jobs)
-
-    def grow(self, jobs: int) -> None:
-        """Have so many workers of our own again."""
-        if self._cluster is not None and jobs > len(self._cluster.worker_spec):
+    def scale(self, jobs: int) -> None:
+        """Have so many workers of our own; tasks of those that go are begun on others."""
+        if self._cluster is not None:
             self._cluster.scale(jobs)
 
     def cancel(self) -> None:
         """Begin nothing that was submitted, and forget what is running."""
         futures, self._futures = list(self._futures.values()), {}
-        self._labels.clear()
         with suppress(Exception):
             self._client.cancel(futures, force=True)
 
@@ -462,7 +453,7 @@ class Kept:
     def make(self, kind: Any, jobs: int, cache: Path, memory: float) -> Workers:
         """As :func:`make` does; those of dask are the same each time."""
         if self._workers is not None and not self._workers.closed:
-            self._workers.grow(jobs)
+            self._workers.scale(jobs)
             return self._workers
         made = make(kind, jobs, cache, memory)
         if isinstance(made, Dask):

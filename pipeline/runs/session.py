@@ -25,7 +25,7 @@ from rille.pipeline.engine import events, memory, progress
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.code_digest import remember
 from rille.pipeline.engine.failures import reported
-from rille.pipeline.engine.graph import Cut, Graph
+from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.packages import installed
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.store.base import Store
@@ -240,7 +240,6 @@ def _compute(opened: _Opened) -> driver.Result:
             ledger=opened.folder / "ledger.jsonl",
             progress=progress.make("quiet" if options.quiet else options.progress),
             memory_limit=memory_limit(options),
-            survey=lambda: lay_out(view.sequence, view.config, view.frames, opened.graph.cut),
             kept=options.kept,
         ),
     )
@@ -265,13 +264,6 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict
     total = (datetime.now(UTC) - opened.started).total_seconds()
     events.add_facts(opened.folder / "ledger.jsonl", total=total)
     return report
-
-
-def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...], cut: Cut | None = None) -> Graph:
-    """The graph of a reconstruction, or of a part of it, as far as it is known beforehand."""
-    graph = Graph(cut=cut)
-    dataflow(graph, sequence, config, frames)
-    return graph
 
 
 def _outcome(opened: _Opened) -> int:

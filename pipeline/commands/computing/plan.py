@@ -28,7 +28,7 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
-from rille.pipeline.runs.session import lay_out, memory_limit, settings, settings_of_run
+from rille.pipeline.runs.session import memory_limit, settings, settings_of_run
 from rille.stages.core.errors import ConfigError
 
 MAX_REASONS = 3
@@ -155,7 +155,8 @@ def graph(seq: str = "mockup", *, options: Settings = _SETTINGS) -> int:
         As for reconstruct.
     """
     settled = settings(replace(options, sequence=seq))
-    laid_out = lay_out(settled.sequence, settled.config, settled.frames)
+    laid_out = Graph()
+    dataflow(laid_out, settled.sequence, settled.config, settled.frames)
     run(laid_out, Store(cache_folder(options.cache)), RunOptions(dry=True)).check()
     print(dot(laid_out))
     return COMPLETE

@@ -44,14 +44,21 @@ def lay_out():
 def test_what_does_not_fit_alone_is_refused_before_anything_runs(cache):
     graph = lay_out()
     with raises("RIL-500") as caught:
-        driver.run(graph, Store(cache), driver.RunOptions(executor="inline", survey=lay_out))
+        driver.run(graph, Store(cache), driver.RunOptions(executor="inline"))
     assert caught.value.remedy == "change hog.bytes, or give more with --memory-limit"
     assert [h.status for h in graph.nodes] == ["pending", "pending"]
     assert not cache.exists()
 
 
 def test_what_could_not_be_known_beforehand_is_refused_when_its_turn_comes(cache):
-    graph = lay_out()
+    graph = Graph()
+    first = graph.node("toys.hog", "small", NoParams(), {"bytes": 1000, "i": 0})
+
+    def grow():
+        yield first
+        graph.node("toys.hog", "huge", NoParams(), {"bytes": 10 * memory.total(), "i": 1}, inputs={"after": first})
+
+    graph.flow(grow())
     result = driver.run(graph, Store(cache), driver.RunOptions(executor="inline", keep_going=True))
     assert [h.status for h in graph.nodes] == ["computed", "failed"]
     assert isinstance(result.failures[0].error, memory.MemoryRefusedError)

@@ -8,7 +8,6 @@ import threading
 import time
 from collections import Counter
 from contextlib import ExitStack
-from types import SimpleNamespace
 
 import pytest
 from hands import by_hand
@@ -83,35 +82,6 @@ def test_a_client_handed_in_runs_the_tasks_on_its_workers_and_stays_open(hands, 
     assert made == run(tmp_path / "inline")
 
 
-def test_a_worker_that_falls_silent_is_named_once_with_its_task(monkeypatch, capsys):
-    """By what the scheduler heard of it, not by clocks; one that is heard again may fall silent again."""
-    now, seen = [0.0], {"tcp://a": 1.0, "tcp://b": 5e9}
-    monkeypatch.setattr(foreign.time, "monotonic", lambda: now[0])
-    client = SimpleNamespace(
-        scheduler=SimpleNamespace(address="tcp://s", identity=None),
-        subscribe_topic=lambda *_: None,
-        sync=lambda *_, **__: {"workers": {a: {"nthreads": 1, "last_seen": when} for a, when in seen.items()}},
-        scheduler_info=lambda n_workers: {"workers": {"tcp://a": {"name": "first"}}},
-        processing=lambda workers: {"tcp://a": ["numbers-run-7", "scale-run-8", "of-another-1"]},
-    )
-    presence = foreign.Presence(client, 30.0)
-    crew = workers.Dask(client, presence)
-    crew._labels = {"numbers-run-7": "numbers/3", "scale-run-8": "scale/3"}
-
-    def warned_after(seconds, *heard):
-        now[0] += seconds
-        seen.update({address: seen[address] + seconds for address in heard})
-        assert presence.threads() == 2
-        crew._warn_of_silent(presence.silent())
-        return capsys.readouterr().err
-
-    line = "rille: warning RIL-710: worker first (tcp://a) has been silent for 20 s at numbers/3: "
-    assert warned_after(0.0) == warned_after(19.0, "tcp://b") == ""
-    assert warned_after(2.0, "tcp://b").startswith(line)
-    assert warned_after(2.0, "tcp://b") == warned_after(2.0, "tcp://a", "tcp://b") == ""
-    assert warned_after(21.0, "tcp://b").startswith(line)
-
-
 def test_the_ledger_of_a_default_run_names_the_dask_worker_of_each_task(tmp_path):
     graph, ledger = Graph(), tmp_path / "ledger.jsonl"
     chain.build(graph)
@@ -160,7 +130,7 @@ def test_threads_of_libraries_are_refused(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_no_workers_and_a_scheduler_that_leaves(tmp_path, monkeypatch):
-    monkeypatch.setattr(foreign, "NO_WORKERS_SECONDS", 2.0)
+    monkeypatch.setattr(workers, "NO_WORKERS_SECONDS", 2.0)
     with by_hand(tmp_path) as hands:
         with raises("RIL-525"):
             run(tmp_path / "cache", hands.address)
@@ -170,7 +140,7 @@ def test_no_workers_and_a_scheduler_that_leaves(tmp_path, monkeypatch):
         from rille.stages.core.declare import NoParams
 
         graph.node("toys.mischief", "sleep/0", NoParams(), {"what": "sleep", "seconds": 60, "i": 0})
-        monkeypatch.setattr(foreign, "NO_WORKERS_SECONDS", 30.0)
+        monkeypatch.setattr(workers, "NO_WORKERS_SECONDS", 30.0)
         begun = driver.make
 
         def make(*given):
