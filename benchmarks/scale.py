@@ -142,7 +142,8 @@ def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
         steps = {"displacement": [1.0] * (n - 1), "match_rate": [1.0] * (n - 1)}
         return {"basic": list(range(n)), "segments": [[k, k + 1] for k in range(n - 1)], **steps}
     if name == "ground_frame":
-        return {"T_local_left": np.eye(4)[:3].tolist()}
+        seen = {"plane": [0.0, 0.0, -1.0], "relief": [-0.1, 0.1], "ground_share": 1.0, "ground_reach": 10.0}
+        return {"T_local_left": np.eye(4)[:3].ravel().tolist(), "source": "none", "cell_size": CELL, **seen}
     if name == "trajectory":
         frames = args["frames"]
         positions = [[0.0, SPACING * k, 0.0] for k in range(len(frames))]
@@ -160,6 +161,8 @@ def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
             "box": lattice,
             "tiles": list(_tiles(lattice, args["side"])),
         }
+    if name == "loops":
+        return {"pairs": args["pairs"], "candidates": [[] for _ in args["pairs"]]}
     if name == "radiometry":
         return {"steps": {}}
     return {k: v for k, v in args.items() if k in ("pair", "frames")}
