@@ -10,8 +10,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 
 from rille.datasets.mockup.params import SceneParams
 from rille.stages.core.arrays import Floats, Floats32
@@ -40,7 +40,7 @@ def add_octave(out: Floats32, spacing: float, amplitude: float, rng: np.random.G
     grid = rng.standard_normal([int(n / spacing) + 5 for n in out.shape], dtype=np.float32)
     # Sparse, four weights a node: no BLAS sums their products, so that they are the same bits everywhere.
     rows, cols = (
-        BSpline.design_matrix(np.arange(n) / spacing, np.arange(-3.0, coefficients + 1), 3)
+        scipy.interpolate.BSpline.design_matrix(np.arange(n) / spacing, np.arange(-3.0, coefficients + 1), 3)
         for n, coefficients in zip(out.shape, grid.shape, strict=True)
     )
     # RMS of unit white noise after smoothing with the two-dimensional cubic B-spline.

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from rille.pipeline.export import ranges
@@ -103,10 +104,11 @@ def raster(values: Floats, label: str, alt: str, *, extent: Extent | None = None
 
 def medians(points: Floats, values: Floats, size: tuple[int, int]) -> Floats:
     """Medians (row, col) of values (n,) at points (n, 2) column, row, in cells of an image of ``size`` (cols, rows)."""
-    from scipy.stats import binned_statistic_2d
-
     # Residuals are averaged in 24 cells along the longer side.
-    cell = max(size) / 24
-    bins, span = [max(1, round(n / cell)) for n in size[::-1]], [(0, n) for n in size[::-1]]
-    col, row = np.clip(points, 0, size).T
-    return np.asarray(binned_statistic_2d(row, col, values, "median", bins, span).statistic)
+    cols, rows = (max(1, round(24 * n / max(size))) for n in size)
+    col, row = (np.clip(points / size, 0, 1 - 1e-9) * (cols, rows)).astype(int).T
+    cells, at = np.full(rows * cols, np.nan), row * cols + col
+    if len(at):
+        filled = np.unique(at)
+        cells[filled] = scipy.ndimage.median(values, at, filled)
+    return cells.reshape(rows, cols)
