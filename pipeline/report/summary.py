@@ -140,8 +140,7 @@ def given_numbers(view: RunView) -> list[str]:
 
 
 MAX_COMMON_PERCENT = 50.0
-"""RMS disagreement of two trajectories [per cent of the length] from which on they have nothing in common. Of a camera
-at rest, whose length is noise, it stays below."""
+"""RMS disagreement of two trajectories [per cent of the length] from which on they have nothing in common."""
 
 
 def _unlike(figures: Mapping[str, Any]) -> list[str]:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.protocol import Positions, Rows
+from rille.stages.geometry.epipolar import MAX_IMAGE_TURN_DEG
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.scale import MAX_ALIKE_SCALE
 from rille.stages.imaging.image_quality import ImageFigures
@@ -100,6 +101,7 @@ LIMITS = {
     ),
     "epipolar": (
         InputLimit("RIL-661", "known", least=1, remedy="see the matching"),
+        Fault("RIL-673", "turned, degrees", most=MAX_IMAGE_TURN_DEG, remedy="turn one camera's images back"),
         Fault("RIL-662", "adjusted, px", most=5.0, remedy="wrong calibration file, or lens distortion left in"),
         InputLimit("RIL-663", "adjusted, px", most=1.0, remedy="is lens distortion left in, or the wrong file given?"),
         InputLimit(
@@ -298,7 +300,11 @@ def judge_epipolar(facts: Mapping[str, Any]) -> Finding:
         f"off the epipolar lines {offset:+.2f} px, roll {float(facts['roll_deg']):+.3f} degrees, "
         f"residual {before:.2f} px RMS, adjusted {after:.2f}"
     )
-    return judge("epipolar", words, {"adjusted, px": after, "residual or row offset": max(before, 2 * abs(offset))})
+    turn = float(facts["turn_deg"])
+    if abs(turn) > MAX_IMAGE_TURN_DEG:
+        words = f"the right image is turned by {abs(turn):.0f} degrees against the left one; {words}"
+    figures = {"adjusted, px": after, "residual or row offset": max(before, 2 * abs(offset))}
+    return judge("epipolar", words, {"turned, degrees": abs(turn), **figures})
 
 
 def judge_synchrony(facts: Mapping[str, Any]) -> Finding | None:

@@ -19,7 +19,7 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, Params, stage
 from rille.stages.core.validity import matched_back
 from rille.stages.facts.calibration import OrientationFacts
-from rille.stages.geometry.epipolar import NAMES, corrected, distances
+from rille.stages.geometry.epipolar import NAMES, corrected, distances, image_turn
 from rille.stages.geometry.geometry import Rig
 
 
@@ -79,6 +79,7 @@ def orient(rig: Rig, matches: PointPairs) -> tuple[Floats, OrientationFacts]:
     facts["row_offset"] = float(np.median(before[weight > 0]))
     facts["roll_deg"] = math.degrees(fit.x[NAMES.index("roll")])
     facts["residual_before_px"], facts["residual_after_px"] = rms(before, weight), rms(after, weight)
+    facts["turn_deg"] = image_turn(rig, matches.left, matches.right)
     return weight, facts
 
 

@@ -40,7 +40,7 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, stage
 from rille.stages.core.errors import InputError
 from rille.stages.facts.calibration import OrientationFacts, RigFacts
-from rille.stages.geometry.epipolar import NAMES, corrected, distances, standing
+from rille.stages.geometry.epipolar import MAX_IMAGE_TURN_DEG, NAMES, corrected, distances, image_turn, standing
 from rille.stages.geometry.geometry import Rig
 from rille.stages.numeric.robust import mad_sigma
 
@@ -103,12 +103,14 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams) -> Ri
 def _judged(given: Rig, pairs: list[PointPairs], params: RigParams) -> dict[str, Any]:
     """What the pairs say on the given rig, and the rig that follows."""
     decision = decide(given, pairs, params)
-    far = any(abs(math.degrees(p.value)) > MAX_TURN_DEG for p in decision.parameters)
+    turn = float(np.median([image_turn(given, m.left, m.right) for m in pairs]))
+    turned = abs(turn) > MAX_IMAGE_TURN_DEG
+    far = turned or any(abs(math.degrees(p.value)) > MAX_TURN_DEG for p in decision.parameters)
     applied = params.mode != "fixed" and decision.changed and not far
     rig = corrected(given, decision.correction) if applied else given
     per_pair = [_alone(given, m, decision, params) for m in pairs]
     share = impossible_share(rig, pairs, decision.fit)
-    if share > SWAPPED_SHARE:
+    if share > SWAPPED_SHARE and not turned:
         raise InputError(
             "RIL-428",
             f"{100 * share:.0f} % of the matches lie beyond infinity: left and right are swapped, or the baseline "
@@ -121,10 +123,13 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams) -> dict[str,
     kept = "not repaired, for no mount moves that far" if far else "kept because rig.mode = fixed"
     median = float(np.median(np.concatenate(of_given)[weights > 0]))
     warnings = _contradiction(given, median, decision, "repaired" if applied else kept)
+    if turned:
+        words = f"the right images are turned by {abs(turn):.0f} degrees {'anti' if turn < 0 else ''}clockwise"
+        warnings = [f"{words} against the left ones, which the calibration does not say: turn them back"]
     marks: dict[str, Any] = {"contradiction": warnings[0]} if far else {}
     suspects = [m.pair for m, d in zip(pairs, off, strict=True) if far or mad_sigma(d) > BAD_ROWS_PX]
     marks |= {"suspects": suspects} if suspects else {}
-    warnings += _doubts(share, after)
+    warnings += [] if turned else _doubts(share, after)
     moves, knocked = _drift(linearised(given, pairs), per_pair, params)
     warnings += moves
     marks |= {"knocked": knocked} if knocked else {}

@@ -182,7 +182,9 @@ def agreement_stage(
     there = np.diff(own[compared]) == 0
     length = float(np.linalg.norm(np.diff(ours[compared, :, 3], axis=0), axis=1)[there].sum())
     apart = {name: rms(values[np.isfinite(values), None]) for name, values in arrays.items() if name in REASONS}
-    share = 100.0 * apart["distance"] / length if length > 0 else None
+    share: float | str | None = 100.0 * apart["distance"] / length if length > 0 else None
+    if at_rest(ours[compared], arrays["step_distance"][np.isfinite(arrays["step_distance"])]):
+        share = "the camera was at rest"
     of, after = "RMS disagreement of", "after one rotation and translation, no scale"
     best = "scale that would fit the crosscheck to ours best; 1 where both agree"
     figures = {

@@ -25,6 +25,8 @@ class OrientationFacts(Facts):
     residual_before_px: NotRequired[float]
     residual_after_px: NotRequired[float]
     """RMS of inliers, and with the right camera turned as they ask for."""
+    turn_deg: NotRequired[float]
+    """Of the right image in its plane against the given rig, clockwise as one sees it."""
 
 
 class RigFacts(Facts):

@@ -152,6 +152,21 @@ def beyond_infinity(rig: Rig, left: Floats, right: Floats) -> Floats:
     return np.asarray(-rho / per_pixel, dtype=np.float64)
 
 
+MAX_IMAGE_TURN_DEG = 45.0
+"""Turn of the right image against the rig [degrees] above which the image was turned, and not its mount."""
+
+
+def image_turn(rig: Rig, left: Floats, right: Floats) -> float:
+    """Degrees by which the right image is turned in its plane, clockwise as one sees it, against what the rig says.
+
+    ``left``, ``right``: (n, 2) matches, column and row. Depth and lens change it by little.
+    """
+    seen = [points - np.median(points, axis=0) for points in (left, right)]
+    here, there = (points @ (1.0, 1.0j) for points in seen)
+    (cosine, _, _), (sine, _, _), _ = rig.T_right_left.rotation
+    return float(np.degrees(np.angle((here.conj() * there).sum() * complex(cosine, -sine))))
+
+
 def fits(rig: Rig, left: Floats, right: Floats, tolerance: float) -> float:
     """Share of the matches (n, 2), (n, 2) that lie within ``tolerance`` pixels of their epipolar lines, ahead."""
     off, _ = distances(rig, np.zeros(len(NAMES)), left, right)

@@ -155,8 +155,9 @@ def test_sides(share, level):
     assert input_checks.judge_sides(share).level == level
 
 
-def facts(before: float, after: float, offset: float = 0.0):
-    return {"residual_before_px": before, "residual_after_px": after, "row_offset": offset, "roll_deg": 0.1}
+def facts(before: float, after: float, offset: float = 0.0, turn: float = 0.1):
+    residuals = {"residual_before_px": before, "residual_after_px": after, "row_offset": offset}
+    return residuals | {"roll_deg": 0.1, "turn_deg": turn}
 
 
 @pytest.mark.parametrize(
@@ -167,6 +168,7 @@ def facts(before: float, after: float, offset: float = 0.0):
         (facts(0.7, 0.4, -0.6), "WARN", "RIL-664"),
         (facts(2.5, 2.0), "WARN", "RIL-663"),
         (facts(40.0, 20.0), "FAIL", "RIL-662"),
+        (facts(200.0, 0.4, turn=-179.0), "FAIL", "turned by 179 degrees"),
         ({"words": "not checked: 3 matches"}, "WARN", "3 matches"),
     ],
 )

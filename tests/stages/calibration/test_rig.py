@@ -271,6 +271,19 @@ def test_a_correction_that_no_mount_makes_is_a_contradiction_and_no_repair():
     assert "contradiction" not in facts(given, street(roll_deg=2.0))
 
 
+@pytest.mark.parametrize(("degrees", "words"), [(180, "180 degrees"), (90, "90 degrees clockwise"), (-90, "anticlock")])
+def test_turned_images_are_named_and_no_knock(degrees, words):
+    rig, cosine, sine = street_rig(), np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    turn = np.array([[cosine, sine], [-sine, cosine]])  # rows point down: x to y is clockwise
+    middle = 0.5 * np.array([rig.right.width - 1, rig.right.height - 1])
+    pairs = [PointPairs(m.pair, m.left, (m.right - middle) @ turn + middle) for m in street()]
+    found = facts(rig, pairs)
+    assert not found["changed"]
+    assert words in found["contradiction"]
+    assert found["warnings"] == [found["contradiction"]]
+    assert "contradiction" not in facts(rig, street(roll_deg=4.0))
+
+
 def test_a_pair_whose_rows_no_rig_explains_is_a_suspect():
     pairs = street(5)
     rng = np.random.default_rng(1)

@@ -206,6 +206,13 @@ def test_a_resting_camera_is_aligned_by_its_orientations() -> None:
     assert out.meta["metrics"]["scale_ratio"]["value"] is None
 
 
+def test_of_a_camera_at_rest_no_share_of_the_way_is_stated() -> None:
+    rest = np.tile(np.eye(4)[:3], (6, 1, 1))
+    out = run(noisy(rest, 1, shift=1e-7, turn=1e-4), noisy(rest, 2, shift=1e-4, turn=1e-4))
+    assert out.meta["metrics"]["share"]["value"] is None
+    assert "at rest" in out.meta["metrics"]["share"]["how"]
+
+
 def test_from_one_of_our_pieces_to_the_next_there_is_no_way() -> None:
     true = drive(20)
     ours = true.copy()
