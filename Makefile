@@ -66,9 +66,9 @@ lint: $(TOOLS) ## ruff and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-pages: $(TOOLS) ## pages of docs/ that follow from the code: messages, parameters, outputs, blocks that are not run
+pages: $(TOOLS) ## pages of docs/ that follow from the code: messages, parameters, keys of a manifest, outputs, blocks that are not run
 	$(BIN)/rille params --markdown > docs/parameters.md
-	cd tests && for page in test_messages.py test_docs.py pipeline/export/test_output.py; do \
+	cd tests && for page in test_messages.py test_docs.py datasets/test_manifest_page.py pipeline/export/test_output.py; do \
 	  PYTHONPATH=.:stages:pipeline ../$(BIN)/python $$page || exit 1; done
 
 changelog: ## move the notes of changes/ to the end of CHANGELOG.md

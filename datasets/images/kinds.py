@@ -33,7 +33,7 @@ KINDS: dict[str, tuple[str, str]] = {
         ".raw .bin .yuv .bayer",
         "state its size and bits: magick -size WIDTHxHEIGHT -depth 8 gray:FILE FILE.png",
     ),
-    "archive": (".zip .tar .gz .tgz .bz2 .xz .7z .rar .zst .npz", "unpack it"),
+    "archive": (".zip .tar .gz .tgz .bz2 .xz .7z .rar .zst", "unpack it"),
     "file": ("", "neither images nor a calibration or table that is known"),
 }
 """Endings and next step by the name of a kind; the kind ``file`` is any other."""
