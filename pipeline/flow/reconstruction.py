@@ -17,8 +17,9 @@
                     |                                           |     +-> overlap_audit; radiometry -+
                     |                                           +-> merge (world tile) <-------------+
                     |                                                 +-> risk, path (mission)
-                    +-> features (image) -> crosscheck (window) -> crosscheck_join -> agreement <- trajectory
-                               +-> loops (block of pairs) -> loop (pair) -> adjust -> trajectory, where places return
+                    +-> crosscheck (window) -> crosscheck_join -> agreement <- trajectory
+    image -> features -+-> crosscheck
+                       +-> loops (block of pairs) -> loop (pair) -> adjust -> trajectory, where places return
     leaves:  accuracy (trajectory, crosscheck), position_accuracy, dem_accuracy (local and merged DEM), path_check
     outputs: rasters, tracks, tables, figures: a task each; then report.html and report.json around them
 
