@@ -138,7 +138,7 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
         remedy = "give the folder, of a ROS 2 bag too, or a manifest (.toml); `rille init FOLDER` writes one"
         remedy = "; ".join([*unread([name_or_path]), remedy])
         raise InputError("RIL-992", f"the file {name_or_path} is no sequence", remedy=remedy)
-    if not path.is_dir():
+    if not path.is_dir() or not name_or_path:
         kind = "file" if path.suffix else "sequence"
         raise InputError("RIL-276", f"no {kind} {name_or_path!r}", remedy=_suggestion(name_or_path))
     beside = Path(f"{path}.rille.toml")

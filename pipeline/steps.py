@@ -220,6 +220,9 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     built: Any = config.build(carried, {"hfvm": hfvm})
     images = [np.asarray(image) for image in (left, right)]
     for camera, image in zip(("left", "right"), images, strict=True):
+        if image.dtype.kind in "OSU":  # a path, or nothing
+            text = f"the {camera} image is {image.reshape(-1)[:1].tolist()}, no array of pixels"
+            raise InputError("RIL-675", text, remedy="read files first: cv2.imread(NAME, cv2.IMREAD_GRAYSCALE), say")
         if image.dtype.kind == "f" and 0 < np.nanmax(image, initial=0) <= 1:
             text = f"the {camera} image's values end at {np.nanmax(image):.3g}: floating point is taken as 0..255"
             raise InputError("RIL-973", text, remedy="multiply by 255")
@@ -287,6 +290,9 @@ def _disparity(disparity: xarray.Dataset, pair: StereoPair) -> Bundle:
     """The result of the matcher, if it has the size of the pair's images."""
     from rille.stages.hfvm.stage import hfvm_stage
 
+    if not isinstance(pair, StereoPair):
+        text = f"pair is a {type(pair).__name__}"
+        raise InputError("RIL-674", text, remedy="give one pair of a sequence: rille.open(...)[0]")
     given = _bundle(disparity, hfvm_stage, "column_disparity", "rille.match")
     size = pair.sequence.rig.left.height, pair.sequence.rig.left.width
     if disparity.column_disparity.shape != size:

@@ -127,6 +127,10 @@ def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: 
     ):
         with raises("RIL-864", maker):
             step(other)
+    with raises("RIL-674", "rille.open(...)[0]"):
+        rille.terrain(disparity, pair.sequence)
+    with raises("RIL-675", "left.png"):
+        rille.match("left.png", pair.right)
     with raises("RIL-865", "(260, 285)"):
         rille.terrain(disparity.isel(row=slice(5)), pair)
     with raises("RIL-027", "hfvm.no"):
