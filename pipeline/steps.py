@@ -286,7 +286,7 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
     )
 
 
-def _disparity(disparity: xarray.Dataset, pair: StereoPair) -> Bundle:
+def _disparity(disparity: xarray.Dataset, pair: object) -> Bundle:
     """The result of the matcher, if it has the size of the pair's images."""
     from rille.stages.hfvm.stage import hfvm_stage
 
