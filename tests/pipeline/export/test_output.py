@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -166,6 +167,13 @@ def test_files_come_out_of_an_artifact_as_they_went_in(tmp_path: Path) -> None:
     place(Bundle(dict(bundle.arrays), json.loads(json.dumps(dict(bundle.meta)))), tmp_path / "b")
     assert unpack(pack(tmp_path / "b")) == unpack(bundle)
     assert len(unpack(bundle)) == 3
+
+
+def test_every_module_with_outputs_is_one_of_those_that_a_run_makes() -> None:
+    modules = (ROOT / "pipeline").rglob("*.py")
+    declared = {path.stem for path in modules if re.search(r"^STAGE = stage\(", path.read_text(), re.MULTILINE)}
+    listed = {module.__name__.rpartition(".")[2] for module in run_files.MODULES}
+    assert declared == listed, "a module whose outputs are files stands in catalogue.MADE, one of figures in run_files"
 
 
 def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
