@@ -20,10 +20,10 @@ from rille.datasets.protocol import Positions, Rows
 from rille.stages.geometry.epipolar import MAX_IMAGE_TURN_DEG
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.scale import MAX_ALIKE_SCALE
-from rille.stages.imaging.image_quality import ImageFigures
 
 Floats = NDArray[np.float64]
 Level = Literal["OK", "WARN", "FAIL"]
+Look = Mapping[str, Any]
 
 MIN_SHARPNESS_RATIO = 0.6  # of a camera's median sharpness: a Gaussian blur of one more pixel reduces it to this
 
@@ -225,14 +225,14 @@ def judge_up(up: Sequence[tuple[float, float, float] | None] | None, frames: Seq
     return judge("up", words, {"known": len(known), "y in the images": y})
 
 
-def judge_looks(looks: Mapping[str, Mapping[int, ImageFigures]], names: Sequence[str]) -> list[Finding]:
-    """Exposure and sharpness of all images, by camera and frame."""
+def judge_looks(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Finding]:
+    """Exposure and sharpness of all images, by camera and frame: what ``glance`` of stage ``image_quality`` gives."""
     opened = {camera: of for camera, of in looks.items() if of}
     out = [bad for camera, of in opened.items() for bad in _camera(camera, of, names) if bad.level != "OK"]
     judged = {bad.subject for bad in out}
     both = [k for k in opened.get("left", {}) if k in opened.get("right", {})]
     if both and "exposure" not in judged:
-        left, right = (np.array([opened[camera][k].mean for k in both]) for camera in ("left", "right"))
+        left, right = (_figure({k: opened[camera][k] for k in both}, "mean") for camera in ("left", "right"))
         # At least one grey level: the ratio of two black images means nothing.
         ratio = float(np.median(np.maximum(right, 1.0) / np.maximum(left, 1.0)))
         text = f"right is {ratio:.2f} as bright as left, mean grey {np.median([left, right]):.0f}"
@@ -245,7 +245,7 @@ def judge_looks(looks: Mapping[str, Mapping[int, ImageFigures]], names: Sequence
     return out
 
 
-def _camera(camera: str, looks: Mapping[int, ImageFigures], names: Sequence[str]) -> Iterator[Finding]:
+def _camera(camera: str, looks: Mapping[int, Look], names: Sequence[str]) -> Iterator[Finding]:
     """Findings on the images of one camera."""
     at = [names[k] for k in looks]
     # grey levels, standard deviation of an image below which it is blank
@@ -268,8 +268,8 @@ def _camera(camera: str, looks: Mapping[int, ImageFigures], names: Sequence[str]
     yield judge("sharpness", f"{blurred} {camera} images are blurred, {worst}", {"blurred": blurred})
 
 
-def _figure(looks: Mapping[int, ImageFigures], name: str) -> Floats:
-    return np.array([getattr(look, name) for look in looks.values()], dtype=np.float64)
+def _figure(looks: Mapping[int, Look], name: str) -> Floats:
+    return np.array([look[name] for look in looks.values()], dtype=np.float64)  # None is NaN
 
 
 def _usual(values: Floats) -> float:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -27,32 +26,6 @@ STRIP_HEIGHTS = (0.25, 0.5, 0.75)
 """Of the height: where the strips lie whose sharpness stands for the image's."""
 STRIP_ROWS = 32
 """Rows of a strip: some ten thousand pixels, and thrice what the wider blur reaches."""
-
-
-@dataclass(frozen=True)
-class ImageFigures:
-    """One image in figures: mean grey 0..255, deviation, shares of dark and bright clipped pixels, sharpness.
-
-    ``detail`` is what lies between two and four pixels, RMS over the deviation: where even that is gone, noise alone
-    decides on the sharpness.
-    """
-
-    mean: float
-    deviation: float
-    dark: float
-    bright: float
-    sharpness: float
-    detail: float = 0.0
-
-
-def look(image: NDArray[Any], valid: Bytes) -> ImageFigures:
-    """Figures of an image (row, col); ``valid`` not zero where usable."""
-    level = grey(image)
-    values = level[(valid != 0) & np.isfinite(level)]
-    if not values.size:
-        return ImageFigures(math.nan, 0.0, 0.0, 0.0, math.nan)
-    clipped = float((values <= MAX_DARK_GREY).mean()), float((values >= MIN_BRIGHT_GREY).mean())
-    return ImageFigures(float(values.mean()), float(values.std()), *clipped, *texture(image, valid))
 
 
 def texture(image: NDArray[Any], valid: Bytes) -> tuple[float, float]:
@@ -79,7 +52,11 @@ def texture(image: NDArray[Any], valid: Bytes) -> tuple[float, float]:
 
 
 def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
-    """Mean and deviation (grey), sharpness (None: none to tell) and detail of strips of an image, and its digest."""
+    """Figures of an image (row, col); ``valid`` not zero where usable.
+
+    ``mean`` (None: nothing is usable) and ``deviation``, grey 0..255; shares ``dark`` and ``bright`` of clipped pixels;
+    ``sharpness`` (None: none to tell) and ``detail`` of strips; ``digest`` of the pixels.
+    """
     rows = image.shape[0]
     first = sorted(
         {int(np.clip(share * rows - STRIP_ROWS / 2, 0, max(rows - STRIP_ROWS, 0))) for share in STRIP_HEIGHTS}
@@ -90,9 +67,12 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
     thinned = grey(np.ascontiguousarray(image[::2, ::2]))
     mask = ((valid[::2, ::2] != 0) & np.isfinite(thinned)).astype(np.uint8)
     (mean,), (deviation,) = (a.ravel() for a in cv2.meanStdDev(thinned, mask=mask))
+    usable = thinned[mask != 0]
     return {
-        "mean": float(mean) if mask.any() else None,
+        "mean": float(mean) if usable.size else None,
         "deviation": float(deviation),
+        "dark": float((usable <= MAX_DARK_GREY).mean()) if usable.size else 0.0,
+        "bright": float((usable >= MIN_BRIGHT_GREY).mean()) if usable.size else 0.0,
         "sharpness": float(np.median(sharp)) if sharp else None,
         "detail": float(np.median([d for _, d in textures])),
         "digest": hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest(),

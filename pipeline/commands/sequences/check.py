@@ -6,7 +6,6 @@ is computed here is cached for it.
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 from collections.abc import Generator, Mapping
 from dataclasses import replace
@@ -29,7 +28,7 @@ from rille.pipeline.runs.input_checks import Finding
 from rille.pipeline.runs.session import settings
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.epipolar import beyond_infinity, inverse_depth
-from rille.stages.imaging.image_quality import ImageFigures, look
+from rille.stages.imaging.image_quality import glance
 
 Steps = Generator[Wait, Any, None]
 
@@ -119,8 +118,7 @@ class Inspection:
 
     def _images(self) -> Steps:
         """Open every image: sizes, repetitions, exposure, sharpness."""
-        looks: dict[str, dict[int, ImageFigures]] = {camera: {} for camera in CAMERAS}
-        digests: dict[str, dict[int, str]] = {camera: {} for camera in CAMERAS}
+        looks: dict[str, dict[int, dict[str, Any]]] = {camera: {} for camera in CAMERAS}
         sizes, errors = set(), list[RilleError]()
         images = {(frame, camera): self.make.taken(frame, camera) for frame in self.frames for camera in CAMERAS}
         yield Maybe(list(images.values()))
@@ -135,16 +133,16 @@ class Inspection:
                 continue
             image = np.asarray(bundle["image"])
             sizes.add(f"{image.shape[1]} x {image.shape[0]} {image.dtype}")
-            looks[camera][frame] = look(image, np.asarray(bundle["valid"]))
-            if np.ptp(image):  # images of one grey value say the same of any scene
-                digests[camera][frame] = hashlib.sha256(image.tobytes()).hexdigest()
+            looks[camera][frame] = glance(image, np.asarray(bundle["valid"]))
         # Damaged images that are named one by one; the rest is counted
         for refusal in errors[:3]:
             self.refused(refusal, "images")
         whole = f"all {len(images)} open, {' and '.join(sorted(sizes))}"
         text = f"{len(errors)} of {len(images)} images cannot be used" if errors else whole
         self.say(judge.judge("images", text, {"unusable": len(errors)}))
-        self.say(*self._repeated(digests))
+        # Images of one grey value say the same of any scene.
+        several = {c: {k: one["digest"] for k, one in of.items() if one["deviation"]} for c, of in looks.items()}
+        self.say(*self._repeated(several))
         self.say(*judge.judge_looks(looks, self.sequence.frame_names))
 
     def _repeated(self, digests: Mapping[str, Mapping[int, str]]) -> Generator[Finding, None, None]:

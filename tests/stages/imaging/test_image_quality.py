@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+import pytest
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.imaging.image_quality import glance, image_quality_stage
@@ -24,6 +25,19 @@ def test_blur_takes_sharpness_and_strong_blur_takes_detail():
     dark = glance((0.3 * image).astype(np.uint8), valid)  # exposure is no blur
     assert dark["sharpness"] > 0.8 * sharp["sharpness"]
     assert dark["detail"] > 0.8 * sharp["detail"]
+
+
+def test_figures_of_a_known_image():
+    image = np.full((60, 80), 100, np.uint8)
+    image[:, :20] = 255
+    image[:, 20:26] = 0
+    valid = np.ones(image.shape, np.uint8)
+    found = glance(image, valid)
+    assert (found["bright"], found["dark"]) == (0.25, 6 / 80)
+    assert found["mean"] == pytest.approx((20 * 255 + 54 * 100) / 80)
+    assert glance(image.astype(np.uint16) * 257, valid)["mean"] == pytest.approx(found["mean"])
+    valid[:, :26] = 0
+    assert glance(image, valid)["deviation"] == 0
 
 
 def test_a_black_image_deviates_by_nothing_and_equal_images_have_one_digest():
