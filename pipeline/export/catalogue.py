@@ -1,4 +1,6 @@
-"""All files that a run can have, each by its row, in the order in which the report lists them, and ``frames.json``.
+"""All files that a run can have, each by its row, and ``frames.json``.
+
+Every module of this folder that has ``OUTPUTS`` is found: there is no list to add it to.
 
 ``frames.json`` says in which frame, unit and order every file of a run is written, for who reads them with a program.
 """
@@ -7,23 +9,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from fnmatch import fnmatchcase
+from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Any
 
-from rille.pipeline.export import accuracy, paths, rasters, terrain_zarr, trajectories
+from rille.pipeline import export
 from rille.pipeline.export.output import Output
 from rille.pipeline.export.trajectories import stamps
 from rille.pipeline.export.view import RunView
 from rille.pipeline.export.writers import FRAME, WORLDS
 from rille.stages.geometry.pose_arrays import NO_VERTICAL, REFERENCE_PLANE
 
-MADE = (trajectories, rasters, terrain_zarr, paths, accuracy)
+NAMES = (name for _, name, package in iter_modules(export.__path__, f"{export.__name__}.") if not package)
+MADE = tuple(module for module in map(import_module, NAMES) if hasattr(module, "OUTPUTS"))
 """Modules whose outputs are tasks."""
 
 OUTPUTS = (
     Output("report.html", "the report, one page", "any browser"),
     Output("report.json", "every number of the report, for programs", "any text editor, jq"),
-    *(output for module in MADE for output in module.OUTPUTS),
+    *sorted((output for module in MADE for output in module.OUTPUTS), key=attrgetter("name")),
     Output(
         "frames.json",
         "frames, handedness, quaternion order and units of every file; the frames' names",

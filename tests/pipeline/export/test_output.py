@@ -197,7 +197,7 @@ def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
     assert facts["units"]["time"] == "frame number"
     assert facts["frames_of_reference"]["world"]["handedness"] == "right"
     assert "scalar last" in facts["conventions"]["quaternion"]
-    assert [name for name, *_ in catalogue.listed(tmp_path)][:3] == ["report.html", "report.json", "trajectory.kitti"]
+    assert [name for name, *_ in catalogue.listed(tmp_path)][:3] == ["report.html", "report.json", "accuracy.json"]
     assert all(words and programs for _, words, programs in catalogue.listed(tmp_path))
     rows = list(csv.DictReader((tmp_path / "agreement.csv").open()))
     assert "time_s" not in rows[0], "numbers of frames are no seconds"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Mapping
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -140,7 +142,6 @@ def bundles() -> dict[str, Bundle]:
             {"column_disparity": column, "row_disparity": 0.1 * column, "validity": validity}, {}
         )
         made[f"level{pair}"] = Bundle({}, {"source": "pitch"})
-        made[f"orientation{pair}"] = orientation()
         made[f"local_dem{pair}"] = Bundle(dem, {**lattice, "defined": 0.9, "median_elevation_std": 5e-4})
         metrics = {"rmse": figure(1e-3 * (1 + pair), "m", "x"), "completeness": figure(0.9 - 0.05 * pair, "1", "x")}
         made[f"local_dem_accuracy{pair}"] = Bundle({}, {"metrics": metrics})
@@ -216,41 +217,43 @@ def checks() -> dict[str, Bundle]:
         "crosscheck": Bundle({"poses": theirs}, {"frames": list(FRAMES)}),
         "crosscheck_accuracy": Bundle(judged, {"metrics": assessed, "frames": list(FRAMES)}),
         "keyframes": Bundle({}, select),
+        **{f"orientation{pair}": orientation() for pair in BASIC},
     }
+
+
+NAMES = {
+    "images": "image",
+    "tracks": "track",
+    "resections": "resect",
+    "rigs": "rig",
+    "orientations": "orientation",
+    "world_tiles": "tile",
+    "world_risk": "risk",
+    "world_path": "path",
+}
+"""Artifacts of the products that are not called by the product's name."""
+
+
+def products(made: Mapping[str, Bundle] | None = None) -> Products:
+    """Handles, which are names, of the artifacts in ``made``: a name, or one a frame with its number behind."""
+    made = bundles() if made is None else made
+    found: Any = Products()
+    for product, empty in vars(found).items():
+        name = NAMES.get(product, product)
+        numbered = {int(of[1]): of[0] for known in made if (of := re.fullmatch(rf"{name}(\d+)", known))}
+        if isinstance(empty, dict):
+            value: Any = numbered or (dict.fromkeys(BASIC, name) if name in made else {})
+        elif isinstance(empty, list):
+            value = list(numbered.values()) or [name] * (name in made)
+        else:
+            value = name if name in made else empty
+        setattr(found, product, value)
+    return found  # type: ignore[no-any-return]
 
 
 def checked() -> Products:
     """Handles of a run that also checks itself."""
-    found: Any = products()
-    found.rigs, found.orientations = dict.fromkeys(BASIC, "rig"), {k: f"orientation{k}" for k in BASIC}
-    found.agreement, found.crosscheck, found.crosscheck_accuracy = "agreement", "crosscheck", "crosscheck_accuracy"
-    found.keyframes = "keyframes"
-    return found  # type: ignore[no-any-return]
-
-
-def products() -> Products:
-    def each(name: str, numbers: tuple[int, ...]) -> dict[int, Any]:
-        return {n: f"{name}{n}" for n in numbers}
-
-    found: Any = Products(
-        images=each("image", FRAMES),
-        disparity=each("disparity", BASIC),
-        level=each("level", BASIC),
-        local_dem=each("local_dem", BASIC),
-        local_risk=each("local_risk", BASIC),
-        local_path=each("local_path", BASIC),
-        seams={4: "seams4"},
-        local_dem_accuracy=each("local_dem_accuracy", BASIC),
-    )
-    found.tracks, found.resections, found.world_tiles = ["track0", "track1"], ["resect0", "resect1"], ["tile"]
-    found.trajectory, found.world_risk, found.world_path, found.dem_accuracy = (
-        "trajectory",
-        "risk",
-        "path",
-        "dem_accuracy",
-    )
-    found.accuracy, found.path_check = "accuracy", "path_check"
-    return found  # type: ignore[no-any-return]
+    return products(bundles() | checks())
 
 
 TASKS = (
