@@ -46,7 +46,7 @@ ELSEWHERE = {
         "hfvm.given",
         "imaging.undistort",
         "terrain.map_localization",
-        *("odometry.places", "odometry.resection.loop", "odometry.resection.adjust"),
+        *("odometry.loops", "odometry.resection.loop", "odometry.resection.adjust"),
     ),
 }
 """Stages that need a lens, positions, a map, disparities, a doubt or a place seen again: tested with their modules."""

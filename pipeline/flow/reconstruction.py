@@ -17,9 +17,13 @@
                     |                                           |     +-> overlap_audit; radiometry -+
                     |                                           +-> merge (world tile) <-------------+
                     |                                                 +-> risk, path (mission)
-                    +-> crosscheck (window) -> crosscheck_join -> agreement <- trajectory
-    image -> features -+-> crosscheck
-                       +-> loops (block of pairs) -> loop (pair) -> adjust -> trajectory, where places return
+                    +-> crosscheck (window) <- features (image) -> loops (block of pairs) -> loop (pair) -> adjust
+                             +-> crosscheck_join -> agreement <- trajectory                     (disparity, rig) |
+                                                                                            trajectory <---------+
+    lost frames:  image -> image_quality -> frame_screening <- swap_check (left against right; where it asks)
+    other times:  rig -> synchrony (features of right images nearby) -> keyframes, chosen anew
+    wrong camera: resect, refine -> intrinsics -> given rig: all that reads it is laid out anew
+    pose of an adjusted trajectory: pose (pair) <- trajectory as chained, local DEM
     leaves:  accuracy (trajectory, crosscheck), position_accuracy, dem_accuracy (local and merged DEM), path_check
     outputs: rasters, tracks, tables, figures: a task each; then report.html and report.json around them
 
@@ -78,7 +82,7 @@ from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.imaging.image_quality import image_quality_stage
 from rille.stages.odometry.frame_screening import frame_screening_stage
 from rille.stages.odometry.keyframes import keyframes_stage
-from rille.stages.odometry.places import places_stage
+from rille.stages.odometry.loops import loops_stage
 from rille.stages.odometry.resection.adjust import adjust_stage
 from rille.stages.odometry.resection.intrinsics import intrinsics_stage
 from rille.stages.odometry.resection.loop import loop_stage
@@ -270,7 +274,6 @@ def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref[Screen
     along = steps(make, whole)
     bridges: dict[tuple[int, int], Handle] = {}
     sides: dict[int, Handle] = {}
-    # Where the tracks contradict the cameras, all that rests on these is laid out anew with corrected ones.
     turn = 0
     while True:
         asked = make.node(
@@ -513,7 +516,7 @@ def seen_again(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[
     for number, group in groupby(of, lambda frame: frame // PLACES_FRAMES):
         here = list(group)
         features = [make.features(frame, "left") for frame in here]
-        blocks.append(make.node(places_stage, f"loops/{number}", features=features, earlier=list(blocks), pairs=here))
+        blocks.append(make.node(loops_stage, f"loops/{number}", features=features, earlier=list(blocks), pairs=here))
     laid: list[Ref[PlacesFacts]] = yield list(blocks)
     compared = []
     for block in laid:

@@ -139,6 +139,10 @@ def _totals(graph: Graph, result: Result, workers: int) -> Iterable[str]:
     if result.assumed:
         names = some(list(dict.fromkeys(result.assumed)), 3)
         yield f"laid out by the last run's {names}, which will be computed anew: the layout may change"
+    yield from _unknown(result)
+
+
+def _unknown(result: Result) -> Iterable[str]:
     if result.unknown:
         yield f"more tasks follow, known only after {some(list(dict.fromkeys(result.unknown)), 3)}"
 
@@ -146,7 +150,8 @@ def _totals(graph: Graph, result: Result, workers: int) -> Iterable[str]:
 def graph(seq: str = "mockup", *, options: Settings = _SETTINGS) -> int:
     """Draw the stages of a run, the number of their tasks, and what each reads.
 
-    What depends on results that are still to come is drawn as the last run had it, where there was one.
+    What depends on results that are still to come is drawn as the last run had it; where there was none, the title says
+    after what more tasks follow.
     Prints text for Graphviz: rille graph SEQ | dot -Tsvg > graph.svg.
 
     Parameters
@@ -157,14 +162,17 @@ def graph(seq: str = "mockup", *, options: Settings = _SETTINGS) -> int:
     settled = settings(replace(options, sequence=seq))
     laid_out = Graph()
     dataflow(laid_out, settled.sequence, settled.config, settled.frames)
-    run(laid_out, Store(cache_folder(options.cache)), RunOptions(dry=True)).check()
-    print(dot(laid_out))
+    result = run(laid_out, Store(cache_folder(options.cache)), RunOptions(dry=True))
+    result.check()
+    print(dot(laid_out, result))
     return COMPLETE
 
 
-def dot(graph: Graph) -> str:
-    """Return a box for each stage with the number of its tasks, and an arrow for each stage that one reads."""
+def dot(graph: Graph, result: Result) -> str:
+    """Return a box for each stage with the number of its tasks, an arrow for each stage that one reads, and a title
+    where more is to follow."""
     tasks = Counter(handle.stage for handle in graph.nodes)
     arrows = dict.fromkeys((source.stage, handle.stage) for handle in graph.nodes for source in handle.upstream())
     boxes = (f'  "{stage}" [label="{stage} x {count}"];' for stage, count in tasks.items())
-    return "\n".join(["digraph {", *boxes, *(f'  "{a}" -> "{b}";' for a, b in arrows if a != b), "}"])
+    title = (f'  label="{text}";' for text in _unknown(result))
+    return "\n".join(["digraph {", *title, *boxes, *(f'  "{a}" -> "{b}";' for a, b in arrows if a != b), "}"])

@@ -16,3 +16,4 @@ def test_every_stage_is_in_the_text(tmp_path: Path, capsys: pytest.CaptureFixtur
     text = capsys.readouterr().out
     assert '  "mockup.render" [label="mockup.render x 6"];' in text
     assert '"mockup.render" -> "pyramid"' in text
+    assert '  label="more tasks follow, known only after frame_screening";' in text

@@ -8,7 +8,7 @@ from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp, rotation_log
 from rille.stages.imaging.features import extract
-from rille.stages.odometry.places import CANDIDATES, PlacesParams, places_stage, similarities, words
+from rille.stages.odometry.loops import CANDIDATES, LoopsParams, loops_stage, similarities, words
 from rille.stages.odometry.resection.loop import loop_stage
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
@@ -97,8 +97,8 @@ def blocks(images: list[Bundle], sizes: list[int], apart: int) -> list[list[int]
     for start, size in zip(np.cumsum([0, *sizes[:-1]]), sizes, strict=True):
         inputs = {"features": images[start : start + size], "earlier": list(made)}
         numbers = list(range(int(start), int(start) + size))
-        made.append(places_stage.run(PlacesParams(apart=apart), {"pairs": numbers}, inputs))
-        check_outputs(places_stage, made[-1])
+        made.append(loops_stage.run(LoopsParams(apart=apart), {"pairs": numbers}, inputs))
+        check_outputs(loops_stage, made[-1])
     return [row for block in made for row in block.meta["candidates"]]
 
 

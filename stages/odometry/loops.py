@@ -30,7 +30,7 @@ CANDIDATES = 6
 """Earlier pairs that the geometry of a pair is compared with: on a flight (EuRoC) 93 % of the pairs that match."""
 
 
-class PlacesParams(Params):
+class LoopsParams(Params):
     """Parameters of places that are seen again."""
 
     enabled: bool = Field(True, description="look for places that are seen again, and adjust all poses to them")
@@ -67,8 +67,8 @@ def _incidence(images: Sequence[NDArray[np.int32]]) -> scipy.sparse.csr_array:
         Array("count", ("pair",), "int32", "1", "number of words of each pair"),
     ],
 )
-def places_stage(
-    params: PlacesParams, features: Sequence[Bundle], earlier: Sequence[Bundle[PlacesFacts]] = (), *, pairs: list[int]
+def loops_stage(
+    params: LoopsParams, features: Sequence[Bundle], earlier: Sequence[Bundle[PlacesFacts]] = (), *, pairs: list[int]
 ) -> Bundle[PlacesFacts]:
     """Earlier basic pairs that may show the places of some pairs."""
     mine = [words(np.asarray(image["descriptors"])) for image in features]
