@@ -173,7 +173,9 @@ def test_every_module_with_outputs_is_one_of_those_that_a_run_makes() -> None:
     modules = (ROOT / "pipeline").rglob("*.py")
     declared = {path.stem for path in modules if re.search(r"^STAGE = stage\(", path.read_text(), re.MULTILINE)}
     listed = {module.__name__.rpartition(".")[2] for module in run_files.MODULES}
-    assert declared == listed, "a module whose outputs are files stands in catalogue.MADE, one of figures in run_files"
+    assert declared == listed, (
+        "in pipeline/export a module is found by itself; one of figures stands in run_files.MODULES"
+    )
 
 
 def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
