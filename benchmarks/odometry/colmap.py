@@ -9,7 +9,7 @@ import numpy as np
 
 from rille.stages.core.declare import Bundle
 from rille.stages.evaluation.crosscheck import windows
-from rille.stages.evaluation.rigid import by_frame
+from rille.stages.geometry.rigid import by_frame
 
 from .chain import STAGES, Clock, Images, Navigated
 

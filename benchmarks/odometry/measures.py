@@ -9,7 +9,7 @@ import scipy.optimize
 from scipy.spatial.transform import Rotation
 
 from rille.stages.evaluation.accuracy import nees, trajectory_accuracy
-from rille.stages.evaluation.rigid import posed, umeyama
+from rille.stages.geometry.rigid import posed, umeyama
 
 FIRST = 20
 """Frames of the shorter alignment: on a street some twenty metres, where odometry has not drifted yet."""

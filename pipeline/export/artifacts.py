@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rille.pipeline.export.view import RunView
 from rille.stages.core.declare import Bundle
-from rille.stages.evaluation import rigid
+from rille.stages.geometry import rigid
 from rille.stages.geometry.geometry import Rig
 
 Floats = NDArray[Any]

@@ -17,9 +17,9 @@ from rille.pipeline.export.rasters import whole
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow.products import Stop
 from rille.stages.core.declare import Bundle
-from rille.stages.evaluation.rigid import by_frame
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.lattice import Lattice, union
+from rille.stages.geometry.rigid import by_frame
 from rille.stages.odometry.resection.trajectory import world_poses
 
 

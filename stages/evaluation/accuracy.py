@@ -19,13 +19,13 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
-from rille.stages.evaluation import rigid
 from rille.stages.evaluation.conventions import better_reading
 from rille.stages.evaluation.metric import metric
-from rille.stages.evaluation.rigid import posed, rms
 from rille.stages.facts.evaluation import AccuracyFacts, Metric, TruthFacts
 from rille.stages.facts.odometry import TrajectoryFacts
+from rille.stages.geometry import rigid
 from rille.stages.geometry.geometry import RigidTransform, rotation_log
+from rille.stages.geometry.rigid import posed, rms
 from rille.stages.odometry.resection.trajectory import world_poses
 
 MIN_MOVED_M = 1e-6

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
-from rille.stages.evaluation import rigid
 from rille.stages.evaluation.metric import metric
-from rille.stages.evaluation.rigid import rms
 from rille.stages.facts.evaluation import AgreementFacts, JoinFacts
 from rille.stages.facts.odometry import TrajectoryFacts
+from rille.stages.geometry import rigid
+from rille.stages.geometry.rigid import rms
 from rille.stages.numeric.robust import mad_sigma
 
 ORIENTATION_SHARE = 0.1

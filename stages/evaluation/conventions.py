@@ -3,7 +3,7 @@
 A pose of the file becomes another one by each reading (order of the quaternion, direction of the transform, a mirrored
 axis), by a unit of length, and by other axes of the body: a rotation B from the right, one of the 24 that exchange axes
 or the one that fits best. Readings are compared by what the best rotation and translation of the world leaves of
-positions and orientations together (:mod:`rille.stages.evaluation.rigid`), over the extent of the trajectory.
+positions and orientations together (:mod:`rille.stages.geometry.rigid`), over the extent of the trajectory.
 A drive that is straight or hardly turns is fitted by several readings alike: they are named together.
 """
 
@@ -16,8 +16,8 @@ import numpy as np
 import scipy
 
 from rille.stages.core.arrays import Floats
-from rille.stages.evaluation.rigid import alignment, angle, compose, inverse, rms, spread
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
+from rille.stages.geometry.rigid import alignment, angle, compose, inverse, rms, spread
 
 MIN_FRAMES, MAX_FRAMES = 4, 50
 # Share of the extent of a trajectory below which its truth is at rest.

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
-from rille.stages.evaluation.rigid import alignment, by_frame, compose, posed
 from rille.stages.facts.evaluation import JoinFacts, WindowFacts
 from rille.stages.geometry.geometry import orthonormal
+from rille.stages.geometry.rigid import alignment, by_frame, compose, posed
 
 ORIENTATION_SHARE = 1.0
 """Orientations weigh like positions: over the few metres that windows share they are the better compass."""

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.evaluation.metric import metric
-from rille.stages.evaluation.rigid import lengths_along
 from rille.stages.facts.evaluation import Metric, MetricsFacts
 from rille.stages.geometry.geometry import way_length
 from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.rigid import lengths_along
 from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.grid8 import search

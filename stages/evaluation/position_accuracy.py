@@ -28,9 +28,9 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.evaluation.conventions import UNITS
 from rille.stages.evaluation.metric import metric
-from rille.stages.evaluation.rigid import by_frame, lengths_along, rms, umeyama
 from rille.stages.facts.evaluation import AccuracyFacts, Metric
 from rille.stages.facts.odometry import TrajectoryFacts
+from rille.stages.geometry.rigid import by_frame, lengths_along, rms, umeyama
 from rille.stages.odometry.resection.trajectory import world_poses
 
 MIN_FRAMES = 4

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import orthonormal, rotation_log
+from rille.stages.geometry.rigid import motion
 from rille.stages.odometry.resection.sensors import (
     OFFSET_SIGMA_S,
     Fixes,
     RelativePrior,
-    between,
     enough,
     fit_plane,
 )
@@ -73,7 +73,7 @@ def _departure(sensor: RelativePrior, shift: float, poses: Floats, piece: NDArra
     lag = max(len(rows) // WINDOWS, 1)
     a, b = rows[:-lag], rows[lag:]
     a, b = a[piece[a] == piece[b]], b[piece[a] == piece[b]]
-    own, said = between(poses, a, b), between(sensed, a, b)
+    own, said = motion(poses, a, b), motion(sensed, a, b)
     if not len(a):
         return 0.0, ""
     if sensor.drift:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
+from rille.stages.geometry.rigid import compose, motion, umeyama
 from rille.stages.odometry.pose_graph import Factors, bound_of
 
 LEVER_SIGMA_M = 0.05
@@ -34,17 +35,9 @@ MAX_GAP_STEPS = 3.0
 """Median steps of the camera over which its way is interpolated to the time of a position."""
 
 
-def between(poses: Floats, a: NDArray[np.intp], b: NDArray[np.intp]) -> Floats:
-    """Poses ``T_a_b`` (m, 3, 4) of rows of poses (n, 3, 4)."""
-    back = np.swapaxes(poses[a, :, :3], 1, 2)
-    way = np.einsum("mij,mj->mi", back, poses[b, :, 3] - poses[a, :, 3])
-    return np.concatenate([back @ poses[b, :, :3], way[:, :, None]], axis=2)
-
-
 def moved(poses: Floats, rows: Bools, move: RigidTransform) -> Floats:
     """Poses (n, 3, 4), those of some rows (n,) moved as one."""
-    R, C = move.rotation @ poses[:, :, :3], move.apply(poses[:, :, 3])
-    return np.where(rows[:, None, None], np.concatenate([R, C[:, :, None]], axis=2), poses)
+    return np.where(rows[:, None, None], compose(move.matrix34, poses), poses)
 
 
 def resampled(poses: Floats, times: Floats, shift: float) -> Floats:
@@ -54,7 +47,7 @@ def resampled(poses: Floats, times: Floats, shift: float) -> Floats:
     at = times + shift
     k = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
     part = ((at - times[k]) / (times[k + 1] - times[k]))[:, None]
-    step = between(poses, k, k + 1)
+    step = motion(poses, k, k + 1)
     R = poses[k, :, :3] @ rotation_exp(part * rotation_log(step[:, :, :3]))
     C = poses[k, :, 3] + part * (poses[k + 1, :, 3] - poses[k, :, 3])
     out = np.concatenate([R, C[:, :, None]], axis=2)
@@ -92,13 +85,13 @@ class RelativePrior:
         poses = self.at(shift)
         rows = np.flatnonzero(np.isfinite(poses).all((1, 2)))
         a, b = rows[:-1], rows[1:]
-        motion = between(poses, a, b)
-        way, count, clock = np.linalg.norm(motion[:, :, 3], axis=1), len(a), np.zeros((len(a), 6))
+        measured = motion(poses, a, b)
+        way, count, clock = np.linalg.norm(measured[:, :, 3], axis=1), len(a), np.zeros((len(a), 6))
         if self.times is not None and own is not None and count:
             times = self.times[self.rows]
             half = 0.5 * float(np.median(np.diff(times)))
             # Of the camera, not of the sensor: the derivative of the sensor's noise would look like a motion.
-            early, late = (between(resampled(own, times, s), a, b) for s in (-half, half))
+            early, late = (motion(resampled(own, times, s), a, b) for s in (-half, half))
             turned = rotation_log(late[:, :, :3] @ np.swapaxes(early[:, :, :3], 1, 2))
             clock = np.nan_to_num(np.concatenate([late[:, :, 3] - early[:, :, 3], turned], axis=1)) / (2.0 * half)
         root, used = np.zeros((count, 6, 6)), slice(3, 6)
@@ -107,13 +100,13 @@ class RelativePrior:
         else:
             step = np.maximum(way, MIN_STEP_SHARE * np.median(way) if count else 0.0)[:, None]
             sigma, used = np.repeat(step * [self.drift, self.turn], 3, axis=1), slice(0, 6)
-            scale = np.concatenate([self.drift * motion[:, :, 3], np.zeros((count, 3))], axis=1)
+            scale = np.concatenate([self.drift * measured[:, :, 3], np.zeros((count, 3))], axis=1)
             turns = np.concatenate([np.zeros((count, 3, 3)), self.turn * way[:, None, None] * np.eye(3)], axis=1)
             shared = np.concatenate([scale[:, :, None], turns, OFFSET_SIGMA_S * clock[:, :, None]], axis=2)
         root[:, used, used] = np.eye(sigma.shape[1]) / sigma[:, None, :]
         shared[:, : used.start] = 0.0
         bound = np.full(count, bound_of(sigma.shape[1]))
-        return Factors(np.stack([a, b], axis=1), motion, root, shared, np.zeros((count, 3)), bound)
+        return Factors(np.stack([a, b], axis=1), measured, root, shared, np.zeros((count, 3)), bound)
 
 
 @dataclass(frozen=True)
@@ -172,10 +165,9 @@ def fixes_of(prior: PositionPrior, poses: Floats, piece: NDArray[np.int16], time
 
 def fit_plane(positions: Floats, antenna: Floats) -> RigidTransform:
     """How positions (k, 3) are turned about the vertical and shifted to the antenna's (k, 3)."""
-    centre, origin = antenna.mean(0), positions.mean(0)
-    a, b = (v[:, 0] + 1j * v[:, 1] for v in (positions - origin, antenna - centre))
-    R = rotation_exp([0.0, 0.0, float(np.angle((np.conj(a) * b).sum()))])
-    return RigidTransform(R, centre - R @ origin)
+    R = np.eye(3)
+    R[:2, :2], _ = umeyama(positions[:, :2], antenna[:, :2])
+    return RigidTransform(R, antenna.mean(0) - R @ positions.mean(0))
 
 
 def placed(

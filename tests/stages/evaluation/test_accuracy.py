@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.evaluation import truth
 from rille.stages.evaluation.accuracy import accuracy_stage, nees, trajectory_accuracy
-from rille.stages.evaluation.rigid import by_frame
 from rille.stages.geometry.geometry import rotation_exp
+from rille.stages.geometry.rigid import by_frame
 
 
 def walk(seed: int, n: int, step: float = 1.0, turn: float = 0.02) -> np.ndarray:

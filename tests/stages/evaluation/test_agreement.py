@@ -11,8 +11,8 @@ from evo.core.trajectory import PosePath3D
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.evaluation.agreement import agreement_stage, at_rest, compare, flag
-from rille.stages.evaluation.rigid import compose
 from rille.stages.geometry.geometry import rotation_exp
+from rille.stages.geometry.rigid import compose
 
 RNG = np.random.default_rng
 

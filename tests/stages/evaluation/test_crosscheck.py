@@ -22,8 +22,8 @@ from rille.stages.evaluation.crosscheck import (
     match,
     windows,
 )
-from rille.stages.evaluation.rigid import angles_between, posed
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.geometry.rigid import angles_between, posed
 from rille.stages.imaging.features import extract
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)

@@ -6,8 +6,8 @@ import numpy as np
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.evaluation.crosscheck_join import crosscheck_join_stage, join
-from rille.stages.evaluation.rigid import compose, inverse, posed
 from rille.stages.geometry.geometry import rotation_exp
+from rille.stages.geometry.rigid import compose, inverse, posed
 
 
 def drive(n: int) -> np.ndarray:

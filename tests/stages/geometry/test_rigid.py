@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rille.stages.evaluation.rigid import alignment, compose, inverse, posed, spread
 from rille.stages.geometry.geometry import rotation_exp
+from rille.stages.geometry.rigid import alignment, compose, inverse, posed, spread
 
 small = st.floats(-2.0, 2.0)
 vectors = st.tuples(small, small, small)
