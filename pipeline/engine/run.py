@@ -374,6 +374,7 @@ class _Run:
         planned, handle.ref = missing.status == "planned", None
         fate = "failed" if missing.status == "failed" else "was skipped"
         handle.reason = f"input {missing.label} is to be computed" if planned else f"{missing.label} {fate}"
+        handle.cause = missing.label
         if planned:
             handle.earlier = self.known.latest(self.store, handle.stage, handle.label)
         self._resolve(handle, "planned" if planned else "skipped")

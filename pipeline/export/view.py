@@ -30,6 +30,7 @@ class TaskRow:
     status : what became of it in this run.
     seconds : the time it took when it was computed, in this run or an earlier one; None where it never was.
     reason : of a failed or skipped task: why, in one line.
+    cause : label of the task that a skipped one waits for; empty where it was left out for another reason.
     """
 
     label: str
@@ -37,6 +38,7 @@ class TaskRow:
     status: Status
     seconds: float | None = None
     reason: str = ""
+    cause: str = ""
 
 
 @dataclass(frozen=True)

@@ -128,24 +128,24 @@ def contradictions(view: RunView) -> list[str]:
 
 def _failures(view: RunView) -> Items:
     """Failed tasks by cause, with the number of tasks that depend on them; and what was left out for another reason."""
-    behind = {f"{t.label} {fate}": t for t in view.tasks for fate in ("failed", "was skipped")}
+    tasks = {t.label: t for t in view.tasks}
     causes: dict[tuple[str, str], list[TaskRow]] = {}
     for t in view.tasks:
         root = t
-        while root.status == "skipped" and root.reason in behind:
-            root = behind[root.reason]
+        while root.cause in tasks:
+            root = tasks[root.cause]
         if root.status in ("failed", "skipped"):
             # The figures in a message are those of one pair: the cause is the words.
             kind = _kind(root.label) if root.status == "failed" else ""
             causes.setdefault((kind, re.sub(r"-?[0-9][0-9.]*", "#", root.reason)), []).append(t)
     items = []
-    for (kind, _), tasks in causes.items():
-        failed = [t for t in tasks if t.status == "failed"]
+    for (kind, _), behind in causes.items():
+        failed = [t for t in behind if t.status == "failed"]
         if not kind:
-            why = tasks[0].reason or "something it depends on is missing"
-            items.append(_item("skipped", some([t.label for t in tasks], 6), why))
+            why = behind[0].reason or "something it depends on is missing"
+            items.append(_item("skipped", some([t.label for t in behind], 6), why))
             continue
-        n, waiting = len(failed), len(tasks) - len(failed)
+        n, waiting = len(failed), len(behind) - len(failed)
         whole, names = sum(_kind(t.label) == kind for t in view.tasks), [t.label[len(kind) + 1 :] for t in failed]
         what = f"{n} of {whole} tasks {kind} failed ({some(names, 12)})" if whole > 1 else f"{failed[0].label} failed"
         if waiting:

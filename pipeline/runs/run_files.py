@@ -75,7 +75,7 @@ def task_rows(graph: Graph) -> tuple[TaskRow, ...]:
         before = None if h.ref is None else h.ref.seconds
         seconds = h.took.seconds if h.status == "computed" else before
         reason = " ".join(str(h.error).split()) if h.error is not None else h.reason
-        rows.append(TaskRow(h.label, h.stage, h.status, seconds, reason))  # type: ignore[arg-type]
+        rows.append(TaskRow(h.label, h.stage, h.status, seconds, reason, h.cause))  # type: ignore[arg-type]
     return tuple(rows)
 
 

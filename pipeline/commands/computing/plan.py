@@ -117,8 +117,7 @@ def describe(graph: Graph, result: Result, workers: int, *, verbose: bool = Fals
 
 def _reasons(planned: list[Handle]) -> list[str]:
     """The reasons of a stage's tasks, own ones first, the most frequent first, with their number."""
-    # The reason of a task that only follows from another one begins so.
-    own = Counter(h.reason for h in planned if not h.reason.startswith("input "))
+    own = Counter(h.reason for h in planned if not h.cause)
     listed = [f"{brief(reason, 80)} ({n})" for reason, n in own.most_common(MAX_REASONS)]
     if len(own) > MAX_REASONS:
         listed.append(f"{len(own) - MAX_REASONS} other reasons")

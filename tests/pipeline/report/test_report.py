@@ -162,8 +162,8 @@ def test_what_is_missing_comes_first(tmp_path: Path) -> None:
     tasks = (
         *TASKS,
         TaskRow("resect/4", "resect", "failed", None, "frame 5: 3 landmarks, 6 are needed: set track.points higher"),
-        TaskRow("trajectory", "trajectory", "skipped", None, "resect/4 failed"),
-        TaskRow("risk/world", "risk", "skipped", None, "resect/4 failed"),
+        TaskRow("trajectory", "trajectory", "skipped", None, "resect/4 failed", "resect/4"),
+        TaskRow("risk/world", "risk", "skipped", None, "resect/4 failed", "resect/4"),
     )
     facts, page_, _, _ = written(tmp_path, view(made, tasks=tasks))
     assert facts["complete"] is False

@@ -95,13 +95,16 @@ def test_stops_without_a_local_path_are_told_with_the_reason_of_each():
 
 
 def failed(label, reason, behind=()):
-    return [TaskRow(label, "any", "failed", None, reason), *(TaskRow(b, "any", "skipped", None, r) for b, r in behind)]
+    return [
+        TaskRow(label, "any", "failed", None, reason),
+        *(TaskRow(b, "any", "skipped", None, "", cause) for b, cause in behind),
+    ]
 
 
 def test_failures_are_told_by_cause_with_the_tasks_that_depend_on_them():
     tasks = [TaskRow(f"locus/local/{k}", "locus", "computed") for k in range(36)]
     for k in (36, 40):
-        behind = [(f"risk/local/{k}", f"locus/local/{k} failed"), (f"path/local/{k}", f"risk/local/{k} was skipped")]
+        behind = [(f"risk/local/{k}", f"locus/local/{k}"), (f"path/local/{k}", f"risk/local/{k}")]
         tasks += failed(f"locus/local/{k}", f"no ground within {k}.5 m: look down", behind)
     tasks += failed("locus/local/44", "too dark: give light")
     tasks += [TaskRow("merge", "merge", "skipped", None, "stopped after locus/local/44 failed")]
