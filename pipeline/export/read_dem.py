@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from affine import Affine
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from rille.datasets.georeference import Georeference
 from rille.datasets.text.reading import TABLE, Search, open_regular, read_lines, read_text
@@ -129,7 +129,7 @@ def _without_marks(dem: DemFile) -> DemFile:
     marked = values == mark
     several, apart = marked.sum() > 1, gap > high - low
     usual = apart and gap > 30.0 * dem.cell and mark in (0.0, -1.0, -99.0, -999.0, 255.0, 999.0)
-    inner = ndimage.binary_erosion(marked, np.ones((3, 3)), border_value=1)
+    inner = scipy.ndimage.binary_erosion(marked, np.ones((3, 3)), border_value=1)
     # Nothing on Earth rises by 300 cells, or by 1500 m, over less than a cell.
     steep = gap > 300.0 * dem.cell and several and apart
     text = (
