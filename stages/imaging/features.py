@@ -100,12 +100,21 @@ def match(a: Floats32, b: Floats32) -> NDArray[np.uint32]:
     if min(len(a), len(b)) == 0:
         return np.zeros((0, 2), np.uint32)
     # All descriptors have nearly the same length, so the greatest product is the least angle.
-    forward = _nearest(a @ b.T)
-    rows = np.flatnonzero(forward >= 0)
-    wanted, place = np.unique(forward[rows], return_inverse=True)
-    backward = _nearest(b[wanted] @ a.T)
-    rows = rows[backward[place] == rows]
-    return np.stack([rows, forward[rows]], axis=1).astype(np.uint32)
+    products = a @ b.T
+    rows, nearest = np.arange(len(a)), products.argmax(axis=1)
+    best = products[rows, nearest]
+    rows = np.flatnonzero(best == products.max(axis=0)[nearest])
+    nearest, best = nearest[rows], best[rows]
+    # What is left of them is the second best of each row and column.
+    products[rows, nearest] = 0.0
+    keep = _clear(best, products.max(axis=1)[rows]) & _clear(best, products.max(axis=0)[nearest])
+    return np.stack([rows[keep], nearest[keep]], axis=1).astype(np.uint32)
+
+
+def _clear(best: Floats32, second: Floats32) -> Bools:
+    """Whether the angles of products of descriptors are those of a match, before the second best."""
+    near, next_near = (np.arccos(np.minimum(p / UNIT_BYTES**2, 1.0)) for p in (best, second))
+    return np.asarray((near <= MAX_DISTANCE) & (near < MAX_RATIO * next_near))
 
 
 def matched_points(a: Bundle, b: Bundle) -> tuple[Floats, Floats]:
@@ -114,18 +123,6 @@ def matched_points(a: Bundle, b: Bundle) -> tuple[Floats, Floats]:
     pairs = match(*(np.asarray(one["descriptors"], np.float32) for one in (a, b)))
     first, second = (np.asarray(s["points"], np.float64)[pairs[:, k]] - PIXEL_CENTRE for k, s in enumerate((a, b)))
     return first, second
-
-
-def _nearest(products: Floats32) -> NDArray[np.intp]:
-    """Column of the nearest descriptor of each row, -1 where there is no clear one; spoils ``products``."""
-    rows = np.arange(len(products))
-    best = products.argmax(axis=1)
-    first = products[rows, best]
-    # Below any product of bytes: the second best is then the maximum of what is left.
-    products[rows, best] = -1.0
-    second = np.maximum(products.max(axis=1), 0.0)
-    near, next_near = (np.arccos(np.minimum(p / UNIT_BYTES**2, 1.0)) for p in (first, second))
-    return np.where((near <= MAX_DISTANCE) & (near < MAX_RATIO * next_near), best, -1)
 
 
 @stage(

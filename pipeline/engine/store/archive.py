@@ -14,6 +14,7 @@ import struct
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
 
 MANIFEST = "manifest.json"
 
@@ -22,6 +23,10 @@ MAX_READ_BYTES = 4_000_000
 
 MALFORMED = (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, OverflowError, struct.error)
 """Errors of zipfile (NotImplementedError: a method that it does not know), json and the codec about what they read."""
+
+
+KEPT_OPEN = 32
+"""Archives that a process keeps open: the arrays of an artifact are read one by one, and opening reads the directory."""
 
 
 class BrokenError(ValueError):
@@ -48,8 +53,14 @@ class Archive(zipfile.ZipFile):
     """An artifact's file, open for reading; ``size`` is that of the file, bytes."""
 
     def __init__(self, file: _RegularFile) -> None:
+        self._file = file
         super().__init__(file)
         self.size = os.fstat(file.fileno()).st_size
+
+    def close(self) -> None:
+        """Close the archive and its file."""
+        super().close()
+        self._file.close()
 
     def member(self, name: str, most: int) -> bytes:
         """Content of a member of at most ``most`` bytes.
@@ -90,8 +101,8 @@ def opened(path: str) -> Iterator[Archive]:
         There is none.
     """
     try:
-        with _RegularFile(path) as file, Archive(file) as archive:
-            yield archive
+        status = os.stat(path)
+        yield _kept(path, (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns))
     except MALFORMED as error:
         raise BrokenError(str(error)) from None
     except OSError as error:
@@ -99,3 +110,9 @@ def opened(path: str) -> Iterator[Archive]:
         if error.errno not in (errno.EINVAL, errno.EISDIR):
             raise
         raise BrokenError(os.strerror(error.errno)) from None
+
+
+@lru_cache(KEPT_OPEN)
+def _kept(path: str, status: tuple[int, ...]) -> Archive:
+    """The archive at a path while the file's ``status`` stays the same; it is closed when nobody refers to it."""
+    return Archive(_RegularFile(path))
