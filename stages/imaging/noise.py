@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
 from rille.stages.core.declare import AnyArray
 
@@ -38,44 +37,26 @@ def standard_deviation(images: Sequence[AnyArray], masks: Sequence[AnyArray]) ->
     """
     if len(images) < 2 or min(images[0].shape) < 3 * BLOCK_SIDE_PX:
         return 0.0
-    rows = images[0].shape[0]
+    rows, cols = images[0].shape
+    blocks = cols // BLOCK_SIDE_PX - 2
     step = BLOCK_SIDE_PX * max(1, images[0].size // MAX_PIXELS)
-    parts = [_blocks(images, masks, y) for y in range(BLOCK_SIDE_PX, rows - 2 * BLOCK_SIDE_PX + 1, step)]
-    variances = np.concatenate(parts) if parts else np.empty(0)
+    tops = range(BLOCK_SIDE_PX, rows - 2 * BLOCK_SIDE_PX + 1, step)
+    squares = [
+        np.stack([_mean_squares(images[level], masks[level], y >> level, BLOCK_SIDE_PX >> level, blocks) for y in tops])
+        for level in (0, 1)
+    ]
+    variances = (squares[0] - squares[1]) / 0.75
+    variances = variances[~np.isnan(variances)]
     return float(np.sqrt(max(np.median(variances), 0.0))) if variances.size >= MIN_BLOCKS else 0.0
 
 
-def _blocks(images: Sequence[AnyArray], masks: Sequence[AnyArray], y: int) -> AnyArray:
-    """Variances of the noise in the blocks of 16 rows from ``y`` on, those with a masked pixel left out."""
-    squares = np.empty((2, images[0].shape[1] // BLOCK_SIDE_PX - 2))
-    for level, side in ((0, BLOCK_SIDE_PX), (1, BLOCK_SIDE_PX // 2)):
-        _mean_squares(images[level], masks[level], y >> level, side, squares[level])
-    variances = (squares[0] - squares[1]) / 0.75
-    return np.asarray(variances[~np.isnan(variances)])
-
-
-@njit(cache=True, nogil=True)
-def _mean_squares(image, mask, first, side, squares):  # type: ignore[no-untyped-def]
-    """Mean squared second differences of the blocks in the ``side`` rows from ``first`` on, the outermost two left out;
-    NaN where a pixel is masked. ``side``: a multiple of eight."""
-    width = squares.size * side
-    down, square, part = np.empty(width + 2), np.empty(width), np.empty(8)
-    squares[:] = 0.0
-    for y in range(first, first + side):
-        # The blocks' columns, and one more to either side.
-        a, b, c = image[y - 1][side - 1 :], image[y][side - 1 :], image[y + 1][side - 1 :]
-        usable = mask[y][side:]
-        for x in range(width + 2):
-            down[x] = (np.float64(c[x]) - b[x]) - (np.float64(b[x]) - a[x])
-        for x in range(width):
-            # White noise of variance 1 has a second difference of variance 6 along an axis, 36 along both.
-            bend = ((down[x + 2] - down[x + 1]) - (down[x + 1] - down[x])) / 6.0
-            square[x] = bend * bend if usable[x] else np.nan
-        for k in range(squares.size):
-            # Eight sums side by side: this order fixes the last digits.
-            part[:] = 0.0
-            for x in range(k * side, (k + 1) * side, 8):
-                for i in range(8):
-                    part[i] += square[x + i]
-            squares[k] += ((part[0] + part[1]) + (part[2] + part[3])) + ((part[4] + part[5]) + (part[6] + part[7]))
-    squares /= side * side
+def _mean_squares(image: AnyArray, mask: AnyArray, top: int, side: int, blocks: int) -> AnyArray:
+    """Mean squared second differences of so many blocks of ``side`` rows from ``top`` on, the first one of them left
+    out; NaN where a pixel is masked."""
+    right = (blocks + 1) * side
+    # The blocks' pixels, and one more to each side.
+    bend = np.diff(np.diff(image[top - 1 : top + side + 1, side - 1 : right + 1], 2, axis=0), 2, axis=1)
+    # White noise of variance 1 has a second difference of variance 6 along an axis, 36 along both.
+    square = np.square(bend, dtype=np.float64) / 36.0
+    square[mask[top : top + side, side:right] == 0] = np.nan
+    return np.asarray(square.reshape(side, -1, side).mean(axis=(0, 2)))
