@@ -29,6 +29,7 @@ from rille.stages.facts.calibration import CalibrationFacts, OrientationFacts, R
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts, MovingFacts, ResectFacts, TrackFacts, TrajectoryFacts
 from rille.stages.facts.terrain import DemFacts, GroundFacts, MergeFacts, TileIndexFacts
+from rille.stages.geometry.geometry import Rig
 from rille.stages.hazard.risk import risk_stage
 from rille.stages.hfvm.stage import hfvm_stage
 from rille.stages.imaging.features import features_stage
@@ -102,12 +103,12 @@ def name(graph: Graph, sequence: Sequence, frames: Series[int]) -> None:
     graph.sequence, graph.choice = sequence.name, digest(tuple(frames))[:16]
 
 
-def recalibrated(sequence: Sequence, errors: Series[float]) -> Sequence:
-    """The sequence with both cameras changed by errors of focal length and principal point (over the former)."""
-    rig, lenses = sequence.rig, (sequence.lenses or {}).items()
+def recalibrated(sequence: Sequence, errors: Series[float], rig: Args) -> Sequence:
+    """The sequence with another rig, whose cameras were changed by errors of focal length and principal point."""
+    lenses = (sequence.lenses or {}).items()
     return replace(
         sequence,
-        rig=replace(rig, left=corrected(rig.left, errors), right=corrected(rig.right, errors)),
+        rig=Rig.from_dict(rig),
         lenses={side: replace(lens, camera=corrected(lens.camera, errors)) for side, lens in lenses} or None,
     )
 
@@ -123,7 +124,7 @@ class Builder:
         self.graph, self.sequence, self.config = graph, sequence, config
         self.products = Products()
         self.made: dict[Any, Any] = {}
-        self.given_camera = sequence.rig.left.to_dict()
+        self.corrections: list[float] | None = None
 
     # Arguments of many tasks, one object for all: each would hold some kilobytes of its own until the run's end.
 
@@ -147,9 +148,10 @@ class Builder:
         chosen: Params = params or getattr(self.config, stage.name, NO_PARAMS)
         return self.graph.call(stage, label, chosen, **given)
 
-    def recalibrate(self, errors: Series[float]) -> None:
-        """Go on with both cameras changed; what does not rest on them is the same task as before."""
-        self.sequence = recalibrated(self.sequence, errors)
+    def recalibrate(self, errors: Series[float], rig: Args) -> None:
+        """Go on with the calibration changed; what does not rest on it is the same task as before."""
+        self.sequence = recalibrated(self.sequence, errors, rig)
+        self.corrections = [a + b for a, b in zip(self.corrections or [0.0] * len(errors), errors, strict=True)]
         self.graph.anew = True
         self.made.clear()
         self.products.contradictions.clear()

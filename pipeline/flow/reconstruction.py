@@ -115,8 +115,9 @@ TABLE_FRAMES = 100
 PLACES_FRAMES = 500
 """Frames whose basic pairs are looked for in earlier ones together: blocks that are read by all later blocks."""
 
-CALIBRATIONS = 4
-"""Corrections of the cameras, at most: of a focal length that is 10 % off one to three are usual."""
+CALIBRATIONS = 6
+"""Corrections of the calibration, at most: of a focal length that is 10 % off one to three are usual, of a yaw that is
+half a degree off two."""
 
 Steps = Generator[Wait, Any, None]
 Facts = Mapping[str, Any]
@@ -176,10 +177,10 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         segments, moved = yield from unmoved(make, matched, segments)
         p.tracks, p.resections = [s.track for s in segments], [s.resection for s in segments]
         p.refined = refined(make, matched, segments)
-        correction = (yield from asked_for(make, matched[basic[0]])) if p.refined else []
-        if not any(correction) or turn == CALIBRATIONS:
+        asked = (yield from asked_for(make, matched[basic[0]])) if p.refined else None
+        if asked is None or turn == CALIBRATIONS:
             break
-        make.recalibrate(correction)
+        make.recalibrate(asked["correction"], asked["rig"])
         turn += 1
     if p.intrinsics is not None:
         p.contradictions.append(p.intrinsics)
@@ -497,14 +498,16 @@ def moving_parts(
     return out
 
 
-def asked_for(make: Builder, key: BasicPair) -> Generator[Wait, Any, list[float]]:
-    """Correction of the cameras that all segments ask for, zeros where they do not; of the rig of pair ``key``."""
+def asked_for(make: Builder, key: BasicPair) -> Generator[Wait, Any, IntrinsicsFacts | None]:
+    """Another calibration that all segments ask for, None where they do not; of the rig of pair ``key``."""
     p = make.products
-    given = make.given_camera if make.graph.anew else None
-    p.intrinsics = make.node(intrinsics_stage, "intrinsics", segments=p.refined, rig=key.rig, given=given)
+    fixed = make.config.rig.mode == "fixed"
+    asked = {"before": make.corrections, "fixed": fixed or None}
+    p.intrinsics = make.node(intrinsics_stage, "intrinsics", segments=p.refined, rig=key.rig, **asked)
     judged: list[Ref[IntrinsicsFacts] | None] = yield Maybe([p.intrinsics])
+    facts: Any = None if judged[0] is None else judged[0].meta
     # A plan takes the facts of earlier runs, which may be those of an earlier release.
-    return [] if judged[0] is None else judged[0].meta.get("correction", [])
+    return facts if facts and "rig" in facts and any(facts["correction"]) else None
 
 
 def seen_again(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[Handle[LoopFacts]]]:

@@ -75,7 +75,8 @@ class ResectFacts(Facts):
 
 class RefineFacts(Facts):
     """A segment adjusted with its landmarks: bias and costs of the ``adjustment``, and what it says of errors of the
-    calibration (``intrinsics``: ``information``, ``pull``, ``turn_deg``); both empty where no frame has a pose."""
+    calibration (``intrinsics``: ``information``, ``pull``, ``turn_deg``; ``yaw``: information and pull of the rig's);
+    both empty where no frame has a pose."""
 
     adjustment: dict[str, Any]
     intrinsics: dict[str, Any]
@@ -84,12 +85,15 @@ class RefineFacts(Facts):
 
 class IntrinsicsFacts(Facts):
     """``errors`` of the calibration, each with its sigma, and their ``covariance``; those that are ``held`` by the
-    calibration as given, since the sequence shows them little; ``correction`` that the tracks ask for (else 0) of focal
-    length and principal point, over the focal length."""
+    calibration as given, since the sequence shows them little; the rig's ``yaw`` and its sigma, rad; the ``correction``
+    that the tracks ask for (else 0) of focal length and principal point, over the focal length, and of the yaw; and the
+    ``rig`` that has it."""
 
     errors: dict[str, list[float]]
     covariance: list[list[float]]
     held: list[str]
+    yaw: list[float]
+    rig: dict[str, Any]
     correction: list[float]
     contradiction: NotRequired[str]
 

@@ -26,7 +26,7 @@ MALFORMED = (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, Va
 
 
 KEPT_OPEN = 32
-"""Archives that a process keeps open: the arrays of an artifact are read one by one, and opening reads the directory."""
+"""Archives that a process keeps open: arrays are read one by one, and opening reads the directory."""
 
 
 class BrokenError(ValueError):

@@ -7,10 +7,12 @@ unknowns (poses, depths, bias) are eliminated, and the change of its poses with 
 and the priors of a usual calibration give the errors and their covariance; the trajectory adds it up like other errors
 that all segments share.
 
-A number of the cameras that the tracks contradict is corrected, and all that rests on it is computed anew: images are
-undistorted, rig and segments found with the corrected cameras, so that poses and maps are of one calibration. An error
-that does not contradict its prior is part of the covariance alone. Held are the rig's yaw, which the common error of
-the disparities stands for, and the baseline's length, which no image shows.
+The rig's yaw is an error that all disparities share: near and far landmarks ask for different motions. A straight
+drive shows that as well, so that all segments count for it, each by what its own common error says.
+
+A number that the tracks contradict is corrected, and all that rests on it is computed anew: images are undistorted, rig
+and segments found with the corrected calibration, so that poses and maps are of one. An error that does not contradict
+its prior is part of the covariance alone. Held is the baseline's length, which no image shows.
 """
 
 from __future__ import annotations
@@ -40,6 +42,7 @@ from rille.stages.odometry.resection.bundle_adjustment import (
     SegmentTracks,
 )
 from rille.stages.odometry.resection.landmarks import triangulated
+from rille.stages.odometry.resection.pnp import bias_information
 
 PRIORS: Mapping[str, float] = {
     "focal length": 1.0,
@@ -58,6 +61,9 @@ the rows of all pairs show the rig's angles far better (:mod:`rille.stages.calib
 CORRECTED = 3
 """How many of these are corrected: those of the camera without distortion."""
 
+YAW_PRIOR = 0.1
+"""Standard deviation of the rig's yaw, rad, over that of the focal length, as of the other angles."""
+
 STEP = 1e-4
 """Change of each number by which the tracks are differentiated."""
 
@@ -72,6 +78,10 @@ MIN_ERROR = 0.0175
 
 MIN_CHANGE = 0.004
 """The same of a camera that was corrected: which prior it had is no longer believed."""
+
+MIN_YAW_PX, MIN_YAW_CHANGE_PX = 0.4, 0.1
+"""The same two limits of the yaw, as pixels of disparity; rows pass up to as many
+(:class:`rille.stages.calibration.parameter_selection.RelativeParams`)."""
 
 MIN_SIGMAS = 5.0
 """Standard deviations of the estimate from which on a prior is not believed."""
@@ -127,6 +137,18 @@ def corrected_rig(rig: Rig, errors: Floats) -> Rig:
     return replace(turned, left=corrected(rig.left, errors), right=corrected(rig.right, errors))
 
 
+def calibrated_anew(rig: Rig, correction: Sequence[float]) -> Rig:
+    """Rig whose cameras are changed by the first :data:`CORRECTED` of a correction, and whose yaw by the last, rad."""
+    turned = epipolar.corrected(rig, np.array([0.0, correction[-1], 0.0, 0.0, 0.0]))
+    return replace(turned, left=corrected(rig.left, correction), right=corrected(rig.right, correction))
+
+
+def _in_key_pair(tracks: SegmentTracks, cameras: SegmentCameras) -> tuple[Floats, Floats]:
+    """Pixels (n, 2) of a segment's landmarks in the left and the right image of its key pair."""
+    rig, key = cameras.rig, cameras.T_local_key.inverse().apply(tracks.position)
+    return rig.left.project(key), rig.right.project(rig.T_right_left.apply(key))
+
+
 def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) -> SegmentTracks:
     """Measurements as they would be if the calibration were changed by ``errors`` (k,)."""
     rig, T_local_key = cameras.rig, cameras.T_local_key
@@ -141,9 +163,11 @@ def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) 
         ray = (pixels - centre) / focal
         return np.asarray(pixels - errors[CORRECTED] * focal * ray * (ray**2).sum(-1, keepdims=True))
 
-    key = T_local_key.inverse().apply(tracks.position)
-    left = undistorted_anew(rig.left.project(key), "left", rig.left, other.left)
-    right = undistorted_anew(rig.right.project(rig.T_right_left.apply(key)), "right", rig.right, other.right)
+    left, right = _in_key_pair(tracks, cameras)
+    left, right = (
+        undistorted_anew(left, "left", rig.left, other.left),
+        undistorted_anew(right, "right", rig.right, other.right),
+    )
     at = triangulated(left, right, other, T_local_key, tracks.sigma)
     pixels = undistorted_anew(tracks.pixels, "left", rig.left, other.left)
     return replace(tracks, position=at.position, along=at.per_pixel, pixels=pixels, camera=other.left)
@@ -188,6 +212,25 @@ def contribution(
     turned = np.swapaxes(state.R, 1, 2)[:, None] @ -step[:-1].reshape(-1, 2, 3, k)
     information = matrix[p:, p:] + matrix[p:, :p] @ step
     return IntrinsicsPart(information, right[p:] + step.T @ right[:p], turned.reshape(-1, 6, k))
+
+
+def yaw_part(
+    tracks: SegmentTracks, state: SegmentState, cameras: SegmentCameras, params: RefineParams
+) -> tuple[float, float]:
+    """What an adjusted segment says of the rig's yaw, rad, by the common error of its disparities: information, pull.
+
+    The prior that the segment has for that error, which would draw it towards zero, is left out.
+    """
+    left, right = _in_key_pair(tracks, cameras)
+    turned = triangulated(
+        left, right, calibrated_anew(cameras.rig, [0.0] * CORRECTED + [STEP]), cameras.T_local_key, tracks.sigma
+    ).position
+    along = ((turned - tracks.position) * tracks.along).sum(1) / (tracks.along**2).sum(1)
+    px_per_rad = float(np.nanmedian(along)) / STEP
+    matrix, _ = SegmentAdjustment(tracks, params).normal(state).without_depths()
+    held = float(matrix[-1, -1] - matrix[-1, :-1] @ np.linalg.solve(matrix[:-1, :-1], matrix[:-1, -1]))
+    information = max(held - bias_information(params.bias_sigma), 0.0)
+    return information * px_per_rad**2, held * state.bias * px_per_rad
 
 
 class CommonErrors(NamedTuple):
@@ -235,21 +278,21 @@ def common_errors(information: Floats, pull: Floats, sigma: Floats, least: float
         wrong[departure.argmax()] = True
 
 
-def contradiction(used: Camera, given: Camera, sigma: Floats) -> str:
-    """One line on the numbers of the camera in use that are not those given; empty where all are.
+def contradiction(errors: Floats, sigma: Floats, focal: float) -> str:
+    """One line on the numbers of the cameras that are not those given; empty where all are.
 
     Parameters
     ----------
-    sigma : (k,) standard deviations of the errors.
+    errors, sigma : (k,) by which they were changed, and their standard deviations.
+    focal : focal length, px.
     """
-    focal = given.fx
-    changes = (used.fx / focal - 1.0, (used.cx - given.cx) / focal, (used.cy - given.cy) / focal)
-    wrong = []
-    for name, change, one, (scale, unit) in zip(
-        PRIORS, changes, sigma, ((100.0, "%"), (focal, "px"), (focal, "px")), strict=False
-    ):
-        if abs(change) > MIN_ERROR:
-            wrong.append(f"the {name} by some {scale * change:+.2g} +- {scale * one:.1g} {unit}")
+    wrong = [
+        f"the {name} by some {scale * error:+.2g} +- {scale * one:.1g} {unit}"
+        for name, error, one, (scale, unit) in zip(
+            PRIORS, errors, sigma, ((100.0, "%"), (focal, "px"), (focal, "px")), strict=False
+        )
+        if abs(error) > MIN_ERROR
+    ]
     if not wrong:
         return ""
     return (
@@ -258,34 +301,61 @@ def contradiction(used: Camera, given: Camera, sigma: Floats) -> str:
     )
 
 
-@stage("intrinsics", version=2)
+def yaw_contradiction(angle: float, sigma: float, fixed: bool) -> str:
+    """One line on a yaw that was changed by an angle, rad, or would be, were it not ``fixed``; empty where it is 0."""
+    if not angle:
+        return ""
+    outcome = "kept because rig.mode = fixed: depths and lengths are off by that" if fixed else "corrected"
+    return (
+        "the tracks contradict the rig: near and far landmarks ask for different motions, unless the right camera is "
+        f"turned by {math.degrees(angle):+.3f} +- {math.degrees(sigma):.3f} degrees (yaw); {outcome}"
+    )
+
+
+@stage("intrinsics", version=3)
 def intrinsics_stage(
     params: IntrinsicsParams,
     segments: Sequence[Bundle[RefineFacts]],
     rig: Bundle[CalibrationFacts],
     *,
-    given: Camera | None = None,
+    before: Sequence[float] | None = None,
+    fixed: bool = False,
 ) -> Bundle[IntrinsicsFacts]:
-    """Errors of the calibration that the tracks of all segments show; ``given``: the left camera, if corrected."""
-    parts = [s.meta["intrinsics"] for s in segments if s.meta["intrinsics"]]
+    """Errors of the calibration that the tracks of all segments show.
+
+    ``before`` are corrections that were made already; with ``fixed`` the rig keeps its yaw. The yaw is corrected first:
+    while it is wrong, so is what the tracks say of the cameras.
+    """
+    parts, k = [s.meta["intrinsics"] for s in segments if s.meta["intrinsics"]], len(PRIORS)
     turning = [part for part in parts if part["turn_deg"] >= MIN_TURN_DEG]
-    if len(turning) < MIN_SEGMENTS:
-        turning = []
-    k = len(PRIORS)
-    information = np.array([part["information"] for part in turning]).reshape(-1, k, k)
-    pull = np.array([part["pull"] for part in turning]).reshape(-1, k)
-    common = common_errors(information, pull, params.sigma, MIN_ERROR if given is None else MIN_CHANGE)
-    sigma, used = np.sqrt(np.diag(common.covariance)), Rig.from_dict(rig.meta["rig"]).left
-    correction = np.where(common.wrong, common.errors, 0.0)[:CORRECTED]
+    used, made = Rig.from_dict(rig.meta["rig"]), np.zeros(CORRECTED + 1) if before is None else np.array(before)
+    enough = [part for part in turning if len(turning) >= MIN_SEGMENTS]
+    common = common_errors(
+        np.array([part["information"] for part in enough]).reshape(-1, k, k),
+        np.array([part["pull"] for part in enough]).reshape(-1, k),
+        params.sigma,
+        MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR,
+    )
+    shown = np.array([part["yaw"] for part in parts if len(parts) >= MIN_SEGMENTS]).reshape(-1, 2, 1)
+    least = (MIN_YAW_CHANGE_PX if made[-1] else MIN_YAW_PX) / used.left.fx
+    yaw = common_errors(shown[:, :1], shown[:, 1], np.array([YAW_PRIOR * params.prior]), least)
+    turn, sigma = float(yaw.errors[0]) * bool(yaw.wrong[0]), np.sqrt(np.diag(common.covariance))
+    correction = np.append(np.where(common.wrong, common.errors, 0.0)[:CORRECTED], 0.0)
+    if turn and not fixed:
+        correction = np.array([*np.zeros(CORRECTED), turn])
     facts: IntrinsicsFacts = {
         "errors": dict(zip(PRIORS, np.column_stack([common.errors, sigma]).tolist(), strict=True)),
         # What is not corrected stays in the poses: their covariance has its square.
         "covariance": (common.covariance + np.outer(common.errors, common.errors)).tolist(),
         "held": [name for name, share in zip(PRIORS, sigma / params.sigma, strict=True) if share > HELD_SHARE],
+        "yaw": [float(yaw.errors[0]), math.sqrt(yaw.covariance[0, 0])],
         "correction": correction.tolist(),
+        "rig": calibrated_anew(used, correction.tolist()).to_dict(),
     }
-    if line := contradiction(corrected(used, correction), given or used, sigma):
-        facts["contradiction"] = line
-        # Said once, by the last of the corrections.
-        facts["warnings"] = [] if correction.any() else [line]
+    cameras = contradiction((made + correction)[:CORRECTED], sigma, used.left.fx)
+    angle = yaw_contradiction(turn if fixed else made[-1] + turn, facts["yaw"][1], fixed)
+    if doubt := "; ".join(filter(None, [cameras, angle if fixed else ""])):
+        facts["contradiction"] = doubt
+    # Said once, by the last of the corrections.
+    facts["warnings"] = [] if correction.any() else [line for line in (angle, cameras) if line]
     return Bundle({}, facts)

@@ -38,7 +38,14 @@ from rille.stages.odometry.resection.bundle_adjustment import (
     SegmentTracks,
     adjust,
 )
-from rille.stages.odometry.resection.intrinsics import PRIORS, IntrinsicsPart, SegmentCameras, contribution, turn_deg
+from rille.stages.odometry.resection.intrinsics import (
+    PRIORS,
+    IntrinsicsPart,
+    SegmentCameras,
+    contribution,
+    turn_deg,
+    yaw_part,
+)
 from rille.stages.odometry.resection.pnp import Pose, back_projection, bias_information, pose_covariance
 from rille.stages.odometry.resection.robust_pose import (
     MIN_LANDMARKS,
@@ -140,7 +147,7 @@ class RefineInputs(NamedTuple):
 
 @stage(
     "refine",
-    version=7,
+    version=8,
     outputs=[
         replace(POSES, frame="local"),
         replace(COVARIANCE, frame="local"),
@@ -176,6 +183,7 @@ def refine_stage(
                 "information": (part.information / errors.excess).tolist(),
                 "pull": (part.pull / errors.excess).tolist(),
                 "turn_deg": turn_deg(end.state, T_local_key),
+                "yaw": [one / errors.excess for one in yaw_part(end.tracks, end.state, cameras, params)],
             }
             meta["per_frame"] = _per_frame(end, params, inputs.track.meta["frames"])
     return Bundle(out, meta)

@@ -16,6 +16,7 @@ from rille.pipeline.flow.builders import PYRAMID_BYTES, Builder, other_plane
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.flow.products import Products
 from rille.pipeline.flow.reconstruction import SEAMS, cells_in_both, overlaps, spread
+from rille.stages.odometry.resection.intrinsics import calibrated_anew
 from rille.stages.terrain.ground_frame import SCENE
 from rille.stages.terrain.tile_index import Box
 
@@ -56,8 +57,9 @@ def lay_out(
         handles, go_on, _ = [w for w in graph.expansions if w[0][0].stage == stage][-1]
         facts = found | meta if stage == "keyframes" else meta
         go_on(*(SimpleNamespace(meta=facts) for _ in handles))
-    for turn, correction in enumerate([*(cameras or []), [0.0, 0.0, 0.0]]):
-        facts = {"keyframes": found, "ground_frame": ground or GROUND, "intrinsics": {"correction": correction}}
+    for turn, correction in enumerate([*(cameras or []), [0.0, 0.0, 0.0, 0.0]]):
+        asked = {"correction": correction, "rig": calibrated_anew(sequence.rig, correction).to_dict()}
+        facts = {"keyframes": found, "ground_frame": ground or GROUND, "intrinsics": asked}
         for stage in [*(("keyframes", "rig") if turn else ()), "ground_frame", "resect", "intrinsics"]:
             of = (jumps or {}) if stage == "resect" else {}
             for handles, go_on, _ in [w for w in graph.expansions if w[0][0].stage == stage][-1:]:
@@ -99,7 +101,7 @@ def test_wrong_cameras_are_corrected_in_all_that_rests_on_them_and_nothing_else_
         {"chain": list(range(8)), "lost": [], "unfit": []},
         {"basic": [0, 4], "segments": [[0, 1, 2, 3, 4], [4, 5, 6, 7]]},
         {"frames": list(range(8)), "pieces": [[0, 7]], "main": 0, "positions": [[0, 0, k] for k in range(8)]},
-        cameras=[[-0.1, 0.0, 0.0]],
+        cameras=[[-0.1, 0.0, 0.0, 0.0]],
     )
     assert labels(graph, "intrinsics") == ["intrinsics", "intrinsics/anew"]
     asked = [h for h in graph.nodes if h.label in ("orientation/0", "orientation/0/anew")]

@@ -16,11 +16,13 @@ from rille.stages.odometry.resection.intrinsics import (
     PRIORS,
     IntrinsicsParams,
     SegmentCameras,
+    calibrated_anew,
     common_errors,
     contribution,
     corrected,
     intrinsics_stage,
     with_errors,
+    yaw_part,
 )
 from rille.stages.odometry.resection.landmarks import triangulated
 from rille.stages.odometry.resection.refine import pose_errors
@@ -35,10 +37,16 @@ T_RIGHT_LEFT = RigidTransform(np.eye(3), np.array([-0.12, 0.0, 0.0]))
 POINTS = 80
 
 
-def segment(seed: int, given: Camera, lens: Lens, turn: float) -> tuple[SegmentTracks, SegmentState, SegmentCameras]:
-    """A camera of 450 px that turns by some ``turn`` radians, and is taken for the given one; true poses."""
+def segment(
+    seed: int, given: Camera, lens: Lens, turn: float, yaw: float = 0.0
+) -> tuple[SegmentTracks, SegmentState, SegmentCameras]:
+    """A camera of 450 px that turns by some ``turn`` radians, and is taken for the given one; true poses.
+
+    The given rig's right camera is turned by ``yaw``, rad.
+    """
     rng = np.random.default_rng(seed)
-    rig, wrong = Rig(given, given, T_RIGHT_LEFT), replace(lens, camera=given)
+    rig = calibrated_anew(Rig(given, given, T_RIGHT_LEFT), [0.0, 0.0, 0.0, yaw])
+    wrong = replace(lens, camera=given)
 
     def measured(points):
         pixels = wrong.undistort(lens.distort(CAMERA.project(points), CAMERA), given)
@@ -59,26 +67,27 @@ def segment(seed: int, given: Camera, lens: Lens, turn: float) -> tuple[SegmentT
     return tracks, state, SegmentCameras(rig, lenses, LEVEL)
 
 
-def facts_of(given: Camera, lens: Lens, turn: float = 0.05, first: Camera | None = None):
-    """Facts that eight segments lead to, of a camera that is given, or was corrected from the ``first``."""
-    parts, rig = [], Bundle({}, {"rig": Rig(given, given, T_RIGHT_LEFT).to_dict()})
+def facts_of(given: Camera, lens: Lens, turn: float = 0.05, yaw: float = 0.0, **known):
+    """Facts that eight segments lead to, of a camera that is given, and of a rig that is off by a yaw."""
+    parts = []
     for seed in range(8):
-        tracks, state, cameras = segment(seed, given, lens, turn)
-        part = contribution(tracks, adjust(tracks, state, PARAMS).state, cameras, PARAMS)
-        facts = {"information": part.information, "pull": part.pull, "turn_deg": 57.3 * turn}
+        tracks, state, cameras = segment(seed, given, lens, turn, yaw)
+        end = adjust(tracks, state, PARAMS).state
+        part, shown = contribution(tracks, end, cameras, PARAMS), yaw_part(tracks, end, cameras, PARAMS)
+        facts = {"information": part.information, "pull": part.pull, "turn_deg": 57.3 * turn, "yaw": shown}
         parts.append(Bundle({}, {"intrinsics": facts}))
-    known = {"given": first.to_dict()} if first else {}
+    rig = Bundle({}, {"rig": cameras.rig.to_dict()})
     return intrinsics_stage.run(IntrinsicsParams(), known, {"segments": parts, "rig": rig}).meta
 
 
 def corrections(given: Camera, lens: Lens, turn: float = 0.1):
     """The camera that the run computes with, corrected and asked again as the flow does, and the last facts."""
-    used = given
+    used, before = given, np.zeros(CORRECTED + 1)
     for _ in range(4):
-        facts = facts_of(used, lens, turn, given)
+        facts = facts_of(used, lens, turn, before=before.tolist())
         if not any(facts["correction"]):
             break
-        used = corrected(used, facts["correction"])
+        used, before = corrected(used, facts["correction"]), before + facts["correction"]
     return used, facts
 
 
@@ -96,7 +105,7 @@ def test_a_wrong_number_is_corrected_where_the_camera_turns(number, by, lens):
 def test_right_numbers_are_believed(lens):
     facts = facts_of(CAMERA, lens, 0.1)
     assert "contradiction" not in facts
-    assert facts["correction"] == [0.0] * CORRECTED
+    assert facts["correction"] == [0.0] * (CORRECTED + 1)
     errors, sigma = np.array(list(facts["errors"].values())).T
     assert (np.abs(errors) < 4.0 * sigma).all()
     assert NAMES[0] not in facts["held"]
@@ -107,6 +116,33 @@ def test_a_straight_drive_rests_on_the_given_numbers_and_their_prior():
     assert "contradiction" not in facts
     assert facts["held"] == list(NAMES)
     assert np.array(facts["covariance"]) == pytest.approx(np.diag(SIGMA**2))
+
+
+@pytest.mark.parametrize("yaw", [0.003, -0.006])
+def test_a_wrong_yaw_is_corrected_on_a_straight_drive(yaw):
+    off, before = yaw, 0.0
+    for _ in range(4):
+        facts = facts_of(CAMERA, Lens(CAMERA), turn=0.0, yaw=off, before=[0.0, 0.0, 0.0, before])
+        assert facts["correction"][:CORRECTED] == [0.0] * CORRECTED
+        off, before = off + facts["correction"][-1], before + facts["correction"][-1]
+        if not facts["correction"][-1]:
+            break
+    assert abs(off) * CAMERA.fx < 0.15
+    assert "contradiction" not in facts  # all that rests on it is computed anew
+    assert f"{np.degrees(before):+.3f}" in facts["warnings"][0]
+    assert facts["warnings"][0].endswith("corrected")
+
+
+def test_a_yaw_is_kept_where_the_rig_is_fixed():
+    facts = facts_of(CAMERA, Lens(CAMERA), turn=0.0, yaw=0.003, fixed=True)
+    assert not any(facts["correction"])
+    assert "kept because rig.mode = fixed" in facts["contradiction"]
+
+
+def test_a_yaw_below_half_a_pixel_passes():
+    facts = facts_of(CAMERA, Lens(CAMERA), turn=0.0, yaw=0.2 / CAMERA.fx)
+    assert facts["correction"] == [0.0] * (CORRECTED + 1)
+    assert facts["yaw"][0] == pytest.approx(-0.2 / CAMERA.fx, abs=4.0 * facts["yaw"][1])
 
 
 def test_covariances_contain_the_errors_of_the_calibration():
