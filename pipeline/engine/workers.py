@@ -22,7 +22,7 @@ import time
 import traceback
 import uuid
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
@@ -84,8 +84,10 @@ class Call:
         """Numbers of the calls in flight that it waits for, each once, in a fixed order."""
         return list(dict.fromkeys(g for g in flat(self.refs) if isinstance(g, int)))
 
-    def run(self, made: Mapping[int, Ref]) -> Outcome | Failed:
-        """Run it here, with the artifacts of the calls that it waited for."""
+    def run(self, made: Mapping[int, Ref]) -> Outcome | Failed | NotBegun:
+        """Run it here, with the artifacts of the calls that it waited for, unless one did not come."""
+        if not made.keys() >= {*self.upstream()}:
+            return NotBegun()
 
         def ref(given: Any) -> Ref:
             found: Ref = made[given] if isinstance(given, int) else given
@@ -183,31 +185,32 @@ def make(kind: Any, jobs: int, cache: Path, memory: float) -> Workers:
 class Inline:
     """One call after the other in this process: for debugging, and where one core is all there is."""
 
-    room = 1
-
     def __init__(self) -> None:
         import zarr
 
-        self._call: Call | None = None
+        self._calls: list[Call] = []
+        self._made: dict[int, Ref] = {}
         with held():  # zarr makes its event loop when it is first used
             zarr.create_group(zarr.storage.MemoryStore())
 
-    def submit(self, call: Call) -> None:
-        """Remember the call; :meth:`wait` runs it."""
-        self._call = call
+    def submit(self, calls: Sequence[Call]) -> None:
+        """Remember calls; :meth:`wait` runs them."""
+        self._calls = sorted([*self._calls, *calls], key=lambda call: call.number)
 
     def wait(self) -> list[tuple[int, Ended]]:
-        """Run the call."""
-        assert self._call is not None
-        call, self._call = self._call, None
-        return [(call.number, call.run({}))]
+        """Run the next call."""
+        call = self._calls.pop(0)
+        ended = call.run(self._made)
+        if isinstance(ended, Outcome):
+            self._made[call.number] = light(ended.ref)
+        return [(call.number, ended)]
 
     def scale(self, jobs: int) -> None:
         """There is one worker."""
 
     def cancel(self) -> None:
         """Forget what was not run."""
-        self._call = None
+        self._calls = []
 
     def close(self, *, kill: bool = False) -> None:
         """Nothing to leave."""
@@ -276,8 +279,6 @@ class Dask:
     ``kept`` ones stay at the end of a run, unless they are killed.
     """
 
-    room = 2000  # workers need not wait for this process, and the scheduler stays small
-
     def __init__(self, client: Any, *, cluster: Any = None, ours: bool = True) -> None:
         self._client, self._cluster, self._ours = client, cluster, ours
         self._address = client.scheduler.address
@@ -291,24 +292,29 @@ class Dask:
         # The handler runs on the client's event loop: it only hands over what came.
         client.subscribe_topic(self._run, lambda event: self._events.put(event[1]))
 
-    def submit(self, call: Call) -> None:
-        """Start a call after those in flight that it waits for."""
-        self._submitted += 1
-        # Dask takes equal names for equal results: a call that is tried again needs a new one.
-        name = f"{call.spec.stage.name}-{self._run}-{self._submitted}"
-        inputs = [self._futures[number] for number in call.upstream()]
-        self._futures[call.number] = self._client.submit(
-            work,
-            # Bytes: dask would unpickle a call, and import its stage, on the thread on which a worker hears of others.
-            pickle.dumps(call),
-            self._run,
-            self._cluster is not None,
-            *inputs,
-            key=name,
-            priority=-call.number,
-            pure=False,
-            retries=0,
-        )
+    def submit(self, calls: Sequence[Call]) -> None:
+        """Start calls after those in flight that they wait for.
+
+        They leave as one graph: each alone would cost the client and the scheduler several times as much.
+        """
+        from distributed import Future
+
+        for call in calls:
+            self._submitted += 1
+            # Dask takes equal names for equal results: a call that is tried again needs a new one.
+            name = f"{call.spec.stage.name}-{self._run}-{self._submitted}"
+            self._futures[call.number] = Future(name, self._client)
+        if calls:
+            self._client.map(
+                work,
+                # Bytes: dask would unpickle a call, and import its stage, where a worker hears of others
+                [pickle.dumps(call) for call in calls],
+                [[self._futures[number] for number in call.upstream()] for call in calls],
+                run=self._run,
+                ours=self._cluster is not None,
+                key=[self._futures[call.number].key for call in calls],
+                priority=-calls[0].number,
+            )
 
     def wait(self) -> list[tuple[int, Ended]]:
         """Block until at least one call has ended; all that have ended meanwhile are given."""
@@ -468,11 +474,10 @@ class Kept:
 
 
 Workers = Inline | Dask
-"""They run calls, each known by its number, the least first; of ``room`` many at a time, those that wait for others
-among them."""
+"""They run calls, each known by its number, the least first."""
 
 
-def work(pickled: bytes, run: str, ours: bool, *made: Ref | None) -> Ref | None:
+def work(pickled: bytes, made: list[Ref | None], run: str, ours: bool) -> Ref | None:
     """Run a call on a worker, which is ``ours`` or another's, unless an input did not come; give its artifact to the
     calls that wait for it.
 
@@ -483,10 +488,8 @@ def work(pickled: bytes, run: str, ours: bool, *made: Ref | None) -> Ref | None:
 
     _prepare(ours=ours)
     call: Call = pickle.loads(pickled)
-    worker, outcome = get_worker(), NotBegun()  # type: tuple[Any, Ended]
-    refs = {number: ref for number, ref in zip(call.upstream(), made, strict=True) if ref is not None}
-    if len(refs) == len(made):
-        outcome = call.run(refs)
+    worker = get_worker()
+    outcome = call.run({number: ref for number, ref in zip(call.upstream(), made, strict=True) if ref is not None})
     if isinstance(outcome, Outcome):
         outcome = replace(outcome, took=replace(outcome.took, worker=str(worker.name)))
     # Events travel as msgpack, which has no types of ours: bytes pass.
