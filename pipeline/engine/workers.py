@@ -11,7 +11,9 @@ loopback with keys of this run alone, because whoever reaches a scheduler of das
 
 from __future__ import annotations
 
+import asyncio
 import inspect
+import itertools
 import logging
 import math
 import multiprocessing
@@ -282,7 +284,7 @@ class Dask:
     def __init__(self, client: Any, *, cluster: Any = None, ours: bool = True) -> None:
         self._client, self._cluster, self._ours = client, cluster, ours
         self._address = client.scheduler.address
-        self._run, self._submitted = f"rille-{uuid.uuid4().hex}", 0
+        self._run, self._unused = f"rille-{uuid.uuid4().hex}", itertools.count()
         self._looked = self._manned = time.monotonic()
         self._futures: dict[int, Any] = {}
         self._leaving: list[Any] = []
@@ -299,20 +301,18 @@ class Dask:
         """
         from distributed import Future
 
-        for call in calls:
-            self._submitted += 1
-            # Dask takes equal names for equal results: a call that is tried again needs a new one.
-            name = f"{call.spec.stage.name}-{self._run}-{self._submitted}"
-            self._futures[call.number] = Future(name, self._client)
+        # Dask takes equal names for equal results: a call that is tried again needs a new one.
+        names = [f"{call.spec.stage.name}-{self._run}-{next(self._unused)}" for call in calls]
+        self._futures |= {call.number: Future(name, self._client) for call, name in zip(calls, names, strict=True)}
         if calls:
             self._client.map(
                 work,
                 # Bytes: dask would unpickle a call, and import its stage, where a worker hears of others
-                [pickle.dumps(call) for call in calls],
+                [pickle.dumps(named) for named in zip(names, calls, strict=True)],
                 [[self._futures[number] for number in call.upstream()] for call in calls],
                 run=self._run,
                 ours=self._cluster is not None,
-                key=[self._futures[call.number].key for call in calls],
+                key=names,
                 priority=-calls[0].number,
             )
 
@@ -477,24 +477,31 @@ Workers = Inline | Dask
 """They run calls, each known by its number, the least first."""
 
 
-def work(pickled: bytes, made: list[Ref | None], run: str, ours: bool) -> Ref | None:
-    """Run a call on a worker, which is ``ours`` or another's, unless an input did not come; give its artifact to the
-    calls that wait for it.
+async def work(pickled: bytes, made: list[Ref | None], run: str, ours: bool) -> Ref | None:
+    """Run a call on a worker, which is ``ours`` or another's; give its artifact to the calls that wait for it.
 
     What became of it leaves as an event of dask for the client of ``run``, which costs half of what fetching a result
     does. Never an exception: dask would state it as the failure of every call that waits for this one.
     """
     from distributed import get_worker
 
+    worker, loop = get_worker(), asyncio.get_running_loop()
+    default = worker.executors["default"]
+    event, ref = await loop.run_in_executor(default, _run, pickled, made, str(worker.name), ours)
+    # Not now, but when the loop hears that this has ended: so both leave as one message.
+    loop.call_soon(worker.log_event, run, event)
+    return ref
+
+
+def _run(pickled: bytes, made: list[Ref | None], worker: str, ours: bool) -> tuple[bytes, Ref | None]:
+    """Run a call on a thread of a worker; the event of it, and its artifact, if it has one."""
     _prepare(ours=ours)
-    call: Call = pickle.loads(pickled)
-    worker = get_worker()
-    outcome = call.run({number: ref for number, ref in zip(call.upstream(), made, strict=True) if ref is not None})
-    if isinstance(outcome, Outcome):
-        outcome = replace(outcome, took=replace(outcome.took, worker=str(worker.name)))
+    name, call = pickle.loads(pickled)
+    ended = call.run({number: ref for number, ref in zip(call.upstream(), made, strict=True) if ref is not None})
+    if isinstance(ended, Outcome):
+        ended = replace(ended, took=replace(ended.took, worker=worker))
     # Events travel as msgpack, which has no types of ours: bytes pass.
-    worker.log_event(run, pickle.dumps((call.number, worker.get_current_task(), outcome)))
-    return light(outcome.ref) if isinstance(outcome, Outcome) else None
+    return pickle.dumps((call.number, name, ended)), light(ended.ref) if isinstance(ended, Outcome) else None
 
 
 def light(ref: Ref) -> Ref:
