@@ -43,7 +43,7 @@ from rille.pipeline.engine.store.base import GoneError, NonDeterministicError, S
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import CodeChangedError, Outcome
-from rille.pipeline.engine.workers import Call, Died, Ended, Failed, Kept, NotBegun, Workers, check, light, make
+from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, check, light, make
 from rille.stages.core.errors import DegenerateError, RilleError
 
 MISSING = ("failed", "skipped", "planned")
@@ -145,7 +145,8 @@ class RunOptions:
     ledger : file of JSON lines, one a node, written as they resolve.
     progress : receives every step of the run.
     memory_limit : bytes that this process and its workers may take together; None is what is free here.
-    kept : workers of runs before and after this one; None: those of this run end with it.
+    kept : the workers that a run has left are used by the next one that is given the same list, and whoever made it
+        ends them; None: those of this run end with it.
     """
 
     executor: Any = "dask"
@@ -156,7 +157,7 @@ class RunOptions:
     ledger: Path | None = None
     progress: Progress = field(default_factory=Progress)
     memory_limit: float | None = None
-    kept: Kept | None = None
+    kept: list[Workers] | None = None
 
 
 _DEFAULTS = RunOptions()
@@ -237,8 +238,13 @@ class _Run:
         return self.result
 
     def _close(self, *, kill: bool) -> None:
-        if self.workers is not None:
+        if self.workers is None:
+            return
+        if kill or self.options.kept is None:
             self.workers.close(kill=kill)
+        else:
+            self.workers.cancel()
+            self.options.kept.append(self.workers)
 
     def _loop(self, interrupts: Interrupts) -> None:
         self.progress.open(self.graph)
@@ -363,8 +369,11 @@ class _Run:
         name = kind if isinstance(kind, str) else kind.scheduler.address
         self.ledger.run(executor=name, jobs=jobs)
         self.result.workers_started = True
-        begin = make if self.options.kept is None else self.options.kept.make
-        return begin(kind, jobs, self.store.root, self.budget.limit)
+        if not self.options.kept:
+            return make(kind, jobs, self.store.root, self.budget.limit)
+        workers = self.options.kept.pop()
+        workers.scale(jobs)
+        return workers
 
     def _resolve(self, handle: Handle, status: str) -> None:
         handle.status = status

@@ -276,10 +276,7 @@ def _elsewhere(where: Any, cache: Path) -> Dask:
 
 
 class Dask:
-    """Workers of dask; ``cluster`` is one of our own, ``ours`` whether the client is.
-
-    ``kept`` ones stay at the end of a run, unless they are killed.
-    """
+    """Workers of dask; ``cluster`` is one of our own, ``ours`` whether the client is."""
 
     def __init__(self, client: Any, *, cluster: Any = None, ours: bool = True) -> None:
         self._client, self._cluster, self._ours = client, cluster, ours
@@ -290,7 +287,6 @@ class Dask:
         self._leaving: list[Any] = []
         self._events: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._dead: set[Any] = set()
-        self.kept, self.closed = False, False
         # The handler runs on the client's event loop: it only hands over what came.
         client.subscribe_topic(self._run, lambda event: self._events.put(event[1]))
 
@@ -424,9 +420,6 @@ class Dask:
         """End workers of our own, at once if ``kill``; leave others as they are."""
         within = HURRY_SECONDS if kill else LEAVE_SECONDS
         self.cancel()
-        if self.kept and not kill:
-            return
-        self.closed = True
         if self._cluster is None:
             with suppress(Exception):
                 self._client.unsubscribe_topic(self._run)
@@ -448,29 +441,6 @@ class Dask:
         self._cluster.shutdown_on_close = False  # else it is closed once more at exit, for up to ten seconds
         _kill(processes)
         take_back()
-
-
-class Kept:
-    """Workers that runs of this process use one after another: none of them but the first waits for their start."""
-
-    def __init__(self) -> None:
-        self._workers: Dask | None = None
-
-    def make(self, kind: Any, jobs: int, cache: Path, memory: float) -> Workers:
-        """As :func:`make` does; those of dask are the same each time."""
-        if self._workers is not None and not self._workers.closed:
-            self._workers.scale(jobs)
-            return self._workers
-        made = make(kind, jobs, cache, memory)
-        if isinstance(made, Dask):
-            made.kept, self._workers = True, made
-        return made
-
-    def close(self) -> None:
-        """End them, if any are left."""
-        if self._workers is not None and not self._workers.closed:
-            self._workers.kept = False
-            self._workers.close()
 
 
 Workers = Inline | Dask
