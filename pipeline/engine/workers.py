@@ -287,30 +287,36 @@ class Dask:
         self._leaving: list[Any] = []
         self._events: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._dead: set[Any] = set()
-        # The handler runs on the client's event loop: it only hands over what came.
-        client.subscribe_topic(self._run, lambda event: self._events.put(event[1]))
+        client.subscribe_topic(self._run, self._hear)
 
     def submit(self, calls: Sequence[Call]) -> None:
         """Start calls after those in flight that they wait for.
 
         They leave as one graph: each alone would cost the client and the scheduler several times as much.
         """
-        from distributed import Future
+        from dask.task_spec import Alias
 
+        if not calls:
+            return
         # Dask takes equal names for equal results: a call that is tried again needs a new one.
-        names = [f"{call.spec.stage.name}-{self._run}-{next(self._unused)}" for call in calls]
-        self._futures |= {call.number: Future(name, self._client) for call, name in zip(calls, names, strict=True)}
-        if calls:
-            self._client.map(
-                work,
-                # Bytes: dask would unpickle a call, and import its stage, where a worker hears of others
-                [pickle.dumps(named) for named in zip(names, calls, strict=True)],
-                [[self._futures[number] for number in call.upstream()] for call in calls],
-                run=self._run,
-                ours=self._cluster is not None,
-                key=names,
-                priority=-calls[0].number,
-            )
+        names = {call.number: f"{call.spec.stage.name}-{self._run}-{next(self._unused)}" for call in calls}
+        known = {number: future.key for number, future in self._futures.items()} | names
+        futures = self._client.map(
+            work,
+            # Bytes: dask would unpickle a call, and import its stage, where a worker hears of others.
+            [pickle.dumps((names[call.number], call)) for call in calls],
+            [[Alias(known[number]) for number in call.upstream()] for call in calls],
+            run=self._run,
+            ours=self._cluster is not None,
+            key=[*names.values()],
+            priority=-calls[0].number,
+        )
+        self._futures |= zip(names, futures, strict=True)
+
+    def _hear(self, event: tuple[float, bytes]) -> None:
+        """Hand an event over, on the client's event loop; there it costs less to drop what ended before."""
+        self._leaving.clear()
+        self._events.put(event[1])
 
     def wait(self) -> list[tuple[int, Ended]]:
         """Block until at least one call has ended; all that have ended meanwhile are given."""
@@ -340,10 +346,8 @@ class Dask:
                 number, name, outcome = pickle.loads(self._events.get(timeout=0 if ended else timeout))
                 # Of another name: it ran again because its worker died after it had said so.
                 if number in self._futures and self._futures[number].key == name:
-                    # Dask has not heard of the end yet: a future that is dropped now would count as cancelled.
                     self._leaving.append(self._futures.pop(number))
                     ended.append((number, outcome))
-        self._leaving = [future for future in self._leaving if future.status == "pending"]
         return ended
 
     def _why(self, future: Any) -> Ended:
@@ -374,8 +378,7 @@ class Dask:
             The scheduler is gone, or had no workers for too long.
         """
         try:
-            identity = self._client.scheduler.identity
-            workers = self._client.sync(identity, n_workers=-1, callback_timeout=ANSWER_SECONDS)["workers"].values()
+            workers = self._client.sync(self._client.scheduler.ncores, callback_timeout=ANSWER_SECONDS)
         except Exception as error:
             raise self._gone() from error
         now, patience = time.monotonic(), NO_WORKERS_SECONDS if self._cluster is None else START_SECONDS
@@ -385,7 +388,7 @@ class Dask:
             text = f"the dask scheduler at {self._address} had no workers for {patience:.0f} s"
             remedy = "start workers, and run the same command: what is committed stays"
             raise ClusterError("RIL-525", text, remedy=remedy)
-        return sum(worker["nthreads"] for worker in workers)
+        return sum(workers.values())
 
     def _gone(self) -> ClusterError:
         """The error of a scheduler that is gone."""
@@ -423,9 +426,6 @@ class Dask:
         if self._cluster is None:
             with suppress(Exception):
                 self._client.unsubscribe_topic(self._run)
-            until = time.monotonic() + within
-            while any(future.status == "pending" for future in self._leaving) and time.monotonic() < until:
-                time.sleep(0.01)
             if self._ours:
                 _leave(self._client, within)
             return
