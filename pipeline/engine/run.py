@@ -347,7 +347,6 @@ class _Run:
         given, force = each(_given, handle.inputs), handle.stage in self.force
         self.calls.append(Call(handle.index, self.store.root, handle.spec, given, handle.key, force))
         self.in_flight[handle.index] = handle
-        self.progress.running(handle)
 
     def _begin(self) -> Workers:
         """Start as many workers as memory leaves room for.
