@@ -110,7 +110,7 @@ class Options(Work):
     quiet
         No progress; warnings and errors only.
     kept
-        :class:`~rille.pipeline.engine.workers.Kept` of several runs, one after another.
+        List of the workers that a run leaves to the next one; whoever gives it ends them.
     """
 
     keep_going: Annotated[bool, FLAG] = False

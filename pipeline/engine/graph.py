@@ -51,7 +51,7 @@ NOTHING = Took()
 class Handle(Generic[F]):
     """A node of the graph and what became of it.
 
-    ``status`` is ``pending``, ``running``, ``computed``, ``cached``, ``failed``, ``skipped`` or, when dry, ``planned``.
+    ``status`` is ``pending``, ``computed``, ``cached``, ``failed``, ``skipped`` or, when dry, ``planned``.
     ``reason`` says in words why it was not found in the cache, or why it was skipped; ``cause`` is the
     label of the input that this is due to. ``earlier``, of a planned node, is what the same label led to before: a plan
     takes its facts for what is to come. ``expect`` are bytes (decoded) that it works on and no input has, as what it

@@ -44,9 +44,6 @@ class Progress:
         """The run of a graph begins; the graph may still grow."""
         self.graph = graph
 
-    def running(self, handle: Handle) -> None:
-        """A task was given to a worker."""
-
     def resolved(self, handle: Handle) -> None:
         """The outcome of a node is known."""
         self.done += 1
@@ -112,18 +109,11 @@ class Bar(Lines):
         self.task = self.rich.add_task("", total=None)
         self.rich.start()
 
-    def running(self, handle: Handle) -> None:
-        """Name what runs."""
-        self._move(handle.label)
-
     def resolved(self, handle: Handle) -> None:
-        """Move the bar."""
+        """Move the bar, and name what has ended last."""
         Progress.resolved(self, handle)
         self._compiled(handle)
-        self._move(handle.label)
-
-    def _move(self, label: str) -> None:
-        self.rich.update(self.task, completed=self.done, total=self.total(), description=plain(label))
+        self.rich.update(self.task, completed=self.done, total=self.total(), description=plain(handle.label))
 
     def close(self, result: Result) -> None:
         """Take the bar away."""

@@ -43,11 +43,15 @@ from rille.pipeline.engine.store.base import GoneError, NonDeterministicError, S
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import CodeChangedError, Outcome
-from rille.pipeline.engine.workers import Call, Died, Ended, Failed, Kept, NotBegun, Workers, check, light, make
+from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, check, light, make
 from rille.stages.core.errors import DegenerateError, RilleError
 
 MISSING = ("failed", "skipped", "planned")
 """Statuses of an input after which a task is not begun."""
+
+ROOM = 2000
+"""Tasks that the workers have at a time, also those that wait for others: so many that no worker waits for this
+process, and so few that dask's scheduler stays small."""
 
 
 class TaskError(RilleError):
@@ -141,7 +145,8 @@ class RunOptions:
     ledger : file of JSON lines, one a node, written as they resolve.
     progress : receives every step of the run.
     memory_limit : bytes that this process and its workers may take together; None is what is free here.
-    kept : workers of runs before and after this one; None: those of this run end with it.
+    kept : the workers that a run has left are used by the next one that is given the same list, and whoever made it
+        ends them; None: those of this run end with it.
     """
 
     executor: Any = "dask"
@@ -152,7 +157,7 @@ class RunOptions:
     ledger: Path | None = None
     progress: Progress = field(default_factory=Progress)
     memory_limit: float | None = None
-    kept: Kept | None = None
+    kept: list[Workers] | None = None
 
 
 _DEFAULTS = RunOptions()
@@ -178,8 +183,8 @@ class _Run:
     ----------
     taken : nodes of the graph that were taken up, in order.
     again : numbers of nodes to be taken up again, the least first.
-    in_flight : with the workers.
-    first : nodes to be computed that are known before any result is, until the workers are started for them.
+    in_flight : with the workers, or in ``calls``.
+    calls : what the workers are given next, all at once.
     suspects : numbers of nodes whose workers died; each is tried when nothing else runs, and is then in ``alone``.
     before : digests of artifacts that are computed again because they were damaged or gone, by number of the node.
     seen : nodes of a cut graph of which it is known whether they are wanted for themselves.
@@ -197,7 +202,7 @@ class _Run:
         self.taken = 0
         self.again: list[int] = []
         self.in_flight: dict[int, Handle] = {}
-        self.first: list[Handle] = []
+        self.calls: list[Call] = []
         self.suspects: list[int] = []
         self.alone: set[int] = set()
         self.heals: Counter[int] = Counter()
@@ -233,8 +238,13 @@ class _Run:
         return self.result
 
     def _close(self, *, kill: bool) -> None:
-        if self.workers is not None:
+        if self.workers is None:
+            return
+        if kill or self.options.kept is None:
             self.workers.close(kill=kill)
+        else:
+            self.workers.cancel()
+            self.options.kept.append(self.workers)
 
     def _loop(self, interrupts: Interrupts) -> None:
         self.progress.open(self.graph)
@@ -243,13 +253,12 @@ class _Run:
             while self._take() or self._go_on():
                 # An interrupt in a finaliser or a callback of a weak reference was remembered, not raised.
                 interrupts.check()
-            if self.first and not self.stopped:
-                self._begin()
-                continue
             if not self.in_flight:
                 return
-            assert self.workers is not None
-            for number, ended in self.workers.wait():
+            workers = self.workers = self.workers or self._begin()
+            workers.submit(self.calls)
+            self.calls = []
+            for number, ended in workers.wait():
                 interrupts.check()
                 if number in self.in_flight:  # not if the run was stopped by one before
                     self._land(self.in_flight.pop(number), ended)
@@ -273,8 +282,8 @@ class _Run:
     # -- what becomes of a node ---------------------------------------------------------------------------------
 
     def _take(self) -> bool:
-        """Take up the next node; whether there was one for which the workers have room."""
-        if self.stopped or (self.workers is not None and len(self.in_flight) >= self.workers.room):
+        """Take up the next node; whether there was one, and room for it."""
+        if self.stopped or len(self.in_flight) >= ROOM:
             return False
         if self.suspects or not self.alone.isdisjoint(self.in_flight):
             if self.in_flight:
@@ -327,42 +336,43 @@ class _Run:
 
     def _submit(self, handle: Handle, upstream: list[Handle]) -> None:
         needs = self.estimates.task(handle)
-        if self.workers is None:
-            self.first.append(handle)
-            return
-        if (refused := self.budget.refusal(handle, needs)) is not None and all(h.done for h in upstream):
+        refused = self.budget.refusal(handle, needs) if all(h.done for h in upstream) else None
+        if refused is not None:
             self._fail(handle, Failed(refused))
             return
         if needs > self.largest:
             self.largest = needs
-            self.workers.scale(self.budget.workers(self.jobs, needs))
-        force = handle.stage in self.force
-        call = Call(handle.index, self.store.root, handle.spec, each(_given, handle.inputs), handle.key, force)
-        handle.status = "running"
+            if self.workers is not None:
+                self.workers.scale(self.budget.workers(self.jobs, needs))
+        given, force = each(_given, handle.inputs), handle.stage in self.force
+        self.calls.append(Call(handle.index, self.store.root, handle.spec, given, handle.key, force))
         self.in_flight[handle.index] = handle
-        self.workers.submit(call)
-        self.progress.running(handle)
 
-    def _begin(self) -> None:
-        """Refuse what cannot fit, and start the workers that memory leaves room for; then the first nodes are taken up
-        again."""
+    def _begin(self) -> Workers:
+        """Start as many workers as memory leaves room for.
+
+        Raises
+        ------
+        MemoryRefusedError
+            It has none for one of the tasks that are known before any result is.
+        """
         kind = self.options.executor
         check(kind, self.options.jobs)
         self.budget = memory.budget(kind, self.options.memory_limit)
-        for handle in self.first:
-            needs = self.estimates.task(handle)
-            if (refused := self.budget.refusal(handle, needs)) is not None:
+        for handle in self.in_flight.values():
+            if (refused := self.budget.refusal(handle, self.estimates.task(handle))) is not None:
                 raise refused.at(handle.label)
-            self.largest = max(self.largest, needs)
         # Before the workers start: a full or read-only disk should not cost that time.
         self.store.writable()
         jobs = self.budget.workers(self.jobs, self.largest)
         name = kind if isinstance(kind, str) else kind.scheduler.address
         self.ledger.run(executor=name, jobs=jobs)
-        begin = make if self.options.kept is None else self.options.kept.make
         self.result.workers_started = True
-        self.workers = begin(kind, jobs, self.store.root, self.budget.limit)
-        self.again, self.first = [handle.index for handle in self.first], []
+        if not self.options.kept:
+            return make(kind, jobs, self.store.root, self.budget.limit)
+        workers = self.options.kept.pop()
+        workers.scale(jobs)
+        return workers
 
     def _resolve(self, handle: Handle, status: str) -> None:
         handle.status = status
@@ -383,7 +393,6 @@ class _Run:
 
     def _land(self, handle: Handle, ended: Ended) -> None:
         """Take up what the workers give back."""
-        handle.status = "pending"
         if isinstance(ended, Outcome):
             self._succeed(handle, ended)
         elif isinstance(ended, NotBegun):
@@ -452,9 +461,8 @@ class _Run:
         self.progress.failed(failure.label, failure.error)
         if not self.options.keep_going and not is_hole(failure.error):
             self.stopped = f"stopped after {failure.label} failed"
-            for handle in self.in_flight.values():
-                handle.status = "pending"
             self.in_flight.clear()
+            self.calls.clear()
             if self.workers is not None:
                 self.workers.cancel()
 
@@ -471,7 +479,7 @@ class _Run:
                 self._ask()
                 return True
         last = self.graph.last
-        if last is None or (self.graph.expansions and (self.first or self.in_flight)):
+        if last is None or (self.graph.expansions and self.in_flight):
             return False
         self.graph.last = None
         last()
@@ -510,7 +518,7 @@ class _Run:
     def _count(self) -> None:
         for handle in self.graph.nodes:
             counts = self.result.counts.setdefault(handle.stage, Counts())
-            if handle.status not in ("pending", "running"):
+            if handle.status != "pending":
                 setattr(counts, handle.status, getattr(counts, handle.status) + 1)
                 counts.seconds += handle.took.seconds
 

@@ -11,7 +11,9 @@ loopback with keys of this run alone, because whoever reaches a scheduler of das
 
 from __future__ import annotations
 
+import asyncio
 import inspect
+import itertools
 import logging
 import math
 import multiprocessing
@@ -22,7 +24,7 @@ import time
 import traceback
 import uuid
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
@@ -84,8 +86,10 @@ class Call:
         """Numbers of the calls in flight that it waits for, each once, in a fixed order."""
         return list(dict.fromkeys(g for g in flat(self.refs) if isinstance(g, int)))
 
-    def run(self, made: Mapping[int, Ref]) -> Outcome | Failed:
-        """Run it here, with the artifacts of the calls that it waited for."""
+    def run(self, made: Mapping[int, Ref]) -> Outcome | Failed | NotBegun:
+        """Run it here, with the artifacts of the calls that it waited for, unless one did not come."""
+        if not made.keys() >= {*self.upstream()}:
+            return NotBegun()
 
         def ref(given: Any) -> Ref:
             found: Ref = made[given] if isinstance(given, int) else given
@@ -183,31 +187,32 @@ def make(kind: Any, jobs: int, cache: Path, memory: float) -> Workers:
 class Inline:
     """One call after the other in this process: for debugging, and where one core is all there is."""
 
-    room = 1
-
     def __init__(self) -> None:
         import zarr
 
-        self._call: Call | None = None
+        self._calls: list[Call] = []
+        self._made: dict[int, Ref] = {}
         with held():  # zarr makes its event loop when it is first used
             zarr.create_group(zarr.storage.MemoryStore())
 
-    def submit(self, call: Call) -> None:
-        """Remember the call; :meth:`wait` runs it."""
-        self._call = call
+    def submit(self, calls: Sequence[Call]) -> None:
+        """Remember calls; :meth:`wait` runs them."""
+        self._calls = sorted([*self._calls, *calls], key=lambda call: call.number)
 
     def wait(self) -> list[tuple[int, Ended]]:
-        """Run the call."""
-        assert self._call is not None
-        call, self._call = self._call, None
-        return [(call.number, call.run({}))]
+        """Run the next call."""
+        call = self._calls.pop(0)
+        ended = call.run(self._made)
+        if isinstance(ended, Outcome):
+            self._made[call.number] = light(ended.ref)
+        return [(call.number, ended)]
 
     def scale(self, jobs: int) -> None:
         """There is one worker."""
 
     def cancel(self) -> None:
         """Forget what was not run."""
-        self._call = None
+        self._calls = []
 
     def close(self, *, kill: bool = False) -> None:
         """Nothing to leave."""
@@ -271,44 +276,47 @@ def _elsewhere(where: Any, cache: Path) -> Dask:
 
 
 class Dask:
-    """Workers of dask; ``cluster`` is one of our own, ``ours`` whether the client is.
-
-    ``kept`` ones stay at the end of a run, unless they are killed.
-    """
-
-    room = 2000  # workers need not wait for this process, and the scheduler stays small
+    """Workers of dask; ``cluster`` is one of our own, ``ours`` whether the client is."""
 
     def __init__(self, client: Any, *, cluster: Any = None, ours: bool = True) -> None:
         self._client, self._cluster, self._ours = client, cluster, ours
         self._address = client.scheduler.address
-        self._run, self._submitted = f"rille-{uuid.uuid4().hex}", 0
+        self._run, self._unused = f"rille-{uuid.uuid4().hex}", itertools.count()
         self._looked = self._manned = time.monotonic()
         self._futures: dict[int, Any] = {}
         self._leaving: list[Any] = []
         self._events: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._dead: set[Any] = set()
-        self.kept, self.closed = False, False
-        # The handler runs on the client's event loop: it only hands over what came.
-        client.subscribe_topic(self._run, lambda event: self._events.put(event[1]))
+        client.subscribe_topic(self._run, self._hear)
 
-    def submit(self, call: Call) -> None:
-        """Start a call after those in flight that it waits for."""
-        self._submitted += 1
+    def submit(self, calls: Sequence[Call]) -> None:
+        """Start calls after those in flight that they wait for.
+
+        They leave as one graph: each alone would cost the client and the scheduler several times as much.
+        """
+        from dask.task_spec import Alias
+
+        if not calls:
+            return
         # Dask takes equal names for equal results: a call that is tried again needs a new one.
-        name = f"{call.spec.stage.name}-{self._run}-{self._submitted}"
-        inputs = [self._futures[number] for number in call.upstream()]
-        self._futures[call.number] = self._client.submit(
+        names = {call.number: f"{call.spec.stage.name}-{self._run}-{next(self._unused)}" for call in calls}
+        known = {number: future.key for number, future in self._futures.items()} | names
+        futures = self._client.map(
             work,
-            # Bytes: dask would unpickle a call, and import its stage, on the thread on which a worker hears of others.
-            pickle.dumps(call),
-            self._run,
-            self._cluster is not None,
-            *inputs,
-            key=name,
-            priority=-call.number,
-            pure=False,
-            retries=0,
+            # Bytes: dask would unpickle a call, and import its stage, where a worker hears of others.
+            [pickle.dumps((names[call.number], call)) for call in calls],
+            [[Alias(known[number]) for number in call.upstream()] for call in calls],
+            run=self._run,
+            ours=self._cluster is not None,
+            key=[*names.values()],
+            priority=-calls[0].number,
         )
+        self._futures |= zip(names, futures, strict=True)
+
+    def _hear(self, event: tuple[float, bytes]) -> None:
+        """Hand an event over, on the client's event loop; there it costs less to drop what ended before."""
+        self._leaving.clear()
+        self._events.put(event[1])
 
     def wait(self) -> list[tuple[int, Ended]]:
         """Block until at least one call has ended; all that have ended meanwhile are given."""
@@ -338,10 +346,8 @@ class Dask:
                 number, name, outcome = pickle.loads(self._events.get(timeout=0 if ended else timeout))
                 # Of another name: it ran again because its worker died after it had said so.
                 if number in self._futures and self._futures[number].key == name:
-                    # Dask has not heard of the end yet: a future that is dropped now would count as cancelled.
                     self._leaving.append(self._futures.pop(number))
                     ended.append((number, outcome))
-        self._leaving = [future for future in self._leaving if future.status == "pending"]
         return ended
 
     def _why(self, future: Any) -> Ended:
@@ -372,8 +378,7 @@ class Dask:
             The scheduler is gone, or had no workers for too long.
         """
         try:
-            identity = self._client.scheduler.identity
-            workers = self._client.sync(identity, n_workers=-1, callback_timeout=ANSWER_SECONDS)["workers"].values()
+            workers = self._client.sync(self._client.scheduler.ncores, callback_timeout=ANSWER_SECONDS)
         except Exception as error:
             raise self._gone() from error
         now, patience = time.monotonic(), NO_WORKERS_SECONDS if self._cluster is None else START_SECONDS
@@ -383,7 +388,7 @@ class Dask:
             text = f"the dask scheduler at {self._address} had no workers for {patience:.0f} s"
             remedy = "start workers, and run the same command: what is committed stays"
             raise ClusterError("RIL-525", text, remedy=remedy)
-        return sum(worker["nthreads"] for worker in workers)
+        return sum(workers.values())
 
     def _gone(self) -> ClusterError:
         """The error of a scheduler that is gone."""
@@ -418,15 +423,9 @@ class Dask:
         """End workers of our own, at once if ``kill``; leave others as they are."""
         within = HURRY_SECONDS if kill else LEAVE_SECONDS
         self.cancel()
-        if self.kept and not kill:
-            return
-        self.closed = True
         if self._cluster is None:
             with suppress(Exception):
                 self._client.unsubscribe_topic(self._run)
-            until = time.monotonic() + within
-            while any(future.status == "pending" for future in self._leaving) and time.monotonic() < until:
-                time.sleep(0.01)
             if self._ours:
                 _leave(self._client, within)
             return
@@ -444,54 +443,35 @@ class Dask:
         take_back()
 
 
-class Kept:
-    """Workers that runs of this process use one after another: none of them but the first waits for their start."""
-
-    def __init__(self) -> None:
-        self._workers: Dask | None = None
-
-    def make(self, kind: Any, jobs: int, cache: Path, memory: float) -> Workers:
-        """As :func:`make` does; those of dask are the same each time."""
-        if self._workers is not None and not self._workers.closed:
-            self._workers.scale(jobs)
-            return self._workers
-        made = make(kind, jobs, cache, memory)
-        if isinstance(made, Dask):
-            made.kept, self._workers = True, made
-        return made
-
-    def close(self) -> None:
-        """End them, if any are left."""
-        if self._workers is not None and not self._workers.closed:
-            self._workers.kept = False
-            self._workers.close()
-
-
 Workers = Inline | Dask
-"""They run calls, each known by its number, the least first; of ``room`` many at a time, those that wait for others
-among them."""
+"""They run calls, each known by its number, the least first."""
 
 
-def work(pickled: bytes, run: str, ours: bool, *made: Ref | None) -> Ref | None:
-    """Run a call on a worker, which is ``ours`` or another's, unless an input did not come; give its artifact to the
-    calls that wait for it.
+async def work(pickled: bytes, made: list[Ref | None], run: str, ours: bool) -> Ref | None:
+    """Run a call on a worker, which is ``ours`` or another's; give its artifact to the calls that wait for it.
 
     What became of it leaves as an event of dask for the client of ``run``, which costs half of what fetching a result
     does. Never an exception: dask would state it as the failure of every call that waits for this one.
     """
     from distributed import get_worker
 
+    worker, loop = get_worker(), asyncio.get_running_loop()
+    default = worker.executors["default"]
+    event, ref = await loop.run_in_executor(default, _run, pickled, made, str(worker.name), ours)
+    # Not now, but when the loop hears that this has ended: so both leave as one message.
+    loop.call_soon(worker.log_event, run, event)
+    return ref
+
+
+def _run(pickled: bytes, made: list[Ref | None], worker: str, ours: bool) -> tuple[bytes, Ref | None]:
+    """Run a call on a thread of a worker; the event of it, and its artifact, if it has one."""
     _prepare(ours=ours)
-    call: Call = pickle.loads(pickled)
-    worker, outcome = get_worker(), NotBegun()  # type: tuple[Any, Ended]
-    refs = {number: ref for number, ref in zip(call.upstream(), made, strict=True) if ref is not None}
-    if len(refs) == len(made):
-        outcome = call.run(refs)
-    if isinstance(outcome, Outcome):
-        outcome = replace(outcome, took=replace(outcome.took, worker=str(worker.name)))
+    name, call = pickle.loads(pickled)
+    ended = call.run({number: ref for number, ref in zip(call.upstream(), made, strict=True) if ref is not None})
+    if isinstance(ended, Outcome):
+        ended = replace(ended, took=replace(ended.took, worker=worker))
     # Events travel as msgpack, which has no types of ours: bytes pass.
-    worker.log_event(run, pickle.dumps((call.number, worker.get_current_task(), outcome)))
-    return light(outcome.ref) if isinstance(outcome, Outcome) else None
+    return pickle.dumps((call.number, name, ended)), light(ended.ref) if isinstance(ended, Outcome) else None
 
 
 def light(ref: Ref) -> Ref:

@@ -13,33 +13,25 @@ line that names the parameter, and the exit code of a run with holes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from functools import cache
 from typing import Any
 
-from rille.datasets.protocol import Sequence
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.flow.config import stages
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import ConfigError
 
-
-@cache
-def recorded() -> frozenset[str]:
-    """Stages, and so sections, that only a reconstruction has."""
-    of_both = {*stages("builders"), *stages("closed_loop")} - {"undistort"}
-    return frozenset({*stages("builders", "reconstruction", "assessment")} - of_both)
-
-
-@cache
-def driven() -> frozenset[str]:
-    """Stages, and so sections, that only a drive has."""
-    of_both = stages("builders", "reconstruction", "assessment")
-    return frozenset({"drive", *stages("closed_loop")} - {*of_both})
-
-
 CHECKED = frozenset(("undistort", "pyramid", "motion", "hfvm", "tiling", "orientation"))
 """Sections that ``rille check`` reads."""
+
+
+@cache
+def foreign(*, driven: bool) -> frozenset[str]:
+    """Sections that only the other kind of run has: of a drive those of a reconstruction, and the other way round."""
+    drives = {"drive", *stages("builders", "closed_loop")} - {"undistort"}
+    reconstructions = {*stages("builders", "reconstruction", "assessment")}
+    return frozenset(reconstructions - drives if driven else drives - reconstructions)
 
 
 def set_by_user(given: Mapping[str, Any], config: Params, without: Params) -> tuple[str, ...]:
@@ -57,43 +49,22 @@ def set_by_user(given: Mapping[str, Any], config: Params, without: Params) -> tu
     return tuple(found)
 
 
-def refuse_unreadable(keys: Iterable[str], config: Params, sequence: Sequence) -> None:
-    """Refuse parameters that the user has set and that no task of such a run (reconstruction or drive) can read.
+def refuse(keys: Iterable[str], config: Params, nobody: Collection[str], who: str) -> None:
+    """Refuse parameters that the user has set and that no task can read.
 
     Parameters
     ----------
     keys : dotted keys of the parameters set, see :func:`set_by_user`.
+    nobody : sections, and dotted keys, that no task reads.
+    who : in words, the run or command that does not read them.
 
     Raises
     ------
     ConfigError
-        A key belongs to a section that only the other kind of run has.
+        No task reads one of the keys.
     """
-    simulated = sequence.simulation is not None
-    foreign = recorded() if simulated else driven()
-    # A drive is over ground.
-    lost = [key for key in keys if key.partition(".")[0] in foreign or (simulated and key == "terrain.reference")]
-    if lost:
-        who = "a drive" if simulated else f"a reconstruction of {sequence.name}"
+    if lost := [key for key in keys if key in nobody or key.partition(".")[0] in nobody]:
         raise ConfigError("RIL-730", f"{values(lost, config)}: no task of {who} reads it", remedy="leave it out")
-
-
-def refuse_unchecked(keys: Iterable[str], config: Params) -> None:
-    """Refuse parameters that the user has set and that ``rille check`` does not read.
-
-    Parameters
-    ----------
-    keys : dotted keys of the parameters set, see :func:`set_by_user`.
-
-    Raises
-    ------
-    ConfigError
-        The section of a key is not in :data:`CHECKED`.
-    """
-    lost = [key for key in keys if key.partition(".")[0] not in CHECKED]
-    if lost:
-        known = ", ".join(sorted(CHECKED))
-        raise ConfigError("RIL-731", f"{values(lost, config)}: check does not read it", remedy=f"it reads {known}")
 
 
 def unread(keys: Iterable[str], config: Params, graph: Graph) -> list[str]:

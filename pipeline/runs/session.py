@@ -116,8 +116,11 @@ def settings_of_run(options: Work) -> Settled:
     check(options.executor, options.jobs)
     memory_limit(options)
     settled = settings(options)
-    unread.refuse_unreadable(settled.given, settled.config, settled.sequence)
-    sequence = settled.sequence
+    sequence, driven = settled.sequence, settled.sequence.simulation is not None
+    who = "a drive" if driven else f"a reconstruction of {sequence.name}"
+    # A drive is over ground.
+    nobody = unread.foreign(driven=driven) | ({"terrain.reference"} if driven else set())
+    unread.refuse(settled.given, settled.config, nobody, who)
     rig = judge_rig(sequence.rig)
     # A manifest warns of its baseline itself, with the key to change.
     if rig.level != "OK" and not any("baseline" in line for line in sequence.warnings):

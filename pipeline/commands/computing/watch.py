@@ -17,7 +17,7 @@ from rille.datasets.registry import open_sequence
 from rille.pipeline.commands.complaints import complain
 from rille.pipeline.commands.options import HOLES, INTERRUPTED, WatchOptions, cache_folder
 from rille.pipeline.engine.plain import some
-from rille.pipeline.engine.workers import Kept
+from rille.pipeline.engine.workers import Workers
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.runs import session
 from rille.stages.core.errors import ConfigError, IncompleteError, InputError, RilleError
@@ -39,7 +39,7 @@ def watch(seq: str, *, options: WatchOptions = _OPTIONS) -> int:
         A folder or a manifest of image files. A file is taken once it is whole.
     """
     configuration.build(session.configured(options)[1])  # a wrong parameter should not wait for the first pair
-    kept, arrivals = Kept(), Arrivals(cache_folder(options.cache) / "files.json")
+    kept, arrivals = list[Workers](), Arrivals(cache_folder(options.cache) / "files.json")
     watched = _Watched(replace(options, sequence=seq, kept=kept), arrivals)
     try:
         return watched.to_the_end()
@@ -48,7 +48,8 @@ def watch(seq: str, *, options: WatchOptions = _OPTIONS) -> int:
         print(f"rille: interrupted; {last}; `rille reconstruct {seq}` computes the rest", file=sys.stderr)
         return INTERRUPTED
     finally:
-        kept.close()
+        for workers in kept:
+            workers.close()
 
 
 class _Seen(NamedTuple):

@@ -21,8 +21,8 @@ from rille.pipeline.commands.options import COMPLETE, FAILED, Settings, cache_fo
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.flow import unread
 from rille.pipeline.flow.builders import Builder, name
-from rille.pipeline.flow.unread import refuse_unchecked
 from rille.pipeline.runs import input_checks as judge
 from rille.pipeline.runs.input_checks import Finding
 from rille.pipeline.runs.session import settings
@@ -52,7 +52,8 @@ def check(seq: str, *more: str, options: Settings = _SETTINGS) -> int:
 
 def _check(seq: str, options: Settings) -> int:
     settled = settings(replace(options, sequence=seq))
-    refuse_unchecked(settled.given, settled.config)
+    nobody = type(settled.config).model_fields.keys() - unread.CHECKED
+    unread.refuse(settled.given, settled.config, nobody, "a check")
     return inspect(settled.sequence, settled.config, settled.frames, cache_folder(options.cache))
 
 

@@ -60,7 +60,7 @@ def write(path: Path, data: bytes | str) -> None:
 
 def create(path: Path, content: bytes | memoryview) -> bool:
     """Write a file unless there is one, and flush it to the disk before it can be seen; whether it was written."""
-    above = [folder for folder in list(path.parents)[1:4] if not path.parent.exists()]
+    above = [] if path.parent.exists() else list(path.parents)[1:4]
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _beside(path)
     try:

@@ -109,15 +109,16 @@ def test_a_damaged_artifact_is_computed_again_and_nothing_else(cache):
     assert digests(graph) == before
 
 
-class Removed(progress.Progress):
-    """Removes artifacts just as the task ``last`` is given to a worker."""
+class Removing(base.Inline):
+    """Removes artifacts just as the task ``last`` is given to it."""
 
     def __init__(self, *paths):
         super().__init__()
         self.paths = list(paths)
 
-    def running(self, handle):
-        while handle.label == "last" and self.paths:
+    def submit(self, calls):
+        super().submit(calls)
+        while self.paths and any(call.spec.label == "last" for call in calls):
             self.paths.pop().unlink()
 
 
@@ -133,15 +134,15 @@ def in_a_row(*whats, **first):
 
 
 @pytest.mark.parametrize("keep_going", [False, True])
-def test_where_healing_fails_all_that_waits_is_left_out_and_told(cache, tmp_path, keep_going):
+def test_where_healing_fails_all_that_waits_is_left_out_and_told(cache, tmp_path, keep_going, monkeypatch):
     tally = tmp_path / "tally"
     earlier, _ = run(cache, make=in_a_row("first", "second", tally=str(tally)))
     tally.unlink()
     tally.mkdir()  # now the first task fails
+    monkeypatch.setattr(driver, "make", lambda *_: Removing(*(cache / h.ref.path for h in earlier.nodes)))
     graph, result = run(
         cache,
         make=in_a_row("first", "second", "last", "rest", tally=str(tally)),
-        progress=Removed(*(cache / h.ref.path for h in earlier.nodes)),
         keep_going=keep_going,
         ledger=tmp_path / "ledger.jsonl",
     )
@@ -154,7 +155,7 @@ def test_where_healing_fails_all_that_waits_is_left_out_and_told(cache, tmp_path
 
 
 def test_what_waits_for_healing_goes_on_if_another_worker_has_healed_it(cache, tmp_path, monkeypatch):
-    class Dying(base.Inline):
+    class Dying(Removing):
         """Its worker dies, once, after it has committed the task that others wait for."""
 
         died = False
@@ -166,13 +167,8 @@ def test_what_waits_for_healing_goes_on_if_another_worker_has_healed_it(cache, t
             return [(number, outcome)]
 
     earlier, _ = run(cache, make=in_a_row("first"))
-    monkeypatch.setattr(driver, "make", lambda *_: Dying())
-    graph, result = run(
-        cache,
-        make=in_a_row("first", "last"),
-        progress=Removed(cache / earlier.nodes[0].ref.path),
-        ledger=tmp_path / "ledger.jsonl",
-    )
+    monkeypatch.setattr(driver, "make", lambda *_: Dying(cache / earlier.nodes[0].ref.path))
+    graph, result = run(cache, make=in_a_row("first", "last"), ledger=tmp_path / "ledger.jsonl")
     assert result.ok
     assert statuses(graph) == {"first": "cached", "last": "computed"}
     assert [row["label"] for row in ledger.read(tmp_path / "ledger.jsonl")] == ["first", "last"], "one line a node"

@@ -11,6 +11,8 @@ from toys.chain import build as toy
 
 from rille.datasets.registry import open_sequence
 from rille.pipeline.cli import main
+from rille.pipeline.commands.options import Settings
+from rille.pipeline.commands.sequences.check import check
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow import unread
@@ -36,7 +38,7 @@ def test_the_configuration_of_a_run_can_be_given_back(tmp_path, name):
     assert sorted(again.given) == sorted(more_key.partition("=")[0] for more_key in more)
     assert again.config == first.config
     assert "crosscheck" in tomllib.loads(path.read_text())
-    unread.refuse_unreadable(again.given, again.config, again.sequence)
+    unread.refuse(again.given, again.config, unread.foreign(driven=name != "mockup"), name)
 
 
 def test_what_a_user_has_switched_off_himself_may_stay(tmp_path):
@@ -76,10 +78,10 @@ def test_a_drive_refuses_how_a_recorded_rig_moves(assignment):
 
 
 def test_check_refuses_what_it_does_not_read(tmp_path):
-    config = configuration.build({})
-    unread.refuse_unchecked(["hfvm.preset", "motion.level", "tiling.memory"], config)
-    with raises("RIL-731", "locus.both"):
-        unread.refuse_unchecked(["hfvm.preset", "locus.both"], config)
+    assignments = ("hfvm.preset=fast", "motion.level=2", "tiling.memory=900", "locus.both=true")
+    with raises("RIL-730", "locus.both") as caught:
+        check("mockup", options=Settings(assignments=assignments, cache=tmp_path / "cache"))
+    assert "hfvm" not in str(caught.value)
 
 
 def test_sections_without_a_task_in_the_graph_are_told():
