@@ -1,9 +1,10 @@
 """Sub-pixel alignment of templates under a local affinity (refinement of tracked positions, section 5.2.1).
 
 Feature vectors find *which* pixel corresponds. The grey values give the position within the pixel more exactly, once
-the template is drawn in the perspective of the searched frame. Affine Lucas-Kanade with gain and offset, inverse
-compositional: Baker and Matthews (2004), doi:10.1023/B:VISI.0000011205.11775.fd. The affinity that the neighbouring
-tracks suggest is a prior, so that weak texture keeps to it.
+the template is drawn in the perspective of the searched frame. Affine Lucas-Kanade, inverse compositional: Baker and
+Matthews (2004), doi:10.1023/B:VISI.0000011205.11775.fd. Grey values are compared less their mean and at equal contrast,
+so that the exposure may change from frame to frame. The affinity that the neighbouring tracks suggest is a prior, so
+that weak texture keeps to it.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ SETTLED_PX = 0.01
 """Step below which a template has converged: a tenth of the error that remains."""
 MIN_TEXTURE = 1e-9
 """Sum of squared differences [grey levels] in each direction, below which a template has none: it is rounding."""
+MIN_CONTRAST = 1e-9
+"""Grey levels below which a square is flat: no contrast makes a template of it."""
 MIN_AREA = 0.1
 """Area of a template over that in its first frame, below which it draws no texture."""
 
@@ -67,6 +70,7 @@ def align(
     """
     out = np.full(templates.points.shape, np.nan)
     template, descent = _descent(a, templates.points)
+    contrast = np.linalg.norm(template, axis=1, keepdims=True)
     gram = descent @ np.swapaxes(descent, 1, 2)
     xx, yy, xy = gram[:, 0, 0], gram[:, 1, 1], gram[:, 0, 1]
     # Not so where the template leaves the image, is flat, or has one direction only.
@@ -85,7 +89,8 @@ def align(
         grey = _drawn(b, at, affinity, HALF)
         inside = np.isfinite(grey).all(1)
         live, at, affinity = live[inside], at[inside], affinity[inside]
-        right = descent[live] @ (grey[inside] - template[live])[:, :, None]
+        off = _levelled(grey[inside], contrast[live]) - template[live]
+        right = descent[live] @ off[:, :, None]
         # Added, not subtracted: a step is composed inversely, so what the affinity has too much counts like a grey
         # difference.
         right[:, 2:6] += ridge * (unexpected[live] @ affinity - np.eye(2)).reshape(-1, 4, 1)
@@ -102,9 +107,9 @@ def align(
 
 
 def _descent(a: Floats32, points: Floats) -> tuple[Floats, Floats]:
-    """Templates (n, k) of k pixels and derivatives (n, 8, k) of their grey values; NaN where one leaves the image.
+    """Grey values (n, k) of k pixels less their mean, and derivatives (n, 8, k); NaN where a template leaves the image.
 
-    By the unknowns: shift (2), affinity (4), offset, gain.
+    By the unknowns: shift (2), affinity (4), and offset and gain, which a shift changes as well.
     """
     # One pixel more on every side than the template, for its central differences.
     patch = _drawn(a, points, np.eye(2), HALF + 1).reshape(-1, SIDE + 2, SIDE + 2)
@@ -112,9 +117,14 @@ def _descent(a: Floats32, points: Floats) -> tuple[Floats, Floats]:
     gx = 0.5 * (patch[:, 1:-1, 2:] - patch[:, 1:-1, :-2]).reshape(-1, SIDE * SIDE)
     gy = 0.5 * (patch[:, 2:, 1:-1] - patch[:, :-2, 1:-1]).reshape(-1, SIDE * SIDE)
     x, y = _offsets(HALF)
-    # Gain about the mean: its derivative is then orthogonal to that of the offset.
-    gain = grey - grey.mean(1, keepdims=True)
-    return grey, np.stack([gx, gy, gx * x, gx * y, gy * x, gy * y, np.ones_like(grey), gain], 1)
+    off = grey - grey.mean(1, keepdims=True)
+    return off, np.stack([gx, gy, gx * x, gx * y, gy * x, gy * y, np.ones_like(grey), off], 1)
+
+
+def _levelled(grey: Floats, contrast: Floats) -> Floats:
+    """Grey values (n, k) less their mean, at the contrast (n, 1) of their template: of the same exposure."""
+    off = grey - grey.mean(1, keepdims=True)
+    return np.asarray(off * (contrast / np.maximum(np.linalg.norm(off, axis=1, keepdims=True), MIN_CONTRAST)))
 
 
 def _offsets(half: int) -> Floats:

@@ -9,8 +9,7 @@ measured against the first.
 
 A point that is lost keeps its predicted position and may be found again. Buckets of the image that have run empty get
 new points at intermediate frames; such a point is looked up backwards in the key frame, where its coordinates are
-known, and dropped if it is not found there. Where the exposure changes, it is undone first
-(:mod:`rille.stages.odometry.exposure`); where a frame is blurred, lost points are searched in images blurred alike
+known, and dropped if it is not found there. Where a frame is blurred, lost points are searched in images blurred alike
 (:mod:`rille.stages.odometry.sharpness`).
 """
 
@@ -32,7 +31,6 @@ from rille.stages.facts.odometry import MotionFacts, TrackFacts
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.odometry.affine_lk import HALF, Templates, align
 from rille.stages.odometry.displacements import NEIGHBOURS, LevelDisplacements, fit_affinity, known
-from rille.stages.odometry.exposure import levelled
 from rille.stages.odometry.moravec import clear_of_mask, interest_points
 from rille.stages.odometry.sharpness import equally_sharp
 
@@ -41,9 +39,6 @@ BORDER = 8
 
 REACH_PX = 4.0
 """Largest distance of a point from its prediction: one pixel of the coarse displacement map."""
-
-MIN_AREA = 0.1
-"""Area of a template over that in its first frame, below which it draws no texture."""
 
 SETTLED_BACK_PX = 0.03
 """Step below which the alignment back has converged: a fraction of what it may miss by."""
@@ -95,7 +90,6 @@ def track(frames: Sequence[Pyramid], motions: Sequence[LevelDisplacements], para
     """
     if len(motions) != len(frames) - 1:
         raise InputError("RIL-447", f"{len(frames)} frames need {len(frames) - 1} motions, not {len(motions)}")
-    frames = levelled(frames, motions)
     first = frames[0]
     seeds = interest_points(first.images[0], first.valid[0], params.points, noise=params.noise, border=BORDER)
     state = _State.born(seeds.astype(np.float64), 0, len(frames))
@@ -161,8 +155,8 @@ def _aligned(a: Pyramid, b: Pyramid, templates: Templates, params: TrackParams) 
     place = _there_and_back(*images, b.valid[0], templates, params)
     alike = equally_sharp(*images, templates.points, templates.start)
     if alike is not None:
-        lost = np.isnan(place[:, 0])
-        place[lost] = _there_and_back(*alike, b.valid[0], Templates(*(v[lost] for v in templates)), params)
+        lost = np.flatnonzero(np.isnan(place[:, 0]))
+        place[lost] = _there_and_back(*alike, b.valid[0], templates.take(lost), params)
     return place
 
 
@@ -172,7 +166,6 @@ def _there_and_back(a: Floats32, b: Floats32, valid: Mask, templates: Templates,
     how = {"noise": params.noise * 2.0**0.5, "spread": AFFINITY_SIGMA, "reach": REACH_PX}
     place = align(a, b, templates, **how)
     good = np.flatnonzero(clear_of_mask(valid, place, HALF))
-    good = good[np.abs(np.linalg.det(templates.affinity[good])) > MIN_AREA]
     back = Templates(place[good], templates.points[good], np.linalg.inv(templates.affinity[good]))
     miss = align(b, a, back, **how, settled=SETTLED_BACK_PX) - templates.points[good]
     kept = np.isin(np.arange(len(place)), good[np.hypot(*miss.T) <= MAX_RETURN_PX])
