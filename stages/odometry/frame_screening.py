@@ -27,7 +27,7 @@ from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.facts.calibration import SwapFacts
 from rille.stages.facts.imaging import QualityFacts
-from rille.stages.facts.odometry import MotionFacts, ScreeningFacts
+from rille.stages.facts.odometry import MotionFacts, ScreeningFacts, StepTableFacts
 from rille.stages.imaging.image_quality import MAX_DARK_GREY, MIN_BRIGHT_GREY
 from rille.stages.odometry.steps import MIN_MATCHES, Step, steps_of
 
@@ -205,7 +205,7 @@ def _jumps(frames: Sequence[int], changes: Sequence[float], params: FrameScreeni
 def frame_screening_stage(
     params: FrameScreeningParams,
     qualities: Sequence[Bundle[QualityFacts]],
-    steps: Sequence[Bundle],
+    steps: Sequence[Bundle[StepTableFacts]],
     bridges: Sequence[Bundle[MotionFacts]],
     sides: Sequence[Bundle[SwapFacts]],
     *,

@@ -19,7 +19,7 @@ from pydantic import Field, model_validator
 
 from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.core.errors import ConfigError, InputError
-from rille.stages.facts.odometry import KeyframesFacts
+from rille.stages.facts.odometry import KeyframesFacts, StepTableFacts
 from rille.stages.odometry.steps import Step, overlaps, steps_of
 
 LITTLE = 0.4
@@ -160,7 +160,7 @@ def _warnings(steps: Sequence[Step], overlap: Sequence[float | None], params: Ke
 @stage("keyframes", version=3)
 def keyframes_stage(
     params: KeyframesParams,
-    steps: Sequence[Bundle],
+    steps: Sequence[Bundle[StepTableFacts]],
     *,
     frames: int,
     unfit: Sequence[int] = (),

@@ -166,7 +166,8 @@ def _there_and_back(a: Floats32, b: Floats32, valid: Mask, templates: Templates,
     how = {"noise": params.noise * 2.0**0.5, "spread": AFFINITY_SIGMA, "reach": REACH_PX}
     place = align(a, b, templates, **how)
     good = np.flatnonzero(clear_of_mask(valid, place, HALF))
-    back = Templates(place[good], templates.points[good], np.linalg.inv(templates.affinity[good]))
+    inverse = np.asarray(np.linalg.inv(templates.affinity[good]), np.float64)
+    back = Templates(place[good], templates.points[good], inverse)
     miss = align(b, a, back, **how, settled=SETTLED_BACK_PX) - templates.points[good]
     kept = np.isin(np.arange(len(place)), good[np.hypot(*miss.T) <= MAX_RETURN_PX])
     return np.where(kept[:, None], place, np.nan)
