@@ -60,7 +60,6 @@ IDEAS = (
     Idea("no affinity of the neighbours", name="odometry.track.fit_affinity", function=_no_change),
     Idea("points aligned one way only", name="odometry.track.MAX_RETURN_PX", function=1e9),
     Idea("no new points in empty parts", name="odometry.track._reseed", function=lambda state, *given: state),
-    Idea("exposure as it is", name="odometry.track.levelled", function=lambda frames, motions: list(frames)),
     Idea("no turned frames", ("motion.turn_below=0",)),
     Idea("no random samples", name="odometry.resection.robust_pose._sampled", function=lambda *given: []),
     Idea(

@@ -246,16 +246,9 @@ def steps(make: Builder, frames: list[int]) -> list[Handle[StepTableFacts]]:
     if tuple(frames) not in made:
         taken = "step_table/bridged" if made else "step_table"
         parts = [list(part) for _, part in groupby(pairwise(frames), lambda step: step[0] // TABLE_FRAMES)]
-        # A step is judged by the one before it, also across the border of two tables.
-        last = [None, *(make.motion(*part[-1]) for part in parts)]
         made[tuple(frames)] = [
-            make.node(
-                step_table_stage,
-                f"{taken}/{part[0][0]}",
-                motions=[make.motion(*step) for step in part],
-                before=before,
-            )
-            for part, before in zip(parts, last, strict=False)
+            make.node(step_table_stage, f"{taken}/{part[0][0]}", motions=[make.motion(*step) for step in part])
+            for part in parts
         ]
     return made[tuple(frames)]
 

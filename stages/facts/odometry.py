@@ -17,10 +17,9 @@ class MotionFacts(Facts):
 
 
 class StepTableFacts(Facts):
-    """``side`` of a block and ``size`` (columns, rows) of the image, px."""
+    """``side`` of a block, px."""
 
     side: float
-    size: list[float]
 
 
 class ScreeningFacts(Facts):

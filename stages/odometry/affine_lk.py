@@ -1,9 +1,10 @@
 """Sub-pixel alignment of templates under a local affinity (refinement of tracked positions, section 5.2.1).
 
 Feature vectors find *which* pixel corresponds. The grey values give the position within the pixel more exactly, once
-the template is drawn in the perspective of the searched frame. Affine Lucas-Kanade with gain and offset, inverse
-compositional: Baker and Matthews (2004), doi:10.1023/B:VISI.0000011205.11775.fd. The affinity that the neighbouring
-tracks suggest is a prior, so that weak texture keeps to it.
+the template is drawn in the perspective of the searched frame. Affine Lucas-Kanade, inverse compositional: Baker and
+Matthews (2004), doi:10.1023/B:VISI.0000011205.11775.fd. Grey values are compared less their mean and at equal contrast,
+so that the exposure may change from frame to frame. The affinity that the neighbouring tracks suggest is a prior, so
+that weak texture keeps to it.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.geometry.cubic import cubic
@@ -23,10 +25,12 @@ STEPS = 15
 """Most steps before a template is given up; five are usual."""
 SETTLED_PX = 0.01
 """Step below which a template has converged: a tenth of the error that remains."""
-UNKNOWNS = 8
-"""Shift (2), affinity (4), offset, gain."""
 MIN_TEXTURE = 1e-9
 """Sum of squared differences [grey levels] in each direction, below which a template has none: it is rounding."""
+MIN_CONTRAST = 1e-9
+"""Grey levels below which a square is flat: no contrast makes a template of it."""
+MIN_AREA = 0.1
+"""Area of a template over that in its first frame, below which it draws no texture."""
 
 
 class Templates(NamedTuple):
@@ -36,6 +40,10 @@ class Templates(NamedTuple):
     points: Floats
     start: Floats
     affinity: Floats
+
+    def take(self, which: NDArray[np.intp]) -> Templates:
+        """Those with these numbers."""
+        return Templates(*(values[which] for values in self))
 
 
 def align(
@@ -61,124 +69,83 @@ def align(
     settled : step [pixels] below which a template has converged.
     """
     out = np.full(templates.points.shape, np.nan)
-    _align_all(
-        np.ascontiguousarray(a, dtype=np.float32),
-        np.ascontiguousarray(b, dtype=np.float32),
-        Templates(*(np.ascontiguousarray(v, dtype=np.float64) for v in templates)),
-        # Weight of the prior in squared grey levels: variance of a grey difference over that of an element of the
-        # affinity.
-        (noise / spread) ** 2,
-        float(reach),
-        settled,
-        out,
-    )
+    template, descent = _descent(a, templates.points)
+    contrast = np.linalg.norm(template, axis=1, keepdims=True)
+    gram = descent @ np.swapaxes(descent, 1, 2)
+    xx, yy, xy = gram[:, 0, 0], gram[:, 1, 1], gram[:, 0, 1]
+    # Not so where the template leaves the image, is flat, or has one direction only.
+    textured = xx * yy - xy**2 > MIN_TEXTURE * (xx + yy)
+    live = np.flatnonzero(textured & (np.abs(np.linalg.det(templates.affinity)) > MIN_AREA))
+    # Weight of the prior in squared grey levels: variance of a grey difference over that of an element of the affinity.
+    ridge = (noise / spread) ** 2
+    prior = np.array([0.0, 0.0, ridge, ridge, ridge, ridge, 0.0, 0.0])
+    inverse, unexpected = np.zeros_like(gram), np.zeros_like(templates.affinity)
+    # Inverse compositional: derivatives are those of the template, so one inverse serves all steps.
+    inverse[live] = np.linalg.inv(gram[live] + np.diag(prior + 1e-9))
+    unexpected[live] = np.linalg.inv(templates.affinity[live])
+    # Steps are composed into the affinity; the prior pulls towards what was expected.
+    at, affinity = templates.start[live], templates.affinity[live]
+    for _ in range(STEPS):
+        grey = _drawn(b, at, affinity, HALF)
+        inside = np.isfinite(grey).all(1)
+        live, at, affinity = live[inside], at[inside], affinity[inside]
+        off = _levelled(grey[inside], contrast[live]) - template[live]
+        right = descent[live] @ off[:, :, None]
+        # Added, not subtracted: a step is composed inversely, so what the affinity has too much counts like a grey
+        # difference.
+        right[:, 2:6] += ridge * (unexpected[live] @ affinity - np.eye(2)).reshape(-1, 4, 1)
+        step = inverse[live] @ right
+        affinity = affinity @ np.linalg.inv(np.eye(2) + step[:, 2:6].reshape(-1, 2, 2))
+        move = (affinity @ step[:, :2])[:, :, 0]
+        at = at - move
+        near = (np.abs(at - templates.start[live]) <= reach).all(1)
+        done = near & (np.abs(move) < settled).all(1)
+        out[live[done]] = at[done]
+        on = near & ~done
+        live, at, affinity = live[on], at[on], affinity[on]
     return out
 
 
-@njit(cache=True, nogil=True)
-def _align_all(a, b, templates, ridge, reach, settled, out):  # type: ignore[no-untyped-def]
-    patch, template = np.empty((SIDE + 2) ** 2), np.empty(SIDE * SIDE)
-    descent, grey = np.empty((UNKNOWNS, SIDE * SIDE)), np.empty(SIDE * SIDE)
-    for n in range(len(templates.points)):
-        point, start, expected = templates.points[n], templates.start[n], templates.affinity[n]
-        if not _descent(a, point[0], point[1], patch, template, descent):
-            continue
-        gram = np.dot(descent, descent.T)
-        # The template is flat, or has one direction only.
-        if not gram[0, 0] * gram[1, 1] - gram[0, 1] ** 2 > MIN_TEXTURE * (gram[0, 0] + gram[1, 1]):
-            continue
-        for k in range(UNKNOWNS):
-            gram[k, k] += 1e-9 + (ridge if 2 <= k < 6 else 0.0)
-        # Inverse compositional: derivatives are those of the template, so one inverse serves all steps.
-        inverse, unexpected = np.linalg.inv(gram), _inverse(expected)
-        # Steps are composed into the copy; the prior pulls towards what was given.
-        affinity, at = expected.copy(), start.copy()
-        for _ in range(STEPS):
-            if not _warp(b, at[0], at[1], affinity, grey):
-                break
-            grey -= template
-            right = np.dot(descent, grey)
-            # Added, not subtracted: a step is composed inversely, so what the affinity has too much counts like a grey
-            # difference.
-            right[2:6] += ridge * (_product(unexpected, affinity) - np.eye(2)).ravel()
-            step = np.dot(inverse, right)
-            affinity = _product(affinity, _inverse(np.eye(2) + step[2:6].reshape(2, 2)))
-            dx = affinity[0, 0] * step[0] + affinity[0, 1] * step[1]
-            dy = affinity[1, 0] * step[0] + affinity[1, 1] * step[1]
-            at[0], at[1] = at[0] - dx, at[1] - dy
-            # Negated so that NaN, of a singular system, is refused as well.
-            if not (abs(at[0] - start[0]) <= reach and abs(at[1] - start[1]) <= reach):
-                break
-            if max(abs(dx), abs(dy)) < settled:
-                out[n] = at
-                break
+def _descent(a: Floats32, points: Floats) -> tuple[Floats, Floats]:
+    """Grey values (n, k) of k pixels less their mean, and derivatives (n, 8, k); NaN where a template leaves the image.
 
-
-@njit(cache=True, nogil=True)
-def _product(a, b):  # type: ignore[no-untyped-def]
-    """Product (2, 2); of matrices this small a call of BLAS takes longer than their sums."""
-    out = np.empty((2, 2))
-    for i in range(2):
-        for j in range(2):
-            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j]
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _inverse(m):  # type: ignore[no-untyped-def]
-    """Inverse (2, 2); not finite of a singular matrix."""
-    det = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
-    return np.array([[m[1, 1] / det, -m[0, 1] / det], [-m[1, 0] / det, m[0, 0] / det]])
-
-
-@njit(cache=True, nogil=True)
-def _descent(a, x0, y0, patch, template, descent):  # type: ignore[no-untyped-def]
-    """Template and derivatives of its grey values by the unknowns; False where it leaves the image."""
+    By the unknowns: shift (2), affinity (4), and offset and gain, which a shift changes as well.
+    """
     # One pixel more on every side than the template, for its central differences.
-    wide, far = SIDE + 2, HALF + 1
-    if not (_holds(a, x0 - far, y0 - far) and _holds(a, x0 + far, y0 + far)):
-        return False
-    # At whole pixels the interpolating spline is the pixel itself.
-    if x0 == np.floor(x0) and y0 == np.floor(y0):
-        for i in range(wide * wide):
-            patch[i] = a[int(y0) + i // wide - far, int(x0) + i % wide - far]
-    else:
-        for i in range(wide * wide):
-            patch[i] = cubic(a, x0 + i % wide - far, y0 + i // wide - far)
-    # Derivatives of the template's grey values g by the warp: shift (gx, gy), affinity (gx x, gx y, gy x, gy y).
-    mean = 0.0
-    for i in range(SIDE * SIDE):
-        x, y = i % SIDE - HALF, i // SIDE - HALF
-        at = (i // SIDE + 1) * wide + i % SIDE + 1
-        gx, gy = 0.5 * (patch[at + 1] - patch[at - 1]), 0.5 * (patch[at + wide] - patch[at - wide])
-        template[i] = patch[at]
-        mean += patch[at]
-        descent[0, i], descent[1, i] = gx, gy
-        descent[2, i], descent[3, i], descent[4, i], descent[5, i] = gx * x, gx * y, gy * x, gy * y
-        descent[6, i] = 1.0
-    for i in range(SIDE * SIDE):
-        # Gain about the mean: its derivative is then orthogonal to that of the offset.
-        descent[7, i] = template[i] - mean / (SIDE * SIDE)
-    return True
+    patch = _drawn(a, points, np.eye(2), HALF + 1).reshape(-1, SIDE + 2, SIDE + 2)
+    grey = patch[:, 1:-1, 1:-1].reshape(-1, SIDE * SIDE)
+    gx = 0.5 * (patch[:, 1:-1, 2:] - patch[:, 1:-1, :-2]).reshape(-1, SIDE * SIDE)
+    gy = 0.5 * (patch[:, 2:, 1:-1] - patch[:, :-2, 1:-1]).reshape(-1, SIDE * SIDE)
+    x, y = _offsets(HALF)
+    off = grey - grey.mean(1, keepdims=True)
+    return off, np.stack([gx, gy, gx * x, gx * y, gy * x, gy * y, np.ones_like(grey), off], 1)
+
+
+def _levelled(grey: Floats, contrast: Floats) -> Floats:
+    """Grey values (n, k) less their mean, at the contrast (n, 1) of their template: of the same exposure."""
+    off = grey - grey.mean(1, keepdims=True)
+    return np.asarray(off * (contrast / np.maximum(np.linalg.norm(off, axis=1, keepdims=True), MIN_CONTRAST)))
+
+
+def _offsets(half: int) -> Floats:
+    """Column, row (2, k) of the pixels of a square from its middle, row by row."""
+    return np.asarray(np.mgrid[-half : half + 1, -half : half + 1][::-1].reshape(2, -1), np.float64)
+
+
+def _drawn(image: Floats32, at: Floats, affinity: Floats, half: int) -> Floats:
+    """Grey values (n, k) of squares under affinities (n, 2, 2) about points (n, 2); NaN outside the image."""
+    places = at[:, :, None] + affinity @ _offsets(half)
+    out = np.empty((len(at), places.shape[2]))
+    _sample(np.ascontiguousarray(image, np.float32), places, out)
+    return out
 
 
 @njit(cache=True, nogil=True)
-def _warp(b, x0, y0, m, grey):  # type: ignore[no-untyped-def]
-    """Grey values under the template; False where one of its corners, and so it, leaves the image."""
-    # An affinity makes a parallelogram of the square: inside with its corners inside.
-    for j in (-HALF, HALF):
-        for i in (-HALF, HALF):
-            if not _holds(b, x0 + m[0, 0] * i + m[0, 1] * j, y0 + m[1, 0] * i + m[1, 1] * j):
-                return False
-    k = 0
-    for j in range(-HALF, HALF + 1):
-        for i in range(-HALF, HALF + 1):
-            grey[k] = cubic(b, x0 + m[0, 0] * i + m[0, 1] * j, y0 + m[1, 0] * i + m[1, 1] * j)
-            k += 1
-    return True
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _holds(image, x, y):  # type: ignore[no-untyped-def]
-    """Whether all that cubic interpolation reads lies in the image."""
-    return 1.0 <= x < image.shape[1] - 2.0 and 1.0 <= y < image.shape[0] - 2.0
+def _sample(image, places, out):  # type: ignore[no-untyped-def]
+    """Grey values ``out`` (n, k) at places (n, 2, k); NaN where cubic interpolation reads beyond the image."""
+    rows, cols = image.shape
+    for n in range(len(out)):
+        for k in range(out.shape[1]):
+            x, y = places[n, 0, k], places[n, 1, k]
+            inside = 1.0 <= x < cols - 2.0 and 1.0 <= y < rows - 2.0
+            out[n, k] = cubic(image, x, y) if inside else np.nan

@@ -15,7 +15,7 @@ result is final.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from itertools import groupby, pairwise
 from typing import Any
@@ -27,15 +27,16 @@ from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.facts.calibration import SwapFacts
 from rille.stages.facts.imaging import QualityFacts
-from rille.stages.facts.odometry import MotionFacts, ScreeningFacts
+from rille.stages.facts.odometry import MotionFacts, ScreeningFacts, StepTableFacts
 from rille.stages.imaging.image_quality import MAX_DARK_GREY, MIN_BRIGHT_GREY
-from rille.stages.odometry.keyframes import LEAST_BLOCKS
-from rille.stages.odometry.steps import Step, changes_of, steps_of
+from rille.stages.odometry.steps import MIN_MATCHES, Step, steps_of
 
 Steps = Mapping[tuple[int, int], float]
 Asks = dict[str, list[Any]]
 
 SIDES = ("left", "right")
+GREYS = ((MAX_DARK_GREY, "black"), (MIN_BRIGHT_GREY, "uniform"), (np.inf, "white"))
+"""Largest mean grey value of a uniform image, and how it is called."""
 QUIET = 0.25
 """Quantile of the changes that counts as usual: one exchanged frame changes three steps, half of a short sequence."""
 
@@ -60,12 +61,6 @@ class FrameScreeningParams(Params):
         le=1,
         description="share of the camera's usual sharpness below which a pair cannot be a basic pair; a Gaussian blur"
         " of one pixel costs 0.4",
-    )
-    min_matches: float = Field(
-        0.2,
-        ge=0,
-        le=1,
-        description="share of the textured pixels that must find a displacement for two frames to count as overlapping",
     )
     jump: float = Field(
         4.0,
@@ -107,26 +102,31 @@ def judge(
     out = Judgement()
     _see(out, frames, qualities, params)
     best = max((facts["as_given"] for facts in sides.values() if "as_given" in facts), default=0.0)
-    for f in frames:
-        if f in sides and sides[f]["swapped"]:
-            out.lost.setdefault(f, _swapped(sides[f]))
-        elif best > SIMULTANEOUS_SHARE and f in sides and sides[f].get("as_given", best) < SIMULTANEOUS_SHARE * best:
-            out.lost.setdefault(f, _of_two_times(sides[f]["as_given"], best))
-    doubted = set(jumps) | _neighbours(frames, {f for f in out.lost if f in sides})
+    for f, facts in sides.items():
+        fit = facts.get("as_given", best)
+        if facts["swapped"]:
+            words = f"left and right are swapped ({facts['exchanged']:.0%} of its matches fit the rig with the sides"
+            out.lost.setdefault(f, f"{words} exchanged, {fit:.0%} as given)")
+        elif best > SIMULTANEOUS_SHARE and fit < SIMULTANEOUS_SHARE * best:
+            words = f"left and right are not of one time ({fit:.0%} of its matches fit the rig, of other frames"
+            out.lost.setdefault(f, f"{words} {best:.0%})")
+    doubted = set(jumps) | _neighbours(frames, out.lost.keys() & sides.keys())
     out.asks["sides"] = [f for f in frames if f in doubted and f not in sides and f not in out.lost]
     chain = [f for f in frames if f not in out.lost]
     out.asks["bridges"] = [s for s in pairwise(chain) if s not in steps]
     if any(out.asks.values()):
         return out
-    good = [steps[s] >= params.min_matches for s in pairwise(chain)]
-    for i, j in _doubtful_runs(good):
-        bridge, inside = (chain[i], chain[j]), chain[i + 1 : j]
+    for i, j in _doubtful_runs([steps[s] >= MIN_MATCHES for s in pairwise(chain)]):
+        bridge = chain[i], chain[j]
         if bridge not in steps:
             out.asks["bridges"].append(bridge)
             continue
-        for f, (a, b) in zip(inside, zip(chain[i:], chain[i + 2 :], strict=False), strict=False):
-            if steps[bridge] >= params.min_matches or f in out.unfit:
-                out.lost[f] = _unmatched(out.unfit.get(f, ""), steps[a, f], steps[f, b])
+        for a, f, b in zip(chain[i:j], chain[i + 1 : j], chain[i + 2 :], strict=False):
+            if steps[bridge] >= MIN_MATCHES or f in out.unfit:
+                shares = f"{steps[a, f]:.0%} of its pixels match the frame before, {steps[f, b]:.0%} the one behind"
+                out.lost[f] = (
+                    f"{out.unfit[f]}, {shares}" if f in out.unfit else f"not found in its neighbours: {shares}"
+                )
     _leading(out, [f for f in chain if f not in out.lost])
     return out
 
@@ -135,30 +135,31 @@ def _see(
     out: Judgement, frames: Sequence[int], qualities: Mapping[int, Mapping[str, Any]], params: FrameScreeningParams
 ) -> None:
     """Judge frames by their images alone: uniform, blurred, copied."""
-    usual = {
-        (s, what): _usual([qualities[f][s][what] for f in frames]) for s in SIDES for what in ("sharpness", "detail")
-    }
-    for f in frames:
-        for side in SIDES:
+    for side in SIDES:
+        usual = {what: _usual([qualities[f][side][what] for f in frames]) for what in ("sharpness", "detail")}
+        for f in frames:
             seen = qualities[f][side]
             if seen["deviation"] < params.uniform:
-                words = _uniform(seen, side)
+                kind = "empty" if seen["mean"] is None else next(word for up, word in GREYS if seen["mean"] <= up)
+                words = f"{kind} {side} image (grey values deviate by {seen['deviation']:.1f} levels)"
                 (out.lost if side == "left" else out.unfit).setdefault(f, words)
                 continue
             for what, limit in (("sharpness", params.blurred), ("detail", 0.5 * params.blurred)):
-                share = seen[what] / usual[side, what] if seen[what] is not None and usual[side, what] > 0 else 1.0
+                share = seen[what] / usual[what] if seen[what] is not None and usual[what] > 0 else 1.0
                 if share < limit:
                     out.unfit.setdefault(f, f"blurred {side} image ({share:.0%} of the usual {what})")
-        if qualities[f]["left"]["digest"] == qualities[f]["right"]["digest"] and f not in out.lost:
+    digests = {f: [qualities[f][side]["digest"] for side in SIDES] for f in frames}
+    for f in frames:
+        if digests[f][0] == digests[f][1] and f not in out.lost:
             out.unfit[f] = "left and right are one image"
     for a, b in pairwise(frames):
-        same = {side: qualities[a][side]["digest"] == qualities[b][side]["digest"] for side in SIDES}
+        same = [side for side, was, now in zip(SIDES, digests[a], digests[b], strict=True) if was == now]
         if a in out.lost or b in out.lost:
             continue
-        if same["left"]:
+        if "left" in same:
             out.repeated.append((a, b))
-        if same["left"] != same["right"]:
-            out.unfit.setdefault(b, f"its {'left' if same['left'] else 'right'} image is that of frame {a}")
+        if len(same) == 1:
+            out.unfit.setdefault(b, f"its {same[0]} image is that of frame {a}")
 
 
 def _usual(values: Sequence[float | None]) -> float:
@@ -166,49 +167,15 @@ def _usual(values: Sequence[float | None]) -> float:
     return float(np.median(known)) if len(known) > 2 else 0.0
 
 
-def _uniform(seen: Mapping[str, Any], side: str) -> str:
-    mean = seen["mean"]
-    kind = (
-        "empty"
-        if mean is None
-        else "black"
-        if mean <= MAX_DARK_GREY
-        else "white"
-        if mean >= MIN_BRIGHT_GREY
-        else "uniform"
-    )
-    return f"{kind} {side} image (grey values deviate by {seen['deviation']:.1f} levels)"
-
-
-def _swapped(facts: Mapping[str, Any]) -> str:
-    return (
-        f"left and right are swapped ({facts['exchanged']:.0%} of its matches fit the rig with the sides exchanged,"
-        f" {facts['as_given']:.0%} as given)"
-    )
-
-
-def _of_two_times(fit: float, best: float) -> str:
-    return f"left and right are not of one time ({fit:.0%} of its matches fit the rig, of other frames {best:.0%})"
-
-
-def _unmatched(why: str, before: float, after: float) -> str:
-    shares = f"{before:.0%} of its pixels match the frame before, {after:.0%} the one behind"
-    return f"{why}, {shares}" if why else f"not found in its neighbours: {shares}"
-
-
-def _neighbours(frames: Sequence[int], of: set[int]) -> set[int]:
+def _neighbours(frames: Sequence[int], of: Set[int]) -> set[int]:
     """Frames beside some others."""
     return {n for a, b in pairwise(frames) for f, n in ((a, b), (b, a)) if f in of}
 
 
 def _doubtful_runs(good: Sequence[bool]) -> list[tuple[int, int]]:
     """Places (i, j) of the frames before and behind each run of at least two doubtful steps between good ones."""
-    runs = []
-    for fine, group in groupby(range(len(good)), good.__getitem__):
-        steps = list(group)
-        if not fine and len(steps) >= 2:
-            runs.append((steps[0], steps[-1] + 1))
-    return runs
+    runs = [(fine, list(group)) for fine, group in groupby(range(len(good)), good.__getitem__)]
+    return [(steps[0], steps[-1] + 1) for fine, steps in runs if not fine and len(steps) >= 2]
 
 
 def _leading(out: Judgement, chain: list[int]) -> None:
@@ -225,11 +192,6 @@ def _leading(out: Judgement, chain: list[int]) -> None:
         out.lost[f] = f"{out.unfit[f]}, and no good pair before it"
 
 
-def share(step: Step) -> float:
-    """Share of matches of a step; 0 where too few blocks of the image have one."""
-    return step.match_rate if int(step.known.sum()) >= LEAST_BLOCKS else 0.0
-
-
 def _jumps(frames: Sequence[int], changes: Sequence[float], params: FrameScreeningParams) -> list[int]:
     """Frames at the abrupt changes; ``changes`` has one value a frame but the first and the last."""
     if not changes:
@@ -243,7 +205,7 @@ def _jumps(frames: Sequence[int], changes: Sequence[float], params: FrameScreeni
 def frame_screening_stage(
     params: FrameScreeningParams,
     qualities: Sequence[Bundle[QualityFacts]],
-    steps: Sequence[Bundle],
+    steps: Sequence[Bundle[StepTableFacts]],
     bridges: Sequence[Bundle[MotionFacts]],
     sides: Sequence[Bundle[SwapFacts]],
     *,
@@ -255,10 +217,9 @@ def frame_screening_stage(
     if len(along) != len(frames) - 1 or len(qualities) != len(frames):
         raise InputError("RIL-317", f"{len(frames)} frames need as many image qualities and {len(frames) - 1} steps")
     seen = {f: s.meta for f, s in zip(frames, qualities, strict=True)}
-    shares = {s: share(step) for s, step in zip(pairwise(frames), along, strict=True)}
-    changes = changes_of(steps)
-    spanned = [(a, b) for a, b in bridged]
-    shares |= {s: share(Step.from_bundle(m)) for s, m in zip(spanned, bridges, strict=True)}
+    shares = {s: step.match_rate for s, step in zip(pairwise(frames), along, strict=True)}
+    shares |= {(a, b): Step.from_bundle(m).match_rate for (a, b), m in zip(bridged, bridges, strict=True)}
+    changes = [a.change(b) for a, b in pairwise(along)]
     tested = {s.meta["frame"]: s.meta for s in sides}
     found = judge(list(frames), seen, shares, _jumps(list(frames), changes, params), tested, params)
     chain = [f for f in frames if f not in found.lost]

@@ -12,24 +12,15 @@ often.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import reduce
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
 from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.core.errors import ConfigError, InputError
-from rille.stages.facts.odometry import KeyframesFacts
-from rille.stages.odometry.steps import Covisibility, Step, steps_of
-
-LEAST_BLOCKS = 12
-"""Least number of blocks with a displacement from which the overlap of two images is estimated."""
-
-MIN_MATCHES = 0.2
-"""Share of the textured pixels that must find a displacement; below, both frames become basic pairs (rule stride: the
-later one)."""
+from rille.stages.facts.odometry import KeyframesFacts, StepTableFacts
+from rille.stages.odometry.steps import Step, overlaps, steps_of
 
 LITTLE = 0.4
 """Overlap below which a stride, which asks for none, is warned of: most landmarks of a segment leave the image."""
@@ -82,86 +73,62 @@ class KeyframesParams(Params):
         return values
 
 
-@dataclass(frozen=True)
-class Marked:
-    """Positions that the choice must respect, whatever the steps show.
-
-    ``unfit`` may not be basic; ``behind`` a gap of lost frames are: if the bridge over the gap is refused, what follows
-    is posed as a piece of its own.
-    """
-
-    unfit: frozenset[int] = frozenset()
-    behind: frozenset[int] = frozenset()
-
-    @classmethod
-    def of(cls, frames: int, unfit: Sequence[int], behind: Sequence[int]) -> Marked:
-        """Build for a number of frames; after a gap the first position that is not unfit is basic."""
-        fit = [k for k in range(frames) if k not in unfit]
-        return cls(frozenset(unfit), frozenset(n for k in behind for n in [n for n in fit if n >= k][:1]))
-
-
-UNMARKED = Marked()
-
-
-def by_stride(steps: Sequence[Step], params: KeyframesParams, marked: Marked = UNMARKED) -> dict[int, str]:
+def by_stride(steps: Sequence[Step], params: KeyframesParams, unfit: set[int], behind: set[int]) -> dict[int, str]:
     """Positions 0, stride, 2 stride ... of one more frame than there are steps, and why; for an unfit one the next.
 
     A frame after a step with too few matches is basic, too: the frames that follow then get poses, in a piece of their
     own.
     """
     count = len(steps) + 1
-    broken = [k + 1 for k, step in enumerate(steps) if doubtful(step)]
-    wanted = dict.fromkeys(marked.behind, "behind a gap") | dict.fromkeys(broken, "few matches")
+    broken = [k + 1 for k, step in enumerate(steps) if not step.overlaps]
+    wanted = dict.fromkeys(behind, "behind a gap") | dict.fromkeys(broken, "few matches")
     wanted |= dict.fromkeys(range(0, count, params.stride), "stride")
     chosen: dict[int, str] = {}
     for k in sorted(wanted):
-        fit = next((n for n in range(k, count) if n not in marked.unfit), None)
-        if fit is not None:
+        if (fit := _fit(range(k, count), unfit)) is not None:
             chosen.setdefault(fit, wanted[k])
     return chosen
 
 
-def by_overlap(steps: Sequence[Step], params: KeyframesParams, marked: Marked = UNMARKED) -> dict[int, str]:
+def by_overlap(steps: Sequence[Step], params: KeyframesParams, unfit: set[int], behind: set[int]) -> dict[int, str]:
     """Positions as far apart as the wanted overlap permits, and why; at least one frame apart.
 
     Parameters
     ----------
     steps : coarse displacements from each frame to the next.
-    marked : in place of an unfit position the last one before that may be basic, else the next one.
+    unfit : positions that may not be basic: in place of one the last before it, else the next.
+    behind : positions that are basic whatever the steps show.
     """
-    chosen, key, k = {0: ""}, 0, 0
-    seen = Covisibility.all_of(steps[0]) if steps else None
-    while seen is not None and k < len(steps):
-        ahead = seen.after(steps[k])
-        reason = "behind a gap" if k in marked.behind else _why(steps, k, key, ahead, params)
-        fit = next((n for n in range(k, key, -1) if n not in marked.unfit), None) if reason else None
-        if fit is not None:
-            chosen[fit] = reason
-            k = key = fit
-            ahead = Covisibility.all_of(steps[k]).after(steps[k])
-        seen, k = ahead, k + 1
+    chosen: dict[int, str] = {}
+    key: int | None = 0
+    reason = ""
+    while key is not None:
+        chosen[key] = reason
+        begun, key = key, None
+        for k, overlap in enumerate(overlaps(steps[begun:]), begun):
+            # Position k is basic where one more frame would be too much.
+            reasons = {
+                "behind a gap": k in behind,
+                "few matches": not all(step.overlaps for step in steps[max(k - 1, begun) : k + 1]),
+                "overlap": min(overlap) < params.overlap,
+                "max_gap": k + 1 - begun > params.max_gap,
+            }
+            reason = next((words for words, holds in reasons.items() if holds), "")
+            key = _fit(range(k, begun, -1), unfit) if reason else None
+            if key is not None:
+                break
     return chosen
 
 
-def _why(steps: Sequence[Step], k: int, key: int, ahead: Covisibility, params: KeyframesParams) -> str:
-    """Why position ``k`` should be basic, given what ``ahead`` would still be seen one frame on; empty: it need not."""
-    if any(doubtful(step) for step in steps[max(k - 1, key) : k + 1]):
-        return "few matches"
-    if ahead.overlap < params.overlap:
-        return "overlap"
-    return "max_gap" if k + 1 - key > params.max_gap else ""
-
-
-def doubtful(step: Step) -> bool:
-    """Whether a step has too few matches to be used."""
-    return step.match_rate < MIN_MATCHES or int(step.known.sum()) < LEAST_BLOCKS
+def _fit(positions: Iterable[int], unfit: set[int]) -> int | None:
+    """The first position that may be basic; None: none."""
+    return next((n for n in positions if n not in unfit), None)
 
 
 def _overlap(steps: Sequence[Step]) -> float | None:
-    """Overlap of the frames before and behind some steps; None: one of them is doubtful."""
-    if any(doubtful(step) for step in steps):
-        return None
-    return reduce(Covisibility.after, steps, Covisibility.all_of(steps[0])).overlap
+    """Overlap of the frames before and behind some steps; None: one of them shows too little."""
+    *_, last = overlaps(steps)
+    return min(last) if all(step.overlaps for step in steps) else None
 
 
 def segments(basic: list[int], frames: int) -> list[list[int]]:
@@ -173,7 +140,7 @@ def segments(basic: list[int], frames: int) -> list[list[int]]:
 def _warnings(steps: Sequence[Step], overlap: Sequence[float | None], params: KeyframesParams) -> list[str]:
     """What the choice could not give."""
     lines = []
-    blind = [k for k, step in enumerate(steps) if doubtful(step)]
+    blind = [k for k, step in enumerate(steps) if not step.overlaps]
     if blind:
         lines.append(
             f"{len(blind)} of {len(steps)} steps between frames have too few coarse matches (at least"
@@ -193,7 +160,7 @@ def _warnings(steps: Sequence[Step], overlap: Sequence[float | None], params: Ke
 @stage("keyframes", version=3)
 def keyframes_stage(
     params: KeyframesParams,
-    steps: Sequence[Bundle],
+    steps: Sequence[Bundle[StepTableFacts]],
     *,
     frames: int,
     unfit: Sequence[int] = (),
@@ -206,8 +173,9 @@ def keyframes_stage(
     if len(moves) != frames - 1:
         raise InputError("RIL-438", f"{frames} frames need {frames - 1} steps, not {len(moves)}")
     stride = params.rule == "stride"
-    marked = Marked.of(frames, unfit, behind)
-    chosen = (by_stride if stride else by_overlap)(moves, params, marked)
+    # Where the bridge over a gap of lost frames is refused, the frames behind it are posed as a piece of their own.
+    after = {n for k in behind if (n := _fit(range(k, frames), set(unfit))) is not None}
+    chosen = (by_stride if stride else by_overlap)(moves, params, set(unfit), after)
     basic, (_, *why) = list(chosen), chosen.values()
     overlap = [None, *(_overlap(moves[a:b]) for a, b in itertools.pairwise(basic))]
     meta: KeyframesFacts = {

@@ -49,7 +49,11 @@ def _blurred(image: Floats32, points: Floats, wanted: float) -> Floats32:
 
 
 def _gradients(image: Floats32, points: Floats) -> float:
-    """Mean squared gradient of the templates around the points: median over those inside; 0 where none is."""
+    """Mean squared gradient of the templates around the points, over their brightness squared, whatever the exposure.
+
+    Median over those inside; 0 where none is.
+    """
     squares = sum(cv2.Scharr(image, cv2.CV_32F, dx, 1 - dx) ** 2 for dx in (0, 1))
-    inside, (mean,) = windows_at(points, 0, cv2.blur(squares, (SIDE, SIDE)))
+    brightness = np.maximum(cv2.blur(image, (SIDE, SIDE)), 1.0)
+    inside, (mean,) = windows_at(points, 0, cv2.blur(squares, (SIDE, SIDE)) / brightness**2)
     return float(np.median(mean[inside])) if inside.any() else 0.0

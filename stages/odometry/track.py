@@ -9,8 +9,7 @@ measured against the first.
 
 A point that is lost keeps its predicted position and may be found again. Buckets of the image that have run empty get
 new points at intermediate frames; such a point is looked up backwards in the key frame, where its coordinates are
-known, and dropped if it is not found there. Where the exposure changes, it is undone first
-(:mod:`rille.stages.odometry.exposure`); where a frame is blurred, lost points are searched in images blurred alike
+known, and dropped if it is not found there. Where a frame is blurred, lost points are searched in images blurred alike
 (:mod:`rille.stages.odometry.sharpness`).
 """
 
@@ -32,7 +31,6 @@ from rille.stages.facts.odometry import MotionFacts, TrackFacts
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.odometry.affine_lk import HALF, Templates, align
 from rille.stages.odometry.displacements import NEIGHBOURS, LevelDisplacements, fit_affinity, known
-from rille.stages.odometry.exposure import levelled
 from rille.stages.odometry.moravec import clear_of_mask, interest_points
 from rille.stages.odometry.sharpness import equally_sharp
 
@@ -41,9 +39,6 @@ BORDER = 8
 
 REACH_PX = 4.0
 """Largest distance of a point from its prediction: one pixel of the coarse displacement map."""
-
-MIN_AREA = 0.1
-"""Area of a template over that in its first frame, below which it draws no texture."""
 
 SETTLED_BACK_PX = 0.03
 """Step below which the alignment back has converged: a fraction of what it may miss by."""
@@ -72,12 +67,25 @@ class TrackParams(Params):
     )
 
 
-@dataclass(frozen=True)
+@dataclass
 class Tracks:
-    """``points`` (n, frames, 2) column, row, NaN lost; ``birth`` (n,) index of the frame that the template is from."""
+    """``points`` (n, frames, 2) column, row, NaN lost; ``birth`` (n,) index of the frame that the template is from;
+    ``expected`` (n, 2) where each point is thought to be in the last frame that was searched."""
 
-    points: Floats32
+    points: Floats
     birth: NDArray[np.int16]
+    expected: Floats
+
+    @staticmethod
+    def born(points: Floats, frame: int, frames: int) -> Tracks:
+        """Tracks of points (n, 2) that one of so many frames shows first."""
+        state = Tracks(np.full((len(points), frames, 2), np.nan), np.full(len(points), frame, np.int16), points.copy())
+        state.points[:, frame] = points
+        return state
+
+    def and_also(self, other: Tracks, keep: Bools) -> Tracks:
+        """These, and those of the others (n,) that are kept."""
+        return Tracks(*(np.concatenate([mine, vars(other)[name][keep]]) for name, mine in vars(self).items()))
 
 
 def track(frames: Sequence[Pyramid], motions: Sequence[LevelDisplacements], params: TrackParams) -> Tracks:
@@ -95,36 +103,17 @@ def track(frames: Sequence[Pyramid], motions: Sequence[LevelDisplacements], para
     """
     if len(motions) != len(frames) - 1:
         raise InputError("RIL-447", f"{len(frames)} frames need {len(frames) - 1} motions, not {len(motions)}")
-    frames = levelled(frames, motions)
     first = frames[0]
     seeds = interest_points(first.images[0], first.valid[0], params.points, noise=params.noise, border=BORDER)
-    state = _State.born(seeds.astype(np.float64), 0, len(frames))
+    state = Tracks.born(seeds.astype(np.float64), 0, len(frames))
     for j in range(1, len(frames)):
         _advance(state, frames, motions[j - 1], j, params)
         if j < len(frames) - 1:
             state = _reseed(state, frames, j, params)
-    return Tracks(state.points.astype(np.float32), state.birth)
+    return state
 
 
-@dataclass
-class _State:
-    """Tracks in the making; ``expected`` (n, 2) is where each point is thought to be in the present frame."""
-
-    points: Floats
-    birth: NDArray[np.int16]
-    expected: Floats
-
-    @staticmethod
-    def born(points: Floats, frame: int, frames: int) -> _State:
-        state = _State(np.full((len(points), frames, 2), np.nan), np.full(len(points), frame, np.int16), points.copy())
-        state.points[:, frame] = points
-        return state
-
-    def and_also(self, other: _State, keep: Bools) -> _State:
-        return _State(*(np.concatenate([mine, vars(other)[name][keep]]) for name, mine in vars(self).items()))
-
-
-def _advance(state: _State, frames: Sequence[Pyramid], motion: LevelDisplacements, j: int, params: TrackParams) -> None:
+def _advance(state: Tracks, frames: Sequence[Pyramid], motion: LevelDisplacements, j: int, params: TrackParams) -> None:
     """Find all points of frame j - 1 in frame j; a lost one goes on with its prediction, and may be found again."""
     state.expected = state.expected + motion.at(state.expected)
     inside = known(state.expected)
@@ -139,7 +128,7 @@ def _advance(state: _State, frames: Sequence[Pyramid], motion: LevelDisplacement
         state.expected[who] = np.where(np.isfinite(place), place, state.expected[who])
 
 
-def _reseed(state: _State, frames: Sequence[Pyramid], j: int, params: TrackParams) -> _State:
+def _reseed(state: Tracks, frames: Sequence[Pyramid], j: int, params: TrackParams) -> Tracks:
     """Add points of frame j in empty buckets, as far as they are found in the key frame."""
     alive = known(state.points[:, j]) & known(state.points[:, 0])
     here, there = state.points[alive, j], state.points[alive, 0]
@@ -150,7 +139,7 @@ def _reseed(state: _State, frames: Sequence[Pyramid], j: int, params: TrackParam
     if len(seeds) == 0 or len(here) < NEIGHBOURS:
         return state
     affinity, shift = fit_affinity(here, there, np.ones(len(here), bool), seeds)
-    new = _State.born(seeds, j, len(frames))
+    new = Tracks.born(seeds, j, len(frames))
     new.points[:, 0] = _aligned(frames[j], frames[0], Templates(seeds, seeds + shift, affinity), params)
     return state.and_also(new, known(new.points[:, 0]))
 
@@ -161,8 +150,8 @@ def _aligned(a: Pyramid, b: Pyramid, templates: Templates, params: TrackParams) 
     place = _there_and_back(*images, b.valid[0], templates, params)
     alike = equally_sharp(*images, templates.points, templates.start)
     if alike is not None:
-        lost = np.isnan(place[:, 0])
-        place[lost] = _there_and_back(*alike, b.valid[0], Templates(*(v[lost] for v in templates)), params)
+        lost = np.flatnonzero(np.isnan(place[:, 0]))
+        place[lost] = _there_and_back(*alike, b.valid[0], templates.take(lost), params)
     return place
 
 
@@ -172,8 +161,8 @@ def _there_and_back(a: Floats32, b: Floats32, valid: Mask, templates: Templates,
     how = {"noise": params.noise * 2.0**0.5, "spread": AFFINITY_SIGMA, "reach": REACH_PX}
     place = align(a, b, templates, **how)
     good = np.flatnonzero(clear_of_mask(valid, place, HALF))
-    good = good[np.abs(np.linalg.det(templates.affinity[good])) > MIN_AREA]
-    back = Templates(place[good], templates.points[good], np.linalg.inv(templates.affinity[good]))
+    inverse = np.asarray(np.linalg.inv(templates.affinity[good]), np.float64)
+    back = Templates(place[good], templates.points[good], inverse)
     miss = align(b, a, back, **how, settled=SETTLED_BACK_PX) - templates.points[good]
     kept = np.isin(np.arange(len(place)), good[np.hypot(*miss.T) <= MAX_RETURN_PX])
     return np.where(kept[:, None], place, np.nan)
@@ -197,4 +186,4 @@ def track_stage(
         for b in motions
     ]
     found = track([Pyramid.from_bundle(b) for b in pyramids], moves, params)
-    return Bundle({"points": found.points}, {"frames": list(frames)})
+    return Bundle({"points": found.points.astype(np.float32)}, {"frames": list(frames)})

@@ -81,9 +81,4 @@ def share_kept(flow):
 def tables(motions, rows=3):
     """Tables of steps of so many motions each, as the flow cuts them."""
     cuts = range(0, len(motions), rows)
-    return [
-        steps.step_table_stage.run(
-            NoParams(), {}, {"motions": motions[k : k + rows]} | ({"before": motions[k - 1]} if k else {})
-        )
-        for k in cuts
-    ]
+    return [steps.step_table_stage.run(NoParams(), {}, {"motions": motions[k : k + rows]}) for k in cuts]

@@ -11,7 +11,6 @@ from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.imaging.pyramid import PyramidParams, build
 from rille.stages.odometry import track as tracking
 from rille.stages.odometry.displacements import LevelDisplacements, common_similarity, fit_affinity, known_median
-from rille.stages.odometry.exposure import log_ratio
 from rille.stages.odometry.track import (
     TrackParams,
     track,
@@ -305,23 +304,3 @@ def test_points_are_found_in_frames_of_other_exposure():
     known = [np.isfinite(t.points[..., 0]).sum(axis=0) for t in (same, found)]
     assert (known[1][1:] > 0.9 * known[0][1:]).all()
     assert np.nanmedian(errors(found, places)[:, 1:]) < 0.03
-
-
-@pytest.mark.parametrize("level", [0, 2])
-def test_the_ratio_of_brightness_is_that_of_the_pixels_that_displacements_connect(level):
-    frames, _ = sequence([1.0, 1.0], [(0, 0), (8.0, -4.0)], noise=0.0)
-    shape = [n >> level for n in (ROWS, COLS)]
-    motion = LevelDisplacements(np.full(shape, 8.0, np.float32), np.full(shape, -4.0, np.float32), level)
-    darker = build(frames[1].images[0] * np.float32(0.7), PyramidParams(levels=4))
-    assert log_ratio(frames[0], darker, motion) == pytest.approx(np.log(0.7), abs=1e-5)
-    assert log_ratio(darker, frames[0], LevelDisplacements(-motion.column, -motion.row, level)) == pytest.approx(
-        -np.log(0.7), abs=1e-5
-    )
-
-
-def test_too_few_displacements_tell_no_brightness():
-    frames, _ = sequence([1.0, 1.0], [(0, 0), (0, 0)])
-    few = np.full((ROWS // 4, COLS // 4), np.nan, np.float32)
-    few[0, :99] = 0.0
-    darker = build(frames[1].images[0] * np.float32(0.5), PyramidParams(levels=4))
-    assert log_ratio(frames[0], darker, LevelDisplacements(few, few, 2)) == 0.0
