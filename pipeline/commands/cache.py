@@ -9,7 +9,7 @@ from typing import Annotated
 
 from cyclopts import App
 
-from rille.pipeline.commands.options import COMPLETE, FAILED, FLAG, RUNS, CacheFolder, Runs, cache_folder
+from rille.pipeline.runs.options import COMPLETE, FAILED, FLAG, RUNS, CacheFolder, Runs, cache_folder
 
 app = App(name="cache", help=__doc__)
 

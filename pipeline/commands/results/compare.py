@@ -13,10 +13,10 @@ import numpy as np
 from rille.datasets.manifest.opening import dotted
 from rille.datasets.text.reading import read_lines, read_toml
 from rille.pipeline import api
-from rille.pipeline.commands.options import COMPLETE, RUNS, Run, Runs
 from rille.pipeline.engine import events
 from rille.pipeline.report.words import metres, quantity
 from rille.pipeline.runs import lookup
+from rille.pipeline.runs.options import COMPLETE, RUNS, Run, Runs
 
 
 def compare(a: Run, b: Run, *, runs: Runs = RUNS) -> int:

@@ -16,13 +16,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE, FLAG, RUNS, Output, Runs
 from rille.pipeline.commands.results.registration import register
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
 from rille.pipeline.export.writers import ENGINEERING_CRS, Meaning, write_bands
 from rille.pipeline.runs import lookup
+from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation import dem_changes
 from rille.stages.evaluation import dem_comparison as evaluation

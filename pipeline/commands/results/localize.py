@@ -17,7 +17,6 @@ from rasterio.crs import CRS
 
 from rille.datasets.georeference import Georeference
 from rille.pipeline import api
-from rille.pipeline.commands.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder
 from rille.pipeline.commands.results.run_terrain import Terrain, level_pose, yaw
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
@@ -27,6 +26,7 @@ from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
 from rille.pipeline.export.writers import write_trajectory_tum
 from rille.pipeline.runs import lookup
+from rille.pipeline.runs.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError

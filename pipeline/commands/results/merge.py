@@ -13,7 +13,6 @@ import numpy as np
 
 from rille.datasets.georeference import Georeference
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE, RUNS, Output, Run, Runs
 from rille.pipeline.commands.results.registration import register
 from rille.pipeline.commands.results.run_terrain import Terrain, level_pose, yaw
 from rille.pipeline.engine.plain import warn
@@ -21,6 +20,7 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import refuse_unlike_systems
 from rille.pipeline.export.writers import Meaning, write_raster
 from rille.pipeline.runs import lookup
+from rille.pipeline.runs.options import COMPLETE, RUNS, Output, Run, Runs
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.evaluation import dem_comparison

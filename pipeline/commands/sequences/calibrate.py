@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from rille.datasets.images import chessboard, pairing
 from rille.datasets.images.files import SUFFIXES, read_grey
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE, FLAG, Output, check_output
 from rille.pipeline.engine.plain import warn
+from rille.pipeline.runs.options import COMPLETE, FLAG, Output, check_output
 from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig
 from rille.stages.core.errors import InputError, told
 from rille.stages.geometry.geometry import Sizes

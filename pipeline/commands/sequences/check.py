@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Generator, Mapping
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ import numpy as np
 
 from rille.datasets.protocol import CAMERAS, Sequence
 from rille.pipeline.commands import batch
-from rille.pipeline.commands.options import COMPLETE, FAILED, Settings, cache_folder
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store
@@ -25,6 +23,7 @@ from rille.pipeline.flow.builders import Builder, name
 from rille.pipeline.flow.unread import refuse_unchecked
 from rille.pipeline.runs import input_checks as judge
 from rille.pipeline.runs.input_checks import Finding
+from rille.pipeline.runs.options import COMPLETE, FAILED, Settings, cache_folder
 from rille.pipeline.runs.session import settings
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.epipolar import beyond_infinity, inverse_depth
@@ -51,7 +50,7 @@ def check(seq: str, *more: str, options: Settings = _SETTINGS) -> int:
 
 
 def _check(seq: str, options: Settings) -> int:
-    settled = settings(replace(options, sequence=seq))
+    settled = settings(seq, options)
     refuse_unchecked(settled.given, settled.config)
     return inspect(settled.sequence, settled.config, settled.frames, cache_folder(options.cache))
 
