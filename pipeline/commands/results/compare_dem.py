@@ -16,19 +16,19 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.results.registration import register
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
 from rille.pipeline.export.writers import ENGINEERING_CRS, Meaning, write_bands
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs
+from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation import dem_changes
 from rille.stages.evaluation import dem_comparison as evaluation
 from rille.stages.evaluation.dem_comparison import Grid
+from rille.stages.evaluation.place import register
 
-Floats = NDArray[np.float64]
 SHOWN_CHANGES = 12
 """Patches that are printed; all are in the JSON file."""
 WORDS = {"rmse": "RMSE", "nmad": "NMAD", "p95": "95 %", "bias": "bias", "median": "median"}
@@ -72,7 +72,7 @@ def compare_dem(
             text = f"{files[0]} is no run: it has no ortho image"
             raise InputError("RIL-908", text, remedy="leave --align place out")
         image, reference = (read_ortho(path / "ortho.tif")[0] for path in paths)
-        placed = register(image, reference, (one.values, other.values))
+        placed = register((image, reference), (one.grid, other.grid))
         found = {"motion_of_a": placed.motion.tolist(), "by": placed.by}
         one, align = moved(one, placed.motion), "rigid"
     check(one, other)

@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from affine import Affine
 from cyclopts import Parameter
 from cyclopts.validators import Number
 from rasterio.crs import CRS
 
 from rille.datasets.georeference import Georeference
 from rille.pipeline import api
-from rille.pipeline.commands.results.run_terrain import Terrain, level_pose, yaw
+from rille.pipeline.commands.results.run_terrain import Terrain, level_pose
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
@@ -31,9 +30,9 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.evaluation.dem_comparison import Grid
-from rille.stages.evaluation.place import Ortho, PlacedImage, place
-from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
-from rille.stages.terrain.map_localization import MIN_CHI2_GAP, GlobalMap, MapLocalizationParams, SearchArea, fix
+from rille.stages.evaluation.place import PlacedImage, place, relief
+from rille.stages.geometry.geometry import RigidTransform, heading_of, rotation_exp, rotation_log
+from rille.stages.terrain.map_localization import MIN_CHI2_GAP, MapLocalizationParams, SearchArea
 
 TURN_DEG = 20.0
 """Degrees to either side of a given heading that are searched."""
@@ -96,8 +95,9 @@ class Localization:
     def numbers(self) -> dict[str, tuple[float, float]]:
         """What was found, by name, with its standard deviation: position, tilts about the map's axes, yaw."""
         R, sigma = self.pose.rotation, np.sqrt(np.diag(self.covariance))
-        tilts = np.degrees(rotation_log(R @ rotation_exp([0.0, 0.0, -yaw(self.pose)])))[:2]
-        values = *self.pose.translation, *tilts, math.degrees(yaw(self.pose))
+        heading = heading_of(self.pose)
+        tilts = np.degrees(rotation_log(R @ rotation_exp([0.0, 0.0, -heading])))[:2]
+        values = *self.pose.translation, *tilts, math.degrees(heading)
         sigmas = *sigma[:3], *np.degrees(sigma[3:])
         return {
             name: (float(value), float(s)) for name, value, s in zip(NAMES, values, sigmas, strict=True) if s < math.inf
@@ -173,7 +173,7 @@ def localize(
     return HOLES if why else COMPLETE
 
 
-def _found(terrain: Terrain, model: DemFile | None, image: Ortho | None, around: SearchArea | None) -> Localization:
+def _found(terrain: Terrain, model: DemFile | None, image: Grid | None, around: SearchArea | None) -> Localization:
     """Place by the ortho images, where there is one; then by the elevations, where there are some.
 
     Raises
@@ -184,8 +184,8 @@ def _found(terrain: Terrain, model: DemFile | None, image: Ortho | None, around:
     by_ortho = None
     if image is not None:
         if around is not None and around.distance < math.inf:
-            away = np.linalg.norm(Grid(image.grey, image.matrix).centres() - [around.x, around.y], axis=-1)
-            image = image._replace(known=image.known & (away <= around.distance + terrain.radius))
+            away = np.linalg.norm(image.centres() - [around.x, around.y], axis=-1)
+            image = replace(image, values=np.where(away <= around.distance + terrain.radius, image.values, np.nan))
         try:
             by_ortho = _by_ortho(place(terrain.image, image))
         except DegenerateError as error:
@@ -201,7 +201,7 @@ def _found(terrain: Terrain, model: DemFile | None, image: Ortho | None, around:
         return _by_elevations(terrain, model, around)
     x, y, _ = by_ortho.pose.translation
     # Elevations and ortho images must agree on a place within ten cells of the map.
-    about = SearchArea(float(x), float(y), yaw(by_ortho.pose), 10.0 * model.cell, math.radians(TURN_DEG))
+    about = SearchArea(float(x), float(y), heading_of(by_ortho.pose), 10.0 * model.cell, math.radians(TURN_DEG))
     found = _by_elevations(terrain, model, about)
     return replace(found, facts={**found.facts, **by_ortho.facts})
 
@@ -218,38 +218,16 @@ def _by_ortho(placed: PlacedImage) -> Localization:
 
 def _by_elevations(terrain: Terrain, model: DemFile, around: SearchArea | None) -> Localization:
     """The place that elevations tell."""
-    # A raster may be turned or mirrored: the search is in a frame along its rows.
-    values, t = model.values, model.transform @ Affine.translation(0.5, 0.5)
-    if t.determinant > 0:
-        values, t = values[::-1], t @ Affine.translation(0, len(values) - 1) @ Affine.scale(1, -1)
-    to_map = RigidTransform(rotation_exp([0.0, 0.0, math.atan2(t.d, t.a)]), np.array([t.c, t.f, 0.0]))
-    rows, cols = values.shape
-    middle = 0.5 * model.cell * (cols - 1), 0.5 * model.cell * (1 - rows)
-    everywhere = math.hypot(*middle) + terrain.radius
-    x, y, heading, distance, turn = *middle, 0.0, everywhere, math.pi
-    if around is not None:
-        x, y, _ = to_map.inverse().apply([around.x, around.y, 0.0])
-        heading, turn = around.heading - yaw(to_map), around.turn
-        distance = min(around.distance, everywhere + math.hypot(middle[0] - x, middle[1] - y))
     # Standard deviation, degrees, of a vertical that a sensor gives, and of one that is that of the ground.
     tilt = 0.5 if terrain.vertical == "attitude" else 5.0
-    placed = fix(
-        terrain.elevation,
-        terrain.lattice,
-        GlobalMap(values, 0.0, 0.0, model.cell),
-        SearchArea(float(x), float(y), heading, distance, turn),
-        MapLocalizationParams.model_validate({"sigma_tilt_deg": tilt}),
-    )
-    pose, both = to_map @ placed.pose, np.kron(np.eye(2), to_map.rotation)
+    params = MapLocalizationParams.model_validate({"sigma_tilt_deg": tilt})
+    placed = relief(terrain.elevation, terrain.lattice, model.grid, around, params)
     kept = "overlap", "rms", "explained", "cells", "independent"
-    facts = {name: value for name, value in placed.facts().items() if name in kept}
-    doubt = ""
+    facts: dict[str, Any] = {name: getattr(placed, name) for name in kept}
     if placed.other is not None:
-        other, chi2 = to_map.apply([*placed.other[0][:2], 0.0])[:2], placed.other[1]
-        facts["other"] = {"x_m": other[0], "y_m": other[1], "chi2": chi2, "wanted": MIN_CHI2_GAP}
-        there, here = (f"({point[0]:.2f}, {point[1]:.2f}) m" for point in (other, pose.translation))
-        doubt = f"{there} fits {'better than' if chi2 < 0 else 'nearly as well as'} {here}" if placed.doubt else ""
-    return Localization(pose, both @ placed.covariance @ both.T, facts, doubt)
+        (x, y, _), chi2 = placed.other
+        facts["other"] = {"x_m": x, "y_m": y, "chi2": chi2, "wanted": MIN_CHI2_GAP}
+    return Localization(placed.pose, placed.covariance, facts, placed.doubt)
 
 
 def _facts(found: Localization | None) -> dict[str, Any]:

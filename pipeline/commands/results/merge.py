@@ -13,8 +13,7 @@ import numpy as np
 
 from rille.datasets.georeference import Georeference
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.results.registration import register
-from rille.pipeline.commands.results.run_terrain import Terrain, level_pose, yaw
+from rille.pipeline.commands.results.run_terrain import Terrain, level_pose
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import refuse_unlike_systems
@@ -25,7 +24,8 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.evaluation import dem_comparison
 from rille.stages.evaluation.dem_comparison import Alignment, Grid
-from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
+from rille.stages.evaluation.place import register
+from rille.stages.geometry.geometry import RigidTransform, heading_of, rotation_exp, rotation_log
 from rille.stages.geometry.lattice import Lattice, union
 from rille.stages.terrain.map_localization import independent_cells
 from rille.stages.terrain.merge import EXACT, MergeParams, ModelLayer, Placed
@@ -120,7 +120,7 @@ def _registered(first: Terrain, other: Terrain) -> Session:
         refuse_unlike_systems({other.name: b.crs, first.name: a.crs})
         how, start, rough = "georeferences", _in_system(a).inverse() @ _in_system(b), np.zeros(3)
     else:
-        placed = register(other.image, first.image, (other.elevation, first.elevation))
+        placed = register((other.image, first.image), (other.grid, first.grid))
         how, start, rough = placed.by, level_pose(placed.motion), placed.sigma
     # The place is level: so far it turns about the vertical alone.
     moved = start.rotation[:2, :2] @ other.grid.matrix
@@ -211,7 +211,7 @@ def _line(one: Session) -> str:
     """How a run was laid, and how far it differs."""
     x, y, z = one.pose.translation
     overlap, sigma = one.facts["overlap"], one.sigma
-    turned, turn = math.degrees(yaw(one.pose)), math.degrees(sigma[5])
+    turned, turn = math.degrees(heading_of(one.pose)), math.degrees(sigma[5])
     place_ = (
         f"{one.terrain.name}: at {x:.4g}, {y:.4g}, {z:.4g} m, turned by {turned:.3f} degrees (sigma "
         f"{1e3 * sigma[0]:.2g}, {1e3 * sigma[1]:.2g}, {1e3 * sigma[2]:.2g} mm, {turn:.2g} degrees; "
