@@ -38,7 +38,7 @@ def driven() -> frozenset[str]:
     return frozenset({"drive", *stages("closed_loop")} - {*of_both})
 
 
-CHECKED = frozenset(("undistort", "pyramid", "motion", "hfvm", "tiling", "orientation"))
+CHECKED = frozenset(("undistort", "pyramid", "motion", "hfvm", "tiling", "orientation", "frame_screening"))
 """Sections that ``rille check`` reads."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
@@ -151,6 +152,11 @@ def cache_folder(given: str | Path | None) -> Path:
     from rille.pipeline.engine.store.folder import locate
 
     return locate(given or os.environ.get("RILLE_CACHE") or Path(".rille/cache"))
+
+
+def named(output: Path, ending: str) -> Path:
+    """One of the files of an output that is named without ending; a name with the ending of one is that of all."""
+    return output.with_name(re.sub(r"\.(gpkg|json|tif|tum)$", "", output.name) + ending)
 
 
 def check_output(path: Path, *endings: str) -> None:

@@ -186,8 +186,8 @@ def _agreed(p: Floats, q: Floats, near: float) -> tuple[Floats | None, Bools]:
 
 def _described(image: Grid, other: float) -> tuple[Floats, AnyArray]:
     """Places x, y (n, 2) of keypoints, metres, and descriptors (n, 128); in an image no finer than ``other``, m."""
-    grey, known, matrix = image.values.astype(np.float32), np.isfinite(image.values).astype(np.float32), image.matrix
-    grey, ratio = np.nan_to_num(grey), other / image.cell
+    grey: AnyArray = np.nan_to_num(image.values.astype(np.float32))
+    known, matrix, ratio = np.isfinite(image.values).astype(np.float32), image.matrix, other / image.cell
     if ratio > MAX_RATIO:
         rows, cols = (max(1, round(n / ratio)) for n in grey.shape)
         step = np.diag([grey.shape[1] / cols, grey.shape[0] / rows])

@@ -21,7 +21,7 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
 from rille.pipeline.export.writers import ENGINEERING_CRS, Meaning, write_bands
 from rille.pipeline.runs import lookup
-from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs
+from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs, named
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation import dem_changes
@@ -65,7 +65,7 @@ def compare_dem(
     """
     paths = [lookup.elevation(text, runs) for text in (a, b)]
     one, other = (read_elevation(path) for path in paths)
-    found = None
+    place = None
     if align == "place":
         files = [path for path in paths if not path.is_dir()]
         if files:
@@ -73,26 +73,25 @@ def compare_dem(
             raise InputError("RIL-908", text, remedy="leave --align place out")
         image, reference = (read_ortho(path / "ortho.tif")[0] for path in paths)
         placed = register((image, reference), (one.grid, other.grid))
-        found = {"motion_of_a": placed.motion.tolist(), "by": placed.by}
+        place = {"motion_of_a": placed.motion.tolist(), "by": placed.by}
         one, align = moved(one, placed.motion), "rigid"
     check(one, other)
     figures, error = measure(one, other, align)
-    figures["place"] = found
+    figures["place"] = place
     for line in figures["warnings"]:
         warn(line)
-    _print(figures)
+    lines = [*_lines(figures)]
     coarse = other if one.cell <= other.cell * (1.0 + 1e-9) else one
     rasters = {"difference": error.astype(np.float32)}
     if changes:
         rasters["standard_deviation"], figures["changes"] = changed(one, other, error)
-        print("\n".join(_change_table(figures["changes"])))
-    # Either ending is understood as the name of both files.
-    target = output.with_name(output.name.removesuffix(".tif").removesuffix(".json"))
-    atomic.write(target.with_name(target.name + ".json"), json.dumps(figures, indent=1, allow_nan=False) + "\n")
+        lines += _change_table(figures["changes"])
+    print("\n".join(lines))
+    raster, facts = named(output, ".tif"), named(output, ".json")
+    atomic.write(facts, json.dumps(figures, indent=1, allow_nan=False) + "\n")
     profile = {"driver": "COG", "crs": coarse.crs or None, "transform": coarse.transform}
-    meaning = Meaning("m", tags={"error": figures["error"]})
-    write_bands(target.with_name(target.name + ".tif"), rasters, meaning, profile)
-    print(f"{target}.tif  {target}.json")
+    write_bands(raster, rasters, Meaning("m", tags={"error": figures["error"]}), profile)
+    print(f"{raster}  {facts}")
     return COMPLETE
 
 
@@ -251,26 +250,28 @@ def _range(target: Grid, a: DemFile, b: DemFile) -> tuple[Floats | None, str]:
     return np.asarray(cKDTree(cameras).query(target.centres())[0], np.float64), unit
 
 
-def _print(figures: dict[str, Any]) -> None:
-    print(f"A  {figures['a']['path']}  {figures['a']['cell_m']:g} m cells")
-    print(f"B  {figures['b']['path']}  {figures['b']['cell_m']:g} m cells, the reference")
-    print(f"cells: {figures['resampling']}; errors are A minus B")
+def _lines(figures: Mapping[str, Any]) -> Iterator[str]:
+    """What is printed of the figures."""
+    for name, word in (("a", ""), ("b", ", the reference")):
+        yield f"{name.upper()}  {figures[name]['path']}  {figures[name]['cell_m']:g} m cells{word}"
+    yield f"cells: {figures['resampling']}; errors are A minus B"
     if figures["place"]:
         (cos, _, x), (sin, _, y) = figures["place"]["motion_of_a"]
         turn = math.degrees(math.atan2(sin, cos))
-        print(f"place: A turned by {turn:.3f} degrees, moved by {x:.4f}, {y:.4f} m ({figures['place']['by']})")
+        yield f"place: A turned by {turn:.3f} degrees, moved by {x:.4f}, {y:.4f} m ({figures['place']['by']})"
+    after = ""
     if "alignment" in figures:
-        aligned = figures["alignment"]
+        aligned, after = figures["alignment"], "after   "
         moved = ", ".join(f"{k} {v:.6g} (sigma {aligned['sigma'][k]:.2g})" for k, v in aligned["motion_of_a"].items())
-        print(f"aligned ({aligned['kind']}): A was moved by {moved}")
-        print("before  " + _line(figures["before_alignment"]))
-    print(("after   " if "alignment" in figures else "") + _line(figures["figures"]))
+        yield f"aligned ({aligned['kind']}): A was moved by {moved}"
+        yield f"before  {_line(figures['before_alignment'])}"
+    yield after + _line(figures["figures"])
     share = figures["completeness"]
-    print(f"complete {share['of_b']:.3f}; {share['of_b_within_a']:.3f} within A's outline ({share['how']})")
+    yield f"complete {share['of_b']:.3f}; {share['of_b_within_a']:.3f} within A's outline ({share['how']})"
     for name, words in (("by_range", "range"), ("by_slope", "slope")):
-        print(f"\n{words} ({figures[name]['unit']})")
+        yield f"\n{words} ({figures[name]['unit']})"
         for f in figures[name]["bins"]:
-            print(f"{f['from']:8.3g} .. {f['to']:<8.3g} {_line(f)}  {f['cells']:.0f} cells")
+            yield f"{f['from']:8.3g} .. {f['to']:<8.3g} {_line(f)}  {f['cells']:.0f} cells"
 
 
 def _line(f: dict[str, float]) -> str:

@@ -25,7 +25,7 @@ from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
 from rille.pipeline.export.writers import write_trajectory_tum
 from rille.pipeline.runs import lookup
-from rille.pipeline.runs.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder
+from rille.pipeline.runs.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder, named
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
@@ -103,6 +103,24 @@ class Localization:
             name: (float(value), float(s)) for name, value, s in zip(NAMES, values, sigmas, strict=True) if s < math.inf
         }
 
+    def for_file(self) -> dict[str, Any]:
+        """Facts for the JSON file."""
+        known = np.isfinite(np.diag(self.covariance))
+        return {
+            "T_map_world": self.pose.to_list(),
+            "place": {name: value for name, (value, _) in self.numbers.items()},
+            "sigma": {name: sigma for name, (_, sigma) in self.numbers.items()},
+            "covariance_m_rad": self.covariance[np.ix_(known, known)].tolist(),
+            **self.facts,
+        }
+
+    def table(self) -> Iterator[str]:
+        """A line for each number."""
+        for name, (value, sigma) in self.numbers.items():
+            word, _, unit = name.rpartition("_")
+            digits = min(6, max(0, 1 - math.floor(math.log10(max(sigma, 1e-6)))))
+            yield f"  {word:10s} {value:.{digits}f} +- {sigma:.{digits}f} {unit}"
+
     def about(self) -> Iterator[str]:
         """Lines on how it was found."""
         facts = self.facts
@@ -147,12 +165,14 @@ def localize(
     """
     if dem is None and ortho is None:
         raise ConfigError("RIL-844", "no map is given", remedy="name an elevation model, or --ortho IMAGE")
-    folder = lookup.find(run, runs)
+    folder, systems, model, image = lookup.find(run, runs), dict[str, str](), None, None
     around, terrain = area.around(), Terrain.of(folder)
-    image, system = (None, "") if ortho is None else read_ortho(ortho)
-    model = None if dem is None else read_elevation(dem)
-    systems = {str(dem): "" if model is None else model.crs, str(ortho): system}
-    crs = next((wkt for wkt in systems.values() if wkt), "")
+    if ortho is not None:
+        image, systems[str(ortho)] = read_ortho(ortho)
+    if dem is not None:
+        model = read_elevation(dem)
+        systems[str(dem)] = model.crs
+    crs = next((wkt for wkt in reversed(systems.values()) if wkt), "")
     if terrain.place is not None:
         systems[f"run {terrain.name}"] = CRS.from_user_input(terrain.place.crs).to_wkt(version="WKT2_2019")
     refuse_unlike_systems(systems)
@@ -162,14 +182,18 @@ def localize(
         why = found.doubt
     except DegenerateError as error:
         why = f"{error.code}: {error}"
-    target, written = output.with_name(output.name.removesuffix(".json")), [".json"]
+    written = [named(output, ".json")]
     facts = {"run": terrain.name, "dem": dem and str(dem), "ortho": ortho and str(ortho), "crs": crs}
-    text = json.dumps({**facts, "ambiguous": bool(why), "why": why, **_facts(found)}, indent=1, allow_nan=False)
-    atomic.write(target.with_name(target.name + ".json"), text + "\n")
-    if found is not None and not why:
-        written += _export(folder, found, target, crs, Store(cache_folder(cache)))
-    print("\n".join([f"ambiguous    {why}", *(found.about() if found else ())] if why else _lines(found, crs)))
-    print("wrote        " + "  ".join(f"{target}{ending}" for ending in written))
+    facts |= {"ambiguous": bool(why), "why": why, **({} if found is None else found.for_file())}
+    atomic.write(written[0], json.dumps(facts, indent=1, allow_nan=False) + "\n")
+    if found is None or why:
+        lines = [f"ambiguous    {why}"]
+    else:
+        written += _export(folder, found, output, crs, Store(cache_folder(cache)))
+        lines = [f"place        of the world's origin{f' in {crs_name(crs)}' if crs else ''}, yaw to the left"]
+        lines += found.table()
+    print("\n".join([*lines, *(() if found is None else found.about())]))
+    print("wrote        " + "  ".join(map(str, written)))
     return HOLES if why else COMPLETE
 
 
@@ -230,49 +254,23 @@ def _by_elevations(terrain: Terrain, model: DemFile, around: SearchArea | None) 
     return Localization(placed.pose, placed.covariance, facts, placed.doubt)
 
 
-def _facts(found: Localization | None) -> dict[str, Any]:
-    """Facts of a place for the JSON file."""
-    if found is None:
-        return {}
-    known = np.isfinite(np.diag(found.covariance))
-    return {
-        "T_map_world": found.pose.to_list(),
-        "place": {name: value for name, (value, _) in found.numbers.items()},
-        "sigma": {name: sigma for name, (_, sigma) in found.numbers.items()},
-        "covariance_m_rad": found.covariance[np.ix_(known, known)].tolist(),
-        **found.facts,
-    }
-
-
-def _lines(found: Localization | None, crs: str) -> Iterator[str]:
-    """What is printed of a place."""
-    assert found is not None
-    yield f"place        of the world's origin{f' in {crs_name(crs)}' if crs else ''}, yaw to the left"
-    for name, (value, sigma) in found.numbers.items():
-        word, _, unit = name.rpartition("_")
-        digits = min(6, max(0, 1 - math.floor(math.log10(max(sigma, 1e-6)))))
-        yield f"  {word:10s} {value:.{digits}f} +- {sigma:.{digits}f} {unit}"
-    yield from found.about()
-
-
-def _export(folder: Path, found: Localization, target: Path, crs: str, store: Store) -> list[str]:
-    """Write trajectory and path in the map's coordinates; gives the endings."""
-    written, words = [], f"of the map{f', {crs_name(crs)}' if crs else ''}: T_map_world of {target.name}.json"
+def _export(folder: Path, found: Localization, output: Path, crs: str, store: Store) -> Iterator[Path]:
+    """Write trajectory and path in the map's coordinates; gives the files."""
+    words = f"of the map{f', {crs_name(crs)}' if crs else ''}: T_map_world of {named(output, '.json').name}"
     if (folder / "trajectory.kitti").exists():
         known = api.Run(folder).trajectory
         turned, there = found.pose.rotation @ known["rotation"].values, found.pose.apply(known["position"].values)
         poses = np.concatenate([turned, there[..., None]], axis=2)
-        write_trajectory_tum(target.with_name(target.name + ".tum"), poses, known["time"].values.tolist(), words)
-        written.append(".tum")
+        write_trajectory_tum(named(output, ".tum"), poses, known["time"].values.tolist(), words)
+        yield named(output, ".tum")
     try:
         with lookup.reading(folder):
             planned = RunArtifacts(folder, store).find("path/world")
     except InputError as error:
         warn(f"{error.code}: {error}; no path is written")
-        return written
+        return
     if planned is not None:
         moved = Bundle({"path": found.pose.apply(np.asarray(planned["path"]))}, {**planned.meta, "frame": words})
         frame = Georeference(crs, (0.0, 0.0, 0.0), 0.0) if crs else None
-        write_path(target.with_name(target.name + ".gpkg"), moved, frame)
-        written.append(".gpkg")
-    return written
+        write_path(named(output, ".gpkg"), moved, frame)
+        yield named(output, ".gpkg")

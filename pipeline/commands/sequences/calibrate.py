@@ -28,6 +28,23 @@ from rille.stages.geometry.geometry import Sizes
 
 SIDES = ("left", "right")
 
+SAME_PLACE_PX = 1.0
+"""RMS distance of all corners below which two views show the board at one place: noise moves them by tenths, a hand by
+many."""
+
+MAX_CLUTTER = 0.1
+"""Residual over the spacing of the corners from which they are not those of a flat board: print errs by hundredths. It
+holds for any resolution and distance of the board."""
+
+MAX_RMS_PX = 1.0
+"""Residual over all views that a chessboard on paper does not exceed."""
+
+MAX_FOCAL_SIGMA = 0.01
+"""Relative standard deviation of a focal length that is worth a warning: all depths err by as much."""
+
+MIN_COVER = 0.5
+"""Share of an image that all corners together should span: beyond them, distortion is extrapolated."""
+
 
 @Parameter(name="*")
 @dataclass(frozen=True)
@@ -144,9 +161,7 @@ def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | N
             out.left_out.append((name, f"no whole board in the {' nor in the '.join(missing)} image"))
         else:
             view = BoardView(name, points[0], chessboard.same_order(points[0], points[1], corners))
-            # RMS distance of all corners, pixels, below which two views show the board at one place: noise moves them
-            # by tenths, a hand by many
-            same = next((other.name for other in out.views if _distance(view, other) < 1.0), None)
+            same = next((other.name for other in out.views if _distance(view, other) < SAME_PLACE_PX), None)
             if same is None:
                 out.views.append(view)
             else:
@@ -171,9 +186,7 @@ def _refuse_clutter(rig: RigCalibration, boards: Boards) -> None:
     columns, rows = boards.corners
     grids = [p.reshape(rows, columns, 2) for v in boards.views for p in (v.left, v.right)]
     spacing = float(np.median([np.linalg.norm(np.diff(g, axis=1), axis=-1) for g in grids]))
-    # Residual over the spacing of the corners from which they are not those of a flat board: print errs by hundredths
-    # Relative to the spacing: it holds for any resolution and distance of the board.
-    if rig.rms > 0.1 * spacing:
+    if rig.rms > MAX_CLUTTER * spacing:
         raise InputError(
             "RIL-800",
             f"the corners taken for a board of {columns} x {rows} miss by {rig.rms:.1f} px RMS, "
@@ -194,20 +207,17 @@ def doubts(rig: RigCalibration, boards: Boards, model: str) -> Iterator[str]:
         if not r.used:
             text = f"view {r.name} is left out: its corners miss by {r.worst:.2f} px RMS; remove or retake it"
             yield warning("RIL-695", text)
-    # Pixels RMS over all views that a chessboard on paper does not exceed
-    if rig.rms > 1.0:
+    if rig.rms > MAX_RMS_PX:
         text = f"corners miss by {rig.rms:.2f} px RMS: is the board flat, are the images paired rightly?"
         yield warning("RIL-696", text)
     used = [view for view, r in zip(boards.views, rig.residuals, strict=True) if r.used]
     for side, lens, size in zip(SIDES, (rig.left, rig.right), boards.sizes, strict=True):
         share = rig.sigma[f"{side} fx"] / lens.camera.fx
-        # Relative standard deviation of a focal length that is worth a warning: all depths err by as much
-        if share > 0.01:
+        if share > MAX_FOCAL_SIGMA:
             text = f"{side} focal length is known to {100 * share:.1f} % only; take views with the board tilted"
             yield warning("RIL-697", text)
         seen = cover([getattr(view, side) for view in used], size)
-        # Share of an image that all corners together should span: beyond them, distortion is extrapolated
-        if seen < 0.5:
+        if seen < MIN_COVER:
             text = f"the corners span {100 * seen:.0f} % of the {side} image; distortion beyond is a guess"
             yield warning("RIL-698", text)
         coefficients = dict(zip(MODELS[model], lens.coefficients, strict=True))

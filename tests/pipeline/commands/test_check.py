@@ -154,7 +154,7 @@ def test_frames_are_chosen_and_warnings_repeated(tmp_path, capsys):
 def test_moments_are_judged_over_the_frames_that_are_looked_at(tmp_path, capsys):
     path = folder(tmp_path / "wall", frames=9)
     _, lines = run(path, capsys)
-    assert "rows of 6 pairs" in line(lines, "simultaneous")
+    assert "rows of 5 pairs" in line(lines, "simultaneous")
     _, lines = run(path, capsys, frames=(0, 4, 8))
     assert "rows of 3 pairs" in line(lines, "simultaneous")
     _, lines = run(path, capsys, frames=(4,))

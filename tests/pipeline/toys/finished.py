@@ -331,7 +331,7 @@ def _blank(fig: object, alt: str, *, photo: bool = False) -> canvas.Panel:
 
 def report(folder: Path, run: RunView) -> None:
     """Both files of the report, of artifacts as they are."""
-    write_report(folder, run, summary.gather(run), [drawing.figure(run) for drawing in gallery.DRAWINGS])
+    write_report(folder, run, summary.collect(run), [drawing.figure(run) for drawing in gallery.DRAWINGS])
 
 
 Written = tuple[dict[str, Any], Page, str, Path]
