@@ -183,7 +183,7 @@ def localize(
     except DegenerateError as error:
         why = f"{error.code}: {error}"
     written = [named(output, ".json")]
-    facts = {"run": terrain.name, "dem": dem and str(dem), "ortho": ortho and str(ortho), "crs": crs}
+    facts: dict[str, Any] = {"run": terrain.name, "dem": dem and str(dem), "ortho": ortho and str(ortho), "crs": crs}
     facts |= {"ambiguous": bool(why), "why": why, **({} if found is None else found.for_file())}
     atomic.write(written[0], json.dumps(facts, indent=1, allow_nan=False) + "\n")
     if found is None or why:
