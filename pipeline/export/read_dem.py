@@ -72,13 +72,6 @@ class DemFile:
         """The elevations, placed by the centres of their cells."""
         return Grid(self.values, centres(self.transform))
 
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """Outline x_min, x_max, y_min, y_max in the CRS."""
-        rows, cols = self.values.shape
-        x, y = self.transform @ (np.array([0, cols, 0, cols]), np.array([0, 0, rows, rows]))
-        return float(x.min()), float(x.max()), float(y.min()), float(y.max())
-
 
 def centres(transform: Affine) -> NDArray[np.float64]:
     """Map (2, 3) from (column, row, 1) of the cells' centres, of a raster's transform, which is that of corners."""

@@ -123,10 +123,15 @@ def common(a: Grid, b: Grid) -> tuple[Grid, Grid, str]:
     brought = Grid(values, target.matrix)
     pair = (brought, target) if name == "A" else (target, brought)
     if not (np.isfinite(values) & np.isfinite(target.values)).any():
-        raise InputError(
-            "RIL-323", "they have no known cell in common", remedy="compare models of the same place and frame"
-        )
+        text = f"no known cell in common: A is at {_outline(a)}, B at {_outline(b)}"
+        raise InputError("RIL-323", text, remedy="compare models of the same place and frame")
     return *pair, how
+
+
+def _outline(grid: Grid) -> str:
+    """Where the known cells of a model lie."""
+    (x0, y0), (x1, y1) = (edge(grid.centres()[np.isfinite(grid.values)], axis=0) for edge in (np.min, np.max))
+    return f"x {x0:.6g}..{x1:.6g}, y {y0:.6g}..{y1:.6g} m"
 
 
 @dataclass(frozen=True)

@@ -75,20 +75,20 @@ def compare_dem(
         placed = register((image, reference), (one.grid, other.grid))
         place = {"motion_of_a": placed.motion.tolist(), "by": placed.by}
         one, align = moved(one, placed.motion), "rigid"
-    check(one, other)
-    figures, error = measure(one, other, align)
+    refuse_unlike_systems({one.name: one.crs, other.name: other.crs})
+    figures, error, cells = measure(one, other, align)
     figures["place"] = place
     for line in figures["warnings"]:
         warn(line)
     lines = [*_lines(figures)]
-    coarse = other if one.cell <= other.cell * (1.0 + 1e-9) else one
     rasters = {"difference": error.astype(np.float32)}
     if changes:
-        rasters["standard_deviation"], figures["changes"] = changed(one, other, error)
+        rasters["standard_deviation"], figures["changes"] = changed(one, other, error, cells)
         lines += _change_table(figures["changes"])
     print("\n".join(lines))
     raster, facts = named(output, ".tif"), named(output, ".json")
     atomic.write(facts, json.dumps(figures, indent=1, allow_nan=False) + "\n")
+    coarse = other if np.array_equal(cells.matrix, other.grid.matrix) else one
     profile = {"driver": "COG", "crs": coarse.crs or None, "transform": coarse.transform}
     write_bands(raster, rasters, Meaning("m", tags={"error": figures["error"]}), profile)
     print(f"{raster}  {facts}")
@@ -102,27 +102,8 @@ def moved(dem: DemFile, motion: Floats) -> DemFile:
     return replace(dem, transform=Affine(*motion.ravel()) @ dem.transform, viewpoints=eyes)
 
 
-def check(a: DemFile, b: DemFile) -> None:
-    """Refuse models that are not comparable.
-
-    Raises
-    ------
-    InputError
-        Their CRS differ, or their outlines do not overlap.
-    """
-    refuse_unlike_systems({a.name: a.crs, b.name: b.crs})
-    x0, x1, y0, y1 = a.extent
-    u0, u1, v0, v1 = b.extent
-    if min(x1, u1) <= max(x0, u0) or min(y1, v1) <= max(y0, v0):
-        text = (
-            f"no overlap: A is at x {x0:.6g}..{x1:.6g}, y {y0:.6g}..{y1:.6g} m, B at x {u0:.6g}..{u1:.6g}, "
-            f"y {v0:.6g}..{v1:.6g} m"
-        )
-        raise InputError("RIL-616", text, remedy="compare models of the same place")
-
-
-def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any], Floats]:
-    """All figures of A against the reference B (JSON-able), and the error, m, of the common cells (rows, cols).
+def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any], Floats, Grid]:
+    """All figures (JSON-able) of A against the reference B, the error, m, on the common cells (rows, cols), B on them.
 
     Raises
     ------
@@ -168,12 +149,11 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
         # Bins are open at their upper end: a hair more keeps the farthest cell in the last one.
         bins = evaluation.binned(error, distance, np.linspace(0.0, far * (1.0 + 1e-9), 9))
     figures["by_range"] = {"unit": unit, "bins": bins}
-    return figures, error
+    return figures, error, on_b
 
 
-def changed(a: DemFile, b: DemFile, error: Floats) -> tuple[NDArray[np.float32], dict[str, Any]]:
-    """Standard deviation of the ``error`` of :func:`measure`, and list (JSON-able) of what rose or fell from B to A."""
-    grid = evaluation.common(a.grid, b.grid)[1]
+def changed(a: DemFile, b: DemFile, error: Floats, grid: Grid) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    """Standard deviation of the ``error`` of :func:`measure` on a grid, and list (JSON-able) of what rose or fell."""
     sigma = [
         np.zeros(error.shape) if one.sigma is None else evaluation.interpolate(one.grid, grid.centres(), one.sigma)
         for one in (a, b)

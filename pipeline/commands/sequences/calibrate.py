@@ -107,7 +107,7 @@ def calibrate(
     output.write_text(_yaml(rig, boards, board.square), encoding="utf-8")
     origin, size = "given" if given else "found", " x ".join(map(str, boards.corners))
     print(f"board        {size} inner corners ({origin}), squares of {board.square:g} m")
-    print("\n".join([*_views(rig, boards), "", *_parameters(rig, model), ""]))
+    print("\n".join([*_views(rig, boards), "", *_parameters(rig), ""]))
     for line in doubts(rig, boards, model):
         warn(line)
     print(f'wrote        {output}\nnext         in the manifest of the sequence:\n\n[cameras]\nfile = "{output.name}"')
@@ -211,8 +211,8 @@ def doubts(rig: RigCalibration, boards: Boards, model: str) -> Iterator[str]:
         text = f"corners miss by {rig.rms:.2f} px RMS: is the board flat, are the images paired rightly?"
         yield warning("RIL-696", text)
     used = [view for view, r in zip(boards.views, rig.residuals, strict=True) if r.used]
-    for side, lens, size in zip(SIDES, (rig.left, rig.right), boards.sizes, strict=True):
-        share = rig.sigma[f"{side} fx"] / lens.camera.fx
+    for side, size in zip(SIDES, boards.sizes, strict=True):
+        share = rig.sigma[f"{side} fx"] / rig.values[f"{side} fx"]
         if share > MAX_FOCAL_SIGMA:
             text = f"{side} focal length is known to {100 * share:.1f} % only; take views with the board tilted"
             yield warning("RIL-697", text)
@@ -220,9 +220,8 @@ def doubts(rig: RigCalibration, boards: Boards, model: str) -> Iterator[str]:
         if seen < MIN_COVER:
             text = f"the corners span {100 * seen:.0f} % of the {side} image; distortion beyond is a guess"
             yield warning("RIL-698", text)
-        coefficients = dict(zip(MODELS[model], lens.coefficients, strict=True))
-        sigma = {name: rig.sigma[f"{side} {name}"] for name in coefficients}
-        vague = [k for k, v in coefficients.items() if sigma[k] > max(abs(v), 0.1) and k not in ("p1", "p2")]
+        known = {name: (abs(rig.values[f"{side} {name}"]), rig.sigma[f"{side} {name}"]) for name in MODELS[model]}
+        vague = [k for k, (value, sigma) in known.items() if sigma > max(value, 0.1) and k not in ("p1", "p2")]
         if vague:
             # A model with fewer terms, which these views may determine.
             fewer = "radtan" if model == "rational" else "radtan4"
@@ -241,20 +240,14 @@ def _views(rig: RigCalibration, boards: Boards) -> Iterator[str]:
     yield from (f"{name:{width}s}  left out: {reason}" for name, reason in boards.left_out)
 
 
-def _parameters(rig: RigCalibration, model: str) -> Iterator[str]:
+def _parameters(rig: RigCalibration) -> Iterator[str]:
     """Table of parameters, each with its standard deviation; the right camera's pose is that from the left one."""
-    names = ("fx", "fy", "cx", "cy", *MODELS[model])
-    values = {"baseline": float(np.linalg.norm(rig.T_right_left.translation))}
-    for side, lens in zip(SIDES, (rig.left, rig.right), strict=True):
-        numbers = (lens.camera.fx, lens.camera.fy, lens.camera.cx, lens.camera.cy, *lens.coefficients)
-        values |= {f"{side} {name}": number for name, number in zip(names, numbers, strict=True)}
-    for axis, turn in zip("xyz", cv2.Rodrigues(rig.T_right_left.rotation)[0].ravel(), strict=True):
-        values[f"rotation {axis}"] = float(turn)
-    for name, value in values.items():
-        unit = (
-            "m" if name == "baseline" else "rad" if "rotation" in name else "px" if name.split()[1][0] in "fc" else ""
-        )
-        yield f"{name:13s}{value:12.5f} +- {rig.sigma[name]:.5f} {unit}".rstrip()
+    units = {"baseline": "m", "rotation": "rad", **dict.fromkeys(("fx", "fy", "cx", "cy"), "px")}
+    for name, value in rig.values.items():
+        whole, _, part = name.partition(" ")
+        if whole != "translation":  # the baseline is its length
+            unit = units.get(whole, units.get(part, ""))
+            yield f"{name:13s}{value:12.5f} +- {rig.sigma[name]:.5f} {unit}".rstrip()
 
 
 def _yaml(rig: RigCalibration, boards: Boards, square: float) -> str:

@@ -229,6 +229,6 @@ def test_views_that_are_left_out_cover_nothing():
     lens = Lens(Camera(100, 100, 50, 40, 100, 80), "radtan", (0.0, 0.0, 0.0, 0.0))
     sigma = {f"{side} {name}": 0.0 for side in ("left", "right") for name in ("fx", *MODELS["radtan4"])}
     seen = tuple(ViewResidual(v.name, 0.1, 0.1, 0.1, used=v.name == "used") for v in views)
-    found = RigCalibration(lens, lens, RigidTransform.identity(), sigma, 0.1, seen)
+    found = RigCalibration(lens, lens, RigidTransform.identity(), dict.fromkeys(sigma, 1.0), sigma, 0.1, seen)
     told = doubts(found, Boards((2, 2), ((100, 80), (100, 80)), views), "radtan4")
     assert [line[:7] for line in told] == ["RIL-695", "RIL-698", "RIL-698"]
