@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.pipeline.export.artifacts import Floats, by_frame, used_rig
+from rille.pipeline.export.artifacts import by_frame, used_rig
 from rille.pipeline.export.comparison import CrosscheckComparison, compare
 from rille.pipeline.export.rasters import whole
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow.products import Stop
-from rille.stages.core.declare import Bundle
+from rille.stages.core.arrays import Floats
+from rille.stages.core.declare import AnyArray, Bundle
 from rille.stages.geometry import rigid
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.lattice import Lattice, union
@@ -27,7 +28,7 @@ class WorldTerrain:
     """Arrays (row, col) of an elevation model, and the lattice they lie on."""
 
     lattice: Lattice
-    arrays: Mapping[str, Floats]
+    arrays: Mapping[str, AnyArray]
 
     def at(self, name: str, xy: Floats) -> Floats:
         """Values (n,) of an array in the cells of points (n, 2), m; NaN outside, and where there is no such array."""

@@ -17,15 +17,13 @@ from numpy.typing import NDArray
 
 from rille.datasets.text.reading import TABLE, read_text
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
-from rille.stages.core.arrays import Bytes
+from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.imaging.features import PIXEL_CENTRE
 from rille.stages.odometry.resection.landmarks import matches_at
 from rille.stages.odometry.resection.trajectory import world_poses
 from rille.stages.terrain.points import colours
-
-Floats = NDArray[np.float64]
 
 MAX_REPROJECTION_PX = 0.5
 """Pixels from an observation to its point's projection. COLMAP weighs all observations alike, so that one which our
