@@ -136,9 +136,8 @@ def _registered(first: Terrain, other: Terrain) -> Session:
         centre = np.array([*np.nanmean(one.centres()[np.isfinite(one.values)], axis=0), np.nanmedian(one.values)])
         alignment = Alignment(np.eye(3), np.zeros(3), centre, np.zeros(6), 0, 0)
     error = dem_comparison.errors(one, two, alignment)
-    cells = int(np.isfinite(error).sum())
     # Errors of neighbours are alike: there are fewer than cells.
-    sigma = alignment.sigma * math.sqrt(cells / max(independent_cells(error), 1.0)) if cells else alignment.sigma
+    sigma = alignment.sigma * math.sqrt(np.isfinite(error).sum() / max(independent_cells(error), 1.0))
     sigma = np.where(sigma > 0, sigma, [rough[0], rough[1], 0.0, 0.0, 0.0, rough[2]])
     motion = np.array([*alignment.translation, *rotation_log(alignment.rotation)])
     # Georeferences are believed within three standard deviations: lattices that fit are then not resampled.
@@ -217,8 +216,6 @@ def _line(one: Session) -> str:
         f"{1e3 * sigma[0]:.2g}, {1e3 * sigma[1]:.2g}, {1e3 * sigma[2]:.2g} mm, {turn:.2g} degrees; "
         f"by {one.facts['by']})"
     )
-    if not overlap["cells"]:
-        return f"{place_}; no ground in common"
     return (
         f"{place_}; {overlap['cells']:.0f} cells in common: median {1e3 * overlap['median']:+.2g} mm, NMAD "
         f"{1e3 * overlap['nmad']:.2g} mm, 95 % {1e3 * overlap['p95']:.2g} mm"
