@@ -20,8 +20,7 @@ import numpy as np
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.evaluation.conventions import better_reading
-from rille.stages.evaluation.metric import metric
-from rille.stages.facts.evaluation import AccuracyFacts, Metric, TruthFacts
+from rille.stages.facts.evaluation import AccuracyFacts, Metric, TruthFacts, metric
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry import rigid
 from rille.stages.geometry.geometry import RigidTransform, rotation_log

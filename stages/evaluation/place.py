@@ -100,6 +100,12 @@ def _by_relief(a: Grid, b: Grid) -> Registration | None:
     return Registration(motion, f"relief, {found.cells} cells", np.sqrt(np.diag(found.covariance))[[0, 1, 5]])
 
 
+def level_pose(motion: Floats) -> RigidTransform:
+    """Turn and shift of a motion (2, 3) in the plane, as those of space."""
+    turn = rotation_exp([0.0, 0.0, math.atan2(motion[1, 0], motion[0, 0])])
+    return RigidTransform(turn, np.array([*motion[:, 2], 0.0]))
+
+
 def relief(
     elevation: Floats, lattice: Lattice, ground: Grid, around: SearchArea | None, params: MapLocalizationParams
 ) -> Fix:
@@ -120,9 +126,7 @@ def relief(
     values, matrix, (rows, cols) = ground.values, ground.matrix, ground.values.shape
     if np.linalg.det(matrix[:, :2]) > 0:
         values, matrix = values[::-1], matrix @ np.array([[1.0, 0.0, 0.0], [0.0, -1.0, rows - 1.0], [0.0, 0.0, 1.0]])
-    to_ground = RigidTransform(
-        rotation_exp([0.0, 0.0, math.atan2(matrix[1, 0], matrix[0, 0])]), np.array([*matrix[:, 2], 0.0])
-    )
+    to_ground = level_pose(matrix)
     x0, x1, y0, y1 = lattice.bounds
     middle = 0.5 * ground.cell * (cols - 1), 0.5 * ground.cell * (1 - rows)
     everywhere = math.hypot(*middle) + math.hypot(max(-x0, x1), max(-y0, y1))

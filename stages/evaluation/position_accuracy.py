@@ -28,8 +28,7 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.evaluation.accuracy import counts, over_length
 from rille.stages.evaluation.conventions import UNITS
-from rille.stages.evaluation.metric import metric
-from rille.stages.facts.evaluation import AccuracyFacts, Metric
+from rille.stages.facts.evaluation import AccuracyFacts, Metric, metric
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry.rigid import by_frame, rms, umeyama
 from rille.stages.odometry.resection.trajectory import world_poses

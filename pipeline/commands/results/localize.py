@@ -16,7 +16,7 @@ from rasterio.crs import CRS
 
 from rille.datasets.georeference import Georeference
 from rille.pipeline import api
-from rille.pipeline.commands.results.run_terrain import Terrain, level_pose
+from rille.pipeline.commands.results.run_terrain import Terrain
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
@@ -30,7 +30,7 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.evaluation.dem_comparison import Grid
-from rille.stages.evaluation.place import PlacedImage, place, relief
+from rille.stages.evaluation.place import PlacedImage, level_pose, place, relief
 from rille.stages.geometry.geometry import RigidTransform, heading_of, rotation_exp, rotation_log
 from rille.stages.terrain.map_localization import MIN_CHI2_GAP, MapLocalizationParams, SearchArea
 

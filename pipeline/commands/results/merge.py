@@ -13,7 +13,7 @@ import numpy as np
 
 from rille.datasets.georeference import Georeference
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.results.run_terrain import Terrain, level_pose
+from rille.pipeline.commands.results.run_terrain import Terrain
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import refuse_unlike_systems
@@ -24,7 +24,7 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.evaluation import dem_comparison
 from rille.stages.evaluation.dem_comparison import Alignment, Grid
-from rille.stages.evaluation.place import register
+from rille.stages.evaluation.place import level_pose, register
 from rille.stages.geometry.geometry import RigidTransform, heading_of, rotation_exp, rotation_log
 from rille.stages.geometry.lattice import Lattice, union
 from rille.stages.terrain.map_localization import independent_cells

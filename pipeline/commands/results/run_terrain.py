@@ -17,15 +17,8 @@ from rille.pipeline.runs import lookup
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation.dem_comparison import Grid
-from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
-
-
-def level_pose(motion: Floats) -> RigidTransform:
-    """Motion (2, 3) in the plane, a turn and a shift, as one of space."""
-    turn = rotation_exp([0.0, 0.0, math.atan2(motion[1, 0], motion[0, 0])])
-    return RigidTransform(turn, np.array([*motion[:, 2], 0.0]))
 
 
 @dataclass(frozen=True)

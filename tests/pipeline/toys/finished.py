@@ -23,8 +23,8 @@ from rille.stages.calibration.rig import RigParams
 from rille.stages.core.declare import Bundle
 from rille.stages.evaluation.accuracy import trajectory_accuracy
 from rille.stages.evaluation.dem_accuracy import dem_accuracy
-from rille.stages.evaluation.metric import metric as figure
 from rille.stages.evaluation.path_check import path_check
+from rille.stages.facts.evaluation import metric as figure
 from rille.stages.geometry.epipolar import corrected
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
