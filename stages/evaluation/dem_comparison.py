@@ -187,11 +187,9 @@ def align(a: Grid, b: Grid, kind: Align) -> Alignment:
     # Cells at a border that come and go from step to step keep the motion from settling, but within its own errors.
     if (np.abs(step) < sigma).all():
         return state
-    raise DegenerateError(
-        "RIL-324",
-        f"no alignment after {MAX_ITERATIONS} steps: the last one still moved by {np.abs(step / unit).max():.2g} cells",
-        remedy="choose fewer freedoms (tilt or shift), or bring the models closer first",
-    )
+    still = f"the last one still moved by {np.abs(step / unit).max():.2g} cells"
+    remedy = "choose fewer freedoms (tilt or shift), or bring the models closer first"
+    raise DegenerateError("RIL-324", f"no alignment after {MAX_ITERATIONS} steps: {still}", remedy=remedy)
 
 
 def _difference(b: Grid, slopes: Floats, points: Floats) -> tuple[Floats, Floats]:
@@ -209,11 +207,8 @@ def _gauss_newton(
     difference, normal = _difference(b, slopes, moved)
     good = np.isfinite(difference) & np.isfinite(normal).all(axis=1)
     if good.sum() < 10 * len(free):
-        raise DegenerateError(
-            "RIL-325",
-            f"{int(good.sum())} cells are left to align by",
-            remedy="leave --align out, or choose overlapping models",
-        )
+        text = f"{int(good.sum())} cells are left to align by"
+        raise DegenerateError("RIL-325", text, remedy="leave --align out, or choose overlapping models")
     r, n = difference[good], normal[good]
     # Rotations turn about the moved centre: their correlation with the shifts is then least.
     q = moved[good] - state.centre - state.translation
@@ -223,12 +218,9 @@ def _gauss_newton(
     N = (J * w[:, None]).T @ J
     values = np.linalg.eigvalsh(N)
     if not values[0] * MAX_CONDITION > values[-1]:
-        raise DegenerateError(
-            "RIL-326",
-            f"the terrain is too flat to align by: condition {values[-1] / max(values[0], 1e-300):.1e}, "
-            f"more than {MAX_CONDITION:.0e}",
-            remedy="choose --align tilt, which flat terrain determines",
-        )
+        condition = f"condition {values[-1] / max(values[0], 1e-300):.1e}, more than {MAX_CONDITION:.0e}"
+        text = f"the terrain is too flat to align by: {condition}"
+        raise DegenerateError("RIL-326", text, remedy="choose --align tilt, which flat terrain determines")
     step = -np.linalg.solve(N, (J * w[:, None]).T @ r)
     variance = float((w * r * r).sum()) / max(float(w.sum()) - len(free), 1.0)
     return step * unit, np.sqrt(variance * np.diag(np.linalg.inv(N))) * unit, int(good.sum())

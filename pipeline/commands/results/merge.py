@@ -209,14 +209,11 @@ def _laid(number: int, first: Terrain, session: Session) -> ModelLayer:
 def _line(one: Session) -> str:
     """How a run was laid, and how far it differs."""
     x, y, z = one.pose.translation
-    overlap, sigma = one.facts["overlap"], one.sigma
-    turned, turn = math.degrees(heading_of(one.pose)), math.degrees(sigma[5])
-    place_ = (
-        f"{one.terrain.name}: at {x:.4g}, {y:.4g}, {z:.4g} m, turned by {turned:.3f} degrees (sigma "
-        f"{1e3 * sigma[0]:.2g}, {1e3 * sigma[1]:.2g}, {1e3 * sigma[2]:.2g} mm, {turn:.2g} degrees; "
-        f"by {one.facts['by']})"
-    )
+    overlap, (a, b, c) = one.facts["overlap"], 1e3 * one.sigma[:3]
+    turned, turn = math.degrees(heading_of(one.pose)), math.degrees(one.sigma[5])
+    sigma = f"sigma {a:.2g}, {b:.2g}, {c:.2g} mm, {turn:.2g} degrees; by {one.facts['by']}"
+    median, nmad, p95 = (1e3 * overlap[name] for name in ("median", "nmad", "p95"))
     return (
-        f"{place_}; {overlap['cells']:.0f} cells in common: median {1e3 * overlap['median']:+.2g} mm, NMAD "
-        f"{1e3 * overlap['nmad']:.2g} mm, 95 % {1e3 * overlap['p95']:.2g} mm"
+        f"{one.terrain.name}: at {x:.4g}, {y:.4g}, {z:.4g} m, turned by {turned:.3f} degrees ({sigma}); "
+        f"{overlap['cells']:.0f} cells in common: median {median:+.2g} mm, NMAD {nmad:.2g} mm, 95 % {p95:.2g} mm"
     )
