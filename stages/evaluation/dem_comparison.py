@@ -187,9 +187,10 @@ def align(a: Grid, b: Grid, kind: Align) -> Alignment:
     # Cells at a border that come and go from step to step keep the motion from settling, but within its own errors.
     if (np.abs(step) < sigma).all():
         return state
-    still = f"the last one still moved by {np.abs(step / unit).max():.2g} cells"
+    cells = np.abs(step / unit).max()
+    text = f"no alignment after {MAX_ITERATIONS} steps: the last one still moved by {cells:.2g} cells"
     remedy = "choose fewer freedoms (tilt or shift), or bring the models closer first"
-    raise DegenerateError("RIL-324", f"no alignment after {MAX_ITERATIONS} steps: {still}", remedy=remedy)
+    raise DegenerateError("RIL-324", text, remedy=remedy)
 
 
 def _difference(b: Grid, slopes: Floats, points: Floats) -> tuple[Floats, Floats]:
@@ -218,8 +219,8 @@ def _gauss_newton(
     N = (J * w[:, None]).T @ J
     values = np.linalg.eigvalsh(N)
     if not values[0] * MAX_CONDITION > values[-1]:
-        condition = f"condition {values[-1] / max(values[0], 1e-300):.1e}, more than {MAX_CONDITION:.0e}"
-        text = f"the terrain is too flat to align by: {condition}"
+        condition = values[-1] / max(values[0], 1e-300)
+        text = f"the terrain is too flat to align by: condition {condition:.1e}, more than {MAX_CONDITION:.0e}"
         raise DegenerateError("RIL-326", text, remedy="choose --align tilt, which flat terrain determines")
     step = -np.linalg.solve(N, (J * w[:, None]).T @ r)
     variance = float((w * r * r).sum()) / max(float(w.sum()) - len(free), 1.0)
