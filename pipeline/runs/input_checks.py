@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
 
-import cv2
 import numpy as np
 
 from rille.datasets.protocol import Positions, Rows
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.epipolar import MAX_IMAGE_TURN_DEG
 from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.rigid import angles_between
 from rille.stages.geometry.scale import MAX_ALIKE_SCALE
 from rille.stages.odometry.frame_screening import FrameScreeningParams
 
@@ -201,17 +201,14 @@ def judge_attitude(
     if attitude is None:
         return None
     known = [k for k in frames if attitude[k] is not None]
-    apart = []
-    for a, b in pairwise(known):
-        before, after = (None, None) if truth is None else (truth[a], truth[b])
-        if before is not None and after is not None:
-            # Turns are compared, not attitudes: the sensor's reference is another one than that of the truth.
-            sensed = np.array(attitude[b]).T @ np.array(attitude[a])
-            true = after.rotation.T @ before.rotation
-            apart.append(math.degrees(float(np.linalg.norm(cv2.Rodrigues(sensed @ true.T)[0]))))
-    off = float(np.median(apart)) if apart else 0.0
-    words = f"{len(known)} of {len(frames)} frames"
-    words += f"; between frames it turns {off:.3g} degrees otherwise than truth" if apart else ""
+    true = {k: T.rotation for k in known if truth is not None and (T := truth[k]) is not None}
+    words, off = f"{len(known)} of {len(frames)} frames", 0.0
+    if len(true) > 1:
+        both = np.array([attitude[k] for k in true]), np.array(list(true.values()))
+        # Turns are compared, not attitudes: the sensor's reference is another one than that of the truth.
+        turns = (np.swapaxes(R[:-1], 1, 2) @ R[1:] for R in both)
+        off = math.degrees(float(np.median(angles_between(*turns))))
+        words += f"; between frames it turns {off:.3g} degrees otherwise than truth"
     return judge("attitude", words, {"degrees off": off, "without": len(frames) - len(known)})
 
 
