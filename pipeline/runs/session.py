@@ -36,6 +36,7 @@ from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import Drive, dataflow
 from rille.pipeline.runs import part_of_run, roots
 from rille.pipeline.runs.input_checks import judge_rig
+from rille.pipeline.runs.lookup import LEDGER
 from rille.pipeline.runs.options import COMPLETE, HOLES, Options, Settings, Work, cache_folder
 from rille.stages.core.errors import ConfigError, RilleError
 
@@ -212,7 +213,7 @@ def perform(
     words = (": ".join(word for word in (item["what"], item["why"]) if word) for item in missing)
     complaints = [f"rille: missing: {line}" for line in words]
     if not result.ok:
-        ledger = opened.folder / "ledger.jsonl"
+        ledger = opened.folder / LEDGER
         complaints.append(f"rille: {total.failed} failed, {total.skipped} left out; ledger: {ledger}")
     # A drive that ended early did not come to the tasks that would have read all parameters.
     idle = list(_idle(opened)) if result.ok and arrived == COMPLETE else []
@@ -266,7 +267,7 @@ def _compute(opened: _Opened, kept: Kept | None) -> driver.Result:
             jobs=options.jobs,
             keep_going=options.keep_going,
             force=options.force,
-            ledger=opened.folder / "ledger.jsonl",
+            ledger=opened.folder / LEDGER,
             progress=progress.make("quiet" if options.quiet else options.progress),
             memory_limit=memory_limit(options),
             kept=kept,
@@ -291,7 +292,7 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict
     whole = opened.late(tasks=tasks, seconds=result.seconds, left_out=result.left_out)
     report = run_files.write(opened.folder, whole, made, opened.store)
     total = (datetime.now(UTC) - opened.started).total_seconds()
-    events.add_facts(opened.folder / "ledger.jsonl", total=total)
+    events.add_facts(opened.folder / LEDGER, total=total)
     return report
 
 

@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
-from cyclopts import Parameter
 from numpy.typing import NDArray
 
 from rille.datasets.images import chessboard, pairing
@@ -46,23 +45,6 @@ MIN_COVER = 0.5
 """Share of an image that all corners together should span: beyond them, distortion is extrapolated."""
 
 
-@Parameter(name="*")
-@dataclass(frozen=True)
-class Board:
-    """The chessboard of a calibration.
-
-    Parameters
-    ----------
-    square
-        Side of a square, metres.
-    corners
-        Inner corners, COLUMNSxROWS, for example 9x6; detected by default.
-    """
-
-    square: float
-    corners: str | None = None
-
-
 @dataclass
 class Boards:
     """Boards in the images of two sizes: ``views``, and in ``left_out`` name and reason of pairs of no use."""
@@ -77,7 +59,8 @@ def calibrate(
     left: Path,
     right: Path,
     *,
-    board: Board,
+    square: float,
+    corners: str | None = None,
     model: Literal["radtan", "radtan4", "rational", "fisheye"] = "radtan",
     output: Annotated[Path, Output] = Path("rig.yaml"),
     keep_bad: Annotated[bool, FLAG] = False,
@@ -90,6 +73,10 @@ def calibrate(
         Folder or glob of the left camera's images.
     right
         The same of the right camera; views are paired by number.
+    square
+        Side of a square, metres.
+    corners
+        Inner corners, COLUMNSxROWS, for example 9x6; detected by default.
     model
         Distortion model.
     output
@@ -98,15 +85,15 @@ def calibrate(
         Keep views whose residuals are far above the others'.
     """
     check_output(output, *((".yaml", ".yml") if output.suffix else ()))
-    given = None if board.corners is None else chessboard.parse_corners(board.corners)
-    chessboard.board_points((3, 3), board.square)  # a wrong unit is said before minutes of detection
+    given = None if corners is None else chessboard.parse_corners(corners)
+    chessboard.board_points((3, 3), square)  # a wrong unit is said before minutes of detection
     boards = find_boards(pairing.pair_up(*_files(left, right)), given)
-    points = chessboard.board_points(boards.corners, board.square)
+    points = chessboard.board_points(boards.corners, square)
     rig = calibrate_rig(points, boards.views, boards.sizes, model, keep_bad=keep_bad)
     _refuse_clutter(rig, boards)
-    output.write_text(_yaml(rig, boards, board.square), encoding="utf-8")
+    output.write_text(_yaml(rig, boards, square), encoding="utf-8")
     origin, size = "given" if given else "found", " x ".join(map(str, boards.corners))
-    print(f"board        {size} inner corners ({origin}), squares of {board.square:g} m")
+    print(f"board        {size} inner corners ({origin}), squares of {square:g} m")
     print("\n".join([*_views(rig, boards), "", *_parameters(rig), ""]))
     for line in doubts(rig, boards, model):
         warn(line)
