@@ -127,9 +127,8 @@ def relief(
     if np.linalg.det(matrix[:, :2]) > 0:
         values, matrix = values[::-1], matrix @ np.array([[1.0, 0.0, 0.0], [0.0, -1.0, rows - 1.0], [0.0, 0.0, 1.0]])
     to_ground = level_pose(matrix)
-    x0, x1, y0, y1 = lattice.bounds
     middle = 0.5 * ground.cell * (cols - 1), 0.5 * ground.cell * (1 - rows)
-    everywhere = math.hypot(*middle) + math.hypot(max(-x0, x1), max(-y0, y1))
+    everywhere = math.hypot(*middle) + lattice.radius
     area = SearchArea(*middle, 0.0, everywhere, math.pi)
     if around is not None:
         x, y, _ = to_ground.inverse().apply([around.x, around.y, 0.0])

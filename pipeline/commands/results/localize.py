@@ -209,7 +209,8 @@ def _found(terrain: Terrain, model: DemFile | None, image: Grid | None, around: 
     if image is not None:
         if around is not None and around.distance < math.inf:
             away = np.linalg.norm(image.centres() - [around.x, around.y], axis=-1)
-            image = replace(image, values=np.where(away <= around.distance + terrain.radius, image.values, np.nan))
+            near = away <= around.distance + terrain.lattice.radius
+            image = replace(image, values=np.where(near, image.values, np.nan))
         try:
             by_ortho = _by_ortho(place(terrain.image, image))
         except DegenerateError as error:

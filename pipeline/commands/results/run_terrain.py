@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -74,9 +73,3 @@ class Terrain:
     def image(self) -> Grid:
         """The ortho image in the world frame."""
         return replace(self.grid, values=self.ortho)
-
-    @property
-    def radius(self) -> float:
-        """Distance, m, of the farthest corner from the world's origin."""
-        x0, x1, y0, y1 = self.lattice.bounds
-        return math.hypot(max(-x0, x1), max(-y0, y1))
