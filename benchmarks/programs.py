@@ -31,10 +31,10 @@ import xarray
 from evo.tools import file_interface
 
 import rille
-from rille.pipeline.commands.options import cache_folder
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs import colmap as colmap_export
 from rille.pipeline.export.programs.run_artifacts import export_run
+from rille.pipeline.runs.options import cache_folder
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "pipeline"))
 from toys import map_server

@@ -109,14 +109,14 @@ def main() -> None:
     from matching import say, start_process, table
 
     start_process(1)
-    from rille.pipeline.commands.options import cache_folder
     from rille.pipeline.engine import events
     from rille.pipeline.engine.store.base import Store
     from rille.pipeline.runs import lookup
-    from rille.pipeline.runs.session import Options, reconstruct
+    from rille.pipeline.runs.options import cache_folder
+    from rille.pipeline.runs.session import Options, perform
 
     cache = cache_folder(given.cache)
-    if given.run is None and reconstruct(Options(SEQUENCE, (PRESET,), runs=given.runs, cache=str(cache))):
+    if given.run is None and perform(SEQUENCE, Options((PRESET,), runs=given.runs, cache=str(cache))).code:
         sys.exit("the run is not complete")
     folder = lookup.find(given.run or SEQUENCE, given.runs)
     rows = {row["label"]: row for row in events.read(folder / lookup.LEDGER)}

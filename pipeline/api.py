@@ -84,24 +84,24 @@ def reconstruct(
     from rille.pipeline.engine.runtime.environment import prepare_environment
 
     prepare_environment()
-    from rille.pipeline.commands.options import Options
     from rille.pipeline.runs import session
+    from rille.pipeline.runs.options import Options
 
     if not isinstance(seq, StereoSequence):
         check_place(seq)
     opened = seq.source if isinstance(seq, StereoSequence) else None
     options = Options(
-        str(seq) if opened is None else opened.name,
         assignments=tuple(assignments(settings)),
         frames=frames,
         executor=executor if client is None else client,
         runs=Path(runs),
         cache=None if cache is None else str(cache),
-        opened=opened,
         quiet=quiet,
     )
+    result = session.perform(str(seq) if opened is None else opened, options)
+    result.print()
     # Absolute: the program may change its folder, or send the run to another.
-    return Run(session.perform(options)[1].resolve())
+    return Run(result.folder.resolve())
 
 
 def reconstruct_many(

@@ -17,8 +17,8 @@ from cyclopts import App, CycloptsError, MissingArgumentError, UnusedCliTokensEr
 from rich.console import Console
 
 from rille.pipeline.commands.complaints import complain, print_error
-from rille.pipeline.commands.options import COMPLETE, FAILED, INTERRUPTED, USAGE, prepare
 from rille.pipeline.engine.plain import plain_output, raw
+from rille.pipeline.runs.options import COMPLETE, FAILED, INTERRUPTED, USAGE
 
 COMMANDS = {
     "reconstruct": "computing.reconstruct:reconstruct",
@@ -99,6 +99,16 @@ def main(argv: list[str] | None = None) -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
             code = FAILED
     sys.exit(code)
+
+
+def prepare() -> None:
+    """One thread a library, safe kernels, and nothing of the current folder, before NumPy and numba are imported."""
+    from rille.pipeline.engine.runtime import apart
+    from rille.pipeline.engine.runtime.environment import prepare_environment
+
+    prepare_environment()
+    apart.leave_out()
+    apart.ignore_settings()
 
 
 def _run(argv: list[str] | None) -> int:

@@ -29,7 +29,6 @@ FLOORS = (
     "rille.pipeline.flow",
     "rille.pipeline.export",
     "rille.pipeline.report",
-    "rille.pipeline.commands.options",
     "rille.pipeline.runs",
     "rille.pipeline.steps",
     "rille.pipeline.api",

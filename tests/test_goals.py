@@ -18,10 +18,8 @@ pytestmark = pytest.mark.slow
 
 
 def metrics(sequence: str, folder: Path, *settings: str, complete: bool = True) -> dict[str, Any]:
-    options = session.Options(
-        sequence, assignments=settings, runs=folder / "runs", cache=folder / "cache", progress="quiet"
-    )
-    assert session.reconstruct(options) == (0 if complete else 3)
+    options = session.Options(settings, runs=folder / "runs", cache=folder / "cache", progress="quiet")
+    assert session.perform(sequence, options).code == (0 if complete else 3)
     report = json.loads(next(folder.glob("runs/*/latest/report.json")).read_text())
     assert report["complete"] == complete
     return {name: m["value"] for name, m in report["metrics"].items()}

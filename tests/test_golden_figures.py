@@ -42,15 +42,14 @@ def test_figures_are_those_stated(name: str, data_dir: Path, tmp_path: Path, mon
     monkeypatch.setenv("RILLE_DATA", str(data_dir))  # devon_island is known by its name, not by a folder
     fast = ("hfvm.preset=fast", "crosscheck.enabled=false")
     options = session.Options(
-        name if name == "devon_island" else str(data_dir / name),
-        assignments=fast,
+        fast,
         frames="0:6",
         executor="inline",
         runs=tmp_path / "runs",
         cache=tmp_path / "cache",
         progress="quiet",
     )
-    assert session.reconstruct(options) == 0
+    assert session.perform(name if name == "devon_island" else str(data_dir / name), options).code == 0
     report = json.loads(next(tmp_path.glob("runs/*/latest/report.json")).read_text())
     figures = {figure: report["metrics"][figure]["value"] for figure in FIGURES[name]}
     assert figures == pytest.approx(FIGURES[name], rel=TOLERANCE)

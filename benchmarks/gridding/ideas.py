@@ -55,7 +55,7 @@ def _scenes(seeds: tuple[int, ...]) -> Iterator[tuple[Any, dict[str, Any]]]:
     from stereo.pairs import fetcher
 
     from rille.datasets.registry import open_sequence
-    from rille.pipeline.commands.options import cache_folder
+    from rille.pipeline.runs.options import cache_folder
 
     from .scenes import match, simulated
 

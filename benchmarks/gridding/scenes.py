@@ -89,7 +89,7 @@ def match(scene: Scene, preset: str = "default", turned: bool = False) -> Dispar
 def mockup(pairs: int | None = None) -> Iterator[Scene]:
     """Basic pairs of the built-in simulator with its true disparities, in the window that its accuracy is judged in."""
     from rille.datasets.registry import open_sequence
-    from rille.pipeline.commands.options import cache_folder
+    from rille.pipeline.runs.options import cache_folder
 
     sequence, fetch = open_sequence("mockup"), fetcher(cache_folder(None))
     assert sequence.truth is not None

@@ -134,7 +134,7 @@ def _middlebury() -> list[Pair]:
 def mockup() -> Pair:
     """First pair of the built-in simulator, 570 x 520 as in the paper, and its exact truth."""
     from rille.datasets.registry import open_sequence
-    from rille.pipeline.commands.options import cache_folder
+    from rille.pipeline.runs.options import cache_folder
 
     sequence, fetch = open_sequence("mockup"), fetcher(cache_folder(None))
     assert sequence.truth_disparity is not None

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rille.pipeline.commands.complaints import complain
-from rille.pipeline.commands.options import COMPLETE, FAILED, HOLES, USAGE
 from rille.pipeline.engine import events
 from rille.pipeline.engine.failures import translated
 from rille.pipeline.runs.lookup import LEDGER
+from rille.pipeline.runs.options import COMPLETE, FAILED, HOLES, USAGE
 
 STATES = {COMPLETE: "complete", HOLES: "with holes", USAGE: "refused", FAILED: "failed"}
 

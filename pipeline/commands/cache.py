@@ -9,15 +9,19 @@ from typing import Annotated
 
 from cyclopts import App
 
-from rille.pipeline.commands.options import COMPLETE, FAILED, FLAG, RUNS, CacheFolder, Runs, cache_folder
+from rille.pipeline.engine.memory import words
+from rille.pipeline.engine.runtime import kernels
+from rille.pipeline.engine.store import maintenance
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.runs import lookup, roots
+from rille.pipeline.runs.options import COMPLETE, FAILED, FLAG, RUNS, CacheFolder, Runs, cache_folder
+from rille.stages.core.errors import ConfigError
 
 app = App(name="cache", help=__doc__)
 
 
 def _there(cache: str | None) -> Path:
     """The folder of a cache; one that there is not was mistyped more often than it is empty."""
-    from rille.stages.core.errors import ConfigError
-
     folder = cache_folder(cache)
     if not folder.is_dir():
         raise ConfigError("RIL-589", f"there is no cache {folder}", remedy="name it with --cache")
@@ -27,9 +31,6 @@ def _there(cache: str | None) -> Path:
 @app.command
 def verify(*, cache: CacheFolder = None) -> int:
     """Read and decode every artifact, and compare its digest; damaged ones are named and recomputed by the next run."""
-    from rille.pipeline.engine.store import maintenance
-    from rille.pipeline.engine.store.base import Store
-
     sound, damages = maintenance.verify(Store(_there(cache)))
     for damage in damages:
         print(f"rille: {damage}", file=sys.stderr)
@@ -53,13 +54,6 @@ def gc(
     dry_run
         List by stage what would be removed, and remove nothing.
     """
-    from rille.pipeline.engine.memory import words
-    from rille.pipeline.engine.runtime import kernels
-    from rille.pipeline.engine.store import maintenance
-    from rille.pipeline.engine.store.base import Store
-    from rille.pipeline.runs import lookup, roots
-    from rille.stages.core.errors import ConfigError
-
     store = Store(_there(cache))
     ledgers = [path for folder in roots.folders(store, runs) for path in folder.glob(f"*/*/{lookup.LEDGER}")]
     kept = set[str]().union(*(lookup.used(path.parent) for path in ledgers if path.is_file()))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import traceback
 
-from rille.pipeline.commands.options import FAILED, USAGE
+from rille.pipeline.runs.options import FAILED, USAGE
 
 LONGEST_COMPLAINT = 1000
 """Characters."""

@@ -13,8 +13,8 @@ from pydantic.fields import FieldInfo
 from rille.datasets.images.misalign import MisalignParams
 from rille.datasets.mockup.params import MockupParams
 from rille.datasets.mockup.rover import RoverParams
-from rille.pipeline.commands.options import COMPLETE, FLAG
 from rille.pipeline.flow import config
+from rille.pipeline.runs.options import COMPLETE, FLAG
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import ConfigError
 

@@ -43,9 +43,14 @@ def raw(stream: Any) -> Any:
     return stream.raw if isinstance(stream, PlainStream) else stream
 
 
+def warned(line: str) -> str:
+    """A warning as it is printed: one that begins with a code (``RIL-680: ...``) shows it where an error would."""
+    return f"rille: warning{' ' if line.startswith('RIL-') else ': '}{' '.join(line.split())}"
+
+
 def warn(line: str) -> None:
-    """Print a warning on stderr; a line that begins with a code (``RIL-680: ...``) shows it where an error would."""
-    print(f"rille: warning{' ' if line.startswith('RIL-') else ': '}{' '.join(line.split())}", file=sys.stderr)
+    """Print a warning on stderr."""
+    print(warned(line), file=sys.stderr)
 
 
 def brief(value: Any, most: int) -> str:

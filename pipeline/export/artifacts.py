@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.pipeline.export.view import RunView
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry import rigid
 from rille.stages.geometry.geometry import Rig
-
-Floats = NDArray[Any]
 
 
 def used_rig(view: RunView, pair: int) -> Rig:

@@ -30,7 +30,6 @@ from rille.pipeline.engine.memory import free, words
 from rille.pipeline.export.writers import ENGINEERING_CRS
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation.dem_comparison import Grid
-from rille.stages.evaluation.place import Ortho
 
 MAX_CELLS = 500_000_000
 """Of an elevation model, which is read whole."""
@@ -72,13 +71,6 @@ class DemFile:
     def grid(self) -> Grid:
         """The elevations, placed by the centres of their cells."""
         return Grid(self.values, centres(self.transform))
-
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """Outline x_min, x_max, y_min, y_max in the CRS."""
-        rows, cols = self.values.shape
-        x, y = self.transform @ (np.array([0, cols, 0, cols]), np.array([0, 0, rows, rows]))
-        return float(x.min()), float(x.max()), float(y.min()), float(y.max())
 
 
 def centres(transform: Affine) -> NDArray[np.float64]:
@@ -206,8 +198,8 @@ def read_raster(path: Path) -> DemFile:
     return DemFile(str(path), values, transform, wkt, warnings=() if unit else (doubt,))
 
 
-def read_ortho(path: Path) -> tuple[Ortho, str]:
-    """Image of the ground, the mean of the bands of a GeoTIFF, and its CRS (WKT), empty where it states none.
+def read_ortho(path: Path) -> tuple[Grid, str]:
+    """Grey image of the ground, the mean of the bands of a GeoTIFF, and its CRS (WKT), empty where it states none.
 
     Raises
     ------
@@ -222,7 +214,7 @@ def read_ortho(path: Path) -> tuple[Ortho, str]:
     known &= np.isfinite(grey)
     if not known.any():
         raise InputError("RIL-856", f"{path} has no known cell", remedy="give another image")
-    return Ortho(grey, known, centres(t)), wkt
+    return Grid(np.where(known, grey, np.nan), centres(t)), wkt
 
 
 def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

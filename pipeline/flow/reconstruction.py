@@ -577,7 +577,7 @@ def cells_in_both(a: Series[int], b: Series[int]) -> int:
     return max(columns, 0) * max(lines, 0)
 
 
-def spread(pairs: list[int], most: int) -> list[int]:
-    """Choose at most ``most`` of the pairs, evenly spaced, beginning with the first."""
+def spread(items: list[Any], most: int) -> list[Any]:
+    """Choose at most ``most`` of the items, evenly spaced, beginning with the first."""
     # Minus twice: rounds the stride up, so that no more than `most` remain.
-    return pairs[:: -(-len(pairs) // most)]
+    return items[:: -(-len(items) // most) or 1]

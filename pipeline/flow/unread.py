@@ -22,7 +22,7 @@ from rille.pipeline.flow.config import stages
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import ConfigError
 
-CHECKED = frozenset(("undistort", "pyramid", "motion", "hfvm", "tiling", "orientation"))
+CHECKED = frozenset(("undistort", "pyramid", "motion", "hfvm", "tiling", "orientation", "frame_screening"))
 """Sections that ``rille check`` reads."""
 
 

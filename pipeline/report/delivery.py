@@ -24,11 +24,19 @@ from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
 Rows = list[dict[str, Any]]
 Items = list[dict[str, str]]
 
+HARMLESS = ("no path", "crosscheck")
+"""Kinds of what is missing that are answers, or lie outside of the reconstruction: the run is complete with them."""
+
+MIN_OFF_MAP = 0.1
+"""Share of the matched pixels from which on it is said that limits keep them off the map."""
+
+MIN_MOVING = 0.02
+"""Share of an image that moves by itself from which on that is said; errors of displacements come to less."""
+
 
 def is_complete(missing: Items) -> bool:
     """Whether what is missing leaves the reconstruction whole: answers and what lies outside of it."""
-    # Kinds of what is missing that are answers, or lie outside of the reconstruction: the run is complete with them
-    return all(m["kind"] in ("no path", "crosscheck") for m in missing)
+    return all(m["kind"] in HARMLESS for m in missing)
 
 
 def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
@@ -207,8 +215,7 @@ def coverage(view: RunView) -> list[str]:
     maps = {pair: facts_of(view, dem).get("coverage", {}) for pair, dem in view.products.local_dem.items()}
     lacking = {pair: facts["outside"] + facts["unsure"] for pair, facts in maps.items() if facts.get("settings")}
     pair = max(lacking, key=lambda k: lacking[k], default=-1)
-    # Share of the matched pixels from which on it is said that limits keep them off the map
-    if lacking.get(pair, 0.0) < 0.1:
+    if lacking.get(pair, 0.0) < MIN_OFF_MAP:
         return []
     facts, size = maps[pair], [metres(v) for v in maps[pair]["size"]]
     settings = " ".join(f"--set {name}={value:g}" for name, value in facts["settings"].items())
@@ -222,8 +229,7 @@ def coverage(view: RunView) -> list[str]:
 def moved(view: RunView) -> list[str]:
     """What moved by itself, in one line for the run."""
     shares = {pair: float(facts_of(view, one).get("share", 0.0)) for pair, one in view.products.moving.items()}
-    # Share of an image that moves by itself from which on that is said; errors of displacements come to less
-    pairs = [pair for pair, share in shares.items() if share >= 0.02]
+    pairs = [pair for pair, share in shares.items() if share >= MIN_MOVING]
     if not pairs:
         return []
     most = max(pairs, key=lambda pair: shares[pair])

@@ -7,17 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from rille.pipeline.export import ranges
 from rille.pipeline.report import canvas
 from rille.pipeline.report.canvas import Panel
+from rille.stages.core.arrays import Floats
 
-Floats = NDArray[Any]
 Extent = tuple[float, float, float, float]
 """x_min, x_max, y_min, y_max, m."""
 

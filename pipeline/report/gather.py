@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.pipeline.export.artifacts import Floats, used_rig
-from rille.pipeline.export.artifacts import by_frame as rows
+from rille.pipeline.export.artifacts import by_frame, used_rig
 from rille.pipeline.export.comparison import CrosscheckComparison, compare
 from rille.pipeline.export.rasters import whole
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow.products import Stop
-from rille.stages.core.declare import Bundle
+from rille.stages.core.arrays import Floats
+from rille.stages.core.declare import AnyArray, Bundle
+from rille.stages.geometry import rigid
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.lattice import Lattice, union
-from rille.stages.geometry.rigid import by_frame
 from rille.stages.odometry.resection.trajectory import world_poses
 
 
@@ -28,7 +28,7 @@ class WorldTerrain:
     """Arrays (row, col) of an elevation model, and the lattice they lie on."""
 
     lattice: Lattice
-    arrays: Mapping[str, Floats]
+    arrays: Mapping[str, AnyArray]
 
     def at(self, name: str, xy: Floats) -> Floats:
         """Values (n,) of an array in the cells of points (n, 2), m; NaN outside, and where there is no such array."""
@@ -166,10 +166,10 @@ def trajectory(view: RunView) -> Track:
     nowhere, nothing = np.full((n, 3), np.nan), np.full(n, -1)
     if bundle is None:
         return Track(nowhere, None, nowhere[:, 0], nothing, nothing)
-    poses = by_frame(world_poses(bundle), list(bundle.meta["frames"]), list(view.frames))
+    poses = rigid.by_frame(world_poses(bundle), list(bundle.meta["frames"]), list(view.frames))
     there = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
-    variances = np.trace(rows(view, bundle, "covariance")[:, :3, :3], axis1=1, axis2=2)
-    segment, piece = (np.nan_to_num(rows(view, bundle, name), nan=-1).astype(int) for name in ("segment", "piece"))
+    variances = np.trace(by_frame(view, bundle, "covariance")[:, :3, :3], axis1=1, axis2=2)
+    segment, piece = (np.nan_to_num(by_frame(view, bundle, name), nan=-1).astype(int) for name in ("segment", "piece"))
     return Track(
         np.where(there[:, None], poses[:, :, 3], np.nan),
         _truth_in_world(view),
@@ -185,7 +185,7 @@ def _truth_in_world(view: RunView) -> Floats | None:
     None where no frame has a pose and truth.
     """
     assessed = view.bundle(view.products.accuracy)
-    truth = np.full((1, 3), np.nan) if assessed is None else rows(view, assessed, "position_truth")
+    truth = np.full((1, 3), np.nan) if assessed is None else by_frame(view, assessed, "position_truth")
     return truth if np.isfinite(truth).any() else None
 
 

@@ -29,7 +29,7 @@ def write_report(folder: Path, view: RunView, facts: Mapping[str, Any], figures:
     ----------
     folder : the run's folder; what it holds already is listed and explained in the report.
     view : the run.
-    facts : as :func:`rille.pipeline.report.summary.gather` gives them.
+    facts : as :func:`rille.pipeline.report.summary.collect` gives them.
     figures : in the order of the page.
     """
     whole = summarise(view, facts, figures)

@@ -19,6 +19,7 @@ from rille.pipeline.report import canvas, gather
 from rille.pipeline.report.canvas import Block, Panel
 from rille.pipeline.report.gather import Scene, WorldTerrain
 from rille.pipeline.report.words import metres
+from rille.stages.core.arrays import Floats
 from rille.stages.core.validity import matched
 from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.features import grey_bytes
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
     from rille.pipeline.flow.products import Stop
 
-Floats = NDArray[Any]
 
 BUDGET_CHARACTERS = 900_000
 """Of the pictures of a strip: the page has 5 MB at most."""

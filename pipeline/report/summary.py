@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ import numpy as np
 from rille.datasets.text.count import count
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView
+from rille.pipeline.flow.products import Products
 from rille.pipeline.report import delivery, tables
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene, facts_of, frames_of
-from rille.pipeline.report.metrics import metric, metrics
+from rille.pipeline.report.metrics import metrics, stated
 from rille.pipeline.report.words import metres, number, quantity
 from rille.stages.evaluation import imu_check
 from rille.stages.odometry.resection.intrinsics import CORRECTED
@@ -26,7 +28,7 @@ REPORT_FORMAT = 2
 """Raised when the meaning of a key of report.json changes."""
 
 
-def gather(view: RunView) -> dict[str, Any]:
+def collect(view: RunView) -> dict[str, Any]:
     """Collect the part of ``report.json`` that depends on the artifacts alone, not on time and place of the run."""
     scene = Scene(view)
     frames, pairs = tables.frames(scene), tables.pairs(scene)
@@ -65,7 +67,7 @@ def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]
     complete = delivery.is_complete(outcome["missing"]) and not view.part
     state = "Incomplete" if not complete else "Complete but for what is listed" if outcome["missing"] else "Complete"
     how = "wall clock, without writing the page; what is cached costs no time"
-    clock = {"group": "Run", "truth": None, **metric("Time of this run's tasks", view.seconds, "s", how)}
+    clock = {"group": "Run", "truth": None, **stated("Time of this run's tasks", view.seconds, "s", how)}
     return {
         "format": REPORT_FORMAT,
         "run": view.run_id,
@@ -84,7 +86,7 @@ def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]
 
 
 def _write(path: Path, run: RunView) -> None:
-    path.write_text(json.dumps(gather(run), allow_nan=False), encoding="utf-8")
+    path.write_text(json.dumps(collect(run), allow_nan=False), encoding="utf-8")
 
 
 def find_warnings(scene: Scene, figures: Mapping[str, Any]) -> list[str]:
@@ -342,14 +344,14 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
     return {name: {key: round(value, 3) for key, value in row.items()} for name, row in by_stage.items()}
 
 
+NOT_IN_FACTS = ("images", "undistorted", "tracks", "world_dem", "accuracy_pieces", "truth_risk")
+"""Products that the facts are not made of."""
+
+
 def _reads(run: RunView) -> tuple[object, ...]:
-    p, s, config = run.products, run.sequence, run.config
+    s, config = run.sequence, run.config
     return (
-        *(p.contradictions, p.intrinsics, p.crosschecks, p.crosscheck, p.agreement, p.crosscheck_accuracy),
-        *(p.loops, p.chained, p.trajectory, p.accuracy, p.position_accuracy, p.overlap_audit),
-        *(p.rigs, p.ground, p.resections, p.refined),
-        *(p.moving, p.world_tiles, p.world_risk, p.world_path, p.dem_accuracy, p.path_check, p.drive),
-        *(p.disparity_accuracy, *tables.of_pairs(p)),
+        *(getattr(run.products, product.name) for product in fields(Products) if product.name not in NOT_IN_FACTS),
         *(config.vehicle, config.rig.significance, config.crosscheck.enabled),
         *(s.name, s.frames, s.frame_names, s.rig, s.truth, s.truth_source, s.truth_positions, s.warnings, s.notes),
         *(s.evaluation_window, s.georeference, s.times, s.up, s.attitude, s.imu_axes),

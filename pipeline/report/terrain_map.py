@@ -16,18 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.pipeline.export import colour, ranges
-from rille.pipeline.export.artifacts import Floats
 from rille.pipeline.report import canvas, gather, strips
 from rille.pipeline.report.canvas import Block
 from rille.pipeline.report.gather import Scene, WorldTerrain
 from rille.pipeline.report.strips import StripLine
+from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import mosaic
 from rille.stages.hazard.risk import REASONS, UNKNOWN
 from rille.stages.odometry.resection.trajectory import world_poses
 from rille.stages.terrain.shading import slope_deg
-
-Bytes = NDArray[np.uint8]
 
 MAX_CELLS = 350_000
 """Cells of the map; three pictures of these and the ortho image are about 2 MB in the page."""
@@ -111,7 +109,7 @@ def _of_risk(scene: Scene, name: str, missing: float) -> Floats:
     return mosaic([(scene.risk.lattice, scene.risk.arrays[name])], missing, scene.world.lattice)
 
 
-def _steps(values: Floats, low: float, span: float, steps: int) -> NDArray[np.int64]:
+def _steps(values: NDArray[Any], low: float, span: float, steps: int) -> NDArray[np.int64]:
     """1 .. ``steps`` + 1 from ``low`` to ``low + span``, 0 undefined."""
     whole = 1 + np.rint(np.clip((np.nan_to_num(values, nan=low) - low) / span, 0, 1) * steps).astype(np.int64)
     return np.where(np.isfinite(values), whole, 0)

@@ -12,20 +12,21 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.datasets.protocol import Positions, Rows
+from rille.stages.core.arrays import Floats
 from rille.stages.geometry.epipolar import MAX_IMAGE_TURN_DEG
 from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.rigid import angles_between
 from rille.stages.geometry.scale import MAX_ALIKE_SCALE
+from rille.stages.odometry.frame_screening import FrameScreeningParams
 
-Floats = NDArray[np.float64]
 Level = Literal["OK", "WARN", "FAIL"]
 Look = Mapping[str, Any]
 
-MIN_SHARPNESS_RATIO = 0.6  # of a camera's median sharpness: a Gaussian blur of one more pixel reduces it to this
+GAP_STEPS = 2.5
+"""Median steps of time above which a step is a gap."""
 
 
 @dataclass(frozen=True)
@@ -167,8 +168,7 @@ def judge_times(times: Sequence[float] | None) -> Finding:
         k = int(np.argmax(steps <= 0))
         return judge("times", f"time goes back or rests from frame {k} to {k + 1}", {"steps back": 1})
     usual = float(np.median(steps))
-    # median steps of time above which a step is a gap
-    gaps, longest = int((steps > 2.5 * usual).sum()), int(np.argmax(steps))
+    gaps, longest = int((steps > GAP_STEPS * usual).sum()), int(np.argmax(steps))
     words = f"{1 / usual:.3g} frames a second over {float(steps.sum()):.4g} s"
     if gaps:
         words += f"; {gaps} gaps, the longest {steps[longest]:.3g} s from frame {longest} to {longest + 1}"
@@ -201,17 +201,14 @@ def judge_attitude(
     if attitude is None:
         return None
     known = [k for k in frames if attitude[k] is not None]
-    apart = []
-    for a, b in pairwise(known):
-        before, after = (None, None) if truth is None else (truth[a], truth[b])
-        if before is not None and after is not None:
-            # Turns are compared, not attitudes: the sensor's reference is another one than that of the truth.
-            sensed = np.array(attitude[b]).T @ np.array(attitude[a])
-            true = after.rotation.T @ before.rotation
-            apart.append(math.degrees(float(np.linalg.norm(cv2.Rodrigues(sensed @ true.T)[0]))))
-    off = float(np.median(apart)) if apart else 0.0
-    words = f"{len(known)} of {len(frames)} frames"
-    words += f"; between frames it turns {off:.3g} degrees otherwise than truth" if apart else ""
+    true = {k: T.rotation for k in known if truth is not None and (T := truth[k]) is not None}
+    words, off = f"{len(known)} of {len(frames)} frames", 0.0
+    if len(true) > 1:
+        both = np.array([attitude[k] for k in true]), np.array(list(true.values()))
+        # Turns are compared, not attitudes: the sensor's reference is another one than that of the truth.
+        turns = (np.swapaxes(R[:-1], 1, 2) @ R[1:] for R in both)
+        off = math.degrees(float(np.median(angles_between(*turns))))
+        words += f"; between frames it turns {off:.3g} degrees otherwise than truth"
     return judge("attitude", words, {"degrees off": off, "without": len(frames) - len(known)})
 
 
@@ -225,10 +222,15 @@ def judge_up(up: Sequence[tuple[float, float, float] | None] | None, frames: Seq
     return judge("up", words, {"known": len(known), "y in the images": y})
 
 
-def judge_looks(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Finding]:
-    """Exposure and sharpness of all images, by camera and frame: what ``glance`` of stage ``image_quality`` gives."""
+def judge_looks(
+    looks: Mapping[str, Mapping[int, Look]], names: Sequence[str], limits: FrameScreeningParams
+) -> list[Finding]:
+    """Exposure and sharpness of all images, by camera and frame: what ``glance`` of stage ``image_quality`` gives.
+
+    Blank and blurred are images by the ``limits`` of a run.
+    """
     opened = {camera: of for camera, of in looks.items() if of}
-    out = [bad for camera, of in opened.items() for bad in _camera(camera, of, names) if bad.level != "OK"]
+    out = [bad for camera, of in opened.items() for bad in _camera(camera, of, names, limits) if bad.level != "OK"]
     judged = {bad.subject for bad in out}
     both = [k for k in opened.get("left", {}) if k in opened.get("right", {})]
     if both and "exposure" not in judged:
@@ -245,11 +247,12 @@ def judge_looks(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -
     return out
 
 
-def _camera(camera: str, looks: Mapping[int, Look], names: Sequence[str]) -> Iterator[Finding]:
+def _camera(
+    camera: str, looks: Mapping[int, Look], names: Sequence[str], limits: FrameScreeningParams
+) -> Iterator[Finding]:
     """Findings on the images of one camera."""
     at = [names[k] for k in looks]
-    # grey levels, standard deviation of an image below which it is blank
-    blank = np.flatnonzero(_figure(looks, "deviation") < 1.0)
+    blank = np.flatnonzero(_figure(looks, "deviation") < limits.uniform)
     if blank.size:
         text = f"{blank.size} {camera} images show nothing, first frame {at[blank[0]]}"
         yield judge("images", text, {"blank": blank.size})
@@ -263,7 +266,7 @@ def _camera(camera: str, looks: Mapping[int, Look], names: Sequence[str]) -> Ite
         yield judge("exposure", text, {"change": change[k]})
     sharpness = _figure(looks, "sharpness")
     share_of_usual = np.nan_to_num(sharpness / _usual(sharpness), nan=1.0)
-    blurred, k = int((share_of_usual < MIN_SHARPNESS_RATIO).sum()), int(np.argmin(share_of_usual))
+    blurred, k = int((share_of_usual < limits.blurred).sum()), int(np.argmin(share_of_usual))
     worst = f"the worst frame {at[k]} ({100 * share_of_usual[k]:.0f} % of usual)"
     yield judge("sharpness", f"{blurred} {camera} images are blurred, {worst}", {"blurred": blurred})
 

@@ -14,20 +14,13 @@ FLOWS = ("builders", "reconstruction", "assessment")
 """Modules whose stages a reconstruction is made of."""
 
 MADE_BY = {
-    "trajectory": "trajectory",
-    "agreement": "agreement",
-    "accuracy": "accuracy",
     "crosscheck_accuracy": "accuracy",
-    "position_accuracy": "position_accuracy",
-    "disparity_accuracy": "disparity_accuracy",
     "local_dem_accuracy": "dem_accuracy",
-    "dem_accuracy": "dem_accuracy",
-    "path_check": "path_check",
     "world_tiles": "merge",
     "world_risk": "risk",
     "world_path": "path",
 }
-"""Stage of each product that files are made of; others are there before the trajectory is."""
+"""Stage of each product that files are made of, where its name is another; what no stage is named by is there early."""
 
 
 def cut(until: Collection[str], only: Collection[str]) -> Cut | None:
@@ -57,5 +50,5 @@ def cut(until: Collection[str], only: Collection[str]) -> Cut | None:
     if not only:
         return None
     read = {name.removeprefix("products.") for file in only for name in names(files[file].names)}
-    behind = {MADE_BY[name] for name in read & MADE_BY.keys()} or {"trajectory"}
+    behind = {MADE_BY.get(name, name) for name in read} & stages or {"trajectory"}
     return Cut(frozenset(behind), lambda h: h.label.partition("/")[0] in wanted)

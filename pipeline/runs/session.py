@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -20,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 from rille.datasets.images.files import Digests
 from rille.datasets.protocol import Sequence
 from rille.datasets.registry import open_sequence
-from rille.pipeline.commands.options import COMPLETE, HOLES, Options, Settings, Work, cache_folder
 from rille.pipeline.engine import events, memory, progress
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.code_digest import remember
@@ -29,17 +29,18 @@ from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.packages import installed
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.workers import check
+from rille.pipeline.engine.workers import Workers, check
 from rille.pipeline.export.view import UNSTATED, RunView
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import Drive, dataflow
 from rille.pipeline.runs import part_of_run, roots
 from rille.pipeline.runs.input_checks import judge_rig
+from rille.pipeline.runs.lookup import LEDGER
+from rille.pipeline.runs.options import COMPLETE, HOLES, Options, Settings, Work, cache_folder
 from rille.stages.core.errors import ConfigError, RilleError
 
 if TYPE_CHECKING:
-    from rille.pipeline.report.delivery import Items
     from rille.pipeline.runs import run_files
 
 
@@ -85,16 +86,14 @@ def configured(options: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
     return configuration.split_dataset(read)
 
 
-def settings(options: Settings) -> Settled:
-    """Open a sequence and determine its configuration: defaults, presets, file and options of the user."""
+def settings(sequence: str | Sequence, options: Settings) -> Settled:
+    """Open a sequence, if it is none yet, and determine its configuration: defaults, presets, file and options."""
     for_dataset, for_stages = configured(options)
-    if options.opened is None:
-        sequence = open_sequence(options.sequence, for_dataset, Digests(cache_folder(options.cache) / "files.json"))
+    if isinstance(sequence, str):
+        sequence = open_sequence(sequence, for_dataset, Digests(cache_folder(options.cache) / "files.json"))
     elif for_dataset:
         text = f"{next(iter(for_dataset))}: the sequence is open already"
         raise ConfigError("RIL-860", text, remedy="give its parameters to rille.open")
-    else:
-        sequence = options.opened
     vehicle, source = {}, UNSTATED
     if sequence.vehicle is not None:
         vehicle, source = {"vehicle": sequence.vehicle.model_dump()}, f"sequence {sequence.name}"
@@ -107,15 +106,15 @@ def settings(options: Settings) -> Settled:
     return Settled(sequence, choose_frames(options.frames, sequence.frames), config, source, given)
 
 
-def settings_of_run(options: Work) -> Settled:
-    """The same for a run: what it cannot use is refused, what is suspicious but possible in the input is printed."""
+def settings_of_run(sequence: str | Sequence, options: Work, warn: Callable[[str], None] = warn) -> Settled:
+    """The same for a run: what it cannot use is refused, of what is suspicious but possible ``warn`` is told."""
     # Before anything is read or written.
     stages = configuration.stage_names() if options.force else set()
     for name in sorted(options.force - stages):
         raise ConfigError("RIL-060", f"--force {name!r} is no stage", remedy=f"one of {', '.join(sorted(stages))}")
     check(options.executor, options.jobs)
     memory_limit(options)
-    settled = settings(options)
+    settled = settings(sequence, options)
     sequence, driven = settled.sequence, settled.sequence.simulation is not None
     who = "a drive" if driven else f"a reconstruction of {sequence.name}"
     # A drive is over ground.
@@ -135,9 +134,21 @@ def memory_limit(options: Work) -> int | None:
     return None if options.memory_limit is None else memory.parse(options.memory_limit)
 
 
-def reconstruct(options: Options) -> int:
-    """Run the whole chain; gives the exit code. Running the same options again resumes."""
-    return perform(options)[0]
+@dataclass(frozen=True)
+class RunResult:
+    """What a run came to: its exit code, the folder of the results, and lines for stdout, the closing one first, and
+    for stderr."""
+
+    code: int
+    folder: Path
+    lines: list[str]
+    complaints: list[str]
+
+    def print(self) -> None:
+        """Print all lines."""
+        for line in self.complaints:
+            print(line, file=sys.stderr)
+        print("\n".join(self.lines))
 
 
 @dataclass(frozen=True)
@@ -160,49 +171,68 @@ class _Opened:
         return replace(self.view, **known)
 
 
-def perform(options: Options) -> tuple[int, Path]:
-    """Run the whole chain; gives the exit code and the folder of the results."""
+def perform(
+    sequence: str | Sequence,
+    options: Options,
+    *,
+    verb: str = "reconstruct",
+    kept: list[Workers] | None = None,
+    warn: Callable[[str], None] = warn,
+) -> RunResult:
+    """Run the whole chain; the same again resumes.
+
+    Parameters
+    ----------
+    sequence : its name or path, or itself, where it is open already.
+    verb : command that asks for the run.
+    kept : list of the workers that a run leaves to the next one; whoever gives it ends them.
+    warn : takes warnings, one line each: those of the input before anything is computed.
+    """
     # They import matplotlib, which a wrong option should not have to wait for.
     from rille.pipeline.report.delivery import is_complete, left_out
     from rille.pipeline.runs import run_files
 
-    opened = _open(options)
+    opened = _open(sequence, options, verb, warn)
     made: run_files.Made = {}
     opened.graph.last = lambda: run_files.lay_out(opened.graph, opened.late(), made)
-    result = _compute(opened)
+    result = _compute(opened, kept)
     remember()
     report = _write(opened, result, made)
-    missing: Items = report["missing"]
     _point_latest(opened.folder)
     suspicious = (line for h in opened.graph.nodes if h.ref is not None for line in h.ref.meta.get("warnings", ()))
     # Some follow from several tasks alone; those of the input were said before the run.
     for line in dict.fromkeys((*suspicious, *report["warnings"])):
         if line not in opened.view.sequence.warnings:
             warn(line)
-    arrived = _outcome(opened)
-    total = result.total()
-    for item in missing:
-        print(f"rille: missing: {': '.join(word for word in (item['what'], item['why']) if word)}", file=sys.stderr)
+    total, missing, lines, arrived = result.total(), report["missing"], [], COMPLETE
+    if opened.drive is not None:
+        outcome, stops = opened.drive.outcome(), opened.drive.driven.stops
+        lines.append(f"{': '.join(word for word in outcome if word)}  ({len(stops)} stops)")
+        arrived = COMPLETE if outcome[0] == "goal" else HOLES
     page = opened.folder / "report.html"
-    print(f"{page}  computed {total.computed}, cached {total.cached}, missing {len(missing)}")
+    lines.append(f"{page}  computed {total.computed}, cached {total.cached}, missing {len(missing)}")
     if opened.view.part:
-        print(f"left out, as {opened.view.part} asks: {left_out(result.left_out)}")
+        lines.append(f"left out, as {opened.view.part} asks: {left_out(result.left_out)}")
+    words = (": ".join(word for word in (item["what"], item["why"]) if word) for item in missing)
+    complaints = [f"rille: missing: {line}" for line in words]
     if not result.ok:
-        ledger = opened.folder / "ledger.jsonl"
-        print(f"rille: {total.failed} failed, {total.skipped} left out; ledger: {ledger}", file=sys.stderr)
-        return HOLES, opened.folder
-    whole = COMPLETE if is_complete(missing) else HOLES
-    return max(arrived, whole, _all_read(opened, arrived)), opened.folder
+        ledger = opened.folder / LEDGER
+        complaints.append(f"rille: {total.failed} failed, {total.skipped} left out; ledger: {ledger}")
+    # A drive that ended early did not come to the tasks that would have read all parameters.
+    idle = list(_idle(opened)) if result.ok and arrived == COMPLETE else []
+    whole = result.ok and arrived == COMPLETE and is_complete(missing) and not idle
+    return RunResult(COMPLETE if whole else HOLES, opened.folder, lines, [*complaints, *idle])
 
 
-def _open(options: Options) -> _Opened:
+def _open(name: str | Sequence, options: Options, verb: str, warn: Callable[[str], None] = warn) -> _Opened:
     """Read the input and lay the run out."""
     started = datetime.now(UTC)
-    settled = settings_of_run(options)
+    settled = settings_of_run(name, options, warn)
     sequence, frames, config = settled.sequence, settled.frames, settled.config
-    if options.verb == "drive" and sequence.simulation is None:
+    if verb == "drive" and sequence.simulation is None:
         raise ConfigError("RIL-059", f"{sequence.name} is recorded, it cannot be driven", remedy="drive mockup-loop")
-    header = f"# {options.command()}\n# rille reconstruct SEQ --config THIS_FILE uses the same parameters.\n\n"
+    command = options.command(verb, name if isinstance(name, str) else name.name)
+    header = f"# {command}\n# rille reconstruct SEQ --config THIS_FILE uses the same parameters.\n\n"
     text = header + configuration.to_toml(config, sequence.parameters)
     graph, store = Graph(cut=part_of_run.cut(options.until, options.only)), Store(cache_folder(options.cache))
     products, drive = dataflow(graph, sequence, config, frames)
@@ -218,7 +248,7 @@ def _open(options: Options) -> _Opened:
         config=config,
         config_toml=text,
         versions=installed(),
-        command=options.command(),
+        command=command,
         vehicle_source=settled.vehicle_source,
         started=started.strftime("%Y-%m-%dT%H:%M:%SZ"),
         part=options.part(),
@@ -228,7 +258,7 @@ def _open(options: Options) -> _Opened:
     return _Opened(options, settled, view, folder, started, store, graph, drive)
 
 
-def _compute(opened: _Opened) -> driver.Result:
+def _compute(opened: _Opened, kept: list[Workers] | None) -> driver.Result:
     """Bring every task to its artifact; raise the first failure unless the data are its cause and poses are there."""
     options, view = opened.options, opened.view
     roots.note(opened.store, options.runs)
@@ -240,10 +270,10 @@ def _compute(opened: _Opened) -> driver.Result:
             jobs=options.jobs,
             keep_going=options.keep_going,
             force=options.force,
-            ledger=opened.folder / "ledger.jsonl",
+            ledger=opened.folder / LEDGER,
             progress=progress.make("quiet" if options.quiet else options.progress),
             memory_limit=memory_limit(options),
-            kept=options.kept,
+            kept=kept,
         ),
     )
     trajectory = view.products.trajectory
@@ -265,34 +295,20 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict
     whole = opened.late(tasks=tasks, seconds=result.seconds, left_out=result.left_out)
     report = run_files.write(opened.folder, whole, made, opened.store)
     total = (datetime.now(UTC) - opened.started).total_seconds()
-    events.add_facts(opened.folder / "ledger.jsonl", total=total)
+    events.add_facts(opened.folder / LEDGER, total=total)
     return report
 
 
-def _outcome(opened: _Opened) -> int:
-    """Say how a drive ended; the exit code, which is that of a run with holes where it did not reach its goal."""
-    if opened.drive is None:
-        return COMPLETE
-    outcome, stops = opened.drive.outcome(), opened.drive.driven.stops
-    print(f"{': '.join(word for word in outcome if word)}  ({len(stops)} stops)")
-    return COMPLETE if outcome[0] == "goal" else HOLES
-
-
-def _all_read(opened: _Opened, arrived: int) -> int:
-    """Exit code of a run that came to its end: a parameter that no task of it read is an error, and named."""
-    # A drive that ended early did not come to the tasks that would have read it.
-    if arrived != COMPLETE:
-        return COMPLETE
+def _idle(opened: _Opened) -> Iterator[str]:
+    """Errors of a run that came to its end: a parameter that no task of it read, and stages that it does not have."""
     # What a part of a run does not read may be meant for the rest.
     lost = [] if opened.view.part else unread.unread(opened.settled.given, opened.view.config, opened.graph)
     if lost:
         text = f"{unread.values(lost, opened.view.config)}: no task of this run read it"
-        print(f"rille: error RIL-732: {text}: {unread.remedy(lost, opened.view.config)}", file=sys.stderr)
+        yield f"rille: error RIL-732: {text}: {unread.remedy(lost, opened.view.config)}"
     idle = sorted(opened.options.force - {h.stage for h in opened.graph.nodes})
     if idle:
-        text = f"--force {', '.join(idle)}: this run has no such task: leave it out"
-        print(f"rille: error RIL-735: {text}", file=sys.stderr)
-    return HOLES if lost or idle else COMPLETE
+        yield f"rille: error RIL-735: --force {', '.join(idle)}: this run has no such task: leave it out"
 
 
 def _make_folder(parent: Path, started: datetime, plan: str) -> Path:

@@ -84,8 +84,9 @@ class ViewResidual:
 class RigCalibration:
     """Result of a calibration: both lenses, the relative pose, and their errors.
 
-    ``sigma``: standard deviation by name (``left fx`` in pixels, ``right k1``, ``rotation x`` in radians,
-    ``translation x`` and ``baseline`` in metres), from the residuals and the geometry of the views. ``rms``: of all
+    ``values`` and ``sigma``: what was found and its standard deviation by name (``baseline`` in metres, ``left fx`` in
+    pixels, ``right k1``, ``rotation x`` in radians, ``translation x`` in metres), from the residuals and the geometry
+    of the views. ``rms``: of all
     corners that were used, pixels. ``residuals``: one a view; of a view that was left out those of the first
     adjustment.
     """
@@ -93,6 +94,7 @@ class RigCalibration:
     left: Lens
     right: Lens
     T_right_left: RigidTransform
+    values: Mapping[str, float]
     sigma: Mapping[str, float]
     rms: float
     residuals: tuple[ViewResidual, ...]
@@ -142,6 +144,7 @@ def calibrate_rig(
         left,
         right,
         used.rig(x).T_right_left,
+        {"baseline": used.rig(x).baseline, **dict(zip(used.names(), x.tolist(), strict=False))},
         sigma,
         rms,
         tuple(final.get(r.name, ViewResidual(r.name, r.left, r.right, r.epipolar, used=False)) for r in first),

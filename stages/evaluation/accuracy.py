@@ -17,11 +17,10 @@ import math
 
 import numpy as np
 
-from rille.stages.core.arrays import Floats
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.evaluation.conventions import better_reading
-from rille.stages.evaluation.metric import metric
-from rille.stages.facts.evaluation import AccuracyFacts, Metric, TruthFacts
+from rille.stages.facts.evaluation import AccuracyFacts, Metric, TruthFacts, metric
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry import rigid
 from rille.stages.geometry.geometry import RigidTransform, rotation_log
@@ -50,13 +49,7 @@ def trajectory_accuracy(
     has both), and metrics by name; with fewer than two frames that have both no error applies.
     """
     has_pose, has_truth = posed(estimate), posed(truth)
-    judged = np.flatnonzero(has_pose & has_truth)
-    figures = {
-        "frames": metric(len(estimate), "frames", "frames that were to be posed"),
-        "frames_missing": metric(int((~has_pose).sum()), "frames", "of them without a pose"),
-        "frames_without_truth": metric(int((~has_truth).sum()), "frames", "of them without truth, left out"),
-        "frames_judged": metric(len(judged), "frames", "of them with a pose and truth"),
-    }
+    judged, figures = np.flatnonzero(has_pose & has_truth), counts(has_pose, has_truth)
     aligned = np.full_like(truth, np.nan)
     if len(judged):
         # By the first frame that has both: a run is judged by what grows from its own start, not by where the truth's
@@ -76,19 +69,36 @@ def trajectory_accuracy(
     return {"position": estimate[:, :, 3].copy(), "position_truth": aligned[:, :, 3].copy()}, figures
 
 
+def counts(has_pose: Bools, has_truth: Bools) -> dict[str, Metric]:
+    """Numbers of frames (frame,) by whether they have a pose and truth, by name."""
+    return {
+        "frames": metric(len(has_pose), "frames", "frames that were to be posed"),
+        "frames_missing": metric(int((~has_pose).sum()), "frames", "of them without a pose"),
+        "frames_without_truth": metric(int((~has_truth).sum()), "frames", "of them without truth, left out"),
+        "frames_judged": metric(int((has_pose & has_truth).sum()), "frames", "of them with a pose and truth"),
+    }
+
+
+def over_length(error: float, truth: Floats, what: str) -> tuple[Metric, Metric]:
+    """Length of the true way (frame, 2 or 3), m, of the judged frames, and an ``error``, m, at its end over it."""
+    length = float(rigid.lengths_along(truth)[-1])
+    drift = 100.0 * error / length if length > 0 else "the camera did not move"
+    way = "true length from the first to the last judged frame, straight over gaps of the truth"
+    return metric(length, "m", way), metric(drift, "%", f"{what}, over the true length")
+
+
 def _absolute(P: Floats, Q: Floats) -> dict[str, Metric]:
     """Errors of positions (frame, 3), m, both in the world; the first and the last frame have both."""
     both = np.isfinite(P + Q).all(axis=1)
     rotation, translation = rigid.umeyama(P[both], Q[both])
     best = rms(P[both] @ rotation.T + translation - Q[both])
-    length, error = float(rigid.lengths_along(Q)[-1]), float(np.linalg.norm(P[-1] - Q[-1]))
-    drift = 100.0 * error / length if length > 0 else "the camera did not move"
-    last, way = "error of the last position with the first poses made equal", "from the first to the last judged frame"
+    error, last = float(np.linalg.norm(P[-1] - Q[-1])), "error of the last position with the first poses made equal"
+    length, drift = over_length(error, Q, last)
     return {
         "ate_rmse": metric(best, "m", "RMS position error after the best rotation and translation, no scale"),
-        "path_length": metric(length, "m", f"true length {way}, straight over gaps of the truth"),
+        "path_length": length,
         "final_error": metric(error, "m", last),
-        "drift": metric(drift, "%", f"{last}, over the true length"),
+        "drift": drift,
     }
 
 

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
-from rille.stages.evaluation.metric import metric
-from rille.stages.facts.evaluation import AgreementFacts, JoinFacts
+from rille.stages.facts.evaluation import AgreementFacts, JoinFacts, metric
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry import rigid
 from rille.stages.geometry.rigid import rms

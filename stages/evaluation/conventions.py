@@ -16,6 +16,7 @@ import numpy as np
 import scipy
 
 from rille.stages.core.arrays import Floats
+from rille.stages.evaluation.imu_check import signed_axes
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
 from rille.stages.geometry.rigid import alignment, angle, compose, inverse, rms, spread
 
@@ -118,11 +119,8 @@ def _fits(P: Floats, Q: Floats, mount: Floats, words: list[str]) -> list[Reading
         doubt = "" if unit in UNITS else ", unless its clock runs otherwise, or the rig's baseline is wrong"
         words = [*words, f"its unit of length is {unit:g} m: state truth.unit = {unit:g}{doubt}"]
         Q = Q * [1.0, 1.0, 1.0, unit]
-    exchanges = scipy.spatial.transform.Rotation.create_group("O").as_matrix()
-    for start in (
-        np.eye(3),
-        min(exchanges, key=lambda B: _misfit(P, Q @ _turn(B))),
-    ):
+    exchanges = [S for S in signed_axes() if np.linalg.det(S) > 0]
+    for start in (exchanges[0], min(exchanges, key=lambda B: _misfit(P, Q @ _turn(B)))):
         turn = start
         for _ in range(10):
             # In turn: the world's rotation for this body, by the positions above all, and the body's for this world.

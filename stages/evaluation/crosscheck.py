@@ -24,7 +24,7 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, Memory, Params, stage
 from rille.stages.facts.evaluation import WindowFacts
 from rille.stages.geometry.epipolar import distances
-from rille.stages.geometry.geometry import Camera, Rig
+from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.features import PIXEL_CENTRE, match
 
 SPAN = 2
@@ -88,36 +88,34 @@ def image_pairs(frames: int) -> list[tuple[int, int]]:
     return pairs
 
 
-def _write_rig(database: Any, rig: Rig) -> list[Any]:
+def colmap_rig(rig: Rig) -> tuple[list[Any], Any]:
+    """Left and right camera as COLMAP has them, without lens distortion, and their rig."""
     import pycolmap
 
-    cameras = [_camera(number, camera) for number, camera in ((1, rig.left), (2, rig.right))]
-    for camera in cameras:
-        database.write_camera(camera, use_camera_id=True)
+    cameras = []
+    for number, camera in ((1, rig.left), (2, rig.right)):
+        values = [camera.fx, camera.fy, camera.cx + PIXEL_CENTRE, camera.cy + PIXEL_CENTRE]
+        size = {"width": camera.width, "height": camera.height}
+        cameras.append(pycolmap.Camera(model="PINHOLE", params=values, camera_id=number, **size))
+        cameras[-1].has_prior_focal_length = True
     body = pycolmap.Rig(rig_id=1)
     body.add_ref_sensor(cameras[0].sensor_id)
     # COLMAP's sensor_from_rig is the pose of the right camera in the frame of the left, as ours.
     body.add_sensor(cameras[1].sensor_id, pycolmap.Rigid3d(np.array(rig.T_right_left.matrix34)))
-    database.write_rig(body, use_rig_id=True)
-    return cameras
+    return cameras, body
 
 
-def _camera(number: int, camera: Camera) -> Any:
-    import pycolmap
-
-    values = [camera.fx, camera.fy, camera.cx + PIXEL_CENTRE, camera.cy + PIXEL_CENTRE]
-    out = pycolmap.Camera(model="PINHOLE", width=camera.width, height=camera.height, params=values, camera_id=number)
-    out.has_prior_focal_length = True
-    return out
-
-
-def _write_frames(database: Any, cameras: list[Any], features: Sequence[Bundle]) -> Verified:
-    """Features and verified matches to the database; the matches of each image pair that has enough.
+def _write_frames(database: Any, rig: Rig, features: Sequence[Bundle]) -> Verified:
+    """Rig, features and verified matches to the database; the matches of each image pair that has enough.
 
     ``features`` of stage ``features``, left and right in turn.
     """
     import pycolmap
 
+    cameras, body = colmap_rig(rig)
+    for camera in cameras:
+        database.write_camera(camera, use_camera_id=True)
+    database.write_rig(body, use_rig_id=True)
     points = [np.asarray(b["points"]) for b in features]
     descriptors = [np.asarray(b["descriptors"], np.float32) for b in features]
     for k in range(len(features) // 2):
@@ -248,7 +246,7 @@ def crosscheck_stage(
     pycolmap.logging.minloglevel = 3  # fatal: what goes wrong is said by the result
     features = list(itertools.chain.from_iterable(zip(left, right, strict=True)))
     with pycolmap.Database.open(":memory:") as database:
-        verified = _write_frames(database, _write_rig(database, rig), features)
+        verified = _write_frames(database, rig, features)
         stereo = _stereo_points(features, verified)
         models = _models(database, {left: _near(rig, *points) for left, points in stereo.items()})
     poses, reprojection, reason = np.full((len(frames), 3, 4), np.nan), None, ""

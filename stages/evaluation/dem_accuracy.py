@@ -16,8 +16,7 @@ from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Bundle, NoParams, raster, stage
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation.dem_comparison import figures
-from rille.stages.evaluation.metric import metric
-from rille.stages.facts.evaluation import DemAccuracyFacts, Metric
+from rille.stages.facts.evaluation import DemAccuracyFacts, Metric, metric
 from rille.stages.geometry.lattice import Lattice, mosaic
 
 ERRORS: Mapping[str, str] = {

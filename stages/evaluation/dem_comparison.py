@@ -123,10 +123,15 @@ def common(a: Grid, b: Grid) -> tuple[Grid, Grid, str]:
     brought = Grid(values, target.matrix)
     pair = (brought, target) if name == "A" else (target, brought)
     if not (np.isfinite(values) & np.isfinite(target.values)).any():
-        raise InputError(
-            "RIL-323", "they have no known cell in common", remedy="compare models of the same place and frame"
-        )
+        text = f"no known cell in common: A is at {_outline(a)}, B at {_outline(b)}"
+        raise InputError("RIL-323", text, remedy="compare models of the same place and frame")
     return *pair, how
+
+
+def _outline(grid: Grid) -> str:
+    """Where the known cells of a model lie."""
+    (x0, y0), (x1, y1) = (edge(grid.centres()[np.isfinite(grid.values)], axis=0) for edge in (np.min, np.max))
+    return f"x {x0:.6g}..{x1:.6g}, y {y0:.6g}..{y1:.6g} m"
 
 
 @dataclass(frozen=True)
@@ -182,11 +187,10 @@ def align(a: Grid, b: Grid, kind: Align) -> Alignment:
     # Cells at a border that come and go from step to step keep the motion from settling, but within its own errors.
     if (np.abs(step) < sigma).all():
         return state
-    raise DegenerateError(
-        "RIL-324",
-        f"no alignment after {MAX_ITERATIONS} steps: the last one still moved by {np.abs(step / unit).max():.2g} cells",
-        remedy="choose fewer freedoms (tilt or shift), or bring the models closer first",
-    )
+    cells = np.abs(step / unit).max()
+    text = f"no alignment after {MAX_ITERATIONS} steps: the last one still moved by {cells:.2g} cells"
+    remedy = "choose fewer freedoms (tilt or shift), or bring the models closer first"
+    raise DegenerateError("RIL-324", text, remedy=remedy)
 
 
 def _difference(b: Grid, slopes: Floats, points: Floats) -> tuple[Floats, Floats]:
@@ -204,11 +208,8 @@ def _gauss_newton(
     difference, normal = _difference(b, slopes, moved)
     good = np.isfinite(difference) & np.isfinite(normal).all(axis=1)
     if good.sum() < 10 * len(free):
-        raise DegenerateError(
-            "RIL-325",
-            f"{int(good.sum())} cells are left to align by",
-            remedy="leave --align out, or choose overlapping models",
-        )
+        text = f"{int(good.sum())} cells are left to align by"
+        raise DegenerateError("RIL-325", text, remedy="leave --align out, or choose overlapping models")
     r, n = difference[good], normal[good]
     # Rotations turn about the moved centre: their correlation with the shifts is then least.
     q = moved[good] - state.centre - state.translation
@@ -218,12 +219,9 @@ def _gauss_newton(
     N = (J * w[:, None]).T @ J
     values = np.linalg.eigvalsh(N)
     if not values[0] * MAX_CONDITION > values[-1]:
-        raise DegenerateError(
-            "RIL-326",
-            f"the terrain is too flat to align by: condition {values[-1] / max(values[0], 1e-300):.1e}, "
-            f"more than {MAX_CONDITION:.0e}",
-            remedy="choose --align tilt, which flat terrain determines",
-        )
+        condition = values[-1] / max(values[0], 1e-300)
+        text = f"the terrain is too flat to align by: condition {condition:.1e}, more than {MAX_CONDITION:.0e}"
+        raise DegenerateError("RIL-326", text, remedy="choose --align tilt, which flat terrain determines")
     step = -np.linalg.solve(N, (J * w[:, None]).T @ r)
     variance = float((w * r * r).sum()) / max(float(w.sum()) - len(free), 1.0)
     return step * unit, np.sqrt(variance * np.diag(np.linalg.inv(N))) * unit, int(good.sum())

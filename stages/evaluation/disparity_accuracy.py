@@ -12,8 +12,7 @@ import numpy as np
 from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.core.validity import matched
-from rille.stages.evaluation.metric import metric
-from rille.stages.facts.evaluation import Metric, MetricsFacts
+from rille.stages.facts.evaluation import Metric, MetricsFacts, metric
 from rille.stages.facts.matching import DisparityFacts
 
 THRESHOLDS_PX = (1, 2, 4)

@@ -19,8 +19,7 @@ import numpy as np
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.evaluation.accuracy import trajectory_accuracy
-from rille.stages.evaluation.metric import metric
-from rille.stages.facts.evaluation import DriveCheckFacts, Metric, TruthFacts
+from rille.stages.facts.evaluation import DriveCheckFacts, Metric, TruthFacts, metric
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry.geometry import way_length
 

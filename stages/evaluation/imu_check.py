@@ -56,16 +56,13 @@ def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) ->
     given = [0.1 * off[0] * (S is signed_axes()[0]) for _, S in readings]
     best = int(np.argmin(np.subtract(off, given)))
     factor, S = readings[best]
-    return [
-        f"the IMU contradicts the images: between frames it turns {np.degrees(off[0]):.2g} degrees otherwise (median); "
-        + ("" if factor == 1.0 else "its rates are in degrees a second: name its columns so, [deg/s]; ")
-        + (
-            ""
-            if np.allclose(S, np.eye(3))
-            else f"its x, y and z would have to be its {names(S)}: exchange its columns; "
-        )
-        + f"that leaves {np.degrees(off[best]):.2g} degrees"
-    ]
+    turned = f"between frames it turns {np.degrees(off[0]):.2g} degrees otherwise (median)"
+    words = [f"the IMU contradicts the images: {turned}"]
+    if factor != 1.0:
+        words.append("its rates are in degrees a second: name its columns so, [deg/s]")
+    if not np.allclose(S, np.eye(3)):
+        words.append(f"its x, y and z would have to be its {names(S)}: exchange its columns")
+    return ["; ".join([*words, f"that leaves {np.degrees(off[best]):.2g} degrees"])]
 
 
 def of_gravity(given: Floats, seen: Floats, axes: Floats) -> list[str]:

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
-from rille.stages.evaluation.metric import metric
-from rille.stages.facts.evaluation import Metric, MetricsFacts
+from rille.stages.facts.evaluation import Metric, MetricsFacts, metric
 from rille.stages.geometry.geometry import way_length
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.rigid import lengths_along

@@ -1,12 +1,15 @@
-"""Where the ortho image of one model lies in that of another of the same place: for runs whose world frames differ.
+"""Where one model lies in another of the same place: for runs whose world frames differ.
 
-Keypoints of both images (SIFT, Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94) that are alike, and the turn and
-shift that most of them agree on. Both images are in metres, so that a scale other than 1 is a wrong place.
+Ortho images tell it by the keypoints (SIFT, Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94) that are alike, and the
+turn and shift that most of them agree on. Both images are in metres, so that a scale other than 1 is a wrong place.
+Under another sun, or over ground that was raked, they show no place that both share; the relief does
+(:mod:`rille.stages.terrain.map_localization`), and has to be unlike every other place.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -14,8 +17,12 @@ import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray
-from rille.stages.core.errors import DegenerateError
+from rille.stages.core.errors import DegenerateError, InputError
+from rille.stages.evaluation.dem_comparison import Grid
+from rille.stages.geometry.geometry import RigidTransform, heading_of, rotation_exp
+from rille.stages.geometry.lattice import Lattice
 from rille.stages.imaging.features import UNIT_BYTES, match
+from rille.stages.terrain.map_localization import Fix, GlobalMap, MapLocalizationParams, SearchArea, fix
 
 KEYPOINTS = 8000
 """Of an image."""
@@ -36,14 +43,6 @@ RIVAL_SHARE = 0.5
 """Of the matches that agree: when as many agree on another place, both are possible."""
 
 
-class Ortho(NamedTuple):
-    """Grey image (row, col), which of its cells are known, and the map (2, 3) from (col, row, 1) to x, y, metres."""
-
-    grey: AnyArray
-    known: Bools
-    matrix: Floats
-
-
 class PlacedImage(NamedTuple):
     """``motion`` (2, 3) from x, y of A to those of B, a turn and a shift, on which ``agreeing`` matches agree.
 
@@ -56,16 +55,103 @@ class PlacedImage(NamedTuple):
     sigma: Floats
 
 
-def place(a: Ortho, b: Ortho) -> PlacedImage:
-    """Where A lies in B.
+class Registration(NamedTuple):
+    """``motion`` (2, 3) from x, y of A to those of B, a turn and a shift; ``by`` what it was found, in words; ``sigma``
+    (3,): standard deviations of the shift, m, and of the turn, rad."""
+
+    motion: Floats
+    by: str
+    sigma: Floats
+
+
+def register(images: tuple[Grid, Grid], heights: tuple[Grid, Grid]) -> Registration:
+    """Find where A lies in B, without a start, by the ortho images of both or else their elevations, all in metres.
+
+    Raises
+    ------
+    DegenerateError
+        Neither the images nor the relief tell one place.
+    """
+    try:
+        placed = place(*images)
+    except DegenerateError:
+        found = _by_relief(*heights)
+        if found is None:
+            raise
+        return found
+    return Registration(placed.motion, f"ortho images, {placed.agreeing} keypoints", placed.sigma)
+
+
+def _by_relief(a: Grid, b: Grid) -> Registration | None:
+    """The only place whose relief fits; None where there is none, or another fits nearly as well."""
+    (along, turned, x0), (across, down, y0) = a.matrix
+    if not (along > 0 and abs(down + along) < 1e-6 * along and max(abs(turned), abs(across)) < 1e-9 * along):
+        return None  # its rows are turned against the axes, or its cells are no squares
+    try:
+        model = Lattice(float(x0), float(y0), float(along), *a.values.shape)
+        found = relief(a.values, model, b, None, MapLocalizationParams.model_validate({}))
+    except (DegenerateError, InputError):
+        return None
+    if found.doubt:
+        return None
+    motion = np.column_stack([found.pose.rotation[:2, :2], found.pose.translation[:2]])
+    # A tilt, which the elevations tell later, shortens the level part of the rotation.
+    motion[:, :2] /= math.sqrt(np.linalg.det(motion[:, :2]))
+    return Registration(motion, f"relief, {found.cells} cells", np.sqrt(np.diag(found.covariance))[[0, 1, 5]])
+
+
+def level_pose(motion: Floats) -> RigidTransform:
+    """Turn and shift of a motion (2, 3) in the plane, as those of space."""
+    turn = rotation_exp([0.0, 0.0, math.atan2(motion[1, 0], motion[0, 0])])
+    return RigidTransform(turn, np.array([*motion[:, 2], 0.0]))
+
+
+def relief(
+    elevation: Floats, lattice: Lattice, ground: Grid, around: SearchArea | None, params: MapLocalizationParams
+) -> Fix:
+    """Place a level model (row, col), m, in a model of more ground, whose rows may be turned or mirrored.
+
+    Parameters
+    ----------
+    around : what of the ground is searched; None: all of it.
+
+    Raises
+    ------
+    DegenerateError
+        The model covers too few cells, or the ground is too flat to tell.
+    InputError
+        Nowhere within the search the ground is known, or the search is too wide.
+    """
+    # The search is in a frame along the rows of the ground.
+    values, matrix, (rows, cols) = ground.values, ground.matrix, ground.values.shape
+    if np.linalg.det(matrix[:, :2]) > 0:
+        values, matrix = values[::-1], matrix @ np.array([[1.0, 0.0, 0.0], [0.0, -1.0, rows - 1.0], [0.0, 0.0, 1.0]])
+    to_ground = level_pose(matrix)
+    middle = 0.5 * ground.cell * (cols - 1), 0.5 * ground.cell * (1 - rows)
+    everywhere = math.hypot(*middle) + lattice.radius
+    area = SearchArea(*middle, 0.0, everywhere, math.pi)
+    if around is not None:
+        x, y, _ = to_ground.inverse().apply([around.x, around.y, 0.0])
+        distance = min(around.distance, everywhere + math.hypot(middle[0] - x, middle[1] - y))
+        area = SearchArea(float(x), float(y), around.heading - heading_of(to_ground), distance, around.turn)
+    placed = fix(elevation, lattice, GlobalMap(values, 0.0, 0.0, ground.cell), area, params)
+    both, other = np.kron(np.eye(2), to_ground.rotation), placed.other
+    if other is not None:
+        (x, y, heading), chi2 = other
+        other = np.array([*to_ground.apply([x, y, 0.0])[:2], heading + heading_of(to_ground)]), chi2
+    return replace(placed, pose=to_ground @ placed.pose, covariance=both @ placed.covariance @ both.T, other=other)
+
+
+def place(a: Grid, b: Grid) -> PlacedImage:
+    """Where the grey image A lies in the image B, by their keypoints.
 
     Raises
     ------
     DegenerateError
         Too few matches agree: the images show other places, or another light; or half as many agree on another place.
     """
-    near = NEAR_CELLS * max(_cell(a), _cell(b))
-    (here, one), (there, other) = _described(a, _cell(b)), _described(b, _cell(a))
+    near = NEAR_CELLS * max(a.cell, b.cell)
+    (here, one), (there, other) = _described(a, b.cell), _described(b, a.cell)
     alike = match(one, other)
     p, q = here[alike[:, 0]], there[alike[:, 1]]
     motion, used = _agreed(p, q, near)
@@ -101,19 +187,15 @@ def _agreed(p: Floats, q: Floats, near: float) -> tuple[Floats | None, Bools]:
     return np.column_stack([motion[:, :2], motion[:, 2] + b - motion[:, :2] @ a]), used.ravel() != 0
 
 
-def _cell(image: Ortho) -> float:
-    return float(np.sqrt(abs(np.linalg.det(image.matrix[:, :2]))))
-
-
-def _described(image: Ortho, other: float) -> tuple[Floats, AnyArray]:
+def _described(image: Grid, other: float) -> tuple[Floats, AnyArray]:
     """Places x, y (n, 2) of keypoints, metres, and descriptors (n, 128); in an image no finer than ``other``, m."""
-    grey, known, matrix = np.nan_to_num(image.grey), image.known.astype(np.float32), image.matrix
-    ratio = other / _cell(image)
+    grey: AnyArray = np.nan_to_num(image.values.astype(np.float32))
+    known, matrix, ratio = np.isfinite(image.values).astype(np.float32), image.matrix, other / image.cell
     if ratio > MAX_RATIO:
         rows, cols = (max(1, round(n / ratio)) for n in grey.shape)
         step = np.diag([grey.shape[1] / cols, grey.shape[0] / rows])
         shares = cv2.resize(known, (cols, rows), interpolation=cv2.INTER_AREA)
-        sums = cv2.resize(np.where(image.known, grey, 0), (cols, rows), interpolation=cv2.INTER_AREA)
+        sums = cv2.resize(grey, (cols, rows), interpolation=cv2.INTER_AREA)
         grey, known = sums / np.maximum(shares, 1e-6), (shares > 0.5).astype(np.float32)
         matrix = np.column_stack([matrix[:, :2] @ step, matrix @ [*(0.5 * (np.diag(step) - 1.0)), 1.0]])
     low, high = np.percentile(grey[known > 0], (1, 99)) if known.any() else (0.0, 255.0)

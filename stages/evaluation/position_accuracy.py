@@ -26,11 +26,11 @@ import scipy
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
+from rille.stages.evaluation.accuracy import counts, over_length
 from rille.stages.evaluation.conventions import UNITS
-from rille.stages.evaluation.metric import metric
-from rille.stages.facts.evaluation import AccuracyFacts, Metric
+from rille.stages.facts.evaluation import AccuracyFacts, Metric, metric
 from rille.stages.facts.odometry import TrajectoryFacts
-from rille.stages.geometry.rigid import by_frame, lengths_along, rms, umeyama
+from rille.stages.geometry.rigid import by_frame, rms, umeyama
 from rille.stages.odometry.resection.trajectory import world_poses
 
 MIN_FRAMES = 4
@@ -302,12 +302,7 @@ def _otherwise(truth: Floats) -> dict[str, Floats]:
 def _figures(estimate: Floats, truth: Floats, how: str) -> dict[str, Metric]:
     """Figures of positions (frame, 3) against those of the truth (frame, 2 or 3), both in the world."""
     both, width = _both(estimate, truth), truth.shape[1]
-    compared = int(both.sum())
-    figures = {
-        "frames": metric(len(estimate), "frames", "frames that were to be posed"),
-        "frames_missing": metric(int(np.isnan(estimate[:, 0]).sum()), "frames", "of them without a pose"),
-        "frames_judged": metric(compared, "frames", "of them with a pose and a true position"),
-    }
+    figures, compared = counts(np.isfinite(estimate[:, 0]), np.isfinite(truth[:, 0])), int(both.sum())
     if compared < MIN_FRAMES:
         why = f"{compared} frames have a pose and a true position, {MIN_FRAMES} are needed"
         return figures | {"position_rmse": metric(why, "m", how)}
@@ -315,15 +310,14 @@ def _figures(estimate: Floats, truth: Floats, how: str) -> dict[str, Metric]:
     away = np.linalg.norm(error, axis=1)
     first, last = np.flatnonzero(both)[[0, -1]]
     # With the truth of frames between that have no pose: the true path leads on there.
-    length = float(lengths_along(truth[first : last + 1])[-1])
-    drift = 100.0 * float(np.linalg.norm(error[-1] - error[0])) / length if length > 0 else None
-    way = "from the first to the last compared frame"
+    whole = truth[first : last + 1]
+    length, drift = over_length(float(np.linalg.norm(error[-1] - error[0])), whole, f"error of the way, {how}")
     return figures | {
         "position_rmse": metric(rms(error), "m", f"RMS error, {how}"),
         "position_median": metric(float(np.median(away)), "m", f"median error, {how}"),
         "position_max": metric(float(away.max()), "m", f"largest error, {how}"),
-        "path_length": metric(length, "m", f"true length {way}, straight over gaps of the truth"),
-        "position_drift": metric(drift, "%", f"error of the way {way} over its true length, {how}"),
+        "path_length": length,
+        "position_drift": drift,
     }
 
 

@@ -1,11 +1,25 @@
 """Facts of the stages that compare results with the truth, or with another program's."""
 
+import math
 from typing import Any
 
 from rille.stages.core.declare import Facts
 
 Metric = dict[str, Any]
 """Value, unit, and how it was measured."""
+
+Value = float | int | str | None
+"""A figure; or why it does not apply."""
+
+
+def metric(value: Value, unit: str, how: str) -> Metric:
+    """Return one figure of the report: ``value``, its ``unit``, and ``how`` it was measured.
+
+    A text instead of a value says why the figure does not apply. None, NaN and infinity become None as well.
+    """
+    if isinstance(value, str):
+        return {"value": None, "unit": unit, "how": f"not applicable: {value}"}
+    return {"value": value if value is not None and math.isfinite(value) else None, "unit": unit, "how": how}
 
 
 class TruthFacts(Facts):

@@ -107,6 +107,12 @@ class Lattice:
         x, y = self.xs(), self.ys()
         return float(x[0]) - half, float(x[-1]) + half, float(y[-1]) - half, float(y[0]) + half
 
+    @property
+    def radius(self) -> float:
+        """Distance, m, of the farthest corner from the origin."""
+        x0, x1, y0, y1 = self.bounds
+        return math.hypot(max(-x0, x1), max(-y0, y1))
+
     def xs(self) -> Floats:
         """Coordinate x (cols,) of the cell centres, metres."""
         # Integer times cell, not a sum of steps: the same cell has the same bits in every lattice.

@@ -37,11 +37,10 @@ def reconstruct(
     shutil.copytree(place / "good", folder)
     spoil(folder)
     capsys.readouterr()
-    options = session.Options(
-        str(folder), PLAIN, executor="inline", progress="quiet", runs=place / "runs", cache=place / "cache"
-    )
-    code = session.reconstruct(options)
-    return code, capsys.readouterr().err, (place / "runs" / name / "latest").resolve()
+    options = session.Options(PLAIN, executor="inline", progress="quiet", runs=place / "runs", cache=place / "cache")
+    result = session.perform(str(folder), options)
+    result.print()
+    return result.code, capsys.readouterr().err, (place / "runs" / name / "latest").resolve()
 
 
 def files(folder: Path, frame: int) -> list[Path]:

@@ -41,7 +41,7 @@ SMALL = (
 
 def options(folder: Path, *more: str, **kw: Any) -> session.Options:
     defaults: dict[str, Any] = {"executor": "inline", "progress": "quiet", "cache": folder / "cache"}
-    return session.Options("mockup-short", assignments=(*SMALL, *more), runs=folder / "runs", **(defaults | kw))
+    return session.Options((*SMALL, *more), runs=folder / "runs", **(defaults | kw))
 
 
 def latest(folder: Path) -> Path:
@@ -63,7 +63,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def cold(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("chain")
-    assert session.reconstruct(options(folder)) == 0
+    assert session.perform("mockup-short", options(folder)).code == 0
     return folder
 
 
@@ -125,19 +125,19 @@ def test_the_same_again_computes_nothing(cold: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr("rille.pipeline.engine.run.make", no_worker)
     before = digests(cold)
-    assert session.reconstruct(options(cold, executor="dask")) == 0
+    assert session.perform("mockup-short", options(cold, executor="dask")).code == 0
     assert computed(cold) == set()
     assert digests(cold) == before
 
 
 def test_what_is_done_to_the_files_of_a_run_reaches_neither_the_cache_nor_the_next_run(cold: Path) -> None:
-    assert session.reconstruct(options(cold)) == 0
+    assert session.perform("mockup-short", options(cold)).code == 0
     first = latest(cold)
     written = contents(first)
     for path in first.rglob("*"):
         if path.is_file():
             path.write_bytes(b"edited in place")
-    assert session.reconstruct(options(cold)) == 0
+    assert session.perform("mockup-short", options(cold)).code == 0
     assert latest(cold) != first
     assert computed(cold) == set()
     again = contents(latest(cold))
@@ -147,7 +147,7 @@ def test_what_is_done_to_the_files_of_a_run_reaches_neither_the_cache_nor_the_ne
 
 
 def test_a_damaged_output_is_drawn_again(cold: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert session.reconstruct(options(cold)) == 0
+    assert session.perform("mockup-short", options(cold)).code == 0
     before, written = digests(cold), (latest(cold) / "path.gpkg").read_bytes()
     path = next((cold / "cache").glob("artifacts/output.paths/*/*.zip"))
     with zipfile.ZipFile(path) as archive:
@@ -155,11 +155,11 @@ def test_a_damaged_output_is_drawn_again(cold: Path, capsys: pytest.CaptureFixtu
         start = member.header_offset + len(member.FileHeader())
     data = path.read_bytes()
     path.write_bytes(data[:start] + bytes(member.file_size) + data[start + member.file_size :])
-    assert session.reconstruct(options(cold)) == 0
+    assert session.perform("mockup-short", options(cold)).code == 0
     assert "is damaged" in capsys.readouterr().err
     assert (latest(cold) / "path.gpkg").read_bytes() == written
     assert digests(cold) == before
-    assert session.reconstruct(options(cold)) == 0
+    assert session.perform("mockup-short", options(cold)).code == 0
     assert "is damaged" not in capsys.readouterr().err, "the artifact was replaced"
 
 
@@ -174,7 +174,9 @@ def test_a_figure_that_cannot_be_drawn_is_missing(
         return FIGURE.validate_json(failed) if title == "Pairs" else Figure(title)
 
     monkeypatch.setattr(run_files, "FIGURE", SimpleNamespace(validate_json=read))
-    assert session.reconstruct(options(cold)) == 3
+    result = session.perform("mockup-short", options(cold))
+    assert result.code == 3
+    result.print()
     told = capsys.readouterr()
     assert "rille: missing: Pairs: drawing failed, ZeroDivisionError" in told.err
     found = json.loads((latest(cold) / "report.json").read_text())
@@ -186,7 +188,7 @@ def test_a_figure_that_cannot_be_drawn_is_missing(
 
 
 def test_one_risk_parameter_reruns_risk_path_and_what_reads_them(cold: Path) -> None:
-    assert session.reconstruct(options(cold, "risk.max_hole=0.25")) == 0
+    assert session.perform("mockup-short", options(cold, "risk.max_hole=0.25")).code == 0
     labels = computed(cold)
     assert {label.split("/")[0] for label in labels} == {"risk", "path", "path_check", "output"}
     drawn = {label.removeprefix("output/") for label in labels if label.startswith("output/")}
@@ -196,7 +198,7 @@ def test_one_risk_parameter_reruns_risk_path_and_what_reads_them(cold: Path) -> 
 
 def test_what_the_data_do_not_determine_is_missing_and_the_rest_is_delivered(cold: Path, tmp_path: Path) -> None:
     folder = tmp_path / "runs"
-    assert session.reconstruct(replace(options(cold, "vehicle.track=5.0"), runs=folder)) == 3
+    assert session.perform("mockup-short", replace(options(cold, "vehicle.track=5.0"), runs=folder)).code == 3
     latest = folder / "mockup-short" / "latest"
     assert {"dem.tif", "trajectory.tum", "report.html"} <= {p.name for p in latest.iterdir()}
     report = json.loads((latest / "report.json").read_text())
@@ -207,30 +209,29 @@ def test_what_the_data_do_not_determine_is_missing_and_the_rest_is_delivered(col
 
     # one model without a cell: the world is made of the others
     behind = options(cold, "locus.extent=[-0.1, 0.1, -9.0, -8.9]")
-    assert session.reconstruct(replace(behind, runs=folder)) == 3
+    assert session.perform("mockup-short", replace(behind, runs=folder)).code == 3
     written = {p.name for p in latest.iterdir()}
     assert {"trajectory.tum", "report.html"} <= written
     assert "dem.tif" not in written
 
 
 def test_written_configuration_repeats_the_run(cold: Path) -> None:
-    assert session.reconstruct(options(cold)) == 0
+    assert session.perform("mockup-short", options(cold)).code == 0
     first = digests(cold)
     again = session.Options(
-        "mockup-short",
         config=latest(cold) / "config.toml",
         runs=cold / "runs",
         cache=cold / "cache",
         executor="inline",
         progress="quiet",
     )
-    assert session.reconstruct(again) == 0
+    assert session.perform("mockup-short", again).code == 0
     assert computed(cold) == set()
     assert digests(cold) == first
 
 
 def test_two_workers_killed_on_the_way_give_the_same_bits(cold: Path, tmp_path: Path) -> None:
-    assert session.reconstruct(options(cold)) == 0
+    assert session.perform("mockup-short", options(cold)).code == 0
     command = [sys.executable, "-m", "rille.pipeline.cli", "reconstruct", "mockup-short", "--jobs", "2", "--quiet"]
     command += [w for a in SMALL for w in ("--set", a)]
     command += ["--cache", str(tmp_path / "cache"), "--runs", str(tmp_path / "runs")]

@@ -10,7 +10,7 @@ from rille.pipeline.runs import session
 
 
 def test_ctrl_c_says_what_the_documents_say(monkeypatch, capsys):
-    def interrupted(options):
+    def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(session, "perform", interrupted)

@@ -6,15 +6,14 @@ small drive of simulated sequences, in a temporary folder. What they compile sta
 
 from __future__ import annotations
 
-import io
 import sys
 import tempfile
 import time
-from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 
-from rille.pipeline.commands.options import COMPLETE, Options
 from rille.pipeline.engine.runtime import kernels
+from rille.pipeline.runs.options import COMPLETE, Options
 from rille.pipeline.runs.session import perform
 
 SMALL = (
@@ -36,11 +35,12 @@ def compile_kernels() -> int:
     """
     print("rille: compiling kernels; from nothing this takes one to two minutes", file=sys.stderr)
     began, before = time.perf_counter(), _kernels()
-    with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-        runs, cache = Path(folder) / "runs", f"{folder}/cache"
-        perform(Options("mockup-short", SMALL, runs=runs, cache=cache, progress="quiet"))
+    with tempfile.TemporaryDirectory() as folder:
+        options = Options(SMALL, runs=Path(folder) / "runs", cache=f"{folder}/cache", quiet=True)
+        perform("mockup-short", options, warn=lambda _: None)
         # A drive that ends, far from its goal, when all kernels of driving were called
-        perform(Options("mockup-loop", ("drive.max_stops=3",), runs=runs, cache=cache, progress="quiet", verb="drive"))
+        driven = replace(options, assignments=("drive.max_stops=3",))
+        perform("mockup-loop", driven, verb="drive", warn=lambda _: None)
     made, seconds = len(_kernels() - before), time.perf_counter() - began
     print(f"{kernels.folder()}  kernels compiled: {made}, in {seconds:.0f} s")
     return COMPLETE

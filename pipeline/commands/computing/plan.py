@@ -11,14 +11,12 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable
-from dataclasses import replace
 from itertools import chain
 from typing import Annotated
 
 from cyclopts import Parameter
 
 from rille.datasets.text.count import count
-from rille.pipeline.commands.options import COMPLETE, FLAG, Settings, Work, cache_folder
 from rille.pipeline.engine import memory
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.memory import words
@@ -28,6 +26,7 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
+from rille.pipeline.runs.options import COMPLETE, FLAG, Settings, Work, cache_folder
 from rille.pipeline.runs.session import memory_limit, settings, settings_of_run
 from rille.stages.core.errors import ConfigError
 
@@ -52,7 +51,7 @@ def plan(
     verbose
         Each task with its reason.
     """
-    settled = settings_of_run(replace(options, sequence=seq))
+    settled = settings_of_run(seq, options)
     sequence, frames, config = settled.sequence, settled.frames, settled.config
     graph, store = Graph(), Store(cache_folder(options.cache))
     products, drive = dataflow(graph, sequence, config, frames)
@@ -158,7 +157,7 @@ def graph(seq: str = "mockup", *, options: Settings = _SETTINGS) -> int:
     seq
         As for reconstruct.
     """
-    settled = settings(replace(options, sequence=seq))
+    settled = settings(seq, options)
     laid_out = Graph()
     dataflow(laid_out, settled.sequence, settled.config, settled.frames)
     result = run(laid_out, Store(cache_folder(options.cache)), RunOptions(dry=True))

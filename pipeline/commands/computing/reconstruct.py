@@ -7,10 +7,10 @@ from pathlib import Path
 
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands import batch
-from rille.pipeline.commands.options import COMPLETE, HOLES, DriveOptions, Options
 from rille.pipeline.engine.plain import some, warn
 from rille.pipeline.export.programs import rocrate
 from rille.pipeline.runs import session
+from rille.pipeline.runs.options import COMPLETE, HOLES, DriveOptions, Options
 
 _OPTIONS, _DRIVE = Options(), DriveOptions()
 
@@ -30,33 +30,34 @@ def reconstruct(seq: str = "mockup", *more: str, options: Options = _OPTIONS) ->
         Others, which follow one after another.
     """
     if not more:
-        return _perform(replace(options, sequence=seq))[0]
+        return _perform(seq, options)[0]
     sequences = (seq, *more)
-    ended = batch.each(sequences, lambda name: _perform(replace(options, sequence=name)), keep_going=options.keep_going)
+    ended = batch.each(sequences, lambda name: _perform(name, options), keep_going=options.keep_going)
     print(batch.table(ended, sequences))
     return batch.worst(ended)
 
 
-def _perform(options: Options) -> tuple[int, Path]:
+def _perform(seq: str, options: Options) -> tuple[int, Path]:
     """Run a sequence, or the run of a crate anew; the exit code and the folder of the results."""
-    if not (Path(options.sequence) / rocrate.METADATA).is_file():
-        return session.perform(options)
-    crate = rocrate.read(Path(options.sequence))
-    frames = crate.options.get("--frames", (None,))[-1]
-    again = replace(
-        options,
-        sequence=crate.sequence,
-        config=options.config or crate.folder / "config.toml",
-        frames=options.frames or frames,
-        until=options.until or crate.options.get("--until", ()),
-        only=options.only or crate.options.get("--only", ()),
-    )
-    code, run = session.perform(again)
-    unlike = crate.unlike(run)
+    crate = rocrate.read(Path(seq)) if (Path(seq) / rocrate.METADATA).is_file() else None
+    if crate is not None:
+        frames = crate.options.get("--frames", (None,))[-1]
+        options = replace(
+            options,
+            config=options.config or crate.folder / "config.toml",
+            frames=options.frames or frames,
+            until=options.until or crate.options.get("--until", ()),
+            only=options.only or crate.options.get("--only", ()),
+        )
+    result = session.perform(seq if crate is None else crate.sequence, options)
+    result.print()
+    if crate is None:
+        return result.code, result.folder
+    unlike = crate.unlike(result.folder)
     print(f"{len(crate.digests) - len(unlike)} of {len(crate.digests)} results are those of {crate.folder}, to the bit")
     if unlike:
         warn(warning("RIL-041", f"other results than those of the crate: {some(unlike, 6)}"))
-    return max(code, HOLES if unlike else COMPLETE), run
+    return max(result.code, HOLES if unlike else COMPLETE), result.folder
 
 
 def drive(seq: str = "mockup-loop", *, options: DriveOptions = _DRIVE) -> int:
@@ -70,4 +71,6 @@ def drive(seq: str = "mockup-loop", *, options: DriveOptions = _DRIVE) -> int:
     seq
         A simulated sequence; mockup-loop.
     """
-    return session.reconstruct(replace(options, sequence=seq, verb="drive"))
+    result = session.perform(seq, options, verb="drive")
+    result.print()
+    return result.code

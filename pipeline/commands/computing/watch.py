@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import shutil
 import sys
 import time
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -15,15 +13,18 @@ from rille.datasets.images.arrivals import Arrivals
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.registry import open_sequence
 from rille.pipeline.commands.complaints import complain
-from rille.pipeline.commands.options import HOLES, INTERRUPTED, WatchOptions, cache_folder
-from rille.pipeline.engine.plain import some
+from rille.pipeline.engine.plain import some, warned
 from rille.pipeline.engine.workers import Workers
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.runs import session
+from rille.pipeline.runs.options import HOLES, INTERRUPTED, WatchOptions, cache_folder
 from rille.stages.core.errors import ConfigError, IncompleteError, InputError, RilleError
 
 UPDATED = ("trajectory.tum", "trajectory.kitti", "dem.tif", "dem_sigma.tif", "risk.tif", "path.gpkg")
 """Files that each update makes; all others, COLMAP's trajectory and the figures follow at the end."""
+
+GAP_SECONDS = 10.0
+"""Time for which a pair between others is waited for; then it counts as lost until it is there."""
 
 _OPTIONS = WatchOptions()
 
@@ -40,7 +41,7 @@ def watch(seq: str, *, options: WatchOptions = _OPTIONS) -> int:
     """
     configuration.build(session.configured(options)[1])  # a wrong parameter should not wait for the first pair
     kept, arrivals = list[Workers](), Arrivals(cache_folder(options.cache) / "files.json")
-    watched = _Watched(replace(options, sequence=seq, kept=kept), arrivals)
+    watched = _Watched(seq, options, kept, arrivals)
     try:
         return watched.to_the_end()
     except KeyboardInterrupt:
@@ -70,7 +71,9 @@ class _Watched:
     gaps : when it was first seen, by the monotonic clock, that a frame between others is missing, by its name.
     """
 
+    seq: str
     options: WatchOptions
+    kept: list[Workers]
     arrivals: Arrivals
     folder: Path | None = None
     taken: _Seen | None = None
@@ -100,7 +103,7 @@ class _Watched:
             Its images are no files.
         """
         try:
-            sequence = open_sequence(self.options.sequence, digests=self.arrivals)
+            sequence = open_sequence(self.seq, digests=self.arrivals)
         except InputError as error:
             if self.taken is None and not isinstance(error, IncompleteError):
                 raise
@@ -109,8 +112,7 @@ class _Watched:
         now = time.monotonic()
         names = {sequence.frame_names[k]: k for k in sequence.lost}
         self.gaps = {name: self.gaps.get(name, now) for name in names}
-        # Time for which a pair between others is waited for; then it counts as lost until it is there
-        frames = min((names[n] for n, t in self.gaps.items() if now - t < 10.0), default=sequence.frames)
+        frames = min((names[n] for n, t in self.gaps.items() if now - t < GAP_SECONDS), default=sequence.frames)
         if frames < sequence.frames:
             self.say(f"rille: waiting: {sequence.lost[frames]}")
         images = [_image(sequence.image(k, c)) for k in range(frames) if k not in sequence.lost for c in CAMERAS]
@@ -135,56 +137,52 @@ class _Watched:
             self.say(f"rille: written anew, so that what depends on it is computed anew: {some(replaced, 6)}")
         part = not (self.options.until or self.options.only)
         options = replace(self.options, quiet=True, only=UPDATED if part else self.options.only)
-        warnings = io.StringIO()
         try:
-            with redirect_stderr(warnings):
-                _, line = self.run(options, seen)
+            result = self.run(options, seen)
         except ConfigError:
             raise
         except RilleError as error:
             complain(error)
             return
-        finally:
-            self.say(warnings.getvalue())
+        for line in result.complaints:
+            self.say(line)
         since = time.monotonic() - max(self.arrivals.first_seen(path) for path in seen.files)
-        print(f"{len(seen.files) // 2} pairs, {since:.1f} s after the last file: {line}", flush=True)
+        print(f"{len(seen.files) // 2} pairs, {since:.1f} s after the last file: {result.lines[0]}", flush=True)
 
     def finish(self) -> int:
         """Reconstruct all that has arrived, as ``rille reconstruct`` does; the exit code."""
         left_out = []
         self.arrivals.growing = False
         try:
-            sequence = open_sequence(self.options.sequence, digests=self.arrivals)
+            sequence = open_sequence(self.seq, digests=self.arrivals)
         except InputError as error:
             if self.taken is None:
                 raise
             # A run refuses images without a partner, or a table with more rows: not all has arrived.
             self.arrivals.growing = True
-            sequence = open_sequence(self.options.sequence, digests=self.arrivals)
+            sequence = open_sequence(self.seq, digests=self.arrivals)
             left_out = [error.message]
-        code, line = self.run(self.options, _Seen(sequence, sequence.frames, {}))
-        print(line)
+        result = self.run(self.options, _Seen(sequence, sequence.frames, {}))
+        result.print()
         left_out += self.arrivals.troubles()
         if left_out:
             self.say(f"rille: not all has arrived: {'; '.join(left_out)}")
-        return max(code, HOLES) if left_out else code
+        return HOLES if left_out else result.code
 
-    def run(self, options: WatchOptions, seen: _Seen) -> tuple[int, str]:
-        """Exit code and closing line of a run, whose folder takes the place of that of the run before."""
-        frames = None if seen.frames == seen.sequence.frames else f"0:{seen.frames}"
-        with redirect_stdout(io.StringIO()) as said:
-            code, folder = session.perform(replace(options, opened=seen.sequence, frames=frames))
+    def run(self, options: WatchOptions, seen: _Seen) -> session.RunResult:
+        """Run, with a folder that takes the place of that of the run before."""
+        options = replace(options, frames=None if seen.frames == seen.sequence.frames else f"0:{seen.frames}")
+        result = session.perform(seen.sequence, options, kept=self.kept, warn=lambda line: self.say(warned(line)))
         if self.folder is not None:
             shutil.rmtree(self.folder, ignore_errors=True)
-        self.folder = folder
-        return code, said.getvalue().partition("\n")[0]
+        self.folder = result.folder
+        return result
 
-    def say(self, text: str) -> None:
-        """Print lines on stderr that were not printed before."""
-        for line in text.splitlines():
-            if line not in self.said:
-                self.said.add(line)
-                print(line, file=sys.stderr, flush=True)
+    def say(self, line: str) -> None:
+        """Print a line on stderr that was not printed before."""
+        if line not in self.said:
+            self.said.add(line)
+            print(line, file=sys.stderr)
 
 
 def _image(source: Source) -> Source:

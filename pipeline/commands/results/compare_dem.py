@@ -16,19 +16,19 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE, FLAG, RUNS, Output, Runs
-from rille.pipeline.commands.results.registration import register
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
 from rille.pipeline.export.writers import ENGINEERING_CRS, Meaning, write_bands
 from rille.pipeline.runs import lookup
+from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs, named
+from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation import dem_changes
 from rille.stages.evaluation import dem_comparison as evaluation
 from rille.stages.evaluation.dem_comparison import Grid
+from rille.stages.evaluation.place import register
 
-Floats = NDArray[np.float64]
 SHOWN_CHANGES = 12
 """Patches that are printed; all are in the JSON file."""
 WORDS = {"rmse": "RMSE", "nmad": "NMAD", "p95": "95 %", "bias": "bias", "median": "median"}
@@ -65,34 +65,33 @@ def compare_dem(
     """
     paths = [lookup.elevation(text, runs) for text in (a, b)]
     one, other = (read_elevation(path) for path in paths)
-    found = None
+    place = None
     if align == "place":
         files = [path for path in paths if not path.is_dir()]
         if files:
             text = f"{files[0]} is no run: it has no ortho image"
             raise InputError("RIL-908", text, remedy="leave --align place out")
         image, reference = (read_ortho(path / "ortho.tif")[0] for path in paths)
-        placed = register(image, reference, (one.values, other.values))
-        found = {"motion_of_a": placed.motion.tolist(), "by": placed.by}
+        placed = register((image, reference), (one.grid, other.grid))
+        place = {"motion_of_a": placed.motion.tolist(), "by": placed.by}
         one, align = moved(one, placed.motion), "rigid"
-    check(one, other)
-    figures, error = measure(one, other, align)
-    figures["place"] = found
+    refuse_unlike_systems({one.name: one.crs, other.name: other.crs})
+    figures, error, cells = measure(one, other, align)
+    figures["place"] = place
     for line in figures["warnings"]:
         warn(line)
-    _print(figures)
-    coarse = other if one.cell <= other.cell * (1.0 + 1e-9) else one
+    lines = [*_lines(figures)]
     rasters = {"difference": error.astype(np.float32)}
     if changes:
-        rasters["standard_deviation"], figures["changes"] = changed(one, other, error)
-        print("\n".join(_change_table(figures["changes"])))
-    # Either ending is understood as the name of both files.
-    target = output.with_name(output.name.removesuffix(".tif").removesuffix(".json"))
-    atomic.write(target.with_name(target.name + ".json"), json.dumps(figures, indent=1, allow_nan=False) + "\n")
+        rasters["standard_deviation"], figures["changes"] = changed(one, other, error, cells)
+        lines += _change_table(figures["changes"])
+    print("\n".join(lines))
+    raster, facts = named(output, ".tif"), named(output, ".json")
+    atomic.write(facts, json.dumps(figures, indent=1, allow_nan=False) + "\n")
+    coarse = other if np.array_equal(cells.matrix, other.grid.matrix) else one
     profile = {"driver": "COG", "crs": coarse.crs or None, "transform": coarse.transform}
-    meaning = Meaning("m", tags={"error": figures["error"]})
-    write_bands(target.with_name(target.name + ".tif"), rasters, meaning, profile)
-    print(f"{target}.tif  {target}.json")
+    write_bands(raster, rasters, Meaning("m", tags={"error": figures["error"]}), profile)
+    print(f"{raster}  {facts}")
     return COMPLETE
 
 
@@ -103,27 +102,8 @@ def moved(dem: DemFile, motion: Floats) -> DemFile:
     return replace(dem, transform=Affine(*motion.ravel()) @ dem.transform, viewpoints=eyes)
 
 
-def check(a: DemFile, b: DemFile) -> None:
-    """Refuse models that are not comparable.
-
-    Raises
-    ------
-    InputError
-        Their CRS differ, or their outlines do not overlap.
-    """
-    refuse_unlike_systems({a.name: a.crs, b.name: b.crs})
-    x0, x1, y0, y1 = a.extent
-    u0, u1, v0, v1 = b.extent
-    if min(x1, u1) <= max(x0, u0) or min(y1, v1) <= max(y0, v0):
-        text = (
-            f"no overlap: A is at x {x0:.6g}..{x1:.6g}, y {y0:.6g}..{y1:.6g} m, B at x {u0:.6g}..{u1:.6g}, "
-            f"y {v0:.6g}..{v1:.6g} m"
-        )
-        raise InputError("RIL-616", text, remedy="compare models of the same place")
-
-
-def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any], Floats]:
-    """All figures of A against the reference B (JSON-able), and the error, m, of the common cells (rows, cols).
+def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any], Floats, Grid]:
+    """All figures (JSON-able) of A against the reference B, the error, m, on the common cells (rows, cols), B on them.
 
     Raises
     ------
@@ -169,12 +149,11 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
         # Bins are open at their upper end: a hair more keeps the farthest cell in the last one.
         bins = evaluation.binned(error, distance, np.linspace(0.0, far * (1.0 + 1e-9), 9))
     figures["by_range"] = {"unit": unit, "bins": bins}
-    return figures, error
+    return figures, error, on_b
 
 
-def changed(a: DemFile, b: DemFile, error: Floats) -> tuple[NDArray[np.float32], dict[str, Any]]:
-    """Standard deviation of the ``error`` of :func:`measure`, and list (JSON-able) of what rose or fell from B to A."""
-    grid = evaluation.common(a.grid, b.grid)[1]
+def changed(a: DemFile, b: DemFile, error: Floats, grid: Grid) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    """Standard deviation of the ``error`` of :func:`measure` on a grid, and list (JSON-able) of what rose or fell."""
     sigma = [
         np.zeros(error.shape) if one.sigma is None else evaluation.interpolate(one.grid, grid.centres(), one.sigma)
         for one in (a, b)
@@ -251,26 +230,28 @@ def _range(target: Grid, a: DemFile, b: DemFile) -> tuple[Floats | None, str]:
     return np.asarray(cKDTree(cameras).query(target.centres())[0], np.float64), unit
 
 
-def _print(figures: dict[str, Any]) -> None:
-    print(f"A  {figures['a']['path']}  {figures['a']['cell_m']:g} m cells")
-    print(f"B  {figures['b']['path']}  {figures['b']['cell_m']:g} m cells, the reference")
-    print(f"cells: {figures['resampling']}; errors are A minus B")
+def _lines(figures: Mapping[str, Any]) -> Iterator[str]:
+    """What is printed of the figures."""
+    for name, word in (("a", ""), ("b", ", the reference")):
+        yield f"{name.upper()}  {figures[name]['path']}  {figures[name]['cell_m']:g} m cells{word}"
+    yield f"cells: {figures['resampling']}; errors are A minus B"
     if figures["place"]:
         (cos, _, x), (sin, _, y) = figures["place"]["motion_of_a"]
         turn = math.degrees(math.atan2(sin, cos))
-        print(f"place: A turned by {turn:.3f} degrees, moved by {x:.4f}, {y:.4f} m ({figures['place']['by']})")
+        yield f"place: A turned by {turn:.3f} degrees, moved by {x:.4f}, {y:.4f} m ({figures['place']['by']})"
+    after = ""
     if "alignment" in figures:
-        aligned = figures["alignment"]
+        aligned, after = figures["alignment"], "after   "
         moved = ", ".join(f"{k} {v:.6g} (sigma {aligned['sigma'][k]:.2g})" for k, v in aligned["motion_of_a"].items())
-        print(f"aligned ({aligned['kind']}): A was moved by {moved}")
-        print("before  " + _line(figures["before_alignment"]))
-    print(("after   " if "alignment" in figures else "") + _line(figures["figures"]))
+        yield f"aligned ({aligned['kind']}): A was moved by {moved}"
+        yield f"before  {_line(figures['before_alignment'])}"
+    yield after + _line(figures["figures"])
     share = figures["completeness"]
-    print(f"complete {share['of_b']:.3f}; {share['of_b_within_a']:.3f} within A's outline ({share['how']})")
+    yield f"complete {share['of_b']:.3f}; {share['of_b_within_a']:.3f} within A's outline ({share['how']})"
     for name, words in (("by_range", "range"), ("by_slope", "slope")):
-        print(f"\n{words} ({figures[name]['unit']})")
+        yield f"\n{words} ({figures[name]['unit']})"
         for f in figures[name]["bins"]:
-            print(f"{f['from']:8.3g} .. {f['to']:<8.3g} {_line(f)}  {f['cells']:.0f} cells")
+            yield f"{f['from']:8.3g} .. {f['to']:<8.3g} {_line(f)}  {f['cells']:.0f} cells"
 
 
 def _line(f: dict[str, float]) -> str:

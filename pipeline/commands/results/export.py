@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from rille.pipeline.commands.options import COMPLETE, RUNS, CacheFolder, Output, Run, Runs, cache_folder, check_output
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs.run_artifacts import export_run
 from rille.pipeline.runs import lookup
+from rille.pipeline.runs.options import COMPLETE, RUNS, CacheFolder, Output, Run, Runs, cache_folder, check_output
 from rille.stages.core.errors import ConfigError
 
 FILES = {"laz": "cloud.laz", "ply": "cloud.ply", "glb": "terrain.glb"}

@@ -10,15 +10,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from affine import Affine
 from cyclopts import Parameter
 from cyclopts.validators import Number
 from rasterio.crs import CRS
 
 from rille.datasets.georeference import Georeference
 from rille.pipeline import api
-from rille.pipeline.commands.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder
-from rille.pipeline.commands.results.run_terrain import Terrain, level_pose, yaw
+from rille.pipeline.commands.results.run_terrain import Terrain
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
@@ -27,13 +25,14 @@ from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
 from rille.pipeline.export.writers import write_trajectory_tum
 from rille.pipeline.runs import lookup
+from rille.pipeline.runs.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder, named
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.evaluation.dem_comparison import Grid
-from rille.stages.evaluation.place import Ortho, PlacedImage, place
-from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
-from rille.stages.terrain.map_localization import MIN_CHI2_GAP, GlobalMap, MapLocalizationParams, SearchArea, fix
+from rille.stages.evaluation.place import PlacedImage, level_pose, place, relief
+from rille.stages.geometry.geometry import RigidTransform, heading_of, rotation_exp, rotation_log
+from rille.stages.terrain.map_localization import MIN_CHI2_GAP, MapLocalizationParams, SearchArea
 
 TURN_DEG = 20.0
 """Degrees to either side of a given heading that are searched."""
@@ -96,12 +95,31 @@ class Localization:
     def numbers(self) -> dict[str, tuple[float, float]]:
         """What was found, by name, with its standard deviation: position, tilts about the map's axes, yaw."""
         R, sigma = self.pose.rotation, np.sqrt(np.diag(self.covariance))
-        tilts = np.degrees(rotation_log(R @ rotation_exp([0.0, 0.0, -yaw(self.pose)])))[:2]
-        values = *self.pose.translation, *tilts, math.degrees(yaw(self.pose))
+        heading = heading_of(self.pose)
+        tilts = np.degrees(rotation_log(R @ rotation_exp([0.0, 0.0, -heading])))[:2]
+        values = *self.pose.translation, *tilts, math.degrees(heading)
         sigmas = *sigma[:3], *np.degrees(sigma[3:])
         return {
             name: (float(value), float(s)) for name, value, s in zip(NAMES, values, sigmas, strict=True) if s < math.inf
         }
+
+    def for_file(self) -> dict[str, Any]:
+        """Facts for the JSON file."""
+        known = np.isfinite(np.diag(self.covariance))
+        return {
+            "T_map_world": self.pose.to_list(),
+            "place": {name: value for name, (value, _) in self.numbers.items()},
+            "sigma": {name: sigma for name, (_, sigma) in self.numbers.items()},
+            "covariance_m_rad": self.covariance[np.ix_(known, known)].tolist(),
+            **self.facts,
+        }
+
+    def table(self) -> Iterator[str]:
+        """A line for each number."""
+        for name, (value, sigma) in self.numbers.items():
+            word, _, unit = name.rpartition("_")
+            digits = min(6, max(0, 1 - math.floor(math.log10(max(sigma, 1e-6)))))
+            yield f"  {word:10s} {value:.{digits}f} +- {sigma:.{digits}f} {unit}"
 
     def about(self) -> Iterator[str]:
         """Lines on how it was found."""
@@ -147,12 +165,14 @@ def localize(
     """
     if dem is None and ortho is None:
         raise ConfigError("RIL-844", "no map is given", remedy="name an elevation model, or --ortho IMAGE")
-    folder = lookup.find(run, runs)
+    folder, systems, model, image = lookup.find(run, runs), dict[str, str](), None, None
     around, terrain = area.around(), Terrain.of(folder)
-    image, system = (None, "") if ortho is None else read_ortho(ortho)
-    model = None if dem is None else read_elevation(dem)
-    systems = {str(dem): "" if model is None else model.crs, str(ortho): system}
-    crs = next((wkt for wkt in systems.values() if wkt), "")
+    if ortho is not None:
+        image, systems[str(ortho)] = read_ortho(ortho)
+    if dem is not None:
+        model = read_elevation(dem)
+        systems[str(dem)] = model.crs
+    crs = next((wkt for wkt in reversed(systems.values()) if wkt), "")
     if terrain.place is not None:
         systems[f"run {terrain.name}"] = CRS.from_user_input(terrain.place.crs).to_wkt(version="WKT2_2019")
     refuse_unlike_systems(systems)
@@ -162,18 +182,22 @@ def localize(
         why = found.doubt
     except DegenerateError as error:
         why = f"{error.code}: {error}"
-    target, written = output.with_name(output.name.removesuffix(".json")), [".json"]
-    facts = {"run": terrain.name, "dem": dem and str(dem), "ortho": ortho and str(ortho), "crs": crs}
-    text = json.dumps({**facts, "ambiguous": bool(why), "why": why, **_facts(found)}, indent=1, allow_nan=False)
-    atomic.write(target.with_name(target.name + ".json"), text + "\n")
-    if found is not None and not why:
-        written += _export(folder, found, target, crs, Store(cache_folder(cache)))
-    print("\n".join([f"ambiguous    {why}", *(found.about() if found else ())] if why else _lines(found, crs)))
-    print("wrote        " + "  ".join(f"{target}{ending}" for ending in written))
+    written = [named(output, ".json")]
+    facts: dict[str, Any] = {"run": terrain.name, "dem": dem and str(dem), "ortho": ortho and str(ortho), "crs": crs}
+    facts |= {"ambiguous": bool(why), "why": why, **({} if found is None else found.for_file())}
+    atomic.write(written[0], json.dumps(facts, indent=1, allow_nan=False) + "\n")
+    if found is None or why:
+        lines = [f"ambiguous    {why}"]
+    else:
+        written += _export(folder, found, output, crs, Store(cache_folder(cache)))
+        lines = [f"place        of the world's origin{f' in {crs_name(crs)}' if crs else ''}, yaw to the left"]
+        lines += found.table()
+    print("\n".join([*lines, *(() if found is None else found.about())]))
+    print("wrote        " + "  ".join(map(str, written)))
     return HOLES if why else COMPLETE
 
 
-def _found(terrain: Terrain, model: DemFile | None, image: Ortho | None, around: SearchArea | None) -> Localization:
+def _found(terrain: Terrain, model: DemFile | None, image: Grid | None, around: SearchArea | None) -> Localization:
     """Place by the ortho images, where there is one; then by the elevations, where there are some.
 
     Raises
@@ -184,8 +208,9 @@ def _found(terrain: Terrain, model: DemFile | None, image: Ortho | None, around:
     by_ortho = None
     if image is not None:
         if around is not None and around.distance < math.inf:
-            away = np.linalg.norm(Grid(image.grey, image.matrix).centres() - [around.x, around.y], axis=-1)
-            image = image._replace(known=image.known & (away <= around.distance + terrain.radius))
+            away = np.linalg.norm(image.centres() - [around.x, around.y], axis=-1)
+            near = away <= around.distance + terrain.lattice.radius
+            image = replace(image, values=np.where(near, image.values, np.nan))
         try:
             by_ortho = _by_ortho(place(terrain.image, image))
         except DegenerateError as error:
@@ -201,7 +226,7 @@ def _found(terrain: Terrain, model: DemFile | None, image: Ortho | None, around:
         return _by_elevations(terrain, model, around)
     x, y, _ = by_ortho.pose.translation
     # Elevations and ortho images must agree on a place within ten cells of the map.
-    about = SearchArea(float(x), float(y), yaw(by_ortho.pose), 10.0 * model.cell, math.radians(TURN_DEG))
+    about = SearchArea(float(x), float(y), heading_of(by_ortho.pose), 10.0 * model.cell, math.radians(TURN_DEG))
     found = _by_elevations(terrain, model, about)
     return replace(found, facts={**found.facts, **by_ortho.facts})
 
@@ -218,83 +243,35 @@ def _by_ortho(placed: PlacedImage) -> Localization:
 
 def _by_elevations(terrain: Terrain, model: DemFile, around: SearchArea | None) -> Localization:
     """The place that elevations tell."""
-    # A raster may be turned or mirrored: the search is in a frame along its rows.
-    values, t = model.values, model.transform @ Affine.translation(0.5, 0.5)
-    if t.determinant > 0:
-        values, t = values[::-1], t @ Affine.translation(0, len(values) - 1) @ Affine.scale(1, -1)
-    to_map = RigidTransform(rotation_exp([0.0, 0.0, math.atan2(t.d, t.a)]), np.array([t.c, t.f, 0.0]))
-    rows, cols = values.shape
-    middle = 0.5 * model.cell * (cols - 1), 0.5 * model.cell * (1 - rows)
-    everywhere = math.hypot(*middle) + terrain.radius
-    x, y, heading, distance, turn = *middle, 0.0, everywhere, math.pi
-    if around is not None:
-        x, y, _ = to_map.inverse().apply([around.x, around.y, 0.0])
-        heading, turn = around.heading - yaw(to_map), around.turn
-        distance = min(around.distance, everywhere + math.hypot(middle[0] - x, middle[1] - y))
     # Standard deviation, degrees, of a vertical that a sensor gives, and of one that is that of the ground.
     tilt = 0.5 if terrain.vertical == "attitude" else 5.0
-    placed = fix(
-        terrain.elevation,
-        terrain.lattice,
-        GlobalMap(values, 0.0, 0.0, model.cell),
-        SearchArea(float(x), float(y), heading, distance, turn),
-        MapLocalizationParams.model_validate({"sigma_tilt_deg": tilt}),
-    )
-    pose, both = to_map @ placed.pose, np.kron(np.eye(2), to_map.rotation)
+    params = MapLocalizationParams.model_validate({"sigma_tilt_deg": tilt})
+    placed = relief(terrain.elevation, terrain.lattice, model.grid, around, params)
     kept = "overlap", "rms", "explained", "cells", "independent"
-    facts = {name: value for name, value in placed.facts().items() if name in kept}
-    doubt = ""
+    facts: dict[str, Any] = {name: getattr(placed, name) for name in kept}
     if placed.other is not None:
-        other, chi2 = to_map.apply([*placed.other[0][:2], 0.0])[:2], placed.other[1]
-        facts["other"] = {"x_m": other[0], "y_m": other[1], "chi2": chi2, "wanted": MIN_CHI2_GAP}
-        there, here = (f"({point[0]:.2f}, {point[1]:.2f}) m" for point in (other, pose.translation))
-        doubt = f"{there} fits {'better than' if chi2 < 0 else 'nearly as well as'} {here}" if placed.doubt else ""
-    return Localization(pose, both @ placed.covariance @ both.T, facts, doubt)
+        (x, y, _), chi2 = placed.other
+        facts["other"] = {"x_m": x, "y_m": y, "chi2": chi2, "wanted": MIN_CHI2_GAP}
+    return Localization(placed.pose, placed.covariance, facts, placed.doubt)
 
 
-def _facts(found: Localization | None) -> dict[str, Any]:
-    """Facts of a place for the JSON file."""
-    if found is None:
-        return {}
-    known = np.isfinite(np.diag(found.covariance))
-    return {
-        "T_map_world": found.pose.to_list(),
-        "place": {name: value for name, (value, _) in found.numbers.items()},
-        "sigma": {name: sigma for name, (_, sigma) in found.numbers.items()},
-        "covariance_m_rad": found.covariance[np.ix_(known, known)].tolist(),
-        **found.facts,
-    }
-
-
-def _lines(found: Localization | None, crs: str) -> Iterator[str]:
-    """What is printed of a place."""
-    assert found is not None
-    yield f"place        of the world's origin{f' in {crs_name(crs)}' if crs else ''}, yaw to the left"
-    for name, (value, sigma) in found.numbers.items():
-        word, _, unit = name.rpartition("_")
-        digits = min(6, max(0, 1 - math.floor(math.log10(max(sigma, 1e-6)))))
-        yield f"  {word:10s} {value:.{digits}f} +- {sigma:.{digits}f} {unit}"
-    yield from found.about()
-
-
-def _export(folder: Path, found: Localization, target: Path, crs: str, store: Store) -> list[str]:
-    """Write trajectory and path in the map's coordinates; gives the endings."""
-    written, words = [], f"of the map{f', {crs_name(crs)}' if crs else ''}: T_map_world of {target.name}.json"
+def _export(folder: Path, found: Localization, output: Path, crs: str, store: Store) -> Iterator[Path]:
+    """Write trajectory and path in the map's coordinates; gives the files."""
+    words = f"of the map{f', {crs_name(crs)}' if crs else ''}: T_map_world of {named(output, '.json').name}"
     if (folder / "trajectory.kitti").exists():
         known = api.Run(folder).trajectory
         turned, there = found.pose.rotation @ known["rotation"].values, found.pose.apply(known["position"].values)
         poses = np.concatenate([turned, there[..., None]], axis=2)
-        write_trajectory_tum(target.with_name(target.name + ".tum"), poses, known["time"].values.tolist(), words)
-        written.append(".tum")
+        write_trajectory_tum(named(output, ".tum"), poses, known["time"].values.tolist(), words)
+        yield named(output, ".tum")
     try:
         with lookup.reading(folder):
             planned = RunArtifacts(folder, store).find("path/world")
     except InputError as error:
         warn(f"{error.code}: {error}; no path is written")
-        return written
+        return
     if planned is not None:
         moved = Bundle({"path": found.pose.apply(np.asarray(planned["path"]))}, {**planned.meta, "frame": words})
         frame = Georeference(crs, (0.0, 0.0, 0.0), 0.0) if crs else None
-        write_path(target.with_name(target.name + ".gpkg"), moved, frame)
-        written.append(".gpkg")
-    return written
+        write_path(named(output, ".gpkg"), moved, frame)
+        yield named(output, ".gpkg")

@@ -13,19 +13,19 @@ import numpy as np
 
 from rille.datasets.georeference import Georeference
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE, RUNS, Output, Run, Runs
-from rille.pipeline.commands.results.registration import register
-from rille.pipeline.commands.results.run_terrain import Terrain, level_pose, yaw
+from rille.pipeline.commands.results.run_terrain import Terrain
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import refuse_unlike_systems
 from rille.pipeline.export.writers import Meaning, write_raster
 from rille.pipeline.runs import lookup
+from rille.pipeline.runs.options import COMPLETE, RUNS, Output, Run, Runs
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.evaluation import dem_comparison
 from rille.stages.evaluation.dem_comparison import Alignment, Grid
-from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
+from rille.stages.evaluation.place import level_pose, register
+from rille.stages.geometry.geometry import RigidTransform, heading_of, rotation_exp, rotation_log
 from rille.stages.geometry.lattice import Lattice, union
 from rille.stages.terrain.map_localization import independent_cells
 from rille.stages.terrain.merge import EXACT, MergeParams, ModelLayer, Placed
@@ -120,7 +120,7 @@ def _registered(first: Terrain, other: Terrain) -> Session:
         refuse_unlike_systems({other.name: b.crs, first.name: a.crs})
         how, start, rough = "georeferences", _in_system(a).inverse() @ _in_system(b), np.zeros(3)
     else:
-        placed = register(other.image, first.image, (other.elevation, first.elevation))
+        placed = register((other.image, first.image), (other.grid, first.grid))
         how, start, rough = placed.by, level_pose(placed.motion), placed.sigma
     # The place is level: so far it turns about the vertical alone.
     moved = start.rotation[:2, :2] @ other.grid.matrix
@@ -136,9 +136,8 @@ def _registered(first: Terrain, other: Terrain) -> Session:
         centre = np.array([*np.nanmean(one.centres()[np.isfinite(one.values)], axis=0), np.nanmedian(one.values)])
         alignment = Alignment(np.eye(3), np.zeros(3), centre, np.zeros(6), 0, 0)
     error = dem_comparison.errors(one, two, alignment)
-    cells = int(np.isfinite(error).sum())
     # Errors of neighbours are alike: there are fewer than cells.
-    sigma = alignment.sigma * math.sqrt(cells / max(independent_cells(error), 1.0)) if cells else alignment.sigma
+    sigma = alignment.sigma * math.sqrt(np.isfinite(error).sum() / max(independent_cells(error), 1.0))
     sigma = np.where(sigma > 0, sigma, [rough[0], rough[1], 0.0, 0.0, 0.0, rough[2]])
     motion = np.array([*alignment.translation, *rotation_log(alignment.rotation)])
     # Georeferences are believed within three standard deviations: lattices that fit are then not resampled.
@@ -210,16 +209,11 @@ def _laid(number: int, first: Terrain, session: Session) -> ModelLayer:
 def _line(one: Session) -> str:
     """How a run was laid, and how far it differs."""
     x, y, z = one.pose.translation
-    overlap, sigma = one.facts["overlap"], one.sigma
-    turned, turn = math.degrees(yaw(one.pose)), math.degrees(sigma[5])
-    place_ = (
-        f"{one.terrain.name}: at {x:.4g}, {y:.4g}, {z:.4g} m, turned by {turned:.3f} degrees (sigma "
-        f"{1e3 * sigma[0]:.2g}, {1e3 * sigma[1]:.2g}, {1e3 * sigma[2]:.2g} mm, {turn:.2g} degrees; "
-        f"by {one.facts['by']})"
-    )
-    if not overlap["cells"]:
-        return f"{place_}; no ground in common"
+    overlap, (a, b, c) = one.facts["overlap"], 1e3 * one.sigma[:3]
+    turned, turn = math.degrees(heading_of(one.pose)), math.degrees(one.sigma[5])
+    sigma = f"sigma {a:.2g}, {b:.2g}, {c:.2g} mm, {turn:.2g} degrees; by {one.facts['by']}"
+    median, nmad, p95 = (1e3 * overlap[name] for name in ("median", "nmad", "p95"))
     return (
-        f"{place_}; {overlap['cells']:.0f} cells in common: median {1e3 * overlap['median']:+.2g} mm, NMAD "
-        f"{1e3 * overlap['nmad']:.2g} mm, 95 % {1e3 * overlap['p95']:.2g} mm"
+        f"{one.terrain.name}: at {x:.4g}, {y:.4g}, {z:.4g} m, turned by {turned:.3f} degrees ({sigma}); "
+        f"{overlap['cells']:.0f} cells in common: median {median:+.2g} mm, NMAD {nmad:.2g} mm, 95 % {p95:.2g} mm"
     )

@@ -18,11 +18,11 @@ import tomli_w
 
 from rille.datasets.text.reading import read_toml
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE, RUNS, CacheFolder, Output, Runs, cache_folder, check_output
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.runs import lookup
+from rille.pipeline.runs.options import COMPLETE, RUNS, CacheFolder, Output, Run, Runs, cache_folder, check_output
 from rille.stages.calibration.parameter_selection import Parameter, decide
 from rille.stages.calibration.relative_orientation import MIN_MATCHES, PointPairs, adjust, solution
 from rille.stages.calibration.rig import RigParams
@@ -52,8 +52,8 @@ class Joint:
 
 
 def rig(
-    run: str,
-    *more: str,
+    run: Run,
+    *more: Run,
     output: Annotated[Path, Output] = Path("rig.toml"),
     runs: Runs = RUNS,
     cache: CacheFolder = None,
@@ -65,8 +65,6 @@ def rig(
 
     Parameters
     ----------
-    run
-        A run by name: SEQUENCE (its latest), SEQUENCE/ID, ID, latest (of all); or its folder.
     more
         Others.
     output

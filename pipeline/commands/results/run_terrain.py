@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,21 +16,8 @@ from rille.pipeline.runs import lookup
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation.dem_comparison import Grid
-from rille.stages.evaluation.place import Ortho
-from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
-
-
-def level_pose(motion: Floats) -> RigidTransform:
-    """Motion (2, 3) in the plane, a turn and a shift, as one of space."""
-    turn = rotation_exp([0.0, 0.0, math.atan2(motion[1, 0], motion[0, 0])])
-    return RigidTransform(turn, np.array([*motion[:, 2], 0.0]))
-
-
-def yaw(pose: RigidTransform) -> float:
-    """Angle, rad, to the left, of the x axis of a frame."""
-    return math.atan2(pose.rotation[1, 0], pose.rotation[0, 0])
 
 
 @dataclass(frozen=True)
@@ -84,12 +70,6 @@ class Terrain:
         return Grid(self.elevation, np.array([[at.cell, 0.0, at.x0], [0.0, -at.cell, at.y0]]))
 
     @property
-    def image(self) -> Ortho:
+    def image(self) -> Grid:
         """The ortho image in the world frame."""
-        return Ortho(self.ortho.astype(np.float32), np.isfinite(self.ortho), self.grid.matrix)
-
-    @property
-    def radius(self) -> float:
-        """Distance, m, of the farthest corner from the world's origin."""
-        x0, x1, y0, y1 = self.lattice.bounds
-        return math.hypot(max(-x0, x1), max(-y0, y1))
+        return replace(self.grid, values=self.ortho)

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from rille.datasets.text.count import count
-from rille.pipeline.commands.options import COMPLETE, RUNS, Run, Runs
 from rille.pipeline.engine import events
 from rille.pipeline.runs import lookup
+from rille.pipeline.runs.options import COMPLETE, RUNS, Run, Runs
 from rille.stages.core.errors import ConfigError
 
 

@@ -7,7 +7,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from rille.pipeline.commands.options import COMPLETE, RUNS, CacheFolder, Run, Runs, cache_folder
 from rille.pipeline.engine import events, provenance
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.memory import words
@@ -16,6 +15,7 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import artifact_path
 from rille.pipeline.flow.config import build
 from rille.pipeline.runs import lookup
+from rille.pipeline.runs.options import COMPLETE, RUNS, CacheFolder, Run, Runs, cache_folder
 
 SHORT_DIGITS = 12
 """Hexadecimal digits of a digest that are shown."""

@@ -14,36 +14,35 @@ from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
-from cyclopts import Parameter
 from numpy.typing import NDArray
 
 from rille.datasets.images import chessboard, pairing
 from rille.datasets.images.files import SUFFIXES, read_grey
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE, FLAG, Output, check_output
 from rille.pipeline.engine.plain import warn
+from rille.pipeline.runs.options import COMPLETE, FLAG, Output, check_output
 from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig
 from rille.stages.core.errors import InputError, told
 from rille.stages.geometry.geometry import Sizes
 
 SIDES = ("left", "right")
 
+SAME_PLACE_PX = 1.0
+"""RMS distance of all corners below which two views show the board at one place: noise moves them by tenths, a hand by
+many."""
 
-@Parameter(name="*")
-@dataclass(frozen=True)
-class Board:
-    """The chessboard of a calibration.
+MAX_CLUTTER = 0.1
+"""Residual over the spacing of the corners from which they are not those of a flat board: print errs by hundredths. It
+holds for any resolution and distance of the board."""
 
-    Parameters
-    ----------
-    square
-        Side of a square, metres.
-    corners
-        Inner corners, COLUMNSxROWS, for example 9x6; detected by default.
-    """
+MAX_RMS_PX = 1.0
+"""Residual over all views that a chessboard on paper does not exceed."""
 
-    square: float
-    corners: str | None = None
+MAX_FOCAL_SIGMA = 0.01
+"""Relative standard deviation of a focal length that is worth a warning: all depths err by as much."""
+
+MIN_COVER = 0.5
+"""Share of an image that all corners together should span: beyond them, distortion is extrapolated."""
 
 
 @dataclass
@@ -60,7 +59,8 @@ def calibrate(
     left: Path,
     right: Path,
     *,
-    board: Board,
+    square: float,
+    corners: str | None = None,
     model: Literal["radtan", "radtan4", "rational", "fisheye"] = "radtan",
     output: Annotated[Path, Output] = Path("rig.yaml"),
     keep_bad: Annotated[bool, FLAG] = False,
@@ -73,6 +73,10 @@ def calibrate(
         Folder or glob of the left camera's images.
     right
         The same of the right camera; views are paired by number.
+    square
+        Side of a square, metres.
+    corners
+        Inner corners, COLUMNSxROWS, for example 9x6; detected by default.
     model
         Distortion model.
     output
@@ -81,16 +85,16 @@ def calibrate(
         Keep views whose residuals are far above the others'.
     """
     check_output(output, *((".yaml", ".yml") if output.suffix else ()))
-    given = None if board.corners is None else chessboard.parse_corners(board.corners)
-    chessboard.board_points((3, 3), board.square)  # a wrong unit is said before minutes of detection
+    given = None if corners is None else chessboard.parse_corners(corners)
+    chessboard.board_points((3, 3), square)  # a wrong unit is said before minutes of detection
     boards = find_boards(pairing.pair_up(*_files(left, right)), given)
-    points = chessboard.board_points(boards.corners, board.square)
+    points = chessboard.board_points(boards.corners, square)
     rig = calibrate_rig(points, boards.views, boards.sizes, model, keep_bad=keep_bad)
     _refuse_clutter(rig, boards)
-    output.write_text(_yaml(rig, boards, board.square), encoding="utf-8")
+    output.write_text(_yaml(rig, boards, square), encoding="utf-8")
     origin, size = "given" if given else "found", " x ".join(map(str, boards.corners))
-    print(f"board        {size} inner corners ({origin}), squares of {board.square:g} m")
-    print("\n".join([*_views(rig, boards), "", *_parameters(rig, model), ""]))
+    print(f"board        {size} inner corners ({origin}), squares of {square:g} m")
+    print("\n".join([*_views(rig, boards), "", *_parameters(rig), ""]))
     for line in doubts(rig, boards, model):
         warn(line)
     print(f'wrote        {output}\nnext         in the manifest of the sequence:\n\n[cameras]\nfile = "{output.name}"')
@@ -144,9 +148,7 @@ def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | N
             out.left_out.append((name, f"no whole board in the {' nor in the '.join(missing)} image"))
         else:
             view = BoardView(name, points[0], chessboard.same_order(points[0], points[1], corners))
-            # RMS distance of all corners, pixels, below which two views show the board at one place: noise moves them
-            # by tenths, a hand by many
-            same = next((other.name for other in out.views if _distance(view, other) < 1.0), None)
+            same = next((other.name for other in out.views if _distance(view, other) < SAME_PLACE_PX), None)
             if same is None:
                 out.views.append(view)
             else:
@@ -171,9 +173,7 @@ def _refuse_clutter(rig: RigCalibration, boards: Boards) -> None:
     columns, rows = boards.corners
     grids = [p.reshape(rows, columns, 2) for v in boards.views for p in (v.left, v.right)]
     spacing = float(np.median([np.linalg.norm(np.diff(g, axis=1), axis=-1) for g in grids]))
-    # Residual over the spacing of the corners from which they are not those of a flat board: print errs by hundredths
-    # Relative to the spacing: it holds for any resolution and distance of the board.
-    if rig.rms > 0.1 * spacing:
+    if rig.rms > MAX_CLUTTER * spacing:
         raise InputError(
             "RIL-800",
             f"the corners taken for a board of {columns} x {rows} miss by {rig.rms:.1f} px RMS, "
@@ -194,25 +194,21 @@ def doubts(rig: RigCalibration, boards: Boards, model: str) -> Iterator[str]:
         if not r.used:
             text = f"view {r.name} is left out: its corners miss by {r.worst:.2f} px RMS; remove or retake it"
             yield warning("RIL-695", text)
-    # Pixels RMS over all views that a chessboard on paper does not exceed
-    if rig.rms > 1.0:
+    if rig.rms > MAX_RMS_PX:
         text = f"corners miss by {rig.rms:.2f} px RMS: is the board flat, are the images paired rightly?"
         yield warning("RIL-696", text)
     used = [view for view, r in zip(boards.views, rig.residuals, strict=True) if r.used]
-    for side, lens, size in zip(SIDES, (rig.left, rig.right), boards.sizes, strict=True):
-        share = rig.sigma[f"{side} fx"] / lens.camera.fx
-        # Relative standard deviation of a focal length that is worth a warning: all depths err by as much
-        if share > 0.01:
+    for side, size in zip(SIDES, boards.sizes, strict=True):
+        share = rig.sigma[f"{side} fx"] / rig.values[f"{side} fx"]
+        if share > MAX_FOCAL_SIGMA:
             text = f"{side} focal length is known to {100 * share:.1f} % only; take views with the board tilted"
             yield warning("RIL-697", text)
         seen = cover([getattr(view, side) for view in used], size)
-        # Share of an image that all corners together should span: beyond them, distortion is extrapolated
-        if seen < 0.5:
+        if seen < MIN_COVER:
             text = f"the corners span {100 * seen:.0f} % of the {side} image; distortion beyond is a guess"
             yield warning("RIL-698", text)
-        coefficients = dict(zip(MODELS[model], lens.coefficients, strict=True))
-        sigma = {name: rig.sigma[f"{side} {name}"] for name in coefficients}
-        vague = [k for k, v in coefficients.items() if sigma[k] > max(abs(v), 0.1) and k not in ("p1", "p2")]
+        known = {name: (abs(rig.values[f"{side} {name}"]), rig.sigma[f"{side} {name}"]) for name in MODELS[model]}
+        vague = [k for k, (value, sigma) in known.items() if sigma > max(value, 0.1) and k not in ("p1", "p2")]
         if vague:
             # A model with fewer terms, which these views may determine.
             fewer = "radtan" if model == "rational" else "radtan4"
@@ -231,20 +227,14 @@ def _views(rig: RigCalibration, boards: Boards) -> Iterator[str]:
     yield from (f"{name:{width}s}  left out: {reason}" for name, reason in boards.left_out)
 
 
-def _parameters(rig: RigCalibration, model: str) -> Iterator[str]:
+def _parameters(rig: RigCalibration) -> Iterator[str]:
     """Table of parameters, each with its standard deviation; the right camera's pose is that from the left one."""
-    names = ("fx", "fy", "cx", "cy", *MODELS[model])
-    values = {"baseline": float(np.linalg.norm(rig.T_right_left.translation))}
-    for side, lens in zip(SIDES, (rig.left, rig.right), strict=True):
-        numbers = (lens.camera.fx, lens.camera.fy, lens.camera.cx, lens.camera.cy, *lens.coefficients)
-        values |= {f"{side} {name}": number for name, number in zip(names, numbers, strict=True)}
-    for axis, turn in zip("xyz", cv2.Rodrigues(rig.T_right_left.rotation)[0].ravel(), strict=True):
-        values[f"rotation {axis}"] = float(turn)
-    for name, value in values.items():
-        unit = (
-            "m" if name == "baseline" else "rad" if "rotation" in name else "px" if name.split()[1][0] in "fc" else ""
-        )
-        yield f"{name:13s}{value:12.5f} +- {rig.sigma[name]:.5f} {unit}".rstrip()
+    units = {"baseline": "m", "rotation": "rad", **dict.fromkeys(("fx", "fy", "cx", "cy"), "px")}
+    for name, value in rig.values.items():
+        whole, _, part = name.partition(" ")
+        if whole != "translation":  # the baseline is its length
+            unit = units.get(whole, units.get(part, ""))
+            yield f"{name:13s}{value:12.5f} +- {rig.sigma[name]:.5f} {unit}".rstrip()
 
 
 def _yaml(rig: RigCalibration, boards: Boards, square: float) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Generator, Mapping
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,20 +16,28 @@ import numpy as np
 
 from rille.datasets.protocol import CAMERAS, Sequence
 from rille.pipeline.commands import batch
-from rille.pipeline.commands.options import COMPLETE, FAILED, Settings, cache_folder
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.builders import Builder, name
+from rille.pipeline.flow.reconstruction import spread
 from rille.pipeline.runs import input_checks as judge
 from rille.pipeline.runs.input_checks import Finding
+from rille.pipeline.runs.options import COMPLETE, FAILED, Settings, cache_folder
 from rille.pipeline.runs.session import settings
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.epipolar import beyond_infinity, inverse_depth
 from rille.stages.imaging.image_quality import glance
 
 Steps = Generator[Wait, Any, None]
+
+NAMED_IMAGES = 3
+"""Damaged images that are named one by one; the others are counted."""
+
+MOTIONS, COMPARED_PAIRS = 12, 6
+"""Motions that are measured, and pairs whose rows are compared with those of shifted right images: all over the
+sequence, so that a fault of its second half is found as well."""
 
 _SETTINGS = Settings()
 
@@ -51,7 +58,7 @@ def check(seq: str, *more: str, options: Settings = _SETTINGS) -> int:
 
 
 def _check(seq: str, options: Settings) -> int:
-    settled = settings(replace(options, sequence=seq))
+    settled = settings(seq, options)
     nobody = type(settled.config).model_fields.keys() - unread.CHECKED
     unread.refuse(settled.given, settled.config, nobody, "a check")
     return inspect(settled.sequence, settled.config, settled.frames, cache_folder(options.cache))
@@ -113,8 +120,7 @@ class Inspection:
         yield from self._first_pair(whole[0])
         yield from self._motions()
         if len(whole) > 1:
-            # Pairs whose rows are compared with those of shifted right images, spread over the sequence
-            rows = yield self.make.synchrony("synchrony", _spread(whole, 6), whole)
+            rows = yield self.make.synchrony("synchrony", spread(whole, COMPARED_PAIRS), whole)
             self.say(judge.judge_synchrony(rows.meta))
 
     def _images(self) -> Steps:
@@ -135,8 +141,7 @@ class Inspection:
             image = np.asarray(bundle["image"])
             sizes.add(f"{image.shape[1]} x {image.shape[0]} {image.dtype}")
             looks[camera][frame] = glance(image, np.asarray(bundle["valid"]))
-        # Damaged images that are named one by one; the rest is counted
-        for refusal in errors[:3]:
+        for refusal in errors[:NAMED_IMAGES]:
             self.refused(refusal, "images")
         whole = f"all {len(images)} open, {' and '.join(sorted(sizes))}"
         text = f"{len(errors)} of {len(images)} images cannot be used" if errors else whole
@@ -144,7 +149,7 @@ class Inspection:
         # Images of one grey value say the same of any scene.
         several = {c: {k: one["digest"] for k, one in of.items() if one["deviation"]} for c, of in looks.items()}
         self.say(*self._repeated(several))
-        self.say(*judge.judge_looks(looks, self.sequence.frame_names))
+        self.say(*judge.judge_looks(looks, self.sequence.frame_names, self.make.config.frame_screening))
 
     def _repeated(self, digests: Mapping[str, Mapping[int, str]]) -> Generator[Finding, None, None]:
         names = self.sequence.frame_names
@@ -180,9 +185,7 @@ class Inspection:
 
     def _motions(self) -> Steps:
         """Overlap of some successive left images."""
-        # Successive pairs whose motion is measured, spread over the sequence: a sample tells what a run can expect
-        # Evenly over the sequence, so that a fault of its second half is found as well.
-        chosen = _spread(list(pairwise(self.frames)), 12)
+        chosen = spread(list(pairwise(self.frames)), MOTIONS)
         tasks = {(a, b): self.make.motion(a, b) for a, b in chosen if not {(a, "left"), (b, "left")} & self.broken}
         yield Maybe(list(tasks.values()))
         for task in tasks.values():
@@ -190,11 +193,6 @@ class Inspection:
                 self.refused(_cause(task), "motion")
         motions = {step: task.ref.meta for step, task in tasks.items() if task.ref is not None}
         self.say(judge.judge_motion(motions, self.sequence.frame_names))
-
-
-def _spread(items: list[Any], most: int) -> list[Any]:
-    """At most so many of the items, evenly over all of them."""
-    return [items[k] for k in sorted({int(k) for k in np.linspace(0, len(items) - 1, most).round()})] if items else []
 
 
 def _cause(handle: Handle) -> RilleError:

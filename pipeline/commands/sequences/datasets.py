@@ -9,12 +9,12 @@ from cyclopts import App
 from rille.datasets import registry
 from rille.datasets.export import export
 from rille.datasets.protocol import Source
-from rille.pipeline.commands.options import COMPLETE, Assignments, CacheFolder, cache_folder
 from rille.pipeline.engine.spec import Spec
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import ensure
 from rille.pipeline.flow import config
+from rille.pipeline.runs.options import COMPLETE, Assignments, CacheFolder, cache_folder
 from rille.stages.core.errors import ConfigError
 
 app = App(name="datasets", help=__doc__)

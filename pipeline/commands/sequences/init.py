@@ -12,7 +12,7 @@ from rille.datasets.inspection import Findings, inspect
 from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_words
 from rille.datasets.registry import hindrance
 from rille.datasets.text.names import derived_name
-from rille.pipeline.commands.options import COMPLETE, FLAG, Output
+from rille.pipeline.runs.options import COMPLETE, FLAG, Output
 from rille.stages.core.errors import ConfigError
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.count import count
-from rille.pipeline.commands.options import COMPLETE, Output
+from rille.pipeline.runs.options import COMPLETE, Output
 from rille.pipeline.steps import open as open_sequence
 from rille.stages.core.errors import InputError
 from rille.stages.imaging.pyramid import grey

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from rille.datasets.images.files import read_grey, refuse_swapped
 from rille.datasets.text.warning import warning
-from rille.pipeline.commands.options import COMPLETE, FLAG, HOLES, Assignments, Output, check_output
 from rille.pipeline.engine.plain import raw, warn
 from rille.pipeline.export.writers import write_confidence, write_disparity
 from rille.pipeline.flow import config as configuration
+from rille.pipeline.runs.options import COMPLETE, FLAG, HOLES, Assignments, Output, check_output
 from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.core.validity import Validity, has, matched, matched_back
 from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX

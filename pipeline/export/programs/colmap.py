@@ -17,15 +17,14 @@ from numpy.typing import NDArray
 
 from rille.datasets.text.reading import TABLE, read_text
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
-from rille.stages.core.arrays import Bytes
+from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import Bundle
+from rille.stages.evaluation.crosscheck import colmap_rig
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.imaging.features import PIXEL_CENTRE
 from rille.stages.odometry.resection.landmarks import matches_at
 from rille.stages.odometry.resection.trajectory import world_poses
 from rille.stages.terrain.points import colours
-
-Floats = NDArray[np.float64]
 
 MAX_REPROJECTION_PX = 0.5
 """Pixels from an observation to its point's projection. COLMAP weighs all observations alike, so that one which our
@@ -114,10 +113,8 @@ def build(
     number = {image: k for k, image in enumerate(seen, start=1)}
 
     model = pycolmap.Reconstruction()
-    cameras = {side: _camera(pycolmap, k, getattr(rig, side)) for k, side in enumerate(SIDES, start=1)}
-    body = pycolmap.Rig(rig_id=1)
-    body.add_ref_sensor(cameras["left"].sensor_id)
-    body.add_sensor(cameras["right"].sensor_id, _rigid(pycolmap, rig.T_right_left))
+    both, body = colmap_rig(rig)
+    cameras = dict(zip(SIDES, both, strict=True))
     for camera in cameras.values():
         model.add_camera(camera)
     model.add_rig(body)
@@ -125,7 +122,7 @@ def build(
         ours = pycolmap.Frame(frame_id=k, rig_id=1)
         for side, camera in cameras.items():
             ours.add_data_id(pycolmap.data_t(camera.sensor_id, number[frame, side]))
-        ours.rig_from_world = _rigid(pycolmap, T_world_left.inverse())
+        ours.rig_from_world = pycolmap.Rigid3d(np.array(T_world_left.inverse().matrix34))
         model.add_frame(ours)
         for side, camera in cameras.items():
             image = pycolmap.Image(
@@ -193,15 +190,6 @@ def _points(
 def _near(camera: Camera, points: Floats, pixels: Floats) -> NDArray[np.bool_]:
     """Whether points (n, 3) of the camera frame, metres, project near to pixels (n, 2)."""
     return np.asarray(np.hypot(*(camera.project(points) - pixels).T) <= MAX_REPROJECTION_PX)
-
-
-def _camera(pycolmap: Any, number: int, camera: Camera) -> Any:
-    values = [camera.fx, camera.fy, camera.cx + PIXEL_CENTRE, camera.cy + PIXEL_CENTRE]
-    return pycolmap.Camera(model="PINHOLE", width=camera.width, height=camera.height, params=values, camera_id=number)
-
-
-def _rigid(pycolmap: Any, T: RigidTransform) -> Any:
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(np.array(T.rotation)), np.array(T.translation))
 
 
 def _names(run: Path) -> dict[int, str]:

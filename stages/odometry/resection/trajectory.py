@@ -23,7 +23,7 @@ ground that they tilt defines the world's vertical, so that they tilt no elevati
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -79,6 +79,19 @@ class Chained:
     piece: NDArray[np.int16]
 
 
+class _Row(NamedTuple):
+    """One frame of a :class:`Chained`, by the same names."""
+
+    poses: Floats
+    covariance: Floats
+    own_covariance: Floats
+    segment: int
+    piece: int
+
+
+LOST = _Row(np.full((3, 4), np.nan), np.full((6, 6), np.nan), np.full((6, 6), np.nan), -1, -1)
+
+
 def chain(segments: Sequence[ChainLink], levels: Sequence[RigidTransform]) -> Chained:
     """Compose the poses of segments into one trajectory.
 
@@ -99,8 +112,7 @@ def chain(segments: Sequence[ChainLink], levels: Sequence[RigidTransform]) -> Ch
     shared = segments[0].shared.shape[2] if segments else 0
     count = shared + segments[0].calibration.shape[2] if segments else 0
     world, own, common, broken, piece = levels[0], np.zeros((6, 6)), np.zeros((6, count)), False, 0
-    rows: list[tuple[Floats, Floats, Floats, int, int]] = [(world.matrix34, own, own, 0, 0)]
-    lost = np.full((3, 4), np.nan), np.full((6, 6), np.nan), np.full((6, 6), np.nan), -1, -1
+    rows = [_Row(world.matrix34, own, own, 0, 0)]
     for number, (segment, level) in enumerate(zip(segments, levels, strict=False)):
         local = segment.poses
         # Both come from the same level stage: a difference beyond rounding means that the wrong ones were paired.
@@ -108,27 +120,27 @@ def chain(segments: Sequence[ChainLink], levels: Sequence[RigidTransform]) -> Ch
             raise InputError("RIL-451", f"segment {number} was not resected in the local frame of its own basic pair")
         if broken:
             world, own, common, piece = level, np.zeros((6, 6)), np.zeros((6, count)), piece + 1
-            rows[-1] = world.matrix34, own, own, number, piece
+            rows[-1] = _Row(world.matrix34, own, own, number, piece)
         # Once a segment: over thousands of products rounding would bend the rotation.
         T_world_local = _clean(world @ level.inverse())
         key, key_own, key_common = world, own, common
-        for pose, covariance, *roots in zip(*(each[1:] for each in segment), strict=True):
-            broken = not np.isfinite(pose).all()
+        for k in range(1, len(local)):
+            broken = not np.isfinite(local[k]).all()
             if broken:
-                rows.append(lost)
+                rows.append(LOST)
                 continue
-            world = T_world_local @ RigidTransform.from_matrix(pose)
+            world = T_world_local @ RigidTransform.from_matrix(local[k])
             lever, turn = propagation(key, T_world_local, world)
-            alone = covariance - roots[0] @ roots[0].T
+            alone = segment.covariance[k] - segment.shared[k] @ segment.shared[k].T
             # Own errors add as variances; those of one cause go together in all segments, so their roots add first.
             # Rounding makes the two halves of the product differ, and more so from frame to frame.
             own = _symmetric(lever @ key_own @ lever.T + turn @ alone @ turn.T)
-            common = lever @ key_common + turn @ np.hstack(roots)
+            common = lever @ key_common + turn @ np.hstack([segment.shared[k], segment.calibration[k]])
             without = own + common[:, :shared] @ common[:, :shared].T
-            rows.append((world.matrix34, own + common @ common.T, without, number, piece))
-    poses, covariances, owns, owner, pieces = zip(*rows, strict=True)
-    arrays = np.array(poses), np.array(covariances), np.array(owns)
-    return _without_single_frames(Chained(*arrays, np.array(owner, np.int16), np.array(pieces, np.int16)))
+            rows.append(_Row(world.matrix34, own + common @ common.T, without, number, piece))
+    poses, covariance, alone, owner, pieces = (np.array(column) for column in zip(*rows, strict=True))
+    owner, pieces = owner.astype(np.int16), pieces.astype(np.int16)
+    return _without_single_frames(Chained(poses, covariance, alone, owner, pieces))
 
 
 def _without_single_frames(found: Chained) -> Chained:
@@ -225,50 +237,48 @@ def account(frames: list[int], found: Chained, causes: Mapping[int, str], vertic
     Positions, pieces with their ``verticals``, how many frames have a pose and how many in the world, and lost frames
     with their ``causes``.
     """
-    piece = found.piece
-    posed = np.flatnonzero(piece >= 0)
-    pieces = [
-        [frames[rows[0]], frames[rows[-1]]]
-        for k in range(int(piece.max()) + 1)
-        if len(rows := np.flatnonzero(piece == k))
-    ]
-    lost, lines = [], []
+    piece, main = found.piece, largest(found.piece)
+    posed, lost = np.flatnonzero(piece >= 0), list[dict[str, Any]]()
+    members = [np.flatnonzero(piece == k) for k in range(int(piece.max()) + 1)]
     # Runs of lost frames: between neighbours the row grows by one.
-    for run in np.split(rows := np.flatnonzero(piece < 0), np.flatnonzero(np.diff(rows) > 1) + 1):
-        if not run.size:
-            continue
+    rows = np.flatnonzero(piece < 0)
+    for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if rows.size else ():
         before, behind = posed[posed < run[0]], posed[posed > run[-1]]
         bridged = None
         # Bridged: the frames on both sides are of one piece, tracked across.
         if before.size and behind.size and piece[before[-1]] == piece[behind[0]]:
             bridged = [frames[before[-1]], frames[behind[0]]]
-        for row in run:
-            cause = causes.get(frames[row], "no frame beside it could be posed with it")
-            lost.append({"frame": frames[row], "cause": cause, "bridged": bridged})
-            how = "no pose" if bridged is None else f"bridged from {bridged[0]} to {bridged[1]}"
-            lines.append(f"frame {frames[row]} lost: {cause}; {how}")
-    if len(pieces) > 1:
-        words = ", ".join(f"piece {k}: frames {a}-{b}" for k, (a, b) in enumerate(pieces, start=1))
-        where = ", ".join(f"before frame {a} ({causes.get(a, 'no motion found')})" for a, _ in pieces[1:])
-        world = f"each in its own frame, the world is that of piece {largest(piece) + 1}, the largest"
-        lines.append(f"the trajectory is broken {where}: {words}; {world}")
-    lines += [
-        f"nothing tells of the vertical at frames {a}-{b}: their world is that of camera {a}, whose own up is z"
-        for (a, b), source in zip(pieces, verticals, strict=True)
-        if source == NO_VERTICAL
-    ]
-    main = largest(piece)
-    return {
+        for frame in (frames[row] for row in run):
+            cause = causes.get(frame, "no frame beside it could be posed with it")
+            lost.append({"frame": frame, "cause": cause, "bridged": bridged})
+    facts = {
         # Facts are JSON, which has no NaN.
         "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in found.poses],
         "verticals": list(verticals),
-        "pieces": pieces,
+        "pieces": [[frames[rows[0]], frames[rows[-1]]] for rows in members],
         "main": main,
         "posed": len(posed),
         "in_world": int((piece == main).sum()),
         "lost": lost,
-        "warnings": lines,
     }
+    return facts | {"warnings": list(_missing(facts, causes))}
+
+
+def _missing(facts: Mapping[str, Any], causes: Mapping[int, str]) -> Iterator[str]:
+    """Lines on what a trajectory lacks, by the facts of :func:`account`."""
+    for one in facts["lost"]:
+        how = "no pose" if one["bridged"] is None else f"bridged from {one['bridged'][0]} to {one['bridged'][1]}"
+        yield f"frame {one['frame']} lost: {one['cause']}; {how}"
+    pieces = facts["pieces"]
+    if len(pieces) > 1:
+        words = ", ".join(f"piece {k}: frames {a}-{b}" for k, (a, b) in enumerate(pieces, start=1))
+        where = ", ".join(f"before frame {a} ({causes.get(a, 'no motion found')})" for a, _ in pieces[1:])
+        world = f"each in its own frame, the world is that of piece {facts['main'] + 1}, the largest"
+        yield f"the trajectory is broken {where}: {words}; {world}"
+    for (a, b), source in zip(pieces, facts["verticals"], strict=True):
+        if source == NO_VERTICAL:
+            world = f"their world is that of camera {a}, whose own up is z"
+            yield f"nothing tells of the vertical at frames {a}-{b}: {world}"
 
 
 def _moved(frames: list[int], steps: Sequence[tuple[float | None, float]]) -> dict[int, list[str]]:

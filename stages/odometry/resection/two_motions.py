@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import DegenerateError
+from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.odometry.resection.landmarks import SegmentPoints
 from rille.stages.odometry.resection.pnp import Pose, back_projection
 from rille.stages.odometry.resection.robust_pose import MIN_LANDMARKS, Resection, ResectParams, observations, resect
@@ -98,9 +99,19 @@ def moving_by_themselves(
     # The smaller part may be all that shows the motion only where the larger one is the vehicle itself.
     if len(parts[1].rows) < (BODY_SHARE if body and still.pose is posed else SECOND_SHARE) * total:
         return left[:0]
-    moved = [float(np.linalg.norm(part.pose.T_local_left.translation - key.translation)) for part in (still, moving)]
-    counts = len(still.rows), len(moving.rows)
-    raise AmbiguousError(
+    raise _ambiguity((still, moving), key, total, stays=stays, body=body)
+
+
+def _ambiguity(
+    parts: tuple[_Part, _Part], key: RigidTransform, total: int, *, stays: bool, body: bool
+) -> AmbiguousError:
+    """The error in words: of the part that moves less in the image, and of the other, among ``total`` landmarks.
+
+    ``stays``: the former does not move in the image; ``body``: it is nearer than all of the other.
+    """
+    moved = [float(np.linalg.norm(part.pose.T_local_left.translation - key.translation)) for part in parts]
+    counts = [len(part.rows) for part in parts]
+    return AmbiguousError(
         "RIL-770",
         f"two motions: {counts[0]} of {total} landmarks ({counts[0] / total:.0%}) "
         f"{'do not move in the image' if stays else f'moved by {moved[0]:.3g} m'}, "

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rille.pipeline.commands import batch
-from rille.pipeline.commands.options import COMPLETE, FAILED, HOLES, USAGE
+from rille.pipeline.runs.options import COMPLETE, FAILED, HOLES, USAGE
 from rille.stages.core.errors import DegenerateError, InputError
 
 ENDS = {

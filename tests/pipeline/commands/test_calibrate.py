@@ -12,7 +12,7 @@ import pytest
 from raising import raises
 
 from rille.datasets.cameras import read_cameras, rig_of
-from rille.pipeline.commands.sequences.calibrate import Board, Boards, calibrate, cover, doubts
+from rille.pipeline.commands.sequences.calibrate import Boards, calibrate, cover, doubts
 from rille.stages.calibration.target import MODELS, BoardView, RigCalibration, ViewResidual
 from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.lens import Lens
@@ -27,7 +27,7 @@ def results(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[st
     for name, (corners, square) in BOARDS.items():
         out[name] = tmp_path_factory.mktemp("boards") / "rig.yaml"
         sides = [data_dir / name / f"{side}*.jpg" for side in ("left", "right")]
-        assert calibrate(*sides, board=Board(square, corners), output=out[name]) == 0
+        assert calibrate(*sides, square=square, corners=corners, output=out[name]) == 0
     return out
 
 
@@ -106,7 +106,7 @@ def test_a_wide_fisheye_is_calibrated_from_its_pictures(tmp_path):
         for side, T in (("left", pose @ centre), ("right", T_right_left @ pose @ centre)):
             cv2.imwrite(str(tmp_path / f"{side}{k}.png"), drawn(lens, T, 0.03))
     out = tmp_path / "rig.yaml"
-    assert calibrate(tmp_path, tmp_path, board=Board(0.03, "9x6"), model="fisheye", output=out) == 0
+    assert calibrate(tmp_path, tmp_path, square=0.03, corners="9x6", model="fisheye", output=out) == 0
     left, right = read_cameras(out)
     assert left.lens.model == "fisheye"
     assert left.lens.camera.fx == pytest.approx(114, rel=0.01)
@@ -125,7 +125,7 @@ def test_mispaired_view_and_stray_image_are_named(data_dir, tmp_path, capsys):
         shutil.copy(source, tmp_path / f"right{k:02d}.jpg")
     for side in ("left", "right"):
         cv2.imwrite(str(tmp_path / f"{side}99.jpg"), np.full((480, 640), 90, np.uint8))
-    assert calibrate(tmp_path, tmp_path, board=Board(0.03, "6x4"), model="radtan4", output=tmp_path / "r.yaml") == 0
+    assert calibrate(tmp_path, tmp_path, square=0.03, corners="6x4", model="radtan4", output=tmp_path / "r.yaml") == 0
     shown = capsys.readouterr()
     assert "view 04 is left out" in shown.err
     assert re.search(r"^99 +left out: no whole board in the left nor in the right image", shown.out, re.MULTILINE)
@@ -145,13 +145,13 @@ def images(folder: Path, count: int = 2) -> Path:
 
 def test_complaints_say_what_to_change(tmp_path):
     folder = images(tmp_path / "flat")
-    given = {"board": Board(0.03), "output": tmp_path / "rig.yaml"}
+    given = {"square": 0.03, "output": tmp_path / "rig.yaml"}
     with raises("RIL-152", "0.025"):
-        calibrate(folder, folder, **(given | {"board": Board(25)}))
+        calibrate(folder, folder, **(given | {"square": 25}))
     with raises("RIL-153"):
         calibrate(folder, folder, **given)
     with raises("RIL-961", "9 x 6", "0 of 2", "no whole board in the left nor in the right image"):
-        calibrate(folder, folder, **(given | {"board": Board(0.03, "9x6")}))
+        calibrate(folder, folder, **(given | {"corners": "9x6"}))
     with raises("RIL-011"):
         calibrate(folder / "left*.bmp", folder, **given)
     (tmp_path / "plain").mkdir()
@@ -168,7 +168,7 @@ def test_pictures_of_a_board_at_rest_are_one_view(data_dir, tmp_path):
         for side in ("left", "right"):
             shutil.copy(data_dir / "chessboard_opencv" / f"{side}01.jpg", tmp_path / f"{side}{k}.jpg")
     with raises("RIL-961", "1 of 5", "1: the board stands as in view 0"):
-        calibrate(tmp_path, tmp_path, board=Board(0.025, "9x6"), output=tmp_path / "rig.yaml")
+        calibrate(tmp_path, tmp_path, square=0.025, corners="9x6", output=tmp_path / "rig.yaml")
     assert not (tmp_path / "rig.yaml").exists()
 
 
@@ -182,7 +182,7 @@ def test_a_right_camera_of_half_the_size_gives_the_same_rig(data_dir, tmp_path, 
                 image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
                 half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
                 cv2.imwrite(str(tmp_path / f"{side}{k:02d}.png"), half if side == "right" else image)
-    assert calibrate(tmp_path, tmp_path, board=Board(0.025, "9x6"), output=tmp_path / "rig.yaml") == 0
+    assert calibrate(tmp_path, tmp_path, square=0.025, corners="9x6", output=tmp_path / "rig.yaml") == 0
     whole, mixed = (read_cameras(path) for path in (results["chessboard_opencv"], tmp_path / "rig.yaml"))
     sizes = [(c.lens.camera.width, c.lens.camera.height) for c in mixed]
     assert sizes == [(640, 480), (320, 240)]
@@ -205,7 +205,7 @@ def test_pictures_of_a_street_show_no_board(data_dir, tmp_path):
         for path in sorted((data_dir / "kitti06_51" / folder).iterdir())[::10]:
             shutil.copy(path, side)
     with raises("RIL-153"):
-        calibrate(*sides, board=Board(0.1), output=tmp_path / "rig.yaml")
+        calibrate(*sides, square=0.1, output=tmp_path / "rig.yaml")
     assert not (tmp_path / "rig.yaml").exists()
 
 
@@ -219,7 +219,7 @@ def test_views_of_no_flat_board_write_nothing(data_dir, tmp_path, monkeypatch):
         shutil.copy(left, tmp_path / f"left{k}.jpg")
         shutil.copy(right, tmp_path / f"right{k}.jpg")
     with raises("RIL-800", "6 x 4"):
-        calibrate(tmp_path, tmp_path, board=Board(0.03, "6x4"), keep_bad=True, output=tmp_path / "rig.yaml")
+        calibrate(tmp_path, tmp_path, square=0.03, corners="6x4", keep_bad=True, output=tmp_path / "rig.yaml")
     assert not (tmp_path / "rig.yaml").exists()
 
 
@@ -229,6 +229,6 @@ def test_views_that_are_left_out_cover_nothing():
     lens = Lens(Camera(100, 100, 50, 40, 100, 80), "radtan", (0.0, 0.0, 0.0, 0.0))
     sigma = {f"{side} {name}": 0.0 for side in ("left", "right") for name in ("fx", *MODELS["radtan4"])}
     seen = tuple(ViewResidual(v.name, 0.1, 0.1, 0.1, used=v.name == "used") for v in views)
-    found = RigCalibration(lens, lens, RigidTransform.identity(), sigma, 0.1, seen)
+    found = RigCalibration(lens, lens, RigidTransform.identity(), dict.fromkeys(sigma, 1.0), sigma, 0.1, seen)
     told = doubts(found, Boards((2, 2), ((100, 80), (100, 80)), views), "radtan4")
     assert [line[:7] for line in told] == ["RIL-695", "RIL-698", "RIL-698"]

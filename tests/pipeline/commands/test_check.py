@@ -154,7 +154,7 @@ def test_frames_are_chosen_and_warnings_repeated(tmp_path, capsys):
 def test_moments_are_judged_over_the_frames_that_are_looked_at(tmp_path, capsys):
     path = folder(tmp_path / "wall", frames=9)
     _, lines = run(path, capsys)
-    assert "rows of 6 pairs" in line(lines, "simultaneous")
+    assert "rows of 5 pairs" in line(lines, "simultaneous")
     _, lines = run(path, capsys, frames=(0, 4, 8))
     assert "rows of 3 pairs" in line(lines, "simultaneous")
     _, lines = run(path, capsys, frames=(4,))
@@ -165,10 +165,10 @@ def test_a_doubtful_rig_is_one_finding(tmp_path):
     path = folder(tmp_path / "wall", frames=1)
     calibration = path / "calib.txt"
     calibration.write_text(calibration.read_text().replace("-32.0", "-1.0"))
-    options = session.Options(str(path), cache=tmp_path / "cache")
-    assert judge_rig(session.settings(options).sequence.rig).code == "RIL-641"
-    assert not session.settings(options).sequence.warnings, "check judges the rig itself"
-    assert "RIL-641" in " ".join(session.settings_of_run(options).sequence.warnings)
+    options = session.Options(cache=tmp_path / "cache")
+    assert judge_rig(session.settings(str(path), options).sequence.rig).code == "RIL-641"
+    assert not session.settings(str(path), options).sequence.warnings, "check judges the rig itself"
+    assert "RIL-641" in " ".join(session.settings_of_run(str(path), options).sequence.warnings)
 
 
 @pytest.mark.parametrize(("scale", "told"), [(16, True), (257, False)])
@@ -176,8 +176,7 @@ def test_a_run_says_that_it_spreads_samples_that_leave_bits_empty(tmp_path, scal
     path = folder(tmp_path / "wall", frames=4)
     for image in path.glob("*/*.png"):
         cv2.imwrite(str(image), cv2.imread(str(image), cv2.IMREAD_GRAYSCALE).astype(np.uint16) * scale)
-    options = session.Options(str(path), cache=tmp_path / "cache")
-    found = [line for line in session.settings_of_run(options).sequence.warnings if "RIL-827" in line]
+    options = session.Options(cache=tmp_path / "cache")
+    found = [line for line in session.settings_of_run(str(path), options).sequence.warnings if "RIL-827" in line]
     assert ["(sample - 0) x 8" in line for line in found] == [True] * told
-    loop = session.Options("mockup-loop", cache=tmp_path / "cache", verb="drive")
-    assert not session.settings_of_run(loop).sequence.warnings, "no image is there before the drive"
+    assert not session.settings_of_run("mockup-loop", options).sequence.warnings, "no image is there before the drive"

@@ -151,7 +151,7 @@ def test_one_clear_line_for_what_cannot_be_compared(tmp_path: Path, capsys: pyte
     (tmp_path / "text.tif").write_text("no raster")
     (tmp_path / "folder").mkdir()
     assert "none.tif does not exist" in refused(capsys, run, tmp_path / "none.tif")
-    assert "no overlap: A is at x -1.025..2.475" in refused(capsys, run, away)
+    assert "no known cell in common: A is at x -1..2.45" in refused(capsys, run, away)
     told = refused(capsys, run, utm)
     assert "Rille world frame" in told
     assert "UTM zone 33N" in told

@@ -13,6 +13,7 @@ import pytest
 
 from rille.pipeline.commands.computing import compile as compilation
 from rille.pipeline.engine.runtime import kernels as compiled
+from rille.pipeline.runs.session import RunResult
 from rille.stages.core.errors import RilleError
 
 
@@ -31,13 +32,13 @@ def test_only_the_number_of_new_kernels_is_said(
 ) -> None:
     folders = []
 
-    def perform(options: Any) -> tuple[int, Path]:
-        print("a run's own words")
+    def perform(sequence: str, options: Any, *, verb: str = "reconstruct", warn: Any) -> RunResult:
+        warn("a warning of the run")
         (kernels / "function").mkdir(exist_ok=True)
-        (kernels / "function" / f"{options.verb}.nbc").touch()
+        (kernels / "function" / f"{verb}.nbc").touch()
         options.runs.mkdir(exist_ok=True)
         folders.append(options.runs.parent)
-        return 3, options.runs  # a drive that does not reach its goal
+        return RunResult(3, options.runs, ["a run's own words"], [])  # a drive that does not reach its goal
 
     monkeypatch.setattr(compilation, "perform", perform)
     assert compilation.compile_kernels() == 0
@@ -49,7 +50,7 @@ def test_only_the_number_of_new_kernels_is_said(
 def test_a_run_that_fails_is_an_error_and_leaves_nothing(kernels: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folders = []
 
-    def perform(options: Any) -> tuple[int, Path]:
+    def perform(sequence: str, options: Any, *, verb: str = "reconstruct", warn: Any) -> RunResult:
         options.runs.mkdir()
         folders.append(options.runs.parent)
         raise RilleError("RIL-061", "cannot make a folder", remedy="make room")

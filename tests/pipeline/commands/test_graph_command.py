@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rille.pipeline.commands.computing.plan import graph
-from rille.pipeline.commands.options import Settings
+from rille.pipeline.runs.options import Settings
 
 
 def test_every_stage_is_in_the_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,11 +15,12 @@ import pytest
 from raising import raises
 
 from rille.datasets.images import arrivals
+from rille.datasets.protocol import Sequence
 from rille.pipeline import cli
 from rille.pipeline.commands.computing import watch as command
-from rille.pipeline.commands.options import COMPLETE, HOLES, INTERRUPTED, WatchOptions
 from rille.pipeline.engine import events
 from rille.pipeline.runs import session
+from rille.pipeline.runs.options import COMPLETE, HOLES, INTERRUPTED, WatchOptions
 from rille.stages.core.errors import DegenerateError
 
 MANIFEST = """
@@ -67,15 +68,14 @@ class Scenario:
         if self.steps:
             self.steps.pop(0)()
 
-    def perform(self, options: WatchOptions) -> tuple[int, Path]:
-        whole = options.opened.frames - len(options.opened.lost)
+    def perform(self, sequence: Sequence, options: WatchOptions, **_: Any) -> session.RunResult:
+        whole = sequence.frames - len(sequence.lost)
         self.runs.append((whole, options.frames, bool(options.only)))
         if self.error is not None:
             raise self.error
         folder = self.places["runs"] / f"{len(self.runs)}"
         folder.mkdir(parents=True)
-        print(f"run {len(self.runs)}\nmore")
-        return COMPLETE, folder
+        return session.RunResult(COMPLETE, folder, [f"run {len(self.runs)}"], [])
 
     def watch(self, *steps: Callable[[], None], until_idle: float | None = 3.0, **options: Any) -> int:
         self.steps = list(steps)

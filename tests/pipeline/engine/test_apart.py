@@ -67,7 +67,7 @@ if __name__ == "__main__":
 COMPILES_AND_WRITES = """
 import sys
 from pathlib import Path
-from rille.pipeline.commands.options import prepare
+from rille.pipeline.cli import prepare
 prepare()
 import numba, matplotlib
 import numpy as np

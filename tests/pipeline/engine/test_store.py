@@ -25,10 +25,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 from raising import raises
 
-from rille.pipeline.commands.options import cache_folder
 from rille.pipeline.engine.store import archive, maintenance, zarr_group
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.output_digest import array_digests, output_digest
+from rille.pipeline.runs.options import cache_folder
 from rille.stages.core.declare import Array, Bundle, NoParams, Stage
 
 STAGE = Stage(

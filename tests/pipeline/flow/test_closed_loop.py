@@ -136,14 +136,14 @@ def test_killed_in_the_middle_it_goes_on_to_the_same_bits(arrived: tuple[Drive, 
 
 
 @pytest.mark.slow
-def test_the_report_shows_the_drive(
-    arrived: tuple[Drive, Result], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_report_shows_the_drive(arrived: tuple[Drive, Result], store: Path, tmp_path: Path) -> None:
     given: dict[str, Any] = {"runs": tmp_path, "cache": store, "executor": "inline", "progress": "quiet"}
-    assert session.reconstruct(session.Options("mockup-loop", assignments=SMALL, verb="drive", **given)) == 0
-    assert capsys.readouterr().out.startswith("goal: ")
-    assert session.reconstruct(session.Options("mockup-loop", assignments=SMALL, verb="drive", **given)) == 0
-    assert capsys.readouterr().out.startswith("goal: "), "nothing computed, the same answer"
+    first = session.perform("mockup-loop", session.Options(SMALL, **given), verb="drive")
+    assert first.code == 0
+    assert first.lines[0].startswith("goal: ")
+    again = session.perform("mockup-loop", session.Options(SMALL, **given), verb="drive")
+    assert again.code == 0
+    assert again.lines[0] == first.lines[0], "nothing computed, the same answer"
     folder = tmp_path / "mockup-loop" / "latest"
     facts = json.loads((folder / "report.json").read_text())
     assert facts["complete"], facts["missing"]
@@ -152,7 +152,7 @@ def test_the_report_shows_the_drive(
     assert "The drive, stop by stop" in page
     assert page.count('alt="Stop ') == len(arrived[0].driven.stops)
     with raises("RIL-059"):
-        session.reconstruct(session.Options("mockup-short", verb="drive", **given))
+        session.perform("mockup-short", session.Options(**given), verb="drive")
 
 
 def numbers(value: Any) -> Iterator[float]:
@@ -201,7 +201,7 @@ def test_a_lost_image_is_left_out_and_the_last_one_taken_again(arrived: tuple[Dr
 
 @pytest.mark.slow
 def test_slip_of_thirty_per_cent_stops_says_so_and_keeps_all(
-    arrived: tuple[Drive, Result], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    arrived: tuple[Drive, Result], store: Path, tmp_path: Path
 ) -> None:
     slips = ("rover.slip=0.3", "rover.slip_sigma=0.0", "drive.max_safety_stops=1")
     flow, _ = drive(store, *slips)
@@ -212,9 +212,9 @@ def test_slip_of_thirty_per_cent_stops_says_so_and_keeps_all(
     assert flow.driven.check is not None
     given: dict[str, Any] = {"runs": tmp_path, "cache": store, "executor": "inline", "progress": "quiet"}
     for _ in range(2):  # the second time nothing is computed, and the run before stands
-        code = session.reconstruct(session.Options("mockup-loop", assignments=(*SMALL, *slips), verb="drive", **given))
-        assert code == session.HOLES
-        assert capsys.readouterr().out.startswith("safety stop: slip of ")
+        result = session.perform("mockup-loop", session.Options((*SMALL, *slips), **given), verb="drive")
+        assert result.code == session.HOLES
+        assert result.lines[0].startswith("safety stop: slip of ")
     lines = (tmp_path / "mockup-loop" / "latest" / "trajectory.tum").read_text().splitlines()
     assert len(lines) == 1 + len(flow.posed) > 2, "the way to where it stopped, too"
 

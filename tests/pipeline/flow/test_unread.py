@@ -20,7 +20,7 @@ from rille.pipeline.runs import session
 
 
 def settled(tmp_path: Path, sequence: str, *assignments: str, config: Path | None = None) -> session.Settled:
-    return session.settings(session.Options(sequence, assignments, config=config, cache=tmp_path / "cache"))
+    return session.settings(sequence, session.Options(assignments, config=config, cache=tmp_path / "cache"))
 
 
 def test_only_values_that_differ_from_what_would_be_in_force_count(tmp_path):

@@ -31,7 +31,7 @@ def metric(value, unit, label="", truth=None, completeness=None):
 def page_of(**changes):
     """Text of the page of the toy's run, with other facts."""
     run = view()
-    facts = summary.summarise(run, summary.gather(run), ()) | changes
+    facts = summary.summarise(run, summary.collect(run), ()) | changes
     facts["metrics"] = {name: {"group": "", **entry} for name, entry in facts["metrics"].items()}
     return Page(page.render(run, facts, (), ())).text
 
@@ -77,7 +77,7 @@ def test_every_reason_on_the_map_has_words():
 
 
 def test_columns_of_pairs_without_anything_are_left_out():
-    (first, *_) = summary.gather(view())["pairs"]
+    (first, *_) = summary.collect(view())["pairs"]
     nothing = dict.fromkeys(first)
     pairs = [nothing | {"frame": 0, "matched": 0.5}, nothing | {"frame": 4, "path": "found"}]
     assert "local path Frame Matched Path 0 50 % – 4 – found Overlap:" in page_of(pairs=pairs)
@@ -205,7 +205,7 @@ def test_standard_deviations_are_not_judged_by_truth_that_was_misread(warnings, 
     made = bundles()
     metrics = made["accuracy"].meta["metrics"] | {"nees": {"value": 850.0, "unit": "", "how": ""}}
     made["accuracy"] = Bundle(made["accuracy"].arrays, {"metrics": metrics, "warnings": warnings})
-    lines = summary.gather(view(made))["warnings"]
+    lines = summary.collect(view(made))["warnings"]
     assert sum("times their standard deviations" in line for line in lines) == told
 
 

@@ -10,7 +10,9 @@ import pytest
 from rille.datasets.protocol import Positions
 from rille.pipeline.runs import input_checks
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.odometry.frame_screening import FrameScreeningParams
 
+LIMITS = FrameScreeningParams.model_validate({})
 CAMERA = Camera(500.0, 500.0, 160.0, 120.0, 320, 240)
 
 
@@ -104,7 +106,7 @@ def changed(**values: float) -> dict[str, float]:
 
 
 def test_good_images_give_two_lines():
-    assert levels(input_checks.judge_looks(looks([GOOD] * 5, [GOOD] * 5), NAMES)) == ["OK", "OK"]
+    assert levels(input_checks.judge_looks(looks([GOOD] * 5, [GOOD] * 5), NAMES, LIMITS)) == ["OK", "OK"]
 
 
 @pytest.mark.parametrize(
@@ -119,7 +121,7 @@ def test_good_images_give_two_lines():
     ],
 )
 def test_bad_images_are_told(left, right, level, words):
-    found = input_checks.judge_looks(looks(left, right), NAMES)
+    found = input_checks.judge_looks(looks(left, right), NAMES, LIMITS)
     assert any(v.level == level and words in v.text for v in found)
 
 

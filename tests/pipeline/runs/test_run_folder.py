@@ -39,7 +39,7 @@ def test_a_link_that_a_killed_run_of_this_number_left_is_replaced(tmp_path):
 
 def test_the_command_of_a_run_is_one_line_that_a_shell_takes(tmp_path):
     assignments = ("drive.goal=[0.1,\n2.0]", "hfvm.preset=fast", "a.b=\x1b")
-    command = session.Options("my data", assignments, config=tmp_path / "my file.toml").command()
+    command = session.Options(assignments, config=tmp_path / "my file.toml").command("reconstruct", "my data")
     assert tomllib.loads(f"# {command}\n") == {}
     words = shlex.split(command)
     assert words[:5] == ["rille", "reconstruct", "my data", "--config", str(tmp_path / "my file.toml")]

@@ -23,8 +23,8 @@ from rille.stages.calibration.rig import RigParams
 from rille.stages.core.declare import Bundle
 from rille.stages.evaluation.accuracy import trajectory_accuracy
 from rille.stages.evaluation.dem_accuracy import dem_accuracy
-from rille.stages.evaluation.metric import metric as figure
 from rille.stages.evaluation.path_check import path_check
+from rille.stages.facts.evaluation import metric as figure
 from rille.stages.geometry.epipolar import corrected
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
@@ -331,7 +331,7 @@ def _blank(fig: object, alt: str, *, photo: bool = False) -> canvas.Panel:
 
 def report(folder: Path, run: RunView) -> None:
     """Both files of the report, of artifacts as they are."""
-    write_report(folder, run, summary.gather(run), [drawing.figure(run) for drawing in gallery.DRAWINGS])
+    write_report(folder, run, summary.collect(run), [drawing.figure(run) for drawing in gallery.DRAWINGS])
 
 
 Written = tuple[dict[str, Any], Page, str, Path]

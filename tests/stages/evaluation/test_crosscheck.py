@@ -16,7 +16,7 @@ from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.evaluation.crosscheck import (
     OVERLAP,
     CrosscheckParams,
-    _camera,
+    colmap_rig,
     crosscheck_stage,
     image_pairs,
     match,
@@ -176,7 +176,7 @@ def test_matching_of_nothing_and_of_one() -> None:
 
 
 def test_the_principal_point_is_counted_as_positions_are() -> None:
-    camera = _camera(1, CAMERA)
+    (camera, _), _ = colmap_rig(RIG)
     assert (camera.principal_point_x, camera.principal_point_y) == (CAMERA.cx + 0.5, CAMERA.cy + 0.5)
     np.testing.assert_allclose(camera.img_from_cam(np.array([0.0, 0.0, 1.0])), [CAMERA.cx + 0.5, CAMERA.cy + 0.5])
 

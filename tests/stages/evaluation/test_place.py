@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from raising import raises
 
-from rille.stages.evaluation.place import Ortho, place
+from rille.stages.evaluation.dem_comparison import Grid
+from rille.stages.evaluation.place import place
 
 
 def ground(seed):
@@ -24,7 +26,7 @@ def seen(image, matrix, cells=300):
     to_pixels = 100.0 * matrix
     grey = cv2.warpAffine(image, to_pixels, (cells, cells), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     known = cv2.warpAffine(np.ones_like(image), to_pixels, (cells, cells), flags=cv2.WARP_INVERSE_MAP) > 0.99
-    return Ortho(grey, known, matrix)
+    return Grid(np.where(known, grey, np.nan), matrix)
 
 
 def lattice(cell, turn_deg=0.0, x=0.0, y=0.0):
@@ -40,7 +42,7 @@ def test_turn_and_shift_are_found(turn, cell):
     motion = lattice(1.0, turn, 2.4, 2.2)
     own = np.array([[cell, 0.0, -140 * cell], [0.0, cell, -150 * cell]])
     there = motion[:, :2] @ own + np.column_stack([np.zeros((2, 2)), motion[:, 2]])
-    a = Ortho(*seen(ground(1), there)[:2], own)
+    a = Grid(seen(ground(1), there).values, own)
     found, agreeing, centre, sigma = place(a, b)
     middle = np.array([0.1, -0.05])
     error = (found - motion)[:, :2] @ middle + (found - motion)[:, 2]
@@ -54,33 +56,33 @@ def test_turn_and_shift_are_found(turn, cell):
 def test_eastings_and_northings_lose_no_digits():
     a, b = seen(ground(1), lattice(0.01)), seen(ground(1), lattice(0.01, x=0.4, y=0.3))
     far = np.array([[0.0, 0.0, 500000.0], [0.0, 0.0, 5200000.0]])
-    found = place(a, b._replace(matrix=b.matrix + far)).motion
+    found = place(a, replace(b, matrix=b.matrix + far)).motion
     assert np.abs(found - far - lattice(1.0)).max() < 0.005
 
 
 def test_a_much_coarser_image_in_other_units_is_compared_at_its_own_cells():
     a = seen(ground(1), lattice(0.01))
-    fine = seen(ground(1), lattice(0.01), cells=480).grey
+    fine = seen(ground(1), lattice(0.01), cells=480).values
     coarse = fine.reshape(160, 3, 160, 3).mean(axis=(1, 3))
-    b = Ortho(40.0 * coarse + 7000.0, np.ones(coarse.shape, bool), lattice(0.03, x=0.01, y=0.01))
+    b = Grid(40.0 * coarse + 7000.0, lattice(0.03, x=0.01, y=0.01))
     assert np.abs(place(a, b).motion - lattice(1.0)).max() < 0.01
 
 
 def test_an_image_that_fits_two_places_is_refused():
     a = seen(ground(1), lattice(0.01), cells=150)
     b = seen(ground(1), lattice(0.01), cells=150)
-    twice = np.concatenate([b.grey, b.grey], axis=1)
+    twice = np.concatenate([b.values, b.values], axis=1)
     # Of twins a keypoint's second best match is as good as its best: noise tells half of them apart.
     twice[:, :150] += np.random.default_rng(4).normal(0, 12, (150, 150)) * (np.indices((150, 150))[0] % 50 < 25)
     twice[:, 150:] += np.random.default_rng(5).normal(0, 12, (150, 150)) * (np.indices((150, 150))[0] % 50 >= 25)
     with raises("RIL-841", "two places"):
-        place(a, Ortho(twice, np.ones(twice.shape, bool), b.matrix))
+        place(a, Grid(twice, b.matrix))
 
 
 def test_another_place_is_refused():
     a, b = (seen(ground(seed), lattice(0.01)) for seed in (1, 2))
     with raises("RIL-327", "one place"):
         place(a, b)
-    blank = Ortho(np.full((50, 50), 90.0), np.ones((50, 50), bool), lattice(0.01))
+    blank = Grid(np.full((50, 50), 90.0), lattice(0.01))
     with raises("RIL-327", "0 keypoints"):
         place(blank, b)

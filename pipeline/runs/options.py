@@ -1,8 +1,9 @@
-"""Options that several commands of ``rille`` share, with their explanation, and the steps before each command."""
+"""Options of a run, with their explanation, and those that other commands share; exit codes."""
 
 from __future__ import annotations
 
 import os
+import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +40,7 @@ Unparsed = Parameter(parse=False)
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Settings:
-    """Options that choose what is computed, and the cache; ``sequence`` is the word or path that names the sequence.
+    """Options that choose what is computed, and the cache.
 
     Parameters
     ----------
@@ -47,26 +48,12 @@ class Settings:
         TOML file of parameters; every run writes one with all defaults filled.
     frames
         Frame range START:STOP[:STEP], as in Python; all by default.
-    opened
-        The :class:`~rille.datasets.protocol.Sequence` itself, where it is open already.
     """
 
-    sequence: Annotated[str, Unparsed] = ""
     assignments: Assignments = ()
     config: Path | None = None
     frames: str | None = None
     cache: CacheFolder = None
-    verb: Annotated[str, Unparsed] = "reconstruct"
-    opened: Annotated[Any, Unparsed] = None
-
-    def command(self) -> str:
-        """The command line that repeats this run, as a shell takes it, in one line."""
-        words = ["rille", self.verb, self.sequence]
-        words += ["--config", str(self.config)] if self.config else []
-        words += ["--frames", self.frames] if self.frames else []
-        words += [word for a in self.assignments for word in ("--set", a)]
-        # A line feed within a list of TOML is as good as a space; in `config.toml` this is a comment of one line.
-        return plain(shlex.join(words).replace("\n", " "))
 
 
 @Parameter(name="*")
@@ -109,8 +96,6 @@ class Options(Work):
         How progress is shown on stderr.
     quiet
         No progress; warnings and errors only.
-    kept
-        List of the workers that a run leaves to the next one; whoever gives it ends them.
     """
 
     keep_going: Annotated[bool, FLAG] = False
@@ -119,15 +104,19 @@ class Options(Work):
     runs: Runs = RUNS
     progress: Literal["auto", "bar", "plain", "quiet"] = "auto"
     quiet: Annotated[bool, FLAG, Parameter(name=["--quiet", "-q"])] = False
-    kept: Annotated[Any, Unparsed] = None
 
     def part(self) -> str:
         """The options that choose a part of the run, as they are typed; empty: all of it."""
         return " ".join([*(f"--until {name}" for name in self.until), *(f"--only {name}" for name in self.only)])
 
-    def command(self) -> str:
-        """The same, with the part of the run."""
-        return f"{super().command()} {plain(self.part())}".strip()
+    def command(self, verb: str, sequence: str) -> str:
+        """The command line that repeats a run of a sequence, by its name or path, as a shell takes it, in one line."""
+        words = ["rille", verb, sequence]
+        words += ["--config", str(self.config)] if self.config else []
+        words += ["--frames", self.frames] if self.frames else []
+        words += [word for a in self.assignments for word in ("--set", a)]
+        # A line feed within a list of TOML is as good as a space; in `config.toml` this is a comment of one line.
+        return plain(f"{shlex.join(words)} {self.part()}".replace("\n", " ").strip())
 
 
 @Parameter(name="*")
@@ -165,6 +154,11 @@ def cache_folder(given: str | Path | None) -> Path:
     return locate(given or os.environ.get("RILLE_CACHE") or Path(".rille/cache"))
 
 
+def named(output: Path, ending: str) -> Path:
+    """One of the files of an output that is named without ending; a name with the ending of one is that of all."""
+    return output.with_name(re.sub(r"\.(gpkg|json|tif|tum)$", "", output.name) + ending)
+
+
 def check_output(path: Path, *endings: str) -> None:
     """Refuse a name that the file to be written cannot have, before anything is computed.
 
@@ -180,13 +174,3 @@ def check_output(path: Path, *endings: str) -> None:
     if endings and path.suffix.lower() not in endings:
         allowed = " or ".join(endings)
         raise ConfigError("RIL-871", f"the output {path} has another ending", remedy=f"end it in {allowed}")
-
-
-def prepare() -> None:
-    """One thread a library, safe kernels, and nothing of the current folder, before NumPy and numba are imported."""
-    from rille.pipeline.engine.runtime import apart
-    from rille.pipeline.engine.runtime.environment import prepare_environment
-
-    prepare_environment()
-    apart.leave_out()
-    apart.ignore_settings()
