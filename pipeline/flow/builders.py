@@ -125,6 +125,7 @@ class Builder:
         self.products = Products()
         self.made: dict[Any, Any] = {}
         self.corrections: list[float] | None = None
+        self.first_rig: Args | None = None
 
     # Arguments of many tasks, one object for all: each would hold some kilobytes of its own until the run's end.
 
@@ -150,6 +151,7 @@ class Builder:
 
     def recalibrate(self, errors: Series[float], rig: Args) -> None:
         """Go on with the calibration changed; what does not rest on it is the same task as before."""
+        self.first_rig = self.first_rig or self.given_rig
         self.sequence = recalibrated(self.sequence, errors, rig)
         self.corrections = [a + b for a, b in zip(self.corrections or [0.0] * len(errors), errors, strict=True)]
         self.graph.anew = True
@@ -279,7 +281,8 @@ class Builder:
     def rig(self, pairs: Series[int], which: str = "") -> tuple[Handle[RigFacts], Handle[CalibrationFacts]]:
         """The rig that the orientations of these pairs agree on, and what of it other stages read."""
         orientations = [self.orientation(pair) for pair in pairs]
-        found = self.node(rig_stage, f"rig{which}", orientations=orientations, rig=self.given_rig)
+        given = {"rig": self.given_rig, "first": self.first_rig}
+        found = self.node(rig_stage, f"rig{which}", orientations=orientations, **given)
         return found, self.node(calibration_stage, f"calibration{which}", rig=found)
 
     def level(

@@ -303,9 +303,12 @@ def _shown(start: Sequence[Linear], columns: list[int], usual: Floats, departure
 
 @stage("rig", version=3)
 def rig_stage(
-    params: RigParams, orientations: Sequence[Bundle[OrientationFacts]] = (), *, rig: Rig
+    params: RigParams, orientations: Sequence[Bundle[OrientationFacts]] = (), *, rig: Rig, first: Rig | None = None
 ) -> Bundle[RigFacts]:
-    """The rig: the given calibration, repaired where the images contradict it."""
+    """The rig: the given calibration, repaired where the images contradict it.
+
+    ``first``: as it was given, where the tracks have corrected it already.
+    """
     pairs = [
         PointPairs(
             found.meta["pair"],
@@ -314,4 +317,10 @@ def rig_stage(
         )
         for found in orientations
     ]
-    return Bundle({}, orient_rig(rig, pairs, params))
+    facts = orient_rig(rig, pairs, params)
+    if first is not None:
+        of_given = orient_rig(first, pairs, params.model_copy(update={"mode": "fixed"}))
+        facts |= {"given": of_given["given"], "source": f"{facts['source']}, corrected by the tracks", "changed": True}
+        if "residual_before_px" in of_given:
+            facts["residual_before_px"] = of_given["residual_before_px"]
+    return Bundle({}, facts)

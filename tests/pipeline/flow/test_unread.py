@@ -11,12 +11,12 @@ from toys.chain import build as toy
 
 from rille.datasets.registry import open_sequence
 from rille.pipeline.cli import main
-from rille.pipeline.commands.options import Settings
 from rille.pipeline.commands.sequences.check import check
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow import unread
 from rille.pipeline.runs import session
+from rille.pipeline.runs.options import Settings
 
 
 def settled(tmp_path: Path, sequence: str, *assignments: str, config: Path | None = None) -> session.Settled:
