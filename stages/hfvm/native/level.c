@@ -29,7 +29,7 @@ void EXPORT(search)(const Pair *pair, const int16_t *up_u, const int16_t *up_v, 
   Parents up = {up_u, up_v, (cols + 1) / 2};
   int32_t stride = up.cols + 2;
   for (int32_t j = 0; j < up_rows; j++) {
-    RowLines row = row_lines(&pair->band, pair->y0 + 2 * j + 0.5);
+    RowLines row = row_lines(&pair->band, 2 * j + 0.5);
     int32_t *to = centres + (int64_t)(j + 1) * stride;
     for (int32_t i = 0; i < up.cols; i++) to[i + 1] = centre_of(pair, &up, row, i, j);
     to[0] = to[1], to[up.cols + 1] = to[up.cols];
@@ -37,7 +37,7 @@ void EXPORT(search)(const Pair *pair, const int16_t *up_u, const int16_t *up_v, 
   memcpy(centres, centres + stride, stride * sizeof *centres);
   memcpy(centres + (int64_t)(up_rows + 1) * stride, centres + (int64_t)up_rows * stride, stride * sizeof *centres);
   for (int32_t j = 0; j < up_rows; j++) {
-    RowLines row = row_lines(&pair->band, pair->y0 + 2 * j + 0.5);
+    RowLines row = row_lines(&pair->band, 2 * j + 0.5);
     for (int32_t i = 0; i < up.cols; i++) {
       const int32_t *centre = centres + (int64_t)(j + 1) * stride + i + 1;
       Children best = search_parent(pair, row, centre, stride, (Shift){i, j}, *reach);
@@ -69,7 +69,7 @@ static void turn_row(const Pair *pair, Field field, uint8_t *dirty, Todo todo, i
   if (n == 0) return;
   /* Vectors run past the end of the list; settling the last pixel again does no harm. */
   for (int k = 0; k < LANES; k++) todo.columns[n + k] = todo.columns[n - 1];
-  RowLines row = row_lines(&pair->band, y + pair->y0);
+  RowLines row = row_lines(&pair->band, y);
   const int32_t *own = field.shift + start, *up = field.shift + (int64_t)above * cols;
   const int32_t *down = field.shift + (int64_t)below_ * cols, *cost = field.cost + start;
   for (int32_t k = 0; k < n; k += LANES) {
@@ -90,7 +90,7 @@ static void turn_row(const Pair *pair, Field field, uint8_t *dirty, Todo todo, i
       near[0] = ints_at(up, x), near[1] = ints_at(own, west), near[2] = ints_at(own, east), near[3] = ints_at(down, x);
     }
     Words words = words_at(pair->left.words + start, x);
-    Look look = {pair, words, x, y, lines_at(row, floats(x + pair->x0)), near, how.smoothness};
+    Look look = {pair, words, x, y, lines_at(row, floats(x)), near, how.smoothness};
     Settled best = settle(&look, mine, stay, how.beside);
     memcpy(todo.shift + k, &best.shift, sizeof best.shift);
     memcpy(todo.cost + k, &best.cost, sizeof best.cost);
@@ -174,7 +174,7 @@ void EXPORT(sums)(const Pair *pair, const int16_t *us, const int16_t *vs, const 
   for (int32_t y = 0; y < rows; y++) {
     for (int32_t x = 0, n = 1; x < cols; x += n) {
       int64_t i = (int64_t)y * cols + x;
-      int32_t u = us[i], v = vs[i], xr = x + pair->ahead_x + u, yr = y + pair->ahead_y + v;
+      int32_t u = us[i], v = vs[i], xr = x + u, yr = y + v;
       n = 1;
       out_u[i] = (float)u, out_v[i] = (float)v, out_distance[i] = -1.0f;
       if (!wanted[i] || xr < 0 || xr >= right_cols || yr < 0 || yr >= right_rows) continue;
@@ -253,7 +253,7 @@ static inline Eight differ(Eight shift, Eight other, const EdgeRule *rule) {
 /* What the displacement of a pixel costs; negative: it leads out of the right image. */
 static inline int32_t cost_there(const Pair *pair, Place p, int32_t shift, const Weights *weight, const EdgeRule *rule) {
   int32_t cols = pair->left.cols, right_cols = pair->right.cols;
-  int32_t y = p.y + pair->ahead_y + (shift >> 16), x = p.x + pair->ahead_x + (int16_t)shift;
+  int32_t y = p.y + (shift >> 16), x = p.x + (int16_t)shift;
   if (y < EDGE_RADIUS || y >= pair->right.rows - EDGE_RADIUS || x < EDGE_RADIUS || x >= right_cols - EDGE_RADIUS) return -1;
   const uint64_t *here = pair->left.words + p.at - (int64_t)EDGE_RADIUS * cols - EDGE_RADIUS;
   const uint64_t *there = pair->right.words + (int64_t)(y - EDGE_RADIUS) * right_cols + x - EDGE_RADIUS;
@@ -338,8 +338,8 @@ static Candidates listed(const Pair *pair, const Pair *compact, const Parents *u
   const Eight order = {0, 1, 2, 3, 4, 5, 6, 7};
   int32_t right_cols = pair->right.cols;
   int64_t i = place(&pair->left, x, y);
-  RowLines row = row_lines(&pair->band, y + pair->y0);
-  Line line = line_at(row, (float)(x + pair->x0), (float)(UNIT + costs->compact) * row.cost);
+  RowLines row = row_lines(&pair->band, y);
+  Line line = line_at(row, (float)x, (float)(UNIT + costs->compact) * row.cost);
   List list = candidates_of(pair, up, maps, x, y);
   Eight u = columns(list.shift), v = list.shift >> 16, xr = u + x, yr = v + y;
   Eight within_right = below(xr, right_cols) & below(yr, pair->right.rows), at = (yr * right_cols + xr) & within_right;

@@ -21,8 +21,6 @@ typedef struct { int32_t u, v; } Shift;                              /* columns 
 typedef struct {
   Image left, right;
   Band band;
-  int32_t x0, y0;           /* where the left window begins in its image */
-  int32_t ahead_x, ahead_y; /* and in the right window */
 } Pair;
 typedef struct { const int16_t *u, *v; int32_t cols; } Parents;      /* displacements of the coarser level */
 
@@ -59,7 +57,7 @@ RULE int32_t inside(const Image *image, int32_t x, int32_t y) {
 RULE int64_t place(const Image *image, int32_t x, int32_t y) { return (int64_t)y * image->cols + x; }
 
 RULE void try_pixel(const Pair *pair, Line line, Children *best, int n, Shift s) {
-  int32_t x = best->x + (n & 1), y = best->y + (n >> 1), xr = x + pair->ahead_x + s.u, yr = y + pair->ahead_y + s.v;
+  int32_t x = best->x + (n & 1), y = best->y + (n >> 1), xr = x + s.u, yr = y + s.v;
   if (!inside(&pair->right, xr, yr)) return;
   int32_t cost = distance(pair->left.words[place(&pair->left, x, y)],
                           pair->right.words[place(&pair->right, xr, yr)]) + off_line(line, s);
@@ -92,8 +90,8 @@ RULE void try_square(const Pair *pair, Square own, int64_t at, int32_t off, int3
 }
 RULE void try_strip(const Pair *pair, Line line, Strip strip, Children *best) {
   int32_t x = best->x, y = best->y, cols = pair->left.cols, right_cols = pair->right.cols;
-  int32_t xr = x + pair->ahead_x, yr = y + pair->ahead_y + strip.v;
-  if (x + 1 >= cols || y + 1 >= pair->left.rows || xr + strip.u < 0 || xr + strip.u + strip.count >= right_cols ||
+  int32_t yr = y + strip.v;
+  if (x + 1 >= cols || y + 1 >= pair->left.rows || x + strip.u < 0 || x + strip.u + strip.count >= right_cols ||
       yr < strip.cross || yr + 1 + strip.cross >= pair->right.rows) {
     try_strip_singly(pair, line, strip, best);
     return;
@@ -101,7 +99,7 @@ RULE void try_strip(const Pair *pair, Line line, Strip strip, Children *best) {
   Square own = square(pair->left.words, (int64_t)y * cols + x, cols);
   Eight u = (Eight){0, 1, 2, 3, 4, 5, 6, 7} + strip.u, v = (Eight){} + strip.v;
   Eight off = magnitude(line.a * floats(u) + line.b * floats(v) + line.c, FARTHEST_OFF);
-  int64_t row = (int64_t)yr * right_cols + xr;
+  int64_t row = (int64_t)yr * right_cols + x;
   int32_t offs[LANES], centre = strip.centre - strip.u;
   __builtin_memcpy(offs, &off, sizeof offs);
   if (centre >= 0 && centre < strip.count)
@@ -156,7 +154,7 @@ RULE void search_rectangles(const Pair *pair, Line line, const int32_t centres[C
 RULE int32_t centre_of(const Pair *pair, const Parents *up, RowLines row, int32_t i, int32_t j) {
   Shift s = {2 * up->u[(int64_t)j * up->cols + i], 2 * up->v[(int64_t)j * up->cols + i]};
   if (pair->band.cost < SHARP) return pack(s.u, s.v);
-  Line line = line_at(row, (float)pair->x0 + ((float)(2 * i) + 0.5f), 1.0f);
+  Line line = line_at(row, (float)(2 * i) + 0.5f, 1.0f);
   float off = line.a * (float)s.u + line.b * (float)s.v + line.c;
   off = off < -1.0f ? -1.0f : off > 1.0f ? 1.0f : off;
   return pack((int32_t)((float)s.u - rintf(off * line.a)), (int32_t)((float)s.v - rintf(off * line.b)));
@@ -165,7 +163,7 @@ RULE int32_t centre_of(const Pair *pair, const Parents *up, RowLines row, int32_
    `centre`: the parent's among all centres, which have a frame of one and are `stride` apart. */
 RULE Children search_parent(const Pair *pair, RowLines row, const int32_t *centre, int32_t stride, Shift at, Shift reach) {
   const int32_t centres[CENTRES] = {centre[0], centre[-1], centre[1], centre[-stride], centre[stride]};
-  Line line = line_at(row, (float)pair->x0 + ((float)(2 * at.u) + 0.5f), row.cost);
+  Line line = line_at(row, (float)(2 * at.u) + 0.5f, row.cost);
   Children best = {2 * at.u, 2 * at.v, {centre[0], centre[0], centre[0], centre[0]}, {FAR, FAR, FAR, FAR}};
   /* A row about a centre fits into eight columns up to a reach of 3, and a cross has one row to either side. */
   if (pair->band.cost >= SHARP && reach.u <= 3 && reach.v <= 1) search_rows(pair, line, centres, reach, &best);
@@ -197,8 +195,8 @@ typedef struct { const Pair *pair; Words words; Eight x; int32_t y; Lines line; 
 /* Take a displacement where it costs less than the best so far, and where `fresh`. */
 RULE void attempt(const Look *look, Eight tried, Eight fresh, Settled *best) {
   const Image *right = &look->pair->right;
-  Eight u = columns(tried), v = tried >> 16, x = look->x + look->pair->ahead_x + u;
-  Eight y = v + (look->y + look->pair->ahead_y);
+  Eight u = columns(tried), v = tried >> 16, x = look->x + u;
+  Eight y = v + look->y;
   Eight inside = below(x, right->cols) & below(y, right->rows) & fresh;
   Eight cost = distances(look->words, words_at(right->words, (y * right->cols + x) & inside));
   cost += magnitude(look->line.a * floats(u) + look->line.b * floats(v) + look->line.c, FARTHEST_OFF);

@@ -21,7 +21,7 @@ FUNCTIONS = "search", "propagate", "sums", "edges", "paths"
 class _Pair(Structure):
     _fields_ = (
         *(("left", c_void_p), ("left_shape", 2 * c_int32), ("right", c_void_p), ("right_shape", 2 * c_int32)),
-        *(("f", 9 * c_double), ("mu", c_double), ("place", 4 * c_int32)),
+        *(("f", 9 * c_double), ("mu", c_double)),
     )
 
 
@@ -39,7 +39,7 @@ def _at(array: AnyArray, kind: DTypeLike) -> int:
 def _pair(pair: LevelPair) -> _Pair:
     f = (9 * c_double)(*np.asarray(pair.f, np.float64).ravel())
     images = [part for words in (pair.left, pair.right) for part in (_at(words, np.uint64), words.shape)]
-    return _Pair(*images, f, pair.mu, (pair.x0, pair.y0, pair.ahead_x, pair.ahead_y))
+    return _Pair(*images, f, pair.mu)
 
 
 class Library:

@@ -13,18 +13,13 @@ class LevelPair(NamedTuple):
     """Feature vectors of two images, or of windows of them, and the epipolar band.
 
     ``left, right``: (row, col) uint64. ``f``: (3, 3) float64, fundamental matrix of the images, zeros without a band;
-    ``mu``: cost of a pixel off a line, byte steps. ``x0, y0``: first column and row of the left window, even;
-    ``ahead_x, ahead_y``: its place in the right window.
+    ``mu``: cost of a pixel off a line, byte steps.
     """
 
     left: AnyArray
     right: AnyArray
     f: AnyArray
     mu: float
-    x0: int = 0
-    y0: int = 0
-    ahead_x: int = 0
-    ahead_y: int = 0
 
 
 class Field(NamedTuple):

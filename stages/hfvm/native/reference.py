@@ -184,11 +184,11 @@ def _centres(pair, up_u, up_v, centres):  # type: ignore[no-untyped-def]
     rows, cols = up_u.shape
     one = np.float32(1.0)
     for j in range(rows):
-        terms = epipolar.row_terms(pair.f, pair.y0 + 2 * j + 0.5)
+        terms = epipolar.row_terms(pair.f, 2 * j + 0.5)
         for i in range(cols):
             u, v = np.float32(2 * up_u[j, i]), np.float32(2 * up_v[j, i])
             if pair.mu >= SHARP:
-                x = np.float32(pair.x0) + (np.float32(2 * i) + np.float32(0.5))
+                x = np.float32(2 * i) + np.float32(0.5)
                 a, b, c = epipolar.line(terms, x, one)
                 off = min(max(a * u + b * v + c, -one), one)
                 u, v = u - np.rint(off * a), v - np.rint(off * b)
@@ -204,12 +204,12 @@ def _search(pair, centres, reach, out):  # type: ignore[no-untyped-def]
     (rows, cols), (right_rows, right_cols) = left.shape, right.shape
     strips, words = np.empty((MAX_STRIPS, 5), np.int64), np.empty(4, np.uint64)
     for j in range(1, centres.shape[0] - 1):
-        terms = epipolar.row_terms(pair.f, pair.y0 + 2 * (j - 1) + 0.5)
+        terms = epipolar.row_terms(pair.f, 2 * (j - 1) + 0.5)
         for i in range(1, centres.shape[1] - 1):
             near[0], near[1], near[2] = centres[j, i], centres[j, i - 1], centres[j, i + 1]
             near[3], near[4] = centres[j - 1, i], centres[j + 1, i]
             x, y = 2 * (i - 1), 2 * (j - 1)
-            line = epipolar.line(terms, np.float32(pair.x0) + (np.float32(x) + np.float32(0.5)), np.float32(pair.mu))
+            line = epipolar.line(terms, np.float32(x) + np.float32(0.5), np.float32(pair.mu))
             for n in range(4):
                 best[n], least[n] = near[0], FAR
                 words[n] = left[min(y + (n >> 1), rows - 1), min(x + (n & 1), cols - 1)]
@@ -219,7 +219,7 @@ def _search(pair, centres, reach, out):  # type: ignore[no-untyped-def]
                 for k in range(0 if u <= centre < u + count else 1, count + 1 + 2 * cross):
                     du = centre if k == 0 or k > count else u + k - 1
                     dv = v if k <= count else v + 2 * (k - count) - 3
-                    xr, yr = x + pair.ahead_x + du, y + pair.ahead_y + dv
+                    xr, yr = x + du, y + dv
                     off, tried = _off_line(line, du, dv), pack(du, dv)
                     for n in range(4):
                         p, q = xr + (n & 1), yr + (n >> 1)
@@ -301,13 +301,13 @@ def propagate(pair: LevelPair, field: Field, smoothing: Smoothing) -> None:
 def _propagate(pair, field, smoothing, dirty):  # type: ignore[no-untyped-def]
     left, right, shift, costs = pair.left, pair.right, field.shift, field.cost
     (rows, cols), (right_rows, right_cols), (smoothness, rounds, beside) = left.shape, right.shape, smoothing
-    ahead_x, ahead_y, mu = pair.ahead_x, pair.ahead_y, np.float32(pair.mu)
+    mu = np.float32(pair.mu)
     lines, tried = np.empty((cols, 3), np.float32), np.empty(8, np.int32)
     for turn in range(2 * rounds):
         for y in range(rows):
-            terms = epipolar.row_terms(pair.f, np.float64(y + pair.y0))
+            terms = epipolar.row_terms(pair.f, np.float64(y))
             for x in range(cols):
-                lines[x, 0], lines[x, 1], lines[x, 2] = epipolar.line(terms, np.float32(x + pair.x0), mu)
+                lines[x, 0], lines[x, 1], lines[x, 2] = epipolar.line(terms, np.float32(x), mu)
             up, down = np.uint64(_mirrored(y - 1, rows)), np.uint64(_mirrored(y + 1, rows))
             for x in range((y + turn) & 1, cols, 2):
                 # The first turn of each colour looks at every pixel; later ones at what was marked.
@@ -321,7 +321,7 @@ def _propagate(pair, field, smoothing, dirty):  # type: ignore[no-untyped-def]
                 line = lines[x, 0], lines[x, 1], lines[x, 2]
                 for k in range(_listed(own, near, beside, tried)):
                     one = tried[k]
-                    xr, yr = x + ahead_x + columns(one), y + ahead_y + rows_of(one)
+                    xr, yr = x + columns(one), y + rows_of(one)
                     if xr < 0 or xr >= right_cols or yr < 0 or yr >= right_rows:
                         continue
                     its_cost = distance(word, right[np.uint64(yr), np.uint64(xr)])
@@ -441,7 +441,7 @@ def _sums(pair, maps, wanted, out):  # type: ignore[no-untyped-def]
         for x in range(cols):
             if us[y, x] != u or vs[y, x] != v:
                 u, v, held = np.int64(us[y, x]), np.int64(vs[y, x]), -1
-            q, p = y + pair.ahead_y + v, x + pair.ahead_x + u
+            q, p = y + v, x + u
             out_u[y, x], out_v[y, x], out_distance[y, x] = u, v, -1.0
             if not wanted[y, x] or p < 0 or p >= right.shape[1] or q < 0 or q >= right.shape[0]:
                 continue
@@ -492,7 +492,7 @@ def _edges(pair, grey, maps, wanted, rule, out):  # type: ignore[no-untyped-def]
                 continue
             best, chosen = np.int64(1 << 40), 0
             for k in range(count):
-                q, p = y + pair.ahead_y + vs[k], x + pair.ahead_x + us[k]
+                q, p = y + vs[k], x + us[k]
                 if not (EDGE_RADIUS <= q < high - EDGE_RADIUS and EDGE_RADIUS <= p < wide - EDGE_RADIUS):
                     if k == 0:
                         break
@@ -524,7 +524,7 @@ def _sides(maps, at, rule, us, vs):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _window_cost(pair, grey, y, x, u, v, rule):  # type: ignore[no-untyped-def]
     """Sum over a window of the distances, limited, by how alike in grey a pixel is to the middle."""
-    q, p = y + pair.ahead_y + v, x + pair.ahead_x + u
+    q, p = y + v, x + u
     left, right = pair.left, pair.right
     own, total = np.int32(grey[y, x]), np.int32(0)
     far, bright, nil = np.int64(rule.far), np.int32(rule.grey), np.int32(0)
@@ -575,9 +575,9 @@ def paths(
 def _candidates(pair, second, up, shift, listed):  # type: ignore[no-untyped-def]
     (compact, share), (rows, cols), (high, wide) = second, shift.shape, pair.right.shape
     for y in range(rows):
-        terms = epipolar.row_terms(pair.f, np.float64(y + pair.y0))
+        terms = epipolar.row_terms(pair.f, np.float64(y))
         for x in range(cols):
-            line = epipolar.line(terms, np.float32(x + pair.x0), np.float32(UNIT + share) * np.float32(pair.mu))
+            line = epipolar.line(terms, np.float32(x), np.float32(UNIT + share) * np.float32(pair.mu))
             known, cost, count = listed[0][y, x], listed[1][y, x], 0
             known[:], cost[:] = shift[y, x], NONE
             near = 1 + len(BESIDE) + len(AROUND)

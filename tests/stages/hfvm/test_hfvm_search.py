@@ -30,9 +30,8 @@ def some_band(seed):
 
 
 def line(f, y, x, length):
-    """Line of a pixel of the window, as the kernels add it up."""
-    terms = epipolar.row_terms(f, float(y + Y0))
-    return np.array(epipolar.line(terms, np.float32(x + X0), np.float32(length)), np.float32)
+    """Line of a pixel, as the kernels add it up."""
+    return np.array(epipolar.line(epipolar.row_terms(f, float(y)), np.float32(x), np.float32(length)), np.float32)
 
 
 def off_line(f, y, x, u, v, mu):
@@ -42,7 +41,7 @@ def off_line(f, y, x, u, v, mu):
 
 def test_terms_of_a_row_make_its_lines():
     f = some_band(1)
-    planes = np.moveaxis(epipolar.lines(epipolar.moved(f, (X0, Y0), (X0, Y0)), (ROWS, COLS)), 2, 0)
+    planes = np.moveaxis(epipolar.lines(f, (ROWS, COLS)), 2, 0)
     for y, x in np.ndindex(ROWS, COLS):
         np.testing.assert_allclose(line(f, y, x, 1.0), planes[:, y, x], rtol=1e-5, atol=1e-5)
         np.testing.assert_allclose(line(f, y, x, 3.0), 3 * planes[:, y, x], rtol=1e-5, atol=1e-5)
@@ -110,7 +109,7 @@ def test_descend_finds_the_first_of_the_best_around_its_centres(mu, reach_x, rea
     up_u[2:], up_v[2:] = up_u[2:] // 2 + 1, 0
     f = some_band(4)
     out = Field(*np.zeros((2, ROWS, COLS), np.int32))
-    reference.search(LevelPair(left, right, f, mu, X0, Y0), (up_u, up_v), (reach_x, reach_y), out)
+    reference.search(LevelPair(left, right, f, mu), (up_u, up_v), (reach_x, reach_y), out)
     found_u, found_v = unpacked(out.shift)
     for y, x in np.ndindex(ROWS, COLS):
         j, i = y // 2, x // 2
@@ -165,7 +164,7 @@ def test_propagation_equals_slow_numpy_over_several_rounds(mu, beside, monkeypat
     for rounds in (1, 3):
         expected = slow_checkerboard(left, right, u, v, f, mu, 2, rounds, beside)
         field = Field(pack_map(u, v), costs(left, right, u, v, f, mu))
-        reference.propagate(LevelPair(left, right, f, mu, X0, Y0), field, Smoothing(2, rounds, beside))
+        reference.propagate(LevelPair(left, right, f, mu), field, Smoothing(2, rounds, beside))
         found = unpacked(field.shift)
         np.testing.assert_array_equal(found, expected)
         assert (found[0] != u).any()

@@ -37,8 +37,7 @@ def words(shape, rng, levels=256):
 def some_pair(sizes, rng, mu, levels=6):
     left, right = (words(size, rng, levels) for size in sizes)
     f = np.array([[1e-4, 0.02, 0.1], [0.01, 1e-3, 1.0], [0.03, -1.0, 0.4]]) + rng.normal(0, 1e-3, (3, 3))
-    place = {"x0": 6, "y0": 4, "ahead_x": int(rng.integers(-1, 2)), "ahead_y": int(rng.integers(-1, 2))}
-    return LevelPair(left, right, f if mu else np.zeros((3, 3)), mu, **place)
+    return LevelPair(left, right, f if mu else np.zeros((3, 3)), mu)
 
 
 def some_maps(shape, rng, reach=4):
@@ -111,7 +110,7 @@ def test_edges(native, sizes):
 @pytest.mark.parametrize("with_up", [False, True])
 def test_paths(native, sizes, with_up):
     rng = np.random.default_rng(5)
-    pair = some_pair(sizes, rng, 8.0)._replace(ahead_x=0, ahead_y=0)
+    pair = some_pair(sizes, rng, 8.0)
     grey, costs = rng.uniform(0, 255, sizes[0]).astype(np.float32), PathCosts(8, 36, 240, 10)
     compact = LevelPair(words(sizes[0], rng), words(sizes[1], rng), np.zeros((3, 3)), 0.0)
     up = some_maps(tuple((n + 1) // 2 for n in sizes[0]), rng) if with_up else None
