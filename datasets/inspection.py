@@ -22,7 +22,7 @@ from rille.datasets.images import pairing
 from rille.datasets.images.files import SUFFIXES, common_header
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import unread
-from rille.datasets.images.pairing import ImagePair, natural, side_of, stamp_of
+from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
 from rille.datasets.poses import names_positions, read_positions
 from rille.datasets.text.reading import Search, is_file, read_lines
 from rille.datasets.text.tables import read_table
@@ -36,9 +36,6 @@ CALIBRATIONS = (".yaml", ".yml", ".xml", ".tsai", ".txt", ".toml", ".ini", ".cfg
 TABLES = (".txt", ".csv", ".tum", ".dat")
 MOST_TEXTS = 200
 """Text files that are tried as calibration and as table; some data sets have one for each image."""
-
-UNWRITABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
-"""In a name: control characters and line separators, which would end a comment, and bytes that are not UTF-8."""
 
 SPLIT = "if each shows both views: ffmpeg -i FILE -vf crop=iw/2:ih:0:0 left/FILE -vf crop=iw/2:ih:iw/2:0 right/FILE"
 
@@ -118,7 +115,7 @@ def inspect(folder: Path) -> Findings:
     there = _files(folder)
     paths = [p for p in there if p.suffix.lower() in (*SUFFIXES, *CALIBRATIONS, *TABLES)]
     for path in paths:
-        _writable(_relative(path, folder))
+        writable(_relative(path, folder))
     strange = [UNWRITABLE.sub("?", _relative(p, folder)) for p in there if p not in set(paths)]
     try:
         found = Findings(folder, find_views(folder, [p for p in paths if p.suffix.lower() in SUFFIXES]))
@@ -153,12 +150,6 @@ def _files(folder: Path) -> list[Path]:
     """Files below a folder in natural order, hidden ones left out."""
     entries = (e for _, entries in Search().below(folder, DEPTH, links=True) for e in entries)
     return sorted((Path(e.path) for e in entries if is_file(e.path)), key=lambda path: natural(str(path)))
-
-
-def _writable(name: str) -> None:
-    if UNWRITABLE.search(name):
-        text = f"the name {name!r} has a line break, or is not in UTF-8: no manifest holds it"
-        raise InputError("RIL-185", text, remedy="rename it")
 
 
 def _relative(path: Path, folder: Path) -> str:

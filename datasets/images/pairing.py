@@ -109,6 +109,23 @@ def _times(paths: Sequence[Path]) -> tuple[float, ...]:
     return ()
 
 
+UNWRITABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+"""In a name: control characters and line separators, which would end a comment, and bytes that are not UTF-8."""
+
+
+def writable(name: str) -> None:
+    """Refuse the name of a file that no line of text can hold.
+
+    Raises
+    ------
+    InputError
+        It has a line break, or is not in UTF-8.
+    """
+    if UNWRITABLE.search(name):
+        text = f"the name {name!r} has a line break, or is not in UTF-8: no manifest holds it"
+        raise InputError("RIL-185", text, remedy="rename it")
+
+
 def natural(text: str) -> tuple[tuple[int, int | str], ...]:
     """Sorting key in which numbers count as numbers: ``a2`` before ``a10``."""
     return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", text) if part)

@@ -19,7 +19,7 @@ from rille.datasets.bags import is_bag, open_bag
 from rille.datasets.cameras.model import RECTIFIED
 from rille.datasets.images import disparities, files
 from rille.datasets.images.headers import sizes_of
-from rille.datasets.images.pairing import ImagePair, common_headers, pair_up
+from rille.datasets.images.pairing import ImagePair, common_headers, pair_up, writable
 from rille.datasets.manifest.model import Cameras, Disparity, DisparityMaps, Images, Manifest, RigSection, read_manifest
 from rille.datasets.manifest.motion import MotionReader
 from rille.datasets.manifest.rig import read_optics
@@ -214,6 +214,8 @@ def find_pairs(
         if pattern.endswith("*"):  # of any kind: then what is no image may lie beside the images
             paths = [path for path in paths if path.suffix.lower() in files.SUFFIXES] or paths
         paths = [path for path in paths if digests.whole(path)]
+        for path in paths:
+            writable(path.name)
         if not paths:
             text = f"{name}: images.{side} = {pattern!r} finds no file in {root}"
             raise IncompleteError("RIL-217", text, remedy="correct the pattern or root")

@@ -510,6 +510,14 @@ def test_bad_patterns(tmp_path, line, expected):
         opened(path)
 
 
+@pytest.mark.parametrize("name", ["a\n01.png", "\udcff01.png"])
+def test_images_whose_names_no_line_can_hold_are_refused(tmp_path, name):
+    path = write_sequence(tmp_path)
+    (tmp_path / "left" / "01.png").rename(tmp_path / "left" / name)
+    with raises("RIL-185", repr(name)):
+        opened(path)
+
+
 @pytest.mark.parametrize(
     ("parts", "line"),
     [
