@@ -130,17 +130,15 @@ def corrected(camera: Camera, errors: Sequence[float] | Floats) -> Camera:
     return replace(camera, fx=camera.fx * larger, fy=camera.fy * larger, cx=column, cy=row)
 
 
-def corrected_rig(rig: Rig, errors: Floats) -> Rig:
-    """Rig whose cameras and angles are changed by ``errors`` (k,)."""
-    pitch, *others = errors[CORRECTED + 1 :]
-    turned = epipolar.corrected(rig, np.array([pitch, 0.0, *others]))
+def corrected_rig(rig: Rig, errors: Sequence[float] | Floats, angles: Sequence[float]) -> Rig:
+    """Rig whose cameras are changed by the first of ``errors``, and whose angles by ``angles`` (5,), rad."""
+    turned = epipolar.corrected(rig, np.array(angles))
     return replace(turned, left=corrected(rig.left, errors), right=corrected(rig.right, errors))
 
 
 def calibrated_anew(rig: Rig, correction: Sequence[float]) -> Rig:
     """Rig whose cameras are changed by the first :data:`CORRECTED` of a correction, and whose yaw by the last, rad."""
-    turned = epipolar.corrected(rig, np.array([0.0, correction[-1], 0.0, 0.0, 0.0]))
-    return replace(turned, left=corrected(rig.left, correction), right=corrected(rig.right, correction))
+    return corrected_rig(rig, correction, [0.0, correction[-1], 0.0, 0.0, 0.0])
 
 
 def _in_key_pair(tracks: SegmentTracks, cameras: SegmentCameras) -> tuple[Floats, Floats]:
@@ -152,7 +150,8 @@ def _in_key_pair(tracks: SegmentTracks, cameras: SegmentCameras) -> tuple[Floats
 def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) -> SegmentTracks:
     """Measurements as they would be if the calibration were changed by ``errors`` (k,)."""
     rig, T_local_key = cameras.rig, cameras.T_local_key
-    other = corrected_rig(rig, errors)
+    pitch, *others = errors[CORRECTED + 1 :]
+    other = corrected_rig(rig, errors, [pitch, 0.0, *others])
 
     def undistorted_anew(pixels: Floats, side: str, given: Camera, ideal: Camera) -> Floats:
         if (lens := cameras.lenses.get(side)) is not None:
