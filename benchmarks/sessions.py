@@ -48,10 +48,10 @@ def moved_stones(seed: int, moves: list[np.ndarray]) -> Any:
     from rille.datasets.mockup import terrain
 
     original = terrain._scattered
-    rng = np.random.default_rng(seed)
 
     def scattered(p: Any, area: float) -> Iterator[Any]:
-        medium = 0
+        # Called for the drawn bed and for the exact one: the same moves.
+        rng, medium = np.random.default_rng(seed), 0
         for rock in original(p, area):
             if SIZES_M[0] <= rock.diameter < SIZES_M[1]:
                 medium += 1
@@ -131,27 +131,34 @@ def judge(seed: int, place: Path) -> str:
     with rasterio.open(place / "is.tif") as file:
         known, to_world = np.isfinite(file.read(1)), np.reshape(file.transform[:6], (2, 3))
         cell = abs(file.transform.a)
+    with rasterio.open(before.folder / "dem.tif") as file:
+        elevation = file.read(1)
+    known &= np.isfinite(elevation)
 
     def in_bed(points: np.ndarray) -> np.ndarray:
         return points @ before.T_bed_world[:3, :3].T + before.T_bed_world[:3, 3]
 
-    # Compared cells in the bed, and in the world of the later run, from which the found motion leads back.
+    # Compared cells, the earlier model's, in the bed, where its world need not be upright; and in the world of
+    # the later run, from which the found motion leads back.
     rows, cols = np.nonzero(known)
     xy = np.column_stack([cols + 0.5, rows + 0.5]) @ to_world[:, :2].T + to_world[:, 2]
-    at = in_bed(np.column_stack([xy, np.zeros(len(xy))]))
+    ground = np.column_stack([xy, elevation[known]])
+    at = in_bed(ground)
     later = np.linalg.inv(after.T_bed_world)
-    error = motion_found(found, at @ later[:3, :3].T + later[:3, 3]) - np.column_stack([xy, np.zeros(len(xy))])
+    error = motion_found(found, at @ later[:3, :3].T + later[:3, 3]) - ground
     shift = np.hypot(*error[:, :2].T).mean() / cell
 
     change = after.heights(*at[:, :2].T) - before.heights(*at[:, :2].T)
     tree = scipy.spatial.cKDTree(at[:, :2])
     patches = found["changes"]["patches"]
-    middles = in_bed(np.array([[p["x_m"], p["y_m"], 0.0] for p in patches]).reshape(-1, 3))[:, :2]
+    listed = np.array([[p["x_m"], p["y_m"]] for p in patches]).reshape(-1, 2)
+    middles = at[scipy.spatial.cKDTree(xy).query(listed)[1], :2]
     volumes = np.array([p["volume_m3"] for p in patches])
-    sides, ratios = 0, []
+    sides, ratios, stones, found_stones = 0, [], 0, 0
     for move in np.unique(moves, axis=0):
         about = tree.query_ball_point(move.reshape(2, 2), 0.5 * SIZES_M[1] + MOVE_M)
         near = np.unique(np.concatenate(about).astype(int))
+        known_sides, found_sides = sides, len(ratios)
         for sign in (1, -1):
             part = near[sign * change[near] > CHANGED_M]
             if len(part) < FEWEST:
@@ -161,12 +168,14 @@ def judge(seed: int, place: Path) -> str:
             fits = (sign * volumes > 0) & (np.hypot(*(middles - middle).T) < NEAR_M)
             if fits.any():
                 ratios.append(abs(volumes[fits].sum()) / (np.abs(change[part]).sum() * cell**2))
+        stones, found_stones = stones + (sides > known_sides), found_stones + (len(ratios) > found_sides)
     changed = np.abs(change) > CHANGED_M
     false = sum(not changed[tree.query_ball_point(xy, NEAR_M)].any() for xy in middles)
     return (
         f"seed {seed}: registered ({found['place']['by']}) within {shift:.2f} cells of {1e3 * cell:.0f} mm, "
-        f"{known.sum()} compared; {len(ratios)} of {sides} sides of moved stones found, their volumes "
-        f"{np.median(ratios):.2f} of the exact ones (median); {len(patches)} listed, {false} where nothing changed"
+        f"{known.sum()} compared; {found_stones} of {stones} moved stones found, {len(ratios)} of {sides} sides, "
+        f"their volumes {np.median(ratios) if ratios else np.nan:.2f} of the exact ones (median); "
+        f"{len(patches)} listed, {false} where nothing changed"
     )
 
 

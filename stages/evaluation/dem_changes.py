@@ -4,7 +4,8 @@ The standard deviation of a difference is that of both models, and what a remain
 slope; all of it is scaled up where most differences spread more, since most of the ground has not changed. A
 change is a patch of cells that differ one way by twice that, one of them at least by :data:`SURE` times. Its volume is
 that of the patch and of the cells about it, where it runs out; it has the errors of all of them, of which neighbours
-share a part: as large a part as they do where nothing has changed.
+share a part: as large a part as they do where nothing has changed. It is at least :data:`SURE_VOLUME` times its
+standard deviation.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from rille.stages.numeric.robust import mad_sigma
 SHIFT_CELLS = 0.25
 """By which the models may still be shifted."""
 
-SURE, BESIDE = 5.0, 2.0
-"""Standard deviations that one cell of a change differs by, and all of its cells."""
+SURE, BESIDE, SURE_VOLUME = 4.5, 2.0, 3.5
+"""Standard deviations that one cell of a change differs by, all of its cells, and its volume."""
 
 LEAST_CELLS = 6
 """Smaller patches are what single matches make."""
@@ -76,9 +77,12 @@ def changes(error: Floats, deviation: Floats, cell: float) -> list[Change]:
         for k, (rows, cols) in enumerate(scipy.ndimage.find_objects(label, number), 1):
             window = tuple(slice(max(one.start - FOOT, 0), one.stop + FOOT) for one in (rows, cols))
             patch = label[window] == k
-            if patch.sum() >= LEAST_CELLS and (sign * ratio[window][patch]).max() > SURE:
-                patch = scipy.ndimage.binary_dilation(patch, iterations=FOOT) & np.isfinite(error[window])
-                found.append(_change(error[window], deviation[window], patch, cell, shared, window))
+            if patch.sum() < LEAST_CELLS or (sign * ratio[window][patch]).max() < SURE:
+                continue
+            patch = scipy.ndimage.binary_dilation(patch, iterations=FOOT) & np.isfinite(error[window])
+            change = _change(error[window], deviation[window], patch, cell, shared, window)
+            if sign * change.volume > SURE_VOLUME * change.sigma:
+                found.append(change)
     return sorted(found, key=lambda change: -abs(change.volume))
 
 

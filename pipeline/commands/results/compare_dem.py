@@ -173,8 +173,8 @@ def changed(a: DemFile, b: DemFile, error: Floats, grid: Grid) -> tuple[NDArray[
         total[way] = {"volume_m3": sum(one.volume for one in of), "sigma_m3": sigma_m3}
     how = (
         f"patches of cells that differ one way by {dem_changes.BESIDE:g} standard deviations, one of them by "
-        f"{dem_changes.SURE:g}; standard deviations of both models and of a shift by {dem_changes.SHIFT_CELLS:g} "
-        "cells, scaled up where most differences spread more"
+        f"{dem_changes.SURE:g}, their volume by {dem_changes.SURE_VOLUME:g} of its own; standard deviations of both "
+        f"models and of a shift by {dem_changes.SHIFT_CELLS:g} cells, scaled up where most differences spread more"
     )
     return deviation.astype(np.float32), {"total": total, "patches": rows, "how": how}
 
