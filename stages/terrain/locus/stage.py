@@ -41,8 +41,8 @@ from rille.stages.terrain.locus.coverage import coverage, explain
 from rille.stages.terrain.locus.kernel import Dem
 from rille.stages.terrain.locus.refinement import refine
 from rille.stages.terrain.locus.solve import LocusParams, Matches, cameras_of, join, observed, solve
-from rille.stages.terrain.locus.uncertainty import standard_deviation
-from rille.stages.terrain.locus.views import SurfaceViews, View
+from rille.stages.terrain.locus.uncertainty import NEAR_SIDE_CELLS, standard_deviation
+from rille.stages.terrain.locus.views import SurfaceViews, View, facing
 
 OWN_STD_FACTOR = 1.4  # times max_sigma: a cell's own standard deviation scatters about the typical one
 NO_LIMIT = {"max_sigma": None, "max_std": None}
@@ -130,7 +130,8 @@ def _refine(dem: Dem, views: SurfaceViews, lattice: Lattice, params: LocusParams
     """
     elevation, seen = refine(views, lattice, dem.elevation, params.refine_steps)
     moved = elevation - dem.elevation
-    dem.elevation_std[...] = standard_deviation(elevation, seen, moved, apart, dem.elevation_std)
+    turned = facing(elevation, lattice, views.centre, NEAR_SIDE_CELLS)
+    dem.elevation_std[...] = standard_deviation(elevation, seen, turned, moved, apart, dem.elevation_std)
     share = np.float32(params.refined_share)
     dem.elevation[...] = share * elevation + (np.float32(1.0) - share) * dem.elevation
     dem.ortho[...] = np.clip(seen.left, 0.0, 255.0)

@@ -3,7 +3,9 @@
 A sum of variances, each of which can be seen on the ground itself. With s the pixels of disparity a metre of elevation,
 
     (s sigma_Z)^2 = FLOOR_PX^2 + STEP_FACTOR t^2 + REST_FACTOR r^2 / I + (SHADE_FACTOR N / g)^2
-                    + (MOVE_FACTOR m)^2 + HOLE_VARIANCE_PX2 u + (DIFFERENCE_FACTOR d)^2
+                    + (MOVE_FACTOR m)^2 + HOLE_VARIANCE_PX2 u + (DIFFERENCE_FACTOR d)^2,
+
+times 2 - v where the ground turns away from the left camera, v < 1.
 
 t: the step of Z from cell to cell (RMS of 3 x 3 cells), since a position that is wrong by a part of a cell is an
 elevation that is wrong by as much of its step. r: what both images still differ by (RMS of 5 x 5 cells), I: the sum of
@@ -14,12 +16,16 @@ disagree about, neither is sure of. u: the unknown share of 7 x 7 cells; a match
 mean of two surfaces. d: the difference of both directions of matching (RMS of 5 x 5 cells),
 :data:`ONE_SIDED_DIFFERENCE_PX` where none of them has both; 0 where there was one direction.
 
+v: the area of the image that the slope of 5 x 5 cells takes over what level ground there would; 0 is seen edge-on, less
+cannot be seen. A window lies over more of such ground, and over what it hides.
+
 The factors are those of a fit by non-negative least squares to the squared errors of pairs of the simulator (both
 directions, preset ``accurate``, seeds 2 and 3, 22 November 2026), rounded; HOLE_VARIANCE_PX2, without which cells of
 one direction look too certain beside hidden ground, was chosen on 27 November 2026 with figures of the seeds 1 to 6 at
 hand: 72 % of their errors are below one and 93 % below two standard deviations where one direction was matched, 77 and
 95 % with both. The disparity's own standard deviation brings nothing besides.
-``benchmarks/surest.py`` prints such shares.
+``benchmarks/surest.py`` prints such shares. v was chosen on 28 November 2026 with three rougher beds, seeds 2 to 4, in
+whose errors the ratio to the standard deviation rose from 1.5 where v is 1 to 2 where it is 0.1.
 """
 
 from __future__ import annotations
@@ -60,7 +66,12 @@ HOLE_SIDE_CELLS = 7
 
 
 def standard_deviation(
-    elevation: Floats32, seen: OrthoPair, moved: Floats32, apart: Floats32 | None, otherwise: Floats32
+    elevation: Floats32,
+    seen: OrthoPair,
+    turned: Floats32,
+    moved: Floats32,
+    apart: Floats32 | None,
+    otherwise: Floats32,
 ) -> Floats32:
     """Standard deviation of each cell, metres, see the module.
 
@@ -68,6 +79,7 @@ def standard_deviation(
     ----------
     elevation : (rows, cols) metres, NaN undefined.
     seen : as :func:`rille.stages.terrain.locus.refinement.refine` gives it for these elevations.
+    turned : (rows, cols) v, see :func:`rille.stages.terrain.locus.views.facing`.
     moved : (rows, cols) what the refinement moved each cell by, metres.
     apart : (rows, cols) difference of both directions' elevations, metres, NaN where not both gave one; None: there was
         one direction.
@@ -96,6 +108,7 @@ def standard_deviation(
         variance += DIFFERENCE_FACTOR**2 * np.where(
             window_sum32(both, NEAR_SIDE_CELLS) < 1.0, np.float32(ONE_SIDED_DIFFERENCE_PX**2), differ
         )
+    variance *= 1.0 + np.clip(1.0 - turned, 0.0, 1.0)
     # Differences of running sums may fall below zero by their rounding.
     std = np.sqrt(np.maximum(variance, FLOOR_PX**2)) / scale
     return np.where(known, std, otherwise).astype(np.float32)

@@ -15,6 +15,7 @@ from numba import njit
 from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.spline import value_and_gradient
+from rille.stages.numeric.windows import window_mean
 
 
 class View(NamedTuple):
@@ -52,6 +53,24 @@ def look(views: SurfaceViews, lattice: Lattice, elevation: Floats | Floats32) ->
     out = OrthoPair(*np.full((len(OrthoPair._fields), *lattice.shape), np.nan, np.float32))
     _look(lattice.xs(), lattice.ys(), np.ascontiguousarray(elevation), lattice.cell, views, out)
     return out
+
+
+def facing(elevation: Floats32, lattice: Lattice, centre: Floats, side: int) -> Floats32:
+    """Area that the ground (rows, cols) takes in an image over what it would if it were level; 1 where it is unknown.
+
+    Parameters
+    ----------
+    elevation : (rows, cols) metres, NaN undefined.
+    centre : (3,) the camera's, m, in the frame of the lattice.
+    side : of the windows, cells, whose mean slope counts.
+    """
+    ahead = [
+        window_mean(np.gradient(elevation, at, axis=axis).astype(np.float32), side)
+        for axis, at in ((1, lattice.xs()), (0, lattice.ys()))
+    ]
+    dx, dy, below = lattice.xs() - centre[0], lattice.ys()[:, None] - centre[1], elevation - centre[2]
+    share = 1.0 - (dx * ahead[0] + dy * ahead[1]) / below
+    return np.where(np.isfinite(share), share, 1.0).astype(np.float32)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -205,7 +205,7 @@ def test_undefined_cells_stay_undefined_and_cast_doubt() -> None:
     found, seen = refine(through(), LATTICE, elevation, 2)
     np.testing.assert_array_equal(np.isfinite(found), np.isfinite(elevation))
     none = np.zeros(elevation.shape, np.float32)
-    std = standard_deviation(found, seen, none, None, none)
+    std = standard_deviation(found, seen, none + 1, none, None, none)
     # Twelve of the 49 cells around it.
     assert std[29, 42] > np.sqrt(HOLE_VARIANCE_PX2 * 12 / 49) / seen.scale[29, 42]
     assert std[29, 42] > 2.0 * std[10, 42]

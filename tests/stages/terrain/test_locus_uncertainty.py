@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain.locus.uncertainty import (
     DIFFERENCE_FACTOR,
     FLOOR_PX,
@@ -15,7 +16,7 @@ from rille.stages.terrain.locus.uncertainty import (
     STEP_FACTOR,
     standard_deviation,
 )
-from rille.stages.terrain.locus.views import OrthoPair
+from rille.stages.terrain.locus.views import OrthoPair, facing
 
 SHAPE = (40, 50)
 SCALE = 500.0
@@ -39,8 +40,11 @@ def uniform(value: float) -> np.ndarray:
     return np.full(SHAPE, value, np.float32)
 
 
-def std(elevation: np.ndarray, seen: np.ndarray, moved: float = 0.0, apart: float | np.ndarray = 0.0) -> np.ndarray:
-    return standard_deviation(elevation, OrthoPair(*seen), uniform(moved), uniform(1.0) * apart, uniform(0.5))
+def std(
+    elevation: np.ndarray, seen: np.ndarray, *, turned: float = 1.0, moved: float = 0.0, apart: float | np.ndarray = 0.0
+) -> np.ndarray:
+    apart = uniform(1.0) * apart
+    return standard_deviation(elevation, OrthoPair(*seen), uniform(turned), uniform(moved), apart, uniform(0.5))
 
 
 def expected(*, rise: float = RISE, grey: float = GREY, apart: float = 0.0, moved: float = 0.0) -> float:
@@ -134,8 +138,35 @@ def test_where_one_direction_found_nothing_a_difference_is_supposed() -> None:
 
 def test_one_direction_has_no_difference() -> None:
     elevation, seen = ground()
-    one = standard_deviation(elevation, OrthoPair(*seen), uniform(0.0), None, uniform(0.5))
+    one = standard_deviation(elevation, OrthoPair(*seen), uniform(1.0), uniform(0.0), None, uniform(0.5))
     np.testing.assert_array_equal(one, std(elevation, seen))
+
+
+def test_ground_that_turns_away_is_less_sure_and_ground_that_faces_the_camera_not_surer() -> None:
+    level, edge_on, hidden, facing = (std(*ground(), turned=v)[20, 40] for v in (1.0, 0.0, -3.0, 2.5))
+    assert edge_on == pytest.approx(np.sqrt(2.0) * level, rel=1e-5)
+    assert (hidden, facing) == (edge_on, level)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7])
+def test_facing_is_the_area_in_the_image_over_that_of_level_ground(turn: float) -> None:
+    lattice = Lattice(x0=-0.1, y0=2.0, cell=0.01, rows=30, cols=40)
+    slope, centre = 0.3 * np.array([np.sin(turn), -np.cos(turn)]), np.array([0.2, -0.5, 0.9])
+    x, y = lattice.xs()[None, :], lattice.ys()[:, None]
+    z = (slope[0] * x + slope[1] * y).astype(np.float32)
+    z[3:5, 7] = np.nan
+    v = facing(z, lattice, centre, 5)
+
+    def area(a: np.ndarray, b: np.ndarray, at: np.ndarray) -> float:
+        """Solid angle, but for its third power of the distance, of a parallelogram seen from the camera."""
+        return float(np.dot(np.cross(a, b), at - centre))
+
+    for row, col in ((2, 2), (15, 20), (28, 35)):
+        at = np.array([x[0, col], y[row, 0], z[row, col]])
+        sloping = area(np.array([1.0, 0.0, slope[0]]), np.array([0.0, 1.0, slope[1]]), at)
+        level = area(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), at)
+        assert v[row, col] == pytest.approx(sloping / level, abs=2e-4)
+    assert v[3, 7] == 1.0
 
 
 def test_cells_that_the_images_do_not_show_keep_theirs() -> None:
