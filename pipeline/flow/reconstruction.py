@@ -160,7 +160,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     row = {frame: k for k, frame in enumerate(frames)}
     behind = [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1]
     # Where the tracks contradict the cameras, all that rests on these is laid out anew with corrected ones.
-    turn = 0
+    turn, since = 0, len(make.graph.nodes)
     while True:
         if turn and p.crosscheck is not None:
             p.crosscheck = another_program(make, whole)
@@ -180,7 +180,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         asked = (yield from asked_for(make, matched[basic[0]])) if p.refined else None
         if asked is None or turn == CALIBRATIONS:
             break
-        make.recalibrate(asked["correction"], asked["rig"])
+        make.recalibrate(asked["corrected"], since)
         turn += 1
     if p.intrinsics is not None:
         p.contradictions.append(p.intrinsics)
@@ -495,12 +495,12 @@ def asked_for(make: Builder, key: BasicPair) -> Generator[Wait, Any, IntrinsicsF
     """Another calibration that all segments ask for, None where they do not; of the rig of pair ``key``."""
     p = make.products
     fixed = make.config.rig.mode == "fixed"
-    asked = {"before": make.corrections, "fixed": fixed or None}
+    asked = {"before": make.correction, "fixed": fixed or None}
     p.intrinsics = make.node(intrinsics_stage, "intrinsics", segments=p.refined, rig=key.rig, **asked)
     judged: list[Ref[IntrinsicsFacts] | None] = yield Maybe([p.intrinsics])
     facts: Any = None if judged[0] is None else judged[0].meta
     # A plan takes the facts of earlier runs, which may be those of an earlier release.
-    return facts if facts and "rig" in facts and any(facts["correction"]) else None
+    return facts if facts and "corrected" in facts and any(facts["correction"]) else None
 
 
 def seen_again(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[Handle[LoopFacts]]]:

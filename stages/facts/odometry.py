@@ -85,15 +85,15 @@ class RefineFacts(Facts):
 class IntrinsicsFacts(Facts):
     """``errors`` of the calibration, each with its sigma, and their ``covariance``; those that are ``held`` by the
     calibration as given, since the sequence shows them little; the rig's ``yaw`` and its sigma, rad; the ``correction``
-    that the tracks ask for (else 0) of focal length and principal point, over the focal length, and of the yaw; and the
-    ``rig`` that has it."""
+    that the tracks ask for (else 0) of focal length and principal point, over the focal length, and of the yaw; and how
+    the calibration that was given is ``corrected`` with that and those before."""
 
     errors: dict[str, list[float]]
     covariance: list[list[float]]
     held: list[str]
     yaw: list[float]
-    rig: dict[str, Any]
     correction: list[float]
+    corrected: list[float]
     contradiction: NotRequired[str]
 
 

@@ -44,7 +44,6 @@ from rille.stages.odometry.resection.intrinsics import (
     SegmentCameras,
     contribution,
     turn_deg,
-    yaw_part,
 )
 from rille.stages.odometry.resection.pnp import Pose, back_projection, bias_information, pose_covariance
 from rille.stages.odometry.resection.robust_pose import (
@@ -183,7 +182,7 @@ def refine_stage(
                 "information": (part.information / errors.excess).tolist(),
                 "pull": (part.pull / errors.excess).tolist(),
                 "turn_deg": turn_deg(end.state, T_local_key),
-                "yaw": [one / errors.excess for one in yaw_part(end.tracks, end.state, cameras, params)],
+                "yaw": [one / errors.excess for one in part.yaw],
             }
             meta["per_frame"] = _per_frame(end, params, inputs.track.meta["frames"])
     return Bundle(out, meta)

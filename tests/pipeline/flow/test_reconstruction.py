@@ -16,7 +16,6 @@ from rille.pipeline.flow.builders import PYRAMID_BYTES, Builder, other_plane
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.flow.products import Products
 from rille.pipeline.flow.reconstruction import SEAMS, cells_in_both, overlaps, spread
-from rille.stages.odometry.resection.intrinsics import calibrated_anew
 from rille.stages.terrain.ground_frame import SCENE
 from rille.stages.terrain.tile_index import Box
 
@@ -58,7 +57,7 @@ def lay_out(
         facts = found | meta if stage == "keyframes" else meta
         go_on(*(SimpleNamespace(meta=facts) for _ in handles))
     for turn, correction in enumerate([*(cameras or []), [0.0, 0.0, 0.0, 0.0]]):
-        asked = {"correction": correction, "rig": calibrated_anew(sequence.rig, correction).to_dict()}
+        asked = {"correction": correction, "corrected": correction}
         facts = {"keyframes": found, "ground_frame": ground or GROUND, "intrinsics": asked}
         for stage in [*(("keyframes", "rig") if turn else ()), "ground_frame", "resect", "intrinsics"]:
             of = (jumps or {}) if stage == "resect" else {}
