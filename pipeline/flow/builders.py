@@ -134,6 +134,11 @@ class Builder:
         return self.sequence.rig.to_dict()
 
     @cached_property
+    def given_lenses(self) -> dict[str, Any] | None:
+        """The sequence's lenses by camera, None where its images are ideal."""
+        return {side: lens.to_dict() for side, lens in (self.sequence.lenses or {}).items()} or None
+
+    @cached_property
     def given_vehicle(self) -> dict[str, Any]:
         """The vehicle without its name, which changes no result."""
         found: dict[str, Any] = self.config.vehicle.model_dump(mode="json", exclude={"name"})
@@ -157,7 +162,8 @@ class Builder:
         self.graph.outdated |= set(range(since, len(self.graph.nodes)))
         self.made.clear()
         self.products.contradictions.clear()
-        del self.given_rig
+        for cached in ("given_rig", "given_lenses"):
+            self.__dict__.pop(cached, None)
 
     # -- images -------------------------------------------------------------------------------------------------
 
@@ -373,6 +379,7 @@ class Builder:
             disparity=key.disparity,
             after=after and after.disparity,
             rig_after=after and after.rig,
+            lenses=self.given_lenses,
             refused=refused,
         )
         return Segment(tuple(frames), tracked, posed)

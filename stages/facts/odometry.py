@@ -62,24 +62,17 @@ class TrackFacts(Facts):
 class ResectFacts(Facts):
     """Poses of a segment's frames.
 
-    ``per_frame``: frame, landmarks, inliers, rms_px of each, and why it is ``lost``.
+    ``per_frame``: frame, landmarks, inliers, rms_px of each, and why it is ``lost``. ``intrinsics``: what the segment,
+    adjusted jointly, says of errors of the calibration (``information``, ``pull``, ``turn_deg``; ``yaw``: information
+    and pull of the rig's), and the ``bias_px`` of its disparities; empty where nothing was adjusted.
     ``jump`` (column, row, px) and ``knocked``: the rig moved before the pair at the segment's end.
     """
 
     per_frame: list[dict[str, Any]]
+    intrinsics: dict[str, Any]
     contradiction: NotRequired[str]
     jump: NotRequired[list[float]]
     knocked: NotRequired[str]
-
-
-class RefineFacts(Facts):
-    """A segment adjusted with its landmarks: bias and costs of the ``adjustment``, and what it says of errors of the
-    calibration (``intrinsics``: ``information``, ``pull``, ``turn_deg``; ``yaw``: information and pull of the rig's);
-    both empty where no frame has a pose."""
-
-    adjustment: dict[str, Any]
-    intrinsics: dict[str, Any]
-    per_frame: list[dict[str, Any]]
 
 
 class IntrinsicsFacts(Facts):

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
-from rille.stages.facts.odometry import FactorsFacts, IntrinsicsFacts, RefineFacts, ResectFacts, TrajectoryFacts
+from rille.stages.facts.odometry import FactorsFacts, IntrinsicsFacts, ResectFacts, TrajectoryFacts
 from rille.stages.geometry.geometry import RigidTransform, rotation_log
 from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, bound_of, root_of
 from rille.stages.odometry.resection.priors import Sensors
@@ -166,7 +166,6 @@ def adjust_stage(
     params: NoParams,
     trajectory: Bundle[TrajectoryFacts],
     segments: Sequence[Bundle[ResectFacts]],
-    refined: Sequence[Bundle[RefineFacts]] = (),
     loops: Sequence[Bundle[FactorsFacts]] = (),
     intrinsics: Bundle[IntrinsicsFacts] | None = None,
     *,
@@ -178,7 +177,7 @@ def adjust_stage(
     posed = np.flatnonzero(chained.piece >= 0)
     row = {frames[k]: node for node, k in enumerate(posed)}
     numbers = [[int(f["frame"]) for f in bundle.meta["per_frame"]] for bundle in segments]
-    links = [ChainLink.of(bundle, intrinsics) for bundle in refined or segments]
+    links = [ChainLink.of(bundle, intrinsics) for bundle in segments]
     calibration = links[0].calibration.shape[2] if links else 0
     chain = chain_factors(links, numbers, row)
     given = [one for bundle in loops for one in bundle.meta["factors"] if one["from"] in row and one["to"] in row]

@@ -29,13 +29,12 @@ from pydantic import Field
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.facts.calibration import CalibrationFacts
-from rille.stages.facts.odometry import IntrinsicsFacts, RefineFacts
+from rille.stages.facts.odometry import IntrinsicsFacts, ResectFacts
 from rille.stages.geometry import epipolar
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lens import Lens
 from rille.stages.numeric.robust import huber_weight
 from rille.stages.odometry.resection.bundle_adjustment import (
-    RefineParams,
     SegmentAdjustment,
     SegmentNormal,
     SegmentState,
@@ -43,6 +42,7 @@ from rille.stages.odometry.resection.bundle_adjustment import (
 )
 from rille.stages.odometry.resection.landmarks import triangulated
 from rille.stages.odometry.resection.pnp import bias_information
+from rille.stages.odometry.resection.robust_pose import ResectParams
 
 PRIORS: Mapping[str, float] = {
     "focal length": 1.0,
@@ -165,12 +165,12 @@ def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) 
         ray = (pixels - centre) / focal
         return np.asarray(pixels - errors[CORRECTED] * focal * ray * (ray**2).sum(-1, keepdims=True))
 
-    key = T_local_key.inverse().apply(tracks.position)
+    key = T_local_key.inverse().apply(tracks.landmarks.position)
     left = undistorted_anew(rig.left.project(key), "left", rig.left, other.left)
     right = undistorted_anew(rig.right.project(rig.T_right_left.apply(key)), "right", rig.right, other.right)
-    at = triangulated(left, right, other, T_local_key, tracks.sigma)
+    landmarks = triangulated(left, right, other, T_local_key, tracks.landmarks.sigma)
     pixels = undistorted_anew(tracks.pixels, "left", rig.left, other.left)
-    return replace(tracks, position=at.position, along=at.per_pixel, pixels=pixels, camera=other.left)
+    return replace(tracks, landmarks=landmarks, pixels=pixels, camera=other.left)
 
 
 def turn_deg(state: SegmentState, T_local_key: RigidTransform) -> float:
@@ -180,7 +180,7 @@ def turn_deg(state: SegmentState, T_local_key: RigidTransform) -> float:
 
 
 def contribution(
-    tracks: SegmentTracks, state: SegmentState, cameras: SegmentCameras, params: RefineParams
+    tracks: SegmentTracks, state: SegmentState, cameras: SegmentCameras, params: ResectParams
 ) -> IntrinsicsPart:
     """What an adjusted segment says of the errors of :data:`PRIORS`, all its unknowns free, by the stated errors."""
     problem = SegmentAdjustment(tracks, params)
@@ -213,7 +213,8 @@ def contribution(
     # Of C = -R^T t and of R^T, by the left perturbation of T_cam_local.
     by_error = np.swapaxes(state.R, 1, 2)[:, None] @ -step[:-1].reshape(-1, 2, 3, k)
     information = matrix[p:, p:] + matrix[p:, :p] @ step
-    along = ((turned.position - tracks.position) * tracks.along).sum(1) / (tracks.along**2).sum(1)
+    moved, ray = turned.landmarks.position - tracks.landmarks.position, tracks.landmarks.per_pixel
+    along = (moved * ray).sum(1) / (ray**2).sum(1)
     px_per_rad, of_bias = float(np.nanmedian(along)) / STEP, 1.0 / float(inverse[-1, -1])
     own = max(of_bias - bias_information(params.bias_sigma), 0.0)
     yaw = own * px_per_rad**2, of_bias * state.bias * px_per_rad
@@ -302,7 +303,7 @@ def yaw_contradiction(angle: float, sigma: float, fixed: bool) -> str:
 @stage("intrinsics", version=3)
 def intrinsics_stage(
     params: IntrinsicsParams,
-    segments: Sequence[Bundle[RefineFacts]],
+    segments: Sequence[Bundle[ResectFacts]],
     rig: Bundle[CalibrationFacts],
     *,
     before: Sequence[float] | None = None,

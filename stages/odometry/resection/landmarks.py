@@ -8,7 +8,7 @@ interpolation and is more exact. Coordinates are those of the local frame, with 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -46,7 +46,7 @@ class Landmarks:
     position: Floats
     per_pixel: Floats
     sigma: Floats
-    lost: dict[str, int]
+    lost: dict[str, int] = field(default_factory=dict)
 
     def summary(self) -> str:
         """The counts in words."""
@@ -110,7 +110,7 @@ def triangulated(points: Floats, right: Floats, rig: Rig, T_local_left: RigidTra
     inverse, slope = inverse_depth(rig, points, right - points)
     depth = 1.0 / np.where(inverse > 0, inverse, np.nan)
     along = (depth**2 * slope)[:, None] * (rays @ T_local_left.rotation.T)
-    return Landmarks(T_local_left.apply(rays * depth[:, None]), along, sigma, {})
+    return Landmarks(T_local_left.apply(rays * depth[:, None]), along, sigma)
 
 
 def matches_at(points: Floats, disparity: Bundle) -> tuple[Floats, Bools]:

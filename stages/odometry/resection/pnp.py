@@ -22,9 +22,10 @@ import numpy as np
 from numba import njit
 
 from rille.stages.core.arrays import Bools, Floats
-from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.projection import NEAREST_M, Pinhole, linearise, perturbed, rotated
 from rille.stages.numeric.robust import huber_weight
+from rille.stages.odometry.resection.landmarks import Landmarks
 
 HUBER = 2.5
 """Huber's bound in standard deviations: 4 % of Gaussian errors in two dimensions lie beyond it."""
@@ -44,6 +45,15 @@ class Observations(NamedTuple):
     pixels: Floats
     camera: Pinhole
     pixel_sigma: float
+
+    @staticmethod
+    def of(landmarks: Landmarks, pixels: Floats, camera: Camera, pixel_sigma: float) -> Observations:
+        """Landmarks as a camera observes them at ``pixels`` (n, 2)."""
+        position, per_pixel, sigma, seen = (
+            np.ascontiguousarray(a, dtype=np.float64)
+            for a in (landmarks.position, landmarks.per_pixel, landmarks.sigma, pixels)
+        )
+        return Observations(position, per_pixel, sigma, seen, Pinhole.of(camera), pixel_sigma)
 
 
 class Pose(NamedTuple):

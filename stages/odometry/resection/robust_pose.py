@@ -37,7 +37,6 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import Camera, RigidTransform
-from rille.stages.geometry.projection import Pinhole
 from rille.stages.numeric.least_squares import levenberg_marquardt
 from rille.stages.odometry.resection.landmarks import MAX_RELATIVE_SIGMA, Landmarks
 from rille.stages.odometry.resection.pnp import (
@@ -97,6 +96,7 @@ class ResectParams(Params):
         description="largest back-projection error [pixels] of an inlier; the worst landmarks are removed until all "
         "are below; 1.0: 5 pixel_sigma",
     )
+    joint: bool = Field(True, description="then adjust all poses and landmark depths of a segment jointly")
     max_position_ratio: float = Field(
         0.02,
         gt=0,
@@ -127,7 +127,7 @@ class Resection:
     @property
     def total(self) -> Floats:
         """Covariance (6, 6) of the pose, all errors together, neighbours' being alike."""
-        return np.asarray(max(1.0, self.together) * self.covariance + self.shared @ self.shared.T)
+        return whole(self.covariance, self.shared, [self.together])
 
     @property
     def rms_px(self) -> float:
@@ -160,7 +160,7 @@ def resect(
     where = f"frame {frame}"
     enough(len(pixels), f"{where}: too few landmarks: {len(pixels)} have coordinates and were found", MORE_POINTS)
     _not_collinear(landmarks.position, where)
-    obs = observations(landmarks, pixels, camera, params)
+    obs = Observations.of(landmarks, pixels, camera, params.pixel_sigma)
     predictions = [Pose.of(T.inverse()) for T in starts]
     pose, near = _robust_start(obs, predictions, params, frame)
     pose, active = _without_inconsistent(obs, pose, near, params, where)
@@ -180,15 +180,6 @@ def resect(
         float(pose.bias),
         scatter_of_blocks(obs.pixels[active], errors.error[active], weight, camera),
     )
-
-
-def observations(landmarks: Landmarks, pixels: Floats, camera: Camera, params: ResectParams) -> Observations:
-    """Landmarks as a frame observes them at ``pixels`` (n, 2)."""
-    position, per_pixel, sigma, seen = (
-        np.ascontiguousarray(a, dtype=np.float64)
-        for a in (landmarks.position, landmarks.per_pixel, landmarks.sigma, pixels)
-    )
-    return Observations(position, per_pixel, sigma, seen, Pinhole.of(camera), float(params.pixel_sigma))
 
 
 def _robust_start(obs: Observations, predictions: list[Pose], params: ResectParams, frame: int) -> tuple[Pose, Bools]:
@@ -327,6 +318,19 @@ def scatter_of_blocks(pixels: Floats, white: Floats, weight: Floats, camera: Cam
     if freedom < 6 or spread <= 0.0:
         return 1.0
     return float((sums[:, used] ** 2 / count[used]).sum()) / spread / freedom
+
+
+def correlation(together: Sequence[float]) -> float:
+    """Variance of poses over that by independent errors: the mean of what :func:`scatter_of_blocks` gives, at least 1.
+
+    Of one frame it scatters by a fifth; frames of a segment share their landmarks.
+    """
+    return max(1.0, float(np.mean(together))) if together else 1.0
+
+
+def whole(covariance: Floats, shared: Floats, together: Sequence[float]) -> Floats:
+    """Covariances (..., 6, 6) with all errors: neighbours' being alike, and those that segments share (..., 6, 7)."""
+    return np.asarray(correlation(together) * covariance + shared @ np.swapaxes(shared, -1, -2))
 
 
 def enough(count: int, what: str, remedy: str) -> None:

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
-from rille.stages.facts.odometry import IntrinsicsFacts, RefineFacts, ResectFacts, TrajectoryFacts
+from rille.stages.facts.odometry import IntrinsicsFacts, ResectFacts, TrajectoryFacts
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform, cross_matrix, level_rotation, orthonormal
 from rille.stages.geometry.pose_arrays import COVARIANCE, NO_VERTICAL, OWN_COVARIANCE, POSES
@@ -299,11 +299,10 @@ def _facts(segments: Sequence[Bundle]) -> list[dict[str, Any]]:
 
 
 class TrajectoryInputs(NamedTuple):
-    """Segments as resected, levels of their key frames; segments as adjusted, and what they say of the cameras."""
+    """Segments, levels of their key frames, and what the segments say of the cameras."""
 
     segments: Sequence[Bundle[ResectFacts]]
     levels: Sequence[Bundle[GroundFacts]]
-    refined: Sequence[Bundle[RefineFacts]] = ()
     intrinsics: Bundle[IntrinsicsFacts] | None = None
 
 
@@ -328,7 +327,7 @@ def trajectory_stage(
 ) -> Bundle[TrajectoryFacts]:
     """Poses of all left frames in the world frame."""
     level = [RigidTransform.from_matrix(b.meta["T_local_left"]) for b in inputs.levels]
-    chained = [ChainLink.of(b, inputs.intrinsics) for b in inputs.refined or inputs.segments]
+    chained = [ChainLink.of(b, inputs.intrinsics) for b in inputs.segments]
     facts = _facts(inputs.segments) or [{"frame": frames[0], "inliers": 0}]
     causes = {int(f["frame"]): str(f["cause"]) for f in lost}
     causes |= {int(f["frame"]): str(f["lost"]) for f in facts if "lost" in f}

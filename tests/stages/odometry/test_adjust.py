@@ -256,10 +256,10 @@ def test_an_error_of_the_calibration_stays_in_the_covariance_however_many_frames
         scaled.append(Bundle(dict(one.arrays) | {"by_intrinsics": by}, one.meta))
     scale = {"intrinsics": Bundle({}, {"covariance": [[1e-4]]})}
     levels = [Bundle({}, {"T_local_left": one["poses"][0].ravel().tolist(), "source": "attitude"}) for one in scaled]
-    inputs = {"segments": segments, "levels": levels, "refined": scaled, **scale}
+    inputs = {"segments": scaled, "levels": levels, **scale}
     before = trajectory_stage.run(NoParams(), {"frames": list(range(frames))}, inputs)
     loops = [seen(truth, k, frames - 1 - k, rng) for k in range(frames // 6)]
-    out = adjusted(segments, before, *loops, refined=scaled, **scale)
+    out = adjusted(scaled, before, *loops, **scale)
     shares = [
         np.trace((one["covariance"] - one["own_covariance"])[frames // 2, :3, :3]) ** 0.5 for one in (before, out)
     ]

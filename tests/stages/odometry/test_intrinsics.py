@@ -10,7 +10,7 @@ import pytest
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
-from rille.stages.odometry.resection.bundle_adjustment import RefineParams, SegmentState, SegmentTracks, adjust
+from rille.stages.odometry.resection.bundle_adjustment import SegmentState, SegmentTracks, adjust, pose_errors
 from rille.stages.odometry.resection.intrinsics import (
     CORRECTED,
     PRIORS,
@@ -24,11 +24,11 @@ from rille.stages.odometry.resection.intrinsics import (
     with_errors,
 )
 from rille.stages.odometry.resection.landmarks import triangulated
-from rille.stages.odometry.resection.refine import pose_errors
+from rille.stages.odometry.resection.robust_pose import ResectParams
 
 CAMERA = Camera(450.0, 450.0, 375.5, 239.5, 752, 480)
 BENT = Lens(CAMERA, "radtan", (-0.28, 0.07, 0.0, 0.0))
-PARAMS = RefineParams()
+PARAMS = ResectParams()
 SIGMA = IntrinsicsParams().sigma
 NAMES = tuple(PRIORS)
 LEVEL = RigidTransform(rotation_exp(np.array([1.2, 0.1, -0.1])), np.array([0.3, 0.2, 1.0]))
@@ -55,9 +55,9 @@ def segment(
     moves = [
         RigidTransform(rotation_exp(turn * rng.standard_normal(3) * k), 0.1 * rng.standard_normal(3)) for k in (1, 2)
     ]
-    at = triangulated(measured(X), measured(T_RIGHT_LEFT.apply(X)), rig, LEVEL, np.full(POINTS, 0.2))
+    landmarks = triangulated(measured(X), measured(T_RIGHT_LEFT.apply(X)), rig, LEVEL, np.full(POINTS, 0.2))
     pixels = np.array([measured(move.apply(X)) for move in moves])
-    tracks = SegmentTracks(at.position, at.per_pixel, at.sigma, pixels, np.ones((2, POINTS), bool), given)
+    tracks = SegmentTracks(landmarks, pixels, np.ones((2, POINTS), bool), given)
     true = [move @ LEVEL.inverse() for move in moves]
     state = SegmentState(
         np.array([T.rotation for T in true]), np.array([T.translation for T in true]), np.zeros(POINTS)

@@ -164,23 +164,15 @@ def test_what_segments_share_adds_up_and_what_they_do_not_adds_squared():
     np.testing.assert_allclose(more[:, 2, 2], [(k * 5e-3) ** 2 for k in range(5)], atol=1e-15)
 
 
-def test_refined_poses_and_their_covariances_take_the_place_of_resected_ones():
+def test_poses_and_their_covariances_are_chained():
     truth, levels, _ = broken_run(set())
-    segments, better = [], []
+    segments, claimed = [], np.diag([1e-6] * 3 + [1e-8] * 3)
     for (a, b), T_local_key in zip(((0, 3), (3, 6), (6, 7)), levels, strict=True):
         local = np.array([(T_local_key @ truth[a].inverse() @ truth[i]).matrix34 for i in range(a, b + 1)])
-        better.append(local)
-        rough = local.copy()
-        rough[1:, :, 3] += 0.01
         n = b - a + 1
-        arrays = {"poses": rough, "covariance": np.zeros((n, 6, 6)), "shared": NONE[:n]}
+        arrays = {"poses": local, "covariance": np.tile(claimed, (n, 1, 1)), "shared": NONE[:n]}
         segments.append(Bundle(arrays, {"per_frame": [{"frame": i, "inliers": 9} for i in range(a, b + 1)]}))
     inputs = {"segments": segments, "levels": [Bundle({}, {"T_local_left": T.to_list()}) for T in levels]}
-    claimed = np.diag([1e-6] * 3 + [1e-8] * 3)
-    inputs["refined"] = [
-        Bundle({"poses": p, "covariance": np.tile(claimed, (len(p), 1, 1)), "shared": np.zeros((len(p), 6, 2))}, {})
-        for p in better
-    ]
     out = trajectory_stage.run(NoParams(), {"frames": list(range(8))}, inputs)
     # Of a frame of the first segment it is what was claimed, in the world: both parts are the same about all axes.
     np.testing.assert_allclose(out["covariance"][1], claimed, atol=1e-18)
