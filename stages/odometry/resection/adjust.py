@@ -26,7 +26,7 @@ from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
 from rille.stages.facts.odometry import FactorsFacts, IntrinsicsFacts, ResectFacts, TrajectoryFacts
 from rille.stages.geometry.geometry import RigidTransform, rotation_log
-from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, bound_of, root_of
+from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, root_of
 from rille.stages.odometry.resection.priors import Sensors
 from rille.stages.odometry.resection.sensors import moved
 from rille.stages.odometry.resection.trajectory import Chained, ChainLink, account, trajectory_stage
@@ -56,14 +56,11 @@ def chain_factors(segments: Sequence[ChainLink], numbers: Sequence[Sequence[int]
             poses.append((key.inverse() @ RigidTransform.from_matrix(link.poses[k])).matrix34)
             covariances.append(turn @ (link.covariance[k] - common @ common.T) @ turn.T)
             shared.append(turn @ np.hstack([common, link.calibration[k]]))
-    count = len(ends)
-    return Factors(
+    return Factors.of(
         np.array(ends, np.intp).reshape(-1, 2),
         np.array(poses).reshape(-1, 3, 4),
         root_of(np.array(covariances).reshape(-1, 6, 6)),
-        np.array(shared).reshape(count, 6, -1) if count else np.zeros((0, 6, 0)),
-        np.zeros((count, 3)),
-        np.full(count, np.inf),
+        shared=np.array(shared) if shared else None,
     )
 
 
@@ -83,14 +80,9 @@ def stated_factors(given: Sequence[Mapping[str, Any]], row: Mapping[int, int]) -
                 f"the covariance of the motion from frame {one['from']} to frame {one['to']} is not positive definite"
             )
             raise InputError("RIL-452", text, remedy="give that of (position m, rotation rad), symmetric")
-    return Factors(
-        np.array([[row[one["from"]], row[one["to"]]] for one in given], np.intp).reshape(-1, 2),
-        np.array([one["pose"] for one in given], dtype=np.float64).reshape(-1, 3, 4),
-        root_of(covariance),
-        np.zeros((len(given), 6, 0)),
-        np.zeros((len(given), 3)),
-        np.full(len(given), bound_of(6)),
-    )
+    ends = np.array([[row[one["from"]], row[one["to"]]] for one in given], np.intp).reshape(-1, 2)
+    poses = np.array([one["pose"] for one in given], dtype=np.float64).reshape(-1, 3, 4)
+    return Factors.of(ends, poses, root_of(covariance), components=6)
 
 
 def measured_alike(stated: Factors, chain: Factors, calibration: int) -> Factors:
@@ -131,7 +123,7 @@ def join(poses: Floats, piece: NDArray[np.int16], factors: Factors, sure: Bools)
         for first, other in np.unique(pieces[pieces[:, 0] != pieces[:, 1]], axis=0):
             rows = np.flatnonzero((pieces == [first, other]).all(1))
             here = factors.take(rows)
-            graph = PoseGraph(here, len(poses), 0, np.ones(len(rows)))
+            graph = PoseGraph(here, len(poses), np.ones(len(rows)))
             laid = [_moved(poses, piece == other, ends, pose) for ends, pose in zip(here.ends, here.poses, strict=True)]
             states = (GraphState.of(one, here.shared.shape[2]) for one in laid)
             squares = np.array([(graph.errors(state) ** 2).sum(1) for state in states])

@@ -158,7 +158,7 @@ class Sensors:
                 return None
             factors = Factors.joined([known, *groups.values(), anchor(poses[0])])
             ends = np.where(factors.ends < 0, len(nodes), factors.ends)
-            graph = PoseGraph(replace(factors, ends=ends), len(nodes) + 1, 0, np.ones(len(ends)), common=common)
+            graph = PoseGraph(replace(factors, ends=ends), len(nodes) + 1, np.ones(len(ends)), common=common)
             start = GraphState.of(np.concatenate([poses, np.eye(3, 4)[None]]), factors.shared.shape[2])
             done = adjust(graph, start, excesses)
             if excesses == EXCESS and not self._refused(groups, done, count, common):

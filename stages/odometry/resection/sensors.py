@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
 from rille.stages.geometry.rigid import compose, motion, umeyama
-from rille.stages.odometry.pose_graph import Factors, bound_of
+from rille.stages.odometry.pose_graph import Factors
 
 LEVER_SIGMA_M = 0.05
 """Of each component of a lever arm that is stated."""
@@ -105,8 +105,7 @@ class RelativePrior:
             shared = np.concatenate([scale[:, :, None], turns, OFFSET_SIGMA_S * clock[:, :, None]], axis=2)
         root[:, used, used] = np.eye(sigma.shape[1]) / sigma[:, None, :]
         shared[:, : used.start] = 0.0
-        bound = np.full(count, bound_of(sigma.shape[1]))
-        return Factors(np.stack([a, b], axis=1), measured, root, shared, np.zeros((count, 3)), bound)
+        return Factors.of(np.stack([a, b], axis=1), measured, root, sigma.shape[1], shared)
 
 
 @dataclass(frozen=True)
@@ -209,9 +208,8 @@ def position_factors(fixes: Fixes, laid: RigidTransform, prior: PositionPrior, p
     root[:, [0, 1, 2], [0, 1, 2]] = 1.0 / prior.sigma
     # The arm that is stated less the true one.
     shared[:, :3, :3], shared[:, :3, 3] = LEVER_SIGMA_M * turns, OFFSET_SIGMA_S * fixes.velocity
-    ends = np.stack([np.full(count, -1), fixes.nodes], axis=1)
-    bound = np.full(count, bound_of(int(np.isfinite(prior.sigma).sum())))
-    return Factors(ends, measured, root, shared, np.tile(prior.lever, (count, 1)), bound)
+    ends, components = np.stack([np.full(count, -1), fixes.nodes], axis=1), int(np.isfinite(prior.sigma).sum())
+    return Factors.of(ends, measured, root, components, shared, np.tile(prior.lever, (count, 1)))
 
 
 def vertical_factors(up: Floats, sigma: float, poses: Floats) -> Factors:
@@ -226,13 +224,10 @@ def vertical_factors(up: Floats, sigma: float, poses: Floats) -> Factors:
     T = np.concatenate([rotation_exp(turn) @ R, np.zeros((len(nodes), 3, 1))], axis=2)
     root = np.zeros((len(nodes), 6, 6))
     root[:, [3, 4], [3, 4]] = 1.0 / sigma
-    bound = np.full(len(nodes), bound_of(2))
-    ends = np.stack([np.full(len(nodes), -1), nodes], axis=1)
-    return Factors(ends, T, root, np.zeros((len(nodes), 6, 0)), np.zeros((len(nodes), 3)), bound)
+    return Factors.of(np.stack([np.full(len(nodes), -1), nodes], axis=1), T, root, 2)
 
 
 def anchor(pose: Floats) -> Factors:
     """What is known of the place beforehand, by the pose (3, 4) of node 0: it is about upright in the world."""
     root = np.diag([1e-3] * 3 + [1.0 / VERTICAL_SIGMA] * 2 + [0.1])[None]
-    none = np.zeros((1, 6, 0)), np.zeros((1, 3)), np.full(1, np.inf)
-    return Factors(np.array([[-1, 0]]), pose[None], root, *none)
+    return Factors.of(np.array([[-1, 0]]), pose[None], root)

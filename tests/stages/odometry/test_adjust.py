@@ -109,7 +109,7 @@ def test_a_dense_solver_finds_the_same_poses_and_covariances():
         np.array(ends), np.array([T.matrix34 for T in measured]), np.tile(root_of(LOOP), (7, 1, 1)), shared,
         levers, np.full(7, np.inf),
     )  # fmt: skip
-    graph = PoseGraph(factors, 6, 0, np.ones(7), common=2)
+    graph = PoseGraph(factors, 6, np.ones(7), common=2)
     start = GraphState.of(np.array([T.matrix34 for T in truth]), 2)
 
     def unpacked(x):
@@ -150,7 +150,7 @@ def test_an_error_is_spread_over_a_loop_as_the_covariances_say():
         np.zeros((5, 6, 0)), np.zeros((5, 3)), np.full(5, np.inf),
     )  # fmt: skip
     start = np.array([RigidTransform(np.eye(3), np.array([0.0, 0, k])).matrix34 for k in range(5)])
-    done = adjust(PoseGraph(factors, 5, 0, np.ones(5)), GraphState.of(start, 0))
+    done = adjust(PoseGraph(factors, 5, np.ones(5)), GraphState.of(start, 0))
     np.testing.assert_allclose(np.diff(done.state.C[:, 2]) - 1, [-0.001, -0.001, -0.004, -0.004], atol=1e-7)
 
 
