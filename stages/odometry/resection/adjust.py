@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from rille.stages.facts.odometry import FactorsFacts, IntrinsicsFacts, ResectFac
 from rille.stages.geometry.geometry import RigidTransform, rotation_log
 from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, root_of
 from rille.stages.odometry.resection.priors import Sensors
-from rille.stages.odometry.resection.sensors import moved
+from rille.stages.odometry.resection.sensors import OwnTrajectory, moved
 from rille.stages.odometry.resection.trajectory import Chained, ChainLink, account, trajectory_stage
 
 MIN_WAY_SHARE = 0.03
@@ -100,14 +100,7 @@ def measured_alike(stated: Factors, chain: Factors, calibration: int) -> Factors
     return replace(stated, shared=seen)
 
 
-class JoinedPieces(NamedTuple):
-    """Poses (n, 3, 4) in a common frame as far as factors join them, and the piece (n,) of each."""
-
-    poses: Floats
-    piece: NDArray[np.int16]
-
-
-def join(poses: Floats, piece: NDArray[np.int16], factors: Factors, sure: Bools) -> JoinedPieces:
+def join(own: OwnTrajectory, factors: Factors, sure: Bools) -> OwnTrajectory:
     """Pieces laid together by the factors between them, each by the one that most others agree with.
 
     Within a piece the chain contradicts a place that is taken for another; between two pieces nothing but a second
@@ -115,9 +108,10 @@ def join(poses: Floats, piece: NDArray[np.int16], factors: Factors, sure: Bools)
 
     Parameters
     ----------
-    poses, piece : (n, 3, 4) and (n,), each piece in a frame of its own.
+    own : its poses are in a common frame afterwards as far as factors join their pieces.
     sure : which factors (m,) need no other that agrees about with them.
     """
+    poses, piece = own.poses, own.piece
     while True:
         pieces = np.sort(piece[factors.ends], axis=1)
         for first, other in np.unique(pieces[pieces[:, 0] != pieces[:, 1]], axis=0):
@@ -133,7 +127,7 @@ def join(poses: Floats, piece: NDArray[np.int16], factors: Factors, sure: Bools)
                 poses, piece = laid[int(np.argmin(costs))], np.where(piece == other, first, piece)
                 break
         else:
-            return JoinedPieces(poses, piece)
+            return own._replace(poses=poses, piece=piece)
 
 
 def _moved(poses: Floats, rows: Bools, ends: NDArray[np.intp], pose: Floats) -> Floats:
@@ -174,11 +168,13 @@ def adjust_stage(
     chain = chain_factors(links, numbers, row)
     given = [one for bundle in loops for one in bundle.meta["factors"] if one["from"] in row and one["to"] in row]
     stated = measured_alike(stated_factors(given, row), chain, calibration)
-    sensors = Sensors.of(priors or {}, posed)
-    sensors.believe(chained.poses[posed], chained.piece[posed])
-    between = Factors.joined([stated, *(sensor.factors(0.0) for sensor in sensors.relative)])
+    sensors = Sensors.of(priors or {}, len(frames))
+    own = OwnTrajectory(chained.poses[posed], chained.piece[posed], sensors.times[posed], posed)
+    sensors.believe(own)
+    between = Factors.joined([stated, *sensors.between(own)])
     sure = np.arange(len(between.ends)) >= len(given)
-    poses, piece = sensors.laid(*join(chained.poses[posed], chained.piece[posed], between, sure))
+    own = sensors.laid(join(own, between, sure))
+    piece = own.piece
     alone = piece[stated.ends[:, 0]] != piece[stated.ends[:, 1]]
     out, excess = chained, 1.0
     lines = [
@@ -187,13 +183,13 @@ def adjust_stage(
     ]
     for number in np.unique(piece):
         nodes = np.flatnonzero(piece == number)
-        own, mine = _within(chain, nodes), _within(stated, nodes)
-        done = sensors.adjusted(poses[nodes], nodes, own.beside(mine))
+        inside, mine = _within(chain, nodes), _within(stated, nodes)
+        done = sensors.adjusted(own.take(nodes), inside.beside(mine))
         if done is None:
             continue
         excess = max(excess, done.graph.excess)
-        out = _written(out, posed[nodes], done, slice(own.shared.shape[2] - calibration, own.shared.shape[2]))
-        kept = done.kept[len(own.ends) : len(own.ends) + len(mine.ends)]
+        out = _written(out, posed[nodes], done, slice(inside.shared.shape[2] - calibration, inside.shared.shape[2]))
+        kept = done.kept[len(inside.ends) : len(inside.ends) + len(mine.ends)]
         for k in np.flatnonzero(np.isin(stated.ends, nodes).all(1))[~kept]:
             ends = np.searchsorted(nodes, stated.ends[k])
             lines.append(_left_out(given[k], done.state.poses[ends]))
