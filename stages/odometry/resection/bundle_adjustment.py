@@ -124,19 +124,15 @@ class SegmentAdjustment:
         return huber_weights(errors.norm, self.tracks.seen[f])
 
     def normal(self, state: SegmentState) -> SegmentNormal:
-        """Normal equations and Huber's cost of the tracks, with the priors of depths and bias."""
-        out = self.measured(state)
-        prior = bias_information(self.params.bias_sigma)
-        out.poses[-1, -1] += prior
-        out.pose_gradient[-1] += prior * state.bias
-        return out._replace(cost=out.cost + 0.5 * prior * state.bias**2)
+        """Normal equations and Huber's cost of the tracks, with the priors of depths and bias.
 
-    def measured(self, state: SegmentState) -> SegmentNormal:
-        """The same without the prior of the bias; landmarks behind a camera do not count."""
+        Landmarks behind a camera do not count.
+        """
         p, n = 6 * len(state.R) + 1, len(state.depth)
         held = self.tracks.landmarks.sigma**-2.0
         out = SegmentNormal(np.zeros((p, p)), np.zeros((p, n)), held.copy(), np.zeros(p), state.depth * held, 0.0)
-        cost = 0.5 * float((state.depth**2 * held).sum())
+        prior = bias_information(self.params.bias_sigma)
+        cost = 0.5 * float((state.depth**2 * held).sum() + prior * state.bias**2)
         for f in range(len(state.R)):
             errors = self.errors(state, f)
             weight, at = self.weights(errors, f), slice(6 * f, 6 * f + 6)
@@ -153,6 +149,8 @@ class SegmentAdjustment:
             out.between[-1] += square
             out.pose_gradient[-1] += slope.sum()
         out.poses[-1] = out.poses[:, -1] = out.between.sum(1)
+        out.poses[-1, -1] += prior
+        out.pose_gradient[-1] += prior * state.bias
         return out._replace(cost=cost)
 
     def ahead(self, state: SegmentState, normal: SegmentNormal, damping: float) -> SegmentState:
@@ -244,7 +242,8 @@ class PoseErrors(NamedTuple):
 def pose_errors(tracks: SegmentTracks, state: SegmentState, params: ResectParams) -> PoseErrors:
     """Errors of the poses of an adjusted segment, of position (m) and rotation vector (rad) of T_local_left."""
     problem, prior = SegmentAdjustment(tracks, params), bias_information(params.bias_sigma)
-    matrix, _ = problem.measured(state).without_depths()
+    matrix, _ = problem.normal(state).without_depths()
+    matrix[-1, -1] -= prior  # which stays as it is, however large the errors are
     factor = problem.scatter(state)
     measured, stated = pose_covariance(matrix / factor, prior), pose_covariance(matrix / max(factor, 1.0), prior)
     count = len(state.R)

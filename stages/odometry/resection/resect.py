@@ -33,11 +33,9 @@ from rille.stages.odometry.resection.intrinsics import PRIORS, SegmentCameras, c
 from rille.stages.odometry.resection.landmarks import SegmentPoints, landmarks_of, matches_at
 from rille.stages.odometry.resection.robust_pose import (
     MIN_LANDMARKS,
-    MORE_POINTS,
     SHARED_SOURCES,
     Resection,
     ResectParams,
-    enough,
     resect,
     whole,
 )
@@ -90,6 +88,11 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
     last, together = key, list[float]()
     doubt: AmbiguousError | None = None
     trusted = np.ones(len(known), bool)
+
+    def posed_by(use: NDArray[np.intp], j: int) -> Resection:
+        pixels = points.tracks[use, j].astype(np.float64)
+        return resect(points.landmarks.take(use), pixels, points.camera, [last], params, frames[j])
+
     for j in range(1, len(frames)):
         # What once moved by itself is no landmark: seen longer than others, or standing for a while, it might prevail.
         use = np.flatnonzero(known[:, j] & trusted)
@@ -99,12 +102,12 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
             # What is in doubt stays so: later frames see fewer of the landmarks that told the motions apart.
             if doubt:
                 raise doubt
-            posed = _resect_frame(points, j, use, last, params, frames[j])
+            posed = posed_by(use, j)
             others = moving_by_themselves(points, j, trusted, posed, params, frames[j])
             if others.size:
                 trusted[others] = False
                 use = np.flatnonzero(known[:, j] & trusted)
-                posed = _resect_frame(points, j, use, last, params, frames[j])
+                posed = posed_by(use, j)
         except DegenerateError as error:
             facts["lost"] = error.message.removeprefix(f"frame {frames[j]}: ")
             if isinstance(error, AmbiguousError) and not doubt:
@@ -152,25 +155,6 @@ def adjust_segment(
         "yaw": [one / errors.excess for one in part.yaw],
         "bias_px": end.state.bias,
     }
-
-
-def _resect_frame(
-    points: SegmentPoints,
-    j: int,
-    use: NDArray[np.intp],
-    last: RigidTransform,
-    params: ResectParams,
-    frame: int,
-) -> Resection:
-    """Pose of the frame in place ``j`` of a segment behind pose ``last``, by the points that are used."""
-    enough(
-        use.size,
-        f"frame {frame}: too few landmarks: {use.size} of {len(points.tracks)} tracked points have coordinates and were"
-        f" found ({points.landmarks.summary()})",
-        MORE_POINTS,
-    )
-    pixels = points.tracks[use, j].astype(np.float64)
-    return resect(points.landmarks.take(use), pixels, points.camera, [last], params, frame)
 
 
 def knocked(points: SegmentPoints, segment: SegmentPoses, after: Bundle, rig: Rig) -> tuple[str, list[float]] | None:

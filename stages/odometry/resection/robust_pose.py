@@ -54,7 +54,6 @@ from rille.stages.odometry.resection.pnp import (
 
 MIN_LANDMARKS = 6
 """Fewest landmarks of a pose: twelve equations for six unknowns, so that one wrong landmark shows."""
-MORE_POINTS = "set track.points higher or choose basic pairs closer"
 MAX_BLOCKS = 6
 """Blocks along either side of the image whose mean errors show how far neighbours' errors go together."""
 MIN_PER_BLOCK = 6
@@ -158,7 +157,8 @@ def resect(
         Fewer than six landmarks (in all, or consistent), all on a line, or a pose that they do not determine.
     """
     where = f"frame {frame}"
-    enough(len(pixels), f"{where}: too few landmarks: {len(pixels)} have coordinates and were found", MORE_POINTS)
+    count = f"{where}: too few landmarks: {len(pixels)} have coordinates and were found ({landmarks.summary()})"
+    enough(len(pixels), count, "set track.points higher or choose basic pairs closer")
     _not_collinear(landmarks.position, where)
     obs = Observations.of(landmarks, pixels, camera, params.pixel_sigma)
     predictions = [Pose.of(T.inverse()) for T in starts]

@@ -335,7 +335,7 @@ def test_a_frame_that_cannot_be_posed_is_lost_and_the_next_one_is_posed():
     _, found = segment_poses(points, landmarks, steps[0], [4, 5, 6, 7])
     assert np.isnan(found.poses[1:3]).all()
     assert np.isnan(found.covariance[1:3]).all()
-    assert "0 of 80" in found.facts[1]["lost"]
+    assert "0 have coordinates" in found.facts[1]["lost"]
     assert "3 too far" in found.facts[1]["lost"]
     assert "agree with one pose" in found.facts[2]["lost"]
     assert not found.inlier[:, 1:3].any()
