@@ -159,8 +159,8 @@ def adjust_stage(
 ) -> Bundle[TrajectoryFacts]:
     """Poses of all left frames, adjusted to places seen again and to what other sensors say."""
     frames = trajectory.meta["frames"]
-    chained = Chained(**{field.name: np.array(trajectory[field.name]) for field in fields(Chained)})
-    posed = np.flatnonzero(chained.piece >= 0)
+    out = Chained(**{field.name: np.array(trajectory[field.name]) for field in fields(Chained)})
+    posed = np.flatnonzero(out.piece >= 0)
     row = {frames[k]: node for node, k in enumerate(posed)}
     numbers = [[int(f["frame"]) for f in bundle.meta["per_frame"]] for bundle in segments]
     links = [ChainLink.of(bundle, intrinsics) for bundle in segments]
@@ -169,71 +169,60 @@ def adjust_stage(
     given = [one for bundle in loops for one in bundle.meta["factors"] if one["from"] in row and one["to"] in row]
     stated = measured_alike(stated_factors(given, row), chain, calibration)
     sensors = Sensors.of(priors or {}, len(frames))
-    own = OwnTrajectory(chained.poses[posed], chained.piece[posed], sensors.times[posed], posed)
+    own = OwnTrajectory(out.poses[posed], out.piece[posed], sensors.times[posed], posed)
     sensors.believe(own)
     between = Factors.joined([stated, *sensors.between(own)])
     sure = np.arange(len(between.ends)) >= len(given)
     own = sensors.laid(join(own, between, sure))
-    piece = own.piece
-    alone = piece[stated.ends[:, 0]] != piece[stated.ends[:, 1]]
-    out, excess = chained, 1.0
+    alone = own.piece[stated.ends[:, 0]] != own.piece[stated.ends[:, 1]]
     lines = [
         f"frames {given[k]['from']} and {given[k]['to']} alone link their pieces, which are not joined"
         for k in np.flatnonzero(alone)
     ]
-    for number in np.unique(piece):
-        nodes = np.flatnonzero(piece == number)
-        inside, mine = _within(chain, nodes), _within(stated, nodes)
-        done = sensors.adjusted(own.take(nodes), inside.beside(mine))
+    known, excess = chain.beside(stated), 1.0
+    for number in np.unique(own.piece):
+        nodes = np.flatnonzero(own.piece == number)
+        inside = np.flatnonzero(np.isin(known.ends, nodes).all(1))
+        ends = np.searchsorted(nodes, known.ends[inside])
+        done = sensors.adjusted(own.take(nodes), replace(known.take(inside), ends=ends))
         if done is None:
             continue
         excess = max(excess, done.graph.excess)
-        out = _written(out, posed[nodes], done, slice(inside.shared.shape[2] - calibration, inside.shared.shape[2]))
-        kept = done.kept[len(inside.ends) : len(inside.ends) + len(mine.ends)]
-        for k in np.flatnonzero(np.isin(stated.ends, nodes).all(1))[~kept]:
-            ends = np.searchsorted(nodes, stated.ends[k])
-            lines.append(_left_out(given[k], done.state.poses[ends]))
+        sources = known.shared.shape[2]
+        _write(out, posed[nodes], done, slice(sources - calibration, sources))
+        for k in np.flatnonzero(~done.kept[: len(inside)]):
+            lines.append(_left_out(given[inside[k] - len(chain.ends)], done.state.poses[ends[k]]))
     if excess > 1.0:
         lines.append(f"the camera's own errors are about {excess:.0f} times those stated: all covariances grow by that")
     return _bundle(trajectory, out, [*lines, *sensors.lines], {"excess": excess, "priors": sensors.facts})
 
 
-def _within(factors: Factors, nodes: NDArray[np.intp]) -> Factors:
-    """The factors between some nodes, which are numbered anew."""
-    inside = factors.take(np.flatnonzero(np.isin(factors.ends, nodes).all(1)))
-    return replace(inside, ends=np.searchsorted(nodes, inside.ends))
-
-
-def _written(out: Chained, rows: NDArray[np.intp], done: Adjusted, calibration: slice) -> Chained:
-    """The trajectory with the adjusted poses in these rows, which are one piece now.
+def _write(out: Chained, rows: NDArray[np.intp], done: Adjusted, calibration: slice) -> None:
+    """Write the adjusted poses into these rows, which are one piece now.
 
     ``calibration`` are the sources that are errors of it.
     """
-    changed = {name: value.copy() for name, value in vars(out).items()}
     exact = replace(done.graph.factors, shared=done.graph.factors.shared.copy())
     exact.shared[:, :, calibration] = 0.0
     # The place of positions and of the vertical is a node behind the frames.
-    changed["poses"][rows] = done.state.poses[:-1]
-    changed["covariance"][rows] = done.graph.covariance(done.state)[:-1]
-    changed["own_covariance"][rows] = replace(done.graph, factors=exact).covariance(done.state)[:-1]
-    changed["piece"][rows] = changed["piece"][rows].min()
-    return Chained(**changed)
+    out.poses[rows] = done.state.poses[:-1]
+    out.covariance[rows] = done.graph.covariance(done.state)[:-1]
+    out.own_covariance[rows] = replace(done.graph, factors=exact).covariance(done.state)[:-1]
+    out.piece[rows] = out.piece[rows].min()
 
 
 def _bundle(
     before: Bundle[TrajectoryFacts], out: Chained, lines: list[str], more: Mapping[str, Any]
 ) -> Bundle[TrajectoryFacts]:
     """Arrays and facts as of stage ``trajectory``."""
-    kept, number = np.unique(out.piece[out.piece >= 0], return_inverse=True)
-    piece = out.piece.copy()
-    piece[piece >= 0] = number
-    out, frames = replace(out, piece=piece), before.meta["frames"]
+    kept, out.piece[out.piece >= 0] = np.unique(out.piece[out.piece >= 0], return_inverse=True)
+    frames = before.meta["frames"]
     verticals = [before.meta["verticals"][k] for k in kept]
     facts = account(frames, out, {int(one["frame"]): one["cause"] for one in before.meta["lost"]}, verticals)
     meta: TrajectoryFacts = {
         **before.meta,
         **facts,  # type: ignore[typeddict-item]
-        "world": [frame for frame, k in zip(frames, piece, strict=True) if k == facts["main"]],
+        "world": [frame for frame, k in zip(frames, out.piece, strict=True) if k == facts["main"]],
         **more,
         "warnings": [*facts["warnings"], *lines],
     }
