@@ -173,21 +173,20 @@ def world_poses(trajectory: Bundle, piece: int | None = None) -> Floats:
     return np.where((np.asarray(trajectory["piece"]) == wanted)[:, None, None], poses, np.nan)
 
 
-def levelled(found: Chained, first: int, up: Floats) -> Chained:
-    """Turn the piece that begins in row ``first`` so that ``up`` (3,) of its frame becomes z."""
-    rows = np.flatnonzero(found.piece == found.piece[first])
-    R = found.poses[first, :, :3]
+def _level(found: Chained, piece: int, up: Floats) -> None:
+    """Turn a piece so that ``up`` (3,) of its frame becomes z; y is ahead of its first camera."""
+    rows = np.flatnonzero(found.piece == piece)
+    R = found.poses[rows[0], :, :3]
     turn = level_rotation(R.T @ up) @ R.T
     # Position and rotation vector turn alike.
     both = np.kron(np.eye(2), turn)
-    poses, covariance, own = found.poses.copy(), found.covariance.copy(), found.own_covariance.copy()
-    poses[rows] = turn @ poses[rows]
-    covariance[rows], own[rows] = (both @ each[rows] @ both.T for each in (covariance, own))
-    return replace(found, poses=poses, covariance=covariance, own_covariance=own)
+    found.poses[rows] = turn @ found.poses[rows]
+    for covariance in (found.covariance, found.own_covariance):
+        covariance[rows] = both @ covariance[rows] @ both.T
 
 
-def _with_verticals(found: Chained, keys: Sequence[int], levels: Sequence[Bundle]) -> tuple[Chained, list[str]]:
-    """Pieces levelled by the first of their pairs that knows the vertical; the source of each piece's vertical.
+def _level_pieces(found: Chained, keys: Sequence[int], levels: Sequence[Bundle]) -> list[str]:
+    """Level pieces by the first of their pairs that knows the vertical; the source of each piece's vertical.
 
     ``keys`` are the rows of the pairs that ``levels`` are of.
     """
@@ -195,16 +194,14 @@ def _with_verticals(found: Chained, keys: Sequence[int], levels: Sequence[Bundle
     for piece in range(int(found.piece.max()) + 1):
         mine = [(key, level) for key, level in zip(keys, levels, strict=True) if found.piece[key] == piece]
         source = mine[0][1].meta.get("source", "") if mine else NO_VERTICAL
-        if source == NO_VERTICAL:
-            first = int(np.flatnonzero(found.piece == piece)[0])
-            known = ((key, level) for key, level in mine if level.meta["source"] != NO_VERTICAL)
-            for key, level in known:
-                R_local_left = RigidTransform.from_matrix(level.meta["T_local_left"]).rotation
-                found = levelled(found, first, found.poses[key, :, :3] @ R_local_left[2])
-                source = level.meta["source"]
-                break
+        known = ((key, level) for key, level in mine if level.meta["source"] != NO_VERTICAL)
+        if source == NO_VERTICAL and (one := next(known, None)) is not None:
+            key, level = one
+            R_local_left = RigidTransform.from_matrix(level.meta["T_local_left"]).rotation
+            _level(found, piece, found.poses[key, :, :3] @ R_local_left[2])
+            source = level.meta["source"]
         sources.append(source)
-    return found, sources
+    return sources
 
 
 def account(frames: list[int], found: Chained, causes: Mapping[int, str], verticals: Sequence[str]) -> dict[str, Any]:
@@ -216,17 +213,13 @@ def account(frames: list[int], found: Chained, causes: Mapping[int, str], vertic
     piece, main = found.piece, largest(found.piece)
     posed, lost = np.flatnonzero(piece >= 0), list[dict[str, Any]]()
     members = [np.flatnonzero(piece == k) for k in range(int(piece.max()) + 1)]
-    # Runs of lost frames: between neighbours the row grows by one.
-    rows = np.flatnonzero(piece < 0)
-    for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if rows.size else ():
-        before, behind = posed[posed < run[0]], posed[posed > run[-1]]
-        bridged = None
+    for row in np.flatnonzero(piece < 0):
+        behind = int(np.searchsorted(posed, row))
+        sides = posed[behind - 1 : behind + 1] if behind else posed[:0]
         # Bridged: the frames on both sides are of one piece, tracked across.
-        if before.size and behind.size and piece[before[-1]] == piece[behind[0]]:
-            bridged = [frames[before[-1]], frames[behind[0]]]
-        for frame in (frames[row] for row in run):
-            cause = causes.get(frame, "no frame beside it could be posed with it")
-            lost.append({"frame": frame, "cause": cause, "bridged": bridged})
+        bridged = [frames[k] for k in sides] if len(sides) == 2 and piece[sides[0]] == piece[sides[1]] else None
+        cause = causes.get(frames[row], "no frame beside it could be posed with it")
+        lost.append({"frame": frames[row], "cause": cause, "bridged": bridged})
     facts = {
         # Facts are JSON, which has no NaN.
         "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in found.poses],
@@ -311,7 +304,8 @@ def trajectory_stage(
         causes = {f: "; ".join([cause, *moved.get(f, ())]) for f, cause in causes.items()}
     row = {frame: k for k, frame in enumerate(frames)}
     rows = [[row[int(f["frame"])] for f in part] for part in parts]
-    found, verticals = _with_verticals(chain(links, levels, rows, len(frames)), [at[0] for at in rows], inputs.levels)
+    found = chain(links, levels, rows, len(frames))
+    verticals = _level_pieces(found, [at[0] for at in rows], inputs.levels)
     inliers = {int(f["frame"]): int(f["inliers"]) for f in facts}
     meta: TrajectoryFacts = {
         "frames": frames,
