@@ -41,14 +41,13 @@ from rille.stages.numeric.least_squares import levenberg_marquardt
 from rille.stages.odometry.resection.landmarks import MAX_RELATIVE_SIGMA, Landmarks
 from rille.stages.odometry.resection.pnp import (
     Errors,
+    Normal,
     Observations,
     Pose,
     PoseAdjustment,
     PoseCovariance,
     back_projection,
     bias_information,
-    huber_weights,
-    normal_equations,
     pose_covariance,
 )
 
@@ -168,9 +167,9 @@ def resect(
     _not_by_chance(errors, params, where)
     _not_collinear(landmarks.position[active], where)
     depth = float(np.median(obs.landmarks[active] @ pose.R[2] + pose.t[2]))
-    measured, stated = _certainty(errors, active, depth, params, where)
+    normal = PoseAdjustment(obs, active, params.bias_sigma).normal(pose)
+    measured, stated = _certainty(errors, normal, depth, params, where)
     covariance, shared = frame_errors(measured, stated, pose.R, depth)
-    weight = huber_weights(errors.norm, active)[active]
     return Resection(
         RigidTransform(pose.R, pose.t).inverse(),
         covariance,
@@ -178,7 +177,7 @@ def resect(
         active,
         np.where(np.isfinite(errors.norm), errors.pixels, np.nan),
         float(pose.bias),
-        scatter_of_blocks(obs.pixels[active], errors.error[active], weight, camera),
+        scatter_of_blocks(obs.pixels[active], errors.error[active], normal.weight[active], camera),
     )
 
 
@@ -196,9 +195,13 @@ def _robust_start(obs: Observations, predictions: list[Pose], params: ResectPara
     for _ in range(2):
         active = back_projection(obs, best).norm <= bound
         if active.sum() >= 4:
-            problem = PoseAdjustment(obs, active, params.bias_sigma)
-            best = levenberg_marquardt(problem, best, 10, tolerance=1e-4).state
+            best = _adjusted(obs, active, best, params)
     return best, back_projection(obs, best).norm <= bound
+
+
+def _adjusted(obs: Observations, active: Bools, start: Pose, params: ResectParams) -> Pose:
+    """The pose of least cost for the active (n,) landmarks."""
+    return levenberg_marquardt(PoseAdjustment(obs, active, params.bias_sigma), start, MAX_STEPS).state
 
 
 def _sampled(obs: Observations, threshold: float, seed: int) -> list[Pose]:
@@ -223,7 +226,7 @@ def _without_inconsistent(
             f"{where}: too few landmarks: {count} agree with one pose",
             "raise resect.threshold or choose basic pairs closer",
         )
-        pose = levenberg_marquardt(PoseAdjustment(obs, active, params.bias_sigma), pose, MAX_STEPS, 1e-3).state
+        pose = _adjusted(obs, active, pose, params)
         usable = _first_order(obs, pose)
         if (active & ~usable).any():
             active = active & usable
@@ -231,9 +234,7 @@ def _without_inconsistent(
         norm = np.where(active, back_projection(obs, pose).norm, -1.0)
         beyond = int((norm > bound).sum())
         if beyond == 0:
-            # Only the last adjustment needs the full accuracy.
-            problem = PoseAdjustment(obs, active, params.bias_sigma)
-            return levenberg_marquardt(problem, pose, MAX_STEPS, 1e-10).state, active
+            return pose, active
         active = active.copy()
         # Not all of them at once: the worst pull the pose, and others agree once these are gone.
         active[np.argsort(-norm, kind="stable")[: math.ceil(beyond / REMOVED_SHARE)]] = False
@@ -250,14 +251,15 @@ def _first_order(obs: Observations, pose: Pose) -> Bools:
 
 
 def _certainty(
-    errors: Errors, active: Bools, depth: float, params: ResectParams, where: str
+    errors: Errors, normal: Normal, depth: float, params: ResectParams, where: str
 ) -> tuple[PoseCovariance, PoseCovariance]:
     """Covariances of a pose by the errors found, and by the larger of those and the stated ones."""
-    normal, prior = normal_equations(errors, active), bias_information(params.bias_sigma)
+    active, prior, matrix = normal.weight > 0, bias_information(params.bias_sigma), normal.matrix.copy()
+    matrix[6, 6] -= prior  # which stays as it is, however large the errors are
     # A posteriori variance factor: the errors found, not the ones expected, set the scale.
     squares = (normal.weight[active] * errors.norm[active] ** 2).sum()
     factor = max(float(squares / (2 * active.sum() - 6)), 1e-12)
-    expected = pose_covariance(normal.matrix, prior)
+    expected = pose_covariance(matrix, prior)
     position_sigma = float(np.sqrt(np.trace(expected.noise[:3, :3]) + (expected.by_bias[:3] ** 2).sum()))
     if position_sigma > params.max_position_ratio * depth:
         raise DegenerateError(
@@ -266,7 +268,7 @@ def _certainty(
             f" by {position_sigma:.2g} m (condition {expected.condition:.1e})",
             remedy="they are too far, too few or in one direction: set track.points higher or use nearer texture",
         )
-    return pose_covariance(normal.matrix / factor, prior), pose_covariance(normal.matrix / max(factor, 1.0), prior)
+    return pose_covariance(matrix / factor, prior), pose_covariance(matrix / max(factor, 1.0), prior)
 
 
 def frame_errors(
