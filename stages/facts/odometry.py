@@ -90,20 +90,15 @@ class IntrinsicsFacts(Facts):
     contradiction: NotRequired[str]
 
 
-class FactorsFacts(Facts):
-    """Measured motions between frames.
+class LoopFacts(Facts):
+    """Motions to a basic pair from earlier ones; ``refused`` are frames that look alike, and the ``reason``.
 
     Each of the ``factors`` has the numbers of two frames, ``from`` and ``to``; ``pose``, twelve numbers of T_from_to
-    (left cameras, m); ``covariance``, 36 numbers of (position m, rotation rad) in the frame of the first; and perhaps
+    (left cameras, m); ``covariance``, 36 numbers of (position m, rotation rad) in the frame of the first; and
     ``source``, in words.
     """
 
     factors: list[dict[str, Any]]
-
-
-class LoopFacts(FactorsFacts):
-    """Motions to a basic pair from earlier ones; ``refused`` are frames that look alike, and the ``reason``."""
-
     refused: list[dict[str, Any]]
 
 

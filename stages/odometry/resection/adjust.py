@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Bundle, NoParams, stage
-from rille.stages.core.errors import InputError
-from rille.stages.facts.odometry import FactorsFacts, IntrinsicsFacts, ResectFacts, TrajectoryFacts
+from rille.stages.facts.odometry import IntrinsicsFacts, LoopFacts, ResectFacts, TrajectoryFacts
 from rille.stages.geometry.geometry import RigidTransform, rotation_log
 from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, root_of
 from rille.stages.odometry.resection.priors import Sensors
@@ -65,21 +64,8 @@ def chain_factors(segments: Sequence[ChainLink], numbers: Sequence[Sequence[int]
 
 
 def stated_factors(given: Sequence[Mapping[str, Any]], row: Mapping[int, int]) -> Factors:
-    """Factors as facts state them (``from``, ``to``, ``pose``, ``covariance``); ``row`` is the node of each frame.
-
-    Raises
-    ------
-    InputError
-        A covariance is not positive definite.
-    """
+    """Factors as facts state them (``from``, ``to``, ``pose``, ``covariance``); ``row`` is the node of each frame."""
     covariance = np.array([one["covariance"] for one in given], dtype=np.float64).reshape(-1, 6, 6)
-    for one, matrix in zip(given, covariance, strict=True):
-        # Also of NaN, which no comparison holds of.
-        if not np.linalg.eigvalsh(matrix).min() > 0.0:
-            text = (
-                f"the covariance of the motion from frame {one['from']} to frame {one['to']} is not positive definite"
-            )
-            raise InputError("RIL-452", text, remedy="give that of (position m, rotation rad), symmetric")
     ends = np.array([[row[one["from"]], row[one["to"]]] for one in given], np.intp).reshape(-1, 2)
     poses = np.array([one["pose"] for one in given], dtype=np.float64).reshape(-1, 3, 4)
     return Factors.of(ends, poses, root_of(covariance), components=6)
@@ -142,7 +128,7 @@ def _left_out(one: Mapping[str, Any], adjusted: Floats) -> str:
     off = RigidTransform.from_matrix(one["pose"]).inverse() @ a.inverse() @ b
     turn = math.degrees(np.linalg.norm(rotation_log(off.rotation)))
     return (
-        f"the motion from frame {one['from']} to frame {one['to']} ({one.get('source', 'stated')}) contradicts the "
+        f"the motion from frame {one['from']} to frame {one['to']} ({one['source']}) contradicts the "
         f"others by {np.linalg.norm(off.translation):.2g} m and {turn:.2g} degrees: it is left out"
     )
 
@@ -152,7 +138,7 @@ def adjust_stage(
     params: NoParams,
     trajectory: Bundle[TrajectoryFacts],
     segments: Sequence[Bundle[ResectFacts]],
-    loops: Sequence[Bundle[FactorsFacts]] = (),
+    loops: Sequence[Bundle[LoopFacts]] = (),
     intrinsics: Bundle[IntrinsicsFacts] | None = None,
     *,
     priors: Mapping[str, Any] | None = None,
