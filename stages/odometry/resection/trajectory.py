@@ -110,7 +110,8 @@ def chain(
             world, (own, common), piece = level, none, piece + 1
             put(at[0], number)
         # Once a segment: over thousands of products rounding would bend the rotation.
-        T_world_local = _clean(world @ level.inverse())
+        T_world_local = world @ level.inverse()
+        T_world_local = RigidTransform(orthonormal(T_world_local.rotation), T_world_local.translation)
         key, key_own, key_common = world, own, common
         for k in range(1, len(at)):
             if broken := not np.isfinite(segment.poses[k]).all():
@@ -119,8 +120,9 @@ def chain(
             lever, turn = propagation(key, T_world_local, world)
             alone = segment.covariance[k] - segment.shared[k] @ segment.shared[k].T
             # Own errors add as variances; those of one cause go together in all segments, so their roots add first.
+            own = lever @ key_own @ lever.T + turn @ alone @ turn.T
             # Rounding makes the two halves of the product differ, and more so from frame to frame.
-            own = _symmetric(lever @ key_own @ lever.T + turn @ alone @ turn.T)
+            own = 0.5 * (own + own.T)
             common = lever @ key_common + turn @ np.hstack([segment.shared[k], segment.calibration[k]])
             put(at[k], number)
     _lose_single_frames(out)
@@ -148,20 +150,6 @@ def propagation(key: RigidTransform, T_world_local: RigidTransform, world: Rigid
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = T_world_local.rotation
     return lever, turn
-
-
-def _symmetric(a: Floats) -> Floats:
-    return np.asarray(0.5 * (a + a.T))
-
-
-def _clean(T: RigidTransform) -> RigidTransform:
-    """Undo what rounding does to the rotation of a long product."""
-    return RigidTransform(orthonormal(T.rotation), T.translation)
-
-
-def largest(piece: NDArray[np.int16]) -> int:
-    """Number of the piece with the most frames, the first of equals."""
-    return int(np.argmax(np.bincount(piece[piece >= 0], minlength=1)))
 
 
 def world_poses(trajectory: Bundle, piece: int | None = None) -> Floats:
@@ -210,7 +198,8 @@ def account(frames: list[int], found: Chained, causes: Mapping[int, str], vertic
     Positions, pieces with their ``verticals``, how many frames have a pose and how many in the world, and lost frames
     with their ``causes``.
     """
-    piece, main = found.piece, largest(found.piece)
+    piece = found.piece
+    main = int(np.argmax(np.bincount(piece[piece >= 0], minlength=1)))  # the first of the largest
     posed, lost = np.flatnonzero(piece >= 0), list[dict[str, Any]]()
     members = [np.flatnonzero(piece == k) for k in range(int(piece.max()) + 1)]
     for row in np.flatnonzero(piece < 0):
