@@ -20,6 +20,7 @@ from rille.stages.core.validity import matched as is_matched
 from rille.stages.geometry.epipolar import NAMES, distances, inverse_depth
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.numeric.least_squares import irls
+from rille.stages.odometry.affine_lk import HALF
 from rille.stages.odometry.displacements import windows_at
 
 MAX_DISPARITY_STEP_PX = 1.0
@@ -27,8 +28,6 @@ MAX_DISPARITY_STEP_PX = 1.0
 MAX_RELATIVE_SIGMA = 0.2
 """Largest standard deviation of a landmark's distance over the distance; beyond, depth is no longer normal though
 disparity is, and first-order covariances are wrong."""
-TEMPLATE_HALF_PX = 5
-"""Half the side of a template, pixels (see stages.odometry.affine_lk): what its relief is taken over."""
 
 
 @dataclass(frozen=True)
@@ -145,16 +144,14 @@ def relief(points: Floats, disparity: Bundle) -> Floats:
     if not len(points):
         return np.zeros(0)
     names = "column_disparity", "row_disparity", "validity"
-    inside, windows = windows_at(points, TEMPLATE_HALF_PX, *(np.asarray(disparity[name]) for name in names))
+    inside, windows = windows_at(points, HALF, *(np.asarray(disparity[name]) for name in names))
     column, row, valid = (window.reshape(len(points), -1) for window in windows)
     values = np.stack([column, row], -1).astype(np.float64)
     use = inside[:, None] & is_matched(valid) & np.isfinite(values).all(-1)
     values[~use] = 0.0
-    dy, dx = (
-        o.ravel() for o in np.mgrid[-TEMPLATE_HALF_PX : TEMPLATE_HALF_PX + 1, -TEMPLATE_HALF_PX : TEMPLATE_HALF_PX + 1]
-    )
+    dy, dx = (o.ravel() for o in np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1])
     # In units of the template, so that all sums are of the same size.
-    design = np.stack([np.ones(dx.size), dx / TEMPLATE_HALF_PX, dy / TEMPLATE_HALF_PX], -1)
+    design = np.stack([np.ones(dx.size), dx / HALF, dy / HALF], -1)
     # Matched pixels on a line leave the slope across open: it is 0 then.
     plane = irls(design[None], values, lambda _: use.astype(np.float64), 1e-9 * np.eye(3), rounds=1)
     rest = np.where(use[..., None], values - design @ plane, 0.0)
