@@ -35,7 +35,7 @@ ARGUMENTS: dict[str, set[str]] = {
 }
 """Stages that get parameters of another section as arguments."""
 
-REWIRING = {"rig.mode", "locus.both", "refine.enabled", "crosscheck.enabled", "moving.enabled"}
+REWIRING = {"rig.mode", "locus.both", "resect.joint", "crosscheck.enabled", "moving.enabled"}
 REWIRING |= {"tiling.tile", "loops.enabled", "loops.apart"}
 """Parameters by which there are other tasks, or the same ones read others."""
 

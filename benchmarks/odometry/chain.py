@@ -97,11 +97,14 @@ def settings(sequence: Sequence, assignments: list[str]) -> Any:
 
 
 class Chain:
-    """One run of the stages; ``cameras`` are the left camera as given, and as it was corrected so far."""
+    """One run of the stages; ``corrections`` are those of the calibration so far, each of the one that was given."""
 
-    def __init__(self, images: Images, config: Any, cameras: tuple[Any, ...] = ()) -> None:
-        self.images, self.sequence, self.config = images, images.sequence, config
-        self.cameras = (*cameras, self.sequence.rig.left.to_dict())
+    def __init__(self, images: Images, config: Any, corrections: tuple[list[float], ...] = ()) -> None:
+        self.given, self.config, self.corrections, self.images = images, config, corrections, images
+        if corrections:
+            self.images = copy.copy(images)
+            self.images.sequence = recalibrated(images.sequence, corrections[-1])
+        self.sequence = self.images.sequence
         self.frames = list(images.frames)
         self.clock = Clock()
         self._pyramids: dict[tuple[int, str], Bundle] = {}
@@ -120,18 +123,15 @@ class Chain:
         self.disparity = {k: self._match(k) for k in basic}
         self.calibration = self._calibration(basic)
         segments = [self._segment(part) for part in parts]
-        given = {"segments": [r for r, _, _ in segments], "levels": [level for _, level, _ in segments]}
-        if self.config.refine.enabled:
-            given["refined"] = self._refined(segments)
-            first = {"given": self.cameras[0]} if len(self.cameras) > 1 else {}
-            found = self._stage("intrinsics", first, segments=given["refined"], rig=self.calibration)
+        given: dict[str, Any] = {"segments": [r for r, _ in segments], "levels": [level for _, level in segments]}
+        if self.config.resect.joint:
+            before = {"before": self.corrections[-1]} if self.corrections else {}
+            found = self._stage("intrinsics", before, segments=given["segments"], rig=self.calibration)
             given["intrinsics"] = found
-            if any(found.meta["correction"]) and len(self.cameras) <= CALIBRATIONS:
-                other = copy.copy(self.images)
-                other.sequence = recalibrated(self.sequence, found.meta["correction"])
-                return Chain(other, self.config, self.cameras).run()
+            if any(found.meta["correction"]) and len(self.corrections) < CALIBRATIONS:
+                return Chain(self.given, self.config, (*self.corrections, found.meta["corrected"])).run()
         trajectory = self._stage("trajectory", {"frames": self.frames, "lost": lost}, **given)
-        facts = {"basic": basic, "select": select.meta, "resect": [r.meta for r, _, _ in segments]}
+        facts = {"basic": basic, "select": select.meta, "resect": [r.meta for r, _ in segments]}
         facts |= {"intrinsics": given["intrinsics"].meta if "intrinsics" in given else {}}
         facts |= {"rig": self.rig_facts, "trajectory": trajectory.meta}
         return Navigated(world_poses(trajectory), trajectory["covariance"], facts, self.clock)
@@ -163,21 +163,6 @@ class Chain:
         motions = [self.motion[step] for step in itertools.pairwise(frames)]
         return [self._stage("step_table", {}, motions=motions)] if motions else []
 
-    def _refined(self, segments: list[tuple[Bundle, Bundle, Bundle]]) -> list[Bundle]:
-        lenses = {side: lens.to_dict() for side, lens in (self.sequence.lenses or {}).items()}
-        given = {"lenses": lenses} if lenses else {}
-        return [
-            self._stage(
-                "refine",
-                given,
-                track=track,
-                resection=resection,
-                level=level,
-                rig=self.calibration,
-            )
-            for resection, level, track in segments
-        ]
-
     def _motion(self, a: int, b: int) -> Bundle:
         return self._stage("motion", {}, a=self._pyramid(a, "left"), b=self._pyramid(b, "left"))
 
@@ -192,7 +177,7 @@ class Chain:
         self.rig_facts = found.meta
         return self._stage("calibration", {}, rig=found)
 
-    def _segment(self, part: list[int]) -> tuple[Bundle, Bundle, Bundle]:
+    def _segment(self, part: list[int]) -> tuple[Bundle, Bundle]:
         key, s = part[0], self.sequence
         args: dict[str, Any] = {}
         if s.up is not None and s.up[key] is not None:
@@ -206,15 +191,16 @@ class Chain:
             pyramids=[self._pyramid(f, "left") for f in part],
             motions=[self.motion[step] for step in itertools.pairwise(part)],
         )
+        lenses = {side: lens.to_dict() for side, lens in (s.lenses or {}).items()}
         found = self._stage(
             "resect",
-            {},
+            {"lenses": lenses} if lenses else {},
             track=track,
             disparity=self.disparity[key],
             level=level,
             rig=self.calibration,
         )
-        return found, level, track
+        return found, level
 
     def _pyramid(self, frame: int, camera: str) -> Bundle:
         if (frame, camera) not in self._pyramids:

@@ -51,8 +51,8 @@ def _no_change(origin: Any, moved: Any, use: Any, at: Any) -> Any:
 
 IDEAS = (
     Idea("as it is"),
-    Idea("no joint refinement", ("refine.enabled=false",)),
-    Idea("no error that all disparities share", ("resect.bias_sigma=0", "refine.bias_sigma=0")),
+    Idea("no joint adjustment", ("resect.joint=false",)),
+    Idea("no error that all disparities share", ("resect.bias_sigma=0",)),
     Idea("landmarks taken as exact", ("resect.disparity_sigma=0.001",)),
     Idea(
         "no relief under templates", name="odometry.resection.landmarks.relief", function=lambda p, d: np.zeros(len(p))

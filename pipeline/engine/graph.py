@@ -151,6 +151,7 @@ class Graph:
     last : called once nothing else will be laid out: adds what reads all of it.
     cut : what of it is wanted; None: all.
     asked : numbers of the nodes that a cut graph computes, as far as it is known.
+    outdated : numbers of nodes of a calibration that has been corrected since; one that is laid out again counts again.
     unfinished : flows that wait for something: where a plan ends with some, it does not know all tasks.
     """
 
@@ -162,7 +163,7 @@ class Graph:
     cut: Cut | None = None
     asked: set[int] = field(default_factory=set)
     unfinished: int = 0
-    anew: bool = False
+    outdated: set[int] = field(default_factory=set)
     _labels: dict[str, Handle] = field(default_factory=dict)
     _complete: set[str] = field(default_factory=set)
 
@@ -193,9 +194,10 @@ class Graph:
         spec = Spec(module, label, params, dict(args) if args else _NONE, dict(hints) if hints else _NONE)
         given = {p: h if isinstance(h, Handle) else list(h) for p, h in (inputs or {}).items()}
         while (taken := self._labels.get(spec.label)) is not None:
-            if not self.anew:
+            if not self.outdated:
                 raise ValueError(f"the label {label!r} is taken: labels of nodes are unique")
             if taken.spec == spec and taken.inputs == given:
+                self.outdated.discard(taken.index)
                 return cast(Handle[F], taken)
             spec = replace(spec, label=f"{spec.label}/anew")
         _check_ports(spec, given)

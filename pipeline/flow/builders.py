@@ -29,14 +29,13 @@ from rille.stages.facts.calibration import CalibrationFacts, OrientationFacts, R
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts, MovingFacts, ResectFacts, TrackFacts, TrajectoryFacts
 from rille.stages.facts.terrain import DemFacts, GroundFacts, MergeFacts, TileIndexFacts
-from rille.stages.geometry.geometry import Rig
 from rille.stages.hazard.risk import risk_stage
 from rille.stages.hfvm.stage import hfvm_stage
 from rille.stages.imaging.features import features_stage
 from rille.stages.imaging.pyramid import pyramid_stage
 from rille.stages.imaging.undistort import undistort_stage
 from rille.stages.odometry.motion import motion_stage
-from rille.stages.odometry.resection.intrinsics import corrected
+from rille.stages.odometry.resection.intrinsics import calibrated_anew, corrected
 from rille.stages.odometry.resection.pose import pose_stage
 from rille.stages.odometry.resection.resect import resect_stage
 from rille.stages.odometry.track import track_stage
@@ -103,13 +102,13 @@ def name(graph: Graph, sequence: Sequence, frames: Series[int]) -> None:
     graph.sequence, graph.choice = sequence.name, digest(tuple(frames))[:16]
 
 
-def recalibrated(sequence: Sequence, errors: Series[float], rig: Args) -> Sequence:
-    """The sequence with another rig, whose cameras were changed by errors of focal length and principal point."""
+def recalibrated(sequence: Sequence, correction: Series[float]) -> Sequence:
+    """The sequence with a correction of its cameras and its rig's yaw, as stage ``intrinsics`` gives it."""
     lenses = (sequence.lenses or {}).items()
     return replace(
         sequence,
-        rig=Rig.from_dict(rig),
-        lenses={side: replace(lens, camera=corrected(lens.camera, errors)) for side, lens in lenses} or None,
+        rig=calibrated_anew(sequence.rig, correction),
+        lenses={side: replace(lens, camera=corrected(lens.camera, correction)) for side, lens in lenses} or None,
     )
 
 
@@ -122,10 +121,10 @@ class Builder:
 
     def __init__(self, graph: Graph, sequence: Sequence, config: Any) -> None:
         self.graph, self.sequence, self.config = graph, sequence, config
+        self.uncorrected = sequence
+        self.correction: list[float] | None = None
         self.products = Products()
         self.made: dict[Any, Any] = {}
-        self.corrections: list[float] | None = None
-        self.first_rig: Args | None = None
 
     # Arguments of many tasks, one object for all: each would hold some kilobytes of its own until the run's end.
 
@@ -133,6 +132,11 @@ class Builder:
     def given_rig(self) -> dict[str, Any]:
         """The sequence's rig."""
         return self.sequence.rig.to_dict()
+
+    @cached_property
+    def given_lenses(self) -> dict[str, Any] | None:
+        """The sequence's lenses by camera, None where its images are ideal."""
+        return {side: lens.to_dict() for side, lens in (self.sequence.lenses or {}).items()} or None
 
     @cached_property
     def given_vehicle(self) -> dict[str, Any]:
@@ -149,15 +153,17 @@ class Builder:
         chosen: Params = params or getattr(self.config, stage.name, NO_PARAMS)
         return self.graph.call(stage, label, chosen, **given)
 
-    def recalibrate(self, errors: Series[float], rig: Args) -> None:
-        """Go on with the calibration changed; what does not rest on it is the same task as before."""
-        self.first_rig = self.first_rig or self.given_rig
-        self.sequence = recalibrated(self.sequence, errors, rig)
-        self.corrections = [a + b for a, b in zip(self.corrections or [0.0] * len(errors), errors, strict=True)]
-        self.graph.anew = True
+    def recalibrate(self, correction: list[float], since: int) -> None:
+        """Go on with the calibration corrected; what does not rest on it is the same task as before.
+
+        The tasks laid out ``since`` a number are of no account any more, unless they are laid out again.
+        """
+        self.sequence, self.correction = recalibrated(self.uncorrected, correction), correction
+        self.graph.outdated |= set(range(since, len(self.graph.nodes)))
         self.made.clear()
         self.products.contradictions.clear()
-        del self.given_rig
+        for cached in ("given_rig", "given_lenses"):
+            self.__dict__.pop(cached, None)
 
     # -- images -------------------------------------------------------------------------------------------------
 
@@ -281,8 +287,8 @@ class Builder:
     def rig(self, pairs: Series[int], which: str = "") -> tuple[Handle[RigFacts], Handle[CalibrationFacts]]:
         """The rig that the orientations of these pairs agree on, and what of it other stages read."""
         orientations = [self.orientation(pair) for pair in pairs]
-        given = {"rig": self.given_rig, "first": self.first_rig}
-        found = self.node(rig_stage, f"rig{which}", orientations=orientations, **given)
+        first = None if self.correction is None else self.uncorrected.rig.to_dict()
+        found = self.node(rig_stage, f"rig{which}", orientations=orientations, rig=self.given_rig, first=first)
         return found, self.node(calibration_stage, f"calibration{which}", rig=found)
 
     def level(
@@ -373,6 +379,7 @@ class Builder:
             disparity=key.disparity,
             after=after and after.disparity,
             rig_after=after and after.rig,
+            lenses=self.given_lenses,
             refused=refused,
         )
         return Segment(tuple(frames), tracked, posed)

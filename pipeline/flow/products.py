@@ -20,7 +20,6 @@ from rille.stages.facts.odometry import (
     KeyframesFacts,
     LoopFacts,
     MovingFacts,
-    RefineFacts,
     ResectFacts,
     ScreeningFacts,
     TrackFacts,
@@ -96,7 +95,6 @@ class Products:
     local_path: dict[int, Handle] = field(default_factory=dict)
     tracks: list[Handle[TrackFacts]] = field(default_factory=list)
     resections: list[Handle[ResectFacts]] = field(default_factory=list)
-    refined: list[Handle[RefineFacts]] = field(default_factory=list)
     intrinsics: Handle[IntrinsicsFacts] | None = None
     moving: dict[int, Handle[MovingFacts]] = field(default_factory=dict)
     world_dem: dict[int, Handle[DemFacts]] = field(default_factory=dict)

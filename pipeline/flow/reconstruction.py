@@ -6,7 +6,7 @@
              (if needed)           |                    +-> track (segment) --+
                                    |                                          |
                                    +-> hfvm (basic pair) -+-> ground_frame ---+-> resect (segment) -> trajectory
-                                                          |     |               (landmarks)  (refine)     |
+                                                          |     |               (landmarks)               |
         given rig --+-> orientation (basic pair) <--------+     |                                         |
                     |       +-> rig -> calibration -------+-----+-> locus (local frame; pyramids)         |
                     |           (pooled; into the frame,  |           +-> risk, path (local)              |
@@ -22,7 +22,7 @@
                                                                                             trajectory <---------+
     lost frames:  image -> image_quality -> frame_screening <- swap_check (left against right; where it asks)
     other times:  rig -> synchrony (features of right images nearby) -> keyframes, chosen anew
-    wrong camera: resect, refine -> intrinsics -> given rig: all that reads it is laid out anew
+    wrong camera: resect -> intrinsics -> given rig: all that reads it is laid out anew
     pose of an adjusted trajectory: pose (pair) <- trajectory as chained, local DEM
     leaves:  accuracy (trajectory, crosscheck), position_accuracy, dem_accuracy (local and merged DEM), path_check
     outputs: rasters, tracks, tables, figures: a task each; then report.html and report.json around them
@@ -33,7 +33,7 @@ whose rows the rig does not explain go through ``synchrony`` (right images of ot
 basic, and ``keyframes`` chooses anew. ``resect`` compares each basic pair with the one before: behind a rig that was
 knocked nothing is posed.
 
-A segment needs landmarks only relative to its own basic pair, so all segments are resected and refined in parallel, and
+A segment needs landmarks only relative to its own basic pair, so all segments are resected in parallel, and
 ``trajectory`` chains them; ``intrinsics`` asks all of them for errors of the calibration, whose covariance it needs.
 Where the cameras are wrong, all that rests on them is laid out anew with corrected ones. Where other sensors are
 measurements (dead reckoning, GNSS, attitude) all poses are adjusted to them together: ``adjust``. Locus then runs a
@@ -73,7 +73,6 @@ from rille.stages.facts.odometry import (
     LoopFacts,
     MovingFacts,
     PlacesFacts,
-    RefineFacts,
     ScreeningFacts,
     StepTableFacts,
 )
@@ -87,7 +86,6 @@ from rille.stages.odometry.resection.adjust import adjust_stage
 from rille.stages.odometry.resection.intrinsics import intrinsics_stage
 from rille.stages.odometry.resection.loop import loop_stage
 from rille.stages.odometry.resection.moving import moving_stage
-from rille.stages.odometry.resection.refine import refine_stage
 from rille.stages.odometry.resection.resect import MIN_JUMP_PX
 from rille.stages.odometry.resection.trajectory import trajectory_stage
 from rille.stages.odometry.steps import step_table_stage
@@ -160,7 +158,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     row = {frame: k for k, frame in enumerate(frames)}
     behind = [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1]
     # Where the tracks contradict the cameras, all that rests on these is laid out anew with corrected ones.
-    turn = 0
+    turn, since = 0, len(make.graph.nodes)
     while True:
         if turn and p.crosscheck is not None:
             p.crosscheck = another_program(make, whole)
@@ -176,11 +174,10 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         segments = [make.segment(way, matched[way[0]], after=matched.get(way[-1])) for way in ways]
         segments, moved = yield from unmoved(make, matched, segments)
         p.tracks, p.resections = [s.track for s in segments], [s.resection for s in segments]
-        p.refined = refined(make, matched, segments)
-        asked = (yield from asked_for(make, matched[basic[0]])) if p.refined else None
+        asked = (yield from asked_for(make, matched[basic[0]])) if segments and make.config.resect.joint else None
         if asked is None or turn == CALIBRATIONS:
             break
-        make.recalibrate(asked["correction"], asked["rig"])
+        make.recalibrate(asked["corrected"], since)
         turn += 1
     if p.intrinsics is not None:
         p.contradictions.append(p.intrinsics)
@@ -193,7 +190,6 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         "trajectory",
         segments=p.resections,
         levels=[matched[s.frames[0]].level for s in segments] or [matched[basic[0]].level],
-        refined=p.refined or None,
         intrinsics=p.intrinsics,
         frames=list(frames),
         steps=steps_of(make, chosen),
@@ -201,7 +197,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     )
     yield from adjusted(make, frames, list(pairs.values()))
     flow(assessment.of_trajectory(make, frames), lays=("accuracy",))
-    yield Complete(("track", "resect", "refine", "intrinsics", "trajectory", "features", "loops", "loop", "adjust"))
+    yield Complete(("track", "resect", "intrinsics", "trajectory", "features", "loops", "loop", "adjust"))
     yield Complete(("agreement", "position_accuracy", "accuracy", "truth"))
     posed = yield from done(p.trajectory)
 
@@ -441,33 +437,10 @@ def adjusted(make: Builder, frames: Series[int], pairs: list[Pair]) -> Steps:
         "trajectory/adjusted",
         trajectory=p.chained,
         segments=p.resections,
-        refined=p.refined or None,
         loops=p.loops or None,
         intrinsics=p.intrinsics,
         priors=known or None,
     )
-
-
-def refined(make: Builder, pairs: Mapping[int, BasicPair], segments: list[Segment]) -> list[Handle[RefineFacts]]:
-    """Segments adjusted with their landmarks, where that is wanted."""
-    if not make.config.refine.enabled:
-        return []
-    lenses = {side: lens.to_dict() for side, lens in (make.sequence.lenses or {}).items()}
-    out = []
-    for segment in segments:
-        key = pairs[segment.frames[0]]
-        out.append(
-            make.node(
-                refine_stage,
-                f"refine/{key.frame}",
-                lenses=lenses or None,
-                track=segment.track,
-                resection=segment.resection,
-                level=key.level,
-                rig=key.rig,
-            )
-        )
-    return out
 
 
 def moving_parts(
@@ -495,12 +468,12 @@ def asked_for(make: Builder, key: BasicPair) -> Generator[Wait, Any, IntrinsicsF
     """Another calibration that all segments ask for, None where they do not; of the rig of pair ``key``."""
     p = make.products
     fixed = make.config.rig.mode == "fixed"
-    asked = {"before": make.corrections, "fixed": fixed or None}
-    p.intrinsics = make.node(intrinsics_stage, "intrinsics", segments=p.refined, rig=key.rig, **asked)
+    asked = {"before": make.correction, "fixed": fixed or None}
+    p.intrinsics = make.node(intrinsics_stage, "intrinsics", segments=p.resections, rig=key.rig, **asked)
     judged: list[Ref[IntrinsicsFacts] | None] = yield Maybe([p.intrinsics])
     facts: Any = None if judged[0] is None else judged[0].meta
     # A plan takes the facts of earlier runs, which may be those of an earlier release.
-    return facts if facts and "rig" in facts and any(facts["correction"]) else None
+    return facts if facts and "corrected" in facts and any(facts["correction"]) else None
 
 
 def seen_again(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[Handle[LoopFacts]]]:

@@ -71,8 +71,8 @@ def unread(keys: Iterable[str], config: Params, graph: Graph) -> list[str]:
     """Those of the keys that no task of a complete graph reads."""
     kinds = {type(h.spec.params) for h in graph.nodes}
     read = {name for name in type(config).model_fields if type(getattr(config, name)) in kinds}
-    # Sections that reach stages as arguments, not as their parameters: the flow, the vehicle, resection in `refine`.
-    read |= {"drive", "terrain"} | {name for h in graph.nodes for name in h.spec.args if name in ("vehicle", "resect")}
+    # Sections that reach stages as arguments, not as their parameters: the flow, and the vehicle.
+    read |= {"drive", "terrain"} | {name for h in graph.nodes for name in h.spec.args if name == "vehicle"}
     read |= {"tiling"} if "hfvm" in read else set()
     return [key for key in keys if key.partition(".")[0] not in read]
 

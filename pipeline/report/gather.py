@@ -199,15 +199,12 @@ def stops(view: RunView) -> list[Stop]:
 def frame_facts(view: RunView) -> dict[int, dict[str, Any]]:
     """Facts of the resection of each frame; a key frame's come from the segment that posed it, the one before.
 
-    Inliers and error are those of the joint refinement, where there was one: its poses are the trajectory's.
+    Inliers and error are those of the joint adjustment, where there was one.
     """
     facts: dict[int, dict[str, Any]] = {}
     for handle in view.products.resections:
         for item in facts_of(view, handle).get("per_frame", ()):
             facts.setdefault(int(item["frame"]), dict(item))
-    for adjusted in view.products.refined:
-        for item in facts_of(view, adjusted).get("per_frame", ()):
-            facts.setdefault(int(item["frame"]), {}).update(item)
     return facts
 
 

@@ -199,7 +199,8 @@ def perform(
     remember()
     report = _write(opened, result, made)
     _point_latest(opened.folder)
-    suspicious = (line for h in opened.graph.nodes if h.ref is not None for line in h.ref.meta.get("warnings", ()))
+    valid = (h.ref for h in opened.graph.nodes if h.ref is not None and h.index not in opened.graph.outdated)
+    suspicious = (line for ref in valid for line in ref.meta.get("warnings", ()))
     # Some follow from several tasks alone; those of the input were said before the run.
     for line in dict.fromkeys((*suspicious, *report["warnings"])):
         if line not in opened.view.sequence.warnings:

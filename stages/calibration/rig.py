@@ -71,8 +71,10 @@ class RigParams(RelativeParams):
     )
 
 
-def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams) -> RigFacts:
+def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams, first: Rig | None = None) -> RigFacts:
     """Facts of the rig to be used; without a pair that can be used, only the first six and ``warnings``.
+
+    ``first``: as it was given, where the tracks have corrected its cameras or its yaw since.
 
     Raises
     ------
@@ -82,7 +84,7 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams) -> Ri
     given.check()
     facts: RigFacts = {
         "rig": given.to_dict(),
-        "given": given.to_dict(),
+        "given": (first or given).to_dict(),
         "mode": params.mode,
         "baseline": given.baseline,
         "source": "given calibration",
@@ -91,17 +93,20 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams) -> Ri
     }
     usable = [m for m in pairs if len(m.left) >= MIN_MATCHES]
     if usable:
-        facts |= cast(RigFacts, _judged(given, _share(usable), params))
+        yaw_shown = first is not None and first.T_right_left.to_list() != given.T_right_left.to_list()
+        facts |= cast(RigFacts, _judged(given, _share(usable), params, yaw_shown=yaw_shown))
         if len(usable) < len(pairs):
             few = len(pairs) - len(usable)
             facts["warnings"].insert(0, f"{few} of {len(pairs)} pairs have too few matches for the rig")
     elif pairs:
         facts["warnings"] = ["no pair has enough matches to check the calibration; it is used as given"]
+    if first is not None:
+        facts |= {"source": f"{facts['source']}, corrected by the tracks", "changed": True}
     return facts
 
 
-def _judged(given: Rig, pairs: list[PointPairs], params: RigParams) -> dict[str, Any]:
-    """What the pairs say on the given rig, and the rig that follows."""
+def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, *, yaw_shown: bool) -> dict[str, Any]:
+    """What the pairs say on the given rig, and the rig that follows; ``yaw_shown``: its yaw is that of the tracks."""
     decision = decide(given, pairs, params)
     turn = float(np.median([image_turn(given, m.left, m.right) for m in pairs]))
     turned = abs(turn) > MAX_IMAGE_TURN_DEG
@@ -122,7 +127,8 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams) -> dict[str,
     before, after = (rms(np.concatenate(one), weights) for one in (of_given, off))
     kept = "not repaired, for no mount moves that far" if far else "kept because rig.mode = fixed"
     median = float(np.median(np.concatenate(of_given)[weights > 0]))
-    warnings = _contradiction(given, median, decision, "repaired" if applied else kept)
+    hidden = [p for p in decision.parameters if not (p.observed or (yaw_shown and p.name == "yaw"))]
+    warnings = _contradiction(given, median, decision, "repaired" if applied else kept, hidden)
     if turned:
         words = f"the right images are turned by {abs(turn):.0f} degrees {'anti' if turn < 0 else ''}clockwise"
         warnings = [f"{words} against the left ones, which the calibration does not say: turn them back"]
@@ -203,19 +209,19 @@ def _misalignment(rig: Rig, offset: float, decision: Decision) -> str:
     return ", ".join(parts)
 
 
-def _contradiction(given: Rig, offset: float, decision: Decision, done: str) -> list[str]:
+def _contradiction(given: Rig, offset: float, decision: Decision, done: str, hidden: Sequence[Parameter]) -> list[str]:
     """What a user should know of a calibration that the images contradict.
 
     Parameters
     ----------
     offset : median distance of the matches from their epipolar lines, pixels.
     done : what became of it.
+    hidden : parameters that nothing shows.
     """
     if not decision.changed:
         return []
     words = _misalignment(given, offset, decision)
     lines = [f"the calibration contradicts the images: {words}; {done}"]
-    hidden = [p for p in decision.parameters if not p.observed]
     if hidden:
         names = ", ".join(f"{_word(p)} (taken alone they ask for {math.degrees(p.asked):+.2f} degrees)" for p in hidden)
         lines.append(
@@ -305,10 +311,7 @@ def _shown(start: Sequence[Linear], columns: list[int], usual: Floats, departure
 def rig_stage(
     params: RigParams, orientations: Sequence[Bundle[OrientationFacts]] = (), *, rig: Rig, first: Rig | None = None
 ) -> Bundle[RigFacts]:
-    """The rig: the given calibration, repaired where the images contradict it.
-
-    ``first``: as it was given, where the tracks have corrected it already.
-    """
+    """The rig: the given calibration, repaired where the images contradict it."""
     pairs = [
         PointPairs(
             found.meta["pair"],
@@ -317,10 +320,4 @@ def rig_stage(
         )
         for found in orientations
     ]
-    facts = orient_rig(rig, pairs, params)
-    if first is not None:
-        of_given = orient_rig(first, pairs, params.model_copy(update={"mode": "fixed"}))
-        facts |= {"given": of_given["given"], "source": f"{facts['source']}, corrected by the tracks", "changed": True}
-        if "residual_before_px" in of_given:
-            facts["residual_before_px"] = of_given["residual_before_px"]
-    return Bundle({}, facts)
+    return Bundle({}, orient_rig(rig, pairs, params, first))

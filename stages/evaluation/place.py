@@ -1,15 +1,14 @@
-"""Where one model lies in another of the same place: for runs whose world frames differ.
+"""Where one model lies in another of the same place, by their ortho images: for runs whose world frames differ.
 
-Ortho images tell it by the keypoints (SIFT, Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94) that are alike, and the
-turn and shift that most of them agree on. Both images are in metres, so that a scale other than 1 is a wrong place.
-Under another sun, or over ground that was raked, they show no place that both share; the relief does
-(:mod:`rille.stages.terrain.map_localization`), and has to be unlike every other place.
+The keypoints (SIFT, Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94) that are alike tell it, by the turn and shift
+that most of them agree on. Both images are in metres, so that a scale other than 1 is a wrong place. Under another sun,
+or over ground that was raked, they show no place that both share; the relief does
+(:func:`rille.stages.terrain.map_localization.fix_on`), and has to be unlike every other place.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -19,10 +18,9 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.evaluation.dem_comparison import Grid
-from rille.stages.geometry.geometry import RigidTransform, heading_of, rotation_exp
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.imaging.features import UNIT_BYTES, match
-from rille.stages.terrain.map_localization import Fix, GlobalMap, MapLocalizationParams, SearchArea, fix
+from rille.stages.terrain.map_localization import MapLocalizationParams, fix_on
 
 KEYPOINTS = 8000
 """Of an image."""
@@ -89,7 +87,7 @@ def _by_relief(a: Grid, b: Grid) -> Registration | None:
         return None  # its rows are turned against the axes, or its cells are no squares
     try:
         model = Lattice(float(x0), float(y0), float(along), *a.values.shape)
-        found = relief(a.values, model, b, None, MapLocalizationParams.model_validate({}))
+        found = fix_on(a.values, model, b.values, b.matrix, None, MapLocalizationParams.model_validate({}))
     except (DegenerateError, InputError):
         return None
     if found.doubt:
@@ -98,48 +96,6 @@ def _by_relief(a: Grid, b: Grid) -> Registration | None:
     # A tilt, which the elevations tell later, shortens the level part of the rotation.
     motion[:, :2] /= math.sqrt(np.linalg.det(motion[:, :2]))
     return Registration(motion, f"relief, {found.cells} cells", np.sqrt(np.diag(found.covariance))[[0, 1, 5]])
-
-
-def level_pose(motion: Floats) -> RigidTransform:
-    """Turn and shift of a motion (2, 3) in the plane, as those of space."""
-    turn = rotation_exp([0.0, 0.0, math.atan2(motion[1, 0], motion[0, 0])])
-    return RigidTransform(turn, np.array([*motion[:, 2], 0.0]))
-
-
-def relief(
-    elevation: Floats, lattice: Lattice, ground: Grid, around: SearchArea | None, params: MapLocalizationParams
-) -> Fix:
-    """Place a level model (row, col), m, in a model of more ground, whose rows may be turned or mirrored.
-
-    Parameters
-    ----------
-    around : what of the ground is searched; None: all of it.
-
-    Raises
-    ------
-    DegenerateError
-        The model covers too few cells, or the ground is too flat to tell.
-    InputError
-        Nowhere within the search the ground is known, or the search is too wide.
-    """
-    # The search is in a frame along the rows of the ground.
-    values, matrix, (rows, cols) = ground.values, ground.matrix, ground.values.shape
-    if np.linalg.det(matrix[:, :2]) > 0:
-        values, matrix = values[::-1], matrix @ np.array([[1.0, 0.0, 0.0], [0.0, -1.0, rows - 1.0], [0.0, 0.0, 1.0]])
-    to_ground = level_pose(matrix)
-    middle = 0.5 * ground.cell * (cols - 1), 0.5 * ground.cell * (1 - rows)
-    everywhere = math.hypot(*middle) + lattice.radius
-    area = SearchArea(*middle, 0.0, everywhere, math.pi)
-    if around is not None:
-        x, y, _ = to_ground.inverse().apply([around.x, around.y, 0.0])
-        distance = min(around.distance, everywhere + math.hypot(middle[0] - x, middle[1] - y))
-        area = SearchArea(float(x), float(y), around.heading - heading_of(to_ground), distance, around.turn)
-    placed = fix(elevation, lattice, GlobalMap(values, 0.0, 0.0, ground.cell), area, params)
-    both, other = np.kron(np.eye(2), to_ground.rotation), placed.other
-    if other is not None:
-        (x, y, heading), chi2 = other
-        other = np.array([*to_ground.apply([x, y, 0.0])[:2], heading + heading_of(to_ground)]), chi2
-    return replace(placed, pose=to_ground @ placed.pose, covariance=both @ placed.covariance @ both.T, other=other)
 
 
 def place(a: Grid, b: Grid) -> PlacedImage:

@@ -62,55 +62,43 @@ class TrackFacts(Facts):
 class ResectFacts(Facts):
     """Poses of a segment's frames.
 
-    ``per_frame``: frame, landmarks, inliers, rms_px of each, and why it is ``lost``.
+    ``per_frame``: frame, landmarks, inliers, rms_px of each, and why it is ``lost``. ``intrinsics``: what the segment,
+    adjusted jointly, says of errors of the calibration (``information``, ``pull``, ``turn_deg``; ``yaw``: information
+    and pull of the rig's), and the ``bias_px`` of its disparities; empty where nothing was adjusted.
     ``jump`` (column, row, px) and ``knocked``: the rig moved before the pair at the segment's end.
     """
 
     per_frame: list[dict[str, Any]]
+    intrinsics: dict[str, Any]
     contradiction: NotRequired[str]
     jump: NotRequired[list[float]]
     knocked: NotRequired[str]
 
 
-class RefineFacts(Facts):
-    """A segment adjusted with its landmarks: bias and costs of the ``adjustment``, and what it says of errors of the
-    calibration (``intrinsics``: ``information``, ``pull``, ``turn_deg``; ``yaw``: information and pull of the rig's);
-    both empty where no frame has a pose."""
-
-    adjustment: dict[str, Any]
-    intrinsics: dict[str, Any]
-    per_frame: list[dict[str, Any]]
-
-
 class IntrinsicsFacts(Facts):
     """``errors`` of the calibration, each with its sigma, and their ``covariance``; those that are ``held`` by the
     calibration as given, since the sequence shows them little; the rig's ``yaw`` and its sigma, rad; the ``correction``
-    that the tracks ask for (else 0) of focal length and principal point, over the focal length, and of the yaw; and the
-    ``rig`` that has it."""
+    that the tracks ask for (else 0) of focal length and principal point, over the focal length, and of the yaw; and how
+    the calibration that was given is ``corrected`` with that and those before."""
 
     errors: dict[str, list[float]]
     covariance: list[list[float]]
     held: list[str]
     yaw: list[float]
-    rig: dict[str, Any]
     correction: list[float]
+    corrected: list[float]
     contradiction: NotRequired[str]
 
 
-class FactorsFacts(Facts):
-    """Measured motions between frames.
+class LoopFacts(Facts):
+    """Motions to a basic pair from earlier ones; ``refused`` are frames that look alike, and the ``reason``.
 
     Each of the ``factors`` has the numbers of two frames, ``from`` and ``to``; ``pose``, twelve numbers of T_from_to
-    (left cameras, m); ``covariance``, 36 numbers of (position m, rotation rad) in the frame of the first; and perhaps
+    (left cameras, m); ``covariance``, 36 numbers of (position m, rotation rad) in the frame of the first; and
     ``source``, in words.
     """
 
     factors: list[dict[str, Any]]
-
-
-class LoopFacts(FactorsFacts):
-    """Motions to a basic pair from earlier ones; ``refused`` are frames that look alike, and the ``reason``."""
-
     refused: list[dict[str, Any]]
 
 

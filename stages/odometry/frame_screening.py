@@ -24,7 +24,7 @@ import numpy as np
 from pydantic import Field
 
 from rille.stages.core.declare import Bundle, Params, stage
-from rille.stages.core.errors import DegenerateError, InputError
+from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.calibration import SwapFacts
 from rille.stages.facts.imaging import QualityFacts
 from rille.stages.facts.odometry import MotionFacts, ScreeningFacts, StepTableFacts
@@ -214,8 +214,6 @@ def frame_screening_stage(
 ) -> Bundle[ScreeningFacts]:
     """Which frames are lost, and which may not be basic."""
     along = steps_of(steps)
-    if len(along) != len(frames) - 1 or len(qualities) != len(frames):
-        raise InputError("RIL-317", f"{len(frames)} frames need as many image qualities and {len(frames) - 1} steps")
     seen = {f: s.meta for f, s in zip(frames, qualities, strict=True)}
     shares = {s: step.match_rate for s, step in zip(pairwise(frames), along, strict=True)}
     shares |= {(a, b): Step.from_bundle(m).match_rate for (a, b), m in zip(bridged, bridges, strict=True)}

@@ -18,7 +18,6 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from rille.stages.core.declare import Bundle, Params, stage
-from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.facts.odometry import KeyframesFacts, StepTableFacts
 from rille.stages.odometry.steps import Step, overlaps, steps_of
 
@@ -167,11 +166,7 @@ def keyframes_stage(
     behind: Sequence[int] = (),
 ) -> Bundle[KeyframesFacts]:
     """Which stereo pairs become elevation models, and the segments between them."""
-    if frames < 1:
-        raise ConfigError("RIL-437", "no frame is chosen", remedy="choose at least one with --frames")
     moves = steps_of(steps)
-    if len(moves) != frames - 1:
-        raise InputError("RIL-438", f"{frames} frames need {frames - 1} steps, not {len(moves)}")
     stride = params.rule == "stride"
     # Where the bridge over a gap of lost frames is refused, the frames behind it are posed as a piece of their own.
     after = {n for k in behind if (n := _fit(range(k, frames), set(unfit))) is not None}

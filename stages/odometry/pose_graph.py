@@ -54,6 +54,20 @@ class Factors:
     bound: Floats
 
     @staticmethod
+    def of(
+        ends: NDArray[np.intp],
+        poses: Floats,
+        root: Floats,
+        components: int = 0,
+        shared: Floats | None = None,
+        lever: Floats | None = None,
+    ) -> Factors:
+        """Factors that measure so many ``components`` and are doubted; 0: they are not doubted."""
+        bound = np.full(len(ends), bound_of(components) if components else np.inf)
+        shared = np.zeros((len(ends), 6, 0)) if shared is None else shared
+        return Factors(ends, poses, root, shared, np.zeros((len(ends), 3)) if lever is None else lever, bound)
+
+    @staticmethod
     def joined(parts: Sequence[Factors]) -> Factors:
         """All of them, the sources of each part being its own."""
         names, width = ("ends", "poses", "root", "lever", "bound"), sum(part.shared.shape[2] for part in parts)
@@ -119,23 +133,16 @@ class GraphEquations(NamedTuple):
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """Factors between ``nodes`` nodes of which the first is ``held``, with a weight (m,) each.
+    """Factors between ``nodes`` nodes, of which the first is held, with a weight (m,) each.
 
     ``excess`` is the factor k on the errors of the chain, and of its first ``common`` sources.
     """
 
     factors: Factors
     nodes: int
-    held: int
     weight: Floats
     excess: float = 1.0
     common: int = 0
-
-    @cached_property
-    def _columns(self) -> NDArray[np.intp]:
-        """Column of the first unknown of each node, behind the last for the one that is held."""
-        free = np.arange(self.nodes) - (np.arange(self.nodes) > self.held)
-        return np.asarray(np.where(np.arange(self.nodes) == self.held, self.unknowns, 6 * free), dtype=np.intp)
 
     @property
     def unknowns(self) -> int:
@@ -181,7 +188,8 @@ class PoseGraph:
         of_a[:, :3, 3:], of_b[:, :3, 3:] = back @ cross_matrix(way), -back @ cross_matrix(lever)
         jacobian = root @ np.concatenate([of_a, of_b, -f.shared], axis=2)
         sources = 6 * (self.nodes - 1) + np.arange(f.shared.shape[2])
-        nodes = (self._columns[f.ends][:, :, None] + np.arange(6)).reshape(len(off), 12)
+        first = np.where(f.ends > 0, 6 * (f.ends - 1), self.unknowns)
+        nodes = (first[:, :, None] + np.arange(6)).reshape(len(off), 12)
         columns = np.concatenate([nodes, np.broadcast_to(sources, (len(off), len(sources)))], axis=1)
         rows = np.broadcast_to(np.arange(6 * len(off)).reshape(-1, 6, 1), jacobian.shape)
         placed = jacobian.reshape(-1), (rows.reshape(-1), np.repeat(columns, 6, axis=0).reshape(-1))
@@ -197,15 +205,15 @@ class PoseGraph:
         """State after one step, the diagonal enlarged by ``damping`` times itself."""
         damped = normal.matrix + scipy.sparse.diags_array(damping * normal.matrix.diagonal())
         step = -_factorised(damped).solve(normal.gradient)
-        nodes = np.insert(step[: 6 * (self.nodes - 1)].reshape(-1, 6), self.held, 0.0, axis=0)
+        nodes = np.vstack([np.zeros(6), step[: 6 * (self.nodes - 1)].reshape(-1, 6)])
         sources = state.sources + step[6 * (self.nodes - 1) :]
         return GraphState(rotation_exp(nodes[:, 3:]) @ state.R, state.C + nodes[:, :3], sources)
 
     def covariance(self, state: GraphState) -> Floats:
         """Covariances (n, 6, 6) of (position m, rotation rad) against the held node."""
         solver, out = _factorised(self.normal(state).matrix), np.zeros((self.nodes, 6, 6))
-        for node in np.flatnonzero(np.arange(self.nodes) != self.held):
-            first = int(self._columns[node])
+        for node in range(1, self.nodes):
+            first = 6 * (node - 1)
             block = solver.solve(np.eye(self.unknowns, 6, -first))[first : first + 6]
             out[node] = 0.5 * (block + block.T)
         return out

@@ -24,7 +24,6 @@ from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Params, stage
-from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Mask
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts, TrackFacts
@@ -95,19 +94,12 @@ def track(frames: Sequence[Pyramid], motions: Sequence[LevelDisplacements], para
     ----------
     frames : pyramids of the left images of a segment, key frame first.
     motions : displacements from each frame to the next, one fewer than frames.
-
-    Raises
-    ------
-    InputError
-        Not one motion between each two frames.
     """
-    if len(motions) != len(frames) - 1:
-        raise InputError("RIL-447", f"{len(frames)} frames need {len(frames) - 1} motions, not {len(motions)}")
     first = frames[0]
     seeds = interest_points(first.images[0], first.valid[0], params.points, noise=params.noise, border=BORDER)
     state = Tracks.born(seeds.astype(np.float64), 0, len(frames))
-    for j in range(1, len(frames)):
-        _advance(state, frames, motions[j - 1], j, params)
+    for j, motion in enumerate(motions, start=1):
+        _advance(state, frames, motion, j, params)
         if j < len(frames) - 1:
             state = _reseed(state, frames, j, params)
     return state

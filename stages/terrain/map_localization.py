@@ -34,7 +34,7 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.facts.terrain import DemFacts, MapFixFacts
-from rille.stages.geometry.geometry import RigidTransform, cross_matrix, rotation_exp
+from rille.stages.geometry.geometry import RigidTransform, cross_matrix, heading_of, rotation_exp
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.numeric.robust import huber_weight, mad_sigma
 from rille.stages.terrain.shading import gradient
@@ -111,11 +111,6 @@ class Fix:
     cells: int
     independent: float
     other: tuple[Floats, float] | None = None
-
-    @property
-    def heading(self) -> float:
-        """To the left, rad."""
-        return math.atan2(self.pose.rotation[1, 0], self.pose.rotation[0, 0])
 
     @property
     def doubt(self) -> str:
@@ -271,6 +266,56 @@ def fix(
     other = min(rivals, key=lambda fit: fit.square)
     chi2 = placed.independent * math.log(max(other.square, 1e-24) / max(best.square, 1e-24))
     return replace(placed, other=(other.place(middle), chi2))
+
+
+def level_pose(motion: Floats) -> RigidTransform:
+    """Turn and shift of a motion (2, 3) in the plane, as those of space."""
+    turn = rotation_exp([0.0, 0.0, math.atan2(motion[1, 0], motion[0, 0])])
+    return RigidTransform(turn, np.array([*motion[:, 2], 0.0]))
+
+
+def fix_on(
+    elevation: Floats,
+    lattice: Lattice,
+    values: Floats,
+    matrix: Floats,
+    around: SearchArea | None,
+    params: MapLocalizationParams,
+) -> Fix:
+    """Place a level model (row, col), m, on a map whose rows may be turned or mirrored.
+
+    Parameters
+    ----------
+    values : heights of the map (row, col), m, NaN unknown.
+    matrix : (2, 3), from (col, row, 1) of its cell centres to x, y, m; its cells are squares.
+    around : what of the map is searched; None: all of it.
+
+    Raises
+    ------
+    DegenerateError
+        The model covers too few cells, or the ground is too flat to tell.
+    InputError
+        Nowhere within the search the ground is known, or the search is too wide.
+    """
+    # The search is in a frame along the rows of the map.
+    rows, cols = values.shape
+    cell = math.sqrt(abs(np.linalg.det(matrix[:, :2])))
+    if np.linalg.det(matrix[:, :2]) > 0:
+        values, matrix = values[::-1], matrix @ np.array([[1.0, 0.0, 0.0], [0.0, -1.0, rows - 1.0], [0.0, 0.0, 1.0]])
+    to_ground = level_pose(matrix)
+    middle = 0.5 * cell * (cols - 1), 0.5 * cell * (1 - rows)
+    everywhere = math.hypot(*middle) + lattice.radius
+    area = SearchArea(*middle, 0.0, everywhere, math.pi)
+    if around is not None:
+        x, y, _ = to_ground.inverse().apply([around.x, around.y, 0.0])
+        distance = min(around.distance, everywhere + math.hypot(middle[0] - x, middle[1] - y))
+        area = SearchArea(float(x), float(y), around.heading - heading_of(to_ground), distance, around.turn)
+    placed = fix(elevation, lattice, GlobalMap(values, 0.0, 0.0, cell), area, params)
+    both, other = np.kron(np.eye(2), to_ground.rotation), placed.other
+    if other is not None:
+        (x, y, heading), chi2 = other
+        other = np.array([*to_ground.apply([x, y, 0.0])[:2], heading + heading_of(to_ground)]), chi2
+    return replace(placed, pose=to_ground @ placed.pose, covariance=both @ placed.covariance @ both.T, other=other)
 
 
 def _tries(ground: GlobalMap, far: float, around: SearchArea) -> float:

@@ -36,7 +36,7 @@ FACTS: dict[str, dict[str, Any]] = {
 }
 """What each stage would have found: enough that the graph grows to its end."""
 
-APART = {"trajectory": {"refined", "intrinsics"}, "resect": {"after", "rig_after"}, "locus": {"moving"}}
+APART = {"trajectory": {"intrinsics"}, "resect": {"after", "rig_after"}, "locus": {"moving"}}
 """Ports that one flow alone has, by stage: a drive goes on before there is anything to be adjusted jointly, a pair
 after a segment to compare its rig with, or a frame that shows what moved."""
 

@@ -30,9 +30,15 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.evaluation.dem_comparison import Grid
-from rille.stages.evaluation.place import PlacedImage, level_pose, place, relief
+from rille.stages.evaluation.place import PlacedImage, place
 from rille.stages.geometry.geometry import RigidTransform, heading_of, rotation_exp, rotation_log
-from rille.stages.terrain.map_localization import MIN_CHI2_GAP, MapLocalizationParams, SearchArea
+from rille.stages.terrain.map_localization import (
+    MIN_CHI2_GAP,
+    MapLocalizationParams,
+    SearchArea,
+    fix_on,
+    level_pose,
+)
 
 TURN_DEG = 20.0
 """Degrees to either side of a given heading that are searched."""
@@ -246,7 +252,8 @@ def _by_elevations(terrain: Terrain, model: DemFile, around: SearchArea | None) 
     # Standard deviation, degrees, of a vertical that a sensor gives, and of one that is that of the ground.
     tilt = 0.5 if terrain.vertical == "attitude" else 5.0
     params = MapLocalizationParams.model_validate({"sigma_tilt_deg": tilt})
-    placed = relief(terrain.elevation, terrain.lattice, model.grid, around, params)
+    grid = model.grid
+    placed = fix_on(terrain.elevation, terrain.lattice, grid.values, grid.matrix, around, params)
     kept = "overlap", "rms", "explained", "cells", "independent"
     facts: dict[str, Any] = {name: getattr(placed, name) for name in kept}
     if placed.other is not None:

@@ -24,10 +24,10 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.evaluation import dem_comparison
 from rille.stages.evaluation.dem_comparison import Alignment, Grid
-from rille.stages.evaluation.place import level_pose, register
+from rille.stages.evaluation.place import register
 from rille.stages.geometry.geometry import RigidTransform, heading_of, rotation_exp, rotation_log
 from rille.stages.geometry.lattice import Lattice, union
-from rille.stages.terrain.map_localization import independent_cells
+from rille.stages.terrain.map_localization import independent_cells, level_pose
 from rille.stages.terrain.merge import EXACT, MergeParams, ModelLayer, Placed
 from rille.stages.terrain.merge import merge as merge_layers
 from rille.stages.terrain.shading import gradient

@@ -38,17 +38,11 @@ Seen = dict[tuple[int, str], list[Floats]]
 
 
 class MatchedSegment(NamedTuple):
-    """Tracks from one key frame to the next, their resection, and by frame number the disparities of its pairs.
-
-    ``landmarks`` (point, 3), m, local frame of the key, and ``inlier`` (point, frame): after the joint refinement if
-    there was one, as the poses are.
-    """
+    """Tracks from one key frame to the next, their resection, and by frame number the disparities of its pairs."""
 
     track: Bundle
     resection: Bundle
     matches: Mapping[int, Bundle]
-    landmarks: Floats
-    inlier: NDArray[np.uint8]
 
 
 def write_run(folder: Path, run: RunArtifacts) -> str:
@@ -73,12 +67,9 @@ def _segments(bundles: RunArtifacts) -> list[MatchedSegment]:
     tracks, resections = bundles.all("track"), bundles.all("resect")
     of_key = {_ends(track)[0]: (track, resections[part]) for part, track in tracks.items() if part in resections}
     segments = []
-    for key, (track, resection) in sorted(of_key.items(), key=itemgetter(0)):
+    for _, (track, resection) in sorted(of_key.items(), key=itemgetter(0)):
         matches = {f: pair for f in _ends(track) if (pair := bundles.find(f"hfvm/{f}")) is not None}
-        refined = bundles.find(f"refine/{key}")
-        points = resection if refined is None else refined
-        landmarks, inlier = np.asarray(points["landmarks"]), np.asarray(points["inlier"])
-        segments.append(MatchedSegment(track, resection, matches, landmarks, inlier))
+        segments.append(MatchedSegment(track, resection, matches))
     return segments
 
 
@@ -160,7 +151,7 @@ def _points(
     if key not in poses:
         return
     T_local_key = RigidTransform.from_matrix(np.asarray(segment.resection["poses"])[0])
-    world = (poses[key] @ T_local_key.inverse()).apply(segment.landmarks)
+    world = (poses[key] @ T_local_key.inverse()).apply(np.asarray(segment.resection["landmarks"]))
     # Pixels (point, frame, camera, 2) of left and right cameras, and which of them are observations.
     pixels = np.repeat(np.asarray(segment.track["points"], dtype=np.float64)[:, :, None], 2, axis=2)
     shown = np.zeros(pixels.shape[:3], bool)
@@ -168,7 +159,7 @@ def _points(
         if frame not in poses:
             continue
         in_left, left = poses[frame].inverse().apply(world), pixels[:, j, 0]
-        agrees = segment.inlier[:, j] != 0
+        agrees = np.asarray(segment.resection["inlier"])[:, j] != 0
         shown[:, j, 0] = agrees & _near(rig.left, in_left, left)
         if (pair := segment.matches.get(frame)) is not None:
             vectors, matched = matches_at(left, pair)

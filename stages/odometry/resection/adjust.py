@@ -16,19 +16,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Bundle, NoParams, stage
-from rille.stages.core.errors import InputError
-from rille.stages.facts.odometry import FactorsFacts, IntrinsicsFacts, RefineFacts, ResectFacts, TrajectoryFacts
+from rille.stages.facts.odometry import IntrinsicsFacts, LoopFacts, ResectFacts, TrajectoryFacts
 from rille.stages.geometry.geometry import RigidTransform, rotation_log
-from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, bound_of, root_of
+from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, root_of
 from rille.stages.odometry.resection.priors import Sensors
-from rille.stages.odometry.resection.sensors import moved
+from rille.stages.odometry.resection.sensors import OwnTrajectory, moved
 from rille.stages.odometry.resection.trajectory import Chained, ChainLink, account, trajectory_stage
 
 MIN_WAY_SHARE = 0.03
@@ -56,41 +55,20 @@ def chain_factors(segments: Sequence[ChainLink], numbers: Sequence[Sequence[int]
             poses.append((key.inverse() @ RigidTransform.from_matrix(link.poses[k])).matrix34)
             covariances.append(turn @ (link.covariance[k] - common @ common.T) @ turn.T)
             shared.append(turn @ np.hstack([common, link.calibration[k]]))
-    count = len(ends)
-    return Factors(
+    return Factors.of(
         np.array(ends, np.intp).reshape(-1, 2),
         np.array(poses).reshape(-1, 3, 4),
         root_of(np.array(covariances).reshape(-1, 6, 6)),
-        np.array(shared).reshape(count, 6, -1) if count else np.zeros((0, 6, 0)),
-        np.zeros((count, 3)),
-        np.full(count, np.inf),
+        shared=np.array(shared) if shared else None,
     )
 
 
 def stated_factors(given: Sequence[Mapping[str, Any]], row: Mapping[int, int]) -> Factors:
-    """Factors as facts state them (``from``, ``to``, ``pose``, ``covariance``); ``row`` is the node of each frame.
-
-    Raises
-    ------
-    InputError
-        A covariance is not positive definite.
-    """
+    """Factors as facts state them (``from``, ``to``, ``pose``, ``covariance``); ``row`` is the node of each frame."""
     covariance = np.array([one["covariance"] for one in given], dtype=np.float64).reshape(-1, 6, 6)
-    for one, matrix in zip(given, covariance, strict=True):
-        # Also of NaN, which no comparison holds of.
-        if not np.linalg.eigvalsh(matrix).min() > 0.0:
-            text = (
-                f"the covariance of the motion from frame {one['from']} to frame {one['to']} is not positive definite"
-            )
-            raise InputError("RIL-452", text, remedy="give that of (position m, rotation rad), symmetric")
-    return Factors(
-        np.array([[row[one["from"]], row[one["to"]]] for one in given], np.intp).reshape(-1, 2),
-        np.array([one["pose"] for one in given], dtype=np.float64).reshape(-1, 3, 4),
-        root_of(covariance),
-        np.zeros((len(given), 6, 0)),
-        np.zeros((len(given), 3)),
-        np.full(len(given), bound_of(6)),
-    )
+    ends = np.array([[row[one["from"]], row[one["to"]]] for one in given], np.intp).reshape(-1, 2)
+    poses = np.array([one["pose"] for one in given], dtype=np.float64).reshape(-1, 3, 4)
+    return Factors.of(ends, poses, root_of(covariance), components=6)
 
 
 def measured_alike(stated: Factors, chain: Factors, calibration: int) -> Factors:
@@ -108,14 +86,7 @@ def measured_alike(stated: Factors, chain: Factors, calibration: int) -> Factors
     return replace(stated, shared=seen)
 
 
-class JoinedPieces(NamedTuple):
-    """Poses (n, 3, 4) in a common frame as far as factors join them, and the piece (n,) of each."""
-
-    poses: Floats
-    piece: NDArray[np.int16]
-
-
-def join(poses: Floats, piece: NDArray[np.int16], factors: Factors, sure: Bools) -> JoinedPieces:
+def join(own: OwnTrajectory, factors: Factors, sure: Bools) -> OwnTrajectory:
     """Pieces laid together by the factors between them, each by the one that most others agree with.
 
     Within a piece the chain contradicts a place that is taken for another; between two pieces nothing but a second
@@ -123,15 +94,16 @@ def join(poses: Floats, piece: NDArray[np.int16], factors: Factors, sure: Bools)
 
     Parameters
     ----------
-    poses, piece : (n, 3, 4) and (n,), each piece in a frame of its own.
+    own : its poses are in a common frame afterwards as far as factors join their pieces.
     sure : which factors (m,) need no other that agrees about with them.
     """
+    poses, piece = own.poses, own.piece
     while True:
         pieces = np.sort(piece[factors.ends], axis=1)
         for first, other in np.unique(pieces[pieces[:, 0] != pieces[:, 1]], axis=0):
             rows = np.flatnonzero((pieces == [first, other]).all(1))
             here = factors.take(rows)
-            graph = PoseGraph(here, len(poses), 0, np.ones(len(rows)))
+            graph = PoseGraph(here, len(poses), np.ones(len(rows)))
             laid = [_moved(poses, piece == other, ends, pose) for ends, pose in zip(here.ends, here.poses, strict=True)]
             states = (GraphState.of(one, here.shared.shape[2]) for one in laid)
             squares = np.array([(graph.errors(state) ** 2).sum(1) for state in states])
@@ -141,7 +113,7 @@ def join(poses: Floats, piece: NDArray[np.int16], factors: Factors, sure: Bools)
                 poses, piece = laid[int(np.argmin(costs))], np.where(piece == other, first, piece)
                 break
         else:
-            return JoinedPieces(poses, piece)
+            return own._replace(poses=poses, piece=piece)
 
 
 def _moved(poses: Floats, rows: Bools, ends: NDArray[np.intp], pose: Floats) -> Floats:
@@ -156,7 +128,7 @@ def _left_out(one: Mapping[str, Any], adjusted: Floats) -> str:
     off = RigidTransform.from_matrix(one["pose"]).inverse() @ a.inverse() @ b
     turn = math.degrees(np.linalg.norm(rotation_log(off.rotation)))
     return (
-        f"the motion from frame {one['from']} to frame {one['to']} ({one.get('source', 'stated')}) contradicts the "
+        f"the motion from frame {one['from']} to frame {one['to']} ({one['source']}) contradicts the "
         f"others by {np.linalg.norm(off.translation):.2g} m and {turn:.2g} degrees: it is left out"
     )
 
@@ -166,87 +138,77 @@ def adjust_stage(
     params: NoParams,
     trajectory: Bundle[TrajectoryFacts],
     segments: Sequence[Bundle[ResectFacts]],
-    refined: Sequence[Bundle[RefineFacts]] = (),
-    loops: Sequence[Bundle[FactorsFacts]] = (),
+    loops: Sequence[Bundle[LoopFacts]] = (),
     intrinsics: Bundle[IntrinsicsFacts] | None = None,
     *,
     priors: Mapping[str, Any] | None = None,
 ) -> Bundle[TrajectoryFacts]:
     """Poses of all left frames, adjusted to places seen again and to what other sensors say."""
     frames = trajectory.meta["frames"]
-    chained = Chained(**{field.name: np.array(trajectory[field.name]) for field in fields(Chained)})
-    posed = np.flatnonzero(chained.piece >= 0)
+    out = Chained(**{field.name: np.array(trajectory[field.name]) for field in fields(Chained)})
+    posed = np.flatnonzero(out.piece >= 0)
     row = {frames[k]: node for node, k in enumerate(posed)}
     numbers = [[int(f["frame"]) for f in bundle.meta["per_frame"]] for bundle in segments]
-    links = [ChainLink.of(bundle, intrinsics) for bundle in refined or segments]
+    links = [ChainLink.of(bundle, intrinsics) for bundle in segments]
     calibration = links[0].calibration.shape[2] if links else 0
     chain = chain_factors(links, numbers, row)
     given = [one for bundle in loops for one in bundle.meta["factors"] if one["from"] in row and one["to"] in row]
     stated = measured_alike(stated_factors(given, row), chain, calibration)
-    sensors = Sensors.of(priors or {}, posed)
-    sensors.believe(chained.poses[posed], chained.piece[posed])
-    between = Factors.joined([stated, *(sensor.factors(0.0) for sensor in sensors.relative)])
+    sensors = Sensors.of(priors or {}, len(frames))
+    own = OwnTrajectory(out.poses[posed], out.piece[posed], sensors.times[posed], posed)
+    sensors.believe(own)
+    between = Factors.joined([stated, *sensors.between(own)])
     sure = np.arange(len(between.ends)) >= len(given)
-    poses, piece = sensors.laid(*join(chained.poses[posed], chained.piece[posed], between, sure))
-    alone = piece[stated.ends[:, 0]] != piece[stated.ends[:, 1]]
-    out, excess = chained, 1.0
+    own = sensors.laid(join(own, between, sure))
+    alone = own.piece[stated.ends[:, 0]] != own.piece[stated.ends[:, 1]]
     lines = [
         f"frames {given[k]['from']} and {given[k]['to']} alone link their pieces, which are not joined"
         for k in np.flatnonzero(alone)
     ]
-    for number in np.unique(piece):
-        nodes = np.flatnonzero(piece == number)
-        own, mine = _within(chain, nodes), _within(stated, nodes)
-        done = sensors.adjusted(poses[nodes], nodes, own.beside(mine))
+    known, excess = chain.beside(stated), 1.0
+    for number in np.unique(own.piece):
+        nodes = np.flatnonzero(own.piece == number)
+        inside = np.flatnonzero(np.isin(known.ends, nodes).all(1))
+        ends = np.searchsorted(nodes, known.ends[inside])
+        done = sensors.adjusted(own.take(nodes), replace(known.take(inside), ends=ends))
         if done is None:
             continue
         excess = max(excess, done.graph.excess)
-        out = _written(out, posed[nodes], done, slice(own.shared.shape[2] - calibration, own.shared.shape[2]))
-        kept = done.kept[len(own.ends) : len(own.ends) + len(mine.ends)]
-        for k in np.flatnonzero(np.isin(stated.ends, nodes).all(1))[~kept]:
-            ends = np.searchsorted(nodes, stated.ends[k])
-            lines.append(_left_out(given[k], done.state.poses[ends]))
+        sources = known.shared.shape[2]
+        _write(out, posed[nodes], done, slice(sources - calibration, sources))
+        for k in np.flatnonzero(~done.kept[: len(inside)]):
+            lines.append(_left_out(given[inside[k] - len(chain.ends)], done.state.poses[ends[k]]))
     if excess > 1.0:
         lines.append(f"the camera's own errors are about {excess:.0f} times those stated: all covariances grow by that")
     return _bundle(trajectory, out, [*lines, *sensors.lines], {"excess": excess, "priors": sensors.facts})
 
 
-def _within(factors: Factors, nodes: NDArray[np.intp]) -> Factors:
-    """The factors between some nodes, which are numbered anew."""
-    inside = factors.take(np.flatnonzero(np.isin(factors.ends, nodes).all(1)))
-    return replace(inside, ends=np.searchsorted(nodes, inside.ends))
-
-
-def _written(out: Chained, rows: NDArray[np.intp], done: Adjusted, calibration: slice) -> Chained:
-    """The trajectory with the adjusted poses in these rows, which are one piece now.
+def _write(out: Chained, rows: NDArray[np.intp], done: Adjusted, calibration: slice) -> None:
+    """Write the adjusted poses into these rows, which are one piece now.
 
     ``calibration`` are the sources that are errors of it.
     """
-    changed = {name: value.copy() for name, value in vars(out).items()}
     exact = replace(done.graph.factors, shared=done.graph.factors.shared.copy())
     exact.shared[:, :, calibration] = 0.0
     # The place of positions and of the vertical is a node behind the frames.
-    changed["poses"][rows] = done.state.poses[:-1]
-    changed["covariance"][rows] = done.graph.covariance(done.state)[:-1]
-    changed["own_covariance"][rows] = replace(done.graph, factors=exact).covariance(done.state)[:-1]
-    changed["piece"][rows] = changed["piece"][rows].min()
-    return Chained(**changed)
+    out.poses[rows] = done.state.poses[:-1]
+    out.covariance[rows] = done.graph.covariance(done.state)[:-1]
+    out.own_covariance[rows] = replace(done.graph, factors=exact).covariance(done.state)[:-1]
+    out.piece[rows] = out.piece[rows].min()
 
 
 def _bundle(
     before: Bundle[TrajectoryFacts], out: Chained, lines: list[str], more: Mapping[str, Any]
 ) -> Bundle[TrajectoryFacts]:
     """Arrays and facts as of stage ``trajectory``."""
-    kept, number = np.unique(out.piece[out.piece >= 0], return_inverse=True)
-    piece = out.piece.copy()
-    piece[piece >= 0] = number
-    out, frames = replace(out, piece=piece), before.meta["frames"]
+    kept, out.piece[out.piece >= 0] = np.unique(out.piece[out.piece >= 0], return_inverse=True)
+    frames = before.meta["frames"]
     verticals = [before.meta["verticals"][k] for k in kept]
     facts = account(frames, out, {int(one["frame"]): one["cause"] for one in before.meta["lost"]}, verticals)
     meta: TrajectoryFacts = {
         **before.meta,
         **facts,  # type: ignore[typeddict-item]
-        "world": [frame for frame, k in zip(frames, piece, strict=True) if k == facts["main"]],
+        "world": [frame for frame, k in zip(frames, out.piece, strict=True) if k == facts["main"]],
         **more,
         "warnings": [*facts["warnings"], *lines],
     }

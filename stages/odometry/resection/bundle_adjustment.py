@@ -1,23 +1,30 @@
-"""Least squares of one segment: poses, depths of landmarks, and an error that all its disparities share.
+"""Joint adjustment of a segment: all its poses and the depths of its landmarks at once, by least squares.
+
+Resection poses each frame by itself, with landmarks as the key pair's disparity has them. Here the landmarks' depths
+are unknowns, too, each held by its disparity: a point that four frames see from four places says more of its depth than
+its disparity alone; and so is an error that all disparities share. The disparity of the basic pair at the segment's end
+is no second measurement: it shares its errors with the first and gains little.
 
 Huber's weights, Levenberg-Marquardt. A landmark has one unknown (along its ray), so that its elimination (Schur's
 complement) is a division, and the system has the size of the poses (Triggs, McLauchlan, Hartley, Fitzgibbon 2000,
-doi:10.1007/3-540-44480-7_21). The inverse of the same reduced system is the covariance of the poses.
+doi:10.1007/3-540-44480-7_21). The inverse of the same reduced system is the covariance of the poses, by the same rules
+as the resection's (:mod:`rille.stages.odometry.resection.robust_pose`): the errors that are found set the scale, what
+the stated ones leave beyond them is shared by all segments.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
+from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Bools, Floats
-from rille.stages.core.declare import Params
-from rille.stages.geometry.geometry import Camera
-from rille.stages.geometry.projection import Pinhole, perturbed
+from rille.stages.core.arrays import Bools, Bytes, Floats
+from rille.stages.geometry.geometry import Camera, RigidTransform
+from rille.stages.geometry.projection import NEAREST_M, perturbed
 from rille.stages.numeric.least_squares import Minimum, levenberg_marquardt
+from rille.stages.odometry.resection.landmarks import Landmarks, SegmentPoints
 from rille.stages.odometry.resection.pnp import (
     Errors,
     Observations,
@@ -26,34 +33,33 @@ from rille.stages.odometry.resection.pnp import (
     bias_information,
     huber_costs,
     huber_weights,
+    pose_covariance,
+)
+from rille.stages.odometry.resection.robust_pose import (
+    MIN_LANDMARKS,
+    SHARED_SOURCES,
+    ResectParams,
+    correlation,
+    frame_errors,
+    scatter_of_blocks,
+    whole,
 )
 
-
-class RefineParams(Params):
-    """Parameters of the joint refinement."""
-
-    enabled: bool = Field(default=True, description="adjust poses and landmark depths of a segment jointly")
-    iterations: int = Field(default=20, ge=1, description="limit of Levenberg-Marquardt iterations; 5 are usual")
-    pixel_sigma: float = Field(default=0.2, gt=0, description="standard deviation [pixels] of a tracked position")
-    bias_sigma: float = Field(
-        default=0.1,
-        ge=0,
-        description="prior standard deviation [pixels] of an error common to all disparities (toe-in of the rig)",
-    )
+MAX_STEPS = 20
+"""Steps of Levenberg-Marquardt, at most; about 5 suffice."""
+MIN_DISPARITY_SIGMA_PX = 1e-3
+"""Pixels: an exact disparity would have infinite information."""
 
 
 @dataclass(frozen=True)
 class SegmentTracks:
     """Measurements of one segment.
 
-    ``position``, ``along`` (n, 3) of the landmarks in the local frame, and how they move with their disparity, m and
-    m/pixel; ``sigma`` (n,) of it, pixels. ``pixels`` (frame, n, 2) of the frames behind the key, ``seen`` (frame, n)
-    whether they count.
+    ``landmarks`` (n) in the local frame; ``pixels`` (frame, n, 2) of them in the frames behind the key, and whether
+    they count there, ``seen`` (frame, n).
     """
 
-    position: Floats
-    along: Floats
-    sigma: Floats
+    landmarks: Landmarks
     pixels: Floats
     seen: Bools
     camera: Camera
@@ -100,17 +106,17 @@ class SegmentAdjustment:
     """A segment as a problem of least squares."""
 
     tracks: SegmentTracks
-    params: RefineParams
+    params: ResectParams
 
     def observations(self, f: int) -> Observations:
         """Frame ``f`` by itself, landmarks as their disparities have them."""
-        tracks, camera = self.tracks, Pinhole.of(self.tracks.camera)
-        known = tracks.position, tracks.along, tracks.sigma, tracks.pixels[f]
-        return Observations(*known, camera, self.params.pixel_sigma)
+        return Observations.of(
+            self.tracks.landmarks, self.tracks.pixels[f], self.tracks.camera, self.params.pixel_sigma
+        )
 
     def errors(self, state: SegmentState, f: int) -> Errors:
         """Back-projection errors of frame ``f``; depths are unknowns, so landmarks have no error of their own."""
-        exact = self.observations(f)._replace(sigma=np.zeros(len(self.tracks.sigma)))
+        exact = self.observations(f)._replace(sigma=np.zeros(len(state.depth)))
         return back_projection(exact, Pose(state.R[f], state.t[f], state.depth + state.bias))
 
     def weights(self, errors: Errors, f: int) -> Floats:
@@ -118,19 +124,15 @@ class SegmentAdjustment:
         return huber_weights(errors.norm, self.tracks.seen[f])
 
     def normal(self, state: SegmentState) -> SegmentNormal:
-        """Normal equations and Huber's cost of the tracks, with the priors of depths and bias."""
-        out = self.measured(state)
-        prior = bias_information(self.params.bias_sigma)
-        out.poses[-1, -1] += prior
-        out.pose_gradient[-1] += prior * state.bias
-        return out._replace(cost=out.cost + 0.5 * prior * state.bias**2)
+        """Normal equations and Huber's cost of the tracks, with the priors of depths and bias.
 
-    def measured(self, state: SegmentState) -> SegmentNormal:
-        """The same without the prior of the bias; landmarks behind a camera do not count."""
+        Landmarks behind a camera do not count.
+        """
         p, n = 6 * len(state.R) + 1, len(state.depth)
-        held = self.tracks.sigma**-2.0
+        held = self.tracks.landmarks.sigma**-2.0
         out = SegmentNormal(np.zeros((p, p)), np.zeros((p, n)), held.copy(), np.zeros(p), state.depth * held, 0.0)
-        cost = 0.5 * float((state.depth**2 * held).sum())
+        prior = bias_information(self.params.bias_sigma)
+        cost = 0.5 * float((state.depth**2 * held).sum() + prior * state.bias**2)
         for f in range(len(state.R)):
             errors = self.errors(state, f)
             weight, at = self.weights(errors, f), slice(6 * f, 6 * f + 6)
@@ -147,6 +149,8 @@ class SegmentAdjustment:
             out.between[-1] += square
             out.pose_gradient[-1] += slope.sum()
         out.poses[-1] = out.poses[:, -1] = out.between.sum(1)
+        out.poses[-1, -1] += prior
+        out.pose_gradient[-1] += prior * state.bias
         return out._replace(cost=cost)
 
     def ahead(self, state: SegmentState, normal: SegmentNormal, damping: float) -> SegmentState:
@@ -163,7 +167,7 @@ class SegmentAdjustment:
 
         Depths add one unknown and one measurement each (their disparity), so that tracks and poses decide the freedom.
         """
-        total, measured = float(((state.depth / self.tracks.sigma) ** 2).sum()), 0
+        total, measured = float(((state.depth / self.tracks.landmarks.sigma) ** 2).sum()), 0
         for f in range(len(state.R)):
             errors = self.errors(state, f)
             weight = self.weights(errors, f)
@@ -174,6 +178,81 @@ class SegmentAdjustment:
         return max(total / max(measured - 6 * len(state.R), 1), 1e-12)
 
 
-def adjust(tracks: SegmentTracks, start: SegmentState, params: RefineParams) -> Minimum[SegmentState]:
+def adjust(tracks: SegmentTracks, start: SegmentState, params: ResectParams) -> Minimum[SegmentState]:
     """The state of least cost; never worse than its start by the same cost."""
-    return levenberg_marquardt(SegmentAdjustment(tracks, params), start, params.iterations)
+    return levenberg_marquardt(SegmentAdjustment(tracks, params), start, MAX_STEPS)
+
+
+class PosedTracks(NamedTuple):
+    """Measurements of a segment and its state; which of its frames have a pose, and which of its points are used."""
+
+    tracks: SegmentTracks
+    state: SegmentState
+    frames: NDArray[np.intp]
+    points: NDArray[np.intp]
+
+    @staticmethod
+    def of(points: SegmentPoints, poses: Floats, inlier: Bytes) -> PosedTracks | None:
+        """A segment's points that agree with the poses (frame, 3, 4) of its frames; None: no frame is posed.
+
+        ``inlier`` (n, frame): those that agree, 1.
+        """
+        frames = 1 + np.flatnonzero(np.isfinite(poses[1:]).all((1, 2)))
+        rows = np.flatnonzero(inlier[:, frames].any(1))
+        if not len(rows):
+            return None
+        landmarks = points.landmarks.take(rows)
+        landmarks = replace(landmarks, sigma=np.maximum(landmarks.sigma, MIN_DISPARITY_SIGMA_PX))
+        pixels = np.swapaxes(points.tracks[rows][:, frames], 0, 1).astype(np.float64)
+        T = [RigidTransform.from_matrix(poses[j]).inverse() for j in frames]
+        state = SegmentState(
+            np.array([p.rotation for p in T]), np.array([p.translation for p in T]), np.zeros(len(rows))
+        )
+        tracks = SegmentTracks(landmarks, pixels, inlier[np.ix_(rows, frames)].T != 0, points.camera)
+        return PosedTracks(tracks, state, frames, rows)._determined()
+
+    def adjusted(self, state: SegmentState) -> PosedTracks | None:
+        """The segment in this state; a landmark behind a camera agrees with no pose, and has no image there."""
+        moved = self._replace(state=state)
+        z = np.einsum("fj,nj->fn", state.R[:, 2], moved.landmarks()) + state.t[:, 2:]
+        return moved._replace(tracks=replace(self.tracks, seen=self.tracks.seen & (z >= NEAREST_M)))._determined()
+
+    def _determined(self) -> PosedTracks | None:
+        """The same without the frames that too few landmarks see to determine a pose; None if no frame is left."""
+        enough = self.tracks.seen.sum(1) >= MIN_LANDMARKS
+        tracks = replace(self.tracks, pixels=self.tracks.pixels[enough], seen=self.tracks.seen[enough])
+        state = self.state._replace(R=self.state.R[enough], t=self.state.t[enough])
+        return PosedTracks(tracks, state, self.frames[enough], self.points) if enough.any() else None
+
+    def landmarks(self) -> Floats:
+        """Landmarks (n, 3) in this state, m, local frame."""
+        known = self.tracks.landmarks
+        return known.position + (self.state.depth + self.state.bias)[:, None] * known.per_pixel
+
+
+class PoseErrors(NamedTuple):
+    """Covariances (frame, 6, 6) of adjusted poses, roots (frame, 6, 7) of the part that all segments share, and the
+    variance of the errors of tracks over the one stated, correlation between neighbours included; at least 1."""
+
+    covariance: Floats
+    shared: Floats
+    excess: float
+
+
+def pose_errors(tracks: SegmentTracks, state: SegmentState, params: ResectParams) -> PoseErrors:
+    """Errors of the poses of an adjusted segment, of position (m) and rotation vector (rad) of T_local_left."""
+    problem, prior = SegmentAdjustment(tracks, params), bias_information(params.bias_sigma)
+    matrix, _ = problem.normal(state).without_depths()
+    matrix[-1, -1] -= prior  # which stays as it is, however large the errors are
+    factor = problem.scatter(state)
+    measured, stated = pose_covariance(matrix / factor, prior), pose_covariance(matrix / max(factor, 1.0), prior)
+    count = len(state.R)
+    own, shared, together = np.empty((count, 6, 6)), np.empty((count, 6, SHARED_SOURCES)), list[float]()
+    for f in range(count):
+        seen = tracks.seen[f]
+        depth = float(np.median(tracks.landmarks.position[seen] @ state.R[f, 2] + state.t[f, 2]))
+        own[f], shared[f] = frame_errors(measured, stated, state.R[f], depth, f)
+        errors = back_projection(problem.observations(f), Pose(state.R[f], state.t[f], state.bias))
+        weight = problem.weights(errors, f)[seen]
+        together.append(scatter_of_blocks(tracks.pixels[f][seen], errors.error[seen], weight, tracks.camera))
+    return PoseErrors(whole(own, shared, together), shared, max(factor, 1.0) * correlation(together))

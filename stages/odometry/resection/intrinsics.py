@@ -29,13 +29,12 @@ from pydantic import Field
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.facts.calibration import CalibrationFacts
-from rille.stages.facts.odometry import IntrinsicsFacts, RefineFacts
+from rille.stages.facts.odometry import IntrinsicsFacts, ResectFacts
 from rille.stages.geometry import epipolar
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lens import Lens
 from rille.stages.numeric.robust import huber_weight
 from rille.stages.odometry.resection.bundle_adjustment import (
-    RefineParams,
     SegmentAdjustment,
     SegmentNormal,
     SegmentState,
@@ -43,6 +42,7 @@ from rille.stages.odometry.resection.bundle_adjustment import (
 )
 from rille.stages.odometry.resection.landmarks import triangulated
 from rille.stages.odometry.resection.pnp import bias_information
+from rille.stages.odometry.resection.robust_pose import ResectParams
 
 PRIORS: Mapping[str, float] = {
     "focal length": 1.0,
@@ -117,11 +117,13 @@ class SegmentCameras(NamedTuple):
 
 class IntrinsicsPart(NamedTuple):
     """What a segment says of k errors: ``information`` (k, k), ``pull`` (k,); ``by_error`` (frame, 6, k) changes of its
-    poses (position m, rotation vector rad of T_local_left) with each."""
+    poses (position m, rotation vector rad of T_local_left) with each. ``yaw``: information and pull of the rig's yaw,
+    rad, by the common error of its disparities, without the prior of that, which would draw it towards zero."""
 
     information: Floats
     pull: Floats
     by_error: Floats
+    yaw: tuple[float, float]
 
 
 def corrected(camera: Camera, errors: Sequence[float] | Floats) -> Camera:
@@ -141,17 +143,18 @@ def calibrated_anew(rig: Rig, correction: Sequence[float]) -> Rig:
     return corrected_rig(rig, correction, [0.0, correction[-1], 0.0, 0.0, 0.0])
 
 
-def _in_key_pair(tracks: SegmentTracks, cameras: SegmentCameras) -> tuple[Floats, Floats]:
-    """Pixels (n, 2) of a segment's landmarks in the left and the right image of its key pair."""
-    rig, key = cameras.rig, cameras.T_local_key.inverse().apply(tracks.position)
-    return rig.left.project(key), rig.right.project(rig.T_right_left.apply(key))
+def composed(before: Sequence[float] | Floats, correction: Sequence[float] | Floats) -> Floats:
+    """One correction that changes a calibration as two do one after the other."""
+    larger = 1.0 + before[0]
+    scale = np.array([larger, larger, larger, 1.0])  # those of the cameras are over the focal length
+    return np.array(before) + scale * correction
 
 
 def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) -> SegmentTracks:
-    """Measurements as they would be if the calibration were changed by ``errors`` (k,)."""
+    """Measurements as they would be if the calibration were changed by ``errors`` (k + 1,), the yaw last."""
     rig, T_local_key = cameras.rig, cameras.T_local_key
-    pitch, *others = errors[CORRECTED + 1 :]
-    other = corrected_rig(rig, errors, [pitch, 0.0, *others])
+    pitch, *others, yaw = errors[CORRECTED + 1 :]
+    other = corrected_rig(rig, errors, [pitch, yaw, *others])
 
     def undistorted_anew(pixels: Floats, side: str, given: Camera, ideal: Camera) -> Floats:
         if (lens := cameras.lenses.get(side)) is not None:
@@ -162,14 +165,12 @@ def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) 
         ray = (pixels - centre) / focal
         return np.asarray(pixels - errors[CORRECTED] * focal * ray * (ray**2).sum(-1, keepdims=True))
 
-    left, right = _in_key_pair(tracks, cameras)
-    left, right = (
-        undistorted_anew(left, "left", rig.left, other.left),
-        undistorted_anew(right, "right", rig.right, other.right),
-    )
-    at = triangulated(left, right, other, T_local_key, tracks.sigma)
+    key = T_local_key.inverse().apply(tracks.landmarks.position)
+    left = undistorted_anew(rig.left.project(key), "left", rig.left, other.left)
+    right = undistorted_anew(rig.right.project(rig.T_right_left.apply(key)), "right", rig.right, other.right)
+    landmarks = triangulated(left, right, other, T_local_key, tracks.landmarks.sigma)
     pixels = undistorted_anew(tracks.pixels, "left", rig.left, other.left)
-    return replace(tracks, position=at.position, along=at.per_pixel, pixels=pixels, camera=other.left)
+    return replace(tracks, landmarks=landmarks, pixels=pixels, camera=other.left)
 
 
 def turn_deg(state: SegmentState, T_local_key: RigidTransform) -> float:
@@ -179,12 +180,13 @@ def turn_deg(state: SegmentState, T_local_key: RigidTransform) -> float:
 
 
 def contribution(
-    tracks: SegmentTracks, state: SegmentState, cameras: SegmentCameras, params: RefineParams
+    tracks: SegmentTracks, state: SegmentState, cameras: SegmentCameras, params: ResectParams
 ) -> IntrinsicsPart:
     """What an adjusted segment says of the errors of :data:`PRIORS`, all its unknowns free, by the stated errors."""
     problem = SegmentAdjustment(tracks, params)
     normal, k = problem.normal(state), len(PRIORS)
-    steps = [SegmentAdjustment(with_errors(tracks, cameras, STEP * one), params) for one in np.eye(k)]
+    *changed, turned = (with_errors(tracks, cameras, STEP * one) for one in np.eye(k + 1))
+    steps = [SegmentAdjustment(one, params) for one in changed]
     p, n = normal.between.shape
     by_pose, by_depth, squares, gradient = np.zeros((p, k)), np.zeros((k, n)), np.zeros((k, k)), np.zeros(k)
     for f in range(len(state.R)):
@@ -206,30 +208,17 @@ def contribution(
         normal.depth_gradient,
         normal.cost,
     ).without_depths()
-    step = -np.linalg.solve(matrix[:p, :p], matrix[:p, p:])
+    inverse = np.linalg.inv(matrix[:p, :p])
+    step = -inverse @ matrix[:p, p:]
     # Of C = -R^T t and of R^T, by the left perturbation of T_cam_local.
-    turned = np.swapaxes(state.R, 1, 2)[:, None] @ -step[:-1].reshape(-1, 2, 3, k)
+    by_error = np.swapaxes(state.R, 1, 2)[:, None] @ -step[:-1].reshape(-1, 2, 3, k)
     information = matrix[p:, p:] + matrix[p:, :p] @ step
-    return IntrinsicsPart(information, right[p:] + step.T @ right[:p], turned.reshape(-1, 6, k))
-
-
-def yaw_part(
-    tracks: SegmentTracks, state: SegmentState, cameras: SegmentCameras, params: RefineParams
-) -> tuple[float, float]:
-    """What an adjusted segment says of the rig's yaw, rad, by the common error of its disparities: information, pull.
-
-    The prior that the segment has for that error, which would draw it towards zero, is left out.
-    """
-    left, right = _in_key_pair(tracks, cameras)
-    turned = triangulated(
-        left, right, calibrated_anew(cameras.rig, [0.0] * CORRECTED + [STEP]), cameras.T_local_key, tracks.sigma
-    ).position
-    along = ((turned - tracks.position) * tracks.along).sum(1) / (tracks.along**2).sum(1)
-    px_per_rad = float(np.nanmedian(along)) / STEP
-    matrix, _ = SegmentAdjustment(tracks, params).normal(state).without_depths()
-    held = float(matrix[-1, -1] - matrix[-1, :-1] @ np.linalg.solve(matrix[:-1, :-1], matrix[:-1, -1]))
-    information = max(held - bias_information(params.bias_sigma), 0.0)
-    return information * px_per_rad**2, held * state.bias * px_per_rad
+    moved, ray = turned.landmarks.position - tracks.landmarks.position, tracks.landmarks.per_pixel
+    along = (moved * ray).sum(1) / (ray**2).sum(1)
+    px_per_rad, of_bias = float(np.nanmedian(along)) / STEP, 1.0 / float(inverse[-1, -1])
+    own = max(of_bias - bias_information(params.bias_sigma), 0.0)
+    yaw = own * px_per_rad**2, of_bias * state.bias * px_per_rad
+    return IntrinsicsPart(information, right[p:] + step.T @ right[:p], by_error.reshape(-1, 6, k), yaw)
 
 
 class CommonErrors(NamedTuple):
@@ -277,7 +266,7 @@ def common_errors(information: Floats, pull: Floats, sigma: Floats, least: float
         wrong[departure.argmax()] = True
 
 
-def contradiction(errors: Floats, sigma: Floats, focal: float) -> str:
+def contradiction(errors: Sequence[float], sigma: Floats, focal: float) -> str:
     """One line on the numbers of the cameras that are not those given; empty where all are.
 
     Parameters
@@ -314,7 +303,7 @@ def yaw_contradiction(angle: float, sigma: float, fixed: bool) -> str:
 @stage("intrinsics", version=3)
 def intrinsics_stage(
     params: IntrinsicsParams,
-    segments: Sequence[Bundle[RefineFacts]],
+    segments: Sequence[Bundle[ResectFacts]],
     rig: Bundle[CalibrationFacts],
     *,
     before: Sequence[float] | None = None,
@@ -322,12 +311,13 @@ def intrinsics_stage(
 ) -> Bundle[IntrinsicsFacts]:
     """Errors of the calibration that the tracks of all segments show.
 
-    ``before`` are corrections that were made already; with ``fixed`` the rig keeps its yaw. The yaw is corrected first:
-    while it is wrong, so is what the tracks say of the cameras.
+    ``before`` is the correction that was made already; with ``fixed`` the rig keeps its yaw. The yaw is corrected
+    first: while it is wrong, so is what the tracks say of the cameras.
     """
     parts, k = [s.meta["intrinsics"] for s in segments if s.meta["intrinsics"]], len(PRIORS)
     turning = [part for part in parts if part["turn_deg"] >= MIN_TURN_DEG]
-    used, made = Rig.from_dict(rig.meta["rig"]), np.zeros(CORRECTED + 1) if before is None else np.array(before)
+    focal = Rig.from_dict(rig.meta["rig"]).left.fx
+    made = np.zeros(CORRECTED + 1) if before is None else np.array(before)
     enough = [part for part in turning if len(turning) >= MIN_SEGMENTS]
     common = common_errors(
         np.array([part["information"] for part in enough]).reshape(-1, k, k),
@@ -336,7 +326,7 @@ def intrinsics_stage(
         MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR,
     )
     shown = np.array([part["yaw"] for part in parts if len(parts) >= MIN_SEGMENTS]).reshape(-1, 2, 1)
-    least = (MIN_YAW_CHANGE_PX if made[-1] else MIN_YAW_PX) / used.left.fx
+    least = (MIN_YAW_CHANGE_PX if made[-1] else MIN_YAW_PX) / focal
     yaw = common_errors(shown[:, :1], shown[:, 1], np.array([YAW_PRIOR * params.prior]), least)
     turn, sigma = float(yaw.errors[0]) * bool(yaw.wrong[0]), np.sqrt(np.diag(common.covariance))
     correction = np.append(np.where(common.wrong, common.errors, 0.0)[:CORRECTED], 0.0)
@@ -349,9 +339,9 @@ def intrinsics_stage(
         "held": [name for name, share in zip(PRIORS, sigma / params.sigma, strict=True) if share > HELD_SHARE],
         "yaw": [float(yaw.errors[0]), math.sqrt(yaw.covariance[0, 0])],
         "correction": correction.tolist(),
-        "rig": calibrated_anew(used, correction.tolist()).to_dict(),
+        "corrected": composed(made, correction).tolist(),
     }
-    cameras = contradiction((made + correction)[:CORRECTED], sigma, used.left.fx)
+    cameras = contradiction(facts["corrected"][:CORRECTED], sigma, focal)
     angle = yaw_contradiction(turn if fixed else made[-1] + turn, facts["yaw"][1], fixed)
     if doubt := "; ".join(filter(None, [cameras, angle if fixed else ""])):
         facts["contradiction"] = doubt

@@ -8,7 +8,7 @@ interpolation and is more exact. Coordinates are those of the local frame, with 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from rille.stages.core.validity import matched as is_matched
 from rille.stages.geometry.epipolar import NAMES, distances, inverse_depth
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.numeric.least_squares import irls
+from rille.stages.odometry.affine_lk import HALF
 from rille.stages.odometry.displacements import windows_at
 
 MAX_DISPARITY_STEP_PX = 1.0
@@ -27,8 +28,6 @@ MAX_DISPARITY_STEP_PX = 1.0
 MAX_RELATIVE_SIGMA = 0.2
 """Largest standard deviation of a landmark's distance over the distance; beyond, depth is no longer normal though
 disparity is, and first-order covariances are wrong."""
-TEMPLATE_HALF_PX = 5
-"""Half the side of a template, pixels (see stages.odometry.affine_lk): what its relief is taken over."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Landmarks:
     position: Floats
     per_pixel: Floats
     sigma: Floats
-    lost: dict[str, int]
+    lost: dict[str, int] = field(default_factory=dict)
 
     def summary(self) -> str:
         """The counts in words."""
@@ -110,7 +109,7 @@ def triangulated(points: Floats, right: Floats, rig: Rig, T_local_left: RigidTra
     inverse, slope = inverse_depth(rig, points, right - points)
     depth = 1.0 / np.where(inverse > 0, inverse, np.nan)
     along = (depth**2 * slope)[:, None] * (rays @ T_local_left.rotation.T)
-    return Landmarks(T_local_left.apply(rays * depth[:, None]), along, sigma, {})
+    return Landmarks(T_local_left.apply(rays * depth[:, None]), along, sigma)
 
 
 def matches_at(points: Floats, disparity: Bundle) -> tuple[Floats, Bools]:
@@ -145,16 +144,14 @@ def relief(points: Floats, disparity: Bundle) -> Floats:
     if not len(points):
         return np.zeros(0)
     names = "column_disparity", "row_disparity", "validity"
-    inside, windows = windows_at(points, TEMPLATE_HALF_PX, *(np.asarray(disparity[name]) for name in names))
+    inside, windows = windows_at(points, HALF, *(np.asarray(disparity[name]) for name in names))
     column, row, valid = (window.reshape(len(points), -1) for window in windows)
     values = np.stack([column, row], -1).astype(np.float64)
     use = inside[:, None] & is_matched(valid) & np.isfinite(values).all(-1)
     values[~use] = 0.0
-    dy, dx = (
-        o.ravel() for o in np.mgrid[-TEMPLATE_HALF_PX : TEMPLATE_HALF_PX + 1, -TEMPLATE_HALF_PX : TEMPLATE_HALF_PX + 1]
-    )
+    dy, dx = (o.ravel() for o in np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1])
     # In units of the template, so that all sums are of the same size.
-    design = np.stack([np.ones(dx.size), dx / TEMPLATE_HALF_PX, dy / TEMPLATE_HALF_PX], -1)
+    design = np.stack([np.ones(dx.size), dx / HALF, dy / HALF], -1)
     # Matched pixels on a line leave the slope across open: it is 0 then.
     plane = irls(design[None], values, lambda _: use.astype(np.float64), 1e-9 * np.eye(3), rounds=1)
     rest = np.where(use[..., None], values - design @ plane, 0.0)

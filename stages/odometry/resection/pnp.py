@@ -22,9 +22,10 @@ import numpy as np
 from numba import njit
 
 from rille.stages.core.arrays import Bools, Floats
-from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.projection import NEAREST_M, Pinhole, linearise, perturbed, rotated
 from rille.stages.numeric.robust import huber_weight
+from rille.stages.odometry.resection.landmarks import Landmarks
 
 HUBER = 2.5
 """Huber's bound in standard deviations: 4 % of Gaussian errors in two dimensions lie beyond it."""
@@ -44,6 +45,15 @@ class Observations(NamedTuple):
     pixels: Floats
     camera: Pinhole
     pixel_sigma: float
+
+    @staticmethod
+    def of(landmarks: Landmarks, pixels: Floats, camera: Camera, pixel_sigma: float) -> Observations:
+        """Landmarks as a camera observes them at ``pixels`` (n, 2)."""
+        position, per_pixel, sigma, seen = (
+            np.ascontiguousarray(a, dtype=np.float64)
+            for a in (landmarks.position, landmarks.per_pixel, landmarks.sigma, pixels)
+        )
+        return Observations(position, per_pixel, sigma, seen, Pinhole.of(camera), pixel_sigma)
 
 
 class Pose(NamedTuple):
@@ -108,7 +118,7 @@ def _linearised(obs, R, t, whitened, lengths):  # type: ignore[no-untyped-def]
 
 
 class Normal(NamedTuple):
-    """Weighted normal matrix (7, 7), gradient (7,), weights (n,), and Huber's cost that they are of."""
+    """Weighted normal matrix (7, 7), gradient (7,), weights (n,), 0 of what is not active, and the cost they are of."""
 
     matrix: Floats
     gradient: Floats
@@ -116,9 +126,9 @@ class Normal(NamedTuple):
     cost: float
 
 
-def huber_weights(norm: Floats, active: Bools | None = None) -> Floats:
+def huber_weights(norm: Floats, active: Bools) -> Floats:
     """Huber's weights of whitened errors of this length: 0 of those behind the camera, or not active."""
-    usable = np.isfinite(norm) if active is None else np.isfinite(norm) & active
+    usable = np.isfinite(norm) & active
     return np.where(usable, huber_weight(np.where(usable, norm, 1.0), HUBER), 0.0)
 
 
@@ -126,17 +136,6 @@ def huber_costs(norm: Floats) -> float:
     """Sum of Huber's costs: a parabola, beyond the bound its tangent."""
     within = np.minimum(norm, HUBER)
     return float((within * (norm - 0.5 * within)).sum())
-
-
-def normal_equations(errors: Errors, active: Bools) -> Normal:
-    """Normal equations of the active (n,) landmarks, without the prior of the bias.
-
-    The cost is infinite where one of them is behind the camera.
-    """
-    weight = huber_weights(errors.norm, active)
-    jacobian = errors.jacobian.reshape(-1, 7)
-    weighted = (jacobian * np.repeat(weight, 2)[:, None]).T
-    return Normal(weighted @ jacobian, weighted @ errors.error.ravel(), weight, huber_costs(errors.norm[active]))
 
 
 def bias_information(sigma: float) -> float:
@@ -154,14 +153,15 @@ class PoseAdjustment:
     bias_sigma: float
 
     def normal(self, pose: Pose) -> Normal:
-        """Normal equations with the prior of the bias."""
-        normal, prior = (
-            normal_equations(back_projection(self.obs, pose), self.active),
-            bias_information(self.bias_sigma),
-        )
-        normal.matrix[6, 6] += prior
-        normal.gradient[6] += prior * float(pose.bias)
-        return normal._replace(cost=normal.cost + 0.5 * prior * float(pose.bias) ** 2)
+        """Normal equations with the prior of the bias; the cost is infinite where a landmark is behind the camera."""
+        errors, prior, bias = back_projection(self.obs, pose), bias_information(self.bias_sigma), float(pose.bias)
+        weight = huber_weights(errors.norm, self.active)
+        jacobian = errors.jacobian.reshape(-1, 7)
+        weighted = (jacobian * np.repeat(weight, 2)[:, None]).T
+        matrix, gradient = weighted @ jacobian, weighted @ errors.error.ravel()
+        matrix[6, 6] += prior
+        gradient[6] += prior * bias
+        return Normal(matrix, gradient, weight, huber_costs(errors.norm[self.active]) + 0.5 * prior * bias**2)
 
     def ahead(self, pose: Pose, normal: Normal, damping: float) -> Pose:
         """The pose one damped step on."""

@@ -1,8 +1,7 @@
 """Other sensors beside the camera: which of them are believed, how late their clocks are, and what is said of them.
 
-Their factors are those of :mod:`rille.stages.odometry.resection.sensors`; a sensor that contradicts the chain
-(:mod:`rille.stages.odometry.resection.contradiction`), or most of whose factors the adjusted graph leaves out, is not
-used.
+What they say is in :mod:`rille.stages.odometry.resection.sensors`; a sensor that contradicts the chain, or most of
+whose factors the adjusted graph leaves out, is not used.
 """
 
 from __future__ import annotations
@@ -13,27 +12,21 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.odometry.pose_graph import EXCESS, MAJORITY, Adjusted, Factors, GraphState, PoseGraph, adjust
-from rille.stages.odometry.resection.contradiction import (
-    MIN_SIGMAS,
-    motion_contradiction,
-    position_contradiction,
-    vertical_contradiction,
-)
 from rille.stages.odometry.resection.sensors import (
     MIN_FIXES,
+    MIN_SIGMAS,
     OFFSET_SIGMA_S,
+    OwnTrajectory,
     PositionPrior,
     RelativePrior,
+    Sensor,
+    VerticalPrior,
     anchor,
-    fixes_of,
     placed,
-    position_factors,
-    vertical_factors,
 )
 
 MAX_SIGMA_SHARE = 0.1
@@ -44,11 +37,6 @@ MANY_LEFT_OUT = 0.05
 """Share of a sensor's measurements from which on those that were left out are worth a word."""
 MAX_SHARED_SIGMAS = 4.0
 """Standard deviations of what all measurements of a sensor share, from which on it is wrong."""
-SHARED_ERRORS = {
-    "odometry": ("scale", "turn about x", "turn about y", "turn about z"),
-    "positions": ("lever arm along x", "lever arm along y", "lever arm along z"),
-}
-"""Sources of each sensor before that of its clock, in the left camera's frame."""
 REMEDY = {
     "odometry": "correct T_body_left, unit or time_offset, or raise drift and turn_deg",
     "attitude": "correct T_body_left (T_imu_left), the order of its columns or time_offset, or raise sigma_deg",
@@ -71,117 +59,94 @@ class Clock(NamedTuple):
 
 @dataclass
 class Sensors:
-    """Other sensors of a trajectory whose ``times`` (n,) are those of its nodes; ``lines`` collects what is noticed.
+    """Other sensors of a trajectory by name; ``lines`` collects what is noticed.
 
-    ``up`` (n, 3) is the direction of up in the left cameras, NaN of none, with its ``up_sigma``, rad. ``timed``: times
-    are seconds, so that clocks are compared; ``georeferenced``: the world has a place on Earth. ``fit`` lays positions
-    on the world. ``facts`` of each sensor.
+    ``times`` (frame,) of all frames; ``timed``: they are seconds, so that clocks are compared; ``georeferenced``: the
+    world has a place on Earth. ``facts`` of each sensor.
     """
 
-    relative: list[RelativePrior]
-    positions: PositionPrior | None
-    up: Floats
-    up_sigma: float
+    used: dict[str, Sensor]
     times: Floats
     timed: bool
     georeferenced: bool
     lines: list[str] = field(default_factory=list)
-    fit: RigidTransform | None = None
     facts: dict[str, Any] = field(default_factory=dict)
 
     @staticmethod
-    def of(given: Mapping[str, Any], rows: NDArray[np.intp]) -> Sensors:
-        """Of the argument of stage ``adjust``; ``rows`` are the frames that are nodes."""
+    def of(given: Mapping[str, Any], frames: int) -> Sensors:
+        """Of the argument of stage ``adjust``, which has so many frames."""
 
         def stacked(name: str, key: str, shape: tuple[int, ...]) -> Floats:
-            entries, missing = given.get(name, {}).get(key, [None] * len(times)), np.full(shape, np.nan)
-            return np.array([missing if one is None else np.reshape(one, shape) for one in entries])
+            missing = np.full(shape, np.nan)
+            return np.array([missing if one is None else np.reshape(one, shape) for one in given[name][key]])
 
         timed = bool(given.get("timed", False))
-        times = np.array(given.get("times", np.arange(rows.max(initial=0) + 1)), dtype=np.float64)
+        times, used = np.array(given.get("times", np.arange(frames)), dtype=np.float64), dict[str, Sensor]()
         clock = times if timed else None
-        relative = []
         if "odometry" in given:
-            odometry, poses = given["odometry"], stacked("odometry", "poses", (3, 4))
-            relative.append(RelativePrior("odometry", poses, rows, clock, odometry["drift"], odometry["turn"]))
+            stated, poses = given["odometry"], stacked("odometry", "poses", (3, 4))
+            used["odometry"] = RelativePrior(poses, clock, stated["drift"], stated["turn"])
         if "attitude" in given:
             R = stacked("attitude", "rotations", (3, 3))
             poses = np.concatenate([R, np.where(np.isnan(R[:, :, :1]), np.nan, 0.0)], axis=2)
-            relative.append(RelativePrior("attitude", poses, rows, clock, 0.0, given["attitude"]["sigma"]))
-        positions = PositionPrior.of(given["positions"]) if "positions" in given else None
-        up, up_sigma = stacked("up", "directions", (3,))[rows], float(given.get("up", {}).get("sigma", 1.0))
-        return Sensors(relative, positions, up, up_sigma, times[rows], timed, bool(given.get("georeferenced", False)))
+            used["attitude"] = RelativePrior(poses, clock, 0.0, given["attitude"]["sigma"])
+        if "positions" in given:
+            used["positions"] = PositionPrior.of(given["positions"], clocked=timed)
+        if "up" in given:
+            used["up"] = VerticalPrior(stacked("up", "directions", (3,)), float(given["up"]["sigma"]))
+        return Sensors(used, times, timed, bool(given.get("georeferenced", False)))
 
-    def believe(self, poses: Floats, piece: NDArray[np.int16]) -> None:
-        """Leave out the sensors that contradict the camera's own chain (n, 3, 4), and say so."""
-        why = {sensor.name: motion_contradiction(sensor, poses, piece) for sensor in self.relative}
-        if self.positions is not None:
-            fixes = fixes_of(self.positions, poses, piece, self.times, 0.0)
-            why["positions"] = position_contradiction(fixes, self.positions.sigma, piece)
-        why["up"] = vertical_contradiction(self.up, self.up_sigma, poses, piece)
-        for name, reason in why.items():
-            if reason:
+    def believe(self, own: OwnTrajectory) -> None:
+        """Leave out the sensors that contradict the camera's own chain, and say so."""
+        for name, sensor in list(self.used.items()):
+            if reason := sensor.contradiction(own):
                 self._refuse(name, reason)
 
     def _refuse(self, name: str, reason: str) -> None:
-        self.relative = [sensor for sensor in self.relative if sensor.name != name]
-        self.positions = None if name == "positions" else self.positions
-        self.up = np.full_like(self.up, np.nan) if name == "up" else self.up
+        del self.used[name]
         self.facts[name] = {"used": False, "why": reason}
         self.lines.append(f"[{name}] contradicts the images and is not used: {reason}: {REMEDY[name]}")
 
-    def laid(self, poses: Floats, piece: NDArray[np.int16]) -> tuple[Floats, NDArray[np.int16]]:
-        """Poses (n, 3, 4) and pieces (n,) with those pieces joined that positions join."""
-        if self.positions is None:
-            return poses, piece
-        found = placed(fixes_of(self.positions, poses, piece, self.times, 0.0), poses, piece)
+    def between(self, own: OwnTrajectory) -> list[Factors]:
+        """Factors between frames, which may join pieces, clocks being right."""
+        return [sensor.factors(own, 0.0) for sensor in self.used.values() if isinstance(sensor, RelativePrior)]
+
+    def laid(self, own: OwnTrajectory) -> OwnTrajectory:
+        """The trajectory with those pieces joined that positions join."""
+        if not isinstance(positions := self.used.get("positions"), PositionPrior):
+            return own
+        found = placed(positions.fixes(own), own)
         if found is None:
             self._refuse("positions", f"no piece has {MIN_FIXES} of them")
-            return poses, piece
-        self.fit, poses, piece = found
-        return poses, piece
+            return own
+        self.used["positions"] = replace(positions, laid=found[0])
+        return found[1]
 
-    def adjusted(self, poses: Floats, nodes: NDArray[np.intp], known: Factors) -> Adjusted | None:
+    def adjusted(self, own: OwnTrajectory, known: Factors) -> Adjusted | None:
         """A piece adjusted to its chain and stated factors (``known``) and to the sensors; None: nothing to adjust.
 
-        Parameters
-        ----------
-        poses : (n, 3, 4) in a common frame; the place is a node behind them.
-        nodes : (n,) numbers of these nodes in the trajectory.
+        The place is a node behind those of the piece.
         """
-        clocks, count, common = dict[str, Clock](), len(known.ends), known.shared.shape[2]
+        clocks, nodes, common = dict[str, Clock](), len(own.poses), known.shared.shape[2]
         done = None
         # Clocks first, by which what is left of the errors then tells more of the chain's.
         for excesses in ((1.0,), (1.0,), EXCESS, EXCESS, EXCESS):
-            groups = self._groups(poses, nodes, clocks)
+            said = {name: one.factors(own, clocks.get(name, Clock()).late) for name, one in self.used.items()}
+            groups = {name: factors for name, factors in said.items() if len(factors.ends)}
             if not groups and not known.doubtful.any():
                 return None
-            factors = Factors.joined([known, *groups.values(), anchor(poses[0])])
-            ends = np.where(factors.ends < 0, len(nodes), factors.ends)
-            graph = PoseGraph(replace(factors, ends=ends), len(nodes) + 1, 0, np.ones(len(ends)), common=common)
-            start = GraphState.of(np.concatenate([poses, np.eye(3, 4)[None]]), factors.shared.shape[2])
+            factors = Factors.joined([known, *groups.values(), anchor(own.poses[0])])
+            ends = np.where(factors.ends < 0, nodes, factors.ends)
+            graph = PoseGraph(replace(factors, ends=ends), nodes + 1, np.ones(len(ends)), common=common)
+            start = GraphState.of(np.concatenate([own.poses, np.eye(3, 4)[None]]), factors.shared.shape[2])
             done = adjust(graph, start, excesses)
-            if excesses == EXCESS and not self._refused(groups, done, count, common):
+            if excesses == EXCESS and not self._refused(groups, done, len(known.ends), common):
                 break
             clocks = self._clocks(groups, clocks, done, common)
         assert done is not None
         clocks = self._clocks(groups, clocks, done, common)
         self._account(clocks, done.state.poses[-1])
         return done
-
-    def _groups(self, poses: Floats, nodes: NDArray[np.intp], clocks: Mapping[str, Clock]) -> dict[str, Factors]:
-        """Factors of each sensor that says something of these nodes, by clocks as they are known."""
-        groups, times = dict[str, Factors](), self.times[nodes]
-        for one in self.relative:
-            groups[one.name] = replace(one, rows=one.rows[nodes]).factors(clocks.get(one.name, Clock()).late, poses)
-        if self.positions is not None and self.fit is not None:
-            same = np.zeros(len(nodes), np.int16)
-            fixes = fixes_of(self.positions, poses, same, times, clocks.get("positions", Clock()).late)
-            groups["positions"] = position_factors(fixes, self.fit, self.positions, poses)
-            if not self.timed:
-                groups["positions"].shared[:, :, 3] = 0.0
-        groups["up"] = vertical_factors(self.up[nodes], self.up_sigma, poses)
-        return {name: factors for name, factors in groups.items() if len(factors.ends)}
 
     def _refused(self, groups: Mapping[str, Factors], done: Adjusted, first: int, column: int) -> bool:
         """Whether a sensor is not believed: most was left out, or what all share is far off its standard deviation.
@@ -202,7 +167,9 @@ class Sensors:
             if np.mean(kept) < MAJORITY:
                 why = f"{(~kept).sum()} of its {len(kept)} measurements contradict the others"
             elif worst >= 0 and abs(shared[worst]) > MAX_SHARED_SIGMAS:
-                why = f"its {SHARED_ERRORS[name][worst]} is off by {abs(shared[worst]):.0f} standard deviations"
+                why = (
+                    f"its {self.used[name].shared_errors[worst]} is off by {abs(shared[worst]):.0f} standard deviations"
+                )
             if why:
                 refused = True
                 self._refuse(name, why)
@@ -242,8 +209,8 @@ class Sensors:
             if fact.get("left_out", 0) > MANY_LEFT_OUT * fact.get("measurements", 0):
                 count = f"{fact['left_out']} of {fact['measurements']}"
                 self.lines.append(f"[{name}] {count} of its measurements contradict the others and are left out")
-        if self.fit is not None and self.positions is not None:
-            there = (RigidTransform.from_matrix(place) @ self.fit).inverse()
+        if isinstance(positions := self.used.get("positions"), PositionPrior):
+            there = (RigidTransform.from_matrix(place) @ positions.laid).inverse()
             origin, ahead = there.translation, there.rotation[:, 1]
             azimuth = math.degrees(math.atan2(ahead[0], ahead[1])) % 360.0
             self.facts["place"] = {"origin": origin.tolist(), "azimuth_deg": azimuth}

@@ -1,14 +1,18 @@
-"""Resection: pose of each frame of a segment from landmarks whose 3-D coordinates are known (section 5.2.2).
+"""Resection: poses of the frames of a segment from landmarks whose 3-D coordinates are known (section 5.2.2).
 
 The landmarks are points of the segment's key frame, triangulated in its stereo pair
 (:mod:`rille.stages.odometry.resection.landmarks`); each other frame is posed by itself
 (:mod:`rille.stages.odometry.resection.robust_pose`). A pose is refused where the landmarks that contradict it agree
-with another one, and a pair whose disparities depart from the landmarks' shows that the rig was knocked.
+with another one. Then all poses and the landmarks' depths are adjusted jointly
+(:mod:`rille.stages.odometry.resection.bundle_adjustment`). An error of the calibration shows over the whole sequence
+only: each segment gives what it says of it, and how its poses change with it
+(:mod:`rille.stages.odometry.resection.intrinsics`). A pair whose disparities depart from the landmarks' shows that the
+rig was knocked.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -22,16 +26,18 @@ from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.odometry import ResectFacts, TrackFacts
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import Rig, RigidTransform
-from rille.stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
+from rille.stages.geometry.lens import Lens
+from rille.stages.geometry.pose_arrays import BY_INTRINSICS, COVARIANCE, POSES, SHARED
+from rille.stages.odometry.resection.bundle_adjustment import PosedTracks, SegmentAdjustment, adjust, pose_errors
+from rille.stages.odometry.resection.intrinsics import PRIORS, SegmentCameras, contribution, turn_deg
 from rille.stages.odometry.resection.landmarks import SegmentPoints, landmarks_of, matches_at
 from rille.stages.odometry.resection.robust_pose import (
     MIN_LANDMARKS,
-    MORE_POINTS,
     SHARED_SOURCES,
     Resection,
     ResectParams,
-    enough,
     resect,
+    whole,
 )
 from rille.stages.odometry.resection.two_motions import AmbiguousError, moving_by_themselves
 
@@ -47,17 +53,22 @@ class SegmentPoses:
     poses: Floats
     covariance: Floats
     shared: Floats
+    by_intrinsics: Floats
     inlier: Bytes
+    landmarks: Floats
     facts: list[dict[str, Any]]
 
     @staticmethod
-    def unposed(points: int, frames: int) -> SegmentPoses:
+    def unposed(points: SegmentPoints) -> SegmentPoses:
         """Nothing is known of any frame."""
+        count, frames = points.tracks.shape[:2]
         return SegmentPoses(
             np.full((frames, 3, 4), np.nan),
             np.full((frames, 6, 6), np.nan),
             np.full((frames, 6, SHARED_SOURCES), np.nan),
-            np.zeros((points, frames), np.uint8),
+            np.zeros((frames, 6, len(PRIORS))),
+            np.zeros((count, frames), np.uint8),
+            points.landmarks.position.copy(),
             [],
         )
 
@@ -67,7 +78,7 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
 
     ``frames`` are the frame numbers, for messages and seeds.
     """
-    out = SegmentPoses.unposed(*points.tracks.shape[:2])
+    out = SegmentPoses.unposed(points)
     known = points.known()
     key = points.T_local_key
     out.poses[0], out.covariance[0], out.shared[0] = key.matrix34, 0.0, 0.0
@@ -77,6 +88,11 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
     last, together = key, list[float]()
     doubt: AmbiguousError | None = None
     trusted = np.ones(len(known), bool)
+
+    def posed_by(use: NDArray[np.intp], j: int) -> Resection:
+        pixels = points.tracks[use, j].astype(np.float64)
+        return resect(points.landmarks.take(use), pixels, points.camera, [last], params, frames[j])
+
     for j in range(1, len(frames)):
         # What once moved by itself is no landmark: seen longer than others, or standing for a while, it might prevail.
         use = np.flatnonzero(known[:, j] & trusted)
@@ -86,12 +102,12 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
             # What is in doubt stays so: later frames see fewer of the landmarks that told the motions apart.
             if doubt:
                 raise doubt
-            posed = _resect_frame(points, j, use, last, params, frames[j])
+            posed = posed_by(use, j)
             others = moving_by_themselves(points, j, trusted, posed, params, frames[j])
             if others.size:
                 trusted[others] = False
                 use = np.flatnonzero(known[:, j] & trusted)
-                posed = _resect_frame(points, j, use, last, params, frames[j])
+                posed = posed_by(use, j)
         except DegenerateError as error:
             facts["lost"] = error.message.removeprefix(f"frame {frames[j]}: ")
             if isinstance(error, AmbiguousError) and not doubt:
@@ -104,29 +120,41 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
         facts |= {"inliers": int(posed.inlier.sum()), "rms_px": posed.rms_px}
         facts |= {} if trusted.all() else {"moving": int((known[:, j] & ~trusted).sum())}
         together.append(posed.together)
-    # One frame's figure scatters by a fifth, a segment's frames share their landmarks.
-    out.covariance[:] *= max(1.0, float(np.mean(together))) if together else 1.0
-    out.covariance[:] += out.shared @ np.swapaxes(out.shared, 1, 2)
+    out.covariance[:] = whole(out.covariance, out.shared, together)
     return out
 
 
-def _resect_frame(
-    points: SegmentPoints,
-    j: int,
-    use: NDArray[np.intp],
-    last: RigidTransform,
-    params: ResectParams,
-    frame: int,
-) -> Resection:
-    """Pose of the frame in place ``j`` of a segment behind pose ``last``, by the points that are used."""
-    enough(
-        use.size,
-        f"frame {frame}: too few landmarks: {use.size} of {len(points.tracks)} tracked points have coordinates and were"
-        f" found ({points.landmarks.summary()})",
-        MORE_POINTS,
-    )
-    pixels = points.tracks[use, j].astype(np.float64)
-    return resect(points.landmarks.take(use), pixels, points.camera, [last], params, frame)
+def adjust_segment(
+    points: SegmentPoints, segment: SegmentPoses, cameras: SegmentCameras, params: ResectParams
+) -> dict[str, Any]:
+    """Adjust the poses of a segment jointly with its landmarks, in place; what it says of errors of the calibration.
+
+    A frame that keeps too few landmarks keeps the pose of its resection. Nothing is said where no frame is adjusted.
+    """
+    start = PosedTracks.of(points, segment.poses, segment.inlier)
+    end = start and start.adjusted(adjust(start.tracks, start.state, params).state)
+    if end is None:
+        return {}
+    errors = pose_errors(end.tracks, end.state, params)
+    part = contribution(end.tracks, end.state, cameras, params)
+    segment.covariance[end.frames], segment.shared[end.frames] = errors.covariance, errors.shared
+    segment.by_intrinsics[end.frames] = part.by_error
+    segment.landmarks[end.points] = end.landmarks()
+    segment.inlier[:] = 0
+    segment.inlier[end.points, 0] = end.tracks.seen.any(0)
+    segment.inlier[np.ix_(end.points, end.frames)] = end.tracks.seen.T
+    problem = SegmentAdjustment(end.tracks, params)
+    for f, row in enumerate(end.frames):
+        segment.poses[row] = RigidTransform(end.state.R[f], end.state.t[f]).inverse().matrix34
+        off = problem.errors(end.state, f).pixels[end.tracks.seen[f]]
+        segment.facts[row] |= {"inliers": len(off), "rms_px": float(np.sqrt((off**2).mean()))}
+    return {
+        "information": (part.information / errors.excess).tolist(),
+        "pull": (part.pull / errors.excess).tolist(),
+        "turn_deg": turn_deg(end.state, cameras.T_local_key),
+        "yaw": [one / errors.excess for one in part.yaw],
+        "bias_px": end.state.bias,
+    }
 
 
 def knocked(points: SegmentPoints, segment: SegmentPoses, after: Bundle, rig: Rig) -> tuple[str, list[float]] | None:
@@ -168,18 +196,23 @@ class ResectInputs(NamedTuple):
 
 @stage(
     "resect",
-    version=4,
+    version=5,
     outputs=[
         replace(POSES, frame="local"),
         replace(COVARIANCE, frame="local"),
         replace(SHARED, frame="local"),
+        replace(BY_INTRINSICS, frame="local"),
         Array("inlier", ("point", "frame"), "uint8", "1", "landmark agrees with the pose", nodata="0"),
         Array("landmarks", ("point", "xyz"), "float64", "m", "coordinates of the landmarks", "nan", "local"),
-        Array("per_pixel", ("point", "xyz"), "float64", "m/px", "their motion with the disparity", "nan", "local"),
-        Array("disparity_sigma", ("point",), "float64", "px", "standard deviation of their disparity", "nan"),
     ],
 )
-def resect_stage(params: ResectParams, inputs: ResectInputs, *, refused: str | None = None) -> Bundle[ResectFacts]:
+def resect_stage(
+    params: ResectParams,
+    inputs: ResectInputs,
+    *,
+    lenses: Mapping[str, Any] | None = None,
+    refused: str | None = None,
+) -> Bundle[ResectFacts]:
     """Poses of a segment's frames in the local frame of its basic pair."""
     rig = Rig.from_dict(inputs.rig.meta["rig"])
     T_local_key = RigidTransform.from_matrix(inputs.level.meta["T_local_left"])
@@ -193,7 +226,10 @@ def resect_stage(params: ResectParams, inputs: ResectInputs, *, refused: str | N
     segment = resect_segment(points, frames, params)
     for fact in segment.facts[1:] if refused is not None else ():
         fact["lost"] = refused
-    meta: ResectFacts = {"per_frame": segment.facts}
+    meta: ResectFacts = {"per_frame": segment.facts, "intrinsics": {}}
+    if params.joint:
+        opened = {side: Lens.from_dict(lens) for side, lens in (lenses or {}).items()}
+        meta["intrinsics"] = adjust_segment(points, segment, SegmentCameras(rig, opened, T_local_key), params)
     if inputs.after is not None and inputs.rig_after is not None:
         jumped = knocked(points, segment, inputs.after, Rig.from_dict(inputs.rig_after.meta["rig"]))
         if jumped is not None:
@@ -201,6 +237,4 @@ def resect_stage(params: ResectParams, inputs: ResectInputs, *, refused: str | N
             meta["warnings"] = [f"{jumped[0]}: calibrate anew from there on"]
     for line in [fact["contradiction"] for fact in segment.facts if "contradiction" in fact]:
         meta["contradiction"], meta["warnings"] = line, [line]
-    arrays = {name: getattr(segment, name) for name in ("poses", "covariance", "shared", "inlier")}
-    arrays |= {"landmarks": landmarks.position, "per_pixel": landmarks.per_pixel, "disparity_sigma": landmarks.sigma}
-    return Bundle(arrays, meta)
+    return Bundle({name: value for name, value in vars(segment).items() if name != "facts"}, meta)

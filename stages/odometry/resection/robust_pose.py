@@ -37,25 +37,22 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import Camera, RigidTransform
-from rille.stages.geometry.projection import Pinhole
 from rille.stages.numeric.least_squares import levenberg_marquardt
 from rille.stages.odometry.resection.landmarks import MAX_RELATIVE_SIGMA, Landmarks
 from rille.stages.odometry.resection.pnp import (
     Errors,
+    Normal,
     Observations,
     Pose,
     PoseAdjustment,
     PoseCovariance,
     back_projection,
     bias_information,
-    huber_weights,
-    normal_equations,
     pose_covariance,
 )
 
 MIN_LANDMARKS = 6
 """Fewest landmarks of a pose: twelve equations for six unknowns, so that one wrong landmark shows."""
-MORE_POINTS = "set track.points higher or choose basic pairs closer"
 MAX_BLOCKS = 6
 """Blocks along either side of the image whose mean errors show how far neighbours' errors go together."""
 MIN_PER_BLOCK = 6
@@ -97,6 +94,7 @@ class ResectParams(Params):
         description="largest back-projection error [pixels] of an inlier; the worst landmarks are removed until all "
         "are below; 1.0: 5 pixel_sigma",
     )
+    joint: bool = Field(True, description="then adjust all poses and landmark depths of a segment jointly")
     max_position_ratio: float = Field(
         0.02,
         gt=0,
@@ -127,7 +125,7 @@ class Resection:
     @property
     def total(self) -> Floats:
         """Covariance (6, 6) of the pose, all errors together, neighbours' being alike."""
-        return np.asarray(max(1.0, self.together) * self.covariance + self.shared @ self.shared.T)
+        return whole(self.covariance, self.shared, [self.together])
 
     @property
     def rms_px(self) -> float:
@@ -158,9 +156,10 @@ def resect(
         Fewer than six landmarks (in all, or consistent), all on a line, or a pose that they do not determine.
     """
     where = f"frame {frame}"
-    enough(len(pixels), f"{where}: too few landmarks: {len(pixels)} have coordinates and were found", MORE_POINTS)
+    count = f"{where}: too few landmarks: {len(pixels)} have coordinates and were found ({landmarks.summary()})"
+    enough(len(pixels), count, "set track.points higher or choose basic pairs closer")
     _not_collinear(landmarks.position, where)
-    obs = observations(landmarks, pixels, camera, params)
+    obs = Observations.of(landmarks, pixels, camera, params.pixel_sigma)
     predictions = [Pose.of(T.inverse()) for T in starts]
     pose, near = _robust_start(obs, predictions, params, frame)
     pose, active = _without_inconsistent(obs, pose, near, params, where)
@@ -168,9 +167,9 @@ def resect(
     _not_by_chance(errors, params, where)
     _not_collinear(landmarks.position[active], where)
     depth = float(np.median(obs.landmarks[active] @ pose.R[2] + pose.t[2]))
-    measured, stated = _certainty(errors, active, depth, params, where)
+    normal = PoseAdjustment(obs, active, params.bias_sigma).normal(pose)
+    measured, stated = _certainty(errors, normal, depth, params, where)
     covariance, shared = frame_errors(measured, stated, pose.R, depth)
-    weight = huber_weights(errors.norm, active)[active]
     return Resection(
         RigidTransform(pose.R, pose.t).inverse(),
         covariance,
@@ -178,17 +177,8 @@ def resect(
         active,
         np.where(np.isfinite(errors.norm), errors.pixels, np.nan),
         float(pose.bias),
-        scatter_of_blocks(obs.pixels[active], errors.error[active], weight, camera),
+        scatter_of_blocks(obs.pixels[active], errors.error[active], normal.weight[active], camera),
     )
-
-
-def observations(landmarks: Landmarks, pixels: Floats, camera: Camera, params: ResectParams) -> Observations:
-    """Landmarks as a frame observes them at ``pixels`` (n, 2)."""
-    position, per_pixel, sigma, seen = (
-        np.ascontiguousarray(a, dtype=np.float64)
-        for a in (landmarks.position, landmarks.per_pixel, landmarks.sigma, pixels)
-    )
-    return Observations(position, per_pixel, sigma, seen, Pinhole.of(camera), float(params.pixel_sigma))
 
 
 def _robust_start(obs: Observations, predictions: list[Pose], params: ResectParams, frame: int) -> tuple[Pose, Bools]:
@@ -205,9 +195,13 @@ def _robust_start(obs: Observations, predictions: list[Pose], params: ResectPara
     for _ in range(2):
         active = back_projection(obs, best).norm <= bound
         if active.sum() >= 4:
-            problem = PoseAdjustment(obs, active, params.bias_sigma)
-            best = levenberg_marquardt(problem, best, 10, tolerance=1e-4).state
+            best = _adjusted(obs, active, best, params)
     return best, back_projection(obs, best).norm <= bound
+
+
+def _adjusted(obs: Observations, active: Bools, start: Pose, params: ResectParams) -> Pose:
+    """The pose of least cost for the active (n,) landmarks."""
+    return levenberg_marquardt(PoseAdjustment(obs, active, params.bias_sigma), start, MAX_STEPS).state
 
 
 def _sampled(obs: Observations, threshold: float, seed: int) -> list[Pose]:
@@ -232,7 +226,7 @@ def _without_inconsistent(
             f"{where}: too few landmarks: {count} agree with one pose",
             "raise resect.threshold or choose basic pairs closer",
         )
-        pose = levenberg_marquardt(PoseAdjustment(obs, active, params.bias_sigma), pose, MAX_STEPS, 1e-3).state
+        pose = _adjusted(obs, active, pose, params)
         usable = _first_order(obs, pose)
         if (active & ~usable).any():
             active = active & usable
@@ -240,9 +234,7 @@ def _without_inconsistent(
         norm = np.where(active, back_projection(obs, pose).norm, -1.0)
         beyond = int((norm > bound).sum())
         if beyond == 0:
-            # Only the last adjustment needs the full accuracy.
-            problem = PoseAdjustment(obs, active, params.bias_sigma)
-            return levenberg_marquardt(problem, pose, MAX_STEPS, 1e-10).state, active
+            return pose, active
         active = active.copy()
         # Not all of them at once: the worst pull the pose, and others agree once these are gone.
         active[np.argsort(-norm, kind="stable")[: math.ceil(beyond / REMOVED_SHARE)]] = False
@@ -259,14 +251,15 @@ def _first_order(obs: Observations, pose: Pose) -> Bools:
 
 
 def _certainty(
-    errors: Errors, active: Bools, depth: float, params: ResectParams, where: str
+    errors: Errors, normal: Normal, depth: float, params: ResectParams, where: str
 ) -> tuple[PoseCovariance, PoseCovariance]:
     """Covariances of a pose by the errors found, and by the larger of those and the stated ones."""
-    normal, prior = normal_equations(errors, active), bias_information(params.bias_sigma)
+    active, prior, matrix = normal.weight > 0, bias_information(params.bias_sigma), normal.matrix.copy()
+    matrix[6, 6] -= prior  # which stays as it is, however large the errors are
     # A posteriori variance factor: the errors found, not the ones expected, set the scale.
     squares = (normal.weight[active] * errors.norm[active] ** 2).sum()
     factor = max(float(squares / (2 * active.sum() - 6)), 1e-12)
-    expected = pose_covariance(normal.matrix, prior)
+    expected = pose_covariance(matrix, prior)
     position_sigma = float(np.sqrt(np.trace(expected.noise[:3, :3]) + (expected.by_bias[:3] ** 2).sum()))
     if position_sigma > params.max_position_ratio * depth:
         raise DegenerateError(
@@ -275,7 +268,7 @@ def _certainty(
             f" by {position_sigma:.2g} m (condition {expected.condition:.1e})",
             remedy="they are too far, too few or in one direction: set track.points higher or use nearer texture",
         )
-    return pose_covariance(normal.matrix / factor, prior), pose_covariance(normal.matrix / max(factor, 1.0), prior)
+    return pose_covariance(matrix / factor, prior), pose_covariance(matrix / max(factor, 1.0), prior)
 
 
 def frame_errors(
@@ -327,6 +320,19 @@ def scatter_of_blocks(pixels: Floats, white: Floats, weight: Floats, camera: Cam
     if freedom < 6 or spread <= 0.0:
         return 1.0
     return float((sums[:, used] ** 2 / count[used]).sum()) / spread / freedom
+
+
+def correlation(together: Sequence[float]) -> float:
+    """Variance of poses over that by independent errors: the mean of what :func:`scatter_of_blocks` gives, at least 1.
+
+    Of one frame it scatters by a fifth; frames of a segment share their landmarks.
+    """
+    return max(1.0, float(np.mean(together))) if together else 1.0
+
+
+def whole(covariance: Floats, shared: Floats, together: Sequence[float]) -> Floats:
+    """Covariances (..., 6, 6) with all errors: neighbours' being alike, and those that segments share (..., 6, 7)."""
+    return np.asarray(correlation(together) * covariance + shared @ np.swapaxes(shared, -1, -2))
 
 
 def enough(count: int, what: str, remedy: str) -> None:

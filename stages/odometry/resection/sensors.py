@@ -1,25 +1,29 @@
-"""What other sensors say of the trajectory, as factors of its pose graph.
+"""What other sensors say of the trajectory: factors of its pose graph, and whether they contradict the camera's chain.
 
 Dead reckoning and attitude say how frames stand to each other, also across a gap of the chain; positions and the
 vertical say how frames stand in a *place*, a node of its own near the world, whose pose is found, too: positions are of
 a frame of their own. Beside errors of each measurement a sensor has some that all of its measurements share (scale and
 turn of dead reckoning, a constant offset of its clock), which are sources of the graph.
+
+A sensor that was mounted, timed or read otherwise than stated departs from the chain by more than errors of either. Of
+vectors a (ways or turns by the chain) and b (by the sensor), the matrix Q and the scale s are sought for which s Q b is
+nearest to a (Schoenemann 1966, doi:10.1007/BF02289451): they tell a turned mount, exchanged axes and a wrong unit.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
-from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
+from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp, rotation_log
 from rille.stages.geometry.rigid import compose, motion, umeyama
-from rille.stages.odometry.pose_graph import Factors, bound_of
+from rille.stages.odometry.pose_graph import Factors
 
 LEVER_SIGMA_M = 0.05
 """Of each component of a lever arm that is stated."""
@@ -33,6 +37,44 @@ MIN_FIXES = 3
 """Positions of a piece from which on it is laid on them."""
 MAX_GAP_STEPS = 3.0
 """Median steps of the camera over which its way is interpolated to the time of a position."""
+WINDOWS = 16
+"""Parts of a trajectory over which ways are compared: over single frames noise would hide a turned mount."""
+CAMERA_SHARE = 0.05
+"""Error of the camera's own ways that no sensor is doubted for."""
+MIN_TURN = math.radians(1.0)
+"""RMS turn of the camera below which an attitude is not tested, noise having any axis; and what its own may err."""
+HELD = 0.02
+"""Weight of the identity against the data where Q is sought: along a straight way a roll does not show."""
+MIN_SIGMAS = 3.0
+"""Standard deviations from which on a departure is one of the whole sensor."""
+
+
+class OwnTrajectory(NamedTuple):
+    """The camera's own trajectory: ``poses`` (n, 3, 4), each ``piece`` (n,) in a frame of its own, ``times`` (n,), s,
+    and ``rows`` (n,) of its nodes among the frames."""
+
+    poses: Floats
+    piece: NDArray[np.int16]
+    times: Floats
+    rows: NDArray[np.intp]
+
+    def take(self, nodes: NDArray[np.intp]) -> OwnTrajectory:
+        """Some of its nodes."""
+        return OwnTrajectory._make(values[nodes] for values in self)
+
+
+class Sensor(Protocol):
+    """One sensor; ``shared_errors`` are its sources before that of its clock, in words."""
+
+    shared_errors: ClassVar[tuple[str, ...]]
+
+    def contradiction(self, own: OwnTrajectory) -> str:
+        """Why the camera's own trajectory contradicts it; empty: it does not."""
+        ...
+
+    def factors(self, own: OwnTrajectory, late: float) -> Factors:
+        """What it says of these nodes, its clock being ``late``, s; the place is node -1, the last source the clock."""
+        ...
 
 
 def moved(poses: Floats, rows: Bools, move: RigidTransform) -> Floats:
@@ -55,45 +97,91 @@ def resampled(poses: Floats, times: Floats, shift: float) -> Floats:
     return out
 
 
+def departure(own: Floats, said: Floats, allowed: float, what: str) -> tuple[float, str]:
+    """By which share vectors (m, 3) of a sensor depart from the camera's; how, where it is more than allowed."""
+    size = math.sqrt(float((own**2).sum()))
+    off = math.sqrt(float(((own - said) ** 2).sum())) / max(size, 1e-12)
+    if off <= allowed:
+        return off, ""
+    u, _, vt = np.linalg.svd(own.T @ said / (own**2).sum() + HELD * np.eye(3))
+    Q = u @ vt
+    turned = said @ Q.T
+    scale = float((own * turned).sum() / max((turned**2).sum(), 1e-12))
+    left = math.sqrt(float(((own - scale * turned) ** 2).sum())) / size
+    axis = rotation_log(orthonormal(Q))
+    angle = float(np.linalg.norm(axis))
+    reads = []
+    if np.linalg.det(Q) < 0:
+        reads.append("two of its axes are exchanged, or one has the wrong sign")
+    elif angle > math.radians(2.0):
+        about = ", ".join(f"{v:.2f}" for v in axis / angle)
+        reads.append(f"it is turned by {math.degrees(angle):.1f} degrees about ({about}) of the left camera")
+    if abs(scale - 1.0) > 0.5 * allowed:
+        reads.append(f"its lengths have to be multiplied by {scale:.3g}")
+    fits = f"; {' and '.join(reads)}, which leaves {left:.1%}" if reads and left < 0.5 * off else ""
+    return off, f"its {what} depart from the camera's by {off:.1%}, where {allowed:.1%} is possible{fits}"
+
+
 @dataclass(frozen=True)
 class RelativePrior:
-    """Poses ``T_reference_left`` (frame, 3, 4) by a sensor, NaN of none; ``rows`` (n,) are the frames that are nodes.
+    """Poses ``T_reference_left`` (frame, 3, 4) by dead reckoning or attitude, NaN of none.
 
     ``times`` (frame,), s, None: its clock is the camera's. ``drift`` is the standard deviation of its ways as a share
     of them, 0: it measures no ways; ``turn`` that of its rotations, rad, of an attitude for each, of dead reckoning for
     each metre of way.
     """
 
-    name: str
+    shared_errors: ClassVar[tuple[str, ...]] = ("scale", "turn about x", "turn about y", "turn about z")
+
     poses: Floats
-    rows: NDArray[np.intp]
     times: Floats | None
     drift: float
     turn: float
 
-    def at(self, shift: float) -> Floats:
-        """Poses (n, 3, 4) of the nodes by the sensor ``shift`` seconds later."""
-        return (self.poses if self.times is None else resampled(self.poses, self.times, shift))[self.rows]
+    def _at(self, rows: NDArray[np.intp], shift: float) -> Floats:
+        """Poses (n, 3, 4) of some frames by the sensor ``shift`` seconds later."""
+        return (self.poses if self.times is None else resampled(self.poses, self.times, shift))[rows]
 
-    def factors(self, shift: float, own: Floats | None = None) -> Factors:
-        """Factors from each node to the next that has a pose ``shift`` seconds later; the last source is the clock.
+    def contradiction(self, own: OwnTrajectory) -> str:
+        """Why the camera's own trajectory contradicts it at all clocks; empty: it does not."""
+        shifts = [0.0] if self.times is None else sorted(np.linspace(-OFFSET_SIGMA_S, OFFSET_SIGMA_S, 21), key=abs)
+        return min((self._departure(own, shift) for shift in shifts), key=lambda one: one[0])[1]
 
-        Parameters
-        ----------
-        own : poses (n, 3, 4) by the camera, whose motion an offset of the clock shows in; None: in nothing.
-        """
-        poses = self.at(shift)
+    def _departure(self, own: OwnTrajectory, shift: float) -> tuple[float, str]:
+        """By which share of the camera's ways or turns it departs ``shift`` seconds later; why that is too much."""
+        sensed = self._at(own.rows, shift)
+        rows = np.flatnonzero(np.isfinite(sensed).all((1, 2)))
+        lag = max(len(rows) // WINDOWS, 1)
+        a, b = rows[:-lag], rows[lag:]
+        same = own.piece[a] == own.piece[b]
+        a, b = a[same], b[same]
+        moves, said = motion(own.poses, a, b), motion(sensed, a, b)
+        if not len(a):
+            return 0.0, ""
+        if self.drift:
+            ways = moves[:, :, 3]
+            # A turn that grows along the way leads it aside by half as much.
+            allowed = self.drift + 0.5 * self.turn * float(np.linalg.norm(ways, axis=1).mean())
+            return departure(ways, said[:, :, 3], CAMERA_SHARE + MIN_SIGMAS * allowed, "ways")
+        turns = rotation_log(moves[:, :, :3])
+        size = math.sqrt(float((turns**2).sum(1).mean()))
+        if size < MIN_TURN:
+            return 0.0, ""
+        return departure(turns, rotation_log(said[:, :, :3]), CAMERA_SHARE + MIN_SIGMAS * self.turn / size, "turns")
+
+    def factors(self, own: OwnTrajectory, late: float) -> Factors:
+        """Factors from each node to the next that has a pose by the sensor."""
+        poses = self._at(own.rows, late)
         rows = np.flatnonzero(np.isfinite(poses).all((1, 2)))
         a, b = rows[:-1], rows[1:]
         measured = motion(poses, a, b)
         way, count, clock = np.linalg.norm(measured[:, :, 3], axis=1), len(a), np.zeros((len(a), 6))
-        if self.times is not None and own is not None and count:
-            times = self.times[self.rows]
-            half = 0.5 * float(np.median(np.diff(times)))
+        if self.times is not None and count:
+            half = 0.5 * float(np.median(np.diff(own.times)))
             # Of the camera, not of the sensor: the derivative of the sensor's noise would look like a motion.
-            early, late = (motion(resampled(own, times, s), a, b) for s in (-half, half))
-            turned = rotation_log(late[:, :, :3] @ np.swapaxes(early[:, :, :3], 1, 2))
-            clock = np.nan_to_num(np.concatenate([late[:, :, 3] - early[:, :, 3], turned], axis=1)) / (2.0 * half)
+            before, after = (motion(resampled(own.poses, own.times, s), a, b) for s in (-half, half))
+            turned = rotation_log(after[:, :, :3] @ np.swapaxes(before[:, :, :3], 1, 2))
+            clock = np.nan_to_num(np.concatenate([after[:, :, 3] - before[:, :, 3], turned], axis=1)) / (2.0 * half)
         root, used = np.zeros((count, 6, 6)), slice(3, 6)
         if not self.drift:
             sigma, shared = np.full((count, 3), self.turn), OFFSET_SIGMA_S * clock[:, :, None]
@@ -105,30 +193,7 @@ class RelativePrior:
             shared = np.concatenate([scale[:, :, None], turns, OFFSET_SIGMA_S * clock[:, :, None]], axis=2)
         root[:, used, used] = np.eye(sigma.shape[1]) / sigma[:, None, :]
         shared[:, : used.start] = 0.0
-        bound = np.full(count, bound_of(sigma.shape[1]))
-        return Factors(np.stack([a, b], axis=1), measured, root, shared, np.zeros((count, 3)), bound)
-
-
-@dataclass(frozen=True)
-class PositionPrior:
-    """Positions (k, 3), m, of an antenna at ``times`` (k,), s.
-
-    ``sigma`` (3,), m, along x, y and z, infinite where there are no heights; ``lever`` (3,), m, of the antenna in the
-    left camera's frame.
-    """
-
-    positions: Floats
-    times: Floats
-    sigma: Floats
-    lever: Floats
-
-    @staticmethod
-    def of(given: Mapping[str, Any]) -> PositionPrior:
-        """Of the arguments of stage ``adjust``."""
-        rows, times, sigma, lever = (np.array(given[n], np.float64) for n in ("positions", "times", "sigma", "lever"))
-        lacking = 3 - rows.shape[1]
-        sigma[3 - lacking :] = np.inf
-        return PositionPrior(np.pad(rows, ((0, 0), (0, lacking))), times, sigma, lever)
+        return Factors.of(np.stack([a, b], axis=1), measured, root, sigma.shape[1], shared)
 
 
 @dataclass(frozen=True)
@@ -142,25 +207,112 @@ class Fixes:
     velocity: Floats
 
 
-def fixes_of(prior: PositionPrior, poses: Floats, piece: NDArray[np.int16], times: Floats, shift: float) -> Fixes:
-    """Positions at the moments of the nearest nodes, by the camera's own way from the one to the other.
+@dataclass(frozen=True)
+class PositionPrior:
+    """Positions (k, 3), m, of an antenna at ``times`` (k,), s.
 
-    Parameters
-    ----------
-    poses, piece, times : (n, 3, 4), (n,) and (n,), s, of the nodes in order.
-    shift : s, by which the positions are earlier than stated.
+    ``sigma`` (3,), m, along x, y and z, infinite where there are no heights; ``lever`` (3,), m, of the antenna in the
+    left camera's frame; ``clocked``: its clock is one of its own; ``laid``: how positions are laid on the world.
     """
-    antenna = poses[:, :, 3] + poses[:, :, :3] @ prior.lever
-    at = prior.times - shift
-    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
-    length = times[after] - times[after - 1]
-    part = (at - times[after - 1]) / length
-    near = np.where(part < 0.5, after - 1, after)
-    usable = (length <= MAX_GAP_STEPS * np.median(np.diff(times))) & (piece[after] == piece[after - 1])
-    usable &= (part > -0.5) & (part < 1.5)
-    velocity = (antenna[after] - antenna[after - 1]) / length[:, None]
-    moved = prior.positions + (times[near] - at)[:, None] * velocity
-    return Fixes(near[usable], moved[usable], antenna[near[usable]], velocity[usable])
+
+    shared_errors: ClassVar[tuple[str, ...]] = ("lever arm along x", "lever arm along y", "lever arm along z")
+
+    positions: Floats
+    times: Floats
+    sigma: Floats
+    lever: Floats
+    clocked: bool
+    laid: RigidTransform = field(default_factory=RigidTransform.identity)
+
+    @staticmethod
+    def of(given: Mapping[str, Any], *, clocked: bool) -> PositionPrior:
+        """Of the arguments of stage ``adjust``."""
+        rows, times, sigma, lever = (np.array(given[n], np.float64) for n in ("positions", "times", "sigma", "lever"))
+        lacking = 3 - rows.shape[1]
+        sigma[3 - lacking :] = np.inf
+        return PositionPrior(np.pad(rows, ((0, 0), (0, lacking))), times, sigma, lever, clocked)
+
+    def fixes(self, own: OwnTrajectory, late: float = 0.0) -> Fixes:
+        """Positions at the moments of the nearest nodes, by the camera's own way from the one to the other."""
+        antenna = own.poses[:, :, 3] + own.poses[:, :, :3] @ self.lever
+        at = self.times - late
+        after = np.clip(np.searchsorted(own.times, at), 1, len(own.times) - 1)
+        length = own.times[after] - own.times[after - 1]
+        part = (at - own.times[after - 1]) / length
+        near = np.where(part < 0.5, after - 1, after)
+        usable = length <= MAX_GAP_STEPS * np.median(np.diff(own.times))
+        usable &= (own.piece[after] == own.piece[after - 1]) & (part > -0.5) & (part < 1.5)
+        velocity = (antenna[after] - antenna[after - 1]) / length[:, None]
+        positions = self.positions + (own.times[near] - at)[:, None] * velocity
+        return Fixes(near[usable], positions[usable], antenna[near[usable]], velocity[usable])
+
+    def contradiction(self, own: OwnTrajectory) -> str:
+        """Why the camera's own way in the plane contradicts the shape of the positions; empty: it does not."""
+        fixes = self.fixes(own)
+        for k in enough(fixes, own.piece):
+            mine = own.piece[fixes.nodes] == k
+            way = (fixes.antenna[mine] - fixes.antenna[mine].mean(0)) * [1.0, 1.0, 0.0]
+            said = fit_plane(fixes.positions[mine], way).apply(fixes.positions[mine]) * [1.0, 1.0, 0.0]
+            share = float(np.hypot(*self.sigma[:2])) / math.sqrt(float((way**2).sum(1).mean()))
+            _, why = departure(way, said, CAMERA_SHARE + MIN_SIGMAS * share, "ways")
+            if why:
+                return why
+        return ""
+
+    def factors(self, own: OwnTrajectory, late: float) -> Factors:
+        """Factors of positions in the place; sources are three of the lever arm, and the clock."""
+        fixes = self.fixes(own, late)
+        count, turns = len(fixes.nodes), own.poses[fixes.nodes, :, :3]
+        measured = np.tile(np.eye(3, 4), (count, 1, 1))
+        measured[:, :, 3] = self.laid.apply(fixes.positions)
+        root, shared = np.zeros((count, 6, 6)), np.zeros((count, 6, 4))
+        root[:, [0, 1, 2], [0, 1, 2]] = 1.0 / self.sigma
+        # The arm that is stated less the true one.
+        shared[:, :3, :3], shared[:, :3, 3] = LEVER_SIGMA_M * turns, OFFSET_SIGMA_S * self.clocked * fixes.velocity
+        components = int(np.isfinite(self.sigma).sum())
+        return Factors.of(in_place(fixes.nodes), measured, root, components, shared, np.tile(self.lever, (count, 1)))
+
+
+@dataclass(frozen=True)
+class VerticalPrior:
+    """Direction of ``up`` (frame, 3) in the left cameras, NaN of none, with its standard deviation, rad."""
+
+    shared_errors: ClassVar[tuple[str, ...]] = ()
+
+    up: Floats
+    sigma: float
+
+    def contradiction(self, own: OwnTrajectory) -> str:
+        """Why the camera's turns contradict the direction of up; empty: they do not."""
+        up = self.up[own.rows]
+        for k in np.unique(own.piece[np.isfinite(up).all(1)]):
+            rows = np.flatnonzero((own.piece == k) & np.isfinite(up).all(1))
+            above = np.einsum("nij,nj->ni", own.poses[rows, :, :3], up[rows])
+            mean = np.broadcast_to(above.mean(0) / np.linalg.norm(above.mean(0)), above.shape)
+            _, why = departure(mean, above, MIN_TURN + MIN_SIGMAS * self.sigma, "directions")
+            if why:
+                return why
+        return ""
+
+    def factors(self, own: OwnTrajectory, late: float) -> Factors:
+        """Factors of the direction of up in the place; its clock plays no part."""
+        up = self.up[own.rows]
+        nodes = np.flatnonzero(np.isfinite(up).all(1))
+        R = own.poses[nodes, :, :3]
+        above = np.einsum("nij,nj->ni", R, up[nodes])
+        # The smallest turn that takes it to z leaves the heading as it is, which gravity does not tell.
+        axis = np.cross(above, [0.0, 0.0, 1.0])
+        length = np.linalg.norm(axis, axis=1, keepdims=True)
+        turn = axis * np.arctan2(length, above[:, 2:]) / np.maximum(length, 1e-12)
+        T = np.concatenate([rotation_exp(turn) @ R, np.zeros((len(nodes), 3, 1))], axis=2)
+        root = np.zeros((len(nodes), 6, 6))
+        root[:, [3, 4], [3, 4]] = 1.0 / self.sigma
+        return Factors.of(in_place(nodes), T, root, 2)
+
+
+def in_place(nodes: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Ends (k, 2) of factors from the place to some nodes."""
+    return np.stack([np.full(len(nodes), -1), nodes], axis=1)
 
 
 def fit_plane(positions: Floats, antenna: Floats) -> RigidTransform:
@@ -170,24 +322,20 @@ def fit_plane(positions: Floats, antenna: Floats) -> RigidTransform:
     return RigidTransform(R, antenna.mean(0) - R @ positions.mean(0))
 
 
-def placed(
-    fixes: Fixes, poses: Floats, piece: NDArray[np.int16]
-) -> tuple[RigidTransform, Floats, NDArray[np.int16]] | None:
-    """Positions laid on the first piece that has enough of them, and the other such pieces on these positions.
+def placed(fixes: Fixes, own: OwnTrajectory) -> tuple[RigidTransform, OwnTrajectory] | None:
+    """How positions are laid on the first piece that has enough of them, and the other such pieces on these positions.
 
-    Returns
-    -------
-    How the positions are laid, and the poses (n, 3, 4) and pieces (n,) then; None where no piece has enough.
+    None where no piece has enough.
     """
-    first, *others = enough(fixes, piece) or (-1,)
+    first, *others = enough(fixes, own.piece) or (-1,)
     if first < 0:
         return None
-    mine = piece[fixes.nodes]
+    mine, poses, piece = own.piece[fixes.nodes], own.poses, own.piece
     laid = fit_plane(fixes.positions[mine == first], fixes.antenna[mine == first])
     for k in others:
         move = fit_plane(fixes.antenna[mine == k], laid.apply(fixes.positions[mine == k]))
         poses, piece = moved(poses, piece == k, move), np.where(piece == k, piece.dtype.type(first), piece)
-    return laid, poses, piece
+    return laid, own._replace(poses=poses, piece=piece)
 
 
 def enough(fixes: Fixes, piece: NDArray[np.int16]) -> list[int]:
@@ -195,44 +343,7 @@ def enough(fixes: Fixes, piece: NDArray[np.int16]) -> list[int]:
     return [int(k) for k, count in enumerate(np.bincount(piece[fixes.nodes])) if count >= MIN_FIXES]
 
 
-def position_factors(fixes: Fixes, laid: RigidTransform, prior: PositionPrior, poses: Floats) -> Factors:
-    """Factors of positions in the place, the node behind all others; sources are three of the lever arm, and the clock.
-
-    Parameters
-    ----------
-    poses : (n, 3, 4) of the nodes.
-    """
-    count, turns = len(fixes.nodes), poses[fixes.nodes, :, :3]
-    measured = np.tile(np.eye(3, 4), (count, 1, 1))
-    measured[:, :, 3] = laid.apply(fixes.positions)
-    root, shared = np.zeros((count, 6, 6)), np.zeros((count, 6, 4))
-    root[:, [0, 1, 2], [0, 1, 2]] = 1.0 / prior.sigma
-    # The arm that is stated less the true one.
-    shared[:, :3, :3], shared[:, :3, 3] = LEVER_SIGMA_M * turns, OFFSET_SIGMA_S * fixes.velocity
-    ends = np.stack([np.full(count, -1), fixes.nodes], axis=1)
-    bound = np.full(count, bound_of(int(np.isfinite(prior.sigma).sum())))
-    return Factors(ends, measured, root, shared, np.tile(prior.lever, (count, 1)), bound)
-
-
-def vertical_factors(up: Floats, sigma: float, poses: Floats) -> Factors:
-    """Factors of the direction of up (n, 3) in each left camera, NaN of none, in the place, the node behind all."""
-    nodes = np.flatnonzero(np.isfinite(up).all(1))
-    R = poses[nodes, :, :3]
-    above = np.einsum("nij,nj->ni", R, up[nodes])
-    # The smallest turn that takes it to z leaves the heading as it is, which gravity does not tell.
-    axis = np.cross(above, [0.0, 0.0, 1.0])
-    length = np.linalg.norm(axis, axis=1, keepdims=True)
-    turn = axis * np.arctan2(length, above[:, 2:]) / np.maximum(length, 1e-12)
-    T = np.concatenate([rotation_exp(turn) @ R, np.zeros((len(nodes), 3, 1))], axis=2)
-    root = np.zeros((len(nodes), 6, 6))
-    root[:, [3, 4], [3, 4]] = 1.0 / sigma
-    bound = np.full(len(nodes), bound_of(2))
-    ends = np.stack([np.full(len(nodes), -1), nodes], axis=1)
-    return Factors(ends, T, root, np.zeros((len(nodes), 6, 0)), np.zeros((len(nodes), 3)), bound)
-
-
 def anchor(pose: Floats) -> Factors:
     """What is known of the place beforehand, by the pose (3, 4) of node 0: it is about upright in the world."""
     root = np.diag([1e-3] * 3 + [1.0 / VERTICAL_SIGMA] * 2 + [0.1])[None]
-    none = np.zeros((1, 6, 0)), np.zeros((1, 3)), np.full(1, np.inf)
-    return Factors(np.array([[-1, 0]]), pose[None], root, *none)
+    return Factors.of(np.array([[-1, 0]]), pose[None], root)

@@ -32,9 +32,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
-from rille.stages.core.errors import InputError
-from rille.stages.facts.odometry import IntrinsicsFacts, RefineFacts, ResectFacts, TrajectoryFacts
+from rille.stages.core.declare import Array, Bundle, NoParams, stage
+from rille.stages.facts.odometry import IntrinsicsFacts, ResectFacts, TrajectoryFacts
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform, cross_matrix, level_rotation, orthonormal
 from rille.stages.geometry.pose_arrays import COVARIANCE, NO_VERTICAL, OWN_COVARIANCE, POSES
@@ -78,78 +77,66 @@ class Chained:
     segment: NDArray[np.int16]
     piece: NDArray[np.int16]
 
-
-class _Row(NamedTuple):
-    """One frame of a :class:`Chained`, by the same names."""
-
-    poses: Floats
-    covariance: Floats
-    own_covariance: Floats
-    segment: int
-    piece: int
+    @staticmethod
+    def unposed(frames: int) -> Chained:
+        """All frames are lost."""
+        covariance, lost = np.full((frames, 6, 6), np.nan), np.full(frames, -1, np.int16)
+        return Chained(np.full((frames, 3, 4), np.nan), covariance, covariance.copy(), lost, lost.copy())
 
 
-LOST = _Row(np.full((3, 4), np.nan), np.full((6, 6), np.nan), np.full((6, 6), np.nan), -1, -1)
-
-
-def chain(segments: Sequence[ChainLink], levels: Sequence[RigidTransform]) -> Chained:
+def chain(
+    segments: Sequence[ChainLink], levels: Sequence[RigidTransform], rows: Sequence[Sequence[int]], frames: int
+) -> Chained:
     """Compose the poses of segments into one trajectory.
 
     Where the last frame of a segment is lost, the next segment begins a new piece in the local frame of its own key.
 
     Parameters
     ----------
-    segments : none for a sequence of one pair.
-    levels : T_local_left of each segment's key frame by its own level stage; of the only pair without segments.
-
-    Raises
-    ------
-    InputError
-        Not one level a segment, or a segment whose key pose is not its level's.
+    levels : T_local_left of each segment's key frame by its own level stage.
+    rows : of the frames of each segment, key first, in the trajectory, which has so many ``frames``.
     """
-    if len(levels) != max(len(segments), 1):
-        raise InputError("RIL-450", f"{len(segments)} segments and {len(levels)} levels do not make a trajectory")
-    shared = segments[0].shared.shape[2] if segments else 0
-    count = shared + segments[0].calibration.shape[2] if segments else 0
-    world, own, common, broken, piece = levels[0], np.zeros((6, 6)), np.zeros((6, count)), False, 0
-    rows = [_Row(world.matrix34, own, own, 0, 0)]
-    for number, (segment, level) in enumerate(zip(segments, levels, strict=False)):
-        local = segment.poses
-        # Both come from the same level stage: a difference beyond rounding means that the wrong ones were paired.
-        if np.abs(local[0] - level.matrix34).max() > 1e-9 * max(1.0, float(np.abs(local[0]).max())):
-            raise InputError("RIL-451", f"segment {number} was not resected in the local frame of its own basic pair")
+    out, shared = Chained.unposed(frames), segments[0].shared.shape[2]
+    none = np.zeros((6, 6)), np.zeros((6, shared + segments[0].calibration.shape[2]))
+    world, (own, common), broken, piece = levels[0], none, True, -1
+
+    def put(row: int, number: int) -> None:
+        without = own + common[:, :shared] @ common[:, :shared].T
+        out.poses[row], out.covariance[row], out.own_covariance[row] = world.matrix34, own + common @ common.T, without
+        out.segment[row], out.piece[row] = number, piece
+
+    for number, (segment, level, at) in enumerate(zip(segments, levels, rows, strict=True)):
         if broken:
-            world, own, common, piece = level, np.zeros((6, 6)), np.zeros((6, count)), piece + 1
-            rows[-1] = _Row(world.matrix34, own, own, number, piece)
+            world, (own, common), piece = level, none, piece + 1
+            put(at[0], number)
         # Once a segment: over thousands of products rounding would bend the rotation.
-        T_world_local = _clean(world @ level.inverse())
+        T_world_local = world @ level.inverse()
+        T_world_local = RigidTransform(orthonormal(T_world_local.rotation), T_world_local.translation)
         key, key_own, key_common = world, own, common
-        for k in range(1, len(local)):
-            broken = not np.isfinite(local[k]).all()
-            if broken:
-                rows.append(LOST)
+        for k in range(1, len(at)):
+            if broken := not np.isfinite(segment.poses[k]).all():
                 continue
-            world = T_world_local @ RigidTransform.from_matrix(local[k])
+            world = T_world_local @ RigidTransform.from_matrix(segment.poses[k])
             lever, turn = propagation(key, T_world_local, world)
             alone = segment.covariance[k] - segment.shared[k] @ segment.shared[k].T
             # Own errors add as variances; those of one cause go together in all segments, so their roots add first.
+            own = lever @ key_own @ lever.T + turn @ alone @ turn.T
             # Rounding makes the two halves of the product differ, and more so from frame to frame.
-            own = _symmetric(lever @ key_own @ lever.T + turn @ alone @ turn.T)
+            own = 0.5 * (own + own.T)
             common = lever @ key_common + turn @ np.hstack([segment.shared[k], segment.calibration[k]])
-            without = own + common[:, :shared] @ common[:, :shared].T
-            rows.append(_Row(world.matrix34, own + common @ common.T, without, number, piece))
-    poses, covariance, alone, owner, pieces = (np.array(column) for column in zip(*rows, strict=True))
-    owner, pieces = owner.astype(np.int16), pieces.astype(np.int16)
-    return _without_single_frames(Chained(poses, covariance, alone, owner, pieces))
+            put(at[k], number)
+    _lose_single_frames(out)
+    return out
 
 
-def _without_single_frames(found: Chained) -> Chained:
+def _lose_single_frames(found: Chained) -> None:
     """A frame that is a piece by itself is lost like others, unless there is nothing else; pieces count on from 0."""
     count = np.bincount(found.piece[found.piece >= 0])
     kept = np.flatnonzero(count > 1) if (count > 1).any() else np.arange(1)
-    there = np.flatnonzero(np.isin(found.piece, kept))
-    rows = Chained(**{name: value[there] for name, value in vars(found).items()})
-    return _spread(replace(rows, piece=np.searchsorted(kept, rows.piece).astype(np.int16)), there, len(found.piece))
+    there = np.isin(found.piece, kept)
+    for value in vars(found).values():
+        value[~there] = -1 if value.dtype == np.int16 else np.nan
+    found.piece[there] = np.searchsorted(kept, found.piece[there])
 
 
 def propagation(key: RigidTransform, T_world_local: RigidTransform, world: RigidTransform) -> tuple[Floats, Floats]:
@@ -165,20 +152,6 @@ def propagation(key: RigidTransform, T_world_local: RigidTransform, world: Rigid
     return lever, turn
 
 
-def _symmetric(a: Floats) -> Floats:
-    return np.asarray(0.5 * (a + a.T))
-
-
-def _clean(T: RigidTransform) -> RigidTransform:
-    """Undo what rounding does to the rotation of a long product."""
-    return RigidTransform(orthonormal(T.rotation), T.translation)
-
-
-def largest(piece: NDArray[np.int16]) -> int:
-    """Number of the piece with the most frames, the first of equals."""
-    return int(np.argmax(np.bincount(piece[piece >= 0], minlength=1)))
-
-
 def world_poses(trajectory: Bundle, piece: int | None = None) -> Floats:
     """Poses (frame, 3, 4) of the piece whose frame is the world, or of another one in its own; NaN elsewhere."""
     poses = np.asarray(trajectory["poses"], dtype=np.float64)
@@ -188,21 +161,20 @@ def world_poses(trajectory: Bundle, piece: int | None = None) -> Floats:
     return np.where((np.asarray(trajectory["piece"]) == wanted)[:, None, None], poses, np.nan)
 
 
-def levelled(found: Chained, first: int, up: Floats) -> Chained:
-    """Turn the piece that begins in row ``first`` so that ``up`` (3,) of its frame becomes z."""
-    rows = np.flatnonzero(found.piece == found.piece[first])
-    R = found.poses[first, :, :3]
+def _level(found: Chained, piece: int, up: Floats) -> None:
+    """Turn a piece so that ``up`` (3,) of its frame becomes z; y is ahead of its first camera."""
+    rows = np.flatnonzero(found.piece == piece)
+    R = found.poses[rows[0], :, :3]
     turn = level_rotation(R.T @ up) @ R.T
     # Position and rotation vector turn alike.
     both = np.kron(np.eye(2), turn)
-    poses, covariance, own = found.poses.copy(), found.covariance.copy(), found.own_covariance.copy()
-    poses[rows] = turn @ poses[rows]
-    covariance[rows], own[rows] = (both @ each[rows] @ both.T for each in (covariance, own))
-    return replace(found, poses=poses, covariance=covariance, own_covariance=own)
+    found.poses[rows] = turn @ found.poses[rows]
+    for covariance in (found.covariance, found.own_covariance):
+        covariance[rows] = both @ covariance[rows] @ both.T
 
 
-def _with_verticals(found: Chained, keys: Sequence[int], levels: Sequence[Bundle]) -> tuple[Chained, list[str]]:
-    """Pieces levelled by the first of their pairs that knows the vertical; the source of each piece's vertical.
+def _level_pieces(found: Chained, keys: Sequence[int], levels: Sequence[Bundle]) -> list[str]:
+    """Level pieces by the first of their pairs that knows the vertical; the source of each piece's vertical.
 
     ``keys`` are the rows of the pairs that ``levels`` are of.
     """
@@ -210,25 +182,14 @@ def _with_verticals(found: Chained, keys: Sequence[int], levels: Sequence[Bundle
     for piece in range(int(found.piece.max()) + 1):
         mine = [(key, level) for key, level in zip(keys, levels, strict=True) if found.piece[key] == piece]
         source = mine[0][1].meta.get("source", "") if mine else NO_VERTICAL
-        if source == NO_VERTICAL:
-            first = int(np.flatnonzero(found.piece == piece)[0])
-            known = ((key, level) for key, level in mine if level.meta["source"] != NO_VERTICAL)
-            for key, level in known:
-                R_local_left = RigidTransform.from_matrix(level.meta["T_local_left"]).rotation
-                found = levelled(found, first, found.poses[key, :, :3] @ R_local_left[2])
-                source = level.meta["source"]
-                break
+        known = ((key, level) for key, level in mine if level.meta["source"] != NO_VERTICAL)
+        if source == NO_VERTICAL and (one := next(known, None)) is not None:
+            key, level = one
+            R_local_left = RigidTransform.from_matrix(level.meta["T_local_left"]).rotation
+            _level(found, piece, found.poses[key, :, :3] @ R_local_left[2])
+            source = level.meta["source"]
         sources.append(source)
-    return found, sources
-
-
-def _spread(found: Chained, at: NDArray[np.intp], count: int) -> Chained:
-    """The same with a row for each of ``count`` frames; ``at`` (n,) are the rows of those that were tracked."""
-    rows = dict[str, AnyArray]()
-    for name, value in vars(found).items():
-        rows[name] = np.full((count, *value.shape[1:]), -1 if value.dtype == np.int16 else np.nan, value.dtype)
-        rows[name][at] = value
-    return Chained(**rows)
+    return sources
 
 
 def account(frames: list[int], found: Chained, causes: Mapping[int, str], verticals: Sequence[str]) -> dict[str, Any]:
@@ -237,20 +198,17 @@ def account(frames: list[int], found: Chained, causes: Mapping[int, str], vertic
     Positions, pieces with their ``verticals``, how many frames have a pose and how many in the world, and lost frames
     with their ``causes``.
     """
-    piece, main = found.piece, largest(found.piece)
+    piece = found.piece
+    main = int(np.argmax(np.bincount(piece[piece >= 0], minlength=1)))  # the first of the largest
     posed, lost = np.flatnonzero(piece >= 0), list[dict[str, Any]]()
     members = [np.flatnonzero(piece == k) for k in range(int(piece.max()) + 1)]
-    # Runs of lost frames: between neighbours the row grows by one.
-    rows = np.flatnonzero(piece < 0)
-    for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if rows.size else ():
-        before, behind = posed[posed < run[0]], posed[posed > run[-1]]
-        bridged = None
+    for row in np.flatnonzero(piece < 0):
+        behind = int(np.searchsorted(posed, row))
+        sides = posed[behind - 1 : behind + 1] if behind else posed[:0]
         # Bridged: the frames on both sides are of one piece, tracked across.
-        if before.size and behind.size and piece[before[-1]] == piece[behind[0]]:
-            bridged = [frames[before[-1]], frames[behind[0]]]
-        for frame in (frames[row] for row in run):
-            cause = causes.get(frame, "no frame beside it could be posed with it")
-            lost.append({"frame": frame, "cause": cause, "bridged": bridged})
+        bridged = [frames[k] for k in sides] if len(sides) == 2 and piece[sides[0]] == piece[sides[1]] else None
+        cause = causes.get(frames[row], "no frame beside it could be posed with it")
+        lost.append({"frame": frames[row], "cause": cause, "bridged": bridged})
     facts = {
         # Facts are JSON, which has no NaN.
         "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in found.poses],
@@ -290,20 +248,11 @@ def _moved(frames: list[int], steps: Sequence[tuple[float | None, float]]) -> di
     }
 
 
-def _facts(segments: Sequence[Bundle]) -> list[dict[str, Any]]:
-    """Facts of each tracked frame; of a key frame those of the segment before, which posed it."""
-    facts: list[dict[str, Any]] = []
-    for bundle in segments:
-        facts += bundle.meta["per_frame"][1 if facts else 0 :]
-    return facts
-
-
 class TrajectoryInputs(NamedTuple):
-    """Segments as resected, levels of their key frames; segments as adjusted, and what they say of the cameras."""
+    """Segments, levels of their key frames, and what the segments say of the cameras."""
 
     segments: Sequence[Bundle[ResectFacts]]
     levels: Sequence[Bundle[GroundFacts]]
-    refined: Sequence[Bundle[RefineFacts]] = ()
     intrinsics: Bundle[IntrinsicsFacts] | None = None
 
 
@@ -327,9 +276,15 @@ def trajectory_stage(
     steps: Sequence[tuple[float | None, float]] | None = None,
 ) -> Bundle[TrajectoryFacts]:
     """Poses of all left frames in the world frame."""
-    level = [RigidTransform.from_matrix(b.meta["T_local_left"]) for b in inputs.levels]
-    chained = [ChainLink.of(b, inputs.intrinsics) for b in inputs.refined or inputs.segments]
-    facts = _facts(inputs.segments) or [{"frame": frames[0], "inliers": 0}]
+    levels = [RigidTransform.from_matrix(b.meta["T_local_left"]) for b in inputs.levels]
+    links = [ChainLink.of(b, inputs.intrinsics) for b in inputs.segments]
+    parts = [b.meta["per_frame"] for b in inputs.segments]
+    if not parts:
+        # One pair alone.
+        links = [ChainLink(levels[0].matrix34[None], np.zeros((1, 6, 6)), *np.zeros((2, 1, 6, 0)))]
+        parts = [[{"frame": frames[0], "inliers": 0}]]
+    # A key frame was posed by the segment before.
+    facts = [*parts[0][:1], *(fact for part in parts for fact in part[1:])]
     causes = {int(f["frame"]): str(f["cause"]) for f in lost}
     causes |= {int(f["frame"]): str(f["lost"]) for f in facts if "lost" in f}
     if steps is not None:
@@ -337,10 +292,9 @@ def trajectory_stage(
         moved = _moved(through, steps)
         causes = {f: "; ".join([cause, *moved.get(f, ())]) for f, cause in causes.items()}
     row = {frame: k for k, frame in enumerate(frames)}
-    at = np.array([row[int(f["frame"])] for f in facts], dtype=np.intp)
-    found = _spread(chain(chained, level), at, len(frames))
-    keys = [row[int(b.meta["per_frame"][0]["frame"])] for b in inputs.segments] or [int(at[0])]
-    found, verticals = _with_verticals(found, keys, inputs.levels)
+    rows = [[row[int(f["frame"])] for f in part] for part in parts]
+    found = chain(links, levels, rows, len(frames))
+    verticals = _level_pieces(found, [at[0] for at in rows], inputs.levels)
     inliers = {int(f["frame"]): int(f["inliers"]) for f in facts}
     meta: TrajectoryFacts = {
         "frames": frames,

@@ -16,8 +16,8 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.odometry.resection.landmarks import SegmentPoints
-from rille.stages.odometry.resection.pnp import Pose, back_projection
-from rille.stages.odometry.resection.robust_pose import MIN_LANDMARKS, Resection, ResectParams, observations, resect
+from rille.stages.odometry.resection.pnp import Observations, Pose, back_projection
+from rille.stages.odometry.resection.robust_pose import MIN_LANDMARKS, Resection, ResectParams, resect
 
 CONTRADICTION = 2.0
 """Times the threshold from which on a landmark surely does not move as a pose says."""
@@ -69,7 +69,7 @@ def moving_by_themselves(
     seen = points.known()[:, 1 : j + 1] & trusted[:, None]
     total, use = int(seen.any(1).sum()), np.flatnonzero(seen[:, -1])
     known, pixels = points.landmarks.take(use), points.tracks[use, j].astype(np.float64)
-    observed = observations(known, pixels, camera, params)
+    observed = Observations.of(known, pixels, camera, params.pixel_sigma)
 
     def contradict(pose: Resection) -> Bools:
         errors = back_projection(observed, Pose.of(pose.T_local_left.inverse()))

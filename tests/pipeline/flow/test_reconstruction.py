@@ -16,7 +16,6 @@ from rille.pipeline.flow.builders import PYRAMID_BYTES, Builder, other_plane
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.flow.products import Products
 from rille.pipeline.flow.reconstruction import SEAMS, cells_in_both, overlaps, spread
-from rille.stages.odometry.resection.intrinsics import calibrated_anew
 from rille.stages.terrain.ground_frame import SCENE
 from rille.stages.terrain.tile_index import Box
 
@@ -58,7 +57,7 @@ def lay_out(
         facts = found | meta if stage == "keyframes" else meta
         go_on(*(SimpleNamespace(meta=facts) for _ in handles))
     for turn, correction in enumerate([*(cameras or []), [0.0, 0.0, 0.0, 0.0]]):
-        asked = {"correction": correction, "rig": calibrated_anew(sequence.rig, correction).to_dict()}
+        asked = {"correction": correction, "corrected": correction}
         facts = {"keyframes": found, "ground_frame": ground or GROUND, "intrinsics": asked}
         for stage in [*(("keyframes", "rig") if turn else ()), "ground_frame", "resect", "intrinsics"]:
             of = (jumps or {}) if stage == "resect" else {}
@@ -108,7 +107,7 @@ def test_wrong_cameras_are_corrected_in_all_that_rests_on_them_and_nothing_else_
     given, again = (h.spec.args["rig"]["left"]["fx"] for h in asked)
     assert again == pytest.approx(0.9 * given)
     (anew,) = [h for h in graph.nodes if h.label == "calibration/anew"]
-    using = [*products.refined, *products.local_dem.values(), *products.world_dem.values()]
+    using = [*products.resections, *products.local_dem.values(), *products.world_dem.values()]
     assert [h.inputs["rig"] for h in using] == [anew] * 6
     assert len(labels(graph, "hfvm")) == 2
     assert labels(graph, "locus")[:2] == ["locus/local/0", "locus/local/4"]
@@ -189,28 +188,27 @@ def test_the_world_is_that_of_the_largest_piece_and_each_piece_is_judged() -> No
         {"chain": list(range(8)), "lost": [], "unfit": []},
         {"basic": [0, 3, 6], "segments": [[0, 1, 2, 3], [3, 4, 5, 6], [6, 7]]},
         {"frames": list(range(8)), "pieces": [[0, 2], [3, 7]], "main": 1, "positions": [[0, 0, k] for k in range(8)]},
-        refine={"enabled": False},
+        resect={"joint": False},
     )
     assert list(products.world_dem) == [3, 6]
     assert products.world_dem[6].inputs["reference"] is products.level[3]
     assert labels(graph, "accuracy") == ["accuracy/piece/1", "accuracy"]
     assert products.accuracy is products.accuracy_pieces[1]
-    assert labels(graph, "refine") == labels(graph, "intrinsics") == []
+    assert labels(graph, "intrinsics") == []
 
 
 def test_a_first_frame_that_is_lost_leaves_no_pair_behind() -> None:
-    graph, products = lay_out(
+    _, products = lay_out(
         [],
         {"chain": list(range(1, 8)), "lost": [{"frame": 0, "cause": "black"}], "unfit": []},
         {"basic": [0, 3], "segments": [[0, 1, 2, 3], [3, 4, 5, 6]]},
         {"frames": list(range(8)), "pieces": [[1, 7]], "main": 0, "positions": [None, *([0, 0, k] for k in range(7))]},
     )
     assert list(products.disparity) == [1, 4]
-    assert labels(graph, "refine") == ["refine/1", "refine/4"]
     assert products.trajectory is not None
-    refined = products.trajectory.inputs["refined"]
-    assert isinstance(refined, list)
-    assert [h.label for h in refined] == ["refine/1", "refine/4"]
+    segments = products.trajectory.inputs["segments"]
+    assert isinstance(segments, list)
+    assert [h.label for h in segments] == ["resect/1", "resect/4"]
 
 
 def test_what_many_tasks_are_given_is_held_once() -> None:

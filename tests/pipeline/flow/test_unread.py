@@ -52,7 +52,7 @@ def test_what_a_user_has_switched_off_himself_may_stay(tmp_path):
     [
         ("mockup", "local_planner.max_length=0.3"),
         ("mockup", "drive.goal=[0.0,1.0]"),
-        ("mockup-loop", "refine.iterations=3"),
+        ("mockup-loop", "keyframes.max_gap=3"),
         ("mockup-loop", "crosscheck.enabled=true"),
         ("mockup-loop", "terrain.reference=scene"),
     ],
@@ -96,8 +96,8 @@ def test_sections_without_a_task_in_the_graph_are_told():
         {"vehicle": {}},
         inputs={"a": graph.nodes[0], "b": graph.nodes[0]},
     )
-    keys = ["motion.level", "vehicle.track", "tiling.tile", "refine.iterations"]
-    assert unread.unread(keys, config, graph) == ["tiling.tile", "refine.iterations"]
-    assert unread.remedy(["refine.iterations"], config).startswith("leave it out")
-    off = configuration.build({"refine": {"enabled": False}})
-    assert "refine.enabled=true" in unread.remedy(["refine.iterations"], off)
+    keys = ["motion.level", "vehicle.track", "tiling.tile", "loops.apart"]
+    assert unread.unread(keys, config, graph) == ["tiling.tile", "loops.apart"]
+    assert unread.remedy(["loops.apart"], config).startswith("leave it out")
+    off = configuration.build({"loops": {"enabled": False}})
+    assert "loops.enabled=true" in unread.remedy(["loops.apart"], off)

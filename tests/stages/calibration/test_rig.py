@@ -84,6 +84,15 @@ def test_a_knock_is_repaired_and_told():
     assert found["parameters"][1]["why"].startswith("not observed")
 
 
+def test_a_yaw_that_the_tracks_have_corrected_is_not_said_to_be_held():
+    first = knocked(street_rig(), yaw_deg=0.3)
+    found = orient_rig(street_rig(), street(pitch_deg=-0.24, roll_deg=0.3), RigParams(), first)
+    assert found["given"] == first.to_dict()
+    assert found["source"].endswith("corrected by the tracks")
+    assert "contradicts the images" in found["warnings"][0]
+    assert not any("yaw" in line for line in found["warnings"])
+
+
 def test_words_of_a_knock_where_one_camera_stands_above_the_other():
     rig = street_rig()
     standing = replace(rig, T_right_left=RigidTransform(np.eye(3), np.array([0.0, -rig.baseline, 0.0])))

@@ -10,7 +10,7 @@ import pytest
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
-from rille.stages.odometry.resection.bundle_adjustment import RefineParams, SegmentState, SegmentTracks, adjust
+from rille.stages.odometry.resection.bundle_adjustment import SegmentState, SegmentTracks, adjust, pose_errors
 from rille.stages.odometry.resection.intrinsics import (
     CORRECTED,
     PRIORS,
@@ -22,14 +22,13 @@ from rille.stages.odometry.resection.intrinsics import (
     corrected,
     intrinsics_stage,
     with_errors,
-    yaw_part,
 )
 from rille.stages.odometry.resection.landmarks import triangulated
-from rille.stages.odometry.resection.refine import pose_errors
+from rille.stages.odometry.resection.robust_pose import ResectParams
 
 CAMERA = Camera(450.0, 450.0, 375.5, 239.5, 752, 480)
 BENT = Lens(CAMERA, "radtan", (-0.28, 0.07, 0.0, 0.0))
-PARAMS = RefineParams()
+PARAMS = ResectParams()
 SIGMA = IntrinsicsParams().sigma
 NAMES = tuple(PRIORS)
 LEVEL = RigidTransform(rotation_exp(np.array([1.2, 0.1, -0.1])), np.array([0.3, 0.2, 1.0]))
@@ -56,9 +55,9 @@ def segment(
     moves = [
         RigidTransform(rotation_exp(turn * rng.standard_normal(3) * k), 0.1 * rng.standard_normal(3)) for k in (1, 2)
     ]
-    at = triangulated(measured(X), measured(T_RIGHT_LEFT.apply(X)), rig, LEVEL, np.full(POINTS, 0.2))
+    landmarks = triangulated(measured(X), measured(T_RIGHT_LEFT.apply(X)), rig, LEVEL, np.full(POINTS, 0.2))
     pixels = np.array([measured(move.apply(X)) for move in moves])
-    tracks = SegmentTracks(at.position, at.per_pixel, at.sigma, pixels, np.ones((2, POINTS), bool), given)
+    tracks = SegmentTracks(landmarks, pixels, np.ones((2, POINTS), bool), given)
     true = [move @ LEVEL.inverse() for move in moves]
     state = SegmentState(
         np.array([T.rotation for T in true]), np.array([T.translation for T in true]), np.zeros(POINTS)
@@ -73,8 +72,8 @@ def facts_of(given: Camera, lens: Lens, turn: float = 0.05, yaw: float = 0.0, **
     for seed in range(8):
         tracks, state, cameras = segment(seed, given, lens, turn, yaw)
         end = adjust(tracks, state, PARAMS).state
-        part, shown = contribution(tracks, end, cameras, PARAMS), yaw_part(tracks, end, cameras, PARAMS)
-        facts = {"information": part.information, "pull": part.pull, "turn_deg": 57.3 * turn, "yaw": shown}
+        part = contribution(tracks, end, cameras, PARAMS)
+        facts = {"information": part.information, "pull": part.pull, "turn_deg": 57.3 * turn, "yaw": part.yaw}
         parts.append(Bundle({}, {"intrinsics": facts}))
     rig = Bundle({}, {"rig": cameras.rig.to_dict()})
     return intrinsics_stage.run(IntrinsicsParams(), known, {"segments": parts, "rig": rig}).meta
@@ -82,12 +81,13 @@ def facts_of(given: Camera, lens: Lens, turn: float = 0.05, yaw: float = 0.0, **
 
 def corrections(given: Camera, lens: Lens, turn: float = 0.1):
     """The camera that the run computes with, corrected and asked again as the flow does, and the last facts."""
-    used, before = given, np.zeros(CORRECTED + 1)
+    used, before = given, [0.0] * (CORRECTED + 1)
     for _ in range(4):
-        facts = facts_of(used, lens, turn, before=before.tolist())
+        facts = facts_of(used, lens, turn, before=before)
         if not any(facts["correction"]):
             break
-        used, before = corrected(used, facts["correction"]), before + facts["correction"]
+        before = facts["corrected"]
+        used = corrected(given, before)
     return used, facts
 
 
@@ -171,7 +171,7 @@ def test_a_turned_right_camera_moves_poses_as_the_change_with_its_angles_says():
     tracks, true, cameras = segment(5, CAMERA, Lens(CAMERA), 0.05)
     part, number = contribution(tracks, adjust(tracks, true, PARAMS).state, cameras, PARAMS), NAMES.index("roll")
     by = 2e-4
-    other = with_errors(tracks, cameras, by * np.eye(len(NAMES))[number])
+    other = with_errors(tracks, cameras, by * np.eye(len(NAMES) + 1)[number])
     before, after = adjust(tracks, true, PARAMS).state, adjust(other, true, PARAMS).state
     for f in range(2):
         T, moved = (RigidTransform(s.R[f], s.t[f]).inverse() for s in (before, after))

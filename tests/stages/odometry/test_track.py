@@ -5,7 +5,6 @@ import itertools
 import cv2
 import numpy as np
 import pytest
-from raising import raises
 
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.imaging.pyramid import PyramidParams, build
@@ -141,12 +140,6 @@ def test_untextured_frames_give_no_track_and_no_error():
     still = LevelDisplacements(np.zeros((50, 65), np.float32), np.zeros((50, 65), np.float32), 2)
     found = track([flat, flat], [still], PARAMS)
     assert found.points.shape == (0, 2, 2)
-
-
-def test_number_of_motions_must_fit():
-    frames, _ = sequence([1.0, 1.0], [(0, 0), (1, 1)])
-    with raises("RIL-447"):
-        track(frames, [], PARAMS)
 
 
 def test_displacement_is_looked_up_at_the_pixel_centre_of_the_coarse_level():

@@ -1,7 +1,8 @@
 """The scan over segments against composing by hand, with tilted local frames; covariance against sampling."""
 
+from itertools import pairwise
+
 import numpy as np
-from raising import raises
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
@@ -14,6 +15,13 @@ NONE = np.zeros((9, 6, 2))
 
 def link(poses, covariance, shared, calibration=None):
     return ChainLink(poses, covariance, shared, NONE[: len(poses), :, :0] if calibration is None else calibration)
+
+
+def chained(segments, levels):
+    """The segments, each of which begins with the last frame of the one before."""
+    ends = np.cumsum([0, *(len(one.poses) - 1 for one in segments)])
+    rows = [list(range(a, b + 1)) for a, b in pairwise(ends)]
+    return chain(segments, levels, rows, int(ends[-1]) + 1)
 
 
 def pose(rng, scale=1.0):
@@ -35,7 +43,7 @@ def test_scan_equals_composition_by_hand_whatever_the_tilt_of_the_local_frames()
         local = [T_local_key @ truth[a].inverse() @ truth[i] for i in range(a, b + 1)]
         poses = np.array([T.matrix34 for T in local])
         segments.append(link(poses, np.zeros((b - a + 1, 6, 6)), NONE[: b - a + 1]))
-    found = chain(segments, levels)
+    found = chained(segments, levels)
     poses, covariance, segment = found.poses, found.covariance, found.segment
     assert not found.piece.any()
     expected = [levels[0] @ truth[0].inverse() @ T for T in truth]
@@ -45,22 +53,13 @@ def test_scan_equals_composition_by_hand_whatever_the_tilt_of_the_local_frames()
     np.testing.assert_array_equal(poses[0], levels[0].matrix34)
 
 
-def test_a_segment_of_another_local_frame_is_refused():
-    rng = np.random.default_rng(6)
-    T = level(rng)
-    with raises("RIL-451", "segment 0"):
-        poses = np.array([level(rng).matrix34, pose(rng).matrix34])
-        chain([link(poses, np.zeros((2, 6, 6)), NONE[:2])], [T])
-    with raises("RIL-450"):
-        chain([], [])
-
-
 def test_one_pair_alone_stands_at_its_own_level():
     T = level(np.random.default_rng(8))
-    found = chain([], [T])
-    np.testing.assert_array_equal(found.poses, [T.matrix34])
-    assert found.covariance.shape == (1, 6, 6)
-    assert found.segment.tolist() == found.piece.tolist() == [0]
+    inputs = {"segments": [], "levels": [Bundle({}, {"T_local_left": T.to_list(), "source": "attitude"})]}
+    found = trajectory_stage.run(NoParams(), {"frames": [4]}, inputs)
+    np.testing.assert_array_equal(found["poses"], [T.matrix34])
+    assert found["covariance"].shape == (1, 6, 6)
+    assert found["segment"].tolist() == found["piece"].tolist() == [0]
 
 
 def test_covariance_is_that_of_sampled_trajectories():
@@ -69,7 +68,7 @@ def test_covariance_is_that_of_sampled_trajectories():
     local = [np.array([T.matrix34, (T @ pose(rng, 0.5)).matrix34]) for T in levels]
     spread = np.diag([2e-3, 1e-3, 3e-3, 1e-3, 2e-3, 5e-4]) ** 2
     covs = [np.array([np.zeros((6, 6)), spread])] * 3
-    found = chain([link(p, c, NONE[:2]) for p, c in zip(local, covs, strict=True)], levels)
+    found = chained([link(p, c, NONE[:2]) for p, c in zip(local, covs, strict=True)], levels)
     mean, covariance = found.poses, found.covariance
     samples = []
     for _ in range(1500):
@@ -78,7 +77,7 @@ def test_covariance_is_that_of_sampled_trajectories():
             d = np.sqrt(np.diag(spread)) * rng.standard_normal(6)
             T = RigidTransform(rotation_exp(d[3:]) @ poses[1][:, :3], poses[1][:, 3] + d[:3])
             noisy.append(link(np.array([poses[0], T.matrix34]), covs[0], NONE[:2]))
-        end = chain(noisy, levels).poses[-1]
+        end = chained(noisy, levels).poses[-1]
         turn = end[:, :3] @ mean[-1][:, :3].T
         w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
         samples.append(np.concatenate([end[:, 3] - mean[-1][:, 3], w]))
@@ -155,32 +154,24 @@ def test_what_segments_share_adds_up_and_what_they_do_not_adds_squared():
     own = np.zeros((2, 6, 6))
     own[1, 2, 2] = 3e-3**2
     one = link(np.array([start, step]), own + shared @ np.swapaxes(shared, 1, 2), shared)
-    found = chain([one] * 4, [RigidTransform.identity()] * 4)
+    found = chained([one] * 4, [RigidTransform.identity()] * 4)
     np.testing.assert_allclose(found.covariance[:, 2, 2], [k * 3e-3**2 + (k * 2e-3) ** 2 for k in range(5)], atol=1e-15)
     # Of the calibration 5 mm more, which a run that knows it exactly does not have.
-    calibrated = chain([one._replace(calibration=2.5 * shared)] * 4, [RigidTransform.identity()] * 4)
+    calibrated = chained([one._replace(calibration=2.5 * shared)] * 4, [RigidTransform.identity()] * 4)
     np.testing.assert_array_equal(calibrated.own_covariance, found.covariance)
     more = calibrated.covariance - calibrated.own_covariance
     np.testing.assert_allclose(more[:, 2, 2], [(k * 5e-3) ** 2 for k in range(5)], atol=1e-15)
 
 
-def test_refined_poses_and_their_covariances_take_the_place_of_resected_ones():
+def test_poses_and_their_covariances_are_chained():
     truth, levels, _ = broken_run(set())
-    segments, better = [], []
+    segments, claimed = [], np.diag([1e-6] * 3 + [1e-8] * 3)
     for (a, b), T_local_key in zip(((0, 3), (3, 6), (6, 7)), levels, strict=True):
         local = np.array([(T_local_key @ truth[a].inverse() @ truth[i]).matrix34 for i in range(a, b + 1)])
-        better.append(local)
-        rough = local.copy()
-        rough[1:, :, 3] += 0.01
         n = b - a + 1
-        arrays = {"poses": rough, "covariance": np.zeros((n, 6, 6)), "shared": NONE[:n]}
+        arrays = {"poses": local, "covariance": np.tile(claimed, (n, 1, 1)), "shared": NONE[:n]}
         segments.append(Bundle(arrays, {"per_frame": [{"frame": i, "inliers": 9} for i in range(a, b + 1)]}))
     inputs = {"segments": segments, "levels": [Bundle({}, {"T_local_left": T.to_list()}) for T in levels]}
-    claimed = np.diag([1e-6] * 3 + [1e-8] * 3)
-    inputs["refined"] = [
-        Bundle({"poses": p, "covariance": np.tile(claimed, (len(p), 1, 1)), "shared": np.zeros((len(p), 6, 2))}, {})
-        for p in better
-    ]
     out = trajectory_stage.run(NoParams(), {"frames": list(range(8))}, inputs)
     # Of a frame of the first segment it is what was claimed, in the world: both parts are the same about all axes.
     np.testing.assert_allclose(out["covariance"][1], claimed, atol=1e-18)

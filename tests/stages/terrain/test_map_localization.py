@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from raising import raises
 
 from rille.stages.core.errors import DegenerateError
+from rille.stages.geometry.geometry import heading_of
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain.map_localization import Fix, GlobalMap, MapLocalizationParams, SearchArea, fix, thin
 
@@ -53,7 +54,7 @@ def scene(ground: Callable[[Floats, Floats], Floats], noise: float = 0.0, tilt: 
 def error(found: Fix) -> Floats:
     """Of x, y, z, m, and heading, rad."""
     x, y, heading, z = TRUE
-    return np.array([*(found.pose.translation - [x, y, z]), found.heading - heading])
+    return np.array([*(found.pose.translation - [x, y, z]), heading_of(found.pose) - heading])
 
 
 def unsure(z: Floats, local: Lattice, ground: GlobalMap, around: SearchArea) -> bool:

@@ -45,7 +45,7 @@ def parts():
     matches = disparities(pixels[:, 0], RIG.right.project((RIG.T_right_left @ poses[0].inverse()).apply(world)))
     return (
         Bundle({"poses": given}, {"frames": FRAMES}),
-        [MatchedSegment(track, resection, {FRAMES[0]: matches}, resection["landmarks"], inlier)],
+        [MatchedSegment(track, resection, {FRAMES[0]: matches})],
         poses,
         world,
     )

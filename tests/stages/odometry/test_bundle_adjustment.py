@@ -1,4 +1,4 @@
-"""Joint refinement: derivatives against differences, what it gains, that it never loses, and the stage's wiring."""
+"""Joint adjustment: derivatives against differences, what it gains, that it never loses, and a segment's poses."""
 
 import math
 from dataclasses import replace
@@ -7,22 +7,25 @@ import numpy as np
 import pytest
 
 from rille.pipeline.engine.store.output_digest import output_digest
-from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.geometry.projection import perturbed
 from rille.stages.odometry.resection.bundle_adjustment import (
-    RefineParams,
+    PosedTracks,
     SegmentAdjustment,
     SegmentState,
     SegmentTracks,
     adjust,
+    pose_errors,
 )
+from rille.stages.odometry.resection.intrinsics import SegmentCameras
+from rille.stages.odometry.resection.landmarks import Landmarks, SegmentPoints
 from rille.stages.odometry.resection.pnp import pose_covariance
-from rille.stages.odometry.resection.refine import pose_errors, refine_stage, segment_start
+from rille.stages.odometry.resection.resect import SegmentPoses, adjust_segment
+from rille.stages.odometry.resection.robust_pose import ResectParams
 
 CAMERA = Camera(500.0, 500.0, 299.5, 199.5, 600, 400)
 RIG = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), np.array([-0.2, 0.0, 0.0])))
-PARAMS = RefineParams()
+PARAMS = ResectParams()
 
 
 def scene(seed, n=150, frames=4, bias=0.0, noise=0.2):
@@ -38,20 +41,19 @@ def scene(seed, n=150, frames=4, bias=0.0, noise=0.2):
         for k in range(1, frames)
     ]
     pixels = np.array([CAMERA.project(P.apply(X)) for P in T]) + noise * rng.standard_normal((frames - 1, n, 2))
-    views = SegmentTracks(
-        X - (error + bias)[:, None] * per_pixel,
-        per_pixel,
-        np.full(n, noise),
-        pixels,
-        np.ones((frames - 1, n), bool),
-        CAMERA,
-    )
+    known = Landmarks(X - (error + bias)[:, None] * per_pixel, per_pixel, np.full(n, noise))
+    views = SegmentTracks(known, pixels, np.ones((frames - 1, n), bool), CAMERA)
     start = [P @ RigidTransform(rotation_exp(1e-4 * rng.standard_normal(3)), 3e-3 * rng.standard_normal(3)) for P in T]
     return (
         views,
         SegmentState(np.array([P.rotation for P in start]), np.array([P.translation for P in start]), np.zeros(n)),
         T,
     )
+
+
+def said_to_be(views, sigma):
+    """The same tracks, disparities being said to have this standard deviation."""
+    return replace(views, landmarks=replace(views.landmarks, sigma=np.full(len(views.landmarks.sigma), sigma)))
 
 
 def error_of(state, T):
@@ -88,7 +90,7 @@ def test_gradient_is_that_of_the_cost():
 
 def test_without_noise_the_truth_is_found():
     views, start, T = scene(2, noise=1e-6)
-    found = adjust(replace(views, sigma=np.full(150, 0.2)), start, PARAMS)
+    found = adjust(said_to_be(views, 0.2), start, PARAMS)
     assert error_of(found.state, T) < 1e-6
     assert abs(found.state.bias) < 1e-4
     assert found.after < 1e-6 * found.before
@@ -106,14 +108,14 @@ def test_shared_depths_lower_the_error():
 
 
 def test_a_bias_of_all_disparities_is_found():
-    found = [adjust(*scene(30 + k, bias=0.3)[:2], RefineParams(bias_sigma=1.0)).state.bias for k in range(5)]
+    found = [adjust(*scene(30 + k, bias=0.3)[:2], ResectParams(bias_sigma=1.0)).state.bias for k in range(5)]
     assert np.mean(found) == pytest.approx(0.3, abs=0.1)
 
 
 def test_an_optimum_stays_and_its_cost_is_that_of_the_result():
     views, start, _ = scene(3)
     found = adjust(views, start, PARAMS)
-    again = adjust(views, found.state, RefineParams(iterations=1))
+    again = adjust(views, found.state, PARAMS)
     assert again.after <= again.before == SegmentAdjustment(views, PARAMS).normal(found.state).cost
     np.testing.assert_allclose(again.state.t, found.state.t, atol=1e-4)
 
@@ -140,16 +142,17 @@ def test_the_covariance_is_the_inverse_of_the_whole_normal_matrix():
     def residuals(x):
         """Whitened errors of tracks, of depths and of the bias."""
         at = moved(state, x[:12].reshape(m, 6), x[12 : 12 + n], x[-1])
-        X = views.position + (at.depth + at.bias)[:, None] * views.along
+        X = views.landmarks.position + (at.depth + at.bias)[:, None] * views.landmarks.per_pixel
         tracks = [(CAMERA.project(X @ R.T + t) - p) / 0.2 for R, t, p in zip(at.R, at.t, views.pixels, strict=True)]
-        return np.concatenate([*(t.ravel() for t in tracks), at.depth / views.sigma, [at.bias / 0.1]])
+        return np.concatenate([*(t.ravel() for t in tracks), at.depth / views.landmarks.sigma, [at.bias / 0.1]])
 
     steps = 1e-6 * np.eye(12 + n + 1)
     J = np.array([(residuals(e) - residuals(-e)) / 2e-6 for e in steps]).T
     size = np.linalg.norm(residuals(np.zeros(12 + n + 1))[: 2 * m * n].reshape(-1, 2), axis=1)
     weight = np.concatenate([np.repeat(np.minimum(1, 2.5 / size), 2), np.ones(n + 1)])
     dense = np.linalg.inv(J.T @ (weight[:, None] * J))[:12, :12]
-    matrix, _ = SegmentAdjustment(views, PARAMS).measured(state).without_depths()
+    matrix, _ = SegmentAdjustment(views, PARAMS).normal(state).without_depths()
+    matrix[-1, -1] -= 100.0
     found = pose_covariance(matrix, 100.0)
     whole = found.noise + np.outer(found.by_bias, found.by_bias)
     np.testing.assert_allclose(whole, dense, rtol=1e-4, atol=1e-6 * np.abs(dense).max())
@@ -176,77 +179,79 @@ def test_claimed_covariances_are_those_of_the_errors():
 def test_errors_larger_than_stated_widen_the_covariance():
     for noise in (0.1, 0.2, 0.3):
         views, start, _ = scene(5, noise=noise)
-        views = replace(views, sigma=np.full(150, 0.2))
+        views = said_to_be(views, 0.2)
         state = adjust(views, start, PARAMS).state
         assert SegmentAdjustment(views, PARAMS).scatter(state) == pytest.approx((noise / 0.2) ** 2, rel=0.25)
 
 
-def bundles():
-    """A segment of three frames ahead of a textured wall, as the stages hand it over."""
+def posed_segment():
+    """A segment of three frames ahead of a textured wall, posed one by one with errors of 2 mm."""
     rng = np.random.default_rng(5)
     key = rng.uniform([60, 60], [540, 340], (80, 2))
     X = CAMERA.rays(key) * 4.0
-    points = np.stack([CAMERA.project(X - [0.0, 0.0, 0.1 * j]) for j in range(3)], 1).astype(np.float32)
-    poses = np.array([np.hstack([np.eye(3), [[0.0], [0.0], [0.1 * j + 0.002 * (j > 0)]]]) for j in range(3)])
-    claimed = {"covariance": np.zeros((3, 6, 6)), "shared": np.zeros((3, 6, 7))}
-    agreed = {"inlier": np.ones((80, 3), np.uint8), "landmarks": np.where(np.arange(80)[:, None] < 79, X, np.nan)}
+    tracks = np.stack([CAMERA.project(X - [0.0, 0.0, 0.1 * j]) for j in range(3)], 1).astype(np.float32)
     # Along the ray by Z^2 / (f B) a pixel.
-    agreed |= {"per_pixel": CAMERA.rays(key) * 4.0**2 / (500.0 * 0.2), "disparity_sigma": np.full(80, 0.2)}
-    return {
-        "track": Bundle({"points": points}, {"frames": [0, 1, 2]}),
-        "resection": Bundle({"poses": poses} | agreed | claimed, {}),
-        "level": Bundle({}, {"T_local_left": RigidTransform.identity().to_list()}),
-        "rig": Bundle({}, {"rig": RIG.to_dict()}),
-    }
+    known = Landmarks(
+        np.where(np.arange(80)[:, None] < 79, X, np.nan), CAMERA.rays(key) * 4.0**2 / (500.0 * 0.2), np.full(80, 0.2)
+    )
+    points = SegmentPoints(tracks, known, CAMERA, RigidTransform.identity())
+    segment = SegmentPoses.unposed(points)
+    segment.poses[:] = [np.hstack([np.eye(3), [[0.0], [0.0], [0.1 * j + 0.002 * (j > 0)]]]) for j in range(3)]
+    segment.covariance[:], segment.shared[:] = 0.0, 0.0
+    segment.inlier[:79] = 1
+    segment.facts.extend({"frame": j, "inliers": 79, "rms_px": 1.0} for j in range(3))
+    return points, segment
 
 
-def test_the_stage_adjusts_its_segment():
-    given = bundles()
-    out = refine_stage.run(PARAMS, {}, given)
-    check_outputs(refine_stage, out)
-    np.testing.assert_allclose(out["poses"][:, :, 3], [[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]], atol=2e-4)
-    assert out.meta["adjustment"]["cost_after"] < out.meta["adjustment"]["cost_before"]
+CAMERAS = SegmentCameras(RIG, {}, RigidTransform.identity())
+
+
+def test_a_segment_is_adjusted():
+    points, segment = posed_segment()
+    said = adjust_segment(points, segment, CAMERAS, PARAMS)
+    output_digest({}, said)  # can be committed
+    np.testing.assert_allclose(segment.poses[:, :, 3], [[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]], atol=2e-4)
     for j in (1, 2):
-        agrees = out["inlier"][:, j] != 0
-        at = RigidTransform.from_matrix(out["poses"][j]).inverse().apply(out["landmarks"])
-        off = (CAMERA.project(at) - given["track"]["points"][:, j])[agrees]
-        said = out.meta["per_frame"][j - 1]
-        assert said["frame"] == j
-        assert said["inliers"] == len(off) > 70
-        assert said["rms_px"] == pytest.approx(np.sqrt((off**2).sum(1).mean()))
-        assert said["rms_px"] < 0.01
-    assert not out["covariance"][0].any()
-    assert (np.linalg.eigvalsh(out["covariance"][1:])[:, 0] > 0).all()
+        agrees = segment.inlier[:, j] != 0
+        at = RigidTransform.from_matrix(segment.poses[j]).inverse().apply(segment.landmarks)
+        off = (CAMERA.project(at) - points.tracks[:, j])[agrees]
+        assert segment.facts[j]["inliers"] == len(off) > 70
+        assert segment.facts[j]["rms_px"] == pytest.approx(np.sqrt((off**2).sum(1).mean()))
+        assert segment.facts[j]["rms_px"] < 0.01
+    assert not segment.covariance[0].any()
+    assert (np.linalg.eigvalsh(segment.covariance[1:])[:, 0] > 0).all()
+    assert segment.by_intrinsics[1:].any(axis=(1, 2)).all()
 
 
 def test_a_frame_that_keeps_no_landmark_keeps_its_pose_and_ends_nothing():
     """All landmarks of frame 1 are behind its camera: no image, no error of it, and no part in the adjustment."""
-    given = bundles()
+    points, segment = posed_segment()
     back = RigidTransform(rotation_exp([0.0, math.pi, 0.0]), [0.0, 0.0, 0.1]).matrix34
-    given["resection"].arrays["poses"][1] = back
-    out = refine_stage.run(PARAMS, {}, given)
-    output_digest({}, out.meta)  # can be committed
-    np.testing.assert_array_equal(out["poses"][1], back)
-    assert np.isfinite(out["covariance"]).all()
-    assert not out["inlier"][:, 1].any()
-    rows = [(row["frame"], row["inliers"] > 12, row["rms_px"] < 0.01) for row in out.meta["per_frame"]]
-    assert rows == [(2, True, True)]
-    assert out["poses"][2, 2, 3] == pytest.approx(0.2, abs=3e-4)
+    segment.poses[1] = back
+    assert adjust_segment(points, segment, CAMERAS, PARAMS)
+    np.testing.assert_array_equal(segment.poses[1], back)
+    assert np.isfinite(segment.covariance).all()
+    assert not segment.inlier[:, 1].any()
+    assert segment.facts[1] == {"frame": 1, "inliers": 79, "rms_px": 1.0}
+    assert segment.facts[2]["inliers"] > 12
+    assert segment.facts[2]["rms_px"] < 0.01
+    assert segment.poses[2, 2, 3] == pytest.approx(0.2, abs=3e-4)
 
 
 def test_a_lost_frame_stays_lost():
-    given = bundles()
-    track, resection = given["track"], given["resection"]
-    for name in ("poses", "covariance", "shared"):
-        resection.arrays[name][1] = np.nan
-    out = refine_stage.run(PARAMS, {}, given)
-    for name in ("poses", "covariance", "shared"):
-        assert np.isnan(out[name][1]).all()
-        assert np.isfinite(out[name][[0, 2]]).all()
-    assert out["poses"][2, 2, 3] == pytest.approx(0.2, abs=3e-4)
-    assert segment_start(track, resection, RIG).frames.tolist() == [2]
-    resection.arrays["poses"][2] = np.nan
-    assert segment_start(track, resection, RIG) is None
-    out = refine_stage.run(PARAMS, {}, given)  # of a segment without a pose nothing is adjusted
-    assert out.meta["per_frame"] == []
-    np.testing.assert_array_equal(out["poses"], resection["poses"])
+    points, segment = posed_segment()
+    given = (segment.poses, segment.covariance, segment.shared)
+    for array in given:
+        array[1] = np.nan
+    segment.inlier[:, 1] = 0
+    adjust_segment(points, segment, CAMERAS, PARAMS)
+    for array in given:
+        assert np.isnan(array[1]).all()
+        assert np.isfinite(array[[0, 2]]).all()
+    assert segment.poses[2, 2, 3] == pytest.approx(0.2, abs=3e-4)
+    assert PosedTracks.of(points, segment.poses, segment.inlier).frames.tolist() == [2]
+    segment.poses[2], segment.inlier[:, 2] = np.nan, 0
+    before = segment.poses.copy()
+    assert PosedTracks.of(points, segment.poses, segment.inlier) is None
+    assert adjust_segment(points, segment, CAMERAS, PARAMS) == {}  # of a segment without a pose nothing is adjusted
+    np.testing.assert_array_equal(segment.poses, before)
