@@ -29,7 +29,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 import scipy
 from pydantic import Field
 
@@ -37,6 +36,7 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import Camera, RigidTransform
+from rille.stages.numeric.colmap import pycolmap
 from rille.stages.numeric.least_squares import levenberg_marquardt
 from rille.stages.odometry.resection.landmarks import MAX_RELATIVE_SIGMA, Landmarks
 from rille.stages.odometry.resection.pnp import (
