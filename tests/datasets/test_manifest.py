@@ -439,7 +439,7 @@ def test_sensors_need_times(tmp_path):
 @pytest.mark.parametrize(
     ("parts", "expected"),
     [
-        ({"rig": "[rig]\nbaseline = 97\n"}, ("RIL-244", "0.097")),
+        ({"rig": "[rig]\nbaseline = 97\n"}, ("RIL-244", "0.097 or 0.97")),
         ({"rig": "[rig]\nbaseline = -0.1\n"}, ("RIL-223", "-0.1")),
         ({"rig": "[rig]\nT_right_left = [[1,0,0,0.1],[0,1,0,0],[0,0,1,0]]\n"}, ("RIL-130",)),
         (
