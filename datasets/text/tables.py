@@ -52,7 +52,7 @@ class TextTable:
         wrong = ~(np.abs(values) < GREATEST) & ~(gaps & np.isnan(values).all(axis=1, keepdims=True))
         if wrong.any():
             row, column = np.argwhere(wrong)[0]
-            cell = self.rows[row][columns[column]]
+            cell = self.rows[row][columns[column]][:40]
             text = f"{self.name}, line {self.lines[row]}: {cell!r} is not a finite number below {GREATEST:g}"
             raise InputError("RIL-284", text, remedy="correct or remove that line")
         return values
