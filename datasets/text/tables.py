@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.datasets.text.reading import GREATEST, read_lines
+from rille.datasets.text.reading import GREATEST, SAMPLE, read_lines
 from rille.stages.core.errors import InputError
 
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", re.IGNORECASE)
+DATE = re.compile(r"\s*[\"']?\d{4}[-/.]\d\d?[-/.]\d")
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,9 @@ def read_table(path: Path, what: str) -> TextTable:
         rows.append(row)
         at.append(k)
     if not rows:
-        raise InputError("RIL-286", f"{what} {path} has no rows of numbers", remedy="check that it is the right file")
+        dated = any(DATE.match(line) for line in lines[:SAMPLE])
+        remedy = "write times as seconds, not as dates" if dated else "check that it is the right file"
+        raise InputError("RIL-286", f"{what} {path} has no rows of numbers", remedy=remedy)
     header = split(names, separator) if names else ()
     header = header if len(header) == len(rows[0]) else ()
     return TextTable(str(path), tuple(name.lower() for name in header), tuple(rows), tuple(at), separator is not None)

@@ -121,14 +121,14 @@ class Sensors:
         why["up"] = vertical_contradiction(self.up, self.up_sigma, poses, piece)
         for name, reason in why.items():
             if reason:
-                self._refuse(name, reason)
+                self._refuse(name, reason, "contradicts the images and ")
 
-    def _refuse(self, name: str, reason: str) -> None:
+    def _refuse(self, name: str, reason: str, how: str = "") -> None:
         self.relative = [sensor for sensor in self.relative if sensor.name != name]
         self.positions = None if name == "positions" else self.positions
         self.up = np.full_like(self.up, np.nan) if name == "up" else self.up
         self.facts[name] = {"used": False, "why": reason}
-        self.lines.append(f"[{name}] contradicts the images and is not used: {reason}: {REMEDY[name]}")
+        self.lines.append(f"[{name}] {how}is not used: {reason}: {REMEDY[name]}")
 
     def laid(self, poses: Floats, piece: NDArray[np.int16]) -> tuple[Floats, NDArray[np.int16]]:
         """Poses (n, 3, 4) and pieces (n,) with those pieces joined that positions join."""
