@@ -231,9 +231,9 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
         if image.dtype.kind in "OSU":  # a path, or nothing
             text = f"the {camera} image is {image.reshape(-1)[:1].tolist()}, no array of pixels"
             raise InputError("RIL-675", text, remedy="read files first: cv2.imread(NAME, cv2.IMREAD_GRAYSCALE), say")
-        if image.dtype.kind == "f" or image.dtype == np.uint16:
+        if image.dtype.kind == "f" or np.issubdtype(image.dtype, np.uint16):
             low, high = float(np.nanmin(image, initial=0)), float(np.nanmax(image, initial=0))
-            full = 65535 if image.dtype == np.uint16 else 255
+            full = 255 if image.dtype.kind == "f" else 65535
             # From 0 to 1, or with the mean removed and the deviation made 1; 8 bits in 16.
             if 0 < high <= full / 255 or (low < 0 and high - low < 16):
                 values = f"the {camera} image's values lie from {low:.3g} to {high:.3g}"

@@ -60,7 +60,7 @@ def test_each_step_has_the_values_of_a_run(pair: rille.StereoPair, disparity: An
 
 def test_match_refuses_grey_values_of_another_scale() -> None:
     right = np.random.default_rng(1).random((40, 60))
-    for other in (right, (right - 0.5) / 0.3, (255 * right).astype(np.uint16)):
+    for other in (right, (right - 0.5) / 0.3, (255 * right).astype(">u2")):
         with raises("RIL-973", "the right image"):
             rille.match(np.float32(255) * right, other)
 
