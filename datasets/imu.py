@@ -159,9 +159,10 @@ def _plausible(rates: Floats, forces: Floats, name: str) -> None:
         text = f"{name}: the rates are {turn:.3g} and the accelerations {force:.3g}: they look exchanged"
         remedy = "order the columns time, rates, accelerations, or name them gyro_x ... acc_x ..."
         raise InputError("RIL-187", text, remedy=remedy)
-    if 0.8 < force < 1.2:
-        text = f"{name}: accelerations of {force:.3g} look like multiples of gravity"
-        raise InputError("RIL-188", text, remedy="give them in m/s^2: 9.81 at rest")
+    # Multiples of gravity, or without it; even the Moon's is more.
+    if force < 1.2:
+        text = f"{name}: accelerations of {force:.3g} are too small to hold gravity in m/s^2"
+        raise InputError("RIL-188", text, remedy="give them in m/s^2, gravity not taken off: 9.81 at rest")
 
 
 # -- frames ------------------------------------------------------------------------------------------------------------

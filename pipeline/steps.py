@@ -20,6 +20,7 @@ their attributes carry the facts and settings that the next step needs.
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, field
@@ -33,7 +34,7 @@ from numpy.typing import NDArray
 from rille.datasets import registry
 from rille.datasets.protocol import Sequence
 from rille.pipeline.engine.runtime.environment import prepare_environment
-from rille.stages.core.declare import Bundle, Stage
+from rille.stages.core.declare import AnyArray, Bundle, Stage
 from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.geometry.geometry import Rig
 
@@ -184,7 +185,8 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     Parameters
     ----------
     left, right
-        Images of a :class:`StereoPair`, or arrays (row, col), uint8, uint16 or floating point 0..255.
+        Images of a :class:`StereoPair`, or arrays (row, col), uint8, uint16 or floating point 0..255. Pixels that are
+        NaN, or masked by :mod:`numpy.ma`, are not used.
     hfvm
         Parameters of section ``hfvm``, e.g. ``preset="fast"``.
 
@@ -197,9 +199,14 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     Raises
     ------
     InputError
-        An image is not grey, or its values are floating point from 0 to 1.
+        An image is not grey, or its values are floating point from 0 to 1, normalised, or 8 bits in 16.
     ConfigError
         A parameter is unknown, or not permitted.
+
+    Warns
+    -----
+    UserWarning
+        Hardly a pixel matches, most have no texture, or left and right seem swapped.
 
     Examples
     --------
@@ -213,6 +220,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     """
     prepare_environment()
     from rille.pipeline.flow import config, tiles
+    from rille.pipeline.runs.doubts import doubts
     from rille.stages.hfvm.stage import facts, hfvm_stage, match_pyramids
     from rille.stages.imaging import pyramid
 
@@ -223,16 +231,30 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
         if image.dtype.kind in "OSU":  # a path, or nothing
             text = f"the {camera} image is {image.reshape(-1)[:1].tolist()}, no array of pixels"
             raise InputError("RIL-675", text, remedy="read files first: cv2.imread(NAME, cv2.IMREAD_GRAYSCALE), say")
-        if image.dtype.kind == "f" and 0 < np.nanmax(image, initial=0) <= 1:
-            text = f"the {camera} image's values end at {np.nanmax(image):.3g}: floating point is taken as 0..255"
-            raise InputError("RIL-973", text, remedy="multiply by 255")
-    valid = [np.asarray(image.valid) if "valid" in getattr(image, "coords", ()) else None for image in (left, right)]
+        if image.dtype.kind == "f" or np.issubdtype(image.dtype, np.uint16):
+            low, high = float(np.nanmin(image, initial=0)), float(np.nanmax(image, initial=0))
+            full = 255 if image.dtype.kind == "f" else 65535
+            # From 0 to 1, or with the mean removed and the deviation made 1; 8 bits in 16.
+            if 0 < high <= full / 255 or (low < 0 and high - low < 16):
+                values = f"the {camera} image's values lie from {low:.3g} to {high:.3g}"
+                text = f"{values}: {image.dtype} is taken as 0..{full}"
+                raise InputError("RIL-973", text, remedy=f"scale them to 0..{full}")
+    valid = [_valid(image) for image in (left, right)]
     first, second = (pyramid.build(image, built.pyramid, mask) for image, mask in zip(images, valid, strict=True))
     how = tiles.how(built.tiling, built.hfvm, built.pyramid, (images[0].shape, images[1].shape))
     disparity = match_pyramids(first, second, built.hfvm, how=how)
     arrays = {name: value for name, value in vars(disparity).items() if name != "aligned"}
     meta = facts(arrays, built.hfvm, disparity.aligned, int(np.count_nonzero(first.valid[0])))
+    for line in doubts(disparity, *images, closely=False):
+        warnings.warn(line, stacklevel=2)
     return _dataset(hfvm_stage, Bundle(arrays, meta), config.merge(carried, {"hfvm": hfvm}))
+
+
+def _valid(image: Any) -> AnyArray | None:
+    """Which pixels to use (row, col): of a :class:`StereoPair`, or of an array of :mod:`numpy.ma`; None: all."""
+    if "valid" in getattr(image, "coords", ()):
+        return np.asarray(image.valid)
+    return ~np.ma.getmaskarray(image) if isinstance(image, np.ma.MaskedArray) else None
 
 
 def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarray.Dataset:

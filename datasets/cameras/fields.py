@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rille.datasets.cameras.model import UNKNOWN_SIZE
+from rille.datasets.text.reading import GREATEST
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, RigidTransform
@@ -215,8 +216,8 @@ class Fields:
             number = math.nan if isinstance(value, bool) else float(value)
         except (TypeError, ValueError):
             number = math.nan
-        if not math.isfinite(number):
-            raise self.error("RIL-121", key, f"is {_shown(value)}, it should be a number")
+        if not abs(number) < GREATEST:
+            raise self.error("RIL-121", key, f"is {_shown(value)}, it should be a number below {GREATEST:g}")
         return number
 
     def _pixels(self, key: str, value: float) -> int:

@@ -62,8 +62,9 @@ def kitti(text: str, path: Path) -> list[CalibratedCamera]:
 
 
 def _rectified(fields: Fields, label: str) -> CalibratedCamera:
+    projection = fields.matrix(label, 3, 4)
     try:
-        k, T_camera_reference = decompose(fields.matrix(label, 3, 4), label)
+        k, T_camera_reference = decompose(projection, label)
     except InputError as error:
         raise error.at(fields.file) from error
     number = label.rpartition("_")[2] if label.startswith("P_rect") else ""

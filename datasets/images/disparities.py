@@ -106,17 +106,19 @@ def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> list[Path
         maps = sorted(Search().matching(root, pattern), key=lambda path: natural(path.name))
     except InputError as error:
         raise error.at(key) from error
-    shared = False
+    lacking = list[str]()
     for name in (lambda path: without_side(path.stem, 0), _number):
         ours, theirs = ({name(path): path for path in paths} for paths in (maps, lefts))
         if len(ours) < len(maps) or len(theirs) < len(lefts):
             continue  # it does not tell them apart
         if ours.keys() >= theirs.keys():
             return [ours[one] for one in theirs]
-        shared |= not ours.keys().isdisjoint(theirs)
-    if len(maps) == len(lefts) and (len(maps) == 1 or not shared):
+        if not (lacking or ours.keys().isdisjoint(theirs)):
+            lacking = [path.name for one, path in theirs.items() if one not in ours]
+    if len(maps) == len(lefts) and (len(maps) == 1 or not lacking):
         return maps
     text = f"{key} = {pattern!r}: {count(len(maps), 'map')} ({ends(maps)}) for {count(len(lefts), 'left image')}"
+    text += f", none for {lacking[0]}" if lacking else ""
     remedy = f"give one map a pair, named or numbered as the left images are ({ends(lefts)})"
     raise InputError("RIL-901", text, remedy=remedy)
 

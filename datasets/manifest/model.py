@@ -43,7 +43,8 @@ Vector = tuple[float, float, float]
 Direction = Annotated[Vector, AfterValidator(_direction)]
 PoseFormat = Literal["auto", "kitti", "tum", "euroc", "csv"]
 Columns = dict[Literal["time", "x", "y", "z"], str | int]
-PositiveFloat = Annotated[float, Field(gt=0)]
+Deviation = Annotated[float, Field(ge=1e-6)]
+"""A standard deviation: no sensor is as good, and 1e-300 would make every equation singular."""
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
 
@@ -271,8 +272,8 @@ class Odometry(PoseFile):
     turn_deg : degrees for each metre of way; standard deviation of the rotation.
     """
 
-    drift: float | None = Field(default=None, gt=0, lt=1)
-    turn_deg: float | None = Field(default=None, gt=0)
+    drift: float | None = Field(default=None, ge=1e-6, lt=1)
+    turn_deg: Deviation | None = None
 
     @model_validator(mode="after")
     def _both_or_none(self) -> Odometry:
@@ -295,7 +296,7 @@ class PositionFile(Table):
     """
 
     file: str
-    sigma: PositiveFloat | tuple[PositiveFloat, PositiveFloat, PositiveFloat]
+    sigma: Deviation | tuple[Deviation, Deviation, Deviation]
     lever_arm: Vector = (0.0, 0.0, 0.0)
     columns: Columns = Field(default={})
     unit: float = Field(default=1.0, gt=0)
@@ -336,7 +337,7 @@ class Attitude(Table):
     format: PoseFormat = "auto"
     T_body_left: Pose | None = None
     up: Direction | None = None
-    sigma_deg: float | None = Field(default=None, gt=0)
+    sigma_deg: Deviation | None = None
     max_gap: float = Field(default=0.5, gt=0)
     time_offset: float = 0.0
 
@@ -354,7 +355,7 @@ class Imu(Table):
 
     file: str
     T_imu_left: Pose
-    sigma_deg: float | None = Field(default=None, gt=0)
+    sigma_deg: Deviation | None = None
     time_offset: float = 0.0
 
 

@@ -213,10 +213,10 @@ def _check_baseline(baseline: float, section: RigSection, name: str) -> None:
     """Refuse what cannot be metres."""
     from_files = section.baseline is None and section.T_right_left is None
     if baseline > LONGEST_BASELINE:
-        unit = section.unit / 1000
-        hint = f"a manifest's rig.unit = {unit:g} reads a calibration in millimetres" if from_files else "give metres"
-        text = f"{name}: the baseline is {baseline:g} m, which looks like millimetres"
-        raise InputError("RIL-244", text, remedy=f"did you mean {baseline / 1000:g}? {hint}")
+        units = f"rig.unit = {section.unit / 1000:g} or {section.unit / 100:g}"
+        hint = f"a manifest's {units} reads a calibration in these" if from_files else "give metres"
+        text = f"{name}: the baseline is {baseline:g} m, which looks like millimetres or centimetres"
+        raise InputError("RIL-244", text, remedy=f"did you mean {baseline / 1000:g} or {baseline / 100:g}? {hint}")
 
 
 def unusual_cameras(cameras: Iterable[CalibratedCamera], sizes: Sizes) -> tuple[str, ...]:

@@ -38,6 +38,9 @@ DEEPEST = 20
 MOST_ENTRIES = 300_000
 """Files and folders that are looked at in a search; a walk over them takes two or three seconds."""
 
+GREATEST = 1e20
+"""Beyond any measurement in any unit: numbers below it can be squared, and multiplied, and stay finite."""
+
 BETWEEN = re.compile(r'[\s;:=\[\]()"]+|,\s')
 COMMA, POINT = re.compile(r"[-+]?(\d+),(\d+)([eE][-+]?\d+)?"), re.compile(r"\d\.\d")
 """What stands between numbers, and numbers with a decimal comma and with a point."""

@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.datasets.text.reading import read_lines
+from rille.datasets.text.reading import GREATEST, SAMPLE, read_lines
 from rille.stages.core.errors import InputError
 
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", re.IGNORECASE)
+DATE = re.compile(r"\s*[\"']?\d{4}[-/.]\d\d?[-/.]\d")
 
 
 @dataclass(frozen=True)
@@ -41,19 +42,19 @@ class TextTable:
         return [row[column] for row in self.rows]
 
     def numbers(self, columns: Sequence[int], gaps: bool = False) -> NDArray[np.float64]:
-        """Columns as finite numbers, (rows, columns); with ``gaps`` rows may be NaN as a whole.
+        """Columns as numbers below ``GREATEST``, (rows, columns); with ``gaps`` rows may be NaN as a whole.
 
         Raises
         ------
         InputError
-            A cell is not a finite number; the message names the line.
+            A cell is no such number; the message names the line.
         """
         values = np.array([[_number(row[column]) for column in columns] for row in self.rows])
-        wrong = ~np.isfinite(values) & ~(gaps & np.isnan(values).all(axis=1, keepdims=True))
+        wrong = ~(np.abs(values) < GREATEST) & ~(gaps & np.isnan(values).all(axis=1, keepdims=True))
         if wrong.any():
             row, column = np.argwhere(wrong)[0]
-            cell = self.rows[row][columns[column]]
-            text = f"{self.name}, line {self.lines[row]}: {cell!r} is not a finite number"
+            cell = self.rows[row][columns[column]][:40]
+            text = f"{self.name}, line {self.lines[row]}: {cell!r} is not a finite number below {GREATEST:g}"
             raise InputError("RIL-284", text, remedy="correct or remove that line")
         return values
 
@@ -99,7 +100,9 @@ def read_table(path: Path, what: str) -> TextTable:
         rows.append(row)
         at.append(k)
     if not rows:
-        raise InputError("RIL-286", f"{what} {path} has no rows of numbers", remedy="check that it is the right file")
+        dated = any(DATE.match(line) for line in lines[:SAMPLE])
+        remedy = "write times as seconds, not as dates" if dated else "check that it is the right file"
+        raise InputError("RIL-286", f"{what} {path} has no rows of numbers", remedy=remedy)
     header = split(names, separator) if names else ()
     header = header if len(header) == len(rows[0]) else ()
     return TextTable(str(path), tuple(name.lower() for name in header), tuple(rows), tuple(at), separator is not None)

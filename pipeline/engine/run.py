@@ -491,6 +491,8 @@ class _Run:
         self.result.assumed += assumed
         try:
             flow(*(h.ref or h.earlier for h in handles))
+        except BrokenPipeError:  # who read what the flow prints has had enough of it
+            raise
         except Exception as error:
             if assumed:  # what was found with other parameters or images does not fit: no more can be said
                 self.result.unknown += assumed

@@ -183,6 +183,9 @@ def read_raster(path: Path) -> DemFile:
     with opened_raster(path) as file:
         _check_cells(path, file.shape, path.stat().st_size)
         # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
+        if "red" in {band.name for band in file.colorinterp}:
+            remedy = "give an elevation model; rille localize takes images by --ortho"
+            raise InputError("RIL-636", f"{path} has colours, no elevations", remedy=remedy)
         values = file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
         crs, transform, unit = file.crs, file.transform, file.units[0]
     wkt = _checked_system(path, transform, crs)

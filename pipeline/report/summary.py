@@ -171,13 +171,11 @@ def _displaced(view: RunView) -> list[str]:
 
 
 def _imu(view: RunView) -> list[str]:
-    """The IMU contradicts the images, by its rotations or by its gravity."""
+    """The IMU contradicts the images by its rotations, or it or a stated vertical the ground that they show."""
     # Of the ground that was looked for: elevations may be measured from another plane.
     s, trajectory, levels = view.sequence, view.bundle(view.products.trajectory), view.products.ground
-    if s.imu_axes is None or s.attitude is None:
-        return []
-    axes, lines = np.array(s.imu_axes), []
-    if trajectory is not None and s.times is not None:
+    axes, lines = None if s.imu_axes is None else np.array(s.imu_axes), []
+    if axes is not None and s.attitude is not None and trajectory is not None and s.times is not None:
         frames, unknown = trajectory.meta["frames"], np.full((3, 3), np.nan)
         sensed = np.array([unknown if s.attitude[f] is None else s.attitude[f] for f in frames], dtype=float)
         times = np.array([s.times[f] for f in frames])

@@ -90,6 +90,12 @@ LIMITS = {
     ),
     "matching": (
         Fault("RIL-669", "whole pairs", least=1),
+        Fault(
+            "RIL-907",
+            "borne out",
+            least=0.1,
+            remedy="are the maps of these left images, in pixels (SGBM counts in sixteenths), and of this sign?",
+        ),
         Fault("RIL-656", "matched", least=0.02, remedy="do both images show one scene, taken at one time, and sharp?"),
         InputLimit("RIL-657", "matched", least=0.3, remedy="little texture, or little overlap of left and right"),
         InputLimit("RIL-658", "baselines away", most=200, remedy="depth is a guess there; is the baseline right?"),
@@ -280,13 +286,14 @@ def _usual(values: Floats) -> float:
     return float(np.median(values[np.isfinite(values)])) if np.isfinite(values).any() else math.nan
 
 
-def judge_matching(rate: float | None, depths: Floats, baseline: float) -> Finding:
-    """Share of usable pixels that are matched, and how far away they lie (m)."""
+def judge_matching(rate: float | None, depths: Floats, baseline: float, *, given: bool = False) -> Finding:
+    """Share of usable pixels that are matched, and how far away they lie (m); ``given``: of another program's map."""
     share = rate or 0.0
     near, middle, far = (float(v) for v in np.percentile(depths, [5, 50, 95])) if depths.size else (math.nan,) * 3
     text = f"{100 * share:.0f} % of the first pair is matched, depth {near:.3g} to {far:.3g} m, median {middle:.3g} m"
     away = {"baselines away": middle / baseline} if depths.size else {}
-    return judge("matching", text, {"matched": share, **away})
+    borne_out = {"borne out": share} if given else {}
+    return judge("matching", text, {"matched": share, **borne_out, **away})
 
 
 def judge_sides(beyond: float) -> Finding:

@@ -65,18 +65,21 @@ def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) ->
     return ["; ".join([*words, f"that leaves {np.degrees(off[best]):.2g} degrees"])]
 
 
-def of_gravity(given: Floats, seen: Floats, axes: Floats) -> list[str]:
+def of_gravity(given: Floats, seen: Floats, axes: Floats | None) -> list[str]:
     """Warn where gravity contradicts the ground that is seen, and name the axes that would fit.
 
     Parameters
     ----------
-    given, seen : (3,) up in the left camera's frame by the sensor, and by the ground.
-    axes : (3, 3) R_imu_left.
+    given, seen : (3,) up in the left camera's frame as stated or by a sensor, and by the ground.
+    axes : (3, 3) R_imu_left; None: up is not an IMU's.
     """
+    off = float(np.degrees(np.arccos(np.clip(given @ seen, -1.0, 1.0))))
+    if axes is None:
+        vertical = f"the stated vertical is {off:.0f} degrees off that of the ground which is seen"
+        return [f"{vertical}: correct up (its sign, too), the angles' unit, T_body_left or pitch_deg"]
     a, b = axes @ given, axes @ seen
     fits = sorted((float(-b @ S @ a), k) for k, S in enumerate(signed_axes()) if b @ S @ a > MIN_COSINE)
     told = "; or ".join(dict.fromkeys(names(signed_axes()[k]) for _, k in fits[:3]))
-    off = float(np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0))))
     return [
         f"the IMU contradicts the images: its up is {off:.0f} degrees off that of the ground which is seen; its x, y "
         f"and z would have to be its {told or 'own, turned'} (gravity alone does not tell which): exchange its "

@@ -200,7 +200,8 @@ def scene_plane(samples: Samples) -> GroundPlane:
     """
     rays, rho, _ = samples
     if not len(rays):
-        raise NoGroundError("RIL-385", "no pixel is matched, so no surface is seen")
+        remedy = "`rille check` says more of the images, and of the maps of [disparity] if there are any"
+        raise NoGroundError("RIL-385", "no pixel is matched, so no surface is seen", remedy=remedy)
     view = rays.mean(axis=0) / np.linalg.norm(rays.mean(axis=0))
     with suppress(NoGroundError):
         plane = fit_plane(samples, lambda n: np.asarray(-n @ view >= math.cos(math.radians(MAX_SLANT_DEG))))

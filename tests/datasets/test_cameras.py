@@ -260,7 +260,7 @@ def test_what_would_be_another_lens_is_refused(tmp_path, text, expected):
     path = written(tmp_path, text)
     with raises(*expected) as error:
         read_cameras(path)
-    assert str(path) in str(error.value)
+    assert str(error.value).count(str(path)) == 1
     assert "\n" not in str(error.value)
 
 
@@ -592,6 +592,7 @@ def test_middlebury_is_in_millimetres(tmp_path):
             ("RIL-135", "'omni'"),
         ),
         (SENSOR.format(y=0).replace("458.654", "wide"), ("RIL-121", "'wide'")),
+        (SENSOR.format(y=0).replace("458.654", "1e308"), ("RIL-121", "'1e308'")),
         (SENSOR.format(y=0).replace("458.654", "-458"), ("RIL-329",)),
         (SENSOR.format(y=0).replace("458.654, ", ""), ("RIL-116",)),
         (SENSOR.format(y=0).replace("[752, 480]", "[752.5, 480]"), ("RIL-122", "752.5")),
@@ -607,6 +608,7 @@ def test_middlebury_is_in_millimetres(tmp_path):
         (STRAIGHT + "lens_model = fisheye\n", ("RIL-810", "lens_model")),
         (STRAIGHT.replace("C = 1 2 3", "C = 1 2"), ("RIL-116",)),
         (STRAIGHT + "pitch = 0\n" + BENT, ("RIL-146",)),
+        ("P0: 500 0 320 0\nP1: 500 0 320 -60\n", ("RIL-116", "P0")),
         ("1 OPENCV 640 480 500 501 320 240\n", ("RIL-109",)),
         ("1 THIN_PRISM 640 480 500\n", ("RIL-108", "THIN_PRISM")),
         (MONO.format(count=4, values="[0, 0, 0, .nan]"), ("RIL-121", "distortion_coefficients")),
@@ -627,7 +629,7 @@ def test_one_line_that_names_file_and_key(tmp_path, text, expected):
     path = written(tmp_path, text)
     with raises(*expected) as error:
         read_cameras(path)
-    assert str(path) in str(error.value)
+    assert str(error.value).count(str(path)) == 1
     assert "\n" not in str(error.value)
     assert error.value.remedy
 

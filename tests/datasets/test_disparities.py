@@ -161,19 +161,19 @@ def test_maps_are_paired_by_name_number_or_order(tmp_path, lefts, maps, wanted):
 
 
 @pytest.mark.parametrize(
-    ("lefts", "maps"),
+    ("lefts", "maps", "lacking"),
     [
-        ("07.png 08.png 09.png", "07.pfm 09.pfm"),
-        ("07.png 08.png 09.png", "07.pfm 09.pfm 10.pfm"),  # as many, but not of these images
-        ("a.png b.png", "1.npy 2.npy 3.npy"),
-        ("a.png b.png", "map.npy"),
-        ("a.png", ""),
+        ("07.png 08.png 09.png", "07.pfm 09.pfm", "none for 08.png"),
+        ("07.png 08.png 09.png", "07.pfm 09.pfm 10.pfm", "none for 08.png"),  # as many, but not of these images
+        ("a.png b.png", "1.npy 2.npy 3.npy", ""),
+        ("a.png b.png", "map.npy", ""),
+        ("a.png", "", ""),
     ],
 )
-def test_maps_that_do_not_fit_are_refused(tmp_path, lefts, maps):
+def test_maps_that_do_not_fit_are_refused(tmp_path, lefts, maps, lacking):
     paths(tmp_path, " ".join(f"disp/{name}" for name in maps.split()))
     counts = f"{len(maps.split())} map", f"{len(lefts.split())} left image"
-    with raises("RIL-901", "disparity.left", *counts):
+    with raises("RIL-901", "disparity.left", lacking, *counts):
         find("disp/*", tmp_path, [Path(name) for name in lefts.split()], "disparity.left")
 
 

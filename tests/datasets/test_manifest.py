@@ -439,7 +439,7 @@ def test_sensors_need_times(tmp_path):
 @pytest.mark.parametrize(
     ("parts", "expected"),
     [
-        ({"rig": "[rig]\nbaseline = 97\n"}, ("RIL-244", "0.097")),
+        ({"rig": "[rig]\nbaseline = 97\n"}, ("RIL-244", "0.097 or 0.97")),
         ({"rig": "[rig]\nbaseline = -0.1\n"}, ("RIL-223", "-0.1")),
         ({"rig": "[rig]\nT_right_left = [[1,0,0,0.1],[0,1,0,0],[0,0,1,0]]\n"}, ("RIL-130",)),
         (
@@ -616,6 +616,7 @@ def test_without_standard_deviations_sensors_are_no_measurements(tmp_path):
         ('sigma = 0.5\ncolumns = { x = "E" }', ["time,x,y", "0,1,2"], ("RIL-806", "'E'")),
         ("sigma = 0.5", ["time,x,y", "0,1,?", "1,2,3"], ("RIL-284", "line 2")),
         ("", ["time,x,y", "0,1,2", "1,2,3"], ("RIL-223", "positions", "sigma")),
+        ("sigma = 1e-300", ["time,x,y", "0,1,2", "1,2,3"], ("RIL-223", "positions", "sigma")),
     ],
 )
 def test_positions_that_cannot_be_used(tmp_path, more, lines, expected):

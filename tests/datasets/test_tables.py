@@ -50,7 +50,9 @@ def test_names_that_do_not_fit_the_columns_are_none(tmp_path):
         ("1,2,3\n4,5\n", ("RIL-285", "t.csv", "line 2")),
         ("1,2,3\n4,five,6\n", ("RIL-284", "t.csv", "line 2", "'five'")),
         ("1,2,3\n4,nan,6\n", ("RIL-284", "t.csv", "line 2", "'nan'")),
+        ("1,2,3\n4,-1e300,6\n", ("RIL-284", "t.csv", "line 2", "'-1e300'")),
         ("time,x\n", ("RIL-286", "t.csv")),
+        ("time,x\n2020-09-13T12:26:40Z,1\n", ("RIL-286", "dates")),
     ],
 )
 def test_what_is_wrong_names_the_line(tmp_path, text, expected):

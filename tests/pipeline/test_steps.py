@@ -58,10 +58,25 @@ def test_each_step_has_the_values_of_a_run(pair: rille.StereoPair, disparity: An
             np.testing.assert_array_equal(found[name], stored[name], err_msg=f"{label} {name}")
 
 
-def test_match_refuses_grey_values_from_0_to_1() -> None:
+def test_match_refuses_grey_values_of_another_scale() -> None:
     right = np.random.default_rng(1).random((40, 60))
-    with raises("RIL-973", "the right image"):
-        rille.match(np.float32(255) * right, right)
+    for other in (right, (right - 0.5) / 0.3, (255 * right).astype(">u2")):
+        with raises("RIL-973", "the right image"):
+            rille.match(np.float32(255) * right, other)
+
+
+def test_match_leaves_out_what_is_masked() -> None:
+    left = np.random.default_rng(1).integers(0, 256, (80, 120)).astype(np.uint8)
+    masked = np.ma.masked_array(left, mask=np.arange(120) < 60 + np.zeros((80, 1)))
+    found = np.isfinite(rille.match(masked, np.roll(left, -3, 1)).column_disparity)
+    assert found[:, 70:100].all()
+    assert not found[:, :40].any()
+
+
+def test_match_warns_of_images_that_do_not_fit() -> None:
+    left, right = (np.random.default_rng(k).integers(0, 256, (80, 120)).astype(np.uint8) for k in (1, 2))
+    with pytest.warns(UserWarning, match="RIL-700"):
+        rille.match(left, right)
 
 
 def test_the_package_says_its_version_and_what_it_raises() -> None:

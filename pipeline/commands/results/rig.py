@@ -19,6 +19,7 @@ import tomli_w
 from rille.datasets.text.reading import read_toml
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
+from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.runs import lookup
@@ -84,7 +85,7 @@ def rig(
         raise InputError("RIL-028", text, remedy="give runs of sequences with one calibration, and images of one size")
     params = RigParams.model_validate(read_toml(folders[0] / "config.toml", "configuration").get("rig", {}))
     found = joint(Rig.from_dict(next(iter(given.values()))), matches, params)
-    output.write_text(_toml(found), encoding="utf-8")
+    atomic.write(output, _toml(found))
     print("\n".join(_table(found)))
     for line in disagreements(found, params.significance):
         warn(line)

@@ -20,6 +20,7 @@ from rille.datasets.images import chessboard, pairing
 from rille.datasets.images.files import SUFFIXES, read_grey
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
+from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import COMPLETE, FLAG, Output, check_output
 from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig
 from rille.stages.core.errors import InputError, told
@@ -91,7 +92,7 @@ def calibrate(
     points = chessboard.board_points(boards.corners, square)
     rig = calibrate_rig(points, boards.views, boards.sizes, model, keep_bad=keep_bad)
     _refuse_clutter(rig, boards)
-    output.write_text(_yaml(rig, boards, square), encoding="utf-8")
+    atomic.write(output, _yaml(rig, boards, square))
     origin, size = "given" if given else "found", " x ".join(map(str, boards.corners))
     print(f"board        {size} inner corners ({origin}), squares of {square:g} m")
     print("\n".join([*_views(rig, boards), "", *_parameters(rig), ""]))

@@ -177,7 +177,8 @@ class Inspection:
         left, right = arrays["left"][used], arrays["right"][used]
         rig = self.sequence.rig
         rho, _ = inverse_depth(rig, left, right - left)
-        self.say(judge.judge_matching(disparity.meta["match_rate"], 1.0 / rho[rho > 0], rig.baseline))
+        given, rate = self.sequence.disparity is not None, disparity.meta["match_rate"]
+        self.say(judge.judge_matching(rate, 1.0 / rho[rho > 0], rig.baseline, given=given))
         if len(left):
             beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
             self.say(judge.judge_sides(float(beyond.mean())))

@@ -12,6 +12,7 @@ from rille.datasets.inspection import Findings, inspect
 from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_words
 from rille.datasets.registry import hindrance
 from rille.datasets.text.names import derived_name
+from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import COMPLETE, FLAG, Output
 from rille.stages.core.errors import ConfigError
 
@@ -51,7 +52,7 @@ def init(
         raise ConfigError("RIL-038", f"{path} exists", remedy="give another --output, or overwrite it by --force")
     # Written whether complete or not: what is missing stands in it as comments, at its place.
     text = manifest_text(findings, _root(directory, path))
-    path.write_text(text, encoding="utf-8")
+    atomic.write(path, text)
     needed = needs(text)
     left = hindrance(path) if not needed else None
     if left is not None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.count import count
+from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import COMPLETE, Output
 from rille.pipeline.steps import open as open_sequence
 from rille.stages.core.errors import InputError
@@ -47,7 +48,7 @@ def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> int:
         seen = cv2.cvtColor(np.rint(grey(images[0])).astype(np.uint8), cv2.COLOR_GRAY2BGR)
         seen[body] = seen[body] // 2 + np.array([0, 0, 127], np.uint8)
         for name, picture in ((path, np.where(body, 0, 255).astype(np.uint8)), (path.with_suffix(".look.png"), seen)):
-            name.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+            atomic.write(name, cv2.imencode(".png", picture)[1].tobytes())
         print(f"{camera:12s} {100 * body.mean():.1f} % keeps its place in {len(images)} images: {path}")
         written.append(f'{camera} = "{path.resolve()}"')
     if written:

@@ -18,25 +18,14 @@ from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import raw, warn
 from rille.pipeline.export.writers import write_confidence, write_disparity
 from rille.pipeline.flow import config as configuration
+from rille.pipeline.runs.doubts import MIN_MATCHED_SHARE, doubts
 from rille.pipeline.runs.options import COMPLETE, FLAG, HOLES, Assignments, Output, check_output
 from rille.stages.core.errors import ConfigError, InputError
-from rille.stages.core.validity import Validity, has, matched, matched_back
-from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX
+from rille.stages.core.validity import matched
 from rille.stages.imaging import levels
 
 MIN_PIXELS_OF_BAR = 1_000_000
 """Pixels: above, matching takes seconds, and a bar on the terminal shows how far it is."""
-
-MIN_MATCHED_SHARE = 0.05
-"""Share of matched pixels at which two images have little to do with each other; unrelated ones stay below."""
-
-WHY_NOT = (
-    (Validity.NO_TEXTURE, "have no texture (black, saturated or blank)"),
-    (Validity.OUT_OF_IMAGE, "have their match outside the right image"),
-    (Validity.BACKMATCH_FAILED, "do not match back"),
-    (Validity.OVER_THRESHOLD, "look like nothing in the right image"),
-    (Validity.SPECKLE, "lie in isolated patches"),
-)
 
 
 @Parameter(name="*")
@@ -152,7 +141,7 @@ def match(
     write_disparity(output, column, row, tags | {"FILLED": str(dense).lower()})
     if confidence is not None:
         write_confidence(confidence, result.disparity_std, result.validity, result.backmatch_error, tags)
-    for line in (*levelled, *warnings(result, *images)):
+    for line in (*levelled, *doubts(result, *images)):
         warn(line)
     share = float(matched(result.validity).mean())
     typical = f", standard deviation {np.nanmedian(result.disparity_std):.2f} px (median)" if share else ""
@@ -171,45 +160,6 @@ def _check_outputs(left: Path, right: Path, output: Path, confidence: Path | Non
                 text = f"{name} and {taken[path.resolve()]} are both {path}"
                 raise ConfigError("RIL-043", text, remedy="give another name")
             taken[path.resolve()] = name
-
-
-def warnings(result: Any, left: NDArray[Any], right: NDArray[Any]) -> Iterator[str]:
-    """Signs that two matched images do not fit, one line each with its figure; ``result``: their ``StereoMatches``."""
-    from rille.stages.hfvm import given
-
-    share, blank = float(matched(result.validity).mean()), float(has(result.validity, Validity.NO_TEXTURE).mean())
-    ok = matched_back(result.validity, result.backmatch_error)
-    if share < MIN_MATCHED_SHARE:
-        # The two most frequent reasons: they tell a user whether the light, the order or the scene is at fault.
-        shares = sorted(((float(has(result.validity, bit).mean()), words) for bit, words in WHY_NOT), reverse=True)
-        frequent = ", ".join(f"{100 * s:.0f} % {words}" for s, words in shares[:2] if s >= 0.005)
-        text = f"only {100 * share:.1f} % of the pixels match ({frequent}): do both images show one scene in one light?"
-        yield warning("RIL-700", text)
-    elif blank > 0.5:  # however well the others match
-        text = f"{100 * blank:.0f} % of the pixels have no texture (black, saturated or blank) and cannot match"
-        yield warning("RIL-701", text)
-    # Of images of unlike size nobody knows how their middles correspond, and so which displacement far things have.
-    elif left.shape == right.shape and given.swapped(result.column_disparity, result.row_disparity, ok):
-        median = float(np.median(result.column_disparity[ok]))
-        text = (
-            f"disparities have the sign of swapped images (median {median:+.1f} px, right minus left): if this is "
-            "a pair of a left and a right camera, give them in the other order"
-        )
-        yield warning("RIL-702", text)
-    elif (judged := given.judge(left, right, result, ok)) is not None:
-        on_lines, repeated = judged
-        if on_lines < given.MIN_RIGID_SHARE:
-            text = (
-                f"only {100 * on_lines:.0f} % of the matches lie within {MAX_LINE_DISTANCE_PX:.0f} px of one epipolar "
-                "geometry: wrong matches, things that move, or a lens that distorts: look at them first"
-            )
-            yield warning("RIL-703", text)
-        if repeated > given.MAX_REPEATED_SHARE:
-            text = (
-                f"{100 * repeated:.0f} % of the matches look as well elsewhere on their epipolar line: on a repeating "
-                "pattern they may be off by a period: look at them first"
-            )
-            yield warning("RIL-704", text)
 
 
 @contextmanager

@@ -51,25 +51,31 @@ class OutsideImports:
 
 
 class Interrupts:
-    """Remembers interrupts while it is entered, on the main thread and where nobody else handles them."""
+    """Remembers interrupts while it is entered, on the main thread and where nobody else handles them.
+
+    SIGTERM, by which batch systems and ``timeout`` end a program, is one as well.
+    """
 
     def __init__(self) -> None:
         self.came = False
         self._hook: Any = None
-        self._before: Any = None
+        self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Interrupts:
         main = threading.current_thread() is threading.main_thread()
         # A notebook or another program that has a handler of its own keeps it.
         before = signal.getsignal(signal.SIGINT)
         if main and (before is signal.default_int_handler or isinstance(before, OutsideImports)):
-            self._before = signal.signal(signal.SIGINT, self._interrupted)
+            # Set even where it is the default: a library may have put a handler there that prints its stack.
+            ours = [signal.SIGINT, *[signal.SIGTERM] * (signal.getsignal(signal.SIGTERM) is signal.SIG_DFL)]
+            self._before = {number: signal.signal(number, self._interrupted) for number in ours}
             self._hook, sys.unraisablehook = sys.unraisablehook, self._unraisable
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         if self._hook is not None:
-            signal.signal(signal.SIGINT, self._before)
+            for number, before in self._before.items():
+                signal.signal(number, before)
             sys.unraisablehook, self._hook = self._hook, None
 
     def check(self) -> None:

@@ -100,12 +100,12 @@ class Sensors:
         """Leave out the sensors that contradict the camera's own chain, and say so."""
         for name, sensor in list(self.used.items()):
             if reason := sensor.contradiction(own):
-                self._refuse(name, reason)
+                self._refuse(name, reason, "contradicts the images and ")
 
-    def _refuse(self, name: str, reason: str) -> None:
+    def _refuse(self, name: str, reason: str, how: str = "") -> None:
         del self.used[name]
         self.facts[name] = {"used": False, "why": reason}
-        self.lines.append(f"[{name}] contradicts the images and is not used: {reason}: {REMEDY[name]}")
+        self.lines.append(f"[{name}] {how}is not used: {reason}: {REMEDY[name]}")
 
     def between(self, own: OwnTrajectory) -> list[Factors]:
         """Factors between frames, which may join pieces, clocks being right."""

@@ -117,7 +117,9 @@ def departure(own: Floats, said: Floats, allowed: float, what: str) -> tuple[flo
         about = ", ".join(f"{v:.2f}" for v in axis / angle)
         reads.append(f"it is turned by {math.degrees(angle):.1f} degrees about ({about}) of the left camera")
     if abs(scale - 1.0) > 0.5 * allowed:
-        reads.append(f"its lengths have to be multiplied by {scale:.3g}")
+        # Metres of a degree of latitude and, as far north as people drive, of longitude
+        unit = " (degrees are no metres)" if 3e4 < scale < 1.2e5 else ""
+        reads.append(f"its lengths have to be multiplied by {scale:.3g}{unit}")
     fits = f"; {' and '.join(reads)}, which leaves {left:.1%}" if reads and left < 0.5 * off else ""
     return off, f"its {what} depart from the camera's by {off:.1%}, where {allowed:.1%} is possible{fits}"
 

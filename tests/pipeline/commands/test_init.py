@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import cv2
@@ -100,6 +101,19 @@ def test_nothing_is_overwritten_without_force(drive):
     init(drive, force=True)
 
 
+def test_on_a_full_disk_the_manifest_that_was_there_stays(drive, monkeypatch):
+    path = drive / "m.toml"
+    path.write_text("mine")
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="No space"):
+        init(drive, output=path, force=True)
+    assert path.read_text() == "mine"
+
+
 def test_a_folder_that_opens_as_it_is_gets_no_manifest_unasked(drive, tmp_path, capsys):
     rows = ["60 0 31.5 0 0 60 23.5 0 0 0 1 0", "60 0 31.5 -12 0 60 23.5 0 0 0 1 0"]
     (drive / "calib.txt").write_text("\n".join(rows))
@@ -148,8 +162,9 @@ def test_image_folders_of_raw_recordings_open_with_their_calibration(drive, caps
 
 
 def test_places_that_cannot_be_written(drive, tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"m\.toml"):
-        init(drive, output=tmp_path / "nowhere" / "m.toml")
+    (tmp_path / "file").touch()
+    with pytest.raises(FileExistsError, match="file"):
+        init(drive, output=tmp_path / "file" / "m.toml")
     with raises("RIL-037", "m.yaml"):
         init(drive, output=tmp_path / "m.yaml")
     with raises("RIL-193"):

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 from affine import Affine
 from map_runs import Frame, centres, grey, height, made_map, made_run
 from raising import raises
@@ -132,6 +133,9 @@ def test_input_that_is_no_map_is_one_line_each(tmp_path: Path) -> None:
     coarse = made_map(tmp_path / "coarse.tif", np.zeros((9, 9), np.float32), Affine.scale(2.0, -2.0))
     placeless = made_map(tmp_path / "placeless.tif", np.zeros((80, 80), np.float32), Affine.identity())
     degrees = elevations(tmp_path / "degrees.tif", RASTERS["turned"], crs="EPSG:4326")
+    colours, about = tmp_path / "colours.tif", {"width": 80, "height": 80, "count": 3, "dtype": "uint8"}
+    with rasterio.open(colours, "w", driver="GTiff", transform=RASTERS["turned"], **about) as file:
+        file.write(np.zeros((3, 80, 80), np.uint8))
     plane = made_run(tmp_path / "plane", FRAME, vertical="reference plane")
     empty = made_run(tmp_path / "empty", FRAME, known=math.nan)
     bare = tmp_path / "bare"
@@ -147,6 +151,7 @@ def test_input_that_is_no_map_is_one_line_each(tmp_path: Path) -> None:
         ("RIL-338", folder, small, {}),
         ("RIL-630", folder, placeless, {}),
         ("RIL-633", folder, degrees, {}),
+        ("RIL-636", folder, colours, {}),
         ("RIL-627", folder, tmp_path / "none.tif", {}),
         ("RIL-842", plane, dem, {}),
         ("RIL-843", empty, dem, {}),

@@ -92,6 +92,18 @@ def test_an_error_of_a_flow_is_a_failure_of_the_run(tmp_path):
     assert [f"{f.label}: {f.error}" for f in run(graph, tmp_path).failures] == ["plan after numbers/0: no such pair"]
 
 
+def test_a_flow_whose_reader_has_gone_ends_the_run(tmp_path):
+    graph = Graph()
+
+    def printing():
+        yield number(graph, 0)
+        raise BrokenPipeError
+
+    graph.flow(printing())
+    with pytest.raises(BrokenPipeError):
+        run(graph, tmp_path)
+
+
 def test_a_stage_may_be_named_by_its_module(tmp_path):
     graph = Graph()
     a, b = number(graph, 0), graph.node("toys.numbers", "b", NumbersParams(size=8), {"frame": 0})

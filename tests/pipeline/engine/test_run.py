@@ -292,10 +292,11 @@ def interruptible():
     signal.signal(signal.SIGINT, before)
 
 
-def test_an_interrupt_where_python_forgets_it_stops_the_run_all_the_same(cache, tmp_path, capfd, interruptible):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_where_python_forgets_it_stops_the_run_all_the_same(cache, tmp_path, capfd, interruptible, number):
     class Forgotten:
         def __del__(self):
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
             time.sleep(0)  # the handler runs between two instructions
 
     done = []
@@ -316,6 +317,7 @@ def test_an_interrupt_where_python_forgets_it_stops_the_run_all_the_same(cache, 
     assert [node.status for node in done] == ["pending"], "the flow went on, the run did not"
     assert capfd.readouterr().err == ""
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     found, _ = run(cache, make=lambda graph: graph.node("toys.numbers", "first", NumbersParams(), {"frame": 0}))
     assert statuses(found) == {"first": "cached"}
 

@@ -164,6 +164,12 @@ def test_matching():
     assert input_checks.judge_matching(0.7, 100 * depths, 0.1).level == "WARN"
 
 
+def test_maps_that_the_images_do_not_bear_out_are_named():
+    found = input_checks.judge_matching(0.0, np.zeros(0), 0.1, given=True)
+    assert (found.level, found.code) == ("FAIL", "RIL-907")
+    assert input_checks.judge_matching(0.7, np.ones(9), 0.1, given=True).level == "OK"
+
+
 @pytest.mark.parametrize(("overlap", "level"), [(0.8, "OK"), (0.3, "WARN"), (0.05, "FAIL"), (None, "FAIL")])
 def test_motion(overlap, level):
     motions = {(0, 1): {"overlap": 0.8, "median_length": 12.0}, (1, 2): {"overlap": overlap, "median_length": None}}

@@ -145,3 +145,12 @@ def test_what_a_straight_drive_cannot_tell_apart_is_named_together():
     assert "negate z" in line
     assert "; or: " in line
     assert line.endswith("this drive cannot tell these apart")
+
+
+def test_a_jump_is_named_as_one_and_not_taken_for_a_unit():
+    true = drive(1)
+    wrong = true.copy()
+    wrong[9, :, 3] = [1e6, 0.0, 0.0]
+    (line,) = better_reading(estimated(true, 1), wrong, RigidTransform.identity(), 0.01)
+    assert "jumps by 1e+06 m behind 9 of its 24 poses" in line
+    assert "unit" not in line

@@ -72,3 +72,9 @@ def test_gravity_off_the_ground_names_the_axes_that_would_fit():
     assert "its z, y, x" in line
     assert "gravity alone does not tell" in line
     assert "134 degrees" in line
+
+
+def test_a_stated_vertical_off_the_ground_is_named():
+    up = np.array([0.0, -1.0, 0.0])
+    (line,) = of_gravity(-up, up, None)
+    assert "stated vertical is 180 degrees off" in line

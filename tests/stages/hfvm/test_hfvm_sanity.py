@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from matching_scenes import Texture, convergent_rig, pair, rig_displacement
 
-from rille.pipeline.commands.sequences.match import warnings
+from rille.pipeline.runs.doubts import doubts
 from rille.stages.core.validity import matched
 from rille.stages.hfvm import given
 from rille.stages.hfvm.stage import match
@@ -12,7 +12,7 @@ from rille.stages.hfvm.stage import match
 
 def codes(left, right):
     found = match(left, right)
-    return [line[:7] for line in warnings(found, left, right)]
+    return [line[:7] for line in doubts(found, left, right)]
 
 
 def test_a_rigid_scene_without_repetition_is_not_doubted():

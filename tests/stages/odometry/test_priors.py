@@ -7,6 +7,7 @@ from test_adjust import errors, run_of
 from rille.stages.core.declare import NoParams
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.odometry.resection.adjust import adjust_stage
+from rille.stages.odometry.resection.contradiction import departure
 from rille.stages.odometry.resection.sensors import resampled
 
 TIMES = 0.1 * np.arange(31)
@@ -129,6 +130,21 @@ WRONG = {
         ("lever_arm",),
     ),
 }
+
+
+def test_degrees_of_latitude_are_named():
+    own = np.random.default_rng(1).normal(size=(9, 3))
+    assert "degrees are no metres" in departure(own, own / 1.11e5, 0.1, "ways")[1]
+
+
+def test_too_few_positions_contradict_nothing():
+    truth, rng = winding(), np.random.default_rng(4)
+    segments, before = run_of(truth, rng)
+    few = gnss(truth, rng)
+    few["positions"].update({key: few["positions"][key][:2] for key in ("positions", "times")})
+    (line,) = (line for line in adjusted(segments, before, few).meta["warnings"] if line.startswith("["))
+    assert "is not used: no piece" in line
+    assert "contradicts" not in line
 
 
 @pytest.mark.parametrize("case", WRONG)
