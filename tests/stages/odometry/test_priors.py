@@ -7,8 +7,7 @@ from test_adjust import errors, run_of
 from rille.stages.core.declare import NoParams
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.odometry.resection.adjust import adjust_stage
-from rille.stages.odometry.resection.contradiction import departure
-from rille.stages.odometry.resection.sensors import resampled
+from rille.stages.odometry.resection.sensors import departure, resampled
 
 TIMES = 0.1 * np.arange(31)
 BASE = {"times": TIMES.tolist(), "timed": True, "georeferenced": True}
