@@ -71,7 +71,7 @@ def drive(settings: list[str]) -> dict[str, Any]:
         shutil.rmtree(folder, ignore_errors=True)
     errors = [f"{f.label}: {f.error}" for f in result.failures]
     seconds = time.perf_counter() - begin
-    least = shortest_within_limits(bed, goal, config.local_planner)
+    least = shortest_within_limits(bed, goal)
     return {**found, "goal": goal, "shortest_within_limits": least, "errors": errors, "seconds": seconds}
 
 

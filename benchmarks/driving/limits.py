@@ -18,6 +18,7 @@ from driving.exact_bed import ExactBed
 from rille.stages.geometry.geometry import from_above
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.local_planner.ground import SPACING_WHEELS, TOLERANCE_WHEELBASES
 from rille.stages.planning.local_planner.route import length_of, pieces, straightened
 from rille.stages.planning.local_planner.state_lattice import LatticeGraph, PoseGrid
 from rille.stages.planning.wheels import HeightGrid, measured
@@ -46,7 +47,7 @@ class Limits:
         return bool(self.gaps(x, y, heading).all())
 
 
-def shortest_within_limits(bed: ExactBed, goal: tuple[float, float], params: Any) -> float | None:
+def shortest_within_limits(bed: ExactBed, goal: tuple[float, float]) -> float | None:
     """Length, m, of the shortest way from the start to a goal (world frame) for the planner's grid; None: none."""
     vehicle, ground, T_bed_world = bed.vehicle, bed.ground, bed.T_world_bed.inverse()
     T_bed_vehicle = T_bed_world @ bed.T_world_vehicle
@@ -54,7 +55,7 @@ def shortest_within_limits(bed: ExactBed, goal: tuple[float, float], params: Any
     gx, gy, _ = T_bed_world.apply([*goal, bed.T_world_vehicle.translation[2]])
     rows, cols = ground.height.shape
     sides = ground.x0, ground.x0 + ground.cell * (cols - 1), ground.y0 - ground.cell * (rows - 1), ground.y0
-    spacing = params.spacing * vehicle.wheel_diameter
+    spacing = max(SPACING_WHEELS * vehicle.wheel_diameter, ground.cell)
     grid = PoseGrid.over(Lattice.snap(sides, ground.cell), (x, y), heading, spacing)
     limits = Limits(ground, vehicle)
 
@@ -63,7 +64,7 @@ def shortest_within_limits(bed: ExactBed, goal: tuple[float, float], params: Any
 
     graph = LatticeGraph.of(limits, grid, price)  # type: ignore[arg-type]
     px, py = grid.places()
-    goals = np.hypot(px - gx, py - gy) <= 0.5 * params.tolerance * vehicle.wheel_base
+    goals = np.hypot(px - gx, py - gy) <= 0.5 * TOLERANCE_WHEELBASES * vehicle.wheel_base
     cost, move = graph.search(goals, 0.0, 1.0)
     if not np.isfinite(cost[0, grid.origin[0], grid.origin[1]]):
         return None
