@@ -178,7 +178,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         remedy = "name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand"
         for path in images[: 0 if any(named) else 1]:
             with suppress(InputError):
-                width, height, _ = common_header([path])
+                (width, height, _), _ = common_header([path])
                 remedy = f"{SPLIT}; else {remedy}" if width >= 2 * height else remedy
         text = f"{folder} holds {len(images)} images, {named[0]} named as left and {named[1]} as right: no pairs"
         text += "" if images else f" ({DEPTH} folders deep)"
@@ -189,7 +189,8 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     sizes, trouble, matched, lines = None, "", tuple[ImagePair, ...](), list[str]()
     try:
         matched = pairing.pair_up(left, right, gaps=True, warnings=lines)  # as the manifest opens
-        sizes = sizes_of(pairing.common_headers(matched))
+        headers, matched = pairing.common_headers(matched)
+        sizes = sizes_of(headers)
     except InputError as error:
         trouble = str(error)
     tokens = pairing.SIDES[key[0]]

@@ -334,10 +334,14 @@ def _named(pairs: list[tuple[Path, Path]]) -> tuple[ImagePair, ...]:
     return tuple(ImagePair(name, *pair) for name, pair in zip(names, pairs, strict=True))
 
 
-def common_headers(pairs: Sequence[ImagePair]) -> Headers:
-    """Width, height and bits that all images of a side share (see :func:`rille.datasets.images.files.common_header`).
+def common_headers(pairs: Sequence[ImagePair]) -> tuple[Headers, tuple[ImagePair, ...]]:
+    """Width, height and bits of most images of each side (see :func:`rille.datasets.images.files.common_header`).
 
-    Pairs of which a file is absent are left out.
+    And the pairs; of those with an image that has others, or cannot be read, ``absent`` says so.
     """
     whole = [pair for pair in pairs if not pair.absent]
-    return files.common_header([pair.left for pair in whole]), files.common_header([pair.right for pair in whole])
+    left, refused = files.common_header([pair.left for pair in whole])
+    right, others = files.common_header([pair.right for pair in whole])
+    refused |= others
+    causes = [pair.absent or refused.get(pair.left, refused.get(pair.right, "")) for pair in pairs]
+    return (left, right), tuple(replace(pair, absent=why) for pair, why in zip(pairs, causes, strict=True))

@@ -87,8 +87,7 @@ def _of_files(
 ) -> tuple[Sequence, tuple[ImagePair, ...]]:
     """Images and cameras of a manifest that names files."""
     lines: list[str] = []
-    pairs = find_pairs(manifest.images, root, name, lines, digests)
-    headers = common_headers(pairs)
+    headers, pairs = common_headers(find_pairs(manifest.images, root, name, lines, digests))
     names = (os.path.relpath(path, root.parent) for path in (pairs[0].left, pairs[0].right))
     optics = read_optics(manifest, root, name, sizes_of(headers), _are_rectified(manifest.images, names))
 

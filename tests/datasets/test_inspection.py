@@ -414,7 +414,7 @@ def test_a_link_to_nothing_is_named(tmp_path):
     write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
     for side in ("left", "right"):
         (tmp_path / side / "3.png").symlink_to("../.git/annex/objects/x.png")
-    assert "left/3.png cannot be read: it is a link to" in inspect(tmp_path).views.trouble
+    assert "left/3.png cannot be read: it is a link to" in inspect(tmp_path).views.absent[0]
 
 
 def test_pairing_by_time_stamps_is_proposed(tmp_path):

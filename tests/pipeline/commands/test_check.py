@@ -47,6 +47,13 @@ def folder(path: Path, *, rows: float = 0.0, frames: int = 4) -> Path:
     return path
 
 
+def damage(path: Path) -> None:
+    """Change a byte of an image's data; its header and its end stay."""
+    data = bytearray(path.read_bytes())
+    data[-200] ^= 0xFF
+    path.write_bytes(data)
+
+
 def look(sequence: Sequence, cache: Path, frames: tuple[int, ...] | None = None) -> int:
     """The check of a sequence, of all frames by default, with the parameters that suit it."""
     config = configuration.build(configuration.expand(sequence.defaults))
@@ -94,19 +101,21 @@ def test_rows_that_are_off_are_measured(tmp_path, capsys):
 def test_damaged_images_are_named_and_the_rest_is_looked_at(tmp_path, capsys):
     path = folder(tmp_path / "wall")
     broken = path / "right" / "000.png"
-    broken.write_bytes(broken.read_bytes()[:-200])
+    damage(broken)
+    short = path / "right" / "002.png"
+    short.write_bytes(short.read_bytes()[:-200])
     code, lines = run(path, capsys)
     assert code == 1
-    assert any("000.png" in text and "truncated" in text for text in lines)
-    assert any("RIL-670: 1 of 8 images" in text for text in lines)
+    assert any("000.png" in text and "damaged" in text for text in lines)
+    assert any("RIL-670: 1 of 6 images" in text for text in lines)
+    assert any("RIL-668: frame 002: right/002.png is damaged or truncated" in text for text in lines)
     assert line(lines, "matching").startswith("OK")
 
 
 def test_nothing_whole_is_no_crash(tmp_path, capsys):
     path = folder(tmp_path / "wall", frames=1)
     for side in ("left", "right"):
-        file = path / side / "000.png"
-        file.write_bytes(file.read_bytes()[:-200])
+        damage(path / side / "000.png")
     code, lines = run(path, capsys)
     assert code == 1
     assert any("RIL-669" in text for text in lines)
