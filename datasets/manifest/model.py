@@ -227,7 +227,7 @@ class Times(Table):
 
     file: str | None = None
     names: bool = False
-    rate_hz: float | None = Field(default=None, gt=0)
+    rate_hz: float | None = Field(default=None, ge=1e-6, le=1e6)
     unit: TimeUnit = "auto"
 
     @model_validator(mode="after")

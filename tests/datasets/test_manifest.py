@@ -254,6 +254,51 @@ def test_times_of_a_file_in_order_or_by_name(tmp_path):
     assert opened(path).times == (1.5, 2.5, 3.5)
 
 
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["00.png 10.0", "01.png 10.5", "02.png 11.0"],
+        ["filename,timestamp", "left/02.png,11.0", "left/01.png,10.5", "left/00.png,10.0"][::-1],
+        ["#frame;time [s];image name", *(f"{k};{10 + k / 2};C:\\x\\0{k}.jpg" for k in range(3))],
+        ["index time", "0 10.0", "1 10.5", "2 11.0"],
+        ["1970-01-01 00:00:10.000000000", "1970-01-01T00:00:10.5Z", "19700101_000011"],
+    ],
+)
+def test_tables_of_times_of_other_programs(tmp_path, lines):
+    path = write_sequence(tmp_path, '[times]\nfile = "t.txt"\n')
+    write_lines(tmp_path / "t.txt", lines)
+    assert opened(path).times == (10.0, 10.5, 11.0)
+
+
+def test_a_table_of_other_images_is_refused(tmp_path):
+    path = write_sequence(tmp_path, '[times]\nfile = "t.txt"\n')
+    write_lines(tmp_path / "t.txt", ["0.0 07.png", "0.5 08.png", "1.0 09.png"])
+    with raises("RIL-229", "none of 00"):
+        opened(path)
+
+
+def test_a_pair_that_lost_its_image_needs_no_time(tmp_path):
+    path = write_sequence(tmp_path, '[times]\nfile = "t.txt"\n', frames=4)
+    (tmp_path / "left" / "01.png").unlink()
+    write_lines(tmp_path / "t.txt", ["0.0 00.png", "1.0 02.png", "1.5 03.png", "2.0 04.png"])
+    assert opened(path).times == (0.0, 0.5, 1.0, 1.5)
+
+
+def test_dates_in_names_are_times_and_counts_are_not(tmp_path):
+    for k, name in enumerate(["20240229_235959_750", "20240301_000000_250", "20240301_000000_750"]):
+        write_images(tmp_path, [f"{side}/{name}.png" for side in ("left", "right")])
+        write_images(tmp_path, [f"count/{side}/{k:03d}.png" for side in ("left", "right")])
+    path = write_sequence(tmp_path, "[times]\nnames = true\n", frames=0)
+    times = opened(path).times
+    assert times is not None
+    assert [t - times[0] for t in times] == [0.0, 0.5, 1.0]
+    path = write_sequence(tmp_path / "count", "[times]\nnames = true\n", frames=0)
+    with raises("RIL-227", "000.png to 002.png"):
+        opened(path)
+    path.write_text(path.read_text() + 'unit = "s"\n')
+    assert opened(path).times == (0.0, 1.0, 2.0)
+
+
 def test_times_of_names(tmp_path):
     names = [f"{side}/{1_500_000_000 + k}.5.png" for k in range(3) for side in ("left", "right")]
     path = write_sequence(tmp_path, "[times]\nnames = true\n", frames=0)
