@@ -205,7 +205,9 @@ def find_pairs(
         A pattern finds nothing, both find the same files, or images have no partners.
     """
     found, search = {}, Search()
-    for side, pattern in (("left", images.left), ("right", images.right)):
+    for side, stated in (("left", images.left), ("right", images.right)):
+        # A folder stands for what it holds.
+        pattern = f"{stated.rstrip('/')}/*" if stated and os.path.isdir(root / stated) else stated
         try:
             paths = search.matching(root, pattern)
         except InputError as error:

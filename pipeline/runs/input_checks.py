@@ -82,7 +82,13 @@ LIMITS = {
         InputLimit(
             "RIL-652", "change", most=1.5, remedy="it is levelled, but black and white is lost: fix the exposure"
         ),
-        InputLimit("RIL-653", "right over left", least=1 / 1.5, most=1.5, remedy="couple the exposure of both cameras"),
+        InputLimit(
+            "RIL-653",
+            "right over left",
+            least=1 / 1.5,
+            most=1.5,
+            remedy="couple their exposure; do both have as many bits?",
+        ),
     ),
     "sharpness": (
         InputLimit("RIL-654", "blurred", most=0, remedy="leave them out, or expect a weak pose there"),
@@ -283,10 +289,12 @@ def _usual(values: Floats) -> float:
 def judge_matching(rate: float | None, depths: Floats, baseline: float) -> Finding:
     """Share of usable pixels that are matched, and how far away they lie (m)."""
     share = rate or 0.0
-    near, middle, far = (float(v) for v in np.percentile(depths, [5, 50, 95])) if depths.size else (math.nan,) * 3
-    text = f"{100 * share:.0f} % of the first pair is matched, depth {near:.3g} to {far:.3g} m, median {middle:.3g} m"
-    away = {"baselines away": middle / baseline} if depths.size else {}
-    return judge("matching", text, {"matched": share, **away})
+    text, figures = f"{100 * share:.0f} % of the first pair is matched", {"matched": share}
+    if depths.size:
+        near, middle, far = (float(v) for v in np.percentile(depths, [5, 50, 95]))
+        text += f", depth {near:.3g} to {far:.3g} m, median {middle:.3g} m"
+        figures["baselines away"] = middle / baseline
+    return judge("matching", text, figures)
 
 
 def judge_sides(beyond: float) -> Finding:
@@ -329,6 +337,6 @@ def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Se
     (a, b), least = min(overlap.items(), key=lambda kv: kv[1])
     text = (
         f"successive images overlap by {100 * np.median(list(overlap.values())):.0f} %, least {100 * least:.0f} % "
-        f"from frame {names[a]} to {names[b]}; motion {np.median(length) if length else math.nan:.1f} px"
+        f"from frame {names[a]} to {names[b]}{f'; motion {np.median(length):.1f} px' if length else ''}"
     )
     return judge("motion", text, {"overlap": least})

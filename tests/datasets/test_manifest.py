@@ -241,6 +241,20 @@ def test_place_on_earth(tmp_path):
     assert s.georeference == Georeference("EPSG:32633", (500100.0, 5200200.0, 1800.0), math.pi / 2)
 
 
+@pytest.mark.parametrize(
+    ("left", "right"), [("left", "right/"), ("left/*.PNG", "right/??.png"), ("my [left]/*.png", "my [[]right]/*.png")]
+)
+def test_folders_brackets_and_the_case_of_suffixes_in_patterns(tmp_path, left, right):
+    path = write_sequence(tmp_path)
+    (tmp_path / "left" / "01.png").rename(tmp_path / "left" / "01.PNG")
+    for side in ("left", "right"):
+        (tmp_path / side / "notes.txt").write_text("none")
+        (tmp_path / f"my [{side}]").symlink_to(side)
+    path.write_text(path.read_text().replace("left/*.png", left).replace("right/*.png", right))
+    s = opened(path)
+    assert (s.frames, s.lost) == (3, {})
+
+
 # -- times -------------------------------------------------------------------------------------------------------------
 
 

@@ -160,7 +160,9 @@ def test_matching():
     assert "depth 2.1 to 3.9 m, median 3 m" in good.text
     assert input_checks.judge_matching(0.1, depths, 0.1).level == "WARN"
     assert input_checks.judge_matching(0.001, depths, 0.1).level == "FAIL"
-    assert input_checks.judge_matching(None, depths[:0], 0.1).level == "FAIL"
+    none = input_checks.judge_matching(None, depths[:0], 0.1)
+    assert none.level == "FAIL"
+    assert "nan" not in str(none)
     assert input_checks.judge_matching(0.7, 100 * depths, 0.1).level == "WARN"
 
 
