@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from raising import raises
 
 from rille.datasets.protocol import Sequence
 from rille.datasets.registry import open_sequence
@@ -15,6 +16,7 @@ from rille.pipeline.commands.sequences.check import inspect
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.runs import session
 from rille.pipeline.runs.input_checks import judge_rig
+from rille.pipeline.runs.options import Settings
 
 ROWS, COLUMNS, MARGIN = 120, 200, 40
 
@@ -110,6 +112,16 @@ def test_damaged_images_are_named_and_the_rest_is_looked_at(tmp_path, capsys):
     assert any("RIL-670: 1 of 6 images" in text for text in lines)
     assert any("RIL-668: frame 002: right/002.png is damaged or truncated" in text for text in lines)
     assert line(lines, "matching").startswith("OK")
+
+
+def test_a_wrong_default_of_a_sequence_is_told_from_a_wrong_option(tmp_path):
+    sequence = replace(open_sequence(str(folder(tmp_path / "wall"))), defaults={"locus.cell_size": -1})
+    with raises("RIL-027", "defaults of wall: locus.cell_size"):
+        session.settings(sequence, Settings())
+    sequence = replace(sequence, defaults={})
+    with raises("RIL-027") as caught:
+        session.settings(sequence, Settings(("locus.cell_size=-1",)))
+    assert "wall" not in str(caught.value)
 
 
 def test_nothing_whole_is_no_crash(tmp_path, capsys):
