@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import re
 import threading
@@ -159,7 +160,7 @@ def decode_colour(
         check_size(header._replace(depth=wanted.depth), wanted, name)
     image, complaint = _unpacked(data)
     if image is None:
-        raise InputError("RIL-763", f"{name} cannot be decoded", remedy=COPY_AGAIN)
+        raise InputError("RIL-763", f"{name} cannot be decoded", remedy=f"{COPY_AGAIN}, or save a TIFF uncompressed")
     if complaint:
         raise InputError("RIL-192", f"{name} is damaged ({complaint})", remedy=COPY_AGAIN)
     if image.dtype not in (np.uint8, np.uint16):
@@ -187,7 +188,7 @@ def _sound(header: Header | None, name: str) -> Header:
     if header is None:
         kind = kind_of(name)
         text = f"{name} cannot be read as an image"
-        remedy = f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM are read" if kind == "file" else KINDS[kind][1]
+        remedy = f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM of 8 or 16 bits are read" if kind == "file" else KINDS[kind][1]
         raise InputError("RIL-171", text, remedy=remedy)
     width, height, bits = header
     if bits > 16:
@@ -250,7 +251,8 @@ def _header(path: Path) -> Header:
         file.seek(0)
         start, size = file.read(2), file.seek(0, os.SEEK_END)
         file.seek(max(0, size - TAIL))
-        if header is None or ENDS.get(start, b"") not in file.read():
+        bands = {b"P5": 1, b"P6": 3, b"BM": 1}.get(start, 0)  # at least, of samples that are not packed
+        if header is None or size < bands * math.prod(header) // 8 or ENDS.get(start, b"") not in file.read():
             read_grey(path)  # says what is wrong
     return _sound(header, str(path))
 

@@ -69,7 +69,7 @@ LIMITS = {
         InputLimit("RIL-649", "y in the images", most=0.0, remedy="held upside down, or a wrong sign?"),
     ),
     "images": (
-        Fault("RIL-650", "blank", most=0, remedy="leave these frames out with --frames"),
+        InputLimit("RIL-650", "blank", most=0, remedy="left ones get no pose, right ones no depth: take them anew"),
         InputLimit("RIL-668", "lost", most=0, remedy="it gets no pose; its neighbours are joined across it"),
         Fault("RIL-670", "unusable", most=0),
         Fault("RIL-671", "left and right are one", most=0, remedy="give the right camera's images"),

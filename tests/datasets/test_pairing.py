@@ -130,6 +130,19 @@ def test_images_that_do_not_belong_to_the_others_are_absent(tmp_path):
         common_headers(pairs)
 
 
+@pytest.mark.parametrize("kind", ["pgm", "ppm", "bmp", "jpg"])
+def test_images_of_other_kinds_that_break_off_are_absent(tmp_path, kind):
+    for k in range(3):
+        for side in "lr":
+            cv2.imwrite(
+                str(tmp_path / f"{k}_{side}.{kind}"), np.full((40, 60, 3 if kind == "ppm" else 1), 90, np.uint8)
+            )
+    short = tmp_path / f"1_r.{kind}"
+    short.write_bytes(short.read_bytes()[: -short.stat().st_size // 2])
+    _, checked = common_headers(pair_up(sorted(tmp_path.glob("*_l*")), sorted(tmp_path.glob("*_r*"))))
+    assert [bool(pair.absent) for pair in checked] == [False, True, False]
+
+
 def test_some_images_without_most_of_one_size_are_refused(tmp_path):
     for k, rows in enumerate((4, 5)):
         for side in "lr":

@@ -141,6 +141,8 @@ class Inspection:
             image = np.asarray(bundle["image"])
             sizes.add(f"{image.shape[1]} x {image.shape[0]} {image.dtype}")
             looks[camera][frame] = glance(image, np.asarray(bundle["valid"]))
+            if looks[camera][frame]["deviation"] < self.make.config.frame_screening.uniform:
+                self.broken.add((frame, camera))
         for refusal in errors[:NAMED_IMAGES]:
             self.refused(refusal, "images")
         whole = f"all {len(images)} open, {' and '.join(sorted(sizes))}"

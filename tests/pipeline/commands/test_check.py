@@ -124,6 +124,17 @@ def test_a_wrong_default_of_a_sequence_is_told_from_a_wrong_option(tmp_path):
     assert "wall" not in str(caught.value)
 
 
+def test_blank_images_are_passed_over_as_a_run_does(tmp_path, capsys):
+    path = folder(tmp_path / "wall")
+    for name in ("left/000.png", "left/002.png", "right/003.png"):
+        cv2.imwrite(str(path / name), np.zeros((ROWS, COLUMNS), np.uint8))
+    code, lines = run(path, capsys)
+    assert code == 0
+    assert sum("RIL-650" in text for text in lines) == 2
+    assert line(lines, "matching").startswith("OK")
+    assert "RIL-666" not in " ".join(lines)
+
+
 def test_nothing_whole_is_no_crash(tmp_path, capsys):
     path = folder(tmp_path / "wall", frames=1)
     for side in ("left", "right"):
