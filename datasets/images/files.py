@@ -247,9 +247,8 @@ def _header(path: Path) -> Header:
         It cannot be read, is none of an image that is ever decoded, or the file breaks off.
     """
     with open_regular(path, "image", MOST_BYTES) as file:
-        header = read_header(file)
-        file.seek(0)
-        start, size = file.read(2), file.seek(0, os.SEEK_END)
+        start, header = file.peek(2)[:2], read_header(file)
+        size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - TAIL))
         bands = {b"P5": 1, b"P6": 3, b"BM": 1}.get(start, 0)  # at least, of samples that are not packed
         if header is None or size < bands * math.prod(header) // 8 or ENDS.get(start, b"") not in file.read():

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import ntpath
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -125,7 +126,7 @@ class MotionReader:
         for k, line in enumerate(lines, start=1):
             text = undated(line.strip())
             cells = split(text.removeprefix("#"), next((s for s in ",;\t" if s in text), None))
-            names = [cell for cell in cells if PureWindowsPath(cell).suffix.lower() in SUFFIXES]
+            names = [cell for cell in cells if cell.lower().endswith(SUFFIXES)]
             others = [cell for cell in cells if cell not in names]
             if text.startswith("#") or not others or not re.match(r"[-+.\d]|(nan|inf)$", others[0], re.I):
                 header = cells or header
@@ -134,7 +135,7 @@ class MotionReader:
             stated = [cell for title, cell in titles.items() if re.search("time|stamp", title, re.I)]
             rows.append((next((cell for cell in stated if NUMBER.match(cell)), others[0]).split()[0], k))
             images = images or bool(names)
-            by_name |= {PureWindowsPath(cell).stem: rows[-1] for cell in names or cells[1:2]}
+            by_name |= {ntpath.splitext(ntpath.basename(cell))[0]: rows[-1] for cell in names or cells[1:2]}
         # Tables may list more images than there are pairs, in any order: names decide where all are found.
         stems = [pair.left.stem for pair in self.pairs]
         absent = next((p.left.stem for p in self.pairs if not p.absent and p.left.stem not in by_name), "")
