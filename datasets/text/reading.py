@@ -191,17 +191,11 @@ def check_depth(value: Any, file: str) -> None:
     """Refuse entries that are nested more than ``DEEPEST`` levels: whatever walks them would run out of stack."""
     level = [value]
     for _ in range(DEEPEST):
-        level = [inner for outer in level for inner in _inner(outer)]
+        nested = [v.values() if isinstance(v, dict) else v for v in level if isinstance(v, dict | list)]
+        level = [v for values in nested for v in values]
         if not level:
             return
     raise InputError("RIL-760", f"{file} is nested more than {DEEPEST} levels deep", remedy="correct the file")
-
-
-def _inner(value: Any) -> Iterator[Any]:
-    if isinstance(value, dict):
-        yield from value.values()
-    elif isinstance(value, list):
-        yield from value
 
 
 def _no_long_line(lines: list[str], path: Path, what: str) -> None:

@@ -23,7 +23,7 @@ UPPER = {"s": 1e11, "ms": 1e14, "us": 1e17}
 """Above it a value can no longer be in that unit: 1e11 s after 1970 is the year 5138."""
 
 DATE = re.compile(
-    r"(?<!\d)((?:19|20)\d\d)([-_/]?)(\d\d)\2(\d\d)[-_T ]?(\d\d)([-_:]?)(\d\d)\6(\d\d)"
+    r"(?<!\d)((?:19|20)\d\d([-_/]?)\d\d\2\d\d)[-_T ]?(\d\d([-_:]?)\d\d\4\d\d)"
     r"(?:\.(\d+)|[-_]?(\d{3}))?(?:Z|\+00:00)?(?!\d)"
 )
 """Date and time of day, with a fraction or milliseconds, as logs and names of files have them."""
@@ -33,10 +33,10 @@ def undated(text: str) -> str:
     """The text with seconds since 1970 in the place of a date and time of day, which is taken for UTC."""
 
     def since(match: re.Match[str]) -> str:
-        year, _, month, day, hour, _, minute, second, fraction, milliseconds = match.groups()
+        date, clock = (re.sub(r"\D", "", match[k]) for k in (1, 3))
         with suppress(ValueError):  # no day of a calendar
-            date = datetime.fromisoformat(f"{year}-{month}-{day}T{hour}:{minute}:{second}Z")
-            return f"{date.timestamp():.0f}.{fraction or milliseconds or 0}"
+            moment = datetime.fromisoformat(f"{date}T{clock}Z")
+            return f"{moment.timestamp():.0f}.{match[5] or match[6] or 0}"
         return match[0]
 
     return DATE.sub(since, text)

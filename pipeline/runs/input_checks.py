@@ -83,11 +83,7 @@ LIMITS = {
             "RIL-652", "change", most=1.5, remedy="it is levelled, but black and white is lost: fix the exposure"
         ),
         InputLimit(
-            "RIL-653",
-            "right over left",
-            least=1 / 1.5,
-            most=1.5,
-            remedy="couple their exposure; do both have as many bits?",
+            "RIL-653", "right over left", least=1 / 1.5, most=1.5, remedy="give both one exposure and bit depth"
         ),
     ),
     "sharpness": (
