@@ -218,7 +218,8 @@ def pair_up(
         pairs = _named(list(zip(left, right, strict=True)))
         lines += _two_clocks(pairs, *times, tolerance) if all(times) and len(pairs) > 1 else []
         return pairs
-    if rule == "nearest" or (rule == "auto" and joined is not None and joined.apart):
+    shared = {without_side(path.stem, 0) for path in left} & {without_side(path.stem, 1) for path in right}
+    if rule == "nearest" or (rule == "auto" and joined is not None and (joined.apart or not shared)):
         if joined is None or not joined.places:
             why = f"the nearest are {joined.apart:.4g} s apart" if joined else "not each has its own"
             remedy = 'state images.tolerance (s), or, of two clocks, images.pair = "order"'
@@ -227,7 +228,6 @@ def pair_up(
         lines += joined.lines("RIL-821")
         return _named([(left[i], right[j]) for i, j in joined.places])
     if rule == "auto":
-        shared = {without_side(path.stem, 0) for path in left} & {without_side(path.stem, 1) for path in right}
         rule = "name" if shared else "number"
     by_key = _by_key(left, 0, rule), _by_key(right, 1, rule)
     if growing:
@@ -255,7 +255,7 @@ def _by_key(paths: Sequence[Path], side: int, rule: str) -> dict[str, Path]:
             raise InputError("RIL-257", text, remedy=remedy)
         key = str(int(numbers[-1])) if rule == "number" else without_side(path.stem, side)
         if key in by_key:
-            text = f"{by_key[key]} and {path.name} are the same frame by {rule}"
+            text = f"{by_key[key]} and {path} are the same frame by {rule}"
             raise InputError("RIL-258", text, remedy="narrow the patterns, or choose another images.pair")
         by_key[key] = path
     return by_key

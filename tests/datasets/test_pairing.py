@@ -229,6 +229,12 @@ def test_pairs_by_order_are_never_frames_apart(left, right, expected):
         pair_up(stamped("{ns}.png", left), stamped("{ns}.png", right), "order")
 
 
+def test_equal_stamps_of_unlike_digits_are_pairs():
+    left = [Path(f"left/{1_600_000_000 + k / 10:.3f}.png") for k in range(4)]
+    right = [Path(f"right/{1_600_000_000 + k / 10:.6f}.png") for k in range(4)]
+    assert [(pair.left, pair.right) for pair in pair_up(left, right)] == list(zip(left, right, strict=True))
+
+
 def test_stamps_of_two_clocks_are_said():
     left, right = stamped("{ns}.png", [0, 100, 200]), stamped("{ns}.png", [7e6 + 3, 7e6 + 101, 7e6 + 204])
     with raises("RIL-822", "of two clocks"):
