@@ -93,28 +93,24 @@ class MotionReader:
         if section.rate_hz is not None:
             return tuple(k / section.rate_hz for k in range(len(self.pairs)))
         path = self.root / (section.file or "")
-        stamps = self.stamps_of_names() if section.names else self.stamps_of_file(path)
+        stamps = self.stamps_of_names(section.unit) if section.names else self.stamps_of_file(path)
         what = "the image names" if section.names else str(path)
         known = [k for k, stamp in enumerate(stamps) if stamp is not None]
         rows = [stamp for stamp in stamps if stamp is not None]
         times = seconds([t for t, _ in rows], what, unit=section.unit, lines=[line for _, line in rows])
-        counted = len(times) > 2 and times[0] < 1e8 and set(np.diff(times)) == {1}
-        if section.names and section.unit == "auto" and counted:
-            text = f"{self.name}: times.names: {ends([pair.left for pair in self.pairs])} count images, or seconds"
-            raise InputError("RIL-227", text, remedy='give times.rate_hz, or state times.unit = "s"')
         return tuple(float(t) for t in np.interp(range(len(stamps)), known, times))
 
-    def stamps_of_names(self) -> list[tuple[str, int]]:
+    def stamps_of_names(self, unit: str) -> list[tuple[str, int]]:
         """The time stamp in each left image's name, a date, one since 1970 or its last number; and the pair's place."""
-        stamps = []
-        for k, pair in enumerate(self.pairs, start=1):
-            stem = undated(pair.left.stem)
-            numbers = [stamp_of(stem)] if stamp_of(stem) else re.findall(r"\d+(?:\.\d+)?", stem)
-            if not numbers:
-                text = f"{self.name}: times.names: {pair.left} has no number in its name"
-                raise InputError("RIL-227", text, remedy=NEEDS_TIMES)
-            stamps.append((str(numbers[-1]), k))
-        return stamps
+        stems = [undated(pair.left.stem) for pair in self.pairs]
+        stamps = [stamp_of(stem) or ["", *re.findall(r"\d+(?:\.\d+)?", stem)][-1] for stem in stems]
+        wrong = stamps.index("") if "" in stamps else 0
+        small = unit == "auto" and len(stamps) > 2 and "" not in stamps and float(stamps[0]) < 1e8
+        if "" in stamps or (small and set(np.diff(np.array(stamps, float))) == {1}):
+            text = f"{self.name}: times.names: {self.pairs[wrong].left} has no number in its name, or one that counts"
+            remedy = 'give times.file or times.rate_hz; or, where the names are seconds, times.unit = "s"'
+            raise InputError("RIL-227", text, remedy=remedy)
+        return [(stamp, k) for k, stamp in enumerate(stamps, start=1)]
 
     def stamps_of_file(self, path: Path) -> Sequence[tuple[str, int] | None]:
         """Time stamp of each pair as text, and the line that it stands in."""
