@@ -71,7 +71,7 @@ LIMITS = {
     "images": (
         InputLimit("RIL-650", "blank", most=0, remedy="left ones get no pose, right ones no depth: take them anew"),
         InputLimit("RIL-668", "lost", most=0, remedy="it gets no pose; its neighbours are joined across it"),
-        Fault("RIL-670", "unusable", most=0),
+        Fault("RIL-670", "unusable", most=0, remedy="mend, convert or remove what is wrong"),
         Fault("RIL-671", "left and right are one", most=0, remedy="give the right camera's images"),
         InputLimit("RIL-672", "repeated", most=0, remedy="was a frame copied, or did the camera hang?"),
     ),

@@ -110,7 +110,7 @@ def test_damaged_images_are_named_and_the_rest_is_looked_at(tmp_path, capsys):
     assert code == 1
     assert any("000.png" in text and "damaged" in text for text in lines)
     assert any("RIL-670: 1 of 6 images" in text for text in lines)
-    assert any("RIL-668: frame 002: right/002.png is damaged or truncated" in text for text in lines)
+    assert any("RIL-670: frame 002: right/002.png is damaged or truncated" in text for text in lines)
     assert line(lines, "matching").startswith("OK")
 
 
