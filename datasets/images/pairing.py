@@ -227,8 +227,7 @@ def pair_up(
             raise IncompleteError("RIL-822", text, remedy=remedy)
         lines += joined.lines("RIL-821")
         return _named([(left[i], right[j]) for i, j in joined.places])
-    if rule == "auto":
-        rule = "name" if shared else "number"
+    rule = rule if rule != "auto" else "name" if shared else "number"
     by_key = _by_key(left, 0, rule), _by_key(right, 1, rule)
     if growing:
         by_key = _up_to_last_pair(*by_key)
@@ -344,6 +343,5 @@ def common_headers(pairs: Sequence[ImagePair]) -> tuple[Headers, tuple[ImagePair
     whole = [pair for pair in pairs if not pair.absent]
     left, refused = files.common_header([pair.left for pair in whole])
     right, others = files.common_header([pair.right for pair in whole])
-    refused |= others
-    causes = [pair.absent or refused.get(pair.left, refused.get(pair.right, "")) for pair in pairs]
+    causes = [pair.absent or refused.get(pair.left) or others.get(pair.right, "") for pair in pairs]
     return (left, right), tuple(replace(pair, absent=why) for pair, why in zip(pairs, causes, strict=True))

@@ -133,10 +133,9 @@ class MotionReader:
             images = images or bool(names)
             by_name |= {ntpath.splitext(ntpath.basename(cell))[0]: rows[-1] for cell in names or cells[1:2]}
         # Tables may list more images than there are pairs, in any order: names decide where all are found.
-        stems = [pair.left.stem for pair in self.pairs]
         absent = next((p.left.stem for p in self.pairs if not p.absent and p.left.stem not in by_name), "")
         if by_name and not absent:
-            return [by_name.get(stem) for stem in stems]
+            return [by_name.get(pair.left.stem) for pair in self.pairs]
         rows = list(self.arrived(rows))
         if images or len(rows) not in self.counts():
             more = f", none of {absent}" if by_name else ""

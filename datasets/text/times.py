@@ -33,9 +33,8 @@ def undated(text: str) -> str:
     """The text with seconds since 1970 in the place of a date and time of day, which is taken for UTC."""
 
     def since(match: re.Match[str]) -> str:
-        date, clock = (re.sub(r"\D", "", match[k]) for k in (1, 3))
         with suppress(ValueError):  # no day of a calendar
-            moment = datetime.fromisoformat(f"{date}T{clock}Z")
+            moment = datetime.fromisoformat(re.sub("[-_:/]", "", f"{match[1]}T{match[3]}Z"))
             return f"{moment.timestamp():.0f}.{match[5] or match[6] or 0}"
         return match[0]
 
@@ -78,10 +77,9 @@ def seconds(
             raise InputError("RIL-293", text, remedy="put the rows in order of time, each once, in one unit")
     times = tuple(float(v / UNITS[stated]) for v in exact)
     usual = float(np.median(np.diff(np.asarray(times)))) if len(times) > 1 else 1.0
-    # s; larger stamps of any unit are known by their magnitude: 1973 and later
-    guessed = unit == "auto" and times[0] < 1e8
-    # s; pairs an hour apart are possible, but a wrong unit is likelier; no camera takes ten million images a second
-    if (guessed and usual > 3600.0) or usual < 1e-7:
+    # s; stamps of 1973 and later are known by their magnitude. Pairs an hour apart are possible, but a wrong unit is
+    # likelier, and no camera takes ten million images a second.
+    if (unit == "auto" and times[0] < 1e8 and usual > 3600.0) or usual < 1e-7:
         text = f"times of {what} are {usual:.4g} s apart, if their unit is {stated}"
         likely = "ns" if usual > 1.0 else "s"
         remedy = (
