@@ -223,7 +223,7 @@ def common_header(paths: Sequence[Path]) -> tuple[Header, dict[Path, str]]:
     Raises
     ------
     InputError
-        Not most of them can be used together.
+        None of them can be read, or not most of these are of one size and depth, or of one that is ever decoded.
     """
     headers, refused = dict[Path, Header](), dict[Path, InputError]()
     for path in paths:
@@ -231,10 +231,12 @@ def common_header(paths: Sequence[Path]) -> tuple[Header, dict[Path, str]]:
             headers[path] = _header(path)
         except InputError as error:
             refused[path] = error
-    wanted = Counter(headers.values()).most_common(1)[0][0] if headers else Header(0, 0, 0)
-    refused |= {path: _unlike(found, wanted, str(path)) for path, found in headers.items() if found != wanted}
-    if 2 * len(refused) >= len(paths):
-        raise next(iter(refused.values()))
+    wanted, count = next(iter(Counter(headers.values()).most_common(1)), (Header(0, 0, 0), 0))
+    unlike = {path: _unlike(found, wanted, str(path)) for path, found in headers.items() if found != wanted}
+    refused |= unlike
+    if 2 * count <= len(headers):
+        raise next(iter((unlike or refused).values()))
+    _sound(wanted, str(next(path for path in paths if path not in refused)))
     return wanted, {p: why.message.replace(str(p), f"{p.parent.name}/{p.name}") for p, why in refused.items()}
 
 
@@ -244,16 +246,17 @@ def _header(path: Path) -> Header:
     Raises
     ------
     InputError
-        It cannot be read, is none of an image that is ever decoded, or the file breaks off.
+        It cannot be read, or the file breaks off.
     """
     with open_regular(path, "image", MOST_BYTES) as file:
         start, header = file.peek(2)[:2], read_header(file)
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - TAIL))
         bands = {b"P5": 1, b"P6": 3, b"BM": 1}.get(start, 0)  # at least, of samples that are not packed
-        if header is None or size < bands * math.prod(header) // 8 or ENDS.get(start, b"") not in file.read():
-            read_grey(path)  # says what is wrong
-    return _sound(header, str(path))
+        if header is not None and size >= bands * math.prod(header) // 8 and ENDS.get(start, b"") in file.read():
+            return header
+    image = read_grey(path)  # says what is wrong
+    return Header(image.shape[1], image.shape[0], 8 * image.itemsize)
 
 
 class Digests:

@@ -158,7 +158,7 @@ def test_an_image_is_never_unpacked_beyond_its_bounds(tmp_path, monkeypatch):
     (tmp_path / "b.png").write_bytes(png(640, 480))
     data = (tmp_path / "b.png").read_bytes()
     refused("RIL-176", files.decode, data, "b.png", Header(64, 48, 8))
-    refused("RIL-762", files.common_header, [tmp_path / "b.png", tmp_path / "a.png"])
+    refused("RIL-176", files.common_header, [tmp_path / "b.png", tmp_path / "a.png"])
 
 
 PIXELS = [

@@ -133,6 +133,6 @@ def test_images(folder):
     bomb = png(30_000)
     assert len(bomb) < 120_000
     (folder / "left" / "1.png").write_bytes(bomb)
-    refused(folder, "RIL-762", "reconstruct", "m.toml", "--cache", "cache")
+    refused(folder, "RIL-176", "reconstruct", "m.toml", "--cache", "cache")
     refused(folder, "RIL-762", "match", "left/1.png", "right/1.png")
     refused(folder, "RIL-762", "calibrate", "left", "right", "--square", "0.03")
