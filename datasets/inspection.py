@@ -55,6 +55,7 @@ class FoundImages:
     sides : the words or letters in the names that mark left and right.
     absent : of the pairs that lack a file, what is missing; they are counted in ``pairs``.
     lines : how the pairs are joined by the time stamps in their names, where these differ.
+    others : patterns of the left images of other sets of pairs.
     """
 
     left: str
@@ -67,6 +68,7 @@ class FoundImages:
     sides: tuple[str, str] = ("left", "right")
     absent: tuple[str, ...] = ()
     lines: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,7 @@ def inspect(folder: Path) -> Findings:
         found = Findings(folder, find_views(folder, [p for p in paths if p.suffix.lower() in SUFFIXES]))
     except InputError as error:
         raise InputError(error.code, "; ".join([error.message, *unread(strange)]), remedy=error.remedy) from error
+    found.unread += [f"{of} and its right images: of another set" for of in found.views.others]
     texts = [p for p in paths if p.suffix.lower() in (*CALIBRATIONS, *TABLES)]
     # Each is tried as a calibration and as a table; thousands of them (one an image) would take minutes.
     if len(texts) > MOST_TEXTS:
@@ -178,18 +181,19 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         remedy = "name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand"
         for path in images[: 0 if any(named) else 1]:
             with suppress(InputError):
-                width, height, _ = common_header([path])
+                (width, height, _), _ = common_header([path])
                 remedy = f"{SPLIT}; else {remedy}" if width >= 2 * height else remedy
         text = f"{folder} holds {len(images)} images, {named[0]} named as left and {named[1]} as right: no pairs"
         text += "" if images else f" ({DEPTH} folders deep)"
         raise InputError("RIL-194", text, remedy=remedy)
-    # Most pairs first; of as many, the surest token (SIDES).
-    key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0]))
+    # Most pairs first; of as many, the surest token (SIDES), and the shortest name: not left_depth before left.
+    key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0], -len(k[1])))
     left, right = both[key]
     sizes, trouble, matched, lines = None, "", tuple[ImagePair, ...](), list[str]()
     try:
         matched = pairing.pair_up(left, right, gaps=True, warnings=lines)  # as the manifest opens
-        sizes = sizes_of(pairing.common_headers(matched))
+        headers, matched = pairing.common_headers(matched)
+        sizes = sizes_of(headers)
     except InputError as error:
         trouble = str(error)
     tokens = pairing.SIDES[key[0]]
@@ -204,6 +208,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         tokens,
         tuple(pair.absent for pair in matched if pair.absent),
         tuple(lines),
+        tuple(pattern(sides[0], folder) for place, sides in both.items() if place != key),
     )
 
 
@@ -292,11 +297,12 @@ def table_kind(path: Path, pairs: int) -> str:
         It is no text, has decimal commas, or is one of true positions by its columns' names, and cannot be read.
     """
     read_lines(path, "table")  # refuses what is no text; of other files most are no tables, which is no error
+    named = "times" if "time" in path.stem.lower() else ""
     try:
         table = read_table(path, "table")
         row = np.array([float(cell) for cell in table.rows[0]])
-    except (InputError, ValueError):
-        return ""
+    except (InputError, ValueError):  # such as names of images, and dates
+        return named
     header = " ".join(table.header)
     if any(word in header for word in ("gyro", "w_rs", "ang_vel", "angular", "accel")) and row.size >= 7:
         return "imu"
@@ -306,7 +312,7 @@ def table_kind(path: Path, pairs: int) -> str:
     # Without times they must be one a pair.
     if positions is not None and (positions.times is not None or len(positions.positions) == pairs):
         return "positions"
-    return _kind_of_row(row, len(table.rows), pairs, "times" if "time" in path.stem.lower() else "")
+    return _kind_of_row(row, len(table.rows), pairs, named)
 
 
 def _kind_of_row(row: np.ndarray, rows: int, pairs: int, named: str) -> str:

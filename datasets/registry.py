@@ -124,7 +124,7 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
     if name_or_path in MANIFESTS:
         return open_manifest(Path(__file__).parent / "manifests" / f"{name_or_path}.toml", digests)
     path, number = _split(name_or_path)
-    if path.is_file() and path.suffix == ".toml":
+    if path.is_file() and path.suffix.lower() == ".toml":
         return open_manifest(path, digests)
     # What the user wrote down goes before what the folder looks like.
     manifest = folder_manifest(path) if number is None and path.is_dir() else None

@@ -6,8 +6,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from rille.datasets.images.files import MOST_BYTES, Digests, decode
-from rille.datasets.text.reading import read_bytes
+from rille.datasets.images.files import Digests, read_grey
 from rille.stages.core.errors import InputError
 
 SETTLE_SECONDS = 0.5
@@ -53,7 +52,11 @@ class Arrivals(Digests):
             self._seen[path] = _Seen(status.st_size, status.st_mtime_ns, now)
             return False
         if seen.trouble == WRITTEN and now - seen.since >= SETTLE_SECONDS:
-            seen.trouble = _damage(path)
+            seen.trouble = ""
+            try:
+                read_grey(path)
+            except InputError as error:
+                seen.trouble = error.message
         return not seen.trouble
 
     def first_seen(self, path: Path) -> float:
@@ -64,12 +67,3 @@ class Arrivals(Digests):
         """Why files that are there are not whole, one line each."""
         there = ((path, seen.trouble) for path, seen in self._seen.items() if seen.trouble and path.exists())
         return [f"{path} {WRITTEN}" if trouble == WRITTEN else trouble for path, trouble in there]
-
-
-def _damage(path: Path) -> str:
-    """Why an image cannot be decoded, in words; empty: it can."""
-    try:
-        decode(read_bytes(path, "image", MOST_BYTES), str(path))
-    except InputError as error:
-        return error.message
-    return ""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import re
 import threading
+from collections import Counter
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -43,6 +45,12 @@ EXCHANGE = 'python -c "import sys, cv2; [cv2.imwrite(f, cv2.imread(f, -1).bytesw
 PNG, JPEG, TIFF = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", (b"II", b"MM")
 """How files begin."""
 
+TAIL = 4096
+"""Bytes in which a file ends: its end marker may be followed by padding."""
+
+ENDS = {PNG[:2]: b"IEND", JPEG: b"\xff\xd9"}
+"""What nothing else ends a file with, by its first two bytes."""
+
 _STDERR = threading.Lock()
 
 COLOUR = Array(
@@ -61,8 +69,7 @@ def _damage(data: bytes) -> str:
             opened(BytesIO(data)).verify()
         except Exception as error:  # whatever the parser of a damaged file comes upon
             return f"is damaged or truncated ({' '.join(str(error).split())[:100]})"
-    # the end marker may be followed by padding, but nothing else ends a JPEG
-    if data.startswith(JPEG) and b"\xff\xd9" not in data[-4096:]:
+    if data.startswith(JPEG) and ENDS[JPEG] not in data[-TAIL:]:
         return f"is truncated (the JPEG breaks off at byte {len(data)})"
     return ""
 
@@ -153,7 +160,7 @@ def decode_colour(
         check_size(header._replace(depth=wanted.depth), wanted, name)
     image, complaint = _unpacked(data)
     if image is None:
-        raise InputError("RIL-763", f"{name} cannot be decoded", remedy=COPY_AGAIN)
+        raise InputError("RIL-763", f"{name} cannot be decoded", remedy=f"{COPY_AGAIN}, or save a TIFF uncompressed")
     if complaint:
         raise InputError("RIL-192", f"{name} is damaged ({complaint})", remedy=COPY_AGAIN)
     if image.dtype not in (np.uint8, np.uint16):
@@ -181,7 +188,7 @@ def _sound(header: Header | None, name: str) -> Header:
     if header is None:
         kind = kind_of(name)
         text = f"{name} cannot be read as an image"
-        remedy = f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM are read" if kind == "file" else KINDS[kind][1]
+        remedy = f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM of 8 or 16 bits are read" if kind == "file" else KINDS[kind][1]
         raise InputError("RIL-171", text, remedy=remedy)
     width, height, bits = header
     if bits > 16:
@@ -210,28 +217,46 @@ def refuse_swapped(images: Sequence[AnyArray], name: str) -> None:
         raise InputError("RIL-830", text, remedy=f"exchange them: {EXCHANGE} FILES")
 
 
-def common_header(paths: Sequence[Path]) -> Header:
-    """Width, height and bits a sample that all images share; one without a header is left to its reading.
+def common_header(paths: Sequence[Path]) -> tuple[Header, dict[Path, str]]:
+    """Width, height and bits a sample of most images; and of each of the others why it cannot be used beside them.
 
     Raises
     ------
     InputError
-        The first image is none, or none that is ever decoded; or another one has a different size or depth.
+        None of them can be read, or not most of these are of one size and depth, or of one that is ever decoded.
     """
-    first = _header(paths[0])
-    if first is None:
-        read_grey(paths[0])  # says what is wrong
-    wanted = _sound(first, str(paths[0]))
-    for path in paths[1:]:
-        found = _header(path)
-        if found is not None:
-            check_size(found, wanted, str(path))
-    return wanted
+    headers, refused = dict[Path, Header](), dict[Path, InputError]()
+    for path in paths:
+        try:
+            headers[path] = _header(path)
+        except InputError as error:
+            refused[path] = error
+    wanted, count = next(iter(Counter(headers.values()).most_common(1)), (Header(0, 0, 0), 0))
+    unlike = {path: _unlike(found, wanted, str(path)) for path, found in headers.items() if found != wanted}
+    refused |= unlike
+    if 2 * count <= len(headers):
+        raise next(iter((unlike or refused).values()))
+    _sound(wanted, str(next(path for path in paths if path not in refused)))
+    return wanted, {p: why.message.replace(str(p), f"{p.parent.name}/{p.name}") for p, why in refused.items()}
 
 
-def _header(path: Path) -> Header | None:
+def _header(path: Path) -> Header:
+    """Header of an image file.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or the file breaks off.
+    """
     with open_regular(path, "image", MOST_BYTES) as file:
-        return read_header(file)
+        start, header = file.peek(2)[:2], read_header(file)
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - TAIL))
+        bands = {b"P5": 1, b"P6": 3, b"BM": 1}.get(start, 0)  # at least, of samples that are not packed
+        if header is not None and size >= bands * math.prod(header) // 8 and ENDS.get(start, b"") in file.read():
+            return header
+    image = read_grey(path)  # says what is wrong
+    return Header(image.shape[1], image.shape[0], 8 * image.itemsize)
 
 
 class Digests:
@@ -302,10 +327,14 @@ def read_unchanged(path: Path, sha256: str, name: str) -> bytes:
 def check_size(found: Header, wanted: Header, name: str) -> None:
     """Refuse an image whose width, height or depth differs from those of its camera's other images."""
     if found != wanted:
-        words = [f"{w} x {h}, {d} bits" for w, h, d in (found, wanted)]
-        text = f"{name} is {words[0]}; others of its camera are {words[1]}"
-        remedy = "all images of a camera must have one size and depth; leave the frame out or convert it"
-        raise InputError("RIL-176", text, remedy=remedy)
+        raise _unlike(found, wanted, name)
+
+
+def _unlike(found: Header, wanted: Header, name: str) -> InputError:
+    words = [f"{w} x {h}, {d} bits" for w, h, d in (found, wanted)]
+    text = f"{name} is {words[0]}; others of its camera are {words[1]}"
+    remedy = "all images of a camera must have one size and depth; leave the frame out or convert it"
+    return InputError("RIL-176", text, remedy=remedy)
 
 
 @stage(

@@ -29,12 +29,14 @@ SHARE, MOST_APART = 0.25, 0.01
 SIDES: tuple[tuple[str, str], ...] = (
     ("left", "right"),
     ("cam0", "cam1"),
+    ("cam_0", "cam_1"),
     ("camera0", "camera1"),
     ("camera_0", "camera_1"),
     ("image_0", "image_1"),
     ("image_2", "image_3"),
     ("image_00", "image_01"),
     ("image_02", "image_03"),
+    ("infra1", "infra2"),
     ("im0", "im1"),
     ("view0", "view1"),
     ("i1", "i2"),
@@ -216,7 +218,8 @@ def pair_up(
         pairs = _named(list(zip(left, right, strict=True)))
         lines += _two_clocks(pairs, *times, tolerance) if all(times) and len(pairs) > 1 else []
         return pairs
-    if rule == "nearest" or (rule == "auto" and joined is not None and joined.apart):
+    shared = {without_side(path.stem, 0) for path in left} & {without_side(path.stem, 1) for path in right}
+    if rule == "nearest" or (rule == "auto" and joined is not None and (joined.apart or not shared)):
         if joined is None or not joined.places:
             why = f"the nearest are {joined.apart:.4g} s apart" if joined else "not each has its own"
             remedy = 'state images.tolerance (s), or, of two clocks, images.pair = "order"'
@@ -224,9 +227,7 @@ def pair_up(
             raise IncompleteError("RIL-822", text, remedy=remedy)
         lines += joined.lines("RIL-821")
         return _named([(left[i], right[j]) for i, j in joined.places])
-    if rule == "auto":
-        shared = {without_side(path.stem, 0) for path in left} & {without_side(path.stem, 1) for path in right}
-        rule = "name" if shared else "number"
+    rule = rule if rule != "auto" else "name" if shared else "number"
     by_key = _by_key(left, 0, rule), _by_key(right, 1, rule)
     if growing:
         by_key = _up_to_last_pair(*by_key)
@@ -253,7 +254,7 @@ def _by_key(paths: Sequence[Path], side: int, rule: str) -> dict[str, Path]:
             raise InputError("RIL-257", text, remedy=remedy)
         key = str(int(numbers[-1])) if rule == "number" else without_side(path.stem, side)
         if key in by_key:
-            text = f"{by_key[key]} and {path.name} are the same frame by {rule}"
+            text = f"{by_key[key]} and {path} are the same frame by {rule}"
             raise InputError("RIL-258", text, remedy="narrow the patterns, or choose another images.pair")
         by_key[key] = path
     return by_key
@@ -334,10 +335,13 @@ def _named(pairs: list[tuple[Path, Path]]) -> tuple[ImagePair, ...]:
     return tuple(ImagePair(name, *pair) for name, pair in zip(names, pairs, strict=True))
 
 
-def common_headers(pairs: Sequence[ImagePair]) -> Headers:
-    """Width, height and bits that all images of a side share (see :func:`rille.datasets.images.files.common_header`).
+def common_headers(pairs: Sequence[ImagePair]) -> tuple[Headers, tuple[ImagePair, ...]]:
+    """Width, height and bits of most images of each side (see :func:`rille.datasets.images.files.common_header`).
 
-    Pairs of which a file is absent are left out.
+    And the pairs; of those with an image that has others, or cannot be read, ``absent`` says so.
     """
     whole = [pair for pair in pairs if not pair.absent]
-    return files.common_header([pair.left for pair in whole]), files.common_header([pair.right for pair in whole])
+    left, refused = files.common_header([pair.left for pair in whole])
+    right, others = files.common_header([pair.right for pair in whole])
+    causes = [pair.absent or refused.get(pair.left) or others.get(pair.right, "") for pair in pairs]
+    return (left, right), tuple(replace(pair, absent=why) for pair, why in zip(pairs, causes, strict=True))

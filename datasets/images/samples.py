@@ -59,11 +59,8 @@ def examined(sequence: Sequence) -> Sequence:
 
     def image(frame: int, camera: str) -> Source:
         source = sequence.image(frame, camera)
-        return (
-            replace(source, args={**source.args, "levels": chosen_levels})
-            if source.args["header"]["depth"] == 16
-            else source
-        )
+        deep = source.args["header"]["depth"] == 16
+        return replace(source, args={**source.args, "levels": chosen_levels}) if deep else source
 
     return replace(sequence, image=image, warnings=(*sequence.warnings, *lines))
 

@@ -57,8 +57,9 @@ class Images(Table):
 
     Attributes
     ----------
-    left : pattern of the left images below the root, e.g. left/*.png; ** is any folder; or BAG, or BAG:TOPIC.
-    right : pattern of the right images, or the same bag.
+    left : folder of the left images below the root, or their pattern, e.g. left/*.png; ** is any folder; or BAG, or
+        BAG:TOPIC.
+    right : that of the right images, or the same bag.
     pair : how images are paired: by name (left/right aside), by the last number in the name, by the nearest time stamp
         in it, or by order; auto: by name, by time stamps where these differ, else by number.
     tolerance : s; time between the images of a pair at most, by the stamps in their names; by default a quarter of the
@@ -228,7 +229,7 @@ class Times(Table):
 
     file: str | None = None
     names: bool = False
-    rate_hz: float | None = Field(default=None, gt=0)
+    rate_hz: float | None = Field(default=None, ge=1e-6, le=1e6)
     unit: TimeUnit = "auto"
 
     @model_validator(mode="after")

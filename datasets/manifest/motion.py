@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import ntpath
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,13 +13,15 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rille.datasets import protocol
+from rille.datasets.images.files import SUFFIXES
 from rille.datasets.images.pairing import ImagePair, ends, stamp_of
 from rille.datasets.imu import at_frames, read_imu
 from rille.datasets.manifest.model import Attitude, Imu, Manifest, Odometry, PoseFile, PositionFile, Times, Truth
 from rille.datasets.manifest.rig import direction
 from rille.datasets.poses import TimedPositions, coverage, interpolate, read_poses, read_positions, refuse_apart
 from rille.datasets.text.reading import read_lines
-from rille.datasets.text.times import seconds
+from rille.datasets.text.tables import NUMBER, split
+from rille.datasets.text.times import seconds, undated
 from rille.stages.core.errors import IncompleteError, InputError
 from rille.stages.geometry.geometry import RigidTransform
 
@@ -84,51 +87,62 @@ class MotionReader:
         Raises
         ------
         InputError
-            The times do not parse, are not one a pair, do not increase, or mix units.
+            The times do not parse, are not one a pair or of other images, do not increase, mix units, or are names that
+            count.
         """
         if section.rate_hz is not None:
             return tuple(k / section.rate_hz for k in range(len(self.pairs)))
         path = self.root / (section.file or "")
-        stamps = self.stamps_of_names() if section.names else self.stamps_of_file(path)
+        stamps = self.stamps_of_names(section.unit) if section.names else self.stamps_of_file(path)
         what = "the image names" if section.names else str(path)
         known = [k for k, stamp in enumerate(stamps) if stamp is not None]
         rows = [stamp for stamp in stamps if stamp is not None]
         times = seconds([t for t, _ in rows], what, unit=section.unit, lines=[line for _, line in rows])
         return tuple(float(t) for t in np.interp(range(len(stamps)), known, times))
 
-    def stamps_of_names(self) -> list[tuple[str, int]]:
-        """The time stamp in each left image's name, one since 1970 or its last number, and the place of the pair."""
-        stamps = []
-        for k, pair in enumerate(self.pairs, start=1):
-            stem = pair.left.stem
-            numbers = [stamp_of(stem)] if stamp_of(stem) else re.findall(r"\d+(?:\.\d+)?", stem)
-            if not numbers:
-                text = f"{self.name}: times.names: {pair.left} has no number in its name"
-                raise InputError("RIL-227", text, remedy=NEEDS_TIMES)
-            stamps.append((str(numbers[-1]), k))
-        return stamps
+    def stamps_of_names(self, unit: str) -> list[tuple[str, int]]:
+        """The time stamp in each left image's name, a date, one since 1970 or its last number; and the pair's place."""
+        stems = [undated(pair.left.stem) for pair in self.pairs]
+        stamps = [stamp_of(stem) or ["", *re.findall(r"\d+(?:\.\d+)?", stem)][-1] for stem in stems]
+        wrong = stamps.index("") if "" in stamps else 0
+        small = unit == "auto" and len(stamps) > 2 and "" not in stamps and float(stamps[0]) < 1e8
+        if "" in stamps or (small and set(np.diff(np.array(stamps, float))) == {1}):
+            text = f"{self.name}: times.names: {self.pairs[wrong].left} has no number in its name, or one that counts"
+            remedy = 'give times.file or times.rate_hz; or, where the names are seconds, times.unit = "s"'
+            raise InputError("RIL-227", text, remedy=remedy)
+        return [(stamp, k) for k, stamp in enumerate(stamps, start=1)]
 
     def stamps_of_file(self, path: Path) -> Sequence[tuple[str, int] | None]:
         """Time stamp of each pair as text, and the line that it stands in."""
         lines = read_lines(path, "times")
         if self.growing and not path.read_bytes().endswith(b"\n"):  # whoever writes it has not come to the line's end
             del lines[-1:]
-        text = enumerate(lines, start=1)
-        rows = [(k, re.split(r"[,;\s]+", line.replace('"', " ").strip(", \t"))) for k, line in text]
-        rows = [(k, words) for k, words in rows if re.match(r"[-+.\d]|(nan|inf)$", words[0], re.I)]
+        header, rows = tuple[str, ...](), list[tuple[str, int]]()
+        images, by_name = False, dict[str, tuple[str, int]]()
+        for k, line in enumerate(lines, start=1):
+            text = undated(line.strip())
+            cells = split(text.removeprefix("#"), next((s for s in ",;\t" if s in text), None))
+            names = [cell for cell in cells if cell.lower().endswith(SUFFIXES)]
+            others = [cell for cell in cells if cell not in names]
+            if text.startswith("#") or not others or not re.match(r"[-+.\d]|(nan|inf)$", others[0], re.I):
+                header = cells or header
+                continue
+            titles = dict(zip(header, cells, strict=True)) if len(header) == len(cells) else {}
+            stated = [cell for title, cell in titles.items() if re.search("time|stamp", title, re.I)]
+            rows.append((next((cell for cell in stated if NUMBER.match(cell)), others[0]).split()[0], k))
+            images = images or bool(names)
+            by_name |= {ntpath.splitext(ntpath.basename(cell))[0]: rows[-1] for cell in names or cells[1:2]}
         # Tables may list more images than there are pairs, in any order: names decide where all are found.
-        by_name = {Path(words[1]).stem: (words[0], k) for k, words in rows if len(words) > 1}
-        stems = [pair.left.stem for pair in self.pairs]
-        if by_name and all(stem in by_name for stem in stems):
-            return [by_name[stem] for stem in stems]
+        absent = next((p.left.stem for p in self.pairs if not p.absent and p.left.stem not in by_name), "")
+        if by_name and not absent:
+            return [by_name.get(pair.left.stem) for pair in self.pairs]
         rows = list(self.arrived(rows))
-        if len(rows) not in self.counts():
-            absent = next((stem for stem in stems if stem not in by_name), "")
+        if images or len(rows) not in self.counts():
             more = f", none of {absent}" if by_name else ""
             which = ends([pair.left for pair in self.pairs])
             problem = f"{path} has {len(rows)} times for {len(self.pairs)} pairs ({which}){more}"
             raise IncompleteError("RIL-229", problem, remedy="give one line a pair, or lines of time and file name")
-        return self.one_a_pair([(words[0], k) for k, words in rows])
+        return self.one_a_pair(rows)
 
     def counts(self) -> set[int]:
         """Numbers of rows that a file may have: one a pair, or one for each pair with both images."""

@@ -87,8 +87,7 @@ def _of_files(
 ) -> tuple[Sequence, tuple[ImagePair, ...]]:
     """Images and cameras of a manifest that names files."""
     lines: list[str] = []
-    pairs = find_pairs(manifest.images, root, name, lines, digests)
-    headers = common_headers(pairs)
+    headers, pairs = common_headers(find_pairs(manifest.images, root, name, lines, digests))
     names = (os.path.relpath(path, root.parent) for path in (pairs[0].left, pairs[0].right))
     optics = read_optics(manifest, root, name, sizes_of(headers), _are_rectified(manifest.images, names))
 
@@ -206,7 +205,9 @@ def find_pairs(
         A pattern finds nothing, both find the same files, or images have no partners.
     """
     found, search = {}, Search()
-    for side, pattern in (("left", images.left), ("right", images.right)):
+    for side, stated in (("left", images.left), ("right", images.right)):
+        # A folder stands for what it holds.
+        pattern = f"{stated.rstrip('/')}/*" if stated and os.path.isdir(root / stated) else stated
         try:
             paths = search.matching(root, pattern)
         except InputError as error:

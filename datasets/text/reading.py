@@ -194,17 +194,11 @@ def check_depth(value: Any, file: str) -> None:
     """Refuse entries that are nested more than ``DEEPEST`` levels: whatever walks them would run out of stack."""
     level = [value]
     for _ in range(DEEPEST):
-        level = [inner for outer in level for inner in _inner(outer)]
+        nested = [v.values() if isinstance(v, dict) else v for v in level if isinstance(v, dict | list)]
+        level = [v for values in nested for v in values]
         if not level:
             return
     raise InputError("RIL-760", f"{file} is nested more than {DEEPEST} levels deep", remedy="correct the file")
-
-
-def _inner(value: Any) -> Iterator[Any]:
-    if isinstance(value, dict):
-        yield from value.values()
-    elif isinstance(value, list):
-        yield from value
 
 
 def _no_long_line(lines: list[str], path: Path, what: str) -> None:
@@ -261,7 +255,7 @@ class Search:
                 return
 
     def matching(self, root: Path, pattern: str) -> list[Path]:
-        """Files whose path below ``root`` matches a pattern; ``**`` stands for any folders.
+        """Files whose path below ``root`` matches a pattern, the suffix in any case; ``**`` stands for any folders.
 
         Raises
         ------
@@ -271,12 +265,12 @@ class Search:
         *above, last = pattern.split("/")
         if not last or pattern.startswith("/"):
             text = f"{pattern!r} is no pattern of files below a folder"
-            raise InputError("RIL-216", text, remedy="give one such as left/*.png")
+            raise InputError("RIL-216", text, remedy="give one such as left/*.png, and the folder above as root")
         places = [root]
         for part in above:
             if part == "**":
                 places = [place for top in places for place, _ in self.below(top)]
-            elif WILD.search(part):
+            elif WILD.search(part) and not any(os.path.isdir(place / part) for place in places):
                 places = [path for place in places for path in self._named(place, part) if os.path.isdir(path)]
             else:
                 # os.path, here and below: pathlib raises where a name is longer than the system allows.
@@ -287,4 +281,10 @@ class Search:
     def _named(self, folder: Path, pattern: str) -> list[Path]:
         """What a pattern names, of hidden ones (as macOS adds to archives) nothing unless it begins with a dot."""
         entries = (e for e in self.entries(folder) if pattern.startswith(".") or not e.name.startswith("."))
-        return [Path(e.path) for e in entries if fnmatch.fnmatchcase(e.name, pattern)]
+        return [Path(e.path) for e in entries if fnmatch.fnmatchcase(_folded(e.name), _folded(pattern))]
+
+
+def _folded(name: str) -> str:
+    """A name, or a pattern of names, with its suffix in lower case."""
+    stem, suffix = os.path.splitext(name)
+    return stem + suffix.lower()

@@ -6,7 +6,10 @@ nanoseconds. Smaller ones count from some other start; they are taken for second
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from contextlib import suppress
+from datetime import datetime
 from decimal import Decimal, InvalidOperation
 
 import numpy as np
@@ -18,6 +21,24 @@ UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 
 UPPER = {"s": 1e11, "ms": 1e14, "us": 1e17}
 """Above it a value can no longer be in that unit: 1e11 s after 1970 is the year 5138."""
+
+DATE = re.compile(
+    r"(?<!\d)((?:19|20)\d\d([-_/]?)\d\d\2\d\d)[-_T ]?(\d\d([-_:]?)\d\d\4\d\d)"
+    r"(?:\.(\d+)|[-_]?(\d{3}))?(?:Z|\+00:00)?(?!\d)"
+)
+"""Date and time of day, with a fraction or milliseconds, as logs and names of files have them."""
+
+
+def undated(text: str) -> str:
+    """The text with seconds since 1970 in the place of a date and time of day, which is taken for UTC."""
+
+    def since(match: re.Match[str]) -> str:
+        with suppress(ValueError):  # no day of a calendar
+            moment = datetime.fromisoformat(re.sub("[-_:/]", "", f"{match[1]}T{match[3]}Z"))
+            return f"{moment.timestamp():.0f}.{match[5] or match[6] or 0}"
+        return match[0]
+
+    return DATE.sub(since, text)
 
 
 def seconds(
@@ -39,8 +60,8 @@ def seconds(
     Raises
     ------
     InputError
-        A stamp is no number, two are equal or go back, units are mixed or unknown, or small stamps without a unit are
-        more than an hour apart.
+        A stamp is no number, two are equal or go back, units are mixed or unknown, small stamps without a unit are more
+        than an hour apart, or any less than .1 microseconds.
     """
     at = list(lines) if lines is not None else list(range(1, len(values) + 1))
     # Nanoseconds since 1970 have 19 digits; a float64 keeps 16, and would make stamps of successive samples equal.
@@ -55,9 +76,16 @@ def seconds(
             text = f"{what}, line {line}: time {now} {words}"
             raise InputError("RIL-293", text, remedy="put the rows in order of time, each once, in one unit")
     times = tuple(float(v / UNITS[stated]) for v in exact)
-    # s; larger stamps of any unit are known by their magnitude: 1973 and later
-    if unit == "auto" and times[0] < 1e8:
-        _refuse_slow(times, what)
+    usual = float(np.median(np.diff(np.asarray(times)))) if len(times) > 1 else 1.0
+    # s; stamps of 1973 and later are known by their magnitude. Pairs an hour apart are possible, but a wrong unit is
+    # likelier, and no camera takes ten million images a second.
+    if (unit == "auto" and times[0] < 1e8 and usual > 3600.0) or usual < 1e-7:
+        text = f"times of {what} are {usual:.4g} s apart, if their unit is {stated}"
+        likely = "ns" if usual > 1.0 else "s"
+        remedy = (
+            f'state their unit: times.unit = "{likely}" in the manifest, or time_{likely} as the name of the column'
+        )
+        raise InputError("RIL-687", text, remedy=remedy)
     return times
 
 
@@ -86,13 +114,3 @@ def _unit(exact: Sequence[Decimal], what: str, lines: Sequence[int]) -> str:
             remedy = "write all times in one unit, or state it where small stamps are not seconds"
             raise InputError("RIL-292", text, remedy=remedy)
     return units[0]
-
-
-def _refuse_slow(times: Sequence[float], what: str) -> None:
-    """Refuse stamps that no unit by magnitude fits: small ones that are far apart for seconds."""
-    usual = float(np.median(np.diff(np.asarray(times)))) if len(times) > 1 else 0.0
-    # s; pairs an hour apart are possible, but a wrong unit is likelier
-    if usual > 3600.0:
-        text = f"times of {what} are {usual:.4g} s apart, if they are seconds"
-        remedy = 'state their unit: times.unit = "ns" in the manifest, or time_ns as the name of the column'
-        raise InputError("RIL-687", text, remedy=remedy)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
@@ -14,7 +15,8 @@ from rille.stages.core.errors import ConfigError, InputError, RilleError, told
 Model = TypeVar("Model", bound=Params)
 
 TAG = "("
-"""Begins the name of a member of a union, which pydantic gives as if it were a key."""
+MEMBER = re.compile(r"[(\[]|(constrained-)?(float|int|str)$|tuple\[")
+"""Begins the name of a member of a union, or of one without a name, which pydantic gives as if it were a key."""
 
 
 def validated(
@@ -53,13 +55,14 @@ def validated(
 
 def _complaint(error: Mapping[str, Any], section: str, known: list[str]) -> str:
     """One of pydantic's complaints as dotted key, value and reason."""
-    key = section + ".".join(str(part) for part in error["loc"] if not str(part).startswith(TAG))
+    first, *parts = map(str, error["loc"] or [""])
+    key = section + ".".join([first, *(part for part in parts if not MEMBER.match(part))])
     if error["type"] == "extra_forbidden":
-        return f"unknown key {key!r} (value {error['input']!r}): {_nearest(key, known)}"
+        return f"unknown key {key!r} (value {error['input']!r:.200}): {_nearest(key, known)}"
     if error["type"] == "missing":
         return f"{key} is missing"
-    reason = str(error.get("ctx", {}).get("error", error["msg"]))
-    value = "" if isinstance(error["input"], dict) else f" = {error['input']!r} is not permitted"
+    reason = str(error.get("ctx", {}).get("error", error["msg"])).replace("valid tuple", "list")
+    value = "" if isinstance(error["input"], dict) else f" = {error['input']!r:.200} is not permitted"
     return f"{key}{value}: {reason[0].lower() + reason[1:]}" if key else reason
 
 

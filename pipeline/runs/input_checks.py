@@ -69,9 +69,9 @@ LIMITS = {
         InputLimit("RIL-649", "y in the images", most=0.0, remedy="held upside down, or a wrong sign?"),
     ),
     "images": (
-        Fault("RIL-650", "blank", most=0, remedy="leave these frames out with --frames"),
+        InputLimit("RIL-650", "blank", most=0, remedy="left ones get no pose, right ones no depth: take them anew"),
         InputLimit("RIL-668", "lost", most=0, remedy="it gets no pose; its neighbours are joined across it"),
-        Fault("RIL-670", "unusable", most=0),
+        Fault("RIL-670", "unusable", most=0, remedy="mend, convert or remove what is wrong"),
         Fault("RIL-671", "left and right are one", most=0, remedy="give the right camera's images"),
         InputLimit("RIL-672", "repeated", most=0, remedy="was a frame copied, or did the camera hang?"),
     ),
@@ -82,7 +82,9 @@ LIMITS = {
         InputLimit(
             "RIL-652", "change", most=1.5, remedy="it is levelled, but black and white is lost: fix the exposure"
         ),
-        InputLimit("RIL-653", "right over left", least=1 / 1.5, most=1.5, remedy="couple the exposure of both cameras"),
+        InputLimit(
+            "RIL-653", "right over left", least=1 / 1.5, most=1.5, remedy="give both one exposure and bit depth"
+        ),
     ),
     "sharpness": (
         InputLimit("RIL-654", "blurred", most=0, remedy="leave them out, or expect a weak pose there"),
@@ -289,11 +291,14 @@ def _usual(values: Floats) -> float:
 def judge_matching(rate: float | None, depths: Floats, baseline: float, *, given: bool = False) -> Finding:
     """Share of usable pixels that are matched, and how far away they lie (m); ``given``: of another program's map."""
     share = rate or 0.0
-    near, middle, far = (float(v) for v in np.percentile(depths, [5, 50, 95])) if depths.size else (math.nan,) * 3
-    text = f"{100 * share:.0f} % of the first pair is matched, depth {near:.3g} to {far:.3g} m, median {middle:.3g} m"
-    away = {"baselines away": middle / baseline} if depths.size else {}
-    borne_out = {"borne out": share} if given else {}
-    return judge("matching", text, {"matched": share, **borne_out, **away})
+    text, figures = f"{100 * share:.0f} % of the first pair is matched", {"matched": share}
+    if given:
+        figures["borne out"] = share
+    if depths.size:
+        near, middle, far = (float(v) for v in np.percentile(depths, [5, 50, 95]))
+        text += f", depth {near:.3g} to {far:.3g} m, median {middle:.3g} m"
+        figures["baselines away"] = middle / baseline
+    return judge("matching", text, figures)
 
 
 def judge_sides(beyond: float) -> Finding:
@@ -336,6 +341,6 @@ def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Se
     (a, b), least = min(overlap.items(), key=lambda kv: kv[1])
     text = (
         f"successive images overlap by {100 * np.median(list(overlap.values())):.0f} %, least {100 * least:.0f} % "
-        f"from frame {names[a]} to {names[b]}; motion {np.median(length) if length else math.nan:.1f} px"
+        f"from frame {names[a]} to {names[b]}{f'; motion {np.median(length):.1f} px' if length else ''}"
     )
     return judge("motion", text, {"overlap": least})

@@ -101,8 +101,12 @@ def settings(sequence: str | Sequence, options: Settings) -> Settled:
         source = "user"
     # What suits the sequence lies beneath; a user's value always wins.
     layers = vehicle, configuration.expand(sequence.defaults)
+    try:
+        suited = configuration.build(*layers)
+    except ConfigError as error:
+        raise error.at(f"defaults of {sequence.name}") from error
     config = configuration.build(*layers, for_stages)
-    given = unread.set_by_user(for_stages, config, configuration.build(*layers))
+    given = unread.set_by_user(for_stages, config, suited)
     return Settled(sequence, choose_frames(options.frames, sequence.frames), config, source, given)
 
 

@@ -62,6 +62,7 @@ def both(template: str, names: list[str]) -> list[str]:
         (["mav0/cam0/data/5.png", "mav0/cam1/data/5.png"], "mav0/cam0/data/5.png", "mav0/cam1/data/5.png", 1),
         ([f"image_{c}/{k}.png" for c in range(4) for k in (1, 2)], "image_0/*.png", "image_1/*.png", 2),
         (["im0.png", "im1.png"], "im0.png", "im1.png", 1),
+        (["infra1/7.png", "infra2/7.png"], "infra1/7.png", "infra2/7.png", 1),
         ([*both("{side}/{name}.png", ["1", "2"]), "left/9.jpg", "right/9.jpg"], "left/*.png", "right/*.png", 2),
     ],
 )
@@ -168,6 +169,23 @@ def test_of_several_resolutions_that_of_the_images_is_taken(tmp_path):
     assert found.calibration is not None
     assert (found.calibration.files, found.calibration.cameras) == (("SN1.conf",), 2)
     assert found.calibration.sizes == ((960, 600), (960, 600))
+
+
+def test_of_several_sets_the_plainest_is_taken_and_the_others_are_told(tmp_path):
+    names = ["1", "2"]
+    write_images(tmp_path, [*both("depth_{side}/{name}.png", names), *both("{side}/{name}.png", names)])
+    write_images(tmp_path, both("{side}/{name}.jpg", ["3"]))
+    found = inspect(tmp_path)
+    assert found.views.left == "left/*.png"
+    told = " ".join(found.unread)
+    assert "depth_left/*.png" in told
+    assert "left/3.jpg" in told
+
+
+def test_times_with_names_of_images_or_dates_are_times(tmp_path):
+    for name, line in (("timestamps.csv", "14000{k},0{k}.png"), ("times.txt", "2011-09-26 13:02:2{k}.964389445")):
+        write_lines(tmp_path / name, ["#time,filename", *(line.format(k=k) for k in range(3))])
+        assert table_kind(tmp_path / name, 3) == "times"
 
 
 def test_single_numbers_are_times_whatever_their_count_where_the_name_says_so(tmp_path):
@@ -358,7 +376,7 @@ def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
     assert "3 files (readme.txt and 2 more): neither images nor" in text
     assert "rig.yaml cannot be parsed" in text
     assert len(found.unread) == 8
-    assert all(f"# Not readable: {line}" in manifest_text(found, ".") for line in found.unread)
+    assert all(f"# Not read: {line}" in manifest_text(found, ".") for line in found.unread)
 
 
 @pytest.mark.parametrize(
@@ -414,7 +432,7 @@ def test_a_link_to_nothing_is_named(tmp_path):
     write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
     for side in ("left", "right"):
         (tmp_path / side / "3.png").symlink_to("../.git/annex/objects/x.png")
-    assert "left/3.png cannot be read: it is a link to" in inspect(tmp_path).views.trouble
+    assert "left/3.png cannot be read: it is a link to" in inspect(tmp_path).views.absent[0]
 
 
 def test_pairing_by_time_stamps_is_proposed(tmp_path):

@@ -241,6 +241,20 @@ def test_place_on_earth(tmp_path):
     assert s.georeference == Georeference("EPSG:32633", (500100.0, 5200200.0, 1800.0), math.pi / 2)
 
 
+@pytest.mark.parametrize(
+    ("left", "right"), [("left", "right/"), ("left/*.PNG", "right/??.png"), ("my [left]/*.png", "my [[]right]/*.png")]
+)
+def test_folders_brackets_and_the_case_of_suffixes_in_patterns(tmp_path, left, right):
+    path = write_sequence(tmp_path)
+    (tmp_path / "left" / "01.png").rename(tmp_path / "left" / "01.PNG")
+    for side in ("left", "right"):
+        (tmp_path / side / "notes.txt").write_text("none")
+        (tmp_path / f"my [{side}]").symlink_to(side)
+    path.write_text(path.read_text().replace("left/*.png", left).replace("right/*.png", right))
+    s = opened(path)
+    assert (s.frames, s.lost) == (3, {})
+
+
 # -- times -------------------------------------------------------------------------------------------------------------
 
 
@@ -252,6 +266,51 @@ def test_times_of_a_file_in_order_or_by_name(tmp_path):
     assert opened(path).times == (10.0, 10.5, 11.0)
     write_lines(tmp_path / "t.txt", ['"name";"time"', '"1.5"', '"2.5"', '"3.5"'])
     assert opened(path).times == (1.5, 2.5, 3.5)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["00.png 10.0", "01.png 10.5", "02.png 11.0"],
+        ["filename,timestamp", "left/02.png,11.0", "left/01.png,10.5", "left/00.png,10.0"][::-1],
+        ["#frame;time [s];image name", *(f"{k};{10 + k / 2};C:\\x\\0{k}.jpg" for k in range(3))],
+        ["index time", "0 10.0", "1 10.5", "2 11.0"],
+        ["1970-01-01 00:00:10.000000000", "1970-01-01T00:00:10.5Z", "19700101_000011"],
+    ],
+)
+def test_tables_of_times_of_other_programs(tmp_path, lines):
+    path = write_sequence(tmp_path, '[times]\nfile = "t.txt"\n')
+    write_lines(tmp_path / "t.txt", lines)
+    assert opened(path).times == (10.0, 10.5, 11.0)
+
+
+def test_a_table_of_other_images_is_refused(tmp_path):
+    path = write_sequence(tmp_path, '[times]\nfile = "t.txt"\n')
+    write_lines(tmp_path / "t.txt", ["0.0 07.png", "0.5 08.png", "1.0 09.png"])
+    with raises("RIL-229", "none of 00"):
+        opened(path)
+
+
+def test_a_pair_that_lost_its_image_needs_no_time(tmp_path):
+    path = write_sequence(tmp_path, '[times]\nfile = "t.txt"\n', frames=4)
+    (tmp_path / "left" / "01.png").unlink()
+    write_lines(tmp_path / "t.txt", ["0.0 00.png", "1.0 02.png", "1.5 03.png", "2.0 04.png"])
+    assert opened(path).times == (0.0, 0.5, 1.0, 1.5)
+
+
+def test_dates_in_names_are_times_and_counts_are_not(tmp_path):
+    for k, name in enumerate(["20240229_235959_750", "20240301_000000_250", "20240301_000000_750"]):
+        write_images(tmp_path, [f"{side}/{name}.png" for side in ("left", "right")])
+        write_images(tmp_path, [f"count/{side}/{k:03d}.png" for side in ("left", "right")])
+    path = write_sequence(tmp_path, "[times]\nnames = true\n", frames=0)
+    times = opened(path).times
+    assert times is not None
+    assert [t - times[0] for t in times] == [0.0, 0.5, 1.0]
+    path = write_sequence(tmp_path / "count", "[times]\nnames = true\n", frames=0)
+    with raises("RIL-227", "000.png", 'times.unit = "s"'):
+        opened(path)
+    path.write_text(path.read_text() + 'unit = "s"\n')
+    assert opened(path).times == (0.0, 1.0, 2.0)
 
 
 def test_times_of_names(tmp_path):
@@ -474,6 +533,9 @@ def test_sensors_need_times(tmp_path):
         ({"head": "colour = 1"}, ("RIL-223", "'colour'")),
         ({"head": "name = "}, ("RIL-026", "rover.rille.toml")),
         ({"text": "[images.more]\n"}, ("RIL-223", "'images.more'")),
+        ({"text": "[positions]\nfile = 'x'\nsigma = -1\n"}, ("RIL-223", "positions.sigma = -1 is not")),
+        ({"text": "[positions]\nfile = 'x'\nsigma = 1\ncolumns = { t = 1 }\n"}, ("RIL-223", "positions.columns.t = ")),
+        ({"head": "name = 1" + 1000 * "0"}, ("RIL-223", "name = 100")),
         ({"text": "[times]\nrate_hz = 1.0\nnames = true\n"}, ("RIL-223", "rate_hz")),
         ({"text": "[world]\npitch_deg = 3.0\nup = [0, 0, 1]\n"}, ("RIL-223",)),
         ({"text": '[world]\ncrs = "EPSG:32633"\n'}, ("RIL-223", "azimuth_deg")),

@@ -108,19 +108,55 @@ def test_words_that_only_look_like_a_side(name):
     assert side_of(name) is None
 
 
-def test_sizes_are_compared(tmp_path):
-    for name, shape in (("a_l", (4, 6)), ("a_r", (4, 6)), ("b_l", (4, 6)), ("b_r", (5, 6))):
-        cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros(shape, np.uint8))
+def test_images_that_do_not_belong_to_the_others_are_absent(tmp_path):
+    names = [f"{k}_{side}.png" for k in range(6) for side in "lr"]
+    for name in names:
+        cv2.imwrite(str(tmp_path / name), np.zeros((4, 6), np.uint8))
     pairs = pair_up(sorted(tmp_path.glob("*_l.png")), sorted(tmp_path.glob("*_r.png")))
-    assert common_headers(pairs[:1]) == ((6, 4, 8), (6, 4, 8))
-    with raises("RIL-176", "b_r.png", "6 x 5", "6 x 4"):
+    assert common_headers(pairs) == (((6, 4, 8), (6, 4, 8)), pairs)
+    cv2.imwrite(str(tmp_path / "0_l.png"), np.zeros((5, 6), np.uint8))
+    cv2.imwrite(str(tmp_path / "0_r.png"), np.zeros((4, 6), np.uint16))
+    (tmp_path / "1_r.png").write_bytes(b"")
+    (tmp_path / "2_l.png").write_bytes((tmp_path / "3_l.png").read_bytes()[:-12])
+    headers, checked = common_headers(pairs)
+    assert headers == ((6, 4, 8), (6, 4, 8))
+    words = [("6 x 5, 8 bits",), ("/1_r.png is empty",), ("/2_l.png", "truncated"), (), (), ()]
+    for pair, of in zip(checked, words, strict=True):
+        assert bool(pair.absent) == bool(of)
+        assert all(word in pair.absent for word in of)
+        assert str(tmp_path) not in pair.absent  # it stands in results
+    for pair in pairs:
+        pair.left.write_bytes(b"")
+    with raises("RIL-170", "0_l.png is empty"):
         common_headers(pairs)
+
+
+@pytest.mark.parametrize("kind", ["pgm", "ppm", "bmp", "jpg"])
+def test_images_of_other_kinds_that_break_off_are_absent(tmp_path, kind):
+    for k in range(3):
+        for side in "lr":
+            cv2.imwrite(
+                str(tmp_path / f"{k}_{side}.{kind}"), np.full((40, 60, 3 if kind == "ppm" else 1), 90, np.uint8)
+            )
+    short = tmp_path / f"1_r.{kind}"
+    short.write_bytes(short.read_bytes()[: -short.stat().st_size // 2])
+    _, checked = common_headers(pair_up(sorted(tmp_path.glob("*_l*")), sorted(tmp_path.glob("*_r*"))))
+    assert [bool(pair.absent) for pair in checked] == [False, True, False]
+
+
+def test_some_images_without_most_of_one_size_are_refused(tmp_path):
+    for k, rows in enumerate((4, 5)):
+        for side in "lr":
+            cv2.imwrite(str(tmp_path / f"{k}_{side}.png"), np.zeros((rows, 6), np.uint8))
+    with raises("RIL-176", "6 x 5", "6 x 4"):
+        common_headers(pair_up(sorted(tmp_path.glob("*_l.png")), sorted(tmp_path.glob("*_r.png"))))
 
 
 def test_size_of_another_kind_of_file_is_read(tmp_path):
     for side in "lr":
         cv2.imwrite(str(tmp_path / f"a_{side}.pgm"), np.zeros((4, 6), np.uint16))
-    assert common_headers(pair_up([tmp_path / "a_l.pgm"], [tmp_path / "a_r.pgm"])) == ((6, 4, 16), (6, 4, 16))
+    headers, _ = common_headers(pair_up([tmp_path / "a_l.pgm"], [tmp_path / "a_r.pgm"]))
+    assert headers == ((6, 4, 16), (6, 4, 16))
 
 
 def test_unequal_counts_name_both_ends():
@@ -192,6 +228,12 @@ def test_the_tolerance_follows_the_interval_and_is_stated():
 def test_pairs_by_order_are_never_frames_apart(left, right, expected):
     with raises(*expected):
         pair_up(stamped("{ns}.png", left), stamped("{ns}.png", right), "order")
+
+
+def test_equal_stamps_of_unlike_digits_are_pairs():
+    left = [Path(f"left/{1_600_000_000 + k / 10:.3f}.png") for k in range(4)]
+    right = [Path(f"right/{1_600_000_000 + k / 10:.6f}.png") for k in range(4)]
+    assert [(pair.left, pair.right) for pair in pair_up(left, right)] == list(zip(left, right, strict=True))
 
 
 def test_stamps_of_two_clocks_are_said():

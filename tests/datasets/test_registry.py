@@ -99,7 +99,9 @@ def test_an_unknown_folder_or_file_says_how_to_open_it(tmp_path):
 def test_a_manifest_or_the_folder_that_holds_it(tmp_path):
     path = write_sequence(tmp_path / "rover")
     assert open_sequence(str(path)).name == open_sequence(str(path.parent)).name == "rover"
-    path.rename(path.parent / "manifest.toml")
+    upper = path.rename(path.parent / "MANIFEST.TOML")
+    assert open_sequence(str(upper)).frames == 3
+    upper.rename(path.parent / "manifest.toml")
     assert open_sequence(str(path.parent)).frames == 3
     for name in ("a", "b"):
         (path.parent / f"{name}.rille.toml").write_text("")

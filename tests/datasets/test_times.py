@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from raising import raises
 
-from rille.datasets.text.times import UNITS, seconds
+from rille.datasets.text.times import UNITS, seconds, undated
 
 
 @pytest.mark.parametrize(
@@ -46,6 +46,8 @@ def test_small_stamps_are_seconds_unless_stated():
 def test_small_stamps_in_a_larger_unit_are_refused():
     with raises("RIL-687", "5e+07 s"):
         seconds([0, 50_000_000, 100_000_000], "t")
+    with raises("RIL-687", "1e-10 s", 'unit = "s"'):
+        seconds([0.0, 0.1, 0.2], "t", unit="ns")
     assert seconds([0, 5000], "t", unit="s") == (0.0, 5000.0)
     assert seconds(["1500000000", "1500086400"], "t") == (1.5e9, 1500086400.0)
 
@@ -77,3 +79,23 @@ def test_what_is_wrong_names_the_line(stamps, expected):
 def test_any_increasing_stamps_of_a_stated_unit(steps, start, unit):
     stamps = [start + int(v) for v in np.cumsum(steps)]
     assert seconds(stamps, "t", unit=unit) == tuple(float(Fraction(s, UNITS[unit])) for s in stamps)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "20240101120000.png",
+        "2024-01-01T12:00:00Z",
+        "2024/01/01 12:00:00 a",
+        "img_20240101-120000",
+    ],
+)
+def test_dates_become_seconds(text):
+    assert "1704110400.0" in undated(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["1912010203040506", "1403715273262142976", "20241301_120000", "20090101_000061", "1920x1080"]
+)
+def test_other_numbers_stay(text):
+    assert undated(text) == text

@@ -104,7 +104,8 @@ class Inspection:
         s = self.sequence
         self.say(judge.judge("sequence", f"{s.name}, {len(self.frames)} of {s.frames} pairs"))
         for frame, why in self.lost.items():
-            self.say(judge.judge("images", f"frame {s.frame_names[frame]}: {why}", {"lost": 1}))
+            figure = "lost" if why.endswith("missing") else "unusable"
+            self.say(judge.judge("images", f"frame {s.frame_names[frame]}: {why}", {figure: 1}))
         self.say(*(Finding("", line, "input", "WARN") for line in s.warnings))  # it begins with its code
         self.say(*(Finding("", line, "input") for line in s.notes))
         self.say(judge.judge_rig(s.rig))
@@ -141,6 +142,8 @@ class Inspection:
             image = np.asarray(bundle["image"])
             sizes.add(f"{image.shape[1]} x {image.shape[0]} {image.dtype}")
             looks[camera][frame] = glance(image, np.asarray(bundle["valid"]))
+            if looks[camera][frame]["deviation"] < self.make.config.frame_screening.uniform:
+                self.broken.add((frame, camera))
         for refusal in errors[:NAMED_IMAGES]:
             self.refused(refusal, "images")
         whole = f"all {len(images)} open, {' and '.join(sorted(sizes))}"

@@ -46,7 +46,7 @@ def init(
     name = f"{derived_name(directory.resolve().name)}.rille.toml"
     findings = inspect(directory)
     path = output if output is not None else Path(name)
-    if path.suffix != ".toml":
+    if path.suffix.lower() != ".toml":
         raise ConfigError("RIL-037", f"--output {path} is no .toml file", remedy=f"e.g. {name}")
     if path.exists() and not force:
         raise ConfigError("RIL-038", f"{path} exists", remedy="give another --output, or overwrite it by --force")

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from raising import raises
 
 from rille.datasets.protocol import Sequence
 from rille.datasets.registry import open_sequence
@@ -15,6 +16,7 @@ from rille.pipeline.commands.sequences.check import inspect
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.runs import session
 from rille.pipeline.runs.input_checks import judge_rig
+from rille.pipeline.runs.options import Settings
 
 ROWS, COLUMNS, MARGIN = 120, 200, 40
 
@@ -45,6 +47,13 @@ def folder(path: Path, *, rows: float = 0.0, frames: int = 4) -> Path:
     k = "200 0 99.5 {} 0 200 59.5 0 0 0 1 0\n"
     (path / "calib.txt").write_text(k.format(0) + k.format(-200 * 0.16))
     return path
+
+
+def damage(path: Path) -> None:
+    """Change a byte of an image's data; its header and its end stay."""
+    data = bytearray(path.read_bytes())
+    data[-200] ^= 0xFF
+    path.write_bytes(data)
 
 
 def look(sequence: Sequence, cache: Path, frames: tuple[int, ...] | None = None) -> int:
@@ -94,19 +103,42 @@ def test_rows_that_are_off_are_measured(tmp_path, capsys):
 def test_damaged_images_are_named_and_the_rest_is_looked_at(tmp_path, capsys):
     path = folder(tmp_path / "wall")
     broken = path / "right" / "000.png"
-    broken.write_bytes(broken.read_bytes()[:-200])
+    damage(broken)
+    short = path / "right" / "002.png"
+    short.write_bytes(short.read_bytes()[:-200])
     code, lines = run(path, capsys)
     assert code == 1
-    assert any("000.png" in text and "truncated" in text for text in lines)
-    assert any("RIL-670: 1 of 8 images" in text for text in lines)
+    assert any("000.png" in text and "damaged" in text for text in lines)
+    assert any("RIL-670: 1 of 6 images" in text for text in lines)
+    assert any("RIL-670: frame 002: right/002.png is damaged or truncated" in text for text in lines)
     assert line(lines, "matching").startswith("OK")
+
+
+def test_a_wrong_default_of_a_sequence_is_told_from_a_wrong_option(tmp_path):
+    sequence = replace(open_sequence(str(folder(tmp_path / "wall"))), defaults={"locus.cell_size": -1})
+    with raises("RIL-027", "defaults of wall: locus.cell_size"):
+        session.settings(sequence, Settings())
+    sequence = replace(sequence, defaults={})
+    with raises("RIL-027") as caught:
+        session.settings(sequence, Settings(("locus.cell_size=-1",)))
+    assert "wall" not in str(caught.value)
+
+
+def test_blank_images_are_passed_over_as_a_run_does(tmp_path, capsys):
+    path = folder(tmp_path / "wall")
+    for name in ("left/000.png", "left/002.png", "right/003.png"):
+        cv2.imwrite(str(path / name), np.zeros((ROWS, COLUMNS), np.uint8))
+    code, lines = run(path, capsys)
+    assert code == 0
+    assert sum("RIL-650" in text for text in lines) == 2
+    assert line(lines, "matching").startswith("OK")
+    assert "RIL-666" not in " ".join(lines)
 
 
 def test_nothing_whole_is_no_crash(tmp_path, capsys):
     path = folder(tmp_path / "wall", frames=1)
     for side in ("left", "right"):
-        file = path / side / "000.png"
-        file.write_bytes(file.read_bytes()[:-200])
+        damage(path / side / "000.png")
     code, lines = run(path, capsys)
     assert code == 1
     assert any("RIL-669" in text for text in lines)
