@@ -29,7 +29,8 @@ from rille.stages.geometry.scale import other_size
 from rille.stages.hfvm import plane
 from rille.stages.hfvm.epipolar import typical
 from rille.stages.hfvm.image import Grey, Image, Shape, Window, thinned
-from rille.stages.hfvm.level import Map, State, Views, descend, sample
+from rille.stages.hfvm.level import State, Views, descend, sample
+from rille.stages.hfvm.native.problem import Map
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
 

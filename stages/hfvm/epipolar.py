@@ -179,12 +179,6 @@ def line(terms, x, length):  # type: ignore[no-untyped-def]
     return a * scale, b * scale, c * scale
 
 
-def along_line(line: AnyArray, u: AnyArray, v: AnyArray) -> AnyArray:
-    """How far along their lines (3, n) displacements lead, pixels: what :func:`on_line` undoes."""
-    a, b, _ = line
-    return np.asarray(b * u - a * v)
-
-
 @register_jitable
 def on_line(line, along):  # type: ignore[no-untyped-def]
     """Displacement (column, row) on a line (a, b, c) of unit normal, ``along`` pixels from the shortest one on it."""

@@ -25,9 +25,9 @@ from rille.stages.geometry import spline
 from rille.stages.geometry.scale import effective
 from rille.stages.hfvm import epipolar, plane, refinement, textureless
 from rille.stages.hfvm.coarse import Coarse
-from rille.stages.hfvm.image import Image, Layer, Shape, Window, thinned, whole
-from rille.stages.hfvm.level import MAX_FIT_MATCHES, Band, Map, State, fill_rows, hand_down, match_level
-from rille.stages.hfvm.native.problem import LevelPair
+from rille.stages.hfvm.image import Layer, Shape, Window, thinned, whole
+from rille.stages.hfvm.level import MAX_FIT_MATCHES, Band, State, fill_rows, hand_down, match_level
+from rille.stages.hfvm.native.problem import LevelPair, Map
 from rille.stages.hfvm.native.solver import solver
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.refinement import local_mean
@@ -204,8 +204,8 @@ Step = Callable[[FinestWork, Fine], Fine]
 
 def subpixel(work: FinestWork) -> Fine:
     """Fractions of a pixel from distances summed over 5 x 5 pixels, and means of like neighbours (4.3.2)."""
-    pair = LevelPair(work.a.words, work.b.words, epipolar.NO_BAND, 0.0)
-    u, v, distance = solver.sums(pair, work.left.u, work.left.v, np.ones(work.left.u.shape, np.uint8))
+    everywhere = np.ones(work.left.u.shape, np.uint8)
+    u, v, distance = solver.sums(LevelPair(work.a.words, work.b.words), *work.left, everywhere)
     u, v = local_mean(u, v, np.ones(u.shape, bool), 2, 2)
     zeros = np.zeros(u.shape, np.float32)
     return Fine(u, v, np.zeros(u.shape, np.uint8), zeros, distance, zeros)
@@ -282,20 +282,6 @@ def fitted_lines(results: Results, shapes: tuple[Shape, Shape]) -> epipolar.Matr
     if fitted is None or not fitted[1] <= epipolar.SHARP_SPREAD_PX:
         return None
     return epipolar.oriented(fitted[0], shapes[0])
-
-
-def textureless_planes(
-    images: tuple[Image, Image], results: Results, f: epipolar.Matrix, near_sign: float
-) -> textureless.Planes:
-    """Planes of the left image's textureless regions: what no window tells, a whole region does."""
-    left, right = (image.layers[textureless.REGION_LEVEL] for image in images)
-    rows, cols = left.shape
-    unmatched = np.ones((2 * rows, 2 * cols), bool)
-    unmatched[: results["u"].shape[0], : results["u"].shape[1]] = results["validity"] != 0
-    none = (unmatched[::2, ::2] & unmatched[::2, 1::2]) & (unmatched[1::2, ::2] & unmatched[1::2, 1::2])
-    y, x = thinned(results["validity"] == 0, MAX_FIT_MATCHES)
-    along = epipolar.along_line(epipolar.lines_at(f, x, y), results["u"][y, x], results["v"][y, x])
-    return textureless.find(left, right, f, none, along, -near_sign)
 
 
 @dataclass(frozen=True)
@@ -438,7 +424,7 @@ def ending(pair: Coarse, arrays: Mapping[str, AnyArray], with_planes: bool) -> E
     # Without a band rows are free: they are not to be set by lines.
     free = views.params.band == 0 or views.levels <= textureless.REGION_LEVEL
     f = None if free else fitted_lines(arrays, (views.left.shapes[0], views.right.shapes[0]))
-    planes = textureless_planes((views.left, views.right), arrays, f, sign) if f is not None and with_planes else None
+    planes = textureless.find((views.left, views.right), arrays, f, sign) if f is not None and with_planes else None
     return Ending(sign, pair.alignment, f, planes, views.left.shapes[0])
 
 

@@ -47,7 +47,8 @@ from rille.stages.hfvm.coarse import (
 )
 from rille.stages.hfvm.finest import Ending, FinestWork, lands
 from rille.stages.hfvm.image import Shape, view, whole
-from rille.stages.hfvm.level import FREE_BAND, Map, State, Views, one_way
+from rille.stages.hfvm.level import FREE_BAND, State, Views, one_way
+from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS, facts
 from rille.stages.imaging.pyramid import Pyramid

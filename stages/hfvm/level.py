@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm import epipolar
 from rille.stages.hfvm.image import Image, Layer, thinned
-from rille.stages.hfvm.native.problem import EdgeRule, Field, LevelPair, PathCosts, Smoothing, pack_map, unpacked
+from rille.stages.hfvm.native.problem import Field, LevelPair, Map, Smoothing, pack_map, unpacked
 from rille.stages.hfvm.native.reference import exhaustive
 from rille.stages.hfvm.native.solver import solver
 from rille.stages.hfvm.params import HfvmParams
@@ -67,26 +67,6 @@ def fill_rows(u, v, keep, reach, near_sign, filled):  # type: ignore[no-untyped-
 
 MAX_FIT_MATCHES = 500
 """Matches that a band or plane is fitted to; more change nothing that matters and cost time."""
-
-PATH_COSTS = PathCosts(compact=8, small=36, large=240, grey=10)
-"""Costs of propagation along paths: larger ``compact``: depth edges less fattened; ``small``: smoother; ``large``:
-fewer depth steps; ``grey``: depth steps follow image edges less."""
-
-EDGE_RULE = EdgeRule(reach=4, apart=4, grey=16, far=100, own=9, other=10, near=0)
-"""Placement of depth edges. Features put an edge a few pixels too far out: ``reach``. With displacements ``apart`` by 2
-the errors among the matched were 6 % fewer still, and the time doubled: slopes count then, too. What is hidden differs
-by any amount: ``far``. Of weak evidence none changes: ``own`` against ``other``; a farther one need only cost less:
-with the ratio for it, too, bad-2 after filling was 1 % more on both halves of the Middlebury pairs, and that of the
-matched 8 %. Windows of 5 to 9 pixels, ``far`` of 70 to 200, ``grey`` of 16 to 32 and a reach of 4 to 8 differ by less
-than 3 %.
-"""
-
-
-class Map(NamedTuple):
-    """Displacements of one direction at one level, (row, col) int16 columns and rows."""
-
-    u: AnyArray
-    v: AnyArray
 
 
 @dataclass(frozen=True)
@@ -188,7 +168,7 @@ def search(look: Look, field: Field) -> Field:
     """Best displacements around the predictions; at the top around none (4.3.1, Eq. 2 and 3)."""
     p = look.params
     if look.up is not None:
-        solver.search(look.pair, (look.up.u, look.up.v), (p.search_columns, p.search_rows), field)
+        solver.search(look.pair, look.up, (p.search_columns, p.search_rows), field)
         return field
     rows, cols = np.maximum(look.a.words.shape, look.b.words.shape)
     exhaustive(look.pair, (int(np.ceil(p.top_columns * cols)), int(np.ceil(p.top_rows * rows))), field)
@@ -207,13 +187,11 @@ def propagate(look: Look, field: Field) -> Field:
 def paths(look: Look, field: Field) -> Field:
     """Displacements chosen by costs gathered along paths from the borders of the image.
 
-    A pixel's candidates are its own displacement and those a pixel beside it, those of near and farther pixels, and
-    those handed down. Along six directions (eight but for those within a row) each gathers the least cost of getting
+    A pixel's candidates are its own displacement and those a pixel beside it, and those of near and farther pixels.
+    Along six directions (eight but for those within a row) each gathers the least cost of getting
     there, smoothness included; so evidence travels over weak texture as far as it must, and stops at depth edges.
     """
-    compact = LevelPair(look.a.compact, look.b.compact, epipolar.NO_BAND, 0.0)
-    up = None if look.up is None else (look.up.u, look.up.v)
-    solver.paths(look.pair, compact, up, look.a.grey, PATH_COSTS, field.shift)
+    solver.paths(look.pair, LevelPair(look.a.compact, look.b.compact), look.a.grey, field.shift)
     return field
 
 
@@ -233,10 +211,8 @@ def edges(look: Look, field: Field) -> Field:
     since they mostly lie on its surface. Adaptive support weights: Yoon and Kweon (2006), doi:10.1109/TPAMI.2006.70.
     """
     wanted = (look.a.deviation >= look.params.texture) & (look.a.valid != 0)
-    pair = LevelPair(look.a.compact, look.b.compact, epipolar.NO_BAND, 0.0)
-    rule = EDGE_RULE._replace(near=int(look.near_sign))
-    grey = np.rint(look.a.grey).astype(np.int16)
-    return Field(solver.edges(pair, grey, field.shift, wanted.view(np.uint8), rule), field.cost)
+    pair, grey = LevelPair(look.a.compact, look.b.compact), np.rint(look.a.grey).astype(np.int16)
+    return Field(solver.edges(pair, grey, field.shift, wanted.view(np.uint8), int(look.near_sign)), field.cost)
 
 
 def match_level(views: Views, level: int, above: State | None, near_sign: float = 0.0) -> State:
@@ -286,7 +262,7 @@ def one_way(views: Views, level: int, above: State | None, near_sign: float, fin
     field = Field(np.empty(a.words.shape, np.int32), np.empty(a.words.shape, np.int32))
     for step in (*views.steps.every, *(views.steps.finest if level == 0 and above is not None else ())):
         field = step(look, field)
-    return Map(*unpacked(field.shift))
+    return unpacked(field.shift)
 
 
 def hand_down(state: State, params: HfvmParams) -> Map:
@@ -304,8 +280,7 @@ def sample(views: Views, state: State) -> Sample:
     wanted = np.zeros(state.left_ok.shape, np.uint8)
     wanted[y, x] = 1
     a, b = views.left.layers[state.level], views.right.layers[state.level]
-    pair = LevelPair(a.words, b.words, epipolar.NO_BAND, 0.0)
-    u, v, _ = solver.sums(pair, state.left.u, state.left.v, wanted)
+    u, v, _ = solver.sums(LevelPair(a.words, b.words), state.left.u, state.left.v, wanted)
     return Sample(x, y, u[y, x], v[y, x])
 
 

@@ -21,7 +21,8 @@ from rille.stages.core.validity import Validity, mark
 from rille.stages.hfvm.finest import FAILED_PX, Ending, backmatch, complete
 from rille.stages.hfvm.image import planes as table_1
 from rille.stages.hfvm.image import whole
-from rille.stages.hfvm.level import Map, agree, fill_rows
+from rille.stages.hfvm.level import agree, fill_rows
+from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.native.reference import linear
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging.pyramid import Pyramid

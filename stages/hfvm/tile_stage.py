@@ -20,7 +20,8 @@ from rille.stages.hfvm.coarse import Coarse
 from rille.stages.hfvm.finest import Ending
 from rille.stages.hfvm.image import Window, view, whole
 from rille.stages.hfvm.image import tiles as cut
-from rille.stages.hfvm.level import Band, Map, State, Views
+from rille.stages.hfvm.level import Band, State, Views
+from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS
 from rille.stages.imaging.pyramid import Pyramid

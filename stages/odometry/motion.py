@@ -21,7 +21,7 @@ from rille.stages.core.declare import AnyArray, Bundle, Params, raster, stage
 from rille.stages.core.validity import Mask, Validity, defined, mark, matched, matched_share
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts
-from rille.stages.hfvm import epipolar, plane
+from rille.stages.hfvm import plane
 from rille.stages.hfvm.image import view
 from rille.stages.hfvm.level import LevelSteps, Views, descend, fill_rows, median, propagate, search
 from rille.stages.hfvm.matcher import DEFAULT
@@ -109,7 +109,7 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: plane.Matr
     views = Views(left, right, hp, LevelSteps((search, propagate, median), (), rounds))
     state, layers = descend(views, 0), (views.left.layers[0], views.right.layers[0])
     validity = np.zeros(state.left.u.shape, np.uint8)
-    pair = LevelPair(layers[0].words, layers[1].words, epipolar.NO_BAND, 0.0)
+    pair = LevelPair(layers[0].words, layers[1].words)
     u, v, distance = solver.sums(pair, state.left.u, state.left.v, np.ones_like(validity))
     scale = np.float32(2.0**level)
     mark(validity, a.valid[0] == 0, Validity.OUT_OF_IMAGE)

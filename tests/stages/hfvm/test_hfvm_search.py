@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from rille.stages.hfvm import epipolar, paper
-from rille.stages.hfvm.level import Map
 from rille.stages.hfvm.native import reference
-from rille.stages.hfvm.native.problem import FAR, Field, LevelPair, Smoothing, pack_map, unpacked
+from rille.stages.hfvm.native.problem import Field, LevelPair, Map, Smoothing, pack_map, unpacked
+from rille.stages.hfvm.native.reference import FAR
 
 ROWS, COLS = 11, 13
 
