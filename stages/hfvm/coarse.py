@@ -77,11 +77,11 @@ def _bounded(u: AnyArray, v: AnyArray) -> PriorDisparities:
 
 
 def aligned(prior: PriorDisparities | None, h: plane.Matrix | None) -> PriorDisparities | None:
-    """The prior towards the aligned right image: see :func:`rille.stages.hfvm.plane.decompose`."""
+    """The prior towards the aligned right image."""
     if prior is None or h is None:
         return prior
     # Ends that come to lie near the horizon of the plane are led farther than the given ones.
-    return _bounded(*plane.decompose(h, prior.u, prior.v, prior.u.shape))
+    return _bounded(*plane.carried(np.linalg.inv(plane.to_original(h, prior.u.shape)), prior.u, prior.v))
 
 
 def impose(views: Views, state: State, prior: PriorDisparities | None) -> State:

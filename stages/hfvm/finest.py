@@ -153,21 +153,19 @@ class FinestWork:
 
     def to_right(self, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
         """Displacements in the window of the right image, of those in the window of ``b``."""
-        if self.alignment is None:
-            return u, v
-        a, b, c = self.a.window, self.b.window, self.right.window
-        u, v = (d + np.float32(to - at) for d, to, at in ((u, b.x0, a.x0), (v, b.y0, a.y0)))
-        u, v = plane.compose(self.alignment, u, v, self.shape, a.x0, a.y0)
-        return u - np.float32(c.x0 - a.x0), v - np.float32(c.y0 - a.y0)
+        return self._carried(u, v, self.b, self.right)
 
     def from_right(self, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
         """The reverse of :meth:`to_right`."""
+        return self._carried(u, v, self.right, self.b)
+
+    def _carried(self, u: AnyArray, v: AnyArray, start: Layer, end: Layer) -> tuple[AnyArray, AnyArray]:
         if self.alignment is None:
             return u, v
-        a, b, c = self.a.window, self.b.window, self.right.window
-        u, v = (d + np.float32(to - at) for d, to, at in ((u, c.x0, a.x0), (v, c.y0, a.y0)))
-        u, v = plane.decompose(self.alignment, u, v, self.shape, a.x0, a.y0)
-        return u - np.float32(b.x0 - a.x0), v - np.float32(b.y0 - a.y0)
+        a, b, c, h = self.a.window, start.window, end.window, plane.to_original(self.alignment, self.shape)
+        u, v = (d + np.float32(to - at) for d, to, at in ((u, b.x0, a.x0), (v, b.y0, a.y0)))
+        u, v = plane.carried(h if end is self.right else np.linalg.inv(h), u, v, a.x0, a.y0)
+        return u - np.float32(c.x0 - a.x0), v - np.float32(c.y0 - a.y0)
 
     def images(self) -> refinement.SplineImages:
         """What refinement compares."""
@@ -211,21 +209,32 @@ def subpixel(work: FinestWork) -> Fine:
     return Fine(u, v, np.zeros(u.shape, np.uint8), zeros, distance, zeros)
 
 
+def reasons(
+    there: Map, back: Map, distance: AnyArray, layers: tuple[Layer, Layer], params: HfvmParams, deviation: AnyArray
+) -> tuple[AnyArray, AnyArray]:
+    """Back-matching errors (4.3.3), pixels, and bits that speak against each pixel: they, distance, texture.
+
+    ``there, back``: displacements of the ``layers``, (row, col) float32; ``deviation``: of the left one.
+    """
+    error = np.full(distance.shape, FAILED_PX, np.float32)
+    backmatch(there.u, there.v, back, layers[1].valid, error)
+    validity = np.zeros(error.shape, np.uint8)
+    # A masked pixel is no part of the image, so it counts as outside.
+    outside = (error >= FAILED_PX) | (layers[0].valid == 0)
+    mark(validity, outside, Validity.OUT_OF_IMAGE)
+    mark(validity, ~outside & (error > params.backmatch), Validity.BACKMATCH_FAILED)
+    mark(validity, distance > params.threshold, Validity.OVER_THRESHOLD)
+    mark(validity, deviation < params.texture, Validity.NO_TEXTURE)
+    return error, validity
+
+
 def check(work: FinestWork, fine: Fine) -> Fine:
     """Reasons against each pixel: matching back (4.3.3), distance, texture."""
-    p = work.params
     # Back from the right whole displacements suffice.
-    u, v = (a.astype(np.float32) for a in (work.back.u, work.back.v))
-    back = local_mean(u, v, np.ones(u.shape, bool), 2, 2)
-    error = np.full(fine.u.shape, FAILED_PX, np.float32)
-    backmatch(fine.u, fine.v, back, work.b.valid, error)
-    validity = np.zeros(fine.u.shape, np.uint8)
-    # A masked pixel is no part of the image, so it counts as outside.
-    outside = (error >= FAILED_PX) | (work.a.valid == 0)
-    mark(validity, outside, Validity.OUT_OF_IMAGE)
-    mark(validity, ~outside & (error > p.backmatch), Validity.BACKMATCH_FAILED)
-    mark(validity, fine.distance > p.threshold, Validity.OVER_THRESHOLD)
-    mark(validity, work.a.deviation < p.texture, Validity.NO_TEXTURE)
+    u, v = (a.astype(np.float32) for a in work.back)
+    back = Map(*local_mean(u, v, np.ones(u.shape, bool), 2, 2))
+    found = Map(fine.u, fine.v), back, fine.distance, (work.a, work.b), work.params, work.a.deviation
+    error, validity = reasons(*found)
     return replace(fine, error=error, validity=validity)
 
 
@@ -333,7 +342,7 @@ def complete(
         # A filled pixel has its neighbour's depth, not its row: between turned cameras rows change along a row.
         v = epipolar.settled(epipolar.moved(ending.f, *2 * ((window.x0, window.y0),)), u, v, filled)
     if ending.alignment is not None:
-        u, v = plane.compose(ending.alignment, u, v, ending.shape, window.x0, window.y0)
+        u, v = plane.carried(plane.to_original(ending.alignment, ending.shape), u, v, window.x0, window.y0)
         # Found in pixels of the aligned image, as displacements were.
         std = std * np.float32(effective(plane.scale(ending.alignment, ending.shape)))
     mark(validity, matches, Validity.MATCHED)

@@ -46,17 +46,14 @@ from rille.stages.hfvm.coarse import (
     ratio_of_matches,
 )
 from rille.stages.hfvm.finest import Ending, FinestWork, lands
-from rille.stages.hfvm.image import Shape, view, whole
-from rille.stages.hfvm.level import FREE_BAND, State, Views, one_way
+from rille.stages.hfvm.image import Shape, as_matched, whole
+from rille.stages.hfvm.level import FREE_BAND, NEAR_SIGN, State, Views, one_way
 from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS, facts
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
-
-NEAR_SIGN = -1.0
-"""Between parallel cameras nearer things have lesser column displacements (see ``level.State``)."""
 
 
 def check(left: Pyramid, right: Pyramid, given: PriorDisparities, params: HfvmParams) -> dict[str, AnyArray]:
@@ -68,7 +65,7 @@ def check(left: Pyramid, right: Pyramid, given: PriorDisparities, params: HfvmPa
     known = np.isfinite(given.u)
     u, zeros = np.where(known, given.u, np.float32(0.0)), np.zeros_like(given.u)
     there = Map(np.rint(u).astype(np.int16), np.zeros(u.shape, np.int16))
-    a, b = view(left, params), view(right, params)
+    a, b = as_matched(left, params), as_matched(right, params)
     inside = lands(np.rint(u), zeros, known, right.valid[0])
     ratio = ratio_of_matches(a, b, State(0, there, there, inside, inside, FREE_BAND, NEAR_SIGN))
     if ratio is not None and greatest(ratio) > MIN_LOG_RATIO:

@@ -83,6 +83,9 @@ class Band:
 
 FREE_BAND = Band(epipolar.NO_BAND, 0.0)
 
+NEAR_SIGN = -1.0
+"""Between parallel cameras nearer things have lesser column displacements (see :class:`State`)."""
+
 
 @dataclass(frozen=True)
 class State:

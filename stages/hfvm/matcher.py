@@ -14,8 +14,8 @@ from rille.stages.core.declare import AnyArray
 from rille.stages.core.validity import Validity
 from rille.stages.hfvm import coarse, finest, level
 from rille.stages.hfvm.coarse import PriorDisparities
+from rille.stages.hfvm.image import as_matched, whole
 from rille.stages.hfvm.image import tiles as cut
-from rille.stages.hfvm.image import view, whole
 from rille.stages.hfvm.level import LevelSteps, Views
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging.pyramid import Pyramid
@@ -179,7 +179,7 @@ def match(left: Pyramid, right: Pyramid, params: HfvmParams, prior: PriorDispari
             match(left.above(1), right.above(1), halved(params), prior and prior.halved(), how), left, right
         )
     how.tell(0.0, "coarse levels")
-    images = view(left, params), view(right, params)
+    images = as_matched(left, params), as_matched(right, params)
     views = Views(*images, params, recipe.steps, how.threads)
     pair = coarse.begin(views, recipe.begin, prior)  # 4.3.1 features; 4.3.4 hierarchy; brightness, alignment
     side = how.side if local(params) and views.levels > 1 else None

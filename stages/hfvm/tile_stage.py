@@ -18,7 +18,7 @@ from rille.stages.facts.matching import TileFacts
 from rille.stages.hfvm import coarse, finest, matcher, textureless
 from rille.stages.hfvm.coarse import Coarse
 from rille.stages.hfvm.finest import Ending
-from rille.stages.hfvm.image import Window, view, whole
+from rille.stages.hfvm.image import Window, as_matched, whole
 from rille.stages.hfvm.image import tiles as cut
 from rille.stages.hfvm.level import Band, State, Views
 from rille.stages.hfvm.native.problem import Map
@@ -98,7 +98,7 @@ class Task:
     def views(self) -> Views:
         """Both images at that resolution."""
         params, first = (matcher.halved(self.params), 1) if self.half else (self.params, 0)
-        left, right = (view(opened(bundle).above(first), params) for bundle in self.given[:2])
+        left, right = (as_matched(opened(bundle).above(first), params) for bundle in self.given[:2])
         return Views(left, right, params, matcher.recipe_of(params).steps)
 
     @property

@@ -22,7 +22,7 @@ from rille.stages.core.validity import Mask, Validity, defined, mark, matched, m
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts
 from rille.stages.hfvm import plane
-from rille.stages.hfvm.image import view
+from rille.stages.hfvm.image import as_matched
 from rille.stages.hfvm.level import LevelSteps, Views, descend, fill_rows, median, propagate, search
 from rille.stages.hfvm.matcher import DEFAULT
 from rille.stages.hfvm.native.problem import LevelPair
@@ -102,7 +102,7 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: plane.Matr
     )
     # At a coarse level no level is finest: all have the same rounds. At level 0 the matcher's own figures hold.
     rounds = (ROUNDS, ROUNDS) if level else DEFAULT.steps.rounds
-    left, right = view(a, hp), view(b, hp)
+    left, right = as_matched(a, hp), as_matched(b, hp)
     if turn is not None:
         turn = np.linalg.inv(plane.finer(level)) @ turn @ plane.finer(level)
         right = plane.aligned(right, turn, left)
@@ -124,7 +124,7 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: plane.Matr
     mark(validity, interpolated != 0, Validity.INTERPOLATED)
     u[~defined(validity)] = v[~defined(validity)] = np.nan
     if turn is not None:
-        u, v = plane.compose(turn, u, v, a.shape)
+        u, v = plane.carried(plane.to_original(turn, a.shape), u, v)
         # Seen in the upright frame, but its place in b lies behind the camera.
         validity[np.isnan(u)] &= ~np.uint8(Validity.MATCHED | Validity.INTERPOLATED)
     return Motion(level, u * scale, v * scale, validity)
@@ -141,7 +141,7 @@ def _turned(a: Pyramid, b: Pyramid, plain: Motion, params: MotionParams) -> Moti
         if abs(_roll_deg(plain)) < MIN_ROLL_DEG:
             return None
         needed = 1.0
-    turn = plane.find_turn(view(a, HfvmParams()), view(b, HfvmParams()))
+    turn = plane.find_turn(as_matched(a, HfvmParams()), as_matched(b, HfvmParams()))
     if turn is None:
         return None
     motion = coarse_motion(a, b, params, turn)

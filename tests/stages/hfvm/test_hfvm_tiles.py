@@ -6,7 +6,7 @@ from matching_scenes import pair
 
 from rille.stages.core.validity import matched
 from rille.stages.hfvm.finest import _bounded
-from rille.stages.hfvm.image import Window, thinned, tiles, view, whole
+from rille.stages.hfvm.image import Window, as_matched, thinned, tiles, whole
 from rille.stages.hfvm.matcher import How, local
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
@@ -87,7 +87,7 @@ def test_denoising_averages_noise_and_keeps_texture_on_every_level():
     scene = np.where(x < 120, 90.0, 90.0 + 80 * ((x // 8 + y // 8) % 2))
     noisy = build(scene + rng.normal(0, 4, scene.shape), PyramidParams())
     assert noisy.noise > 2
-    quiet = view(noisy, HfvmParams())
+    quiet = as_matched(noisy, HfvmParams())
     assert quiet.noise == noisy.noise
     for level in range(3):
         before, after = noisy.images[level], quiet.layers[level].grey
@@ -101,7 +101,7 @@ def test_denoising_averages_noise_and_keeps_texture_on_every_level():
 
 def test_views_without_noise_are_left_as_they_are():
     pyramid = build(misaligned()[1], PyramidParams())
-    image = view(pyramid, HfvmParams(denoise_from=9.0))
+    image = as_matched(pyramid, HfvmParams(denoise_from=9.0))
     assert image.noise == 0
     np.testing.assert_array_equal(image.layers[1].grey, pyramid.images[1])
 
