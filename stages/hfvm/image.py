@@ -50,10 +50,13 @@ class Window:
         return slice(self.y0, self.y1), slice(self.x0, self.x1)
 
     def grow(self, rows: int, columns: int, shape: Shape) -> Window:
-        """Wider by so much on every side, within an image of ``shape``; even borders, so that parents are whole."""
-        y0, x0 = (max(a - by, 0) // 2 * 2 for a, by in ((self.y0, rows), (self.x0, columns)))
-        y1, x1 = ((a + by + 1) // 2 * 2 for a, by in ((self.y1, rows), (self.x1, columns)))
-        return Window(y0, min(y1, shape[0]), x0, min(x1, shape[1]))
+        """Wider by so much on every side, within an image of ``shape``: two pixels at least, with even borders, so that
+        parents are whole."""
+        (y0, y1), (x0, x1) = (
+            _bounds(low - by, high + by, size)
+            for low, high, by, size in ((self.y0, self.y1, rows, shape[0]), (self.x0, self.x1, columns, shape[1]))
+        )
+        return Window(y0, y1, x0, x1)
 
     def parent(self) -> Window:
         """Pixels of the next coarser level that lie above these."""
@@ -70,6 +73,11 @@ class Window:
             slice(self.y0 - outer.y0, self.y1 - outer.y0),
             slice(self.x0 - outer.x0, self.x1 - outer.x0),
         )
+
+
+def _bounds(low: int, high: int, size: int) -> tuple[int, int]:
+    first = max(0, min(low, size - 2)) // 2 * 2
+    return first, min((max(high, first + 2) + 1) // 2 * 2, size)
 
 
 def whole(shape: Shape) -> Window:

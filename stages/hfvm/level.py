@@ -135,29 +135,32 @@ Step = Callable[[Look, Field], Field]
 
 
 @dataclass(frozen=True)
-class LevelSteps:
-    """What is done at a level: steps of every level, and further ones of the finest.
+class Recipe:
+    """A preset as lists of steps: of every level, further ones of the finest, and those after fractions of a pixel.
 
     ``rounds``: limits of the propagation at the finest level, from left to right, and from right to left, which serves
-    the check of consistency alone; each coarser level has one more, at most ``HfvmParams.rounds``.
+    the check of consistency alone; each coarser level has one more, at most ``HfvmParams.rounds``. ``refinement``:
+    steps of :mod:`rille.stages.hfvm.finest`. ``half``: images are matched at half their resolution.
     """
 
     every: tuple[Step, ...]
     finest: tuple[Step, ...]
     rounds: tuple[int, int]
+    refinement: tuple[Callable[[Any, Any], Any], ...] = ()
+    half: bool = False
 
 
 @dataclass(frozen=True)
-class Views:
+class ImagePair:
     """The left and the right image as they are matched, and how; two ``threads`` match both directions side by side."""
 
     left: Image
     right: Image
     params: HfvmParams
-    steps: LevelSteps
+    recipe: Recipe
     threads: int = 1
 
-    def reverse(self) -> Views:
+    def reverse(self) -> ImagePair:
         """The images exchanged."""
         return replace(self, left=self.right, right=self.left)
 
@@ -218,17 +221,17 @@ def edges(look: Look, field: Field) -> Field:
     return Field(solver.edges(pair, grey, field.shift, wanted.view(np.uint8), int(look.near_sign)), field.cost)
 
 
-def match_level(views: Views, level: int, above: State | None, near_sign: float = 0.0) -> State:
+def match_level(images: ImagePair, level: int, above: State | None, near_sign: float = 0.0) -> State:
     """The state of a level, from that of the level above (None: the top): search, propagate, check, band."""
-    known, rounds = near_sign if above is None else above.near_sign, views.steps.rounds
+    known, rounds = near_sign if above is None else above.near_sign, images.recipe.rounds
     back = None if above is None else above.reverse()
-    ahead = partial(one_way, views, level, above, known, rounds[0])
+    ahead = partial(one_way, images, level, above, known, rounds[0])
     left, right = side_by_side(
-        [ahead, partial(one_way, views.reverse(), level, back, -known, rounds[1])], views.threads
+        [ahead, partial(one_way, images.reverse(), level, back, -known, rounds[1])], images.threads
     )
-    a, b = views.left.layers[level].valid, views.right.layers[level].valid
-    ok = agree(left, right, a, b, views.params.backmatch), agree(right, left, b, a, views.params.backmatch)
-    return with_band(views, State(level, left, right, *ok, FREE_BAND, known))
+    a, b = images.left.layers[level].valid, images.right.layers[level].valid
+    ok = agree(left, right, a, b, images.params.backmatch), agree(right, left, b, a, images.params.backmatch)
+    return with_band(images, State(level, left, right, *ok, FREE_BAND, known))
 
 
 def agree(own: Any, other: Any, own_valid: AnyArray, other_valid: AnyArray, limit: float) -> NDArray[np.bool_]:
@@ -254,16 +257,16 @@ def _agree(own, other, own_valid, other_valid, most, agreeing):  # type: ignore[
                 agreeing[y, x] = du * du + dv * dv <= most
 
 
-def one_way(views: Views, level: int, above: State | None, near_sign: float, fine_rounds: int) -> Map:
+def one_way(images: ImagePair, level: int, above: State | None, near_sign: float, fine_rounds: int) -> Map:
     """Displacements from the left image to the right one, at a level below that of the state ``above``, by the rounds
     ``fine_rounds`` at the finest; ``above`` None: the top."""
-    up = None if above is None else hand_down(above, views.params)
-    rounds = min(views.params.rounds, fine_rounds if level == 0 else views.steps.rounds[0] + level)
+    up = None if above is None else hand_down(above, images.params)
+    rounds = min(images.params.rounds, fine_rounds if level == 0 else images.recipe.rounds[0] + level)
     band = FREE_BAND if above is None else above.band
-    a, b = views.left.layers[level], views.right.layers[level]
-    look = Look(level, a, b, up, band, near_sign, rounds, views.params)
+    a, b = images.left.layers[level], images.right.layers[level]
+    look = Look(level, a, b, up, band, near_sign, rounds, images.params)
     field = Field(np.empty(a.words.shape, np.int32), np.empty(a.words.shape, np.int32))
-    for step in (*views.steps.every, *(views.steps.finest if level == 0 and above is not None else ())):
+    for step in images.params.kept((*images.recipe.every, *(images.recipe.finest if level == 0 and above else ()))):
         field = step(look, field)
     return unpacked(field.shift)
 
@@ -277,36 +280,36 @@ def hand_down(state: State, params: HfvmParams) -> Map:
     return Map(*(np.rint(a).astype(np.int16) for a in (u, v)))
 
 
-def sample(views: Views, state: State) -> Sample:
+def sample(images: ImagePair, state: State) -> Sample:
     """About :data:`MAX_FIT_MATCHES` evenly strided consistent matches of a level, with fractions of a pixel."""
     y, x = thinned(state.left_ok, MAX_FIT_MATCHES)
     wanted = np.zeros(state.left_ok.shape, np.uint8)
     wanted[y, x] = 1
-    a, b = views.left.layers[state.level], views.right.layers[state.level]
+    a, b = images.left.layers[state.level], images.right.layers[state.level]
     u, v, _ = solver.sums(LevelPair(a.words, b.words), state.left.u, state.left.v, wanted)
     return Sample(x, y, u[y, x], v[y, x])
 
 
-def with_band(views: Views, state: State) -> State:
+def with_band(images: ImagePair, state: State) -> State:
     """The state with the epipolar band for the next finer level, where there is one and it can be fitted."""
-    if views.params.band == 0 or state.level == 0:
+    if images.params.band == 0 or state.level == 0:
         return state
-    s, shapes = sample(views, state), (state.left.u.shape, state.right.u.shape)
+    s, shapes = sample(images, state), (state.left.u.shape, state.right.u.shape)
     fit = epipolar.fit_points(*s, *shapes)
     if fit is None:
         return state
     f, spread = fit
     # Where lenses bend the lines, or the fit is poor, the band gives way.
-    mu = views.params.band * min(1.0, epipolar.SHARP_SPREAD_PX / max(spread, 1e-9)) ** 2
+    mu = images.params.band * min(1.0, epipolar.SHARP_SPREAD_PX / max(spread, 1e-9)) ** 2
     # Found once, by the first level that has a band; finer ones keep it.
     sign = state.near_sign or epipolar.near_sign(f, s.u, *shapes)
     return replace(state, band=Band(epipolar.finer(f), mu), near_sign=sign)
 
 
-def descend(views: Views, stop: int, above: State | None = None, near_sign: float = 0.0) -> State:
+def descend(images: ImagePair, stop: int, above: State | None = None, near_sign: float = 0.0) -> State:
     """Match from the top (or below ``above``) down to level ``stop``, or to the top if that is below."""
-    first, state = (views.levels if above is None else above.level) - 1, above
-    for level in range(first, min(stop, views.levels - 1) - 1, -1):
-        state = match_level(views, level, state, near_sign)
+    first, state = (images.levels if above is None else above.level) - 1, above
+    for level in range(first, min(stop, images.levels - 1) - 1, -1):
+        state = match_level(images, level, state, near_sign)
     assert state is not None
     return state

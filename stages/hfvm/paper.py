@@ -73,7 +73,7 @@ def match(left: Pyramid, right: Pyramid, params: HfvmParams, tell: Callable[[flo
     error, validity = reasons(fine[0], fine[1], ways[0].distance, (layers[0], layers[1]), params, planes[0][DEVIATION])
     arrays = {"u": fine[0].u, "v": fine[0].v, "validity": validity, "error": error, "distance": ways[0].distance}
     arrays["noise"] = np.zeros_like(error)
-    return complete(arrays, layers[0].valid, layers[0].window, params, Ending(NEAR_SIGN, None, None, None, left.shape))
+    return complete(arrays, layers[0].valid, layers[0].window, params, Ending(left.shape))
 
 
 def _one_way(a: AnyArray, b: AnyArray, above: Map | None, params: HfvmParams) -> IntegerMatches:

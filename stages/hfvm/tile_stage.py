@@ -20,7 +20,7 @@ from rille.stages.hfvm.coarse import Coarse
 from rille.stages.hfvm.finest import Ending
 from rille.stages.hfvm.image import Window, as_matched, whole
 from rille.stages.hfvm.image import tiles as cut
-from rille.stages.hfvm.level import Band, State, Views
+from rille.stages.hfvm.level import Band, ImagePair, State
 from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS
@@ -86,25 +86,19 @@ class Task:
     @cached_property
     def half(self) -> bool:
         """Whether the pair is matched at half its resolution."""
-        recipe = matcher.recipe_of(self.params)
-        return matcher.halves(recipe, *(int(pyramid.meta["levels"]) for pyramid in self.given[:2]))
+        return matcher.halves(self.params, *(int(pyramid.meta["levels"]) for pyramid in self.given[:2]))
 
     @cached_property
-    def recipe(self) -> matcher.Recipe:
-        """Steps of matching at the resolution at which the pair is matched."""
-        return matcher.recipe_of(self.views.params)
-
-    @cached_property
-    def views(self) -> Views:
+    def images(self) -> ImagePair:
         """Both images at that resolution."""
         params, first = (matcher.halved(self.params), 1) if self.half else (self.params, 0)
         left, right = (as_matched(opened(bundle).above(first), params) for bundle in self.given[:2])
-        return Views(left, right, params, matcher.recipe_of(params).steps)
+        return ImagePair(left, right, params, matcher.RECIPES[params.preset])
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Rows and columns of the left image at that resolution."""
-        return self.views.left.shapes[0]
+        return self.images.left.shapes[0]
 
     @cached_property
     def windows(self) -> list[Window]:
@@ -127,7 +121,7 @@ class Task:
         band = Band(np.array(meta["f"]), meta["mu"])
         state = State(meta["level"], maps[0], maps[1], oks[0], oks[1], band, meta["near_sign"])
         ratio, alignment = (None if meta[name] is None else np.array(meta[name]) for name in ("ratio", "alignment"))
-        return Coarse.again(self.views, state, ratio, alignment)
+        return Coarse.again(self.images, state, ratio, alignment)
 
     def fine(self, window: Window, names: Sequence[str] = FINE) -> dict[str, AnyArray]:
         """Arrays of the tiles' fine results."""
@@ -135,7 +129,7 @@ class Task:
 
 
 def _coarse(task: Task) -> Bundle[TileFacts]:
-    pair = coarse.begin(task.views, task.recipe.begin)
+    pair = coarse.match_coarse_levels(task.images)
     s = pair.state
     arrays: dict[str, AnyArray] = {}
     for way, m, ok in (("left", s.left, s.left_ok), ("right", s.right, s.right_ok)):
@@ -153,12 +147,11 @@ def _coarse(task: Task) -> Bundle[TileFacts]:
 
 
 def _fine(task: Task) -> Bundle[TileFacts]:
-    return Bundle(finest.fine(task.pair, task.recipe.refinement, task.window), {})
+    return Bundle(finest.match_finest_level(task.pair, task.window), {})
 
 
 def _ending(task: Task) -> Bundle[TileFacts]:
-    arrays = task.fine(whole(task.shape), ("u", "v", "validity"))
-    ending = finest.ending(task.pair, arrays, task.recipe.planes)
+    ending = finest.fit_lines_and_planes(task.pair, task.fine(whole(task.shape), ("u", "v", "validity")))
     meta: TileFacts = {"f": None if ending.f is None else ending.f.tolist(), "terms": None}
     if ending.planes is None:
         return Bundle({}, meta)
@@ -172,10 +165,10 @@ def _final(task: Task) -> Bundle[TileFacts]:
     f = None if bundle.meta["f"] is None else np.array(bundle.meta["f"])
     terms = bundle.meta["terms"]
     planes = None if terms is None or f is None else textureless.Planes(bundle["region"], terms, f)
-    ending = Ending(task.pair.state.near_sign, task.pair.alignment, f, planes, shape)
+    ending = Ending(shape, task.pair.state.near_sign, task.pair.alignment, f, planes)
     # At half the resolution with the neighbours that slopes are taken from.
     window = task.window.grow(1, 1, shape) if task.half else task.window
-    arrays = finest.final(task.pair, window, task.fine(finest.around(task.pair, window)), ending)
+    arrays = finest.interpolate_undefined(task.pair, window, task.fine(finest.around(task.pair, window)), ending)
     if task.half:
         left, right = (tuple(one.raster("level_0").shape) for one in task.given[:2])
         outer, inner = window.child(left), task.window.child(left)

@@ -23,7 +23,7 @@ from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts
 from rille.stages.hfvm import plane
 from rille.stages.hfvm.image import as_matched
-from rille.stages.hfvm.level import LevelSteps, Views, descend, fill_rows, median, propagate, search
+from rille.stages.hfvm.level import ImagePair, Recipe, descend, fill_rows, median, propagate, search
 from rille.stages.hfvm.matcher import DEFAULT
 from rille.stages.hfvm.native.problem import LevelPair
 from rille.stages.hfvm.native.solver import solver
@@ -101,13 +101,13 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: plane.Matr
         rounds=ROUNDS,
     )
     # At a coarse level no level is finest: all have the same rounds. At level 0 the matcher's own figures hold.
-    rounds = (ROUNDS, ROUNDS) if level else DEFAULT.steps.rounds
+    rounds = (ROUNDS, ROUNDS) if level else DEFAULT.rounds
     left, right = as_matched(a, hp), as_matched(b, hp)
     if turn is not None:
         turn = np.linalg.inv(plane.finer(level)) @ turn @ plane.finer(level)
         right = plane.aligned(right, turn, left)
-    views = Views(left, right, hp, LevelSteps((search, propagate, median), (), rounds))
-    state, layers = descend(views, 0), (views.left.layers[0], views.right.layers[0])
+    images = ImagePair(left, right, hp, Recipe((search, propagate, median), (), rounds))
+    state, layers = descend(images, 0), (images.left.layers[0], images.right.layers[0])
     validity = np.zeros(state.left.u.shape, np.uint8)
     pair = LevelPair(layers[0].words, layers[1].words)
     u, v, distance = solver.sums(pair, state.left.u, state.left.v, np.ones_like(validity))

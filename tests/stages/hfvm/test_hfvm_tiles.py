@@ -5,7 +5,6 @@ import pytest
 from matching_scenes import pair
 
 from rille.stages.core.validity import matched
-from rille.stages.hfvm.finest import _bounded
 from rille.stages.hfvm.image import Window, as_matched, thinned, tiles, whole
 from rille.stages.hfvm.matcher import How, local
 from rille.stages.hfvm.params import HfvmParams
@@ -126,4 +125,4 @@ def test_windows():
     assert Window(2, 9, 4, 7).parent() == Window(1, 5, 2, 4)
     assert Window(1, 5, 2, 4).child((9, 7)) == Window(2, 9, 4, 7)
     # nothing of it lies in the image: still two pixels, which no place can mean
-    assert _bounded(Window(-9, -5, 20, 30), (10, 7), 2) == Window(0, 2, 4, 7)
+    assert Window(-9, -5, 20, 30).grow(2, 2, (10, 7)) == Window(0, 2, 4, 7)
