@@ -129,17 +129,6 @@ def _in_small_patches(u: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool
 
 Results = Mapping[str, AnyArray]
 
-SUPPORT_SIDE_PX = 25
-"""Pixels: side of the neighbourhood that bears out a pixel without texture. Chosen, as the shares below, with five
-pairs (motorcycle, Baby1, Cloth1, Lampshade1, Midd1): of what is borne out 98 to 100 % are within 2 px, of all that is
-consistent without texture 14 to 100 %."""
-
-MIN_CONSISTENT_SHARE = 0.9
-"""Least share of that neighbourhood that is consistent."""
-
-MIN_MATCHED_SHARE = 0.3
-"""Least share of that neighbourhood that is matched."""
-
 
 @dataclass(frozen=True)
 class FinestWork:
@@ -272,19 +261,6 @@ def speckles(work: FinestWork, fine: Fine) -> Fine:
     """Reasons against pixels in small isolated patches, most of which are errors."""
     small = isolated(work.left.u, fine.keep, work.images.params.speckle)
     return replace(fine, validity=fine.against(small, Validity.SPECKLE))
-
-
-def blanks(work: FinestWork, fine: Fine) -> Fine:
-    """Pixels without texture count as matched where nearly all around are consistent, and enough of them are matches.
-
-    Among failures, as on a wall without any texture, consistent pixels are chance.
-    """
-    keep, blank = fine.keep, fine.validity == Validity.NO_TEXTURE
-    room = window_room(keep.shape, SUPPORT_SIDE_PX)
-    around = window_count(keep | blank, SUPPORT_SIDE_PX), window_count(keep, SUPPORT_SIDE_PX)
-    blank &= (around[0] >= MIN_CONSISTENT_SHARE * room) & (around[1] >= MIN_MATCHED_SHARE * room)
-    noise = np.where(blank, np.float32((refinement.BLANK_STD_PX / refinement.NOISE_FACTOR) ** 2), fine.noise)
-    return replace(fine, validity=np.where(blank, np.uint8(0), fine.validity), noise=noise)
 
 
 def fitted_lines(results: Results, shapes: tuple[Shape, Shape]) -> epipolar.Matrix | None:

@@ -78,9 +78,7 @@ def check(left: Pyramid, right: Pyramid, given: PriorDisparities, params: HfvmPa
     # Scaled as the noise will be.
     moved = ((fine.u - u) / np.float32(refinement.NOISE_FACTOR)) ** 2
     fine = replace(fine, u=u, noise=fine.noise + moved)
-    for step in (finest.landing, finest.speckles, finest.blanks):
-        fine = step(work, fine)
-    results = asdict(fine)
+    results = asdict(finest.speckles(work, finest.landing(work, fine)))
     lines = finest.fitted_lines(results, (left_layer.shape, right_layer.shape))
     return finest.complete(results, left_layer.valid, left_layer.window, params, Ending(left_layer.shape, f=lines))
 

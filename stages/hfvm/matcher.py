@@ -24,14 +24,14 @@ DEFAULT = Recipe(
     (level.search, level.propagate, level.median),
     (level.edges,),
     rounds=(2, 2),
-    refinement=(finest.check, finest.refine, finest.landing, finest.speckles, finest.blanks),
+    refinement=(finest.check, finest.refine, finest.landing, finest.speckles),
 )
 FAST = replace(DEFAULT, half=True)
 ACCURATE = Recipe(
     (level.search, level.propagate, level.paths, level.median),
     (level.edges,),
     rounds=(4, 4),
-    refinement=(finest.check, finest.refine, finest.smooth, finest.landing, finest.speckles, finest.blanks),
+    refinement=(finest.check, finest.refine, finest.smooth, finest.landing, finest.speckles),
 )
 RECIPES: Mapping[str, Recipe] = {"default": DEFAULT, "fast": FAST, "accurate": ACCURATE}
 

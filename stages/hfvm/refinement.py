@@ -487,7 +487,7 @@ SURROUNDINGS_SIDE_PX = 9
 """Pixels: side of the window in which unmatched pixels count; about the reach of features and windows together."""
 
 BLANK_STD_PX = 0.2
-"""Standard deviation (pixels) that is added to a match without texture; the parts below do not explain it."""
+"""Standard deviation (pixels) that is added to matches of textureless regions; the parts below do not explain it."""
 
 # Factors of the parts. For each of several floors ``benchmarks/disparity_std.py --fit`` found the others on four mockup
 # pairs (seeds 1, 2 and 6, and seed 7 with noise of 4 grey levels); the floor, which no simulated lens shows, is the one

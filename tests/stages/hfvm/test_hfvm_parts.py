@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from matching_scenes import convergent_rig, pair, rig_displacement
 from scipy import ndimage
 
-from rille.stages.core.validity import Validity, has
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.spline import coefficients
 from rille.stages.hfvm import epipolar, level, paper, plane, refinement
@@ -18,7 +17,6 @@ from rille.stages.hfvm.image import planes as table_1
 from rille.stages.hfvm.level import Map, agree
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.plane import Sample
-from rille.stages.hfvm.stage import match
 from rille.stages.imaging.pyramid import PyramidParams, build
 
 
@@ -347,21 +345,6 @@ class TestLookup:
         table = learn(paper.search(*vectors, maps[0], (0, 0)).offset[..., 0][ok])
         # One of six images of the lesson: a few hundredths.
         np.testing.assert_allclose(table, paper.DEFAULT_TABLE, atol=0.03)
-
-
-def test_a_patch_without_texture_on_a_textured_wall_is_matched_with_a_larger_deviation():
-    rng = np.random.default_rng(4)
-    grey = ndimage.gaussian_filter(rng.uniform(0, 255, (160, 240)), 1.2)
-    grey = np.clip((grey - grey.mean()) * 3 + 128, 0, 255)
-    grey[70:90, 110:130] = 128
-    left, right = (np.rint(grey[:, at : at + 200]).astype(np.uint8) for at in (0, 12))
-    found = match(left, right)
-    inside = np.s_[76:84, 116:124]
-    assert has(found.validity[inside], Validity.MATCHED).mean() > 0.95
-    np.testing.assert_allclose(found.column_disparity[inside], -12, atol=0.5)
-    around = found.disparity_std[20:60, 40:180]
-    more = np.nanmin(found.disparity_std[inside]) ** 2 - np.nanmedian(around) ** 2
-    assert more > 0.99 * refinement.BLANK_STD_PX**2
 
 
 def test_values_and_gradients_are_those_of_scipys_spline():
