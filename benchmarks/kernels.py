@@ -2,7 +2,7 @@
 
 ``python benchmarks/kernels.py [--image LEFT RIGHT]``: the street's first pair of RILLE_DATA by default. Each preset
 runs in a process of its own, with either solver in turn. It fails if any result differs, or if the reference takes more
-than 1.9 times as long.
+than five times as long.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PRESETS = {"default": 7, "fast": 7, "accurate": 3}
 """Presets, and how often each is run."""
 SOLVERS = "native", "reference"
 ROUNDS = 3
-MOST = 1.9
+MOST = 5.0
 """Greatest ratio of the reference's time."""
 
 

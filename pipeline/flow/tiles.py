@@ -85,7 +85,7 @@ def _levels(pyramid: PyramidParams, shape: Shape) -> int:
 
 def _half(params: HfvmParams) -> int:
     """Levels that are left out at the fine end."""
-    return int(matcher.recipe_of(params).half)
+    return int(matcher.RECIPES[params.preset].half)
 
 
 def build(graph: Graph, params: HfvmParams, images: dict[str, Handle], shape: Shape, side: int, label: str) -> Handle:

@@ -17,14 +17,11 @@ class DisparityFacts(Facts):
 
 
 class TileFacts(Facts, total=False):
-    """Of the coarse levels: ``level``, ``alignment`` and ``ratio`` of brightness, band ``f`` and ``mu``, ``near_sign``
-    (see ``hfvm.level.State``). Of the ending: epipolar lines ``f``, and ``terms`` of textureless planes."""
+    """Of the coarse levels: ``level``, cost ``mu`` of the band, sign of depth ``near_sign`` (``hfvm.level.State``). Of
+    the ending: ``terms`` of textureless planes."""
 
     level: int
     aligned: bool
-    alignment: list[list[float]] | None
-    ratio: list[list[float]] | None
-    f: list[list[float]] | None
     mu: float
     near_sign: float
-    terms: list[Any] | None
+    terms: list[Any]

@@ -29,7 +29,8 @@ from rille.stages.geometry.scale import other_size
 from rille.stages.hfvm import plane
 from rille.stages.hfvm.epipolar import typical
 from rille.stages.hfvm.image import Grey, Image, Shape, Window, thinned
-from rille.stages.hfvm.level import Map, State, Views, descend, sample
+from rille.stages.hfvm.level import ImagePair, State, descend, sample
+from rille.stages.hfvm.native.problem import Map
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
 
@@ -76,14 +77,14 @@ def _bounded(u: AnyArray, v: AnyArray) -> PriorDisparities:
 
 
 def aligned(prior: PriorDisparities | None, h: plane.Matrix | None) -> PriorDisparities | None:
-    """The prior towards the aligned right image: see :func:`rille.stages.hfvm.plane.decompose`."""
+    """The prior towards the aligned right image."""
     if prior is None or h is None:
         return prior
     # Ends that come to lie near the horizon of the plane are led farther than the given ones.
-    return _bounded(*plane.decompose(h, prior.u, prior.v, prior.u.shape))
+    return _bounded(*plane.carried(np.linalg.inv(plane.to_original(h, prior.u.shape)), prior.u, prior.v))
 
 
-def impose(views: Views, state: State, prior: PriorDisparities | None) -> State:
+def impose(images: ImagePair, state: State, prior: PriorDisparities | None) -> State:
     """State of the same level with the prior's displacements in both directions where they are known.
 
     At level 0 (images too small for coarser ones) the whole range has been searched, and nothing is imposed.
@@ -94,7 +95,7 @@ def impose(views: Views, state: State, prior: PriorDisparities | None) -> State:
     left = _overlay(state.left, u, v, known)
     ru, rv, hit = _reverse(u, v, known, state.right.u.shape, state.near_sign or -1.0)
     right = _overlay(state.right, ru, rv, hit)
-    masks = [image.layers[state.level].valid != 0 for image in (views.left, views.right)]
+    masks = [image.layers[state.level].valid != 0 for image in (images.left, images.right)]
     left_ok, right_ok = (state.left_ok | known) & masks[0], (state.right_ok | hit) & masks[1]
     return replace(state, left=left, right=right, left_ok=left_ok, right_ok=right_ok)
 
@@ -246,12 +247,12 @@ MIN_EVEN_SHARE = 0.85
 class Coarse:
     """A pair of images and its matches at a coarse level, ``state``.
 
-    ``views``: the images as they are matched: the right one in the left one's brightness, divided by ``ratio``, and
+    ``images``: the images as they are matched: the right one in the left one's brightness, divided by ``ratio``, and
     aligned by the homography ``alignment`` (None: neither). ``right``: as it is before it is aligned. ``prior``:
     disparities known beforehand.
     """
 
-    views: Views
+    images: ImagePair
     state: State
     right: Image
     ratio: Floats | None = None
@@ -260,26 +261,26 @@ class Coarse:
 
     def with_threads(self, threads: int) -> Coarse:
         """The same, to be matched on by so many threads."""
-        return replace(self, views=replace(self.views, threads=threads))
+        return replace(self, images=replace(self.images, threads=threads))
 
     @staticmethod
-    def again(views: Views, state: State, ratio: Floats | None, alignment: plane.Matrix | None) -> Coarse:
-        """As it was when these were its state, ratio and alignment; ``views``: the images as they are."""
-        right = levelled(views.right, ratio)
-        matched = right if alignment is None else plane.aligned(right, alignment, views.left)
-        return Coarse(replace(views, right=matched), state, right, ratio, alignment)
+    def again(images: ImagePair, state: State, ratio: Floats | None, alignment: plane.Matrix | None) -> Coarse:
+        """As it was when these were its state, ratio and alignment; ``images``: the images as they are."""
+        right = levelled(images.right, ratio)
+        matched = right if alignment is None else plane.aligned(right, alignment, images.left)
+        return Coarse(replace(images, right=matched), state, right, ratio, alignment)
 
     def anew(self, matched: Image, **changed: object) -> Coarse:
         """Coarse levels of another right image, and other facts changed."""
-        views = replace(self.views, right=matched)
-        return replace(self, views=views, state=descend(views, COARSE_LEVEL, None, self.state.near_sign), **changed)  # type: ignore[arg-type]
+        images = replace(self.images, right=matched)
+        return replace(self, images=images, state=descend(images, COARSE_LEVEL, None, self.state.near_sign), **changed)  # type: ignore[arg-type]
 
 
 def even(coarse: Coarse) -> Coarse:
     """Brightness ratio of both images undone in the right one, first by a guess where little matches."""
-    left, right = coarse.views.left, coarse.right
+    left, right = coarse.images.left, coarse.right
     if coarse.state.share < MIN_EVEN_SHARE:
-        guessed = guess(left, right, min(COARSE_LEVEL + 2, coarse.views.levels - 1))
+        guessed = guess(left, right, min(COARSE_LEVEL + 2, coarse.images.levels - 1))
         if greatest(guessed) > MIN_LOG_RATIO:
             other = levelled(right, guessed)
             tried = coarse.anew(other, right=other, ratio=guessed)
@@ -301,34 +302,31 @@ def even(coarse: Coarse) -> Coarse:
 def known(coarse: Coarse) -> Coarse:
     """Disparities known beforehand in the place of those found."""
     prior = aligned(coarse.prior, coarse.alignment)
-    return replace(coarse, state=impose(coarse.views, coarse.state, prior))
+    return replace(coarse, state=impose(coarse.images, coarse.state, prior))
 
 
 def align(coarse: Coarse) -> Coarse:
     """The right image aligned by the dominant plane, where one explains the matches."""
-    h = plane.find(sample(coarse.views, coarse.state), coarse.state.level, coarse.views.left.shapes)
-    return coarse if h is None else known(coarse.anew(plane.aligned(coarse.right, h, coarse.views.left), alignment=h))
+    h = plane.find(sample(coarse.images, coarse.state), coarse.state.level, coarse.images.left.shapes)
+    return coarse if h is None else known(coarse.anew(plane.aligned(coarse.right, h, coarse.images.left), alignment=h))
 
 
 def turn(coarse: Coarse) -> Coarse:
     """The right image turned and scaled by keypoints, where hardly a pixel matches and that helps."""
     # A plane may also be fitted to the few matches that chance makes.
-    sizes = coarse.views.left.shapes[0], coarse.right.shapes[0]
+    sizes = coarse.images.left.shapes[0], coarse.right.shapes[0]
     few = coarse.state.share <= MIN_UPRIGHT_SHARE or (coarse.alignment is None and other_size(*sizes))
-    h = plane.find_turn(coarse.views.left, coarse.right) if few and coarse.prior is None else None
+    h = plane.find_turn(coarse.images.left, coarse.right) if few and coarse.prior is None else None
     if h is None:
         return coarse
     upright = replace(coarse, state=replace(coarse.state, near_sign=0.0))
-    turned = upright.anew(plane.aligned(coarse.right, h, coarse.views.left), alignment=h)
+    turned = upright.anew(plane.aligned(coarse.right, h, coarse.images.left), alignment=h)
     return turned if turned.state.share > coarse.state.share else coarse
 
 
-Step = Callable[[Coarse], Coarse]
-
-
-def begin(views: Views, steps: tuple[Step, ...], prior: PriorDisparities | None = None) -> Coarse:
+def match_coarse_levels(images: ImagePair, prior: PriorDisparities | None = None) -> Coarse:
     """The coarse levels of two images as they are, down to level 1 or, of small images, to the top."""
-    coarse = Coarse(views, descend(views, COARSE_LEVEL), views.right, prior=prior)
-    for step in steps:
+    coarse = Coarse(images, descend(images, COARSE_LEVEL), images.right, prior=prior)
+    for step in images.params.kept((even, known, align, turn)):
         coarse = step(coarse)
-    return replace(coarse, state=descend(coarse.views, 1, coarse.state))
+    return replace(coarse, state=descend(coarse.images, 1, coarse.state))

@@ -69,8 +69,10 @@ def fit_points(
         cols = _solve(p[::-1], q[::-1], MATCH_SIGMA_PX / scale)
         swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         f, spread = (rows[0], rows[2]) if rows[1] <= cols[1] else (swap @ cols[0] @ swap, cols[2])
-    to_left = np.array([[1 / scale, 0.0, -left_mid[0] / scale], [0.0, 1 / scale, -left_mid[1] / scale], [0, 0, 1.0]])
-    to_right = np.array([[1 / scale, 0.0, -right_mid[0] / scale], [0.0, 1 / scale, -right_mid[1] / scale], [0, 0, 1.0]])
+    to_left, to_right = (
+        np.array([[1 / scale, 0.0, -x / scale], [0.0, 1 / scale, -y / scale], [0, 0, 1.0]])
+        for x, y in (left_mid, right_mid)
+    )
     return np.asarray(to_right.T @ f @ to_left, dtype=np.float64), spread * scale
 
 
@@ -116,17 +118,13 @@ def near_sign(f: Matrix, u: AnyArray, left_shape: tuple[int, ...], right_shape: 
     (keystone), which give it for a focal length of about the image width. A vote: only the filling of gaps hangs on it.
     ``u``: column displacements of matches (n,).
     """
-    rows, cols = left_shape
-    to_left = np.array([[1.0, 0.0, 0.5 * (cols - 1)], [0.0, 1.0, 0.5 * (rows - 1)], [0.0, 0.0, 1.0]])
-    to_right = np.array(
-        [[1.0, 0.0, 0.5 * (right_shape[1] - 1)], [0.0, 1.0, 0.5 * (right_shape[0] - 1)], [0.0, 0.0, 1.0]]
-    )
-    g = to_right.T @ f @ to_left
+    (rows, cols), (right_rows, right_cols) = left_shape, right_shape
+    middles = (0.5 * (cols - 1), 0.5 * (rows - 1)), (0.5 * (right_cols - 1), 0.5 * (right_rows - 1))
+    g = moved(f, *middles)
     # Lines along the columns: column displacements do not tell near from far, and the usual sign stands.
     if abs(g[1, 2]) < abs(g[0, 2]):
         return -1.0
-    shift = 0.5 * (right_shape[1] - cols)
-    far = -(g[1, 0] + g[0, 1]) / g[1, 2] * float(cols) ** 2 + shift
+    far = -(g[1, 0] + g[0, 1]) / g[1, 2] * float(cols) ** 2 + 0.5 * (right_cols - cols)
     return -1.0 if np.median(u) <= far else 1.0
 
 
@@ -139,21 +137,10 @@ def lines(f: Matrix, shape: tuple[int, ...]) -> NDArray[np.float32]:
     return np.ascontiguousarray(lines_at(f, x, y).T.reshape(*shape, 3))
 
 
-def moved(f: Matrix, left: tuple[int, int], right: tuple[int, int]) -> Matrix:
-    """The same constraint in pixels of windows that begin at these columns and rows of the images."""
+def moved(f: Matrix, left: tuple[float, float], right: tuple[float, float]) -> Matrix:
+    """The same constraint in coordinates that begin at these columns and rows of the images."""
     to_left, to_right = (np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]]) for x, y in (left, right))
     return np.asarray(to_right.T @ f @ to_left, dtype=np.float64)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def unit_line(f, x, y):  # type: ignore[no-untyped-def]
-    """Epipolar line (a, b, c) of a pixel, its normal of length one; float32."""
-    a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
-    b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
-    c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
-    # Without a band all is zero, and 0 / 0 must stay 0.
-    scale = 1.0 / max(np.sqrt(a * a + b * b), 1e-12)
-    return np.float32(a * scale), np.float32(b * scale), np.float32((c + a * x + b * y) * scale)
 
 
 @njit(cache=True, nogil=True)
@@ -179,12 +166,6 @@ def line(terms, x, length):  # type: ignore[no-untyped-def]
     return a * scale, b * scale, c * scale
 
 
-def along_line(line: AnyArray, u: AnyArray, v: AnyArray) -> AnyArray:
-    """How far along their lines (3, n) displacements lead, pixels: what :func:`on_line` undoes."""
-    a, b, _ = line
-    return np.asarray(b * u - a * v)
-
-
 @register_jitable
 def on_line(line, along):  # type: ignore[no-untyped-def]
     """Displacement (column, row) on a line (a, b, c) of unit normal, ``along`` pixels from the shortest one on it."""
@@ -195,21 +176,23 @@ def on_line(line, along):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def lines_at(f, x, y):  # type: ignore[no-untyped-def]
     """As :func:`lines`, of single pixels (n,): (3, n) float32."""
-    out = np.empty((3, len(x)), np.float32)
-    for n in range(len(x)):
-        out[0, n], out[1, n], out[2, n] = unit_line(f, np.float64(x[n]), np.float64(y[n]))
-    return out
+    a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
+    b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
+    c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
+    # Without a band all is zero, and 0 / 0 must stay 0.
+    scale = 1.0 / np.maximum(np.sqrt(a * a + b * b), 1e-12)
+    return np.stack((a * scale, b * scale, (c + a * x + b * y) * scale)).astype(np.float32)
 
 
 def along_rows(f: Matrix, shape: tuple[int, ...]) -> bool:
     """Whether the lines of an image of ``shape`` run along the rows rather than along the columns."""
-    a, b, _ = unit_line(f, float(shape[1] // 2), float(shape[0] // 2))
+    a, b, _ = lines_at(f, np.array([shape[1] // 2]), np.array([shape[0] // 2]))
     return bool(abs(b) >= abs(a))
 
 
 def oriented(f: Matrix, shape: tuple[int, ...]) -> Matrix:
     """The matrix with the sign by which :func:`on_line` leads to greater columns, or rows on upright lines."""
-    a, b, _ = unit_line(f, float(shape[1] // 2), float(shape[0] // 2))
+    a, b, _ = lines_at(f, np.array([shape[1] // 2]), np.array([shape[0] // 2]))
     return f if (b if along_rows(f, shape) else -a) > 0 else -f
 
 

@@ -25,9 +25,18 @@ from rille.stages.geometry import spline
 from rille.stages.geometry.scale import effective
 from rille.stages.hfvm import epipolar, plane, refinement, textureless
 from rille.stages.hfvm.coarse import Coarse
-from rille.stages.hfvm.image import Image, Layer, Shape, Window, thinned, whole
-from rille.stages.hfvm.level import MAX_FIT_MATCHES, Band, Map, State, fill_rows, hand_down, match_level
-from rille.stages.hfvm.native.problem import LevelPair
+from rille.stages.hfvm.image import Layer, Shape, Window, thinned, whole
+from rille.stages.hfvm.level import (
+    MAX_FIT_MATCHES,
+    NEAR_SIGN,
+    Band,
+    ImagePair,
+    State,
+    fill_rows,
+    hand_down,
+    match_level,
+)
+from rille.stages.hfvm.native.problem import LevelPair, Map
 from rille.stages.hfvm.native.solver import solver
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.refinement import local_mean
@@ -120,17 +129,6 @@ def _in_small_patches(u: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool
 
 Results = Mapping[str, AnyArray]
 
-SUPPORT_SIDE_PX = 25
-"""Pixels: side of the neighbourhood that bears out a pixel without texture. Chosen, as the shares below, with five
-pairs (motorcycle, Baby1, Cloth1, Lampshade1, Midd1): of what is borne out 98 to 100 % are within 2 px, of all that is
-consistent without texture 14 to 100 %."""
-
-MIN_CONSISTENT_SHARE = 0.9
-"""Least share of that neighbourhood that is consistent."""
-
-MIN_MATCHED_SHARE = 0.3
-"""Least share of that neighbourhood that is matched."""
-
 
 @dataclass(frozen=True)
 class FinestWork:
@@ -138,7 +136,7 @@ class FinestWork:
 
     ``b``: the right image as it was matched, ``right``: as it is; two names of one unless ``alignment``, the homography
     from the one to the other, is given. ``left, back``: whole displacements of the left window in that of ``b``, and
-    the reverse. ``shape``: of the left image. ``noise``: that the images had before they were denoised.
+    the reverse. ``images``: whose windows they are.
     """
 
     a: Layer
@@ -146,30 +144,26 @@ class FinestWork:
     right: Layer
     left: Map
     back: Map
-    params: HfvmParams
-    alignment: plane.Matrix | None
-    noise: tuple[float, float]
-    shape: Shape
+    images: ImagePair
+    alignment: plane.Matrix | None = None
 
     def to_right(self, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
         """Displacements in the window of the right image, of those in the window of ``b``."""
-        if self.alignment is None:
-            return u, v
-        a, b, c = self.a.window, self.b.window, self.right.window
-        u, v = (d + np.float32(to - at) for d, to, at in ((u, b.x0, a.x0), (v, b.y0, a.y0)))
-        u, v = plane.compose(self.alignment, u, v, self.shape, a.x0, a.y0)
-        return u - np.float32(c.x0 - a.x0), v - np.float32(c.y0 - a.y0)
+        return self._carried(u, v, self.b, self.right)
 
     def from_right(self, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
         """The reverse of :meth:`to_right`."""
+        return self._carried(u, v, self.right, self.b)
+
+    def _carried(self, u: AnyArray, v: AnyArray, start: Layer, end: Layer) -> tuple[AnyArray, AnyArray]:
         if self.alignment is None:
             return u, v
-        a, b, c = self.a.window, self.b.window, self.right.window
-        u, v = (d + np.float32(to - at) for d, to, at in ((u, c.x0, a.x0), (v, c.y0, a.y0)))
-        u, v = plane.decompose(self.alignment, u, v, self.shape, a.x0, a.y0)
-        return u - np.float32(b.x0 - a.x0), v - np.float32(b.y0 - a.y0)
+        a, b, c, h = self.a.window, start.window, end.window, plane.to_original(self.alignment, self.a.shape)
+        u, v = (d + np.float32(to - at) for d, to, at in ((u, b.x0, a.x0), (v, b.y0, a.y0)))
+        u, v = plane.carried(h if end is self.right else np.linalg.inv(h), u, v, a.x0, a.y0)
+        return u - np.float32(c.x0 - a.x0), v - np.float32(c.y0 - a.y0)
 
-    def images(self) -> refinement.SplineImages:
+    def compared(self) -> refinement.SplineImages:
         """What refinement compares."""
         return refinement.SplineImages(self.a.grey, spline.coefficients(self.right.grey), self.right.valid)
 
@@ -199,33 +193,41 @@ class Fine:
         return validity
 
 
-Step = Callable[[FinestWork, Fine], Fine]
-
-
 def subpixel(work: FinestWork) -> Fine:
     """Fractions of a pixel from distances summed over 5 x 5 pixels, and means of like neighbours (4.3.2)."""
-    pair = LevelPair(work.a.words, work.b.words, epipolar.NO_BAND, 0.0)
-    u, v, distance = solver.sums(pair, work.left.u, work.left.v, np.ones(work.left.u.shape, np.uint8))
+    everywhere = np.ones(work.left.u.shape, np.uint8)
+    u, v, distance = solver.sums(LevelPair(work.a.words, work.b.words), *work.left, everywhere)
     u, v = local_mean(u, v, np.ones(u.shape, bool), 2, 2)
     zeros = np.zeros(u.shape, np.float32)
     return Fine(u, v, np.zeros(u.shape, np.uint8), zeros, distance, zeros)
 
 
+def reasons(
+    there: Map, back: Map, distance: AnyArray, layers: tuple[Layer, Layer], params: HfvmParams, deviation: AnyArray
+) -> tuple[AnyArray, AnyArray]:
+    """Back-matching errors (4.3.3), pixels, and bits that speak against each pixel: they, distance, texture.
+
+    ``there, back``: displacements of the ``layers``, (row, col) float32; ``deviation``: of the left one.
+    """
+    error = np.full(distance.shape, FAILED_PX, np.float32)
+    backmatch(there.u, there.v, back, layers[1].valid, error)
+    validity = np.zeros(error.shape, np.uint8)
+    # A masked pixel is no part of the image, so it counts as outside.
+    outside = (error >= FAILED_PX) | (layers[0].valid == 0)
+    mark(validity, outside, Validity.OUT_OF_IMAGE)
+    mark(validity, ~outside & (error > params.backmatch), Validity.BACKMATCH_FAILED)
+    mark(validity, distance > params.threshold, Validity.OVER_THRESHOLD)
+    mark(validity, deviation < params.texture, Validity.NO_TEXTURE)
+    return error, validity
+
+
 def check(work: FinestWork, fine: Fine) -> Fine:
     """Reasons against each pixel: matching back (4.3.3), distance, texture."""
-    p = work.params
     # Back from the right whole displacements suffice.
-    u, v = (a.astype(np.float32) for a in (work.back.u, work.back.v))
-    back = local_mean(u, v, np.ones(u.shape, bool), 2, 2)
-    error = np.full(fine.u.shape, FAILED_PX, np.float32)
-    backmatch(fine.u, fine.v, back, work.b.valid, error)
-    validity = np.zeros(fine.u.shape, np.uint8)
-    # A masked pixel is no part of the image, so it counts as outside.
-    outside = (error >= FAILED_PX) | (work.a.valid == 0)
-    mark(validity, outside, Validity.OUT_OF_IMAGE)
-    mark(validity, ~outside & (error > p.backmatch), Validity.BACKMATCH_FAILED)
-    mark(validity, fine.distance > p.threshold, Validity.OVER_THRESHOLD)
-    mark(validity, work.a.deviation < p.texture, Validity.NO_TEXTURE)
+    u, v = (a.astype(np.float32) for a in work.back)
+    back = Map(*local_mean(u, v, np.ones(u.shape, bool), 2, 2))
+    found = Map(fine.u, fine.v), back, fine.distance, (work.a, work.b), work.images.params, work.a.deviation
+    error, validity = reasons(*found)
     return replace(fine, error=error, validity=validity)
 
 
@@ -234,18 +236,18 @@ def refine(work: FinestWork, fine: Fine) -> Fine:
     keep = fine.keep
     # An image that a plane has aligned is sheared, and takes a step more.
     steps = 1 if work.alignment is None else 2
-    u, v, rest, per_noise = refinement.refine(work.images(), work.to_right, (fine.u, fine.v), keep, steps)
-    removed = work.noise[0] ** 2, work.noise[1] ** 2
+    u, v, rest, per_noise = refinement.refine(work.compared(), work.to_right, (fine.u, fine.v), keep, steps)
+    removed = work.images.left.noise**2, work.images.right.noise**2
     alike, variance = refinement.surroundings(rest, work.a.deviation, keep, removed)
     # Denoising takes means of nine pixels: it divides the residuals' variance by as many; no match is placed better.
     noise = per_noise * (variance * np.float32(9) if any(removed) else variance)
-    validity = fine.against(keep & (alike < work.params.correlation), Validity.OVER_THRESHOLD)
+    validity = fine.against(keep & (alike < work.images.params.correlation), Validity.OVER_THRESHOLD)
     return replace(fine, u=u, v=v, noise=noise, validity=validity)
 
 
 def smooth(work: FinestWork, fine: Fine) -> Fine:
     """A piecewise smooth relief fitted to all matches along their epipolar lines."""
-    u, v = work.from_right(*refinement.fit_relief(work.images(), *work.to_right(fine.u, fine.v), fine.keep))
+    u, v = work.from_right(*refinement.fit_relief(work.compared(), *work.to_right(fine.u, fine.v), fine.keep))
     return replace(fine, u=u, v=v)
 
 
@@ -257,21 +259,8 @@ def landing(work: FinestWork, fine: Fine) -> Fine:
 
 def speckles(work: FinestWork, fine: Fine) -> Fine:
     """Reasons against pixels in small isolated patches, most of which are errors."""
-    small = isolated(work.left.u, fine.keep, work.params.speckle)
+    small = isolated(work.left.u, fine.keep, work.images.params.speckle)
     return replace(fine, validity=fine.against(small, Validity.SPECKLE))
-
-
-def blanks(work: FinestWork, fine: Fine) -> Fine:
-    """Pixels without texture count as matched where nearly all around are consistent, and enough of them are matches.
-
-    Among failures, as on a wall without any texture, consistent pixels are chance.
-    """
-    keep, blank = fine.keep, fine.validity == Validity.NO_TEXTURE
-    room = window_room(keep.shape, SUPPORT_SIDE_PX)
-    around = window_count(keep | blank, SUPPORT_SIDE_PX), window_count(keep, SUPPORT_SIDE_PX)
-    blank &= (around[0] >= MIN_CONSISTENT_SHARE * room) & (around[1] >= MIN_MATCHED_SHARE * room)
-    noise = np.where(blank, np.float32((refinement.BLANK_STD_PX / refinement.NOISE_FACTOR) ** 2), fine.noise)
-    return replace(fine, validity=np.where(blank, np.uint8(0), fine.validity), noise=noise)
 
 
 def fitted_lines(results: Results, shapes: tuple[Shape, Shape]) -> epipolar.Matrix | None:
@@ -284,30 +273,17 @@ def fitted_lines(results: Results, shapes: tuple[Shape, Shape]) -> epipolar.Matr
     return epipolar.oriented(fitted[0], shapes[0])
 
 
-def textureless_planes(
-    images: tuple[Image, Image], results: Results, f: epipolar.Matrix, near_sign: float
-) -> textureless.Planes:
-    """Planes of the left image's textureless regions: what no window tells, a whole region does."""
-    left, right = (image.layers[textureless.REGION_LEVEL] for image in images)
-    rows, cols = left.shape
-    unmatched = np.ones((2 * rows, 2 * cols), bool)
-    unmatched[: results["u"].shape[0], : results["u"].shape[1]] = results["validity"] != 0
-    none = (unmatched[::2, ::2] & unmatched[::2, 1::2]) & (unmatched[1::2, ::2] & unmatched[1::2, 1::2])
-    y, x = thinned(results["validity"] == 0, MAX_FIT_MATCHES)
-    along = epipolar.along_line(epipolar.lines_at(f, x, y), results["u"][y, x], results["v"][y, x])
-    return textureless.find(left, right, f, none, along, -near_sign)
-
-
 @dataclass(frozen=True)
 class Ending:
-    """What the whole image tells a window for its last steps: the sign of depth (see ``level.State``), the
-    homography that the right image was aligned by, epipolar lines of the matches, and planes without texture."""
+    """What the whole left image, of ``shape``, tells a window for its last steps: the sign of depth (see
+    ``level.State``), the homography that the right image was aligned by, epipolar lines of the matches, and planes
+    without texture."""
 
-    near_sign: float
-    alignment: plane.Matrix | None
-    f: epipolar.Matrix | None
-    planes: textureless.Planes | None
     shape: Shape
+    near_sign: float = NEAR_SIGN
+    alignment: plane.Matrix | None = None
+    f: epipolar.Matrix | None = None
+    planes: textureless.Planes | None = None
 
 
 def complete(
@@ -347,7 +323,7 @@ def complete(
         # A filled pixel has its neighbour's depth, not its row: between turned cameras rows change along a row.
         v = epipolar.settled(epipolar.moved(ending.f, *2 * ((window.x0, window.y0),)), u, v, filled)
     if ending.alignment is not None:
-        u, v = plane.compose(ending.alignment, u, v, ending.shape, window.x0, window.y0)
+        u, v = plane.carried(plane.to_original(ending.alignment, ending.shape), u, v, window.x0, window.y0)
         # Found in pixels of the aligned image, as displacements were.
         std = std * np.float32(effective(plane.scale(ending.alignment, ending.shape)))
     mark(validity, matches, Validity.MATCHED)
@@ -379,21 +355,21 @@ FILL_MARGIN_PX = 16
 """Pixels around a window that its filling and standard deviations depend on, besides the reach along rows."""
 
 
-def fine(pair: Coarse, refinement: tuple[Step, ...], window: Window) -> dict[str, AnyArray]:
+def match_finest_level(pair: Coarse, window: Window) -> dict[str, AnyArray]:
     """Arrays of :class:`~rille.stages.hfvm.finest.Fine` of a window of the left image; displacements to the whole
     matched image."""
-    views, shape = pair.views, pair.views.left.shapes[0]
+    images, shape = pair.images, pair.images.left.shapes[0]
     outer = window.grow(HALO_PX, HALO_PX, shape)
     state, target = _around(pair, outer)
-    a, b = views.left.cut(outer), views.right.cut(target)
+    a, b = images.left.cut(outer), images.right.cut(target)
     if state.level > 0:
-        state = match_level(replace(views, left=a, right=b), 0, state)  # 4.3.4: search, propagate, check, band
-    left, right, noise = a.layers[0], b.layers[0], (views.left.noise, views.right.noise)
-    work = FinestWork(left, right, right, state.left, state.right, views.params, pair.alignment, noise, shape)
+        state = match_level(replace(images, left=a, right=b), 0, state)  # 4.3.4: search, propagate, check, band
+    left, right = a.layers[0], b.layers[0]
+    work = FinestWork(left, right, right, state.left, state.right, images, pair.alignment)
     if pair.alignment is not None:
         work = replace(work, right=pair.right.layers[0].cut(_landing(work, pair.right.shapes[0])))
     result = subpixel(work)  # 4.3.2
-    for step in refinement:  # 4.3.3 back-matching, refinement, validation
+    for step in images.params.kept(images.recipe.refinement):  # 4.3.3 back-matching, refinement, validation
         result = step(work, result)
     arrays = asdict(result)
     arrays["u"] = arrays["u"] + np.float32(target.x0 - outer.x0)
@@ -403,22 +379,21 @@ def fine(pair: Coarse, refinement: tuple[Step, ...], window: Window) -> dict[str
 
 def _around(pair: Coarse, outer: Window) -> tuple[State, Window]:
     """State of level 1 around a window of level 0, in pixels of it, and the window of the matched image."""
-    state, shape = pair.state, pair.views.right.shapes[0]
-    if outer == whole(pair.views.left.shapes[0]):
+    state, params, shape = pair.state, pair.images.params, pair.images.right.shapes[0]
+    if outer == whole(pair.images.left.shapes[0]):
         return state, whole(shape)
     above = outer.parent()
-    left, right = (hand_down(s, pair.views.params) for s in (state, state.reverse()))
-    own = Map(left.u[above.slices], left.v[above.slices])
-    y0, y1 = (at + 2 * int(f(own.v)) for at, f in ((outer.y0, np.min), (outer.y1, np.max)))
-    x0, x1 = (at + 2 * int(f(own.u)) for at, f in ((outer.x0, np.min), (outer.x1, np.max)))
-    target = _bounded(Window(y0, y1, x0, x1), shape, TARGET_MARGIN_PX)
-    there = target.parent()
-    du, dv = (outer.x0 - target.x0) // 2, (outer.y0 - target.y0) // 2
-    other = Map(right.u[there.slices], right.v[there.slices])
-    maps = Map(*_shifted(own, du, dv)), Map(*_shifted(other, -du, -dv))
+    own = Map(*(a[above.slices] for a in hand_down(state, params)))
+    (x0, x1), (y0, y1) = ((2 * int(a.min()), 2 * int(a.max())) for a in own)
+    target = Window(outer.y0 + y0, outer.y1 + y1, outer.x0 + x0, outer.x1 + x1)
+    target = target.grow(TARGET_MARGIN_PX, TARGET_MARGIN_PX, shape)
+    other = (a[target.parent().slices] for a in hand_down(state.reverse(), params))
+    steps = (outer.x0 - target.x0) // 2, (outer.y0 - target.y0) // 2
+    left = Map(*(a + np.int16(step) for a, step in zip(own, steps, strict=True)))
+    right = Map(*(a - np.int16(step) for a, step in zip(other, steps, strict=True)))
     f = epipolar.moved(state.band.f, (outer.x0, outer.y0), (target.x0, target.y0))
-    left_ok, right_ok = (np.ones(m.u.shape, bool) for m in maps)
-    return State(1, *maps, left_ok, right_ok, Band(f, state.band.mu), state.near_sign), target
+    ok = np.ones(left.u.shape, bool), np.ones(right.u.shape, bool)
+    return State(1, left, right, *ok, Band(f, state.band.mu), state.near_sign), target
 
 
 def _landing(work: FinestWork, shape: Shape) -> Window:
@@ -429,30 +404,33 @@ def _landing(work: FinestWork, shape: Shape) -> Window:
     # Relative to the window that stands there until this one is known.
     x, y = x - a.x0 + work.right.window.x0, y - a.y0 + work.right.window.y0
     ends = Window(*(int(n) for n in (np.nanmin(y), np.nanmax(y) + 1, np.nanmin(x), np.nanmax(x) + 1)))
-    return _bounded(ends, shape, TARGET_MARGIN_PX)
+    return ends.grow(TARGET_MARGIN_PX, TARGET_MARGIN_PX, shape)
 
 
-def ending(pair: Coarse, arrays: Mapping[str, AnyArray], with_planes: bool) -> Ending:
+def fit_lines_and_planes(pair: Coarse, matches: Mapping[str, AnyArray]) -> Ending:
     """What the matches of the whole image tell its windows: their epipolar lines, and planes without texture."""
-    views, sign = pair.views, pair.state.near_sign
+    images, sign, shapes = pair.images, pair.state.near_sign, (pair.images.left.shapes[0], pair.images.right.shapes[0])
     # Without a band rows are free: they are not to be set by lines.
-    free = views.params.band == 0 or views.levels <= textureless.REGION_LEVEL
-    f = None if free else fitted_lines(arrays, (views.left.shapes[0], views.right.shapes[0]))
-    planes = textureless_planes((views.left, views.right), arrays, f, sign) if f is not None and with_planes else None
-    return Ending(sign, pair.alignment, f, planes, views.left.shapes[0])
+    free = images.params.band == 0 or images.levels <= textureless.REGION_LEVEL
+    f, planes = None if free else fitted_lines(matches, shapes), None
+    if f is not None and "planes" not in images.params.without:
+        planes = textureless.find((images.left, images.right), matches, f, sign)
+    return Ending(shapes[0], sign, pair.alignment, f, planes)
 
 
 def around(pair: Coarse, window: Window) -> Window:
-    """Window that :func:`final` needs the arrays of."""
-    return window.grow(FILL_MARGIN_PX, FILL_MARGIN_PX + pair.views.params.fill_reach, pair.views.left.shapes[0])
+    """Window that :func:`interpolate_undefined` needs the arrays of."""
+    return window.grow(FILL_MARGIN_PX, FILL_MARGIN_PX + pair.images.params.fill_reach, pair.images.left.shapes[0])
 
 
-def final(pair: Coarse, window: Window, fine_arrays: Mapping[str, AnyArray], ending: Ending) -> dict[str, AnyArray]:
-    """Arrays of the disparities of a window, from those of :func:`fine` of the window around it, or of the image."""
-    outer, params = around(pair, window), pair.views.params
-    if fine_arrays["u"].shape != outer.shape:
-        fine_arrays = {name: array[outer.slices] for name, array in fine_arrays.items()}
-    arrays = complete(fine_arrays, pair.views.left.layers[0].cut(outer).valid, outer, params, ending)
+def interpolate_undefined(
+    pair: Coarse, window: Window, matches: Mapping[str, AnyArray], ending: Ending
+) -> dict[str, AnyArray]:
+    """Arrays of the disparities of a window, from the matches of the window around it, or of the image."""
+    outer, params = around(pair, window), pair.images.params
+    if matches["u"].shape != outer.shape:
+        matches = {name: array[outer.slices] for name, array in matches.items()}
+    arrays = complete(matches, pair.images.left.layers[0].cut(outer).valid, outer, params, ending)
     return {name: np.ascontiguousarray(a[window.inside(outer)]) for name, a in arrays.items()}
 
 
@@ -466,22 +444,3 @@ def put_together(calls: Mapping[Window, Call], shape: Shape, threads: int) -> di
         for name, values in arrays.items():
             total.setdefault(name, np.empty(shape, values.dtype))[window.slices] = values
     return total
-
-
-def _shifted(m: Map, du: int, dv: int) -> tuple[AnyArray, AnyArray]:
-    return m.u + np.int16(du), m.v + np.int16(dv)
-
-
-def _bounded(window: Window, shape: Shape, margin: int) -> Window:
-    """The window, wider by ``margin`` on every side, within an image; two pixels at least, with even borders."""
-    (y0, y1), (x0, x1) = (
-        _bounds(low - margin, high + margin, size)
-        for low, high, size in ((window.y0, window.y1, shape[0]), (window.x0, window.x1, shape[1]))
-    )
-    return Window(y0, y1, x0, x1)
-
-
-def _bounds(low: int, high: int, size: int) -> tuple[int, int]:
-    first = max(0, min(low, size - 2)) // 2 * 2
-    last = (max(high, first + 2) + 1) // 2 * 2
-    return first, min(last, size)

@@ -46,16 +46,14 @@ from rille.stages.hfvm.coarse import (
     ratio_of_matches,
 )
 from rille.stages.hfvm.finest import Ending, FinestWork, lands
-from rille.stages.hfvm.image import Shape, view, whole
-from rille.stages.hfvm.level import FREE_BAND, Map, State, Views, one_way
+from rille.stages.hfvm.image import as_matched
+from rille.stages.hfvm.level import FREE_BAND, NEAR_SIGN, ImagePair, State, one_way
+from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS, facts
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
-
-NEAR_SIGN = -1.0
-"""Between parallel cameras nearer things have lesser column displacements (see ``level.State``)."""
 
 
 def check(left: Pyramid, right: Pyramid, given: PriorDisparities, params: HfvmParams) -> dict[str, AnyArray]:
@@ -67,44 +65,33 @@ def check(left: Pyramid, right: Pyramid, given: PriorDisparities, params: HfvmPa
     known = np.isfinite(given.u)
     u, zeros = np.where(known, given.u, np.float32(0.0)), np.zeros_like(given.u)
     there = Map(np.rint(u).astype(np.int16), np.zeros(u.shape, np.int16))
-    a, b = view(left, params), view(right, params)
+    a, b = as_matched(left, params), as_matched(right, params)
     inside = lands(np.rint(u), zeros, known, right.valid[0])
     ratio = ratio_of_matches(a, b, State(0, there, there, inside, inside, FREE_BAND, NEAR_SIGN))
     if ratio is not None and greatest(ratio) > MIN_LOG_RATIO:
         b = levelled(b, ratio)
-    back = _way_back(Views(a, b, params, matcher.recipe_of(params).steps), given)
-    left_layer, right_layer = a.layers[0], b.layers[0]
-    work = FinestWork(
-        left_layer, right_layer, right_layer, there, back, params, None, (a.noise, b.noise), left_layer.shape
-    )
+    images, left_layer, right_layer = ImagePair(a, b, params, matcher.DEFAULT), a.layers[0], b.layers[0]
+    work = FinestWork(left_layer, right_layer, right_layer, there, _way_back(images, given), images)
     fine = finest.check(work, replace(finest.subpixel(work), u=u))
     fine = replace(fine, validity=fine.against(~known, Validity.OVER_THRESHOLD))
     fine = finest.refine(work, fine)
     # Scaled as the noise will be.
     moved = ((fine.u - u) / np.float32(refinement.NOISE_FACTOR)) ** 2
     fine = replace(fine, u=u, noise=fine.noise + moved)
-    for step in (finest.landing, finest.speckles, finest.blanks):
-        fine = step(work, fine)
-    results = asdict(fine)
-    ending = Ending(
-        NEAR_SIGN, None, finest.fitted_lines(results, (left_layer.shape, right_layer.shape)), None, left_layer.shape
-    )
-    return finest.complete(results, left_layer.valid, whole(left_layer.shape), params, ending)
+    results = asdict(finest.speckles(work, finest.landing(work, fine)))
+    lines = finest.fitted_lines(results, (left_layer.shape, right_layer.shape))
+    return finest.complete(results, left_layer.valid, left_layer.window, params, Ending(left_layer.shape, f=lines))
 
 
-def _way_back(views: Views, given: PriorDisparities) -> Map:
+def _way_back(images: ImagePair, given: PriorDisparities) -> Map:
     """Displacements of the right image, matched at the finest level near the given ones."""
     above = None
-    if views.levels > 1:
-        left, right = (_nothing(image.shapes[1]) for image in (views.left, views.right))
-        unknown = np.zeros(left.u.shape, bool), np.zeros(right.u.shape, bool)
-        above = impose(views, State(1, left, right, *unknown, FREE_BAND, NEAR_SIGN), given).reverse()
-    return one_way(views.reverse(), 0, above, -NEAR_SIGN, views.steps.rounds[1])
-
-
-def _nothing(shape: Shape) -> Map:
-    """No displacement anywhere."""
-    return Map(np.zeros(shape, np.int16), np.zeros(shape, np.int16))
+    if images.levels > 1:
+        shapes = images.left.shapes[1], images.right.shapes[1]
+        left, right = (Map(*np.zeros((2, *shape), np.int16)) for shape in shapes)
+        unknown = np.zeros(shapes[0], bool), np.zeros(shapes[1], bool)
+        above = impose(images, State(1, left, right, *unknown, FREE_BAND, NEAR_SIGN), given).reverse()
+    return one_way(images.reverse(), 0, above, -NEAR_SIGN, images.recipe.rounds[1])
 
 
 @stage("hfvm_given", outputs=OUTPUTS, memory=Memory(fixed=30e6, factor=10.0, result=1.6))

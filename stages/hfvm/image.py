@@ -50,10 +50,13 @@ class Window:
         return slice(self.y0, self.y1), slice(self.x0, self.x1)
 
     def grow(self, rows: int, columns: int, shape: Shape) -> Window:
-        """Wider by so much on every side, within an image of ``shape``; even borders, so that parents are whole."""
-        y0, x0 = (max(a - by, 0) // 2 * 2 for a, by in ((self.y0, rows), (self.x0, columns)))
-        y1, x1 = ((a + by + 1) // 2 * 2 for a, by in ((self.y1, rows), (self.x1, columns)))
-        return Window(y0, min(y1, shape[0]), x0, min(x1, shape[1]))
+        """Wider by so much on every side, within an image of ``shape``: two pixels at least, with even borders, so that
+        parents are whole."""
+        (y0, y1), (x0, x1) = (
+            _bounds(low - by, high + by, size)
+            for low, high, by, size in ((self.y0, self.y1, rows, shape[0]), (self.x0, self.x1, columns, shape[1]))
+        )
+        return Window(y0, y1, x0, x1)
 
     def parent(self) -> Window:
         """Pixels of the next coarser level that lie above these."""
@@ -70,6 +73,11 @@ class Window:
             slice(self.y0 - outer.y0, self.y1 - outer.y0),
             slice(self.x0 - outer.x0, self.x1 - outer.x0),
         )
+
+
+def _bounds(low: int, high: int, size: int) -> tuple[int, int]:
+    first = max(0, min(low, size - 2)) // 2 * 2
+    return first, min((max(high, first + 2) + 1) // 2 * 2, size)
 
 
 def whole(shape: Shape) -> Window:
@@ -360,10 +368,6 @@ class Image:
         """Rows and columns of each level."""
         return [layer.shape for layer in self.layers]
 
-    def above(self, level: int) -> Image:
-        """The image from a level on; noise halves from level to level."""
-        return Image(self.layers[level:], self.noise * 0.5**level)
-
     def cut(self, window: Window) -> Image:
         """A window of the finest level."""
         return Image((self.layers[0].cut(window),), self.noise)
@@ -374,33 +378,30 @@ class Image:
         return Image(layers, noise)
 
 
-@dataclass(frozen=True)
-class Stored:
-    """Levels and masks of a pyramid, arrays or rasters that are read by window."""
-
-    images: Sequence[AnyArray]
-    masks: Sequence[AnyArray]
-
-    def read(self, level: int, window: Window) -> Grey:
-        """Grey values of a window; those of masked pixels from the next valid level above."""
-        image, mask = (np.ascontiguousarray(a[level][window.slices]) for a in (self.images, self.masks))
-        if mask.all():
-            return image, mask
-        if level + 1 == len(self.images):
-            # At the top there is no level above: the mean of what is seen.
-            everything = whole(self.masks[level].shape).slices
-            top, usable = self.images[level][everything], self.masks[level][everything] != 0
-            return np.where(mask, image, top[usable].mean() if usable.any() else np.float32(0.0)), mask
-        outer = window.parent()
-        above, _ = self.read(level + 1, outer)
-        return pyramid.filled_from(above, image, mask != 0, window.y0 - 2 * outer.y0, window.x0 - 2 * outer.x0), mask
+def _stored(images: Sequence[AnyArray], masks: Sequence[AnyArray], level: int, window: Window) -> Grey:
+    """Grey values of a window of a pyramid's level; those of masked pixels from the next valid level above."""
+    image, mask = (np.ascontiguousarray(a[level][window.slices]) for a in (images, masks))
+    if mask.all():
+        return image, mask
+    if level + 1 == len(images):
+        # At the top there is no level above: the mean of what is seen.
+        everything = whole(masks[level].shape).slices
+        top, usable = images[level][everything], masks[level][everything] != 0
+        return np.where(mask, image, top[usable].mean() if usable.any() else np.float32(0.0)), mask
+    outer = window.parent()
+    above, _ = _stored(images, masks, level + 1, outer)
+    return pyramid.filled_from(above, image, mask != 0, window.y0 - 2 * outer.y0, window.x0 - 2 * outer.x0), mask
 
 
-def view(given: Pyramid, params: HfvmParams) -> Image:
+def as_given(given: Pyramid, weights: Weights) -> Image:
+    """Image of a pyramid, whose levels and masks are arrays, or rasters that are read by window."""
+    read = partial(_stored, given.images, given.valid)
+    return Image(tuple(Layer.of(partial(read, n), m.shape, weights) for n, m in enumerate(given.valid)))
+
+
+def as_matched(given: Pyramid, params: HfvmParams) -> Image:
     """Image of a pyramid, denoised where it is noisy."""
-    stored = Stored(given.images, given.valid)
-    layers = [Layer.of(partial(stored.read, n), m.shape, params.weights) for n, m in enumerate(given.valid)]
-    image = Image(tuple(layers))
+    image = as_given(given, params.weights)
     # Every level: with a binomial kernel on the finest alone bad-2 of five noisy pairs was 2 % larger, the median 5 %.
     return image.changed(partial(_denoised, given.noise), given.noise) if given.noise >= params.denoise_from else image
 

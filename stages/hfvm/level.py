@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm import epipolar
 from rille.stages.hfvm.image import Image, Layer, thinned
-from rille.stages.hfvm.native.problem import EdgeRule, Field, LevelPair, PathCosts, Smoothing, pack_map, unpacked
+from rille.stages.hfvm.native.problem import Field, LevelPair, Map, Smoothing, pack_map, unpacked
 from rille.stages.hfvm.native.reference import exhaustive
 from rille.stages.hfvm.native.solver import solver
 from rille.stages.hfvm.params import HfvmParams
@@ -68,26 +68,6 @@ def fill_rows(u, v, keep, reach, near_sign, filled):  # type: ignore[no-untyped-
 MAX_FIT_MATCHES = 500
 """Matches that a band or plane is fitted to; more change nothing that matters and cost time."""
 
-PATH_COSTS = PathCosts(compact=8, small=36, large=240, grey=10)
-"""Costs of propagation along paths: larger ``compact``: depth edges less fattened; ``small``: smoother; ``large``:
-fewer depth steps; ``grey``: depth steps follow image edges less."""
-
-EDGE_RULE = EdgeRule(reach=4, apart=4, grey=16, far=100, own=9, other=10, near=0)
-"""Placement of depth edges. Features put an edge a few pixels too far out: ``reach``. With displacements ``apart`` by 2
-the errors among the matched were 6 % fewer still, and the time doubled: slopes count then, too. What is hidden differs
-by any amount: ``far``. Of weak evidence none changes: ``own`` against ``other``; a farther one need only cost less:
-with the ratio for it, too, bad-2 after filling was 1 % more on both halves of the Middlebury pairs, and that of the
-matched 8 %. Windows of 5 to 9 pixels, ``far`` of 70 to 200, ``grey`` of 16 to 32 and a reach of 4 to 8 differ by less
-than 3 %.
-"""
-
-
-class Map(NamedTuple):
-    """Displacements of one direction at one level, (row, col) int16 columns and rows."""
-
-    u: AnyArray
-    v: AnyArray
-
 
 @dataclass(frozen=True)
 class Band:
@@ -102,6 +82,9 @@ class Band:
 
 
 FREE_BAND = Band(epipolar.NO_BAND, 0.0)
+
+NEAR_SIGN = -1.0
+"""Between parallel cameras nearer things have lesser column displacements (see :class:`State`)."""
 
 
 @dataclass(frozen=True)
@@ -152,29 +135,32 @@ Step = Callable[[Look, Field], Field]
 
 
 @dataclass(frozen=True)
-class LevelSteps:
-    """What is done at a level: steps of every level, and further ones of the finest.
+class Recipe:
+    """A preset as lists of steps: of every level, further ones of the finest, and those after fractions of a pixel.
 
     ``rounds``: limits of the propagation at the finest level, from left to right, and from right to left, which serves
-    the check of consistency alone; each coarser level has one more, at most ``HfvmParams.rounds``.
+    the check of consistency alone; each coarser level has one more, at most ``HfvmParams.rounds``. ``refinement``:
+    steps of :mod:`rille.stages.hfvm.finest`. ``half``: images are matched at half their resolution.
     """
 
     every: tuple[Step, ...]
     finest: tuple[Step, ...]
     rounds: tuple[int, int]
+    refinement: tuple[Callable[[Any, Any], Any], ...] = ()
+    half: bool = False
 
 
 @dataclass(frozen=True)
-class Views:
+class ImagePair:
     """The left and the right image as they are matched, and how; two ``threads`` match both directions side by side."""
 
     left: Image
     right: Image
     params: HfvmParams
-    steps: LevelSteps
+    recipe: Recipe
     threads: int = 1
 
-    def reverse(self) -> Views:
+    def reverse(self) -> ImagePair:
         """The images exchanged."""
         return replace(self, left=self.right, right=self.left)
 
@@ -188,7 +174,7 @@ def search(look: Look, field: Field) -> Field:
     """Best displacements around the predictions; at the top around none (4.3.1, Eq. 2 and 3)."""
     p = look.params
     if look.up is not None:
-        solver.search(look.pair, (look.up.u, look.up.v), (p.search_columns, p.search_rows), field)
+        solver.search(look.pair, look.up, (p.search_columns, p.search_rows), field)
         return field
     rows, cols = np.maximum(look.a.words.shape, look.b.words.shape)
     exhaustive(look.pair, (int(np.ceil(p.top_columns * cols)), int(np.ceil(p.top_rows * rows))), field)
@@ -207,13 +193,11 @@ def propagate(look: Look, field: Field) -> Field:
 def paths(look: Look, field: Field) -> Field:
     """Displacements chosen by costs gathered along paths from the borders of the image.
 
-    A pixel's candidates are its own displacement and those a pixel beside it, those of near and farther pixels, and
-    those handed down. Along six directions (eight but for those within a row) each gathers the least cost of getting
+    A pixel's candidates are its own displacement and those a pixel beside it, and those of near and farther pixels.
+    Along six directions (eight but for those within a row) each gathers the least cost of getting
     there, smoothness included; so evidence travels over weak texture as far as it must, and stops at depth edges.
     """
-    compact = LevelPair(look.a.compact, look.b.compact, epipolar.NO_BAND, 0.0)
-    up = None if look.up is None else (look.up.u, look.up.v)
-    solver.paths(look.pair, compact, up, look.a.grey, PATH_COSTS, field.shift)
+    solver.paths(look.pair, LevelPair(look.a.compact, look.b.compact), look.a.grey, field.shift)
     return field
 
 
@@ -233,23 +217,21 @@ def edges(look: Look, field: Field) -> Field:
     since they mostly lie on its surface. Adaptive support weights: Yoon and Kweon (2006), doi:10.1109/TPAMI.2006.70.
     """
     wanted = (look.a.deviation >= look.params.texture) & (look.a.valid != 0)
-    pair = LevelPair(look.a.compact, look.b.compact, epipolar.NO_BAND, 0.0)
-    rule = EDGE_RULE._replace(near=int(look.near_sign))
-    grey = np.rint(look.a.grey).astype(np.int16)
-    return Field(solver.edges(pair, grey, field.shift, wanted.view(np.uint8), rule), field.cost)
+    pair, grey = LevelPair(look.a.compact, look.b.compact), np.rint(look.a.grey).astype(np.int16)
+    return Field(solver.edges(pair, grey, field.shift, wanted.view(np.uint8), int(look.near_sign)), field.cost)
 
 
-def match_level(views: Views, level: int, above: State | None, near_sign: float = 0.0) -> State:
+def match_level(images: ImagePair, level: int, above: State | None, near_sign: float = 0.0) -> State:
     """The state of a level, from that of the level above (None: the top): search, propagate, check, band."""
-    known, rounds = near_sign if above is None else above.near_sign, views.steps.rounds
+    known, rounds = near_sign if above is None else above.near_sign, images.recipe.rounds
     back = None if above is None else above.reverse()
-    ahead = partial(one_way, views, level, above, known, rounds[0])
+    ahead = partial(one_way, images, level, above, known, rounds[0])
     left, right = side_by_side(
-        [ahead, partial(one_way, views.reverse(), level, back, -known, rounds[1])], views.threads
+        [ahead, partial(one_way, images.reverse(), level, back, -known, rounds[1])], images.threads
     )
-    a, b = views.left.layers[level].valid, views.right.layers[level].valid
-    ok = agree(left, right, a, b, views.params.backmatch), agree(right, left, b, a, views.params.backmatch)
-    return with_band(views, State(level, left, right, *ok, FREE_BAND, known))
+    a, b = images.left.layers[level].valid, images.right.layers[level].valid
+    ok = agree(left, right, a, b, images.params.backmatch), agree(right, left, b, a, images.params.backmatch)
+    return with_band(images, State(level, left, right, *ok, FREE_BAND, known))
 
 
 def agree(own: Any, other: Any, own_valid: AnyArray, other_valid: AnyArray, limit: float) -> NDArray[np.bool_]:
@@ -275,18 +257,18 @@ def _agree(own, other, own_valid, other_valid, most, agreeing):  # type: ignore[
                 agreeing[y, x] = du * du + dv * dv <= most
 
 
-def one_way(views: Views, level: int, above: State | None, near_sign: float, fine_rounds: int) -> Map:
+def one_way(images: ImagePair, level: int, above: State | None, near_sign: float, fine_rounds: int) -> Map:
     """Displacements from the left image to the right one, at a level below that of the state ``above``, by the rounds
     ``fine_rounds`` at the finest; ``above`` None: the top."""
-    up = None if above is None else hand_down(above, views.params)
-    rounds = min(views.params.rounds, fine_rounds if level == 0 else views.steps.rounds[0] + level)
+    up = None if above is None else hand_down(above, images.params)
+    rounds = min(images.params.rounds, fine_rounds if level == 0 else images.recipe.rounds[0] + level)
     band = FREE_BAND if above is None else above.band
-    a, b = views.left.layers[level], views.right.layers[level]
-    look = Look(level, a, b, up, band, near_sign, rounds, views.params)
+    a, b = images.left.layers[level], images.right.layers[level]
+    look = Look(level, a, b, up, band, near_sign, rounds, images.params)
     field = Field(np.empty(a.words.shape, np.int32), np.empty(a.words.shape, np.int32))
-    for step in (*views.steps.every, *(views.steps.finest if level == 0 and above is not None else ())):
+    for step in images.params.kept((*images.recipe.every, *(images.recipe.finest if level == 0 and above else ()))):
         field = step(look, field)
-    return Map(*unpacked(field.shift))
+    return unpacked(field.shift)
 
 
 def hand_down(state: State, params: HfvmParams) -> Map:
@@ -298,37 +280,36 @@ def hand_down(state: State, params: HfvmParams) -> Map:
     return Map(*(np.rint(a).astype(np.int16) for a in (u, v)))
 
 
-def sample(views: Views, state: State) -> Sample:
+def sample(images: ImagePair, state: State) -> Sample:
     """About :data:`MAX_FIT_MATCHES` evenly strided consistent matches of a level, with fractions of a pixel."""
     y, x = thinned(state.left_ok, MAX_FIT_MATCHES)
     wanted = np.zeros(state.left_ok.shape, np.uint8)
     wanted[y, x] = 1
-    a, b = views.left.layers[state.level], views.right.layers[state.level]
-    pair = LevelPair(a.words, b.words, epipolar.NO_BAND, 0.0)
-    u, v, _ = solver.sums(pair, state.left.u, state.left.v, wanted)
+    a, b = images.left.layers[state.level], images.right.layers[state.level]
+    u, v, _ = solver.sums(LevelPair(a.words, b.words), state.left.u, state.left.v, wanted)
     return Sample(x, y, u[y, x], v[y, x])
 
 
-def with_band(views: Views, state: State) -> State:
+def with_band(images: ImagePair, state: State) -> State:
     """The state with the epipolar band for the next finer level, where there is one and it can be fitted."""
-    if views.params.band == 0 or state.level == 0:
+    if images.params.band == 0 or state.level == 0:
         return state
-    s, shapes = sample(views, state), (state.left.u.shape, state.right.u.shape)
+    s, shapes = sample(images, state), (state.left.u.shape, state.right.u.shape)
     fit = epipolar.fit_points(*s, *shapes)
     if fit is None:
         return state
     f, spread = fit
     # Where lenses bend the lines, or the fit is poor, the band gives way.
-    mu = views.params.band * min(1.0, epipolar.SHARP_SPREAD_PX / max(spread, 1e-9)) ** 2
+    mu = images.params.band * min(1.0, epipolar.SHARP_SPREAD_PX / max(spread, 1e-9)) ** 2
     # Found once, by the first level that has a band; finer ones keep it.
     sign = state.near_sign or epipolar.near_sign(f, s.u, *shapes)
     return replace(state, band=Band(epipolar.finer(f), mu), near_sign=sign)
 
 
-def descend(views: Views, stop: int, above: State | None = None, near_sign: float = 0.0) -> State:
+def descend(images: ImagePair, stop: int, above: State | None = None, near_sign: float = 0.0) -> State:
     """Match from the top (or below ``above``) down to level ``stop``, or to the top if that is below."""
-    first, state = (views.levels if above is None else above.level) - 1, above
-    for level in range(first, min(stop, views.levels - 1) - 1, -1):
-        state = match_level(views, level, state, near_sign)
+    first, state = (images.levels if above is None else above.level) - 1, above
+    for level in range(first, min(stop, images.levels - 1) - 1, -1):
+        state = match_level(images, level, state, near_sign)
     assert state is not None
     return state

@@ -1,9 +1,9 @@
-"""The matcher on one page: the paper's steps (4.3) and ours, each preset as a list of steps; half the resolution."""
+"""The matcher on one page: the paper's steps (4.3) and ours, each preset as lists of steps; half the resolution."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -14,47 +14,24 @@ from rille.stages.core.declare import AnyArray
 from rille.stages.core.validity import Validity
 from rille.stages.hfvm import coarse, finest, level
 from rille.stages.hfvm.coarse import PriorDisparities
+from rille.stages.hfvm.image import as_matched, whole
 from rille.stages.hfvm.image import tiles as cut
-from rille.stages.hfvm.image import view, whole
-from rille.stages.hfvm.level import LevelSteps, Views
+from rille.stages.hfvm.level import ImagePair, Recipe
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging.pyramid import Pyramid
 
-
-@dataclass(frozen=True)
-class Recipe:
-    """A preset as a list of steps: of each level, of the start, and of the finest level after fractions of a pixel.
-
-    ``half``: images are matched at half their resolution.
-    """
-
-    steps: LevelSteps
-    begin: tuple[coarse.Step, ...]
-    refinement: tuple[finest.Step, ...]
-    planes: bool = True
-    half: bool = False
-
-    def less(self, without: tuple[str, ...]) -> Recipe:
-        """The recipe without the steps of these names."""
-
-        def kept(steps: tuple) -> tuple:
-            return tuple(step for step in steps if step.__name__ not in without)
-
-        steps = LevelSteps(kept(self.steps.every), kept(self.steps.finest), self.steps.rounds)
-        refinement = kept(self.refinement)
-        return Recipe(steps, kept(self.begin), refinement, self.planes and "planes" not in without, self.half)
-
-
 DEFAULT = Recipe(
-    LevelSteps((level.search, level.propagate, level.median), (level.edges,), rounds=(2, 2)),
-    (coarse.even, coarse.known, coarse.align, coarse.turn),
-    (finest.check, finest.refine, finest.landing, finest.speckles, finest.blanks),
+    (level.search, level.propagate, level.median),
+    (level.edges,),
+    rounds=(2, 2),
+    refinement=(finest.check, finest.refine, finest.landing, finest.speckles),
 )
-FAST = replace(DEFAULT, planes=False, half=True)
+FAST = replace(DEFAULT, half=True)
 ACCURATE = Recipe(
-    LevelSteps((level.search, level.propagate, level.paths, level.median), (level.edges,), rounds=(4, 4)),
-    (coarse.even, coarse.known, coarse.align, coarse.turn),
-    (finest.check, finest.refine, finest.smooth, finest.landing, finest.speckles, finest.blanks),
+    (level.search, level.propagate, level.paths, level.median),
+    (level.edges,),
+    rounds=(4, 4),
+    refinement=(finest.check, finest.refine, finest.smooth, finest.landing, finest.speckles),
 )
 RECIPES: Mapping[str, Recipe] = {"default": DEFAULT, "fast": FAST, "accurate": ACCURATE}
 
@@ -62,21 +39,17 @@ WHOLE = ("paper",)
 """Presets with a method of their own, see :mod:`rille.stages.hfvm.paper`."""
 
 
-def recipe_of(params: HfvmParams) -> Recipe:
-    """Steps of the preset, but for those that the parameters leave out."""
-    return RECIPES.get(params.preset, DEFAULT).less(params.without)
-
-
 def local(params: HfvmParams) -> bool:
     """Whether all steps look at the surroundings of a pixel alone; paths and the relief reach over whole images."""
-    recipe = recipe_of(params)
-    reaching = level.paths in recipe.steps.every or finest.smooth in recipe.refinement
-    return params.preset not in WHOLE and not reaching
+    if params.preset in WHOLE:
+        return False
+    recipe = RECIPES[params.preset]
+    return not {level.paths, finest.smooth} & {*params.kept(recipe.every), *params.kept(recipe.refinement)}
 
 
-def halves(recipe: Recipe, *levels: int) -> bool:
+def halves(params: HfvmParams, *levels: int) -> bool:
     """Whether images with so many levels are matched at half their resolution."""
-    return recipe.half and min(levels) > 1
+    return RECIPES[params.preset].half and min(levels) > 1
 
 
 def halved(params: HfvmParams) -> HfvmParams:
@@ -163,38 +136,31 @@ class How(NamedTuple):
     threads: int = 1
 
 
-@dataclass(frozen=True)
-class MatchResult:
-    """Arrays of :class:`rille.stages.hfvm.stage.StereoMatches` by name, and whether the right image was aligned."""
-
-    arrays: Mapping[str, AnyArray]
-    aligned: bool
+Arrays = dict[str, AnyArray]
 
 
-def match(left: Pyramid, right: Pyramid, params: HfvmParams, prior: PriorDisparities | None, how: How) -> MatchResult:
-    """Dense displacements from the left image to the right one (4.3), step by step."""
-    recipe = recipe_of(params)
-    if halves(recipe, left.levels, right.levels):
-        return enlarged(
-            match(left.above(1), right.above(1), halved(params), prior and prior.halved(), how), left, right
-        )
+def match(
+    left: Pyramid, right: Pyramid, params: HfvmParams, prior: PriorDisparities | None, how: How
+) -> tuple[Arrays, bool]:
+    """Dense displacements from the left image to the right one (4.3), step by step.
+
+    Arrays of :class:`rille.stages.hfvm.stage.StereoMatches` by name, and whether the right image was aligned.
+    """
+    if halves(params, left.levels, right.levels):
+        half, aligned = match(left.above(1), right.above(1), halved(params), prior and prior.halved(), how)
+        return doubled(half, left.valid[0], right.shape, (0, 0)), aligned
     how.tell(0.0, "coarse levels")
-    images = view(left, params), view(right, params)
-    views = Views(*images, params, recipe.steps, how.threads)
-    pair = coarse.begin(views, recipe.begin, prior)  # 4.3.1 features; 4.3.4 hierarchy; brightness, alignment
-    side = how.side if local(params) and views.levels > 1 else None
+    pyramids = as_matched(left, params), as_matched(right, params)
+    images = ImagePair(*pyramids, params, RECIPES[params.preset], how.threads)
+    pair = coarse.match_coarse_levels(images, prior)  # 4.3.1 features; 4.3.4 hierarchy; brightness, alignment
+    how.tell(0.15, "fine levels")
+    side = how.side if local(params) and images.levels > 1 else None
     windows = [whole(left.shape)] if side is None else cut(left.shape, side)
     # Threads take a window each, or both directions of the only one.
     pair = pair.with_threads(how.threads if len(windows) == 1 else 1)
-    how.tell(0.15, "fine levels")
-    fine = {w: partial(finest.fine, pair, recipe.refinement, w) for w in windows}  # 4.3.4, 4.3.2, 4.3.3
-    arrays = finest.put_together(fine, left.shape, how.threads)
+    fine = {w: partial(finest.match_finest_level, pair, w) for w in windows}  # 4.3.4, 4.3.2, 4.3.3
+    matches = finest.put_together(fine, left.shape, how.threads)
     how.tell(0.9, "filling")
-    ending = finest.ending(pair, arrays, recipe.planes)
-    final = {w: partial(finest.final, pair, w, arrays, ending) for w in windows}  # 4.3.4
-    return MatchResult(finest.put_together(final, left.shape, how.threads), pair.alignment is not None)
-
-
-def enlarged(result: MatchResult, left: Pyramid, right: Pyramid) -> MatchResult:
-    """Results of half the resolution at the full one: each displacement, doubled, for 2 x 2 pixels."""
-    return MatchResult(doubled(result.arrays, left.valid[0], right.shape, (0, 0)), result.aligned)
+    ending = finest.fit_lines_and_planes(pair, matches)
+    final = {w: partial(finest.interpolate_undefined, pair, w, matches, ending) for w in windows}  # 4.3.4
+    return finest.put_together(final, left.shape, how.threads), pair.alignment is not None

@@ -17,11 +17,11 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from rille.stages.core.declare import AnyArray
-from rille.stages.core.validity import Validity, mark
-from rille.stages.hfvm.finest import FAILED_PX, Ending, backmatch, complete
+from rille.stages.hfvm.finest import Ending, complete, reasons
+from rille.stages.hfvm.image import DEVIATION, as_given
 from rille.stages.hfvm.image import planes as table_1
-from rille.stages.hfvm.image import whole
-from rille.stages.hfvm.level import Map, agree, fill_rows
+from rille.stages.hfvm.level import FREE_BAND, NEAR_SIGN, State, agree, hand_down
+from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.native.reference import linear
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging.pyramid import Pyramid
@@ -47,97 +47,49 @@ class IntegerMatches(NamedTuple):
     offset: AnyArray
 
 
-class Around(NamedTuple):
-    """Where is searched: displacements (row, col) int16, and how many columns and rows to either side of them."""
-
-    u: AnyArray
-    v: AnyArray
-    columns: int
-    rows: int
-
-
 def match(left: Pyramid, right: Pyramid, params: HfvmParams, tell: Callable[[float, str], None]) -> dict[str, AnyArray]:
     """Arrays of :class:`rille.stages.hfvm.stage.StereoMatches`."""
-    above: list[Map] = []
-    levels = min(left.levels, right.levels)
-    for n in range(levels - 1, -1, -1):
-        tell(1.0 - 0.25 ** (levels - n), f"level {n}")
-        images = left.filled[n], right.filled[n]
-        valid = left.valid[n], right.valid[n]
+    images = [as_given(pyramid, params.weights) for pyramid in (left, right)]
+    above: tuple[Map | None, Map | None] = None, None
+    for n in reversed(range(min(left.levels, right.levels))):
+        tell(1.0 - 0.25 ** (min(left.levels, right.levels) - n), f"level {n}")
+        layers = [image.layers[n] for image in images]
         # 4.3.1: feature vectors, whose distance is Eq. 1
-        planes = [table_1(image) for image in images]
+        planes = [table_1(layer.grey) for layer in layers]
         vectors = [weighted(plane, params.weights) for plane in planes]
         # 4.3.4: both directions, median-filtered
-        ways = [
-            _one_way(vectors[k], vectors[1 - k], _double(above[k], images[k].shape) if above else None, params)
-            for k in (0, 1)
-        ]
+        ways = [_one_way(vectors[k], vectors[1 - k], above[k], params) for k in (0, 1)]
         maps = [Map(cv2.medianBlur(way.u, 3), cv2.medianBlur(way.v, 3)) for way in ways]
         if n == 0:
             break
         # 4.3.3: what matching back does not confirm is interpolated, and handed down
-        above = []
-        for k in (0, 1):
-            ok = agree(maps[k], maps[1 - k], valid[k], valid[1 - k], params.backmatch)
-            ok &= (ways[k].distance >= 0) & (ways[k].distance <= params.threshold)
-            u, v = maps[k].u.astype(np.float32), maps[k].v.astype(np.float32)
-            fill_rows(u, v, ok, params.fill_reach, -1.0 if k == 0 else 1.0, np.zeros(u.shape, np.uint8))
-            above.append(Map(*(np.rint(a).astype(np.int16) for a in (u, v))))
-    return _finish(vectors, maps, valid, planes[0][6], params)
+        ok = [agree(maps[k], maps[1 - k], layers[k].valid, layers[1 - k].valid, params.backmatch) for k in (0, 1)]
+        ok = [o & (way.distance >= 0) & (way.distance <= params.threshold) for o, way in zip(ok, ways, strict=True)]
+        state = State(n, maps[0], maps[1], ok[0], ok[1], FREE_BAND, NEAR_SIGN)
+        above = hand_down(state, params), hand_down(state.reverse(), params)
+    # 4.3.2 and 4.3.3 at the finest level: fractions of a pixel, back-matching, interpolation
+    ways = [search(vectors[k], vectors[1 - k], maps[k], (0, 0)) for k in (0, 1)]
+    fine = [Map(*(whole + even(way.offset[..., i]) for i, whole in enumerate(way[:2]))) for way in ways]
+    error, validity = reasons(fine[0], fine[1], ways[0].distance, (layers[0], layers[1]), params, planes[0][DEVIATION])
+    arrays = {"u": fine[0].u, "v": fine[0].v, "validity": validity, "error": error, "distance": ways[0].distance}
+    arrays["noise"] = np.zeros_like(error)
+    return complete(arrays, layers[0].valid, layers[0].window, params, Ending(left.shape))
 
 
-def _finish(
-    vectors: list[AnyArray], maps: list[Map], valid: tuple[AnyArray, AnyArray], deviation: AnyArray, params: HfvmParams
-) -> dict[str, AnyArray]:
-    """4.3.2 and 4.3.3 at the finest level: fractions of a pixel, back-matching, interpolation."""
-    fine = []
-    for k in (0, 1):
-        there = _search(vectors[k], vectors[1 - k], maps[k], (0, 0))
-        offset = even(there.offset)
-        fine.append((maps[k].u + offset[..., 0], maps[k].v + offset[..., 1], there.distance))
-    u, v, distance = fine[0]
-    error, validity = np.full(u.shape, FAILED_PX, np.float32), np.zeros(u.shape, np.uint8)
-    backmatch(u, v, fine[1][:2], valid[1], error)
-    outside = (error >= FAILED_PX) | (valid[0] == 0)
-    mark(validity, outside, Validity.OUT_OF_IMAGE)
-    mark(validity, ~outside & (error > params.backmatch), Validity.BACKMATCH_FAILED)
-    mark(validity, distance > params.threshold, Validity.OVER_THRESHOLD)
-    mark(validity, deviation < params.texture, Validity.NO_TEXTURE)
-    arrays: dict[str, AnyArray] = {
-        "u": u,
-        "v": v,
-        "validity": validity,
-        "error": error,
-        "distance": distance,
-        "noise": np.zeros_like(error),
-    }
-    shape: tuple[int, int] = u.shape
-    return complete(arrays, valid[0], whole(shape), params, Ending(-1.0, None, None, None, shape))
-
-
-def _one_way(a: AnyArray, b: AnyArray, centre: Map | None, params: HfvmParams) -> IntegerMatches:
+def _one_way(a: AnyArray, b: AnyArray, above: Map | None, params: HfvmParams) -> IntegerMatches:
     """Displacements from one image to the other: at the top around none, in a large area (4.3.4)."""
-    if centre is not None:
-        return _search(a, b, centre, (params.search_columns, params.search_rows))
     rows, cols = np.maximum(a.shape[:2], b.shape[:2])
-    reach = int(np.ceil(params.top_columns * cols)), int(np.ceil(params.top_rows * rows))
     nothing = np.zeros(a.shape[:2], np.int16)
-    return _search(a, b, Map(nothing, nothing), reach)
-
-
-def _search(a: AnyArray, b: AnyArray, centre: Map, reach: tuple[int, int]) -> IntegerMatches:
-    shape = a.shape[:2]
-    u, v = np.empty(shape, np.int16), np.empty(shape, np.int16)
-    matches = IntegerMatches(u, v, np.empty(shape, np.float32), np.empty((*shape, 2), np.float32))
-    search(a, b, Around(centre.u, centre.v, *reach), matches)
-    return matches
-
-
-def _double(up: Map, shape: tuple[int, ...]) -> Map:
-    """Prediction for the level below: doubled values, each for its 2 x 2 pixels."""
-    # Repeated, not interpolated: means of two depths at an edge are depths that nothing has.
-    big = ((2 * a).repeat(2, axis=0)[: shape[0]].repeat(2, axis=1)[:, : shape[1]] for a in (up.u, up.v))
-    return Map(*(np.ascontiguousarray(a) for a in big))
+    centre, reach = (
+        Map(nothing, nothing),
+        (int(np.ceil(params.top_columns * cols)), int(np.ceil(params.top_rows * rows))),
+    )
+    if above is not None:
+        # Doubled values, each for its 2 x 2 pixels. Means of two depths at an edge would be depths that nothing has.
+        doubled = ((2 * up).repeat(2, axis=0)[: a.shape[0]].repeat(2, axis=1)[:, : a.shape[1]] for up in above)
+        centre, reach = Map(*map(np.ascontiguousarray, doubled)), (params.search_columns, params.search_rows)
+    found: IntegerMatches = search(a, b, centre, reach)
+    return found
 
 
 def weighted(planes: AnyArray, weights: tuple[float, ...]) -> AnyArray:
@@ -158,38 +110,36 @@ def _eq1(f, g):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def search(left, right, around, out):  # type: ignore[no-untyped-def]
-    """Best match of every pixel in the search area around its centre (Eq. 2, Eq. 3).
+def search(left, right, centre, reach):  # type: ignore[no-untyped-def]
+    """Best match (:class:`IntegerMatches`) of every pixel in the search area around its centre (Eq. 2, Eq. 3).
 
-    ``left, right``: vectors (row, col, 8) of the images. ``out`` (:class:`IntegerMatches`): distance by Eq. 1, -1 where
-    nothing lies inside; linear sub-pixel offsets by 4.3.2, 0 at the border of the image. Of equal distances the first
-    in row, column order wins.
+    ``left, right``: vectors (row, col, 8) of the images. ``centre`` (:class:`Map`); ``reach``: columns and rows to
+    either side. Distance by Eq. 1, -1 where nothing lies inside; linear sub-pixel offsets by 4.3.2, 0 at the border of
+    the image. Of equal distances the first in row, column order wins.
     """
     rows, cols = left.shape[:2]
+    out_u, out_v = np.empty((rows, cols), np.int16), np.empty((rows, cols), np.int16)
+    distance, offset = np.empty((rows, cols), np.float32), np.zeros((rows, cols, 2), np.float32)
     rrows, rcols = right.shape[:2]
     for y in range(rows):
         for x in range(cols):
-            cu, cv = np.int64(around.u[y, x]), np.int64(around.v[y, x])
+            cu, cv = np.int64(centre.u[y, x]), np.int64(centre.v[y, x])
             best = np.float32(-1.0)
             bu, bv = cu, cv
             # The area is cut at the border, instead of each candidate clamped to it: none then comes up twice.
-            for v in range(max(cv - around.rows, -y), min(cv + around.rows, rrows - 1 - y) + 1):
-                for u in range(max(cu - around.columns, -x), min(cu + around.columns, rcols - 1 - x) + 1):
+            for v in range(max(cv - reach[1], -y), min(cv + reach[1], rrows - 1 - y) + 1):
+                for u in range(max(cu - reach[0], -x), min(cu + reach[0], rcols - 1 - x) + 1):
                     d = _eq1(left[y, x], right[y + v, x + u])
                     # -1 is nothing so far, as no distance is negative.
                     if best < 0 or d < best:
                         best = d
                         bu, bv = np.int64(u), np.int64(v)
-            out.u[y, x], out.v[y, x], out.distance[y, x] = bu, bv, best
-            out.offset[y, x, 0], out.offset[y, x, 1] = 0.0, 0.0
+            out_u[y, x], out_v[y, x], distance[y, x] = bu, bv, best
             xr, yr = x + bu, y + bv
             if best < 0:
                 continue
             if xr > 0 and xr < rcols - 1:
-                out.offset[y, x, 0] = linear(
-                    _eq1(left[y, x], right[yr, xr - 1]), best, _eq1(left[y, x], right[yr, xr + 1])
-                )
+                offset[y, x, 0] = linear(_eq1(left[y, x], right[yr, xr - 1]), best, _eq1(left[y, x], right[yr, xr + 1]))
             if yr > 0 and yr < rrows - 1:
-                out.offset[y, x, 1] = linear(
-                    _eq1(left[y, x], right[yr - 1, xr]), best, _eq1(left[y, x], right[yr + 1, xr])
-                )
+                offset[y, x, 1] = linear(_eq1(left[y, x], right[yr - 1, xr]), best, _eq1(left[y, x], right[yr + 1, xr]))
+    return IntegerMatches(out_u, out_v, distance, offset)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Literal
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
 from rille.stages.core.declare import Params
+
+Step = TypeVar("Step")
 
 Weights = tuple[float, float, float, float, float, float, float, float]
 
@@ -30,9 +32,8 @@ class HfvmParams(Params):
 
     ``preset = "paper"`` follows section 4.3 to the letter: floating-point Table 1 features and Eq. 1, one search
     centre, no epipolar band, no propagation, no smoothness, no pre-alignment, sub-pixel by linear interpolation and
-    look-up table. ``preset = "accurate"`` adds to the default propagation along paths with compact features, a
-    relief fitted to all matches along their epipolar lines, and an edge-keeping median of what was interpolated; it
-    takes several times as long.
+    look-up table. ``preset = "accurate"`` adds to the default propagation along paths with compact features, and a
+    relief fitted to all matches along their epipolar lines; it takes several times as long.
     """
 
     preset: Literal["default", "fast", "accurate", "paper"] = Field(
@@ -150,6 +151,10 @@ class HfvmParams(Params):
         description="least share of matched pixels in the 9 x 9 window around a match; larger: removes more "
         "isolated matches, which are often errors beside depth edges",
     )
+
+    def kept(self, steps: Iterable[Step]) -> list[Step]:
+        """Steps (functions) but for those that are left out by name."""
+        return [step for step in steps if getattr(step, "__name__", "") not in self.without]
 
     @model_validator(mode="before")
     @classmethod

@@ -135,37 +135,27 @@ def _source(h: Matrix, window: Window, shape: Shape) -> Window:
     return Window(y0, max(y1, y0 + 1), x0, max(x1, x0 + 1))
 
 
-def compose(
-    h: Matrix, u: AnyArray, v: AnyArray, left_shape: Shape, x0: int = 0, y0: int = 0
-) -> tuple[AnyArray, AnyArray]:
-    """Displacements to the original right image of displacements to the aligned one (margin included).
-
-    ``x0, y0``: first column and row of a window of the left image, which has ``left_shape``.
-    """
-    out = np.empty(u.shape, np.float32), np.empty(v.shape, np.float32)
-    _compose(h @ translation(-margin(left_shape)), u, v, (x0, y0), out)
-    return out
-
-
-def decompose(
-    h: Matrix, u: AnyArray, v: AnyArray, left_shape: Shape, x0: int = 0, y0: int = 0
-) -> tuple[AnyArray, AnyArray]:
-    """Displacements to the aligned right image: the inverse of :func:`compose`."""
-    out = np.empty(u.shape, np.float32), np.empty(v.shape, np.float32)
-    _compose(np.linalg.inv(h @ translation(-margin(left_shape))), u, v, (x0, y0), out)
-    return out
+def to_original(h: Matrix, left_shape: Shape) -> Matrix:
+    """Homography to the original right image from aligned pixels that are counted as the left image's are."""
+    return h @ translation(-margin(left_shape))
 
 
 @njit(cache=True, nogil=True)
-def _compose(g, u, v, first, out):  # type: ignore[no-untyped-def]
+def carried(g, u, v, x0=0, y0=0):  # type: ignore[no-untyped-def]
+    """Displacements (row, col) float32 to where a homography maps the ends of given ones.
+
+    ``x0, y0``: first column and row of the left image's window. NaN beyond the horizon.
+    """
+    out_u, out_v = np.empty(u.shape, np.float32), np.empty(u.shape, np.float32)
     for row in range(u.shape[0]):
         for col in range(u.shape[1]):
             # In double precision: the difference of two columns must keep their fractions.
-            x, y = np.float64(col + first[0]), np.float64(row + first[1])
+            x, y = np.float64(col + x0), np.float64(row + y0)
             p, q, w = mapped(g, x + u[row, col], y + v[row, col])
             # Points beyond the horizon would come back mirrored.
             w = w if w > 0.0 else np.nan
-            out[0][row, col], out[1][row, col] = p / w - x, q / w - y
+            out_u[row, col], out_v[row, col] = p / w - x, q / w - y
+    return out_u, out_v
 
 
 def margin(left_shape: tuple[int, ...]) -> int:

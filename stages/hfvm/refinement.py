@@ -54,7 +54,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
-from rille.stages.geometry.spline import slopes, weights
+from rille.stages.geometry.spline import value_and_gradient
 from rille.stages.hfvm import epipolar
 from rille.stages.hfvm.image import thinned
 from rille.stages.numeric.relaxation import OVERRELAXATION
@@ -134,20 +134,14 @@ def _take_back(start, first, new, last):  # type: ignore[no-untyped-def]
             last[y, x] = last[y, x] if better else first[y, x]
 
 
-def local_mean(u: AnyArray, v: AnyArray, keep: AnyArray, radius: int, stride: int) -> tuple[AnyArray, AnyArray]:
+@njit(cache=True, nogil=True)
+def local_mean(u, v, keep, radius, stride):  # type: ignore[no-untyped-def]
     """Means of the kept pixels in a window whose displacement lies within one pixel of the middle's.
 
-    The window reaches ``radius`` pixels, of which each ``stride``-th from its border on takes part.
+    The window reaches ``radius`` pixels, of which each ``stride``-th from its border on takes part. ``u, v``: (row,
+    col) float32; ``keep``: bool.
     """
-    out = np.empty_like(u), np.empty_like(v)
-    _local_mean(u, v, keep, (radius, stride), out)
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _local_mean(u, v, keep, window, out):  # type: ignore[no-untyped-def]
-    (radius, stride), (out_u, out_v) = window, out
-    rows, cols = u.shape
+    out_u, out_v, (rows, cols) = np.empty_like(u), np.empty_like(v), u.shape
     su, sv, count = np.empty(cols, np.float32), np.empty(cols, np.float32), np.empty(cols, np.float32)
     one, nil = np.float32(1.0), np.float32(0.0)
     for y in range(rows):
@@ -159,13 +153,8 @@ def _local_mean(u, v, keep, window, out):  # type: ignore[no-untyped-def]
                 a, b = max(0, -i), min(cols, cols - i)
                 if a >= b:
                     continue
-                cu, cv, ou, ov, ok = (
-                    u[y, a:b],
-                    v[y, a:b],
-                    u[j, a + i : b + i],
-                    v[j, a + i : b + i],
-                    keep[j, a + i : b + i],
-                )
+                cu, cv, ok = u[y, a:b], v[y, a:b], keep[j, a + i : b + i]
+                ou, ov = u[j, a + i : b + i], v[j, a + i : b + i]
                 tu, tv, tn = su[a:b], sv[a:b], count[a:b]
                 for x in range(b - a):
                     # Differences are summed, since float32 keeps more of their fractions than of whole displacements.
@@ -178,6 +167,7 @@ def _local_mean(u, v, keep, window, out):  # type: ignore[no-untyped-def]
             n = max(count[x], one)
             out_u[y, x] = u[y, x] + (su[x] / n if keep[y, x] else nil)
             out_v[y, x] = v[y, x] + (sv[x] / n if keep[y, x] else nil)
+    return out_u, out_v
 
 
 def _step(images: SplineImages, to_right: Frame, now: tuple[AnyArray, AnyArray], keep: AnyArray) -> AnyArray:
@@ -280,20 +270,7 @@ def warp_row(images, u, v, keep, y, out):  # type: ignore[no-untyped-def]
         # Unsigned indices need no check for counting from the end.
         if not images.valid[np.uint64(yr + half), np.uint64(xr + half)]:
             continue
-        i, j = np.int64(xr), np.int64(yr)
-        t, s = xr - np.float32(i), yr - np.float32(j)
-        wx, wy, dx, dy = weights(t), weights(s), slopes(t), slopes(s)
-        value = gx = gy = np.float32(0.0)
-        for k in range(4):
-            across = along = np.float32(0.0)
-            line = spline[np.uint64(j - 1 + k)]
-            for m in range(4):
-                c = line[np.uint64(i - 1 + m)]
-                across += wx[m] * c
-                along += dx[m] * c
-            value += wy[k] * across
-            gx += wy[k] * along
-            gy += dy[k] * across
+        value, gx, gy = value_and_gradient(spline, xr, yr)
         out[0, x], out[1, x], out[2, x], out[3, x] = 1, gx, gy, images.left[y, x] - value
 
 
@@ -416,14 +393,10 @@ def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int
     return epipolar.lines(fit[0], u.shape), min(1.0, (TRUSTED_SPREAD_PX / max(fit[1], 1e-9)) ** 2)
 
 
-def _off(lines: AnyArray, u: AnyArray, v: AnyArray) -> AnyArray:
-    """Signed distance from the line, pixels."""
-    return np.asarray(lines[..., 0] * u + lines[..., 1] * v + lines[..., 2])
-
-
 def _feet(lines: AnyArray, trust: float, u: AnyArray, v: AnyArray, keep: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Kept displacements moved to their lines as far as those are trusted; the others as they are."""
-    e = np.where(keep, np.float32(trust) * _off(lines, u, v), np.float32(0))
+    off = lines[..., 0] * u + lines[..., 1] * v + lines[..., 2]
+    e = np.where(keep, np.float32(trust) * off, np.float32(0))
     return u - e * lines[..., 0], v - e * lines[..., 1]
 
 
@@ -514,7 +487,7 @@ SURROUNDINGS_SIDE_PX = 9
 """Pixels: side of the window in which unmatched pixels count; about the reach of features and windows together."""
 
 BLANK_STD_PX = 0.2
-"""Standard deviation (pixels) that is added to a match without texture; the parts below do not explain it."""
+"""Standard deviation (pixels) that is added to matches of textureless regions; the parts below do not explain it."""
 
 # Factors of the parts. For each of several floors ``benchmarks/disparity_std.py --fit`` found the others on four mockup
 # pairs (seeds 1, 2 and 6, and seed 7 with noise of 4 grey levels); the floor, which no simulated lens shows, is the one

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,7 @@ from rille.stages.core.validity import Mask, counts
 from rille.stages.facts.matching import DisparityFacts
 from rille.stages.hfvm import matcher, paper
 from rille.stages.hfvm.coarse import PriorDisparities, known_beforehand
-from rille.stages.hfvm.matcher import WHOLE, How, MatchResult
+from rille.stages.hfvm.matcher import WHOLE, How
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid, PyramidParams
@@ -103,11 +102,10 @@ def match_pyramids(
 ) -> StereoMatches:
     """Match two image pyramids as :func:`match` does."""
     if params.preset in WHOLE:
-        result = MatchResult(paper.match(left, right, params, how.tell), False)
+        arrays, aligned = paper.match(left, right, params, how.tell), False
     else:
-        result = matcher.match(left, right, params, prior, how)
-    arrays: dict[str, Any] = dict(result.arrays)
-    return StereoMatches(**arrays, aligned=result.aligned)
+        arrays, aligned = matcher.match(left, right, params, prior, how)
+    return StereoMatches(**arrays, aligned=aligned)
 
 
 def facts(arrays: Mapping[str, AnyArray], params: HfvmParams, aligned: bool, usable: int) -> DisparityFacts:

@@ -27,7 +27,7 @@ be some pixels off."""
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import cv2
@@ -37,7 +37,9 @@ from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm import epipolar, plane
-from rille.stages.hfvm.image import Layer, Window, distance
+from rille.stages.hfvm.image import Image, Window, distance, thinned, whole
+from rille.stages.hfvm.level import MAX_FIT_MATCHES
+from rille.stages.hfvm.native.reference import linear
 from rille.stages.hfvm.refinement import BLANK_STD_PX
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import MAD_TO_SIGMA, cauchy
@@ -92,63 +94,40 @@ class Searched(NamedTuple):
     mutual: NDArray[np.bool_]
 
 
-class Best(NamedTuple):
-    """Of each pixel so far: the best step; its sum; the sums a step before and after it; the least ones far from it."""
+class SoFar(NamedTuple):
+    """Of each pixel: the best step so far and its sum; the sums a step before and after it; the least one far from it.
+    And of each right pixel the least mean distance of the windows led to it, and the step that did."""
 
-    step: AnyArray
+    best: AnyArray
     least: AnyArray
     before: AnyArray
     after: AnyArray
-    behind: AnyArray
-    ahead: AnyArray
+    rival: AnyArray
+    claim: AnyArray
+    claimant: AnyArray
 
 
 def search(region: Region, steps: AnyArray) -> Searched:
     """The best step along the line of each pixel of a region, of ``steps``: (n,) float32 pixels, ascending by 1."""
     shape = region.inside.shape
-    tried, size = np.zeros(shape, np.int32), region.size
-    best = Best(np.zeros(shape, np.float32), *np.full((5, *shape), np.inf, np.float32))
-    claims = np.full((2, *region.right.shape), np.inf, np.float32)
+    best, least, distinct = np.zeros((3, *shape), np.float32)
+    found = Searched(np.zeros(shape, np.int32), best, least, distinct, np.zeros(shape, bool))
+    so_far = SoFar(*np.full((5, *shape), np.inf, np.float32), *np.full((2, *region.right.shape), np.inf, np.float32))
     # Sums of the steps before, and the least of all that are more than MIN_DISTINCT_STEPS behind.
-    last, passed = deque[AnyArray](), np.full(shape, np.inf, np.float32)
+    last, passed, size = deque[AnyArray](), np.full(shape, np.inf, np.float32), region.size
     for step in steps:
         total = _sums(region, np.full(shape, step))
-        tried += np.isfinite(total)
         if len(last) > MIN_DISTINCT_STEPS:
             np.minimum(passed, last.popleft(), out=passed)
-        _keep(step, (total, last[-1] if last else passed, passed), best)
-        _claim(region, step, total / size, claims)
+        _look(region, step, (total, last[-1] if last else passed, passed, size), so_far, found.tried)
         last.append(total)
-    rival, mutual = np.minimum(best.behind, best.ahead), np.zeros(shape, bool)
-    distinct = np.subtract(rival, best.least, out=np.zeros_like(rival), where=np.isfinite(rival))
-    _claimed(region, best, claims[1], mutual)
-    return Searched(tried, best.step + _fraction(best.before, best.least, best.after), best.least, distinct, mutual)
-
-
-def _fraction(before: AnyArray, least: AnyArray, after: AnyArray) -> AnyArray:
-    """Where two lines of opposite slopes through three sums meet, steps from the middle one; 0 at an end of the steps.
-
-    Sums of absolute differences are more like two lines than like a parabola.
-    """
-    inner = np.isfinite(before) & np.isfinite(after)
-    rise = np.subtract(np.maximum(before, after), least, out=np.zeros_like(least), where=inner)
-    fall = np.subtract(before, after, out=np.zeros_like(least), where=inner)
-    return np.divide(0.5 * fall, rise, out=np.zeros_like(least), where=rise > 0)
-
-
-def excess(region: Region, at: AnyArray, least: AnyArray) -> AnyArray:
-    """By how much a pixel's distance, mean of the window, exceeds that of the window's ``least`` sum at other steps.
-
-    ``at``: steps (row, col) float32. Infinite where a step leads out of the right image.
-    """
-    sums = _sums(region, at)
-    more = np.subtract(sums, least, out=np.full_like(sums, np.inf), where=np.isfinite(sums) & np.isfinite(least))
-    return np.asarray(more / region.size)
+    _judge(region, so_far, found)
+    return found
 
 
 def _sums(region: Region, at: AnyArray) -> AnyArray:
     """Sum (row, col) of the distances of a region's pixels in each window, float32; infinite outside of the region and
-    where one of them leads out of the right image."""
+    where one of them leads out of the right image. ``at``: the step of each pixel along its line, float32."""
     cost, outside = np.zeros(at.shape, np.float32), np.zeros(at.shape, np.uint8)
     _distances(region, at, cost, outside)
     total = window_sum32(cost, WINDOW_SIDE_PX)
@@ -178,41 +157,42 @@ def _distances(region, at, cost, outside):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _claim(region, step, mean, claims):  # type: ignore[no-untyped-def]
-    """Of each right pixel the least ``mean`` distance of the windows led to it, and the step that did."""
-    for y in range(mean.shape[0]):
-        for x in range(mean.shape[1]):
-            if mean[y, x] < np.inf:
-                j, i = _end(region, y, x, step)
-                if mean[y, x] < claims[0, j, i]:
-                    claims[0, j, i], claims[1, j, i] = mean[y, x], step
-
-
-@njit(cache=True, nogil=True)
-def _keep(step, sums, best):  # type: ignore[no-untyped-def]
-    """Update ``best`` (:class:`Best`) with the sums of one more step, of the step before, and the least of those far
-    behind."""
-    total, previous, passed = sums
+def _look(region, step, sums, so_far, tried):  # type: ignore[no-untyped-def]
+    """Update ``so_far`` with the sums of one more step; ``sums``: those of the step before, the least of those far
+    behind, and the windows' sizes besides."""
+    total, previous, passed, size = sums
     for y in range(total.shape[0]):
         for x in range(total.shape[1]):
-            if total[y, x] < best.least[y, x]:
-                best.step[y, x], best.least[y, x] = step, total[y, x]
-                best.before[y, x], best.after[y, x] = previous[y, x], np.inf
-                best.behind[y, x], best.ahead[y, x] = passed[y, x], np.inf
-            elif step - best.step[y, x] == 1:
-                best.after[y, x] = total[y, x]
-            elif step - best.step[y, x] > MIN_DISTINCT_STEPS:
-                best.ahead[y, x] = min(best.ahead[y, x], total[y, x])
+            since = step - so_far.best[y, x]
+            if total[y, x] < so_far.least[y, x]:
+                so_far.best[y, x], so_far.least[y, x] = step, total[y, x]
+                so_far.before[y, x], so_far.after[y, x], so_far.rival[y, x] = previous[y, x], np.inf, passed[y, x]
+            elif since == 1:
+                so_far.after[y, x] = total[y, x]
+            elif since > MIN_DISTINCT_STEPS:
+                so_far.rival[y, x] = min(so_far.rival[y, x], total[y, x])
+            if total[y, x] < np.inf:
+                tried[y, x] += 1
+                j, i = _end(region, y, x, step)
+                if total[y, x] / size[y, x] < so_far.claim[j, i]:
+                    so_far.claim[j, i], so_far.claimant[j, i] = total[y, x] / size[y, x], step
 
 
 @njit(cache=True, nogil=True)
-def _claimed(region, best, steps, mutual):  # type: ignore[no-untyped-def]
-    """Whether the step that claims the right pixel is like the pixel's own."""
-    for y in range(mutual.shape[0]):
-        for x in range(mutual.shape[1]):
-            if best.least[y, x] < np.inf:
-                j, i = _end(region, y, x, best.step[y, x])
-                mutual[y, x] = abs(steps[j, i] - best.step[y, x]) <= MIN_DISTINCT_STEPS
+def _judge(region, so_far, found):  # type: ignore[no-untyped-def]
+    """Write what all steps together tell. Sums of absolute differences are more like two lines than like a parabola."""
+    for y in range(found.mutual.shape[0]):
+        for x in range(found.mutual.shape[1]):
+            step, least = so_far.best[y, x], so_far.least[y, x]
+            before, after = so_far.before[y, x], so_far.after[y, x]
+            found.best[y, x], found.least[y, x] = step, least
+            if least < np.inf:
+                j, i = _end(region, y, x, step)
+                found.mutual[y, x] = abs(so_far.claimant[j, i] - step) <= MIN_DISTINCT_STEPS
+                if max(before, after) < np.inf:  # no end of the steps
+                    found.best[y, x] += linear(before, least, after)
+                if so_far.rival[y, x] < np.inf:
+                    found.distinct[y, x] = so_far.rival[y, x] - least
 
 
 REGION_LEVEL = 1
@@ -274,46 +254,49 @@ class Planes(NamedTuple):
         return region, u, v, std
 
 
-def find(
-    left: Layer, right: Layer, f: epipolar.Matrix, unmatched: AnyArray, along: AnyArray, far_sign: float
-) -> Planes:
+def find(images: tuple[Image, Image], matches: Mapping[str, AnyArray], f: epipolar.Matrix, near_sign: float) -> Planes:
     """Find the planes of the left image's textureless regions.
 
     Parameters
     ----------
-    left, right : level 1 of both images.
+    matches : displacements ``u, v`` (row, col) of level 0, pixels, and ``validity``, 0 where matched.
     f : fundamental matrix of level 0, see :func:`rille.stages.hfvm.epipolar.oriented`.
-    unmatched : (row, col) bool of level 1: of the pixels of level 0 below none is matched.
-    along : displacements (n,) of matches along their lines, pixels of level 0.
-    far_sign : sign of the column displacement of far things against near ones; 0 unknown.
+    near_sign : sign of the column displacement of near things against far ones; 0 unknown.
     """
+    left, right = (image.layers[REGION_LEVEL] for image in images)
     label, terms = np.zeros(left.shape, np.int8), list[list[float]]()
     up = plane.finer(REGION_LEVEL)
     coarse = up.T @ f @ up
-    steps = _steps(along, far_sign if epipolar.along_rows(coarse, left.shape) else 0.0)
-    for window, inside in _regions(unmatched & (left.deviation < MAX_DEVIATION_GREY) & (left.valid != 0)):
+    steps = _steps(matches, f, near_sign if epipolar.along_rows(coarse, left.shape) else 0.0)
+    # Of the pixels below none is matched.
+    unmatched = np.ones((2 * left.shape[0], 2 * left.shape[1]), bool)
+    np.not_equal(matches["validity"], 0, out=unmatched[whole(matches["validity"].shape).slices])
+    weak = (unmatched[::2, ::2] & unmatched[::2, 1::2]) & (unmatched[1::2, ::2] & unmatched[1::2, 1::2])
+    for window, inside in _regions(weak & (left.deviation < MAX_DEVIATION_GREY) & (left.valid != 0)):
         x0, y0 = window.x0, window.y0
         lines = epipolar.lines(epipolar.moved(coarse, (x0, y0), (x0, y0)), inside.shape)
         words = np.ascontiguousarray(left.words[window.slices])
         region = Region(words, inside, lines, right.words, right.valid, x0, y0)
-        best = search(region, steps)
+        found = search(region, steps)
         # Half of the displacements leave a window with a vote inside the right image.
-        usable = (best.tried >= 0.5 * len(steps)) & (best.distinct > 0)
-        y, x = np.nonzero(usable & best.mutual)
+        usable = (found.tried >= 0.5 * len(steps)) & (found.distinct > 0)
+        y, x = np.nonzero(usable & found.mutual)
         if len(y) < max(MIN_REGION_PX, MIN_VOTING_SHARE * np.count_nonzero(inside)):
             continue
-        votes, step = best.distinct[y, x].astype(np.float64), best.best[y, x].astype(np.float64)
+        votes, step = found.distinct[y, x].astype(np.float64), found.best[y, x].astype(np.float64)
         g, error = _fit(x + x0, y + y0, step, votes)
         rows, cols = np.indices(inside.shape)
         on_plane = (g[0] + g[1] * (cols + x0) + g[2] * (rows + y0)).astype(np.float32)
-        more = excess(region, on_plane, best.least)
+        # By how much a pixel's distance, mean of its window, exceeds there that of the window's least sum.
+        more = np.full(inside.shape, np.inf)
+        more[usable] = (_sums(region, on_plane)[usable] - found.least[usable]) / region.size[usable]
         inner = (steps[1] + 0.5 < step) & (step < steps[-2] - 0.5)
         agree = (error <= MAX_AGREE_DISTANCE_PX) & inner & np.isfinite(more[y, x])
-        if _sure(agree, votes, best.tried[y, x]):
+        if _sure(agree, votes, found.tried[y, x]):
             terms.append(_at_level_0(g, error[agree]))
             alike = more <= np.quantile(more[y[agree], x[agree]], ALIKE_QUANTILE)
             # What has another match of its own is not of this plane.
-            label[window.slices][inside & ~(usable & best.mutual)] = -len(terms)
+            label[window.slices][inside & ~(usable & found.mutual)] = -len(terms)
             label[window.slices][usable & alike] = len(terms)
     return Planes(label, terms, f)
 
@@ -336,13 +319,17 @@ def _at_level_0(g: AnyArray, error: AnyArray) -> list[float]:
     return [float(t) for t in (scale * (g[0] + middle * (g[1] + g[2])), g[1], g[2], std)]
 
 
-def _steps(along: AnyArray, far_sign: float) -> AnyArray:
-    """Displacements along the lines that are tried, pixels of the level; ``far_sign``: of farther ones, 0 unknown."""
+def _steps(matches: Mapping[str, AnyArray], f: epipolar.Matrix, near_sign: float) -> AnyArray:
+    """Displacements along the lines that are tried, pixels of the level; ``near_sign``: of nearer ones, 0 unknown."""
+    y, x = thinned(matches["validity"] == 0, MAX_FIT_MATCHES)
+    a, b, _ = epipolar.lines_at(f, x, y)
+    # How far along their lines matches lead: what ``epipolar.on_line`` undoes.
+    along = b * matches["u"][y, x] - a * matches["v"][y, x]
     low, high = np.quantile(along, (0.005, 0.995)) * 0.5**REGION_LEVEL
     # Half of the range beyond its far end, and some pixels: a wall is often farther than all else.
     beyond = 0.5 * (high - low) + 4
     # Those at the ends do not count.
-    low, high = low - (2 if far_sign > 0 else beyond), high + (2 if far_sign < 0 else beyond)
+    low, high = low - (2 if near_sign < 0 else beyond), high + (2 if near_sign > 0 else beyond)
     return np.arange(np.floor(low), np.ceil(high) + 1, dtype=np.float32)
 
 
@@ -386,11 +373,8 @@ def _fit(x: AnyArray, y: AnyArray, step: AnyArray, votes: AnyArray) -> tuple[Any
 def _support(planes, terms, step, votes):  # type: ignore[no-untyped-def]
     """Votes (n,) of the steps that are near each plane; whole numbers, which are added up several at once."""
     totals = np.zeros(len(planes), np.int64)
-    one, x, y, nothing = terms[0], terms[1], terms[2], np.int64(0)
     for n in range(len(planes)):
-        a, b, c = planes[n, 0], planes[n, 1], planes[n, 2]
-        for k in range(len(step)):
-            totals[n] += (
-                votes[k] if abs(a * one[k] + b * x[k] + c * y[k] - step[k]) <= MAX_VOTE_DISTANCE_PX else nothing
-            )
+        g = planes[n]
+        off = g[0] * terms[0] + g[1] * terms[1] + g[2] * terms[2] - step
+        totals[n] = (votes * (np.abs(off) <= MAX_VOTE_DISTANCE_PX)).sum()
     return totals

@@ -18,9 +18,10 @@ from rille.stages.facts.matching import TileFacts
 from rille.stages.hfvm import coarse, finest, matcher, textureless
 from rille.stages.hfvm.coarse import Coarse
 from rille.stages.hfvm.finest import Ending
-from rille.stages.hfvm.image import Window, view, whole
+from rille.stages.hfvm.image import Window, as_matched, whole
 from rille.stages.hfvm.image import tiles as cut
-from rille.stages.hfvm.level import Band, Map, State, Views
+from rille.stages.hfvm.level import Band, ImagePair, State
+from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS
 from rille.stages.imaging.pyramid import Pyramid
@@ -85,25 +86,19 @@ class Task:
     @cached_property
     def half(self) -> bool:
         """Whether the pair is matched at half its resolution."""
-        recipe = matcher.recipe_of(self.params)
-        return matcher.halves(recipe, *(int(pyramid.meta["levels"]) for pyramid in self.given[:2]))
+        return matcher.halves(self.params, *(int(pyramid.meta["levels"]) for pyramid in self.given[:2]))
 
     @cached_property
-    def recipe(self) -> matcher.Recipe:
-        """Steps of matching at the resolution at which the pair is matched."""
-        return matcher.recipe_of(self.views.params)
-
-    @cached_property
-    def views(self) -> Views:
+    def images(self) -> ImagePair:
         """Both images at that resolution."""
         params, first = (matcher.halved(self.params), 1) if self.half else (self.params, 0)
-        left, right = (view(opened(bundle).above(first), params) for bundle in self.given[:2])
-        return Views(left, right, params, matcher.recipe_of(params).steps)
+        left, right = (as_matched(opened(bundle).above(first), params) for bundle in self.given[:2])
+        return ImagePair(left, right, params, matcher.RECIPES[params.preset])
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Rows and columns of the left image at that resolution."""
-        return self.views.left.shapes[0]
+        return self.images.left.shapes[0]
 
     @cached_property
     def windows(self) -> list[Window]:
@@ -120,13 +115,10 @@ class Task:
         """The result of step ``coarse``."""
         bundle = self.given.coarse
         assert bundle is not None
-        maps = [Map(bundle[f"{way}_u"], bundle[f"{way}_v"]) for way in ("left", "right")]
-        oks = [bundle[f"{way}_ok"] != 0 for way in ("left", "right")]
-        meta = bundle.meta
-        band = Band(np.array(meta["f"]), meta["mu"])
-        state = State(meta["level"], maps[0], maps[1], oks[0], oks[1], band, meta["near_sign"])
-        ratio, alignment = (None if meta[name] is None else np.array(meta[name]) for name in ("ratio", "alignment"))
-        return Coarse.again(self.views, state, ratio, alignment)
+        meta, (left, right) = bundle.meta, (bundle["left"], bundle["right"])
+        oks, band = (left[2] != 0, right[2] != 0), Band(bundle["f"], meta["mu"])
+        state = State(meta["level"], Map(*left[:2]), Map(*right[:2]), *oks, band, meta["near_sign"])
+        return Coarse.again(self.images, state, *(bundle.arrays.get(name) for name in ("ratio", "alignment")))
 
     def fine(self, window: Window, names: Sequence[str] = FINE) -> dict[str, AnyArray]:
         """Arrays of the tiles' fine results."""
@@ -134,47 +126,35 @@ class Task:
 
 
 def _coarse(task: Task) -> Bundle[TileFacts]:
-    pair = coarse.begin(task.views, task.recipe.begin)
+    pair = coarse.match_coarse_levels(task.images)
     s = pair.state
-    arrays: dict[str, AnyArray] = {}
-    for way, m, ok in (("left", s.left, s.left_ok), ("right", s.right, s.right_ok)):
-        arrays |= {f"{way}_u": m.u, f"{way}_v": m.v, f"{way}_ok": ok.view(np.uint8)}
-    meta: TileFacts = {
-        "level": s.level,
-        "aligned": pair.alignment is not None,
-        "alignment": None if pair.alignment is None else pair.alignment.tolist(),
-        "ratio": None if pair.ratio is None else pair.ratio.tolist(),
-        "f": s.band.f.tolist(),
-        "mu": float(s.band.mu),
-        "near_sign": float(s.near_sign),
-    }
-    return Bundle(arrays, meta)
+    arrays = {"left": np.stack([*s.left, s.left_ok]), "right": np.stack([*s.right, s.right_ok]), "f": s.band.f}
+    arrays |= {name: a for name, a in (("ratio", pair.ratio), ("alignment", pair.alignment)) if a is not None}
+    aligned, near_sign = pair.alignment is not None, float(s.near_sign)
+    return Bundle(arrays, {"level": s.level, "aligned": aligned, "mu": float(s.band.mu), "near_sign": near_sign})
 
 
 def _fine(task: Task) -> Bundle[TileFacts]:
-    return Bundle(finest.fine(task.pair, task.recipe.refinement, task.window), {})
+    return Bundle(finest.match_finest_level(task.pair, task.window), {})
 
 
 def _ending(task: Task) -> Bundle[TileFacts]:
-    arrays = task.fine(whole(task.shape), ("u", "v", "validity"))
-    ending = finest.ending(task.pair, arrays, task.recipe.planes)
-    meta: TileFacts = {"f": None if ending.f is None else ending.f.tolist(), "terms": None}
-    if ending.planes is None:
-        return Bundle({}, meta)
-    meta["terms"] = ending.planes.terms
-    return Bundle({"region": ending.planes.region}, meta)
+    ending = finest.fit_lines_and_planes(task.pair, task.fine(whole(task.shape), ("u", "v", "validity")))
+    arrays = {} if ending.f is None else {"f": ending.f}
+    planes = {} if ending.planes is None else {"region": ending.planes.region}
+    return Bundle(arrays | planes, {"terms": [] if ending.planes is None else ending.planes.terms})
 
 
 def _final(task: Task) -> Bundle[TileFacts]:
     bundle, shape = task.given.ending, task.shape
     assert bundle is not None
-    f = None if bundle.meta["f"] is None else np.array(bundle.meta["f"])
-    terms = bundle.meta["terms"]
-    planes = None if terms is None or f is None else textureless.Planes(bundle["region"], terms, f)
-    ending = Ending(task.pair.state.near_sign, task.pair.alignment, f, planes, shape)
+    f, terms, planes = bundle.arrays.get("f"), bundle.meta["terms"], None
+    if f is not None and terms:
+        planes = textureless.Planes(bundle["region"], terms, f)
+    ending = Ending(shape, task.pair.state.near_sign, task.pair.alignment, f, planes)
     # At half the resolution with the neighbours that slopes are taken from.
     window = task.window.grow(1, 1, shape) if task.half else task.window
-    arrays = finest.final(task.pair, window, task.fine(finest.around(task.pair, window)), ending)
+    arrays = finest.interpolate_undefined(task.pair, window, task.fine(finest.around(task.pair, window)), ending)
     if task.half:
         left, right = (tuple(one.raster("level_0").shape) for one in task.given[:2])
         outer, inner = window.child(left), task.window.child(left)
@@ -194,16 +174,13 @@ STEPS: Mapping[str, Callable[[Task], Bundle[TileFacts]]] = {
 
 _GRID = ("row", "col")
 _optional = partial(Array, optional=True)
+_MATRIX = ("line", "column")
 _PARTS = (
-    *(
-        _optional(f"{way}_{name}", _GRID, kind, unit, about)
-        for way in ("left", "right")
-        for name, kind, unit, about in (
-            ("u", "int16", "px", "columns of displacement at level 1"),
-            ("v", "int16", "px", "rows of displacement at level 1"),
-            ("ok", "uint8", "1", "1 = consistent"),
-        )
-    ),
+    _optional("left", ("plane", *_GRID), "int16", "px", "columns, rows of displacement at level 1; 1 = consistent"),
+    _optional("right", ("plane", *_GRID), "int16", "px", "the same of the right image"),
+    _optional("f", _MATRIX, "float64", "1", "fundamental matrix, of level 0 or of the band at it"),
+    _optional("ratio", ("term",), "float64", "1", "logarithm of the ratio of brightness, see hfvm.coarse"),
+    _optional("alignment", _MATRIX, "float64", "1", "homography that the right image is aligned by"),
     _optional("u", _GRID, "float32", "px", "columns of displacement"),
     _optional("v", _GRID, "float32", "px", "rows of displacement"),
     _optional("error", _GRID, "float32", "px", "error of matching there and back"),

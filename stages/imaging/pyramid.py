@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, overload
 
 import cv2
@@ -81,22 +80,6 @@ class Pyramid:
         levels = range(int(bundle.meta["levels"]))
         images, valid = (_Read(bundle, [f"{name}_{n}" for n in levels]) for name in ("level", "valid"))
         return Pyramid(images, valid, float(bundle.meta.get("noise", 0.0)))
-
-    @cached_property
-    def filled(self) -> tuple[Floats32, ...]:
-        """Images whose masked pixels carry the grey of the next valid level above: a mask's edge is no texture."""
-        images = list(self.images)
-        # From the top down, so that the level above is filled already.
-        for n in range(self.levels - 1, -1, -1):
-            mask = self.valid[n] != 0
-            if mask.all():
-                continue
-            if n + 1 < self.levels:
-                images[n] = filled_from(images[n + 1], images[n], mask)
-            else:
-                # At the top there is no level above: the mean of what is seen.
-                images[n] = np.where(mask, images[n], images[n][mask].mean() if mask.any() else np.float32(0.0))
-        return tuple(images)
 
     def above(self, level: int) -> Pyramid:
         """The pyramid from a level on; noise halves from level to level."""

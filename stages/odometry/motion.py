@@ -21,9 +21,9 @@ from rille.stages.core.declare import AnyArray, Bundle, Params, raster, stage
 from rille.stages.core.validity import Mask, Validity, defined, mark, matched, matched_share
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts
-from rille.stages.hfvm import epipolar, plane
-from rille.stages.hfvm.image import view
-from rille.stages.hfvm.level import LevelSteps, Views, descend, fill_rows, median, propagate, search
+from rille.stages.hfvm import plane
+from rille.stages.hfvm.image import as_matched
+from rille.stages.hfvm.level import ImagePair, Recipe, descend, fill_rows, median, propagate, search
 from rille.stages.hfvm.matcher import DEFAULT
 from rille.stages.hfvm.native.problem import LevelPair
 from rille.stages.hfvm.native.solver import solver
@@ -101,15 +101,15 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: plane.Matr
         rounds=ROUNDS,
     )
     # At a coarse level no level is finest: all have the same rounds. At level 0 the matcher's own figures hold.
-    rounds = (ROUNDS, ROUNDS) if level else DEFAULT.steps.rounds
-    left, right = view(a, hp), view(b, hp)
+    rounds = (ROUNDS, ROUNDS) if level else DEFAULT.rounds
+    left, right = as_matched(a, hp), as_matched(b, hp)
     if turn is not None:
         turn = np.linalg.inv(plane.finer(level)) @ turn @ plane.finer(level)
         right = plane.aligned(right, turn, left)
-    views = Views(left, right, hp, LevelSteps((search, propagate, median), (), rounds))
-    state, layers = descend(views, 0), (views.left.layers[0], views.right.layers[0])
+    images = ImagePair(left, right, hp, Recipe((search, propagate, median), (), rounds))
+    state, layers = descend(images, 0), (images.left.layers[0], images.right.layers[0])
     validity = np.zeros(state.left.u.shape, np.uint8)
-    pair = LevelPair(layers[0].words, layers[1].words, epipolar.NO_BAND, 0.0)
+    pair = LevelPair(layers[0].words, layers[1].words)
     u, v, distance = solver.sums(pair, state.left.u, state.left.v, np.ones_like(validity))
     scale = np.float32(2.0**level)
     mark(validity, a.valid[0] == 0, Validity.OUT_OF_IMAGE)
@@ -124,7 +124,7 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: plane.Matr
     mark(validity, interpolated != 0, Validity.INTERPOLATED)
     u[~defined(validity)] = v[~defined(validity)] = np.nan
     if turn is not None:
-        u, v = plane.compose(turn, u, v, a.shape)
+        u, v = plane.carried(plane.to_original(turn, a.shape), u, v)
         # Seen in the upright frame, but its place in b lies behind the camera.
         validity[np.isnan(u)] &= ~np.uint8(Validity.MATCHED | Validity.INTERPOLATED)
     return Motion(level, u * scale, v * scale, validity)
@@ -141,7 +141,7 @@ def _turned(a: Pyramid, b: Pyramid, plain: Motion, params: MotionParams) -> Moti
         if abs(_roll_deg(plain)) < MIN_ROLL_DEG:
             return None
         needed = 1.0
-    turn = plane.find_turn(view(a, HfvmParams()), view(b, HfvmParams()))
+    turn = plane.find_turn(as_matched(a, HfvmParams()), as_matched(b, HfvmParams()))
     if turn is None:
         return None
     motion = coarse_motion(a, b, params, turn)

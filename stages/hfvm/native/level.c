@@ -21,26 +21,22 @@ int supported(void) {
 
 /* ---- search ---- */
 
-/* Displacements and costs of an image from those of the coarser level, half as large. `centres`: room, two rows and two
-   columns more than that has; a border repeats the edge. */
+/* Displacements and costs of an image from those of the coarser level, half as large. `centres`: room for as many. */
 void EXPORT(search)(const Pair *pair, const int16_t *up_u, const int16_t *up_v, const Shift *reach, int32_t *shift,
                     int32_t *cost, int32_t *centres) {
   int32_t rows = pair->left.rows, cols = pair->left.cols, up_rows = (rows + 1) / 2;
   Parents up = {up_u, up_v, (cols + 1) / 2};
-  int32_t stride = up.cols + 2;
   for (int32_t j = 0; j < up_rows; j++) {
     RowLines row = row_lines(&pair->band, 2 * j + 0.5);
-    int32_t *to = centres + (int64_t)(j + 1) * stride;
-    for (int32_t i = 0; i < up.cols; i++) to[i + 1] = centre_of(pair, &up, row, i, j);
-    to[0] = to[1], to[up.cols + 1] = to[up.cols];
+    for (int32_t i = 0; i < up.cols; i++) centres[(int64_t)j * up.cols + i] = centre_of(pair, &up, row, i, j);
   }
-  memcpy(centres, centres + stride, stride * sizeof *centres);
-  memcpy(centres + (int64_t)(up_rows + 1) * stride, centres + (int64_t)up_rows * stride, stride * sizeof *centres);
   for (int32_t j = 0; j < up_rows; j++) {
     RowLines row = row_lines(&pair->band, 2 * j + 0.5);
+    const int32_t *own = centres + (int64_t)j * up.cols;
+    const int32_t *above = j > 0 ? own - up.cols : own, *below_ = j + 1 < up_rows ? own + up.cols : own;
     for (int32_t i = 0; i < up.cols; i++) {
-      const int32_t *centre = centres + (int64_t)(j + 1) * stride + i + 1;
-      Children best = search_parent(pair, row, centre, stride, (Shift){i, j}, *reach);
+      const int32_t near[CENTRES] = {own[i], own[within(i - 1, up.cols)], own[within(i + 1, up.cols)], above[i], below_[i]};
+      Children best = search_parent(pair, row, near, (Shift){i, j}, *reach);
       for (int n = 0; n < 4; n++) {
         int32_t x = 2 * i + (n & 1), y = 2 * j + (n >> 1);
         if (x < cols && y < rows) shift[(int64_t)y * cols + x] = best.shift[n], cost[(int64_t)y * cols + x] = best.cost[n];
@@ -207,34 +203,28 @@ void EXPORT(sums)(const Pair *pair, const int16_t *us, const int16_t *vs, const 
 
 /* ---- depth edges ---- */
 
-enum { EDGE_RADIUS = 3, EDGE_SIDE = 2 * EDGE_RADIUS + 1 };
-typedef struct {
-  int32_t reach;      /* pixels to the farthest whose displacement is tried; half of them, too */
-  int32_t apart;      /* pixels between displacements of two sides */
-  int32_t grey, far;  /* grey levels from which on a pixel does not count; greatest distance */
-  int32_t own, other; /* factors of what the own displacement costs, and the others, but for farther ones */
-  int32_t near;       /* sign of the columns of nearer things, 0 unknown */
-} EdgeRule;
-
+/* What these limit, and why they are as they are: see reference.py. */
+enum { EDGE_REACH = 4, EDGE_RADIUS = 3, EDGE_SIDE = 2 * EDGE_RADIUS + 1, MIN_APART = 4, EDGE_GREY = 16,
+       MAX_EDGE_DISTANCE = 100, OWN_FACTOR = 9, OTHER_FACTOR = 10 };
 typedef struct { Sixteen low, high; } Weights; /* of seven pixels side by side, as `seven_words` has them */
 
-static inline Sixteen edge_weight(Sixteen near, const EdgeRule *rule) {
-  Sixteen weight = (int16_t)rule->grey - PICK(near < 0, -near, near);
+static inline Sixteen edge_weight(Sixteen step) {
+  Sixteen weight = EDGE_GREY - PICK(step < 0, -step, step);
   return weight & (weight > 0);
 }
-/* By how much less than rule->grey the pixels of the window from `grey` on differ from its middle. */
-static inline void edge_weights(const int16_t *grey, int32_t cols, const EdgeRule *rule, Weights out[EDGE_SIDE]) {
+/* By how much less than EDGE_GREY the pixels of the window from `grey` on differ from its middle. */
+static inline void edge_weights(const int16_t *grey, int32_t cols, Weights out[EDGE_SIDE]) {
   int16_t own = grey[EDGE_RADIUS * cols + EDGE_RADIUS];
   for (int j = 0; j < EDGE_SIDE; j++, grey += cols) {
     /* A distance is in the first of the four numbers of a word, and the others are zero, whatever their weight. */
-    out[j] = (Weights){edge_weight(four_wide(grey) - own, rule), edge_weight(four_wide(grey + 3) - own, rule)};
+    out[j] = (Weights){edge_weight(four_wide(grey) - own), edge_weight(four_wide(grey + 3) - own)};
     out[j].high[0] = 0;
   }
 }
-/* Sum of the distances, each at most rule->far, by their weights: below 7 x 7 x 100 x 16, so that 16 bits hold a column. */
+/* Sum of the distances, limited, by their weights: below 7 x 7 x 100 x 16, so that 16 bits hold a column. */
 static inline int32_t edge_cost(const uint64_t *here, const uint64_t *there, const Weights *weight, int32_t cols,
-                                int32_t right_cols, int16_t far) {
-  Sixteen total = {0}, most = total + far;
+                                int32_t right_cols) {
+  Sixteen total = {0}, most = total + MAX_EDGE_DISTANCE;
   for (int j = 0; j < EDGE_SIDE; j++, here += cols, there += right_cols) {
     Words a = seven_words(here), b = seven_words(there);
     total += weight[j].low * least_of_sixteen((Sixteen)square_sad(a.low, b.low), most);
@@ -246,37 +236,38 @@ static inline int32_t edge_cost(const uint64_t *here, const uint64_t *there, con
 }
 typedef struct { int32_t x, y; int64_t at; } Place; /* a pixel, and its index */
 
-/* Which displacements differ from others by rule->apart columns or rows. */
-static inline Eight differ(Eight shift, Eight other, const EdgeRule *rule) {
-  return (Eight)(size_of((Sixteen)shift - (Sixteen)other) >= (int16_t)rule->apart) != 0;
+/* Which displacements differ from others by MIN_APART columns or rows. */
+static inline Eight differ(Eight shift, Eight other) {
+  return (Eight)(size_of((Sixteen)shift - (Sixteen)other) >= MIN_APART) != 0;
 }
 /* What the displacement of a pixel costs; negative: it leads out of the right image. */
-static inline int32_t cost_there(const Pair *pair, Place p, int32_t shift, const Weights *weight, const EdgeRule *rule) {
+static inline int32_t cost_there(const Pair *pair, Place p, int32_t shift, const Weights *weight) {
   int32_t cols = pair->left.cols, right_cols = pair->right.cols;
   int32_t y = p.y + (shift >> 16), x = p.x + (int16_t)shift;
   if (y < EDGE_RADIUS || y >= pair->right.rows - EDGE_RADIUS || x < EDGE_RADIUS || x >= right_cols - EDGE_RADIUS) return -1;
   const uint64_t *here = pair->left.words + p.at - (int64_t)EDGE_RADIUS * cols - EDGE_RADIUS;
   const uint64_t *there = pair->right.words + (int64_t)(y - EDGE_RADIUS) * right_cols + x - EDGE_RADIUS;
-  return edge_cost(here, there, weight, cols, right_cols, (int16_t)rule->far);
+  return edge_cost(here, there, weight, cols, right_cols);
 }
 /* The displacement of a pixel, chosen among its own and the different ones of those `around`. */
-static int32_t chosen(const Pair *pair, Place p, const int16_t *grey, int32_t own, Eight around, const EdgeRule *rule) {
+static int32_t chosen(const Pair *pair, Place p, const int16_t *grey, int32_t own, Eight around, int32_t near_sign) {
   Weights weight[EDGE_SIDE];
-  edge_weights(grey + p.at - (int64_t)EDGE_RADIUS * pair->left.cols - EDGE_RADIUS, pair->left.cols, rule, weight);
-  int32_t best = own, least = cost_there(pair, p, own, weight, rule) * rule->own;
-  Eight other = differ(around, (Eight){} + own, rule);
+  edge_weights(grey + p.at - (int64_t)EDGE_RADIUS * pair->left.cols - EDGE_RADIUS, pair->left.cols, weight);
+  int32_t best = own, least = cost_there(pair, p, own, weight) * OWN_FACTOR;
+  Eight other = differ(around, (Eight){} + own);
   for (uint32_t left; least >= 0 && (left = bits_of(other));) {
-    int32_t tried = around[__builtin_ctz(left)], cost = cost_there(pair, p, tried, weight, rule);
-    cost *= rule->near * ((int16_t)tried - (int16_t)own) < 0 ? rule->own : rule->other;
+    int32_t tried = around[__builtin_ctz(left)], cost = cost_there(pair, p, tried, weight);
+    cost *= near_sign * ((int16_t)tried - (int16_t)own) < 0 ? OWN_FACTOR : OTHER_FACTOR;
     if (cost >= 0 && cost < least) least = cost, best = tried;
-    other &= differ(around, (Eight){} + tried, rule);
+    other &= differ(around, (Eight){} + tried);
   }
   return best;
 }
-/* Displacements of the wanted pixels, chosen anew among those around; pair: words of compact features. */
-void EXPORT(edges)(const Pair *pair, const int16_t *grey, const int32_t *shift, const uint8_t *wanted, const EdgeRule *rule,
+/* Displacements of the wanted pixels, chosen anew among those around; pair: words of compact features; near_sign: of the
+   columns of nearer things, 0 unknown. */
+void EXPORT(edges)(const Pair *pair, const int16_t *grey, const int32_t *shift, const uint8_t *wanted, int32_t near_sign,
                    int32_t *out) {
-  int32_t cols = pair->left.cols, reach = rule->reach;
+  int32_t cols = pair->left.cols, reach = EDGE_REACH;
   const int64_t far = reach, half = far / 2;
   const int64_t aside[8] = {half * cols, -half * cols, half, -half, far * cols, -far * cols, far, -far};
   for (int32_t y = reach; y < pair->left.rows - reach; y++) {
@@ -284,7 +275,7 @@ void EXPORT(edges)(const Pair *pair, const int16_t *grey, const int32_t *shift, 
       int64_t i = (int64_t)y * cols + x;
       int32_t count = cols - reach - x;
       Eight own = first_ints(shift + i, count), marks = {0};
-      for (int n = 0; n < 8; n++) marks |= differ(first_ints(shift + i + aside[n], count), own, rule);
+      for (int n = 0; n < 8; n++) marks |= differ(first_ints(shift + i + aside[n], count), own);
       /* Most pixels have one displacement around them. */
       for (uint32_t left = bits_of(marks); left; left &= left - 1) {
         int32_t k = __builtin_ctz(left);
@@ -292,7 +283,7 @@ void EXPORT(edges)(const Pair *pair, const int16_t *grey, const int32_t *shift, 
         if (!wanted[at]) continue;
         Eight around = {0};
         for (int n = 0; n < 8; n++) around[n] = shift[at + aside[n]];
-        out[at] = chosen(pair, (Place){x + k, y, at}, grey, own[k], around, rule);
+        out[at] = chosen(pair, (Place){x + k, y, at}, grey, own[k], around, near_sign);
       }
     }
   }
@@ -300,8 +291,8 @@ void EXPORT(edges)(const Pair *pair, const int16_t *grey, const int32_t *shift, 
 
 /* ---- paths ---- */
 
-enum { MOST = 8, NONE = 32767, UNIT = 4, OUTSIDE = 8000 }; /* candidates; costs: none, of a byte step, outside */
-typedef struct { int32_t compact, small, large, grey; } PathCosts;
+/* Candidates, and costs: what they are of, see reference.py. */
+enum { MOST = 8, NONE = 32767, OUTSIDE = 8000, UNIT = 4, COMPACT = 8, SMALL = 36, LARGE = 240, LARGE_GREY = 10 };
 typedef struct { Eight shift; int32_t count; } List; /* beyond `count` the first displacement is repeated */
 typedef struct { Eight shift, cost, total; } Candidates; /* of a pixel; total: with what the paths to it cost */
 
@@ -314,9 +305,8 @@ static inline void append(const Pair *pair, int32_t x, int32_t y, int32_t shift,
   list->shift = PICK(SAME(order, (Eight){} + list->count), tried, list->shift);
   list->count++;
 }
-/* Candidates of a pixel: the own displacement, those a pixel beside it, those of near and farther pixels,
-   those of the coarser level. */
-static List candidates_of(const Pair *pair, const Parents *up, const int32_t *maps, int32_t x, int32_t y) {
+/* Candidates of a pixel: the own displacement, those a pixel beside it, those of near and farther pixels. */
+static List candidates_of(const Pair *pair, const int32_t *maps, int32_t x, int32_t y) {
   static const int8_t around[12][2] = {{0, -1}, {0, 1}, {-1, 0}, {1, 0}, {-3, -3}, {-3, 3}, {3, -3}, {3, 3},
                                        {0, -8}, {0, 8}, {-8, 0}, {8, 0}};
   int32_t rows = pair->left.rows, cols = pair->left.cols, shift = maps[(int64_t)y * cols + x];
@@ -325,27 +315,22 @@ static List candidates_of(const Pair *pair, const Parents *up, const int32_t *ma
   for (int n = 0; n < 4; n++) append(pair, x, y, pack(own.u + around[n][1], own.v + around[n][0]), &list);
   for (int n = 0; n < 12; n++)
     append(pair, x, y, maps[(int64_t)within(y + around[n][0], rows) * cols + within(x + around[n][1], cols)], &list);
-  for (int n = 0; up->cols && n < 9; n++) {
-    int64_t k = (int64_t)within(y / 2 + n / 3 - 1, (rows + 1) / 2) * up->cols + within(x / 2 + n % 3 - 1, up->cols);
-    append(pair, x, y, pack(2 * up->u[k], 2 * up->v[k]), &list);
-  }
   return list;
 }
 /* Candidates of a pixel, each once, and their costs; all but the first lead into the right image. `compact`: the images'
    compact features. */
-static Candidates listed(const Pair *pair, const Pair *compact, const Parents *up, const int32_t *maps,
-                         const PathCosts *costs, int32_t x, int32_t y) {
+static Candidates listed(const Pair *pair, const Pair *compact, const int32_t *maps, int32_t x, int32_t y) {
   const Eight order = {0, 1, 2, 3, 4, 5, 6, 7};
   int32_t right_cols = pair->right.cols;
   int64_t i = place(&pair->left, x, y);
   RowLines row = row_lines(&pair->band, y);
-  Line line = line_at(row, (float)x, (float)(UNIT + costs->compact) * row.cost);
-  List list = candidates_of(pair, up, maps, x, y);
+  Line line = line_at(row, (float)x, (float)(UNIT + COMPACT) * row.cost);
+  List list = candidates_of(pair, maps, x, y);
   Eight u = columns(list.shift), v = list.shift >> 16, xr = u + x, yr = v + y;
   Eight within_right = below(xr, right_cols) & below(yr, pair->right.rows), at = (yr * right_cols + xr) & within_right;
   Square own = (Square){} + pair->left.words[i], own_compact = (Square){} + compact->left.words[i];
   Eight cost = UNIT * distances((Words){own, own}, words_at(pair->right.words, at));
-  cost += costs->compact * distances((Words){own_compact, own_compact}, words_at(compact->right.words, at));
+  cost += COMPACT * distances((Words){own_compact, own_compact}, words_at(compact->right.words, at));
   cost = PICK(within_right, cost, (Eight){} + OUTSIDE);
   cost += magnitude(line.a * floats(u) + line.b * floats(v) + line.c, 2 * OUTSIDE);
   /* Leaves room below NONE for the greatest step, 10000. */
@@ -353,19 +338,19 @@ static Candidates listed(const Pair *pair, const Pair *compact, const Parents *u
   return (Candidates){list.shift, cost, {0}};
 }
 /* Costs of a pixel's candidates from those of the pixel before on a path:
-   cost + min over m (before[m] + min(small |difference to m|, far)) - min over m before[m]. */
-static inline Eight path_step(const Candidates *here, const Candidates *from, Eight before, int32_t small, int32_t far) {
+   cost + min over m (before[m] + min(SMALL |difference to m|, far)) - min over m before[m]. */
+static inline Eight path_step(const Candidates *here, const Candidates *from, Eight before, int32_t far) {
   Eight top = (Eight){} + far;
   int32_t least = before[0];
   for (int m = 1; m < MOST; m++) least = before[m] < least ? before[m] : least;
   Eight best = top + least;
   for (int m = 0; m < MOST; m++)
-    best = least_of(best, before[m] + least_of(small * apart(here->shift, (Eight){} + from->shift[m]), top));
+    best = least_of(best, before[m] + least_of(SMALL * apart(here->shift, (Eight){} + from->shift[m]), top));
   return least_of(here->cost + best - least, (Eight){} + NONE);
 }
 /* Add to all totals the costs along three directions: from the upper left, above, the upper right; `s` = -1: their
    opposites. `room`: six rows. */
-static void sweep(const Pair *pair, Candidates *all, const float *grey, const PathCosts *costs, int32_t s, Eight *room) {
+static void sweep(const Pair *pair, Candidates *all, const float *grey, int32_t s, Eight *room) {
   int32_t rows = pair->left.rows, cols = pair->left.cols;
   Eight *before = room, *after = room + 3 * cols;
   for (int32_t row = 0; row < rows; row++) {
@@ -377,10 +362,9 @@ static void sweep(const Pair *pair, Candidates *all, const float *grey, const Pa
         Eight cost = all[at].cost;
         if (inside(&pair->left, i, y - s)) {
           int64_t from = place(&pair->left, i, y - s);
-          float jump = (float)costs->large / (1.0f + fabsf(grey[at] - grey[from]) / (float)costs->grey);
-          float small = (float)(2 * costs->small);
+          int32_t jump = (int32_t)(LARGE / (1.0f + fabsf(grey[at] - grey[from]) / LARGE_GREY));
           /* Small differences cost less than jumps even where the grey step is greatest. */
-          cost = path_step(&all[at], &all[from], before[d * cols + i], costs->small, (int32_t)(jump > small ? jump : small));
+          cost = path_step(&all[at], &all[from], before[d * cols + i], jump > 2 * SMALL ? jump : 2 * SMALL);
         }
         after[d * cols + x] = cost;
         all[at].total += cost;
@@ -390,18 +374,16 @@ static void sweep(const Pair *pair, Candidates *all, const float *grey, const Pa
     before = after, after = other;
   }
 }
-/* Displacements of least cost along paths; of equal ones the first candidate's. `up`: none where it has no
-   columns. `room`: a Candidates a pixel, and six rows
+/* Displacements of least cost along paths; of equal ones the first candidate's. `room`: a Candidates a pixel, and six rows
    of Eight, at a multiple of 32 bytes. */
-void EXPORT(paths)(const Pair *pair, const Pair *compact, const Parents *up, const float *grey, const PathCosts *costs,
-                   int32_t *maps, void *room) {
+void EXPORT(paths)(const Pair *pair, const Pair *compact, const float *grey, int32_t *maps, void *room) {
   int32_t rows = pair->left.rows, cols = pair->left.cols;
   int64_t pixels = (int64_t)rows * cols;
   Candidates *all = room;
   for (int32_t y = 0; y < rows; y++)
-    for (int32_t x = 0; x < cols; x++) all[place(&pair->left, x, y)] = listed(pair, compact, up, maps, costs, x, y);
-  sweep(pair, all, grey, costs, 1, (Eight *)(all + pixels));
-  sweep(pair, all, grey, costs, -1, (Eight *)(all + pixels));
+    for (int32_t x = 0; x < cols; x++) all[place(&pair->left, x, y)] = listed(pair, compact, maps, x, y);
+  sweep(pair, all, grey, 1, (Eight *)(all + pixels));
+  sweep(pair, all, grey, -1, (Eight *)(all + pixels));
   for (int64_t i = 0; i < pixels; i++) {
     int best = 0;
     for (int k = 1; k < MOST; k++) best = all[i].cost[k] != NONE && all[i].total[k] < all[i].total[best] ? k : best;

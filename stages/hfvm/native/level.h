@@ -159,12 +159,12 @@ RULE int32_t centre_of(const Pair *pair, const Parents *up, RowLines row, int32_
   off = off < -1.0f ? -1.0f : off > 1.0f ? 1.0f : off;
   return pack((int32_t)((float)s.u - rintf(off * line.a)), (int32_t)((float)s.v - rintf(off * line.b)));
 }
-/* The best displacements of the four pixels of parent (i, j). With nothing inside the right image the prediction stays.
-   `centre`: the parent's among all centres, which have a frame of one and are `stride` apart. */
-RULE Children search_parent(const Pair *pair, RowLines row, const int32_t *centre, int32_t stride, Shift at, Shift reach) {
-  const int32_t centres[CENTRES] = {centre[0], centre[-1], centre[1], centre[-stride], centre[stride]};
+/* The best displacements of the four pixels of the parent `at`. With nothing inside the right image the prediction, the
+   first of the centres, stays. */
+RULE Children search_parent(const Pair *pair, RowLines row, const int32_t centres[CENTRES], Shift at, Shift reach) {
   Line line = line_at(row, (float)(2 * at.u) + 0.5f, row.cost);
-  Children best = {2 * at.u, 2 * at.v, {centre[0], centre[0], centre[0], centre[0]}, {FAR, FAR, FAR, FAR}};
+  int32_t own = centres[0];
+  Children best = {2 * at.u, 2 * at.v, {own, own, own, own}, {FAR, FAR, FAR, FAR}};
   /* A row about a centre fits into eight columns up to a reach of 3, and a cross has one row to either side. */
   if (pair->band.cost >= SHARP && reach.u <= 3 && reach.v <= 1) search_rows(pair, line, centres, reach, &best);
   else search_rectangles(pair, line, centres, reach, &best);

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rille.stages.core.declare import AnyArray
+from rille.stages.hfvm.epipolar import NO_BAND
 
 
 class LevelPair(NamedTuple):
@@ -18,8 +19,15 @@ class LevelPair(NamedTuple):
 
     left: AnyArray
     right: AnyArray
-    f: AnyArray
-    mu: float
+    f: AnyArray = NO_BAND
+    mu: float = 0.0
+
+
+class Map(NamedTuple):
+    """Displacements of one direction at one level, (row, col) int16 columns and rows."""
+
+    u: AnyArray
+    v: AnyArray
 
 
 class Field(NamedTuple):
@@ -38,45 +46,8 @@ class Smoothing(NamedTuple):
     beside: int
 
 
-class EdgeRule(NamedTuple):
-    """Placement of depth edges, see :mod:`rille.stages.hfvm.level`.
-
-    ``reach``: pixels to the farthest whose displacement is tried. ``apart``: pixels between displacements of two sides.
-    ``grey``: grey levels from which on a pixel does not count. ``far``: greatest distance. ``own, other``: factors of
-    what the own displacement costs, and the others, but for farther ones. ``near``: sign of the columns of nearer
-    things, 0 unknown.
-    """
-
-    reach: int
-    apart: int
-    grey: int
-    far: int
-    own: int
-    other: int
-    near: int
-
-
-class PathCosts(NamedTuple):
-    """Costs in quarters of a byte step.
-
-    ``compact``: of a byte step of compact features; ``small``: of a pixel of difference to the pixel before; ``large``:
-    the most that a difference costs, half of it at a step of ``grey`` levels.
-    """
-
-    compact: int
-    small: int
-    large: int
-    grey: int
-
-
 CANDIDATES = 8
 """Candidates of a pixel on a path; sixteen cost twice the time and change bad-2 by less than .002."""
-
-NONE = 32767
-"""Cost where there is no candidate."""
-
-FAR = 1 << 25
-"""Cost above every cost."""
 
 
 def pack_map(u: AnyArray, v: AnyArray) -> AnyArray:
@@ -87,6 +58,6 @@ def pack_map(u: AnyArray, v: AnyArray) -> AnyArray:
     return shift
 
 
-def unpacked(shift: AnyArray) -> tuple[AnyArray, AnyArray]:
+def unpacked(shift: AnyArray) -> Map:
     """The reverse of :func:`pack_map`."""
-    return shift.astype(np.int16), (shift >> 16).astype(np.int16)
+    return Map(shift.astype(np.int16), (shift >> 16).astype(np.int16))

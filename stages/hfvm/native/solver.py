@@ -24,7 +24,7 @@ def _chosen() -> Any:
     native = _native()
     # Workers are processes of their own, and one warning is enough.
     if native is None and multiprocessing.parent_process() is None:
-        text = "the compiled matcher is missing: matching takes two to four times as long, with the same results"
+        text = "the compiled matcher is missing: matching takes two to five times as long, with the same results"
         line = _warning("RIL-393", text, remedy="install a C compiler (cc), and then rille again")
         warnings.warn(line, RuntimeWarning, stacklevel=3)
     return native or reference

@@ -4,23 +4,30 @@ import numpy as np
 import pytest
 
 from rille.stages.hfvm.image import compact
-from rille.stages.hfvm.level import EDGE_RULE
 from rille.stages.hfvm.native.problem import LevelPair, pack_map, unpacked
-from rille.stages.hfvm.native.reference import EDGE_RADIUS as RADIUS
+from rille.stages.hfvm.native.reference import (
+    EDGE_GREY,
+    EDGE_REACH_PX,
+    MAX_EDGE_DISTANCE,
+    MIN_APART_PX,
+    OTHER_FACTOR,
+    OWN_FACTOR,
+)
+from rille.stages.hfvm.native.reference import EDGE_RADIUS_PX as RADIUS
 from rille.stages.hfvm.native.solver import solver
 
 ROWS, COLS = 40, 60
 
-
-REACH, GREY, FAR, BETTER = EDGE_RULE.reach, EDGE_RULE.grey, EDGE_RULE.far, (EDGE_RULE.own, EDGE_RULE.other)
-AROUND = tuple((j * k, i * k) for k in (REACH // 2, REACH) for j, i in ((1, 0), (-1, 0), (0, 1), (0, -1)))
+BETTER = OWN_FACTOR, OTHER_FACTOR
+SIDES = (1, 0), (-1, 0), (0, 1), (0, -1)
+AROUND = tuple((j * k, i * k) for k in (EDGE_REACH_PX // 2, EDGE_REACH_PX) for j, i in SIDES)
 
 
 def place(left, right, maps, wanted, near_sign):
     """Displacements with depth edges placed anew."""
     words = LevelPair(compact(left), compact(right), np.zeros((3, 3)), 0.0)
-    rule = EDGE_RULE._replace(near=int(near_sign))
-    return unpacked(solver.edges(words, np.rint(left).astype(np.int16), pack_map(*maps), wanted.view(np.uint8), rule))
+    grey = np.rint(left).astype(np.int16)
+    return unpacked(solver.edges(words, grey, pack_map(*maps), wanted.view(np.uint8), int(near_sign)))
 
 
 def by_the_equation(left, right, u, v, wanted, near_sign):
@@ -30,12 +37,12 @@ def by_the_equation(left, right, u, v, wanted, near_sign):
     a, b = (compact(side).view(np.uint8).reshape(*side.shape, 8).astype(int) for side in (left, right))
     grey = np.rint(left).astype(int)
     offsets = np.arange(-RADIUS, RADIUS + 1)
-    for y in range(REACH, rows - REACH):
-        for x in range(REACH, cols - REACH):
+    for y in range(EDGE_REACH_PX, rows - EDGE_REACH_PX):
+        for x in range(EDGE_REACH_PX, cols - EDGE_REACH_PX):
             tried = [(int(u[y, x]), int(v[y, x]))]
             for j, i in AROUND:
                 one = int(u[y + j, x + i]), int(v[y + j, x + i])
-                if all(max(abs(one[0] - p), abs(one[1] - q)) >= EDGE_RULE.apart for p, q in tried):
+                if all(max(abs(one[0] - p), abs(one[1] - q)) >= MIN_APART_PX for p, q in tried):
                     tried.append(one)
             if len(tried) == 1 or not wanted[y, x]:
                 continue
@@ -46,8 +53,8 @@ def by_the_equation(left, right, u, v, wanted, near_sign):
                     costs.append(None)
                     continue
                 window = np.ix_(y + offsets, x + offsets)
-                weight = np.maximum(GREY - abs(grey[window] - grey[y, x]), 0)
-                costs.append(int((weight * np.minimum(abs(a[window] - b[q, p]).sum(axis=-1), FAR)).sum()))
+                weight = np.maximum(EDGE_GREY - abs(grey[window] - grey[y, x]), 0)
+                costs.append(int((weight * np.minimum(abs(a[window] - b[q, p]).sum(axis=-1), MAX_EDGE_DISTANCE)).sum()))
             if costs[0] is None:
                 continue
             chosen, best = 0, BETTER[0] * costs[0]

@@ -12,17 +12,10 @@ from rille.stages.geometry.spline import coefficients
 from rille.stages.hfvm import epipolar, refinement
 from rille.stages.hfvm.finest import lonely
 from rille.stages.hfvm.image import Layer, compact
-from rille.stages.hfvm.level import FREE_BAND, Look, Map, paths
+from rille.stages.hfvm.level import FREE_BAND, Look, paths
 from rille.stages.hfvm.native import reference
-from rille.stages.hfvm.native.problem import (
-    CANDIDATES,
-    NONE,
-    Field,
-    LevelPair,
-    PathCosts,
-    pack_map,
-    unpacked,
-)
+from rille.stages.hfvm.native.problem import CANDIDATES, Field, LevelPair, pack_map, unpacked
+from rille.stages.hfvm.native.reference import NO_CANDIDATE
 from rille.stages.hfvm.params import PRESETS, HfvmParams
 from rille.stages.hfvm.refinement import SplineImages
 from rille.stages.hfvm.stage import match
@@ -38,9 +31,9 @@ def view(image):
     )
 
 
-def propagated(left, right, start, up=None):
+def propagated(left, right, start):
     """Displacements of two images improved along paths."""
-    look = Look(1, view(left), view(right), None if up is None else Map(*up), FREE_BAND, 0.0, 1, ACC)
+    look = Look(1, view(left), view(right), None, FREE_BAND, 0.0, 1, ACC)
     nothing = np.zeros(left.shape, np.int32)
     return unpacked(paths(look, Field(pack_map(*start), nothing)).shift)
 
@@ -124,17 +117,17 @@ def test_path_costs_are_those_of_the_definition(seed):
     shape = (4, 5, CANDIDATES)
     cu, cv = rng.integers(-9, 9, (2, *shape)).astype(np.int16)
     cost = rng.integers(0, 16001, shape).astype(np.int32)
-    cost[rng.random(shape) < 0.2] = NONE
+    cost[rng.random(shape) < 0.2] = NO_CANDIDATE
     cost[..., 0] = np.minimum(cost[..., 0], 16000)  # a pixel has one candidate at least: its own
     grey = rng.uniform(0, 255, shape[:2]).astype(np.float32)
     total = np.zeros(shape, np.int32)
-    for backward in (False, True):
-        reference._sweep((pack_map(cu, cv), cost), grey, PathCosts(8, 36, 240, 10), backward, total)
-    there = cost != NONE
+    for sign in (1, -1):
+        reference._sweep(pack_map(cu, cv), cost, grey, sign, total)
+    there = cost != NO_CANDIDATE
     np.testing.assert_array_equal(total[there], brute_force(cu, cv, cost, grey, 36, 240, 10.0)[there])
 
 
-def listed(maps, up, y, x, right_shape):
+def listed(maps, y, x, right_shape):
     """Candidates (u, v) of a pixel by their definition."""
     u, v = maps
     rows, cols = u.shape
@@ -143,12 +136,6 @@ def listed(maps, up, y, x, right_shape):
     for j, i in reference.AROUND:
         near = min(max(y + j, 0), rows - 1), min(max(x + i, 0), cols - 1)
         more.append((u[near], v[near]))
-    for k in range(9 if up is not None else 0):
-        above = (
-            min(max(y // 2 + k // 3 - 1, 0), up[0].shape[0] - 1),
-            min(max(x // 2 + k % 3 - 1, 0), up[0].shape[1] - 1),
-        )
-        more.append((2 * up[0][above], 2 * up[1][above]))
     for a, b in more:
         inside = 0 <= x + a < right_shape[1] and 0 <= y + b < right_shape[0]
         if inside and (int(a), int(b)) not in found and len(found) < CANDIDATES:
@@ -157,28 +144,26 @@ def listed(maps, up, y, x, right_shape):
 
 
 @pytest.mark.parametrize("mu", [0.0, 3.0])
-@pytest.mark.parametrize("with_up", [False, True])
-def test_candidates_and_their_costs_are_those_of_the_definition(mu, with_up):
+def test_candidates_and_their_costs_are_those_of_the_definition(mu):
     rng = np.random.default_rng(3)
     left, right = (rng.uniform(0, 255, shape).astype(np.float32) for shape in ((11, 14), (12, 17)))
     a, b = view(left), view(right)
     maps = rng.integers(-6, 6, (2, *left.shape)).astype(np.int16)
-    up = rng.integers(-3, 3, (2, 6, 7)).astype(np.int16) if with_up else None
     f = rng.normal(0, 1, (3, 3))
     lines = epipolar.lines(f, left.shape)
-    compact_pair = LevelPair(a.compact, b.compact, np.zeros((3, 3)), 0.0)
     shift, cost = np.empty((2, *left.shape, CANDIDATES), np.int32)
-    above = (np.zeros((0, 0), np.int16),) * 2 if up is None else tuple(up)
-    given = (compact_pair, 8), above, pack_map(*maps), (shift, cost)
-    reference._candidates(LevelPair(a.words, b.words, f, mu), *given)
+    for y, x in np.ndindex(left.shape):
+        line = epipolar.line(epipolar.row_terms(f, float(y)), np.float32(x), np.float32(12 * mu))
+        pairs = LevelPair(a.words, b.words, f, mu), LevelPair(a.compact, b.compact)
+        reference._listed(*pairs, pack_map(*maps), (y, x, line), shift[y, x], cost[y, x])
     cu, cv = unpacked(shift)
 
     def apart(word, other):
         return int(np.abs(bytes_of(word).astype(int) - bytes_of(other)).sum())
 
     for y, x in np.ndindex(left.shape):
-        want = listed(maps, up, y, x, right.shape)
-        there = cost[y, x] != NONE
+        want = listed(maps, y, x, right.shape)
+        there = cost[y, x] != NO_CANDIDATE
         assert list(zip(cu[y, x, there].tolist(), cv[y, x, there].tolist(), strict=True)) == want
         for k, (i, j) in enumerate(want):
             expected = reference.OUTSIDE
@@ -221,7 +206,7 @@ def test_the_true_map_of_equal_images_stays():
 def test_paths_on_tiny_images(shape):
     image = np.random.default_rng(0).uniform(0, 255, shape).astype(np.float32)
     start = np.full(shape, 5, np.int16)  # leads out
-    u, v = propagated(image, image, (start, start), (start, start))
+    u, v = propagated(image, image, (start, start))
     assert u.shape == v.shape == shape
 
 

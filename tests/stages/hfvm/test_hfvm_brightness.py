@@ -7,7 +7,7 @@ from matching_scenes import pair, seen
 from rille.stages.core.validity import matched
 from rille.stages.hfvm import coarse
 from rille.stages.hfvm.image import Window
-from rille.stages.hfvm.image import view as image_of
+from rille.stages.hfvm.image import as_matched as image_of
 from rille.stages.hfvm.level import FREE_BAND, Map, State
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
@@ -17,7 +17,7 @@ SHAPE = (160, 220)
 RATIO = np.array([0.2, -0.1, 0.15, 0.3, -0.05, 0.2, 0.04])
 
 
-def view(image):
+def as_matched(image):
     return image_of(build(image, PyramidParams()), HfvmParams(denoise_from=1e6))
 
 
@@ -46,7 +46,7 @@ def test_terms_mean_the_same_place_on_each_level():
 
 @pytest.mark.parametrize("level", [0, 2])
 def test_levelled_view_is_multiplied_by_the_exponential(level):
-    plain = view(np.random.default_rng(0).uniform(10, 200, SHAPE).astype(np.float32))
+    plain = as_matched(np.random.default_rng(0).uniform(10, 200, SHAPE).astype(np.float32))
     found = coarse.levelled(plain, RATIO)
     window = Window(3, 30, 5, 41)
     expected = plain.layers[level].grey * np.exp(logarithm(plain.shapes[level], level))
@@ -61,18 +61,18 @@ def test_matches_tell_the_ratio_though_a_third_is_wrong():
     right = left / np.exp(logarithm(SHAPE)).astype(np.float32)
     u = np.where(rng.random(SHAPE) < 1 / 3, 7, 0).astype(np.int16)
     ok = np.arange(SHAPE[1]) < SHAPE[1] - 7
-    found = coarse.ratio_of_matches(view(left), view(right), state(0, u, np.broadcast_to(ok, SHAPE).copy()))
+    found = coarse.ratio_of_matches(as_matched(left), as_matched(right), state(0, u, np.broadcast_to(ok, SHAPE).copy()))
     y, x = np.indices(SHAPE)
     # a wrong match errs by .28 in the mean of squares; held down by the robust fit and by 2600 others
     off = np.tensordot(found - RATIO, coarse.terms(x, y, 0, SHAPE), 1)
     assert np.abs(off).mean() < 0.02
-    assert coarse.ratio_of_matches(view(left), view(right), state(0, u, np.zeros(SHAPE, bool))) is None
+    assert coarse.ratio_of_matches(as_matched(left), as_matched(right), state(0, u, np.zeros(SHAPE, bool))) is None
 
 
 def test_guess_of_one_scene_in_two_lights():
     left = np.random.default_rng(2).uniform(60, 120, SHAPE).astype(np.float32)
     right = left / np.exp(logarithm(SHAPE)).astype(np.float32)
-    found = coarse.guess(view(left), view(right), 2)
+    found = coarse.guess(as_matched(left), as_matched(right), 2)
     assert coarse.greatest(found - RATIO) < 0.1 < coarse.greatest(RATIO)
 
 
@@ -94,7 +94,7 @@ def test_dark_corners_of_one_image_cost_no_matches(preset):
 
 def test_equal_light_is_left_alone():
     left, right, *_ = pair(lambda x, y: (-12 + 3 * np.sin(x / 40), 0 * x), SHAPE)
-    views = view(left), view(right)
+    views = as_matched(left), as_matched(right)
     level = 2
     shape = views[0].shapes[level]
     u = np.full(shape, -3, np.int16)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from rille.stages.hfvm import epipolar, paper
-from rille.stages.hfvm.level import Map
 from rille.stages.hfvm.native import reference
-from rille.stages.hfvm.native.problem import FAR, Field, LevelPair, Smoothing, pack_map, unpacked
+from rille.stages.hfvm.native.problem import Field, LevelPair, Map, Smoothing, pack_map, unpacked
+from rille.stages.hfvm.native.reference import FAR
 
 ROWS, COLS = 11, 13
 
@@ -239,7 +239,7 @@ def test_papers_search_is_equation_1_to_3():
     weights = (2.0, 2.0, 3.0, 3.0, 3.0, 3.0, 10.0, 4.0)
     a, b = (paper.weighted(p, weights) for p in planes)
     centre_u, centre_v = rng.integers(-2, 3, (2, 10, 12)).astype(np.int16)
-    u, v, d, _ = paper._search(a, b, Map(centre_u, centre_v), (2, 1))
+    u, v, d, _ = paper.search(a, b, Map(centre_u, centre_v), (2, 1))
     w = np.array(weights)
     for y in range(10):
         for x in range(12):

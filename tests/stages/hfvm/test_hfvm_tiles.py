@@ -5,8 +5,7 @@ import pytest
 from matching_scenes import pair
 
 from rille.stages.core.validity import matched
-from rille.stages.hfvm.finest import _bounded
-from rille.stages.hfvm.image import Window, thinned, tiles, view, whole
+from rille.stages.hfvm.image import Window, as_matched, thinned, tiles, whole
 from rille.stages.hfvm.matcher import How, local
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
@@ -87,7 +86,7 @@ def test_denoising_averages_noise_and_keeps_texture_on_every_level():
     scene = np.where(x < 120, 90.0, 90.0 + 80 * ((x // 8 + y // 8) % 2))
     noisy = build(scene + rng.normal(0, 4, scene.shape), PyramidParams())
     assert noisy.noise > 2
-    quiet = view(noisy, HfvmParams())
+    quiet = as_matched(noisy, HfvmParams())
     assert quiet.noise == noisy.noise
     for level in range(3):
         before, after = noisy.images[level], quiet.layers[level].grey
@@ -101,7 +100,7 @@ def test_denoising_averages_noise_and_keeps_texture_on_every_level():
 
 def test_views_without_noise_are_left_as_they_are():
     pyramid = build(misaligned()[1], PyramidParams())
-    image = view(pyramid, HfvmParams(denoise_from=9.0))
+    image = as_matched(pyramid, HfvmParams(denoise_from=9.0))
     assert image.noise == 0
     np.testing.assert_array_equal(image.layers[1].grey, pyramid.images[1])
 
@@ -126,4 +125,4 @@ def test_windows():
     assert Window(2, 9, 4, 7).parent() == Window(1, 5, 2, 4)
     assert Window(1, 5, 2, 4).child((9, 7)) == Window(2, 9, 4, 7)
     # nothing of it lies in the image: still two pixels, which no place can mean
-    assert _bounded(Window(-9, -5, 20, 30), (10, 7), 2) == Window(0, 2, 4, 7)
+    assert Window(-9, -5, 20, 30).grow(2, 2, (10, 7)) == Window(0, 2, 4, 7)

@@ -7,7 +7,7 @@ from matching_scenes import Texture, pair, seen
 
 from rille.stages.core.validity import matched
 from rille.stages.hfvm import plane
-from rille.stages.hfvm.image import view
+from rille.stages.hfvm.image import as_matched
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
 from rille.stages.imaging.pyramid import PyramidParams, build
@@ -64,7 +64,8 @@ def test_a_plane_fitted_to_chance_matches_does_not_rule_out_a_turn(monkeypatch):
 
 def test_keypoints_tell_the_homography_at_full_resolution():
     left, right, u, v = turned(75, 1.2)
-    views = [view(build(cv2.resize(image, None, fx=4, fy=4), PyramidParams()), HfvmParams()) for image in (left, right)]
+    large = (build(cv2.resize(image, None, fx=4, fy=4), PyramidParams()) for image in (left, right))
+    views = [as_matched(pyramid, HfvmParams()) for pyramid in large]
     assert max(views[1].shapes[0]) > plane.MAX_SIDE_PX
     h = plane.find_turn(*views)
     x, y, _ = h @ (4 * 100 + 1.5, 4 * 80 + 1.5, 1) / (h[2] @ (4 * 100 + 1.5, 4 * 80 + 1.5, 1))
@@ -80,7 +81,7 @@ def test_unrelated_views_are_refused(right):
         "nothing": np.full(SHAPE, 90, np.float32),
         "mirrored": np.ascontiguousarray(Texture(0)(x, y)[:, ::-1]),
     }
-    views = [view(build(image, PyramidParams()), HfvmParams()) for image in (Texture(0)(x, y), images[right])]
+    views = [as_matched(build(image, PyramidParams()), HfvmParams()) for image in (Texture(0)(x, y), images[right])]
     assert plane.find_turn(*views) is None
 
 
