@@ -59,16 +59,13 @@ def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, led
     graph = Graph()
 
     def node(stage: Any, label: str, **given: Any) -> Any:
-        params = MergeParams() if stage is merge_stage else NoParams()
-        inputs = {port: given.pop(port) for port in stage.ports() if port in given}
-        return graph.node(stage, label, params, {k: v for k, v in given.items() if v is not None}, {}, inputs)
+        return graph.call(stage, label, MergeParams() if stage is merge_stage else NoParams(), **given)
 
-    dems = {}
+    dems: dict[int, Any] = {}
     for k, (i, j) in enumerate(where):
         args = {"pair": k, "i0": i, "j0": -j, "cells": cells}
         dems[k] = graph.node("benchmarks.merge_scale", f"dem/{k}", NoParams(), args, {}, {})
-    cut = {"side": TILE_CELLS, "margin": 0}
-    prints = [node(tile_index_stage, f"tile_index/{k}", dem=dem, **cut) for k, dem in dems.items()]
+    prints = [node(tile_index_stage, f"tile_index/{k}", dem=dem, side=TILE_CELLS) for k, dem in dems.items()]
 
     def follow() -> Any:
         found = yield prints

@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -55,19 +56,23 @@ DEGRADATIONS: dict[str, Callable[[Grey], Grey]] = {
 """What is done to the right image; the knocks below move the truth, too."""
 
 
+def changed(pair: Any, change: Callable[[Grey], Grey]) -> Any:
+    return replace(pair, right=change(pair.right))
+
+
 def cases() -> Iterable[tuple[str, Callable[[Any], Any]]]:
     from stereo.misalignment import knocked
 
     from rille.datasets.images.misalign import MisalignParams
 
     for name, change in DEGRADATIONS.items():
-        yield name, lambda pair, change=change: replace(pair, right=change(pair.right))
+        yield name, partial(changed, change=change)
     for name, knock in (
         ("2 rows", {"rows": 2.0}),
         ("0.5 degrees", {"roll_deg": 0.5}),
         ("2 degrees", {"roll_deg": 2.0}),
     ):
-        yield name, lambda pair, knock=knock: knocked(pair, MisalignParams(**knock))
+        yield name, partial(knocked, params=MisalignParams(**knock))
 
 
 def main() -> None:

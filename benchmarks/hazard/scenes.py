@@ -7,7 +7,6 @@ one lattice, and what is exact is so in the exact frame: an error of the vertica
 from __future__ import annotations
 
 import hashlib
-import importlib
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,15 +19,17 @@ from numpy.typing import NDArray
 from rille.datasets.mockup.params import MockupParams
 from rille.datasets.mockup.sequence import mockup
 from rille.datasets.protocol import Source
+from rille.pipeline.engine.spec import resolve
 from rille.pipeline.flow import config
 from rille.stages.core.validity import matched_back
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.hfvm.stage import match
+from rille.stages.terrain.ground import view_ground
 from rille.stages.terrain.ground_frame import GroundFrameParams, VerticalHint, level, z_range
-from rille.stages.terrain.locus.solve import Matches
-from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, local_lattice, reconstruct
+from rille.stages.terrain.locus.solve import LocusParams, Matches
+from rille.stages.terrain.locus.stage import MatchedPair, local_lattice, reconstruct
 
 Floats32 = NDArray[np.float32]
 
@@ -86,7 +87,7 @@ def fetcher() -> Callable[[Source], Any]:
         if not source.args and key in kept:
             return kept[key]
         inputs = {port: run(upstream) for port, upstream in source.inputs.items()}
-        out = importlib.import_module(source.module).STAGE.run(source.params, dict(source.args), inputs)
+        out = resolve(source.module).run(source.params, dict(source.args), inputs)
         if not source.args:
             kept[key] = out
         return out
@@ -144,8 +145,9 @@ def _reconstructed(
     given = pair.matches(pair.forth)
     usable = matched_back(pair.forth.validity, pair.forth.backmatch_error)
     facts = level(given.column, given.row, usable, pair.rig, GroundFrameParams(), VerticalHint(up=up))
-    lattice = lattice or local_lattice(pair.rig, facts, CELL, pair.params)
     T_local_left = RigidTransform.from_matrix(facts["T_local_left"])
+    view = view_ground(pair.rig, T_local_left.rotation, facts["plane"])
+    lattice = lattice or local_lattice(view, CELL, pair.params)
     low, high = z_range(facts["plane"], facts["relief"], list(lattice.bounds))
     left, right = (np.asarray(image, np.float32) for image in pair.images)
     both = MatchedPair(left, given, right, None if pair.back is None else pair.matches(pair.back))

@@ -97,11 +97,12 @@ def settings(sequence: Sequence, assignments: list[str]) -> Any:
 
 
 class Chain:
-    """One run of the stages; ``cameras`` are the left camera as given, and as it was corrected so far."""
+    """One run of the stages; ``before``: corrections of the calibration that were made already, and ``first`` the rig
+    before them."""
 
-    def __init__(self, images: Images, config: Any, cameras: tuple[Any, ...] = ()) -> None:
+    def __init__(self, images: Images, config: Any, before: tuple[Any, ...] = (), first: Any = None) -> None:
         self.images, self.sequence, self.config = images, images.sequence, config
-        self.cameras = (*cameras, self.sequence.rig.left.to_dict())
+        self.before, self.first = before, first
         self.frames = list(images.frames)
         self.clock = Clock()
         self._pyramids: dict[tuple[int, str], Bundle] = {}
@@ -120,16 +121,19 @@ class Chain:
         self.disparity = {k: self._match(k) for k in basic}
         self.calibration = self._calibration(basic)
         segments = [self._segment(part) for part in parts]
-        given = {"segments": [r for r, _, _ in segments], "levels": [level for _, level, _ in segments]}
+        given: dict[str, Any] = {"segments": [r for r, _, _ in segments], "levels": [level for _, level, _ in segments]}
         if self.config.refine.enabled:
             given["refined"] = self._refined(segments)
-            first = {"given": self.cameras[0]} if len(self.cameras) > 1 else {}
-            found = self._stage("intrinsics", first, segments=given["refined"], rig=self.calibration)
+            args: dict[str, Any] = {"before": np.sum(self.before, axis=0).tolist()} if self.before else {}
+            args["fixed"] = self.config.rig.mode == "fixed"
+            found = self._stage("intrinsics", args, segments=given["refined"], rig=self.calibration)
             given["intrinsics"] = found
-            if any(found.meta["correction"]) and len(self.cameras) <= CALIBRATIONS:
+            if any(found.meta["correction"]) and len(self.before) < CALIBRATIONS:
                 other = copy.copy(self.images)
-                other.sequence = recalibrated(self.sequence, found.meta["correction"])
-                return Chain(other, self.config, self.cameras).run()
+                change = found.meta["correction"]
+                other.sequence = recalibrated(self.sequence, change, found.meta["rig"])
+                first = self.first or self.sequence.rig.to_dict()
+                return Chain(other, self.config, (*self.before, change), first).run()
         trajectory = self._stage("trajectory", {"frames": self.frames, "lost": lost}, **given)
         facts = {"basic": basic, "select": select.meta, "resect": [r.meta for r, _, _ in segments]}
         facts |= {"intrinsics": given["intrinsics"].meta if "intrinsics" in given else {}}
@@ -188,7 +192,8 @@ class Chain:
     def _calibration(self, basic: list[int]) -> Bundle:
         rig = self.sequence.rig.to_dict()
         orientations = [self._stage("orientation", {"pair": k, "rig": rig}, disparity=self.disparity[k]) for k in basic]
-        found = self._stage("rig", {"rig": rig}, orientations=orientations)
+        given = {"rig": rig} | ({"first": self.first} if self.first else {})
+        found = self._stage("rig", given, orientations=orientations)
         self.rig_facts = found.meta
         return self._stage("calibration", {}, rig=found)
 
