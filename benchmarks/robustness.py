@@ -56,7 +56,7 @@ DEGRADATIONS: dict[str, Callable[[Grey], Grey]] = {
 """What is done to the right image; the knocks below move the truth, too."""
 
 
-def changed(pair: Any, change: Callable[[Grey], Grey]) -> Any:
+def altered(pair: Any, change: Callable[[Grey], Grey]) -> Any:
     return replace(pair, right=change(pair.right))
 
 
@@ -66,7 +66,7 @@ def cases() -> Iterable[tuple[str, Callable[[Any], Any]]]:
     from rille.datasets.images.misalign import MisalignParams
 
     for name, change in DEGRADATIONS.items():
-        yield name, partial(changed, change=change)
+        yield name, partial(altered, change=change)
     for name, knock in (
         ("2 rows", {"rows": 2.0}),
         ("0.5 degrees", {"roll_deg": 0.5}),
@@ -78,6 +78,7 @@ def cases() -> Iterable[tuple[str, Callable[[Any], Any]]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--preset", action="append", help="of Rille's matcher; may be repeated (default)")
+    parser.add_argument("--pairs", type=int, help="so many of each half only")
     given = parser.parse_args()
     from rille.pipeline.engine.runtime.environment import prepare_environment
 
@@ -97,7 +98,7 @@ def main() -> None:
     for half, pairs in halves().items():
         clean: dict[tuple[str, str], float] = {}
         for case, change in cases():
-            changed = {pair.name: change(pair) for pair in pairs}
+            changed = {pair.name: change(pair) for pair in pairs[: given.pairs]}
             peers = {name: judge(peer(pair), pair.truth)["bad2"] for name, pair in changed.items()}
             for method in (peer, *mine):
                 found = {name: judge(method(pair), pair.truth) for name, pair in changed.items()}
