@@ -35,6 +35,7 @@ OCCLUDED = 0.005
 """Share of the depth by which a point must lie behind what the other view shows there, to be hidden from it."""
 
 
+@np.errstate(invalid="ignore")  # NaN where there is no depth
 def lunar(folder: Path, first: int, second: int) -> tuple[Any, ...] | None:
     """Both images, exact displacements (u, v), and which left pixels the right view sees."""
     names = [folder / f"im_{n:05d}" for n in (first, second)]
