@@ -61,7 +61,7 @@ bench: $(TOOLS) ## side-by-side measurements: every figure of the README; ONLY=m
 	@$(if $(filter-out $(BENCHMARKS),$(ONLY)),echo "no such benchmark: $(filter-out $(BENCHMARKS),$(ONLY)); ONLY= any of: $(BENCHMARKS)" >&2; exit 2)
 	@for b in $(or $(ONLY),$(BENCHMARKS)); do echo "== $$b"; $(BIN)/python benchmarks/record.py $$b $(ARGS) || exit 1; done
 
-lint: $(TOOLS) ## ruff and mypy
+lint: $(TOOLS) ## ruff and mypy, of the benchmarks too
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

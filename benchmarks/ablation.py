@@ -93,7 +93,7 @@ def judged(method: Any, pair: Any) -> dict[str, float]:
     figures = {**judge(found, pair.truth), "seconds": seconds}
     figures |= {"bad1_own": figures["bad1"], "bad2_own": figures["bad2"]}
     if found.dense is not None:
-        off = error(Found(*found.dense, found.matched, found.rows), pair.truth)[pair.truth.known]
+        off = error(Found(found.dense[0], found.dense[1], found.matched, found.rows), pair.truth)[pair.truth.known]
         figures |= {f"bad{n}_own": float((~(off <= n)).mean()) for n in (1, 2)}
     return figures
 

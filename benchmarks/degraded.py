@@ -98,9 +98,14 @@ def _exchanged(pairs: Pairs) -> None:
     pairs.right[2], pairs.right[4] = pairs.right[4], pairs.right[2]
 
 
+def _blackened(pairs: Pairs) -> None:
+    pairs.at([3], np.zeros_like)
+    pairs.at([5], np.zeros_like, left=False)
+
+
 KINDS: dict[str, Callable[[Pairs], None]] = {
     "dropped": _dropped,
-    "black": lambda pairs: (pairs.at([3], np.zeros_like), pairs.at([5], np.zeros_like, left=False))[0],
+    "black": _blackened,
     "knocked": lambda pairs: pairs.at(range(4, FRAMES), _shifted, left=False),
     "doubled": _doubled,
     "exchanged": _exchanged,
@@ -225,7 +230,7 @@ def main() -> int:
         root = Path(at)
         cases = [(scene, kind) for scene in scenes(root, options.scenes, options.jobs) for kind in options.only]
         with ThreadPoolExecutor(options.jobs) as pool:
-            results = pool.map(lambda case: run(*case, root), cases)
+            results = pool.map(lambda case: run(case[0], case[1], root), cases)
             for (scene, kind), (ended, posed, line, seconds) in zip(cases, results, strict=True):
                 table[kind].update({ended: 1, "trajectory": int(posed)})
                 shown = "trajectory" if posed else "-"

@@ -74,7 +74,7 @@ def trajectory_of(sequence: Any, frames: tuple[int, ...], cache: Path, settings:
     class Odometry(Graph):
         """Leaves out elevation models, truth, and what would follow from them."""
 
-        def node(self, stage: Any, *args: Any, **more: Any) -> Handle:
+        def node(self, stage: Any, *args: Any, **more: Any) -> Handle:  # type: ignore[override]
             handle = super().node(stage, *args, **more)
             if handle.stage in ("locus", "truth") or any(h not in self.nodes for h in handle.upstream()):
                 self.nodes.remove(handle)

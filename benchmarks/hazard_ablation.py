@@ -36,7 +36,7 @@ def replacements() -> dict[str, tuple[Any, str, Any]]:
     }
     for measure in measures.MEASURES:
         rest = tuple(m for m in measures.MEASURES if m is not measure)
-        ideas[measure.words] = (risk, "classify", partial(risk.classify, measures=rest))
+        ideas[measure.words] = (risk, "classify", partial(classification.classify, measures=rest))
     return ideas
 
 

@@ -54,6 +54,7 @@ def measure(name: str, files: list[str]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--image", nargs=2, help="left and right image")
+    parser.add_argument("--rounds", type=int, default=ROUNDS, help=f"of both solvers (default {ROUNDS})")
     parser.add_argument("--solver", help=argparse.SUPPRESS)
     options = parser.parse_args()
     files = options.image
@@ -65,7 +66,7 @@ def main() -> None:
         return
     found: dict[tuple[str, str], tuple[str, float]] = {}
     # Round by round, as the machine is not equally fast all the time.
-    for name in SOLVERS * ROUNDS:
+    for name in SOLVERS * options.rounds:
         command = [sys.executable, "-W", "ignore", __file__, "--solver", name, "--image", *files]
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
         for preset, digest, seconds in map(str.split, done.stdout.splitlines()):

@@ -97,9 +97,10 @@ def watched(command: list[str], folder: Path) -> tuple[int, float, list[Sample]]
 
 def resident(process: psutil.Process) -> int:
     """Resident bytes of a process; none of one that has ended."""
-    with suppress(psutil.Error):
+    try:
         return int(process.memory_info().rss)
-    return 0
+    except psutil.Error:
+        return 0
 
 
 def verdict(kept: bool) -> str:

@@ -19,6 +19,7 @@ import json
 import math
 import os
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -97,9 +98,9 @@ def compare(name: str, given: argparse.Namespace) -> list[dict[str, Any]]:
     def rille(preset: str) -> Any:
         return chain.Chain(images, chain.settings(sequence, [*PRESETS[preset], *given.set])).run()
 
-    methods = [("OpenCV odometry", lambda: opencv.Odometry(images).run(), given.rounds)]
+    methods: list[tuple[str, Any, int]] = [("OpenCV odometry", lambda: opencv.Odometry(images).run(), given.rounds)]
     for preset in given.preset or PRESETS:
-        methods += [(f"Rille {preset}", lambda p=preset: rille(p), given.rounds)]
+        methods += [(f"Rille {preset}", partial(rille, preset), given.rounds)]
     if not given.no_colmap:
         methods.append(("COLMAP", lambda: colmap.run(images, chain.settings(sequence, given.set)), 0))
     found: dict[str, dict[str, Any]] = {}

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -106,6 +105,7 @@ def cases(sequence: str, count: int) -> Iterator[tuple[str, Any, Any]]:
 
 
 def row(name: str, ours: Any, theirs: Any) -> list[str]:
+    import numpy as np
     from odometry.chain import STAGES
 
     from rille.stages.core.declare import Bundle
@@ -113,7 +113,8 @@ def row(name: str, ours: Any, theirs: Any) -> list[str]:
     stage = STAGES["agreement"]
     trajectory = Bundle({"poses": ours}, {"frames": theirs.meta["frames"]})
     facts = stage.run(stage.params(), {}, {"trajectory": trajectory, "crosscheck": theirs}).meta
-    value = {name: metric["value"] for name, metric in facts["metrics"].items()}
+    # Too few frames leave figures undefined.
+    value = {name: float(np.nan if m["value"] is None else m["value"]) for name, m in facts["metrics"].items()}
     flagged = " ".join(str(item["frame"]) for item in facts["flagged"]) or "-"
     figures = (1e3 * value["rmse"], 1e3 * value["step_rmse"], value["step_rmse_rotation"], value["scale_ratio"])
     return [name, flagged, *(f"{figure:.3g}" for figure in figures[:3]), f"{figures[3]:.4f}", str(facts["compared"])]
@@ -135,4 +136,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

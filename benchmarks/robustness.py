@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -55,24 +56,29 @@ DEGRADATIONS: dict[str, Callable[[Grey], Grey]] = {
 """What is done to the right image; the knocks below move the truth, too."""
 
 
+def altered(pair: Any, change: Callable[[Grey], Grey]) -> Any:
+    return replace(pair, right=change(pair.right))
+
+
 def cases() -> Iterable[tuple[str, Callable[[Any], Any]]]:
     from stereo.misalignment import knocked
 
     from rille.datasets.images.misalign import MisalignParams
 
     for name, change in DEGRADATIONS.items():
-        yield name, lambda pair, change=change: replace(pair, right=change(pair.right))
+        yield name, partial(altered, change=change)
     for name, knock in (
         ("2 rows", {"rows": 2.0}),
         ("0.5 degrees", {"roll_deg": 0.5}),
         ("2 degrees", {"roll_deg": 2.0}),
     ):
-        yield name, lambda pair, knock=knock: knocked(pair, MisalignParams(**knock))
+        yield name, partial(knocked, params=MisalignParams(**knock))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--preset", action="append", help="of Rille's matcher; may be repeated (default)")
+    parser.add_argument("--pairs", type=int, help="so many of each half only")
     given = parser.parse_args()
     from rille.pipeline.engine.runtime.environment import prepare_environment
 
@@ -92,7 +98,7 @@ def main() -> None:
     for half, pairs in halves().items():
         clean: dict[tuple[str, str], float] = {}
         for case, change in cases():
-            changed = {pair.name: change(pair) for pair in pairs}
+            changed = {pair.name: change(pair) for pair in pairs[: given.pairs]}
             peers = {name: judge(peer(pair), pair.truth)["bad2"] for name, pair in changed.items()}
             for method in (peer, *mine):
                 found = {name: judge(method(pair), pair.truth) for name, pair in changed.items()}

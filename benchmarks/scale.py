@@ -90,7 +90,9 @@ def _measured(ensure: Callable[..., Any]) -> Callable[..., Any]:
 
 
 if os.environ.get(UNFLUSHED) is not None and __name__ == "idle.source":  # in a worker, as it imports its first stage
-    from rille.pipeline.engine import workers as base
+    from rille.pipeline.engine import workers
+
+    base: Any = workers
 
     base.ensure = _measured(base.ensure)
     if os.environ[UNFLUSHED]:
@@ -214,7 +216,7 @@ def graph_of(pairs: int) -> Any:
     class Idle(Graph):
         """Takes for each stage the one that does nothing."""
 
-        def node(self, stage: Any, *args: Any, **more: Any) -> Handle:
+        def node(self, stage: Any, *args: Any, **more: Any) -> Handle:  # type: ignore[override]
             return super().node(stage if isinstance(stage, str) else f"idle.{stage.name}", *args, **more)
 
     none = NoParams()

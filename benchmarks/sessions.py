@@ -59,7 +59,7 @@ def moved_stones(seed: int, moves: list[np.ndarray]) -> Any:
                     way = rng.uniform(0, 2 * np.pi)
                     step = MOVE_M * np.array([np.cos(way), np.sin(way)])
                     shares = [place + step / [p.bed_width, p.bed_length] for place in rock.places]
-                    x, y = (rock.places[0] - [0.5, 1.0]) * [p.bed_width, -p.bed_length]
+                    x, y = (next(iter(rock.places)) - [0.5, 1.0]) * [p.bed_width, -p.bed_length]
                     moves.append(np.array([x, y, x + step[0], y - step[1]]))
                     rock = rock._replace(places=shares)
             yield rock
@@ -78,12 +78,12 @@ class Session:
         from rille.pipeline.commands.sequences.datasets import export_dataset
 
         p, original = MockupParams(**parameters), terrain._scattered
-        given = [f"mockup.{key}={value}" for key, value in parameters.items()]
+        given = tuple(f"mockup.{key}={value}" for key, value in parameters.items())
         try:
             terrain._scattered = stones or original
             # A cache of its own: that stones were moved enters no key.
             if not (place / name).exists():
-                export_dataset("mockup", place / name, assignments=given, cache=place / f"cache-{name}")
+                export_dataset("mockup", place / name, assignments=given, cache=str(place / f"cache-{name}"))
             self.scene = build_scene(p.part(SceneParams))
         finally:
             terrain._scattered = original
@@ -154,7 +154,7 @@ def judge(seed: int, place: Path) -> str:
     listed = np.array([[p["x_m"], p["y_m"]] for p in patches]).reshape(-1, 2)
     middles = at[scipy.spatial.cKDTree(xy).query(listed)[1], :2]
     volumes = np.array([p["volume_m3"] for p in patches])
-    sides, ratios, stones, found_stones = 0, [], 0, 0
+    sides, ratios, stones, found_stones = 0, list[float](), 0, 0
     for move in np.unique(moves, axis=0):
         about = tree.query_ball_point(move.reshape(2, 2), 0.5 * SIZES_M[1] + MOVE_M)
         near = np.unique(np.concatenate(about).astype(int))

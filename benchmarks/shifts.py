@@ -81,7 +81,7 @@ def matchers(pandora2d: Path | None) -> dict[str, Matcher]:
         return run
 
     def dis(left: Grey, right: Grey) -> Vectors:
-        flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(left, right, None)
+        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(left, right, None)
         return flow[..., 0], flow[..., 1]
 
     found: dict[str, Matcher] = {f"HFVM {p}": hfvm(p) for p in ("fast", "default", "accurate")} | {"DIS": dis}

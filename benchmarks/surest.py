@@ -112,8 +112,8 @@ def main() -> None:
     from rille.pipeline.engine import events
     from rille.pipeline.engine.store.base import Store
     from rille.pipeline.runs import lookup
-    from rille.pipeline.runs.options import cache_folder
-    from rille.pipeline.runs.session import Options, perform
+    from rille.pipeline.runs.options import Options, cache_folder
+    from rille.pipeline.runs.session import perform
 
     cache = cache_folder(given.cache)
     if given.run is None and perform(SEQUENCE, Options((PRESET,), runs=given.runs, cache=str(cache))).code:

@@ -35,6 +35,7 @@ OCCLUDED = 0.005
 """Share of the depth by which a point must lie behind what the other view shows there, to be hidden from it."""
 
 
+@np.errstate(invalid="ignore")  # NaN where there is no depth
 def lunar(folder: Path, first: int, second: int) -> tuple[Any, ...] | None:
     """Both images, exact displacements (u, v), and which left pixels the right view sees."""
     names = [folder / f"im_{n:05d}" for n in (first, second)]
@@ -60,7 +61,8 @@ def photographs(data: Path) -> Iterator[tuple[str, Any, Any, Any]]:
     """Name, left and right image, and column disparity (right minus left, NaN unknown) of rectified pairs."""
     from stereo.pairs import read_image, read_truth
 
-    files = [("motorcycle", ["motorcycle_left.png", "motorcycle_right.png", "motorcycle_disp.npz"], None)]
+    names = ["motorcycle_left.png", "motorcycle_right.png", "motorcycle_disp.npz"]
+    files: list[tuple[str, list[str], float | None]] = [("motorcycle", names, None)]
     files += [("cones", ["cones_image_02.png", "cones_image_06.png", "cones_disp_02.png"], 4.0)]
     more = sorted((data / "middlebury0506").glob("*/"))
     files += [(f"middlebury0506/{f.name}", ["view1.png", "view5.png", "disp1.png"], 3.0) for f in more]

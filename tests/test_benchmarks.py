@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import importlib
+import inspect
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ import pytest
 from scipy import ndimage
 
 from rille.datasets.images.misalign import MisalignParams
+from rille.pipeline.flow import config
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import RigidTransform, cross_matrix, rotation_exp
 from rille.stages.geometry.lattice import Lattice
@@ -20,8 +23,12 @@ from rille.stages.geometry.lattice import Lattice
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import gaps
+import hazard_ablation
+import planner_ablation
 from driving.ratios import Ratios, wilson
+from gridding import ideas as of_terrain
 from gridding.mesh import rasterise
+from odometry import ideas as of_navigation
 from odometry.measures import claims
 from odometry.measures import judge as judge_odometry
 from stereo.measures import Found, fill, judge, locking
@@ -31,6 +38,7 @@ from stereo.ratios import means
 from surest import surest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+STAGES = config.stages()
 NONE = np.nan
 
 
@@ -41,6 +49,32 @@ def test_names_that_a_benchmark_takes_from_the_package_are_there(path: Path) -> 
             module = importlib.import_module(str(node.module))
             for alias in node.names:
                 assert hasattr(module, alias.name) or importlib.import_module(f"{node.module}.{alias.name}")
+
+
+@pytest.mark.parametrize("path", sorted(BENCHMARKS.rglob("*.py")), ids=lambda p: str(p.relative_to(BENCHMARKS)))
+def test_what_a_benchmark_gives_a_stage_is_an_input_or_argument_of_it(path: Path) -> None:
+    """Of ``node(tile_index_stage, label, dem=...)`` and ``self._stage("track", {"frames": ...}, pyramids=...)``."""
+    for call in (n for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.Call)):
+        first = ast.unparse(call.args[0]).strip("'").removesuffix("_stage") if call.args else ""
+        if not re.search("node|_stage", ast.unparse(call.func)) or first not in STAGES:
+            continue
+        facts = [name.value for d in call.args[1:] if isinstance(d, ast.Dict) for name in d.keys if name is not None]
+        names = {*facts, *(k.arg for k in call.keywords if k.arg)}
+        stage = STAGES[first]
+        assert stage.function is not None
+        assert names <= {*stage.ports(), *inspect.signature(stage.function).parameters}, ast.unparse(call)
+
+
+def test_what_an_ablation_replaces_is_there() -> None:
+    whole = [*planner_ablation.replacements().values(), *hazard_ablation.replacements().values()]
+    places = [(owner, name) for owner, name, _ in whole]
+    places += [place for *_, changes in (*of_terrain.IDEAS, *of_terrain.TWO_WAYS) for place in changes]
+    for idea in of_navigation.IDEAS:
+        config.build(config.parse_assignments(list(idea.parameters)))
+        module, _, name = f"{of_navigation.STAGES}.{idea.name}".rpartition(".")
+        places += [(importlib.import_module(module), name)] if idea.name else []
+    for owner, name in places:
+        assert hasattr(owner, name), (owner, name)
 
 
 # -- matching ----------------------------------------------------------------------------------------------------------

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from rille.stages.terrain.locus import refinement, solve, uncertainty
-from rille.stages.terrain.locus.solve import Matches
-from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
+from rille.stages.terrain.locus.solve import LocusParams, Matches
+from rille.stages.terrain.locus.stage import MatchedPair, reconstruct
 
 SEEDS = {"chosen": (1, 2, 3), "judged": (4, 5, 6)}
 FRAMES = (0, 6)

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.terrain.locus.solve import Matches
-from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
+from rille.stages.terrain.locus.solve import LocusParams, Matches
+from rille.stages.terrain.locus.stage import MatchedPair, reconstruct
 
 from .mesh import rasterise, without_jumps
 from .scenes import Scene, pixels_of

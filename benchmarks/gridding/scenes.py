@@ -78,10 +78,10 @@ def match(scene: Scene, preset: str = "default", turned: bool = False) -> Dispar
     from rille.stages.core.validity import matched
     from rille.stages.hfvm.stage import match as hfvm
 
-    params = config.build({"hfvm": {"preset": preset}}).hfvm
+    chosen: Any = config.build({"hfvm": {"preset": preset}})
     sides = ((scene.left, scene.valid[0]), (scene.right, scene.valid[1]))
     (image, own), (other, its) = sides[::-1] if turned else sides
-    found = hfvm(image, other, params, valid=(own, its))
+    found = hfvm(image, other, chosen.hfvm, valid=(own, its))
     maps = found.column_disparity, found.row_disparity, matched(found.validity)
     return Disparities(*maps, found.backmatch_error, found.disparity_std)
 
@@ -141,7 +141,7 @@ def motorcycle() -> Scene | None:
     height, width = left.shape
     f, cx, cy, offset, baseline = 994.978, 311.193, 254.877, 31.086, 0.193001
     cameras = [Camera(f, f, c, cy, width, height) for c in (cx, cx + offset)]
-    rig = Rig(*cameras, RigidTransform(np.eye(3), np.array([-baseline, 0.0, 0.0])))
+    rig = Rig(cameras[0], cameras[1], RigidTransform(np.eye(3), np.array([-baseline, 0.0, 0.0])))
     known = np.isfinite(truth.u)
     depth = f * baseline / (offset - truth.u)
     far = float(np.nanpercentile(depth, 99.5))

@@ -33,7 +33,7 @@ def elevations(scene: Scene) -> NDArray[np.float32]:
         maps = cv2.initUndistortRectifyMap(camera.matrix, NO_LENS, R, P, size, cv2.CV_32FC1)
         images.append(cv2.remap(image, *maps, cv2.INTER_LINEAR))
     smooth = {"P1": 8 * BLOCK**2, "P2": 32 * BLOCK**2, "disp12MaxDiff": 1, "uniquenessRatio": 10}
-    matcher = cv2.StereoSGBM_create(
+    matcher = cv2.StereoSGBM.create(
         0, RANGE, BLOCK, **smooth, speckleWindowSize=100, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_HH
     )
     disparity = matcher.compute(*images).astype(np.float32) / 16.0
@@ -63,7 +63,10 @@ def blend(scene: Scene) -> dict[str, Any]:
     size = 2 * round(0.5 * vehicle.wheel_base / CELL) + 1
     slope, residual = _planes(z, size)
     near = np.ones((2 * round(0.5 * vehicle.wheel_diameter / CELL) + 1,) * 2, np.uint8)
-    high, low = (sign * cv2.dilate(np.where(np.isnan(z), -np.inf, sign * z), near) for sign in (1, -1))
+    high, low = (
+        sign * cv2.dilate(np.where(np.isnan(z), -np.inf, sign * z), near, borderType=cv2.BORDER_REPLICATE)
+        for sign in (1, -1)
+    )
     parts = (
         np.degrees(np.arctan(slope)) / vehicle.max_slope_deg,
         residual / vehicle.max_roughness,

@@ -28,8 +28,8 @@ from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.hfvm.stage import match
 from rille.stages.terrain.ground import view_ground
 from rille.stages.terrain.ground_frame import GroundFrameParams, VerticalHint, level, z_range
-from rille.stages.terrain.locus.solve import Matches
-from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, local_lattice, reconstruct
+from rille.stages.terrain.locus.solve import LocusParams, Matches
+from rille.stages.terrain.locus.stage import MatchedPair, local_lattice, reconstruct
 
 Floats32 = NDArray[np.float32]
 

@@ -125,8 +125,9 @@ class Chain:
         segments = [self._segment(part) for part in parts]
         given: dict[str, Any] = {"segments": [r for r, _ in segments], "levels": [level for _, level in segments]}
         if self.config.resect.joint:
-            before = {"before": self.corrections[-1]} if self.corrections else {}
-            found = self._stage("intrinsics", before, segments=given["segments"], rig=self.calibration)
+            args: dict[str, Any] = {"before": self.corrections[-1]} if self.corrections else {}
+            args["fixed"] = self.config.rig.mode == "fixed"
+            found = self._stage("intrinsics", args, segments=given["segments"], rig=self.calibration)
             given["intrinsics"] = found
             if any(found.meta["correction"]) and len(self.corrections) < CALIBRATIONS:
                 return Chain(self.given, self.config, (*self.corrections, found.meta["corrected"])).run()
@@ -173,7 +174,8 @@ class Chain:
     def _calibration(self, basic: list[int]) -> Bundle:
         rig = self.sequence.rig.to_dict()
         orientations = [self._stage("orientation", {"pair": k, "rig": rig}, disparity=self.disparity[k]) for k in basic]
-        found = self._stage("rig", {"rig": rig}, orientations=orientations)
+        given = {"rig": rig} | ({"first": self.given.sequence.rig.to_dict()} if self.corrections else {})
+        found = self._stage("rig", given, orientations=orientations)
         self.rig_facts = found.meta
         return self._stage("calibration", {}, rig=found)
 

@@ -6,7 +6,7 @@ An idea is left out by parameters, or by a function that is put in the place of 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,7 @@ class Idea:
     words: str
     parameters: tuple[str, ...] = ()
     name: str = ""
-    function: Callable[..., Any] | None = None
+    function: Any = None
 
     @contextmanager
     def left_out(self) -> Iterator[tuple[str, ...]]:

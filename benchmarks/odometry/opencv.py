@@ -53,7 +53,7 @@ class Odometry:
             self.left, self.R_left, self.baseline, self.offset = P1[:, :3], R1, -P2[0, 3] / P2[0, 0], 0.0
         else:
             self.baseline, self.offset = rig.baseline, rig.left.cx - rig.right.cx
-        self.matcher = cv2.StereoSGBM_create(
+        self.matcher = cv2.StereoSGBM.create(
             0,
             self._range(),
             BLOCK,
@@ -97,7 +97,7 @@ class Odometry:
         return pair[0], self.clock.timed("depth", self._depth, *pair)
 
     def _rectify(self, pair: list[Any]) -> list[Any]:
-        return [cv2.remap(image, *m, cv2.INTER_LINEAR) for image, m in zip(pair, self.maps, strict=True)]
+        return [cv2.remap(image, x, y, cv2.INTER_LINEAR) for image, (x, y) in zip(pair, self.maps, strict=True)]
 
     def _depth(self, left: Any, right: Any) -> Any:
         disparity = self.matcher.compute(left, right).astype(np.float32) / 16.0 - self.offset
@@ -137,7 +137,7 @@ SIDES = ("left", "right")
 
 
 def _track(a: Any, b: Any, corners: Any) -> tuple[Any, Any]:
-    options = {"winSize": WINDOW, "maxLevel": LEVELS}
+    options: dict[str, Any] = {"winSize": WINDOW, "maxLevel": LEVELS}
     there, found, _ = cv2.calcOpticalFlowPyrLK(a, b, corners, None, **options)
     back, returned, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, **options)
     p, q = corners.reshape(-1, 2), there.reshape(-1, 2)

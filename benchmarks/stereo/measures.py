@@ -83,7 +83,7 @@ def lines(found: Found) -> NDArray[np.float64]:
     y, x = np.nonzero(found.matched)
     terms = model(found.u, np.arange(found.u.shape[0])[:, None], np.arange(found.u.shape[1]))[y, x]
     target, weight = found.v[y, x], np.ones(x.size)
-    g = np.zeros(terms.shape[1])
+    g: NDArray[np.floating[Any]] = np.zeros(terms.shape[1])
     for _ in range(ITERATIONS):
         # Weakly held at nothing: where all depths are alike, columns say as much as displacements.
         normal = (terms * weight[:, None]).T @ terms + 1e-6 * x.size * np.eye(g.size)

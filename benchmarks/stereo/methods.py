@@ -73,14 +73,14 @@ def opencv() -> list[Method]:
     def semiglobal(mode: int) -> Callable[[Pair], Any]:
         def run(pair: Pair) -> Any:
             low, count = pair.range
-            matcher = cv2.StereoSGBM_create(low, count, BLOCK, preFilterCap=CAP, mode=mode, **smooth, **clean)
+            matcher = cv2.StereoSGBM.create(low, count, BLOCK, preFilterCap=CAP, mode=mode, **smooth, **clean)
             return matcher.compute(*_padded(pair))
 
         return run
 
     def block(pair: Pair) -> Any:
         low, count = pair.range
-        matcher = cv2.StereoBM_create(count, BM_BLOCK)
+        matcher = cv2.StereoBM.create(count, BM_BLOCK)
         matcher.setMinDisparity(low)
         matcher.setDisp12MaxDiff(clean["disp12MaxDiff"])
         matcher.setSpeckleWindowSize(clean["speckleWindowSize"])

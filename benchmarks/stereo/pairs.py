@@ -72,7 +72,7 @@ def read_image(path: Path) -> Grey:
     from rille.datasets.images.files import read_grey
 
     image = read_grey(path)
-    return image if image.dtype == np.uint8 else np.rint(image / 257.0).astype(np.uint8)
+    return np.asarray(image if image.dtype == np.uint8 else np.rint(image / 257.0), np.uint8)
 
 
 def read_truth(path: Path, scale: float | None = None) -> Truth:
@@ -113,7 +113,7 @@ def halves() -> dict[str, list[Pair]]:
     for name in (*CHOSEN, *JUDGED):
         if (folder / name).is_dir():
             files = [folder / name / f"{part}.png" for part in ("view1", "view5", "disp1")]
-            found[name] = measured(name, *(read_image(f) for f in files[:2]), read_truth(files[2], 3.0))
+            found[name] = measured(name, read_image(files[0]), read_image(files[1]), read_truth(files[2], 3.0))
     missing = [name for name in (*CHOSEN, *JUDGED) if name not in found]
     if missing:
         raise SystemExit(f"RILLE_DATA holds no {', '.join(missing)}")
@@ -124,10 +124,10 @@ def _middlebury() -> list[Pair]:
     found = []
     if (folder := _data("motorcycle")) is not None:
         files = [folder / f"motorcycle_{name}" for name in ("left.png", "right.png", "disp.npz")]
-        found.append(measured("motorcycle", *(read_image(f) for f in files[:2]), read_truth(files[2])))
+        found.append(measured("motorcycle", read_image(files[0]), read_image(files[1]), read_truth(files[2])))
     if (folder := _data("cones")) is not None:
         files = [folder / f"cones_{name}.png" for name in ("image_02", "image_06", "disp_02")]
-        found.append(measured("cones", *(read_image(f) for f in files[:2]), read_truth(files[2], 4.0)))
+        found.append(measured("cones", read_image(files[0]), read_image(files[1]), read_truth(files[2], 4.0)))
     return found
 
 
@@ -169,8 +169,8 @@ def unrelated(pairs: list[Pair]) -> list[Pair]:
         name = f"left of {pairs[1].name}, right of {pairs[0].name}"
         found.append(Pair(name, pairs[1].left[cut].copy(), pairs[0].right[cut].copy(), None, 0, 127))
     shape = (375, 450)
-    noise = [np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8) for seed in (1, 2)]
-    return [*found, Pair("noise of two seeds", *noise, None, 0, 127)]
+    left, right = (np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8) for seed in (1, 2))
+    return [*found, Pair("noise of two seeds", left, right, None, 0, 127)]
 
 
 def _data(name: str) -> Path | None:
