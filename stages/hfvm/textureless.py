@@ -95,9 +95,11 @@ class Searched(NamedTuple):
 
 
 class SoFar(NamedTuple):
-    """Of each pixel: the best step so far and its sum; the sums a step before and after it; the least one far from it.
-    And of each right pixel the least mean distance of the windows led to it, and the step that did."""
+    """Of each pixel: how many steps were tried; the best one and its sum; the sums a step before and after it; the
+    least one far from it. And of each right pixel the least mean distance of the windows led to it, and the step that
+    did."""
 
+    tried: AnyArray
     best: AnyArray
     least: AnyArray
     before: AnyArray
@@ -110,16 +112,17 @@ class SoFar(NamedTuple):
 def search(region: Region, steps: AnyArray) -> Searched:
     """The best step along the line of each pixel of a region, of ``steps``: (n,) float32 pixels, ascending by 1."""
     shape = region.inside.shape
-    best, least, distinct = np.zeros((3, *shape), np.float32)
-    found = Searched(np.zeros(shape, np.int32), best, least, distinct, np.zeros(shape, bool))
-    so_far = SoFar(*np.full((5, *shape), np.inf, np.float32), *np.full((2, *region.right.shape), np.inf, np.float32))
+    tried, (best, least, distinct) = np.zeros(shape, np.int32), np.zeros((3, *shape), np.float32)
+    found = Searched(tried, best, least, distinct, np.zeros(shape, bool))
+    here, there = np.full((5, *shape), np.inf, np.float32), np.full((2, *region.right.shape), np.inf, np.float32)
+    so_far = SoFar(tried, *here, *there)
     # Sums of the steps before, and the least of all that are more than MIN_DISTINCT_STEPS behind.
     last, passed, size = deque[AnyArray](), np.full(shape, np.inf, np.float32), region.size
     for step in steps:
         total = _sums(region, np.full(shape, step))
         if len(last) > MIN_DISTINCT_STEPS:
             np.minimum(passed, last.popleft(), out=passed)
-        _look(region, step, (total, last[-1] if last else passed, passed, size), so_far, found.tried)
+        _look(region, step, (total, last[-1] if last else passed, passed, size), so_far)
         last.append(total)
     _judge(region, so_far, found)
     return found
@@ -157,7 +160,7 @@ def _distances(region, at, cost, outside):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _look(region, step, sums, so_far, tried):  # type: ignore[no-untyped-def]
+def _look(region, step, sums, so_far):  # type: ignore[no-untyped-def]
     """Update ``so_far`` with the sums of one more step; ``sums``: those of the step before, the least of those far
     behind, and the windows' sizes besides."""
     total, previous, passed, size = sums
@@ -172,7 +175,7 @@ def _look(region, step, sums, so_far, tried):  # type: ignore[no-untyped-def]
             elif since > MIN_DISTINCT_STEPS:
                 so_far.rival[y, x] = min(so_far.rival[y, x], total[y, x])
             if total[y, x] < np.inf:
-                tried[y, x] += 1
+                so_far.tried[y, x] += 1
                 j, i = _end(region, y, x, step)
                 if total[y, x] / size[y, x] < so_far.claim[j, i]:
                     so_far.claim[j, i], so_far.claimant[j, i] = total[y, x] / size[y, x], step

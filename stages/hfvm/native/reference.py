@@ -425,10 +425,8 @@ def paths(pair, compact, grey, shift):  # type: ignore[no-untyped-def]
     rows, cols = shift.shape
     tried, cost = np.empty((2, rows, cols, CANDIDATES), np.int32)
     for y in range(rows):
-        terms = epipolar.row_terms(pair.f, np.float64(y))
         for x in range(cols):
-            line = epipolar.line(terms, np.float32(x), np.float32(UNIT + COMPACT) * np.float32(pair.mu))
-            _listed(pair, compact, shift, (y, x, line), tried[y, x], cost[y, x])
+            _listed(pair, compact, shift, y, x, tried[y, x], cost[y, x])
     total = np.zeros(cost.shape, np.int32)
     for s in (1, -1):
         _sweep(tried, cost, grey, s, total)
@@ -468,10 +466,11 @@ def _sweep(tried, cost, grey, s, total):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _listed(pair, compact, shift, place, tried, cost):  # type: ignore[no-untyped-def]
-    """Write the candidates of a pixel at a ``place`` (row, column, line), and their costs."""
-    (y, x, line), (rows, cols), (high, wide) = place, shift.shape, pair.right.shape
-    own, count = shift[y, x], 0
+def _listed(pair, compact, shift, y, x, tried, cost):  # type: ignore[no-untyped-def]
+    """Write the candidates of a pixel, and their costs."""
+    (rows, cols), (high, wide), own, count = shift.shape, pair.right.shape, shift[y, x], 0
+    terms, length = epipolar.row_terms(pair.f, np.float64(y)), np.float32(UNIT + COMPACT) * np.float32(pair.mu)
+    line = epipolar.line(terms, np.float32(x), length)
     tried[:], cost[:] = own, NO_CANDIDATE
     for n in range(len(BESIDE) + len(AROUND)):
         if n < len(BESIDE):

@@ -153,9 +153,8 @@ def test_candidates_and_their_costs_are_those_of_the_definition(mu):
     lines = epipolar.lines(f, left.shape)
     shift, cost = np.empty((2, *left.shape, CANDIDATES), np.int32)
     for y, x in np.ndindex(left.shape):
-        line = epipolar.line(epipolar.row_terms(f, float(y)), np.float32(x), np.float32(12 * mu))
         pairs = LevelPair(a.words, b.words, f, mu), LevelPair(a.compact, b.compact)
-        reference._listed(*pairs, pack_map(*maps), (y, x, line), shift[y, x], cost[y, x])
+        reference._listed(*pairs, pack_map(*maps), y, x, shift[y, x], cost[y, x])
     cu, cv = unpacked(shift)
 
     def apart(word, other):
