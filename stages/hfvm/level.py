@@ -193,11 +193,13 @@ def propagate(look: Look, field: Field) -> Field:
 def paths(look: Look, field: Field) -> Field:
     """Displacements chosen by costs gathered along paths from the borders of the image.
 
-    A pixel's candidates are its own displacement and those a pixel beside it, and those of near and farther pixels.
-    Along six directions (eight but for those within a row) each gathers the least cost of getting
-    there, smoothness included; so evidence travels over weak texture as far as it must, and stops at depth edges.
+    A pixel's candidates are its own displacement and those a pixel beside it, those of near and farther pixels, and
+    those handed down, without which a wrong plane can take hold in images of unlike brightness. Along six directions
+    (eight but for those within a row) each gathers the least cost of getting there, smoothness included; so evidence
+    travels over weak texture as far as it must, and stops at depth edges.
     """
-    solver.paths(look.pair, LevelPair(look.a.compact, look.b.compact), look.a.grey, field.shift)
+    handed = np.zeros((0, 0), np.int32) if look.up is None else pack_map(2 * look.up.u, 2 * look.up.v)
+    solver.paths(look.pair, LevelPair(look.a.compact, look.b.compact), handed, look.a.grey, field.shift)
     return field
 
 

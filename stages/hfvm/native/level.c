@@ -305,8 +305,9 @@ static inline void append(const Pair *pair, int32_t x, int32_t y, int32_t shift,
   list->shift = PICK(SAME(order, (Eight){} + list->count), tried, list->shift);
   list->count++;
 }
-/* Candidates of a pixel: the own displacement, those a pixel beside it, those of near and farther pixels. */
-static List candidates_of(const Pair *pair, const int32_t *maps, int32_t x, int32_t y) {
+/* Candidates of a pixel: the own displacement, those a pixel beside it, those of near and farther pixels, and those of the
+   coarser level, `up`, doubled and in rows of `up_cols`; 0: there is none. */
+static List candidates_of(const Pair *pair, const int32_t *up, int32_t up_cols, const int32_t *maps, int32_t x, int32_t y) {
   static const int8_t around[12][2] = {{0, -1}, {0, 1}, {-1, 0}, {1, 0}, {-3, -3}, {-3, 3}, {3, -3}, {3, 3},
                                        {0, -8}, {0, 8}, {-8, 0}, {8, 0}};
   int32_t rows = pair->left.rows, cols = pair->left.cols, shift = maps[(int64_t)y * cols + x];
@@ -315,17 +316,20 @@ static List candidates_of(const Pair *pair, const int32_t *maps, int32_t x, int3
   for (int n = 0; n < 4; n++) append(pair, x, y, pack(own.u + around[n][1], own.v + around[n][0]), &list);
   for (int n = 0; n < 12; n++)
     append(pair, x, y, maps[(int64_t)within(y + around[n][0], rows) * cols + within(x + around[n][1], cols)], &list);
+  for (int n = 0; up_cols && n < 9; n++) {
+    int32_t row = within(y / 2 + n / 3 - 1, (rows + 1) / 2);
+    append(pair, x, y, up[(int64_t)row * up_cols + within(x / 2 + n % 3 - 1, up_cols)], &list);
+  }
   return list;
 }
 /* Candidates of a pixel, each once, and their costs; all but the first lead into the right image. `compact`: the images'
    compact features. */
-static Candidates listed(const Pair *pair, const Pair *compact, const int32_t *maps, int32_t x, int32_t y) {
+static Candidates listed(const Pair *pair, const Pair *compact, List list, int32_t x, int32_t y) {
   const Eight order = {0, 1, 2, 3, 4, 5, 6, 7};
   int32_t right_cols = pair->right.cols;
   int64_t i = place(&pair->left, x, y);
   RowLines row = row_lines(&pair->band, y);
   Line line = line_at(row, (float)x, (float)(UNIT + COMPACT) * row.cost);
-  List list = candidates_of(pair, maps, x, y);
   Eight u = columns(list.shift), v = list.shift >> 16, xr = u + x, yr = v + y;
   Eight within_right = below(xr, right_cols) & below(yr, pair->right.rows), at = (yr * right_cols + xr) & within_right;
   Square own = (Square){} + pair->left.words[i], own_compact = (Square){} + compact->left.words[i];
@@ -376,12 +380,14 @@ static void sweep(const Pair *pair, Candidates *all, const float *grey, int32_t 
 }
 /* Displacements of least cost along paths; of equal ones the first candidate's. `room`: a Candidates a pixel, and six rows
    of Eight, at a multiple of 32 bytes. */
-void EXPORT(paths)(const Pair *pair, const Pair *compact, const float *grey, int32_t *maps, void *room) {
+void EXPORT(paths)(const Pair *pair, const Pair *compact, const int32_t *up, int32_t up_cols, const float *grey,
+                   int32_t *maps, void *room) {
   int32_t rows = pair->left.rows, cols = pair->left.cols;
   int64_t pixels = (int64_t)rows * cols;
   Candidates *all = room;
   for (int32_t y = 0; y < rows; y++)
-    for (int32_t x = 0; x < cols; x++) all[place(&pair->left, x, y)] = listed(pair, compact, maps, x, y);
+    for (int32_t x = 0; x < cols; x++)
+      all[place(&pair->left, x, y)] = listed(pair, compact, candidates_of(pair, up, up_cols, maps, x, y), x, y);
   sweep(pair, all, grey, 1, (Eight *)(all + pixels));
   sweep(pair, all, grey, -1, (Eight *)(all + pixels));
   for (int64_t i = 0; i < pixels; i++) {

@@ -78,10 +78,10 @@ class Library:
         self._call("edges", pair, *given, c_int32(near_sign), _at(out, np.int32))
         return out
 
-    def paths(self, pair: LevelPair, compact: LevelPair, grey: AnyArray, shift: AnyArray) -> None:
+    def paths(self, pair: LevelPair, compact: LevelPair, up: AnyArray, grey: AnyArray, shift: AnyArray) -> None:
         """Write the displacements of least cost along paths, see ``reference.paths``."""
         # Three numbers of 32 bits a candidate, and six rows of one; vectors begin at multiples of 32 bytes.
         room = np.empty(4 * CANDIDATES * (3 * shift.size + 6 * shift.shape[1]) + 32, np.uint8)
         room = room[-room.ctypes.data % 32 :]
         given = _at(grey, np.float32), _at(shift, np.int32), _at(room, np.uint8)
-        self._call("paths", pair, _pair(compact), *given)
+        self._call("paths", pair, _pair(compact), _at(up, np.int32), c_int32(up.shape[1]), *given)

@@ -409,24 +409,24 @@ AROUND = ((0, -1), (0, 1), (-1, 0), (1, 0), (-3, -3), (-3, 3), (3, -3), (3, 3), 
 
 
 @njit(cache=True, nogil=True)
-def paths(pair, compact, grey, shift):  # type: ignore[no-untyped-def]
+def paths(pair, compact, up, grey, shift):  # type: ignore[no-untyped-def]
     """Write to ``shift`` the candidates of each pixel of least cost along paths; of equal ones the first.
 
     Candidates are at most :data:`CANDIDATES`, in this order and each once: the pixel's own displacement and those
-    :data:`BESIDE` it, those of the pixels :data:`AROUND` it. All but the first lead into the right image. At the border
-    the nearest pixel inside stands for one outside.
+    :data:`BESIDE` it, those of the pixels :data:`AROUND` it, and of 3 x 3 of the coarser level. All but the first lead
+    into the right image. At the border the nearest pixel inside stands for one outside.
 
     Parameters
     ----------
     compact : words of both images' compact features.
+    up : (row, col) int32 packed displacements of the coarser level, doubled; (0, 0): there is none.
     grey : (row, col) float32, of the left image.
     shift : (row, col) int32 packed displacements.
     """
     rows, cols = shift.shape
     tried, cost = np.empty((2, rows, cols, CANDIDATES), np.int32)
     for y in range(rows):
-        for x in range(cols):
-            _listed(pair, compact, shift, y, x, tried[y, x], cost[y, x])
+        _list(pair, compact, up, shift, y, tried[y], cost[y])
     total = np.zeros(cost.shape, np.int32)
     for s in (1, -1):
         _sweep(tried, cost, grey, s, total)
@@ -466,26 +466,32 @@ def _sweep(tried, cost, grey, s, total):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _listed(pair, compact, shift, y, x, tried, cost):  # type: ignore[no-untyped-def]
-    """Write the candidates of a pixel, and their costs."""
-    (rows, cols), (high, wide), own, count = shift.shape, pair.right.shape, shift[y, x], 0
+def _list(pair, compact, up, shift, y, tried, cost):  # type: ignore[no-untyped-def]
+    """Write the candidates of the pixels of a row, and their costs."""
+    (rows, cols), (high, wide) = shift.shape, pair.right.shape
     terms, length = epipolar.row_terms(pair.f, np.float64(y)), np.float32(UNIT + COMPACT) * np.float32(pair.mu)
-    line = epipolar.line(terms, np.float32(x), length)
-    tried[:], cost[:] = own, NO_CANDIDATE
-    for n in range(len(BESIDE) + len(AROUND)):
-        if n < len(BESIDE):
-            one = pack(columns(own) + BESIDE[n][1], rows_of(own) + BESIDE[n][0])
-        else:
-            j, i = AROUND[n - len(BESIDE)]
-            one = shift[min(max(y + j, 0), rows - 1), min(max(x + i, 0), cols - 1)]
-        q, p = y + rows_of(one), x + columns(one)
-        inside = 0 <= p < wide and 0 <= q < high
-        # Each once: there is room for few, and equal ones would take it from others.
-        if count == CANDIDATES or (n > 0 and (not inside or (tried[:count] == one).any())):
-            continue
-        apart = OUTSIDE
-        if inside:
-            apart = UNIT * distance(pair.left[y, x], pair.right[q, p])
-            apart += COMPACT * distance(compact.left[y, x], compact.right[q, p])
-        # Leaves room below NO_CANDIDATE for the greatest step, 10000.
-        tried[count], cost[count], count = one, min(apart + _off(line, one, 2 * OUTSIDE), 2 * OUTSIDE), count + 1
+    near, all_of = len(BESIDE), len(BESIDE) + len(AROUND)
+    for x in range(cols):
+        own, count, line = shift[y, x], 0, epipolar.line(terms, np.float32(x), length)
+        tried[x], cost[x] = own, NO_CANDIDATE
+        for n in range(all_of + (9 if up.size else 0)):
+            if n < near:
+                one = pack(columns(own) + BESIDE[n][1], rows_of(own) + BESIDE[n][0])
+            elif n < all_of:
+                j, i = AROUND[n - near]
+                one = shift[min(max(y + j, 0), rows - 1), min(max(x + i, 0), cols - 1)]
+            else:
+                j, i = y // 2 + (n - all_of) // 3 - 1, x // 2 + (n - all_of) % 3 - 1
+                one = up[min(max(j, 0), up.shape[0] - 1), min(max(i, 0), up.shape[1] - 1)]
+            q, p = y + rows_of(one), x + columns(one)
+            inside = 0 <= p < wide and 0 <= q < high
+            # Each once: there is room for few, and equal ones would take it from others.
+            if count == CANDIDATES or (n > 0 and (not inside or (tried[x, :count] == one).any())):
+                continue
+            apart = OUTSIDE
+            if inside:
+                apart = UNIT * distance(pair.left[y, x], pair.right[q, p])
+                apart += COMPACT * distance(compact.left[y, x], compact.right[q, p])
+            # Leaves room below NO_CANDIDATE for the greatest step, 10000.
+            tried[x, count], cost[x, count] = one, min(apart + _off(line, one, 2 * OUTSIDE), 2 * OUTSIDE)
+            count += 1

@@ -127,7 +127,7 @@ def test_path_costs_are_those_of_the_definition(seed):
     np.testing.assert_array_equal(total[there], brute_force(cu, cv, cost, grey, 36, 240, 10.0)[there])
 
 
-def listed(maps, y, x, right_shape):
+def listed(maps, up, y, x, right_shape):
     """Candidates (u, v) of a pixel by their definition."""
     u, v = maps
     rows, cols = u.shape
@@ -136,6 +136,9 @@ def listed(maps, y, x, right_shape):
     for j, i in reference.AROUND:
         near = min(max(y + j, 0), rows - 1), min(max(x + i, 0), cols - 1)
         more.append((u[near], v[near]))
+    for j, i in np.ndindex(3, 3) if up.size else ():
+        above = min(max(y // 2 + j - 1, 0), up.shape[1] - 1), min(max(x // 2 + i - 1, 0), up.shape[2] - 1)
+        more.append((up[0][above], up[1][above]))
     for a, b in more:
         inside = 0 <= x + a < right_shape[1] and 0 <= y + b < right_shape[0]
         if inside and (int(a), int(b)) not in found and len(found) < CANDIDATES:
@@ -143,8 +146,9 @@ def listed(maps, y, x, right_shape):
     return found
 
 
+@pytest.mark.parametrize("with_up", [False, True])
 @pytest.mark.parametrize("mu", [0.0, 3.0])
-def test_candidates_and_their_costs_are_those_of_the_definition(mu):
+def test_candidates_and_their_costs_are_those_of_the_definition(mu, with_up):
     rng = np.random.default_rng(3)
     left, right = (rng.uniform(0, 255, shape).astype(np.float32) for shape in ((11, 14), (12, 17)))
     a, b = view(left), view(right)
@@ -152,16 +156,17 @@ def test_candidates_and_their_costs_are_those_of_the_definition(mu):
     f = rng.normal(0, 1, (3, 3))
     lines = epipolar.lines(f, left.shape)
     shift, cost = np.empty((2, *left.shape, CANDIDATES), np.int32)
-    for y, x in np.ndindex(left.shape):
+    up = 2 * rng.integers(-3, 3, (2, 6 * with_up, 7 * with_up)).astype(np.int16)
+    for y in range(len(shift)):
         pairs = LevelPair(a.words, b.words, f, mu), LevelPair(a.compact, b.compact)
-        reference._listed(*pairs, pack_map(*maps), y, x, shift[y, x], cost[y, x])
+        reference._list(*pairs, pack_map(*up), pack_map(*maps), y, shift[y], cost[y])
     cu, cv = unpacked(shift)
 
     def apart(word, other):
         return int(np.abs(bytes_of(word).astype(int) - bytes_of(other)).sum())
 
     for y, x in np.ndindex(left.shape):
-        want = listed(maps, y, x, right.shape)
+        want = listed(maps, up, y, x, right.shape)
         there = cost[y, x] != NO_CANDIDATE
         assert list(zip(cu[y, x, there].tolist(), cv[y, x, there].tolist(), strict=True)) == want
         for k, (i, j) in enumerate(want):

@@ -108,16 +108,18 @@ def test_edges(native, sizes, near_sign):
     assert sizes[0][0] < 30 or (found[0] != shift).any()
 
 
+@pytest.mark.parametrize("handed", [0, 1])
 @pytest.mark.parametrize("sizes", SIZES)
-def test_paths(native, sizes):
+def test_paths(native, sizes, handed):
     rng = np.random.default_rng(5)
     pair = some_pair(sizes, rng, 8.0)
     grey = rng.uniform(0, 255, sizes[0]).astype(np.float32)
     compact = LevelPair(words(sizes[0], rng), words(sizes[1], rng))
-    before = pack_map(*some_maps(sizes[0], rng))
+    before, half = pack_map(*some_maps(sizes[0], rng)), [(n + 1) // 2 * handed for n in sizes[0]]
+    up = pack_map(*(2 * one for one in some_maps(half, rng)))
     found = before.copy(), before.copy()
     for solver, shift in zip((native, reference), found, strict=True):
-        solver.paths(pair, compact, grey, shift)
+        solver.paths(pair, compact, up, grey, shift)
     np.testing.assert_array_equal(*found)
     assert sizes[0][0] < 9 or (found[0] != before).any()
 
