@@ -29,7 +29,7 @@ from rille.stages.geometry.scale import other_size
 from rille.stages.hfvm import plane
 from rille.stages.hfvm.epipolar import typical
 from rille.stages.hfvm.image import Grey, Image, Shape, Window, thinned
-from rille.stages.hfvm.level import ImagePair, State, descend, sample
+from rille.stages.hfvm.level import PyramidPair, State, descend, sample
 from rille.stages.hfvm.native.problem import Map
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
@@ -84,7 +84,7 @@ def aligned(prior: PriorDisparities | None, h: plane.Matrix | None) -> PriorDisp
     return _bounded(*plane.carried(np.linalg.inv(plane.to_original(h, prior.u.shape)), prior.u, prior.v))
 
 
-def impose(images: ImagePair, state: State, prior: PriorDisparities | None) -> State:
+def impose(images: PyramidPair, state: State, prior: PriorDisparities | None) -> State:
     """State of the same level with the prior's displacements in both directions where they are known.
 
     At level 0 (images too small for coarser ones) the whole range has been searched, and nothing is imposed.
@@ -252,7 +252,7 @@ class Coarse:
     disparities known beforehand.
     """
 
-    images: ImagePair
+    images: PyramidPair
     state: State
     right: Image
     ratio: Floats | None = None
@@ -264,7 +264,7 @@ class Coarse:
         return replace(self, images=replace(self.images, threads=threads))
 
     @staticmethod
-    def again(images: ImagePair, state: State, ratio: Floats | None, alignment: plane.Matrix | None) -> Coarse:
+    def again(images: PyramidPair, state: State, ratio: Floats | None, alignment: plane.Matrix | None) -> Coarse:
         """As it was when these were its state, ratio and alignment; ``images``: the images as they are."""
         right = levelled(images.right, ratio)
         matched = right if alignment is None else plane.aligned(right, alignment, images.left)
@@ -324,7 +324,7 @@ def turn(coarse: Coarse) -> Coarse:
     return turned if turned.state.share > coarse.state.share else coarse
 
 
-def match_coarse_levels(images: ImagePair, prior: PriorDisparities | None = None) -> Coarse:
+def match_coarse_levels(images: PyramidPair, prior: PriorDisparities | None = None) -> Coarse:
     """The coarse levels of two images as they are, down to level 1 or, of small images, to the top."""
     coarse = Coarse(images, descend(images, COARSE_LEVEL), images.right, prior=prior)
     for step in images.params.kept((even, known, align, turn)):

@@ -30,7 +30,7 @@ from rille.stages.hfvm.level import (
     MAX_FIT_MATCHES,
     NEAR_SIGN,
     Band,
-    ImagePair,
+    PyramidPair,
     State,
     fill_rows,
     hand_down,
@@ -144,7 +144,7 @@ class FinestWork:
     right: Layer
     left: Map
     back: Map
-    images: ImagePair
+    images: PyramidPair
     alignment: plane.Matrix | None = None
 
     def to_right(self, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:

@@ -47,7 +47,7 @@ from rille.stages.hfvm.coarse import (
 )
 from rille.stages.hfvm.finest import Ending, FinestWork, lands
 from rille.stages.hfvm.image import as_matched
-from rille.stages.hfvm.level import FREE_BAND, NEAR_SIGN, ImagePair, State, one_way
+from rille.stages.hfvm.level import FREE_BAND, NEAR_SIGN, PyramidPair, State, one_way
 from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS, facts
@@ -70,7 +70,7 @@ def check(left: Pyramid, right: Pyramid, given: PriorDisparities, params: HfvmPa
     ratio = ratio_of_matches(a, b, State(0, there, there, inside, inside, FREE_BAND, NEAR_SIGN))
     if ratio is not None and greatest(ratio) > MIN_LOG_RATIO:
         b = levelled(b, ratio)
-    images, left_layer, right_layer = ImagePair(a, b, params, matcher.DEFAULT), a.layers[0], b.layers[0]
+    images, left_layer, right_layer = PyramidPair(a, b, params, matcher.DEFAULT), a.layers[0], b.layers[0]
     work = FinestWork(left_layer, right_layer, right_layer, there, _way_back(images, given), images)
     fine = finest.check(work, replace(finest.subpixel(work), u=u))
     fine = replace(fine, validity=fine.against(~known, Validity.OVER_THRESHOLD))
@@ -83,7 +83,7 @@ def check(left: Pyramid, right: Pyramid, given: PriorDisparities, params: HfvmPa
     return finest.complete(results, left_layer.valid, left_layer.window, params, Ending(left_layer.shape, f=lines))
 
 
-def _way_back(images: ImagePair, given: PriorDisparities) -> Map:
+def _way_back(images: PyramidPair, given: PriorDisparities) -> Map:
     """Displacements of the right image, matched at the finest level near the given ones."""
     above = None
     if images.levels > 1:

@@ -151,7 +151,7 @@ class Recipe:
 
 
 @dataclass(frozen=True)
-class ImagePair:
+class PyramidPair:
     """The left and the right image as they are matched, and how; two ``threads`` match both directions side by side."""
 
     left: Image
@@ -160,7 +160,7 @@ class ImagePair:
     recipe: Recipe
     threads: int = 1
 
-    def reverse(self) -> ImagePair:
+    def reverse(self) -> PyramidPair:
         """The images exchanged."""
         return replace(self, left=self.right, right=self.left)
 
@@ -223,7 +223,7 @@ def edges(look: Look, field: Field) -> Field:
     return Field(solver.edges(pair, grey, field.shift, wanted.view(np.uint8), int(look.near_sign)), field.cost)
 
 
-def match_level(images: ImagePair, level: int, above: State | None, near_sign: float = 0.0) -> State:
+def match_level(images: PyramidPair, level: int, above: State | None, near_sign: float = 0.0) -> State:
     """The state of a level, from that of the level above (None: the top): search, propagate, check, band."""
     known, rounds = near_sign if above is None else above.near_sign, images.recipe.rounds
     back = None if above is None else above.reverse()
@@ -259,7 +259,7 @@ def _agree(own, other, own_valid, other_valid, most, agreeing):  # type: ignore[
                 agreeing[y, x] = du * du + dv * dv <= most
 
 
-def one_way(images: ImagePair, level: int, above: State | None, near_sign: float, fine_rounds: int) -> Map:
+def one_way(images: PyramidPair, level: int, above: State | None, near_sign: float, fine_rounds: int) -> Map:
     """Displacements from the left image to the right one, at a level below that of the state ``above``, by the rounds
     ``fine_rounds`` at the finest; ``above`` None: the top."""
     up = None if above is None else hand_down(above, images.params)
@@ -282,7 +282,7 @@ def hand_down(state: State, params: HfvmParams) -> Map:
     return Map(*(np.rint(a).astype(np.int16) for a in (u, v)))
 
 
-def sample(images: ImagePair, state: State) -> Sample:
+def sample(images: PyramidPair, state: State) -> Sample:
     """About :data:`MAX_FIT_MATCHES` evenly strided consistent matches of a level, with fractions of a pixel."""
     y, x = thinned(state.left_ok, MAX_FIT_MATCHES)
     wanted = np.zeros(state.left_ok.shape, np.uint8)
@@ -292,7 +292,7 @@ def sample(images: ImagePair, state: State) -> Sample:
     return Sample(x, y, u[y, x], v[y, x])
 
 
-def with_band(images: ImagePair, state: State) -> State:
+def with_band(images: PyramidPair, state: State) -> State:
     """The state with the epipolar band for the next finer level, where there is one and it can be fitted."""
     if images.params.band == 0 or state.level == 0:
         return state
@@ -308,7 +308,7 @@ def with_band(images: ImagePair, state: State) -> State:
     return replace(state, band=Band(epipolar.finer(f), mu), near_sign=sign)
 
 
-def descend(images: ImagePair, stop: int, above: State | None = None, near_sign: float = 0.0) -> State:
+def descend(images: PyramidPair, stop: int, above: State | None = None, near_sign: float = 0.0) -> State:
     """Match from the top (or below ``above``) down to level ``stop``, or to the top if that is below."""
     first, state = (images.levels if above is None else above.level) - 1, above
     for level in range(first, min(stop, images.levels - 1) - 1, -1):

@@ -16,7 +16,7 @@ from rille.stages.hfvm import coarse, finest, level
 from rille.stages.hfvm.coarse import PriorDisparities
 from rille.stages.hfvm.image import as_matched, whole
 from rille.stages.hfvm.image import tiles as cut
-from rille.stages.hfvm.level import ImagePair, Recipe
+from rille.stages.hfvm.level import PyramidPair, Recipe
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging.pyramid import Pyramid
 
@@ -151,7 +151,7 @@ def match(
         return doubled(half, left.valid[0], right.shape, (0, 0)), aligned
     how.tell(0.0, "coarse levels")
     pyramids = as_matched(left, params), as_matched(right, params)
-    images = ImagePair(*pyramids, params, RECIPES[params.preset], how.threads)
+    images = PyramidPair(*pyramids, params, RECIPES[params.preset], how.threads)
     pair = coarse.match_coarse_levels(images, prior)  # 4.3.1 features; 4.3.4 hierarchy; brightness, alignment
     how.tell(0.15, "fine levels")
     side = how.side if local(params) and images.levels > 1 else None

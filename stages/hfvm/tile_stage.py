@@ -20,7 +20,7 @@ from rille.stages.hfvm.coarse import Coarse
 from rille.stages.hfvm.finest import Ending
 from rille.stages.hfvm.image import Window, as_matched, whole
 from rille.stages.hfvm.image import tiles as cut
-from rille.stages.hfvm.level import Band, ImagePair, State
+from rille.stages.hfvm.level import Band, PyramidPair, State
 from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS
@@ -89,11 +89,11 @@ class Task:
         return matcher.halves(self.params, *(int(pyramid.meta["levels"]) for pyramid in self.given[:2]))
 
     @cached_property
-    def images(self) -> ImagePair:
+    def images(self) -> PyramidPair:
         """Both images at that resolution."""
         params, first = (matcher.halved(self.params), 1) if self.half else (self.params, 0)
         left, right = (as_matched(opened(bundle).above(first), params) for bundle in self.given[:2])
-        return ImagePair(left, right, params, matcher.RECIPES[params.preset])
+        return PyramidPair(left, right, params, matcher.RECIPES[params.preset])
 
     @property
     def shape(self) -> tuple[int, ...]:

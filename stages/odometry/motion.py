@@ -23,7 +23,7 @@ from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts
 from rille.stages.hfvm import plane
 from rille.stages.hfvm.image import as_matched
-from rille.stages.hfvm.level import ImagePair, Recipe, descend, fill_rows, median, propagate, search
+from rille.stages.hfvm.level import PyramidPair, Recipe, descend, fill_rows, median, propagate, search
 from rille.stages.hfvm.matcher import DEFAULT
 from rille.stages.hfvm.native.problem import LevelPair
 from rille.stages.hfvm.native.solver import solver
@@ -106,7 +106,7 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: plane.Matr
     if turn is not None:
         turn = np.linalg.inv(plane.finer(level)) @ turn @ plane.finer(level)
         right = plane.aligned(right, turn, left)
-    images = ImagePair(left, right, hp, Recipe((search, propagate, median), (), rounds))
+    images = PyramidPair(left, right, hp, Recipe((search, propagate, median), (), rounds))
     state, layers = descend(images, 0), (images.left.layers[0], images.right.layers[0])
     validity = np.zeros(state.left.u.shape, np.uint8)
     pair = LevelPair(layers[0].words, layers[1].words)
