@@ -66,7 +66,6 @@ class Interrupts:
         # A notebook or another program that has a handler of its own keeps it.
         before = signal.getsignal(signal.SIGINT)
         if main and (before is signal.default_int_handler or isinstance(before, OutsideImports)):
-            # Set even where it is the default: a library may have put a handler there that prints its stack.
             ours = [signal.SIGINT, *[signal.SIGTERM] * (signal.getsignal(signal.SIGTERM) is signal.SIG_DFL)]
             self._before = {number: signal.signal(number, self._interrupted) for number in ours}
             self._hook, sys.unraisablehook = sys.unraisablehook, self._unraisable
