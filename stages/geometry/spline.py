@@ -75,12 +75,13 @@ def value_and_gradient(spline, x, y):  # type: ignore[no-untyped-def]
 
     The point lies at 1 <= x < cols - 2, and y alike: a spline reads from one pixel before to two behind it.
     """
-    i, j = np.uint32(x - 1.0), np.uint32(y - 1.0)  # unsigned: not counted from the end, so no check at each use
-    t, s = np.float32(x - 1.0 - i), np.float32(y - 1.0 - j)
+    i, j = np.uint32(x), np.uint32(y)
+    t, s = x - np.float32(i), y - np.float32(j)
     wx, wy, dx, dy = weights(t), weights(s), slopes(t), slopes(s)
     value = along_x = along_y = np.float32(0.0)
     for k in range(4):
-        a, b, c, d = spline[j + k, i], spline[j + k, i + 1], spline[j + k, i + 2], spline[j + k, i + 3]
+        row = spline[j + k - 1]
+        a, b, c, d = row[i - 1], row[i], row[i + 1], row[i + 2]
         across = wx[0] * a + wx[1] * b + wx[2] * c + wx[3] * d
         along = dx[0] * a + dx[1] * b + dx[2] * c + dx[3] * d
         value += wy[k] * across

@@ -173,12 +173,20 @@ def on_line(line, along):  # type: ignore[no-untyped-def]
     return along * b - c * a, -along * a - c * b
 
 
+@register_jitable
+def coefficients(f, x, y):  # type: ignore[no-untyped-def]
+    """Numbers a, b, c of the lines ``a x' + b y' + c = 0`` in the right image, of places in the left one."""
+    return (
+        f[0, 0] * x + f[0, 1] * y + f[0, 2],
+        f[1, 0] * x + f[1, 1] * y + f[1, 2],
+        f[2, 0] * x + f[2, 1] * y + f[2, 2],
+    )
+
+
 @njit(cache=True, nogil=True)
 def lines_at(f, x, y):  # type: ignore[no-untyped-def]
     """As :func:`lines`, of single pixels (n,): (3, n) float32."""
-    a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
-    b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
-    c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
+    a, b, c = coefficients(f, x, y)
     # Without a band all is zero, and 0 / 0 must stay 0.
     scale = 1.0 / np.maximum(np.sqrt(a * a + b * b), 1e-12)
     return np.stack((a * scale, b * scale, (c + a * x + b * y) * scale)).astype(np.float32)
@@ -196,15 +204,17 @@ def oriented(f: Matrix, shape: tuple[int, ...]) -> Matrix:
     return f if (b if along_rows(f, shape) else -a) > 0 else -f
 
 
-def settled(f: Matrix, u: AnyArray, v: AnyArray, wanted: AnyArray) -> AnyArray:
+@njit(cache=True, nogil=True)
+def settled(f, u, v, wanted):  # type: ignore[no-untyped-def]
     """Row displacements (row, col), those of the ``wanted`` pixels by their column displacements and their lines.
 
     Only where lines run along the rows rather than along the columns: there an error of the column is not enlarged.
     """
-    at = np.flatnonzero(wanted)
-    y, x = np.divmod(at, wanted.shape[1])
-    a, b, c = lines_at(f, x, y)
-    flat = np.abs(b) > np.abs(a)
     out = v.copy()
-    out.flat[at[flat]] = -(a * u.flat[at] + c)[flat] / b[flat]
+    for y in range(v.shape[0]):
+        for x in range(v.shape[1]):
+            if wanted[y, x]:
+                a, b, c = coefficients(f, x, y)
+                if abs(b) > abs(a):
+                    out[y, x] = -(a * (x + u[y, x]) + c) / b - y
     return out

@@ -12,7 +12,7 @@ result of the pair matched in one window: tiles do not see patches and propagati
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -371,7 +371,7 @@ def match_finest_level(pair: Coarse, window: Window) -> dict[str, AnyArray]:
     result = subpixel(work)  # 4.3.2
     for step in images.params.kept(images.recipe.refinement):  # 4.3.3 back-matching, refinement, validation
         result = step(work, result)
-    arrays = asdict(result)
+    arrays = dict(vars(result))
     arrays["u"] = arrays["u"] + np.float32(target.x0 - outer.x0)
     arrays["v"] = arrays["v"] + np.float32(target.y0 - outer.y0)
     return {name: np.ascontiguousarray(a[window.inside(outer)]) for name, a in arrays.items()}

@@ -101,8 +101,8 @@ def thinned(marked: AnyArray, most: int) -> tuple[NDArray[np.int64], NDArray[np.
     """
     places = np.flatnonzero(marked)
     step = 1 << max(0, int(np.log2(max(len(places) / most, 1.0))))
-    key = (places.astype(np.uint64) * np.uint64(2654435769)) & np.uint64(0xFFFFFFFF)
-    y, x = np.divmod(places[key < np.uint64((1 << 32) // step)], marked.shape[1])
+    key = places.astype(np.uint32) * np.uint32(2654435769)
+    y, x = np.divmod(places[key < (1 << 32) // step], marked.shape[1])
     return y, x
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numba import njit
 
@@ -75,13 +76,14 @@ def doubled(
     """
     rows, cols = valid.shape
     rest = ("validity", "backmatch_error", "distance", "disparity_std")
-    big = {name: arrays[name].repeat(2, axis=0)[:rows].repeat(2, axis=1)[:, :cols] for name in rest}
+    double = partial(cv2.resize, dsize=None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
+    big = {name: double(arrays[name])[:rows, :cols] for name in rest}
     u, v, inside = np.empty(valid.shape, np.float32), np.empty(valid.shape, np.float32), np.empty(valid.shape, bool)
     _doubled((arrays["column_disparity"], arrays["row_disparity"]), first, right, (u, v), inside)
     bits = big["validity"]
     gone = (valid == 0) | (~inside & (bits & Validity.MATCHED != 0))
-    bits[gone] = bits[gone] & ~np.uint8(Validity.MATCHED | Validity.INTERPOLATED)
-    bits[gone] |= np.uint8(Validity.OUT_OF_IMAGE)
+    unmatched = bits & ~np.uint8(Validity.MATCHED | Validity.INTERPOLATED) | np.uint8(Validity.OUT_OF_IMAGE)
+    np.copyto(bits, unmatched, where=gone)
     for a in (big["backmatch_error"], big["disparity_std"]):
         a *= 2
     for a in (u, v, big["disparity_std"]):
@@ -92,18 +94,16 @@ def doubled(
 @njit(cache=True, nogil=True)
 def _doubled(small, first, right, big, inside):  # type: ignore[no-untyped-def]
     """Displacements twice as large, along their slopes, and whether they end in the right image."""
-    rows, cols = inside.shape
-    u, v = big
+    (rows, cols), half = inside.shape, np.float32(0.5)
     for k in range(2):
-        a, out = small[k], big[k]
-        for j in range(a.shape[0]):
-            for i in range(a.shape[1]):
-                along, down = _slope(a, j, i, 0, 1), _slope(a, j, i, 1, 0)
-                for y in range(2 * j, min(2 * j + 2, rows)):
-                    for x in range(2 * i, min(2 * i + 2, cols)):
-                        # From the middle of the four pixels half a pixel to either side.
-                        below, beside = np.float32(y - 2 * j - 0.5), np.float32(x - 2 * i - 0.5)
-                        out[y, x] = 2 * a[j, i] + down * below + along * beside
+        along, down = _slopes(small[k]), _slopes(small[k].T).T
+        for y in range(rows):
+            # From the middle of the four pixels half a pixel to either side.
+            here, out, below = small[k][y // 2], big[k][y], half if y % 2 else -half
+            for x in range(cols):
+                beside = half if x % 2 else -half
+                out[x] = 2 * here[x // 2] + down[y // 2, x // 2] * below + along[y // 2, x // 2] * beside
+    u, v = big
     for y in range(rows):
         for x in range(cols):
             xr, yr = np.float32(x + first[0]) + u[y, x], np.float32(y + first[1]) + v[y, x]
@@ -111,12 +111,14 @@ def _doubled(small, first, right, big, inside):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _slope(a, y, x, down, along):  # type: ignore[no-untyped-def]
-    """Slope of displacements where it is alike on both sides, within a pixel; else 0."""
-    if y < down or x < along or y + down >= a.shape[0] or x + along >= a.shape[1]:
-        return np.float32(0.0)
-    before, after = a[y, x] - a[y - down, x - along], a[y + down, x + along] - a[y, x]
-    return np.float32(0.5) * (before + after) if abs(before - after) <= 1 else np.float32(0.0)
+def _slopes(a):  # type: ignore[no-untyped-def]
+    """Slopes (row, col) of displacements along their rows, where alike on both sides, within a pixel; else 0."""
+    out = np.zeros(a.shape, np.float32)
+    for y in range(a.shape[0]):
+        for x in range(1, a.shape[1] - 1):
+            before, after = a[y, x] - a[y, x - 1], a[y, x + 1] - a[y, x]
+            out[y, x] = np.float32(0.5) * (before + after) if abs(before - after) <= 1 else np.float32(0.0)
+    return out
 
 
 Tell = Callable[[float, str], None]

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 from rille.stages.core.declare import AnyArray
@@ -21,11 +22,11 @@ from rille.stages.core.declare import AnyArray
 BLOCK_SIDE_PX = 16
 """Pixels of level 0; level 1 shows the same block by half as many."""
 
-MAX_PIXELS = 1 << 20
-"""Pixels: of a larger image only every so many rows of blocks are looked at."""
-
 MIN_BLOCKS = 20
 """Blocks without a masked pixel that an estimate needs."""
+
+SECOND_DIFFERENCE = np.array([1, -2, 1], np.float32) / np.sqrt(np.float32(6))
+"""Leaves white noise its variance."""
 
 
 def standard_deviation(images: Sequence[AnyArray], masks: Sequence[AnyArray]) -> float:
@@ -37,26 +38,17 @@ def standard_deviation(images: Sequence[AnyArray], masks: Sequence[AnyArray]) ->
     """
     if len(images) < 2 or min(images[0].shape) < 3 * BLOCK_SIDE_PX:
         return 0.0
-    rows, cols = images[0].shape
-    blocks = cols // BLOCK_SIDE_PX - 2
-    step = BLOCK_SIDE_PX * max(1, images[0].size // MAX_PIXELS)
-    tops = range(BLOCK_SIDE_PX, rows - 2 * BLOCK_SIDE_PX + 1, step)
-    squares = [
-        np.stack([_mean_squares(images[level], masks[level], y >> level, BLOCK_SIDE_PX >> level, blocks) for y in tops])
-        for level in (0, 1)
-    ]
-    variances = (squares[0] - squares[1]) / 0.75
+    squares = [_mean_squares(images[level], masks[level], BLOCK_SIDE_PX >> level) for level in (0, 1)]
+    rows, cols = squares[0].shape
+    variances = (squares[0] - squares[1][:rows, :cols]) / 0.75
     variances = variances[~np.isnan(variances)]
     return float(np.sqrt(max(np.median(variances), 0.0))) if variances.size >= MIN_BLOCKS else 0.0
 
 
-def _mean_squares(image: AnyArray, mask: AnyArray, top: int, side: int, blocks: int) -> AnyArray:
-    """Mean squared second differences of so many blocks of ``side`` rows from ``top`` on, the first one of them left
-    out; NaN where a pixel is masked."""
-    right = (blocks + 1) * side
-    # The blocks' pixels, and one more to each side.
-    bend = np.diff(np.diff(image[top - 1 : top + side + 1, side - 1 : right + 1], 2, axis=0), 2, axis=1)
-    # White noise of variance 1 has a second difference of variance 6 along an axis, 36 along both.
-    square = np.square(bend, dtype=np.float64) / 36.0
-    square[mask[top : top + side, side:right] == 0] = np.nan
-    return np.asarray(square.reshape(side, -1, side).mean(axis=(0, 2)))
+def _mean_squares(image: AnyArray, mask: AnyArray, side: int) -> AnyArray:
+    """Mean squared second differences of the blocks of ``side`` pixels but the outermost; NaN where one is masked."""
+    rows, cols = (size // side for size in image.shape)
+    bend = cv2.sepFilter2D(image, cv2.CV_32F, SECOND_DIFFERENCE, SECOND_DIFFERENCE)
+    square = np.where(mask, bend * bend, np.float32(np.nan))
+    blocks = cv2.resize(square[: rows * side, : cols * side], (cols, rows), interpolation=cv2.INTER_AREA)
+    return np.asarray(blocks[1:-1, 1:-1])

@@ -50,7 +50,7 @@ def test_little_images_have_none():
     assert noise.standard_deviation([rng.normal(90, 5, (90, 90))], [np.ones((90, 90))]) == 0.0
 
 
-def test_large_images_are_sampled():
+def test_noise_of_a_large_image():
     image = np.random.default_rng(3).normal(90, 4.0, (2048, 2048))
     assert found(image) == pytest.approx(4.0, rel=0.05)
 
