@@ -399,6 +399,8 @@ def _around(pair: Coarse, outer: Window) -> tuple[State, Window]:
 def _landing(work: FinestWork, shape: Shape) -> Window:
     """Window of the right image, as it is and of ``shape``, that the matches of a window lead to."""
     a = work.a.window
+    if a == whole(work.a.shape):
+        return whole(shape)
     u, v = work.to_right(work.left.u.astype(np.float32), work.left.v.astype(np.float32))
     y, x = np.arange(a.y0, a.y1)[:, None] + v, np.arange(a.x0, a.x1) + u
     # Relative to the window that stands there until this one is known.

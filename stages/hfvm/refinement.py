@@ -109,9 +109,11 @@ def refine(
     start : (row, col) float32, smoothed displacements, pixels.
     keep : (row, col) bool, pixels that have one.
     """
-    now, rests = start, list[AnyArray]()
+    now, rests, axes = start, list[AnyArray](), _axes(to_right, start)
     for _ in range(steps):
-        step_u, step_v, rest, per_noise = _step(images, to_right, now, keep)
+        planes = np.empty((4, *keep.shape), np.float32)
+        _window_steps(images, to_right(*now), axes, keep, planes)
+        step_u, step_v, rest, per_noise = planes
         rests.append(rest)
         now = local_mean(now[0] + step_u, now[1] + step_v, keep, 1, 1)
     _take_back(start, rests[0], now, rests[-1])
@@ -170,25 +172,23 @@ def local_mean(u, v, keep, radius, stride):  # type: ignore[no-untyped-def]
     return out_u, out_v
 
 
-def _step(images: SplineImages, to_right: Frame, now: tuple[AnyArray, AnyArray], keep: AnyArray) -> AnyArray:
-    """One mean-free step for every kept pixel: planes (4, row, col) float32.
-
-    Columns and rows, zero where there is none; residual variance before the step, infinite where there is none; and the
-    variance of the column for a unit of variance of the grey levels.
-    """
-    there, out = to_right(*now), np.empty((4, *keep.shape), np.float32)
-    axes = np.empty((4, 0, 0), np.float32)
-    if there[0] is not now[0]:
-        # Of the frame of steps, which the right image's may be turned and scaled against.
-        ends = *to_right(now[0] + 1, now[1]), *to_right(now[0], now[1] + 1)
-        axes = np.stack([end - begin for end, begin in zip(ends, 2 * there, strict=True)])
-    _window_steps(images, there, axes, keep, out)
-    return out
+def _axes(to_right: Frame, now: tuple[AnyArray, AnyArray]) -> AnyArray:
+    """Where a column and a row of the frame of steps lead in the right image, which may be turned and scaled against
+    it: planes (4, row, col) float32, (4, 0, 0) where both frames are one."""
+    there = to_right(*now)
+    if there[0] is now[0]:
+        return np.empty((4, 0, 0), np.float32)
+    ends = *to_right(now[0] + 1, now[1]), *to_right(now[0], now[1] + 1)
+    return np.stack([end - begin for end, begin in zip(ends, 2 * there, strict=True)])
 
 
 @njit(cache=True, nogil=True)
 def _window_steps(images, now, axes, keep, out):  # type: ignore[no-untyped-def]
-    """Steps of all windows; each is summed afresh, so that nothing adds up. Reach: the window's radius."""
+    """Steps of all windows; each is summed afresh, so that nothing adds up. Reach: the window's radius.
+
+    ``out``: planes (4, row, col): columns and rows, zero where there is no step; residual variance before the step,
+    infinite where there is none; and the variance of the column for a unit of variance of the grey levels.
+    """
     (rows, cols), radius, size = keep.shape, WINDOW_RADIUS_PX, 2 * WINDOW_RADIUS_PX + 1
     fresh, total = np.zeros((10, cols + 2 * radius), np.float32), np.empty((10, cols), np.float32)
     ring = np.zeros((size, 10, cols), np.float32)
