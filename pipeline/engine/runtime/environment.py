@@ -42,7 +42,7 @@ def _keep_memory() -> None:
         mallopt = ctypes.CDLL(None).mallopt
         # By default it gives back every array, and a tenth of the time of matching goes into taking memory anew.
         mallopt(-3, 32 << 20)  # M_MMAP_THRESHOLD: bytes of a block that it takes from the system by itself
-        mallopt(-1, 128 << 20)  # M_TRIM_THRESHOLD: bytes of free memory from which on it gives it back
+        mallopt(-1, 256 << 20)  # M_TRIM_THRESHOLD: bytes of free memory from which on it gives it back
 
 
 def cores() -> int:
