@@ -10,6 +10,7 @@ T_world_reference, 3 x 4 a line, of the frame that the calibration refers to.
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -63,7 +64,8 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
     folder = folder.resolve()
     if not (folder / "calib.txt").is_file():
         text = f"{path} has image folders {' and '.join(sides)}, but no calib.txt"
-        raise InputError("RIL-278", text, remedy=f"`rille init {path}` writes a manifest that says what is needed")
+        remedy = f"`rille init {shlex.quote(str(path))}` writes a manifest that says what is needed"
+        raise InputError("RIL-278", text, remedy=remedy)
     sequence = open_described(manifest_of(folder, sides), folder, str(folder), digests)
     return replace(sequence, defaults=STREET if sequence.rig.baseline >= CAR else {})
 

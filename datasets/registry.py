@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import os
 import pkgutil
+import shlex
 import site
 import sysconfig
 from collections.abc import Mapping
@@ -145,7 +146,8 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
     remedy = (
         f"give its manifest, {beside}"
         if beside.is_file()
-        else f"`rille init {name_or_path}` writes a manifest; `rille datasets list` names what opens without one"
+        else f"`rille init {shlex.quote(str(name_or_path))}` writes a manifest; `rille datasets list` names what opens"
+        " without one"
     )
     raise InputError("RIL-277", f"{name_or_path} has no layout that is recognised", remedy=remedy)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 import sys
 import time
@@ -46,7 +47,7 @@ def watch(seq: str, *, options: WatchOptions = _OPTIONS) -> int:
         return watched.to_the_end()
     except KeyboardInterrupt:
         last = f"the last result is {watched.folder}" if watched.folder else "there is no result yet"
-        print(f"rille: interrupted; {last}; `rille reconstruct {seq}` computes the rest", file=sys.stderr)
+        print(f"rille: interrupted; {last}; `rille reconstruct {shlex.quote(seq)}` computes the rest", file=sys.stderr)
         return INTERRUPTED
     finally:
         for workers in kept:
