@@ -498,6 +498,7 @@ def _builder(pair: StereoPair, settings: Settings) -> Builder:
 
 def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
     """Result of a task; of those that it needs what is ``known``, or an image that was ``drawn`` before, is taken."""
+    from rille.datasets.images.files import sound
     from rille.pipeline.engine.spec import each
 
     if handle in known:
@@ -509,7 +510,7 @@ def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
     inputs = each(lambda source: _computed(source, known, drawn), handle.inputs)
     result = known[handle] = spec.stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
     if recorded:
-        drawn[handle.label] = result
+        drawn[handle.label] = sound(result)
     return result
 
 

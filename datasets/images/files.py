@@ -359,8 +359,32 @@ def image_stage(
     """One image file, checked and grey."""
     name = f"frame {frame}, {camera} image {path}"
     data = read_unchanged(Path(path), sha256, name)
-    image, colour = decode_colour(data, name, header, levels)
+    try:
+        image, colour = decode_colour(data, name, header, levels)
+    except InputError as error:
+        return empty(frame, camera, header, error)
     meta: ImageFacts = {"frame": frame, "camera": camera}
     arrays: dict[str, NDArray[Any]] = {"image": image, "valid": np.ones(image.shape, np.uint8)}
     # The right image's colours would colour nothing: an ortho image is made of left ones.
     return Bundle(arrays if colour is None or camera != "left" else arrays | {"colour": colour}, meta)
+
+
+def empty(frame: int, camera: str, header: Header, damage: InputError) -> Bundle[ImageFacts]:
+    """An image without a usable pixel in the place of one that is ``damage``: this costs the frame, not the run."""
+    nothing = np.zeros((header.height, header.width), np.uint16 if header.depth > 8 else np.uint8)
+    why = damage.message.removeprefix(f"frame {frame}, ")
+    meta: ImageFacts = {"frame": frame, "camera": camera, "damage": why}
+    return Bundle({"image": nothing, "valid": nothing.astype(np.uint8)}, meta)
+
+
+def sound(image: Bundle) -> Bundle:
+    """The image, for those who need this very one.
+
+    Raises
+    ------
+    InputError
+        Its file is damaged.
+    """
+    if "damage" in image.meta:
+        raise InputError("RIL-170", f"frame {image.meta['frame']}, {image.meta['damage']}", remedy=COPY_AGAIN)
+    return image

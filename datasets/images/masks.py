@@ -69,4 +69,4 @@ def masked_image_stage(
     mask = usable(files.decode(files.read_unchanged(Path(path), sha256, name), name))
     arrays = {key: np.asarray(array) for key, array in image.arrays.items()}
     arrays["valid"] = (mask & (arrays["valid"] != 0)).astype(np.uint8)
-    return Bundle(arrays, {"frame": frame, "camera": camera})
+    return Bundle(arrays, image.meta)

@@ -70,7 +70,7 @@ def _images(source: Source) -> list[AnyArray]:
     with suppress(RilleError):
         stage = declared(import_module(source.module))
         assert stage is not None
-        return [np.asarray(stage.run(source.params, {**source.args, **source.hints}, {})["image"])]
+        return [np.asarray(files.sound(stage.run(source.params, {**source.args, **source.hints}, {}))["image"])]
     return []
 
 

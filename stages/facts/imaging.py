@@ -13,7 +13,7 @@ class PyramidFacts(Facts):
 
 
 class QualityFacts(Facts):
-    """Of each image of a frame: what :func:`rille.stages.imaging.image_quality.glance` gives."""
+    """Of each image of a frame: what :func:`rille.stages.imaging.image_quality.glance` gives, and its ``damage``."""
 
     frame: int
     left: dict[str, Any]

@@ -82,5 +82,8 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
 @stage("image_quality")
 def image_quality_stage(params: NoParams, left: Bundle, right: Bundle, *, frame: int) -> Bundle[QualityFacts]:
     """Grey values and sharpness of a pair, before anything is matched."""
-    glances = [glance(np.asarray(image["image"]), np.asarray(image["valid"])) for image in (left, right)]
+    glances = [
+        glance(np.asarray(image["image"]), np.asarray(image["valid"])) | {"damage": image.meta.get("damage")}
+        for image in (left, right)
+    ]
     return Bundle({}, {"frame": frame, "left": glances[0], "right": glances[1]})

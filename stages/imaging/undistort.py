@@ -137,4 +137,4 @@ def undistort_stage(
     if "colour" in image.arrays:
         bands = [undistort(band, lens, camera)[0] for band in np.moveaxis(image["colour"], 2, 0)]
         arrays["colour"] = np.rint(np.stack(bands, axis=2)).astype(np.uint8)
-    return Bundle(arrays, {})
+    return Bundle(arrays, image.meta)

@@ -141,7 +141,9 @@ def _see(
             seen = qualities[f][side]
             if seen["deviation"] < params.uniform:
                 kind = "empty" if seen["mean"] is None else next(word for up, word in GREYS if seen["mean"] <= up)
-                words = f"{kind} {side} image (grey values deviate by {seen['deviation']:.1f} levels)"
+                words = seen.get("damage") or (
+                    f"{kind} {side} image (grey values deviate by {seen['deviation']:.1f} levels)"
+                )
                 (out.lost if side == "left" else out.unfit).setdefault(f, words)
                 continue
             for what, limit in (("sharpness", params.blurred), ("detail", 0.5 * params.blurred)):

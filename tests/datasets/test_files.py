@@ -140,11 +140,26 @@ def test_stage_gives_the_image_whole_and_declared(tmp_path, grey):
         assert bundle.meta == {"frame": 3, "camera": "right"}
 
 
-def test_stage_refuses_other_sizes_and_changed_files(tmp_path, grey):
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_file_that_is_damaged_inside_gives_an_empty_image(tmp_path, suffix):
+    data = bytearray(encoded(np.random.default_rng(3).integers(0, 255, (96, 128)).astype(np.uint8), suffix))
+    data[len(data) // 2 : len(data) // 2 + 200] = bytes(200)
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(data)
+    bundle = run(files.image_source(path, 3, "left", Header(128, 96, 8), Digests()))
+    assert bundle["image"].shape == (96, 128)
+    assert not bundle["valid"].any()
+    assert bundle.meta["damage"].startswith(f"left image {path} is damaged")
+    with raises("RIL-170", f"frame 3, left image {path} is damaged"):
+        files.sound(bundle)
+
+
+def test_stage_takes_no_other_size_and_refuses_changed_files(tmp_path, grey):
     path = tmp_path / "a.png"
     path.write_bytes(encoded(grey))
-    with raises("RIL-176", "frame 3", "50 x 40", "51 x 40"):
-        run(files.image_source(path, 3, "left", Header(51, 40, 8), Digests()))
+    other = run(files.image_source(path, 3, "left", Header(51, 40, 8), Digests()))
+    assert "50 x 40, 8 bits; others of its camera are 51 x 40" in other.meta["damage"]
+    assert other["image"].shape == (40, 51)
     source = files.image_source(path, 3, "left", Header(50, 40, 8), Digests())
     path.write_bytes(encoded(grey[::-1]))
     with raises("RIL-177"):

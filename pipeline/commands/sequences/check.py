@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from rille.datasets.images.files import sound
 from rille.datasets.protocol import CAMERAS, Sequence
 from rille.pipeline.commands import batch
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
@@ -134,7 +135,7 @@ class Inspection:
             try:
                 if handle.ref is None:
                     raise _cause(handle)
-                bundle = self.store.open(handle.ref)
+                bundle = sound(self.store.open(handle.ref))
             except RilleError as error:
                 errors.append(error)
                 self.broken.add((frame, camera))

@@ -59,6 +59,8 @@ def test_a_black_frame_is_lost_whatever_matches_and_is_bridged():
     assert found({}, qualities).asks["bridges"] == [(2, 4)]
     out = found({(2, 4): 0.6}, qualities)
     assert out.lost == {3: "black left image (grey values deviate by 0.2 levels)"}
+    qualities[3] = sight(3, mean=None, deviation=0.0, damage="left image 3.png is damaged")
+    assert found({(2, 4): 0.6}, qualities).lost == {3: "left image 3.png is damaged"}
 
 
 def test_a_blurred_frame_is_posed_but_not_basic_unless_nothing_matches_it():
