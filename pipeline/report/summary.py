@@ -308,9 +308,10 @@ def _drive(scene: Scene) -> dict[str, Any] | None:
     if drive is None:
         return None
     fix = scene.view.bundle(drive.fix)
-    place = {} if fix is None else {key: fix.meta[key] for key in ("source", "std", "other") if key in fix.meta}
+    place: dict[str, Any] = {}
     if fix is not None:
-        place["xy"] = [fix.meta["T_global_local"][3], fix.meta["T_global_local"][7]]
+        place = {key: fix.meta[key] for key in ("source", "std") if key in fix.meta}
+        place |= {"xy": fix.meta["T_global_local"][3:8:4], "other": fix.meta.get("fit", {}).get("other")}
     return {"verdict": drive.verdict, "reason": drive.reason, "stops": tables.stops(scene), "place": place}
 
 

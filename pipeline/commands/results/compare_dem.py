@@ -13,7 +13,6 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
@@ -26,8 +25,9 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation import dem_changes
 from rille.stages.evaluation import dem_comparison as evaluation
-from rille.stages.evaluation.dem_comparison import Grid
 from rille.stages.evaluation.place import register
+from rille.stages.geometry.geometry import from_above, rotation_log
+from rille.stages.terrain.grid import Grid
 
 SHOWN_CHANGES = 12
 """Patches that are printed; all are in the JSON file."""
@@ -73,8 +73,11 @@ def compare_dem(
             raise InputError("RIL-908", text, remedy="leave --align place out")
         image, reference = (read_ortho(path / "ortho.tif")[0] for path in paths)
         placed = register((image, reference), (one.grid, other.grid))
-        place = {"motion_of_a": placed.motion.tolist(), "by": placed.by}
-        one, align = moved(one, placed.motion), "rigid"
+        x, y, heading = from_above(placed.pose)
+        cos, sin = math.cos(heading), math.sin(heading)
+        motion = np.array([[cos, -sin, x], [sin, cos, y]])
+        place = {"motion_of_a": motion.tolist(), "by": placed.by}
+        one, align = moved(one, motion), "rigid"
     refuse_unlike_systems({one.name: one.crs, other.name: other.crs})
     figures, error, cells = measure(one, other, align)
     figures["place"] = place
@@ -126,7 +129,7 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
         figures["before_alignment"] = evaluation.figures(evaluation.errors(on_a, on_b))
         alignment = evaluation.align(on_a, on_b, align)  # type: ignore[arg-type]
         figures["alignment"] = _alignment(alignment, align)
-    error = evaluation.errors(on_a, on_b, alignment)
+    error = evaluation.errors(on_a, on_b, None if alignment is None else alignment.pose)
     figures["figures"] = evaluation.figures(error)
     compared, known = int(np.isfinite(error).sum()), np.isfinite(on_b.values)
     if not compared:
@@ -154,10 +157,7 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
 
 def changed(a: DemFile, b: DemFile, error: Floats, grid: Grid) -> tuple[NDArray[np.float32], dict[str, Any]]:
     """Standard deviation of the ``error`` of :func:`measure` on a grid, and list (JSON-able) of what rose or fell."""
-    sigma = [
-        np.zeros(error.shape) if one.sigma is None else evaluation.interpolate(one.grid, grid.centres(), one.sigma)
-        for one in (a, b)
-    ]
+    sigma = [np.zeros(error.shape) if one.sigma is None else one.grid.at(grid.centres(), one.sigma) for one in (a, b)]
     deviation = dem_changes.standard_deviation(error, np.hypot(*sigma), np.hypot(*grid.slopes()), grid.cell)
     found = dem_changes.changes(error, deviation, grid.cell)
     places = [grid.matrix @ np.array([one.col, one.row, 1.0]) for one in found]
@@ -199,16 +199,17 @@ def _about(raster: DemFile) -> dict[str, Any]:
 
 
 def _alignment(alignment: evaluation.Alignment, kind: str) -> dict[str, Any]:
-    turn = np.degrees(Rotation.from_matrix(alignment.rotation).as_rotvec())
     names = ("x_m", "y_m", "z_m", "about_x_deg", "about_y_deg", "about_z_deg")
-    values, sigma = [*alignment.translation, *turn], [*alignment.sigma[:3], *np.degrees(alignment.sigma[3:])]
+    start = alignment.pose.inverse().apply(alignment.centre)
+    values = [*(alignment.centre - start), *np.degrees(rotation_log(alignment.pose.rotation))]
+    sigma = [*alignment.sigma[:3], *np.degrees(alignment.sigma[3:])]
     return {
         "kind": kind,
         "motion_of_a": {names[k]: float(values[k]) for k in evaluation.FREE[kind]},
         "sigma": {names[k]: float(sigma[k]) for k in evaluation.FREE[kind]},
-        "centre_m": alignment.centre.tolist(),
+        "centre_m": start.tolist(),
         "how": "x_b = R (x_a - centre) + centre + t; least squares of the elevation differences, Tukey's biweight",
-        "iterations": alignment.iterations,
+        "iterations": alignment.rounds,
         "points": alignment.points,
     }
 

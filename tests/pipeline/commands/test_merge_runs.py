@@ -98,7 +98,7 @@ def test_what_is_no_second_session_is_one_line_each(tmp_path: Path) -> None:
         ("RIL-327", a, b),
         ("RIL-851", a, coarse),
         ("RIL-615", utm, other),
-        ("RIL-323", utm, far),
+        ("RIL-853", utm, far),
     ):
         with raises(code):
             merge(str(one), str(two), output=tmp_path / "out")
