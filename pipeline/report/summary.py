@@ -343,7 +343,7 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
     return {name: {key: round(value, 3) for key, value in row.items()} for name, row in by_stage.items()}
 
 
-NOT_IN_FACTS = ("images", "undistorted", "tracks", "world_dem", "accuracy_pieces", "truth_risk")
+NOT_IN_FACTS = ("images", "undistorted", "tracks", "world_dem", "truth_risk")
 """Products that the facts are not made of."""
 
 
