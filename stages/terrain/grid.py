@@ -91,11 +91,15 @@ class Grid:
         mean = np.where(count >= MIN_KNOWN_OF_FOUR, np.nansum(four, axis=(1, 3)) / np.maximum(count, 1), np.nan)
         return Grid(mean, self.matrix @ np.array([[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]]))
 
+    def part(self, window: tuple[slice, slice]) -> Grid:
+        """The cells of a window (rows, cols)."""
+        corner = [[1.0, 0.0, window[1].start], [0.0, 1.0, window[0].start], [0.0, 0.0, 1.0]]
+        return Grid(self.values[window], self.matrix @ np.array(corner))
+
     def within(self, xy: Sequence[float], distance: float) -> Grid:
         """The part that holds all within a distance of a place, metres; it may be empty."""
         at = self.index(np.asarray(xy, np.float64))
         (row, col), (last, right) = (
             np.clip(np.rint(at + side * distance / self.cell), 0, self.values.shape).astype(int) for side in (-1, 1)
         )
-        corner = self.matrix @ np.array([[1.0, 0.0, col], [0.0, 1.0, row], [0.0, 0.0, 1.0]])
-        return Grid(self.values[row:last, col:right], corner)
+        return self.part((slice(row, last), slice(col, right)))

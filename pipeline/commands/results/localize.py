@@ -209,7 +209,7 @@ def _found(terrain: Terrain, model: DemFile | None, image: Grid | None, around: 
         warn(line)
     if by_ortho is not None:
         # Elevations and ortho images must agree on a place within ten cells of the map.
-        around = SearchArea(*from_above(by_ortho.pose), 10.0 * model.cell, math.radians(TURN_DEG))
+        around = SearchArea(*from_above(by_ortho.pose), 10.0 * model.grid.cell, math.radians(TURN_DEG))
     # Standard deviation, degrees, of a vertical that a sensor gives, and of one that is that of the ground.
     tilt = 0.5 if terrain.vertical == "attitude" else 5.0
     params = MapLocalizationParams.model_validate({"sigma_tilt_deg": tilt})
