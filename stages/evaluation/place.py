@@ -114,15 +114,10 @@ def _agreed(p: Floats, q: Floats, near: float) -> tuple[Floats | None, Bools]:
 
 def _described(image: Grid, other: float) -> tuple[Floats, AnyArray]:
     """Places x, y (n, 2) of keypoints, metres, and descriptors (n, 128); in an image no finer than ``other``, m."""
+    while other > MAX_RATIO * image.cell:
+        image = image.halved()
     grey: AnyArray = np.nan_to_num(image.values.astype(np.float32))
-    known, matrix, ratio = np.isfinite(image.values).astype(np.float32), image.matrix, other / image.cell
-    if ratio > MAX_RATIO:
-        rows, cols = (max(1, round(n / ratio)) for n in grey.shape)
-        step = np.diag([grey.shape[1] / cols, grey.shape[0] / rows])
-        shares = cv2.resize(known, (cols, rows), interpolation=cv2.INTER_AREA)
-        sums = cv2.resize(grey, (cols, rows), interpolation=cv2.INTER_AREA)
-        grey, known = sums / np.maximum(shares, 1e-6), (shares > 0.5).astype(np.float32)
-        matrix = np.column_stack([matrix[:, :2] @ step, matrix @ [*(0.5 * (np.diag(step) - 1.0)), 1.0]])
+    known, matrix = np.isfinite(image.values).astype(np.float32), image.matrix
     low, high = np.percentile(grey[known > 0], (1, 99)) if known.any() else (0.0, 255.0)
     if low < 0 or high > 255 or high - low < MIN_CONTRAST:  # of other units, or pale
         grey = (grey - low) * (255.0 / max(high - low, 1e-12))
