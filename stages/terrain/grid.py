@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy
@@ -64,18 +65,19 @@ class Grid:
 
         NaN where one of the cells that count is unknown, or outside.
         """
-        array = self.values if values is None else values
         index = np.moveaxis(self.index(xy), -1, 0)
         nearest = np.rint(index)
         index = np.where(np.abs(index - nearest) < 1e-6, nearest, index)  # the same cells: the same values
-        known = np.isfinite(array)
-        share, z = (
-            scipy.ndimage.map_coordinates(a, index, order=1, mode="constant", cval=0.0)
-            # Interpolating the mask beside the values tells where an unknown cell had a part; NaN itself would also
-            # spoil points whose weight for it is 0.
-            for a in (known.astype(np.float64), np.where(known, array, 0.0))
-        )
+        # Interpolating the mask beside the values tells where an unknown cell had a part; NaN itself would also spoil
+        # points whose weight for it is 0.
+        parts = self._parts if values is None else _parts(values)
+        share, z = (scipy.ndimage.map_coordinates(a, index, order=1, mode="constant", cval=0.0) for a in parts)
         return np.where(share > 1.0 - 1e-9, z, np.nan)
+
+    @cached_property
+    def _parts(self) -> tuple[Floats, Floats]:
+        # Kept: an estimation asks for few points of a large map again and again.
+        return _parts(self.values)
 
     def slopes(self) -> Floats:
         """Gradient dz/dx, dz/dy (2, rows, cols) of elevations, NaN unknown."""
@@ -103,3 +105,9 @@ class Grid:
             np.clip(np.rint(at + side * distance / self.cell), 0, self.values.shape).astype(int) for side in (-1, 1)
         )
         return self.part((slice(row, last), slice(col, right)))
+
+
+def _parts(values: Floats) -> tuple[Floats, Floats]:
+    """1 where values are known, and they themselves, both 0 elsewhere."""
+    known = np.isfinite(values)
+    return known.astype(np.float64), np.where(known, values, 0.0)
