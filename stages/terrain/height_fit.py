@@ -47,7 +47,7 @@ class HeightFit(NamedTuple):
 
     ``differences`` (n,): heights of the points above the ground, m, NaN unknown, and their weighted mean ``square``,
     m2. ``normal`` (6, 6): normal matrix of x, y, z, m, and the rotations about them at the centre, rad, without the
-    prior. ``step`` (6,): what would come next; zeros where something is not determined. ``rounds``: steps so far.
+    prior. ``step`` (6,): the last one, zeros where something is not determined. ``rounds``: how many there were.
     """
 
     pose: RigidTransform
@@ -111,5 +111,5 @@ def lay(points: Floats, normals: Floats, ground: Grid, start: RigidTransform, ru
         step = step / max(float(np.abs(step[:2]).max()) / ground.cell, 1.0)
         centre, rotation = centre + step[:3], orthonormal(rotation_exp(step[3:]) @ rotation)
         if not determined or moved < SETTLED_CELLS or math.hypot(*(centre - begin)[:2]) > rules.near:
-            break
+            return fit._replace(pose=RigidTransform(rotation, centre - rotation @ own), centre=centre)
     return fit
