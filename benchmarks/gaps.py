@@ -76,7 +76,7 @@ def trajectory_of(sequence: Any, frames: tuple[int, ...], cache: Path, settings:
 
         def node(self, stage: Any, *args: Any, **more: Any) -> Handle:  # type: ignore[override]
             handle = super().node(stage, *args, **more)
-            if handle.stage in ("locus", "truth") or any(h not in self.nodes for h in handle.upstream()):
+            if handle.stage in ("locus", "accuracy") or any(h not in self.nodes for h in handle.upstream()):
                 self.nodes.remove(handle)
             return handle
 

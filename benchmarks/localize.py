@@ -17,7 +17,7 @@ import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,8 @@ from rille.datasets.mockup.scene import build_scene
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.geometry import RigidTransform, from_above, rotation_exp, rotation_log
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.terrain.map_localization import Fix, GlobalMap, MapLocalizationParams, SearchArea, fix
+from rille.stages.terrain.grid import Grid
+from rille.stages.terrain.map_localization import MapLocalizationParams, Placement, SearchArea, fix
 
 STEP, CELL, ERROR_M = 5, 0.001, 0.002
 DISTANCE_M, TURN = 2.0, math.radians(10.0)
@@ -37,10 +38,9 @@ KEPT = [0, 1, 2, 5]
 
 
 class Stop(NamedTuple):
-    """Elevation model (row, col) of a pair, its lattice, and the true pose of its origin on the bed."""
+    """Elevation model of a pair, and the true pose of its origin on the bed."""
 
-    elevation: Any
-    lattice: Lattice
+    model: Grid
     pose: RigidTransform
 
 
@@ -62,10 +62,10 @@ def stop(seed: int, frame: int, folder: Path | None) -> Stop:
     # Level: x to the right and y along the optical axis, seen from above.
     ahead = camera.rotation[:, 2]
     turn = rotation_exp([0.0, 0.0, math.atan2(-ahead[0], ahead[1])])
-    return Stop(z, Lattice(float(x[0]), float(y[0]), CELL, *z.shape), RigidTransform(turn, camera.translation))
+    return Stop(Grid.on(Lattice(float(x[0]), float(y[0]), CELL, *z.shape), z), RigidTransform(turn, camera.translation))
 
 
-def bed_map(seed: int, ratio: int) -> GlobalMap:
+def bed_map(seed: int, ratio: int) -> Grid:
     """The exact elevation of a bed in so many times wider cells, with errors."""
     p = MockupParams(seed=seed)
     scene = build_scene(p.part(SceneParams))
@@ -73,11 +73,11 @@ def bed_map(seed: int, ratio: int) -> GlobalMap:
     rows, cols = (n // ratio for n in z.shape)
     mean = z[: rows * ratio, : cols * ratio].reshape(rows, ratio, cols, ratio).mean(axis=(1, 3))
     mean += ERROR_M * np.random.default_rng([seed, ratio]).standard_normal(mean.shape)
-    half = 0.5 * (ratio - 1) * at["cell"]
-    return GlobalMap(mean, at["x0"] + half, at["y0"] - half, ratio * at["cell"])
+    half, cell = 0.5 * (ratio - 1) * at["cell"], ratio * at["cell"]
+    return Grid(mean, np.array([[cell, 0.0, at["x0"] + half], [0.0, -cell, at["y0"] - half]]))
 
 
-def sought(one: Stop, ground: GlobalMap, rng: np.random.Generator) -> tuple[Fix | None, float]:
+def sought(one: Stop, ground: Grid, rng: np.random.Generator) -> tuple[Placement | None, float]:
     """The place of a stop, None where it is refused, and processor seconds."""
     x, y, heading = from_above(one.pose)
     far, way = DISTANCE_M * math.sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * math.pi)
@@ -85,7 +85,7 @@ def sought(one: Stop, ground: GlobalMap, rng: np.random.Generator) -> tuple[Fix 
     around = SearchArea(*start, DISTANCE_M, TURN)
     begin = time.process_time()
     try:
-        found = fix(one.elevation, one.lattice, ground, around, MapLocalizationParams())
+        found = fix(one.model, ground, around, MapLocalizationParams())
     except RilleError:
         found = None
     return found, time.process_time() - begin
@@ -104,7 +104,7 @@ def rows(seeds: range, ratio: int, folder: Path | None, elsewhere: bool) -> Iter
                 error = np.concatenate([found.pose.translation - one.pose.translation, turned])[KEPT]
                 row |= {"error": float(np.hypot(*error[:2])), "yaw": abs(math.degrees(error[3]))}
                 row["nees"] = float(error @ np.linalg.solve(found.covariance[np.ix_(KEPT, KEPT)], error))
-                row["chi2"] = math.inf if found.other is None else found.other[1]
+                row["chi2"] = found.figures["other"]["chi2"] if "other" in found.figures else math.inf
                 row["right"] = float(row["error"] < 2.0 * ground.cell and row["yaw"] < 2.0)
             yield row
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from rille.stages.core.declare import Bundle
 from rille.stages.evaluation.crosscheck import windows
 from rille.stages.geometry.rigid import by_frame
+from rille.stages.odometry.resection.trajectory import world_poses
 
 from .chain import STAGES, Clock, Images, Navigated
 
@@ -42,5 +41,5 @@ def run(images: Images, config: Any) -> Navigated:
     """Poses of the largest piece, NaN elsewhere."""
     clock = Clock()
     found, reprojection_px = joined(features(images, clock), images.sequence.rig, config, clock)
-    poses = by_frame(np.asarray(found["poses"]), [int(f) for f in found.meta["frames"]], list(images.frames))
+    poses = by_frame(world_poses(found), [int(f) for f in found.meta["frames"]], list(images.frames))
     return Navigated(poses, None, {"reprojection_px": reprojection_px}, clock)

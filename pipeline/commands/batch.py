@@ -5,15 +5,12 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from rille.pipeline.commands.complaints import complain
-from rille.pipeline.engine import events
 from rille.pipeline.engine.failures import translated
-from rille.pipeline.runs.lookup import LEDGER
 from rille.pipeline.runs.options import COMPLETE, FAILED, HOLES, USAGE
 
 STATES = {COMPLETE: "complete", HOLES: "with holes", USAGE: "refused", FAILED: "failed"}
@@ -81,6 +78,5 @@ def _figures(folder: Path | None) -> tuple[str, str, str, str, str]:
     drift = report["metrics"].get("trajectory_drift", {}).get("value")
     frames = report["frames"]
     share = f"{100 * sum(frame['posed'] for frame in frames) / len(frames):.0f} %" if frames else ""
-    tasks = Counter(row["status"] for row in events.read(folder / LEDGER))
-    missing, computed, cached = len(report["missing"]), tasks["computed"], tasks["cached"]
-    return share, "" if drift is None else f"{drift:.3g} %", str(missing), str(computed), str(cached)
+    computed, cached = (str(sum(one[what] for one in report["stages"].values())) for what in ("computed", "cached"))
+    return share, "" if drift is None else f"{drift:.3g} %", str(len(report["missing"])), computed, cached

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import textwrap
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Literal, get_args, get_origin
@@ -14,6 +13,7 @@ from rille.datasets.images.misalign import MisalignParams
 from rille.datasets.mockup.params import MockupParams
 from rille.datasets.mockup.rover import RoverParams
 from rille.pipeline.flow import config
+from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, FLAG
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import ConfigError
@@ -33,8 +33,7 @@ def params(section: str = "", *, markdown: Annotated[bool, FLAG] = False) -> int
     """
     known = sections()
     if section and section not in known:
-        near = difflib.get_close_matches(section, known, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"one of {', '.join(sorted(known))}"
+        hint = lookup.near(section, known) or f"one of {', '.join(sorted(known))}"
         raise ConfigError("RIL-920", f"there is no section {section!r}", remedy=hint)
     chosen = {section: known[section]} if section else known
     print("\n".join(page(chosen) if markdown else plain(chosen)))

@@ -29,7 +29,7 @@ from rille.datasets.text.warning import warning
 from rille.pipeline.engine.memory import free, words
 from rille.pipeline.export.writers import ENGINEERING_CRS
 from rille.stages.core.errors import InputError
-from rille.stages.evaluation.dem_comparison import Grid
+from rille.stages.terrain.grid import Grid
 
 MAX_CELLS = 500_000_000
 """Of an elevation model, which is read whole."""
@@ -48,34 +48,28 @@ METRE = ("m", "metre", "metres", "meter", "meters")
 class DemFile:
     """An elevation model of any program.
 
-    ``values`` (rows, cols) metres, NaN unknown. ``transform`` maps (column, row), corners of cells at integers, to the
-    CRS. ``crs`` WKT, empty where the file states none. ``viewpoints`` (n, 2) positions of the cameras in the CRS, where
-    they are known. ``sigma`` (rows, cols) standard deviation of the elevations, metres, likewise. ``warnings``: what is
-    suspicious but possible.
+    ``grid`` of elevations, metres, NaN unknown, in the CRS. ``crs`` WKT, empty where the file states none.
+    ``viewpoints`` (n, 2) positions of the cameras in the CRS, where they are known. ``sigma`` (rows, cols) standard
+    deviation of the elevations, metres, likewise. ``warnings``: what is suspicious but possible.
     """
 
     name: str
-    values: NDArray[np.float64]
-    transform: Affine
+    grid: Grid
     crs: str
     viewpoints: NDArray[np.float64] | None = None
     sigma: NDArray[np.float64] | None = None
     warnings: tuple[str, ...] = ()
 
-    @property
-    def cell(self) -> float:
-        """Side of a cell, metres."""
-        return float(np.sqrt(abs(self.transform.determinant)))
 
-    @property
-    def grid(self) -> Grid:
-        """The elevations, placed by the centres of their cells."""
-        return Grid(self.values, centres(self.transform))
+def transform_of(grid: Grid) -> Affine:
+    """Transform from (column, row), corners of cells at integers, to the CRS, as rasters have it."""
+    return Affine(*grid.matrix.ravel()) @ Affine.translation(-0.5, -0.5)
 
 
-def centres(transform: Affine) -> NDArray[np.float64]:
-    """Map (2, 3) from (column, row, 1) of the cells' centres, of a raster's transform, which is that of corners."""
-    return np.asarray(transform @ Affine.translation(0.5, 0.5), np.float64).reshape(3, 3)[:2]
+def _placed(values: NDArray[Any], transform: Affine) -> Grid:
+    """Values on the cells of a raster."""
+    centres = np.asarray(transform @ Affine.translation(0.5, 0.5), np.float64).reshape(3, 3)[:2]
+    return Grid(np.asarray(values, np.float64), centres)
 
 
 def read_elevation(path: Path) -> DemFile:
@@ -95,8 +89,8 @@ def read_elevation(path: Path) -> DemFile:
         remedy = "give a GeoTIFF or ESRI ASCII grid, or the folder of a run"
         raise InputError("RIL-627", f"{path} does not exist", remedy=remedy)
     dem = _without_marks(_of_run(path) if path.is_dir() else read_raster(path))
-    if not np.isfinite(dem.values).any():
-        text = f"{path} has no known cell among {dem.values.size}"
+    if not np.isfinite(dem.grid.values).any():
+        text = f"{path} has no known cell among {dem.grid.values.size}"
         raise InputError("RIL-628", text, remedy="give another elevation model")
     return dem
 
@@ -109,7 +103,7 @@ def _without_marks(dem: DemFile) -> DemFile:
     upright and more than all others extend. Seas, quarries and plateaus have slopes around, or are nearer. A usual mark
     is one at a tenth of that, if its cells are scattered; a sea below a cliff stays, with a warning.
     """
-    values = dem.values
+    values, cell = dem.grid.values, dem.grid.cell
     least, most = np.nanmin(values, initial=np.inf), np.nanmax(values, initial=-np.inf)
     if least >= most:
         return dem
@@ -120,10 +114,10 @@ def _without_marks(dem: DemFile) -> DemFile:
     gap, mark = max((low - least, least), (most - high, most))
     marked = values == mark
     several, apart = marked.sum() > 1, gap > high - low
-    usual = apart and gap > 30.0 * dem.cell and mark in (0.0, -1.0, -99.0, -999.0, 255.0, 999.0)
+    usual = apart and gap > 30.0 * cell and mark in (0.0, -1.0, -99.0, -999.0, 255.0, 999.0)
     inner = scipy.ndimage.binary_erosion(marked, np.ones((3, 3)), border_value=1)
     # Nothing on Earth rises by 300 cells, or by 1500 m, over less than a cell.
-    steep = gap > 300.0 * dem.cell and several and apart
+    steep = gap > 300.0 * cell and several and apart
     text = (
         f"{dem.name}: {mark:.9g} in {marked.sum()} cells {{}}, the others are {low:.6g} to {high:.6g} m: taken as {{}}"
     )
@@ -132,7 +126,8 @@ def _without_marks(dem: DemFile) -> DemFile:
         return replace(dem, warnings=(*dem.warnings, warning("RIL-726", doubt))) if usual else dem
     line = warning("RIL-725", text.format("is no elevation", "unknown; state it in the file, as NODATA"))
     # There may be another such value.
-    return _without_marks(replace(dem, values=np.where(marked, np.nan, values), warnings=(*dem.warnings, line)))
+    known = Grid(np.where(marked, np.nan, values), dem.grid.matrix)
+    return _without_marks(replace(dem, grid=known, warnings=(*dem.warnings, line)))
 
 
 @contextmanager
@@ -198,7 +193,7 @@ def read_raster(path: Path) -> DemFile:
         remedy = "convert it, e.g. with gdal_calc"
         raise InputError("RIL-632", f"{path} has elevations in {unit!r}, not in metres", remedy=remedy)
     doubt = warning("RIL-962", f"{path} states no unit of its elevations: taken as metres")
-    return DemFile(str(path), values, transform, wkt, warnings=() if unit else (doubt,))
+    return DemFile(str(path), _placed(values, transform), wkt, warnings=() if unit else (doubt,))
 
 
 def read_ortho(path: Path) -> tuple[Grid, str]:
@@ -217,7 +212,7 @@ def read_ortho(path: Path) -> tuple[Grid, str]:
     known &= np.isfinite(grey)
     if not known.any():
         raise InputError("RIL-856", f"{path} has no known cell", remedy="give another image")
-    return Grid(np.where(known, grey, np.nan), centres(t)), wkt
+    return _placed(np.where(known, grey, np.nan), t), wkt
 
 
 def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -305,9 +300,9 @@ def _of_run(path: Path) -> DemFile:
         remedy = "give the folder of a finished run, RUNS/sequence/latest, or a GeoTIFF"
         raise InputError("RIL-635", f"{path} has no dem.tif", remedy=remedy)
     dem, beside = read_raster(path / "dem.tif"), path / "dem_sigma.tif"
-    sigma = read_raster(beside).values if beside.is_file() else None
+    sigma = read_raster(beside).grid.values if beside.is_file() else None
     # Another model's, of other cells, is none of this one.
-    sigma = sigma if sigma is not None and sigma.shape == dem.values.shape else None
+    sigma = sigma if sigma is not None and sigma.shape == dem.grid.values.shape else None
     return replace(dem, name=str(path), viewpoints=_cameras(path), sigma=sigma)
 
 

@@ -2,11 +2,11 @@
 
 ::
 
-    trajectory (each unbroken piece), crosscheck --> accuracy, position_accuracy <-- truth
-    trajectory, crosscheck ------------------------> agreement (it needs none)
-    hfvm ------------------------------------------> disparity_accuracy <-- truth
-    locus (local), merge --------------------------> dem_accuracy <-- truth_dem (exact elevations)
-    path ------------------------------------------> path_check <-- risk (of these)
+    trajectory, crosscheck (main pieces) --> accuracy, position_accuracy (by true poses or positions)
+    trajectory, crosscheck ----------------> agreement (it needs none)
+    hfvm ----------------------------------> disparity_accuracy <-- truth_disparity
+    locus (local), merge ------------------> dem_accuracy <-- truth_dem (exact elevations)
+    path ----------------------------------> path_check <-- risk (of these)
 """
 
 from __future__ import annotations
@@ -24,8 +24,6 @@ from rille.stages.evaluation.dem_accuracy import dem_accuracy_stage
 from rille.stages.evaluation.disparity_accuracy import disparity_accuracy_stage
 from rille.stages.evaluation.path_check import path_check_stage
 from rille.stages.evaluation.position_accuracy import position_accuracy_stage
-from rille.stages.evaluation.truth import truth_stage
-from rille.stages.facts.evaluation import JoinFacts, TruthFacts
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice, union
@@ -33,47 +31,22 @@ from rille.stages.geometry.lattice import Lattice, union
 Steps = Generator[Wait, Any, None]
 
 
-def of_trajectory(make: Builder, frames: Sequence[int]) -> Steps:
-    """Against the other program's, and against truth where there is one: each unbroken piece, or all of it."""
+def of_trajectory(make: Builder, frames: Sequence[int]) -> None:
+    """Against the other program's, and both against truth where there is one."""
     p, s = make.products, make.sequence
-    assert p.trajectory is not None
     if p.crosscheck is not None:
         p.agreement = make.node(agreement_stage, "agreement", trajectory=p.trajectory, crosscheck=p.crosscheck)
     if s.truth_positions is not None:
         given = _positions(make, s.truth_positions, frames)
         p.position_accuracy = make.node(position_accuracy_stage, "position_accuracy", trajectory=p.trajectory, **given)
-    true = [_truth(make, f) for f in frames]
+    poses = [None if (pose := _truth(make, f)) is None else pose.to_list() for f in frames]
     # No task for no truth: the report then says that there is none, not that it failed.
-    if all(pose is None for pose in true):
-        return
-    poses = [None if pose is None else pose.to_list() for pose in true]
-    known = make.node(truth_stage, "truth", poses=poses, frames=list(frames))
-    if p.crosscheck is not None:
-        make.graph.flow(_of_crosscheck(make, p.crosscheck, known), lays=("accuracy",))
-    found = yield from done(p.trajectory)
-    pieces, main = found.meta["pieces"], found.meta["main"]
-    for number in range(len(pieces)):
-        label = "accuracy" if number == main else f"accuracy/piece/{number + 1}"
-        p.accuracy_pieces[number] = make.node(
-            accuracy_stage,
-            label,
-            trajectory=p.trajectory,
-            truth=known,
-            piece=number if len(pieces) > 1 else None,
-            mount=s.truth_mount and s.truth_mount.to_list(),
-        )
-    p.accuracy = p.accuracy_pieces.get(main)
-
-
-def _of_crosscheck(make: Builder, joined: Handle[JoinFacts], known: Handle[TruthFacts]) -> Steps:
-    """The other program's trajectory against truth, where it has one there."""
-    found = yield from done(joined)
-    pieces, longest = found.meta["pieces"], found.meta["longest"]
-    if pieces and any(_truth(make, frame) is not None for frame in pieces[longest]):
-        piece = longest if len(pieces) > 1 else None
-        make.products.crosscheck_accuracy = make.node(
-            accuracy_stage, "accuracy/crosscheck", trajectory=joined, truth=known, piece=piece
-        )
+    if any(poses):
+        known = {"truth": poses, "frames": list(frames)}
+        mount = s.truth_mount and s.truth_mount.to_list()
+        p.accuracy = make.node(accuracy_stage, "accuracy", trajectory=p.trajectory, mount=mount, **known)
+        if p.crosscheck is not None:
+            p.crosscheck_accuracy = make.node(accuracy_stage, "accuracy/crosscheck", trajectory=p.crosscheck, **known)
 
 
 def of_pair(make: Builder, pair: Pair) -> Steps:

@@ -54,7 +54,6 @@ from rille.stages.driving.obstacle_monitor import obstacle_monitor_stage
 from rille.stages.evaluation.accuracy import accuracy_stage
 from rille.stages.evaluation.dem_accuracy import dem_accuracy_stage
 from rille.stages.evaluation.drive_check import drive_check_stage
-from rille.stages.evaluation.truth import truth_stage
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.facts.terrain import MapFixFacts, MergeFacts
 from rille.stages.geometry.geometry import RigidTransform
@@ -480,9 +479,8 @@ class Drive:
             p.trajectory = None  # it failed at its first stop
             self._check({})
             return
-        poses = [list(self.true[f]) for f in self.posed]
-        true = make.node(truth_stage, "truth", poses=poses, frames=list(self.posed))
-        p.accuracy = make.node(accuracy_stage, "accuracy", trajectory=p.trajectory, truth=true)
+        true, frames = [list(self.true[f]) for f in self.posed], list(self.posed)
+        p.accuracy = make.node(accuracy_stage, "accuracy", trajectory=p.trajectory, truth=true, frames=frames)
         level = yield from done(self.pairs[0].level)
         T_left_local = RigidTransform.from_matrix(level.meta["T_local_left"]).inverse()
         T_truth_world = RigidTransform.from_matrix(self.true[0]) @ T_left_local
@@ -499,7 +497,7 @@ class Drive:
         legs = [s.leg.ref.meta for s in self.driven.stops if s.leg is not None and s.leg.ref is not None]
         return str(legs[-1]["reason"]) if legs and legs[-1]["verdict"] == "look" and not legs[-1]["way_m"] else ""
 
-    def _check(self, known: dict[str, Handle]) -> None:
+    def _check(self, known: dict[str, Any]) -> None:
         """The legs that were driven, against the truth."""
         d = self.driven
         legs = [(s.row, s.drive) for s in d.stops if s.drive is not None and not _failed(s.drive)]

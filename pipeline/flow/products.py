@@ -108,7 +108,6 @@ class Products:
     world_path: Handle | None = None
     accuracy: Handle[AccuracyFacts] | None = None
     position_accuracy: Handle[AccuracyFacts] | None = None
-    accuracy_pieces: dict[int, Handle[AccuracyFacts]] = field(default_factory=dict)
     disparity_accuracy: dict[int, Handle[MetricsFacts]] = field(default_factory=dict)
     local_dem_accuracy: dict[int, Handle[DemAccuracyFacts]] = field(default_factory=dict)
     dem_accuracy: Handle[DemAccuracyFacts] | None = None

@@ -131,7 +131,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     DegenerateError
         No elevation model has a cell in the world.
     """
-    p, flow = make.products, make.graph.flow
+    p = make.products
     whole = [f for f in frames if f not in make.sequence.lost]
     if not whole:
         raise InputError("RIL-050", "no chosen frame has both images", remedy="choose others with --frames")
@@ -196,9 +196,9 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         lost=lost or None,
     )
     yield from adjusted(make, frames, list(pairs.values()))
-    flow(assessment.of_trajectory(make, frames), lays=("accuracy",))
+    assessment.of_trajectory(make, frames)
     yield Complete(("track", "resect", "intrinsics", "trajectory", "features", "loops", "loop", "adjust"))
-    yield Complete(("agreement", "position_accuracy", "accuracy", "truth"))
+    yield Complete(("agreement", "position_accuracy", "accuracy"))
     posed = yield from done(p.trajectory)
 
     # The world is that of the largest piece: its models, straight on the world lattice.

@@ -308,9 +308,10 @@ def _drive(scene: Scene) -> dict[str, Any] | None:
     if drive is None:
         return None
     fix = scene.view.bundle(drive.fix)
-    place = {} if fix is None else {key: fix.meta[key] for key in ("source", "std", "other") if key in fix.meta}
+    place: dict[str, Any] = {}
     if fix is not None:
-        place["xy"] = [fix.meta["T_global_local"][3], fix.meta["T_global_local"][7]]
+        place = {key: fix.meta[key] for key in ("source", "std") if key in fix.meta}
+        place |= {"xy": fix.meta["T_global_local"][3:8:4], "other": fix.meta.get("fit", {}).get("other")}
     return {"verdict": drive.verdict, "reason": drive.reason, "stops": tables.stops(scene), "place": place}
 
 
@@ -342,7 +343,7 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
     return {name: {key: round(value, 3) for key, value in row.items()} for name, row in by_stage.items()}
 
 
-NOT_IN_FACTS = ("images", "undistorted", "tracks", "world_dem", "accuracy_pieces", "truth_risk")
+NOT_IN_FACTS = ("images", "undistorted", "tracks", "world_dem", "truth_risk")
 """Products that the facts are not made of."""
 
 

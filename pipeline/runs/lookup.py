@@ -75,7 +75,7 @@ def find(text: str, runs: Path) -> Path:
         return started[-1]
     names = [word for run in known for word in (name(run), run.parent.name, run.name)]
     where = f"there are {some(sorted({run.parent.name for run in known}), 4)}" if known else f"{runs} holds none"
-    raise ConfigError("RIL-067", f"no run {text!r}", remedy=_near(text, names) or where)
+    raise ConfigError("RIL-067", f"no run {text!r}", remedy=near(text, names) or where)
 
 
 def elevation(text: str, runs: Path) -> Path:
@@ -100,15 +100,15 @@ def row(rows: Iterable[dict[str, Any]], label: str, run: Path) -> dict[str, Any]
     by_label = {r["label"]: r for r in rows}
     if label in by_label:
         return by_label[label]
-    near = _near(label, by_label)
     text = f"run {name(run)} has no task {label!r}"
-    raise ConfigError("RIL-068", text, remedy=near or f"it has {some(list(by_label), 4)}")
+    raise ConfigError("RIL-068", text, remedy=near(label, by_label) or f"it has {some(list(by_label), 4)}")
 
 
-def _near(text: str, names: Iterable[str]) -> str:
+def near(text: str, names: Iterable[str]) -> str:
+    """The question whether one of the names that are like a text was meant; empty where none is."""
     known = list(dict.fromkeys(names))
-    near = difflib.get_close_matches(text, known, n=3, cutoff=0.5) or [n for n in known if text and text in n][:3]
-    return f"did you mean {' or '.join(near)}?" if near else ""
+    alike = difflib.get_close_matches(text, known, n=3, cutoff=0.5) or [n for n in known if text and text in n][:3]
+    return f"did you mean {' or '.join(alike)}?" if alike else ""
 
 
 def earlier(run: Path, *, of_any: bool = False) -> Iterator[Path]:

@@ -14,13 +14,14 @@ counted and left out. Where truth has a gap, its path is taken to be straight, w
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.evaluation.conventions import better_reading
-from rille.stages.facts.evaluation import AccuracyFacts, Metric, TruthFacts, metric
+from rille.stages.facts.evaluation import AccuracyFacts, Metric, metric
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry import rigid
 from rille.stages.geometry.geometry import RigidTransform, rotation_log
@@ -150,9 +151,14 @@ def nees(P: Floats, aligned: Floats, covariance: Floats) -> float | str:
     return float((error * weighed).sum(1).mean()) / 6.0
 
 
+def pose_rows(poses: Sequence[Sequence[float] | None]) -> Floats:
+    """Poses (frame, 3, 4) of lists of twelve numbers, NaN for None."""
+    return np.array([pose or [np.nan] * 12 for pose in poses], dtype=np.float64).reshape(-1, 3, 4)
+
+
 @stage(
     "accuracy",
-    version=5,
+    version=6,
     outputs=[
         Array("position", ("frame", "xyz"), "float64", "m", "estimated position", "nan", "world"),
         Array("position_truth", ("frame", "xyz"), "float64", "m", "true position, first poses equal", "nan", "world"),
@@ -161,19 +167,18 @@ def nees(P: Floats, aligned: Floats, covariance: Floats) -> float | str:
 def accuracy_stage(
     params: NoParams,
     trajectory: Bundle[TrajectoryFacts],
-    truth: Bundle[TruthFacts],
     *,
-    piece: int | None = None,
+    frames: list[int],
+    truth: Sequence[Sequence[float] | None],
     mount: RigidTransform | None = None,
 ) -> Bundle[AccuracyFacts]:
-    """Trajectory against truth: ATE, RPE, drift, scale, NEES."""
-    given, wanted = trajectory.meta["frames"], truth.meta["frames"]
-    estimate, true = rigid.by_frame(world_poses(trajectory, piece), given, wanted), np.asarray(truth["poses"])
-    claimed = None
+    """Trajectory against the true poses of some frames: ATE, RPE, drift, scale, NEES."""
+    given, true = trajectory.meta["frames"], pose_rows(truth)
+    estimate, claimed = rigid.by_frame(world_poses(trajectory), given, frames), None
     if "covariance" in trajectory.arrays:
-        claimed = rigid.by_frame(np.asarray(trajectory["covariance"]), given, wanted)
+        claimed = rigid.by_frame(np.asarray(trajectory["covariance"]), given, frames)
     arrays, figures = trajectory_accuracy(estimate, true, claimed)
-    facts: AccuracyFacts = {"metrics": figures, "frames": wanted}
+    facts: AccuracyFacts = {"metrics": figures, "frames": frames}
     both = posed(estimate) & posed(true)
     if claimed is not None and both.any():
         sigma = math.sqrt(np.nanmean(np.trace(claimed[both, :3, :3], axis1=1, axis2=2)))

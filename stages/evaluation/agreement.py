@@ -151,7 +151,7 @@ def unbroken(theirs: NDArray[np.int64], ours: NDArray[np.int64]) -> NDArray[np.i
 
 @stage(
     "agreement",
-    version=3,
+    version=4,
     outputs=[
         Array("poses", ("frame", "row", "col"), "float64", "m", "crosscheck's poses in the world", "nan", "world"),
         Array("distance", ("frame",), "float64", "m", "disagreement in position", "nan"),
@@ -168,8 +168,7 @@ def agreement_stage(
     """Trajectory against the crosscheck's."""
     frames, given, ours = trajectory.meta["frames"], crosscheck.meta["frames"], np.asarray(trajectory["poses"])
     theirs, numbers, lines = (
-        rigid.by_frame(np.asarray(crosscheck[name]), given, frames)
-        for name in ("piece_poses", "piece", "line_distance")
+        rigid.by_frame(np.asarray(crosscheck[name]), given, frames) for name in ("poses", "piece", "line_distance")
     )
     own = np.asarray(trajectory.arrays.get("piece", np.zeros(len(frames))), np.int64)
     piece = unbroken(np.nan_to_num(numbers, nan=-1).astype(np.int64), own)

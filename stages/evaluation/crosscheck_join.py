@@ -65,15 +65,11 @@ def _fade(earlier: Floats, later: Floats) -> Floats:
     return np.asarray(out)
 
 
-_POSES = ("frame", "row", "col")
-
-
 @stage(
     "crosscheck_join",
-    version=2,
+    version=3,
     outputs=[
-        Array("poses", _POSES, "float64", "m", "pose [R | t] of the left camera, longest piece", "nan", "crosscheck"),
-        Array("piece_poses", _POSES, "float64", "m", "the same of all pieces", "nan", "crosscheck piece"),
+        Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan", "piece"),
         Array("piece", ("frame",), "int16", "1", "unbroken piece that the frame belongs to", "-1"),
         Array("line_distance", ("frame",), "float64", "px", "median of the matches from their epipolar lines", "nan"),
     ],
@@ -89,11 +85,10 @@ def crosscheck_join_stage(
         line = np.fmax(line, by_frame(np.asarray(b["line_distance"]), b.meta["frames"], frames))
     pieces = [[f for f, p in zip(frames, piece, strict=True) if p == k] for k in range(int(piece.max(initial=-1)) + 1)]
     longest = int(np.argmax([len(one) for one in pieces])) if pieces else -1
-    poses = np.where((piece == longest)[:, None, None] & (longest >= 0), chained, np.nan)
     meta: JoinFacts = {
         "frames": list(frames),
-        "longest": longest,
+        "main": longest,
         "pieces": pieces,
         "reasons": [b.meta["reason"] for b in windows if b.meta["reason"]],
     }
-    return Bundle({"poses": poses, "piece_poses": chained, "piece": piece, "line_distance": line}, meta)
+    return Bundle({"poses": chained, "piece": piece, "line_distance": line}, meta)

@@ -10,6 +10,7 @@ standard deviation.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ import scipy
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.numeric.robust import mad_sigma
+from rille.stages.terrain.grid import Grid
 
 SHIFT_CELLS = 0.25
 """By which the models may still be shifted."""
@@ -36,16 +38,18 @@ BLOCK = 5
 
 @dataclass(frozen=True)
 class Change:
-    """A patch of ground that rose or fell. ``row, col``: its middle; ``greatest``: difference, metres, of either sign;
-    ``area``, square metres; ``volume`` and its standard deviation ``sigma``, cubic metres, negative where it fell."""
+    """A patch of ground that rose or fell: its middle, the greatest difference, of either sign, area and volume.
 
-    row: float
-    col: float
+    The volume is negative where it fell, and has a standard deviation.
+    """
+
+    x_m: float
+    y_m: float
     cells: int
-    greatest: float
-    area: float
-    volume: float
-    sigma: float
+    greatest_m: float
+    area_m2: float
+    volume_m3: float
+    sigma_m3: float
 
 
 def standard_deviation(error: Floats, sigma: Floats, slope: Floats, cell: float) -> Floats:
@@ -67,35 +71,36 @@ def standard_deviation(error: Floats, sigma: Floats, slope: Floats, cell: float)
     return np.asarray(expected * max(mad_sigma(ratio) if ratio.size else 1.0, 1.0))
 
 
-def changes(error: Floats, deviation: Floats, cell: float) -> list[Change]:
-    """Changes, the greatest volume first, by differences and their :func:`standard_deviation`, both (rows, cols)."""
+def changes(error: Floats, deviation: Floats, grid: Grid) -> list[Change]:
+    """Changes, the greatest volume first, by differences and their :func:`standard_deviation`, both (rows, cols).
+
+    ``grid`` says where their cells are.
+    """
     ratio = np.divide(error, deviation, out=np.zeros_like(error), where=np.isfinite(error) & (deviation > 0))
     shared = _shared(ratio, np.abs(ratio) < BESIDE)
     found = []
     for sign in (1.0, -1.0):
         label, number = scipy.ndimage.label(sign * ratio > BESIDE)
         for k, (rows, cols) in enumerate(scipy.ndimage.find_objects(label, number), 1):
-            window = tuple(slice(max(one.start - FOOT, 0), one.stop + FOOT) for one in (rows, cols))
+            up, left = (slice(max(one.start - FOOT, 0), one.stop + FOOT) for one in (rows, cols))
+            window = up, left
             patch = label[window] == k
             if patch.sum() < LEAST_CELLS or (sign * ratio[window][patch]).max() < SURE:
                 continue
             patch = scipy.ndimage.binary_dilation(patch, iterations=FOOT) & np.isfinite(error[window])
-            change = _change(error[window], deviation[window], patch, cell, shared, window)
-            if sign * change.volume > SURE_VOLUME * change.sigma:
+            change = _change(error[window], deviation[window] * math.sqrt(shared), patch, grid.part(window))
+            if sign * change.volume_m3 > SURE_VOLUME * change.sigma_m3:
                 found.append(change)
-    return sorted(found, key=lambda change: -abs(change.volume))
+    return sorted(found, key=lambda change: -abs(change.volume_m3))
 
 
-def _change(
-    error: Floats, deviation: Floats, patch: Bools, cell: float, shared: float, window: tuple[slice, ...]
-) -> Change:
-    rows, cols = np.nonzero(patch)
-    difference, cells = error[patch], len(rows)
-    weight = np.abs(difference) / np.abs(difference).sum()
-    sigma = cell**2 * float(np.sqrt(shared * np.sum(deviation[patch] ** 2)))
-    middle = float(weight @ rows) + window[0].start, float(weight @ cols) + window[1].start
+def _change(error: Floats, deviation: Floats, patch: Bools, grid: Grid) -> Change:
+    """The change of a patch, of a window of all."""
+    difference, area = error[patch], grid.cell**2
+    x, y = np.abs(difference) @ grid.centres()[patch] / np.abs(difference).sum()
     greatest = float(difference[np.argmax(np.abs(difference))])
-    return Change(*middle, cells, greatest, cells * cell**2, float(difference.sum()) * cell**2, sigma)
+    cells, sigma = len(difference), area * float(np.sqrt(np.sum(deviation[patch] ** 2)))
+    return Change(float(x), float(y), cells, greatest, cells * area, float(difference.sum()) * area, sigma)
 
 
 def _shared(ratio: Floats, still: Bools) -> float:

@@ -1,9 +1,8 @@
 """One elevation model against another: brought to common cells, aligned if asked, errors by range and slope.
 
 The error is A minus the reference B. NMAD = 1.4826 median(|e - median(e)|) is the robust standard deviation (Hoehle and
-Hoehle 2009, doi:10.1016/j.isprsjprs.2009.02.003). Alignment minimises the differences of elevation by Gauss-Newton with
-Tukey's biweight: with n = (-gx, -gy, 1) of B's gradient, a small motion (t, w) of A's point q changes its difference by
-n . t + (q x n) . w (Rosenholm and Torlegard 1988; for shifts alone: Nuth and Kaeaeb 2011, doi:10.5194/tc-5-271-2011).
+Hoehle 2009, doi:10.1016/j.isprsjprs.2009.02.003). Alignment weighs the differences by Tukey's biweight: what has
+changed between the models must not move them.
 """
 
 from __future__ import annotations
@@ -13,13 +12,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import scipy
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import DegenerateError, InputError
-from rille.stages.geometry.geometry import orthonormal, rotation_exp
+from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
-from rille.stages.terrain.shading import gradient
+from rille.stages.terrain.grid import Grid
+from rille.stages.terrain.height_fit import MAX_ROUNDS, MIN_EIGENVALUE, FitRules, condition, lay
 
 Align = Literal["shift", "tilt", "rigid"]
 
@@ -28,55 +27,6 @@ MIN_KNOWN_SHARE = 0.5  # of a coarse cell's area that the finer cells must know
 BORDER = 1e-6  # of a coarse cell: a centre nearer than this to a border lies on it
 FREE = {"shift": [0, 1, 2], "tilt": [2, 3, 4], "rigid": [0, 1, 2, 3, 4, 5]}  # of tx ty tz wx wy wz
 MAX_POINTS = 300_000  # that an alignment uses: six unknowns need no more
-MAX_ITERATIONS = 50
-SETTLED_CELLS = 1e-4  # step of an alignment that ends it
-MAX_CONDITION = 1e7  # of the normal matrix in units of cells: beyond, the terrain is flat for what is asked
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Elevations (rows, cols), metres, NaN unknown, and the map (2, 3) from (col, row, 1) of cell centres to x, y."""
-
-    values: Floats
-    matrix: Floats
-
-    @property
-    def cell(self) -> float:
-        """Side of a cell, metres."""
-        return float(np.sqrt(abs(np.linalg.det(self.matrix[:, :2]))))
-
-    def centres(self) -> Floats:
-        """Coordinates x, y (rows, cols, 2) of the cells' centres, metres."""
-        row, col = np.mgrid[: self.values.shape[0], : self.values.shape[1]]
-        return np.stack([col, row], axis=-1) @ self.matrix[:, :2].T + self.matrix[:, 2]
-
-    def index(self, xy: Floats) -> Floats:
-        """Fractional (row, col) (..., 2) of points (..., 2)."""
-        # The matrix gives x, y of column and row; the order is turned round to index arrays.
-        col_row = (xy - self.matrix[:, 2]) @ np.linalg.inv(self.matrix[:, :2]).T
-        return np.asarray(col_row[..., ::-1])
-
-    def slopes(self) -> Floats:
-        """Gradient dz/dx, dz/dy (2, rows, cols) of the terrain, NaN unknown."""
-        # The gradient takes y to grow upwards, against the rows.
-        along = gradient(self.values, 1.0) * np.array([1.0, -1.0])[:, None, None]  # per column, per row
-        return np.tensordot(np.linalg.inv(self.matrix[:, :2]).T, along, axes=1)
-
-
-def interpolate(grid: Grid, xy: Floats, values: Floats | None = None) -> Floats:
-    """Bilinear value (...) at points (..., 2); NaN where one of the cells that count is unknown, or outside."""
-    array = grid.values if values is None else values
-    index = np.moveaxis(grid.index(xy), -1, 0)
-    nearest = np.rint(index)
-    index = np.where(np.abs(index - nearest) < 1e-6, nearest, index)  # the same cells: the same values
-    known = np.isfinite(array)
-    share, z = (
-        scipy.ndimage.map_coordinates(a, index, order=1, mode="constant", cval=0.0)
-        # Interpolating the mask beside the values tells where an unknown cell had a part; NaN itself would also spoil
-        # points whose weight for it is 0.
-        for a in (known.astype(np.float64), np.where(known, array, 0.0))
-    )
-    return np.where(share > 1.0 - 1e-9, z, np.nan)
 
 
 def cell_means(fine: Grid, target: Grid) -> Floats:
@@ -115,7 +65,7 @@ def common(a: Grid, b: Grid) -> tuple[Grid, Grid, str]:
         values = cell_means(fine, target)
         how = f"{name} averaged from {fine.cell:g} m to {target.cell:g} m (half of a cell's area known at least)"
     else:
-        values = interpolate(fine, target.centres())
+        values = fine.at(target.centres())
         # All four, since one model may be turned against the other about one of them.
         corners = fine.index(target.centres()[[0, 0, -1, -1], [0, -1, 0, -1]])
         same = abs(ratio - 1.0) < 1e-9 and np.abs(corners - np.rint(corners)).max() < 1e-6
@@ -136,110 +86,71 @@ def _outline(grid: Grid) -> str:
 
 @dataclass(frozen=True)
 class Alignment:
-    """Motion of A onto B: x_b = rotation (x_a - centre) + centre + translation.
+    """``pose`` T_b_a of A on B, with ``sigma`` of the free parameters (tx ty tz in m, wx wy wz in rad; 0 for those
+    held) for turns about ``centre``, m, of B; ``rounds`` of the estimation, and ``points`` of B that took part."""
 
-    ``sigma`` of the free parameters (tx ty tz in m, wx wy wz in rad; 0 for those held); ``points`` that took part.
-    """
-
-    rotation: Floats
-    translation: Floats
+    pose: RigidTransform
     centre: Floats
     sigma: Floats
-    iterations: int
-    points: int
-
-    def apply(self, points: Floats) -> Floats:
-        """Moved points (..., 3), metres."""
-        return (points - self.centre) @ self.rotation.T + self.centre + self.translation
+    rounds: int = 0
+    points: int = 0
 
 
-def align(a: Grid, b: Grid, kind: Align) -> Alignment:
-    """Motion that brings A, on B's cells, onto B.
+_AS_IT_IS = RigidTransform.identity()
+
+
+def align(a: Grid, b: Grid, kind: Align, start: RigidTransform = _AS_IT_IS) -> Alignment:
+    """Motion that brings A onto B, by B's points on A (:mod:`rille.stages.terrain.height_fit`): the reference's slopes
+    are known better.
 
     Parameters
     ----------
-    a, b : models on the same cells, see :func:`common`.
     kind : ``shift`` x, y, z; ``tilt`` z and the inclinations about x and y; ``rigid`` all six.
+    start : T_b_a, about.
 
     Raises
     ------
     DegenerateError
         The terrain does not determine the motion (it is flat for what is asked), or it is not found.
     """
-    points = np.concatenate([a.centres(), a.values[..., None]], axis=-1)[np.isfinite(a.values)]
-    points = points[:: max(1, len(points) // MAX_POINTS)]
-    slopes, free = b.slopes(), FREE[kind]
-    centre = points.mean(axis=0)
-    # Units of a cell of motion at the terrain's extent, so that the condition compares like with like.
-    unit = np.array([1.0] * 3 + [1.0 / max(float(np.std(points[:, :2])), a.cell)] * 3)[free] * a.cell
-    start = _difference(b, slopes, points)[0]
-    offset = float(np.median(start[np.isfinite(start)])) if np.isfinite(start).any() else 0.0
-    state = Alignment(np.eye(3), np.array([0.0, 0.0, -offset]), centre, np.zeros(6), 0, 0)
-    for iteration in range(1, MAX_ITERATIONS + 1):
-        step, sigma, used = _gauss_newton(b, slopes, points, state, free, unit)
-        full, spread = np.zeros(6), np.zeros(6)
-        full[free], spread[free] = step, sigma
-        # Fifty products of rotations drift from a rotation by rounding.
-        rotation = orthonormal(rotation_exp(full[3:]) @ state.rotation)
-        state = Alignment(rotation, state.translation + full[:3], centre, spread, iteration, used)
-        if np.abs(step / unit).max() < SETTLED_CELLS:
-            return state
-    # Cells at a border that come and go from step to step keep the motion from settling, but within its own errors.
-    if (np.abs(step) < sigma).all():
-        return state
-    cells = np.abs(step / unit).max()
-    text = f"no alignment after {MAX_ITERATIONS} steps: the last one still moved by {cells:.2g} cells"
-    remedy = "choose fewer freedoms (tilt or shift), or bring the models closer first"
-    raise DegenerateError("RIL-324", text, remedy=remedy)
-
-
-def _difference(b: Grid, slopes: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """Elevation of points (n, 3) above B, NaN unknown, and B's normals (-gx, -gy, 1) there."""
-    xy = points[:, :2]
-    gx, gy = (interpolate(b, xy, g) for g in slopes)
-    return points[:, 2] - interpolate(b, xy), np.column_stack([-gx, -gy, np.ones(len(points))])
-
-
-def _gauss_newton(
-    b: Grid, slopes: Floats, points: Floats, state: Alignment, free: list[int], unit: Floats
-) -> tuple[Floats, Floats, int]:
-    """Step and standard deviations of the free parameters, and the number of points."""
-    moved = state.apply(points)
-    difference, normal = _difference(b, slopes, moved)
-    good = np.isfinite(difference) & np.isfinite(normal).all(axis=1)
-    if good.sum() < 10 * len(free):
-        text = f"{int(good.sum())} cells are left to align by"
+    free, known = FREE[kind], np.isfinite(b.values)
+    points, slopes = b.points()[known], b.slopes()[:, known].T
+    normals = np.column_stack([-slopes, np.ones(len(points))])
+    every = slice(None, None, max(1, len(points) // MAX_POINTS))
+    rules = FitRules(10 * len(free), lambda r, sigma: bisquare(r / (TUKEY_BISQUARE * max(sigma, 1e-9))), free)
+    fit = lay(points[every], normals[every], a, start.inverse(), rules)
+    if fit is None:
+        text = f"fewer than {rules.least} cells are left to align by"
         raise DegenerateError("RIL-325", text, remedy="leave --align out, or choose overlapping models")
-    r, n = difference[good], normal[good]
-    # Rotations turn about the moved centre: their correlation with the shifts is then least.
-    q = moved[good] - state.centre - state.translation
-    J = np.column_stack([n, np.cross(q, n)])[:, free] * unit
-    scale = max(mad_sigma(r), 1e-9)
-    w = bisquare(r / (TUKEY_BISQUARE * scale))
-    N = (J * w[:, None]).T @ J
-    values = np.linalg.eigvalsh(N)
-    if not values[0] * MAX_CONDITION > values[-1]:
-        condition = values[-1] / max(values[0], 1e-300)
-        text = f"the terrain is too flat to align by: condition {condition:.1e}, more than {MAX_CONDITION:.0e}"
+    normal = fit.normal[np.ix_(free, free)]
+    if condition(normal) < MIN_EIGENVALUE:
+        text = f"the terrain is too flat to align by: eigenvalue {condition(normal):.1e}, {MIN_EIGENVALUE:.0e} wanted"
         raise DegenerateError("RIL-326", text, remedy="choose --align tilt, which flat terrain determines")
-    step = -np.linalg.solve(N, (J * w[:, None]).T @ r)
-    variance = float((w * r * r).sum()) / max(float(w.sum()) - len(free), 1.0)
-    return step * unit, np.sqrt(variance * np.diag(np.linalg.inv(N))) * unit, int(good.sum())
+    pose, covariance, sigma = fit.pose.inverse(), np.zeros((6, 6)), np.zeros(6)
+    covariance[np.ix_(free, free)] = fit.square * np.linalg.inv(normal)
+    both = np.kron(np.eye(2), pose.rotation)
+    sigma[free] = np.sqrt(np.diag(both @ covariance @ both.T))[free]
+    # Cells at a border that come and go from step to step keep the motion from settling, but within its own errors.
+    if fit.rounds == MAX_ROUNDS and (np.abs(fit.step) > sigma).any():
+        text = f"no alignment after {MAX_ROUNDS} steps: the last one still moved by {np.abs(fit.step[:3]).max():.2g} m"
+        remedy = "choose fewer freedoms (tilt or shift), or bring the models closer first"
+        raise DegenerateError("RIL-324", text, remedy=remedy)
+    return Alignment(pose, pose.apply(fit.centre), sigma, fit.rounds, int(np.isfinite(fit.differences).sum()))
 
 
-def errors(a: Grid, b: Grid, alignment: Alignment | None = None) -> Floats:
+def errors(a: Grid, b: Grid, T_b_a: RigidTransform | None = None) -> Floats:
     """Return the elevation differences A minus B (rows, cols), metres; NaN where one of them is unknown.
 
     Parameters
     ----------
-    a, b : models on the same cells, see :func:`common`.
-    alignment : motion from :func:`align`. Each cell of A is moved by it and compared with B interpolated at the moved
+    a, b : models; without a motion on the same cells, see :func:`common`.
+    T_b_a : motion from :func:`align`. Each cell of A is moved by it and compared with B interpolated at the moved
         point; the difference stands at the cell of A. None: A is compared cell by cell.
     """
-    if alignment is None:
+    if T_b_a is None:
         return a.values - b.values
-    moved = alignment.apply(np.concatenate([a.centres(), a.values[..., None]], axis=-1))
-    return np.asarray(moved[..., 2] - interpolate(b, moved[..., :2]))
+    moved = T_b_a.apply(a.points())
+    return np.asarray(moved[..., 2] - b.at(moved[..., :2]))
 
 
 def figures(error: Floats) -> dict[str, float]:

@@ -18,8 +18,8 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
-from rille.stages.evaluation.accuracy import trajectory_accuracy
-from rille.stages.facts.evaluation import DriveCheckFacts, Metric, TruthFacts, metric
+from rille.stages.evaluation.accuracy import pose_rows, trajectory_accuracy
+from rille.stages.facts.evaluation import DriveCheckFacts, Metric, metric
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry.geometry import way_length
 
@@ -67,7 +67,7 @@ def localisation(estimate: Floats, truth: Floats, length: float) -> tuple[Floats
 
 @stage(
     "drive_check",
-    version=3,
+    version=4,
     outputs=[
         Array("error", ("frame",), "float64", "m", "distance of the estimated from the true position", "nan"),
         Array("way", ("position", "xyz"), "float64", "m", "true position of the vehicle on the ground", frame="truth"),
@@ -77,19 +77,19 @@ def drive_check_stage(
     params: NoParams,
     drives: Sequence[Bundle],
     trajectory: Bundle[TrajectoryFacts] | None = None,
-    truth: Bundle[TruthFacts] | None = None,
     best: Bundle | None = None,
     *,
     rows: Sequence[int],
     vehicle: Mapping[str, Any],
+    truth: Sequence[Sequence[float]] = (),
 ) -> Bundle[DriveCheckFacts]:
     """A drive against the truth: placements, localisation, length."""
     parts = [judged(drive, row) for drive, row in zip(drives, rows, strict=True)]
     figures, error = placements(parts, vehicle), np.zeros(0)
     facts: DriveCheckFacts = {"metrics": figures, "path_exists": None, "with_margin": None}
-    if trajectory is not None and truth is not None:
-        estimate, true = (np.asarray(one["poses"]) for one in (trajectory, truth))
-        error, located = localisation(estimate, true, figures["path_length"]["value"])
+    if trajectory is not None:
+        estimate = np.asarray(trajectory["poses"])
+        error, located = localisation(estimate, pose_rows(truth), figures["path_length"]["value"])
         figures |= located
     if best is not None:
         shortest, margin = best.meta["shortest_m"], best.meta["shortest_margin_m"]

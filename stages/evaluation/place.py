@@ -3,13 +3,13 @@
 The keypoints (SIFT, Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94) that are alike tell it, by the turn and shift
 that most of them agree on. Both images are in metres, so that a scale other than 1 is a wrong place. Under another sun,
 or over ground that was raked, they show no place that both share; the relief does
-(:func:`rille.stages.terrain.map_localization.fix_on`), and has to be unlike every other place.
+(:func:`rille.stages.terrain.map_localization.fix`), and has to be unlike every other place.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -17,10 +17,10 @@ import numpy as np
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import DegenerateError, InputError
-from rille.stages.evaluation.dem_comparison import Grid
-from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.imaging.features import UNIT_BYTES, match
-from rille.stages.terrain.map_localization import MapLocalizationParams, fix_on
+from rille.stages.terrain.grid import Grid
+from rille.stages.terrain.map_localization import MapLocalizationParams, Placement, fix
 
 KEYPOINTS = 8000
 """Of an image."""
@@ -41,28 +41,7 @@ RIVAL_SHARE = 0.5
 """Of the matches that agree: when as many agree on another place, both are possible."""
 
 
-class PlacedImage(NamedTuple):
-    """``motion`` (2, 3) from x, y of A to those of B, a turn and a shift, on which ``agreeing`` matches agree.
-
-    ``sigma`` (3,): standard deviations of the shift of their ``middle`` (2,), in B, m, and of the turn, rad.
-    """
-
-    motion: Floats
-    agreeing: int
-    middle: Floats
-    sigma: Floats
-
-
-class Registration(NamedTuple):
-    """``motion`` (2, 3) from x, y of A to those of B, a turn and a shift; ``by`` what it was found, in words; ``sigma``
-    (3,): standard deviations of the shift, m, and of the turn, rad."""
-
-    motion: Floats
-    by: str
-    sigma: Floats
-
-
-def register(images: tuple[Grid, Grid], heights: tuple[Grid, Grid]) -> Registration:
+def register(images: tuple[Grid, Grid], heights: tuple[Grid, Grid]) -> Placement:
     """Find where A lies in B, without a start, by the ortho images of both or else their elevations, all in metres.
 
     Raises
@@ -71,35 +50,17 @@ def register(images: tuple[Grid, Grid], heights: tuple[Grid, Grid]) -> Registrat
         Neither the images nor the relief tell one place.
     """
     try:
-        placed = place(*images)
+        return place(*images)
     except DegenerateError:
-        found = _by_relief(*heights)
-        if found is None:
-            raise
-        return found
-    return Registration(placed.motion, f"ortho images, {placed.agreeing} keypoints", placed.sigma)
+        with suppress(DegenerateError, InputError):
+            found = fix(*heights, None, MapLocalizationParams.model_validate({}))
+            if not found.doubt:
+                return found
+        raise
 
 
-def _by_relief(a: Grid, b: Grid) -> Registration | None:
-    """The only place whose relief fits; None where there is none, or another fits nearly as well."""
-    (along, turned, x0), (across, down, y0) = a.matrix
-    if not (along > 0 and abs(down + along) < 1e-6 * along and max(abs(turned), abs(across)) < 1e-9 * along):
-        return None  # its rows are turned against the axes, or its cells are no squares
-    try:
-        model = Lattice(float(x0), float(y0), float(along), *a.values.shape)
-        found = fix_on(a.values, model, b.values, b.matrix, None, MapLocalizationParams.model_validate({}))
-    except (DegenerateError, InputError):
-        return None
-    if found.doubt:
-        return None
-    motion = np.column_stack([found.pose.rotation[:2, :2], found.pose.translation[:2]])
-    # A tilt, which the elevations tell later, shortens the level part of the rotation.
-    motion[:, :2] /= math.sqrt(np.linalg.det(motion[:, :2]))
-    return Registration(motion, f"relief, {found.cells} cells", np.sqrt(np.diag(found.covariance))[[0, 1, 5]])
-
-
-def place(a: Grid, b: Grid) -> PlacedImage:
-    """Where the grey image A lies in the image B, by their keypoints.
+def place(a: Grid, b: Grid) -> Placement:
+    """Where the grey image A lies in the image B, by their keypoints: nothing of height and tilt.
 
     Raises
     ------
@@ -128,7 +89,15 @@ def place(a: Grid, b: Grid) -> PlacedImage:
     arm = p[used] - start
     spread = float(np.sqrt(np.mean((q[used] - middle - arm @ turn.T) ** 2)))
     sigma = spread / np.sqrt([agreeing, agreeing, float((arm**2).sum())])
-    return PlacedImage(np.column_stack([turn, middle - turn @ start]), agreeing, middle, sigma)
+    # The middle of the matches is known; the origin may be far from it.
+    x, y = lever = -turn @ start
+    far = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+    kept, covariance = np.ix_([0, 1, 5], [0, 1, 5]), np.diag(np.full(6, math.inf))
+    covariance[kept] = far @ np.diag(sigma**2) @ far.T
+    pose = RigidTransform(
+        rotation_exp([0.0, 0.0, math.atan2(turn[1, 0], turn[0, 0])]), np.array([*(middle + lever), 0.0])
+    )
+    return Placement(pose, covariance, f"ortho images, {agreeing} keypoints", {"keypoints": agreeing})
 
 
 def _agreed(p: Floats, q: Floats, near: float) -> tuple[Floats | None, Bools]:
@@ -145,15 +114,10 @@ def _agreed(p: Floats, q: Floats, near: float) -> tuple[Floats | None, Bools]:
 
 def _described(image: Grid, other: float) -> tuple[Floats, AnyArray]:
     """Places x, y (n, 2) of keypoints, metres, and descriptors (n, 128); in an image no finer than ``other``, m."""
+    while other > MAX_RATIO * image.cell:
+        image = image.halved()
     grey: AnyArray = np.nan_to_num(image.values.astype(np.float32))
-    known, matrix, ratio = np.isfinite(image.values).astype(np.float32), image.matrix, other / image.cell
-    if ratio > MAX_RATIO:
-        rows, cols = (max(1, round(n / ratio)) for n in grey.shape)
-        step = np.diag([grey.shape[1] / cols, grey.shape[0] / rows])
-        shares = cv2.resize(known, (cols, rows), interpolation=cv2.INTER_AREA)
-        sums = cv2.resize(grey, (cols, rows), interpolation=cv2.INTER_AREA)
-        grey, known = sums / np.maximum(shares, 1e-6), (shares > 0.5).astype(np.float32)
-        matrix = np.column_stack([matrix[:, :2] @ step, matrix @ [*(0.5 * (np.diag(step) - 1.0)), 1.0]])
+    known, matrix = np.isfinite(image.values).astype(np.float32), image.matrix
     low, high = np.percentile(grey[known > 0], (1, 99)) if known.any() else (0.0, 255.0)
     if low < 0 or high > 255 or high - low < MIN_CONTRAST:  # of other units, or pale
         grey = (grey - low) * (255.0 / max(high - low, 1e-12))

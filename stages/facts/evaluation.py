@@ -22,12 +22,6 @@ def metric(value: Value, unit: str, how: str) -> Metric:
     return {"value": value if value is not None and math.isfinite(value) else None, "unit": unit, "how": how}
 
 
-class TruthFacts(Facts):
-    """True poses: numbers of their ``frames``."""
-
-    frames: list[int]
-
-
 class AccuracyFacts(Facts):
     """``metrics`` by name, and the ``frames`` that were compared."""
 
@@ -66,13 +60,13 @@ class WindowFacts(Facts):
 
 
 class JoinFacts(Facts):
-    """The windows of the crosscheck, joined: ``pieces`` are lists of frames, ``longest`` the number of one (-1: none).
+    """The windows of the crosscheck, joined: ``pieces`` are lists of frames, ``main`` is the number of the longest.
 
-    ``reasons`` say why windows have no model.
+    It is -1 where there is none; ``reasons`` say why windows have no model.
     """
 
     frames: list[int]
-    longest: int
+    main: int
     pieces: list[list[int]]
     reasons: list[str]
 

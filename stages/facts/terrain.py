@@ -122,14 +122,6 @@ class MapFixFacts(Facts):
     """x, y, z, m, and rotation about them, rad."""
     covariance: NotRequired[list[list[float]]]
     """6 x 6."""
-    overlap: NotRequired[float]
-    rms: NotRequired[float]
-    """m"""
-    explained: NotRequired[float]
-    """Share of the model's relief that the differences leave out."""
-    cells: NotRequired[int]
-    independent: NotRequired[float]
-    """Of the cells, by their correlation."""
-    other: NotRequired[Json | None]
-    """The next best place (x, y, heading) and by how much its chi2 is larger."""
+    fit: NotRequired[Json]
+    """Figures of :class:`rille.stages.terrain.map_localization.Placement`, of elevations."""
     ambiguous: NotRequired[bool]

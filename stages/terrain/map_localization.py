@@ -7,9 +7,9 @@ map's cells, for single cells would differ from the map by their relief and not 
    the height differences. With weights w of the model's blocks and k of the map's known cells, all sums over a place
    are correlations of w, w z, w z^2 with k, k h, k h^2 (masked registration: Padfield 2012,
    doi:10.1109/TIP.2011.2181402), which the fast Fourier transform gives for all places of a heading at once.
-2. The best places that are no neighbours are each refined on the map itself by Gauss-Newton with Huber's weights. The
-   slopes are those of the model, whose noise is less than the map's: noise in slopes would count as relief and make the
-   covariance too small. The tilt has a prior, ``sigma_tilt_deg``.
+2. The best places that are no neighbours are each refined on the map itself (:mod:`rille.stages.terrain.height_fit`)
+   with Huber's weights. The slopes are those of the model, whose noise is less than the map's. The tilt has a prior,
+   ``sigma_tilt_deg``.
 3. Neighbouring differences are correlated, the more so at a wrong place. With r their correlation at a distance of one
    cell, n cells count for n ((1 - r) / (1 + r))^2 independent ones, in the covariance, too. The chi2 by which a place
    is worse than the best one is this number times the logarithm of the ratio of their mean squares, so that no standard
@@ -21,9 +21,9 @@ beside them is no secret."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -34,9 +34,11 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.facts.terrain import DemFacts, MapFixFacts
-from rille.stages.geometry.geometry import RigidTransform, cross_matrix, heading_of, rotation_exp
+from rille.stages.geometry.geometry import RigidTransform, cross_matrix, from_above, rotation_exp
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.numeric.robust import huber_weight, mad_sigma
+from rille.stages.numeric.robust import huber_weight
+from rille.stages.terrain.grid import Grid
+from rille.stages.terrain.height_fit import MIN_EIGENVALUE, FitRules, HeightFit, condition, lay
 from rille.stages.terrain.shading import gradient
 
 MIN_CELLS = 30
@@ -61,10 +63,6 @@ had 148 at least at their right places, 7 at most in the map of another bed; on 
 HUBER_SIGMAS = 1.5
 MAX_ALIKE = 0.95
 """Correlation of neighbouring differences that is believed at most."""
-MIN_EIGENVALUE = 1e-6
-"""Of the normal matrix scaled to a diagonal of ones: below, something is not determined."""
-MAX_ROUNDS, SETTLED_CELLS = 12, 1e-3
-"""Of Gauss-Newton, and the step that ends it."""
 
 
 class MapLocalizationParams(Params):
@@ -84,61 +82,30 @@ class SearchArea:
 
     x: float
     y: float
-    heading: float
-    distance: float
-    turn: float
-
-    @property
-    def place(self) -> tuple[float, float, float]:
-        """x, y and heading of its middle."""
-        return self.x, self.y, self.heading
+    heading: float = 0.0
+    distance: float = math.inf
+    turn: float = math.pi
 
 
 @dataclass(frozen=True)
-class Fix:
-    """``pose``: T_map_model; ``covariance`` (6, 6) of its position, m, and rotation, rad, about the map's axes.
+class Placement:
+    """Where a model lies in a map.
 
-    ``overlap``: share of the model that the map knows; ``rms`` of the height differences, m; ``explained``: share of
-    the model's relief (variance about its plane) that they leave out; ``cells`` compared, ``independent`` of them;
-    ``other``: x, y, heading of the next best place and by how much its chi2 is larger, None where there is one place.
+    ``pose``: T_map_model; ``covariance`` (6, 6) of its position, m, and rotation, rad, about the map's axes, infinite
+    of what is not known. ``by`` what it is known, in words, and ``figures`` on how well it fits. ``doubt``: another
+    place that fits nearly as well, in words; empty where there is none.
+
+    Of elevations the figures are ``overlap``: share of the model that the map knows; ``rms`` of the height differences,
+    m; ``explained``: share of the model's relief (variance about its plane) that they leave out; ``cells`` compared,
+    ``independent`` of them; ``other``: x, y, m, of the next best place, by how much its chi2 is larger, and by how much
+    it must be; not there where there is one place alone.
     """
 
     pose: RigidTransform
     covariance: Floats
-    overlap: float
-    rms: float
-    explained: float
-    cells: int
-    independent: float
-    other: tuple[Floats, float] | None = None
-
-    @property
-    def doubt(self) -> str:
-        """The place that fits nearly as well, in words; empty where there is none."""
-        if self.other is None or self.other[1] >= MIN_CHI2_GAP:
-            return ""
-        (ox, oy, _), chi2 = self.other
-        x, y, _ = self.pose.translation
-        fits = "fits better than" if chi2 < 0.0 else "fits nearly as well as"
-        return (
-            f"({ox:.2f}, {oy:.2f}) m {fits} ({x:.2f}, {y:.2f}) m (chi2 larger by {chi2:.1f}, {MIN_CHI2_GAP:g} wanted)"
-        )
-
-    def facts(self) -> MapFixFacts:
-        """The same, as plain values."""
-        return {
-            "T_global_local": self.pose.to_list(),
-            "source": "aligned to the global map",
-            "std": np.sqrt(np.diag(self.covariance)).tolist(),
-            "covariance": self.covariance.tolist(),
-            "overlap": self.overlap,
-            "rms": self.rms,
-            "explained": self.explained,
-            "cells": self.cells,
-            "independent": self.independent,
-            "other": None if self.other is None else {"place": self.other[0].tolist(), "chi2": self.other[1]},
-            "ambiguous": bool(self.doubt),
-        }
+    by: str
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    doubt: str = ""
 
 
 class ModelBlocks(NamedTuple):
@@ -150,66 +117,32 @@ class ModelBlocks(NamedTuple):
     at: NDArray[np.int64]
     shape: tuple[int, int]
 
+    @property
+    def radius(self) -> float:
+        """Distance of the farthest point from the middle, seen from above, m."""
+        return float(np.hypot(*(self.points - self.points.mean(axis=0))[:, :2].T).max())
 
-def thin(elevation: NDArray[np.floating], lattice: Lattice, cell: float) -> ModelBlocks:
+
+def thin(model: Grid, cell: float) -> ModelBlocks:
     """ModelBlocks of a model, as wide as the cells of a map."""
-    z = np.asarray(elevation, np.float64)
-    known = np.isfinite(z)
-    row, col = (np.floor(axis / cell + 0.5).astype(np.int64) for axis in (-lattice.ys(), lattice.xs()))
-    shape = int(row[-1] - row[0]) + 1, int(col[-1] - col[0]) + 1
-    index = ((row - row[0])[:, None] * shape[1] + (col - col[0]))[known]
+    points = model.points()[np.isfinite(model.values)]
+    # Rows fall with y.
+    at = np.floor(points[:, [1, 0]] * [-1.0, 1.0] / cell + 0.5).astype(np.int64)
+    at -= at.min(axis=0)
+    shape = int(at[:, 0].max()) + 1, int(at[:, 1].max()) + 1
+    index = at[:, 0] * shape[1] + at[:, 1]
     count = np.bincount(index, minlength=shape[0] * shape[1])
-    full = count >= max(1.0, MIN_BLOCK_SHARE * (cell / lattice.cell) ** 2)
-    xyz = (*np.moveaxis(lattice.xy()[known], -1, 0), z[known])
-    points = np.stack([np.bincount(index, values, minlength=len(count))[full] / count[full] for values in xyz], axis=1)
+    full = count >= max(1.0, MIN_BLOCK_SHARE * (cell / model.cell) ** 2)
+    sums = (np.bincount(index, values, minlength=len(count)) for values in points.T)
+    means = np.stack([total[full] / count[full] for total in sums], axis=1)
     mean = np.full(shape, np.nan)
-    mean.reshape(-1)[full] = points[:, 2]
+    mean.reshape(-1)[full] = means[:, 2]
     slopes = gradient(mean, cell).reshape(2, -1)[:, full]
-    return ModelBlocks(points, np.stack([*-slopes, np.ones(len(points))], axis=1), np.flatnonzero(full), shape)
+    return ModelBlocks(means, np.stack([*-slopes, np.ones(len(means))], axis=1), np.flatnonzero(full), shape)
 
 
-@dataclass(frozen=True)
-class GlobalMap:
-    """Heights (row, col), m, NaN unknown, bilinear between cells, whose centres are at x0 + col * cell,
-    y0 - row * cell."""
-
-    heights: Floats
-    x0: float
-    y0: float
-    cell: float
-
-    def at(self, x: Floats, y: Floats) -> Floats:
-        """Height (...), m, at x, y (...), m; NaN outside and beside unknown cells."""
-        rows, cols = (self.y0 - y) / self.cell, (x - self.x0) / self.cell
-        return np.asarray(scipy.ndimage.map_coordinates(self.heights, [rows, cols], order=1, cval=np.nan))
-
-    def halved(self) -> GlobalMap:
-        """The same with cells twice as wide, means of those of four cells that are known, two at least."""
-        rows, cols = (n // 2 for n in self.heights.shape)
-        four = self.heights[: 2 * rows, : 2 * cols].reshape(rows, 2, cols, 2)
-        count = np.isfinite(four).sum(axis=(1, 3))
-        mean = np.where(count >= 2, np.nansum(four, axis=(1, 3)) / np.maximum(count, 1), np.nan)
-        half = 0.5 * self.cell
-        return GlobalMap(mean, self.x0 + half, self.y0 - half, 2.0 * self.cell)
-
-    def within(self, x: float, y: float, distance: float) -> GlobalMap:
-        """The part within a distance of a place along either axis; it may be empty."""
-        at = np.array([self.y0 - y, x - self.x0])
-        (row, col), (last, right) = (
-            np.clip(np.rint((at + side * distance) / self.cell), 0, self.heights.shape).astype(int) for side in (-1, 1)
-        )
-        x0, y0 = self.x0 + float(col) * self.cell, self.y0 - float(row) * self.cell
-        return replace(self, heights=self.heights[row:last, col:right], x0=x0, y0=y0)
-
-
-def fix(
-    elevation: NDArray[np.floating],
-    lattice: Lattice,
-    ground: GlobalMap,
-    around: SearchArea,
-    params: MapLocalizationParams,
-) -> Fix:
-    """Place a model (row, col), m, on a map.
+def fix(model: Grid, ground: Grid, around: SearchArea | None, params: MapLocalizationParams) -> Placement:
+    """Place a level model on a map, both of elevations, m; where nothing is named, anywhere.
 
     Raises
     ------
@@ -218,129 +151,81 @@ def fix(
     InputError
         Nowhere within the search the map knows enough of the ground that the model shows, or the search is too wide.
     """
-    area = int(np.isfinite(elevation).sum()) * lattice.cell**2
-    while ground.cell < (1 - 1e-6) * lattice.cell or area > MAX_CELLS * ground.cell**2:
+    (x, y), everywhere = ground.outline
+    own, radius = model.outline
+    everywhere += radius + math.hypot(*own)
+    around = around or SearchArea(x, y)
+    around = replace(around, distance=min(around.distance, everywhere + math.hypot(x - around.x, y - around.y)))
+    area = int(np.isfinite(model.values).sum()) * model.cell**2
+    while ground.cell < (1 - 1e-6) * model.cell or area > MAX_CELLS * ground.cell**2:
         ground = ground.halved()
-    blocks = thin(elevation, lattice, ground.cell)
+    blocks = thin(model, ground.cell)
     if len(blocks.points) < MIN_CELLS:
         raise DegenerateError(
             "RIL-337",
             f"the model covers {len(blocks.points)} cells of the map, {MIN_CELLS} are needed",
             remedy="give a finer map, or a model of more ground",
         )
-    middle = blocks.points.mean(axis=0)
-    far = float(np.hypot(*(blocks.points - middle)[:, :2].T).max())
+    middle, far = blocks.points.mean(axis=0), blocks.radius
     wide = replace(around, distance=around.distance + far, turn=min(around.turn + MORE_TURN, math.pi))
-    ground = ground.within(wide.x, wide.y, wide.distance + far + math.hypot(*middle[:2]) + 2.0 * ground.cell)
+    ground = ground.within((wide.x, wide.y), wide.distance + far + math.hypot(*middle[:2]) + 2.0 * ground.cell)
     coarse = ground
     while _tries(coarse, far, wide) > MAX_TRIES and area > 4 * MIN_SEARCHED_CELLS * coarse.cell**2:
         coarse = coarse.halved()
     if (tries := _tries(coarse, far, wide)) > MAX_TRIES_AT_ALL:
         text = f"the map is too large to be searched: {tries:.1g} places and headings, at most {MAX_TRIES_AT_ALL:.0g}"
         raise InputError("RIL-840", text, remedy="name a start, or one that is nearer")
-    rough = thin(elevation, lattice, coarse.cell)
-    near, fits = NEIGHBOURS * coarse.cell, list[_Fit]()
-    for start in _search(rough.points - middle, coarse, wide, middle, params.min_overlap):
-        fit = _refined(rough, coarse, middle, start, near, params)
-        fit = fit and _refined(blocks, ground, middle, fit.state, near, params)
+    rough = thin(model, coarse.cell)
+    near, fits = NEIGHBOURS * coarse.cell, list[HeightFit]()
+    for start in _search(rough.points, middle, coarse, wide, params.min_overlap):
+        fit = _refined(rough, coarse, start, near, params)
+        fit = fit and _refined(blocks, ground, fit.pose, near, params)
         fits += [fit] if fit else []
 
-    def apart(fit: _Fit, place: Floats) -> tuple[float, float]:
-        """Distances, m, from a place (x, y, heading) of the origin, and of the farthest points by the turn alone."""
-        x, y, turn = fit.place(middle) - place
-        return math.hypot(x, y), abs(math.remainder(turn, 2.0 * math.pi)) * far
+    def apart(fit: HeightFit, x: float, y: float, heading: float) -> tuple[float, float]:
+        """Distances, m, of the origin from a place, and of the farthest points by the turn alone."""
+        there = from_above(fit.pose)
+        return math.hypot(there[0] - x, there[1] - y), abs(math.remainder(there[2] - heading, 2.0 * math.pi)) * far
 
-    allowed = around.distance + near, around.turn * far + near
-    inside = [fit for fit in fits if np.all(np.less_equal(apart(fit, np.array(around.place)), allowed))]
+    allowed, start_at = (around.distance + near, around.turn * far + near), (around.x, around.y, around.heading)
+    inside = [fit for fit in fits if np.all(np.less_equal(apart(fit, *start_at), allowed))]
     best = min(inside, key=lambda fit: fit.square, default=None)
-    if best is None or _condition(best.normal) < MIN_EIGENVALUE:
+    if best is None or condition(best.normal) < MIN_EIGENVALUE:
         raise DegenerateError(
             "RIL-339",
             "the map or the model is too flat to tell the position, or nothing near the start fits",
             remedy="give a finer map, another start, or a model of more ground",
         )
-    placed = _placed(best, blocks, middle, math.radians(params.sigma_tilt_deg))
-    rivals = [fit for fit in fits if max(apart(fit, best.place(middle))) > near]
-    if not rivals:  # all of the best starts led to one place: what is worse than they are is no rival
-        return placed
-    other = min(rivals, key=lambda fit: fit.square)
-    chi2 = placed.independent * math.log(max(other.square, 1e-24) / max(best.square, 1e-24))
-    return replace(placed, other=(other.place(middle), chi2))
+    placed = _placed(best, blocks, math.radians(params.sigma_tilt_deg))
+    # Where all of the best starts lead to one place, what is worse than they are is no rival.
+    rivals = [fit for fit in fits if max(apart(fit, *from_above(best.pose))) > near]
+    return _against(placed, best, min(rivals, key=lambda fit: fit.square)) if rivals else placed
 
 
-def level_pose(motion: Floats) -> RigidTransform:
-    """Turn and shift of a motion (2, 3) in the plane, as those of space."""
-    turn = rotation_exp([0.0, 0.0, math.atan2(motion[1, 0], motion[0, 0])])
-    return RigidTransform(turn, np.array([*motion[:, 2], 0.0]))
-
-
-def fix_on(
-    elevation: Floats,
-    lattice: Lattice,
-    values: Floats,
-    matrix: Floats,
-    around: SearchArea | None,
-    params: MapLocalizationParams,
-) -> Fix:
-    """Place a level model (row, col), m, on a map whose rows may be turned or mirrored.
-
-    Parameters
-    ----------
-    values : heights of the map (row, col), m, NaN unknown.
-    matrix : (2, 3), from (col, row, 1) of its cell centres to x, y, m; its cells are squares.
-    around : what of the map is searched; None: all of it.
-
-    Raises
-    ------
-    DegenerateError
-        The model covers too few cells, or the ground is too flat to tell.
-    InputError
-        Nowhere within the search the ground is known, or the search is too wide.
-    """
-    # The search is in a frame along the rows of the map.
-    rows, cols = values.shape
-    cell = math.sqrt(abs(np.linalg.det(matrix[:, :2])))
-    if np.linalg.det(matrix[:, :2]) > 0:
-        values, matrix = values[::-1], matrix @ np.array([[1.0, 0.0, 0.0], [0.0, -1.0, rows - 1.0], [0.0, 0.0, 1.0]])
-    to_ground = level_pose(matrix)
-    middle = 0.5 * cell * (cols - 1), 0.5 * cell * (1 - rows)
-    everywhere = math.hypot(*middle) + lattice.radius
-    area = SearchArea(*middle, 0.0, everywhere, math.pi)
-    if around is not None:
-        x, y, _ = to_ground.inverse().apply([around.x, around.y, 0.0])
-        distance = min(around.distance, everywhere + math.hypot(middle[0] - x, middle[1] - y))
-        area = SearchArea(float(x), float(y), around.heading - heading_of(to_ground), distance, around.turn)
-    placed = fix(elevation, lattice, GlobalMap(values, 0.0, 0.0, cell), area, params)
-    both, other = np.kron(np.eye(2), to_ground.rotation), placed.other
-    if other is not None:
-        (x, y, heading), chi2 = other
-        other = np.array([*to_ground.apply([x, y, 0.0])[:2], heading + heading_of(to_ground)]), chi2
-    return replace(placed, pose=to_ground @ placed.pose, covariance=both @ placed.covariance @ both.T, other=other)
-
-
-def _tries(ground: GlobalMap, far: float, around: SearchArea) -> float:
+def _tries(ground: Grid, far: float, around: SearchArea) -> float:
     """Headings and cells of a search, with those that correlations add."""
     edge = 2.0 * far / ground.cell
-    rows, cols = ground.heights.shape
+    rows, cols = ground.values.shape
     return float((2.0 * around.turn * far / ground.cell + 1.0) * (rows + edge) * (cols + edge))
 
 
 def _search(
-    points: Floats, ground: GlobalMap, around: SearchArea, middle: Floats, min_overlap: float
-) -> Iterator[Floats]:
-    """Best places that are no neighbours, the best first: x, y, z (NaN: not known), two tilts and heading of the
-    model's ``middle``."""
+    points: Floats, middle: Floats, ground: Grid, around: SearchArea, min_overlap: float
+) -> Iterator[RigidTransform]:
+    """Best poses of the model that are no neighbours, the best first; their heights mean nothing."""
+    points = points - middle
     # Turns that move the farthest point by one cell: finer steps find no other place.
     step = ground.cell / float(np.hypot(*points[:, :2].T).max())
     count = math.ceil(around.turn / step)
-    headings = around.heading + step * np.arange(-count, count + 1, dtype=np.float64)
-    rows, cols = ground.heights.shape
-    x, y = ground.x0 + ground.cell * np.arange(cols), ground.y0 - ground.cell * np.arange(rows)
-    scores = np.full((len(headings), len(y), len(x)), np.inf, np.float32)
+    turns = rotation_exp(
+        np.outer(around.heading + step * np.arange(-count, count + 1, dtype=np.float64), [0.0, 0.0, 1.0])
+    )
+    x, y = np.ascontiguousarray(np.moveaxis(ground.centres(), -1, 0))
+    scores = np.full((len(turns), *x.shape), np.inf, np.float32)
     best_overlap = 0.0
-    for k, (score, overlap) in enumerate(_scores(points, ground, headings)):
-        dx, dy = _turned(middle[None], headings[k])
-        inside = np.hypot(x - dx - around.x, (y - dy - around.y)[:, None]) <= around.distance + ground.cell
+    for k, (score, overlap) in enumerate(_scores(points, ground, turns[:, :2, :2])):
+        dx, dy, _ = turns[k] @ middle
+        inside = np.hypot(x - dx - around.x, y - dy - around.y) <= around.distance + ground.cell
         best_overlap = max(best_overlap, float(np.max(overlap, where=inside, initial=0.0)))
         scores[k] = np.where(inside & (overlap >= min_overlap), score, np.inf)
     if best_overlap < min_overlap:
@@ -354,32 +239,27 @@ def _search(
         at = np.unravel_index(int(np.argmin(scores)), scores.shape)
         if not np.isfinite(scores[at]):
             return
-        yield np.array([x[at[2]], y[at[1]], np.nan, 0.0, 0.0, headings[at[0]]])
+        turn = turns[at[0]]
+        yield RigidTransform(turn, np.array([x[at[1:]], y[at[1:]], 0.0]) - turn @ middle)
         scores[tuple(slice(max(k - NEIGHBOURS, 0), k + NEIGHBOURS + 1) for k in at)] = np.inf
 
 
-def _turned(points: Floats, heading: float) -> tuple[Floats, Floats]:
-    """x and y (n,) of points, turned to the left by a heading."""
-    c, s = math.cos(heading), math.sin(heading)
-    return c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]
-
-
-def _scores(points: Floats, ground: GlobalMap, headings: Floats) -> Iterator[tuple[Floats, Floats]]:
-    """Of each heading: variance (row, col), m2, of the differences, with the middle of the model at each cell, and the
-    share of the model that the map knows there."""
+def _scores(points: Floats, ground: Grid, turns: Floats) -> Iterator[tuple[Floats, Floats]]:
+    """Of each turn (2, 2): variance (row, col), m2, of the differences, with the middle of the model at each cell, and
+    the share of the model that the map knows there."""
     far = math.ceil(float(np.hypot(*points[:, :2].T).max()) / ground.cell) + 1
-    side, (rows, cols) = 2 * far + 1, ground.heights.shape
-    known = np.isfinite(ground.heights)
+    side, (rows, cols) = 2 * far + 1, ground.values.shape
+    known = np.isfinite(ground.values)
     # Less their mean, since squares of heights above the sea would leave no digits for the relief.
-    mean = np.sum(ground.heights, where=known) / max(known.sum(), 1)
-    heights = np.where(known, ground.heights - mean, 0.0)
+    mean = np.sum(ground.values, where=known) / max(known.sum(), 1)
+    heights = np.where(known, ground.values - mean, 0.0)
     shape = [scipy.fft.next_fast_len(n + 2 * far, real=True) for n in (rows, cols)]
     maps = np.zeros((3, *shape))
     maps[:, far : far + rows, far : far + cols] = known, heights, heights**2
     k, h, hh = scipy.fft.rfft2(maps)
-    for heading in headings:
-        x, y = _turned(points, heading)
-        at = (far - np.rint(y / ground.cell).astype(int)) * side + far + np.rint(x / ground.cell).astype(int)
+    for turn in turns:
+        col, row = far + np.rint(np.linalg.solve(ground.matrix[:, :2], turn) @ points[:, :2].T).astype(int)
+        at = row * side + col
         count = np.bincount(at, minlength=side * side)
         z = np.bincount(at, points[:, 2], side * side) / np.maximum(count, 1)
         model = np.stack([count > 0, z, z * z]).reshape(3, side, side)
@@ -391,84 +271,51 @@ def _scores(points: Floats, ground: GlobalMap, headings: Floats) -> Iterator[tup
         yield np.maximum((dd - d * d / n) / n, 0.0), overlap
 
 
-class _Fit(NamedTuple):
-    """``state``: x, y, z, two tilts and heading of the middle; mean ``square`` of the differences, m2; the differences
-    (n,), NaN unknown, and the normal matrix (6, 6) of their weighted slopes."""
-
-    state: Floats
-    square: float
-    differences: Floats
-    normal: Floats
-
-    def place(self, middle: Floats) -> Floats:
-        """x, y and heading of the model's origin."""
-        return np.array([*(self.state[:2] - np.ravel(_turned(middle[None], self.state[5]))), self.state[5]])
-
-
-def _rotation(state: Floats) -> Floats:
-    return np.asarray(rotation_exp([*state[3:5], 0.0]) @ rotation_exp([0.0, 0.0, state[5]]))
-
-
-def _condition(normal: Floats) -> float:
-    """Least eigenvalue of a normal matrix scaled to a diagonal of ones."""
-    scale = np.sqrt(np.diag(normal)) + 1e-12
-    return float(np.linalg.eigvalsh(normal / np.outer(scale, scale))[0])
-
-
 def _refined(
-    blocks: ModelBlocks, ground: GlobalMap, middle: Floats, start: Floats, near: float, params: MapLocalizationParams
-) -> _Fit | None:
-    """Gauss-Newton with Huber's weights, no farther than ``near``, m; None where the model leaves the map at once."""
-    state, tilt, fit = start.copy(), math.radians(params.sigma_tilt_deg), None
-    for _ in range(MAX_ROUNDS):
-        turn = _rotation(state)
-        q, normals = (blocks.points - middle) @ turn.T, blocks.normals @ turn.T
-        above = q[:, 2] - ground.at(state[0] + q[:, 0], state[1] + q[:, 1])
-        known = np.isfinite(above) & np.isfinite(normals[:, 2])
-        if known.sum() < max(0.5 * params.min_overlap * len(above), MIN_CELLS / 2):
-            return fit
-        state[2] = -np.median(above[known]) if np.isnan(state[2]) else state[2]
-        r, n = (above + state[2])[known], normals[known] / normals[known][:, 2:]
-        J = np.concatenate([n, np.cross(q[known], n)], axis=1)
-        sigma = max(mad_sigma(r), 1e-12)
-        weight = huber_weight(np.abs(r), HUBER_SIGMAS * sigma)
-        normal = J.T @ (weight[:, None] * J)
-        fit = _Fit(state, float((weight * r**2).sum() / weight.sum()), np.full(len(above), np.nan), normal)
-        fit.differences[known] = r
-        prior = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 0.0]) * (sigma / tilt) ** 2
-        if _condition(normal + prior) < MIN_EIGENVALUE:
-            return fit
-        step = -np.linalg.solve(normal + prior, J.T @ (weight * r) + prior @ state)
-        # At most a cell: farther, the slopes are others.
-        size = float(np.abs(step[:2]).max()) / ground.cell
-        state = state + step / max(size, 1.0)
-        if size < SETTLED_CELLS or math.hypot(*(state - start)[:2]) > near:
-            break
-    return fit
+    blocks: ModelBlocks, ground: Grid, start: RigidTransform, near: float, params: MapLocalizationParams
+) -> HeightFit | None:
+    """The model laid on the map, no farther than ``near``, m, away; None where it leaves the map at once."""
+    rules = FitRules(
+        least=max(0.5 * params.min_overlap * len(blocks.points), MIN_CELLS / 2),
+        weigh=lambda r, sigma: huber_weight(np.abs(r), HUBER_SIGMAS * sigma),
+        sigma_tilt=math.radians(params.sigma_tilt_deg),
+        near=near,
+    )
+    return lay(blocks.points, blocks.normals, ground, start, rules)
 
 
-def _placed(best: _Fit, blocks: ModelBlocks, middle: Floats, sigma_tilt: float) -> Fix:
+def _placed(best: HeightFit, blocks: ModelBlocks, sigma_tilt: float) -> Placement:
     """The best fit as the pose of the model's origin, with its covariance."""
     cells = int(np.isfinite(best.differences).sum())
-    field = np.full(blocks.shape, np.nan)
-    field.reshape(-1)[blocks.at] = best.differences
-    independent = independent_cells(field)
-    turn = _rotation(best.state)
+    differences = np.full(blocks.shape, np.nan)
+    differences.reshape(-1)[blocks.at] = best.differences
+    independent = independent_cells(differences)
     information = best.normal * independent / (cells * max(best.square, 1e-24))
     information += np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 0.0]) / sigma_tilt**2
     lever = np.eye(6)
-    lever[:3, 3:] = cross_matrix(turn @ middle)
-    design = np.column_stack([blocks.points[:, :2] - middle[:2], np.ones(len(blocks.points))])
+    lever[:3, 3:] = cross_matrix(best.centre - best.pose.translation)
+    design = np.column_stack([blocks.points[:, :2] - blocks.points[0, :2], np.ones(len(blocks.points))])
     relief = blocks.points[:, 2] - design @ np.linalg.lstsq(design, blocks.points[:, 2], rcond=None)[0]
-    return Fix(
-        RigidTransform(turn, best.state[:3] - turn @ middle),
-        lever @ np.linalg.inv(information) @ lever.T,
-        cells / len(blocks.points),
-        math.sqrt(best.square),
-        1.0 - best.square / max(float(np.mean(relief**2)), 1e-24),
-        cells,
-        independent,
-    )
+    figures = {
+        "overlap": cells / len(blocks.points),
+        "rms": math.sqrt(best.square),
+        "explained": 1.0 - best.square / max(float(np.mean(relief**2)), 1e-24),
+        "cells": cells,
+        "independent": independent,
+    }
+    return Placement(best.pose, lever @ np.linalg.inv(information) @ lever.T, f"relief, {cells} cells", figures)
+
+
+def _against(placed: Placement, best: HeightFit, other: HeightFit) -> Placement:
+    """The same with the next best place beside it, and with a doubt where that fits nearly as well."""
+    chi2 = placed.figures["independent"] * math.log(max(other.square, 1e-24) / max(best.square, 1e-24))
+    (x, y, _), (ox, oy, _), doubt = best.pose.translation, other.pose.translation, ""
+    if chi2 < MIN_CHI2_GAP:
+        fits = "fits better than" if chi2 < 0.0 else "fits nearly as well as"
+        how = f"chi2 larger by {chi2:.1f}, {MIN_CHI2_GAP:g} wanted"
+        doubt = f"({ox:.2f}, {oy:.2f}) m {fits} ({x:.2f}, {y:.2f}) m ({how})"
+    rival = {"x_m": float(ox), "y_m": float(oy), "chi2": chi2, "wanted": MIN_CHI2_GAP}
+    return replace(placed, figures={**placed.figures, "other": rival}, doubt=doubt)
 
 
 def independent_cells(field: Floats) -> float:
@@ -481,7 +328,7 @@ def independent_cells(field: Floats) -> float:
     return float(np.isfinite(field).sum()) * ((1.0 - alike) / (1.0 + alike)) ** 2
 
 
-@stage("map_localization", version=2)
+@stage("map_localization", version=3)
 def map_localization_stage(
     params: MapLocalizationParams,
     dem: Bundle[DemFacts] | None = None,
@@ -497,11 +344,19 @@ def map_localization_stage(
         return Bundle({}, {"T_global_local": known.to_list(), "source": "handed in"})
     assert dem is not None
     assert global_map is not None
-    lattice = Lattice.from_dict(global_map.meta["lattice"])
-    ground = GlobalMap(np.asarray(global_map["elevation"], np.float64), lattice.x0, lattice.y0, lattice.cell)
+    model, ground = (
+        Grid.on(Lattice.from_dict(one.meta["lattice"]), np.asarray(one["elevation"])) for one in (dem, global_map)
+    )
     around = SearchArea(*prior, *(params.reach * sigma for sigma in prior_sigma))
-    placed = fix(np.asarray(dem["elevation"]), Lattice.from_dict(dem.meta["lattice"]), ground, around, params)
-    meta = placed.facts()
+    placed = fix(model, ground, around, params)
+    meta: MapFixFacts = {
+        "T_global_local": placed.pose.to_list(),
+        "source": "aligned to the global map",
+        "std": np.sqrt(np.diag(placed.covariance)).tolist(),
+        "covariance": placed.covariance.tolist(),
+        "fit": dict(placed.figures),
+        "ambiguous": bool(placed.doubt),
+    }
     if placed.doubt:
         meta["warnings"] = [f"the first pose in the global map is ambiguous: {placed.doubt}"]
     return Bundle({}, meta)

@@ -117,7 +117,7 @@ def test_a_report_that_is_none(run: Path, content: str, capsys: Any) -> None:
     assert told(capsys, *COMPARE) == (2, ["RIL-980"])
 
 
-@pytest.mark.parametrize("name", ["report.json", "config.toml", "trajectory.tum"])
+@pytest.mark.parametrize("name", ["report.json", "config.toml", "trajectory.kitti"])
 def test_a_pipe_in_place_of_a_file_of_a_run(run: Path, name: str, capsys: Any) -> None:
     for number in "12":
         (run.parent / number / name).unlink(missing_ok=True)
@@ -128,7 +128,7 @@ def test_a_pipe_in_place_of_a_file_of_a_run(run: Path, name: str, capsys: Any) -
 @pytest.mark.parametrize("content", ["a b c\n", "1 2 3 4\n1 2\n"])
 def test_a_trajectory_that_is_none(run: Path, content: str, capsys: Any) -> None:
     for number in "12":
-        (run.parent / number / "trajectory.tum").write_text(content)
+        (run.parent / number / "trajectory.kitti").write_text(content)
     assert told(capsys, *COMPARE) == (2, ["RIL-980"])
 
 
@@ -195,7 +195,7 @@ def test_a_small_file_does_not_take_more_than_it_can_hold(tmp_path: Path) -> Non
             pass
     with raises("RIL-981"):
         read_elevation(tmp_path / "dem.tif")
-    assert read_elevation(tmp_path / "sparse.tif").values.shape == (1000, 3000)
+    assert read_elevation(tmp_path / "sparse.tif").grid.values.shape == (1000, 3000)
 
 
 def test_what_needs_more_memory_than_there_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -297,7 +297,7 @@ def test_a_mask_beside_a_raster_is_not_followed_either(tmp_path: Path, name: str
         f'<SourceFilename relativeToVRT="0">{tmp_path / "own.tif"}</SourceFilename>'
         "</SimpleSource></VRTRasterBand></VRTDataset>"
     )
-    assert np.isfinite(read_elevation(tmp_path / name).values).all()
+    assert np.isfinite(read_elevation(tmp_path / name).grid.values).all()
 
 
 def test_an_ascii_grid_that_claims_more_than_can_be_read(tmp_path: Path) -> None:

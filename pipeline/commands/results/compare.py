@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rille.datasets.manifest.opening import dotted
-from rille.datasets.text.reading import read_lines, read_toml
+from rille.datasets.text.reading import read_toml
 from rille.pipeline import api
 from rille.pipeline.engine import events
 from rille.pipeline.report.words import metres, quantity
@@ -75,12 +75,12 @@ def _figures(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _positions(a: Path, b: Path) -> str:
-    paths = [run / "trajectory.tum" for run in (a, b)]
-    if not all(path.exists() for path in paths):
+    if not all((run / "trajectory.kitti").exists() for run in (a, b)):
         return "positions     not both runs have a trajectory"
-    tables = (np.loadtxt(read_lines(path, "trajectory"), ndmin=2) for path in paths)
-    one, other = ({row[0]: row[1:4] for row in table} for table in tables)
-    apart = np.array([np.linalg.norm(one[time] - other[time]) for time in one if time in other])
+    one, other = (api.Run(run).trajectory for run in (a, b))
+    _, rows, others = np.intersect1d(one.time, other.time, return_indices=True)
+    apart = np.linalg.norm(one.position.values[rows] - other.position.values[others], axis=1)
+    apart = apart[np.isfinite(apart)]
     if not apart.size:
         return "positions     no frame has a pose in both"
     rms = metres(float(np.sqrt(np.mean(apart**2))))

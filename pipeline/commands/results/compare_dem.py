@@ -5,20 +5,25 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from affine import Affine
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
+from rille.pipeline.export.read_dem import (
+    DemFile,
+    crs_name,
+    read_elevation,
+    read_ortho,
+    refuse_unlike_systems,
+    transform_of,
+)
 from rille.pipeline.export.writers import ENGINEERING_CRS, Meaning, write_bands
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs, named
@@ -26,8 +31,9 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation import dem_changes
 from rille.stages.evaluation import dem_comparison as evaluation
-from rille.stages.evaluation.dem_comparison import Grid
 from rille.stages.evaluation.place import register
+from rille.stages.geometry.geometry import from_above, rotation_log
+from rille.stages.terrain.grid import Grid
 
 SHOWN_CHANGES = 12
 """Patches that are printed; all are in the JSON file."""
@@ -73,8 +79,11 @@ def compare_dem(
             raise InputError("RIL-908", text, remedy="leave --align place out")
         image, reference = (read_ortho(path / "ortho.tif")[0] for path in paths)
         placed = register((image, reference), (one.grid, other.grid))
-        place = {"motion_of_a": placed.motion.tolist(), "by": placed.by}
-        one, align = moved(one, placed.motion), "rigid"
+        x, y, heading = from_above(placed.pose)
+        cos, sin = math.cos(heading), math.sin(heading)
+        motion = np.array([[cos, -sin, x], [sin, cos, y]])
+        place = {"motion_of_a": motion.tolist(), "by": placed.by}
+        one, align = moved(one, motion), "rigid"
     refuse_unlike_systems({one.name: one.crs, other.name: other.crs})
     figures, error, cells = measure(one, other, align)
     figures["place"] = place
@@ -88,8 +97,8 @@ def compare_dem(
     print("\n".join(lines))
     raster, facts = named(output, ".tif"), named(output, ".json")
     atomic.write(facts, json.dumps(figures, indent=1, allow_nan=False) + "\n")
-    coarse = other if np.array_equal(cells.matrix, other.grid.matrix) else one
-    profile = {"driver": "COG", "crs": coarse.crs or None, "transform": coarse.transform}
+    crs = (other if np.array_equal(cells.matrix, other.grid.matrix) else one).crs
+    profile = {"driver": "COG", "crs": crs or None, "transform": transform_of(cells)}
     write_bands(raster, rasters, Meaning("m", tags={"error": figures["error"]}), profile)
     print(f"{raster}  {facts}")
     return COMPLETE
@@ -97,9 +106,9 @@ def compare_dem(
 
 def moved(dem: DemFile, motion: Floats) -> DemFile:
     """The model in another frame, by a motion (2, 3) of x, y."""
-    eyes = dem.viewpoints
-    eyes = None if eyes is None else eyes @ motion[:, :2].T + motion[:, 2]
-    return replace(dem, transform=Affine(*motion.ravel()) @ dem.transform, viewpoints=eyes)
+    turn, shift, eyes = motion[:, :2], motion[:, 2], dem.viewpoints
+    matrix = turn @ dem.grid.matrix + np.column_stack([np.zeros((2, 2)), shift])
+    return replace(dem, grid=Grid(dem.grid.values, matrix), viewpoints=None if eyes is None else eyes @ turn.T + shift)
 
 
 def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any], Floats, Grid]:
@@ -126,7 +135,7 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
         figures["before_alignment"] = evaluation.figures(evaluation.errors(on_a, on_b))
         alignment = evaluation.align(on_a, on_b, align)  # type: ignore[arg-type]
         figures["alignment"] = _alignment(alignment, align)
-    error = evaluation.errors(on_a, on_b, alignment)
+    error = evaluation.errors(on_a, on_b, None if alignment is None else alignment.pose)
     figures["figures"] = evaluation.figures(error)
     compared, known = int(np.isfinite(error).sum()), np.isfinite(on_b.values)
     if not compared:
@@ -154,29 +163,20 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
 
 def changed(a: DemFile, b: DemFile, error: Floats, grid: Grid) -> tuple[NDArray[np.float32], dict[str, Any]]:
     """Standard deviation of the ``error`` of :func:`measure` on a grid, and list (JSON-able) of what rose or fell."""
-    sigma = [
-        np.zeros(error.shape) if one.sigma is None else evaluation.interpolate(one.grid, grid.centres(), one.sigma)
-        for one in (a, b)
-    ]
+    sigma = [np.zeros(error.shape) if one.sigma is None else one.grid.at(grid.centres(), one.sigma) for one in (a, b)]
     deviation = dem_changes.standard_deviation(error, np.hypot(*sigma), np.hypot(*grid.slopes()), grid.cell)
-    found = dem_changes.changes(error, deviation, grid.cell)
-    places = [grid.matrix @ np.array([one.col, one.row, 1.0]) for one in found]
-    rows = [
-        {"x_m": float(x), "y_m": float(y), "cells": one.cells, "greatest_m": one.greatest, "area_m2": one.area}
-        | {"volume_m3": one.volume, "sigma_m3": one.sigma}
-        for one, (x, y) in zip(found, places, strict=True)
-    ]
+    found = dem_changes.changes(error, deviation, grid)
     total = {}
     for way, sign in (("rose", 1), ("fell", -1)):
-        of = [one for one in found if sign * one.volume > 0]
-        sigma_m3 = float(np.sqrt(sum(one.sigma**2 for one in of)))
-        total[way] = {"volume_m3": sum(one.volume for one in of), "sigma_m3": sigma_m3}
+        of = [one for one in found if sign * one.volume_m3 > 0]
+        sigma_m3 = math.hypot(*(one.sigma_m3 for one in of))
+        total[way] = {"volume_m3": sum(one.volume_m3 for one in of), "sigma_m3": sigma_m3}
     how = (
         f"patches of cells that differ one way by {dem_changes.BESIDE:g} standard deviations, one of them by "
         f"{dem_changes.SURE:g}, their volume by {dem_changes.SURE_VOLUME:g} of its own; standard deviations of both "
         f"models and of a shift by {dem_changes.SHIFT_CELLS:g} cells, scaled up where most differences spread more"
     )
-    return deviation.astype(np.float32), {"total": total, "patches": rows, "how": how}
+    return deviation.astype(np.float32), {"total": total, "patches": [asdict(one) for one in found], "how": how}
 
 
 def _change_table(changes: Mapping[str, Any]) -> Iterator[str]:
@@ -194,21 +194,22 @@ def _change_table(changes: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _about(raster: DemFile) -> dict[str, Any]:
-    rows, cols = raster.values.shape
-    return {"path": raster.name, "rows": rows, "cols": cols, "cell_m": raster.cell, "crs": crs_name(raster.crs)}
+    rows, cols = raster.grid.values.shape
+    return {"path": raster.name, "rows": rows, "cols": cols, "cell_m": raster.grid.cell, "crs": crs_name(raster.crs)}
 
 
 def _alignment(alignment: evaluation.Alignment, kind: str) -> dict[str, Any]:
-    turn = np.degrees(Rotation.from_matrix(alignment.rotation).as_rotvec())
     names = ("x_m", "y_m", "z_m", "about_x_deg", "about_y_deg", "about_z_deg")
-    values, sigma = [*alignment.translation, *turn], [*alignment.sigma[:3], *np.degrees(alignment.sigma[3:])]
+    start = alignment.pose.inverse().apply(alignment.centre)
+    values = [*(alignment.centre - start), *np.degrees(rotation_log(alignment.pose.rotation))]
+    sigma = [*alignment.sigma[:3], *np.degrees(alignment.sigma[3:])]
     return {
         "kind": kind,
         "motion_of_a": {names[k]: float(values[k]) for k in evaluation.FREE[kind]},
         "sigma": {names[k]: float(sigma[k]) for k in evaluation.FREE[kind]},
-        "centre_m": alignment.centre.tolist(),
+        "centre_m": start.tolist(),
         "how": "x_b = R (x_a - centre) + centre + t; least squares of the elevation differences, Tukey's biweight",
-        "iterations": alignment.iterations,
+        "iterations": alignment.rounds,
         "points": alignment.points,
     }
 
@@ -216,7 +217,7 @@ def _alignment(alignment: evaluation.Alignment, kind: str) -> dict[str, Any]:
 def _within(target: Grid, a: DemFile) -> NDArray[np.bool_]:
     """Target cells (rows, cols) whose centres lie in the outline of A."""
     index = a.grid.index(target.centres())
-    return np.asarray(((index >= -0.5) & (index <= np.array(a.values.shape) - 0.5)).all(axis=-1))
+    return np.asarray(((index >= -0.5) & (index <= np.array(a.grid.values.shape) - 0.5)).all(axis=-1))
 
 
 def _range(target: Grid, a: DemFile, b: DemFile) -> tuple[Floats | None, str]:

@@ -26,19 +26,12 @@ from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, re
 from rille.pipeline.export.writers import write_trajectory_tum
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder, named
-from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
-from rille.stages.evaluation.dem_comparison import Grid
-from rille.stages.evaluation.place import PlacedImage, place
-from rille.stages.geometry.geometry import RigidTransform, heading_of, rotation_exp, rotation_log
-from rille.stages.terrain.map_localization import (
-    MIN_CHI2_GAP,
-    MapLocalizationParams,
-    SearchArea,
-    fix_on,
-    level_pose,
-)
+from rille.stages.evaluation.place import place
+from rille.stages.geometry.geometry import from_above, heading_of, rotation_exp, rotation_log
+from rille.stages.terrain.grid import Grid
+from rille.stages.terrain.map_localization import MapLocalizationParams, Placement, SearchArea, fix
 
 TURN_DEG = 20.0
 """Degrees to either side of a given heading that are searched."""
@@ -82,63 +75,49 @@ class Area:
             text = f"--near {self.near!r} is not x,y or x,y,yaw"
             raise ConfigError("RIL-847", text, remedy="write e.g. --near 612.5,88.0,30") from None
         turn = math.radians(TURN_DEG) if yaw else math.pi
-        return SearchArea(x, y, math.radians(sum(yaw)), math.inf if self.within is None else self.within, turn)
+        return SearchArea(x, y, math.radians(sum(yaw)), self.within or math.inf, turn)
 
 
-@dataclass(frozen=True)
-class Localization:
-    """``pose`` T_map_world with its covariance (6, 6): position, m, and rotation, rad; infinite: not found.
+def numbers(placed: Placement) -> dict[str, tuple[float, float]]:
+    """What is known of a place, by name, with its standard deviation: position, tilts about the map's axes, yaw."""
+    R, sigma = placed.pose.rotation, np.sqrt(np.diag(placed.covariance))
+    heading = heading_of(placed.pose)
+    tilts = np.degrees(rotation_log(R @ rotation_exp([0.0, 0.0, -heading])))[:2]
+    values = *placed.pose.translation, *tilts, math.degrees(heading)
+    sigmas = *sigma[:3], *np.degrees(sigma[3:])
+    return {name: (float(v), float(s)) for name, v, s in zip(NAMES, values, sigmas, strict=True) if s < math.inf}
 
-    ``facts``: how it was found, for the JSON file; ``doubt`` in words, empty where there is none.
-    """
 
-    pose: RigidTransform
-    covariance: Floats
-    facts: Mapping[str, Any]
-    doubt: str = ""
+def for_file(placed: Placement) -> dict[str, Any]:
+    """Facts for the JSON file."""
+    known = np.isfinite(np.diag(placed.covariance))
+    return {
+        "T_map_world": placed.pose.to_list(),
+        "place": {name: value for name, (value, _) in numbers(placed).items()},
+        "sigma": {name: sigma for name, (_, sigma) in numbers(placed).items()},
+        "covariance_m_rad": placed.covariance[np.ix_(known, known)].tolist(),
+        **placed.figures,
+    }
 
-    @property
-    def numbers(self) -> dict[str, tuple[float, float]]:
-        """What was found, by name, with its standard deviation: position, tilts about the map's axes, yaw."""
-        R, sigma = self.pose.rotation, np.sqrt(np.diag(self.covariance))
-        heading = heading_of(self.pose)
-        tilts = np.degrees(rotation_log(R @ rotation_exp([0.0, 0.0, -heading])))[:2]
-        values = *self.pose.translation, *tilts, math.degrees(heading)
-        sigmas = *sigma[:3], *np.degrees(sigma[3:])
-        return {
-            name: (float(value), float(s)) for name, value, s in zip(NAMES, values, sigmas, strict=True) if s < math.inf
-        }
 
-    def for_file(self) -> dict[str, Any]:
-        """Facts for the JSON file."""
-        known = np.isfinite(np.diag(self.covariance))
-        return {
-            "T_map_world": self.pose.to_list(),
-            "place": {name: value for name, (value, _) in self.numbers.items()},
-            "sigma": {name: sigma for name, (_, sigma) in self.numbers.items()},
-            "covariance_m_rad": self.covariance[np.ix_(known, known)].tolist(),
-            **self.facts,
-        }
+def table(placed: Placement) -> Iterator[str]:
+    """A line for each number."""
+    for name, (value, sigma) in numbers(placed).items():
+        word, _, unit = name.rpartition("_")
+        digits = min(6, max(0, 1 - math.floor(math.log10(max(sigma, 1e-6)))))
+        yield f"  {word:10s} {value:.{digits}f} +- {sigma:.{digits}f} {unit}"
 
-    def table(self) -> Iterator[str]:
-        """A line for each number."""
-        for name, (value, sigma) in self.numbers.items():
-            word, _, unit = name.rpartition("_")
-            digits = min(6, max(0, 1 - math.floor(math.log10(max(sigma, 1e-6)))))
-            yield f"  {word:10s} {value:.{digits}f} +- {sigma:.{digits}f} {unit}"
 
-    def about(self) -> Iterator[str]:
-        """Lines on how it was found."""
-        facts = self.facts
-        if "cells" in facts:
-            yield (
-                f"fit          {facts['cells']} cells ({facts['independent']:.0f} independent), {facts['overlap']:.0%} "
-                f"of the terrain; RMS {facts['rms']:.3g} m, {max(facts['explained'], 0.0):.0%} of the relief explained"
-            )
-            rival = "next best place ({x_m:.2f}, {y_m:.2f}) m: chi2 larger by {chi2:.0f}, {wanted:g} wanted"
-            yield f"ambiguity    {rival.format(**facts['other']) if 'other' in facts else 'no other place'}"
-        if "keypoints" in facts:
-            yield f"ortho        {facts['keypoints']} keypoints agree"
+def about(figures: Mapping[str, Any]) -> Iterator[str]:
+    """Lines on how a place was found."""
+    if "cells" in figures:
+        relief = f"RMS {figures['rms']:.3g} m, {max(figures['explained'], 0.0):.0%} of the relief explained"
+        cells = f"{figures['cells']} cells ({figures['independent']:.0f} independent)"
+        yield f"fit          {cells}, {figures['overlap']:.0%} of the terrain; {relief}"
+        rival = "next best place ({x_m:.2f}, {y_m:.2f}) m: chi2 larger by {chi2:.0f}, {wanted:g} wanted"
+        yield f"ambiguity    {rival.format(**figures['other']) if 'other' in figures else 'no other place'}"
+    if "keypoints" in figures:
+        yield f"ortho        {figures['keypoints']} keypoints agree"
 
 
 _EVERYWHERE = Area()
@@ -190,20 +169,20 @@ def localize(
         why = f"{error.code}: {error}"
     written = [named(output, ".json")]
     facts: dict[str, Any] = {"run": terrain.name, "dem": dem and str(dem), "ortho": ortho and str(ortho), "crs": crs}
-    facts |= {"ambiguous": bool(why), "why": why, **({} if found is None else found.for_file())}
+    facts |= {"ambiguous": bool(why), "why": why, **({} if found is None else for_file(found))}
     atomic.write(written[0], json.dumps(facts, indent=1, allow_nan=False) + "\n")
     if found is None or why:
         lines = [f"ambiguous    {why}"]
     else:
         written += _export(folder, found, output, crs, Store(cache_folder(cache)))
         lines = [f"place        of the world's origin{f' in {crs_name(crs)}' if crs else ''}, yaw to the left"]
-        lines += found.table()
-    print("\n".join([*lines, *(() if found is None else found.about())]))
+        lines += table(found)
+    print("\n".join([*lines, *(() if found is None else about(found.figures))]))
     print("wrote        " + "  ".join(map(str, written)))
     return HOLES if why else COMPLETE
 
 
-def _found(terrain: Terrain, model: DemFile | None, image: Grid | None, around: SearchArea | None) -> Localization:
+def _found(terrain: Terrain, model: DemFile | None, image: Grid | None, around: SearchArea | None) -> Placement:
     """Place by the ortho images, where there is one; then by the elevations, where there are some.
 
     Raises
@@ -218,7 +197,7 @@ def _found(terrain: Terrain, model: DemFile | None, image: Grid | None, around: 
             near = away <= around.distance + terrain.lattice.radius
             image = replace(image, values=np.where(near, image.values, np.nan))
         try:
-            by_ortho = _by_ortho(place(terrain.image, image))
+            by_ortho = place(terrain.image, image)
         except DegenerateError as error:
             if model is None:
                 raise
@@ -228,41 +207,17 @@ def _found(terrain: Terrain, model: DemFile | None, image: Grid | None, around: 
         return by_ortho
     for line in model.warnings:
         warn(line)
-    if by_ortho is None:
-        return _by_elevations(terrain, model, around)
-    x, y, _ = by_ortho.pose.translation
-    # Elevations and ortho images must agree on a place within ten cells of the map.
-    about = SearchArea(float(x), float(y), heading_of(by_ortho.pose), 10.0 * model.cell, math.radians(TURN_DEG))
-    found = _by_elevations(terrain, model, about)
-    return replace(found, facts={**found.facts, **by_ortho.facts})
-
-
-def _by_ortho(placed: PlacedImage) -> Localization:
-    """The place that keypoints agree on; neither height nor tilt."""
-    # The middle of the matches is known; the origin may be far from it.
-    arm, kept = placed.motion[:, 2] - placed.middle, np.ix_([0, 1, 5], [0, 1, 5])
-    lever = np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]], [0.0, 0.0, 1.0]])
-    covariance = np.diag(np.full(6, math.inf))
-    covariance[kept] = lever @ np.diag(placed.sigma**2) @ lever.T
-    return Localization(level_pose(placed.motion), covariance, {"keypoints": placed.agreeing})
-
-
-def _by_elevations(terrain: Terrain, model: DemFile, around: SearchArea | None) -> Localization:
-    """The place that elevations tell."""
+    if by_ortho is not None:
+        # Elevations and ortho images must agree on a place within ten cells of the map.
+        around = SearchArea(*from_above(by_ortho.pose), 10.0 * model.grid.cell, math.radians(TURN_DEG))
     # Standard deviation, degrees, of a vertical that a sensor gives, and of one that is that of the ground.
     tilt = 0.5 if terrain.vertical == "attitude" else 5.0
     params = MapLocalizationParams.model_validate({"sigma_tilt_deg": tilt})
-    grid = model.grid
-    placed = fix_on(terrain.elevation, terrain.lattice, grid.values, grid.matrix, around, params)
-    kept = "overlap", "rms", "explained", "cells", "independent"
-    facts: dict[str, Any] = {name: getattr(placed, name) for name in kept}
-    if placed.other is not None:
-        (x, y, _), chi2 = placed.other
-        facts["other"] = {"x_m": x, "y_m": y, "chi2": chi2, "wanted": MIN_CHI2_GAP}
-    return Localization(placed.pose, placed.covariance, facts, placed.doubt)
+    found = fix(terrain.grid, model.grid, around, params)
+    return found if by_ortho is None else replace(found, figures={**found.figures, **by_ortho.figures})
 
 
-def _export(folder: Path, found: Localization, output: Path, crs: str, store: Store) -> Iterator[Path]:
+def _export(folder: Path, found: Placement, output: Path, crs: str, store: Store) -> Iterator[Path]:
     """Write trajectory and path in the map's coordinates; gives the files."""
     words = f"of the map{f', {crs_name(crs)}' if crs else ''}: T_map_world of {named(output, '.json').name}"
     if (folder / "trajectory.kitti").exists():

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,11 +24,12 @@ from rille.pipeline.runs.options import COMPLETE, RUNS, Output, Run, Runs
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.evaluation import dem_comparison
-from rille.stages.evaluation.dem_comparison import Alignment, Grid
+from rille.stages.evaluation.dem_comparison import Alignment
 from rille.stages.evaluation.place import register
 from rille.stages.geometry.geometry import RigidTransform, heading_of, rotation_exp, rotation_log
 from rille.stages.geometry.lattice import Lattice, union
-from rille.stages.terrain.map_localization import independent_cells, level_pose
+from rille.stages.terrain.grid import Grid
+from rille.stages.terrain.map_localization import independent_cells
 from rille.stages.terrain.merge import EXACT, MergeParams, ModelLayer, Placed
 from rille.stages.terrain.merge import merge as merge_layers
 from rille.stages.terrain.shading import gradient
@@ -118,33 +120,28 @@ def _registered(first: Terrain, other: Terrain) -> Session:
     a, b = first.place, other.place
     if a is not None and b is not None:
         refuse_unlike_systems({other.name: b.crs, first.name: a.crs})
-        how, start, rough = "georeferences", _in_system(a).inverse() @ _in_system(b), np.zeros(3)
+        how, start, rough = "georeferences", _in_system(a).inverse() @ _in_system(b), np.zeros(6)
     else:
         placed = register((other.image, first.image), (other.grid, first.grid))
-        how, start, rough = placed.by, level_pose(placed.motion), placed.sigma
-    # The place is level: so far it turns about the vertical alone.
-    moved = start.rotation[:2, :2] @ other.grid.matrix
-    moved[:, 2] += start.translation[:2]
-    one, two, _ = dem_comparison.common(Grid(other.elevation + start.translation[2], moved), first.grid)
-    alignment = _aligned(one, two)
+        how, start, rough = placed.by, placed.pose, np.sqrt(np.diag(placed.covariance))
+    alignment = _aligned(other.grid, first.grid, start)
+    error = dem_comparison.errors(other.grid, first.grid, start if alignment is None else alignment.pose)
+    shared = np.isfinite(error)
+    if not shared.any() or (alignment is None and how != "georeferences"):
+        text = f"{other.name} and {first.name} have too little ground in common to be laid on each other"
+        raise DegenerateError("RIL-853", text, remedy="choose runs that share more ground")
     if alignment is None:
-        if a is None or b is None:
-            text = f"{other.name} and {first.name} have too little ground in common to be laid on each other"
-            raise DegenerateError("RIL-853", text, remedy="choose runs that share more ground")
         text = f"elevations do not tell how {other.name} lies: it is as the georeferences state, without a sigma"
         warn(warning("RIL-855", text))
-        centre = np.array([*np.nanmean(one.centres()[np.isfinite(one.values)], axis=0), np.nanmedian(one.values)])
-        alignment = Alignment(np.eye(3), np.zeros(3), centre, np.zeros(6), 0, 0)
-    error = dem_comparison.errors(one, two, alignment)
+        alignment = Alignment(start, start.apply(other.grid.points()[shared]).mean(axis=0), np.zeros(6))
     # Errors of neighbours are alike: there are fewer than cells.
-    sigma = alignment.sigma * math.sqrt(np.isfinite(error).sum() / max(independent_cells(error), 1.0))
-    sigma = np.where(sigma > 0, sigma, [rough[0], rough[1], 0.0, 0.0, 0.0, rough[2]])
-    motion = np.array([*alignment.translation, *rotation_log(alignment.rotation)])
+    sigma = alignment.sigma * math.sqrt(shared.sum() / max(independent_cells(error), 1.0))
+    sigma = np.where((sigma == 0.0) & np.isfinite(rough), rough, sigma)
     # Georeferences are believed within three standard deviations: lattices that fit are then not resampled.
+    moved, pose = alignment.pose @ start.inverse(), alignment.pose
+    motion = np.array([*(moved.apply(alignment.centre) - alignment.centre), *rotation_log(moved.rotation)])
     if how == "georeferences" and (np.abs(motion) <= 3.0 * sigma).all():
-        alignment = replace(alignment, rotation=np.eye(3), translation=np.zeros(3))
-    R, centre = alignment.rotation, alignment.centre
-    pose = RigidTransform(R, centre + alignment.translation - R @ centre) @ start
+        pose = start
     facts = {
         "run": other.name,
         "by": how,
@@ -152,7 +149,7 @@ def _registered(first: Terrain, other: Terrain) -> Session:
         "sigma_m_rad": sigma.tolist(),
         "overlap": dem_comparison.figures(error),
     }
-    return Session(other, pose, sigma, centre + alignment.translation, facts)
+    return Session(other, pose, sigma, alignment.centre, facts)
 
 
 def _in_system(place: Georeference) -> RigidTransform:
@@ -160,13 +157,11 @@ def _in_system(place: Georeference) -> RigidTransform:
     return RigidTransform(rotation_exp([0.0, 0.0, -place.azimuth]), np.array(place.origin))
 
 
-def _aligned(one: Grid, two: Grid) -> Alignment | None:
-    """Small motion of the first grid onto the second; height and tilt alone where the terrain tells no more."""
+def _aligned(one: Grid, two: Grid, start: RigidTransform) -> Alignment | None:
+    """Motion of the first grid onto the second; height and tilt alone change where the terrain tells no more."""
     for kind in ("rigid", "tilt"):
-        try:
-            return dem_comparison.align(one, two, kind)
-        except DegenerateError:
-            continue
+        with suppress(DegenerateError):
+            return dem_comparison.align(one, two, kind, start)
     return None
 
 
@@ -187,15 +182,15 @@ def _laid(number: int, first: Terrain, session: Session) -> ModelLayer:
     # The point of a tilted model above a cell is found in rounds: its height moves it by less each time.
     for _ in range(4):
         own = back.apply(np.concatenate([xy, z[..., None]], axis=-1))[..., :2]
-        there = dem_comparison.interpolate(grid, own)
+        there = grid.at(own)
         height = pose.apply(np.concatenate([own, there[..., None]], axis=-1))[..., 2]
         z = np.where(np.isfinite(height), height, z)
     slopes = np.nan_to_num(gradient(height, lattice.cell))
     arm, sigma = xy - session.centre[:2], session.sigma
     sideways = (slopes[0] * np.hypot(sigma[0], sigma[5] * arm[..., 1])) ** 2
     sideways += (slopes[1] * np.hypot(sigma[1], sigma[5] * arm[..., 0])) ** 2
-    std = np.sqrt(dem_comparison.interpolate(grid, own, terrain.sigma) ** 2 + sideways)
-    ortho = dem_comparison.interpolate(grid, own, terrain.ortho)
+    std = np.sqrt(grid.at(own, terrain.sigma) ** 2 + sideways)
+    ortho = grid.at(own, terrain.ortho)
     common = lattice.intersection(first.lattice)
     gain = 1.0
     if common is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +15,9 @@ from rille.pipeline.export.read_dem import georeference_of
 from rille.pipeline.runs import lookup
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
-from rille.stages.evaluation.dem_comparison import Grid
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
+from rille.stages.terrain.grid import Grid
 
 
 @dataclass(frozen=True)
@@ -66,10 +66,9 @@ class Terrain:
     @property
     def grid(self) -> Grid:
         """The elevations in the world frame."""
-        at = self.lattice
-        return Grid(self.elevation, np.array([[at.cell, 0.0, at.x0], [0.0, -at.cell, at.y0]]))
+        return Grid.on(self.lattice, self.elevation)
 
     @property
     def image(self) -> Grid:
         """The ortho image in the world frame."""
-        return replace(self.grid, values=self.ortho)
+        return Grid.on(self.lattice, self.ortho)

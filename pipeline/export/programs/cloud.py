@@ -60,8 +60,7 @@ def write_run(path: Path, run: RunArtifacts, every: int = 1, voxel: float = 0.0)
     write = _write_laz if path.suffix == ".laz" else _write_ply
     parts = (_columns(run, one, place) for one in pairs)
     points = write(path, _thinned(parts, voxel) if voxel else parts, crs)
-    unplaced = f", {pairs.unplaced} without a pose are left out" if pairs.unplaced else ""
-    return f"{count(points, 'point')} of {count(len(pairs.pairs), 'pair')}{unplaced}"
+    return f"{count(points, 'point')} of {pairs.words}"
 
 
 def _thinned(parts: Iterator[Columns], voxel: float) -> Iterator[Columns]:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from rille.datasets.text.count import count
 from rille.pipeline.export.programs.placed_pairs import PlacedPair, PlacedPairs
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.writers import FRAME, Meaning, write_bands
@@ -35,8 +34,7 @@ def write_run(folder: Path, run: RunArtifacts) -> str:
         for name, bands, unit, words in _products(one):
             meaning = Meaning(unit, np.nan, {"frame": FRAME, "unit": unit, "content": words, **tags})
             write_bands(folder / f"{one.pair:06d}_{name}.tif", bands, meaning, PROFILE)
-    left_out = f", {pairs.unplaced} without a pose are left out" if pairs.unplaced else ""
-    return f"XYZ, RNG, RNE, UVW, SLP, RUF and DSP of {count(len(pairs.pairs), 'pair')}{left_out}"
+    return f"XYZ, RNG, RNE, UVW, SLP, RUF and DSP of {pairs.words}"
 
 
 def _products(one: PlacedPair) -> Iterator[tuple[str, Bands, str, str]]:

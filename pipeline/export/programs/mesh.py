@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
-from rille.pipeline.export.read_dem import DemFile, opened_raster, read_elevation
+from rille.pipeline.export.read_dem import DemFile, opened_raster, read_elevation, transform_of
 from rille.stages.core.errors import InputError
 
 MAX_FACES = 2_000_000
@@ -41,7 +41,7 @@ def _ortho(run: Path, terrain: DemFile) -> Layer:
     if not path.is_file():
         return None
     with opened_raster(path) as raster:
-        if raster.shape != terrain.values.shape or raster.transform != terrain.transform:
+        if raster.shape != terrain.grid.values.shape or not raster.transform.almost_equals(transform_of(terrain.grid)):
             raise InputError("RIL-602", f"{path} and dem.tif have other cells", remedy="make the run again")
         bands = raster.read([1, 2, 3] if raster.count == 3 else [1], out_dtype="float64", masked=True).filled(np.nan)
     return np.asarray(np.moveaxis(bands, 0, 2) if len(bands) == 3 else bands[0], np.float64)
@@ -87,7 +87,7 @@ def _colours(ortho: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 def _mesh(terrain: DemFile, step: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
     """Vertices (n, 3) in the CRS, triangles (m, 3) seen from above anticlockwise, texture coordinates (n, 2)."""
-    z = terrain.values[::step, ::step]
+    z = terrain.grid.values[::step, ::step]
     number = np.arange(z.size).reshape(z.shape)
     quads = np.stack([number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]], axis=-1).reshape(-1, 4)
     a, b, c, d = quads[np.isfinite(z.ravel()[quads]).all(axis=1)].T
@@ -96,14 +96,14 @@ def _mesh(terrain: DemFile, step: int) -> tuple[NDArray[np.float64], NDArray[np.
         np.concatenate([np.column_stack([a, b, c]), np.column_stack([c, b, d])]), return_inverse=True
     )
     row, col = np.divmod(used, z.shape[1])
-    at = col * step + 0.5, row * step + 0.5
-    x, y = terrain.transform @ at
-    rows, cols = terrain.values.shape
+    col, row = col * step, row * step
+    x, y = terrain.grid.matrix @ [col, row, np.ones(len(used))]
+    rows, cols = terrain.grid.values.shape
     # trimesh has v = 0 at the foot of the texture, and turns it when it writes glTF.
     return (
-        np.column_stack([x, y, z[row, col]]),
+        np.column_stack([x, y, terrain.grid.values[row, col]]),
         faces.reshape(-1, 3),
-        np.column_stack([at[0] / cols, 1.0 - at[1] / rows]),
+        np.column_stack([(col + 0.5) / cols, 1.0 - (row + 0.5) / rows]),
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rille.datasets.text.count import count
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
@@ -26,7 +27,7 @@ class PlacedPair:
 
 
 class PlacedPairs:
-    """All of a run; iterated, one is opened at a time. ``unplaced``: how many have a disparity and no pose.
+    """All of a run; iterated, one is opened at a time. ``words``: how many there are, and how many have no pose.
 
     Raises
     ------
@@ -42,7 +43,9 @@ class PlacedPairs:
         here = {frame for frame, piece in zip(frames, pieces, strict=True) if piece == trajectory.meta["main"]}
         pairs = sorted(int(name) for name in run.labels(r"hfvm/(\d{1,9})"))
         self._run, self._every, self.pairs = run, every, [pair for pair in pairs if pair in here]
-        self.unplaced = len(pairs) - len(self.pairs)
+        unplaced = len(pairs) - len(self.pairs)
+        left_out = f", {unplaced} without a pose are left out" if unplaced else ""
+        self.words = f"{count(len(self.pairs), 'pair')}{left_out}"
         if not self.pairs:
             text = "no pair of the run has both a disparity and a pose"
             raise InputError("RIL-613", text, remedy="its report says what failed")

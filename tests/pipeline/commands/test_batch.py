@@ -68,10 +68,7 @@ def test_an_interrupt_ends_the_command():
 def test_figures_are_those_of_the_report(tmp_path):
     frames = [{"posed": True}, {"posed": False}, {"posed": True}, {"posed": True}]
     report = {"metrics": {"trajectory_drift": {"value": 0.71234}}, "frames": frames, "missing": [{}, {}]}
+    report["stages"] = {"a": {"computed": 0, "cached": 2}, "b": {"computed": 1, "cached": 0}}
     (tmp_path / "report.json").write_text(json.dumps(report))
-    rows = [
-        {"label": label, "status": status} for label, status in (("a", "cached"), ("b", "computed"), ("c", "cached"))
-    ]
-    (tmp_path / "ledger.jsonl").write_text("\n".join(map(json.dumps, rows)))
     row = batch.table([batch.Ended("street", HOLES, tmp_path, 12.34)], ["street"]).splitlines()[1]
     assert row.split() == ["street", "with", "holes", "75", "%", "0.712", "%", "2", "1", "2", "12.3", str(tmp_path)]

@@ -165,7 +165,7 @@ def test_places_that_cannot_be_written(drive, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(FileExistsError, match="file"):
         init(drive, output=tmp_path / "file" / "m.toml")
-    with raises("RIL-037", "m.yaml"):
+    with raises("RIL-871", "m.yaml"):
         init(drive, output=tmp_path / "m.yaml")
     with raises("RIL-193"):
         init(tmp_path / "nothing")

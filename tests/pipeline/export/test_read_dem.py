@@ -58,7 +58,7 @@ def test_a_value_that_marks_the_unknown_is_no_elevation(tmp_path, mark, base, ki
     found = read_elevation(tiff(tmp_path / "dem.tif", values.astype(kind)))
     expected = np.full(values.shape, True)
     expected[HOLE] = False
-    assert (np.isfinite(found.values) == expected).all()
+    assert (np.isfinite(found.grid.values) == expected).all()
     (line,) = found.warnings
     assert "RIL-725" in line
     assert "450 cells" in line
@@ -68,20 +68,20 @@ def test_so_in_an_ascii_grid_without_its_line_and_where_two_values_do(tmp_path):
     values = hills(100.0)
     values[HOLE], values[40, :] = -9999.0, 1e20
     found = read_elevation(asc(tmp_path / "dem.asc", values))
-    assert np.isnan(found.values).sum() == 450 + 80
+    assert np.isnan(found.grid.values).sum() == 450 + 80
     assert sum("RIL-725" in line for line in found.warnings) == 2
 
 
 def test_so_where_mountains_extend_further_than_the_value_is_off(tmp_path):
     values = hills(2600.0, 1500.0)
     values[HOLE] = -999.0
-    assert np.isnan(read_elevation(asc(tmp_path / "dem.asc", values)).values).sum() == 450
+    assert np.isnan(read_elevation(asc(tmp_path / "dem.asc", values)).grid.values).sum() == 450
 
 
 def test_so_over_level_ground(tmp_path):
     values = np.full((60, 80), 12.5, np.float32)
     values[HOLE] = -9999.0
-    assert np.isnan(read_elevation(tiff(tmp_path / "dem.tif", values)).values).sum() == 450
+    assert np.isnan(read_elevation(tiff(tmp_path / "dem.tif", values)).grid.values).sum() == 450
 
 
 def sea(z: np.ndarray) -> np.ndarray:
@@ -124,7 +124,7 @@ def floor(z: np.ndarray) -> np.ndarray:
 def test_what_is_only_flat_or_far_stays(tmp_path, shape, cell):
     values = shape(hills(0.0)).astype(np.float32)
     found = read_elevation(tiff(tmp_path / "dem.tif", values, cell))
-    assert (found.values == values).all()
+    assert (found.grid.values == values).all()
     # A cliff of 200 m within a metre, upright all along the sea, is doubted.
     doubted = [shape is cliff_over_a_sea and cell == 1.0]
     assert ["RIL-726" in line for line in found.warnings] == [one for one in doubted if one]
@@ -135,17 +135,17 @@ def test_a_usual_mark_in_scattered_cells_is_no_elevation(tmp_path, mark, kind):
     values = hills(100.0)
     values[::7, ::5] = mark
     found = read_elevation(tiff(tmp_path / "dem.tif", values.astype(kind), 0.5))
-    assert np.isnan(found.values).sum() == 9 * 16
+    assert np.isnan(found.grid.values).sum() == 9 * 16
     assert [line.split(":")[0] for line in found.warnings] == ["RIL-725"]
 
 
 @pytest.mark.parametrize("ending", ["txt", "grd", "ASC"])
 def test_an_ascii_grid_is_known_by_its_content(tmp_path, ending):
     path = asc(tmp_path / "dem.asc", hills(100.0)).rename(tmp_path / f"dem.{ending}")
-    assert np.isfinite(read_elevation(path).values).all()
+    assert np.isfinite(read_elevation(path).grid.values).all()
 
 
 def test_a_box_in_a_simulated_bed_stays(tmp_path):
     values = hills(0.0, 0.02)
     values[HOLE] = 0.25
-    assert np.isfinite(read_elevation(tiff(tmp_path / "dem.tif", values, 0.002)).values).all()
+    assert np.isfinite(read_elevation(tiff(tmp_path / "dem.tif", values, 0.002)).grid.values).all()

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 
-from rille.pipeline.flow import assessment
 from rille.stages.core.declare import Bundle, NoParams
-from rille.stages.evaluation import accuracy, crosscheck_join, truth
+from rille.stages.evaluation import accuracy, crosscheck_join
 
 
 @pytest.mark.parametrize("split", [0, 3, 9])
@@ -23,17 +19,7 @@ def test_the_other_program_s_longest_piece_is_judged(split: int) -> None:
         for a, b in ((0, split), (split, 12))
     ]
     joined = crosscheck_join.crosscheck_join_stage.run(NoParams(), {"frames": frames}, {"windows": windows})
-    known = truth.truth_stage.run(NoParams(), {"poses": poses.reshape(12, 12).tolist(), "frames": frames}, {})
-    given: list[dict[str, Any]] = []
-    make: Any = SimpleNamespace(
-        node=lambda stage, label, **words: given.append(words),
-        sequence=SimpleNamespace(truth=poses),
-        products=SimpleNamespace(),
-    )
-    steps: Any = assessment._of_crosscheck(make, "joined", "known")  # type: ignore[arg-type]
-    next(steps)
-    with pytest.raises(StopIteration):
-        steps.send(joined)
-    metrics = accuracy.accuracy_stage(NoParams(), joined, known, piece=given[0]["piece"]).meta["metrics"]
+    known = {"truth": poses.reshape(12, 12).tolist(), "frames": frames}
+    metrics = accuracy.accuracy_stage.run(NoParams(), known, {"trajectory": joined}).meta["metrics"]
     assert metrics["frames_judged"]["value"] == max(split, 12 - split)
     assert metrics["drift"]["value"] == pytest.approx(0.0, abs=1e-9)

@@ -168,7 +168,7 @@ def numbers(value: Any) -> Iterator[float]:
 @pytest.mark.slow
 def test_no_estimate_reads_a_true_pose(arrived: tuple[Drive, Result]) -> None:
     flow, _ = arrived
-    assess = {"truth", "truth_dem"}
+    assess = {"accuracy", "truth_dem"}
     positions = {value for f, pose in flow.true.items() if f for value in np.array(pose).reshape(3, 4)[:, 3].tolist()}
 
     def honest(handle: Handle) -> bool:

@@ -91,7 +91,7 @@ def test_a_lost_frame_is_bridged_and_no_pyramid_is_made_twice() -> None:
     assert products.trajectory is not None
     assert products.trajectory.spec.args["lost"] == [{"frame": 3, "cause": "black"}]
     assert list(products.world_dem) == [0, 4, 6]
-    assert labels(graph, "accuracy") == ["accuracy"]
+    assert labels(graph, "accuracy") == ["accuracy", "accuracy/crosscheck"]
 
 
 def test_wrong_cameras_are_corrected_in_all_that_rests_on_them_and_nothing_else_is_made_twice() -> None:
@@ -182,7 +182,7 @@ def test_a_rig_is_found_from_pairs_over_the_whole_sequence(count: int, found: in
     assert some[-1] >= count - max(count // found + 1, 1)
 
 
-def test_the_world_is_that_of_the_largest_piece_and_each_piece_is_judged() -> None:
+def test_the_world_is_that_of_the_largest_piece() -> None:
     graph, products = lay_out(
         [],
         {"chain": list(range(8)), "lost": [], "unfit": []},
@@ -192,8 +192,6 @@ def test_the_world_is_that_of_the_largest_piece_and_each_piece_is_judged() -> No
     )
     assert list(products.world_dem) == [3, 6]
     assert products.world_dem[6].inputs["reference"] is products.level[3]
-    assert labels(graph, "accuracy") == ["accuracy/piece/1", "accuracy"]
-    assert products.accuracy is products.accuracy_pieces[1]
     assert labels(graph, "intrinsics") == []
 
 

@@ -12,7 +12,6 @@ from evo.core.trajectory import PosePath3D
 from scipy.spatial.transform import Rotation
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
-from rille.stages.evaluation import truth
 from rille.stages.evaluation.accuracy import accuracy_stage, nees, trajectory_accuracy
 from rille.stages.geometry.geometry import rotation_exp
 from rille.stages.geometry.rigid import by_frame
@@ -131,12 +130,9 @@ def test_a_camera_at_rest_has_no_drift_figure() -> None:
 
 def test_the_stage_matches_frames_by_number() -> None:
     true = walk(3, 6)
-    source = truth.truth_stage.run(
-        NoParams(), {"poses": true.reshape(6, 12).tolist(), "frames": [4, 5, 6, 7, 8, 9]}, {}
-    )
-    check_outputs(truth.truth_stage, source)
+    known = {"truth": true.reshape(6, 12).tolist(), "frames": [4, 5, 6, 7, 8, 9]}
     trajectory = Bundle({"poses": true[[0, 1, 2, 4]]}, {"frames": [4, 5, 6, 8]})
-    out = accuracy_stage.run(NoParams(), {}, {"trajectory": trajectory, "truth": source})
+    out = accuracy_stage.run(NoParams(), known, {"trajectory": trajectory})
     check_outputs(accuracy_stage, out)
     assert out.meta["metrics"]["frames_missing"]["value"] == 2
     assert out.meta["metrics"]["ate_rmse"]["value"] == pytest.approx(0.0, abs=1e-9)
@@ -174,11 +170,8 @@ def test_gaps_in_truth_are_counted_left_out_and_bridged() -> None:
 def test_truth_with_gaps_and_a_trajectory_without_poses_as_artifacts() -> None:
     true = walk(3, 4)
     poses = [None if k == 2 else p.reshape(12).tolist() for k, p in enumerate(true)]
-    source = truth.truth_stage.run(NoParams(), {"poses": poses, "frames": [4, 5, 6, 7]}, {})
-    check_outputs(truth.truth_stage, source)
-    assert np.isnan(source["poses"][2]).all()
     nothing = Bundle({"poses": np.full((4, 3, 4), np.nan)}, {"frames": [4, 5, 6, 7]})
-    out = accuracy_stage.run(NoParams(), {}, {"trajectory": nothing, "truth": source})
+    out = accuracy_stage.run(NoParams(), {"truth": poses, "frames": [4, 5, 6, 7]}, {"trajectory": nothing})
     check_outputs(accuracy_stage, out)
     value = {name: m["value"] for name, m in out.meta["metrics"].items()}
     counts = {"frames": 4, "frames_missing": 4, "frames_without_truth": 1, "frames_judged": 0}

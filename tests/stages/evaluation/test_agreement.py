@@ -46,7 +46,7 @@ def run(
     piece = np.where(np.isfinite(theirs[:, 0, 0]), 0, -1) if piece is None else piece
     frames = list(range(10, 10 + len(ours)))
     pieces = [[f for f, p in zip(frames, piece, strict=True) if p == k] for k in range(int(piece.max()) + 1)]
-    arrays = {"piece_poses": theirs, "piece": piece.astype(np.int16)}
+    arrays = {"poses": theirs, "piece": piece.astype(np.int16)}
     arrays["line_distance"] = np.full(len(ours), 0.2) if lines is None else lines
     other = Bundle(arrays, {"frames": frames, "pieces": pieces})
     out = agreement_stage.run(
@@ -219,7 +219,7 @@ def test_from_one_of_our_pieces_to_the_next_there_is_no_way() -> None:
     ours[10:] = moved(true[10:], true[10, :, :3].T, -true[10, :, :3].T @ true[10, :, 3])  # begins at its own origin
     frames = list(range(20))
     given = Bundle({"poses": ours, "piece": np.repeat([0, 1], 10).astype(np.int16)}, {"frames": frames})
-    arrays = {"piece_poses": true, "piece": np.zeros(20, np.int16), "line_distance": np.zeros(20)}
+    arrays = {"poses": true, "piece": np.zeros(20, np.int16), "line_distance": np.zeros(20)}
     other = Bundle(arrays, {"frames": frames, "pieces": [frames]})
     metrics = agreement_stage.run(NoParams(), {}, {"trajectory": given, "crosscheck": other}).meta["metrics"]
     assert metrics["rmse"]["value"] == pytest.approx(0.0, abs=1e-9)

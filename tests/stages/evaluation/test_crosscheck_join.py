@@ -66,9 +66,8 @@ def test_a_broken_chain_names_its_pieces_and_keeps_the_longest() -> None:
     )
     check_outputs(crosscheck_join_stage, out)
     assert out.meta["pieces"] == [[0, 1, 2, 3], [4, 5, 6, 8, 9, 10, 11]]
-    assert out.meta["longest"] == 1
-    assert posed(out["poses"]).tolist() == [False] * 4 + [True] * 3 + [False] + [True] * 4
-    assert posed(out["piece_poses"]).tolist() == [True] * 7 + [False] + [True] * 4
+    assert out.meta["main"] == 1
+    assert posed(out["poses"]).tolist() == [True] * 7 + [False] + [True] * 4
     assert out["piece"].tolist() == [0] * 4 + [1] * 3 + [-1] + [1] * 4
     np.testing.assert_allclose(out["line_distance"], np.arange(12) / 10)
 
