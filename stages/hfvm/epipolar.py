@@ -6,7 +6,7 @@ only a help to the search: it is estimated anew at every level and never leaves 
 The constraint ``p'^T F p = 0`` is linear in F. Divided by the coefficient of ``y'`` it reads ``y' = y + small`` for a
 rig whose baseline lies along the rows, divided by that of ``x'`` likewise for one along the columns; both are fitted as
 a maximum a posteriori with a weak prior on the small terms (a few degrees of roll and toe-in), which decides what a
-flat scene leaves open. The first one is taken where most matches lie on its lines, else the likelier one.
+flat scene leaves open. The likelier one is taken.
 """
 
 from __future__ import annotations
@@ -63,12 +63,12 @@ def fit_points(
     right_mid = (0.5 * (right_shape[1] - 1), 0.5 * (right_shape[0] - 1))
     p = np.stack([(x - left_mid[0]) / scale, (y - left_mid[1]) / scale])
     q = np.stack([(x + u - right_mid[0]) / scale, (y + v - right_mid[1]) / scale])
-    rows = _solve(p, q, MATCH_SIGMA_PX / scale)
-    f, _, spread = rows
-    if spread * scale > MATCH_SIGMA_PX:
-        cols = _solve(p[::-1], q[::-1], MATCH_SIGMA_PX / scale)
+    f, cost, spread = _solve(p, q, MATCH_SIGMA_PX / scale)
+    # Relief of half a pixel lies on lines of either kind: how far off tells them apart.
+    cols = _solve(p[::-1], q[::-1], MATCH_SIGMA_PX / scale)
+    if cols[1] < cost:
         swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-        f, spread = (rows[0], rows[2]) if rows[1] <= cols[1] else (swap @ cols[0] @ swap, cols[2])
+        f, spread = swap @ cols[0] @ swap, cols[2]
     to_left, to_right = (
         np.array([[1 / scale, 0.0, -x / scale], [0.0, 1 / scale, -y / scale], [0, 0, 1.0]])
         for x, y in (left_mid, right_mid)
