@@ -80,14 +80,23 @@ def find(sample: Sample, level: int, shapes: Sequence[Shape]) -> Matrix | None:
     return h if MIN_DISTORTION <= shear < MAX_DISTORTION else None
 
 
+def refitted(sample: Sample, level: int, shapes: Sequence[Shape], h: Matrix) -> Matrix | None:
+    """Homography of the dominant plane by matches with a right image that ``h`` has aligned; None: too few."""
+    fit = fit_points(sample, shapes[level], PLANE_TOLERANCE_PX)
+    return None if fit is None else to_original(h, shapes[0]) @ to_level_0(fit[0], level)
+
+
 def aligned(right: Image, h: Matrix, left: Image) -> Image:
     """The right image resampled to the left one's geometry, with :func:`margin` pixels more on every side."""
     layers: list[Layer] = []
     m, levels = margin(left.shapes[0]), min(len(left.layers), len(right.layers))
+    # A right image of twice the scale is read a level higher, whose pixels are means: it would alias.
+    above = max(0, round(math.log2(scale(h, left.shapes[0]))))
     # From the top down: masked pixels take their grey from the level above.
     for n in range(levels - 1, -1, -1):
-        layer, up = right.layers[n], finer(n)
-        own = np.linalg.inv(up) @ h @ up @ translation(-(m >> n))
+        source = min(n + above, len(right.layers) - 1)
+        layer = right.layers[source]
+        own = np.linalg.inv(finer(source)) @ h @ finer(n) @ translation(-(m >> n))
         wide = tuple(k + 2 * (m >> n) for k in left.shapes[n])
         layers.insert(0, Layer.of(partial(_resampled, layer, own, layers[0] if layers else None), wide, layer.weights))
     return Image(tuple(layers), right.noise)
