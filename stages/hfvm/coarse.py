@@ -239,6 +239,9 @@ MIN_UPRIGHT_SHARE = 0.6
 """Share of consistent pixels below which the images may be turned, or far apart: chance alone makes up to .23 of them
 so, with preset ``accurate``, which smooths more, up to .46; pairs of usual rigs have .8 and more."""
 
+MIN_MANY_SHARE = 0.8
+"""Share of consistent pixels below which a plane need explain fewer of them."""
+
 MIN_EVEN_SHARE = 0.85
 """Share of consistent pixels from which on no other brightness is guessed."""
 
@@ -307,7 +310,8 @@ def known(coarse: Coarse) -> Coarse:
 
 def align(coarse: Coarse) -> Coarse:
     """The right image aligned by the dominant plane, where one explains the matches."""
-    h = plane.find(sample(coarse.images, coarse.state), coarse.state.level, coarse.images.left.shapes)
+    few = coarse.state.share < MIN_MANY_SHARE
+    h = plane.find(sample(coarse.images, coarse.state), coarse.state.level, coarse.images.left.shapes, few)
     return coarse if h is None else known(coarse.anew(plane.aligned(coarse.right, h, coarse.images.left), alignment=h))
 
 

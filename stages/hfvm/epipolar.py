@@ -6,7 +6,7 @@ only a help to the search: it is estimated anew at every level and never leaves 
 The constraint ``p'^T F p = 0`` is linear in F. Divided by the coefficient of ``y'`` it reads ``y' = y + small`` for a
 rig whose baseline lies along the rows, divided by that of ``x'`` likewise for one along the columns; both are fitted as
 a maximum a posteriori with a weak prior on the small terms (a few degrees of roll and toe-in), which decides what a
-flat scene leaves open. The likelier one is taken.
+flat scene leaves open. The first one is taken where most matches lie on its lines, else the likelier one.
 """
 
 from __future__ import annotations
@@ -34,6 +34,10 @@ TERM_SIGMAS = np.array([0.2, 0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.5])
 
 SHARP_SPREAD_PX = 0.2
 """Pixels: median distance of sub-pixel matches from their lines in an ideal rig; beyond it the band is softened."""
+
+PLAIN_SPREAD_PX = 0.05
+"""Pixels: median distance of matches from lines along the rows beyond which lines along the columns may be likelier.
+A plane lies on lines of either kind; relief of less than half a pixel tells them apart."""
 
 MIN_MATCHES = 40
 
@@ -64,11 +68,11 @@ def fit_points(
     p = np.stack([(x - left_mid[0]) / scale, (y - left_mid[1]) / scale])
     q = np.stack([(x + u - right_mid[0]) / scale, (y + v - right_mid[1]) / scale])
     f, cost, spread = _solve(p, q, MATCH_SIGMA_PX / scale)
-    # Relief of half a pixel lies on lines of either kind: how far off tells them apart.
-    cols = _solve(p[::-1], q[::-1], MATCH_SIGMA_PX / scale)
-    if cols[1] < cost:
-        swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-        f, spread = swap @ cols[0] @ swap, cols[2]
+    if spread * scale > PLAIN_SPREAD_PX:
+        cols = _solve(p[::-1], q[::-1], MATCH_SIGMA_PX / scale)
+        if cols[1] < cost:
+            swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+            f, spread = swap @ cols[0] @ swap, cols[2]
     to_left, to_right = (
         np.array([[1 / scale, 0.0, -x / scale], [0.0, 1 / scale, -y / scale], [0, 0, 1.0]])
         for x, y in (left_mid, right_mid)

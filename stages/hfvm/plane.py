@@ -49,7 +49,10 @@ KERNEL_REACH_PX = 2
 """Pixels that the cubic kernel reaches beyond a place."""
 
 MIN_EXPLAINED_SHARE = 0.6
-"""Least share of the coarse matches that the plane must explain."""
+"""Least share of the coarse matches that the plane must explain; a street's ground has .44 to .55."""
+
+MIN_EXPLAINED_OF_FEW = 0.5
+"""The same where windows are so sheared that few match, and of these the ground the least."""
 
 
 MIN_DISTORTION = 0.2
@@ -67,13 +70,13 @@ MARGIN_WIDTH_SHARE = 1.0 / 16.0
 """Share of the width added around the aligned image, for what stands out of the plane."""
 
 
-def find(sample: Sample, level: int, shapes: Sequence[Shape]) -> Matrix | None:
+def find(sample: Sample, level: int, shapes: Sequence[Shape], few: bool = False) -> Matrix | None:
     """Homography from aligned pixels to right image pixels (level 0), or None where alignment would not help.
 
-    ``shapes``: of the left image's levels.
+    ``shapes``: of the left image's levels; ``few``: whether few pixels match.
     """
     fit = fit_points(sample, shapes[level], PLANE_TOLERANCE_PX)
-    if fit is None or fit[1] < MIN_EXPLAINED_SHARE:
+    if fit is None or fit[1] < (MIN_EXPLAINED_OF_FEW if few else MIN_EXPLAINED_SHARE):
         return None
     h = to_level_0(fit[0], level)
     shear = distortion(h, (shapes[0][0], shapes[0][1]))

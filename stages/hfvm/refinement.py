@@ -398,7 +398,9 @@ def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int
     if fit is None:
         return np.zeros((*u.shape, 3), np.float32), 0.0
     lines = epipolar.lines(fit[0], u.shape)
-    off = np.where(keep, lines[..., 0] * u + lines[..., 1] * v + lines[..., 2], np.float32(0))
+    # Clipped, lest a patch of wrong matches passes for a bend.
+    off = np.clip(lines[..., 0] * u + lines[..., 1] * v + lines[..., 2], -0.5, 0.5)
+    off = np.where(keep, off, np.float32(0))
     bent = (window_sum32(off, BENT_SIDE_PX) / np.maximum(window_count(keep, BENT_SIDE_PX), 1))[y, x]
     trust = min(1.0, (TRUSTED_SPREAD_PX / max(fit[1], 1e-9)) ** 2)
     return lines, trust if epipolar.typical(bent) <= MAX_BENT_PX else 0.0
