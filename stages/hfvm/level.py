@@ -274,7 +274,7 @@ def one_way(images: PyramidPair, level: int, above: State | None, near_sign: flo
 
 
 def hand_down(state: State, params: HfvmParams) -> Map:
-    """Map whose inconsistent pixels are interpolated along rows, else along columns: the prediction of the next level."""
+    """Prediction of the next level: the map, its inconsistent pixels interpolated along their row, else column."""
     u, v = (a.astype(np.float32) for a in (state.left.u, state.left.v))
     # While the sign is unknown, the usual rig's stands.
     sign, filled = state.near_sign or -1.0, np.zeros(u.shape, np.uint8)
