@@ -235,9 +235,12 @@ def greatest(ratio: Floats) -> float:
 COARSE_LEVEL = 2
 """Level whose matches decide on brightness, alignment by a plane, and turned views."""
 
-MIN_UPRIGHT_SHARE = 0.45
-"""Share of consistent pixels below which the images may be turned: chance alone makes up to .23 of them so, with preset
-``accurate``, which smooths more, up to .40."""
+MIN_UPRIGHT_SHARE = 0.6
+"""Share of consistent pixels below which the images may be turned, or far apart: chance alone makes up to .23 of them
+so, with preset ``accurate``, which smooths more, up to .46; pairs of usual rigs have .8 and more."""
+
+MIN_MANY_SHARE = 0.8
+"""Share of consistent pixels below which a plane need explain fewer of them."""
 
 MIN_EVEN_SHARE = 0.85
 """Share of consistent pixels from which on no other brightness is guessed."""
@@ -307,7 +310,8 @@ def known(coarse: Coarse) -> Coarse:
 
 def align(coarse: Coarse) -> Coarse:
     """The right image aligned by the dominant plane, where one explains the matches."""
-    h = plane.find(sample(coarse.images, coarse.state), coarse.state.level, coarse.images.left.shapes)
+    few = coarse.state.share < MIN_MANY_SHARE
+    h = plane.find(sample(coarse.images, coarse.state), coarse.state.level, coarse.images.left.shapes, few)
     return coarse if h is None else known(coarse.anew(plane.aligned(coarse.right, h, coarse.images.left), alignment=h))
 
 
@@ -321,7 +325,10 @@ def turn(coarse: Coarse) -> Coarse:
         return coarse
     upright = replace(coarse, state=replace(coarse.state, near_sign=0.0))
     turned = upright.anew(plane.aligned(coarse.right, h, coarse.images.left), alignment=h)
-    return turned if turned.state.share > coarse.state.share else coarse
+    # Keypoints stand on what sticks out; the matches that they made possible say more of the plane.
+    h = plane.refitted(sample(turned.images, turned.state), COARSE_LEVEL, coarse.images.left.shapes, h)
+    again = turned if h is None else upright.anew(plane.aligned(coarse.right, h, coarse.images.left), alignment=h)
+    return max(coarse, turned, again, key=lambda tried: tried.state.share)
 
 
 def match_coarse_levels(images: PyramidPair, prior: PriorDisparities | None = None) -> Coarse:

@@ -35,6 +35,10 @@ TERM_SIGMAS = np.array([0.2, 0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.5])
 SHARP_SPREAD_PX = 0.2
 """Pixels: median distance of sub-pixel matches from their lines in an ideal rig; beyond it the band is softened."""
 
+PLAIN_SPREAD_PX = 0.05
+"""Pixels: median distance of matches from lines along the rows beyond which lines along the columns may be likelier.
+A plane lies on lines of either kind; relief of less than half a pixel tells them apart."""
+
 MIN_MATCHES = 40
 
 MIN_NORMAL = np.float32(1e-12)
@@ -63,12 +67,12 @@ def fit_points(
     right_mid = (0.5 * (right_shape[1] - 1), 0.5 * (right_shape[0] - 1))
     p = np.stack([(x - left_mid[0]) / scale, (y - left_mid[1]) / scale])
     q = np.stack([(x + u - right_mid[0]) / scale, (y + v - right_mid[1]) / scale])
-    rows = _solve(p, q, MATCH_SIGMA_PX / scale)
-    f, _, spread = rows
-    if spread * scale > MATCH_SIGMA_PX:
+    f, cost, spread = _solve(p, q, MATCH_SIGMA_PX / scale)
+    if spread * scale > PLAIN_SPREAD_PX:
         cols = _solve(p[::-1], q[::-1], MATCH_SIGMA_PX / scale)
-        swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-        f, spread = (rows[0], rows[2]) if rows[1] <= cols[1] else (swap @ cols[0] @ swap, cols[2])
+        if cols[1] < cost:
+            swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+            f, spread = swap @ cols[0] @ swap, cols[2]
     to_left, to_right = (
         np.array([[1 / scale, 0.0, -x / scale], [0.0, 1 / scale, -y / scale], [0, 0, 1.0]])
         for x, y in (left_mid, right_mid)

@@ -274,10 +274,13 @@ def one_way(images: PyramidPair, level: int, above: State | None, near_sign: flo
 
 
 def hand_down(state: State, params: HfvmParams) -> Map:
-    """Map whose inconsistent pixels are interpolated along their row: the prediction of the next level."""
+    """Prediction of the next level: the map, its inconsistent pixels interpolated along their row, else column."""
     u, v = (a.astype(np.float32) for a in (state.left.u, state.left.v))
     # While the sign is unknown, the usual rig's stands.
-    fill_rows(u, v, state.left_ok, params.fill_reach, state.near_sign or -1.0, np.zeros(u.shape, np.uint8))
+    sign, filled = state.near_sign or -1.0, np.zeros(u.shape, np.uint8)
+    fill_rows(u, v, state.left_ok, params.fill_reach, sign, filled)
+    # Rows may have nothing to take from, as at the border of what both cameras see: chance predicts nothing.
+    fill_rows(u.T, v.T, (state.left_ok | (filled != 0)).T, params.fill_reach, sign, filled.T)
     # Interpolated values are fractions; a search centre is a whole pixel.
     return Map(*(np.rint(a).astype(np.int16) for a in (u, v)))
 

@@ -49,7 +49,10 @@ KERNEL_REACH_PX = 2
 """Pixels that the cubic kernel reaches beyond a place."""
 
 MIN_EXPLAINED_SHARE = 0.6
-"""Least share of the coarse matches that the plane must explain."""
+"""Least share of the coarse matches that the plane must explain; a street's ground has .44 to .55."""
+
+MIN_EXPLAINED_OF_FEW = 0.5
+"""The same where windows are so sheared that few match, and of these the ground the least."""
 
 
 MIN_DISTORTION = 0.2
@@ -67,27 +70,36 @@ MARGIN_WIDTH_SHARE = 1.0 / 16.0
 """Share of the width added around the aligned image, for what stands out of the plane."""
 
 
-def find(sample: Sample, level: int, shapes: Sequence[Shape]) -> Matrix | None:
+def find(sample: Sample, level: int, shapes: Sequence[Shape], few: bool = False) -> Matrix | None:
     """Homography from aligned pixels to right image pixels (level 0), or None where alignment would not help.
 
-    ``shapes``: of the left image's levels.
+    ``shapes``: of the left image's levels; ``few``: whether few pixels match.
     """
     fit = fit_points(sample, shapes[level], PLANE_TOLERANCE_PX)
-    if fit is None or fit[1] < MIN_EXPLAINED_SHARE:
+    if fit is None or fit[1] < (MIN_EXPLAINED_OF_FEW if few else MIN_EXPLAINED_SHARE):
         return None
     h = to_level_0(fit[0], level)
     shear = distortion(h, (shapes[0][0], shapes[0][1]))
     return h if MIN_DISTORTION <= shear < MAX_DISTORTION else None
 
 
+def refitted(sample: Sample, level: int, shapes: Sequence[Shape], h: Matrix) -> Matrix | None:
+    """Homography of the dominant plane by matches with a right image that ``h`` has aligned; None: too few."""
+    fit = fit_points(sample, shapes[level], PLANE_TOLERANCE_PX)
+    return None if fit is None else to_original(h, shapes[0]) @ to_level_0(fit[0], level)
+
+
 def aligned(right: Image, h: Matrix, left: Image) -> Image:
     """The right image resampled to the left one's geometry, with :func:`margin` pixels more on every side."""
     layers: list[Layer] = []
     m, levels = margin(left.shapes[0]), min(len(left.layers), len(right.layers))
+    # A right image of twice the scale is read a level higher, whose pixels are means: it would alias.
+    above = max(0, round(math.log2(scale(h, left.shapes[0]))))
     # From the top down: masked pixels take their grey from the level above.
     for n in range(levels - 1, -1, -1):
-        layer, up = right.layers[n], finer(n)
-        own = np.linalg.inv(up) @ h @ up @ translation(-(m >> n))
+        source = min(n + above, len(right.layers) - 1)
+        layer = right.layers[source]
+        own = np.linalg.inv(finer(source)) @ h @ finer(n) @ translation(-(m >> n))
         wide = tuple(k + 2 * (m >> n) for k in left.shapes[n])
         layers.insert(0, Layer.of(partial(_resampled, layer, own, layers[0] if layers else None), wide, layer.weights))
     return Image(tuple(layers), right.noise)

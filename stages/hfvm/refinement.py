@@ -322,6 +322,12 @@ LINE_STIFFNESS = 1000.0
 TRUSTED_SPREAD_PX = 0.05
 """Pixels: median distance from the lines up to which they are trusted fully; beyond it by its inverse square."""
 
+BENT_SIDE_PX = 65
+"""Pixels: side of a neighbourhood whose matches lie off their lines to one side where lenses bend the lines."""
+
+MAX_BENT_PX = 0.1
+"""Pixels: median of those means up to which the lines are trusted; noise has .02."""
+
 MAX_FIT_MATCHES = 4000
 
 BEND_STIFFNESS = 2000.0
@@ -385,12 +391,19 @@ def _grey(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> Any
 
 
 def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int]) -> tuple[AnyArray, float]:
-    """Epipolar lines (row, col, 3) fitted to the matches, and how far to trust them, 0..1; 0 where not determined."""
+    """Epipolar lines (row, col, 3) fitted to the matches, and how far to trust them, 0..1; 0 where not determined, or
+    bent."""
     y, x = thinned(keep, MAX_FIT_MATCHES)
     fit = epipolar.fit_points(x, y, u[y, x], v[y, x], keep.shape, right_shape)
     if fit is None:
         return np.zeros((*u.shape, 3), np.float32), 0.0
-    return epipolar.lines(fit[0], u.shape), min(1.0, (TRUSTED_SPREAD_PX / max(fit[1], 1e-9)) ** 2)
+    lines = epipolar.lines(fit[0], u.shape)
+    # Clipped, lest a patch of wrong matches passes for a bend.
+    off = np.clip(lines[..., 0] * u + lines[..., 1] * v + lines[..., 2], -0.5, 0.5)
+    off = np.where(keep, off, np.float32(0))
+    bent = (window_sum32(off, BENT_SIDE_PX) / np.maximum(window_count(keep, BENT_SIDE_PX), 1))[y, x]
+    trust = min(1.0, (TRUSTED_SPREAD_PX / max(fit[1], 1e-9)) ** 2)
+    return lines, trust if epipolar.typical(bent) <= MAX_BENT_PX else 0.0
 
 
 def _feet(lines: AnyArray, trust: float, u: AnyArray, v: AnyArray, keep: AnyArray) -> tuple[AnyArray, AnyArray]:
