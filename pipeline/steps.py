@@ -516,6 +516,8 @@ def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
     inputs = each(lambda source: _computed(source, known, drawn), handle.inputs)
     result = known[handle] = spec.stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
     if recorded:
+        for line in result.meta.get("warnings", ()):
+            raise InputError("RIL-863", f"{handle.label}: {line}", remedy="take another frame")
         drawn[handle.label] = result
     return result
 

@@ -23,6 +23,7 @@ from rille.datasets.images.headers import Header, opened, orientation, read_head
 from rille.datasets.images.kinds import KINDS, kind_of
 from rille.datasets.protocol import Source
 from rille.datasets.text.reading import open_regular, read_bytes
+from rille.datasets.text.warning import warning
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
 from rille.stages.imaging.levels import Levels, spread, swapped
@@ -356,11 +357,16 @@ def image_stage(
     header: Header,
     levels: tuple[int, int] | None = None,
 ) -> Bundle[ImageFacts]:
-    """One image file, checked and grey."""
-    name = f"frame {frame}, {camera} image {path}"
-    data = read_unchanged(Path(path), sha256, name)
-    image, colour = decode_colour(data, name, header, levels)
+    """One image file, checked and grey; of a damaged one no pixel is valid, and a warning says why."""
+    name = f"frame {frame}, {camera} image"  # without the path, which is no part of the key
+    data = read_unchanged(Path(path), sha256, f"{name} {path}")
     meta: ImageFacts = {"frame": frame, "camera": camera}
-    arrays: dict[str, NDArray[Any]] = {"image": image, "valid": np.ones(image.shape, np.uint8)}
+    image, colour = np.zeros((header.height, header.width), np.uint8 if header.depth <= 8 else np.uint16), None
+    try:
+        image, colour = decode_colour(data, name, header, levels)
+    except InputError as error:  # costs this frame, and no other
+        meta["warnings"] = [warning(error.code, error.message)]
+    usable = np.full(image.shape, "warnings" not in meta, np.uint8)
+    arrays: dict[str, NDArray[Any]] = {"image": image, "valid": usable}
     # The right image's colours would colour nothing: an ortho image is made of left ones.
     return Bundle(arrays if colour is None or camera != "left" else arrays | {"colour": colour}, meta)

@@ -140,15 +140,30 @@ def test_stage_gives_the_image_whole_and_declared(tmp_path, grey):
         assert bundle.meta == {"frame": 3, "camera": "right"}
 
 
-def test_stage_refuses_other_sizes_and_changed_files(tmp_path, grey):
+def test_stage_refuses_changed_files(tmp_path, grey):
     path = tmp_path / "a.png"
     path.write_bytes(encoded(grey))
-    with raises("RIL-176", "frame 3", "50 x 40", "51 x 40"):
-        run(files.image_source(path, 3, "left", Header(51, 40, 8), Digests()))
     source = files.image_source(path, 3, "left", Header(50, 40, 8), Digests())
     path.write_bytes(encoded(grey[::-1]))
     with raises("RIL-177"):
         run(source)
+
+
+def test_an_image_that_is_damaged_inside_has_no_valid_pixel(tmp_path, grey):
+    whole, scan = encoded(grey), photograph()
+    bad_crc, short = bytearray(whole), whole[: len(whole) // 2] + whole[-12:]
+    bad_crc[len(whole) // 2] ^= 255
+    scan[len(scan) // 2 : len(scan) // 2 + 200] = bytes(200)
+    cases = ((bad_crc, 50, 40, "RIL-170"), (short, 50, 40, "RIL-170"), (scan, 128, 96, "RIL-192"))
+    for k, (data, width, height, code) in enumerate((*cases, (whole, 51, 40, "RIL-176"))):
+        path = tmp_path / f"{k}.png"
+        path.write_bytes(bytes(data))
+        bundle = run(files.image_source(path, 3, "left", Header(width, height, 8), Digests()))
+        assert bundle["image"].shape == (height, width)
+        assert not np.any(bundle["valid"])
+        (line,) = bundle.meta["warnings"]
+        assert line.startswith(f"{code}: frame 3, left image ")
+        assert str(tmp_path) not in line
 
 
 def test_paths_are_hints_and_content_is_the_identity(tmp_path, grey):

@@ -127,7 +127,7 @@ class Inspection:
     def _images(self) -> Steps:
         """Open every image: sizes, repetitions, exposure, sharpness."""
         looks: dict[str, dict[int, dict[str, Any]]] = {camera: {} for camera in CAMERAS}
-        sizes, errors = set(), list[RilleError]()
+        sizes, errors = set(), list[Finding]()
         images = {(frame, camera): self.make.taken(frame, camera) for frame in self.frames for camera in CAMERAS}
         yield Maybe(list(images.values()))
         for (frame, camera), handle in images.items():
@@ -135,8 +135,11 @@ class Inspection:
                 if handle.ref is None:
                     raise _cause(handle)
                 bundle = self.store.open(handle.ref)
+                damage = [Finding("", line, "images", "FAIL") for line in bundle.meta.get("warnings", ())]
             except RilleError as error:
-                errors.append(error)
+                damage = [Finding(error.code, error.message, "images", "FAIL", error.remedy)]
+            if damage:
+                errors += damage
                 self.broken.add((frame, camera))
                 continue
             image = np.asarray(bundle["image"])
@@ -144,8 +147,7 @@ class Inspection:
             looks[camera][frame] = glance(image, np.asarray(bundle["valid"]))
             if looks[camera][frame]["deviation"] < self.make.config.frame_screening.uniform:
                 self.broken.add((frame, camera))
-        for refusal in errors[:NAMED_IMAGES]:
-            self.refused(refusal, "images")
+        self.say(*errors[:NAMED_IMAGES])
         whole = f"all {len(images)} open, {' and '.join(sorted(sizes))}"
         text = f"{len(errors)} of {len(images)} images cannot be used" if errors else whole
         self.say(judge.judge("images", text, {"unusable": len(errors)}))
