@@ -253,7 +253,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
 
 def _rows_first(image: Any) -> Any:
     """An image of xarray whose dimensions by their names are column and row, transposed; any other as it is."""
-    dims = getattr(image, "dims", ())
+    dims: tuple[object, ...] = getattr(image, "dims", ())
     return image.transpose() if len(dims) == 2 and dims[0] in ("x", "col", "column", "width") else image
 
 
