@@ -135,7 +135,8 @@ class Inspection:
                 if handle.ref is None:
                     raise _cause(handle)
                 bundle = self.store.open(handle.ref)
-                damage = [Finding("", line, "images", "FAIL") for line in bundle.meta.get("warnings", ())]
+                lines, path = bundle.meta.get("warnings", ()), handle.spec.hints.get("path", "")
+                damage = [Finding("", f"{line}: {path}", "images", "FAIL") for line in lines]
             except RilleError as error:
                 damage = [Finding(error.code, error.message, "images", "FAIL", error.remedy)]
             if damage:
