@@ -226,6 +226,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
 
     carried = _settings(left)
     built: Any = config.build(carried, {"hfvm": hfvm})
+    left, right = map(_rows_first, (left, right))
     images = [np.asarray(image) for image in (left, right)]
     for camera, image in zip(("left", "right"), images, strict=True):
         if image.dtype.kind in "OSU":  # a path, or nothing
@@ -234,8 +235,8 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
         if image.dtype.kind == "f" or np.issubdtype(image.dtype, np.uint16):
             low, high = float(np.nanmin(image, initial=0)), float(np.nanmax(image, initial=0))
             full = 255 if image.dtype.kind == "f" else 65535
-            # From 0 to 1, or with the mean removed and the deviation made 1; 8 bits in 16.
-            if 0 < high <= full / 255 or (low < 0 and high - low < 16):
+            # From 0 to 1, or with the mean removed and the deviation made 1; 8 bits in 16, or 16 in floating point.
+            if 0 < high <= full / 255 or (low < 0 and high - low < 16) or high > 2 * full:
                 values = f"the {camera} image's values lie from {low:.3g} to {high:.3g}"
                 text = f"{values}: {image.dtype} is taken as 0..{full}"
                 raise InputError("RIL-973", text, remedy=f"scale them to 0..{full}")
@@ -248,6 +249,12 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     for line in doubts(disparity, *images, closely=False):
         warnings.warn(line, stacklevel=2)
     return _dataset(hfvm_stage, Bundle(arrays, meta), config.merge(carried, {"hfvm": hfvm}))
+
+
+def _rows_first(image: Any) -> Any:
+    """An image of xarray whose dimensions by their names are column and row, transposed; any other as it is."""
+    dims: tuple[object, ...] = getattr(image, "dims", ())
+    return image.transpose() if len(dims) == 2 and dims[0] in ("x", "col", "column", "width") else image
 
 
 def _valid(image: Any) -> AnyArray | None:
@@ -510,7 +517,7 @@ def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
     inputs = each(lambda source: _computed(source, known, drawn), handle.inputs)
     result = known[handle] = spec.stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
     if recorded:
-        drawn[handle.label] = sound(result)
+        drawn[handle.label] = sound(result, handle.spec.hints.get("path", ""))
     return result
 
 

@@ -154,7 +154,7 @@ def bag_image_stage(
         else:
             raise InputError("RIL-944", f"{name} has changed since the run began", remedy="run the same command again")
     try:
-        image = spread(grey_of(content, name, header), levels)
+        image = spread(grey_of(content, f"{camera} image", header), levels)
     except InputError as error:
         return files.empty(frame, camera, header, error)
     return Bundle({"image": image, "valid": np.ones(image.shape, np.uint8)}, {"frame": frame, "camera": camera})

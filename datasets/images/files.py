@@ -357,10 +357,10 @@ def image_stage(
     levels: tuple[int, int] | None = None,
 ) -> Bundle[ImageFacts]:
     """One image file, checked and grey."""
-    name = f"frame {frame}, {camera} image {path}"
-    data = read_unchanged(Path(path), sha256, name)
+    data = read_unchanged(Path(path), sha256, f"frame {frame}, {camera} image {path}")
     try:
-        image, colour = decode_colour(data, name, header, levels)
+        # Without the path, which is no part of the task's key.
+        image, colour = decode_colour(data, f"{camera} image", header, levels)
     except InputError as error:
         return empty(frame, camera, header, error)
     meta: ImageFacts = {"frame": frame, "camera": camera}
@@ -372,13 +372,12 @@ def image_stage(
 def empty(frame: int, camera: str, header: Header, damage: InputError) -> Bundle[ImageFacts]:
     """An image without a usable pixel in the place of one that is ``damage``: this costs the frame, not the run."""
     nothing = np.zeros((header.height, header.width), np.uint16 if header.depth > 8 else np.uint8)
-    why = damage.message.removeprefix(f"frame {frame}, ")
-    meta: ImageFacts = {"frame": frame, "camera": camera, "damage": why}
+    meta: ImageFacts = {"frame": frame, "camera": camera, "damage": damage.message}
     return Bundle({"image": nothing, "valid": nothing.astype(np.uint8)}, meta)
 
 
-def sound(image: Bundle) -> Bundle:
-    """The image, for those who need this very one.
+def sound(image: Bundle, path: str = "") -> Bundle:
+    """The image, which is of the file ``path``, for those who need this very one.
 
     Raises
     ------
@@ -386,5 +385,6 @@ def sound(image: Bundle) -> Bundle:
         Its file is damaged.
     """
     if "damage" in image.meta:
-        raise InputError("RIL-170", f"frame {image.meta['frame']}, {image.meta['damage']}", remedy=COPY_AGAIN)
+        text = f"frame {image.meta['frame']}, {image.meta['damage']}" + (path and f": {path}")
+        raise InputError("RIL-170", text, remedy=COPY_AGAIN)
     return image

@@ -111,6 +111,9 @@ def _times(paths: Sequence[Path]) -> tuple[float, ...]:
     return ()
 
 
+DECIMAL = re.compile(r"(\D*?)((?<!\w)\.\d+|\d+(?:\.\d+)?)(\D*)")
+"""A name with one number, which may have a fraction."""
+
 UNWRITABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """In a name: control characters and line separators, which would end a comment, and bytes that are not UTF-8."""
 
@@ -131,6 +134,19 @@ def writable(name: str) -> None:
 def natural(text: str) -> tuple[tuple[int, int | str], ...]:
     """Sorting key in which numbers count as numbers: ``a2`` before ``a10``."""
     return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", text) if part)
+
+
+def in_order(stems: Sequence[str]) -> list[str]:
+    """Names without their side by the time stamps in them, by the decimals that they are, or in natural order."""
+    found = [DECIMAL.fullmatch(stem) for stem in stems]
+    numbers = [match[2] for match in found if match]
+    fractions = [number.partition(".")[2] for number in numbers]
+    # A fraction that ends in 0, among others of unlike length, is a number of its own: 1.9 before 1.10.
+    counts = len(set(map(len, fractions))) > 1 and any(len(f) > 1 and f.endswith("0") for f in fractions)
+    alike = len(numbers) == len(stems) and len({(match[1], match[3]) for match in found if match}) == 1
+    values = numbers if alike and not counts else [stamp_of(stem) or "0" for stem in stems]
+    by_stem = dict(zip(stems, map(Decimal, values), strict=True))
+    return sorted(stems, key=lambda stem: (by_stem[stem], natural(stem)))
 
 
 def ends(paths: Sequence[Path]) -> str:
@@ -203,10 +219,7 @@ def pair_up(
         An image has no partner, two images make the same pair, the counts differ, or stamps of a pair are apart.
     """
     lines = [] if warnings is None else warnings
-    # Decimals of unlike number do not sort as numbers.
-    left, right = (
-        sorted(paths, key=lambda p: (Decimal(stamp_of(p.stem) or 0), natural(p.name))) for paths in (left, right)
-    )
+    left, right = (_sorted(paths, side) for side, paths in enumerate((left, right)))
     times = _times(left), _times(right)
     joined = join(*times, tolerance) if all(times) else None
     both = " and ".join(f"{len(of)} {side} images ({ends(of)})" for side, of in (("left", left), ("right", right)))
@@ -241,6 +254,12 @@ def pair_up(
         remedy = "add the missing image, narrow the patterns, or choose another images.pair"
         raise IncompleteError("RIL-259", text, remedy=remedy)
     return _named([(path, by_key[1][key]) for key, path in by_key[0].items()])
+
+
+def _sorted(paths: Sequence[Path], side: int) -> list[Path]:
+    stems = in_order([without_side(path.stem, side) for path in paths])
+    place = {stem: k for k, stem in enumerate(stems)}
+    return sorted(paths, key=lambda path: (place[without_side(path.stem, side)], natural(path.name)))
 
 
 def _by_key(paths: Sequence[Path], side: int, rule: str) -> dict[str, Path]:
@@ -297,7 +316,7 @@ def _two_clocks(
 def _with_gaps(by_key: tuple[dict[str, Path], dict[str, Path]]) -> tuple[ImagePair, ...]:
     """Pairs of all keys and of numbers left out of a running count; an absent file has the name that it would have."""
     whole = next(key for key in by_key[0] if key in by_key[1])
-    keys = counted(sorted({**by_key[0], **by_key[1]}, key=natural))
+    keys = counted(in_order(list({**by_key[0], **by_key[1]})))
     paths = [[ours.get(key) or _called(ours[whole], whole, key) for ours in by_key] for key in keys]
     pairs = []
     for key, pair in zip(keys, _named([(left, right) for left, right in paths]), strict=True):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
+from pathlib import Path
 from warnings import catch_warnings
 
 import numpy as np
@@ -39,6 +40,8 @@ def examined(sequence: Sequence) -> Sequence:
     chosen = there[:: max(1, -(-len(there) // 3))]
     sources = {camera: [sequence.image(k, camera) for k in chosen] for camera in CAMERAS}
     images = {camera: [image for source in of for image in _images(source)] for camera, of in sources.items()}
+    for source in [of[0] for camera, of in sources.items() if of and not images[camera] and "path" in of[0].hints]:
+        files.read_grey(Path(source.hints["path"]))  # says what is wrong
     orientations: dict[str, set[int]] = {camera: set() for camera in CAMERAS}
     for camera, source in ((camera, source) for camera, of in sources.items() for source in of):
         turned, several = _tags(source)

@@ -22,6 +22,21 @@ def found(left: list[Path], right: list[Path], rule: str = "auto") -> list[tuple
 
 
 @pytest.mark.parametrize(
+    "names",
+    [
+        ["0.25", "0.5", "1", "1.25", "1.5", "10", "10.25"],
+        ["t_9.75", "t_10", "t_10.25"],
+        ["t_1.5", "t_1.9", "t_1.10", "t_1.100"],  # no decimals: some fractions end in 0
+        ["image", "image (2)", "image (10)"],
+    ],
+)
+@pytest.mark.parametrize("gaps", [False, True])
+def test_pairs_stand_in_the_order_of_the_decimals_in_their_names(names, gaps):
+    sides = [paths(*(f"{side}/{name}.png" for name in random.Random(3).sample(names, len(names)))) for side in "lr"]
+    assert [pair.name for pair in pair_up(*sides, gaps=gaps)] == names
+
+
+@pytest.mark.parametrize(
     ("left", "right", "names"),
     [
         (["l/000.png", "l/001.png"], ["r/000.png", "r/001.png"], ["000", "001"]),

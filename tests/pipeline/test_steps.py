@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xarray
 from raising import raises
 
 import rille
@@ -60,9 +61,16 @@ def test_each_step_has_the_values_of_a_run(pair: rille.StereoPair, disparity: An
 
 def test_match_refuses_grey_values_of_another_scale() -> None:
     right = np.random.default_rng(1).random((40, 60))
-    for other in (right, (right - 0.5) / 0.3, (255 * right).astype(">u2")):
+    for other in (right, (right - 0.5) / 0.3, (255 * right).astype(">u2"), 65535 * right):
         with raises("RIL-973", "the right image"):
             rille.match(np.float32(255) * right, other)
+
+
+def test_match_takes_named_dimensions_in_either_order() -> None:
+    left = np.random.default_rng(1).integers(0, 256, (40, 60)).astype(np.uint8)
+    plain = rille.match(left, np.roll(left, -3, 1))
+    turned = [xarray.DataArray(image.T, dims=("x", "y")) for image in (left, np.roll(left, -3, 1))]
+    np.testing.assert_array_equal(rille.match(*turned).column_disparity, plain.column_disparity)
 
 
 def test_match_leaves_out_what_is_masked() -> None:

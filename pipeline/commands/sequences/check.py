@@ -135,7 +135,7 @@ class Inspection:
             try:
                 if handle.ref is None:
                     raise _cause(handle)
-                bundle = sound(self.store.open(handle.ref))
+                bundle = sound(self.store.open(handle.ref), handle.spec.hints.get("path", ""))
             except RilleError as error:
                 errors.append(error)
                 self.broken.add((frame, camera))
