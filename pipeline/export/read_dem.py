@@ -169,7 +169,10 @@ def opened_raster(path: Path) -> Iterator[Any]:
                 yield file
         except (RasterioError, UnicodeDecodeError) as error:
             remedy = "give a GeoTIFF, or an ESRI ASCII grid as text without a byte order mark"
-            raise InputError("RIL-629", f"{path} cannot be read as a raster ({error})", remedy=remedy) from error
+            if error.__cause__:  # GDAL has opened it, and then read less than it should have
+                remedy = "it breaks off or is damaged: copy it again"
+            text = f"{path} cannot be read as a raster ({error.__cause__ or error})"
+            raise InputError("RIL-629", text, remedy=remedy) from error
 
 
 def read_raster(path: Path) -> DemFile:
@@ -297,6 +300,8 @@ def refuse_unlike_systems(stated: Mapping[str, str]) -> None:
         if first != second and set(names) != {own} and CRS.from_user_input(first) != CRS.from_user_input(second):
             text = f"{a} is in {names[0]}, {b} in {names[1]}"
             remedy = "bring one to the other's system first, e.g. with gdalwarp -t_srs"
+            if own in names:
+                remedy = "rille localize RUN MAP finds a run's place; state it in the manifest ([world]), and run again"
             raise InputError("RIL-615", text, remedy=remedy)
 
 

@@ -30,6 +30,8 @@ FREE = {"shift": [0, 1, 2], "tilt": [2, 3, 4], "rigid": [0, 1, 2, 3, 4, 5]}  # o
 MAX_POINTS = 300_000  # that an alignment uses: six unknowns need no more
 MAX_ITERATIONS = 50
 SETTLED_CELLS = 1e-4  # step of an alignment that ends it
+MIN_RELIEF_CELLS = 100  # known to both, from which on their relief is compared
+MIN_EXPLAINED = 0.9  # share of the relief's variance that a common factor explains
 MAX_CONDITION = 1e7  # of the normal matrix in units of cells: beyond, the terrain is flat for what is asked
 
 
@@ -240,6 +242,19 @@ def errors(a: Grid, b: Grid, alignment: Alignment | None = None) -> Floats:
         return a.values - b.values
     moved = alignment.apply(np.concatenate([a.centres(), a.values[..., None]], axis=-1))
     return np.asarray(moved[..., 2] - interpolate(b, moved[..., :2]))
+
+
+def relief_factor(a: Grid, b: Grid) -> float:
+    """Factor of B's elevations that explains nine tenths of A's but for a plane (runs may lean); 1 where none does."""
+    known = np.argwhere(np.isfinite(errors(a, b)))
+    if len(known) < MIN_RELIEF_CELLS:
+        return 1.0
+    row, col = known[:: len(known) // MAX_POINTS + 1].T
+    z = np.stack([a.values[row, col], b.values[row, col]], axis=-1)
+    plane = np.stack([row, col, np.ones(len(z))], axis=-1)
+    relief = z - plane @ np.linalg.lstsq(plane, z)[0]
+    (saa, sab), (_, sbb) = relief.T @ relief
+    return float(sab / sbb) if sab**2 > MIN_EXPLAINED * saa * sbb else 1.0
 
 
 def figures(error: Floats) -> dict[str, float]:

@@ -58,6 +58,9 @@ MORE_TURN = math.radians(20.0)
 MIN_CHI2_GAP = 30.0
 """Difference of chi2 to the second best place, below which the answer is ambiguous. Stops of the mockup on seeds 1 to 3
 had 148 at least at their right places, 7 at most in the map of another bed; on seeds 4 to 8 64 and 30."""
+MIN_EXPLAINED = 0.6
+"""Of the relief that is compared, below which a place is in doubt. Stops on seeds 1 and 2 had .80 at least at their
+right places, .51 at most in the map of another bed."""
 HUBER_SIGMAS = 1.5
 MAX_ALIKE = 0.95
 """Correlation of neighbouring differences that is believed at most."""
@@ -99,8 +102,9 @@ class Fix:
     """``pose``: T_map_model; ``covariance`` (6, 6) of its position, m, and rotation, rad, about the map's axes.
 
     ``overlap``: share of the model that the map knows; ``rms`` of the height differences, m; ``explained``: share of
-    the model's relief (variance about its plane) that they leave out; ``cells`` compared, ``independent`` of them;
-    ``other``: x, y, heading of the next best place and by how much its chi2 is larger, None where there is one place.
+    the relief (variance of the compared cells about their plane) that they leave out; ``cells`` compared,
+    ``independent`` of them; ``other``: x, y, heading of the next best place and by how much its chi2 is larger, None
+    where there is one place.
     """
 
     pose: RigidTransform
@@ -114,7 +118,9 @@ class Fix:
 
     @property
     def doubt(self) -> str:
-        """The place that fits nearly as well, in words; empty where there is none."""
+        """Why the place may be wrong, in words: it hardly fits, or another does nearly as well; empty where neither."""
+        if self.explained < MIN_EXPLAINED:
+            return f"the best place explains {max(self.explained, 0):.0%} of the relief, {MIN_EXPLAINED:.0%} are wanted"
         if self.other is None or self.other[1] >= MIN_CHI2_GAP:
             return ""
         (ox, oy, _), chi2 = self.other
@@ -458,8 +464,9 @@ def _placed(best: _Fit, blocks: ModelBlocks, middle: Floats, sigma_tilt: float) 
     information += np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 0.0]) / sigma_tilt**2
     lever = np.eye(6)
     lever[:3, 3:] = cross_matrix(turn @ middle)
-    design = np.column_stack([blocks.points[:, :2] - middle[:2], np.ones(len(blocks.points))])
-    relief = blocks.points[:, 2] - design @ np.linalg.lstsq(design, blocks.points[:, 2], rcond=None)[0]
+    compared = blocks.points[np.isfinite(best.differences)]
+    design = np.column_stack([compared[:, :2] - middle[:2], np.ones(len(compared))])
+    relief = compared[:, 2] - design @ np.linalg.lstsq(design, compared[:, 2], rcond=None)[0]
     return Fix(
         RigidTransform(turn, best.state[:3] - turn @ middle),
         lever @ np.linalg.inv(information) @ lever.T,

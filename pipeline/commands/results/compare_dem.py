@@ -31,6 +31,8 @@ from rille.stages.evaluation.place import register
 
 SHOWN_CHANGES = 12
 """Patches that are printed; all are in the JSON file."""
+MAX_RELIEF_FACTOR = 2.0
+"""Between two models of one ground; a foot is .3 m."""
 WORDS = {"rmse": "RMSE", "nmad": "NMAD", "p95": "95 %", "bias": "bias", "median": "median"}
 
 
@@ -139,6 +141,10 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
         "how": f"{compared} cells compared, of {int(known.sum())} that B knows, {within} of these "
         "within the outline of A",
     }
+    factor = evaluation.relief_factor(on_a, on_b)
+    if not 1.0 / MAX_RELIEF_FACTOR < factor < MAX_RELIEF_FACTOR:
+        text = f"the relief of {b.name} is that of {a.name} times {1.0 / factor:.3g}: is one of them in another unit"
+        figures["warnings"].append(warning("RIL-963", f"{text}{', or of depths' if factor < 0.0 else ''}?"))
     slope = np.degrees(np.arctan(np.hypot(*on_b.slopes())))
     edges = np.array([0.0, 2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0])
     figures["by_slope"] = {"unit": "degrees of B", "bins": evaluation.binned(error, slope, edges)}

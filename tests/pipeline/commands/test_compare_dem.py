@@ -76,6 +76,16 @@ def test_whole_numbers_with_a_scale_are_metres(tmp_path: Path, capsys: pytest.Ca
     assert "RIL-962: " in capsys.readouterr().err  # no unit
 
 
+@pytest.mark.parametrize(("factor", "said"), [(100.0, True), (1 / 0.3048, True), (-1.0, True), (1.3, False)])
+def test_another_unit_shows_in_the_relief(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], factor: float, said: bool
+) -> None:
+    """Neither the height of the datum nor a run that leans is taken for it."""
+    other = tiff(tmp_path / "b.tif", factor * elevation() + 50.0 + 0.1 * LATTICE.xy()[..., 0], 0.05, -1.0, 4.5)
+    assert compare(finished(tmp_path / "run"), other, output=tmp_path / "out") == 0
+    assert ("RIL-963: " in capsys.readouterr().err) is said
+
+
 def grid(path: Path, values: np.ndarray, cell: float, x0: float, y0: float) -> Path:
     """ESRI ASCII grid: lower left corner at (x0, y0)."""
     head = {"ncols": values.shape[1], "nrows": values.shape[0], "xllcorner": x0, "yllcorner": y0, "cellsize": cell}
@@ -97,6 +107,13 @@ def test_an_ascii_grid_is_as_good_as_a_tiff(tmp_path: Path, capsys: pytest.Captu
     assert "RIL-962: " in capsys.readouterr().err  # no unit
     (tmp_path / "b.prj").write_text(rasterio.crs.CRS.from_epsg(4326).to_wkt())
     assert "is in degrees" in refused(capsys, tmp_path / "a.tif", tmp_path / "b.ASC")
+
+
+def test_a_grid_that_breaks_off_is_named_as_that(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = grid(tmp_path / "whole.asc", elevation(), 0.05, -1.0, 1.0)
+    (tmp_path / "cut.asc").write_bytes(whole.read_bytes()[:9000])
+    assert "RIL-629" in (said := refused(capsys, tmp_path / "cut.asc", whole))
+    assert "copy it again" in said
 
 
 def test_a_tiff_without_a_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
