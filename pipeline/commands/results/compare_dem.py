@@ -23,7 +23,7 @@ from rille.pipeline.export.writers import ENGINEERING_CRS, Meaning, write_bands
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs, named
 from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.evaluation import dem_changes
 from rille.stages.evaluation import dem_comparison as evaluation
 from rille.stages.evaluation.dem_comparison import Grid
@@ -66,6 +66,9 @@ def compare_dem(
         Files to write, without ending.
     """
     paths = [lookup.elevation(text, runs) for text in (a, b)]
+    raster, facts = named(output, ".tif"), named(output, ".json")
+    if raster.resolve() in {(path / "dem.tif" if path.is_dir() else path).resolve() for path in paths}:
+        raise ConfigError("RIL-043", f"--output and a model are both {raster}", remedy="give another name")
     one, other = (read_elevation(path) for path in paths)
     place = None
     if align == "place":
@@ -88,7 +91,6 @@ def compare_dem(
         rasters["standard_deviation"], figures["changes"] = changed(one, other, error, cells)
         lines += _change_table(figures["changes"])
     print("\n".join(lines))
-    raster, facts = named(output, ".tif"), named(output, ".json")
     atomic.write(facts, json.dumps(figures, indent=1, allow_nan=False) + "\n")
     coarse = other if np.array_equal(cells.matrix, other.grid.matrix) else one
     profile = {"driver": "COG", "crs": coarse.crs or None, "transform": coarse.transform}

@@ -177,6 +177,8 @@ def test_one_clear_line_for_what_cannot_be_compared(tmp_path: Path, capsys: pyte
     assert f"no known cell among {z.size}" in refused(capsys, empty, run)
     assert "cannot be read as a raster" in refused(capsys, tmp_path / "text.tif", run)
     assert "has no dem.tif" in refused(capsys, tmp_path / "folder", run)
+    assert "RIL-043" in refused(capsys, run, away, "-o", tmp_path / "away")
+    assert "RIL-043" in refused(capsys, run, away, "-o", run / "dem")
     shutil.copy(run / "dem.tif", tmp_path / "same.tif")
     assert "too flat" not in refused(capsys, run, run, "--align", "nothing")
 
