@@ -51,7 +51,7 @@ class DemFile:
     ``values`` (rows, cols) metres, NaN unknown. ``transform`` maps (column, row), corners of cells at integers, to the
     CRS. ``crs`` WKT, empty where the file states none. ``viewpoints`` (n, 2) positions of the cameras in the CRS, where
     they are known. ``sigma`` (rows, cols) standard deviation of the elevations, metres, likewise. ``warnings``: what is
-    suspicious but possible.
+    suspicious but possible. ``frame`` in words, where Rille wrote it.
     """
 
     name: str
@@ -61,6 +61,7 @@ class DemFile:
     viewpoints: NDArray[np.float64] | None = None
     sigma: NDArray[np.float64] | None = None
     warnings: tuple[str, ...] = ()
+    frame: str = ""
 
     @property
     def cell(self) -> float:
@@ -190,7 +191,7 @@ def read_raster(path: Path) -> DemFile:
             remedy = "give an elevation model; rille localize takes images by --ortho"
             raise InputError("RIL-636", f"{path} has colours, no elevations", remedy=remedy)
         values = file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
-        crs, transform, unit = file.crs, file.transform, file.units[0]
+        crs, transform, unit, frame = file.crs, file.transform, file.units[0], file.tags().get("FRAME", "")
     wkt = _checked_system(path, transform, crs)
     # Lengths of the cell's sides, not a and e: a raster may be turned.
     across, down = np.hypot(transform.a, transform.d), np.hypot(transform.b, transform.e)
@@ -201,7 +202,7 @@ def read_raster(path: Path) -> DemFile:
         remedy = "convert it, e.g. with gdal_calc"
         raise InputError("RIL-632", f"{path} has elevations in {unit!r}, not in metres", remedy=remedy)
     doubt = warning("RIL-962", f"{path} states no unit of its elevations: taken as metres")
-    return DemFile(str(path), values, transform, wkt, warnings=() if unit else (doubt,))
+    return DemFile(str(path), values, transform, wkt, warnings=() if unit else (doubt,), frame=frame)
 
 
 def read_ortho(path: Path) -> tuple[Grid, str]:

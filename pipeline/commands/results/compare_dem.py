@@ -19,7 +19,7 @@ from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
-from rille.pipeline.export.writers import ENGINEERING_CRS, Meaning, write_bands
+from rille.pipeline.export.writers import ENGINEERING_CRS, ON_PLANE, Meaning, write_bands
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs, named
 from rille.stages.core.arrays import Floats
@@ -81,6 +81,10 @@ def compare_dem(
         place = {"motion_of_a": placed.motion.tolist(), "by": placed.by}
         one, align = moved(one, placed.motion), "rigid"
     refuse_unlike_systems({one.name: one.crs, other.name: other.crs})
+    if one.frame and other.frame and (one.frame == ON_PLANE) != (other.frame == ON_PLANE):
+        name = (one if one.frame == ON_PLANE else other).name
+        text = f"elevations of {name} are distances from a plane that is no ground"
+        raise InputError("RIL-842", text, remedy="run it with --set terrain.reference=ground")
     figures, error, cells = measure(one, other, align)
     figures["place"] = place
     for line in figures["warnings"]:

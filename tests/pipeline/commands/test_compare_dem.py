@@ -15,6 +15,7 @@ from terrain_runs import LATTICE, PLACE, elevation, finished, hills
 
 from rille.pipeline import cli
 from rille.pipeline.commands.results import compare_dem
+from rille.pipeline.export.writers import ON_PLANE, Meaning, write_raster
 
 
 def compare(a: Path, b: Path, **options: Any) -> int:
@@ -181,6 +182,15 @@ def test_one_clear_line_for_what_cannot_be_compared(tmp_path: Path, capsys: pyte
     assert "RIL-043" in refused(capsys, run, away, "-o", run / "dem")
     shutil.copy(run / "dem.tif", tmp_path / "same.tif")
     assert "too flat" not in refused(capsys, run, run, "--align", "nothing")
+
+
+def test_distances_from_a_plane_are_not_compared_with_ground(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, wall = finished(tmp_path / "run"), finished(tmp_path / "wall")
+    write_raster(wall / "dem.tif", {"elevation": elevation()}, LATTICE, Meaning("m", tags={"frame": ON_PLANE}))
+    assert "RIL-842" in refused(capsys, run, wall)
+    assert compare(wall, wall, output=tmp_path / "out") == 0
 
 
 def test_changes_are_listed_with_their_places_and_volumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
